@@ -1,0 +1,91 @@
+"""Files that are either complete or not there."""
+
+from __future__ import annotations
+
+import glob
+import os
+import secrets
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import IO
+
+from mcaptrack.errors import McaptrackError
+
+
+@contextmanager
+def publish(path: Path) -> Iterator[Path]:
+    """A path beside ``path`` to write to; when the block ends well the file there takes the place of ``path``.
+
+    The bytes are on the disk before the name changes, so whatever happens at whatever time leaves the old file or the
+    new one. If the block fails or is interrupted what it wrote is removed.
+    """
+    _sweep(path)
+    part = path.with_name(f".{path.name}.{os.getpid()}.{secrets.token_hex(4)}.part")
+    try:
+        yield part
+        with part.open("rb+") as written:
+            os.fsync(written.fileno())
+        if path.exists():  # whoever could read the old file can read the new one
+            part.chmod(path.stat().st_mode)
+        os.replace(part, path)
+    finally:
+        with suppress(FileNotFoundError):
+            part.unlink()
+    _sync_folder(path.parent)
+
+
+@contextmanager
+def publish_stream(path: Path) -> Iterator[IO[bytes]]:
+    """The same with an open file."""
+    try:
+        with publish(path) as part, part.open("xb") as stream:
+            yield stream
+    except OSError as error:
+        if error.filename is None and error.errno is None:
+            raise
+        raise McaptrackError(f"{path} can't be written: {error.strerror or error}") from error
+
+
+def publish_bytes(path: Path, data: bytes) -> None:
+    """The same for a small file. Raises McaptrackError if it can't be written."""
+    with publish_stream(path) as stream:
+        stream.write(data)
+
+
+def _sweep(path: Path) -> None:
+    """Remove what processes that are gone left half written beside ``path``."""
+    for left in path.parent.glob(f".{glob.escape(path.name)}.*.part"):
+        process = left.name.removeprefix(f".{path.name}.").partition(".")[0]
+        if process.isdigit() and int(process) != os.getpid() and not _is_running(int(process)):
+            left.unlink(missing_ok=True)
+
+
+def _is_running(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:
+        return True
+    return True
+
+
+def _sync_folder(folder: Path) -> None:
+    if not hasattr(os, "O_DIRECTORY"):
+        return
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def refuse_overwrite(path: Path, force: bool) -> None:
+    """Raise McaptrackError if ``path`` can't be written to, or exists and ``force`` is not given."""
+    if path.is_dir():
+        raise McaptrackError(f"{path} is a folder; give the name of a file")
+    if not path.parent.is_dir():
+        raise McaptrackError(f"the folder {path.parent} does not exist")
+    if path.exists() and not force:
+        raise McaptrackError(f"{path} exists; give another name with -o, or --force to replace it")

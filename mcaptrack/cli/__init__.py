@@ -1,0 +1,66 @@
+"""The command line: parse, call, print. One verb a question; ``mcaptrack --help`` lists them."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from typing import Annotated, NoReturn
+
+import typer
+
+from mcaptrack import __version__
+from mcaptrack.cli.common import register
+from mcaptrack.cli.demo import demo
+from mcaptrack.cli.evaluate import evaluate
+from mcaptrack.cli.ingest import ingest
+from mcaptrack.cli.show import export, info
+from mcaptrack.cli.stages import add_stages
+
+app = typer.Typer(
+    name="mcaptrack",
+    no_args_is_help=True,
+    rich_markup_mode="markdown",
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["--help", "-h"]},
+)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        print(f"mcaptrack {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _main(
+    version: Annotated[
+        bool, typer.Option("--version", help="Print the version.", is_eager=True, callback=_version, show_default=False)
+    ] = False,
+) -> None:
+    """Find people in a video or a log, track them, repair the tracks, predict where they go, and write it all back.
+
+    Start with `mcaptrack demo`, or with `mcaptrack ingest video.mp4` and `mcaptrack run video.mcap`.
+    """
+
+
+register(app, "ingest", ingest)
+add_stages(app)
+register(app, "evaluate", evaluate)
+register(app, "export", export)
+register(app, "info", info)
+register(app, "demo", demo)
+
+
+def _terminated(number: int, _: object) -> NoReturn:
+    """A polite kill leaves like Ctrl-C does: what is half written is removed."""
+    raise SystemExit(128 + number)
+
+
+def main() -> None:
+    """The ``mcaptrack`` command."""
+    signal.signal(signal.SIGTERM, _terminated)
+    try:
+        app()
+    except BrokenPipeError:  # whoever read our output has had enough
+        sys.stderr.close()
+        sys.exit(0)

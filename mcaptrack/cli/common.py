@@ -1,0 +1,159 @@
+"""What all commands share: options, words and progress on stderr, JSON on stdout, faults in one line."""
+
+from __future__ import annotations
+
+import glob
+import json
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import wraps
+from pathlib import Path
+from time import monotonic
+from typing import Annotated, Any, Final, ParamSpec
+
+import typer
+
+from mcaptrack.cli.config import read_config
+from mcaptrack.errors import McaptrackError
+
+P = ParamSpec("P")
+
+DONE, REFUSED, LOST, GATE_MISSED = 0, 1, 3, 4
+SCHEMA_VERSION: Final = 1
+
+
+def option(*names: str, shared: bool = False, **given: Any) -> Any:
+    """A Typer option; ``shared`` ones stand apart in the help. That all can come from the environment goes unsaid."""
+    if shared:
+        given |= {"rich_help_panel": "Options of all commands", "show_default": False}
+    return typer.Option(*names, show_envvar=False, **given)
+
+
+Output = Annotated[
+    Path | None, option("--output", "-o", shared=True, help="Write to this instead; the input stays as it is.")
+]
+Force = Annotated[bool, option("--force", shared=True, help="Replace what is there.")]
+Json = Annotated[bool, option("--json", shared=True, help="Print data for programs.")]
+Quiet = Annotated[bool, option("--quiet", "-q", shared=True, help="Say nothing but errors.")]
+Verbose = Annotated[bool, option("--verbose", "-v", shared=True, help="Say more.")]
+Config = Annotated[
+    Path | None,
+    option(
+        "--config",
+        shared=True,
+        help="Options from this file; otherwise from mcaptrack.toml here, if there is one.",
+        is_eager=True,
+        callback=read_config,
+    ),
+]
+Camera = Annotated[str | None, option("--camera", shared=True, help="Which camera, if the log has several.")]
+Logs = Annotated[
+    list[Path], typer.Argument(metavar="LOG...", help="One or several logs, or a pattern.", show_default=False)
+]
+
+
+def register(app: typer.Typer, name: str, command: Callable[..., None], words: str | None = None) -> None:
+    """Add a command whose options can also come from MCAPTRACK_NAME_OPTION."""
+    settings = {"auto_envvar_prefix": f"MCAPTRACK_{name.upper()}", "help_option_names": ["--help", "-h"]}
+    app.command(name, help=words, context_settings=settings)(command)
+
+
+class Talk:
+    """Words and progress for people. Progress only on a terminal; nothing at all if ``quiet``."""
+
+    def __init__(self, quiet: bool, verbose: bool = False) -> None:
+        self.quiet, self.verbose = quiet, verbose
+        self._bar: Any = None
+        self._tasks: dict[str, Any] = {}
+        self._shown = 0.0
+
+    def say(self, words: str) -> None:
+        """A line on stderr."""
+        if not self.quiet:
+            self._stop()
+            print(printable(words), file=sys.stderr)
+
+    def detail(self, words: str) -> None:
+        """A line that only matters to some."""
+        if self.verbose:
+            self.say(words)
+
+    def progress(self, stage: str, done: int, total: int) -> None:
+        """How far a stage is."""
+        if self.quiet or not sys.stderr.isatty():
+            return
+        now = monotonic()
+        if now - self._shown < 0.1 and done < total:
+            return
+        self._shown = now
+        if self._bar is None:
+            self._start()
+        if stage not in self._tasks:
+            self._tasks[stage] = self._bar.add_task(stage, total=total)
+        self._bar.update(self._tasks[stage], completed=done, total=total)
+
+    def _start(self) -> None:
+        from rich.console import Console
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+        columns = (TextColumn("{task.description:>8}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+        self._bar = Progress(*columns, console=Console(stderr=True))
+        self._bar.start()
+
+    def _stop(self) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+            self._bar, self._tasks = None, {}
+
+    @contextmanager
+    def open(self) -> Iterator[Talk]:
+        """Leaves the terminal as it was."""
+        try:
+            yield self
+        finally:
+            self._stop()
+
+
+def printable(words: str) -> str:
+    """Without what would steer a terminal: names from files may hold anything."""
+    return "".join(c if c.isprintable() or c == "\n" else "\N{REPLACEMENT CHARACTER}" for c in words)
+
+
+def one_line(command: Callable[P, None]) -> Callable[P, None]:
+    """A fault that a user can mend becomes one line and exit code 1."""
+
+    @wraps(command)
+    def guarded(*args: P.args, **kwargs: P.kwargs) -> None:
+        try:
+            command(*args, **kwargs)
+        except McaptrackError as error:
+            print(f"mcaptrack: {printable(' '.join(str(error).split()))}", file=sys.stderr)
+            raise typer.Exit(REFUSED) from None
+
+    return guarded
+
+
+def print_json(data: dict[str, Any]) -> None:
+    """One object on stdout, with the version of its shape."""
+    print(json.dumps({"schema_version": SCHEMA_VERSION} | data, indent=2, allow_nan=False))
+
+
+def expand(paths: Sequence[Path]) -> list[Path]:
+    """Paths and patterns as paths. Raises McaptrackError for a pattern that matches nothing."""
+    out: list[Path] = []
+    for path in paths:
+        if path.exists() or not glob.has_magic(str(path)):
+            out.append(path)
+            continue
+        found = sorted(Path(name) for name in glob.glob(str(path), recursive=True))
+        if not found:
+            raise McaptrackError(f"no file matches {path}")
+        out += found
+    return out
+
+
+def only_one_output(paths: Sequence[Path], output: Path | None) -> None:
+    """Raises McaptrackError if several inputs would go to one output."""
+    if output is not None and len(paths) > 1:
+        raise McaptrackError(f"{len(paths)} inputs can't all be written to {output}; leave -o out or give one input")

@@ -1,0 +1,231 @@
+"""``mcaptrack evaluate``: tracks and forecasts against the truth, as a table, JSON or CSV."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
+
+import typer
+
+from mcaptrack.cli import common
+from mcaptrack.errors import McaptrackError
+
+if TYPE_CHECKING:
+    from mcaptrack.evaluation import Outcome, Sequenced
+
+_COLUMNS: Final = ("MOTA", "IDF1", "HOTA", "IDSW", "FP", "FN", "Frag")
+_FORECAST_COLUMNS: Final = {
+    "ADE_m": "ADE m",
+    "FDE_m": "FDE m",
+    "ADE_squared_m2": "ADE m²",
+    "recall": "recall",
+    "false_forecasts_per_frame": "false/frame",
+    "consistency_m": "drift m",
+    "coverage_95": "in 95 %",
+}
+
+
+@common.one_line
+def evaluate(
+    inputs: Annotated[
+        list[Path],
+        typer.Argument(metavar="LOG|TRACKS...", help="Logs, or label files of tracks.", show_default=False),
+    ],
+    truth: Annotated[
+        list[Path] | None,
+        common.option(
+            "--truth", help="True tracks for label files, one for each, in the same order.", show_default=False
+        ),
+    ] = None,
+    similarity: Annotated[
+        Literal["iou", "metres"] | None,
+        common.option(
+            "--similarity",
+            help="What makes two boxes alike.",
+            show_default="both, as far as there are boxes and metres",
+        ),
+    ] = None,
+    gate_m: Annotated[
+        str, common.option("--gate-m", help="Distances in metres within which people count as found.")
+    ] = "0.5,1,2",
+    min_iou: Annotated[float, common.option("--min-iou", help="Overlap from which boxes count as alike.")] = 0.5,
+    rules: Annotated[
+        Literal["trackeval", "motmetrics"],
+        common.option("--rules", help="Whose rules for counting switches and fragments."),
+    ] = "trackeval",
+    topic: Annotated[
+        list[str] | None,
+        common.option(
+            "--topic", help="Score these channels.", show_default="tracks, samples, retracks, retracks/online"
+        ),
+    ] = None,
+    camera: common.Camera = None,
+    ground_plane: Annotated[
+        Path | None,
+        common.option("--ground-plane", help="3x3 homography, for label files in pixels.", show_default=False),
+    ] = None,
+    point: Annotated[
+        Literal["center", "foot"], common.option("--point", help="What of a box stands on the ground.")
+    ] = "foot",
+    fps: Annotated[
+        str | None, common.option("--fps", help="Frames per second of label files.", show_default=False)
+    ] = None,
+    fail_under: Annotated[
+        list[str] | None,
+        common.option("--fail-under", help="Exit 4 if a score is lower, as in idf1=0.7.", show_default=False),
+    ] = None,
+    csv: Annotated[bool, common.option("--csv", help="Print rows for a spreadsheet.")] = False,
+    json: common.Json = False,
+    quiet: common.Quiet = False,
+    verbose: common.Verbose = False,
+    config: common.Config = None,
+) -> None:
+    """Score tracks and forecasts against the truth.
+
+    Reads /camera/truth and the tracks of a log; or label files of tracks, with --truth. Distances are on the ground,
+    for tracks on the clock of prediction; overlaps are those of boxes.
+
+    Example: mcaptrack evaluate log.mcap --similarity metres --gate-m 1
+    """
+    from mcaptrack.evaluation import EvaluateOptions
+    from mcaptrack.evaluation import evaluate as score
+
+    options = EvaluateOptions(
+        similarities=(similarity,) if similarity else (),
+        gates_m=_gates(gate_m),
+        min_iou=min_iou,
+        rules=rules,
+        topics=tuple(topic or ()),
+    )
+    limits = [_limit(text) for text in fail_under or ()]
+    with common.Talk(quiet, verbose).open() as talk:
+        paths = common.expand(inputs)
+        if truth:
+            plane_options = {"ground_plane": ground_plane, "point": point, "fps": fps}
+            sequences = _from_files(paths, common.expand(truth), plane_options)
+        else:
+            sequences = _from_logs(paths, camera, options.topics)
+        outcome = score(sequences, options, talk.detail)
+        for words in outcome.notes:
+            talk.say(words)
+    if json:
+        common.print_json({"results": [result.to_json() for result in outcome.results]})
+    elif csv:
+        _print_csv(outcome)
+    else:
+        print_results(outcome)
+    missed = [words for limit in limits for words in _misses(outcome, *limit)]
+    for words in missed:
+        print(words, file=sys.stderr)
+    if missed:
+        raise typer.Exit(common.GATE_MISSED)
+
+
+def _gates(text: str) -> tuple[float, ...]:
+    try:
+        gates = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        gates = ()
+    if not gates or not all(0 < gate < float("inf") for gate in gates):
+        raise McaptrackError(f"--gate-m needs distances in metres like 0.5,1,2, not {text!r}")
+    return gates
+
+
+def _limit(text: str) -> tuple[str, float]:
+    names = {name.lower(): name for name in ("MOTA", "IDF1", "IDP", "IDR", "HOTA", "DetA", "AssA", "LocA")}
+    name, _, value = text.partition("=")
+    try:
+        return names[name.strip().lower()], float(value)
+    except (KeyError, ValueError):
+        raise McaptrackError(
+            f"--fail-under needs one of {', '.join(names)} and a number, as in idf1=0.7, not {text!r}"
+        ) from None
+
+
+def _misses(outcome: Outcome, name: str, least: float) -> list[str]:
+    rows = [result.to_json() for result in outcome.results]
+    final = [row for row in rows if row["sequence"] == "COMBINED"] or rows
+    return [
+        f"{row['sequence']} {row['tracks']} {row['similarity']} {row['gate']:g}: "
+        f"{name} {row[name]:.4f} is under {least:g}"
+        for row in final
+        if row[name] < least
+    ]
+
+
+def _from_logs(paths: Sequence[Path], camera: str | None, topics: tuple[str, ...]) -> list[Sequenced]:
+    from mcaptrack import log, pipeline
+    from mcaptrack.evaluation import sequence_of_log
+
+    sequences = []
+    for path in paths:
+        with log.read(path) as opened:
+            sequences.append(sequence_of_log(opened, pipeline.find_camera(opened, camera), topics))
+    return sequences
+
+
+def _from_files(tracks: Sequence[Path], truths: Sequence[Path], given: dict[str, Any]) -> list[Sequenced]:
+    from mcaptrack.cli.ingest import _fps
+    from mcaptrack.evaluation import sequence_of_files
+    from mcaptrack.ingest import label_frames
+
+    if len(tracks) != len(truths):
+        raise McaptrackError(f"{len(tracks)} files of tracks and {len(truths)} of truth; give one truth for each")
+    sequences = []
+    for path, truth in zip(tracks, truths, strict=True):
+        both = label_frames({"tracks": path, "truth": truth}, _fps(given["fps"]), given["ground_plane"], given["point"])
+        sequences.append(sequence_of_files(path, both["truth"], both["tracks"]))
+    return sequences
+
+
+def print_results(outcome: Outcome) -> None:
+    """The scores as a table on stdout, and the forecasts below it."""
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    console = Console()
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    several = len({result.sequence for result in outcome.results}) > 1
+    for name in (*(("sequence",) if several else ()), "tracks", "by"):
+        table.add_column(name, no_wrap=True)
+    for name in _COLUMNS:
+        table.add_column(name, justify="right", no_wrap=True)
+    previous = None
+    for result in sorted(outcome.results, key=lambda r: (r.sequence == "COMBINED", r.sequence, r.similarity, r.gate)):
+        row = result.to_json()
+        by = f"IoU {result.gate:g}" if result.similarity == "iou" else f"{result.gate:g} m"
+        if previous not in (None, (result.sequence, by)):
+            table.add_row()
+        previous = (result.sequence, by)
+        numbers = [f"{100 * row[name]:.1f}" if isinstance(row[name], float) else str(row[name]) for name in _COLUMNS]
+        first = [escape(common.printable(result.sequence))] if several else []
+        table.add_row(*first, escape(common.printable(result.tracks)), by, *numbers)
+    console.print(table)
+    forecasts: dict[tuple[str, str], dict[str, float | None]] = {}
+    for result in outcome.results:
+        if result.displacement is not None:
+            forecasts.setdefault((result.sequence, result.tracks), result.displacement.summary())
+    if forecasts:
+        table = Table(box=None, pad_edge=False, header_style="bold")
+        for name in (*(("sequence",) if several else ()), "forecasts of"):
+            table.add_column(name, no_wrap=True)
+        for name in _FORECAST_COLUMNS.values():
+            table.add_column(name, justify="right", no_wrap=True)
+        for (sequence, tracks), values in forecasts.items():
+            numbers = ["-" if values[name] is None else f"{values[name]:.3f}" for name in _FORECAST_COLUMNS]
+            first = [escape(common.printable(sequence))] if several else []
+            table.add_row(*first, escape(common.printable(tracks)), *numbers)
+        console.print()
+        console.print(table)
+
+
+def _print_csv(outcome: Outcome) -> None:
+    import csv
+
+    rows = [{k: v for k, v in result.to_json().items() if k != "displacement"} for result in outcome.results]
+    writer = csv.DictWriter(sys.stdout, fieldnames=list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)

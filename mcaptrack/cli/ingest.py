@@ -1,0 +1,158 @@
+"""``mcaptrack ingest``: whatever exists becomes a log."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from mcaptrack.cli import common
+from mcaptrack.errors import McaptrackError
+
+Inputs = Annotated[
+    list[Path],
+    typer.Argument(
+        metavar="INPUT...", help="Videos, folders of images, or label files; each becomes a log.", show_default=False
+    ),
+]
+LabelFile = Annotated[Path | None, common.option(help="Labels that belong to the pictures.", show_default=False)]
+
+
+@common.one_line
+def ingest(
+    inputs: Inputs,
+    output: common.Output = None,
+    camera: Annotated[
+        str, common.option("--camera", help="Name of the camera: its channels lie below /NAME.")
+    ] = "camera",
+    fps: Annotated[
+        str | None,
+        common.option("--fps", help="Frames per second, instead of the file's own times.", show_default=False),
+    ] = None,
+    start_time: Annotated[
+        str | None,
+        common.option(
+            "--start-time",
+            help="When the recording began (2026-05-01T12:00:00Z, or seconds since 1970).",
+            show_default="as the file says, otherwise 0",
+        ),
+    ] = None,
+    image_format: Annotated[
+        Literal["h264", "jpeg", "png"], common.option("--image-format", help="How pictures are kept.")
+    ] = "h264",
+    ground_plane: Annotated[
+        Path | None,
+        common.option("--ground-plane", help="3x3 homography from pixels to metres.", show_default=False),
+    ] = None,
+    point: Annotated[
+        Literal["center", "foot"], common.option("--point", help="What of a box stands on the ground.")
+    ] = "foot",
+    detections: LabelFile = None,
+    tracks: LabelFile = None,
+    truth: LabelFile = None,
+    label_format: Annotated[
+        Literal["auto", "mot", "sdd", "trajnet", "obsmat"], common.option("--format", help="Format of the label files.")
+    ] = "auto",
+    role: Annotated[
+        Literal["detections", "tracks", "truth"] | None,
+        common.option("--as", help="What INPUT holds, if it is a label file.", show_default="as its ids tell"),
+    ] = None,
+    into: Annotated[
+        Path | None,
+        common.option("--into", help="Add it to this log, instead of making one.", show_default=False),
+    ] = None,
+    force: common.Force = False,
+    json: common.Json = False,
+    quiet: common.Quiet = False,
+    verbose: common.Verbose = False,
+    config: common.Config = None,
+) -> None:
+    """Make a log of a video, a folder of images, or a label file.
+
+    Writes /camera/video, /camera/ground_plane, /camera/detections, /camera/tracks and /camera/truth, as far as they are
+    given. An H.264 stream that viewers can play is passed on as it is; others are encoded again.
+
+    Example: mcaptrack ingest video.mp4 --ground-plane homography.txt --truth gt.txt -o log.mcap
+    """
+    from mcaptrack import log
+    from mcaptrack.atomic import refuse_overwrite
+    from mcaptrack.ingest import IngestOptions
+    from mcaptrack.ingest import ingest as make_log
+
+    if into is not None and output is not None:
+        raise McaptrackError("--into adds to a log in place; it does not go with -o")
+    sources = common.expand(inputs)
+    common.only_one_output(sources, output or into)
+    given = {"detections": detections, "tracks": tracks, "truth": truth}
+    options = IngestOptions(
+        camera=camera,
+        fps=_fps(fps),
+        start_ns=_start_ns(start_time),
+        image_format=image_format,
+        ground_plane=ground_plane,
+        point=point,
+        labels={name: path for name, path in given.items() if path is not None},  # type: ignore[misc]
+        label_format=label_format,
+        role=role,
+    )
+    results, lost = [], False
+    with common.Talk(quiet, verbose).open() as talk:
+        for source in sources:
+            target = into or output or Path((source.name if source.is_dir() else source.stem) + ".mcap")
+            if into is None:
+                refuse_overwrite(target, force or (target.exists() and source.exists() and target.samefile(source)))
+                report = make_log(source, target, options, progress=talk.progress)
+            else:
+                with log.read(into) as opened:
+                    report = make_log(source, target, options, into=opened, force=force, progress=talk.progress)
+            for words in report.notes:
+                talk.detail(words)
+            for words in report.lost:
+                talk.say(f"lost: {words}")
+            lost |= bool(report.lost)
+            talk.say(f"{target}: " + ", ".join(f"{topic} {count}" for topic, count in report.messages.items()))
+            results.append(
+                {"log": str(target), "messages": report.messages, "notes": report.notes, "lost": report.lost}
+            )
+    if json:
+        common.print_json({"results": results})
+    if lost:
+        raise typer.Exit(common.LOST)
+
+
+def _fps(text: str | None) -> Fraction | None:
+    """Frames per second from "25", "29.97" or "30000/1001"."""
+    if text is None:
+        return None
+    try:
+        fps = Fraction(text)
+    except (ValueError, ZeroDivisionError):
+        fps = Fraction(0)
+    if not 0 < fps <= 10_000:
+        raise McaptrackError(f"--fps needs a number like 25, 29.97 or 30000/1001, not {text!r}")
+    return fps
+
+
+def _start_ns(text: str | None) -> int | None:
+    """ISO 8601, or seconds since 1970."""
+    if text is None:
+        return None
+    from datetime import UTC, datetime
+
+    try:
+        seconds = Fraction(text)
+    except (ValueError, ZeroDivisionError):
+        try:
+            moment = datetime.fromisoformat(text)
+        except ValueError:
+            raise McaptrackError(
+                f"--start-time needs 2026-05-01T12:00:00Z or seconds since 1970, not {text!r}"
+            ) from None
+        moment = moment if moment.tzinfo else moment.replace(tzinfo=UTC)
+        passed = moment - datetime(1970, 1, 1, tzinfo=UTC)
+        seconds = Fraction(passed.days * 86400 + passed.seconds) + Fraction(passed.microseconds, 1_000_000)
+    if not 0 <= seconds < 2**63 // 10**9:
+        raise McaptrackError(f"--start-time has to lie between 1970 and 2262, not {text!r}")
+    return round(seconds * 10**9)

@@ -1,0 +1,156 @@
+"""``mcaptrack info`` and ``mcaptrack export``: what is in a log, and the same as tables."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from mcaptrack.cli import common
+from mcaptrack.errors import McaptrackError
+
+if TYPE_CHECKING:
+    from rich.tree import Tree
+
+    from mcaptrack.log import Log
+
+
+@common.one_line
+def info(
+    logs: common.Logs,
+    json: common.Json = False,
+    quiet: common.Quiet = False,
+    verbose: common.Verbose = False,
+    config: common.Config = None,
+) -> None:
+    """Show the channels of a log, how many messages they hold, and what was made from what.
+
+    Reads the summary only. With -v also the parameters that channels were made with.
+
+    Example: mcaptrack info log.mcap
+    """
+    from mcaptrack import log
+
+    results = []
+    for path in common.expand(logs):
+        with log.read(path) as opened:
+            if json:
+                results.append(_as_data(opened))
+            else:
+                _print(opened, verbose)
+    if json:
+        common.print_json({"results": results})
+
+
+def _as_data(opened: Log) -> dict[str, Any]:
+    from mcaptrack.pipeline import is_stale
+    from mcaptrack.provenance import Provenance
+
+    channels = []
+    for topic, channel in sorted(opened.channels.items()):
+        made = Provenance.from_metadata(channel.metadata)
+        channels.append(
+            {
+                "topic": topic,
+                "schema": channel.schema_name,
+                "encoding": channel.message_encoding,
+                "messages": channel.messages,
+                "transform": made.transform if made else None,
+                "input": made.input or None if made else None,
+                "version": made.version if made else None,
+                "parameters": dict(made.parameters) if made else None,
+                "stale": is_stale(opened, topic),
+            }
+        )
+    return {
+        "log": str(opened.path),
+        "bytes": opened.path.stat().st_size,
+        "start_ns": opened.start_ns,
+        "end_ns": opened.end_ns,
+        "messages": sum(opened.index.counts.values()),
+        "attachments": opened.index.attachments,
+        "channels": channels,
+    }
+
+
+def _print(opened: Log, verbose: bool) -> None:
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    data = _as_data(opened)
+    console = Console()
+    seconds = (data["end_ns"] - data["start_ns"]) / 1e9
+    name = escape(common.printable(data["log"]))
+    console.print(f"[bold]{name}[/bold]  {data['bytes']:,} bytes, {data['messages']:,} messages, {seconds:.3f} s")
+    table = Table(box=None, pad_edge=False)
+    for column in ("topic", "schema", "messages"):
+        table.add_column(column, justify="right" if column == "messages" else "left", overflow="fold")
+    for channel in data["channels"]:
+        words = (common.printable(channel["topic"]), common.printable(channel["schema"]), f"{channel['messages']:,}")
+        table.add_row(*(escape(word) for word in words))
+    console.print(table)
+    console.print(_lineage(data["channels"], verbose))
+
+
+def _lineage(channels: list[dict[str, Any]], verbose: bool) -> Tree:
+    """What was made from what, as a tree whose roots are the channels that were recorded or ingested."""
+    from rich.markup import escape
+    from rich.tree import Tree
+
+    topics = {channel["topic"] for channel in channels}
+    root = Tree("lineage")
+
+    def add(parent: Tree, channel: dict[str, Any], above: frozenset[str]) -> None:
+        how = f"  [dim]{escape(channel['transform'])}[/dim]" if channel["transform"] else ""
+        late = "  [red]out of date[/red]" if channel["stale"] else ""
+        node = parent.add(f"{escape(common.printable(channel['topic']))}{how}{late}")
+        if verbose and channel["parameters"]:
+            words = ", ".join(f"{key}={value}" for key, value in sorted(channel["parameters"].items()))
+            node.add(f"[dim]{escape(common.printable(words))}[/dim]")
+        for other in channels:
+            if other["input"] == channel["topic"] and other["topic"] not in above and other["transform"] != "view":
+                add(node, other, above | {other["topic"]})
+
+    for channel in channels:
+        if channel["input"] not in topics and channel["transform"] != "view":
+            add(root, channel, frozenset({channel["topic"]}))
+    return root
+
+
+@common.one_line
+def export(
+    logs: common.Logs,
+    output: Annotated[
+        Path | None,
+        common.option("--output", "-o", help="Folder for the tables.", show_default="LOG.tables beside the log"),
+    ] = None,
+    force: common.Force = False,
+    json: common.Json = False,
+    quiet: common.Quiet = False,
+    verbose: common.Verbose = False,
+    config: common.Config = None,
+) -> None:
+    """Write the rows of a log as Parquet tables.
+
+    One folder a table (frames, detections, tracks, predictions, ground_planes, events, channels), one file a log in it;
+    several logs can share a folder. Tables that were exported before are replaced.
+
+    Example: mcaptrack export log.mcap -o tables/
+    """
+    from mcaptrack import log
+    from mcaptrack.export import default_folder
+    from mcaptrack.export import export as write_tables
+
+    results = []
+    paths = common.expand(logs)
+    if output is not None and output.exists() and not output.is_dir():
+        raise McaptrackError(f"{output} is a file; tables go to a folder")
+    with common.Talk(quiet, verbose).open() as talk:
+        for path in paths:
+            folder = output or default_folder(path)
+            with log.read(path) as opened:
+                written = write_tables(opened, folder, talk.progress)
+            talk.say(f"{folder}: " + ", ".join(f"{name} {rows}" for name, rows in written.items()))
+            results.append({"log": str(path), "folder": str(folder), "rows": written})
+    if json:
+        common.print_json({"results": results})

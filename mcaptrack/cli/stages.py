@@ -1,0 +1,185 @@
+"""One command for each transform, made from its parameters; and ``run``."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Annotated, Any, Final, Literal, get_type_hints
+
+import typer
+
+from mcaptrack.cli import common
+from mcaptrack.errors import McaptrackError
+from mcaptrack.transforms import PROFILES, TRANSFORMS, Transform
+from mcaptrack.transforms.protocol import bare_type
+
+#: What a command says of itself, beyond its transform.
+_WORDS: Final = {
+    "detect": ("Example: mcaptrack detect log.mcap --method mog2", "{camera}/video", "{camera}/detections"),
+    "track": ("Example: mcaptrack track log.mcap --max-age-s 2", "{camera}/detections", "{camera}/tracks"),
+    "sample": ("Example: mcaptrack sample log.mcap --rate-hz 2.5", "{camera}/tracks", "{camera}/samples"),
+    "predict": ("Example: mcaptrack predict log.mcap --predictor cv", "{camera}/samples", "{camera}/predictions"),
+    "retrack": ("Example: mcaptrack retrack log.mcap --profile authors", "{camera}/samples", "{camera}/retracks"),
+}
+Mode = Literal["both", "offline", "online"]
+_OUTPUTS_OF: Final[Mapping[str, tuple[str, ...]]] = {
+    "both": ("", "online", "predictions"),
+    "offline": ("",),
+    "online": ("online", "predictions"),
+}
+
+
+def add_stages(app: typer.Typer) -> None:
+    """A command for every transform, and one for all of them."""
+    for name, kind in TRANSFORMS.items():
+        common.register(app, name, common.one_line(_stage_command(name, kind)), _help(name, kind))
+    common.register(app, "run", common.one_line(run_all))
+
+
+def _help(name: str, kind: type[Transform]) -> str:
+    example, source, target = _WORDS[name]
+    where = (
+        f"From {source.format(camera='/camera')} to {target.format(camera='/camera')}. A missing input is made first."
+    )
+    return f"{inspect.cleandoc(kind.__doc__ or '')}\n\n{where}\n\n{example}"
+
+
+def _option(name: str, annotation: Any, default: Any, words: str) -> inspect.Parameter:
+    """An option that is None unless it is given, and whose help shows what happens then."""
+    flag = "--" + name.replace("_", "-")
+    names = (flag, f"--no-{flag[2:]}") if bare_type(annotation) is bool else (flag,)
+    shown = "none" if default is None else str(default).lower() if isinstance(default, bool) else f"{default}"
+    info = common.option(*names, help=words[:1].upper() + words[1:] + ".", show_default=shown)
+    return _parameter(name, Annotated[bare_type(annotation) | None, info], None)
+
+
+def _parameter(name: str, annotation: Any, default: Any) -> inspect.Parameter:
+    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
+
+
+def _stage_command(name: str, kind: type[Transform]) -> Callable[..., None]:
+    """The function behind a stage's command: its signature is made of what the transform declares."""
+    hints = get_type_hints(kind)
+    own = [f for f in fields(kind) if not f.metadata.get("context")]
+    defaults = PROFILES["default"] if name == "retrack" else kind()
+    parameters = [_parameter("logs", common.Logs, inspect.Parameter.empty)]
+    extra: list[inspect.Parameter] = []
+    if name == "track":
+        words = common.option("--tracker", help="Which tracker.")
+        extra.append(_parameter("tracker", Annotated[Literal["sort"], words], "sort"))
+    if name == "retrack":
+        words = common.option("--profile", help="Whose reading: ours, the paper's, or its authors' program's.")
+        extra.append(_parameter("profile", Annotated[Literal[tuple(PROFILES)], words], "default"))
+        words = common.option("--mode", help="With all the log knows (offline), from the past alone (online), or both.")
+        extra.append(_parameter("mode", Annotated[Mode, words], "both"))
+    parameters += extra
+    parameters += [_option(f.name, hints[f.name], getattr(defaults, f.name), f.metadata["help"]) for f in own]
+    topic = common.option("--topic", shared=True, help="Read this channel instead of the usual one.")
+    to = common.option("--to", shared=True, help="Write this channel instead of the usual one.")
+    parameters += [
+        _parameter("topic", Annotated[str | None, topic], None),
+        _parameter("to", Annotated[str | None, to], None),
+        _parameter("camera", common.Camera, None),
+        _parameter("output", common.Output, None),
+        _parameter("force", common.Force, False),
+        _parameter("json", common.Json, False),
+        _parameter("quiet", common.Quiet, False),
+        _parameter("verbose", common.Verbose, False),
+        _parameter("config", common.Config, None),
+    ]
+
+    def command(**given: Any) -> None:
+        base: Transform = PROFILES[given["profile"]] if name == "retrack" else kind()
+        chosen = {f.name: given[f.name] for f in own if given[f.name] is not None}
+        transform = replace(base, **chosen)
+        keep = _OUTPUTS_OF[given["mode"]] if name == "retrack" else None
+        _run_on_logs(given, lambda plan: plan.stage(name, transform, given["topic"], given["to"], keep))
+
+    command.__name__ = name
+    command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    command.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    return command
+
+
+def run_all(
+    logs: common.Logs,
+    camera: common.Camera = None,
+    output: common.Output = None,
+    tables: Annotated[bool, common.option("--tables/--no-tables", help="Write Parquet tables beside the log.")] = True,
+    force: common.Force = False,
+    json: common.Json = False,
+    quiet: common.Quiet = False,
+    verbose: common.Verbose = False,
+    config: common.Config = None,
+) -> None:
+    """Run all stages that are missing or out of date, then views and tables.
+
+    From /camera/video (or whatever of detections, tracks and samples there is) to /camera/predictions and
+    /camera/retracks, and Parquet tables beside the log.
+
+    Example: mcaptrack run log.mcap
+    """
+    given = {"logs": logs, "camera": camera, "output": output, "topic": None, "force": force, "json": json}
+    _run_on_logs(given | {"quiet": quiet, "verbose": verbose}, lambda plan: plan.all(), tables)
+
+
+class _Plan:
+    """What to do on one log, once it is open."""
+
+    def __init__(self, opened: Any, prefix: str, say: Callable[[str], None]) -> None:
+        self._opened, self._prefix, self._say = opened, prefix, say
+
+    def stage(
+        self, name: str, transform: Transform, topic: str | None, to: str | None, keep: tuple[str, ...] | None
+    ) -> Any:
+        from mcaptrack import pipeline
+
+        return pipeline.plan_stage(self._opened, self._prefix, name, transform, topic, to, keep, self._say)
+
+    def all(self) -> Any:
+        from mcaptrack import pipeline
+
+        return pipeline.plan_all(self._opened, self._prefix, self._say)
+
+
+def _run_on_logs(given: Mapping[str, Any], make_plan: Callable[[_Plan], Any], tables: bool = False) -> None:
+    from mcaptrack import log, pipeline
+    from mcaptrack.atomic import publish_bytes, refuse_overwrite
+    from mcaptrack.export import default_folder, export
+
+    paths = common.expand(given["logs"])
+    output: Path | None = given["output"]
+    common.only_one_output(paths, output)
+    reports = []
+    with common.Talk(given["quiet"], given["verbose"]).open() as talk:
+        for path in paths:
+            target = output or path
+            if output is not None:
+                if output.exists() and path.exists() and output.samefile(path):
+                    raise McaptrackError(f"{path} is both input and output; leave -o out to add to it in place")
+                refuse_overwrite(output, given["force"])
+            with log.read(path) as opened:
+                prefix = pipeline.find_camera(opened, given["camera"], given["topic"])
+                jobs = make_plan(_Plan(opened, prefix, talk.say))
+                report = pipeline.run(opened, prefix, jobs, output, talk.progress, talk.say)
+            if report.layout:
+                publish_bytes(target.with_suffix(".layout.json"), report.layout)
+            for topic, count in report.frames.items():
+                talk.detail(f"{target}: {topic} {count} frames")
+            for topic in report.stale:
+                talk.say(
+                    f"{topic} was made from what has just been replaced; `mcaptrack run {target}` brings it up to date"
+                )
+            written = {}
+            if tables:
+                with log.read(target) as opened:
+                    folder = default_folder(target)
+                    written = export(opened, folder, talk.progress)
+                talk.detail(f"{folder}: {', '.join(f'{name} {rows}' for name, rows in written.items())}")
+            done = ", ".join(report.stages) or "nothing to do, everything is up to date"
+            talk.say(f"{target}: {done}")
+            reports.append({"log": str(target), "stages": report.stages, "frames": report.frames, "tables": written})
+    if given["json"]:
+        common.print_json({"results": reports})

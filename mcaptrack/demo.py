@@ -1,0 +1,58 @@
+"""The demonstration: a scene with known truth, drawn to a real video file, and everything run on it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from mcaptrack.atomic import publish
+from mcaptrack.errors import McaptrackError
+from mcaptrack.scene import Scene
+from mcaptrack.video import Image, write_mp4
+
+#: What the demonstration writes, by name.
+VIDEO: Final = "demo.mp4"
+TRUTH: Final = "truth.txt"
+PLANE: Final = "ground_plane.txt"
+
+
+@dataclass(frozen=True)
+class Footage:
+    """A drawn scene on disk: the video, its true boxes (MOTChallenge) and its ground plane (3x3)."""
+
+    video: Path
+    truth: Path
+    ground_plane: Path
+
+
+def draw(scene: Scene, folder: Path, progress: Callable[[str, int, int], None] = lambda *_: None) -> Footage:
+    """Draw a scene into a folder: what a person with a camera and much patience would have."""
+    footage = Footage(folder / VIDEO, folder / TRUTH, folder / PLANE)
+    lines: list[str] = []
+    total = round(scene.seconds * scene.fps)
+
+    def images() -> Iterator[Image]:
+        for number, shot in enumerate(scene.shots(), start=1):
+            for who, box in zip(shot.ids, shot.boxes.tolist(), strict=True):
+                lines.append(",".join([str(number), str(who), *(f"{value:.2f}" for value in box), "1,1,1"]))
+            progress("draw", number, total)
+            yield shot.image
+
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        write_mp4(footage.video, images(), scene.fps)
+        _write_text(footage.truth, "\n".join(lines) + "\n")
+        rows = np.array(scene.ground_plane().homography).reshape(3, 3).tolist()
+        _write_text(footage.ground_plane, "\n".join(",".join(f"{value:.17g}" for value in row) for row in rows) + "\n")
+    except OSError as error:
+        raise McaptrackError(f"{folder} can't be written to: {error.strerror or error}") from error
+    return footage
+
+
+def _write_text(path: Path, text: str) -> None:
+    with publish(path) as part:
+        part.write_text(text, encoding="utf-8")

@@ -1,0 +1,319 @@
+"""Score the tracks and forecasts of a log, or of label files, against the truth.
+
+Tracks are compared at the truth's times where the tracks have most of these; otherwise (tracks on the clock of
+prediction) the truth is brought to the tracks' times. Impossible comparisons are said, never scored as zeros.
+
+Letters: N rows, G true people, H tracks in one frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaptrack import log, metrics
+from mcaptrack.boxes import columns_to_boxes, iou
+from mcaptrack.clock import NS_PER_S, seconds_to_ns
+from mcaptrack.errors import McaptrackError
+from mcaptrack.metrics import Matchup, Rules, Score
+from mcaptrack.metrics.displacement import Displacement, Forecasts, displacement
+from mcaptrack.metrics.displacement import Path as Positions
+from mcaptrack.metrics.displacement import combine as combine_displacements
+from mcaptrack.provenance import Provenance
+from mcaptrack.resample import looked_at, resample
+from mcaptrack.schema import PREDICTIONS, TRACKS, Frame, Rows
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Similarity = Literal["iou", "metres"]
+
+SCHEMA_VERSION: Final = 1
+COMBINED: Final = "COMBINED"
+IOU_THRESHOLD: Final = 0.5
+DEFAULT_GATES_M: Final = (0.5, 1.0, 2.0)
+#: The truth is interpolated over no longer hole than this.
+_MAX_HOLE_S: Final = 2.0
+_MODES: Final = {"online": "online", "": "offline"}
+
+
+@dataclass(frozen=True)
+class EvaluateOptions:
+    """What to compare and how. ``similarities`` empty means all that the data allow."""
+
+    similarities: tuple[Similarity, ...] = ()
+    gates_m: tuple[float, ...] = DEFAULT_GATES_M
+    min_iou: float = IOU_THRESHOLD
+    rules: Rules = "trackeval"
+    topics: tuple[str, ...] = ()
+
+
+@dataclass
+class Candidate:
+    """Tracks to be scored: where they come from, their frames, and forecasts made from them, if any."""
+
+    name: str
+    mode: str | None
+    frames: Sequence[Frame]
+    forecasts: Sequence[Frame] | None = None
+    forecasts_name: str = ""
+
+
+@dataclass
+class Sequenced:
+    """One sequence: its truth and what is to be scored against it."""
+
+    name: str
+    truth: Sequence[Frame]
+    candidates: Sequence[Candidate]
+
+
+@dataclass
+class Result:
+    """One row of the outcome."""
+
+    sequence: str
+    tracks: str
+    mode: str | None
+    similarity: Similarity
+    gate: float
+    rules: Rules
+    score: Score
+    displacement: Displacement | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        """As ``evaluate --json`` prints it."""
+        names = ("sequence", "tracks", "mode", "similarity", "gate", "rules")
+        out = {name: getattr(self, name) for name in names} | metrics.summary(self.score)
+        if self.displacement is not None:
+            recall, ade = self.displacement.curve()
+            out["displacement"] = self.displacement.summary() | {
+                "curve_recall": recall.tolist(),
+                "curve_ADE_m": ade.tolist(),
+            }
+        return out
+
+
+@dataclass
+class Outcome:
+    """All results, and what could not be compared and why."""
+
+    results: list[Result] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+
+def sequence_of_log(opened: log.Log, prefix: str, topics: Sequence[str]) -> Sequenced:
+    """The truth of a log and its tracks: those of the video's rate, and those of the clock of prediction."""
+    truth_topic = f"{prefix}/truth"
+    if truth_topic not in opened.channels:
+        raise McaptrackError(
+            f"{opened.path} has no channel {truth_topic}; "
+            f"add one with `mcaptrack ingest FILE --as truth --into {opened.path}`"
+        )
+    usual = [f"{prefix}/{name}" for name in ("tracks", "samples", "retracks/online", "retracks")]
+    chosen = list(topics) or [topic for topic in usual if topic in opened.channels]
+    if not chosen:
+        raise McaptrackError(f"{opened.path} has no tracks to score; run `mcaptrack run {opened.path}`")
+    forecasts_of = {
+        f"{prefix}/samples": f"{prefix}/predictions",
+        f"{prefix}/retracks/online": f"{prefix}/retracks/predictions",
+    }
+    candidates = []
+    for topic in chosen:
+        made = Provenance.from_metadata(opened.channel(topic).metadata)
+        mode = None
+        if made and made.transform == "retrack":
+            mode = "online" if topic.endswith("/online") else "offline"
+        name = forecasts_of.get(topic, "")
+        forecasts = opened.frames(name, PREDICTIONS) if name in opened.channels else None
+        candidates.append(Candidate(topic, mode, opened.frames(topic, TRACKS), forecasts, name))
+    return Sequenced(opened.path.stem, opened.frames(truth_topic, TRACKS), candidates)
+
+
+def evaluate(
+    sequences: Iterable[Sequenced], options: EvaluateOptions, progress: Callable[[str], None] = lambda _: None
+) -> Outcome:
+    """Score every candidate of every sequence, and all sequences together where there are several.
+
+    Raises McaptrackError if nothing at all can be compared.
+    """
+    outcome = Outcome()
+    count = 0
+    for sequence in sequences:
+        count += 1
+        if not any(len(frame.rows) for frame in sequence.truth):
+            raise McaptrackError(f"the truth of {sequence.name} holds nobody; there is nothing to score against")
+        for candidate in sequence.candidates:
+            progress(f"{sequence.name} {candidate.name}")
+            outcome.results += _score(sequence, candidate, options, outcome.notes)
+    if not outcome.results:
+        raise McaptrackError("; ".join(outcome.notes) or "there is nothing to score")
+    if count > 1:
+        outcome.results += _combined(outcome.results)
+    return outcome
+
+
+def _combined(results: Sequence[Result]) -> list[Result]:
+    groups: dict[tuple[Any, ...], list[Result]] = {}
+    for one in results:
+        groups.setdefault((one.tracks, one.mode, one.similarity, one.gate, one.rules), []).append(one)
+    out = []
+    for (tracks, mode, similarity, gate, rules), members in groups.items():
+        forecasts = [member.displacement for member in members if member.displacement is not None]
+        out.append(
+            Result(
+                COMBINED,
+                tracks,
+                mode,
+                similarity,
+                gate,
+                rules,
+                metrics.combine([member.score for member in members]),
+                combine_displacements(forecasts) if len(forecasts) == len(members) else None,
+            )
+        )
+    return out
+
+
+def _score(sequence: Sequenced, candidate: Candidate, options: EvaluateOptions, notes: list[str]) -> list[Result]:
+    truth, tracks = _aligned(sequence, candidate)
+    wanted = options.similarities or ("iou", "metres")
+    results = []
+    for similarity in wanted:
+        column = "x_px" if similarity == "iou" else "x_m"
+        sides = {"the truth": truth, candidate.name: tracks}
+        without = [
+            name for name, frames in sides.items() if not _has(frames, column) and any(len(f.rows) for f in frames)
+        ]
+        if without:
+            unit = "boxes" if similarity == "iou" else "positions in metres"
+            if options.similarities:
+                raise McaptrackError(
+                    f"{sequence.name}: {' and '.join(without)} {'have' if len(without) > 1 else 'has'} no {unit}"
+                )
+            continue
+        gates = (options.min_iou,) if similarity == "iou" else options.gates_m
+        for gate in gates:
+            score = metrics.score(matchup(truth, tracks, similarity, gate), options.rules)
+            results.append(
+                Result(sequence.name, candidate.name, candidate.mode, similarity, gate, options.rules, score)
+            )
+    if not results:
+        notes.append(f"{sequence.name}: {candidate.name} and the truth share neither boxes nor positions in metres")
+    if candidate.forecasts is not None and any(result.similarity == "metres" for result in results):
+        errors = _displacement(sequence, candidate)
+        for result in results:
+            result.displacement = errors if result.similarity == "metres" else None
+    return results
+
+
+def _has(frames: Sequence[Frame], column: str) -> bool:
+    return any(np.isfinite(frame.rows[column]).any() for frame in frames)
+
+
+def _aligned(sequence: Sequenced, candidate: Candidate) -> tuple[list[Frame], list[Frame]]:
+    """Truth and tracks at the same times. Raises McaptrackError if they never overlap."""
+    truth_ns = np.array([frame.t_ns for frame in sequence.truth], np.int64)
+    tracks_ns = np.array([frame.t_ns for frame in candidate.frames], np.int64)
+    by_time = {frame.t_ns: frame for frame in candidate.frames}
+    if 2 * np.isin(truth_ns, tracks_ns).sum() >= len(truth_ns):
+        empty = TRACKS.empty()
+        return list(sequence.truth), [by_time.get(f.t_ns, Frame(f.t_ns, f.index, empty)) for f in sequence.truth]
+    kept = looked_at(truth_ns, tracks_ns, seconds_to_ns(_MAX_HOLE_S))
+    if not kept.any():
+        raise McaptrackError(
+            f"{sequence.name}: the truth ({_span(truth_ns)}) and {candidate.name} ({_span(tracks_ns)}) "
+            "never overlap in time"
+        )
+    at_ns = np.unique(tracks_ns[kept])
+    return _resampled(sequence.truth, at_ns), [by_time[t_ns] for t_ns in at_ns.tolist()]
+
+
+def _span(t_ns: Ints) -> str:
+    return f"{t_ns[0] / NS_PER_S:.3f} to {t_ns[-1] / NS_PER_S:.3f} s" if len(t_ns) else "no frames"
+
+
+def _resampled(frames: Sequence[Frame], at_ns: Ints) -> list[Frame]:
+    rows = np.concatenate([TRACKS.empty(), *(frame.rows for frame in frames)])
+    row_ns = np.repeat(np.array([frame.t_ns for frame in frames], np.int64), [len(frame.rows) for frame in frames])
+    out, at = resample(rows, row_ns, at_ns, seconds_to_ns(_MAX_HOLE_S))
+    ends = np.searchsorted(at, np.arange(len(at_ns)), "right").tolist()
+    spans = zip(at_ns.tolist(), [0, *ends][:-1], ends, strict=True)
+    return [Frame(t_ns, index, out[low:high]) for index, (t_ns, low, high) in enumerate(spans)]
+
+
+def _xy(rows: Rows) -> Floats:
+    return np.stack([rows["x_m"], rows["y_m"]], axis=-1)
+
+
+def matchup(truth: Sequence[Frame], tracks: Sequence[Frame], similarity: Similarity, gate: float) -> Matchup:
+    """Truth and tracks at the same times as a matchup: boxes by overlap, or positions by distance."""
+    column = "x_px" if similarity == "iou" else "x_m"
+
+    def usable(frames: Sequence[Frame]) -> list[Rows]:
+        return [frame.rows[np.isfinite(frame.rows[column])] for frame in frames]
+
+    true_rows, track_rows = usable(truth), usable(tracks)
+    true_ids, track_ids = (
+        np.unique(np.concatenate([np.empty(0, np.int64), *(rows["track_id"] for rows in part)]))
+        for part in (true_rows, track_rows)
+    )
+    alike = []
+    for people, found in zip(true_rows, track_rows, strict=True):
+        if similarity == "iou":
+            alike.append(iou(columns_to_boxes(people), columns_to_boxes(found)))
+        else:
+            alike.append(metrics.metres_to_similarity(metrics.distances(_xy(people), _xy(found)), gate))
+    return Matchup(
+        tuple(np.searchsorted(true_ids, rows["track_id"]) for rows in true_rows),
+        tuple(np.searchsorted(track_ids, rows["track_id"]) for rows in track_rows),
+        tuple(alike),
+        gate if similarity == "iou" else 0.5,
+        len(true_ids),
+        len(track_ids),
+    )
+
+
+def _displacement(sequence: Sequenced, candidate: Candidate) -> Displacement | None:
+    """The errors of the forecasts made from a candidate; None if there are no forecasts at all."""
+    frames = [frame for frame in candidate.forecasts or () if len(frame.rows)]
+    if not frames:
+        return None
+    rows = np.concatenate([frame.rows for frame in frames])
+    horizon = int(rows["step"].max())
+    step_s = float(rows["ahead_s"][0]) / int(rows["step"][0])
+    if len(rows) % horizon:
+        raise McaptrackError(f"{candidate.forecasts_name}: not all forecasts have {horizon} steps")
+    clock_ns = np.unique([frame.t_ns for frame in candidate.frames])
+    start, step_ns = int(clock_ns[0]), step_s * NS_PER_S
+
+    def to_step(t_ns: Ints) -> Ints:
+        return np.rint((t_ns - start) / step_ns).astype(np.int64)
+
+    last = int(to_step(clock_ns[-1:])[0])
+    truth_ns = np.array([frame.t_ns for frame in sequence.truth], np.int64)
+    ticks = start + np.rint(np.arange(last + 1) * step_ns).astype(np.int64)
+    ticks = ticks[looked_at(truth_ns, ticks, seconds_to_ns(_MAX_HOLE_S))]
+    made_ns = np.repeat(np.array([frame.t_ns for frame in frames], np.int64), [len(frame.rows) for frame in frames])
+    mean = _xy(rows).reshape(-1, horizon, 2)
+    cov = np.stack([rows["cov_xx_m2"], rows["cov_xy_m2"], rows["cov_xy_m2"], rows["cov_yy_m2"]], axis=-1)
+    forecasts = Forecasts(
+        to_step(made_ns[::horizon]), rows["track_id"][::horizon], mean, cov.reshape(-1, horizon, 2, 2)
+    )
+
+    def positions(members: Sequence[Frame]) -> Positions:
+        kept = [frame.rows[np.isfinite(frame.rows["x_m"])] for frame in members]
+        all_rows = np.concatenate([TRACKS.empty(), *kept])
+        t_ns = np.repeat(np.array([frame.t_ns for frame in members], np.int64), [len(part) for part in kept])
+        return Positions(to_step(t_ns), all_rows["track_id"], _xy(all_rows))
+
+    return displacement(positions(_resampled(sequence.truth, ticks)), positions(candidate.frames), forecasts)
+
+
+def sequence_of_files(tracks: Path, truth_frames: Sequence[Frame], track_frames: Sequence[Frame]) -> Sequenced:
+    """A label file of tracks and its truth, as one sequence."""
+    return Sequenced(tracks.stem, truth_frames, [Candidate(tracks.name, None, track_frames)])

@@ -1,0 +1,91 @@
+"""What is remembered of moving people on a regular clock: recent positions, holes, smoothed displacements.
+
+Letters: K people remembered, N people at one time, B batch, L past positions (the last one is now), T steps.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+Ints = NDArray[np.int64]
+
+
+@dataclass
+class Histories:
+    """The last L positions of everybody seen within L steps."""
+
+    length: int
+    ids: Ints = field(default_factory=lambda: np.empty(0, np.int64))
+    xy_m: Floats = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.xy_m = np.empty((0, self.length, 2))
+
+    def push(self, ids: Ints, xy_m: Floats, steps: int = 1) -> tuple[Floats, Bools]:
+        """Go ``steps`` on and see ``ids`` (N,) at ``xy_m`` (N, 2).
+
+        Returns the past of these people, (N, L, 2) with NaN where nothing is known, and (N, L) what is known.
+        """
+        steps = min(steps, self.length)
+        moved = np.full_like(self.xy_m, np.nan)
+        moved[:, : self.length - steps] = self.xy_m[:, steps:]
+        remembered = np.isfinite(moved[:, :, 0]).any(axis=1) | np.isin(self.ids, ids)
+        new = np.setdiff1d(ids, self.ids[remembered])
+        known = np.concatenate([self.ids[remembered], new])
+        order = np.argsort(known, kind="stable")
+        self.ids = known[order]
+        self.xy_m = np.concatenate([moved[remembered], np.full((len(new), self.length, 2), np.nan)])[order]
+        slot = np.searchsorted(self.ids, ids)
+        self.xy_m[slot, -1] = xy_m
+        past = self.xy_m[slot]
+        return past, np.isfinite(past[:, :, 0])
+
+
+def fill_holes(xy_m: Floats, valid: Bools) -> tuple[Floats, Ints]:
+    """Fill holes between known positions (B, L, 2) linearly; returns them and how many there are up to now (B,).
+
+    What lies before the first known position is set to it. The last position has to be known.
+    """
+    batch, length = valid.shape
+    steps = np.arange(length)
+    before = np.maximum.accumulate(np.where(valid, steps, -1), axis=1)
+    after = np.minimum.accumulate(np.where(valid, steps, length)[:, ::-1], axis=1)[:, ::-1]
+    before = np.where(before < 0, after, before)
+    row = np.arange(batch)[:, None]
+    span = np.maximum(after - before, 1)
+    share = ((steps - before) / span)[..., None]
+    low, high = xy_m[row, before], xy_m[row, after]
+    filled = np.where(after[..., None] == before[..., None], low, low + share * (high - low))
+    return filled, length - valid.argmax(axis=1).astype(np.int64)
+
+
+@dataclass
+class Holt:
+    """Double exponential smoothing of displacements (Eq. 3 of the paper), for K tracks at once.
+
+    ``level`` is the smoothed displacement and ``trend`` its change per step, both (K, 2) in metres. The first level is
+    the first displacement, the first trend is 0.
+    """
+
+    alpha: float
+    beta: float
+
+    def start(self, displacement: Floats) -> tuple[Floats, Floats]:
+        """Level and trend (K, 2) after the first displacement."""
+        return displacement.copy(), np.zeros_like(displacement)
+
+    def step(self, level: Floats, trend: Floats, displacement: Floats) -> tuple[Floats, Floats]:
+        """Level and trend (K, 2) after one more displacement."""
+        new = self.alpha * displacement + (1 - self.alpha) * (level + trend)
+        return new, self.beta * (new - level) + (1 - self.beta) * trend
+
+
+def rebuild(last_m: Floats, displacements: Floats) -> Floats:
+    """Positions (K, L, 2) that end at ``last_m`` (K, 2) and go by ``displacements`` (K, L - 1, 2) before it."""
+    back = np.cumsum(displacements[:, ::-1], axis=1)[:, ::-1]
+    return np.concatenate([last_m[:, None] - back, last_m[:, None]], axis=1)

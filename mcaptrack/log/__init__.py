@@ -1,0 +1,11 @@
+"""Logs: MCAP files, and nothing else here knows what is in them.
+
+with read(path) as log:                 channels, messages, frames
+    with extend(log) as writer: ...     the same file with channels added or left out
+with create(path) as writer: ...        a new one
+"""
+
+from mcaptrack.log.reader import Channel, Log, Message, read, topics_with_schema
+from mcaptrack.log.writer import LogWriter, create, extend
+
+__all__ = ["Channel", "Log", "LogWriter", "Message", "create", "extend", "read", "topics_with_schema"]

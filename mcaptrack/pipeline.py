@@ -1,0 +1,405 @@
+"""Stages in order: which channel feeds which transform, what has to run first, and what it leaves in the log.
+
+A stage runs on a log that stands and adds its channels to it, with what they were made from and how. What is missing is
+made first; what was made from a channel that has changed since is made again, with the parameters it had.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from mcaptrack import foxglove, log, views
+from mcaptrack.clock import NS_PER_S
+from mcaptrack.errors import McaptrackError
+from mcaptrack.plane import GroundPlane, Planes, assumed_plane
+from mcaptrack.provenance import CLOCK, Provenance, digest
+from mcaptrack.schema import DETECTIONS, GROUND_PLANE, PREDICTIONS, SCHEMAS, TRACKS, VIDEO, Frame, Schema
+from mcaptrack.schema.ground import plane_to_rows, rows_to_plane
+from mcaptrack.transforms import TRANSFORMS, Transform
+from mcaptrack.video import Encoded, brightness
+
+Progress = Callable[[str, int, int], None]
+Say = Callable[[str], None]
+
+DEFAULT_CAMERA: Final = "camera"
+
+
+class Route(NamedTuple):
+    """Where a transform reads and writes, below the camera's prefix."""
+
+    reads: str
+    writes: str
+
+
+#: The channels between the stages, in the order in which they run.
+ROUTES: Final[Mapping[str, Route]] = {
+    "detect": Route("video", "detections"),
+    "track": Route("detections", "tracks"),
+    "sample": Route("tracks", "samples"),
+    "predict": Route("samples", "predictions"),
+    "retrack": Route("samples", "retracks"),
+}
+_MAKER: Final = {route.writes: name for name, route in ROUTES.items()}
+_ASSUME: Final = "assume-ground-plane"
+
+
+class Job(NamedTuple):
+    """A transform to run from one topic to another; ``keep`` are the outputs that go into the log, None for all."""
+
+    stage: str
+    transform: Transform
+    source: str
+    target: str
+    keep: tuple[str, ...] | None = None
+
+    def outputs(self) -> dict[str, Schema]:
+        """Topic and schema of each output, in the transform's order."""
+        return {f"{self.target}/{suffix}".rstrip("/"): schema for suffix, schema in self.transform.writes.items()}
+
+    def kept(self) -> set[str]:
+        """The topics that go into the log."""
+        return {f"{self.target}/{suffix}".rstrip("/") for suffix in self.keep or self.transform.writes}
+
+
+class Made(NamedTuple):
+    """A channel that was just made."""
+
+    schema: Schema
+    frames: list[Frame]
+    provenance: Provenance
+    messages: list[tuple[int, int, bytes]]
+
+
+@dataclass
+class Report:
+    """What a run did: the stages that ran, the frames of each topic they made, and the layout for their views.
+
+    ``stale`` are the channels that were made from something that has now been replaced.
+    """
+
+    stages: list[str] = field(default_factory=list)
+    frames: dict[str, int] = field(default_factory=dict)
+    layout: bytes | None = None
+    stale: list[str] = field(default_factory=list)
+
+
+def find_camera(opened: log.Log, camera: str | None, topic: str | None = None) -> str:
+    """The prefix that everything of one camera lives under: of the topic, of the name, or the only one of the log."""
+    if topic:
+        return "/" + topic.strip("/").rpartition("/")[0] if "/" in topic.strip("/") else "/" + DEFAULT_CAMERA
+    if camera:
+        return "/" + camera.strip("/")
+    ours = [channel for channel in opened.channels.values() if Provenance.from_metadata(channel.metadata)]
+    names = [*(route.writes for route in ROUTES.values()), "video", "truth", "ground_plane"]
+    found = {c.topic.removesuffix("/" + name) for c in ours for name in names if c.topic.endswith("/" + name)}
+    found = {prefix for prefix in found if prefix + "/retracks" not in found and not prefix.endswith("/retracks")}
+    if len(found) > 1 and "/" + DEFAULT_CAMERA not in found:
+        raise McaptrackError(f"{opened.path} has several cameras, {', '.join(sorted(found))}; choose one with --camera")
+    return found.pop() if len(found) == 1 else "/" + DEFAULT_CAMERA
+
+
+def plan_stage(
+    opened: log.Log,
+    prefix: str,
+    stage: str,
+    transform: Transform,
+    source: str | None = None,
+    target: str | None = None,
+    keep: tuple[str, ...] | None = None,
+    say: Say = lambda _: None,
+) -> list[Job]:
+    """The jobs that run one stage, whether or not its channel stands, and before it what is missing or out of date.
+
+    ``source`` and ``target`` are topics other than the usual ones. Raises McaptrackError if there is nothing to start
+    from.
+    """
+    route = ROUTES[stage]
+    planner = _Planner(opened, prefix, say)
+    source = source or f"{prefix}/{route.reads}"
+    planner.ensure(source)
+    planner.jobs.append(Job(stage, transform, source, target or f"{prefix}/{route.writes}", keep))
+    _check_inputs(opened, prefix, planner.jobs)
+    return planner.jobs
+
+
+def plan_all(opened: log.Log, prefix: str, say: Say = lambda _: None) -> list[Job]:
+    """The jobs that bring everything about a camera up to date; none if it is."""
+    planner = _Planner(opened, prefix, say)
+    for target in ("predictions", "retracks"):
+        planner.ensure(f"{prefix}/{target}")
+    _check_inputs(opened, prefix, planner.jobs)
+    return planner.jobs
+
+
+class _Planner:
+    """Collects the jobs that make channels stand and be up to date."""
+
+    def __init__(self, opened: log.Log, prefix: str, say: Say) -> None:
+        self.jobs: list[Job] = []
+        self._opened, self._prefix, self._say = opened, prefix, say
+        self._changes: dict[str, bool] = {}
+
+    def ensure(self, topic: str) -> bool:
+        """Plan what makes ``topic``; returns whether it will change."""
+        if topic not in self._changes:
+            self._changes[topic] = self._plan(topic)
+        return self._changes[topic]
+
+    def _plan(self, topic: str) -> bool:
+        stage = _MAKER.get(topic.removeprefix(self._prefix + "/")) if topic.startswith(self._prefix + "/") else None
+        channel = self._opened.channels.get(topic)
+        if stage is None or (channel and not _made_by_stage(channel)):
+            return False  # recorded or ingested: nothing makes it but its recording
+        source = f"{self._prefix}/{ROUTES[stage].reads}"
+        if channel is None:
+            self.ensure(source)
+            self._say(f"{topic} is missing: running {stage}")
+            self.jobs.append(Job(stage, TRANSFORMS[stage](), source, topic))
+            return True
+        made = Provenance.from_metadata(channel.metadata)
+        source = made.input if made else source
+        if not self.ensure(source) and not is_stale(self._opened, topic):
+            return False
+        self._say(f"{topic} was made from an earlier {source}: running {stage} again, as before")
+        self.jobs.append(Job(stage, _transform_of(stage, channel), source, topic))
+        return True
+
+
+def _made_by_stage(channel: log.Channel) -> bool:
+    made = Provenance.from_metadata(channel.metadata)
+    return made is not None and made.transform in TRANSFORMS
+
+
+def is_stale(opened: log.Log, topic: str) -> bool:
+    """Whether the channel that ``topic`` was made from has been replaced since."""
+    made = Provenance.from_metadata(opened.channel(topic).metadata)
+    source = opened.channels.get(made.input) if made else None
+    now = Provenance.from_metadata(source.metadata) if source else None
+    return bool(made and now and now.digest and now.digest != made.input_digest)
+
+
+def _transform_of(stage: str, channel: log.Channel) -> Transform:
+    """The transform that made a channel, with the parameters it had as far as they are known today."""
+    made = Provenance.from_metadata(channel.metadata)
+    kind = TRANSFORMS[stage]
+    names = {f.name for f in fields(kind) if not f.metadata.get("context")}
+    had = made.parameters if made else {}
+    return kind(**{key: value for key, value in had.items() if key in names})
+
+
+def _check_inputs(opened: log.Log, prefix: str, jobs: Sequence[Job]) -> None:
+    """Every job's input is in the log or made by a job before it, and is of the right kind."""
+    coming: dict[str, Schema] = {}
+    for job in jobs:
+        reads = job.transform.reads
+        if job.source in coming:
+            name = coming[job.source].name
+        elif job.source in opened.channels:
+            name = opened.channels[job.source].schema_name
+        else:
+            there = ", ".join(sorted(opened.channels)) or "none"
+            hint = (
+                "" if job.source != f"{prefix}/video" else "; give the topic of the pictures with --topic, or --camera"
+            )
+            raise McaptrackError(f"{opened.path} has no channel {job.source} for {job.stage}; it has {there}{hint}")
+        fits = name in foxglove.PICTURES if reads is VIDEO else name == reads.name
+        if not fits:
+            wanted = " or ".join(foxglove.PICTURES) if reads is VIDEO else reads.name
+            raise McaptrackError(f"{opened.path}: {job.source} holds {name or 'no schema'}; {job.stage} reads {wanted}")
+        coming |= job.outputs()
+
+
+def run(
+    opened: log.Log,
+    prefix: str,
+    jobs: Sequence[Job],
+    output: Path | None = None,
+    progress: Progress = lambda *_: None,
+    say: Say = lambda _: None,
+) -> Report:
+    """Run the jobs and put their channels and the views of these into the log, or into a copy of it at ``output``.
+
+    Nothing is written until everything is computed; then the log is replaced as a whole.
+    """
+    made: dict[str, Made] = {}
+    report = Report()
+    planes = read_planes(opened, prefix)
+    for job in jobs:
+        if planes is None and job.transform.reads in (DETECTIONS, TRACKS) and job.stage in ("track", "sample"):
+            planes = _assume_plane(opened, prefix, made, job.source, say)
+        transform = _in_context(opened, prefix, job, made, planes or ())
+        input_digest, frames = _input(opened, job, made, progress)
+        outputs: list[list[Frame]] = [[] for _ in job.transform.writes]
+        for result in transform(frames):
+            for frame, channel in zip(result, outputs, strict=True):
+                channel.append(frame)
+        weights = getattr(transform, "weights_sha256", "") or ""
+        for (topic, schema), channel in zip(job.outputs().items(), outputs, strict=True):
+            if topic not in job.kept():
+                continue
+            messages = [(f.t_ns, f.index, schema.codec.encode(schema.check(f.rows))) for f in channel]
+            parameters = json.loads(json.dumps(asdict(transform)))
+            provenance = Provenance(job.stage, parameters, job.source, input_digest(), digest(messages), weights)
+            made[topic] = Made(schema, channel, provenance, messages)
+            report.frames[topic] = len(channel)
+        report.stages.append(job.stage)
+    if made or output is not None:
+        report.layout = _write(opened, prefix, made, planes or (), output)
+    digests = {topic: channel.provenance.digest for topic, channel in made.items()}
+    for topic, there in sorted(opened.channels.items()):
+        known = Provenance.from_metadata(there.metadata)
+        if topic not in made and known and known.transform in TRANSFORMS and known.input in digests:
+            report.stale += [topic] if known.input_digest != digests[known.input] else []
+    return report
+
+
+def _in_context(opened: log.Log, prefix: str, job: Job, made: Mapping[str, Made], planes: Planes) -> Transform:
+    """The transform with what the log knows: ground planes, the start of the clock, its rate."""
+    names = {f.name for f in fields(job.transform) if f.metadata.get("context")}
+    known: dict[str, Any] = {}
+    if "ground_planes" in names:
+        known["ground_planes"] = tuple(planes)
+    if "start_ns" in names:
+        known["start_ns"] = _clock_start(opened, prefix)
+    if "rate_hz" in names:
+        times = [f.t_ns for f in made[job.source].frames] if job.source in made else opened.times(job.source).tolist()
+        if len(times) > 1:
+            known["rate_hz"] = round(NS_PER_S / float(np.median(np.diff(times))), 6)
+    return replace(job.transform, **known)
+
+
+def _clock_start(opened: log.Log, prefix: str) -> int | None:
+    """When the clock of prediction begins: as ingest said, or with the first picture of the camera."""
+    said = opened.metadata(CLOCK)
+    if said and said.get("start_ns", "").lstrip("-").isdigit():
+        return int(said["start_ns"])
+    times = opened.times(f"{prefix}/video").tolist() if f"{prefix}/video" in opened.channels else []
+    return min(times, default=None)
+
+
+def _input(
+    opened: log.Log, job: Job, made: Mapping[str, Made], progress: Progress
+) -> tuple[Callable[[], str], Iterable[Frame]]:
+    """The frames that a job reads, and their digest, to be asked for when they have been read."""
+    if job.source in made:
+        source = made[job.source]
+        return (lambda: source.provenance.digest), _counted(source.frames, job.stage, progress)
+    channel = opened.channel(job.source)
+    if job.transform.reads is VIDEO:
+        return _pictures(opened, channel, job.stage, progress)
+    known = Provenance.from_metadata(channel.metadata)
+    said = known.digest if known else ""
+    if not said:
+        said = digest((m.t_ns, m.sequence, m.payload) for m in opened.messages(job.source))
+    frames = opened.frames(job.source, job.transform.reads)
+    return (lambda: said), _counted(frames, job.stage, progress)
+
+
+def _counted(frames: Sequence[Frame], stage: str, progress: Progress) -> Iterator[Frame]:
+    for count, frame in enumerate(frames, start=1):
+        yield frame
+        progress(stage, count, len(frames))
+
+
+def _pictures(
+    opened: log.Log, channel: log.Channel, stage: str, progress: Progress
+) -> tuple[Callable[[], str], Iterator[Frame]]:
+    import hashlib
+
+    total = hashlib.sha256()
+
+    def encoded() -> Iterator[Encoded]:
+        for index, message in enumerate(opened.messages(channel.topic)):
+            total.update(message.t_ns.to_bytes(8, "little") + message.payload)
+            image_format, data = foxglove.unpack_picture(channel.schema_name, message.payload)
+            yield Encoded(message.t_ns, index, image_format, data)
+            progress(stage, index + 1, channel.messages)
+
+    return total.hexdigest, brightness(encoded())
+
+
+def read_planes(opened: log.Log, prefix: str) -> Planes | None:
+    """The ground planes of a camera with the times from which they hold; None if there are none."""
+    topic = f"{prefix}/ground_plane"
+    if topic not in opened.channels:
+        return None
+    frames = opened.frames(topic, GROUND_PLANE)
+    return [(frame.t_ns, rows_to_plane(frame.rows)) for frame in frames] or None
+
+
+def _assume_plane(opened: log.Log, prefix: str, made: dict[str, Made], source: str, say: Say) -> Planes | None:
+    """Guess a scale from the boxes where nobody gave a ground plane; it becomes a channel that says so."""
+    if source in made:
+        frames = made[source].frames
+    else:
+        schema = SCHEMAS[opened.channel(source).schema_name]
+        frames = opened.frames(source, schema)
+    rows = np.concatenate([frame.rows[["x_px", "y_px", "w_px", "h_px"]] for frame in frames]) if frames else None
+    if rows is None or not np.isfinite(rows["h_px"]).any():
+        return None  # nothing in pixels: nothing to bring to metres
+    width, height = (int(np.nanmax(rows[a] + rows[b]).round()) for a, b in (("x_px", "w_px"), ("y_px", "h_px")))
+    plane: GroundPlane = assumed_plane(rows["h_px"], width, height)
+    metres = 1 / plane.homography[0]
+    say(
+        f"no ground plane is known: taking {metres:.3g} px for a metre, since people are 1.7 m high; "
+        "give one with `mcaptrack ingest --ground-plane`"
+    )
+    start = frames[0].t_ns
+    messages = [(start, 0, GROUND_PLANE.codec.encode(plane_to_rows(plane)))]
+    provenance = Provenance(_ASSUME, {}, source, "", digest(messages))
+    made[f"{prefix}/ground_plane"] = Made(GROUND_PLANE, [Frame(start, 0, plane_to_rows(plane))], provenance, messages)
+    return [(start, plane)]
+
+
+def _write(opened: log.Log, prefix: str, made: Mapping[str, Made], planes: Planes, output: Path | None) -> bytes | None:
+    """Put what was made, and its views, into the log. Returns the layout, if there are pictures to draw on."""
+    video, truth = f"{prefix}/video", f"{prefix}/truth"
+    picture_ns = opened.times(video) if video in opened.channels else np.empty(0, np.int64)
+    shown = {topic: (channel.schema, channel.frames, channel.provenance.digest) for topic, channel in made.items()}
+    if truth in opened.channels and truth + views.SUFFIX not in opened.channels:
+        shown[truth] = (TRACKS, opened.frames(truth, TRACKS), "")
+    outdated = {topic + views.SUFFIX for topic in made}
+    with log.extend(opened, output, drop={*made, *outdated}, drop_attachments=[LAYOUT]) as writer:
+        for topic, channel in made.items():
+            record = (channel.schema.name, "protobuf", channel.schema.descriptor)
+            number = writer.add_channel(topic, record, "protobuf", channel.provenance.to_metadata())
+            for message in channel.messages:
+                writer.add_message(number, *message)
+        if not len(picture_ns):
+            return None
+        topics = [topic for topic in opened.channels if topic.endswith(views.SUFFIX) and topic not in outdated]
+        for topic, (schema, frames, made_from) in shown.items():
+            if schema not in (DETECTIONS, TRACKS, PREDICTIONS) or topic.endswith(_NOT_SHOWN):
+                continue
+            metadata = Provenance("view", {}, topic, made_from).to_metadata()
+            record = foxglove.schema_record(foxglove.ANNOTATIONS)
+            number = writer.add_channel(topic + views.SUFFIX, record, "protobuf", metadata)
+            for message in views.view(topic, schema, frames, picture_ns, planes):
+                writer.add_message(number, *message)
+            topics.append(topic + views.SUFFIX)
+        layout_file = layout(prefix, topics)
+        writer.add_attachment(LAYOUT, "application/json", layout_file)
+    return layout_file
+
+
+#: Channels without a view: they show what others show, at fewer times.
+_NOT_SHOWN: Final = ("/samples", "/online")
+#: The attachment that holds the layout.
+LAYOUT: Final = "mcaptrack.layout.json"
+#: Views that a layout switches on, below the prefix; the others can be switched on by hand.
+_SHOWN: Final = ("retracks", "retracks/predictions", "tracks", "detections")
+
+
+def layout(prefix: str, view_topics: Sequence[str]) -> bytes:
+    """The layout for a camera's views: the best that there is switched on."""
+    names = {topic: topic.removeprefix(prefix + "/").removesuffix(views.SUFFIX) for topic in sorted(view_topics)}
+    there = set(names.values())
+    on = {"retracks", "retracks/predictions"} if "retracks" in there else {next((n for n in _SHOWN if n in there), "")}
+    counts = [f"{prefix}/{name}.rows.length" for name in ("detections", "tracks", "retracks") if name in there]
+    return foxglove.layout(f"{prefix}/video", {topic: name in on for topic, name in names.items()}, counts)

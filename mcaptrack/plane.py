@@ -1,0 +1,111 @@
+"""The ground plane: which metre on the ground a pixel of the image shows. Letters: N boxes or points."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaptrack.errors import McaptrackError
+
+Floats = NDArray[np.float64]
+Point = Literal["foot", "center"]
+
+#: The height of a person, where the scale of a scene has to be guessed from the boxes.
+PERSON_HEIGHT_M = 1.7
+
+
+@dataclass(frozen=True)
+class GroundPlane:
+    """A homography from pixels to metres, and which point of a box stands on the ground.
+
+    ``homography`` is row by row, 9 numbers: (x_m, y_m, 1) ~ H (x_px, y_px, 1). ``point`` is "foot", the middle of the
+    box's lower edge, or "center". ``assumed`` says that the scale was guessed. Raises McaptrackError if the homography
+    is not 9 finite numbers or is singular.
+    """
+
+    homography: tuple[float, ...]
+    width_px: int
+    height_px: int
+    point: Point = "foot"
+    assumed: bool = False
+
+    def __post_init__(self) -> None:
+        values = np.asarray(self.homography, np.float64)
+        if values.shape != (9,) or not np.isfinite(values).all():
+            raise McaptrackError(f"a homography is 9 finite numbers, 3 rows of 3; got {len(self.homography)}")
+        if self.point not in get_args(Point):
+            raise McaptrackError(f"a box stands on its {' or '.join(get_args(Point))}, not its {self.point}")
+        # Scaled by the image's size, so that the verdict does not hang on whether pixels or metres are large.
+        scaled = self.matrix @ np.diag([max(self.width_px, 1), max(self.height_px, 1), 1.0])
+        singular_values = np.linalg.svd(scaled, compute_uv=False)
+        if singular_values[-1] <= 1e-9 * singular_values[0]:
+            raise McaptrackError("the homography is singular: it maps the image onto a line or a point, not a plane")
+
+    @cached_property
+    def matrix(self) -> Floats:
+        """The homography, (3, 3)."""
+        return np.asarray(self.homography, np.float64).reshape(3, 3)
+
+    @cached_property
+    def _near_side(self) -> float:
+        """The sign of the third component where the ground is: at the middle of the image's lower edge."""
+        return float(np.sign(self.matrix[2] @ [self.width_px / 2, self.height_px, 1.0])) or 1.0
+
+    def pixels_to_metres(self, xy_px: Floats) -> Floats:
+        """Points (N, 2) of the image -> points on the ground; NaN above the horizon, where there is no ground."""
+        x, y, w = self.matrix @ np.concatenate([xy_px, np.ones((len(xy_px), 1))], axis=1).T
+        w = np.where(w * self._near_side > 0, w, np.nan)
+        return np.stack([x / w, y / w], axis=-1)
+
+    def metres_to_pixels(self, xy_m: Floats) -> Floats:
+        """Points (N, 2) on the ground -> points of the image; NaN behind the camera."""
+        x, y, w = np.linalg.inv(self.matrix) @ np.concatenate([xy_m, np.ones((len(xy_m), 1))], axis=1).T
+        w = np.where(w * self._near_side > 0, w, np.nan)
+        return np.stack([x / w, y / w], axis=-1)
+
+    def boxes_to_metres(self, xywh: Floats) -> Floats:
+        """Where boxes (N, 4) stand on the ground, (N, 2)."""
+        x, y, w, h = xywh.T
+        return self.pixels_to_metres(np.stack([x + w / 2, y + h * self._anchor], axis=-1))
+
+    def standing_boxes(self, xy_m: Floats, size_px: Floats) -> Floats:
+        """Boxes (N, 4) of the given widths and heights (N, 2) that stand on points (N, 2) of the ground."""
+        anchor = self.metres_to_pixels(xy_m)
+        return np.concatenate([anchor - size_px * [0.5, self._anchor], size_px], axis=1)
+
+    @property
+    def _anchor(self) -> float:
+        return 1.0 if self.point == "foot" else 0.5
+
+
+#: The planes of one camera with the times (ns) from which each holds; the first holds from the beginning.
+Planes = Sequence[tuple[int, GroundPlane]]
+
+
+def plane_at(planes: Planes, t_ns: int) -> GroundPlane | None:
+    """The plane that holds at ``t_ns``; None if there is none at all."""
+    held = None
+    for since_ns, plane in planes:
+        if held is not None and since_ns > t_ns:
+            break
+        held = plane
+    return held
+
+
+def assumed_plane(heights_px: Floats, width_px: int, height_px: int) -> GroundPlane:
+    """The plane for a scene that nobody measured: the image itself, scaled so that the median box is a person high.
+
+    The origin is the middle of the image and the second axis points up. Distances are right only for a camera that
+    looks straight down or from far away; the plane says of itself that it is ``assumed``.
+    """
+    heights = heights_px[np.isfinite(heights_px) & (heights_px > 0)]
+    if len(heights) == 0:
+        raise McaptrackError("no boxes to guess a scale from; give the plane with `mcaptrack ingest --ground-plane`")
+    scale = PERSON_HEIGHT_M / float(np.median(heights))
+    homography = (scale, 0.0, -scale * width_px / 2, 0.0, -scale, scale * height_px / 2, 0.0, 0.0, 1.0)
+    return GroundPlane(homography, width_px, height_px, assumed=True)

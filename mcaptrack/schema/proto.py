@@ -1,0 +1,129 @@
+"""Read the row schemas: a strict subset of proto3 in which every field has a fixed width.
+
+A schema file holds one message with one nested message ``Row`` and one field ``repeated Row rows = 1``. Everything
+else of the language is refused, because the row codec stands on rows that all take the same number of bytes. The
+comments of the file are kept: they are what ``--help``, Arrow and Parquet say about a column.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from google.protobuf.descriptor_pb2 import FileDescriptorSet
+
+#: proto3 scalar -> (NumPy format, bytes on the wire, wire type, FieldDescriptorProto.Type)
+KINDS: Final = {
+    "double": ("<f8", 8, 1, 1),
+    "float": ("<f4", 4, 5, 2),
+    "fixed64": ("<u8", 8, 1, 6),
+    "fixed32": ("<u4", 4, 5, 7),
+    "bool": ("?", 1, 0, 8),
+    "sfixed32": ("<i4", 4, 5, 15),
+    "sfixed64": ("<i8", 8, 1, 16),
+}
+UNITS: Final = {"px": "px", "m": "m", "m2": "m^2", "s": "s", "ns": "ns", "hz": "Hz"}
+
+_COMMENT = re.compile(r"//\s?(.*)$")
+_FIELD = re.compile(r"(optional\s+)?(\w+)\s+([a-z]\w*)\s*=\s*(\d+)\s*;$")
+_MESSAGE = re.compile(r"message\s+([A-Z]\w*)\s*\{$")
+
+
+@dataclass(frozen=True)
+class Column:
+    """One field of a row. ``optional`` means that the number may be missing: NaN in rows, null in tables."""
+
+    name: str
+    kind: str
+    number: int
+    optional: bool
+    doc: str
+
+    @property
+    def unit(self) -> str:
+        """The unit that the name ends on ("px", "m", "m^2", "s"), or "" for a plain number."""
+        return UNITS.get(self.name.rpartition("_")[2], "") if "_" in self.name else ""
+
+
+@dataclass(frozen=True)
+class Definition:
+    """One schema file: the message's full name ("mcaptrack.Tracks"), its description and its columns in order."""
+
+    name: str
+    doc: str
+    columns: tuple[Column, ...]
+
+    def file_descriptor_set(self) -> FileDescriptorSet:
+        """The protobuf descriptor of the file, as MCAP's schema record carries it."""
+        from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorSet
+
+        package, _, message_name = self.name.rpartition(".")
+        files = FileDescriptorSet()
+        file = files.file.add(name=f"{package}/{message_name}.proto", package=package, syntax="proto3")
+        message = file.message_type.add(name=message_name)
+        message.field.add(
+            name="rows",
+            json_name="rows",
+            number=1,
+            label=FieldDescriptorProto.LABEL_REPEATED,
+            type=FieldDescriptorProto.TYPE_MESSAGE,
+            type_name=f".{self.name}.Row",
+        )
+        row = message.nested_type.add(name="Row")
+        for column in self.columns:
+            head, *tail = column.name.split("_")
+            field = row.field.add(
+                name=column.name,
+                json_name=head + "".join(word.capitalize() for word in tail),
+                number=column.number,
+                label=FieldDescriptorProto.LABEL_OPTIONAL,
+                type=FieldDescriptorProto.Type.ValueType(KINDS[column.kind][3]),
+            )
+            if column.optional:  # proto3 wraps each optional scalar in a oneof of its own
+                field.proto3_optional = True
+                field.oneof_index = len(row.oneof_decl)
+                row.oneof_decl.add(name=f"_{column.name}")
+        return files
+
+
+def parse(text: str, origin: str) -> Definition:
+    """Read the text of one schema file; ``origin`` names it in errors.
+
+    Raises ValueError, with the line, for anything outside the subset.
+    """
+    package, depth, closed = "", 0, False
+    names: list[str] = []
+    doc: list[str] = []
+    columns: list[Column] = []
+    for number, raw in enumerate(text.splitlines(), start=1):
+        comment = _COMMENT.search(raw)
+        line = (raw[: comment.start()] if comment else raw).strip()
+        if not line:
+            if comment and not names:
+                doc.append(comment.group(1).strip())
+            continue
+        message, field = _MESSAGE.match(line), _FIELD.match(line)
+        if line == 'syntax = "proto3";':
+            continue
+        if line.startswith("package ") and line.endswith(";") and not package:
+            package = line[len("package ") : -1].strip()
+        elif message and depth < 2 and (depth == 0) == (not names) and (depth == 0 or message.group(1) == "Row"):
+            names.append(message.group(1))
+            depth += 1
+        elif line == "}" and depth:
+            depth -= 1
+        elif line == "repeated Row rows = 1;" and depth == 1 and len(names) == 2:
+            closed = True
+        elif field and depth == 2 and field.group(2) in KINDS:
+            optional, kind, name, tag = field.groups()
+            if optional and kind not in ("double", "float"):
+                raise ValueError(f"{origin}:{number}: only double and float can be optional, not {kind} {name}")
+            columns.append(Column(name, kind, int(tag), bool(optional), comment.group(1).strip() if comment else ""))
+        else:
+            raise ValueError(f"{origin}:{number}: not a row schema (fixed-width fields in message Row): {line}")
+    numbers = [column.number for column in columns]
+    if depth or not closed or not package or numbers != sorted(set(numbers)):
+        raise ValueError(f"{origin}: a row schema needs a package, 'repeated Row rows = 1;' and rising field numbers")
+    return Definition(f"{package}.{names[0]}", " ".join(doc), tuple(columns))

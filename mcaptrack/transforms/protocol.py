@@ -1,0 +1,89 @@
+"""What a transform is.
+
+A transform is a frozen, keyword-only dataclass. Its fields are its parameters: each has a default, its unit at the end
+of its name and a help text; they are at once the options of its command and what its channels say of their making.
+Calling it with a stream of frames gives a stream of tuples of frames, one for each of its outputs.
+
+Laws that hold for every transform, tested for all in ``TRANSFORMS``:
+
+* conforms: every output passes the gate of its schema;
+* keeps time: the times of an output never decrease;
+* causal: the run of a prefix is a prefix of the run, but for what lies within ``latency_s`` of the prefix's end;
+* pure: the same input gives the same output, and runs at the same time don't touch each other;
+* order-blind: shuffling the rows of a frame changes names (ids) at most;
+* unmoved by silence: frames without rows never stop a run.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import field, fields
+from types import UnionType
+from typing import Any, ClassVar, Literal, Protocol, get_args, get_origin, get_type_hints
+
+from mcaptrack.errors import McaptrackError
+from mcaptrack.schema import Frame, Schema
+
+
+class Transform(Protocol):
+    """See the module. ``writes`` maps the suffix of each output's topic to its schema; "" is the main output."""
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+    reads: ClassVar[Schema]
+    writes: ClassVar[Mapping[str, Schema]]
+
+    def __call__(self, frames: Iterable[Frame]) -> Iterator[tuple[Frame, ...]]: ...
+
+    @property
+    def latency_s(self) -> Mapping[str, float]:
+        """How far each output looks ahead, in seconds: 0 for the past alone, infinity for the whole log."""
+        ...
+
+
+def option(default: Any, help: str, *, least: float = -math.inf, most: float = math.inf) -> Any:  # noqa: A002
+    """A parameter of a transform: its default, what it means, and its range."""
+    return field(default=default, metadata={"help": help, "least": least, "most": most})
+
+
+def context(factory: Callable[[], Any]) -> Any:
+    """A parameter that the log gives and no command line: the ground plane, the start of the clock."""
+    return field(default_factory=factory, metadata={"context": True})
+
+
+def choices(annotation: Any) -> tuple[str, ...]:
+    """The names that a parameter with this annotation can take; () if it isn't a choice."""
+    return tuple(str(name) for name in get_args(annotation)) if get_origin(annotation) is Literal else ()
+
+
+def bare_type(annotation: Any) -> Any:
+    """The type of a parameter without the "or None"."""
+    if isinstance(annotation, UnionType):
+        return next(part for part in get_args(annotation) if part is not type(None))
+    return annotation
+
+
+def check_options(transform: Transform) -> None:
+    """Refuse parameters that are out of range or of the wrong kind, by name and number. For ``__post_init__``.
+
+    Raises McaptrackError.
+    """
+    hints = get_type_hints(type(transform))
+    for parameter in fields(transform):
+        if parameter.metadata.get("context"):
+            continue
+        value, kind, name = getattr(transform, parameter.name), bare_type(hints[parameter.name]), parameter.name
+        if value is None and kind is not hints[name]:
+            continue
+        names = choices(kind)
+        if names:
+            if value not in names:
+                raise McaptrackError(f"{name} is one of {', '.join(names)}, not {value}")
+            continue
+        wanted = {float: (int, float), int: (int,), bool: (bool,), str: (str,)}[kind]
+        if not isinstance(value, wanted) or (isinstance(value, bool) and kind is not bool):
+            raise McaptrackError(f"{name} needs {kind.__name__}, not {value!r}")
+        least, most = parameter.metadata["least"], parameter.metadata["most"]
+        if kind in (int, float) and not least <= value <= most:
+            limits = f"at least {least:g}" if most == math.inf else f"from {least:g} to {most:g}"
+            raise McaptrackError(f"{name} has to be {limits}, not {value:g}")

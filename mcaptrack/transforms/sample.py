@@ -1,0 +1,103 @@
+"""Tracks at the video's rate -> tracks on the regular clock of prediction, in metres.
+
+The clock starts at the log's first frame and ticks at a fixed rate. After this stage nothing knows of pixels per metre
+or frames per second.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaptrack.boxes import columns_to_boxes
+from mcaptrack.clock import NS_PER_S, seconds_to_ns
+from mcaptrack.errors import McaptrackError
+from mcaptrack.plane import Planes, plane_at
+from mcaptrack.resample import resample
+from mcaptrack.schema import TRACKS, Frame, Rows, Schema
+from mcaptrack.transforms.protocol import check_options, context, option
+
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sample:
+    """Put tracks on the regular clock of prediction, in metres.
+
+    Reads tracks, writes tracks: a row for everybody who is there at a tick; ``observed`` is false inside holes.
+    """
+
+    rate_hz: float = option(2.5, "ticks per second", least=0.1, most=1000.0)
+    max_hole_s: float = option(2.0, "a hole in a track that is longer than this stays a hole", least=0.0)
+    start_ns: int | None = context(lambda: None)
+    ground_planes: Planes = context(tuple)
+
+    reads: ClassVar[Schema] = TRACKS
+    writes: ClassVar[Mapping[str, Schema]] = MappingProxyType({"": TRACKS})
+
+    def __post_init__(self) -> None:
+        check_options(self)
+
+    @property
+    def latency_s(self) -> MappingProxyType[str, float]:
+        """A tick is certain once nothing can close a hole around it any more."""
+        return MappingProxyType({"": max(self.max_hole_s, 2 / self.rate_hz)})
+
+    def __call__(self, frames: Iterable[Frame]) -> Iterator[tuple[Frame, ...]]:
+        times, indices, parts = [], [], []
+        for frame in frames:
+            times.append(frame.t_ns)
+            indices.append(frame.index)
+            parts.append(_in_metres(frame, self.ground_planes))
+        if not times:
+            return
+        frame_ns = np.array(times, np.int64)
+        tick_ns = self._ticks(frame_ns, times[0] if self.start_ns is None else self.start_ns)
+        row_ns = np.repeat(frame_ns, [len(part) for part in parts])
+        rows, at = resample(np.concatenate(parts), row_ns, tick_ns, seconds_to_ns(self.max_hole_s))
+        rows["source_id"] = rows["track_id"]
+        shown = np.array(indices)[np.searchsorted(frame_ns, tick_ns, "right") - 1]  # the picture on screen at each tick
+        first, last = (np.searchsorted(at, np.arange(len(tick_ns)), side) for side in ("left", "right"))
+        for index, t_ns, low, high in zip(*(a.tolist() for a in (shown, tick_ns, first, last)), strict=True):
+            yield (Frame(t_ns, index, rows[low:high]),)
+
+    def _ticks(self, frame_ns: Ints, start: int) -> Ints:
+        """The ticks at which somebody looked: between frames that are no further apart than a hole may be.
+
+        Tick k is at start + k / rate, to the nanosecond; a log that jumps over a year has no ticks in between.
+        """
+        period = NS_PER_S / self.rate_hz
+        limit = max(seconds_to_ns(self.max_hole_s), round(2 * period))
+        ends = np.append(frame_ns[1:], frame_ns[-1])
+        ends = np.where(ends - frame_ns <= limit, ends, frame_ns)
+        low = np.maximum(np.ceil((frame_ns - start) / period - 0.5).astype(np.int64), 0)
+        high = np.maximum(np.floor((ends - start) / period + 0.5).astype(np.int64), -1)
+        count = np.maximum(high - low + 1, 0)  # a tick too many at either end goes below
+        ticks = np.arange(int(count.sum())) - np.repeat(np.cumsum(count) - count, count) + np.repeat(low, count)
+        tick_ns = start + np.rint(ticks * period).astype(np.int64)
+        inside = (tick_ns >= np.repeat(frame_ns, count)) & (tick_ns <= np.repeat(ends, count))
+        return np.unique(tick_ns[inside])
+
+
+def _in_metres(frame: Frame, planes: Planes) -> Rows:
+    """The rows with x_m, y_m filled in from the boxes where they are missing; rows off the ground plane left out.
+
+    Raises McaptrackError if there are boxes without metres and no plane to bring them there.
+    """
+    rows = frame.rows
+    missing = np.isnan(rows["x_m"])
+    if not missing.any():
+        return rows
+    plane = plane_at(planes, frame.t_ns)
+    if plane is None:
+        raise McaptrackError("tracks are in pixels and there is no ground plane to bring them to metres")
+    rows = rows.copy()
+    xy_m = plane.boxes_to_metres(columns_to_boxes(rows[missing]))
+    rows["x_m"][missing], rows["y_m"][missing] = xy_m.T
+    on_ground: Rows = rows[np.isfinite(rows["x_m"])]
+    return on_ground

@@ -1,0 +1,23 @@
+"""Packets and pixels: video files and image folders in, brightness for detectors out, H.264 and JPEG between.
+
+FFmpeg does the work, through PyAV; its wheels bring it along.
+"""
+
+from mcaptrack.video.decode import Encoded, brightness
+from mcaptrack.video.encode import H264Encoder, Image, ImageFormat, encode_image, write_mp4
+from mcaptrack.video.source import IMAGE_SUFFIXES, EncodedPicture, Video, open_video, seqinfo_fps
+
+__all__ = [
+    "IMAGE_SUFFIXES",
+    "Encoded",
+    "EncodedPicture",
+    "H264Encoder",
+    "Image",
+    "ImageFormat",
+    "Video",
+    "brightness",
+    "encode_image",
+    "open_video",
+    "seqinfo_fps",
+    "write_mp4",
+]

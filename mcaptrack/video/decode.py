@@ -1,0 +1,98 @@
+"""Encoded pictures -> brightness, for detectors."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from fractions import Fraction
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaptrack.clock import NS_PER_S
+from mcaptrack.errors import McaptrackError
+from mcaptrack.schema import Frame
+
+#: Names of formats in messages -> decoders of FFmpeg.
+_CODECS: Final = {"h264": "h264", "h265": "hevc", "vp9": "vp9", "av1": "av1"}
+_FULL_RANGE: Final = 2  # AVCOL_RANGE_JPEG
+# Video keeps brightness in 16..235; detectors see 0..255 whatever the picture came from.
+_LIMITED_TO_FULL: Final = np.clip(np.rint((np.arange(256) - 16) * (255 / 219)), 0, 255).astype(np.uint8)
+
+
+class Encoded(NamedTuple):
+    """A picture in a log: ``format`` is "h264", "jpeg" and so on."""
+
+    t_ns: int
+    index: int  # type: ignore[assignment]  # hides tuple.index, which nobody wants here
+    format: str
+    data: bytes
+
+
+def brightness(pictures: Iterable[Encoded]) -> Iterator[Frame]:
+    """Frames whose ``rows`` are the brightness of the picture, (height, width) uint8 from 0 to 255.
+
+    Raises McaptrackError for a format that can't be decoded and for pictures that are broken.
+    """
+    decoder: _VideoDecoder | None = None
+    for picture in pictures:
+        if picture.format in _CODECS:
+            decoder = decoder or _VideoDecoder(picture.format)
+            yield from decoder.decode(picture)
+        else:
+            yield Frame(picture.t_ns, picture.index, _still(picture))
+    if decoder:
+        yield from decoder.flush()
+
+
+def _still(picture: Encoded) -> NDArray[np.uint8]:
+    import cv2
+
+    image = cv2.imdecode(np.frombuffer(picture.data, np.uint8), cv2.IMREAD_GRAYSCALE)
+    if image is None:
+        raise McaptrackError(f"frame {picture.index} can't be decoded as {picture.format or 'an image'}")
+    return np.asarray(image, np.uint8)
+
+
+class _VideoDecoder:
+    def __init__(self, name: str) -> None:
+        import av
+
+        self._codec: Any = av.CodecContext.create(_CODECS[name], "r")
+        self._codec.thread_type = "AUTO"
+        self._base = Fraction(1, NS_PER_S)
+        self._index: dict[int, int] = {}
+
+    def decode(self, picture: Encoded) -> Iterator[Frame]:
+        import av
+
+        packet = av.Packet(picture.data)
+        packet.pts = packet.dts = picture.t_ns
+        packet.time_base = self._base
+        self._index[picture.t_ns] = picture.index
+        yield from self._frames(packet, f"frame {picture.index}")
+
+    def flush(self) -> Iterator[Frame]:
+        yield from self._frames(None, "the end of the video")
+
+    def _frames(self, packet: Any, where: str) -> Iterator[Frame]:
+        import av
+
+        try:
+            decoded = self._codec.decode(packet)
+        except av.error.FFmpegError as error:
+            raise McaptrackError(f"{where} can't be decoded: {error.strerror or error}") from error
+        for frame in decoded:
+            yield Frame(frame.pts, self._index.pop(frame.pts, 0), _luma(frame))
+
+
+def _luma(frame: Any) -> NDArray[np.uint8]:
+    """The brightness of a decoded picture; its Y plane where it has one of 8 bits."""
+    import cv2
+
+    if not frame.format.name.startswith(("yuv4", "yuvj4", "nv12", "gray")) or frame.format.components[0].bits != 8:
+        frame = frame.reformat(format="gray")
+    plane = frame.planes[0]
+    rows = np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)[: frame.height, : frame.width]
+    full = frame.color_range == _FULL_RANGE or frame.format.name.startswith(("gray", "yuvj"))
+    return rows.copy() if full else np.asarray(cv2.LUT(rows, _LIMITED_TO_FULL), np.uint8)
