@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from statistics import median_low
+from statistics import median_high
 from typing import Final
 
 NS_PER_S: Final = 1_000_000_000
@@ -34,10 +34,10 @@ class FrameClock:
         if passed <= 0:
             return 1
         self._intervals.append(passed)
-        return max(1, round(passed / median_low(self._intervals)))
+        return max(1, round(passed / median_high(self._intervals)))
 
     def frames(self, seconds: float) -> int:
         """How many frames a time span is, at least 1; so far as the usual interval is known, otherwise 1."""
         if not self._intervals:
             return 1
-        return max(1, round(seconds_to_ns(seconds) / median_low(self._intervals)))
+        return max(1, round(seconds_to_ns(seconds) / median_high(self._intervals)))

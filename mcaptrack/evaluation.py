@@ -238,9 +238,7 @@ def _span(t_ns: Ints) -> str:
 
 
 def _resampled(frames: Sequence[Frame], at_ns: Ints) -> list[Frame]:
-    rows = np.concatenate([TRACKS.empty(), *(frame.rows for frame in frames)])
-    row_ns = np.repeat(np.array([frame.t_ns for frame in frames], np.int64), [len(frame.rows) for frame in frames])
-    out, at = resample(rows, row_ns, at_ns, seconds_to_ns(_MAX_HOLE_S))
+    out, at = resample(frames, at_ns, seconds_to_ns(_MAX_HOLE_S))
     ends = np.searchsorted(at, np.arange(len(at_ns)), "right").tolist()
     spans = zip(at_ns.tolist(), [0, *ends][:-1], ends, strict=True)
     return [Frame(t_ns, index, out[low:high]) for index, (t_ns, low, high) in enumerate(spans)]

@@ -185,14 +185,14 @@ def layout(image_topic: str, annotation_topics: Mapping[str, bool], plots: Seque
         "xAxisVal": "timestamp",
     }
     tree = {
-        "configById": {"Image!picture": image, "Plot!counts": plot, "SourceInfo!log": {}},
+        "configById": {"Image!picture": image, "Plot!positions": plot, "SourceInfo!log": {}},
         "globalVariables": {},
         "userNodes": {},
         "playbackConfig": {"speed": 1},
         "layout": {
             "direction": "row",
             "first": "Image!picture",
-            "second": {"direction": "column", "first": "Plot!counts", "second": "SourceInfo!log"},
+            "second": {"direction": "column", "first": "Plot!positions", "second": "SourceInfo!log"},
             "splitPercentage": 70,
         },
     }

@@ -203,11 +203,12 @@ def _check_inputs(opened: log.Log, prefix: str, jobs: Sequence[Job]) -> None:
         elif job.source in opened.channels:
             name = opened.channels[job.source].schema_name
         else:
-            there = ", ".join(sorted(opened.channels)) or "none"
-            hint = (
-                "" if job.source != f"{prefix}/video" else "; give the topic of the pictures with --topic, or --camera"
-            )
-            raise McaptrackError(f"{opened.path} has no channel {job.source} for {job.stage}; it has {there}{hint}")
+            there = [topic for topic in sorted(opened.channels) if not topic.endswith(views.SUFFIX)]
+            hint = f"`mcaptrack info {opened.path}` shows more"
+            if job.source == f"{prefix}/video":
+                hint = f"add pictures with `mcaptrack ingest VIDEO --into {opened.path}`, or name theirs with --topic"
+            has = f"it has {', '.join(there) or 'none'}"
+            raise McaptrackError(f"{opened.path} has no channel {job.source} for {job.stage}; {has}. {hint}")
         fits = name in foxglove.PICTURES if reads is VIDEO else name == reads.name
         if not fits:
             wanted = " or ".join(foxglove.PICTURES) if reads is VIDEO else reads.name
@@ -401,5 +402,5 @@ def layout(prefix: str, view_topics: Sequence[str]) -> bytes:
     names = {topic: topic.removeprefix(prefix + "/").removesuffix(views.SUFFIX) for topic in sorted(view_topics)}
     there = set(names.values())
     on = {"retracks", "retracks/predictions"} if "retracks" in there else {next((n for n in _SHOWN if n in there), "")}
-    counts = [f"{prefix}/{name}.rows.length" for name in ("detections", "tracks", "retracks") if name in there]
-    return foxglove.layout(f"{prefix}/video", {topic: name in on for topic, name in names.items()}, counts)
+    paths = [f"{prefix}/{name}.rows[:].x_m" for name in ("tracks", "retracks") if name in there]
+    return foxglove.layout(f"{prefix}/video", {topic: name in on for topic, name in names.items()}, paths)

@@ -40,11 +40,18 @@ class GroundPlane:
             raise McaptrackError(f"a homography is 9 finite numbers, 3 rows of 3; got {len(self.homography)}")
         if self.point not in get_args(Point):
             raise McaptrackError(f"a box stands on its {' or '.join(get_args(Point))}, not its {self.point}")
-        # Scaled by the image's size, so that the verdict does not hang on whether pixels or metres are large.
-        scaled = self.matrix @ np.diag([max(self.width_px, 1), max(self.height_px, 1), 1.0])
-        singular_values = np.linalg.svd(scaled, compute_uv=False)
-        if singular_values[-1] <= 1e-9 * singular_values[0]:
+        if not any(self._spreads(u, v) for u in (0.0, 0.5, 1.0) for v in (1.0, 0.5, 0.0)):
             raise McaptrackError("the homography is singular: it maps the image onto a line or a point, not a plane")
+
+    def _spreads(self, u: float, v: float) -> bool:
+        """Whether the surroundings of a point, given as shares of the image's size, are mapped onto an area.
+
+        Asked of the derivative, so that neither the scale nor the origin of the metres matters.
+        """
+        x, y, w = self.matrix @ [u * self.width_px, v * self.height_px, 1.0]
+        derivative = self.matrix[:2, :2] * w - np.outer([x, y], self.matrix[2, :2])
+        size = float((derivative**2).sum())
+        return size > 0 and abs(float(np.linalg.det(derivative))) > 1e-9 * size
 
     @cached_property
     def matrix(self) -> Floats:

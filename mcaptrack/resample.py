@@ -5,12 +5,13 @@ Letters: N rows in, F frames in, T times, S rows out.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaptrack.schema import Rows
+from mcaptrack.schema import TRACKS, Frame, Rows
 
 Ints = NDArray[np.int64]
 
@@ -20,13 +21,17 @@ LINEAR: Final = ("x_px", "y_px", "w_px", "h_px", "x_m", "y_m", "score")
 _HOLE: Final = 1.5
 
 
-def resample(rows: Rows, row_ns: Ints, at_ns: Ints, max_hole_ns: int) -> tuple[Rows, Ints]:
-    """``rows`` (N,) of tracks, at times ``row_ns`` (N,), brought to the rising times ``at_ns`` (T,).
+def resample(frames: Sequence[Frame], at_ns: Ints, max_hole_ns: int) -> tuple[Rows, Ints]:
+    """The rows of tracks, brought to the rising times ``at_ns`` (T,).
 
     Inside one id a row is interpolated where its neighbours are at most ``max_hole_ns`` apart; a row at one of the
     times stays as it is. ``observed`` is false inside holes. Returns S rows ordered by time and id, and which time each
     belongs to (S,).
     """
+    frame_ns = np.array([frame.t_ns for frame in frames], np.int64)
+    usual_ns = float(np.median(np.diff(frame_ns))) if len(frames) > 1 else 0.0
+    rows = np.concatenate([TRACKS.empty(), *(frame.rows for frame in frames)])
+    row_ns = np.repeat(frame_ns, [len(frame.rows) for frame in frames])
     order = np.lexsort((row_ns, rows["track_id"]))
     rows, row_ns = rows[order], row_ns[order]
     same = np.append(rows["track_id"][1:] == rows["track_id"][:-1], False)[: len(rows)]
@@ -46,8 +51,7 @@ def resample(rows: Rows, row_ns: Ints, at_ns: Ints, max_hole_ns: int) -> tuple[R
     for name in LINEAR:
         start, end = rows[name][before], rows[name][after]
         out[name] = np.where(share == 0, start, start + share * (end - start))
-    usual = float(np.median(np.diff(np.unique(row_ns)))) if len(np.unique(row_ns)) > 1 else 0.0
-    between = rows["observed"][before] & rows["observed"][after] & (span <= _HOLE * usual)
+    between = rows["observed"][before] & rows["observed"][after] & (span <= _HOLE * usual_ns)
     out["observed"] = np.where(share == 0, rows["observed"][before], between)
     order = np.lexsort((out["track_id"], at))
     return out[order], at[order].astype(np.int64)

@@ -73,6 +73,7 @@ class Scene:
     tree_at_m: tuple[float, float] | None = None
     shake_px: float = 0.0
     noise: float = 2.0
+    contrast: float = 1.0  # of the paving
     mast_m: float = 7.0
     tilt_deg: float = 27.0
     seed: int = 1
@@ -152,7 +153,8 @@ class Scene:
         coarse = rng.uniform(-1, 1, (self.height_px // 24 + 2, self.width_px // 24 + 2)).astype(np.float32)
         fine = rng.uniform(-1, 1, (self.height_px, self.width_px)).astype(np.float32)
         size = (self.width_px, self.height_px)
-        shade = 150 + 14 * np.asarray(cv2.resize(coarse, size, interpolation=cv2.INTER_CUBIC)) + 9 * fine
+        rough = 14 * np.asarray(cv2.resize(coarse, size, interpolation=cv2.INTER_CUBIC)) + 9 * fine
+        shade = 150 + self.contrast * rough
         tinted = np.repeat(shade[:, :, None], 3, axis=2) + np.array([-6, 0, 4])
         image: Image = np.clip(tinted, 0, 255).astype(np.uint8)
         lines = [((x, 2.0), (x, 40.0)) for x in np.arange(-20, 21, 2.0)] + [

@@ -55,9 +55,7 @@ def _detections(frames: Sequence[Frame], picture_ns: Ints) -> View:
 
 def _tracks(frames: Sequence[Frame], picture_ns: Ints, planes: Planes, truth: bool) -> View:
     """Boxes with ids, and the trail of the last seconds, fading. True tracks are thin and white."""
-    rows = np.concatenate([TRACKS.empty(), *(frame.rows for frame in frames)])
-    row_ns = np.repeat(np.array([frame.t_ns for frame in frames], np.int64), [len(frame.rows) for frame in frames])
-    shown, at = resample(rows, row_ns, picture_ns, seconds_to_ns(_MAX_HOLE_S))
+    shown, at = resample(frames, picture_ns, seconds_to_ns(_MAX_HOLE_S))
     boxes = columns_to_boxes(shown)
     feet = boxes[:, :2] + boxes[:, 2:] * [0.5, 0.5 if planes and planes[0][1].point == "center" else 1.0]
     first, last = (np.searchsorted(at, np.arange(len(picture_ns)), side) for side in ("left", "right"))

@@ -21,7 +21,7 @@ _FORECAST_COLUMNS: Final = {
     "FDE_m": "FDE m",
     "ADE_squared_m2": "ADE m²",
     "recall": "recall",
-    "false_forecasts_per_frame": "false/frame",
+    "false_forecasts_per_frame": "false",
     "consistency_m": "drift m",
     "coverage_95": "in 95 %",
 }
@@ -186,7 +186,7 @@ def print_results(outcome: Outcome) -> None:
     from rich.markup import escape
     from rich.table import Table
 
-    console = Console()
+    console = Console(width=None if sys.stdout.isatty() else 120)  # a pipe has no width to keep to
     table = Table(box=None, pad_edge=False, header_style="bold")
     several = len({result.sequence for result in outcome.results}) > 1
     for name in (*(("sequence",) if several else ()), "tracks", "by"):

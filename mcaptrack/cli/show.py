@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -78,7 +79,7 @@ def _print(opened: Log, verbose: bool) -> None:
     from rich.table import Table
 
     data = _as_data(opened)
-    console = Console()
+    console = Console(width=None if sys.stdout.isatty() else 120)  # a pipe has no width to keep to
     seconds = (data["end_ns"] - data["start_ns"]) / 1e9
     name = escape(common.printable(data["log"]))
     console.print(f"[bold]{name}[/bold]  {data['bytes']:,} bytes, {data['messages']:,} messages, {seconds:.3f} s")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import mmap
 import os
 from collections import OrderedDict
@@ -53,6 +54,7 @@ class Log:
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self._locked = False
         if path.is_dir():
             raise McaptrackError(f"{path} is a folder, not an MCAP file")
         try:
@@ -82,20 +84,19 @@ class Log:
         return self
 
     def __exit__(self, *_: object) -> None:
+        if self._locked:  # closing is not enough: the map of the file holds on to it
+            fcntl.flock(self._file, fcntl.LOCK_UN)
         self._file.close()
 
     def lock(self) -> None:
         """Be the only one to write to this log until it is closed. Raises McaptrackError if somebody else is."""
-        try:
-            import fcntl
-        except ImportError:  # no such thing on this system
-            return
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             raise McaptrackError(
                 f"{self.path} is being written to by another process; try again when it is done"
             ) from None
+        self._locked = True
         try:
             same = self.path.stat().st_ino == os.fstat(self._file.fileno()).st_ino
         except OSError:
@@ -121,8 +122,10 @@ class Log:
     def channel(self, topic: str) -> Channel:
         """The channel of that topic. Raises McaptrackError, with what there is, if there is none."""
         if topic not in self.channels:
+            there = [name for name in sorted(self.channels) if "/view/" not in name]
             raise McaptrackError(
-                f"{self.path} has no channel {topic}; it has {', '.join(sorted(self.channels)) or 'none'}"
+                f"{self.path} has no channel {topic}; it has {', '.join(there) or 'none'}. "
+                f"`mcaptrack info {self.path}` shows more"
             )
         return self.channels[topic]
 

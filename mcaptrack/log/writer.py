@@ -92,15 +92,8 @@ class LogWriter:
         """A message of a channel that was added. Raises McaptrackError for times that no log can hold."""
         if not 0 <= t_ns <= _MAX_NS:
             raise McaptrackError(f"{t_ns} ns is no time for a log; times run from 0 (1970) to {_MAX_NS} ns (2262)")
-        kind = self._kinds[channel_id]
-        chunk = self._open.setdefault(kind, _OpenChunk(kind))
         message = records.pack_message(channel_id, sequence, t_ns, t_ns, payload)
-        chunk.entries.setdefault(channel_id, []).append((t_ns, chunk.size))
-        chunk.parts.append(message)
-        chunk.size += len(message)
-        self._count(channel_id, t_ns)
-        if chunk.size >= _CHUNK_BYTES[kind]:
-            self._close_chunk(kind)
+        self._put_message(self._kinds[channel_id], channel_id, t_ns, message)
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
         """A metadata record."""
@@ -145,9 +138,10 @@ class LogWriter:
                     continue
             elif record.opcode == Opcode.MESSAGE:
                 channel, _, t_ns, _ = message_head(buffer, record)
-                if channel in dropped:
-                    continue
-                self._count(channel, t_ns)
+                if channel not in dropped:
+                    # Readers that go by the index of chunks would never find it outside of one.
+                    self._put_message("rows", channel, t_ns, whole)
+                continue
             elif record.opcode == Opcode.CHUNK:
                 skip_index = self._copy_chunk(buffer, index, record, dropped, may_be_inside)
                 continue
@@ -299,6 +293,15 @@ class LogWriter:
         self._attachments.append(
             records.pack(Opcode.ATTACHMENT_INDEX, fields, records.text(name), records.text(media_type))
         )
+
+    def _put_message(self, kind: Kind, channel_id: int, t_ns: int, message: bytes) -> None:
+        chunk = self._open.setdefault(kind, _OpenChunk(kind))
+        chunk.entries.setdefault(channel_id, []).append((t_ns, chunk.size))
+        chunk.parts.append(message)
+        chunk.size += len(message)
+        self._count(channel_id, t_ns)
+        if chunk.size >= _CHUNK_BYTES[kind]:
+            self._close_chunk(kind)
 
     def _close_chunk(self, kind: Kind) -> None:
         self._put_chunk(self._open.pop(kind))

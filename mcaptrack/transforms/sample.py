@@ -49,19 +49,15 @@ class Sample:
         return MappingProxyType({"": max(self.max_hole_s, 2 / self.rate_hz)})
 
     def __call__(self, frames: Iterable[Frame]) -> Iterator[tuple[Frame, ...]]:
-        times, indices, parts = [], [], []
-        for frame in frames:
-            times.append(frame.t_ns)
-            indices.append(frame.index)
-            parts.append(_in_metres(frame, self.ground_planes))
-        if not times:
+        members = [frame._replace(rows=_in_metres(frame, self.ground_planes)) for frame in frames]
+        if not members:
             return
-        frame_ns = np.array(times, np.int64)
-        tick_ns = self._ticks(frame_ns, times[0] if self.start_ns is None else self.start_ns)
-        row_ns = np.repeat(frame_ns, [len(part) for part in parts])
-        rows, at = resample(np.concatenate(parts), row_ns, tick_ns, seconds_to_ns(self.max_hole_s))
+        frame_ns = np.array([frame.t_ns for frame in members], np.int64)
+        indices = np.array([frame.index for frame in members])
+        tick_ns = self._ticks(frame_ns, int(frame_ns[0]) if self.start_ns is None else self.start_ns)
+        rows, at = resample(members, tick_ns, seconds_to_ns(self.max_hole_s))
         rows["source_id"] = rows["track_id"]
-        shown = np.array(indices)[np.searchsorted(frame_ns, tick_ns, "right") - 1]  # the picture on screen at each tick
+        shown = indices[np.searchsorted(frame_ns, tick_ns, "right") - 1]  # the picture on screen at each tick
         first, last = (np.searchsorted(at, np.arange(len(tick_ns)), side) for side in ("left", "right"))
         for index, t_ns, low, high in zip(*(a.tolist() for a in (shown, tick_ns, first, last)), strict=True):
             yield (Frame(t_ns, index, rows[low:high]),)

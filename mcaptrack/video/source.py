@@ -106,7 +106,10 @@ def _container(path: Path) -> Iterator[Any]:
         with av.open(str(path)) as container:
             yield container
     except av.error.FFmpegError as error:
-        raise McaptrackError(f"{path} can't be read as a video: {error.strerror or error}") from error
+        raise McaptrackError(
+            f"{path} can't be read as a video ({error.strerror or error}); "
+            "give an mp4, mov, mkv, avi or webm file that is whole"
+        ) from error
 
 
 def _fraction(ratio: Any) -> Fraction | None:
@@ -124,7 +127,7 @@ def open_video(path: Path) -> Video:
         stream = container.streams.video[0]
         context = stream.codec_context
         if context is None:
-            raise McaptrackError(f"{path} holds video in a codec that is not known here")
+            raise McaptrackError(f"{path} holds video in a codec that is not known here; convert it to H.264 first")
         if context.width * context.height > _MAX_PIXELS:
             raise McaptrackError(
                 f"{path} has pictures of {context.width} x {context.height}; at most {_MAX_PIXELS} pixels"

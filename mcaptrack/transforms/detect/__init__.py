@@ -30,6 +30,8 @@ Floats = NDArray[np.float64]
 # over this distance, and what is left smaller than this area (height squared) is no person.
 _JOIN: Final = 0.2
 _LEAST_AREA: Final = 0.03
+#: Where more of the picture than this differs, it is not people that differ.
+_MOST: Final = 0.5
 _SPECK_PX: Final = 20.0
 _FIRST_HEIGHT_PX: Final = 20.0
 _PERSON: Final = 1
@@ -65,6 +67,8 @@ class Detect:
             if is_new:  # another view has another background
                 foreground = model(self.method, self.threshold, self.history_s)
             mask = _steady_mask(foreground.mask(_move(image, to_reference), clock), to_reference)
+            if np.count_nonzero(mask) > _MOST * mask.size:  # a model that knows nothing yet, or a lamp that went on
+                mask = np.zeros_like(mask)
             boxes = _boxes(mask, size.measure(mask))
             yield (Frame(frame.t_ns, frame.index, _rows(_back(boxes, to_reference) * 2**halvings)),)
 

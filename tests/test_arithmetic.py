@@ -1,0 +1,291 @@
+"""Boxes, the ground plane, assignment, clocks, filters and histories."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from mcaptrack.boxes import iou
+from mcaptrack.clock import FrameClock, seconds_to_ns
+from mcaptrack.errors import McaptrackError
+from mcaptrack.history import Histories, Holt, fill_holes, rebuild
+from mcaptrack.kalman import BoxFilter, boxes_to_state, state_to_boxes
+from mcaptrack.match import assign, solve
+from mcaptrack.plane import GroundPlane, assumed_plane, plane_at
+from mcaptrack.resample import looked_at, resample
+from mcaptrack.scene import demo_scene
+from mcaptrack.schema import TRACKS, Frame
+from tests.worlds import tracks_at
+
+BOXES = hnp.arrays(float, st.tuples(st.integers(0, 5), st.just(4)), elements=st.floats(0.5, 100))
+
+
+def test_overlap_of_boxes_by_hand():
+    a = np.array([[0, 0, 2, 2], [0, 0, 4, 4.0]])
+    b = np.array([[1, 1, 2, 2], [10, 10, 1, 1], [0, 0, 2, 2], [5, 5, 0, 0.0]])
+    np.testing.assert_allclose(iou(a, b), [[1 / 7, 0, 1, 0], [4 / 16, 0, 4 / 16, 0]])
+
+
+@given(BOXES, BOXES)
+def test_overlap_is_symmetric_and_between_nothing_and_all(a, b):
+    np.testing.assert_allclose(iou(a, b), iou(b, a).T)
+    assert ((iou(a, b) >= 0) & (iou(a, b) <= 1 + 1e-12)).all()
+    np.testing.assert_allclose(np.diag(iou(a, a)), 1)
+
+
+class TestGroundPlane:
+    oblique = demo_scene().ground_plane()
+
+    @given(hnp.arrays(float, (5, 2), elements=st.floats(-4, 4)))
+    def test_there_and_back(self, offsets):
+        places = offsets + [0, 12]
+        np.testing.assert_allclose(
+            self.oblique.pixels_to_metres(self.oblique.metres_to_pixels(places)), places, atol=1e-6
+        )
+
+    def test_there_is_no_ground_above_the_horizon_and_none_behind_the_camera(self):
+        assert np.isnan(self.oblique.pixels_to_metres(np.array([[480.0, -400.0]]))).all()
+        assert np.isnan(self.oblique.metres_to_pixels(np.array([[0.0, -30.0]]))).all()
+
+    def test_foot_and_centre_by_hand(self):
+        plain = (0.1, 0, 0, 0, 0.1, 0, 0, 0, 1)
+        box = np.array([[10.0, 20.0, 4.0, 8.0]])
+        np.testing.assert_allclose(GroundPlane(plain, 100, 100, "foot").boxes_to_metres(box), [[1.2, 2.8]])
+        np.testing.assert_allclose(GroundPlane(plain, 100, 100, "center").boxes_to_metres(box), [[1.2, 2.4]])
+
+    @pytest.mark.parametrize("point", ["foot", "center"])
+    def test_a_box_stands_where_it_is_put(self, point):
+        plane = GroundPlane(self.oblique.homography, 960, 540, point)
+        places = np.array([[1.0, 10.0], [-3.0, 15.0]])
+        boxes = plane.standing_boxes(places, np.array([[20.0, 50.0], [10.0, 30.0]]))
+        np.testing.assert_allclose(plane.boxes_to_metres(boxes), places, atol=1e-9)
+
+    @pytest.mark.parametrize(
+        ("homography", "words"),
+        [
+            ((1, 0, 0, 0, 1, 0), "9 finite numbers"),
+            ((1, 0, 0, 0, float("nan"), 0, 0, 0, 1), "9 finite numbers"),
+            ((1, 0, 0, 2, 0, 0, 0, 0, 1), "singular"),
+            ((0,) * 9, "singular"),
+        ],
+    )
+    def test_what_is_no_plane_is_refused(self, homography, words):
+        with pytest.raises(McaptrackError, match=words):
+            GroundPlane(homography, 640, 480)
+
+    def test_metres_may_be_much_larger_or_smaller_than_pixels(self):
+        GroundPlane((1e-5, 0, 0, 0, 1e-5, 0, 0, 0, 1), 4000, 3000)
+        GroundPlane((0.03, 0, 5e5, 0, -0.03, 4e6, 0, 0, 1), 4000, 3000)  # metres of a map
+
+    def test_the_plane_that_holds_is_the_last_one_before(self):
+        first, second = (GroundPlane((s, 0, 0, 0, s, 0, 0, 0, 1), 10, 10) for s in (1, 2))
+        planes = [(100, first), (200, second)]
+        assert [plane_at(planes, t) for t in (0, 100, 199, 200, 999)] == [first, first, first, second, second]
+        assert plane_at((), 5) is None
+
+    def test_a_guessed_scale_makes_the_median_box_a_person_high(self):
+        plane = assumed_plane(np.array([10.0, 34.0, 200.0, np.nan]), 640, 480)
+        np.testing.assert_allclose(
+            plane.pixels_to_metres(np.array([[320.0, 240.0], [354.0, 206.0]])), [[0, 0], [1.7, 1.7]]
+        )
+        assert plane.assumed
+        with pytest.raises(McaptrackError, match="no boxes to guess a scale from"):
+            assumed_plane(np.array([np.nan]), 640, 480)
+
+
+def best_by_trying(cost: np.ndarray, gate: float) -> tuple[int, float]:
+    """The most pairs within the gate, and the least total cost of so many."""
+    rows, columns = cost.shape
+    best = (0, 0.0)
+    for count in range(1, min(rows, columns) + 1):
+        for chosen in itertools.combinations(range(rows), count):
+            for others in itertools.permutations(range(columns), count):
+                values = [cost[pair] for pair in zip(chosen, others, strict=True)]
+                if all(value <= gate for value in values) and (count > best[0] or sum(values) < best[1]):
+                    best = (count, sum(values))
+    return best
+
+
+@given(hnp.arrays(float, st.tuples(st.integers(0, 4), st.integers(0, 4)), elements=st.floats(-5, 5)), st.floats(-6, 6))
+def test_assignment_takes_the_most_pairs_and_then_the_cheapest(cost, gate):
+    rows, columns = assign(cost, gate)
+    assert len(set(rows.tolist())) == len(rows) == len(set(columns.tolist()))
+    count, total = best_by_trying(cost, gate)
+    assert len(rows) == count
+    assert (cost[rows, columns] <= gate).all()
+    assert cost[rows, columns].sum() == pytest.approx(total, abs=1e-9)
+
+
+def test_a_far_pair_takes_no_place_from_a_near_one():
+    cost = np.array([[1.0, 2.0], [100.0, 1.5]])
+    assert [part.tolist() for part in assign(cost, 3.0)] == [[0, 1], [0, 1]]
+    cost = np.array([[np.nan, 2.0], [np.inf, 1.5]])
+    assert [part.tolist() for part in assign(cost, 3.0)] == [[1], [1]]
+
+
+@given(hnp.arrays(float, st.tuples(st.integers(1, 4), st.integers(1, 4)), elements=st.floats(-5, 5)))
+def test_the_solver_finds_the_least_total(cost):
+    rows, columns = solve(cost)
+    least = min(
+        sum(cost[pair] for pair in zip(chosen, others, strict=True))
+        for chosen in itertools.combinations(range(cost.shape[0]), min(cost.shape))
+        for others in itertools.permutations(range(cost.shape[1]), min(cost.shape))
+    )
+    assert cost[rows, columns].sum() == pytest.approx(least)
+
+
+class TestFrameClock:
+    def test_a_steady_clock_counts_one_frame_at_a_time(self):
+        clock = FrameClock()
+        assert [clock.tick(round(n * 1e9 / 7)) for n in range(50)] == [1] * 50
+        assert clock.frames(1.0) == 7
+
+    def test_a_gap_counts_the_frames_that_are_missing(self):
+        clock = FrameClock()
+        times = [0.0, 0.1, 0.2, 0.3, 0.8, 0.9]
+        assert [clock.tick(seconds_to_ns(t)) for t in times] == [1, 1, 1, 1, 5, 1]
+
+    @given(st.lists(st.floats(-0.02, 0.02), min_size=5, max_size=60))
+    def test_a_jitter_of_the_clock_changes_nothing(self, jitter):
+        clock = FrameClock()
+        assert {clock.tick(seconds_to_ns(1 + n / 10 + off)) for n, off in enumerate(jitter)} == {1}
+        assert clock.frames(0.5) in (4, 5, 6, 7)
+
+    def test_time_that_stands_still_or_runs_back_counts_a_frame(self):
+        clock = FrameClock()
+        assert [clock.tick(t) for t in (100, 100, 50, 150)] == [1, 1, 1, 1]
+
+    def test_before_two_frames_nothing_is_known(self):
+        assert FrameClock().frames(100.0) == 1
+
+
+class TestBoxFilter:
+    def test_it_is_the_seven_state_filter_of_the_paper(self):
+        """The decoupled filter against plain matrices."""
+        rng = np.random.default_rng(1)
+        boxes = np.abs(rng.normal(50, 10, (30, 4))) + np.arange(30)[:, None] * [1.5, 0.5, 0.2, 0.3]
+        move = np.eye(7) + np.diag([1.0, 1, 1], 4)[:7, :7]
+        see = np.eye(4, 7)
+        noise_seen = np.diag([1.0, 1, 10, 10])
+        noise_move = np.diag([1, 1, 1, 1, 0.01, 0.01, 1e-4])
+        state = np.append(boxes_to_state(boxes[:1])[0], [0, 0, 0])
+        cov = np.diag([10.0, 10, 10, 10, 1e4, 1e4, 1e4])
+        ours = BoxFilter.born(boxes[:1])
+        for number, box in enumerate(boxes[1:]):
+            state, cov = move @ state, move @ cov @ move.T + noise_move
+            ours.predict()
+            if number % 4 != 3:  # some frames are missed
+                seen = boxes_to_state(box[None])[0]
+                gain = cov @ see.T @ np.linalg.inv(see @ cov @ see.T + noise_seen)
+                state, cov = state + gain @ (seen - see @ state), (np.eye(7) - gain @ see) @ cov
+                ours.correct(np.array([0]), box[None])
+            np.testing.assert_allclose(ours.mean[0], state, rtol=1e-9)
+            np.testing.assert_allclose(ours.centre[0], [cov[0, 0], cov[0, 4], cov[4, 4]], rtol=1e-9)
+            np.testing.assert_allclose(ours.area[0], [cov[2, 2], cov[2, 6], cov[6, 6]], rtol=1e-9)
+            np.testing.assert_allclose(ours.ratio[0], cov[3, 3], rtol=1e-9)
+
+    @given(hnp.arrays(float, (3, 4), elements=st.floats(1, 500)))
+    def test_boxes_there_and_back(self, boxes):
+        np.testing.assert_allclose(state_to_boxes(boxes_to_state(boxes)), boxes, rtol=1e-9)
+
+    def test_an_area_that_would_vanish_stops_shrinking(self):
+        filter_ = BoxFilter.born(np.array([[0.0, 0, 4, 4]]))
+        filter_.mean[0, 6] = -20.0
+        filter_.predict()
+        assert filter_.mean[0, 2] == 16
+        assert filter_.mean[0, 6] == 0
+
+
+class TestHistories:
+    def test_pasts_slide_and_strangers_are_forgotten(self):
+        memory = Histories(3)
+        memory.push(np.array([7, 3]), np.array([[0.0, 0], [10, 10]]))
+        past, known = memory.push(np.array([3]), np.array([[11.0, 11]]))
+        assert known.tolist() == [[False, True, True]]
+        np.testing.assert_array_equal(past[0, 1:], [[10, 10], [11, 11]])
+        memory.push(np.empty(0, int), np.empty((0, 2)), steps=2)
+        assert memory.ids.tolist() == [3]
+        past, known = memory.push(np.array([7]), np.array([[5.0, 5]]), steps=50)
+        assert memory.ids.tolist() == [7]
+        assert known.tolist() == [[False, False, True]]
+
+    def test_ids_come_back_in_the_order_they_were_asked(self):
+        memory = Histories(2)
+        past, _ = memory.push(np.array([9, 2, 5]), np.array([[9.0, 0], [2, 0], [5, 0]]))
+        assert past[:, -1, 0].tolist() == [9, 2, 5]
+
+    def test_holes_are_filled_linearly(self):
+        nan = np.nan
+        xy = np.array([[[nan, nan], [0, 0], [nan, nan], [nan, nan], [3, 6.0]]])
+        filled, known = fill_holes(xy, np.isfinite(xy[..., 0]))
+        np.testing.assert_allclose(filled[0], [[0, 0], [0, 0], [1, 2], [2, 4], [3, 6]])
+        assert known.tolist() == [4]
+
+    def test_holt_by_hand(self):
+        """Eq. 3 with alpha = beta = 0.5 on displacements 1, 2, 4."""
+        holt = Holt(0.5, 0.5)
+        level, trend = holt.start(np.array([[1.0, 0.0]]))
+        level, trend = holt.step(level, trend, np.array([[2.0, 0.0]]))
+        assert (level[0, 0], trend[0, 0]) == (1.5, 0.25)  # .5 * 2 + .5 * (1 + 0);  .5 * (1.5 - 1) + .5 * 0
+        level, trend = holt.step(level, trend, np.array([[4.0, 0.0]]))
+        assert (level[0, 0], trend[0, 0]) == (2.875, 0.8125)  # .5 * 4 + .5 * 1.75;  .5 * 1.375 + .5 * .25
+
+    def test_the_past_is_rebuilt_backwards_from_now(self):
+        past = rebuild(np.array([[10.0, 0.0]]), np.array([[[1.0, 0], [2, 0], [3, 0]]]))
+        assert past[0, :, 0].tolist() == [4, 5, 7, 10]
+
+
+class TestResample:
+    frames = (
+        Frame(0, 0, tracks_at({1: (0, 0), 2: (5, 5)})),
+        Frame(10, 1, tracks_at({1: (1, 2)})),
+        Frame(20, 2, tracks_at({})),
+        Frame(30, 3, tracks_at({})),
+        Frame(40, 4, tracks_at({1: (4, 8), 2: (9, 9)})),
+    )
+
+    def at(self, times, hole=100):
+        out, at = resample(self.frames, np.array(times), hole)
+        return [
+            (times[k], int(r["track_id"]), float(r["x_m"]), bool(r["observed"])) for k, r in zip(at, out, strict=True)
+        ]
+
+    def test_rows_lie_on_the_line_between_their_neighbours(self):
+        assert [row[:3] for row in self.at([0, 5, 10, 20])] == [
+            (0, 1, 0.0),
+            (0, 2, 5.0),
+            (5, 1, 0.5),
+            (5, 2, 5.5),
+            (10, 1, 1.0),
+            (10, 2, 6.0),
+            (20, 1, 2.0),
+            (20, 2, 7.0),
+        ]
+
+    def test_what_lies_inside_a_hole_was_not_seen(self):
+        assert [row[3] for row in self.at([5, 10, 20])] == [True, False, True, False, False, False]
+
+    def test_a_hole_that_is_too_long_stays_one(self):
+        assert self.at([20], hole=20) == []
+        assert [row[1] for row in self.at([5], hole=20)] == [1]
+
+    def test_nobody_is_there_before_the_first_or_after_the_last_row(self):
+        assert self.at([-5, 41]) == []
+
+    @given(st.lists(st.integers(0, 100), unique=True, min_size=1).map(sorted))
+    def test_at_their_own_times_rows_stay_as_they_are(self, times):
+        assume(len(times) > 0)
+        frames = [Frame(t, t, tracks_at({3: (t * 0.1, t * 7.3)})) for t in times]
+        out, at = resample(frames, np.array(times), 1000)
+        assert at.tolist() == list(range(len(times)))
+        assert TRACKS.codec.encode(out) == b"".join(TRACKS.codec.encode(frame.rows) for frame in frames)
+
+    def test_looking_is_known_between_frames_that_are_close(self):
+        frames, times = np.array([0, 10, 50]), np.array([-1, 0, 5, 10, 30, 50, 51])
+        assert looked_at(frames, times, 20).tolist() == [False, True, True, True, False, True, False]
+        assert not looked_at(np.empty(0, int), times, 20).any()

@@ -1,0 +1,377 @@
+"""Logs: what is written can be read, by others too; what stood stays; what is damaged is said."""
+
+from __future__ import annotations
+
+import os
+import struct
+import subprocess
+import sys
+import time
+import zlib
+from pathlib import Path
+
+import pytest
+import zstandard
+from hypothesis import given
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from mcap.stream_reader import StreamReader
+from mcap.writer import CompressionType, IndexType, Writer
+from mcap_protobuf.decoder import DecoderFactory
+
+from mcaptrack import log
+from mcaptrack.errors import McaptrackError
+from mcaptrack.log import records
+from mcaptrack.schema import TRACKS, Frame
+from tests.worlds import tracks_at
+
+SCHEMA = ("test.Thing", "jsonschema", b"{}")
+
+MESSAGES = st.lists(
+    st.tuples(st.sampled_from("abc"), st.integers(0, 2**62), st.integers(0, 2**32 - 1), st.binary(max_size=50)),
+    max_size=30,
+)
+
+
+def stock_messages(path: Path) -> list[tuple[str, int, int, bytes]]:
+    """What the stock reader finds, with all checksums checked."""
+    with path.open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        return [(c.topic, m.log_time, m.sequence, m.data) for _, c, m in reader.iter_messages()]
+
+
+def our_messages(path: Path) -> dict[str, list[tuple[int, int, bytes]]]:
+    with log.read(path) as opened:
+        return {topic: [(m.t_ns, m.sequence, m.payload) for m in opened.messages(topic)] for topic in opened.channels}
+
+
+def write_log(path: Path, messages, kind: str = "rows") -> None:
+    with log.create(path) as writer:
+        numbers = {topic: writer.add_channel(topic, SCHEMA, "json", {"about": topic}, kind) for topic in "abc"}
+        for topic, t_ns, sequence, payload in messages:
+            writer.add_message(numbers[topic], t_ns, sequence, payload)
+
+
+def write_stock(path: Path, messages, **options) -> None:
+    """A log that somebody else recorded, with an attachment and metadata."""
+    with path.open("wb") as stream:
+        writer = Writer(stream, **options)
+        writer.start("ros2", "somebody")
+        schema = writer.register_schema(*SCHEMA)
+        numbers = {topic: writer.register_channel(topic, "json", schema, {"about": topic}) for topic in "abc"}
+        for count, (topic, t_ns, sequence, payload) in enumerate(messages):
+            writer.add_message(numbers[topic], t_ns, payload, publish_time=t_ns // 2, sequence=sequence)
+            if count == 1:
+                writer.add_attachment(1, 2, "notes.txt", "text/plain", b"hello")
+                writer.add_metadata("about", {"robot": "r2"})
+        writer.finish()
+
+
+@given(messages=MESSAGES, kind=st.sampled_from(["rows", "media"]))
+def test_what_is_written_is_read_back_by_us_and_by_the_stock_reader(tmp_path_factory, messages, kind):
+    path = tmp_path_factory.mktemp("log") / "a.mcap"
+    write_log(path, messages, kind)
+    ours = our_messages(path)
+    for topic in "abc":
+        wanted = sorted((m[1:] for m in messages if m[0] == topic), key=lambda m: m[0])
+        assert ours[topic] == wanted
+    assert sorted(stock_messages(path)) == sorted(messages)
+
+
+STOCK_OPTIONS = {
+    "zstd": {},
+    "lz4": {"compression": CompressionType.LZ4},
+    "plain": {"compression": CompressionType.NONE, "chunk_size": 64},
+    "no chunks": {"use_chunking": False},
+    "no repeated channels": {"repeat_channels": False, "repeat_schemas": False, "chunk_size": 64},
+    "no statistics": {"use_statistics": False},
+    "no message index": {"index_types": IndexType.CHUNK},
+}
+SOME = [("a", 10, 1, b"x"), ("b", 30, 2, b"yy"), ("a", 20, 3, b"zzz" * 30), ("c", 5, 4, b""), ("b", 40, 5, b"w" * 200)]
+
+
+@pytest.mark.parametrize("options", STOCK_OPTIONS.values(), ids=STOCK_OPTIONS)
+def test_somebody_elses_log_keeps_everything_when_channels_are_added(tmp_path, options):
+    path = tmp_path / "theirs.mcap"
+    write_stock(path, SOME, **options)
+    before = our_messages(path)
+    assert {topic: len(found) for topic, found in before.items()} == {"a": 2, "b": 2, "c": 1}
+    publish = {}
+    with log.read(path) as opened:
+        publish = {m.payload: m.publish_ns for m in opened.messages("b")}
+        with log.extend(opened) as writer:
+            number = writer.add_channel("new", SCHEMA, "json", {})
+            writer.add_message(number, 15, 1, b"added")
+    after = our_messages(path)
+    assert after.pop("new") == [(15, 1, b"added")]
+    assert after == before
+    assert publish == {b"yy": 15, b"w" * 200: 20}
+    assert sorted(stock_messages(path)) == sorted([*SOME, ("new", 15, 1, b"added")])
+    with path.open("rb") as stream:
+        found = list(StreamReader(stream, validate_crcs=True).records)
+    kinds = [type(record).__name__ for record in found]
+    assert kinds.count("Attachment") == kinds.count("Metadata") == 1
+    header = found[0]
+    assert (header.profile, header.library) == ("ros2", "somebody")
+
+
+@pytest.mark.parametrize("options", STOCK_OPTIONS.values(), ids=STOCK_OPTIONS)
+def test_a_channel_that_is_dropped_takes_nothing_with_it(tmp_path, options):
+    path = tmp_path / "theirs.mcap"
+    write_stock(path, SOME, **options)
+    with log.read(path) as opened, log.extend(opened, drop=["b"], drop_attachments=["notes.txt"]):
+        pass
+    assert sorted(stock_messages(path)) == sorted(m for m in SOME if m[0] != "b")
+    with path.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert sorted(channel.topic for channel in summary.channels.values()) == ["a", "c"]
+    assert summary.statistics.message_count == 3
+    assert not summary.attachment_indexes
+    assert len(summary.metadata_indexes) == 1
+
+
+def test_chunks_that_stand_are_copied_to_the_byte(tmp_path):
+    path = tmp_path / "a.mcap"
+    write_stock(path, SOME)
+    before = path.read_bytes()
+    with log.read(path) as opened:
+        (chunk,) = opened.index.chunks
+        old = before[chunk.offset : chunk.offset + chunk.length]
+        with log.extend(opened) as writer:
+            writer.add_channel("new", SCHEMA, "json", {})
+    assert old in path.read_bytes()
+
+
+def test_results_are_replaced_without_opening_what_they_stand_beside(tmp_path):
+    path = tmp_path / "a.mcap"
+    write_stock(path, SOME)
+    size = []
+    for round_number in range(4):
+        with log.read(path) as opened, log.extend(opened, drop=["result"]) as writer:
+            number = writer.add_channel("result", SCHEMA, "json", {})
+            writer.add_message(number, round_number, 0, b"the same every time")
+        size.append(path.stat().st_size)
+        assert our_messages(path)["result"] == [(round_number, 0, b"the same every time")]
+    assert max(size) - min(size) < 16
+
+
+def test_a_topic_can_be_taken_once(tmp_path):
+    with pytest.raises(McaptrackError, match="there is a channel a already"), log.create(tmp_path / "a.mcap") as writer:
+        writer.add_channel("a", SCHEMA, "json", {})
+        writer.add_channel("a", SCHEMA, "json", {})
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("t_ns", [-1, 2**63])
+def test_times_that_no_log_can_hold_are_refused(tmp_path, t_ns):
+    with pytest.raises(McaptrackError, match="is no time for a log"), log.create(tmp_path / "a.mcap") as writer:
+        writer.add_message(writer.add_channel("a", SCHEMA, "json", {}), t_ns, 0, b"")
+
+
+def test_a_failure_leaves_the_old_log_and_nothing_else(tmp_path):
+    path = tmp_path / "a.mcap"
+    write_log(path, SOME)
+    before = path.read_bytes()
+    with pytest.raises(KeyboardInterrupt), log.read(path) as opened, log.extend(opened) as writer:
+        number = writer.add_channel("new", SCHEMA, "json", {})
+        for count in range(1000):
+            writer.add_message(number, count, 0, b"x" * 5000)
+        raise KeyboardInterrupt
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_what_a_killed_process_left_is_swept_away(tmp_path):
+    path = tmp_path / "a.mcap"
+    write_log(path, SOME)
+    code = (
+        "import os, signal, sys; from pathlib import Path; from mcaptrack import log\n"
+        "with log.read(Path(sys.argv[1])) as o, log.extend(o) as w:\n"
+        "    n = w.add_channel('new', ('s', '', b''), 'json', {}); w.add_message(n, 1, 1, b'x' * 2_000_000)\n"
+        "    os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    before = path.read_bytes()
+    subprocess.run([sys.executable, "-c", code, path], check=False)
+    assert path.read_bytes() == before
+    assert len(list(tmp_path.iterdir())) == 2
+    with log.read(path) as opened, log.extend(opened) as writer:
+        writer.add_channel("new", SCHEMA, "json", {})
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_second_writer_is_turned_away(tmp_path):
+    path = tmp_path / "a.mcap"
+    write_log(path, SOME)
+    with log.read(path) as first, log.read(path) as second, log.extend(first) as writer:
+        writer.add_channel("new", SCHEMA, "json", {})
+        with pytest.raises(McaptrackError, match="is being written to by another process"), log.extend(second):
+            pass
+
+
+def test_a_log_that_was_replaced_meanwhile_is_not_extended(tmp_path):
+    path = tmp_path / "a.mcap"
+    write_log(path, SOME)
+    with log.read(path) as stale:
+        with log.read(path) as opened, log.extend(opened) as writer:
+            writer.add_channel("new", SCHEMA, "json", {})
+        with pytest.raises(McaptrackError, match="was replaced while it was being read"), log.extend(stale):
+            pass
+    assert "new" in our_messages(path)
+
+
+def test_a_copy_leaves_the_log_alone(tmp_path):
+    path, copy = tmp_path / "a.mcap", tmp_path / "b.mcap"
+    write_log(path, SOME)
+    before = path.read_bytes()
+    with log.read(path) as opened, log.extend(opened, copy, drop=["a"]):
+        pass
+    assert path.read_bytes() == before
+    assert sorted(our_messages(copy)) == ["b", "c"]
+
+
+def test_the_full_disk_is_said(tmp_path):
+    code = (
+        "import resource, sys; from pathlib import Path; from mcaptrack import errors, log\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))\n"
+        "try:\n"
+        "    with log.read(Path(sys.argv[1])) as o, log.extend(o) as w:\n"
+        "        n = w.add_channel('new', ('s', '', b''), 'json', {}, 'media')\n"
+        "        for t in range(500): w.add_message(n, t, 0, bytes(20_000))\n"
+        "except errors.McaptrackError as error: print(error)\n"
+    )
+    path = tmp_path / "a.mcap"
+    write_log(path, SOME)
+    before = path.read_bytes()
+    done = subprocess.run([sys.executable, "-c", code, path], check=True, capture_output=True, text=True)
+    assert f"{path} can't be written: File too large" in done.stdout
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_frames_come_back_with_times_and_empty_ones_too(tmp_path):
+    path = tmp_path / "a.mcap"
+    frames = [
+        Frame(10, 0, tracks_at({1: (1, 2), 2: (3, 4)})),
+        Frame(20, 1, TRACKS.empty()),
+        Frame(30, 2, tracks_at({1: (5, 6)})),
+    ]
+    with log.create(path) as writer:
+        number = writer.add_channel("/t", (TRACKS.name, "protobuf", TRACKS.descriptor), "protobuf", {})
+        for frame in reversed(frames):  # written in any order, read in that of their times
+            writer.add_message(number, frame.t_ns, frame.index, TRACKS.codec.encode(frame.rows))
+    with log.read(path) as opened:
+        read = opened.frames("/t", TRACKS)
+        assert opened.times("/t").tolist() == [10, 20, 30]
+    assert [(f.t_ns, f.index, TRACKS.codec.encode(f.rows)) for f in read] == [
+        (f.t_ns, f.index, TRACKS.codec.encode(f.rows)) for f in frames
+    ]
+    with path.open("rb") as stream:
+        decoded = list(make_reader(stream, decoder_factories=[DecoderFactory()]).iter_decoded_messages())
+    assert [(m.log_time, [row.x_m for row in d.rows]) for _, _, m, d in decoded] == [(10, [1, 3]), (20, []), (30, [5])]
+
+
+def test_a_channel_of_another_kind_is_refused(tmp_path):
+    path = tmp_path / "a.mcap"
+    write_log(path, SOME)
+    with log.read(path) as opened:
+        with pytest.raises(McaptrackError, match=r"a holds test\.Thing, not mcaptrack\.Tracks"):
+            opened.frames("a", TRACKS)
+        with pytest.raises(McaptrackError, match="has no channel /x; it has a, b, c"):
+            opened.channel("/x")
+
+
+def _damage(path: Path) -> dict[str, bytes]:
+    whole = path.read_bytes()
+    end = len(whole)
+    return {
+        "empty": b"",
+        "text": b"hello, I am no log\n" * 10,
+        "magic only": records.MAGIC,
+        "cut in half": whole[: end // 2],
+        "one byte short": whole[:-1],
+        "no footer": whole[: -8 - 29] + whole[-8:],
+        "summary beyond the file": whole[: -8 - 20] + struct.pack("<QQI", 2**60, 0, 0) + whole[-8:],
+    }
+
+
+@pytest.mark.parametrize("kind", sorted(_damage(Path(__file__))))
+def test_damage_is_said_in_a_line(tmp_path, kind):
+    path = tmp_path / "a.mcap"
+    write_log(path, SOME)
+    path.write_bytes(_damage(path)[kind])
+    try:
+        assert our_messages(path)  # the summary can be done without
+    except McaptrackError as error:
+        assert str(path) in str(error)
+        assert "\n" not in str(error)
+
+
+@given(at=st.integers(0, 10_000), bit=st.integers(0, 7))
+def test_a_flipped_bit_is_never_a_wrong_message(tmp_path_factory, at, bit):
+    path = tmp_path_factory.mktemp("log") / "a.mcap"
+    messages = [("abc"[n % 3], n * 10, n, bytes([n]) * 40) for n in range(40)]
+    write_log(path, messages)
+    raw = bytearray(path.read_bytes())
+    raw[at % len(raw)] ^= 1 << bit
+    path.write_bytes(raw)
+    try:
+        found = our_messages(path)
+    except McaptrackError:
+        return
+    true = {(topic, t_ns, payload) for topic, t_ns, _, payload in messages}
+    read = {(topic, t_ns, payload) for topic, members in found.items() for t_ns, _, payload in members}
+    renamed = len(set(found) - set("abc"))  # the name of a channel in the summary carries no weight for its messages
+    assert renamed or read <= true
+
+
+def _chunk_with(compression: str, data: bytes, size: int, crc: int = 0) -> bytes:
+    return records.pack_chunk((1, 1, size, crc), compression, data)
+
+
+@pytest.mark.parametrize(
+    ("chunk", "words"),
+    [
+        (_chunk_with("zstd", zstandard.compress(bytes(200 << 20)), 1000), "a chunk of 1001 bytes that says 1000"),
+        (_chunk_with("", b"abc", 2**40), "a chunk of 1099511627776 bytes; at most"),
+        (_chunk_with("br", b"abc", 3), "compressed with 'br', which is not known here"),
+        (_chunk_with("zstd", b"no zstd at all", 10), "a chunk can't be decompressed"),
+        (_chunk_with("lz4", b"no lz4 at all", 10), "a chunk can't be decompressed"),
+        (_chunk_with("", b"abc", 3, zlib.crc32(b"abd")), "the checksum of a chunk is wrong"),
+        (
+            _chunk_with("", b"\x05" + (2**50).to_bytes(8, "little"), 9),
+            "a record of 1125899906842624 bytes where 0 are left",
+        ),
+    ],
+)
+def test_hostile_chunks_are_refused_before_they_cost_anything(tmp_path, chunk, words):
+    path = tmp_path / "a.mcap"
+    header = records.pack(1, records.text(""), records.text("x"))
+    footer = records.pack(2, bytes(20))
+    path.write_bytes(records.MAGIC + header + chunk + records.pack(15, bytes(4)) + footer + records.MAGIC)
+    started = time.monotonic()
+    with pytest.raises(McaptrackError, match=words):
+        our_messages(path)
+    assert time.monotonic() - started < 20
+
+
+def test_the_same_messages_give_the_same_bytes(tmp_path):
+    write_log(tmp_path / "a.mcap", SOME)
+    write_log(tmp_path / "b.mcap", SOME)
+    assert (tmp_path / "a.mcap").read_bytes() == (tmp_path / "b.mcap").read_bytes()
+
+
+def test_whoever_could_read_the_log_still_can(tmp_path):
+    path = tmp_path / "a.mcap"
+    write_log(path, SOME)
+    os.chmod(path, 0o640)
+    with log.read(path) as opened, log.extend(opened) as writer:
+        writer.add_channel("new", SCHEMA, "json", {})
+    assert path.stat().st_mode & 0o777 == 0o640
+
+
+def test_the_stock_library_is_happy_with_an_empty_log(tmp_path):
+    with log.create(tmp_path / "a.mcap"):
+        pass
+    assert stock_messages(tmp_path / "a.mcap") == []
+    with log.read(tmp_path / "a.mcap") as opened:
+        assert opened.channels == {}

@@ -1,0 +1,339 @@
+"""Scores: cases by hand, py-motmetrics as oracle, TrackEval's numbers on real sequences."""
+
+from __future__ import annotations
+
+import csv
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mcaptrack.boxes import iou
+from mcaptrack.metrics import Matchup, combine, distances, metres_to_similarity, score, summary
+from mcaptrack.metrics.displacement import Forecasts, Path, displacement
+from mcaptrack.metrics.displacement import combine as combine_displacements
+
+
+def matchup(truth, tracks, gate: float = 1.0) -> Matchup:
+    """People and tracks as {id: x} a frame, on a line, in metres."""
+    true_ids = sorted({who for frame in truth for who in frame})
+    track_ids = sorted({who for frame in tracks for who in frame})
+
+    def points(frame):
+        return np.array([[x, 0.0] for x in frame.values()]).reshape(-1, 2)
+
+    return Matchup(
+        tuple(np.array([true_ids.index(who) for who in frame], int) for frame in truth),
+        tuple(np.array([track_ids.index(who) for who in frame], int) for frame in tracks),
+        tuple(metres_to_similarity(distances(points(a), points(b)), gate) for a, b in zip(truth, tracks, strict=True)),
+        0.5,
+        len(true_ids),
+        len(track_ids),
+    )
+
+
+ONE = [{1: float(n)} for n in range(10)]
+TWO = [{1: float(n), 2: 50.0} for n in range(10)]
+CASES = {
+    # what happens: truth, tracks, and what it counts
+    "perfect": (ONE, ONE, {"MOTA": 1.0, "IDF1": 1.0, "HOTA": 1.0, "IDSW": 0, "FP": 0, "FN": 0, "Frag": 0, "MT": 1}),
+    "all missed": (ONE, [{}] * 10, {"MOTA": 0.0, "IDF1": 0.0, "HOTA": 0.0, "FN": 10, "FP": 0, "ML": 1}),
+    "nobody there, nobody seen": ([{}] * 3, [{}] * 3, {"MOTA": 0.0, "IDF1": 0.0, "FP": 0, "FN": 0, "GT": 0}),
+    "only ghosts": ([{}] * 5, [{7: 0.0}] * 5, {"FP": 5, "FN": 0, "IDF1": 0.0, "MOTA": -5.0}),
+    "too far away": (ONE, [{1: n + 1.01} for n in range(10)], {"FP": 10, "FN": 10, "MOTA": -1.0, "IDF1": 0.0}),
+    "just near enough": (ONE, [{1: n + 0.99} for n in range(10)], {"FP": 0, "FN": 0, "MOTA": 1.0}),
+    "one switch": (
+        ONE,
+        [{5 if n < 6 else 6: float(n)} for n in range(10)],
+        {"IDSW": 1, "MOTA": 0.9, "IDF1": 0.6, "FP": 0, "FN": 0, "MT": 1, "Frag": 0},
+    ),
+    "a hole": (
+        TWO,
+        [{9: 50.0} if n in (4, 5) else {5: float(n), 9: 50.0} for n in range(10)],
+        {"FN": 2, "Frag": 1, "IDSW": 0, "MT": 1, "PT": 1},
+    ),
+    "a hole while nobody at all is tracked, which the devkit passes over": (
+        ONE,
+        [{} if n in (4, 5) else {5: float(n)} for n in range(10)],
+        {"FN": 2, "Frag": 0, "IDSW": 0, "PT": 1},
+    ),
+    "a hole and another id": (
+        TWO,
+        [{9: 50.0} if n in (4, 5) else {5 if n < 4 else 6: float(n), 9: 50.0} for n in range(10)],
+        {"FN": 2, "Frag": 1, "IDSW": 1, "MOTA": 0.85},
+    ),
+    "two tracks on one person": (
+        ONE,
+        [{1: float(n), 2: n + 0.1} for n in range(10)],
+        {"FP": 10, "FN": 0, "IDSW": 0, "IDF1": 2 / 3},
+    ),
+    "one track on two people": (
+        [{1: float(n), 2: n + 0.5} for n in range(10)],
+        [{1: n + 0.25} for n in range(10)],
+        {"FP": 0, "FN": 10, "IDSW": 0, "IDF1": 2 / 3},
+    ),
+    "two who exchange names": (
+        [{1: 0.0, 2: 10.0}] * 10,
+        [{1: 0.0, 2: 10.0} if n < 5 else {2: 0.0, 1: 10.0} for n in range(10)],
+        {"IDSW": 2, "IDF1": 0.5, "FP": 0, "FN": 0},
+    ),
+    "mostly lost": (ONE, [{1: 0.0}] + [{}] * 9, {"ML": 1, "FN": 9}),
+    "partly tracked": (ONE, [{1: float(n)} if n < 5 else {} for n in range(10)], {"PT": 1, "MT": 0, "ML": 0}),
+}
+
+
+@pytest.mark.parametrize(("truth", "tracks", "wanted"), CASES.values(), ids=CASES)
+def test_cases_by_hand(truth, tracks, wanted):
+    found = summary(score(matchup(truth, tracks)))
+    assert {name: found[name] for name in wanted} == pytest.approx(wanted)
+
+
+def test_the_two_evaluators_differ_where_they_are_known_to():
+    """After a miss py-motmetrics keeps the old pair though another track stands nearer; TrackEval takes the nearer."""
+    truth = [{1: 0.0}] * 3
+    tracks = [{5: 0.0}, {7: 90.0}, {5: 0.8, 6: 0.0}]
+    assert summary(score(matchup(truth, tracks), "trackeval"))["IDSW"] == 1
+    assert summary(score(matchup(truth, tracks), "motmetrics"))["IDSW"] == 0
+
+
+def test_hota_by_hand():
+    """Found half of the time, always by the same track, exactly: DetA 0.5, AssA 0.5, LocA 1 at every threshold."""
+    found = summary(score(matchup(ONE, [{1: float(n)} if n % 2 else {} for n in range(10)])))
+    assert (found["DetA"], found["AssA"], found["LocA"], found["HOTA"]) == pytest.approx((0.5, 0.5, 1.0, 0.5))
+
+
+@st.composite
+def made(draw) -> list[tuple[dict[int, float], dict[int, float]]]:
+    """Up to 12 frames of people and tracks, some empty. No two distances are alike, so no choice is arbitrary."""
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+
+    def one(most: int) -> dict[int, float]:
+        who = rng.permutation(5)[: rng.integers(0, most + 1)]
+        return {int(name): float(x) for name, x in zip(who, rng.uniform(0, 6, len(who)), strict=True)}
+
+    return [(one(draw(st.integers(0, 4))), one(draw(st.integers(0, 4)))) for _ in range(draw(st.integers(1, 12)))]
+
+
+FRAMES = made()
+
+
+@given(FRAMES)
+@settings(max_examples=60)
+def test_counts_are_those_of_motmetrics(frames):
+    import motmetrics
+
+    truth, tracks = zip(*frames, strict=True)
+    accumulator = motmetrics.MOTAccumulator(auto_id=True)
+    for people, found in frames:
+        apart = np.abs(np.array(list(people.values()))[:, None] - np.array(list(found.values()))[None, :])
+        apart = np.where(apart <= 1.0, apart, np.nan).reshape(len(people), len(found))
+        accumulator.update(list(people), list(found), apart)
+    names = {
+        "num_switches": "IDSW",
+        "num_false_positives": "FP",
+        "num_misses": "FN",
+        "num_fragmentations": "Frag",
+        "mostly_tracked": "MT",
+        "partially_tracked": "PT",
+        "mostly_lost": "ML",
+        "idf1": "IDF1",
+    }
+    theirs = motmetrics.metrics.create().compute(accumulator, metrics=list(names), name="x").loc["x"]
+    ours = summary(score(matchup(truth, tracks), "motmetrics"))
+    for name, ours_name in names.items():
+        wanted = 0.0 if np.isnan(theirs[name]) else float(theirs[name])
+        assert ours[ours_name] == pytest.approx(wanted, abs=1e-9), name
+
+
+@given(FRAMES)
+@settings(max_examples=30)
+def test_laws_of_all_scores(frames):
+    truth, tracks = zip(*frames, strict=True)
+    for rules in ("trackeval", "motmetrics"):
+        part = score(matchup(truth, tracks), rules)
+        found = summary(part)
+        assert part.counts["TP"] + part.counts["FN"] == sum(map(len, truth))
+        assert part.counts["TP"] + part.counts["FP"] == sum(map(len, tracks))
+        assert found["MT"] + found["PT"] + found["ML"] == found["GT"]
+        assert all(0 <= found[name] <= 1 + 1e-12 for name in ("IDF1", "IDP", "IDR", "HOTA", "DetA", "AssA", "LocA"))
+        # Names don't matter.
+        renamed = [{9 - who: x for who, x in frame.items()} for frame in tracks]
+        assert summary(score(matchup(truth, renamed), rules))["IDF1"] == pytest.approx(found["IDF1"])
+        # Twice the same is the same, but for counts.
+        twice = summary(combine([part, part]))
+        assert not any(truth) or twice["MOTA"] == pytest.approx(found["MOTA"])
+        assert twice["HOTA"] == pytest.approx(found["HOTA"])
+        assert twice["FN"] == 2 * found["FN"]
+
+
+TRACKEVAL = {
+    "HOTA": "HOTA",
+    "DetA": "DetA",
+    "AssA": "AssA",
+    "LocA": "LocA",
+    "MOTA": "MOTA",
+    "IDF1": "IDF1",
+    "IDP": "IDP",
+    "IDR": "IDR",
+    "IDSW": "IDSW",
+    "FP": "CLR_FP",
+    "FN": "CLR_FN",
+    "Frag": "Frag",
+    "MT": "MT",
+    "PT": "PT",
+    "ML": "ML",
+}
+MOTMETRICS = {
+    "MOTA": "mota",
+    "IDF1": "idf1",
+    "IDP": "idp",
+    "IDR": "idr",
+    "IDSW": "num_switches",
+    "FP": "num_false_positives",
+    "FN": "num_misses",
+    "Frag": "num_fragmentations",
+    "MT": "mostly_tracked",
+    "PT": "partially_tracked",
+    "ML": "mostly_lost",
+    "GT": "num_unique_objects",
+}
+
+
+@pytest.mark.parametrize(("rules", "columns"), [("trackeval", TRACKEVAL), ("motmetrics", MOTMETRICS)])
+def test_numbers_of_the_evaluators_on_real_sequences(data, rules, columns):
+    folder = data / "mot15"
+    with (folder / f"{rules}_reference.csv").open() as stream:
+        rows = {next(iter(row.values())): row for row in csv.DictReader(stream)}
+    parts = []
+    for sequence in sorted(path.name for path in folder.iterdir() if path.is_dir()):
+        truth, tracks = (
+            np.loadtxt(folder / sequence / name, delimiter=",") for name in ("gt/gt.txt", "reference/sort.txt")
+        )
+        truth = truth[truth[:, 6] != 0]
+        (true_ids, true_at), (track_ids, track_at) = (
+            np.unique(part[:, 1], return_inverse=True) for part in (truth, tracks)
+        )
+        last = int(max(truth[:, 0].max(), tracks[:, 0].max()))
+        frames = [(truth[:, 0] == n, tracks[:, 0] == n) for n in range(1, last + 1)]
+        parts.append(
+            score(
+                Matchup(
+                    tuple(true_at[a] for a, _ in frames),
+                    tuple(track_at[b] for _, b in frames),
+                    tuple(iou(truth[a, 2:6], tracks[b, 2:6]) for a, b in frames),
+                    0.5,
+                    len(true_ids),
+                    len(track_ids),
+                ),
+                rules,
+            )
+        )
+        found = summary(parts[-1])
+        for ours, theirs in columns.items():
+            assert found[ours] == pytest.approx(float(rows[sequence][theirs]), abs=1e-6), (sequence, ours)
+    total = next((row for name, row in rows.items() if name in ("COMBINED", "OVERALL")), None)
+    if total:
+        found = summary(combine(parts))
+        assert {ours: found[ours] for ours in columns} == pytest.approx(
+            {ours: float(total[theirs]) for ours, theirs in columns.items()}, abs=1e-6
+        )
+
+
+def positions(people: dict[int, dict[int, tuple[float, float]]]) -> Path:
+    """{id: {step: place}} as arrays."""
+    rows = [(step, who, *place) for who, path in people.items() for step, place in path.items()]
+    table = np.array(rows, float).reshape(-1, 4)
+    return Path(table[:, 0].astype(int), table[:, 1].astype(int), table[:, 2:])
+
+
+def straight(who: int, steps: range, offset: float = 0.0, lane: float = 0.0) -> dict:
+    return {who: {step: (step + offset, lane) for step in steps}}
+
+
+def foretold(step: int, who: int, mean: list[tuple[float, float]], variance: float = 1.0) -> tuple:
+    return step, who, mean, [variance * np.eye(2)] * len(mean)
+
+
+def forecasts(*parts: tuple) -> Forecasts:
+    steps, who, means, covs = zip(*parts, strict=True)
+    return Forecasts(np.array(steps), np.array(who), np.array(means, float), np.array(covs))
+
+
+class TestDisplacement:
+    def test_errors_by_hand(self):
+        """One person at x = step; the track lies 0.1 m beside, the forecast misses by 1, 2 and 2 m."""
+        truth = positions(straight(1, range(10)))
+        tracks = positions({5: {step: (step, 0.1) for step in range(10)}})
+        made = forecasts(foretold(4, 5, [(5.0, 1.0), (6.0, 2.0), (9.0, 0.0)]))
+        result = displacement(truth, tracks, made)
+        found = result.summary()
+        assert found["ADE_m"] == pytest.approx(5 / 3)
+        assert found["FDE_m"] == pytest.approx(2.0)
+        assert found["ADE_squared_m2"] == pytest.approx(3.0)
+        assert found["recall"] == 1.0
+        assert found["coverage_95"] == pytest.approx(1.0)  # 2 m are within 2.45 sigma
+        assert result.d_obs_m2.tolist() == pytest.approx([0.01])
+        assert found["false_forecasts_per_frame"] == 0.0
+
+    def test_people_without_a_whole_future_or_past_count_nowhere(self):
+        truth = positions(
+            straight(1, range(10)) | straight(2, range(6), lane=5.0) | straight(3, range(3, 10), lane=9.0)
+        )
+        tracks = positions(straight(7, range(10)) | straight(8, range(6), lane=5.0))
+        made = forecasts(foretold(4, 7, [(5.0, 0), (6.0, 0), (7.0, 0)]), foretold(4, 8, [(9.0, 9), (9.0, 9), (9.0, 9)]))
+        result = displacement(truth, tracks, made)
+        assert result.people == 1
+        assert result.summary()["ADE_m"] == 0.0
+        assert result.false_forecasts == 0  # 8 is person 2, who leaves: neither for nor against
+
+    def test_a_ghost_is_a_false_forecast(self):
+        truth = positions(straight(1, range(10)))
+        tracks = positions(straight(7, range(10)) | straight(8, range(10), lane=40.0))
+        made = forecasts(*(foretold(4, who, [(5.0, 0), (6.0, 0), (7.0, 0)]) for who in (7, 8)))
+        assert displacement(truth, tracks, made).summary()["false_forecasts_per_frame"] == 1.0
+
+    def test_holes_of_a_track_are_filled_and_young_tracks_are_not_asked(self):
+        truth = positions(straight(1, range(10)))
+        holed = positions({7: {step: (step, 0.0) for step in (0, 1, 4, 5)}})
+        young = positions({7: {step: (step, 0.0) for step in (3, 4, 5)}})
+        made = forecasts(foretold(5, 7, [(6.0, 0), (7.0, 0), (8.0, 0)]))
+        assert displacement(truth, holed, made).summary()["recall"] == 1.0
+        assert displacement(truth, young, made).summary()["recall"] == 0.0
+
+    def test_the_curve_is_that_of_every_threshold(self):
+        """Against the definition: match, then keep pairs under tau, for a sweep of tau."""
+        rng = np.random.default_rng(0)
+        truth, tracks, made = {}, {}, []
+        for who in range(12):
+            lane, off = 30.0 * who, rng.gamma(1.0, 0.7)
+            truth |= straight(who, range(10), lane=lane)
+            tracks |= straight(who, range(10), lane=lane + off)
+            made.append(foretold(4, who, [(5 + rng.normal(), lane + rng.normal()) for _ in range(3)]))
+        result = displacement(positions(truth), positions(tracks), forecasts(*made))
+        recall, ade = result.curve()
+        for tau in rng.uniform(0, 4, 30):
+            kept = result.d_obs_m2 < tau
+            if kept.any():
+                at = int(kept.sum()) - 1
+                assert recall[at] == pytest.approx(kept.mean())
+                assert ade[at] == pytest.approx(result.ade_m[kept].mean())
+
+    def test_drift_of_consecutive_forecasts_by_hand(self):
+        truth = positions(straight(1, range(10)))
+        made = forecasts(foretold(4, 7, [(5.0, 0), (6.0, 0), (7.0, 0)]), foretold(5, 7, [(6.0, 1), (7.0, 2), (8.0, 9)]))
+        found = displacement(truth, positions(straight(7, range(10))), made).summary()
+        assert found["consistency_m"] == pytest.approx(1.5)
+
+    def test_nothing_to_average_is_said_as_nothing(self):
+        truth = positions(straight(1, range(3)))
+        made = forecasts(foretold(1, 7, [(5.0, 0), (6.0, 0), (7.0, 0)]))
+        found = displacement(truth, positions(straight(7, range(3))), made).summary()
+        assert found["ADE_m"] is None
+        assert found["recall"] is None
+
+    def test_several_sequences_are_pooled(self):
+        truth, tracks = positions(straight(1, range(10))), positions(straight(5, range(10)))
+        good = displacement(truth, tracks, forecasts(foretold(4, 5, [(5.0, 0), (6.0, 0), (7.0, 0)])))
+        bad = displacement(truth, tracks, forecasts(foretold(4, 5, [(5.0, 2), (6.0, 2), (7.0, 2)])))
+        assert combine_displacements([good, bad]).summary()["ADE_m"] == pytest.approx(1.0)

@@ -1,0 +1,222 @@
+"""Sampling, predictors, prediction."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from mcaptrack.errors import McaptrackError
+from mcaptrack.plane import GroundPlane
+from mcaptrack.predictors import make
+from mcaptrack.predictors.linear import DRIFT_M2_PER_S3, POSITION_NOISE_M, SPEED_M_PER_S, linear_variance
+from mcaptrack.schema import TRACKS, Frame
+from mcaptrack.transforms import Predict, Sample
+from tests.worlds import ids, ns, places, tracks_at, walk
+
+NAMES = ["cv", "holt-cv", "kalman"]
+every_predictor = pytest.mark.parametrize("name", NAMES)
+PASTS = hnp.arrays(float, st.tuples(st.integers(1, 4), st.integers(1, 10), st.just(2)), elements=st.floats(-50, 50))
+
+
+def sampled(frames, **options):
+    return [frame for (frame,) in Sample(**options)(frames)]
+
+
+class TestSample:
+    def test_ticks_lie_between_frames(self):
+        frames = [Frame(ns(n / 7), n, tracks_at({4: (n / 7, 0.0)})) for n in range(15)]
+        out = sampled(frames)
+        assert [frame.t_ns for frame in out] == [ns(0.4 * n) for n in range(6)]
+        np.testing.assert_allclose([frame.rows["x_m"][0] for frame in out], 0.4 * np.arange(6), atol=1e-6)
+        assert [frame.index for frame in out] == [0, 2, 5, 8, 11, 14]  # the picture on screen then
+        assert all(frame.rows["observed"].all() for frame in out)
+        assert all(frame.rows["source_id"].tolist() == [4] for frame in out)
+
+    def test_labels_on_the_clock_stay_as_they_are(self):
+        frames = walk(lambda n: {1: (n * 0.37, -n), 2: (5.0, 5.0)}, 20)
+        out = sampled(frames, start_ns=0)
+        assert [places(frame) for frame in out] == [places(frame) for frame in frames]
+        assert [frame.t_ns for frame in out] == [frame.t_ns for frame in frames]
+
+    def test_the_clock_may_begin_before_the_tracks(self):
+        frames = [Frame(ns(1.0 + n / 10), n, tracks_at({1: (n / 10, 0)})) for n in range(10)]
+        assert [frame.t_ns for frame in sampled(frames, start_ns=ns(0.0))] == [ns(1.2), ns(1.6)]
+
+    def test_a_hole_is_filled_and_says_so_and_a_long_one_stays(self):
+        def path(n):
+            return {} if 3 <= n <= 5 or (n > 10 and n < 18) else {1: (float(n), 0.0)}
+
+        out = {frame.t_ns: frame for frame in sampled(walk(path, 25), max_hole_s=2.0)}
+        seen = {tick: out[ns(0.4 * tick)].rows for tick in range(25)}
+        assert [seen[tick]["observed"].tolist() for tick in range(2, 7)] == [[True], [False], [False], [False], [True]]
+        assert [seen[tick]["x_m"].tolist() for tick in (3, 4, 5)] == [[3.0], [4.0], [5.0]]
+        assert all(len(seen[tick]) == 0 for tick in range(11, 18))
+
+    def test_boxes_come_to_metres_by_the_plane_of_their_time(self):
+        rows = TRACKS.rows(
+            track_id=[1], x_px=[10.0], y_px=[20.0], w_px=[4.0], h_px=[8.0], observed=[True], source_id=[-1]
+        )
+        planes = [
+            (0, GroundPlane((0.1, 0, 0, 0, 0.1, 0, 0, 0, 1), 99, 99)),
+            (ns(0.4), GroundPlane((1, 0, 0, 0, 1, 0, 0, 0, 1), 99, 99)),
+        ]
+        out = sampled([Frame(0, 0, rows), Frame(ns(0.4), 1, rows)], ground_planes=planes)
+        assert [places(frame) for frame in out] == [{1: (1.2, 2.8)}, {1: (12.0, 28.0)}]
+        with pytest.raises(McaptrackError, match="tracks are in pixels and there is no ground plane"):
+            sampled([Frame(0, 0, rows)])
+
+    def test_who_stands_above_the_horizon_is_nowhere(self):
+        tilted = GroundPlane((0.01, 0, 0, 0, 0.01, 0, 0, 0.01, -1), 200, 200)
+        rows = TRACKS.rows(
+            track_id=[1, 2],
+            x_px=[10.0, 10],
+            y_px=[20.0, 150],
+            w_px=[4.0, 4],
+            h_px=[8.0, 8],
+            observed=[True] * 2,
+            source_id=[-1] * 2,
+        )
+        (frame,) = sampled([Frame(0, 0, rows)], ground_planes=[(0, tilted)])
+        assert ids(frame) == [2]
+
+    def test_a_log_that_jumps_over_a_year_has_no_ticks_in_between(self):
+        year = 365 * 86400
+        out = sampled([Frame(ns(s), 0, tracks_at({1: (0, 0)})) for s in (0, 0.4, 0.8, year, year + 0.4)])
+        assert len(out) == 5
+
+
+class TestPredictors:
+    @every_predictor
+    @given(past=PASTS, shift=hnp.arrays(float, 2, elements=st.floats(-1e3, 1e3)))
+    def test_moved_people_have_moved_futures(self, name, past, shift):
+        predictor, known = make(name, 12, 0.4), np.ones(past.shape[:2], bool)
+        here, there = predictor.predict(past, known), predictor.predict(past + shift, known)
+        np.testing.assert_allclose(there.mean, here.mean + shift, atol=1e-6)
+        np.testing.assert_allclose(there.cov, here.cov)
+
+    @every_predictor
+    @given(past=PASTS, angle=st.floats(0, 7))
+    def test_turned_people_have_turned_futures(self, name, past, angle):
+        turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+        predictor, known = make(name, 12, 0.4), np.ones(past.shape[:2], bool)
+        np.testing.assert_allclose(
+            predictor.predict(past @ turn.T, known).mean, predictor.predict(past, known).mean @ turn.T, atol=1e-6
+        )
+
+    @every_predictor
+    @given(past=PASTS)
+    def test_a_batch_is_its_members(self, name, past):
+        predictor, known = make(name, 12, 0.4), np.ones(past.shape[:2], bool)
+        whole = predictor.predict(past, known)
+        for number in range(len(past)):
+            alone = predictor.predict(past[number : number + 1], known[number : number + 1])
+            np.testing.assert_allclose(whole.mean[number], alone.mean[0], atol=1e-9)
+            np.testing.assert_allclose(whole.cov[number], alone.cov[0])
+
+    @every_predictor
+    def test_straight_lines_go_on(self, name):
+        steps = np.arange(8)[:, None] * [0.5, -0.2]
+        forecast = make(name, 12, 0.4).predict(steps[None], np.ones((1, 8), bool))
+        ahead = 7 + np.arange(1, 13)
+        wanted = ahead[:, None] * [0.5, -0.2]
+        # The Kalman filter starts from "at rest, perhaps" and never quite forgets it.
+        np.testing.assert_allclose(forecast.mean[0], wanted, rtol=0.02 if name == "kalman" else 1e-9)
+
+    @every_predictor
+    def test_one_known_position_stays_and_is_uncertain(self, name):
+        past = np.array([[[np.nan, np.nan], [3.0, 4.0]]])
+        forecast = make(name, 12, 0.4).predict(past, np.array([[False, True]]))
+        np.testing.assert_allclose(forecast.mean[0], np.tile([3.0, 4.0], (12, 1)))
+        spread = np.sqrt(forecast.cov[0, :, 0, 0])
+        assert (np.diff(spread) > 0).all()
+        assert spread[-1] > 4.8 * SPEED_M_PER_S
+
+    def test_the_mean_of_three_steps_by_hand(self):
+        past = np.array([[[9.0, 0], [0, 0], [1, 0], [3, 0], [6, 3]]])
+        forecast = make("cv", 2, 0.4).predict(past, np.ones((1, 5), bool))
+        np.testing.assert_allclose(forecast.mean[0], [[8, 4], [10, 5]])  # (6 - 0) / 3, (3 - 0) / 3
+
+    def test_smoothed_velocity_by_hand(self):
+        past = np.array([[[0.0, 0], [1, 0], [3, 0], [7, 0]]])  # displacements 1, 2, 4: level 2.875 as in Eq. 3
+        forecast = make("holt-cv", 2, 0.4).predict(past, np.ones((1, 4), bool))
+        np.testing.assert_allclose(forecast.mean[0, :, 0], [9.875, 12.75])
+
+    def test_the_kalman_filter_is_the_kalman_filter(self):
+        """Against a filter with matrices, on noisy positions."""
+        rng, step = np.random.default_rng(2), 0.4
+        seen = np.cumsum(rng.normal(0.4, 0.2, 8))
+        move = np.array([[1, step], [0, 1]])
+        noise = DRIFT_M2_PER_S3 * np.array([[step**3 / 3, step**2 / 2], [step**2 / 2, step]])
+        state, cov = np.array([seen[0], 0.0]), np.diag([POSITION_NOISE_M**2, SPEED_M_PER_S**2])
+        for value in seen[1:]:
+            state, cov = move @ state, move @ cov @ move.T + noise
+            gain = cov[:, 0] / (cov[0, 0] + POSITION_NOISE_M**2)
+            state, cov = state + gain * (value - state[0]), cov - np.outer(gain, cov[0])
+        forecast = make("kalman", 12, step).predict(np.stack([seen, seen], -1)[None], np.ones((1, 8), bool))
+        for ahead in range(1, 13):
+            state, cov = move @ state, move @ cov @ move.T + noise
+            np.testing.assert_allclose(forecast.mean[0, ahead - 1], state[0], rtol=1e-9)
+            np.testing.assert_allclose(forecast.cov[0, ahead - 1], cov[0, 0] * np.eye(2), rtol=1e-9)
+
+    @every_predictor
+    @pytest.mark.parametrize("known", [1, 2, 4, 8])
+    def test_uncertainty_is_what_walkers_show(self, name, known):
+        """Walkers of the stated kind, simulated: the errors spread as the forecast says."""
+        rng, step, fine, people = np.random.default_rng(known), 0.4, 8, 20_000
+        speed = rng.normal(0, SPEED_M_PER_S, people)
+        place, path = np.zeros(people), []
+        for tick in range(known + 12):
+            path.append(place.copy())
+            for _ in range(fine):
+                kick = rng.normal(0, np.sqrt(DRIFT_M2_PER_S3 * step / fine), people)
+                place += (speed + kick / 2) * step / fine
+                speed = speed + kick
+        path = np.array(path).T
+        seen = path[:, :known] + rng.normal(0, POSITION_NOISE_M, (people, known))
+        forecast = make(name, 12, step).predict(np.stack([seen, seen], -1), np.ones((people, known), bool))
+        errors = forecast.mean[:, :, 0] - path[:, known:]
+        np.testing.assert_allclose(errors.std(axis=0), np.sqrt(forecast.cov[0, :, 0, 0]), rtol=0.04)
+
+    def test_variance_by_hand_for_standing_still(self):
+        """One position, weight 1, foretold 1 s ahead: noise, speed and drift add up."""
+        variance = linear_variance(np.ones((1, 1)), np.array([0.0]), np.array([1.0]))
+        assert variance[0] == pytest.approx(POSITION_NOISE_M**2 + SPEED_M_PER_S**2 + DRIFT_M2_PER_S3 / 3)
+
+
+class TestPredict:
+    def run(self, frames, **options):
+        return [frame for (frame,) in Predict(**options)(frames)]
+
+    def test_one_row_a_step_for_everybody_seen_often_enough(self):
+        out = self.run(
+            walk(lambda n: {1: (0.5 * n, 0.0)} | ({2: (0.0, 1.0 * n)} if n >= 4 else {}), 10), predictor="cv"
+        )
+        assert [len(frame.rows) for frame in out] == [0, 0, 0, 12, 12, 12, 12, 24, 24, 24]
+        rows = out[7].rows
+        assert rows["track_id"].tolist() == [1] * 12 + [2] * 12
+        assert rows["step"].tolist() == list(range(1, 13)) * 2
+        np.testing.assert_allclose(rows["ahead_s"][:3], [0.4, 0.8, 1.2])
+        np.testing.assert_allclose(rows["x_m"][:3], [4.0, 4.5, 5.0])
+        np.testing.assert_allclose(rows["y_m"][12:15], [8.0, 9.0, 10.0])
+        assert (rows["cov_xx_m2"] > 0).all()
+
+    def test_nothing_is_foretold_from_inside_a_hole(self):
+        frames = walk(lambda n: {1: (float(n), 0.0)}, 10)
+        frames[6] = frames[6]._replace(rows=tracks_at({1: (6.0, 0.0)}, observed=False))
+        out = self.run(frames)
+        assert [len(frame.rows) > 0 for frame in out[4:8]] == [True, True, False, True]
+
+    def test_horizon_and_rate_make_the_steps(self):
+        out = self.run(
+            walk(lambda n: {1: (float(n), 0.0)}, 10, rate_hz=5.0), rate_hz=5.0, horizon_s=2.0, predictor="cv"
+        )
+        assert out[9].rows["step"].max() == 10
+        np.testing.assert_allclose(out[9].rows["ahead_s"].max(), 2.0)
+
+    def test_a_gap_in_the_clock_breaks_the_past(self):
+        frames = [Frame(ns(0.4 * t), t, tracks_at({1: (float(t), 0.0)})) for t in (0, 1, 2, 3, 6, 7, 8, 9)]
+        out = self.run(frames)
+        assert [len(frame.rows) > 0 for frame in out] == [False, False, False, True, False, False, False, True]

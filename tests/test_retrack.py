@@ -1,0 +1,361 @@
+"""Re-tracking: Eq. 1 to 3 and every branch of Algorithm 1 by hand, and the paper's four failures in worded scenes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mcaptrack.history import Holt
+from mcaptrack.predictors import Forecast
+from mcaptrack.transforms import PROFILES, Retrack
+from mcaptrack.transforms.retrack.distance import jumps, mahalanobis, paper_covariance, to_forecasts, to_positions
+from mcaptrack.transforms.retrack.state import Motion
+from tests.worlds import ids, places, tracks_at, walk
+
+PAPER, AUTHORS, DEFAULT = PROFILES["paper"], PROFILES["authors"], PROFILES["default"]
+every_profile = pytest.mark.parametrize("profile", PROFILES.values(), ids=PROFILES)
+
+
+def run(profile, frames):
+    """Offline, online and predicted frames."""
+    return [list(part) for part in zip(*profile(frames), strict=True)]
+
+
+def paths(frames) -> dict[int, dict[int, tuple[float, float]]]:
+    """Each id's places by tick."""
+    out: dict[int, dict[int, tuple[float, float]]] = {}
+    for tick, frame in enumerate(frames):
+        for who, place in places(frame).items():
+            out.setdefault(who, {})[tick] = place
+    return out
+
+
+def line(start: float, step: float, count: int = 12) -> np.ndarray:
+    """A forecast along the first axis: start + step, start + 2 step, ..."""
+    return np.stack([start + step * np.arange(1, count + 1), np.zeros(count)], axis=-1)
+
+
+def forecast(*means: np.ndarray, variance: float = 1.0) -> Forecast:
+    mean = np.stack(means)
+    return Forecast(mean, np.broadcast_to(variance * np.eye(2), (*mean.shape, 2)))
+
+
+class TestDistance:
+    def test_eq_1_by_hand(self):
+        off, cov = np.array([[3.0, 4.0], [1.0, 1.0]]), np.array([np.diag([9.0, 16.0]), [[2.0, 1.0], [1.0, 2.0]]])
+        np.testing.assert_allclose(mahalanobis(off, cov), [np.sqrt(2), np.sqrt(2 / 3)])
+
+    def test_uncertainty_grows_as_the_paper_says(self):
+        cov = paper_covariance(np.array([1, 4]), 3, 0.5)
+        np.testing.assert_allclose(cov[:, :, 0, 0], [[0.25, 0.5, 0.75], [1.0, 1.25, 1.5]])
+        np.testing.assert_allclose(cov[:, :, 0, 1], 0)
+
+    def test_eq_2_by_hand(self):
+        """A track foretold one step ago at 0, 1, 2, ...; an observation foretells the same places 2 m further.
+
+        Step j of the overlap (from 1): variances j + 1 and j, so the distance is 2 / sqrt(2 j + 1), for 11 steps.
+        """
+        tracks, seen = forecast(line(0, 1)), forecast(line(1, 1) + [2, 0])
+        each = 2 / np.sqrt(2 * np.arange(1, 12) + 1)
+        age = np.array([1])
+        assert to_forecasts(tracks, age, seen, "mean", 1.0)[0, 0] == pytest.approx(each.mean())
+        assert to_forecasts(tracks, age, seen, "max", 1.0)[0, 0] == pytest.approx(each.max())
+        assert to_forecasts(tracks, age, seen, "first", 1.0)[0, 0] == pytest.approx(each[0])
+        assert to_forecasts(tracks, age, seen, "mean", 2.0)[0, 0] == pytest.approx(each.mean() / 2)
+
+    def test_older_tracks_overlap_less(self):
+        """Ages 1, 9 and 12 leave 11, 3 and no steps, each track by its own."""
+        tracks = forecast(line(0, 1), line(0, 1), line(0, 1))
+        seen = forecast(line(0, 0))
+        distance = to_forecasts(tracks, np.array([1, 9, 12]), seen, "mean", 1.0)[:, 0]
+        steps = np.arange(1, 12)
+        assert distance[0] == pytest.approx(((1 + steps) / np.sqrt(2 * steps + 1)).mean())
+        steps = np.arange(1, 4)
+        assert distance[1] == pytest.approx(((9 + steps) / np.sqrt(9 + 2 * steps)).mean())
+        assert distance[2] == np.inf
+
+    def test_learned_uncertainty_takes_the_place_of_the_papers(self):
+        tracks, seen = forecast(line(0, 0), variance=3.0), forecast(line(0, 0) + [2, 0], variance=1.0)
+        assert to_forecasts(tracks, np.array([1]), seen, "mean", None)[0, 0] == pytest.approx(1.0)
+
+    def test_expected_and_seen_position_by_hand(self):
+        tracks = forecast(line(0, 1), line(0, 1), variance=0.75)
+        xy = np.array([[3.0, 1.0]])
+        distance = to_positions(tracks, np.array([3, 13]), xy, 0.5, None)
+        np.testing.assert_allclose(distance, [[1.0], [np.inf]])
+        np.testing.assert_allclose(jumps(tracks, np.array([2, 13]), xy), [[np.sqrt(2)], [np.nan]])
+
+
+class TestSmoothing:
+    def test_eq_3_through_a_hole_by_hand(self):
+        """Seen at 0 and 1; then a hole; then at 5, three steps on: displacements 1, 4/3, 4/3, 4/3."""
+        holt = Holt(0.5, 0.5)
+        past = np.array([[[np.nan, np.nan], [0.0, 0], [1, 0]]])
+        motion = Motion.along(holt, past, np.isfinite(past[..., 0]))
+        motion.see(holt, np.array([[5.0, 0.0]]), np.array([3]))
+        level, trend = 1.0, 0.0
+        smooth = [level]
+        for displacement in (4 / 3, 4 / 3, 4 / 3):
+            new = 0.5 * displacement + 0.5 * (level + trend)
+            level, trend = new, 0.5 * (new - level) + 0.5 * trend
+            smooth.append(level)
+        rebuilt, known = motion.past()
+        assert known.tolist() == [[True, True, True]]
+        np.testing.assert_allclose(rebuilt[0, :, 0], [5 - smooth[-1] - smooth[-2], 5 - smooth[-1], 5])
+
+    def test_without_smoothing_the_past_is_as_it_was_seen(self):
+        past = np.array([[[0.0, 1], [1, 1], [3, 0], [2, 5]]])
+        motion = Motion.along(Holt(1.0, 0.0), past, np.ones((1, 4), bool))
+        np.testing.assert_allclose(motion.past()[0], past)
+
+
+class TestBranches:
+    """Lines 4 to 18 of Algorithm 1, one by one, on people who walk along the first axis."""
+
+    @every_profile
+    def test_matched_one_who_walks_on_stays_one(self, profile):
+        offline, online, _ = run(profile, walk(lambda n: {7: (0.5 * n, 0.0)}, 20))
+        assert set(paths(offline)) == {1}
+        assert set(paths(online)) == {1}
+        assert paths(offline)[1] == {tick: (0.5 * tick, 0.0) for tick in range(20)}
+
+    @every_profile
+    def test_identity_is_dropped_a_new_id_on_the_same_path_is_the_same_person(self, profile):
+        frames = walk(lambda n: {7 if n < 10 else 8: (0.5 * n, 0.0)}, 24)
+        offline, _, _ = run(profile, frames)
+        (who,) = paths(offline)
+        assert paths(offline)[who] == {tick: (0.5 * tick, 0.0) for tick in range(24)}
+
+    @every_profile
+    def test_unmatched_track_ages_and_is_matched_again_within_its_age(self, profile):
+        """Hidden for five steps, back under another id; matched once that id has a past, and the hole is filled."""
+        frames = walk(lambda n: {7 if n < 10 else 8: (0.5 * n, 0.0)} if not 10 <= n < 13 else {}, 26)
+        offline, _, _ = run(profile, frames)
+        (who,) = paths(offline)
+        assert paths(offline)[who] == {tick: (0.5 * tick, 0.0) for tick in range(26)}
+        filled = [tick for tick, frame in enumerate(offline) if not frame.rows["observed"].all()]
+        assert set(range(10, 13)) <= set(filled)
+
+    @every_profile
+    def test_aged_out_is_somebody_else(self, profile):
+        gone = range(10, 26)  # 6.4 s
+        frames = walk(lambda n: {7 if n < 10 else 8: (0.5 * n, 0.0)} if n not in gone else {}, 40)
+        offline, _, _ = run(profile, frames)
+        assert len(paths(offline)) == 2
+        assert all(len(frame.rows) == 0 for frame in offline[10:26])
+
+    @every_profile
+    def test_age_counts_seconds_not_frames_with_rows(self, profile):
+        """The same hole, but the log has no frames there at all."""
+        frames = [f for f in walk(lambda n: {7: (0.5 * n, 0.0)}, 40) if not 10 <= f.index < 26]
+        offline, _, _ = run(profile, frames)
+        assert len(paths(offline)) == 2
+
+    @every_profile
+    def test_unmatched_observation_starts_a_track(self, profile):
+        frames = walk(lambda n: {7: (0.5 * n, 0.0)} | ({9: (0.0, 20.0 + 0.5 * n)} if n >= 6 else {}), 24)
+        offline, _, predictions = run(profile, frames)
+        assert len(paths(offline)) == 2
+        assert min(paths(offline)[2]) == 6  # with the past of its first observation
+        assert {row["track_id"] for row in predictions[-1].rows} == {1, 2}
+
+    @every_profile
+    def test_probation_what_never_lasts_is_never_reported(self, profile):
+        frames = walk(lambda n: {7: (0.5 * n, 0.0)} | ({9: (0.0, 20.0)} if n in range(8, 12) else {}), 24)
+        offline, _, _ = run(profile, frames)
+        assert len(paths(offline)) == 1
+
+    def test_pairs_beyond_the_gate_are_no_pairs(self):
+        def jump(n):
+            return {7: (0.5 * n, 0.0 if n < 10 else 40.0)}
+
+        offline, _, _ = run(DEFAULT, walk(jump, 24))
+        assert len(paths(offline)) == 2
+
+    def test_no_track_is_matched_further_than_it_can_have_jumped(self):
+        frames = walk(lambda n: {7 if n < 10 else 8: (0.0, 0.0 if n < 10 else 4.0)} if not 10 <= n < 20 else {}, 32)
+        near, _, _ = run(replace(DEFAULT, max_jump_m=None), frames)
+        far, _, _ = run(DEFAULT, frames)
+        assert len(paths(near)) == 1
+        assert len(paths(far)) == 2
+
+    def test_two_who_pass_keep_to_their_paths(self):
+        frames = walk(lambda n: {1: (0.5 * n, 0.0), 2: (10 - 0.5 * n, 0.6)}, 24)
+        offline, _, _ = run(DEFAULT, frames)
+        assert {round(path[23][1], 1): round(path[0][1], 1) for path in paths(offline).values()} == {0.0: 0.0, 0.6: 0.6}
+
+    def test_the_input_says_who_it_is_where_places_do_not(self):
+        """Two walk abreast, 0.3 m apart, in noise; ids of the input decide unless they are dropped."""
+        rng = np.random.default_rng(5)
+        noise = rng.normal(0, 0.25, (60, 2))
+
+        def pair(n):
+            return {1: (0.5 * n, noise[n, 0]), 2: (0.5 * n, 0.3 + noise[n, 1])}
+
+        def switches(profile):
+            _, online, _ = run(profile, walk(pair, 60))
+            sources = [dict(zip(ids(f), f.rows["source_id"].tolist(), strict=True)) for f in online[3:]]
+            return sum(a != b for a, b in zip(sources, sources[1:], strict=False))
+
+        assert switches(DEFAULT) < switches(replace(DEFAULT, same_source=0.0))
+
+    def test_certain_pairs_go_first(self):
+        """Two tracks, one observation each; the sum is least crosswise, but one pair is certain."""
+        frames = walk(lambda n: {1: (0.0, 0.0), 2: (1.0, 0.0)}, 8)
+        late = walk(lambda n: {3: (0.05, 0.0), 4: (-1.0, 0.0)}, 8)
+        frames += [f._replace(t_ns=f.t_ns + 8 * 400_000_000, index=8 + f.index) for f in late]
+        options = {
+            "distance": "first",
+            "covariance": "paper",
+            "min_history": 1,
+            "max_distance": 3.0,
+            "same_source": 0.0,
+        }
+        plain = replace(DEFAULT, **options, max_jump_m=None, noise_m=0.0, certain_distance=0.0)
+        sure = replace(plain, certain_distance=0.15)
+        by = [
+            {f.rows["source_id"][k]: f.rows["track_id"][k] for f in run(p, frames)[1][8:] for k in range(len(f.rows))}
+            for p in (plain, sure)
+        ]
+        assert by[1][3] == 1  # 0.05 m from where track 1 stands: certain
+
+    def test_an_observation_needs_a_past(self):
+        frames = walk(lambda n: {1: (0.5 * n, 0.0)} if n < 3 else {}, 10)
+        for profile, least in ((PAPER, 4), (DEFAULT, 2)):
+            assert profile.min_history == least
+            _, online, _ = run(replace(profile, min_track_s=0.0), frames)
+            assert any(len(frame.rows) for frame in online) == (least <= 3 and profile.min_hits <= 1)
+
+    def test_backfill_takes_what_nobody_holds_or_everything_or_nothing(self):
+        """Id 5 follows track 1 for a while and then jumps away: what it held before belongs to track 1."""
+
+        def path(n):
+            return {5: (0.5 * n, 0.0) if n < 12 else (0.5 * n, 30.0)}
+
+        frames = walk(path, 24)
+        rows = {}
+        for backfill in ("none", "unclaimed", "all"):
+            offline, _, _ = run(replace(AUTHORS, backfill=backfill), frames)
+            rows[backfill] = sum(len(frame.rows) for frame in offline)
+        assert rows["none"] < rows["unclaimed"] < rows["all"]
+        assert rows["unclaimed"] <= 24
+
+    def test_birth_raw_or_smoothed_changes_the_first_forecast(self):
+        wild = [0.0, 1.0, 1.0, 3.0]
+        frames = walk(lambda n: {1: (wild[min(n, 3)] + max(n - 3, 0), 0.0)}, 6)
+        first = {}
+        for birth in ("raw", "smoothed"):
+            _, _, predictions = run(replace(PAPER, birth=birth, min_hits=0), frames)
+            first[birth] = predictions[3].rows["x_m"][:2].tolist()
+        assert first["raw"] == [4.0, 5.0]  # (3 - 0) / 3 a step
+        level, trend = 1.0, 0.0
+        for displacement in (0.0, 2.0):
+            new = 0.5 * displacement + 0.5 * (level + trend)
+            level, trend = new, 0.5 * (new - level) + 0.5 * trend
+        smooth = (1.0 + 0.5 + level) / 3
+        np.testing.assert_allclose(first["smoothed"], [3 + smooth, 3 + 2 * smooth])
+
+    @every_profile
+    def test_online_and_predictions_say_the_same_people_at_the_same_time(self, profile):
+        frames = walk(lambda n: {7: (0.5 * n, 0.0), 8: (0.0, 15.0 + n)} if n % 7 else {7: (0.5 * n, 0.0)}, 30)
+        _, online, predictions = run(profile, frames)
+        for now, then in zip(online, predictions, strict=True):
+            assert now.t_ns == then.t_ns
+            assert sorted(set(then.rows["track_id"].tolist())) == ids(now)
+
+    def test_online_rows_stand_where_they_were_seen(self):
+        frames = walk(lambda n: {7: (0.5 * n, np.sin(n))}, 20)
+        _, online, _ = run(DEFAULT, frames)
+        for tick, frame in enumerate(online[3:], start=3):
+            assert places(frame) == {1: (0.5 * tick, round(np.sin(tick), 3))}
+            assert frame.rows["source_id"].tolist() == [7]
+
+
+class TestFailuresOfThePaper:
+    """Section IV-B: what tracking gets wrong, and what re-tracking makes of it."""
+
+    @every_profile
+    def test_missed_target(self, profile):
+        """One is swallowed by another's box for a second and comes back under a new id: one track, hole filled."""
+
+        def crowd(n):
+            people = {1: (0.5 * n, 0.0)}
+            if n < 10:
+                people[2] = (0.5 * n, 3.0 - 0.25 * n)
+            elif n >= 13:
+                people[3] = (0.5 * n, 3.0 - 0.25 * n)
+            return people
+
+        offline, _, _ = run(profile, walk(crowd, 30))
+        truth = {tick: (0.5 * tick, 3.0 - 0.25 * tick) for tick in range(30)}
+        assert truth in paths(offline).values()
+        assert len(paths(offline)) == 2
+
+    @pytest.mark.parametrize("profile", [AUTHORS, DEFAULT], ids=["authors", "default"])
+    def test_identity_switch_at_meet_and_separate(self, profile):
+        """Two cross; while they are one box it goes by the first's name, and after it the names are exchanged."""
+
+        def crowd(n):
+            a, b = (0.6 * n, 0.45 * n), (0.6 * n, 10.8 - 0.45 * n)
+            if n < 11:
+                return {1: a, 2: b}
+            if n < 14:
+                return {1: (0.6 * n, 5.4)}
+            return {1: b, 3: a}  # the tracker gives the first's name to the wrong one
+
+        offline, _, _ = run(profile, walk(crowd, 30))
+        straight = 0
+        for path in paths(offline).values():
+            ticks = sorted(path)
+            if ticks[0] < 8 and ticks[-1] > 22:
+                rise = (path[5][1] - path[0][1], path[29][1] - path[24][1])
+                straight += (rise[0] > 0) == (rise[1] > 0)
+        assert straight == 2
+
+    @every_profile
+    def test_spurious_track(self, profile):
+        """A gust in a tree: for 2.4 s boxes leap about under one id. At most half of them are left, and of ours none."""
+        kept = 0
+        for seed in range(20):
+            leaps = np.random.default_rng(seed).uniform(-2.5, 2.5, (60, 2))
+
+            def crowd(n, leaps=leaps):
+                tree = {9: (float(leaps[n, 0]), 30 + float(leaps[n, 1]))} if 10 <= n < 16 else {}
+                return {1: (0.4 * n, 0.0)} | tree
+
+            offline, _, _ = run(profile, walk(crowd, 40))
+            found = paths(offline).values()
+            kept += sum(len(path) for path in found if next(iter(path.values()))[1] > 15)
+            assert {tick: (round(0.4 * tick, 3), 0.0) for tick in range(40)} in found
+        assert kept <= (0 if profile == DEFAULT else 0.5 * 20 * 6)
+
+    def test_noisy_track(self):
+        """A shaking camera: forecasts of the re-tracked path jump less from step to step than those of the raw one."""
+        rng = np.random.default_rng(4)
+        noise = rng.normal(0, 0.25, (60, 2))
+        frames = walk(lambda n: {1: (0.5 * n + noise[n, 0], noise[n, 1])}, 60)
+
+        def drift(profile) -> float:
+            _, _, predictions = run(profile, frames)
+            futures = [np.stack([f.rows["x_m"], f.rows["y_m"]], -1) for f in predictions if len(f.rows) == 12]
+            steps = [np.hypot(*(a[1:] - b[:-1]).T).mean() for a, b in zip(futures, futures[1:], strict=False)]
+            return float(np.mean(steps))
+
+        raw = replace(PAPER, alpha=1.0, beta=0.0)
+        assert drift(PAPER) < 0.8 * drift(raw)
+        assert drift(DEFAULT) < 0.8 * drift(raw)
+
+
+def test_profiles_differ_by_named_parameters():
+    assert Retrack() == DEFAULT
+    assert PAPER.distance == "mean"
+    assert AUTHORS.distance == "max"
+    assert replace(AUTHORS, distance="mean", certain_distance=0.0, birth="raw", backfill="unclaimed") == PAPER
+
+
+def test_the_log_without_people_gives_frames_without_rows():
+    offline, online, predictions = run(DEFAULT, walk(lambda n: {}, 5))
+    assert [len(f.rows) for f in (*offline, *online, *predictions)] == [0] * 15
+    assert len(tracks_at({})) == 0

@@ -1,0 +1,191 @@
+"""The row schemas, the codec and the gate."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from google.protobuf.descriptor_pb2 import FileDescriptorSet
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mcaptrack.schema import DETECTIONS, EVENTS, PREDICTIONS, SCHEMAS, TRACKS
+from mcaptrack.schema.proto import parse
+from tests.strategies import columns
+
+ALL = st.sampled_from(sorted(SCHEMAS.values(), key=lambda schema: schema.name))
+FOLDER = Path(__file__).parent.parent / "schemas"
+
+
+def same(a: np.ndarray, b: np.ndarray) -> bool:
+    """Equal to the bit, NaN included."""
+    return a.dtype.names == b.dtype.names and all(a[n].tobytes() == b[n].tobytes() for n in a.dtype.names)
+
+
+@pytest.mark.parametrize("schema", SCHEMAS.values(), ids=str)
+def test_descriptors_are_what_protoc_makes_of_the_files(schema, tmp_path):
+    file, out = FOLDER / f"{schema.name.rpartition('.')[2]}.proto", tmp_path / "out"
+    subprocess.run(
+        [sys.executable, "-m", "grpc_tools.protoc", f"-I{FOLDER}", f"--descriptor_set_out={out}", file], check=True
+    )
+    compiled = FileDescriptorSet.FromString(out.read_bytes())
+    ours = FileDescriptorSet.FromString(schema.descriptor)
+    compiled.file[0].name = ours.file[0].name  # the folder it lies in is no matter
+    for files in (ours, compiled):  # nor whether the names in JSON are spelt out
+        message = files.file[0].message_type[0]
+        for field in [*message.field, *message.nested_type[0].field]:
+            field.ClearField("json_name")
+    assert ours == compiled
+
+
+@given(st.data())
+def test_rows_survive_the_wire_to_the_bit(data):
+    schema = data.draw(ALL)
+    rows = schema.rows(**data.draw(columns(schema)))
+    assert same(schema.codec.decode(schema.codec.encode(rows)), rows)
+
+
+@given(st.data())
+def test_the_protobuf_runtime_reads_what_we_write(data):
+    schema = data.draw(ALL)
+    rows = schema.rows(**data.draw(columns(schema)))
+    message = schema.codec.message_class()
+    message.ParseFromString(schema.codec.encode(rows))
+    for column in schema.columns:
+        theirs = np.array([getattr(row, column.name) for row in message.rows], rows.dtype[column.name])
+        np.testing.assert_array_equal(theirs, rows[column.name])
+
+
+@given(st.data())
+def test_we_read_what_the_protobuf_runtime_writes(data):
+    schema = data.draw(ALL)
+    rows = schema.rows(**data.draw(columns(schema)))
+    message = schema.codec.message_class()
+    for row in rows:
+        added = message.rows.add()
+        for column in schema.columns:
+            value = row[column.name].item()
+            if not (column.optional and np.isnan(value)):
+                setattr(added, column.name, value)  # a default value that is not optional is left out on the wire
+    read = schema.codec.decode(message.SerializeToString())
+    for column in schema.columns:
+        np.testing.assert_array_equal(read[column.name], rows[column.name])
+
+
+@given(st.data())
+def test_a_channel_is_its_messages_laid_end_to_end(data):
+    schema = data.draw(ALL)
+    parts = [schema.rows(**data.draw(columns(schema))) for _ in range(data.draw(st.integers(0, 4)))]
+    rows, counts = schema.codec.decode_all([schema.codec.encode(part) for part in parts])
+    assert counts.tolist() == [len(part) for part in parts]
+    assert same(rows, np.concatenate([schema.empty(), *parts]))
+
+
+def test_a_writer_that_leaves_defaults_out_is_read_between_others():
+    ours = TRACKS.rows(track_id=[5], x_m=[1.5], y_m=[2.5], observed=[True], source_id=[7])
+    message = TRACKS.codec.message_class()
+    message.rows.add(x_m=3.0)
+    rows, counts = TRACKS.codec.decode_all([TRACKS.codec.encode(ours), message.SerializeToString(), b""])
+    assert counts.tolist() == [1, 1, 0]
+    assert rows["x_m"].tolist() == [1.5, 3.0]
+    assert rows["track_id"].tolist() == [5, 0]
+    assert np.isnan(rows["y_m"][1])
+
+
+def test_a_bool_written_as_another_number_is_still_true():
+    payload = bytearray(TRACKS.codec.encode(TRACKS.rows(track_id=[1], observed=[True], source_id=[0])))
+    payload[TRACKS.dtype.fields["observed"][1]] = 2
+    assert TRACKS.codec.decode(bytes(payload))["observed"].tolist() == [True]
+
+
+def test_bytes_that_are_no_message_are_refused():
+    with pytest.raises(ValueError, match=r"5 bytes are no mcaptrack\.Tracks message"):
+        TRACKS.codec.decode(b"\x0a\xff\xff\xff\xff")
+
+
+def test_rows_in_another_layout_are_written_the_same():
+    rows = DETECTIONS.rows(x_px=[1.0], y_px=[2.0], w_px=[3.0], h_px=[4.0], score=[0.5], class_id=[1])
+    tight = np.array(rows.tolist(), [(name, rows.dtype[name]) for name in rows.dtype.names])
+    assert DETECTIONS.codec.encode(tight) == DETECTIONS.codec.encode(rows)
+    assert DETECTIONS.codec.encode(np.concatenate([rows, rows, rows])[::2]) == 2 * DETECTIONS.codec.encode(rows)
+
+
+@pytest.mark.parametrize(
+    ("columns_given", "words"),
+    [
+        (
+            {"x_px": [1.0], "y_px": [1.0], "w_px": [1.0], "h_px": [1.0]},
+            "mcaptrack.Detections needs the column class_id",
+        ),
+        (
+            {"x_px": [1.0], "y_px": [1.0], "w_px": [1.0], "h_px": [1.0], "class_id": [1], "colour": [1]},
+            "mcaptrack.Detections has no column colour",
+        ),
+        (
+            {"x_px": [1.0, 2.0], "y_px": [1.0], "w_px": [1.0], "h_px": [1.0], "class_id": [1]},
+            "mcaptrack.Detections needs columns of one length",
+        ),
+        (
+            {"x_px": [1.0], "y_px": [1.0], "w_px": [1.0], "h_px": [1.0], "class_id": [1.0]},
+            "mcaptrack.Detections.class_id needs whole numbers",
+        ),
+        (
+            {"x_px": [1.0], "y_px": [1.0], "w_px": [1.0], "h_px": [1.0], "class_id": [-1]},
+            "mcaptrack.Detections.class_id holds 0 to 4294967295, not -1",
+        ),
+        (
+            {"x_px": [1.0], "y_px": [float("nan")], "w_px": [1.0], "h_px": [1.0], "class_id": [1]},
+            "mcaptrack.Detections.y_px is required and missing in 1 rows, first in row 0",
+        ),
+        (
+            {"x_px": ["a"], "y_px": [1.0], "w_px": [1.0], "h_px": [1.0], "class_id": [1]},
+            "mcaptrack.Detections.x_px needs numbers",
+        ),
+    ],
+)
+def test_the_gate_names_column_and_schema(columns_given, words):
+    with pytest.raises(ValueError, match=words):
+        DETECTIONS.rows(**columns_given)
+
+
+def test_the_gate_wants_true_or_false():
+    with pytest.raises(ValueError, match=r"mcaptrack\.Tracks\.observed needs true or false, not int64"):
+        TRACKS.rows(track_id=[1], observed=[1], source_id=[1])
+
+
+def test_the_gate_wants_exactly_the_columns_of_the_schema():
+    rows = EVENTS.empty(1)
+    with pytest.raises(ValueError, match=r"mcaptrack\.Tracks has the columns track_id, .*the rows have kind"):
+        TRACKS.check(rows)
+    assert EVENTS.check(rows) is rows
+
+
+def test_units_and_meaning_reach_arrow():
+    field = PREDICTIONS.arrow.field("cov_xy_m2")
+    assert field.metadata == {b"unit": b"m^2", b"description": b"covariance of the two axes"}
+    assert field.nullable
+    assert not PREDICTIONS.arrow.field("x_m").nullable
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (
+            "message A {\n message Row {\n string name = 1;\n }\n repeated Row rows = 1;\n}",
+            "x.proto:3: not a row schema",
+        ),
+        ("message A {\n message Row {\n optional bool b = 1;\n }\n repeated Row rows = 1;\n}", "only double and float"),
+        ("message A {\n message Row {\n double a = 1;\n }\n}", "needs a package, 'repeated Row rows = 1;'"),
+        (
+            "package p;\nmessage A {\n message Row {\n double a = 2;\n double b = 1;\n }\n repeated Row rows = 1;\n}",
+            "rising field numbers",
+        ),
+        ("import 'x';", "x.proto:1: not a row schema"),
+    ],
+)
+def test_what_has_no_fixed_width_is_no_row_schema(text, words):
+    with pytest.raises(ValueError, match=words):
+        parse(text, "x.proto")

@@ -1,0 +1,110 @@
+"""Worded scenes, as rows and as footage, for tests."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import numpy as np
+
+from mcaptrack.clock import NS_PER_S
+from mcaptrack.scene import Block, Scene, Walker
+from mcaptrack.schema import DETECTIONS, TRACKS, Frame
+
+Positions = Mapping[int, tuple[float, float]]
+
+
+def ns(seconds: float) -> int:
+    return round(seconds * NS_PER_S)
+
+
+def boxes_at(centres: Sequence[tuple[float, float]], size: tuple[float, float] = (20.0, 40.0), score: float = 1.0):
+    """Rows of detections around centres, in pixels."""
+    xy = np.array(centres, float).reshape(-1, 2)
+    w, h = size
+    return DETECTIONS.rows(
+        x_px=xy[:, 0] - w / 2,
+        y_px=xy[:, 1] - h / 2,
+        w_px=np.full(len(xy), w),
+        h_px=np.full(len(xy), h),
+        score=np.full(len(xy), score),
+        class_id=np.ones(len(xy), np.uint32),
+    )
+
+
+def detections(path: Callable[[int], Sequence[tuple[float, float]]], frames: int, fps: float = 10.0) -> list[Frame]:
+    """Frames of boxes whose centres ``path`` gives for every frame number."""
+    return [Frame(ns(number / fps), number, boxes_at(path(number))) for number in range(frames)]
+
+
+def tracks_at(people: Positions, observed: bool = True):
+    """Rows of tracks at places in metres, by id."""
+    xy = np.array(list(people.values()), float).reshape(-1, 2)
+    return TRACKS.rows(
+        track_id=np.array(list(people), np.int64),
+        x_m=xy[:, 0],
+        y_m=xy[:, 1],
+        observed=np.full(len(xy), observed),
+        source_id=np.full(len(xy), -1),
+    )
+
+
+def walk(path: Callable[[int], Positions], ticks: int, rate_hz: float = 2.5) -> list[Frame]:
+    """Frames of tracks on the clock of prediction: who is where at every tick."""
+    return [Frame(ns(tick / rate_hz), tick, tracks_at(path(tick))) for tick in range(ticks)]
+
+
+def ids(frame: Frame) -> list[int]:
+    return frame.rows["track_id"].tolist()
+
+
+def places(frame: Frame) -> dict[int, tuple[float, float]]:
+    """Who is where, rounded to a millimetre."""
+    return {int(row["track_id"]): (round(float(row["x_m"]), 3), round(float(row["y_m"]), 3)) for row in frame.rows}
+
+
+def small_scene(seconds: float = 6.0, **changes) -> Scene:
+    """Three people on a small picture, one of them behind something for a while."""
+    people = (
+        Walker(1, ((0.0, -5.0, 9.0), (seconds, 4.0, 12.0)), (30, 30, 30)),
+        Walker(2, ((0.0, 5.0, 13.0), (seconds, -4.0, 10.0)), (120, 40, 20)),
+        Walker(3, ((seconds / 3, 6.0, 15.5), (seconds, -1.0, 15.0)), (20, 60, 20)),
+    )
+    options = {"fps": 10, "width_px": 320, "height_px": 180, "noise": 1.5, "blocks": (Block(2.5, 14.0, 1.2, 2.2),)}
+    return Scene(people, seconds, **(options | changes))
+
+
+def write_clip(
+    path: Path,
+    frames: int = 20,
+    *,
+    size: tuple[int, int] = (64, 48),
+    fps: int = 10,
+    codec: str = "libx264",
+    pixels: str = "yuv420p",
+    options: Mapping[str, str] | None = None,
+    times_ms: Sequence[int] | None = None,
+) -> list[np.ndarray]:
+    """A clip made by FFmpeg: a bright quarter and a spot that wanders one pixel a frame. Returns the pictures."""
+    width, height = size
+    images = []
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate=fps, options=dict(options or {}))
+        stream.width, stream.height, stream.pix_fmt = width, height, pixels
+        if times_ms:
+            stream.codec_context.time_base = Fraction(1, 1000)
+        for number in range(frames):
+            image = np.full((height, width, 3), 40, np.uint8)
+            image[: height // 2, : width // 2] = 220
+            image[height // 2 : height // 2 + 8, number : number + 8] = (20, 20, 230)
+            images.append(image)
+            frame = av.VideoFrame.from_ndarray(image, format="bgr24")
+            if times_ms:
+                frame.pts, frame.time_base = times_ms[number], Fraction(1, 1000)
+            for packet in stream.encode(frame):
+                container.mux(packet)
+        for packet in stream.encode(None):
+            container.mux(packet)
+    return images
