@@ -232,7 +232,8 @@ def run(
     report = Report()
     planes = read_planes(opened, prefix)
     for job in jobs:
-        if planes is None and job.transform.reads in (DETECTIONS, TRACKS) and job.stage in ("track", "sample"):
+        # A guessed scale is guessed anew from new detections; a given one stands.
+        if (planes is None and job.stage in ("track", "sample")) or (job.stage == "track" and _is_assumed(planes)):
             planes = _assume_plane(opened, prefix, made, job.source, say)
         transform = _in_context(opened, prefix, job, made, planes or ())
         input_digest, frames = _input(opened, job, made, progress)
@@ -334,13 +335,18 @@ def read_planes(opened: log.Log, prefix: str) -> Planes | None:
     return [(frame.t_ns, rows_to_plane(frame.rows)) for frame in frames] or None
 
 
+def _is_assumed(planes: Planes | None) -> bool:
+    return planes is not None and all(plane.assumed for _, plane in planes)
+
+
 def _assume_plane(opened: log.Log, prefix: str, made: dict[str, Made], source: str, say: Say) -> Planes | None:
     """Guess a scale from the boxes where nobody gave a ground plane; it becomes a channel that says so."""
     if source in made:
-        frames = made[source].frames
+        frames, known = made[source].frames, made[source].provenance
     else:
-        schema = SCHEMAS[opened.channel(source).schema_name]
-        frames = opened.frames(source, schema)
+        channel = opened.channel(source)
+        frames = opened.frames(source, SCHEMAS[channel.schema_name])
+        known = Provenance.from_metadata(channel.metadata) or Provenance("", {})
     rows = np.concatenate([frame.rows[["x_px", "y_px", "w_px", "h_px"]] for frame in frames]) if frames else None
     if rows is None or not np.isfinite(rows["h_px"]).any():
         return None  # nothing in pixels: nothing to bring to metres
@@ -353,7 +359,7 @@ def _assume_plane(opened: log.Log, prefix: str, made: dict[str, Made], source: s
     )
     start = frames[0].t_ns
     messages = [(start, 0, GROUND_PLANE.codec.encode(plane_to_rows(plane)))]
-    provenance = Provenance(_ASSUME, {}, source, "", digest(messages))
+    provenance = Provenance(_ASSUME, {}, source, known.digest, digest(messages))
     made[f"{prefix}/ground_plane"] = Made(GROUND_PLANE, [Frame(start, 0, plane_to_rows(plane))], provenance, messages)
     return [(start, plane)]
 
@@ -364,7 +370,8 @@ def _write(opened: log.Log, prefix: str, made: Mapping[str, Made], planes: Plane
     picture_ns = opened.times(video) if video in opened.channels else np.empty(0, np.int64)
     shown = {topic: (channel.schema, channel.frames, channel.provenance.digest) for topic, channel in made.items()}
     if truth in opened.channels and truth + views.SUFFIX not in opened.channels:
-        shown[truth] = (TRACKS, opened.frames(truth, TRACKS), "")
+        known = Provenance.from_metadata(opened.channel(truth).metadata)
+        shown[truth] = (TRACKS, opened.frames(truth, TRACKS), known.digest if known else "")
     outdated = {topic + views.SUFFIX for topic in made}
     with log.extend(opened, output, drop={*made, *outdated}, drop_attachments=[LAYOUT]) as writer:
         for topic, channel in made.items():

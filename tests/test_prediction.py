@@ -168,7 +168,7 @@ class TestPredictors:
         rng, step, fine, people = np.random.default_rng(known), 0.4, 8, 20_000
         speed = rng.normal(0, SPEED_M_PER_S, people)
         place, path = np.zeros(people), []
-        for tick in range(known + 12):
+        for _ in range(known + 12):
             path.append(place.copy())
             for _ in range(fine):
                 kick = rng.normal(0, np.sqrt(DRIFT_M2_PER_S3 * step / fine), people)

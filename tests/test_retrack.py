@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -197,7 +198,7 @@ class TestBranches:
         def switches(profile):
             _, online, _ = run(profile, walk(pair, 60))
             sources = [dict(zip(ids(f), f.rows["source_id"].tolist(), strict=True)) for f in online[3:]]
-            return sum(a != b for a, b in zip(sources, sources[1:], strict=False))
+            return sum(a != b for a, b in pairwise(sources))
 
         assert switches(DEFAULT) < switches(replace(DEFAULT, same_source=0.0))
 
@@ -340,7 +341,7 @@ class TestFailuresOfThePaper:
         def drift(profile) -> float:
             _, _, predictions = run(profile, frames)
             futures = [np.stack([f.rows["x_m"], f.rows["y_m"]], -1) for f in predictions if len(f.rows) == 12]
-            steps = [np.hypot(*(a[1:] - b[:-1]).T).mean() for a, b in zip(futures, futures[1:], strict=False)]
+            steps = [np.hypot(*(a[1:] - b[:-1]).T).mean() for a, b in pairwise(futures)]
             return float(np.mean(steps))
 
         raw = replace(PAPER, alpha=1.0, beta=0.0)

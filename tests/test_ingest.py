@@ -1,0 +1,243 @@
+"""Label files, homographies, and logs made of whatever exists."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mcaptrack import foxglove, log
+from mcaptrack.errors import McaptrackError
+from mcaptrack.ingest import IngestOptions, ingest, label_frames
+from mcaptrack.ingest.labels import read_homography, read_labels
+from mcaptrack.provenance import CLOCK, Provenance
+from mcaptrack.schema import DETECTIONS, GROUND_PLANE, TRACKS
+from mcaptrack.schema.ground import plane_to_rows, rows_to_plane
+from mcaptrack.scene import demo_scene
+from tests.worlds import ids, ns, write_clip
+
+MOT15 = "1,3,10,20,4,8,1,-1,-1,-1\n2,3,11,20,4,8,0.5,-1,-1,-1\n1,5,50,60,4,8,1,-1,-1,-1\n"
+MOT17 = "1,1,10,20,4,8,1,1,1.0\n1,2,10,20,4,8,1,7,1.0\n1,3,10,20,4,8,0,1,1.0\n2,1,11,20,4,8,1,1,0.5\n"
+SDD = '0 10 20 14 28 0 0 0 0 "Pedestrian"\n0 11 20 15 28 1 0 0 1 "Pedestrian"\n4 1 1 9 9 1 0 0 0 "Biker"\n0 12 20 16 28 2 1 0 1 "Pedestrian"\n'
+TRAJNET = "0 7 1.5 2.5\n12 7 1.6 2.5\n12 9 3.0 4.0\n24 7 1.7 2.5\n"
+OBSMAT = "780 1 8.46 0 3.59 1.67 0 0.17\n786 1 9.13 0 3.66 1.67 0 0.17\n"
+
+
+def write(path: Path, text: str) -> Path:
+    path.write_text(text)
+    return path
+
+
+class TestLabels:
+    def test_mot15_by_hand(self, tmp_path):
+        labels = read_labels(write(tmp_path / "a.txt", MOT15))
+        assert (labels.format, labels.first_frame, labels.step) == ("mot", 1, 1)
+        assert labels.frame.tolist() == [1, 1, 2]
+        assert labels.id.tolist() == [3, 5, 3]
+        assert labels.boxes_px.tolist() == [[10, 20, 4, 8], [50, 60, 4, 8], [11, 20, 4, 8]]
+        assert labels.score.tolist() == [1, 1, 0.5]
+
+    def test_mot17_truth_counts_people_that_count(self, tmp_path):
+        path = write(tmp_path / "gt.txt", MOT17)
+        truth = read_labels(path, role="truth")
+        assert list(zip(truth.frame.tolist(), truth.id.tolist(), strict=True)) == [(1, 1), (2, 1)]
+        assert truth.left_out == "2 boxes that don't count (score 0 or a class but 1)"
+        assert len(read_labels(path, role="tracks").frame) == 4
+
+    def test_a_frame_0_says_that_frames_count_from_0(self, tmp_path):
+        assert read_labels(write(tmp_path / "a.txt", "0,1,1,1,2,2\n5,1,1,1,2,2\n")).first_frame == 0
+
+    def test_sdd_by_hand(self, tmp_path):
+        labels = read_labels(write(tmp_path / "a.txt", SDD))
+        assert (labels.format, labels.first_frame) == ("sdd", 0)
+        assert labels.boxes_px.tolist() == [[10, 20, 4, 8], [11, 20, 4, 8]]
+        assert labels.left_out == "1 boxes of others than pedestrians and 1 boxes out of sight (lost)"
+
+    @pytest.mark.parametrize("text", [TRAJNET, TRAJNET.replace(" ", ","), TRAJNET.replace(" ", "\t")])
+    def test_trajnet_by_hand(self, tmp_path, text):
+        labels = read_labels(write(tmp_path / "a.txt", text))
+        assert (labels.format, labels.step) == ("trajnet", 12)
+        assert labels.xy_m.tolist() == [[1.5, 2.5], [1.6, 2.5], [3.0, 4.0], [1.7, 2.5]]
+        assert labels.boxes_px is None
+
+    def test_obsmat_by_hand(self, tmp_path):
+        labels = read_labels(write(tmp_path / "obsmat.txt", OBSMAT))
+        assert (labels.format, labels.step) == ("obsmat", 6)
+        assert labels.xy_m.tolist() == [[8.46, 3.59], [9.13, 3.66]]
+
+    def test_blank_lines_and_remarks_are_passed_over(self, tmp_path):
+        assert len(read_labels(write(tmp_path / "a.txt", f"# remark\n\n{MOT15}\n")).frame) == 3
+
+    BAD = {
+        "letters": ("1,1,1,1,2,2\n2,1,x,1,2,2\n", "auto", r"a\.txt:2: not MOTChallenge .*not all are numbers: 2,1,x"),
+        "columns": ("1,1,1,1,2,2\n2,1,3\n", "auto", r"a\.txt:2: not MOTChallenge .*3 columns"),
+        "another format": (MOT15, "trajnet", r"a\.txt:1: not TrajNet \(frame id x y\), 10 columns"),
+        "no format": ("hello world\n", "auto", r"a\.txt:1: 2 columns are of no label format"),
+        "half a frame": ("1.5,1,1,1,2,2\n", "auto", r"a\.txt:1: the frame has to be a whole number from 0 on, not 1\.5"),
+        "negative width": ("1,1,1,1,-2,2\n", "auto", r"a\.txt:1: a box can't be -2 wide"),
+        "not a number": ("1,1,nan,1,2,2\n", "auto", r"a\.txt:1: a number is not finite"),
+        "twice in one frame": ("1,4,1,1,2,2\n1,4,5,5,2,2\n", "auto", r"id 4 appears twice in frame 1"),
+        "nothing": ("\n\n", "auto", "holds no labels"),
+        "sdd without people": (SDD.replace("Pedestrian", "Cart"), "sdd", "holds no pedestrians, only Biker, Cart"),
+        "words in a score": ("1,1,1,1,2,2,high\n", "auto", "not all are numbers"),
+    }
+
+    @pytest.mark.parametrize(("text", "label_format", "words"), BAD.values(), ids=BAD)
+    def test_what_is_wrong_says_its_line(self, tmp_path, text, label_format, words):
+        with pytest.raises(McaptrackError, match=words):
+            read_labels(write(tmp_path / "a.txt", text), label_format)
+
+    def test_what_is_no_text_is_said(self, tmp_path):
+        (tmp_path / "a.txt").write_bytes(b"\xff\xfe\x00\x00" * 10)
+        with pytest.raises(McaptrackError, match="it is not text"):
+            read_labels(tmp_path / "a.txt")
+        with pytest.raises(McaptrackError, match="can't be read"):
+            read_labels(tmp_path / "none.txt")
+
+    @pytest.mark.parametrize("text", ["1,0,0\n0,1,0\n0,0,1\n", "1 0 0\n0 1 0\n0 0 1", "1.0e0\t0\t0\n0,1,0\n0 0 1\n"])
+    def test_homographies_by_comma_or_blank(self, tmp_path, text):
+        assert read_homography(write(tmp_path / "h.txt", text)) == (1, 0, 0, 0, 1, 0, 0, 0, 1)
+
+    @pytest.mark.parametrize("text", ["", "1 2 3\n4 5\n", "1 2 3\n4 5 6\n7 8 9\n1 2 3\n", "a b c\n1 2 3\n1 2 3\n"])
+    def test_what_is_no_homography_is_refused(self, tmp_path, text):
+        with pytest.raises(McaptrackError, match="is no homography: 3 rows of 3 numbers"):
+            read_homography(write(tmp_path / "h.txt", text))
+
+    def test_planes_come_back_from_their_channel(self):
+        plane = demo_scene().ground_plane()
+        assert rows_to_plane(GROUND_PLANE.codec.decode(GROUND_PLANE.codec.encode(plane_to_rows(plane)))) == plane
+
+
+@pytest.fixture
+def clip(tmp_path) -> Path:
+    write_clip(tmp_path / "clip.mp4", options={"bf": "0", "g": "10"})
+    return tmp_path / "clip.mp4"
+
+
+def options(**given) -> IngestOptions:
+    return IngestOptions(**given)
+
+
+class TestIngest:
+    def test_a_video_with_everything_beside_it(self, tmp_path, clip):
+        truth = write(tmp_path / "gt.txt", MOT15)
+        plane = write(tmp_path / "h.txt", "0.1,0,0\n0,0.1,0\n0,0,1\n")
+        out = tmp_path / "a.mcap"
+        report = ingest(clip, out, options(ground_plane=plane, labels={"truth": truth}, start_ns=ns(100)))
+        assert report.messages == {"/camera/video": 20, "/camera/ground_plane": 1, "/camera/truth": 20}
+        assert report.lost == []
+        with log.read(out) as opened:
+            video = list(opened.messages("/camera/video"))
+            assert [m.t_ns for m in video] == [ns(100 + n / 10) for n in range(20)]
+            image_format, data = foxglove.unpack_picture(opened.channel("/camera/video").schema_name, video[3].payload)
+            assert (image_format, data[:3]) == ("h264", b"\x00\x00\x00"[:3])
+            frames = opened.frames("/camera/truth", TRACKS)
+            assert [(f.t_ns, f.index) for f in frames] == [(ns(100 + n / 10), n) for n in range(20)]
+            assert [ids(f) for f in frames[:3]] == [[3, 5], [3], []]  # frame 1 of the file is the first picture
+            np.testing.assert_allclose([frames[0].rows["x_m"][0], frames[0].rows["y_m"][0]], [1.2, 2.8])
+            assert opened.metadata(CLOCK) == {"start_ns": str(ns(100))}
+            made = Provenance.from_metadata(opened.channel("/camera/truth").metadata)
+            assert (made.transform, made.parameters) == ("ingest", {"file": "gt.txt", "format": "mot"})
+
+    def test_labels_of_every_twelfth_frame_leave_the_others_unsaid(self, tmp_path, clip):
+        truth = write(tmp_path / "gt.txt", TRAJNET.replace("24 7", "36 7"))
+        out = tmp_path / "a.mcap"
+        report = ingest(clip, out, options(labels={"truth": truth}))
+        assert report.messages["/camera/truth"] == 2  # frames 0 and 12 of 20
+        assert "1 labels are of frames after the video's last" in report.lost[0]
+
+    def test_labels_alone_keep_their_own_clock(self, tmp_path):
+        out = tmp_path / "a.mcap"
+        ingest(write(tmp_path / "world.txt", TRAJNET), out, options())
+        with log.read(out) as opened:
+            frames = opened.frames("/camera/tracks", TRACKS)
+            assert [(f.t_ns, f.index, ids(f)) for f in frames] == [(0, 0, [7]), (ns(0.4), 12, [7, 9]), (ns(0.8), 24, [7])]
+
+    def test_label_files_of_one_log_share_a_clock(self, tmp_path):
+        """Boxes at every frame that begin at frame 8, truth at every twelfth: both count from the same frame 0."""
+        found = write(tmp_path / "det.txt", "".join(f"{n},-1,10,20,4,8,1,-1,-1,-1\n" for n in range(8, 30)))
+        truth = write(tmp_path / "gt.txt", TRAJNET)
+        out = tmp_path / "a.mcap"
+        ingest(found, out, options(fps=Fraction(30), labels={"truth": truth}))
+        with log.read(out) as opened:
+            assert opened.frames("/camera/detections", DETECTIONS)[0].t_ns == ns(8 / 30)
+            assert [f.t_ns for f in opened.frames("/camera/truth", TRACKS)] == [0, ns(0.4), ns(0.8)]
+            assert opened.metadata(CLOCK) == {"start_ns": "0"}
+
+    def test_empty_frames_between_labels_say_nobody(self, tmp_path):
+        out = tmp_path / "a.mcap"
+        ingest(write(tmp_path / "t.txt", "1,4,1,1,2,2\n2,4,1,1,2,2\n5,4,1,1,2,2\n"), out, options(fps=Fraction(10)))
+        with log.read(out) as opened:
+            assert [len(f.rows) for f in opened.frames("/camera/tracks", TRACKS)] == [1, 1, 0, 0, 1]
+
+    def test_the_frame_rate_of_a_sequence_is_read_beside_it(self, tmp_path):
+        (tmp_path / "gt").mkdir()
+        write(tmp_path / "seqinfo.ini", "[Sequence]\nname=x\nframeRate=14\n")
+        out = tmp_path / "a.mcap"
+        ingest(write(tmp_path / "gt" / "gt.txt", MOT15), out, options(role="truth"))
+        with log.read(out) as opened:
+            assert [f.t_ns for f in opened.frames("/camera/truth", TRACKS)] == [ns(1 / 14), ns(2 / 14)]
+
+    def test_labels_are_added_to_a_log_that_stands(self, tmp_path, clip):
+        out = tmp_path / "a.mcap"
+        ingest(clip, out, options())
+        before = out.read_bytes()
+        found = write(tmp_path / "t.txt", "0 7 1 1\n12 7 1 2\n")
+        with log.read(out) as opened:
+            ingest(found, out, options(role="truth"), into=opened)
+        with log.read(out) as opened:
+            assert sorted(opened.channels) == ["/camera/truth", "/camera/video"]
+        assert before[100:2000] in out.read_bytes()
+        with log.read(out) as opened, pytest.raises(McaptrackError, match="has /camera/truth already; --force replaces"):
+            ingest(found, out, options(role="truth"), into=opened)
+        with log.read(out) as opened:
+            ingest(found, out, options(role="truth"), into=opened, force=True)
+
+    def test_another_camera_lives_under_its_own_name(self, tmp_path, clip):
+        out = tmp_path / "a.mcap"
+        assert list(ingest(clip, out, options(camera="gate/east")).messages) == ["/gate/east/video"]
+        with pytest.raises(McaptrackError, match="a camera's name is made of"):
+            ingest(clip, out, options(camera="../x y"))
+
+    REFUSED = {
+        "labels of boxes that know nobody": ({"labels": {"truth": "0,-1,1,1,2,2\n"}}, "says of nobody who it is"),
+        "detections in metres": ({"labels": {"detections": TRAJNET}}, "holds positions, not boxes"),
+        "a singular plane": ({"ground_plane": "1 0 0\n2 0 0\n0 0 1\n"}, "the homography is singular"),
+        "no plane at all": ({"ground_plane": "1 0\n"}, "is no homography"),
+        "labels after the end": ({"labels": {"truth": "900,1,1,1,2,2\n"}}, "all labels are of frames after"),
+        "a role for a video": ({"role": "truth"}, "is no label file; --as is for those"),
+    }
+
+    @pytest.mark.parametrize(("given", "words"), REFUSED.values(), ids=REFUSED)
+    def test_what_is_refused_leaves_nothing_behind(self, tmp_path, clip, given, words):
+        named = dict(given)
+        if "labels" in named:
+            named["labels"] = {role: write(tmp_path / f"{role}.txt", text) for role, text in named["labels"].items()}
+        if "ground_plane" in named:
+            named["ground_plane"] = write(tmp_path / "h.txt", named["ground_plane"])
+        before = sorted(tmp_path.iterdir())
+        with pytest.raises(McaptrackError, match=words):
+            ingest(clip, tmp_path / "a.mcap", options(**named))
+        assert sorted(tmp_path.iterdir()) == before
+
+    def test_labels_alone_need_a_clock(self, tmp_path):
+        with pytest.raises(McaptrackError, match="has no clock of its own; give the frames per second with --fps"):
+            ingest(write(tmp_path / "a.txt", MOT15), tmp_path / "a.mcap", options())
+
+    def test_input_and_output_are_not_one(self, clip):
+        with pytest.raises(McaptrackError, match="is both input and output"):
+            ingest(clip, clip, options())
+
+    @pytest.mark.parametrize("name", ["a.mcap", "a.bag", "a.db3"])
+    def test_logs_are_not_ingested_as_videos(self, tmp_path, name):
+        (tmp_path / name).write_bytes(b"\x89MCAP")
+        with pytest.raises(McaptrackError, match="is a log, not a video"):
+            ingest(tmp_path / name, tmp_path / "b.mcap", options())
+
+    def test_label_files_can_be_compared_without_a_log(self, tmp_path):
+        both = label_frames(
+            {"tracks": write(tmp_path / "t.txt", MOT15), "truth": write(tmp_path / "g.txt", MOT15)}, None, None, "foot"
+        )
+        assert [ids(f) for f in both["truth"]] == [ids(f) for f in both["tracks"]] == [[3, 5], [3]]

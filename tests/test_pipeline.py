@@ -1,0 +1,290 @@
+"""Stages on logs: what runs first, what is replaced, what a log says of its making. And the whole line, end to end."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap_protobuf.decoder import DecoderFactory
+
+from mcaptrack import demo, log, pipeline
+from mcaptrack.errors import McaptrackError
+from mcaptrack.evaluation import EvaluateOptions, evaluate, sequence_of_log
+from mcaptrack.ingest import IngestOptions, ingest
+from mcaptrack.provenance import Provenance
+from mcaptrack.schema import DETECTIONS, GROUND_PLANE, PREDICTIONS, TRACKS
+from mcaptrack.schema.ground import rows_to_plane
+from mcaptrack.transforms import PROFILES, Detect, Predict, Retrack, Sample, Sort
+from tests.worlds import small_scene
+
+ROWS = ("detections", "tracks", "samples", "predictions", "retracks", "retracks/online", "retracks/predictions")
+
+
+@pytest.fixture(scope="module")
+def footage(tmp_path_factory) -> demo.Footage:
+    return demo.draw(small_scene(9.0), tmp_path_factory.mktemp("footage"))
+
+
+@pytest.fixture
+def fresh(footage, tmp_path) -> Path:
+    """A log with a video, its ground plane and its truth."""
+    options = IngestOptions(ground_plane=footage.ground_plane, labels={"truth": footage.truth})
+    ingest(footage.video, tmp_path / "a.mcap", options)
+    return tmp_path / "a.mcap"
+
+
+@pytest.fixture(scope="module")
+def finished(footage, tmp_path_factory) -> Path:
+    """The same, with everything run on it. Not to be changed."""
+    path = tmp_path_factory.mktemp("finished") / "a.mcap"
+    ingest(footage.video, path, IngestOptions(ground_plane=footage.ground_plane, labels={"truth": footage.truth}))
+    run_all(path)
+    return path
+
+
+def run_all(path: Path) -> tuple[pipeline.Report, list[str]]:
+    said: list[str] = []
+    with log.read(path) as opened:
+        return pipeline.run(opened, "/camera", pipeline.plan_all(opened, "/camera", said.append), say=said.append), said
+
+
+def run_stage(path: Path, name: str, transform, output: Path | None = None, **topics) -> tuple[pipeline.Report, list[str]]:
+    said: list[str] = []
+    with log.read(path) as opened:
+        jobs = pipeline.plan_stage(opened, "/camera", name, transform, say=said.append, **topics)
+        return pipeline.run(opened, "/camera", jobs, output, say=said.append), said
+
+
+def digests(path: Path) -> dict[str, str]:
+    """What each channel holds."""
+    with log.read(path) as opened:
+        return {
+            topic: hashlib.sha256(b"".join(m.t_ns.to_bytes(8, "big") + m.payload for m in opened.messages(topic))).hexdigest()
+            for topic in opened.channels
+        }
+
+
+def test_a_missing_input_is_made_first_and_said(fresh):
+    report, said = run_stage(fresh, "retrack", Retrack())
+    assert report.stages == ["detect", "track", "sample", "retrack"]
+    assert said == [
+        "/camera/detections is missing: running detect",
+        "/camera/tracks is missing: running track",
+        "/camera/samples is missing: running sample",
+    ]
+    with log.read(fresh) as opened:
+        assert {"/camera/retracks", "/camera/retracks/online", "/camera/retracks/predictions"} <= set(opened.channels)
+        assert "/camera/predictions" not in opened.channels
+
+
+def test_everything_is_run_once(fresh):
+    report, _ = run_all(fresh)
+    assert report.stages == ["detect", "track", "sample", "predict", "retrack"]
+    before = fresh.read_bytes()
+    report, said = run_all(fresh)
+    assert (report.stages, said) == ([], [])
+    assert fresh.read_bytes() == before
+
+
+def test_a_stage_run_again_replaces_its_channels_and_nothing_else(fresh):
+    run_all(fresh)
+    before = digests(fresh)
+    run_stage(fresh, "retrack", PROFILES["paper"])
+    after = digests(fresh)
+    assert set(after) == set(before)
+    changed = {topic for topic in after if after[topic] != before[topic]}
+    assert changed <= {topic for topic in after if topic.startswith("/camera/retracks")}
+    assert "/camera/retracks/predictions" in changed
+    run_stage(fresh, "retrack", Retrack())
+    assert digests(fresh) == before
+
+
+def test_what_was_made_from_something_replaced_is_said_and_made_again_as_it_was(fresh):
+    run_stage(fresh, "track", Sort(max_age_s=0.7))
+    run_all(fresh)
+    report, _ = run_stage(fresh, "detect", Detect(method="mog2"))
+    assert report.stale == ["/camera/tracks"]
+    with log.read(fresh) as opened:
+        assert pipeline.is_stale(opened, "/camera/tracks")
+        assert not pipeline.is_stale(opened, "/camera/samples")  # not yet: it still comes from the tracks there are
+    report, said = run_all(fresh)
+    assert report.stages == ["track", "sample", "predict", "retrack"]
+    assert said[0] == "/camera/tracks was made from an earlier /camera/detections: running track again, as before"
+    with log.read(fresh) as opened:
+        made = {topic: Provenance.from_metadata(c.metadata) for topic, c in opened.channels.items()}
+        assert made["/camera/tracks"].parameters["max_age_s"] == 0.7
+        assert made["/camera/detections"].parameters["method"] == "mog2"
+        assert [topic for topic in opened.channels if pipeline.is_stale(opened, topic)] == []
+
+
+def test_other_topics_can_be_read_and_written(fresh):
+    run_stage(fresh, "track", Sort(), target="/camera/tracks/strict")
+    run_stage(fresh, "sample", Sample(), source="/camera/tracks/strict", target="/camera/other")
+    with log.read(fresh) as opened:
+        assert Provenance.from_metadata(opened.channel("/camera/other").metadata).input == "/camera/tracks/strict"
+        assert "/camera/tracks" not in opened.channels
+
+
+def test_outputs_that_are_not_wanted_stay_out(fresh):
+    run_stage(fresh, "retrack", Retrack(), keep=("online", "predictions"))
+    with log.read(fresh) as opened:
+        assert "/camera/retracks/online" in opened.channels
+        assert "/camera/retracks" not in opened.channels
+
+
+def test_another_file_is_written_and_the_log_left_alone(fresh, tmp_path):
+    before = fresh.read_bytes()
+    run_stage(fresh, "detect", Detect(), output=tmp_path / "b.mcap")
+    assert fresh.read_bytes() == before
+    with log.read(tmp_path / "b.mcap") as opened:
+        assert "/camera/detections" in opened.channels
+
+
+def test_a_log_without_what_is_needed_says_what_there_is_and_what_to_do(fresh, tmp_path):
+    with log.create(tmp_path / "empty.mcap") as writer:
+        writer.add_channel("/imu", ("x", "jsonschema", b"{}"), "json", {})
+    with pytest.raises(McaptrackError, match=r"has no channel /camera/video for detect; it has /imu\. add pictures with"):
+        run_stage(tmp_path / "empty.mcap", "retrack", Retrack())
+    with pytest.raises(McaptrackError, match=r"has no channel /nope for track; it has .*/camera/video.*mcaptrack info"):
+        run_stage(fresh, "track", Sort(), source="/nope")
+    with pytest.raises(McaptrackError, match=r"/camera/video holds foxglove\.CompressedVideo; track reads mcaptrack\.Detections"):
+        run_stage(fresh, "track", Sort(), source="/camera/video")
+
+
+def test_a_failure_in_the_middle_leaves_the_log_as_it_was(fresh, monkeypatch):
+    before = fresh.read_bytes()
+
+    def tired(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Predict, "__call__", tired)
+    with pytest.raises(KeyboardInterrupt):
+        run_all(fresh)
+    assert fresh.read_bytes() == before
+    assert list(fresh.parent.iterdir()) == [fresh]
+
+
+def test_without_a_ground_plane_a_scale_is_guessed_said_and_kept(footage, tmp_path):
+    path = tmp_path / "a.mcap"
+    ingest(footage.video, path, IngestOptions())
+    _, said = run_all(path)
+    assert any("no ground plane is known: taking" in words for words in said)
+    with log.read(path) as opened:
+        (frame,) = opened.frames("/camera/ground_plane", GROUND_PLANE)
+        plane = rows_to_plane(frame.rows)
+        heights = np.concatenate([f.rows["h_px"] for f in opened.frames("/camera/detections", DETECTIONS)])
+        assert plane.assumed
+        assert plane.homography[0] == pytest.approx(1.7 / np.median(heights))
+        assert any(len(f.rows) for f in opened.frames("/camera/predictions", PREDICTIONS))
+
+
+def test_labels_alone_are_sampled_predicted_and_retracked(tmp_path):
+    lines = [f"{12 * n} {who} {0.4 * n + who} {who * 5.0}" for n in range(20) for who in (1, 2)]
+    (tmp_path / "world.txt").write_text("\n".join(lines))
+    path = tmp_path / "a.mcap"
+    ingest(tmp_path / "world.txt", path, IngestOptions())
+    report, _ = run_all(path)
+    assert report.stages == ["sample", "predict", "retrack"]
+    with log.read(path) as opened:
+        samples, tracks = opened.frames("/camera/samples", TRACKS), opened.frames("/camera/tracks", TRACKS)
+        assert [f.t_ns for f in samples] == [f.t_ns for f in tracks]
+        assert not any(topic.endswith("/view/image") for topic in opened.channels)
+
+
+def test_two_cameras_share_a_log(footage, fresh):
+    with log.read(fresh) as opened:
+        ingest(footage.video, fresh, IngestOptions(camera="gate"), into=opened)
+    with log.read(fresh) as opened:
+        assert pipeline.find_camera(opened, None) == "/camera"
+        assert pipeline.find_camera(opened, "gate") == "/gate"
+        assert pipeline.find_camera(opened, None, "/gate/video") == "/gate"
+        pipeline.run(opened, "/gate", pipeline.plan_stage(opened, "/gate", "detect", Detect()))
+    with log.read(fresh) as opened:
+        assert "/gate/detections" in opened.channels
+        assert "/camera/detections" not in opened.channels
+
+
+class TestTheWholeLine:
+    def test_the_log_is_complete(self, finished):
+        with log.read(finished) as opened:
+            pictures = opened.times("/camera/video").tolist()
+            for name in ROWS:
+                assert f"/camera/{name}" in opened.channels
+            for name in ("detections", "tracks", "predictions", "retracks", "retracks/predictions", "truth"):
+                assert opened.times(f"/camera/{name}/view/image").tolist() == pictures
+            assert [f.t_ns for f in opened.frames("/camera/detections", DETECTIONS)] == pictures
+            ticks = opened.times("/camera/samples").tolist()
+            assert ticks == [round(0.4e9 * n) for n in range(len(ticks))]
+            assert opened.times("/camera/retracks").tolist() == opened.times("/camera/predictions").tolist() == ticks
+            assert opened.index.attachments == ["mcaptrack.layout.json"]
+
+    def test_the_stock_reader_reads_it_equal(self, finished):
+        with log.read(finished) as opened, finished.open("rb") as stream:
+            reader = make_reader(stream, validate_crcs=True, decoder_factories=[DecoderFactory()])
+            frames = {topic: iter(opened.frames(topic, TRACKS)) for topic in ("/camera/tracks", "/camera/retracks")}
+            for _, _, message, decoded in reader.iter_decoded_messages(topics=list(frames)):
+                topic = next(t for t in frames if opened.channels[t].id == message.channel_id)
+                frame = next(frames[topic])
+                assert (message.log_time, message.sequence) == (frame.t_ns, frame.index)
+                assert [row.track_id for row in decoded.rows] == frame.rows["track_id"].tolist()
+                np.testing.assert_array_equal([row.x_m for row in decoded.rows], frame.rows["x_m"])
+            assert all(next(rest, None) is None for rest in frames.values())
+
+    def test_every_channel_says_how_it_was_made(self, finished):
+        with log.read(finished) as opened:
+            for topic, channel in opened.channels.items():
+                made = Provenance.from_metadata(channel.metadata)
+                assert made.version
+                if made.transform not in ("ingest",):
+                    assert made.input in opened.channels
+                if made.transform in pipeline.ROUTES:
+                    source = Provenance.from_metadata(opened.channel(made.input).metadata)
+                    assert made.input_digest == source.digest or made.input == "/camera/video"
+                    json.dumps(made.parameters)
+                assert str(finished.parent) not in str(channel.metadata), topic
+
+    def test_the_same_video_gives_the_same_bytes(self, finished, fresh):
+        run_all(fresh)
+        assert fresh.read_bytes() == finished.read_bytes()
+
+    def test_people_are_found_where_they_are(self, finished):
+        with log.read(finished) as opened:
+            outcome = evaluate([sequence_of_log(opened, "/camera", [])], EvaluateOptions(gates_m=(1.0,)))
+        rows = {(r.tracks, r.similarity): r.to_json() for r in outcome.results}
+        assert rows["/camera/tracks", "iou"]["MOTA"] > 0.4
+        assert rows["/camera/samples", "metres"]["MOTA"] > 0.5
+        assert rows["/camera/retracks", "metres"]["MOTA"] > 0.5
+        assert rows["/camera/retracks", "metres"]["mode"] == "offline"
+        assert rows["/camera/retracks/online", "metres"]["mode"] == "online"
+        assert rows["/camera/retracks/online", "metres"]["displacement"]["ADE_m"] < 1.5
+
+    def test_online_tracks_and_forecasts_know_nothing_of_the_future(self, finished, tmp_path):
+        """Cut the video in half: what was written of the first half stays as it was."""
+        with log.read(finished) as opened:
+            frames = opened.frames("/camera/samples", TRACKS)
+            whole = {name: opened.frames(f"/camera/{name}", schema) for name, schema in (("retracks/online", TRACKS), ("retracks/predictions", PREDICTIONS), ("predictions", PREDICTIONS))}
+        half = frames[: len(frames) // 2]
+        _, online, predictions = zip(*Retrack()(half), strict=True)
+        plain = [frame for (frame,) in Predict()(half)]
+        for name, part in (("retracks/online", online), ("retracks/predictions", predictions), ("predictions", plain)):
+            for cut, full in zip(part, whole[name], strict=False):
+                assert cut.t_ns == full.t_ns
+                np.testing.assert_array_equal(cut.rows["track_id"], full.rows["track_id"])
+                np.testing.assert_array_equal(cut.rows["x_m"], full.rows["x_m"])
+
+
+def test_a_guessed_scale_is_guessed_anew_from_new_detections(footage, tmp_path):
+    path = tmp_path / "a.mcap"
+    ingest(footage.video, path, IngestOptions())
+    run_all(path)
+    run_stage(path, "detect", Detect(method="mog2", threshold=400.0))
+    run_all(path)
+    with log.read(path) as opened:
+        (frame,) = opened.frames("/camera/ground_plane", GROUND_PLANE)
+        heights = np.concatenate([f.rows["h_px"] for f in opened.frames("/camera/detections", DETECTIONS)])
+        assert rows_to_plane(frame.rows).homography[0] == pytest.approx(1.7 / np.median(heights))
+        assert [topic for topic in opened.channels if pipeline.is_stale(opened, topic)] == []

@@ -1,0 +1,240 @@
+"""Video in and out, with real clips made by FFmpeg."""
+
+from __future__ import annotations
+
+import struct
+from fractions import Fraction
+
+import av
+import cv2
+import numpy as np
+import pytest
+
+from mcaptrack.errors import McaptrackError
+from mcaptrack.video import Encoded, H264Encoder, brightness, encode_image, open_video, write_mp4
+from mcaptrack.video.h264 import inspect
+from mcaptrack.video.source import _images
+from tests.worlds import write_clip
+
+NO_B = {"bf": "0", "g": "10"}
+WITH_B = {"bf": "2", "g": "10"}
+
+
+def pictures(path, image_format="h264", fps=None, start_ns=0):
+    return list(open_video(path).pictures(image_format, fps, start_ns))
+
+
+def decoded(path) -> list[np.ndarray]:
+    """What FFmpeg makes of the file, as gray."""
+    with av.open(str(path)) as container:
+        return [frame.to_ndarray(format="gray") for frame in container.decode(video=0)]
+
+
+def through_the_log(made, image_format="h264") -> list[np.ndarray]:
+    return [frame.rows for frame in brightness(Encoded(p.t_ns, p.index, image_format, p.data) for p in made)]
+
+
+@pytest.mark.parametrize("name", ["a.mp4", "a.mov", "a.mkv", "a.avi"])
+def test_a_stream_that_viewers_can_play_is_passed_on_with_the_same_pictures(tmp_path, name):
+    path = tmp_path / name
+    write_clip(path, options=NO_B)
+    video = open_video(path)
+    assert video.why_transcode == ""
+    made = pictures(path)
+    with av.open(str(path)) as container:
+        sizes = [packet.size for packet in container.demux(video=0) if packet.size]
+    assert len(made) == 20
+    assert all(abs(len(p.data) - size) < 100 for p, size in zip(made, sizes, strict=True))
+    own = through_the_log(made)
+    with av.open(str(path)) as container:
+        theirs = [np.asarray(f.to_ndarray(format="yuv420p")[: f.height]) for f in container.decode(video=0)]
+    full = np.clip(np.rint((np.arange(256) - 16) * (255 / 219)), 0, 255).astype(np.uint8)
+    for ours, luma in zip(own, theirs, strict=True):
+        np.testing.assert_array_equal(ours, full[luma])
+
+
+@pytest.mark.parametrize("name", ["a.mp4", "a.mkv"])
+def test_every_message_of_a_passed_on_stream_stands_on_its_own(tmp_path, name):
+    path = tmp_path / name
+    write_clip(path, options=NO_B)
+    for picture in pictures(path):
+        unit = inspect(picture.data)
+        assert picture.data.startswith(b"\x00\x00")
+        assert unit.has_idr == unit.has_parameter_sets == (picture.index % 10 == 0)
+        assert not unit.has_b_slice
+
+
+REASONS = {
+    "b-frames": (("a.mp4", {"options": WITH_B}), "it has B-frames"),
+    "b-frames in avi, which has no times": (("a.avi", {"options": WITH_B}), "it has B-frames"),
+    "another codec": (("a.webm", {"codec": "libvpx-vp9"}), "it is vp9, not h264"),
+    "motion jpeg": (("a.avi", {"codec": "mjpeg", "pixels": "yuvj420p"}), "it is mjpeg, not h264"),
+    "more than 4:2:0": (("a.mkv", {"options": NO_B, "pixels": "yuv444p"}), "its pixels are yuv444p, not 8-bit 4:2:0"),
+    "10 bit": (("a.mkv", {"options": NO_B, "pixels": "yuv420p10le"}), "its pixels are yuv420p10le"),
+    "key frames far apart": (("a.mp4", {"options": {"bf": "0", "g": "60"}, "frames": 40}), "more than 2 s apart"),
+    "open groups": (
+        ("a.mp4", {"options": {"bf": "0", "g": "10", "x264-params": "open-gop=1:intra-refresh=1"}, "frames": 40}),
+        "open groups of pictures",
+    ),
+}
+
+
+@pytest.mark.parametrize(("clip", "reason"), REASONS.values(), ids=REASONS)
+def test_other_streams_are_encoded_again_and_the_reason_is_known(tmp_path, clip, reason):
+    name, options = clip
+    path = tmp_path / name
+    images = write_clip(path, **options)
+    video = open_video(path)
+    assert reason in video.why_transcode
+    made = pictures(path)
+    assert len(made) == len(images)
+    assert [picture.index for picture in made] == list(range(len(images)))
+    assert not any(inspect(picture.data).has_b_slice for picture in made)
+    for image, seen in zip(images, through_the_log(made), strict=True):  # in the order in which they are shown
+        gray = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+        assert np.abs(gray.astype(int) - seen).mean() < 6
+
+
+def test_times_are_those_of_the_container_to_the_nanosecond(tmp_path):
+    path = tmp_path / "a.mkv"
+    times = [n * 100 + (n % 3) * 17 for n in range(20)]
+    write_clip(path, options=NO_B, times_ms=times)
+    assert [picture.t_ns for picture in pictures(path)] == [ms * 1_000_000 for ms in times]
+    assert [picture.t_ns for picture in pictures(path, "jpeg", start_ns=5)] == [ms * 1_000_000 + 5 for ms in times]
+
+
+def test_frames_per_second_override_the_container(tmp_path):
+    path = tmp_path / "a.mp4"
+    write_clip(path, options=NO_B)
+    assert [p.t_ns for p in pictures(path, fps=Fraction(7))][:3] == [0, 142_857_143, 285_714_286]
+
+
+def test_avi_with_b_frames_is_in_order_and_evenly_spaced(tmp_path):
+    path = tmp_path / "a.avi"
+    write_clip(path, options=WITH_B)
+    assert [p.t_ns for p in pictures(path)] == [n * 100_000_000 for n in range(20)]
+
+
+@pytest.mark.parametrize("quarter_turns", [1, 2, 3])
+def test_a_turned_video_is_put_upright_as_opencv_does(tmp_path, quarter_turns):
+    path = tmp_path / "a.mp4"
+    write_clip(path, options=NO_B)
+    one = 0x10000
+    turns = {1: (0, one, -one, 0), 2: (-one, 0, 0, -one), 3: (0, -one, one, 0)}
+    a, b, c, d = turns[quarter_turns]
+    raw = bytearray(path.read_bytes())
+    at = raw.find(struct.pack(">9i", one, 0, 0, 0, one, 0, 0, 0, 0x40000000), raw.find(b"tkhd"))
+    raw[at : at + 36] = struct.pack(">9i", a, b, 0, c, d, 0, 0, 0, 0x40000000)
+    path.write_bytes(raw)
+    capture = cv2.VideoCapture(str(path))
+    _, wanted = capture.read()
+    video = open_video(path)
+    _, ours = next(iter(_images(video)))
+    assert "turned by" in video.why_transcode
+    assert (video.height_px, video.width_px) == ours.shape[:2] == wanted.shape[:2]
+    np.testing.assert_array_equal(ours, wanted)
+
+
+def test_odd_sizes_are_padded_at_the_right_and_below(tmp_path):
+    path = tmp_path / "a.mkv"
+    write_clip(path, size=(63, 47), pixels="yuv444p")
+    video = open_video(path)
+    assert (video.width_px, video.height_px) == (64, 48)
+    assert through_the_log(pictures(path))[0].shape == (48, 64)
+
+
+@pytest.mark.parametrize("image_format", ["jpeg", "png"])
+def test_pictures_can_be_kept_as_stills(tmp_path, image_format):
+    path = tmp_path / "a.mp4"
+    images = write_clip(path, options=NO_B)
+    seen = through_the_log(pictures(path, image_format), image_format)
+    gray = cv2.cvtColor(images[7], cv2.COLOR_BGR2GRAY)
+    assert np.abs(gray.astype(int) - seen[7]).mean() < 6
+
+
+def test_a_folder_of_images_is_a_video_in_the_order_of_its_numbers(tmp_path):
+    folder = tmp_path / "seq" / "img1"
+    folder.mkdir(parents=True)
+    for number in range(1, 12):
+        cv2.imwrite(str(folder / f"{number}.png"), np.full((20, 30, 3), number * 10, np.uint8))
+    (folder.parent / "seqinfo.ini").write_text("[Sequence]\nframeRate=14\n")
+    video = open_video(folder)
+    assert (video.frames, video.fps, video.why_transcode) == (11, 14, "it is a folder of images")
+    assert [int(image[0, 0, 0]) for _, image in _images(video)] == [10 * n for n in range(1, 12)]
+    (folder / "5.png").write_bytes(b"no image")
+    list(_images(video))
+    assert "5.png can't be read as an image; it is left out" in video.lost[0]
+
+
+def _audio_only(path):
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("aac", rate=8000)
+        frame = av.AudioFrame.from_ndarray(np.zeros((1, 1024), np.float32), format="fltp", layout="mono")
+        frame.sample_rate = 8000
+        for packet in [*stream.encode(frame), *stream.encode(None)]:
+            container.mux(packet)
+
+
+def _renamed_codec(path):
+    write_clip(path, options=NO_B)
+    path.write_bytes(path.read_bytes().replace(b"avc1", b"zzz1"))
+
+
+BAD = {
+    "no video": (lambda p: p.write_text("I am text"), "can't be read as a video"),
+    "nothing": (lambda p: p.write_bytes(b""), "can't be read as a video"),
+    "cut off": (lambda p: (write_clip(p, options=NO_B), p.write_bytes(p.read_bytes()[: p.stat().st_size // 2])), "can't be read as a video"),
+    "sound alone": (_audio_only, "holds no video, only audio"),
+    "unknown codec": (_renamed_codec, "in a codec that is not known here"),
+    "no images": (lambda p: p.mkdir(), "holds no images"),
+}
+
+
+@pytest.mark.parametrize(("make", "words"), BAD.values(), ids=BAD)
+def test_what_is_no_video_is_refused(tmp_path, make, words):
+    path = tmp_path / "a.mp4"
+    make(path)
+    with pytest.raises(McaptrackError, match=words):
+        open_video(path)
+
+
+def test_a_video_without_frames_is_refused(tmp_path):
+    path = tmp_path / "a.mkv"
+    write_clip(path, frames=1, options=NO_B)
+    with av.open(str(path)) as source, av.open(str(tmp_path / "b.mkv"), "w") as target:
+        target.add_stream_from_template(source.streams.video[0])
+        target.start_encoding()
+    with pytest.raises(McaptrackError, match=r"without frames|can't be read as a video"):
+        open_video(tmp_path / "b.mkv")
+
+
+def test_what_is_missing_at_the_end_is_counted(tmp_path):
+    path = tmp_path / "a.avi"
+    write_clip(path, frames=30, codec="mjpeg", pixels="yuvj420p", size=(320, 240))
+    path.write_bytes(path.read_bytes()[: path.stat().st_size * 2 // 3])
+    video = open_video(path)
+    made = list(video.pictures("h264", None, 0))
+    assert 0 < len(made) < 30
+    assert f"claims 30 frames; {len(made)} could be read" in video.lost[-1]
+
+
+def test_the_same_pictures_give_the_same_bytes(tmp_path):
+    images = write_clip(tmp_path / "a.mp4")
+    one, two = (H264Encoder(64, 48, Fraction(10)) for _ in range(2))
+    assert [one.encode(image) for image in images] == [two.encode(image) for image in images]
+    assert write_mp4(tmp_path / "b.mp4", images, 10) == write_mp4(tmp_path / "c.mp4", images, 10) == 20
+    assert (tmp_path / "b.mp4").read_bytes() == (tmp_path / "c.mp4").read_bytes()
+    assert open_video(tmp_path / "b.mp4").why_transcode == ""
+
+
+def test_brightness_is_full_range_whatever_it_came_from():
+    for level in (0, 128, 255):
+        image = np.full((48, 64, 3), level, np.uint8)
+        for image_format, data in (("jpeg", encode_image(image, "jpeg")), ("h264", H264Encoder(64, 48, Fraction(10)).encode(image))):
+            (seen,) = through_the_log([type("P", (), {"t_ns": 0, "index": 0, "data": data})], image_format)
+            assert np.abs(seen.astype(int) - level).max() <= 2, (level, image_format)
+
+
+def test_pictures_that_are_broken_say_which():
+    with pytest.raises(McaptrackError, match="frame 7 can't be decoded as jpeg"):
+        list(brightness([Encoded(0, 7, "jpeg", b"\xff\xd8 no picture")]))
