@@ -13,9 +13,9 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.ingest import IngestOptions, ingest, label_frames
 from mcaptrack.ingest.labels import read_homography, read_labels
 from mcaptrack.provenance import CLOCK, Provenance
+from mcaptrack.scene import demo_scene
 from mcaptrack.schema import DETECTIONS, GROUND_PLANE, TRACKS
 from mcaptrack.schema.ground import plane_to_rows, rows_to_plane
-from mcaptrack.scene import demo_scene
 from tests.worlds import ids, ns, write_clip
 
 MOT15 = "1,3,10,20,4,8,1,-1,-1,-1\n2,3,11,20,4,8,0.5,-1,-1,-1\n1,5,50,60,4,8,1,-1,-1,-1\n"
@@ -75,7 +75,11 @@ class TestLabels:
         "columns": ("1,1,1,1,2,2\n2,1,3\n", "auto", r"a\.txt:2: not MOTChallenge .*3 columns"),
         "another format": (MOT15, "trajnet", r"a\.txt:1: not TrajNet \(frame id x y\), 10 columns"),
         "no format": ("hello world\n", "auto", r"a\.txt:1: 2 columns are of no label format"),
-        "half a frame": ("1.5,1,1,1,2,2\n", "auto", r"a\.txt:1: the frame has to be a whole number from 0 on, not 1\.5"),
+        "half a frame": (
+            "1.5,1,1,1,2,2\n",
+            "auto",
+            r"a\.txt:1: the frame has to be a whole number from 0 on, not 1\.5",
+        ),
         "negative width": ("1,1,1,1,-2,2\n", "auto", r"a\.txt:1: a box can't be -2 wide"),
         "not a number": ("1,1,nan,1,2,2\n", "auto", r"a\.txt:1: a number is not finite"),
         "twice in one frame": ("1,4,1,1,2,2\n1,4,5,5,2,2\n", "auto", r"id 4 appears twice in frame 1"),
@@ -153,7 +157,11 @@ class TestIngest:
         ingest(write(tmp_path / "world.txt", TRAJNET), out, options())
         with log.read(out) as opened:
             frames = opened.frames("/camera/tracks", TRACKS)
-            assert [(f.t_ns, f.index, ids(f)) for f in frames] == [(0, 0, [7]), (ns(0.4), 12, [7, 9]), (ns(0.8), 24, [7])]
+            assert [(f.t_ns, f.index, ids(f)) for f in frames] == [
+                (0, 0, [7]),
+                (ns(0.4), 12, [7, 9]),
+                (ns(0.8), 24, [7]),
+            ]
 
     def test_label_files_of_one_log_share_a_clock(self, tmp_path):
         """Boxes at every frame that begin at frame 8, truth at every twelfth: both count from the same frame 0."""
@@ -190,7 +198,10 @@ class TestIngest:
         with log.read(out) as opened:
             assert sorted(opened.channels) == ["/camera/truth", "/camera/video"]
         assert before[100:2000] in out.read_bytes()
-        with log.read(out) as opened, pytest.raises(McaptrackError, match="has /camera/truth already; --force replaces"):
+        with (
+            log.read(out) as opened,
+            pytest.raises(McaptrackError, match="has /camera/truth already; --force replaces"),
+        ):
             ingest(found, out, options(role="truth"), into=opened)
         with log.read(out) as opened:
             ingest(found, out, options(role="truth"), into=opened, force=True)

@@ -52,7 +52,9 @@ def run_all(path: Path) -> tuple[pipeline.Report, list[str]]:
         return pipeline.run(opened, "/camera", pipeline.plan_all(opened, "/camera", said.append), say=said.append), said
 
 
-def run_stage(path: Path, name: str, transform, output: Path | None = None, **topics) -> tuple[pipeline.Report, list[str]]:
+def run_stage(
+    path: Path, name: str, transform, output: Path | None = None, **topics
+) -> tuple[pipeline.Report, list[str]]:
     said: list[str] = []
     with log.read(path) as opened:
         jobs = pipeline.plan_stage(opened, "/camera", name, transform, say=said.append, **topics)
@@ -63,7 +65,9 @@ def digests(path: Path) -> dict[str, str]:
     """What each channel holds."""
     with log.read(path) as opened:
         return {
-            topic: hashlib.sha256(b"".join(m.t_ns.to_bytes(8, "big") + m.payload for m in opened.messages(topic))).hexdigest()
+            topic: hashlib.sha256(
+                b"".join(m.t_ns.to_bytes(8, "big") + m.payload for m in opened.messages(topic))
+            ).hexdigest()
             for topic in opened.channels
         }
 
@@ -147,11 +151,15 @@ def test_another_file_is_written_and_the_log_left_alone(fresh, tmp_path):
 def test_a_log_without_what_is_needed_says_what_there_is_and_what_to_do(fresh, tmp_path):
     with log.create(tmp_path / "empty.mcap") as writer:
         writer.add_channel("/imu", ("x", "jsonschema", b"{}"), "json", {})
-    with pytest.raises(McaptrackError, match=r"has no channel /camera/video for detect; it has /imu\. add pictures with"):
+    with pytest.raises(
+        McaptrackError, match=r"has no channel /camera/video for detect; it has /imu\. add pictures with"
+    ):
         run_stage(tmp_path / "empty.mcap", "retrack", Retrack())
     with pytest.raises(McaptrackError, match=r"has no channel /nope for track; it has .*/camera/video.*mcaptrack info"):
         run_stage(fresh, "track", Sort(), source="/nope")
-    with pytest.raises(McaptrackError, match=r"/camera/video holds foxglove\.CompressedVideo; track reads mcaptrack\.Detections"):
+    with pytest.raises(
+        McaptrackError, match=r"/camera/video holds foxglove\.CompressedVideo; track reads mcaptrack\.Detections"
+    ):
         run_stage(fresh, "track", Sort(), source="/camera/video")
 
 
@@ -266,7 +274,14 @@ class TestTheWholeLine:
         """Cut the video in half: what was written of the first half stays as it was."""
         with log.read(finished) as opened:
             frames = opened.frames("/camera/samples", TRACKS)
-            whole = {name: opened.frames(f"/camera/{name}", schema) for name, schema in (("retracks/online", TRACKS), ("retracks/predictions", PREDICTIONS), ("predictions", PREDICTIONS))}
+            whole = {
+                name: opened.frames(f"/camera/{name}", schema)
+                for name, schema in (
+                    ("retracks/online", TRACKS),
+                    ("retracks/predictions", PREDICTIONS),
+                    ("predictions", PREDICTIONS),
+                )
+            }
         half = frames[: len(frames) // 2]
         _, online, predictions = zip(*Retrack()(half), strict=True)
         plain = [frame for (frame,) in Predict()(half)]

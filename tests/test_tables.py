@@ -69,7 +69,9 @@ def test_a_log_becomes_a_folder_that_duckdb_reads(tmp_path):
     def ask(query: str):
         return duckdb.sql(query.replace("@", f"{tmp_path}/tables")).fetchall()
 
-    assert ask("select recording, topic, frame, t_ns, track_id, x_m, x_px from '@/tracks/*/*.parquet' order by topic") == [
+    assert ask(
+        "select recording, topic, frame, t_ns, track_id, x_m, x_px from '@/tracks/*/*.parquet' order by topic"
+    ) == [
         ("walk_1", "/camera/retracks", 0, 10, 1, 1.5, None),
         ("walk_1", "/camera/tracks", 0, 10, 4, 1.5, None),
     ]
@@ -78,7 +80,9 @@ def test_a_log_becomes_a_folder_that_duckdb_reads(tmp_path):
     assert ask("select transform, input from '@/channels/*/*.parquet' where topic = '/camera/tracks'") == [
         ("track", "/camera/detections")
     ]
-    joined = "select count(*) from '@/tracks/*/*.parquet' join '@/frames/*/*.parquet' using (recording, topic, frame, t_ns)"
+    joined = (
+        "select count(*) from '@/tracks/*/*.parquet' join '@/frames/*/*.parquet' using (recording, topic, frame, t_ns)"
+    )
     assert ask(joined) == [(2,)]
     assert ask("select epoch_ns(t) - t_ns from '@/detections/*/*.parquet'") == [(0,), (0,)]
 

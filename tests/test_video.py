@@ -183,7 +183,10 @@ def _renamed_codec(path):
 BAD = {
     "no video": (lambda p: p.write_text("I am text"), "can't be read as a video"),
     "nothing": (lambda p: p.write_bytes(b""), "can't be read as a video"),
-    "cut off": (lambda p: (write_clip(p, options=NO_B), p.write_bytes(p.read_bytes()[: p.stat().st_size // 2])), "can't be read as a video"),
+    "cut off": (
+        lambda p: (write_clip(p, options=NO_B), p.write_bytes(p.read_bytes()[: p.stat().st_size // 2])),
+        "can't be read as a video",
+    ),
     "sound alone": (_audio_only, "holds no video, only audio"),
     "unknown codec": (_renamed_codec, "in a codec that is not known here"),
     "no images": (lambda p: p.mkdir(), "holds no images"),
@@ -230,7 +233,10 @@ def test_the_same_pictures_give_the_same_bytes(tmp_path):
 def test_brightness_is_full_range_whatever_it_came_from():
     for level in (0, 128, 255):
         image = np.full((48, 64, 3), level, np.uint8)
-        for image_format, data in (("jpeg", encode_image(image, "jpeg")), ("h264", H264Encoder(64, 48, Fraction(10)).encode(image))):
+        for image_format, data in (
+            ("jpeg", encode_image(image, "jpeg")),
+            ("h264", H264Encoder(64, 48, Fraction(10)).encode(image)),
+        ):
             (seen,) = through_the_log([type("P", (), {"t_ns": 0, "index": 0, "data": data})], image_format)
             assert np.abs(seen.astype(int) - level).max() <= 2, (level, image_format)
 

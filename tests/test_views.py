@@ -52,7 +52,14 @@ def drawn(message) -> list:
 
 
 FORECAST = PREDICTIONS.rows(
-    track_id=[3, 3], step=[1, 2], ahead_s=[0.4, 0.8], x_m=[1.0, 2.0], y_m=[3.0, 4.0], cov_xx_m2=[1.0, 1], cov_xy_m2=[0.0, 0], cov_yy_m2=[1.0, 1]
+    track_id=[3, 3],
+    step=[1, 2],
+    ahead_s=[0.4, 0.8],
+    x_m=[1.0, 2.0],
+    y_m=[3.0, 4.0],
+    cov_xx_m2=[1.0, 1],
+    cov_xy_m2=[0.0, 0],
+    cov_yy_m2=[1.0, 1],
 )
 CHANNELS = {
     "detections": ("/c/detections", DETECTIONS, [Frame(int(PICTURES[4]), 4, boxes_at([(50, 60)]))]),

@@ -1,10 +1,11 @@
-"""The command line: parse, call, print. One verb a question; ``mcaptrack --help`` lists them."""
+"""The command line: parse, call, print. One verb a question; ``mcaptrack --help`` lists them.
+
+The command itself is ``mcaptrack.__main__``, which loads this.
+"""
 
 from __future__ import annotations
 
-import signal
-import sys
-from typing import Annotated, NoReturn
+from typing import Annotated
 
 import typer
 
@@ -49,18 +50,3 @@ register(app, "evaluate", evaluate)
 register(app, "export", export)
 register(app, "info", info)
 register(app, "demo", demo)
-
-
-def _terminated(number: int, _: object) -> NoReturn:
-    """A polite kill leaves like Ctrl-C does: what is half written is removed."""
-    raise SystemExit(128 + number)
-
-
-def main() -> None:
-    """The ``mcaptrack`` command."""
-    signal.signal(signal.SIGTERM, _terminated)
-    try:
-        app()
-    except BrokenPipeError:  # whoever read our output has had enough
-        sys.stderr.close()
-        sys.exit(0)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import glob
+import io
 import json
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout
 from functools import wraps
 from pathlib import Path
 from time import monotonic
@@ -14,6 +15,7 @@ from typing import Annotated, Any, Final, ParamSpec
 
 import typer
 
+from mcaptrack.atomic import publish_bytes, refuse_overwrite
 from mcaptrack.cli.config import read_config
 from mcaptrack.errors import McaptrackError
 
@@ -33,6 +35,7 @@ def option(*names: str, shared: bool = False, **given: Any) -> Any:
 Output = Annotated[
     Path | None, option("--output", "-o", shared=True, help="Write to this instead; the input stays as it is.")
 ]
+Printed = Annotated[Path | None, option("--output", "-o", shared=True, help="Print to this file.")]
 Force = Annotated[bool, option("--force", shared=True, help="Replace what is there.")]
 Json = Annotated[bool, option("--json", shared=True, help="Print data for programs.")]
 Quiet = Annotated[bool, option("--quiet", "-q", shared=True, help="Say nothing but errors.")]
@@ -132,6 +135,18 @@ def one_line(command: Callable[P, None]) -> Callable[P, None]:
             raise typer.Exit(REFUSED) from None
 
     return guarded
+
+
+@contextmanager
+def printed_to(output: Path | None, force: bool) -> Iterator[None]:
+    """What is printed to stdout goes to this file instead, if there is one."""
+    if output is None:
+        yield
+        return
+    refuse_overwrite(output, force)
+    with redirect_stdout(io.StringIO()) as text:
+        yield
+    publish_bytes(output, text.getvalue().encode("utf-8"))
 
 
 def print_json(data: dict[str, Any]) -> None:

@@ -16,6 +16,7 @@ _GATE_M: Final = 1.0
 def demo(
     output: Annotated[Path, common.option("--output", "-o", help="Folder for what it makes.")] = Path("mcaptrack-demo"),
     force: common.Force = False,
+    json: common.Json = False,
     quiet: common.Quiet = False,
     verbose: common.Verbose = False,
     config: common.Config = None,
@@ -60,6 +61,9 @@ def demo(
                 EvaluateOptions(similarities=("metres",), gates_m=(_GATE_M,)),
             )
     sort, retracked = (result.to_json() for result in outcome.results)
+    if json:
+        common.print_json({"results": [sort, retracked]})
+        return
     print(_side_by_side(sort, retracked))
     print(
         f"""

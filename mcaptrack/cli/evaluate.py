@@ -77,6 +77,8 @@ def evaluate(
         common.option("--fail-under", help="Exit 4 if a score is lower, as in idf1=0.7.", show_default=False),
     ] = None,
     csv: Annotated[bool, common.option("--csv", help="Print rows for a spreadsheet.")] = False,
+    output: common.Printed = None,
+    force: common.Force = False,
     json: common.Json = False,
     quiet: common.Quiet = False,
     verbose: common.Verbose = False,
@@ -110,12 +112,13 @@ def evaluate(
         outcome = score(sequences, options, talk.detail)
         for words in outcome.notes:
             talk.say(words)
-    if json:
-        common.print_json({"results": [result.to_json() for result in outcome.results]})
-    elif csv:
-        _print_csv(outcome)
-    else:
-        print_results(outcome)
+    with common.printed_to(output, force):
+        if json:
+            common.print_json({"results": [result.to_json() for result in outcome.results]})
+        elif csv:
+            _print_csv(outcome)
+        else:
+            print_results(outcome)
     missed = [words for limit in limits for words in _misses(outcome, *limit)]
     for words in missed:
         print(words, file=sys.stderr)

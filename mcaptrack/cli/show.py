@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 @common.one_line
 def info(
     logs: common.Logs,
+    output: common.Printed = None,
+    force: common.Force = False,
     json: common.Json = False,
     quiet: common.Quiet = False,
     verbose: common.Verbose = False,
@@ -32,14 +34,15 @@ def info(
     from mcaptrack import log
 
     results = []
-    for path in common.expand(logs):
-        with log.read(path) as opened:
-            if json:
-                results.append(_as_data(opened))
-            else:
-                _print(opened, verbose)
-    if json:
-        common.print_json({"results": results})
+    with common.printed_to(output, force):
+        for path in common.expand(logs):
+            with log.read(path) as opened:
+                if json:
+                    results.append(_as_data(opened))
+                else:
+                    _print(opened, verbose)
+        if json:
+            common.print_json({"results": results})
 
 
 def _as_data(opened: Log) -> dict[str, Any]:

@@ -1,0 +1,445 @@
+"""The command line as a person and as a program use it."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from mcaptrack import __version__, demo
+from tests.worlds import small_scene, write_clip
+
+COMMANDS = ["ingest", "detect", "track", "sample", "predict", "retrack", "run", "evaluate", "export", "info", "demo"]
+
+
+def start(*words, folder: Path | None = None, environment: dict[str, str] | None = None) -> subprocess.Popen:
+    command = [sys.executable, "-m", "mcaptrack", *map(str, words)]
+    env = {k: v for k, v in os.environ.items() if not k.startswith("MCAPTRACK_")} | (environment or {})
+    return subprocess.Popen(command, cwd=folder, env=env, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def call(*words, **options) -> tuple[int, str, str]:
+    """Exit code, stdout and stderr of a command."""
+    process = start(*words, **options)
+    out, err = process.communicate(timeout=120)
+    return process.returncode, out, err
+
+
+def done(*words, **options) -> tuple[str, str]:
+    code, out, err = call(*words, **options)
+    assert code == 0, err
+    return out, err
+
+
+@pytest.fixture(scope="module")
+def footage(tmp_path_factory) -> demo.Footage:
+    return demo.draw(small_scene(), tmp_path_factory.mktemp("footage"))
+
+
+@pytest.fixture(scope="module")
+def finished(footage, tmp_path_factory) -> Path:
+    """A log with everything in it. Not to be changed."""
+    folder = tmp_path_factory.mktemp("finished")
+    path = folder / "walk.mcap"
+    done("ingest", footage.video, "--ground-plane", footage.ground_plane, "--truth", footage.truth, "-o", path)
+    done("run", path)
+    return path
+
+
+@pytest.fixture
+def fresh(footage, tmp_path) -> Path:
+    path = tmp_path / "walk.mcap"
+    done("ingest", footage.video, "--ground-plane", footage.ground_plane, "--truth", footage.truth, "-o", path, "-q")
+    return path
+
+
+class TestHelp:
+    def test_every_command_has_help_with_an_example(self):
+        out, _ = done("--help")
+        for name in COMMANDS:
+            assert name in out
+            words, _ = done(name, "--help")
+            assert f"Example: mcaptrack {name}" in words
+            for option in ("--force", "--quiet", "--config"):
+                assert option in words, (name, option)
+
+    def test_help_imports_nothing_heavy(self):
+        code = (
+            "import sys; sys.argv = ['mcaptrack', '--help']\n"
+            "from mcaptrack.__main__ import main\n"
+            "try: main()\n"
+            "except SystemExit: pass\n"
+            "print('LOADED', *[m for m in ('torch', 'cv2', 'scipy', 'pyarrow', 'av', 'google.protobuf') if m in sys.modules])"
+        )
+        done_ = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+        assert done_.stdout.splitlines()[-1].split() == ["LOADED"]
+
+    def test_version(self):
+        assert done("--version")[0].strip() == f"mcaptrack {__version__}"
+
+    def test_parameters_of_transforms_are_options_with_their_defaults(self):
+        out, _ = done("track", "--help")
+        for option, default in (("--max-age-s", "1.4"), ("--min-iou", "0.2"), ("--min-hits-frames", "none")):
+            assert option in out
+            assert f"[default: ({default})]" in out
+
+
+class TestTheUsualWay:
+    def test_a_finished_log_has_its_companions(self, finished):
+        names = sorted(path.name for path in finished.parent.iterdir())
+        assert names == ["walk.layout.json", "walk.mcap", "walk.tables"]
+        layout = json.loads((finished.parent / "walk.layout.json").read_text())
+        shown = layout["configById"]["Image!picture"]["imageMode"]["annotations"]
+        assert shown["/camera/retracks/view/image"] == {"visible": True}
+        assert shown["/camera/detections/view/image"] == {"visible": False}
+
+    def test_running_again_has_nothing_to_do(self, finished):
+        before = finished.read_bytes()
+        _, err = done("run", finished)
+        assert "nothing to do, everything is up to date" in err
+        assert finished.read_bytes() == before
+
+    def test_a_stage_says_what_it_has_to_make_first(self, fresh):
+        _, err = done("track", fresh)
+        assert "/camera/detections is missing: running detect" in err
+        assert f"{fresh}: detect, track" in err
+
+    def test_quiet_is_quiet(self, fresh):
+        assert done("track", fresh, "-q") == ("", "")
+
+    def test_no_progress_goes_to_a_pipe(self, fresh):
+        _, err = done("detect", fresh)
+        assert "\x1b" not in err
+        assert "\r" not in err
+
+    def test_info_shows_channels_and_lineage(self, finished):
+        out, err = done("info", finished)
+        assert err == ""
+        for words in ("/camera/retracks/online", "foxglove.CompressedVideo", "lineage"):
+            assert words in out
+        assert "/view/image" in out
+        tree = out[out.index("lineage") :]
+        assert [line.split()[-2] for line in tree.splitlines() if "detections" in line or "samples" in line] == [
+            "/camera/detections",
+            "/camera/samples",
+        ]
+
+    def test_info_as_data(self, finished):
+        data = json.loads(done("info", finished, "--json")[0])
+        assert data["schema_version"] == 1
+        (result,) = data["results"]
+        channels = {channel["topic"]: channel for channel in result["channels"]}
+        assert channels["/camera/retracks"]["input"] == "/camera/samples"
+        assert channels["/camera/retracks"]["parameters"]["distance"] == "now"
+        assert not any(channel["stale"] for channel in result["channels"])
+        assert result["messages"] == sum(channel["messages"] for channel in result["channels"])
+
+    def test_export_to_a_folder(self, finished, tmp_path):
+        out, _ = done("export", finished, "-o", tmp_path / "tables", "--json")
+        rows = json.loads(out)["results"][0]["rows"]
+        assert rows["detections"] > 0
+        assert (tmp_path / "tables" / "tracks" / "recording=walk" / "part-0.parquet").is_file()
+
+    def test_several_logs_and_patterns(self, fresh, tmp_path):
+        (tmp_path / "other.mcap").write_bytes(fresh.read_bytes())
+        _, err = done("sample", tmp_path / "*.mcap")
+        assert f"{tmp_path / 'other.mcap'}: detect, track, sample" in err
+        assert f"{fresh}: detect, track, sample" in err
+        code, _, err = call("sample", tmp_path / "*.mcap", "-o", tmp_path / "x.mcap")
+        assert code == 1
+        assert "2 inputs can't all be written to" in err
+
+    def test_stages_as_data(self, fresh):
+        out, _ = done("track", fresh, "--json", "-q")
+        (result,) = json.loads(out)["results"]
+        assert result["stages"] == ["detect", "track"]
+        assert result["frames"]["/camera/tracks"] == 60
+
+    def test_another_file_and_a_profile_and_a_mode(self, finished, tmp_path):
+        before = finished.read_bytes()
+        done(
+            "retrack", finished, "--profile", "paper", "--sigma-m", "2", "--mode", "offline", "-o", tmp_path / "p.mcap"
+        )
+        assert finished.read_bytes() == before
+        (result,) = json.loads(done("info", tmp_path / "p.mcap", "--json")[0])["results"]
+        made = {channel["topic"]: channel["parameters"] for channel in result["channels"]}
+        assert (made["/camera/retracks"]["distance"], made["/camera/retracks"]["sigma_m"]) == ("mean", 2.0)
+        assert made["/camera/retracks/online"]["distance"] == "now"  # only the other output was made
+
+
+class TestEvaluate:
+    def test_a_table_for_people(self, finished):
+        out, _ = done("evaluate", finished)
+        for words in ("IDF1", "IoU 0.5", "0.5 m", "2 m", "/camera/retracks/online", "forecasts of", "ADE m"):
+            assert words in out
+
+    def test_data_for_programs(self, finished):
+        rows = json.loads(done("evaluate", finished, "--json")[0])["results"]
+        keys = {
+            "sequence",
+            "tracks",
+            "mode",
+            "similarity",
+            "gate",
+            "rules",
+            "MOTA",
+            "IDF1",
+            "IDP",
+            "IDR",
+            "HOTA",
+            "DetA",
+            "AssA",
+            "LocA",
+            "IDSW",
+            "FP",
+            "FN",
+            "Frag",
+            "MT",
+            "PT",
+            "ML",
+            "GT",
+        }
+        assert all(keys <= set(row) for row in rows)
+        modes = {row["tracks"]: row["mode"] for row in rows}
+        assert modes == {
+            "/camera/tracks": None,
+            "/camera/samples": None,
+            "/camera/retracks": "offline",
+            "/camera/retracks/online": "online",
+        }
+        assert {row["gate"] for row in rows if row["similarity"] == "metres"} == {0.5, 1.0, 2.0}
+        displaced = [row for row in rows if "displacement" in row]
+        assert {row["tracks"] for row in displaced} == {"/camera/samples", "/camera/retracks/online"}
+        wanted = {
+            "ADE_m",
+            "FDE_m",
+            "ADE_squared_m2",
+            "recall",
+            "AADE_m",
+            "false_forecasts_per_frame",
+            "consistency_m",
+            "coverage_95",
+        }
+        assert wanted <= set(displaced[0]["displacement"])
+
+    def test_rows_for_a_spreadsheet(self, finished):
+        out, _ = done("evaluate", finished, "--csv", "--similarity", "iou", "--topic", "/camera/tracks")
+        (row,) = csv.DictReader(io.StringIO(out))
+        assert (row["tracks"], row["similarity"]) == ("/camera/tracks", "iou")
+
+    def test_several_logs_have_a_combined_row(self, finished, tmp_path):
+        (tmp_path / "other.mcap").write_bytes(finished.read_bytes())
+        rows = json.loads(
+            done("evaluate", finished, tmp_path / "other.mcap", "--similarity", "metres", "--gate-m", "1", "--json")[0]
+        )["results"]
+        combined = {row["tracks"]: row for row in rows if row["sequence"] == "COMBINED"}
+        single = {row["tracks"]: row for row in rows if row["sequence"] == "walk"}
+        assert combined["/camera/samples"]["FN"] == 2 * single["/camera/samples"]["FN"]
+        assert combined["/camera/samples"]["MOTA"] == pytest.approx(single["/camera/samples"]["MOTA"])
+
+    def test_label_files_without_a_log(self, footage):
+        rows = json.loads(done("evaluate", footage.truth, "--truth", footage.truth, "--json")[0])["results"]
+        assert [(row["similarity"], row["MOTA"], row["IDF1"]) for row in rows] == [("iou", 1.0, 1.0)]
+        out, _ = done(
+            "evaluate", footage.truth, "--truth", footage.truth, "--ground-plane", footage.ground_plane, "--json"
+        )
+        assert [row["similarity"] for row in json.loads(out)["results"]] == ["iou", "metres", "metres", "metres"]
+
+    def test_results_can_go_to_a_file(self, finished, tmp_path):
+        out, _ = done("evaluate", finished, "--json", "-o", tmp_path / "scores.json")
+        assert out == ""
+        assert json.loads((tmp_path / "scores.json").read_text())["results"]
+        code, _, err = call("info", finished, "-o", tmp_path / "scores.json")
+        assert (code, "scores.json exists" in err) == (1, True)
+
+    def test_a_gate_that_is_missed_is_exit_4(self, finished):
+        code, _, err = call(
+            "evaluate", finished, "--fail-under", "idf1=0.999", "--similarity", "metres", "--gate-m", "1", "-q"
+        )
+        assert code == 4
+        assert "IDF1" in err
+        assert "is under 0.999" in err
+        assert call("evaluate", finished, "--fail-under", "IDF1=0.01", "-q")[0] == 0
+
+
+class TestConfig:
+    def test_options_come_from_the_file_and_the_command_line_comes_first(self, fresh, tmp_path):
+        (tmp_path / "mcaptrack.toml").write_text('[track]\nmax-age-s = 2.5\nmin_iou = 0.4\n[detect]\nmethod = "mog2"\n')
+
+        def made(*words, environment=None):
+            done("track", fresh, "-q", *words, folder=tmp_path, environment=environment)
+            (result,) = json.loads(done("info", fresh, "--json")[0])["results"]
+            return next(c["parameters"] for c in result["channels"] if c["topic"] == "/camera/tracks")
+
+        assert (made()["max_age_s"], made()["min_iou"]) == (2.5, 0.4)
+        environment = {"MCAPTRACK_TRACK_MIN_IOU": "0.33"}
+        assert made(environment=environment)["min_iou"] == 0.33
+        assert made("--min-iou", "0.1", environment=environment)["min_iou"] == 0.1
+        (tmp_path / "other.toml").write_text("[track]\nmin-iou = 0.6\n")
+        assert made("--config", "other.toml")["min_iou"] == 0.6
+
+    @pytest.mark.parametrize(
+        ("text", "words"),
+        [
+            ("[trak]\nmin-iou = 0.4\n", "there is no command trak; did you mean track?"),
+            ("[track]\nmin-iuo = 0.4\n", "track has no option min-iuo; did you mean min-iou?"),
+            ("[track\n", "is no TOML"),
+            ("track = 1\n", "track is a command; write its options below [track]"),
+        ],
+    )
+    def test_mistakes_in_the_file_are_named(self, tmp_path, text, words):
+        (tmp_path / "mcaptrack.toml").write_text(text)
+        code, _, err = call("track", "x.mcap", folder=tmp_path)
+        assert code == 2
+        assert words in " ".join(err.replace("│", " ").split())
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("mistakes")
+    (folder / "text.mp4").write_text("I am no video\n")
+    (folder / "folder").mkdir()
+    (folder / "bad.txt").write_text("1,1,1,1,2,2\n2,1,x,1,2,2\n")
+    (folder / "good.txt").write_text("1,1,1,1,2,2\n")
+    write_clip(folder / "clip.mp4", options={"bf": "0"})
+    done("ingest", "clip.mp4", "-o", "a.mcap", folder=folder)
+    return folder
+
+
+class TestMistakes:
+    """One line, exit 1, nothing written, nothing lost."""
+
+    CASES = {
+        "no such file": (["ingest", "nothing.mp4"], "nothing.mp4 does not exist"),
+        "no video": (["ingest", "text.mp4"], "text.mp4 can't be read as a video"),
+        "a folder without images": (["ingest", "folder"], "folder holds no images"),
+        "a plane that is none": (
+            ["ingest", "clip.mp4", "--ground-plane", "text.mp4", "-o", "x.mcap"],
+            "is no homography",
+        ),
+        "a truth in the wrong format": (
+            ["ingest", "clip.mp4", "--truth", "bad.txt", "-o", "x.mcap"],
+            "bad.txt:2: not MOTChallenge",
+        ),
+        "an output that exists": (
+            ["ingest", "clip.mp4", "-o", "a.mcap"],
+            "a.mcap exists; give another name with -o, or --force",
+        ),
+        "an output that is a folder": (
+            ["ingest", "clip.mp4", "-o", "folder"],
+            "folder is a folder; give the name of a file",
+        ),
+        "an output nowhere": (["ingest", "clip.mp4", "-o", "no/x.mcap"], "the folder no does not exist"),
+        "input as output": (["ingest", "clip.mp4", "-o", "clip.mp4", "--force"], "clip.mp4 is both input and output"),
+        "a log as its own copy": (["run", "a.mcap", "-o", "a.mcap", "--force"], "a.mcap is both input and output"),
+        "no log": (["run", "text.mp4"], "text.mp4 can't be read as an MCAP file"),
+        "a folder as a log": (["info", "folder"], "folder is a folder, not an MCAP file"),
+        "no such channel": (
+            ["track", "a.mcap", "--topic", "/none"],
+            "has no channel /none for track; it has /camera/video",
+        ),
+        "no truth": (["evaluate", "a.mcap"], "has no channel /camera/truth; add one with"),
+        "no pattern": (["run", "*.nothing"], "no file matches *.nothing"),
+        "a number out of range": (["track", "a.mcap", "--min-iou", "3"], "min_iou has to be from 0 to 1, not 3"),
+        "no frame rate": (["ingest", "clip.mp4", "--fps", "fast", "-o", "x.mcap"], "--fps needs a number"),
+        "no time": (["ingest", "clip.mp4", "--start-time", "noon", "-o", "x.mcap"], "--start-time needs"),
+        "no gates": (["evaluate", "a.mcap", "--gate-m", "near"], "--gate-m needs distances in metres"),
+        "no limit": (["evaluate", "a.mcap", "--fail-under", "luck=1"], "--fail-under needs one of"),
+        "truth without tracks to match": (
+            ["evaluate", "bad.txt", "good.txt", "--truth", "good.txt"],
+            "give one truth for each",
+        ),
+        "a label file without a clock": (
+            ["ingest", "good.txt", "-o", "x.mcap"],
+            "give the frames per second with --fps",
+        ),
+        "two outputs": (["ingest", "clip.mp4", "--into", "a.mcap", "-o", "x.mcap"], "it does not go with -o"),
+    }
+
+    @pytest.mark.parametrize(("words", "said"), CASES.values(), ids=CASES)
+    def test_it_is_said_in_a_line(self, place, words, said):
+        before = {path: path.read_bytes() for path in place.rglob("*") if path.is_file()}
+        code, out, err = call(*words, folder=place)
+        assert code == 1
+        assert said in err
+        assert err.startswith("mcaptrack: ")
+        assert err.count("\n") == 1
+        assert out == ""
+        assert {path: path.read_bytes() for path in place.rglob("*") if path.is_file()} == before
+
+    def test_wrong_words_are_exit_2(self, place):
+        for words in (
+            ["track"],
+            ["track", "a.mcap", "--min-iou", "much"],
+            ["nonsense"],
+            ["detect", "a.mcap", "--method", "magic"],
+        ):
+            code, _, err = call(*words, folder=place)
+            assert code == 2
+            assert "Traceback" not in err
+
+    def test_names_that_would_steer_the_terminal_are_made_harmless(self, place):
+        code, _, err = call("info", "\x1b[2Jevil.mcap", folder=place)
+        assert code == 1
+        assert "\x1b" not in err
+
+    def test_what_was_lost_is_exit_3(self, tmp_path):
+        write_clip(tmp_path / "a.avi", frames=30, codec="mjpeg", pixels="yuvj420p", size=(320, 240))
+        raw = (tmp_path / "a.avi").read_bytes()
+        (tmp_path / "a.avi").write_bytes(raw[: len(raw) * 2 // 3])
+        code, _, err = call("ingest", "a.avi", folder=tmp_path)
+        assert code == 3
+        assert "lost: a.avi claims 30 frames" in err
+        assert (tmp_path / "a.mcap").is_file()
+
+    def test_whoever_stops_reading_gets_no_traceback(self, finished):
+        command = f"{sys.executable} -m mcaptrack evaluate {finished} --json | head -1"
+        piped = subprocess.run(["bash", "-c", command], capture_output=True, text=True, check=False)
+        assert "Traceback" not in piped.stderr
+
+
+@pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM], ids=["Ctrl-C", "kill"])
+def test_an_interruption_at_any_moment_leaves_the_old_log_or_the_new_one(fresh, finished, sent):
+    before, after = fresh.read_bytes(), finished.read_bytes()
+    started = time.monotonic()
+    done("run", fresh, "--no-tables", "-q")
+    whole = time.monotonic() - started
+    assert fresh.read_bytes() == after
+    for part in (0.3, 0.6, 0.8, 0.9, 0.97):
+        fresh.write_bytes(before)
+        process = start("run", fresh, "--no-tables", "-q")
+        time.sleep(part * whole)
+        process.send_signal(sent)
+        _, err = process.communicate(timeout=60)
+        now = fresh.read_bytes()
+        assert now in (before, after)
+        # Before the first line of ours is run, and after the last, the signal is Python's own to answer.
+        assert process.returncode in (0, 130, 128 + sent, -sent)
+        assert process.returncode == -sent or "Traceback" not in err
+        assert not list(fresh.parent.glob(".*.part"))
+
+
+def test_the_demonstration(tmp_path, monkeypatch):
+    """Everything on a scene that it draws itself; a short one here."""
+    code = (
+        "import sys; from mcaptrack import scene; from tests.worlds import small_scene\n"
+        "scene.demo_scene = small_scene; sys.argv = ['mcaptrack', 'demo', '-o', sys.argv[1]]\n"
+        "from mcaptrack.__main__ import main; main()\n"
+    )
+    run = [sys.executable, "-c", code, str(tmp_path / "d")]
+    shown = subprocess.run(run, capture_output=True, text=True, check=True)
+    for words in ("SORT", "re-tracked", "identity switches", "demo.mcap", "Lichtblick"):
+        assert words in shown.stdout
+    names = sorted(path.name for path in (tmp_path / "d").iterdir())
+    assert names == ["demo.layout.json", "demo.mcap", "demo.mp4", "demo.tables", "ground_plane.txt", "truth.txt"]
+    again = subprocess.run(run, capture_output=True, text=True, check=False)
+    assert again.returncode == 1
+    assert "exists; give another folder with -o, or --force" in again.stderr

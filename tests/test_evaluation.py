@@ -1,0 +1,135 @@
+"""Logs and label files against the truth."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mcaptrack.errors import McaptrackError
+from mcaptrack.evaluation import Candidate, EvaluateOptions, Sequenced, evaluate
+from mcaptrack.predictors import Forecast
+from mcaptrack.schema import PREDICTIONS, TRACKS, Frame
+from mcaptrack.schema.predictions import forecast_to_rows
+from tests.worlds import ns, tracks_at, walk
+
+METRES = EvaluateOptions(similarities=("metres",), gates_m=(1.0,))
+
+
+def boxed(people):
+    """{id: (left, top)} with boxes of 10 x 20, and no metres."""
+    xy = np.array(list(people.values()), float).reshape(-1, 2)
+    return TRACKS.rows(
+        track_id=np.array(list(people), np.int64),
+        x_px=xy[:, 0],
+        y_px=xy[:, 1],
+        w_px=np.full(len(xy), 10.0),
+        h_px=np.full(len(xy), 20.0),
+        observed=np.ones(len(xy), bool),
+        source_id=np.full(len(xy), -1),
+    )
+
+
+def scored(truth, tracks, options=METRES, forecasts=None):
+    outcome = evaluate([Sequenced("x", truth, [Candidate("t", None, tracks, forecasts, "p")])], options)
+    return [result.to_json() for result in outcome.results]
+
+
+def test_at_common_times_nothing_is_interpolated():
+    truth = walk(lambda n: {1: (float(n), 0.0)}, 10)
+    (row,) = scored(truth, walk(lambda n: {5: (float(n), 0.0)}, 10))
+    assert (row["MOTA"], row["IDF1"], row["FN"]) == (1.0, 1.0, 0)
+    assert row["gate"] == 1.0
+    assert row["similarity"] == "metres"
+
+
+def test_a_frame_that_the_tracks_lack_counts_as_missed():
+    truth = walk(lambda n: {1: (float(n), 0.0)}, 10)
+    (row,) = scored(truth, truth[:7])
+    assert (row["FN"], row["FP"]) == (3, 0)
+
+
+def test_tracks_at_more_times_are_scored_at_those_of_the_truth():
+    truth = walk(lambda n: {1: (float(n), 0.0)}, 10)
+    tracks = [Frame(ns(n / 30), n, tracks_at({1: (n / 12, 0.0)})) for n in range(9 * 12 + 1)]
+    (row,) = scored(truth, tracks)
+    assert (row["MOTA"], row["FN"], row["FP"]) == (1.0, 0, 0)
+
+
+def test_truth_is_brought_to_the_clock_of_prediction():
+    """Truth at 7 frames a second, tracks at 2.5: no time in common but a few, all rows comparable."""
+    truth = [Frame(ns(n / 7), n, tracks_at({1: (n / 7, 0.0)})) for n in range(71)]
+    tracks = walk(lambda n: {1: (0.4 * n, 0.05)}, 26)
+    (row,) = scored(truth, tracks)
+    assert (row["MOTA"], row["FN"], row["FP"]) == (1.0, 0, 0)
+
+
+def test_where_nobody_labelled_nothing_is_scored():
+    truth = [Frame(ns(n / 7), n, tracks_at({1: (0.0, 0.0)})) for n in range(35)]  # 5 s
+    tracks = walk(lambda n: {1: (0.0, 0.0), 2: (50.0, 0.0)}, 50)  # 20 s
+    (row,) = scored(truth, tracks)
+    assert row["FP"] == 13  # the ghost, at the 13 ticks within the labels
+
+
+def test_boxes_and_metres_are_scored_as_far_as_there_are_both():
+    boxes = [Frame(ns(n), n, boxed({1: (5 * n, 0)})) for n in range(5)]
+    rows = scored(boxes, boxes, EvaluateOptions())
+    assert [(row["similarity"], row["gate"], row["MOTA"]) for row in rows] == [("iou", 0.5, 1.0)]
+    with pytest.raises(McaptrackError, match="the truth and t have no positions in metres"):
+        scored(boxes, boxes, METRES)
+    with pytest.raises(McaptrackError, match="t and the truth share neither boxes nor positions"):
+        scored(boxes, walk(lambda n: {1: (0.0, 0.0)}, 13), EvaluateOptions())
+
+
+def test_impossible_input_is_said_and_never_scored_as_zeros():
+    truth = walk(lambda n: {1: (0.0, 0.0)}, 5)
+    later = [frame._replace(t_ns=frame.t_ns + ns(1000)) for frame in truth]
+    with pytest.raises(
+        McaptrackError, match=r"the truth \(0\.000 to 1\.600 s\) and t \(1000\.000 to .*never overlap in time"
+    ):
+        scored(truth, later)
+    with pytest.raises(McaptrackError, match="the truth of x holds nobody"):
+        scored(walk(lambda n: {}, 5), truth)
+
+
+def test_several_sequences_are_combined():
+    truth = walk(lambda n: {1: (float(n), 0.0)}, 10)
+    sequences = [
+        Sequenced(name, truth, [Candidate("t", None, tracks)]) for name, tracks in (("a", truth), ("b", truth[:5]))
+    ]
+    rows = [result.to_json() for result in evaluate(sequences, METRES).results]
+    assert [(row["sequence"], row["FN"]) for row in rows] == [("a", 0), ("b", 5), ("COMBINED", 5)]
+    assert rows[2]["MOTA"] == pytest.approx(0.75)
+    assert rows[2]["GT"] == 2
+
+
+def test_forecasts_are_compared_with_what_came():
+    """Foretold at constant speed for someone who turns after 4 s: right before, wrong after, and not asked at the end."""
+
+    def path(n):
+        return {1: (0.5 * min(n, 10), 0.5 * max(n - 10, 0))}
+
+    truth = walk(path, 30)
+    frames = []
+    for n in range(30):
+        x, y = path(n)[1]
+        mean = np.array([[[x + 0.5 * k, y] for k in range(1, 4)]])
+        rows = forecast_to_rows(np.array([1]), Forecast(mean, np.tile(np.eye(2), (1, 3, 1, 1))), 0.4)
+        frames.append(Frame(ns(0.4 * n), n, rows if n >= 3 else PREDICTIONS.empty()))
+    (row,) = scored(truth, truth, METRES, frames)
+    found = row["displacement"]
+    assert found["recall"] == 1.0
+    assert found["ADE_m"] > 0
+    assert len(found["curve_recall"]) == 24  # ticks 3 to 26 have a past and a future
+    assert found["curve_recall"][-1] == 1.0
+    early = [frame for frame in frames if frame.index <= 7]
+    (row,) = scored(truth, truth, METRES, early)
+    assert row["displacement"]["ADE_m"] == pytest.approx(0.0, abs=1e-12)
+
+
+def test_rates_lie_between_0_and_1_and_counts_are_whole():
+    truth = walk(lambda n: {1: (float(n), 0.0), 2: (0.0, float(n))}, 10)
+    tracks = walk(lambda n: {7 if n < 5 else 8: (n + 0.3, 0.0), 9: (40.0, 40.0)}, 10)
+    (row,) = scored(truth, tracks)
+    assert all(isinstance(row[name], int) for name in ("IDSW", "FP", "FN", "Frag", "MT", "PT", "ML", "GT"))
+    assert all(0 <= row[name] <= 1 for name in ("IDF1", "IDP", "IDR", "HOTA", "DetA", "AssA", "LocA"))
+    assert (row["IDSW"], row["FP"], row["FN"]) == (1, 10, 10)
