@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 import zstandard
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
@@ -307,6 +307,7 @@ def test_damage_is_said_in_a_line(tmp_path, kind):
 
 
 @given(at=st.integers(0, 10_000), bit=st.integers(0, 7))
+@settings(max_examples=300)
 def test_a_flipped_bit_is_never_a_wrong_message(tmp_path_factory, at, bit):
     path = tmp_path_factory.mktemp("log") / "a.mcap"
     messages = [("abc"[n % 3], n * 10, n, bytes([n]) * 40) for n in range(40)]
@@ -320,8 +321,7 @@ def test_a_flipped_bit_is_never_a_wrong_message(tmp_path_factory, at, bit):
         return
     true = {(topic, t_ns, payload) for topic, t_ns, _, payload in messages}
     read = {(topic, t_ns, payload) for topic, members in found.items() for t_ns, _, payload in members}
-    renamed = len(set(found) - set("abc"))  # the name of a channel in the summary carries no weight for its messages
-    assert renamed or read <= true
+    assert read <= true
 
 
 def _chunk_with(compression: str, data: bytes, size: int, crc: int = 0) -> bytes:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -57,10 +58,12 @@ def _from_summary(buffer: memoryview) -> Index | None:
     at = len(buffer) - _FOOTER_SIZE
     if at < len(MAGIC) or buffer[at] != Opcode.FOOTER:
         raise Damaged("it has no footer where one belongs")
-    summary_start, _, _ = records.FOOTER_BODY.unpack_from(buffer, at + 9)
+    summary_start, _, summary_crc = records.FOOTER_BODY.unpack_from(buffer, at + 9)
     data_end = summary_start - 13
     if not len(MAGIC) <= data_end < at or buffer[data_end] != Opcode.DATA_END:
         return None
+    if summary_crc and zlib.crc32(buffer[summary_start : len(buffer) - len(MAGIC) - 4]) != summary_crc:
+        return None  # the data section says the same, with checksums of its own
     index, has_statistics = Index(data_end), False
     index.data_crc = Reader(buffer, data_end + 9, data_end + 13).number(4)
     for record in walk(buffer, summary_start, at):
@@ -80,10 +83,10 @@ def _take(index: Index, buffer: memoryview, record: Record) -> None:
     reader = Reader(buffer, record.body, record.end)
     if record.opcode == Opcode.SCHEMA:
         schema = records.read_schema(buffer, record)
-        index.schemas[schema.id] = schema
+        index.schemas.setdefault(schema.id, schema)
     elif record.opcode == Opcode.CHANNEL:
         channel = records.read_channel(buffer, record)
-        index.channels[channel.id] = channel
+        index.channels.setdefault(channel.id, channel)
     elif record.opcode == Opcode.CHUNK_INDEX:
         index.chunks.append(records.read_chunk_index(buffer, record))
     elif record.opcode == Opcode.STATISTICS:
@@ -172,8 +175,6 @@ def message_head(buffer: memoryview, record: Record) -> tuple[int, int, int, int
 
 def open_chunk(buffer: memoryview, record: Record) -> memoryview:
     """The records inside a chunk, decompressed and checked. Memory is bounded by what the chunk says of itself."""
-    import zlib
-
     head = records.read_chunk(buffer, record)
     if head.uncompressed_size > MAX_CHUNK_BYTES:
         raise Damaged(f"byte {record.start}: a chunk of {head.uncompressed_size} bytes; at most {MAX_CHUNK_BYTES}")
@@ -218,11 +219,14 @@ def message_times(
     """Log times and offsets inside the chunk of one channel's messages."""
     at = chunk.message_index_offsets[channel_id]
     if at:
-        record = next(walk(buffer, at, len(buffer)))
+        record = records.record_at(buffer, at)
         reader = Reader(buffer, record.body, record.end)
         if record.opcode != Opcode.MESSAGE_INDEX or reader.number(2) != channel_id:
             raise Damaged(f"byte {at}: no message index of channel {channel_id} where one belongs")
-        entries = np.frombuffer(reader.raw(), "<u8").reshape(-1, 2)
+        listed = reader.raw()
+        if len(listed) % 16:
+            raise Damaged(f"byte {at}: a message index of {len(listed)} bytes")
+        entries = np.frombuffer(listed, "<u8").reshape(-1, 2)
     else:
         content = open_chunk(buffer, chunk_record(buffer, chunk))
         found = [r for r in walk(content, 0, len(content)) if r.opcode == Opcode.MESSAGE]
@@ -235,9 +239,7 @@ def message_times(
 
 def chunk_record(buffer: memoryview, chunk: ChunkIndexRecord) -> Record:
     """The chunk that an index points to."""
-    if chunk.offset >= len(buffer):
-        raise Damaged(f"a chunk is said to stand at byte {chunk.offset} of {len(buffer)}")
-    record = next(walk(buffer, chunk.offset, len(buffer)))
+    record = records.record_at(buffer, chunk.offset)
     if record.opcode != Opcode.CHUNK:
         raise Damaged(f"byte {chunk.offset}: no chunk where one belongs")
     return record

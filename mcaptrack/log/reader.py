@@ -134,7 +134,10 @@ class Log:
         found = [offset for known, offset in self.index.metadata if known == name]
         if not found:
             return None
-        return records.read_metadata(self._buffer, next(walk(self._buffer, found[-1], len(self._buffer))))[1]
+        try:
+            return records.read_metadata(self._buffer, records.record_at(self._buffer, found[-1]))[1]
+        except Damaged as error:
+            raise McaptrackError(f"{self.path} is damaged: {error}") from None
 
     def messages(self, topic: str) -> Iterator[Message]:
         """The messages of a channel in the order of their times. Raises McaptrackError where the file is damaged."""
@@ -191,9 +194,7 @@ class Log:
                 if len(opened) > _OPEN_CHUNKS:
                     opened.popitem(last=False)
             content = opened[number]
-            if offset >= len(content):
-                raise Damaged(f"a message is said to stand at byte {offset} of a chunk of {len(content)}")
-            message = self._message(content, next(walk(content, offset, len(content))), channel_id)
+            message = self._message(content, records.record_at(content, offset), channel_id)
             if message is None or message.t_ns != time:
                 raise Damaged(f"no message of channel {channel_id} at {time} ns where the index says one is")
             yield message

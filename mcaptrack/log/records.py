@@ -145,6 +145,13 @@ def walk(buffer: memoryview, start: int, end: int) -> Iterator[Record]:
         at = body + length
 
 
+def record_at(buffer: memoryview, offset: int) -> Record:
+    """The record that stands at an offset. Raises Damaged if there is none."""
+    if not 0 <= offset < len(buffer):
+        raise Damaged(f"a record is said to stand at byte {offset} of {len(buffer)}")
+    return next(walk(buffer, offset, len(buffer)))
+
+
 def read_schema(buffer: memoryview, record: Record) -> SchemaRecord:
     r = Reader(buffer, record.body, record.end)
     return SchemaRecord(r.number(2), r.text(), r.text(), bytes(r.raw()))

@@ -146,6 +146,8 @@ class LogWriter:
                 skip_index = self._copy_chunk(buffer, index, record, dropped, may_be_inside)
                 continue
             elif record.opcode == Opcode.MESSAGE_INDEX:
+                if not skip_index and not self._chunks:
+                    raise records.Damaged(f"byte {record.start}: a message index without a chunk")
                 if not skip_index:
                     channel = records.read_message_index(buffer, record)[0]
                     self._chunks[-1].message_index_offsets[channel] = self._offset
@@ -173,13 +175,15 @@ class LogWriter:
         self, buffer: memoryview, index: Index, record: records.Record, dropped: set[int], may_be_inside: bool
     ) -> bool:
         """Copy a chunk as it is if nothing in it goes, or what is kept of it; returns whether its indexes go too."""
-        known = next(chunk for chunk in index.chunks if chunk.offset == record.start)
+        known = next((chunk for chunk in index.chunks if chunk.offset == record.start), None)
+        if known is None:
+            raise records.Damaged(f"byte {record.start}: a chunk that no index knows")
         content = None
         counts: dict[int, int] = {}
         indexes = known.message_index_offsets
         if all(indexes.values()) and not dropped & set(indexes) and not may_be_inside:
             for offset in indexes.values():
-                channel, count = records.read_message_index(buffer, next(walk(buffer, offset, len(buffer))))
+                channel, count = records.read_message_index(buffer, records.record_at(buffer, offset))
                 counts[channel] = count
         if not counts:
             content = open_chunk(buffer, record)
@@ -361,7 +365,10 @@ def extend(
         log.lock()
     with publish_stream(output or log.path) as stream:
         writer = LogWriter(stream)
-        writer.copy(log, drop, drop_metadata, drop_attachments)
+        try:
+            writer.copy(log, drop, drop_metadata, drop_attachments)
+        except records.Damaged as error:
+            raise McaptrackError(f"{log.path} is damaged: {error}") from None
         yield writer
         _finish(writer, stream)
 
@@ -373,5 +380,9 @@ def _finish(writer: LogWriter, stream: IO[bytes]) -> None:
         import mmap
 
         index = read_index(memoryview(mmap.mmap(check.fileno(), 0, access=mmap.ACCESS_READ)))
-    if sum(index.counts.values()) != written:
-        raise RuntimeError(f"{written} messages were written and {sum(index.counts.values())} can be read")
+    readable = sum(index.counts.values())
+    if readable != written:
+        raise McaptrackError(
+            f"of {written} messages that were written {readable} can be read again; "
+            "the log does not add up, and is left as it was"
+        )
