@@ -22,6 +22,10 @@ def main() -> None:
     except BrokenPipeError:  # whoever read our output has had enough
         sys.stderr.close()
         sys.exit(0)
+    finally:
+        # All is done: a signal during Python's own goodbye ends the process without a word.
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, signal.SIG_DFL)
 
 
 if __name__ == "__main__":

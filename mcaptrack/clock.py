@@ -19,8 +19,9 @@ def seconds_to_ns(seconds: float) -> int:
 class FrameClock:
     """Counts frames by their timestamps.
 
-    The usual interval is the median of the last 25, so neither a jitter of the clock nor a gap moves it, and it is
-    known from the past alone. A step that is n usual intervals long counts as n frames.
+    The usual interval is the median of the last 25, so a gap does not move it, and it is known from the past alone. A
+    step that is n usual intervals long counts as n frames; stamps that are off by less than a tenth of an interval
+    change no count.
     """
 
     def __init__(self) -> None:

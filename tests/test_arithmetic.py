@@ -150,8 +150,9 @@ class TestFrameClock:
         times = [0.0, 0.1, 0.2, 0.3, 0.8, 0.9]
         assert [clock.tick(seconds_to_ns(t)) for t in times] == [1, 1, 1, 1, 5, 1]
 
-    @given(st.lists(st.floats(-0.02, 0.02), min_size=5, max_size=60))
+    @given(st.lists(st.floats(-0.0099, 0.0099), min_size=5, max_size=60))
     def test_a_jitter_of_the_clock_changes_nothing(self, jitter):
+        """Up to a tenth of the interval: then no two intervals differ by half."""
         clock = FrameClock()
         assert {clock.tick(seconds_to_ns(1 + n / 10 + off)) for n, off in enumerate(jitter)} == {1}
         assert clock.frames(0.5) in (4, 5, 6, 7)
