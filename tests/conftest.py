@@ -8,8 +8,11 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, settings
 
-settings.register_profile("mcaptrack", deadline=None, suppress_health_check=[HealthCheck.too_slow], print_blob=True)
-settings.load_profile("mcaptrack")
+# The same examples each time, so that a run says something about a change; `--hypothesis-profile search` looks for new
+# ones, and for many more.
+settings.register_profile("same", deadline=None, suppress_health_check=[HealthCheck.too_slow], derandomize=True)
+settings.register_profile("search", settings.get_profile("same"), derandomize=False, print_blob=True, max_examples=3000)
+settings.load_profile("same")
 
 
 @pytest.fixture(scope="session")
