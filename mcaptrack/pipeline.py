@@ -376,7 +376,8 @@ def _write(opened: log.Log, prefix: str, made: Mapping[str, Made], planes: Plane
     with log.extend(opened, output, drop={*made, *outdated}, drop_attachments=[LAYOUT]) as writer:
         for topic, channel in made.items():
             record = (channel.schema.name, "protobuf", channel.schema.descriptor)
-            number = writer.add_channel(topic, record, "protobuf", channel.provenance.to_metadata())
+            made_by = channel.provenance.transform  # results of one stage share chunks, so that they can go together
+            number = writer.add_channel(topic, record, "protobuf", channel.provenance.to_metadata(), group=made_by)
             for message in channel.messages:
                 writer.add_message(number, *message)
         if not len(picture_ns):
@@ -387,7 +388,8 @@ def _write(opened: log.Log, prefix: str, made: Mapping[str, Made], planes: Plane
                 continue
             metadata = Provenance("view", {}, topic, made_from).to_metadata()
             record = foxglove.schema_record(foxglove.ANNOTATIONS)
-            number = writer.add_channel(topic + views.SUFFIX, record, "protobuf", metadata)
+            made_by = made[topic].provenance.transform if topic in made else ""
+            number = writer.add_channel(topic + views.SUFFIX, record, "protobuf", metadata, group=made_by)
             for message in views.view(topic, schema, frames, picture_ns, planes):
                 writer.add_message(number, *message)
             topics.append(topic + views.SUFFIX)

@@ -106,6 +106,7 @@ def ingest(
                 report = make_log(source, target, options, progress=talk.progress)
             else:
                 with log.read(into) as opened:
+                    opened.lock()
                     report = make_log(source, target, options, into=opened, force=force, progress=talk.progress)
             for words in report.notes:
                 talk.detail(words)

@@ -71,7 +71,7 @@ def _as_data(opened: Log) -> dict[str, Any]:
         "start_ns": opened.start_ns,
         "end_ns": opened.end_ns,
         "messages": sum(opened.index.counts.values()),
-        "attachments": opened.index.attachments,
+        "attachments": [listed.name for listed in opened.index.attachments],
         "channels": channels,
     }
 

@@ -161,6 +161,8 @@ def _run_on_logs(given: Mapping[str, Any], make_plan: Callable[[_Plan], Any], ta
                     raise McaptrackError(f"{path} is both input and output; leave -o out to add to it in place")
                 refuse_overwrite(output, given["force"])
             with log.read(path) as opened:
+                if output is None:
+                    opened.lock()  # a second writer is turned away before it computes anything
                 prefix = pipeline.find_camera(opened, given["camera"], given["topic"])
                 jobs = make_plan(_Plan(opened, prefix, talk.say))
                 report = pipeline.run(opened, prefix, jobs, output, talk.progress, talk.say)

@@ -5,7 +5,8 @@ with read(path) as log:                 channels, messages, frames
 with create(path) as writer: ...        a new one
 """
 
-from mcaptrack.log.reader import Channel, Log, Message, read, topics_with_schema
-from mcaptrack.log.writer import LogWriter, create, extend
+from mcaptrack.log.change import extend
+from mcaptrack.log.reader import Channel, Columns, Log, Message, read, topics_with_schema
+from mcaptrack.log.writer import LogWriter, create
 
-__all__ = ["Channel", "Log", "LogWriter", "Message", "create", "extend", "read", "topics_with_schema"]
+__all__ = ["Channel", "Columns", "Log", "LogWriter", "Message", "create", "extend", "read", "topics_with_schema"]

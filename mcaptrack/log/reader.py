@@ -2,28 +2,25 @@
 
 from __future__ import annotations
 
-import fcntl
 import mmap
 import os
-from collections import OrderedDict
 from collections.abc import Iterator, Sequence
+from itertools import islice
 from pathlib import Path
-from typing import Final, NamedTuple, Self
+from typing import NamedTuple, Self
 
 import numpy as np
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.log import records
-from mcaptrack.log.index import Index, chunk_record, message_head, message_times, open_chunk, read_index
+from mcaptrack.log import journal, records
+from mcaptrack.log.chunks import Heads, chunk_record, forget, heads_at, message_head, message_times, open_chunk
+from mcaptrack.log.index import Index, read_index
 from mcaptrack.log.records import ChunkIndexRecord, Damaged, Record, walk
-from mcaptrack.schema import Frame, Schema
+from mcaptrack.schema import Frame, Rows, Schema
 
 Ints = NDArray[np.int64]
-
-#: Chunks kept open while messages are read in the order of their times.
-_OPEN_CHUNKS: Final = 4
 
 
 class Channel(NamedTuple):
@@ -46,6 +43,15 @@ class Message(NamedTuple):
     payload: bytes
 
 
+class Columns(NamedTuple):
+    """All rows of a channel by time, and of each message its time, sequence number and how many rows are its own."""
+
+    rows: Rows
+    t_ns: Ints
+    sequence: Ints
+    counts: Ints
+
+
 class Log:
     """An MCAP file, open for reading. A context manager.
 
@@ -54,9 +60,11 @@ class Log:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._locked = False
+        self.real_path = path.resolve()
+        self._lock: int | None = None
         if path.is_dir():
             raise McaptrackError(f"{path} is a folder, not an MCAP file")
+        journal.settle(self.real_path)
         try:
             self._file = path.open("rb")
         except OSError as error:
@@ -84,25 +92,34 @@ class Log:
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._locked:  # closing is not enough: the map of the file holds on to it
-            fcntl.flock(self._file, fcntl.LOCK_UN)
+        if self._lock is not None:
+            os.close(self._lock)
+            self._lock = None
         self._file.close()
 
-    def lock(self) -> None:
-        """Be the only one to write to this log until it is closed. Raises McaptrackError if somebody else is."""
-        try:
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            raise McaptrackError(
-                f"{self.path} is being written to by another process; try again when it is done"
-            ) from None
-        self._locked = True
-        try:
-            same = self.path.stat().st_ino == os.fstat(self._file.fileno()).st_ino
-        except OSError:
-            same = False
-        if not same:
-            raise McaptrackError(f"{self.path} was replaced while it was being read; try again")
+    def lock(self) -> int:
+        """Be the only one to write to this log until it is closed; returns a handle to write with.
+
+        Raises McaptrackError if somebody else is, or if nobody may.
+        """
+        if self._lock is None:
+            try:
+                handle = os.open(self.real_path, os.O_RDWR)
+            except OSError as error:
+                raise McaptrackError(
+                    f"{self.path} can't be written to: {error.strerror}; write to another file with -o"
+                ) from None
+            try:
+                journal.lock(self.real_path, handle)
+                if not os.path.samestat(os.fstat(handle), os.fstat(self._file.fileno())) or os.fstat(
+                    handle
+                ).st_size != len(self._buffer):
+                    raise McaptrackError(f"{self.path} was replaced while it was being read; try again")
+            except BaseException:
+                os.close(handle)
+                raise
+            self._lock = handle
+        return self._lock
 
     @property
     def buffer(self) -> memoryview:
@@ -131,7 +148,7 @@ class Log:
 
     def metadata(self, name: str) -> dict[str, str] | None:
         """The last metadata record of that name."""
-        found = [offset for known, offset in self.index.metadata if known == name]
+        found = [listed.offset for listed in self.index.metadata if listed.name == name]
         if not found:
             return None
         try:
@@ -147,20 +164,29 @@ class Log:
         except Damaged as error:
             raise McaptrackError(f"{self.path} is damaged: {error}") from None
 
-    def frames(self, topic: str, schema: Schema) -> list[Frame]:
-        """All rows of a channel, a frame a message. Raises McaptrackError if the channel holds something else."""
+    def rows(self, topic: str, schema: Schema) -> Columns:
+        """All rows of a channel as one array. Raises McaptrackError if the channel holds something else."""
         channel = self.channel(topic)
         if channel.schema_name != schema.name or channel.message_encoding != "protobuf":
             raise McaptrackError(f"{self.path}: {topic} holds {channel.schema_name or 'no schema'}, not {schema.name}")
-        messages = list(self.messages(topic))
         try:
+            found = None if self.index.loose else self._columns(channel.id, schema)
+            if found is not None:
+                return found
+            messages = list(self.messages(topic))
             rows, counts = schema.codec.decode_all([message.payload for message in messages])
-        except ValueError as error:
+        except (Damaged, ValueError) as error:
             raise McaptrackError(f"{self.path}: {topic} is damaged: {error}") from None
-        ends = np.cumsum(counts).tolist()
-        starts = [0, *ends][:-1]
-        spans = zip(messages, starts, ends, strict=True)
-        return [Frame(message.t_ns, message.sequence, rows[start:end]) for message, start, end in spans]
+        t_ns = np.array([message.t_ns for message in messages], np.int64)
+        return Columns(rows, t_ns, np.array([message.sequence for message in messages], np.int64), counts)
+
+    def frames(self, topic: str, schema: Schema) -> list[Frame]:
+        """The same, a frame a message."""
+        found = self.rows(topic, schema)
+        ends = np.cumsum(found.counts)
+        columns = (found.t_ns, found.sequence, ends - found.counts, ends)
+        spans = zip(*(column.tolist() for column in columns), strict=True)
+        return [Frame(t_ns, sequence, found.rows[start:end]) for t_ns, sequence, start, end in spans]
 
     def times(self, topic: str) -> Ints:
         """The times of a channel's messages, rising, without reading them."""
@@ -175,29 +201,67 @@ class Log:
     def _entries(self, channel_id: int) -> tuple[list[ChunkIndexRecord], list[tuple[Ints, Ints]]]:
         """The chunks that hold messages of a channel, and the times and places of these messages."""
         holders = [chunk for chunk in self.index.chunks if channel_id in chunk.message_index_offsets]
-        return holders, [message_times(self._buffer, chunk, channel_id) for chunk in holders]
+        entries = [message_times(self._buffer, chunk, channel_id) for chunk in holders]
+        listed, said = sum(len(times) for times, _ in entries), self.index.counts.get(channel_id, 0)
+        if listed != said:
+            raise Damaged(f"its indexes list {listed} messages of channel {channel_id}, and there are {said}")
+        return holders, entries
+
+    def _columns(self, channel_id: int, schema: Schema) -> Columns | None:
+        """Rows without a loop over messages; None where a message is laid out otherwise than ours."""
+        holders, entries = self._entries(channel_id)
+        parts: list[Columns] = []
+        for chunk, (t_ns, offset) in zip(holders, entries, strict=True):
+            content = open_chunk(self._buffer, chunk_record(self._buffer, chunk))
+            found = heads_at(content, channel_id, t_ns, offset)
+            decoded = schema.codec.decode_at(np.frombuffer(content, np.uint8), found.start, found.end)
+            if decoded is None:
+                return None
+            parts.append(Columns(decoded[0], t_ns, found.head["sequence"].astype(np.int64), decoded[1]))
+        if not parts:
+            return Columns(schema.empty(), *(np.empty(0, np.int64) for _ in range(3)))
+        rows = schema.codec.join([part.rows for part in parts])
+        times, sequence, counts = (np.concatenate(column) for column in list(zip(*parts, strict=True))[1:])
+        order = np.argsort(times, kind="stable")
+        if (np.diff(order) != 1).any():
+            first, kept = (np.cumsum(counts) - counts)[order], counts[order]
+            rows = rows[np.repeat(first - (np.cumsum(kept) - kept), kept) + np.arange(len(rows))]
+        rows.flags.writeable = False
+        return Columns(rows, times[order], sequence[order], counts[order])
 
     def _chunked(self, channel_id: int) -> Iterator[Message]:
+        """By time; messages of one time as they stand in the file. A chunk is open while its messages are due."""
         holders, entries = self._entries(channel_id)
-        if not entries:
+        if not any(len(times) for times, _ in entries):
             return
         t_ns = np.concatenate([times for times, _ in entries])
-        offsets = np.concatenate([offset for _, offset in entries])
         chunk_of = np.repeat(np.arange(len(entries)), [len(times) for times, _ in entries])
-        order = np.argsort(t_ns, kind="stable")
-        opened: OrderedDict[int, memoryview] = OrderedDict()
-        for number, offset, time in zip(
-            chunk_of[order].tolist(), offsets[order].tolist(), t_ns[order].tolist(), strict=True
-        ):
+        due = np.bincount(chunk_of, minlength=len(entries)).tolist()
+        opened: dict[int, Iterator[Message]] = {}
+        in_order = chunk_of[np.argsort(t_ns, kind="stable")]
+        # Chunks rarely overlap: as long as one goes on, its messages are passed on without a look at the others.
+        turns = np.flatnonzero(np.diff(in_order)) + 1
+        starts = np.concatenate([[0], turns, [len(in_order)]])
+        for number, run in zip(in_order[starts[:-1]].tolist(), np.diff(starts).tolist(), strict=True):
             if number not in opened:
-                opened[number] = open_chunk(self._buffer, chunk_record(self._buffer, holders[number]))
-                if len(opened) > _OPEN_CHUNKS:
-                    opened.popitem(last=False)
-            content = opened[number]
-            message = self._message(content, records.record_at(content, offset), channel_id)
-            if message is None or message.t_ns != time:
-                raise Damaged(f"no message of channel {channel_id} at {time} ns where the index says one is")
-            yield message
+                opened[number] = self._messages_of(holders[number], channel_id, *entries[number])
+            yield from islice(opened[number], run)
+            due[number] -= run
+            if not due[number]:
+                del opened[number]
+                forget(self._buffer, holders[number].offset, holders[number].offset + holders[number].length)
+
+    def _messages_of(self, chunk: ChunkIndexRecord, channel_id: int, t_ns: Ints, offset: Ints) -> Iterator[Message]:
+        """One channel's messages in a chunk, by time."""
+        order = np.argsort(t_ns, kind="stable")
+        content = open_chunk(self._buffer, chunk_record(self._buffer, chunk))
+        found: Heads = heads_at(content, channel_id, t_ns[order], offset[order])
+        whole = content.obj
+        data = whole if isinstance(whole, bytes) and len(whole) == len(content) else content
+        spans = zip(found.start.tolist(), found.end.tolist(), strict=True)
+        payloads = (bytes(data[start:end]) for start, end in spans)
+        head = found.head
+        return map(Message, head["t_ns"].tolist(), head["sequence"].tolist(), head["publish_ns"].tolist(), payloads)
 
     def _loose(self, channel_id: int) -> Iterator[Message]:
         """For files in which messages stand outside of chunks."""

@@ -6,7 +6,8 @@ Numbers are little endian; strings, arrays and maps carry their length in bytes 
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable, Iterator, Mapping
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Final, NamedTuple
 
 from mcap.opcode import Opcode
@@ -19,6 +20,7 @@ _HEAD: Final = struct.Struct("<BQ")
 MESSAGE_HEAD: Final = struct.Struct("<HIQQ")
 RECORD_MESSAGE_HEAD: Final = struct.Struct("<BQHIQQ")
 FOOTER_BODY: Final = struct.Struct("<QQI")
+_CRC_POLYNOMIAL: Final = 0xEDB88320
 
 
 class Record(NamedTuple):
@@ -152,6 +154,34 @@ def record_at(buffer: memoryview, offset: int) -> Record:
     return next(walk(buffer, offset, len(buffer)))
 
 
+def crc_before(crc: int, tail: bytes | memoryview) -> int:
+    """The CRC-32 of some bytes, from that of the same bytes with ``tail`` behind them.
+
+    The CRC of a whole is that of its first part, shifted by as many zeros as the second part is long, plus that of the
+    second part (as zlib's crc32_combine has it); a shift can be undone.
+    """
+    shifted = crc ^ zlib.crc32(tail)
+    # One zero bit back, as what becomes of each of the 32 bits; squared, it goes back two, four, eight.
+    back = [1 << bit + 1 for bit in range(31)] + [(1 << 31 ^ _CRC_POLYNOMIAL) << 1 & 0xFFFFFFFF | 1]
+    bits = 8 * len(tail)
+    while bits:
+        if bits & 1:
+            shifted = _times(back, shifted)
+        back = [_times(back, column) for column in back]
+        bits >>= 1
+    return shifted
+
+
+def _times(columns: Sequence[int], vector: int) -> int:
+    """A matrix over bits times a vector of bits."""
+    out = 0
+    for column in columns:
+        if vector & 1:
+            out ^= column
+        vector >>= 1
+    return out
+
+
 def read_schema(buffer: memoryview, record: Record) -> SchemaRecord:
     r = Reader(buffer, record.body, record.end)
     return SchemaRecord(r.number(2), r.text(), r.text(), bytes(r.raw()))
@@ -173,8 +203,16 @@ def read_chunk(buffer: memoryview, record: Record) -> ChunkHead:
 
 def read_message_index(buffer: memoryview, record: Record) -> tuple[int, int]:
     """The channel of a message index and how many messages it lists."""
+    channel, entries = read_message_entries(buffer, record)
+    return channel, len(entries) // 16
+
+
+def read_message_entries(buffer: memoryview, record: Record) -> tuple[int, memoryview]:
+    """The channel of a message index and its entries, log time and offset of 8 bytes each."""
+    if record.opcode != Opcode.MESSAGE_INDEX:
+        raise Damaged(f"byte {record.start}: no message index where one belongs")
     r = Reader(buffer, record.body, record.end)
-    return r.number(2), len(r.raw()) // 16
+    return r.number(2), r.raw()
 
 
 def read_metadata(buffer: memoryview, record: Record) -> tuple[str, dict[str, str]]:
@@ -229,16 +267,9 @@ def pack_channel(channel: ChannelRecord) -> bytes:
     return pack(Opcode.CHANNEL, head, text(channel.topic), text(channel.message_encoding), text_map(channel.metadata))
 
 
-def pack_message(channel_id: int, sequence: int, t_ns: int, publish_ns: int, payload: bytes) -> bytes:
-    size = MESSAGE_HEAD.size + len(payload)
-    return RECORD_MESSAGE_HEAD.pack(Opcode.MESSAGE, size, channel_id, sequence, t_ns, publish_ns) + payload
-
-
-def pack_message_index(channel_id: int, entries: Iterable[tuple[int, int]]) -> bytes:
-    """``entries`` are pairs of log time and offset inside the chunk."""
-    return pack(
-        Opcode.MESSAGE_INDEX, number(channel_id, 2), raw(b"".join(struct.pack("<QQ", *entry) for entry in entries))
-    )
+def pack_message_index(channel_id: int, entries: bytes) -> bytes:
+    """``entries`` are pairs of log time and offset inside the chunk, 8 bytes each."""
+    return pack(Opcode.MESSAGE_INDEX, number(channel_id, 2), raw(entries))
 
 
 def pack_chunk(head: tuple[int, int, int, int], compression: str, data: bytes) -> bytes:

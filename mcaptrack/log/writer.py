@@ -1,67 +1,89 @@
-"""Writing a log: a new one, or one that stands with channels added and others left out.
+"""Writing a log, record after record, and the summary behind them.
 
-A log is written beside its final name and takes it when it is complete, checked and on the disk. Chunks that stand are
-copied as they are; only a chunk that mixes kept and dropped channels is opened. Pictures go to chunks of their own,
-uncompressed, because they are compressed already; rows go to zstd chunks of the stage that made them.
+Pictures go to chunks of their own, uncompressed, because they are compressed already; rows go to zstd chunks of the
+stage that made them, so that a stage that is run again leaves its old chunks out as they are. Every chunk describes the
+channels it holds: it can be read if it is all that is left.
 """
 
 from __future__ import annotations
 
+import mmap
 import zlib
-from collections.abc import Collection, Iterator, Mapping
+from array import array
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, Final, Literal
+from typing import Final, Literal, Protocol
 
+import numpy as np
 from mcap.opcode import Opcode
 
 from mcaptrack import __version__
 from mcaptrack.atomic import publish_stream
 from mcaptrack.errors import McaptrackError
 from mcaptrack.log import records
-from mcaptrack.log.index import Index, message_head, open_chunk, read_index
-from mcaptrack.log.reader import Log
-from mcaptrack.log.records import MAGIC, ChannelRecord, ChunkIndexRecord, SchemaRecord, walk
+from mcaptrack.log.chunks import forget
+from mcaptrack.log.index import Index, Listed, list_attachment, list_metadata, read_index
+from mcaptrack.log.records import MAGIC, ChannelRecord, ChunkIndexRecord, SchemaRecord
 
 Kind = Literal["media", "rows"]
 
 _CHUNK_BYTES: Final[Mapping[Kind, int]] = {"media": 4 * 2**20, "rows": 2**20}
 _ZSTD_LEVEL: Final = 3
 _MAX_NS: Final = 2**63 - 1
+_MAX_ID: Final = 2**16 - 1
+_BLOCK: Final = 8 * 2**20
+
+
+class Sink(Protocol):
+    """Where bytes go, one after another."""
+
+    def write(self, data: bytes, /) -> object:
+        """Put bytes behind those that were written."""
 
 
 @dataclass
 class _OpenChunk:
+    """Records that wait to become a chunk, and for each channel the times and places of its messages."""
+
     kind: Kind
     parts: list[bytes] = field(default_factory=list)
     size: int = 0
-    entries: dict[int, list[tuple[int, int]]] = field(default_factory=dict)
+    entries: dict[int, array[int]] = field(default_factory=dict)  # time, offset, time, offset ...
 
 
 class LogWriter:
-    """Writes one MCAP file from front to back; made by ``create`` and ``extend``."""
+    """Writes an MCAP file from front to back; made by ``create`` and ``extend``.
 
-    def __init__(self, stream: IO[bytes]) -> None:
-        self._stream = stream
-        self._offset = self._crc = 0
-        self._schemas: dict[int, SchemaRecord] = {}
-        self._channels: dict[int, ChannelRecord] = {}
-        self._counts: dict[int, int] = {}
-        self._kinds: dict[int, Kind] = {}
-        self._chunks: list[ChunkIndexRecord] = []
-        self._open: dict[Kind, _OpenChunk] = {}
-        self._attachments: list[bytes] = []
-        self._metadata: list[bytes] = []
-        self._times: tuple[int, int] | None = None
-        self._next_schema = self._next_channel = 1
-        self._write(MAGIC)
+    With an ``index`` it goes on at ``offset`` behind what that index describes, ``crc`` being the checksum of all bytes
+    so far, or None if nobody knows it.
+    """
+
+    def __init__(self, sink: Sink, offset: int = 0, crc: int | None = 0, index: Index | None = None) -> None:
+        index = index or Index()
+        self._sink, self.offset = sink, offset
+        #: The checksum of the data section, or of what this writer added to it where the rest is not known.
+        self.crc = crc or 0
+        self._crc_known = crc is not None
+        self.schemas: dict[int, SchemaRecord] = index.schemas
+        self.channels: dict[int, ChannelRecord] = index.channels
+        self.counts: dict[int, int] = index.counts
+        self.chunks: list[ChunkIndexRecord] = index.chunks
+        self._attachments: list[Listed] = index.attachments
+        self._metadata: list[Listed] = index.metadata
+        full = [chunk for chunk in index.chunks if chunk.message_index_offsets]
+        self._times = (min(c.start_ns for c in full), max(c.end_ns for c in full)) if full else None
+        self._groups: dict[int, tuple[Kind, str]] = {}
+        self._open: dict[tuple[Kind, str], _OpenChunk] = {}
+        self._topics = {channel.topic for channel in self.channels.values()}
 
     # Adding
 
     def header(self, profile: str = "") -> None:
-        """The first record; ``profile`` as in the MCAP registry, "" for none."""
-        self._write(records.pack(Opcode.HEADER, records.text(profile), records.text(f"mcaptrack {__version__}")))
+        """The first bytes; ``profile`` as in the MCAP registry, "" for none."""
+        self.write(MAGIC)
+        self.write(records.pack(Opcode.HEADER, records.text(profile), records.text(f"mcaptrack {__version__}")))
 
     def add_channel(
         self,
@@ -70,174 +92,138 @@ class LogWriter:
         message_encoding: str,
         metadata: Mapping[str, str],
         kind: Kind = "rows",
+        group: str = "",
+        *,
+        another: bool = False,
     ) -> int:
-        """A new channel; returns its id. ``schema`` is its name, encoding and data.
+        """A new channel; returns its id. ``schema`` is its name, encoding and data; ("", "", b"") is none.
 
-        Raises McaptrackError if the topic is taken.
+        Channels of one ``group`` share chunks. Raises McaptrackError if the topic is taken and ``another`` channel of
+        it is not asked for, and if there are 65 535 channels.
         """
-        if any(channel.topic == topic for channel in self._channels.values()):
+        if topic in self._topics and not another:
             raise McaptrackError(f"there is a channel {topic} already")
-        schema_id = next((s.id for s in self._schemas.values() if (s.name, s.encoding, s.data) == schema), 0)
-        if not schema_id:
-            schema_id = self._next_schema
-            self._put_schema(SchemaRecord(schema_id, *schema))
-            self._write(records.pack_schema(self._schemas[schema_id]))
-        channel = ChannelRecord(self._next_channel, schema_id, topic, message_encoding, dict(metadata))
-        self._put_channel(channel)
-        self._kinds[channel.id] = kind
-        self._write(records.pack_channel(channel))
-        return channel.id
+        schema_id = 0
+        if schema != ("", "", b""):
+            schema_id = next((s.id for s in self.schemas.values() if (s.name, s.encoding, s.data) == schema), 0)
+            schema_id = schema_id or _free_id(self.schemas, 1, "schemas")
+            self.schemas[schema_id] = SchemaRecord(schema_id, *schema)
+        channel_id = _free_id(self.channels, 1, "channels")
+        self.channels[channel_id] = ChannelRecord(channel_id, schema_id, topic, message_encoding, dict(metadata))
+        self._topics.add(topic)
+        self._groups[channel_id] = (kind, group)
+        return channel_id
 
-    def add_message(self, channel_id: int, t_ns: int, sequence: int, payload: bytes) -> None:
+    def add_message(
+        self, channel_id: int, t_ns: int, sequence: int, payload: bytes, publish_ns: int | None = None
+    ) -> None:
         """A message of a channel that was added. Raises McaptrackError for times that no log can hold."""
         if not 0 <= t_ns <= _MAX_NS:
             raise McaptrackError(f"{t_ns} ns is no time for a log; times run from 0 (1970) to {_MAX_NS} ns (2262)")
-        message = records.pack_message(channel_id, sequence, t_ns, t_ns, payload)
-        self._put_message(self._kinds[channel_id], channel_id, t_ns, message)
+        group = self._groups[channel_id]
+        chunk = self._open.get(group) or self._new_chunk(group)
+        entries = chunk.entries.get(channel_id)
+        if entries is None:
+            entries = self._describe(chunk, channel_id)
+        size = len(payload)
+        head = records.RECORD_MESSAGE_HEAD.pack(
+            Opcode.MESSAGE, size + 22, channel_id, sequence, t_ns, t_ns if publish_ns is None else publish_ns
+        )
+        entries.append(t_ns)
+        entries.append(chunk.size)
+        chunk.parts += (head, payload)
+        chunk.size += size + 31
+        if chunk.size >= _CHUNK_BYTES[chunk.kind]:
+            self._close_chunk(group)
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
         """A metadata record."""
-        record = records.pack(Opcode.METADATA, records.text(name), records.text_map(values))
-        self._index_metadata(name, len(record))
-        self._write(record)
+        self.put_metadata(records.pack(Opcode.METADATA, records.text(name), records.text_map(values)))
 
     def add_attachment(self, name: str, media_type: str, data: bytes) -> None:
         """A file inside the log."""
-        times = bytes(16)
-        body = times + records.text(name) + records.text(media_type) + records.raw(data, 8)
-        record = records.pack(Opcode.ATTACHMENT, body, records.number(zlib.crc32(body), 4))
-        self._index_attachment(times, name, media_type, len(data), len(record))
-        self._write(record)
+        body = bytes(16) + records.text(name) + records.text(media_type) + records.raw(data, 8)
+        self.put_attachment(records.pack(Opcode.ATTACHMENT, body, records.number(zlib.crc32(body), 4)))
 
-    # Copying
+    # Passing on
 
-    def copy(
-        self, source: Log, drop: Collection[str], drop_metadata: Collection[str], drop_attachments: Collection[str]
-    ) -> None:
-        """All of a log but these channels, metadata and attachments; ids, chunks and checksums stay as they are."""
-        buffer, index = source.buffer, source.index
-        dropped = {channel.id for channel in index.channels.values() if channel.topic in drop}
-        kept_channels = {id_: channel for id_, channel in index.channels.items() if id_ not in dropped}
-        kept_schemas = {channel.schema_id for channel in kept_channels.values()}
-        named_outside = set()
-        for record in walk(buffer, len(MAGIC), index.data_end):
-            if record.opcode == Opcode.CHANNEL:
-                named_outside.add(records.read_channel(buffer, record).id)
-        may_be_inside = bool(dropped - named_outside)
-        self._next_schema = max(index.schemas, default=0) + 1
-        self._next_channel = max(index.channels, default=0) + 1
-        skip_index = False
-        for record in walk(buffer, len(MAGIC), index.data_end):
-            whole = bytes(buffer[record.start : record.end])
-            if record.opcode == Opcode.SCHEMA:
-                schema = records.read_schema(buffer, record)
-                if schema.id not in kept_schemas and dropped:
-                    continue
-            elif record.opcode == Opcode.CHANNEL:
-                if records.read_channel(buffer, record).id in dropped:
-                    continue
-            elif record.opcode == Opcode.MESSAGE:
-                channel, _, t_ns, _ = message_head(buffer, record)
-                if channel not in dropped:
-                    # Readers that go by the index of chunks would never find it outside of one.
-                    self._put_message("rows", channel, t_ns, whole)
-                continue
-            elif record.opcode == Opcode.CHUNK:
-                skip_index = self._copy_chunk(buffer, index, record, dropped, may_be_inside)
-                continue
-            elif record.opcode == Opcode.MESSAGE_INDEX:
-                if not skip_index and not self._chunks:
-                    raise records.Damaged(f"byte {record.start}: a message index without a chunk")
-                if not skip_index:
-                    channel = records.read_message_index(buffer, record)[0]
-                    self._chunks[-1].message_index_offsets[channel] = self._offset
-                    self._chunks[-1] = self._chunks[-1]._replace(
-                        message_index_length=self._chunks[-1].message_index_length + len(whole)
-                    )
-                    self._write(whole)
-                continue
-            elif record.opcode == Opcode.ATTACHMENT:
-                log_ns, create_ns, name, media_type, data = records.read_attachment(buffer, record)
-                if name in drop_attachments:
-                    continue
-                times = records.number(log_ns, 8) + records.number(create_ns, 8)
-                self._index_attachment(times, name, media_type, len(data), len(whole))
-            elif record.opcode == Opcode.METADATA:
-                name = records.read_metadata(buffer, record)[0]
-                if name in drop_metadata:
-                    continue
-                self._index_metadata(name, len(whole))
-            self._write(whole)
-        self._schemas = {id_: s for id_, s in index.schemas.items() if id_ in kept_schemas or not dropped}
-        self._channels = dict(kept_channels)
+    def put_description(self, channel_id: int) -> None:
+        """The records that describe a channel, outside of chunks."""
+        self.write(self._description(channel_id))
 
-    def _copy_chunk(
-        self, buffer: memoryview, index: Index, record: records.Record, dropped: set[int], may_be_inside: bool
-    ) -> bool:
-        """Copy a chunk as it is if nothing in it goes, or what is kept of it; returns whether its indexes go too."""
-        known = next((chunk for chunk in index.chunks if chunk.offset == record.start), None)
-        if known is None:
-            raise records.Damaged(f"byte {record.start}: a chunk that no index knows")
-        content = None
-        counts: dict[int, int] = {}
-        indexes = known.message_index_offsets
-        if all(indexes.values()) and not dropped & set(indexes) and not may_be_inside:
-            for offset in indexes.values():
-                channel, count = records.read_message_index(buffer, records.record_at(buffer, offset))
-                counts[channel] = count
-        if not counts:
-            content = open_chunk(buffer, record)
-            goes = False
-            for inner in walk(content, 0, len(content)):
-                if inner.opcode == Opcode.MESSAGE:
-                    channel = message_head(content, inner)[0]
-                    counts[channel] = counts.get(channel, 0) + 1
-                    goes |= channel in dropped
-                elif inner.opcode == Opcode.CHANNEL:
-                    goes |= records.read_channel(content, inner).id in dropped
-            if goes:
-                self._rewrite_chunk(content, known, dropped)
-                return True
-        self._chunks.append(known._replace(offset=self._offset, message_index_offsets={}, message_index_length=0))
-        for channel, count in counts.items():
-            self._counts[channel] = self._counts.get(channel, 0) + count
-        if counts:
-            self._times_seen(known.start_ns, known.end_ns)
-        self._write(bytes(buffer[record.start : record.end]))
-        return False
+    def put_message(self, channel_id: int, t_ns: int, message: memoryview) -> None:
+        """The record of a message that stood outside of chunks. Readers that go by indexes would not find it there."""
+        group: tuple[Kind, str] = ("rows", "")
+        chunk = self._open.get(group) or self._new_chunk(group)
+        if channel_id not in chunk.entries:
+            self._describe(chunk, channel_id)
+        _append(chunk, channel_id, t_ns, message)
+        if chunk.size >= _CHUNK_BYTES["rows"]:
+            self._close_chunk(group)
 
-    def _rewrite_chunk(self, content: memoryview, known: ChunkIndexRecord, dropped: set[int]) -> None:
-        chunk = _OpenChunk("rows" if known.compression else "media")
-        for inner in walk(content, 0, len(content)):
-            if inner.opcode == Opcode.MESSAGE:
-                channel, _, t_ns, _ = message_head(content, inner)
-                if channel in dropped:
-                    continue
-                chunk.entries.setdefault(channel, []).append((t_ns, chunk.size))
-                self._count(channel, t_ns)
-            elif inner.opcode == Opcode.CHANNEL and records.read_channel(content, inner).id in dropped:
-                continue
-            chunk.parts.append(bytes(content[inner.start : inner.end]))
-            chunk.size += inner.end - inner.start
+    def put_metadata(self, record: bytes) -> None:
+        """A whole metadata record."""
+        buffer = memoryview(record)
+        self._metadata.append(list_metadata(buffer, records.record_at(buffer, 0), self.offset))
+        self.write(record)
+
+    def put_attachment(self, record: bytes) -> None:
+        """A whole attachment record."""
+        buffer = memoryview(record)
+        self._attachments.append(list_attachment(buffer, records.record_at(buffer, 0), self.offset))
+        self.write(record)
+
+    def put_chunk(self, record: bytes, known: ChunkIndexRecord, indexes: Mapping[int, bytes]) -> None:
+        """A whole chunk, and behind it the entries of its message indexes (time and offset, 8 bytes each)."""
+        start = self.offset
+        self.write(record)
+        index_start, offsets = self.offset, {}
+        for channel_id, entries in indexes.items():
+            offsets[channel_id] = self.offset
+            self.write(records.pack_message_index(channel_id, entries))
+            self.counts[channel_id] = self.counts.get(channel_id, 0) + len(entries) // 16
+        self.chunks.append(
+            known._replace(offset=start, message_index_offsets=offsets, message_index_length=self.offset - index_start)
+        )
+        if indexes:
+            low, high = self._times or (known.start_ns, known.end_ns)
+            self._times = (min(low, known.start_ns), max(high, known.end_ns))
+
+    def put_part_of_chunk(self, kind: Kind, parts: Iterable[tuple[int, int, memoryview]]) -> None:
+        """What is kept of a chunk, as a chunk: channel (-1 for no message), log time and record of each part."""
+        chunk = _OpenChunk(kind)
+        for channel_id, t_ns, record in parts:
+            _append(chunk, channel_id, t_ns, record)
         if chunk.parts:
-            self._put_chunk(chunk)
+            self._put(chunk)
+
+    def write(self, data: bytes) -> None:
+        """Bytes of the data section, as they are."""
+        self._sink.write(data)
+        self.crc = zlib.crc32(data, self.crc)
+        self.offset += len(data)
 
     # Finishing
 
     def finish(self) -> int:
         """Close the open chunks, write the summary and the footer. Returns how many messages the file holds."""
-        for kind in tuple(self._open):
-            self._close_chunk(kind)
-        crc = self._crc
-        self._write(records.pack(Opcode.DATA_END, records.number(crc, 4)))
-        start = self._offset
+        for group in tuple(self._open):
+            self._close_chunk(group)
+        for channel_id in self._groups.keys() - self.counts.keys():  # those that no chunk describes
+            self.put_description(channel_id)
+        data_crc = self.crc if self._crc_known else 0
+        self._sink.write(records.pack(Opcode.DATA_END, records.number(data_crc, 4)))
+        self._sink.write(self._summary(self.offset + 13))
+        return sum(self.counts.values())
+
+    def _summary(self, start: int) -> bytes:
         groups = {
-            Opcode.SCHEMA: [records.pack_schema(schema) for schema in self._schemas.values()],
-            Opcode.CHANNEL: [records.pack_channel(channel) for channel in self._channels.values()],
+            Opcode.SCHEMA: [records.pack_schema(schema) for schema in self.schemas.values()],
+            Opcode.CHANNEL: [records.pack_channel(channel) for channel in self.channels.values()],
             Opcode.STATISTICS: [self._statistics()],
-            Opcode.CHUNK_INDEX: [records.pack_chunk_index(chunk) for chunk in self._chunks],
-            Opcode.ATTACHMENT_INDEX: self._attachments,
-            Opcode.METADATA_INDEX: self._metadata,
+            Opcode.CHUNK_INDEX: [records.pack_chunk_index(chunk) for chunk in self.chunks],
+            Opcode.ATTACHMENT_INDEX: [listed.entry for listed in self._attachments],
+            Opcode.METADATA_INDEX: [listed.entry for listed in self._metadata],
         }
         summary, offsets = bytearray(), bytearray()
         for opcode, parts in groups.items():
@@ -246,143 +232,109 @@ class LogWriter:
                 where = records.number(start + len(summary), 8) + records.number(len(group), 8)
                 offsets += records.pack(Opcode.SUMMARY_OFFSET, records.number(opcode, 1), where)
                 summary += group
-        offset_start = start + len(summary)
         body = bytes(summary + offsets)
         footer = records.number(Opcode.FOOTER, 1) + records.number(records.FOOTER_BODY.size, 8)
-        footer += records.number(start, 8) + records.number(offset_start, 8)
-        checksum = zlib.crc32(footer, zlib.crc32(body))
-        self._write(body + footer + records.number(checksum, 4) + MAGIC)
-        self._stream.flush()
-        return sum(self._counts.values())
+        footer += records.number(start, 8) + records.number(start + len(summary), 8)
+        return body + footer + records.number(zlib.crc32(footer, zlib.crc32(body)), 4) + MAGIC
 
     def _statistics(self) -> bytes:
         first, last = self._times or (0, 0)
         sizes = (
-            (sum(self._counts.values()), 8),
-            (len(self._schemas), 2),
-            (len(self._channels), 4),
+            (sum(self.counts.values()), 8),
+            (len(self.schemas), 2),
+            (len(self.channels), 4),
             (len(self._attachments), 4),
             (len(self._metadata), 4),
-            (len(self._chunks), 4),
+            (len(self.chunks), 4),
             (first, 8),
             (last, 8),
         )
-        counts = records.number_map(self._counts, 2, 8)
+        counts = records.number_map(self.counts, 2, 8)
         return records.pack(Opcode.STATISTICS, *(records.number(value, size) for value, size in sizes), counts)
 
     # Inside
 
-    def _put_schema(self, schema: SchemaRecord) -> None:
-        self._schemas[schema.id] = schema
-        self._next_schema = max(self._next_schema, schema.id + 1)
+    def _new_chunk(self, group: tuple[Kind, str]) -> _OpenChunk:
+        return self._open.setdefault(group, _OpenChunk(group[0]))
 
-    def _put_channel(self, channel: ChannelRecord) -> None:
-        self._channels[channel.id] = channel
-        self._next_channel = max(self._next_channel, channel.id + 1)
+    def _describe(self, chunk: _OpenChunk, channel_id: int) -> array[int]:
+        """Put the records that describe a channel into a chunk, before its first message there."""
+        words = self._description(channel_id)
+        chunk.parts.append(words)
+        chunk.size += len(words)
+        return chunk.entries.setdefault(channel_id, array("Q"))
 
-    def _count(self, channel_id: int, t_ns: int) -> None:
-        self._counts[channel_id] = self._counts.get(channel_id, 0) + 1
-        self._times_seen(t_ns, t_ns)
+    def _description(self, channel_id: int) -> bytes:
+        channel = self.channels[channel_id]
+        schema = records.pack_schema(self.schemas[channel.schema_id]) if channel.schema_id else b""
+        return schema + records.pack_channel(channel)
 
-    def _times_seen(self, first_ns: int, last_ns: int) -> None:
-        low, high = self._times or (first_ns, last_ns)
-        self._times = (min(low, first_ns), max(high, last_ns))
+    def _close_chunk(self, group: tuple[Kind, str]) -> None:
+        self._put(self._open.pop(group))
 
-    def _index_metadata(self, name: str, length: int) -> None:
-        fields = records.number(self._offset, 8) + records.number(length, 8)
-        self._metadata.append(records.pack(Opcode.METADATA_INDEX, fields, records.text(name)))
-
-    def _index_attachment(self, times: bytes, name: str, media_type: str, size: int, length: int) -> None:
-        fields = records.number(self._offset, 8) + records.number(length, 8) + times + records.number(size, 8)
-        self._attachments.append(
-            records.pack(Opcode.ATTACHMENT_INDEX, fields, records.text(name), records.text(media_type))
-        )
-
-    def _put_message(self, kind: Kind, channel_id: int, t_ns: int, message: bytes) -> None:
-        chunk = self._open.setdefault(kind, _OpenChunk(kind))
-        chunk.entries.setdefault(channel_id, []).append((t_ns, chunk.size))
-        chunk.parts.append(message)
-        chunk.size += len(message)
-        self._count(channel_id, t_ns)
-        if chunk.size >= _CHUNK_BYTES[kind]:
-            self._close_chunk(kind)
-
-    def _close_chunk(self, kind: Kind) -> None:
-        self._put_chunk(self._open.pop(kind))
-
-    def _put_chunk(self, chunk: _OpenChunk) -> None:
+    def _put(self, chunk: _OpenChunk) -> None:
         content = b"".join(chunk.parts)
-        times = [t_ns for entries in chunk.entries.values() for t_ns, _ in entries]
-        first, last = (min(times), max(times)) if times else (0, 0)
+        indexes = {channel: np.array(entries, "<u8") for channel, entries in chunk.entries.items() if entries}
+        first = min((int(entries[::2].min()) for entries in indexes.values()), default=0)
+        last = max((int(entries[::2].max()) for entries in indexes.values()), default=0)
         compression, data = "", content
         if chunk.kind == "rows":
             import zstandard
 
             compression, data = "zstd", zstandard.ZstdCompressor(_ZSTD_LEVEL).compress(content)
         record = records.pack_chunk((first, last, len(content), zlib.crc32(content)), compression, data)
-        start = self._offset
-        self._write(record)
-        index_start, offsets = self._offset, {}
-        for channel_id, entries in chunk.entries.items():
-            offsets[channel_id] = self._offset
-            self._write(records.pack_message_index(channel_id, entries))
-        length = self._offset - index_start
-        self._chunks.append(
-            ChunkIndexRecord(first, last, start, len(record), offsets, length, compression, len(data), len(content))
-        )
+        known = ChunkIndexRecord(first, last, 0, len(record), {}, 0, compression, len(data), len(content))
+        self.put_chunk(record, known, {channel: entries.tobytes() for channel, entries in indexes.items()})
 
-    def _write(self, data: bytes) -> None:
-        self._stream.write(data)
-        self._crc = zlib.crc32(data, self._crc)
-        self._offset += len(data)
+
+def _append(chunk: _OpenChunk, channel_id: int, t_ns: int, record: memoryview) -> None:
+    """A whole record into a chunk; ``channel_id`` is -1 if it is no message."""
+    if channel_id >= 0:
+        chunk.entries.setdefault(channel_id, array("Q")).extend((t_ns, chunk.size))
+    chunk.parts.append(bytes(record))
+    chunk.size += len(record)
+
+
+def _free_id(taken: Mapping[int, object], first: int, what: str) -> int:
+    """The number after the highest that is taken, or else the lowest that is not."""
+    following = max(taken, default=first - 1) + 1
+    if following <= _MAX_ID:
+        return following
+    free = next((number for number in range(first, _MAX_ID + 1) if number not in taken), None)
+    if free is None:
+        raise McaptrackError(f"there are {len(taken)} {what} already; a log holds no more")
+    return free
 
 
 @contextmanager
-def create(path: Path) -> Iterator[LogWriter]:
+def create(path: Path, profile: str = "") -> Iterator[LogWriter]:
     """A new log at ``path``, there once the block has ended well."""
     with publish_stream(path) as stream:
         writer = LogWriter(stream)
-        writer.header()
+        writer.header(profile)
         yield writer
-        _finish(writer, stream)
+        messages = writer.finish()
+        stream.flush()
+        verify(Path(stream.name), writer, messages)
 
 
-@contextmanager
-def extend(
-    log: Log,
-    output: Path | None = None,
-    *,
-    drop: Collection[str] = (),
-    drop_metadata: Collection[str] = (),
-    drop_attachments: Collection[str] = (),
-) -> Iterator[LogWriter]:
-    """The log with channels added and these topics, metadata and attachments left out, there once the block ends well.
+def verify(path: Path, writer: LogWriter, messages: int, start: int = 0, crc: int = 0) -> None:
+    """Read back what was written from ``start`` on, ``crc`` being the checksum of what was there before.
 
-    ``output`` is another file to write it to; the log itself stays as it is then. Raises McaptrackError if another
-    process is writing to it.
+    Raises McaptrackError if it is not what was written, or does not add up: then it must not stay.
     """
-    if output is None:
-        log.lock()
-    with publish_stream(output or log.path) as stream:
-        writer = LogWriter(stream)
-        try:
-            writer.copy(log, drop, drop_metadata, drop_attachments)
-        except records.Damaged as error:
-            raise McaptrackError(f"{log.path} is damaged: {error}") from None
-        yield writer
-        _finish(writer, stream)
-
-
-def _finish(writer: LogWriter, stream: IO[bytes]) -> None:
-    """Write the end, then read the file's summary back: what can't be read again is not published."""
-    written = writer.finish()
-    with Path(stream.name).open("rb") as check:
-        import mmap
-
-        index = read_index(memoryview(mmap.mmap(check.fileno(), 0, access=mmap.ACCESS_READ)))
+    with path.open("rb") as stream:
+        buffer = memoryview(mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ))
+    index = read_index(buffer)
+    at = start
+    while at < index.data_end:
+        end = min(at + _BLOCK, index.data_end)
+        crc = zlib.crc32(buffer[at:end], crc)
+        forget(buffer, at, end)
+        at = end
     readable = sum(index.counts.values())
-    if readable != written:
+    if crc != writer.crc or readable != messages:
         raise McaptrackError(
-            f"of {written} messages that were written {readable} can be read again; "
+            f"of {messages} messages that were written {readable} can be read again, or others; "
             "the log does not add up, and is left as it was"
         )

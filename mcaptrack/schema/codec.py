@@ -5,7 +5,7 @@ bytes always stand at the same places. A payload is therefore a structured array
 fills a template, decoding is a view. What another protobuf writer made of the same schema (default values left out,
 fields in another order) has another length or other tags; that is detected and given to the protobuf runtime.
 
-Letters: N rows.
+Letters: N rows, M messages.
 """
 
 from __future__ import annotations
@@ -93,6 +93,32 @@ class RowCodec:
         parts = [self.decode(payload) for payload in payloads]
         rows = np.concatenate(parts) if parts else np.empty(0, self.dtype)
         return rows, np.array([len(part) for part in parts], np.int64)
+
+    def decode_at(
+        self, raw: NDArray[np.uint8], start: NDArray[np.int64], end: NDArray[np.int64]
+    ) -> tuple[Rows, NDArray[np.int64]] | None:
+        """Payloads that stand from ``start`` (M,) to ``end`` (M,) in ``raw``, as ``decode_all`` gives them.
+
+        None where one is laid out otherwise than ours.
+        """
+        size = self.dtype.itemsize
+        counts, over = np.divmod(end - start, size)
+        if over.any():
+            return None
+        total = int(counts.sum())
+        if total == 0:
+            return np.empty(0, self.dtype), counts
+        first = np.repeat(start - size * (np.cumsum(counts) - counts), counts) + size * np.arange(total)
+        block = np.lib.stride_tricks.sliding_window_view(raw, size)[first]
+        if ((block & self._fixed) != (self._template & self._fixed)).any():
+            return None
+        return block.view(self.dtype)[:, 0], counts
+
+    def join(self, parts: Sequence[Rows]) -> Rows:
+        """Arrays of this layout as one; as bytes, since NumPy joins structured arrays field by field."""
+        size = self.dtype.itemsize
+        raw = [np.ascontiguousarray(part).view(np.uint8).reshape(-1, size) for part in parts]
+        return np.concatenate([np.empty((0, size), np.uint8), *raw]).view(self.dtype)[:, 0]
 
     def _is_ours(self, payload: bytes) -> bool:
         """Whether every tag stands where our encoder puts it: then each byte between them is what we say it is."""

@@ -1,0 +1,294 @@
+"""A log that stands, with channels added and others left out.
+
+What comes before the first record that goes is not touched: the end from there on is written anew, kept chunks as they
+are, new ones behind them, then a new summary. That is done in place where it is less work than a copy, so adding to a
+log costs what is added. A log without a usable summary, or with messages outside of chunks, is copied and put in order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from mcap.opcode import Opcode
+
+from mcaptrack.atomic import publish_stream
+from mcaptrack.errors import McaptrackError
+from mcaptrack.log import records
+from mcaptrack.log.chunks import chunk_entries, chunk_record, forget, message_head, open_chunk
+from mcaptrack.log.index import Index
+from mcaptrack.log.journal import new_end
+from mcaptrack.log.reader import Log
+from mcaptrack.log.records import MAGIC, ChunkIndexRecord, Damaged, Record, walk
+from mcaptrack.log.writer import LogWriter, Sink, verify
+
+_BLOCK: Final = 8 * 2**20
+
+
+@contextmanager
+def extend(
+    log: Log,
+    output: Path | None = None,
+    *,
+    drop: Collection[str] = (),
+    drop_metadata: Collection[str] = (),
+    drop_attachments: Collection[str] = (),
+) -> Iterator[LogWriter]:
+    """The log with channels added and these topics, metadata and attachments left out, there once the block ends well.
+
+    ``output`` is another file to write it to; the log itself stays as it is then. Raises McaptrackError if the log is
+    damaged, can't be written to, or is being written to by another process.
+    """
+    if output is None:
+        log.lock()
+    try:
+        change = _Change.plan(log, drop, drop_metadata, drop_attachments)
+        opened = _in_place(log, change) if output is None and change.is_small else _as_copy(log, change, output)
+        with opened as writer:
+            yield writer
+    except Damaged as error:
+        raise McaptrackError(f"{log.path} is damaged: {error}") from None
+
+
+@contextmanager
+def _in_place(log: Log, change: _Change) -> Iterator[LogWriter]:
+    index = log.index
+    crc = None
+    if index.data_crc:
+        crc = records.crc_before(index.data_crc, log.buffer[change.cut : index.data_end])
+    try:
+        with new_end(log.real_path, log.lock(), change.cut) as end:
+            writer = LogWriter(end, change.cut, crc, change.before())
+            change.replay(writer, end.old[: index.data_end - change.cut], change.cut)
+            yield writer
+            messages = writer.finish()
+            end.close()
+            verify(log.real_path, writer, messages, change.cut, crc or 0)
+    except OSError as error:
+        raise McaptrackError(f"{log.path} can't be written: {error.strerror or error}; it is left as it was") from error
+
+
+@contextmanager
+def _as_copy(log: Log, change: _Change, output: Path | None) -> Iterator[LogWriter]:
+    """Beside its final name, which it takes when it is complete, checked and on the disk."""
+    with publish_stream(output or log.real_path) as stream:
+        if change.cut > len(MAGIC):
+            _pass_on(log.buffer, change.cut, stream)
+            crc = None
+            if log.index.data_crc:
+                crc = records.crc_before(log.index.data_crc, log.buffer[change.cut : log.index.data_end])
+            writer = LogWriter(stream, change.cut, crc, change.before())
+        else:
+            crc = 0
+            writer = LogWriter(stream, 0, 0, change.before())
+            writer.write(MAGIC)
+        change.replay(writer, log.buffer[: log.index.data_end], 0)
+        yield writer
+        messages = writer.finish()
+        stream.flush()
+        start = change.cut if change.cut > len(MAGIC) else 0
+        copy = Path(stream.name)
+        _compare(log.buffer, copy, start)
+        verify(copy, writer, messages, start, crc or 0)
+
+
+def _pass_on(buffer: memoryview, end: int, stream: Sink) -> None:
+    for at in range(0, end, _BLOCK):
+        until = min(at + _BLOCK, end)
+        stream.write(buffer[at:until])  # type: ignore[arg-type]  # any bytes will do
+        forget(buffer, at, until)
+
+
+def _compare(buffer: memoryview, copy: Path, end: int) -> None:
+    """What was passed on is what was read. Raises McaptrackError otherwise."""
+    with copy.open("rb") as stream:
+        for at in range(0, end, _BLOCK):
+            until = min(at + _BLOCK, end)
+            if stream.read(until - at) != buffer[at:until]:
+                raise McaptrackError(f"{copy} is not what was written to it; the disk can't be relied on")
+            forget(buffer, at, until)
+
+
+@dataclass
+class _Change:
+    """What goes from a log, and where the first record stands that is written anew (``cut``).
+
+    ``described`` are the channels that what stays in place describes; ``open_all`` says that any chunk may describe a
+    channel that goes.
+    """
+
+    index: Index
+    buffer: memoryview
+    dropped: set[int]
+    metadata: Collection[str]
+    attachments: Collection[str]
+    cut: int = len(MAGIC)
+    open_all: bool = False
+
+    @classmethod
+    def plan(cls, log: Log, drop: Collection[str], metadata: Collection[str], attachments: Collection[str]) -> _Change:
+        index = log.index
+        dropped = {channel.id for channel in index.channels.values() if channel.topic in drop}
+        change = cls(index, log.buffer, dropped, metadata, attachments)
+        if not index.regular:
+            change.open_all = True
+            return change
+        places = [index.data_end]
+        places += [chunk.offset for chunk in index.chunks if not dropped.isdisjoint(chunk.message_index_offsets)]
+        places += [listed.offset for listed in index.metadata if listed.name in metadata]
+        places += [listed.offset for listed in index.attachments if listed.name in attachments]
+        undescribed = {channel for channel in dropped if not change._is_described_where_it_begins(channel)}
+        if undescribed:
+            for record in walk(log.buffer, len(MAGIC), index.data_end):
+                if record.opcode == Opcode.CHANNEL:
+                    channel = records.read_channel(log.buffer, record).id
+                    places += [record.start] if channel in dropped else []
+                    undescribed.discard(channel)
+        change.open_all = bool(undescribed)
+        change.cut = len(MAGIC) if undescribed else min(places)
+        return change
+
+    def _is_described_where_it_begins(self, channel_id: int) -> bool:
+        """Whether the first chunk with messages of a channel also describes it: then nothing outside of chunks does."""
+        for chunk in self.index.chunks:
+            if channel_id in chunk.message_index_offsets:
+                return channel_id in _described_in(open_chunk(self.buffer, chunk_record(self.buffer, chunk)))[0]
+        return False
+
+    @property
+    def is_small(self) -> bool:
+        """Whether writing the end twice, to the journal and in place, is less than writing everything once."""
+        return self.index.regular and self.cut > len(self.buffer) - self.cut
+
+    def before(self) -> Index:
+        """What is in the log before the cut, of what stays."""
+        index = self.index
+        channels = {number: channel for number, channel in index.channels.items() if number not in self.dropped}
+        only_dropped = {index.channels[number].schema_id for number in self.dropped}
+        only_dropped -= {channel.schema_id for channel in channels.values()}
+        schemas = {number: schema for number, schema in index.schemas.items() if number not in only_dropped}
+        if self.cut <= len(MAGIC):
+            return Index(schemas=schemas, channels=channels)
+        counts = dict(index.counts)
+        for chunk in index.chunks:
+            if chunk.offset >= self.cut:
+                for offset in chunk.message_index_offsets.values():
+                    channel, count = records.read_message_index(self.buffer, records.record_at(self.buffer, offset))
+                    counts[channel] = counts.get(channel, 0) - count
+        return replace(
+            index,
+            schemas=schemas,
+            channels=channels,
+            counts={number: count for number, count in counts.items() if number in channels and count},
+            chunks=[chunk for chunk in index.chunks if chunk.offset < self.cut],
+            attachments=[listed for listed in index.attachments if listed.offset < self.cut],
+            metadata=[listed for listed in index.metadata if listed.offset < self.cut],
+        )
+
+    def replay(self, writer: LogWriter, buffer: memoryview, base: int) -> None:
+        """Write what stays of the records from the cut on. ``buffer`` is the file from ``base`` to its data's end."""
+        chunks = {chunk.offset: chunk for chunk in self.index.chunks if chunk.offset >= self.cut}
+        described = {channel for chunk in writer.chunks for channel in chunk.message_index_offsets}
+        orphans: dict[int, None] = {}  # channels that stay, and that a chunk that went described
+        for record in walk(buffer, self.cut - base, len(buffer)):
+            if record.opcode == Opcode.CHUNK:
+                known = chunks.get(base + record.start)
+                if known is None:
+                    raise Damaged(f"byte {base + record.start}: a chunk that no index knows")
+                self._replay_chunk(writer, buffer, base, record, known, orphans, described)
+                forget(buffer, record.start, record.end)
+            elif record.opcode == Opcode.MESSAGE:
+                channel, _, t_ns, _ = message_head(buffer, record)
+                if channel not in self.dropped:
+                    writer.put_message(channel, t_ns, buffer[record.start : record.end])
+            elif record.opcode != Opcode.MESSAGE_INDEX and self._stays(buffer, record):
+                whole = bytes(buffer[record.start : record.end])
+                if record.opcode == Opcode.ATTACHMENT:
+                    writer.put_attachment(whole)
+                elif record.opcode == Opcode.METADATA:
+                    writer.put_metadata(whole)
+                else:
+                    writer.write(whole)
+        for channel in orphans:
+            writer.put_description(channel)
+
+    def _stays(self, buffer: memoryview, record: Record) -> bool:
+        if record.opcode == Opcode.SCHEMA:
+            schema = records.read_schema(buffer, record).id
+            users = {channel.id for channel in self.index.channels.values() if channel.schema_id == schema}
+            return not users or not users <= self.dropped
+        if record.opcode == Opcode.CHANNEL:
+            return records.read_channel(buffer, record).id not in self.dropped
+        if record.opcode == Opcode.ATTACHMENT:
+            return records.read_attachment(buffer, record)[2] not in self.attachments
+        if record.opcode == Opcode.METADATA:
+            return records.read_metadata(buffer, record)[0] not in self.metadata
+        return True
+
+    def _replay_chunk(
+        self,
+        writer: LogWriter,
+        buffer: memoryview,
+        base: int,
+        record: Record,
+        known: ChunkIndexRecord,
+        orphans: dict[int, None],
+        described: set[int],
+    ) -> None:
+        holds = set(known.message_index_offsets)
+        content = None
+        if self.open_all or not holds.isdisjoint(self.dropped) or not holds.isdisjoint(orphans):
+            content = open_chunk(buffer, record)
+            channels, schemas = _described_in(content)
+            if holds and holds <= self.dropped:
+                about = {c.id for c in writer.channels.values() if c.id in channels or c.schema_id in schemas}
+                orphans |= dict.fromkeys(about - described)
+                return
+            if not self.dropped.isdisjoint(holds | channels):
+                kind = "rows" if known.compression else "media"
+                writer.put_part_of_chunk(kind, self._kept(content))  # type: ignore[arg-type]
+                return
+            for channel in sorted(holds & orphans.keys()):
+                if channel not in channels or writer.channels[channel].schema_id not in {0, *schemas}:
+                    writer.put_description(channel)
+        for channel in holds:
+            orphans.pop(channel, None)
+        described |= holds
+        indexes: dict[int, bytes] = {}
+        if self.index.regular:
+            for offset in known.message_index_offsets.values():
+                index = records.record_at(buffer, offset - base)
+                channel, entries = records.read_message_entries(buffer, index)
+                indexes[channel] = bytes(entries)
+        elif content is not None:
+            indexes = {channel: entries.tobytes() for channel, entries in chunk_entries(content).items()}
+            low = min((int(np.frombuffer(entries, "<u8")[::2].min()) for entries in indexes.values()), default=0)
+            high = max((int(np.frombuffer(entries, "<u8")[::2].max()) for entries in indexes.values()), default=0)
+            known = known._replace(start_ns=low, end_ns=high)
+        writer.put_chunk(bytes(buffer[record.start : record.end]), known, indexes)
+
+    def _kept(self, content: memoryview) -> Iterator[tuple[int, int, memoryview]]:
+        """The records of a chunk that stay: channel, -1 for no message, log time, and the record."""
+        for inner in walk(content, 0, len(content)):
+            whole = content[inner.start : inner.end]
+            if inner.opcode == Opcode.MESSAGE:
+                channel, _, t_ns, _ = message_head(content, inner)
+                if channel not in self.dropped:
+                    yield channel, t_ns, whole
+            elif self._stays(content, inner):
+                yield -1, 0, whole
+
+
+def _described_in(content: memoryview) -> tuple[set[int], set[int]]:
+    """The channels and the schemas that a chunk describes."""
+    channels, schemas = set(), set()
+    for inner in walk(content, 0, len(content)):
+        if inner.opcode == Opcode.CHANNEL:
+            channels.add(records.read_channel(content, inner).id)
+        elif inner.opcode == Opcode.SCHEMA:
+            schemas.add(records.read_schema(content, inner).id)
+    return channels, schemas

@@ -1,0 +1,160 @@
+"""Chunks and the messages in them: opened within bounds, checked, and read without a loop over messages.
+
+Letters: M messages.
+"""
+
+from __future__ import annotations
+
+import mmap
+import zlib
+from typing import Final, NamedTuple
+
+import numpy as np
+from mcap.opcode import Opcode
+from numpy.typing import NDArray
+
+from mcaptrack.log import records
+from mcaptrack.log.records import ChunkIndexRecord, Damaged, Reader, Record, walk
+
+Ints = NDArray[np.int64]
+
+#: A chunk that says it is larger than this is not decompressed.
+MAX_CHUNK_BYTES: Final = 256 * 2**20
+#: A message record up to its payload.
+HEAD: Final = np.dtype(
+    [
+        ("opcode", "u1"),
+        ("size", "<u8"),
+        ("channel", "<u2"),
+        ("sequence", "<u4"),
+        ("t_ns", "<u8"),
+        ("publish_ns", "<u8"),
+    ]
+)
+_MAX_NS: Final = 2**63 - 1
+
+
+class Heads(NamedTuple):
+    """M messages of one channel in a chunk: their record heads (M,) of ``HEAD``, and where payloads start and end."""
+
+    content: memoryview
+    head: NDArray[np.void]
+    start: Ints
+    end: Ints
+
+
+def message_head(buffer: memoryview, record: Record) -> tuple[int, int, int, int]:
+    """Channel, sequence, log time and publish time of a message record."""
+    if record.end - record.body < records.MESSAGE_HEAD.size:
+        raise Damaged(f"byte {record.start}: a message of {record.end - record.body} bytes")
+    head: tuple[int, int, int, int] = records.MESSAGE_HEAD.unpack_from(buffer, record.body)
+    return head
+
+
+def chunk_record(buffer: memoryview, chunk: ChunkIndexRecord) -> Record:
+    """The chunk that an index points to."""
+    record = records.record_at(buffer, chunk.offset)
+    if record.opcode != Opcode.CHUNK:
+        raise Damaged(f"byte {chunk.offset}: no chunk where one belongs")
+    return record
+
+
+def open_chunk(buffer: memoryview, record: Record) -> memoryview:
+    """The records inside a chunk, decompressed and checked. Memory is bounded by what the chunk says of itself."""
+    head = records.read_chunk(buffer, record)
+    if head.uncompressed_size > MAX_CHUNK_BYTES:
+        raise Damaged(f"byte {record.start}: a chunk of {head.uncompressed_size} bytes; at most {MAX_CHUNK_BYTES}")
+    data = buffer[head.start : head.end]
+    content = _decompress(data, head.compression, head.uncompressed_size, record.start)
+    if len(content) != head.uncompressed_size:
+        raise Damaged(f"byte {record.start}: a chunk of {len(content)} bytes that says {head.uncompressed_size}")
+    if head.uncompressed_crc and zlib.crc32(content) != head.uncompressed_crc:
+        raise Damaged(f"byte {record.start}: the checksum of a chunk is wrong")
+    return content
+
+
+def _decompress(data: memoryview, compression: str, size: int, where: int) -> memoryview:
+    """At most one byte more than ``size``, however much the data would give."""
+    if compression == "":
+        return data
+    try:
+        if compression == "zstd":
+            return memoryview(_zstd(data, size + 1))
+        if compression == "lz4":
+            import lz4.frame
+
+            return memoryview(lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1))
+    except RuntimeError as error:
+        raise Damaged(f"byte {where}: a chunk can't be decompressed ({error})") from None
+    raise Damaged(f"byte {where}: a chunk is compressed with {compression!r}, which is not known here")
+
+
+def _zstd(data: memoryview, most: int) -> bytes:
+    import zstandard
+
+    try:
+        with zstandard.ZstdDecompressor(max_window_size=2**27).stream_reader(data) as stream:
+            return stream.read(most)
+    except zstandard.ZstdError as error:
+        raise RuntimeError(str(error)) from None
+
+
+def forget(buffer: memoryview, start: int, end: int) -> None:
+    """Let go of the memory that reading a part of a mapped file took; the bytes stay readable."""
+    mapped = buffer.obj
+    first = -(-start // mmap.PAGESIZE) * mmap.PAGESIZE
+    if isinstance(mapped, mmap.mmap) and end - first >= mmap.PAGESIZE:
+        mapped.madvise(mmap.MADV_DONTNEED, first, end - first)
+
+
+def message_times(buffer: memoryview, chunk: ChunkIndexRecord, channel_id: int) -> tuple[Ints, Ints]:
+    """Log times and offsets inside the chunk of one channel's messages, (M,) each."""
+    at = chunk.message_index_offsets[channel_id]
+    if at:
+        record = records.record_at(buffer, at)
+        reader = Reader(buffer, record.body, record.end)
+        if record.opcode != Opcode.MESSAGE_INDEX or reader.number(2) != channel_id:
+            raise Damaged(f"byte {at}: no message index of channel {channel_id} where one belongs")
+        listed = reader.raw()
+        if len(listed) % 16:
+            raise Damaged(f"byte {at}: a message index of {len(listed)} bytes")
+        entries = np.frombuffer(listed, "<u8").reshape(-1, 2)
+    else:
+        content = open_chunk(buffer, chunk_record(buffer, chunk))
+        entries = chunk_entries(content).get(channel_id, np.empty((0, 2), "<u8"))
+    if len(entries) and entries.max() > _MAX_NS:
+        raise Damaged("a message has a time beyond the year 2262")
+    if len(np.unique(entries[:, 1])) != len(entries):
+        raise Damaged(f"byte {at}: a message index that lists a message twice")
+    return entries[:, 0].astype(np.int64), entries[:, 1].astype(np.int64)
+
+
+def chunk_entries(content: memoryview) -> dict[int, NDArray[np.uint64]]:
+    """What the message indexes of a chunk have to say: for each channel log time and offset of its messages, (M, 2)."""
+    found: dict[int, list[tuple[int, int]]] = {}
+    for record in walk(content, 0, len(content)):
+        if record.opcode == Opcode.MESSAGE:
+            channel, _, t_ns, _ = message_head(content, record)
+            found.setdefault(channel, []).append((t_ns, record.start))
+    return {channel: np.array(entries, "<u8") for channel, entries in found.items()}
+
+
+def heads_at(content: memoryview, channel_id: int, t_ns: Ints, offset: Ints) -> Heads:
+    """The messages that an index says stand at these offsets, at these times. Raises Damaged where one does not."""
+    room = len(content) - HEAD.itemsize
+    if len(offset) and (room < 0 or offset.max() > room):
+        raise Damaged(f"a message is said to stand at byte {offset.max()} of a chunk of {len(content)}")
+    raw = np.frombuffer(content, np.uint8)
+    if len(offset):
+        head = np.lib.stride_tricks.sliding_window_view(raw, HEAD.itemsize)[offset].view(HEAD)[:, 0]
+    else:
+        head = np.empty(0, HEAD)
+    wrong = (head["opcode"] != Opcode.MESSAGE) | (head["channel"] != channel_id) | (head["t_ns"] != t_ns)
+    wrong |= head["size"] < records.MESSAGE_HEAD.size
+    start = offset + HEAD.itemsize
+    # A size beyond the chunk is found out here, before it is added to anything.
+    wrong |= head["size"] > (len(content) - start + records.MESSAGE_HEAD.size).astype(np.uint64)
+    if wrong.any():
+        time = int(t_ns[wrong.argmax()])
+        raise Damaged(f"no message of channel {channel_id} at {time} ns where the index says one is")
+    return Heads(content, head, start, start + head["size"].astype(np.int64) - records.MESSAGE_HEAD.size)

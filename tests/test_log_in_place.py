@@ -1,0 +1,246 @@
+"""Adding to a log in place: it costs what is added, and a fault at any instant leaves the old log or the new one."""
+
+from __future__ import annotations
+
+import errno
+import os
+import random
+import signal
+import zlib
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+
+from mcaptrack import log
+from mcaptrack.errors import McaptrackError
+from mcaptrack.log import records
+from mcaptrack.log.journal import journal_of
+
+SCHEMA = ("test.Thing", "jsonschema", b"{}")
+
+
+def recorded(path: Path) -> None:
+    """A log of pictures, large beside what is added to it."""
+    noise = random.Random(1)
+    with log.create(path) as writer:
+        number = writer.add_channel("/video", SCHEMA, "json", {}, "media")
+        for n in range(60):
+            writer.add_message(number, n * 10, n, noise.randbytes(100_000))
+        writer.add_metadata("about", {"robot": "r2"})
+
+
+def add_results(path: Path, value: int, count: int = 50) -> None:
+    """Replace the results of a log, as a stage that is run again does."""
+    with log.read(path) as opened:
+        there = [topic for topic in opened.channels if topic.startswith("/result")]
+        with log.extend(opened, drop=there, drop_attachments=["layout"]) as writer:
+            for topic in ("/result/a", "/result/b"):
+                number = writer.add_channel(topic, SCHEMA, "json", {}, group="results")
+                for n in range(count):
+                    writer.add_message(number, n * 10, n, bytes([value]) * (40 + value))
+            writer.add_attachment("layout", "application/json", bytes([value]) * 100)
+
+
+def contents(path: Path) -> dict[str, list[bytes]]:
+    """Digests of what the stock reader finds, checksums of chunks checked; and the data section's by hand."""
+    with log.read(path):  # whoever opens a log first undoes what somebody who was killed began
+        whole = path.read_bytes()
+    with path.open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        found: dict[str, list[bytes]] = {}
+        for _, channel, message in reader.iter_messages():
+            found.setdefault(channel.topic, []).append(zlib.crc32(message.data).to_bytes(4, "little"))
+        summary = reader.get_summary()
+        found |= {attachment.name: [attachment.data] for attachment in reader.iter_attachments()}
+    assert summary is not None
+    assert summary.statistics.message_count == sum(len(found[c.topic]) for c in summary.channels.values())
+    with log.read(path) as opened:
+        assert zlib.crc32(whole[: opened.index.data_end]) == opened.index.data_crc
+        assert opened.index.regular
+    return found
+
+
+@given(st.binary(max_size=200), st.binary(max_size=5000))
+def test_the_checksum_of_the_beginning_follows_from_that_of_the_whole(first, last):
+    assert records.crc_before(zlib.crc32(first + last), last) == zlib.crc32(first)
+
+
+def test_what_stands_is_not_touched_when_something_is_added(tmp_path):
+    path = tmp_path / "a.mcap"
+    recorded(path)
+    before, node = path.read_bytes(), path.stat().st_ino
+    with log.read(path) as opened:
+        end = opened.index.data_end
+    add_results(path, 1)
+    after = path.read_bytes()
+    assert after[:end] == before[:end]
+    assert path.stat().st_ino == node
+    assert len(after) < len(before) + 10_000
+    assert list(tmp_path.iterdir()) == [path]
+    assert len(contents(path)["/result/b"]) == 50
+
+
+def test_results_are_replaced_in_place_and_leave_nothing_behind(tmp_path):
+    path, once = tmp_path / "a.mcap", tmp_path / "b.mcap"
+    recorded(path)
+    recorded(once)
+    node = path.stat().st_ino
+    for value in (7, 3, 9, 1):  # larger and smaller
+        add_results(path, value)
+    add_results(once, 1)
+    assert path.stat().st_ino == node
+    assert contents(path) == contents(once)
+    assert path.read_bytes() == once.read_bytes()
+
+
+def test_a_copy_elsewhere_is_the_same_as_the_change_in_place(tmp_path):
+    path, copy = tmp_path / "a.mcap", tmp_path / "copy.mcap"
+    recorded(path)
+    add_results(path, 1)
+    with log.read(path) as opened, log.extend(opened, copy, drop=["/result/a"]):
+        pass
+    with log.read(path) as opened, log.extend(opened, drop=["/result/a"]):
+        pass
+    assert sorted(contents(copy)) == ["/result/b", "/video", "layout"]
+    assert contents(copy) == contents(path)
+
+
+def test_numbers_of_channels_never_collide(tmp_path):
+    path = tmp_path / "a.mcap"
+    recorded(path)
+    for value in range(1, 4):
+        add_results(path, value)
+        with log.read(path) as opened:
+            assert len(set(opened.index.channels)) == len(opened.index.channels) == 3
+            assert opened.index.channels[1].topic == "/video"
+
+
+CALLS = ("pwrite", "write", "fsync", "replace", "unlink", "ftruncate", "chmod")
+
+
+def _sabotage(monkeypatch, at: int, fault) -> list[str]:
+    """The ``at``-th call that changes something on the disk does half of its work, if it writes, and then ``fault``."""
+    seen: list[str] = []
+
+    def patched(name, real):
+        def call(*args, **kwargs):
+            seen.append(name)
+            if len(seen) == at:
+                if name in ("pwrite", "write"):
+                    real(args[0], bytes(args[1])[: len(args[1]) // 2], *args[2:])
+                fault()
+            return real(*args, **kwargs)
+
+        return call
+
+    for name in CALLS:
+        monkeypatch.setattr(os, name, patched(name, getattr(os, name)))
+    return seen
+
+
+def test_killed_at_any_call_it_is_the_old_log_or_the_new_one(tmp_path, monkeypatch):
+    path = tmp_path / "a.mcap"
+    recorded(path)
+    add_results(path, 1)
+    old, old_bytes = contents(path), path.read_bytes()
+    add_results(path, 2)
+    new = contents(path)
+    seen = set()
+    for at in range(1, 200):
+        path.write_bytes(old_bytes)
+        child = os.fork()
+        if child == 0:  # in the child: nothing of pytest is to run again
+            with monkeypatch.context() as patch:
+                _sabotage(patch, at, lambda: os.kill(os.getpid(), signal.SIGKILL))
+                add_results(path, 2)
+                os._exit(0)
+        _, status = os.waitpid(child, 0)
+        found = contents(path)
+        assert found in (old, new)
+        assert not journal_of(path).exists()
+        seen.add(found == new)
+        if status == 0:
+            break
+    assert status == 0
+    assert at > 10
+    assert seen == {True, False}
+    add_results(path, 3)  # sweeps away what the killed ones left
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("error", [OSError(errno.ENOSPC, "No space left on device"), KeyboardInterrupt()])
+def test_when_the_disk_is_full_or_somebody_interrupts_it_is_the_old_log_or_the_new_one(tmp_path, monkeypatch, error):
+    path = tmp_path / "a.mcap"
+    recorded(path)
+    add_results(path, 1)
+    old, old_bytes = contents(path), path.read_bytes()
+    add_results(path, 2)
+    new = contents(path)
+
+    def fail():
+        raise error
+
+    for at in range(1, 200):
+        path.write_bytes(old_bytes)
+        with monkeypatch.context() as patch:
+            seen = _sabotage(patch, at, fail)
+            try:
+                add_results(path, 2)
+            except (McaptrackError, KeyboardInterrupt) as raised:
+                assert "\n" not in str(raised)
+            finished = len(seen) < at
+        assert contents(path) in ((new,) if finished else (old, new))
+        assert not journal_of(path).exists()
+        if finished:
+            break
+    assert finished
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_journal_of_another_log_is_not_put_into_this_one(tmp_path):
+    path = tmp_path / "a.mcap"
+    recorded(path)
+
+    def killed(*_):
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    child = os.fork()
+    if child == 0:
+        os.pwrite = killed
+        add_results(path, 1)
+        os._exit(0)
+    os.waitpid(child, 0)
+    assert journal_of(path).exists()
+    other = tmp_path / "b.mcap"
+    with log.create(other) as writer:
+        number = writer.add_channel("/video", SCHEMA, "json", {}, "media")
+        for n in range(80):
+            writer.add_message(number, n, n, bytes([n]) * 90_000)
+    os.replace(other, path)
+    before = path.read_bytes()
+    with pytest.raises(McaptrackError, match="does not belong to"):
+        log.read(path)
+    assert path.read_bytes() == before
+    journal_of(path).unlink()
+    assert len(contents(path)["/video"]) == 80
+
+
+def test_a_log_that_may_not_be_written_to_says_what_to_do(tmp_path, monkeypatch):
+    path = tmp_path / "a.mcap"
+    recorded(path)
+
+    def refused(name, flags, *rest):
+        raise PermissionError(errno.EACCES, "Permission denied", name)
+
+    with log.read(path) as opened, monkeypatch.context() as patch:
+        patch.setattr(os, "open", refused)
+        with pytest.raises(
+            McaptrackError, match="can't be written to: Permission denied; write to another file with -o"
+        ):
+            opened.lock()
+    with log.read(path) as opened, log.extend(opened, tmp_path / "copy.mcap") as writer:
+        writer.add_channel("/new", SCHEMA, "json", {})
+    assert contents(path) == {"/video": contents(path)["/video"]}
