@@ -14,7 +14,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
-from mcaptrack import __version__, foxglove, log, tables
+from mcaptrack import __version__, foreign, log, tables
 from mcaptrack.provenance import Provenance
 from mcaptrack.schema import DETECTIONS, EVENTS, GROUND_PLANE, PREDICTIONS, TRACKS, Frame
 
@@ -60,7 +60,7 @@ def export(
         members = {topic: opened.frames(topic, schema) for topic in topics}
         content[name] = tables.rows_table(schema, members)
         entries |= {topic: _entries(frames) for topic, frames in members.items()}
-    for channel in log.topics_with_schema(opened, foxglove.PICTURES):
+    for channel in filter(foreign.holds_pictures, opened.channels.values()):
         times = opened.times(channel.topic).tolist()
         entries[channel.topic] = [(t_ns, index, -1) for index, t_ns in enumerate(times)]
     content["frames"] = tables.frames_table(dict(sorted(entries.items())))

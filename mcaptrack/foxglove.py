@@ -81,8 +81,8 @@ def pack_picture(schema_name: str, t_ns: int, frame_id: str, image_format: str, 
     return payload
 
 
-def unpack_picture(schema_name: str, payload: bytes) -> tuple[str, bytes]:
-    """Format and data of a CompressedVideo or CompressedImage message. Raises McaptrackError if it is none."""
+def unpack(schema_name: str, payload: bytes) -> Any:
+    """A message of a foxglove schema. Raises McaptrackError if it is none."""
     from google.protobuf.message import DecodeError
 
     message = _message_class(schema_name)()
@@ -90,6 +90,12 @@ def unpack_picture(schema_name: str, payload: bytes) -> tuple[str, bytes]:
         message.ParseFromString(payload)
     except DecodeError:
         raise McaptrackError(f"{len(payload)} bytes are no {schema_name} message") from None
+    return message
+
+
+def unpack_picture(schema_name: str, payload: bytes) -> tuple[str, bytes]:
+    """Format and data of a CompressedVideo or CompressedImage message. Raises McaptrackError if it is none."""
+    message = unpack(schema_name, payload)
     return message.format, message.data
 
 

@@ -13,8 +13,9 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from mcaptrack import foxglove, log, views
+from mcaptrack import foreign, foxglove, log, views
 from mcaptrack.clock import NS_PER_S
 from mcaptrack.errors import McaptrackError
 from mcaptrack.plane import GroundPlane, Planes, assumed_plane
@@ -24,6 +25,7 @@ from mcaptrack.schema.ground import plane_to_rows, rows_to_plane
 from mcaptrack.transforms import TRANSFORMS, Transform
 from mcaptrack.video import Encoded, brightness
 
+Ints = NDArray[np.int64]
 Progress = Callable[[str, int, int], None]
 Say = Callable[[str], None]
 
@@ -101,7 +103,28 @@ def find_camera(opened: log.Log, camera: str | None, topic: str | None = None) -
     found = {prefix for prefix in found if prefix + "/retracks" not in found and not prefix.endswith("/retracks")}
     if len(found) > 1 and "/" + DEFAULT_CAMERA not in found:
         raise McaptrackError(f"{opened.path} has several cameras, {', '.join(sorted(found))}; choose one with --camera")
+    if not found:
+        return find_camera(opened, None, _only_pictures(opened) or DEFAULT_CAMERA)
     return found.pop() if len(found) == 1 else "/" + DEFAULT_CAMERA
+
+
+def picture_topic(opened: log.Log, prefix: str) -> str | None:
+    """Where the pictures of a camera are: its video, what its detections were made from, or all that others recorded.
+
+    None if there are no pictures, or several channels of them and nothing to tell whose they are.
+    """
+    if f"{prefix}/video" in opened.channels:
+        return f"{prefix}/video"
+    detections = opened.channels.get(f"{prefix}/detections")
+    made = Provenance.from_metadata(detections.metadata) if detections else None
+    source = opened.channels.get(made.input) if made else None
+    return source.topic if source and foreign.holds_pictures(source) else _only_pictures(opened)
+
+
+def _only_pictures(opened: log.Log) -> str | None:
+    channels = opened.channels.values()
+    theirs = [c.topic for c in channels if foreign.holds_pictures(c) and not Provenance.from_metadata(c.metadata)]
+    return theirs[0] if len(theirs) == 1 else None
 
 
 def plan_stage(
@@ -121,29 +144,50 @@ def plan_stage(
     """
     route = ROUTES[stage]
     planner = _Planner(opened, prefix, say)
-    source = source or f"{prefix}/{route.reads}"
+    source = source or planner.source_of(stage)
     planner.ensure(source)
     planner.jobs.append(Job(stage, transform, source, target or f"{prefix}/{route.writes}", keep))
     _check_inputs(opened, prefix, planner.jobs)
     return planner.jobs
 
 
-def plan_all(opened: log.Log, prefix: str, say: Say = lambda _: None) -> list[Job]:
-    """The jobs that bring everything about a camera up to date; none if it is."""
-    planner = _Planner(opened, prefix, say)
+def plan_all(opened: log.Log, prefix: str, say: Say = lambda _: None, source: str | None = None) -> list[Job]:
+    """The jobs that bring everything about a camera up to date; none if it is.
+
+    ``source`` is a topic with pictures or with boxes that others detected, to begin with. Raises McaptrackError as
+    ``plan_stage`` does.
+    """
+    planner = _Planner(opened, prefix, say, {_stage_from(opened, source): source} if source else {})
     for target in ("predictions", "retracks"):
         planner.ensure(f"{prefix}/{target}")
     _check_inputs(opened, prefix, planner.jobs)
     return planner.jobs
 
 
-class _Planner:
-    """Collects the jobs that make channels stand and be up to date."""
+def _stage_from(opened: log.Log, source: str) -> str:
+    """The first stage of a run that begins with this topic."""
+    channel = opened.channel(source)
+    return "track" if channel.schema_name == DETECTIONS.name or foreign.holds_detections(channel) else "detect"
 
-    def __init__(self, opened: log.Log, prefix: str, say: Say) -> None:
+
+class _Planner:
+    """Collects the jobs that make channels stand and be up to date. ``sources`` are inputs of stages but the usual."""
+
+    def __init__(self, opened: log.Log, prefix: str, say: Say, sources: Mapping[str, str] = {}) -> None:
         self.jobs: list[Job] = []
         self._opened, self._prefix, self._say = opened, prefix, say
+        self._sources = sources
         self._changes: dict[str, bool] = {}
+
+    def source_of(self, stage: str) -> str:
+        """The topic that a stage reads, unless it was made from another one before."""
+        usual = f"{self._prefix}/{ROUTES[stage].reads}"
+        if stage != "detect" or stage in self._sources or usual in self._opened.channels:
+            return self._sources.get(stage, usual)
+        found = picture_topic(self._opened, self._prefix)
+        if found:
+            self._say(f"{usual} is missing: taking the pictures of {found}")
+        return found or usual
 
     def ensure(self, topic: str) -> bool:
         """Plan what makes ``topic``; returns whether it will change."""
@@ -155,17 +199,27 @@ class _Planner:
         stage = _MAKER.get(topic.removeprefix(self._prefix + "/")) if topic.startswith(self._prefix + "/") else None
         channel = self._opened.channels.get(topic)
         if stage is None or (channel and not _made_by_stage(channel)):
+            if stage in self._sources:
+                raise McaptrackError(
+                    f"{self._opened.path}: {topic} is there and was not made by {stage}; leave --topic out to go on "
+                    f"from it, or run {stage} with --topic and --to"
+                )
             return False  # recorded or ingested: nothing makes it but its recording
-        source = f"{self._prefix}/{ROUTES[stage].reads}"
         if channel is None:
+            source = self.source_of(stage)
             self.ensure(source)
             self._say(f"{topic} is missing: running {stage}")
             self.jobs.append(Job(stage, TRANSFORMS[stage](), source, topic))
             return True
         made = Provenance.from_metadata(channel.metadata)
-        source = made.input if made else source
-        if not self.ensure(source) and not is_stale(self._opened, topic):
+        had = made.input if made else self.source_of(stage)
+        source = self._sources.get(stage, had)
+        if not self.ensure(source) and not is_stale(self._opened, topic) and source == had:
             return False
+        if source != had:
+            self._say(f"{topic} was made from {had}: running {stage} again, from {source}")
+            self.jobs.append(Job(stage, _transform_of(stage, channel), source, topic))
+            return True
         self._say(f"{topic} was made from an earlier {source}: running {stage} again, as before")
         self.jobs.append(Job(stage, _transform_of(stage, channel), source, topic))
         return True
@@ -198,21 +252,34 @@ def _check_inputs(opened: log.Log, prefix: str, jobs: Sequence[Job]) -> None:
     coming: dict[str, Schema] = {}
     for job in jobs:
         reads = job.transform.reads
+        channel = opened.channels.get(job.source)
         if job.source in coming:
-            name = coming[job.source].name
-        elif job.source in opened.channels:
-            name = opened.channels[job.source].schema_name
+            name, fits = coming[job.source].name, coming[job.source] is reads
+        elif channel:
+            theirs = foreign.holds_detections(channel) if reads is DETECTIONS else False
+            name = channel.schema_name
+            fits = foreign.holds_pictures(channel) if reads is VIDEO else theirs or name == reads.name
         else:
             there = [topic for topic in sorted(opened.channels) if not topic.endswith(views.SUFFIX)]
             hint = f"`mcaptrack info {opened.path}` shows more"
             if job.source == f"{prefix}/video":
                 hint = f"add pictures with `mcaptrack ingest VIDEO --into {opened.path}`, or name theirs with --topic"
             has = f"it has {', '.join(there) or 'none'}"
+            pictures = [topic for topic in there if foreign.holds_pictures(opened.channels[topic])]
+            if job.source == f"{prefix}/video" and pictures:
+                has, hint = f"it has pictures in {', '.join(pictures)}", "choose one with --topic"
             raise McaptrackError(f"{opened.path} has no channel {job.source} for {job.stage}; {has}. {hint}")
-        fits = name in foxglove.PICTURES if reads is VIDEO else name == reads.name
         if not fits:
-            wanted = " or ".join(foxglove.PICTURES) if reads is VIDEO else reads.name
+            theirs_too = foreign.DETECTIONS_READ if reads is DETECTIONS else ()
+            wanted = " or ".join(foreign.PICTURES_READ if reads is VIDEO else (reads.name, *theirs_too))
             raise McaptrackError(f"{opened.path}: {job.source} holds {name or 'no schema'}; {job.stage} reads {wanted}")
+        for topic in sorted(name for kept in job.kept() for name in (kept, kept + views.SUFFIX)):
+            known = opened.channels.get(topic)
+            if known and not Provenance.from_metadata(known.metadata):
+                raise McaptrackError(
+                    f"{opened.path}: {job.stage} would replace {topic}, which others recorded "
+                    f"({known.schema_name or 'no schema'}); write to another channel with --to"
+                )
         coming |= job.outputs()
 
 
@@ -229,6 +296,7 @@ def run(
     Nothing is written until everything is computed; then the log is replaced as a whole.
     """
     made: dict[str, Made] = {}
+    stamps: dict[str, list[int]] = {}
     report = Report()
     planes = read_planes(opened, prefix)
     for job in jobs:
@@ -236,7 +304,7 @@ def run(
         if (planes is None and job.stage in ("track", "sample")) or (job.stage == "track" and _is_assumed(planes)):
             planes = _assume_plane(opened, prefix, made, job.source, say)
         transform = _in_context(opened, prefix, job, made, planes or ())
-        input_digest, frames = _input(opened, job, made, progress)
+        input_digest, frames = _input(opened, job, made, stamps, progress)
         outputs: list[list[Frame]] = [[] for _ in job.transform.writes]
         for result in transform(frames):
             for frame, channel in zip(result, outputs, strict=True):
@@ -252,7 +320,7 @@ def run(
             report.frames[topic] = len(channel)
         report.stages.append(job.stage)
     if made or output is not None:
-        report.layout = _write(opened, prefix, made, planes or (), output)
+        report.layout = _write(opened, prefix, made, planes or (), stamps, output)
     digests = {topic: channel.provenance.digest for topic, channel in made.items()}
     for topic, there in sorted(opened.channels.items()):
         known = Provenance.from_metadata(there.metadata)
@@ -281,12 +349,12 @@ def _clock_start(opened: log.Log, prefix: str) -> int | None:
     said = opened.metadata(CLOCK)
     if said and said.get("start_ns", "").lstrip("-").isdigit():
         return int(said["start_ns"])
-    times = opened.times(f"{prefix}/video").tolist() if f"{prefix}/video" in opened.channels else []
-    return min(times, default=None)
+    pictures = picture_topic(opened, prefix)
+    return min(opened.times(pictures).tolist(), default=None) if pictures else None
 
 
 def _input(
-    opened: log.Log, job: Job, made: Mapping[str, Made], progress: Progress
+    opened: log.Log, job: Job, made: Mapping[str, Made], stamps: dict[str, list[int]], progress: Progress
 ) -> tuple[Callable[[], str], Iterable[Frame]]:
     """The frames that a job reads, and their digest, to be asked for when they have been read."""
     if job.source in made:
@@ -294,13 +362,19 @@ def _input(
         return (lambda: source.provenance.digest), _counted(source.frames, job.stage, progress)
     channel = opened.channel(job.source)
     if job.transform.reads is VIDEO:
-        return _pictures(opened, channel, job.stage, progress)
+        return _pictures(opened, channel, stamps.setdefault(channel.topic, []), job.stage, progress)
     known = Provenance.from_metadata(channel.metadata)
     said = known.digest if known else ""
     if not said:
         said = digest((m.t_ns, m.sequence, m.payload) for m in opened.messages(job.source))
-    frames = opened.frames(job.source, job.transform.reads)
+    frames = _frames(opened, job.source, job.transform.reads)
     return (lambda: said), _counted(frames, job.stage, progress)
+
+
+def _frames(opened: log.Log, topic: str, schema: Schema) -> list[Frame]:
+    """The rows of a channel, ours or others'."""
+    theirs = foreign.holds_detections(opened.channel(topic))
+    return foreign.detections(opened, topic) if theirs else opened.frames(topic, schema)
 
 
 def _counted(frames: Sequence[Frame], stage: str, progress: Progress) -> Iterator[Frame]:
@@ -310,17 +384,20 @@ def _counted(frames: Sequence[Frame], stage: str, progress: Progress) -> Iterato
 
 
 def _pictures(
-    opened: log.Log, channel: log.Channel, stage: str, progress: Progress
+    opened: log.Log, channel: log.Channel, stamps: list[int], stage: str, progress: Progress
 ) -> tuple[Callable[[], str], Iterator[Frame]]:
+    """The brightness of a channel's pictures; ``stamps`` gets the stamp of each."""
     import hashlib
 
     total = hashlib.sha256()
 
     def encoded() -> Iterator[Encoded]:
-        for index, message in enumerate(opened.messages(channel.topic)):
+        stamps.clear()
+        for index, (message, picture) in enumerate(foreign.pictures(opened, channel.topic)):
             total.update(message.t_ns.to_bytes(8, "little") + message.payload)
-            image_format, data = foxglove.unpack_picture(channel.schema_name, message.payload)
-            yield Encoded(message.t_ns, index, image_format, data)
+            stamps.append(picture.stamp_ns)
+            where = f"{opened.path}: {channel.topic} at {message.t_ns} ns: frame {index}"
+            yield Encoded(message.t_ns, index, picture.format, picture.data, picture.layout, where)
             progress(stage, index + 1, channel.messages)
 
     return total.hexdigest, brightness(encoded())
@@ -345,7 +422,7 @@ def _assume_plane(opened: log.Log, prefix: str, made: dict[str, Made], source: s
         frames, known = made[source].frames, made[source].provenance
     else:
         channel = opened.channel(source)
-        frames = opened.frames(source, SCHEMAS[channel.schema_name])
+        frames = _frames(opened, source, SCHEMAS.get(channel.schema_name, DETECTIONS))
         known = Provenance.from_metadata(channel.metadata) or Provenance("", {})
     rows = np.concatenate([frame.rows[["x_px", "y_px", "w_px", "h_px"]] for frame in frames]) if frames else None
     if rows is None or not np.isfinite(rows["h_px"]).any():
@@ -364,10 +441,30 @@ def _assume_plane(opened: log.Log, prefix: str, made: dict[str, Made], source: s
     return [(start, plane)]
 
 
-def _write(opened: log.Log, prefix: str, made: Mapping[str, Made], planes: Planes, output: Path | None) -> bytes | None:
-    """Put what was made, and its views, into the log. Returns the layout, if there are pictures to draw on."""
-    video, truth = f"{prefix}/video", f"{prefix}/truth"
-    picture_ns = opened.times(video) if video in opened.channels else np.empty(0, np.int64)
+def _stamps(opened: log.Log, topic: str, known: Sequence[int]) -> Ints:
+    """The stamps of a channel's pictures. Our own are the log's times; those of others stand in the messages."""
+    if Provenance.from_metadata(opened.channel(topic).metadata):
+        return opened.times(topic)
+    return np.array(known, np.int64) if known else foreign.stamps(opened, topic)
+
+
+def _write(
+    opened: log.Log,
+    prefix: str,
+    made: Mapping[str, Made],
+    planes: Planes,
+    stamps: Mapping[str, Sequence[int]],
+    output: Path | None,
+) -> bytes | None:
+    """Put what was made, and its views, into the log. Returns the layout, if there are pictures to draw on.
+
+    ``stamps`` are those of pictures that were read on the way.
+    """
+    usual = f"{prefix}/video"
+    video = usual if usual in opened.channels else next(iter(stamps), None) or picture_topic(opened, prefix)
+    truth = f"{prefix}/truth"
+    picture_ns = opened.times(video) if video else np.empty(0, np.int64)
+    stamp_ns = _stamps(opened, video, stamps.get(video, ())) if video else picture_ns
     shown = {topic: (channel.schema, channel.frames, channel.provenance.digest) for topic, channel in made.items()}
     if truth in opened.channels and truth + views.SUFFIX not in opened.channels:
         known = Provenance.from_metadata(opened.channel(truth).metadata)
@@ -380,7 +477,7 @@ def _write(opened: log.Log, prefix: str, made: Mapping[str, Made], planes: Plane
             number = writer.add_channel(topic, record, "protobuf", channel.provenance.to_metadata(), group=made_by)
             for message in channel.messages:
                 writer.add_message(number, *message)
-        if not len(picture_ns):
+        if video is None or not len(picture_ns):
             return None
         topics = [topic for topic in opened.channels if topic.endswith(views.SUFFIX) and topic not in outdated]
         for topic, (schema, frames, made_from) in shown.items():
@@ -390,10 +487,10 @@ def _write(opened: log.Log, prefix: str, made: Mapping[str, Made], planes: Plane
             record = foxglove.schema_record(foxglove.ANNOTATIONS)
             made_by = made[topic].provenance.transform if topic in made else ""
             number = writer.add_channel(topic + views.SUFFIX, record, "protobuf", metadata, group=made_by)
-            for message in views.view(topic, schema, frames, picture_ns, planes):
+            for message in views.view(topic, schema, frames, picture_ns, planes, stamp_ns):
                 writer.add_message(number, *message)
             topics.append(topic + views.SUFFIX)
-        layout_file = layout(prefix, topics)
+        layout_file = layout(prefix, topics, video)
         writer.add_attachment(LAYOUT, "application/json", layout_file)
     return layout_file
 
@@ -406,10 +503,10 @@ LAYOUT: Final = "mcaptrack.layout.json"
 _SHOWN: Final = ("retracks", "retracks/predictions", "tracks", "detections")
 
 
-def layout(prefix: str, view_topics: Sequence[str]) -> bytes:
-    """The layout for a camera's views: the best that there is switched on."""
+def layout(prefix: str, view_topics: Sequence[str], picture_topic: str) -> bytes:
+    """The layout for a camera's views over its pictures: the best that there is switched on."""
     names = {topic: topic.removeprefix(prefix + "/").removesuffix(views.SUFFIX) for topic in sorted(view_topics)}
     there = set(names.values())
     on = {"retracks", "retracks/predictions"} if "retracks" in there else {next((n for n in _SHOWN if n in there), "")}
     paths = [f"{prefix}/{name}.rows[:].x_m" for name in ("tracks", "retracks") if name in there]
-    return foxglove.layout(f"{prefix}/video", {topic: name in on for topic, name in names.items()}, paths)
+    return foxglove.layout(picture_topic, {topic: name in on for topic, name in names.items()}, paths)

@@ -33,41 +33,45 @@ _GREY: Final = (0.75, 0.75, 0.75, 0.9)
 _WHITE: Final = (1.0, 1.0, 1.0, 0.7)
 
 
-def view(topic: str, schema: Schema, frames: Sequence[Frame], picture_ns: Ints, planes: Planes) -> View:
+def view(
+    topic: str, schema: Schema, frames: Sequence[Frame], picture_ns: Ints, planes: Planes, stamp_ns: Ints | None = None
+) -> View:
     """The annotation messages (time, frame, payload) of a channel, one for each picture.
 
-    ``picture_ns`` are the times of the pictures, rising. Predictions need ``planes`` to come back to pixels.
+    ``picture_ns`` are the times of the pictures, rising; ``stamp_ns`` what stands in them, by which viewers match what
+    is drawn, if that is another time. Predictions need ``planes`` to come back to pixels.
     """
+    stamps = (picture_ns if stamp_ns is None else stamp_ns).tolist()
     if schema is DETECTIONS:
-        yield from _detections(frames, picture_ns)
+        yield from _detections(frames, picture_ns, stamps)
     elif schema is TRACKS:
-        yield from _tracks(frames, picture_ns, planes, truth=topic.endswith("/truth"))
+        yield from _tracks(frames, picture_ns, stamps, planes, truth=topic.endswith("/truth"))
     elif schema is PREDICTIONS:
-        yield from _predictions(frames, picture_ns, planes)
+        yield from _predictions(frames, picture_ns, stamps, planes)
 
 
-def _detections(frames: Sequence[Frame], picture_ns: Ints) -> View:
+def _detections(frames: Sequence[Frame], picture_ns: Ints, stamps: list[int]) -> View:
     at = {frame.t_ns: frame.rows for frame in frames}
-    for index, t_ns in enumerate(picture_ns.tolist()):
+    for index, (t_ns, stamp) in enumerate(zip(picture_ns.tolist(), stamps, strict=True)):
         boxes = columns_to_boxes(at.get(t_ns, DETECTIONS.empty()))
-        yield t_ns, index, foxglove.pack_annotations(t_ns, boxes, None, thickness=1.0, rgba=_GREY)
+        yield t_ns, index, foxglove.pack_annotations(stamp, boxes, None, thickness=1.0, rgba=_GREY)
 
 
-def _tracks(frames: Sequence[Frame], picture_ns: Ints, planes: Planes, truth: bool) -> View:
+def _tracks(frames: Sequence[Frame], picture_ns: Ints, stamps: list[int], planes: Planes, truth: bool) -> View:
     """Boxes with ids, and the trail of the last seconds, fading. True tracks are thin and white."""
     shown, at = resample(frames, picture_ns, seconds_to_ns(_MAX_HOLE_S))
     boxes = columns_to_boxes(shown)
     feet = boxes[:, :2] + boxes[:, 2:] * [0.5, 0.5 if planes and planes[0][1].point == "center" else 1.0]
     first, last = (np.searchsorted(at, np.arange(len(picture_ns)), side) for side in ("left", "right"))
     trails = _Trails(shown["track_id"], feet, picture_ns[at])
-    for index, t_ns in enumerate(picture_ns.tolist()):
+    for index, (t_ns, stamp) in enumerate(zip(picture_ns.tolist(), stamps, strict=True)):
         span = slice(int(first[index]), int(last[index]))
         ids = shown["track_id"][span].tolist()
         if truth:
-            yield t_ns, index, foxglove.pack_annotations(t_ns, boxes[span], None, thickness=1.0, rgba=_WHITE)
+            yield t_ns, index, foxglove.pack_annotations(stamp, boxes[span], None, thickness=1.0, rgba=_WHITE)
         else:
             paths = [trails.until(row) for row in range(span.start, span.stop)]
-            yield t_ns, index, foxglove.pack_annotations(t_ns, boxes[span], ids, [path for path in paths if path])
+            yield t_ns, index, foxglove.pack_annotations(stamp, boxes[span], ids, [path for path in paths if path])
 
 
 class _Trails:
@@ -95,19 +99,19 @@ class _Trails:
         return foxglove.Path(int(self._ids[end]), points, (0.9 * (1 - age) + 0.05).tolist())
 
 
-def _predictions(frames: Sequence[Frame], picture_ns: Ints, planes: Planes) -> View:
+def _predictions(frames: Sequence[Frame], picture_ns: Ints, stamps: list[int], planes: Planes) -> View:
     """The latest forecasts as lines that fade into the future."""
     made_ns = np.array([frame.t_ns for frame in frames], np.int64)
     latest = np.searchsorted(made_ns, picture_ns, "right") - 1
     drawn: tuple[int, list[foxglove.Path]] = (-1, [])
     none = np.empty((0, 4))
-    for index, (t_ns, number) in enumerate(zip(picture_ns.tolist(), latest.tolist(), strict=True)):
+    for index, (t_ns, stamp, number) in enumerate(zip(picture_ns.tolist(), stamps, latest.tolist(), strict=True)):
         if number < 0 or t_ns - made_ns[number] > seconds_to_ns(_FORECAST_S):
-            yield t_ns, index, foxglove.pack_annotations(t_ns, none, None)
+            yield t_ns, index, foxglove.pack_annotations(stamp, none, None)
             continue
         if drawn[0] != number:
             drawn = (number, list(_paths(frames[number].rows, planes, int(made_ns[number]))))
-        yield t_ns, index, foxglove.pack_annotations(t_ns, none, None, drawn[1], thickness=1.5)
+        yield t_ns, index, foxglove.pack_annotations(stamp, none, None, drawn[1], thickness=1.5)
 
 
 def _paths(rows: Rows, planes: Planes, t_ns: int) -> Iterator[foxglove.Path]:

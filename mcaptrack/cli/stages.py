@@ -23,6 +23,7 @@ _WORDS: Final = {
     "predict": ("Example: mcaptrack predict log.mcap --predictor cv", "{camera}/samples", "{camera}/predictions"),
     "retrack": ("Example: mcaptrack retrack log.mcap --profile authors", "{camera}/samples", "{camera}/retracks"),
 }
+Topic = Annotated[str | None, common.option("--topic", shared=True, help="Read this channel instead of the usual one.")]
 Mode = Literal["both", "offline", "online"]
 _OUTPUTS_OF: Final[Mapping[str, tuple[str, ...]]] = {
     "both": ("", "online", "predictions"),
@@ -76,10 +77,9 @@ def _stage_command(name: str, kind: type[Transform]) -> Callable[..., None]:
         extra.append(_parameter("mode", Annotated[Mode, words], "both"))
     parameters += extra
     parameters += [_option(f.name, hints[f.name], getattr(defaults, f.name), f.metadata["help"]) for f in own]
-    topic = common.option("--topic", shared=True, help="Read this channel instead of the usual one.")
     to = common.option("--to", shared=True, help="Write this channel instead of the usual one.")
     parameters += [
-        _parameter("topic", Annotated[str | None, topic], None),
+        _parameter("topic", Topic, None),
         _parameter("to", Annotated[str | None, to], None),
         _parameter("camera", common.Camera, None),
         _parameter("output", common.Output, None),
@@ -105,6 +105,7 @@ def _stage_command(name: str, kind: type[Transform]) -> Callable[..., None]:
 
 def run_all(
     logs: common.Logs,
+    topic: Topic = None,
     camera: common.Camera = None,
     output: common.Output = None,
     tables: Annotated[bool, common.option("--tables/--no-tables", help="Write Parquet tables beside the log.")] = True,
@@ -117,12 +118,12 @@ def run_all(
     """Run all stages that are missing or out of date, then views and tables.
 
     From /camera/video (or whatever of detections, tracks and samples there is) to /camera/predictions and
-    /camera/retracks, and Parquet tables beside the log.
+    /camera/retracks, and Parquet tables beside the log. With --topic from the pictures, or the boxes, of that channel.
 
     Example: mcaptrack run log.mcap
     """
-    given = {"logs": logs, "camera": camera, "output": output, "topic": None, "force": force, "json": json}
-    _run_on_logs(given | {"quiet": quiet, "verbose": verbose}, lambda plan: plan.all(), tables)
+    given = {"logs": logs, "camera": camera, "output": output, "topic": topic, "force": force, "json": json}
+    _run_on_logs(given | {"quiet": quiet, "verbose": verbose}, lambda plan: plan.all(topic), tables)
 
 
 class _Plan:
@@ -138,10 +139,10 @@ class _Plan:
 
         return pipeline.plan_stage(self._opened, self._prefix, name, transform, topic, to, keep, self._say)
 
-    def all(self) -> Any:
+    def all(self, topic: str | None) -> Any:
         from mcaptrack import pipeline
 
-        return pipeline.plan_all(self._opened, self._prefix, self._say)
+        return pipeline.plan_all(self._opened, self._prefix, self._say, topic)
 
 
 def _run_on_logs(given: Mapping[str, Any], make_plan: Callable[[_Plan], Any], tables: bool = False) -> None:

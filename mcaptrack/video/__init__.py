@@ -5,15 +5,18 @@ FFmpeg does the work, through PyAV; its wheels bring it along.
 
 from mcaptrack.video.decode import Encoded, brightness
 from mcaptrack.video.encode import H264Encoder, Image, ImageFormat, encode_image, write_mp4
+from mcaptrack.video.raw import RAW_ENCODINGS, Layout
 from mcaptrack.video.source import IMAGE_SUFFIXES, EncodedPicture, Video, open_video, seqinfo_fps
 
 __all__ = [
     "IMAGE_SUFFIXES",
+    "RAW_ENCODINGS",
     "Encoded",
     "EncodedPicture",
     "H264Encoder",
     "Image",
     "ImageFormat",
+    "Layout",
     "Video",
     "brightness",
     "encode_image",

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from mcaptrack.clock import NS_PER_S
 from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import Frame
+from mcaptrack.video.raw import Layout, raw_brightness
 
 #: Names of formats in messages -> decoders of FFmpeg.
 _CODECS: Final = {"h264": "h264", "h265": "hevc", "vp9": "vp9", "av1": "av1"}
@@ -21,12 +22,22 @@ _LIMITED_TO_FULL: Final = np.clip(np.rint((np.arange(256) - 16) * (255 / 219)), 
 
 
 class Encoded(NamedTuple):
-    """A picture in a log: ``format`` is "h264", "jpeg" and so on."""
+    """A picture in a log: ``format`` is "h264", "jpeg" and so on; with a ``layout`` it is that of a pixel, "rgb8".
+
+    ``where`` names the picture in errors; without it they say its number.
+    """
 
     t_ns: int
     index: int  # type: ignore[assignment]  # hides tuple.index, which nobody wants here
     format: str
     data: bytes
+    layout: Layout | None = None
+    where: str = ""
+
+    @property
+    def name(self) -> str:
+        """The picture, as errors say it."""
+        return self.where or f"frame {self.index}"
 
 
 def brightness(pictures: Iterable[Encoded]) -> Iterator[Frame]:
@@ -36,7 +47,9 @@ def brightness(pictures: Iterable[Encoded]) -> Iterator[Frame]:
     """
     decoder: _VideoDecoder | None = None
     for picture in pictures:
-        if picture.format in _CODECS:
+        if picture.layout:
+            yield Frame(picture.t_ns, picture.index, _pixels(picture, picture.layout))
+        elif picture.format in _CODECS:
             decoder = decoder or _VideoDecoder(picture.format)
             yield from decoder.decode(picture)
         else:
@@ -45,12 +58,22 @@ def brightness(pictures: Iterable[Encoded]) -> Iterator[Frame]:
         yield from decoder.flush()
 
 
+def _pixels(picture: Encoded, layout: Layout) -> NDArray[np.uint8]:
+    try:
+        return raw_brightness(picture.format, picture.data, layout)
+    except McaptrackError as error:
+        raise McaptrackError(f"{picture.name}: {error}") from None
+
+
 def _still(picture: Encoded) -> NDArray[np.uint8]:
     import cv2
 
-    image = cv2.imdecode(np.frombuffer(picture.data, np.uint8), cv2.IMREAD_GRAYSCALE)
+    try:
+        image = cv2.imdecode(np.frombuffer(picture.data, np.uint8), cv2.IMREAD_GRAYSCALE)
+    except cv2.error:  # of no bytes, or of a header that promises more pixels than there can be
+        image = None
     if image is None:
-        raise McaptrackError(f"frame {picture.index} can't be decoded as {picture.format or 'an image'}")
+        raise McaptrackError(f"{picture.name} can't be decoded as {picture.format or 'an image'}")
     return np.asarray(image, np.uint8)
 
 
@@ -70,7 +93,7 @@ class _VideoDecoder:
         packet.pts = packet.dts = picture.t_ns
         packet.time_base = self._base
         self._index[picture.t_ns] = picture.index
-        yield from self._frames(packet, f"frame {picture.index}")
+        yield from self._frames(packet, picture.name)
 
     def flush(self) -> Iterator[Frame]:
         yield from self._frames(None, "the end of the video")

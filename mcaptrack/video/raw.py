@@ -1,0 +1,97 @@
+"""Pixels that nobody compressed -> brightness.
+
+Letters: H rows, W columns, B bytes a pixel.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaptrack.errors import McaptrackError
+
+Bytes = NDArray[np.uint8]
+
+
+class Layout(NamedTuple):
+    """How the pixels of a picture that nobody compressed lie in its bytes.
+
+    ``step`` is the distance of rows in bytes, 0 where rows follow one another; ``is_bigendian`` is about pixels of two
+    and four bytes.
+    """
+
+    width_px: int
+    height_px: int
+    step: int = 0
+    is_bigendian: bool = False
+
+
+#: Encoding -> bytes a pixel and the name of OpenCV's conversion; "" where the first plane is the brightness already.
+_COLOURS: Final = {
+    "mono8": (1, ""),
+    "8uc1": (1, ""),
+    "rgb8": (3, "COLOR_RGB2GRAY"),
+    "bgr8": (3, "COLOR_BGR2GRAY"),
+    "8uc3": (3, "COLOR_BGR2GRAY"),
+    "rgba8": (4, "COLOR_RGBA2GRAY"),
+    "bgra8": (4, "COLOR_BGRA2GRAY"),
+    "8uc4": (4, "COLOR_BGRA2GRAY"),
+    # ROS names the pixels of the first two rows.
+    "bayer_rggb8": (1, "COLOR_BayerRGGB2GRAY"),
+    "bayer_bggr8": (1, "COLOR_BayerBGGR2GRAY"),
+    "bayer_gbrg8": (1, "COLOR_BayerGBRG2GRAY"),
+    "bayer_grbg8": (1, "COLOR_BayerGRBG2GRAY"),
+}
+#: Packed YUV: where in a pair of bytes the brightness stands.
+_LUMA_AT: Final = {"uyvy": 1, "yuv422": 1, "yuyv": 0, "yuv422_yuy2": 0}
+_PLANAR: Final = ("nv12", "nv21")
+_WIDE: Final = {"mono16": "u2", "16uc1": "u2", "32fc1": "f4"}
+#: The encodings that are read.
+RAW_ENCODINGS: Final = (*_COLOURS, *_LUMA_AT, *_PLANAR, *_WIDE)
+
+
+def raw_brightness(encoding: str, data: bytes, layout: Layout) -> Bytes:
+    """The brightness (H, W) of a picture, from 0 to 255: of 16 bits the upper 8, of floats from 0 to 1 their share.
+
+    Raises McaptrackError for an encoding that is not read, and for a size that ``data`` does not hold.
+    """
+    import cv2
+
+    if encoding in _COLOURS:
+        size, conversion = _COLOURS[encoding]
+        rows = _rows(data, layout, size)
+        if not conversion:
+            return rows
+        image: Any = rows if size == 1 else rows.reshape(*rows.shape[:1], -1, size)
+        try:
+            return np.asarray(cv2.cvtColor(image, getattr(cv2, conversion)), np.uint8)
+        except cv2.error:
+            raise McaptrackError(f"{layout.width_px} x {layout.height_px} pixels are no {encoding} picture") from None
+    if encoding in _LUMA_AT:
+        return np.ascontiguousarray(_rows(data, layout, 2)[:, _LUMA_AT[encoding] :: 2])
+    if encoding in _PLANAR:
+        luma_rows = layout.height_px
+        both = layout._replace(height_px=luma_rows + (luma_rows + 1) // 2)
+        return _rows(data, both, 1)[:luma_rows].copy()
+    if encoding in _WIDE:
+        kind = np.dtype(_WIDE[encoding]).newbyteorder(">" if layout.is_bigendian else "<")
+        values = _rows(data, layout, kind.itemsize).view(kind)
+        if kind.kind == "u":
+            return np.asarray(values >> 8, np.uint8)
+        shares = np.nan_to_num(np.asarray(values, np.float32)).clip(0, 1)
+        return np.asarray(np.rint(shares * 255), np.uint8)
+    raise McaptrackError(f"pixels of the encoding {encoding[:40]!r} are not read; {', '.join(RAW_ENCODINGS)} are")
+
+
+def _rows(data: bytes, layout: Layout, size: int) -> Bytes:
+    """The bytes of the pixels, (H, W * B), without what fills up rows. Never takes more memory than ``data``."""
+    width, height = layout.width_px, layout.height_px
+    row = width * size
+    step = layout.step or row
+    if width <= 0 or height <= 0 or step < row or (height - 1) * step + row > len(data):
+        raise McaptrackError(
+            f"{len(data)} bytes don't hold {width} x {height} pixels of {size} bytes with {layout.step} bytes a row"
+        )
+    return np.ascontiguousarray(np.ndarray((height, row), np.uint8, data, 0, (step, 1)))

@@ -1,0 +1,273 @@
+"""Stages on logs that others recorded, in place: what was there stays, and what is drawn matches their pictures."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
+from mcap.reader import make_reader
+from mcap.writer import Writer
+
+from mcaptrack import log, pipeline
+from mcaptrack.cli import app
+from mcaptrack.errors import McaptrackError
+from mcaptrack.provenance import Provenance
+from mcaptrack.schema import DETECTIONS, TRACKS
+from mcaptrack.transforms import Detect, Sort
+from mcaptrack.views import SUFFIX
+from tests.test_foreign import Ros, pixels, vision
+from tests.worlds import ns, small_scene
+
+START_NS = 1_700_000_000_000_000_000
+LATE_NS = 41_234_567  # what a message takes from the camera to the log
+IMAGES = "/robot/front/image"
+
+
+def stamp_of(number: int) -> int:
+    return START_NS + ns(number / 10) + 17 * number
+
+
+def write_log(path: Path, *topics: str, boxes: str | None = None) -> list:
+    """A log as a robot writes it: a scene on these topics, boxes of what is truly there. Returns the scene's shots."""
+    ros = Ros("sensor_msgs/CompressedImage")
+    shots = list(small_scene(5.0).shots())
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start(profile="ros2", library="theirs")
+        schema = writer.register_schema(ros.kind.name, "ros2msg", ros.kind.schema)
+        channels = [writer.register_channel(topic, "cdr", schema, {"offered_qos_profiles": ""}) for topic in topics]
+        if boxes:
+            kind = vision("v4", [])[0]
+            found = writer.register_channel(boxes, "cdr", writer.register_schema(kind.name, "ros2msg", kind.schema))
+        for number, shot in enumerate(shots):
+            t_ns = stamp_of(number) + LATE_NS
+            data = cv2.imencode(".jpg", shot.image, [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
+            message = ros.new("sensor_msgs/CompressedImage", ros.header(stamp_of(number)), "jpeg", pixels(data))
+            for channel in channels:
+                writer.add_message(channel, t_ns, ros.pack(message), stamp_of(number), number + 1000)
+            if boxes:
+                payload = vision(
+                    "v4", [(x + w / 2, y + h / 2, w, h, 0.0, [("person", 0.9)]) for x, y, w, h in shot.boxes.tolist()]
+                )[1]
+                writer.add_message(found, t_ns + 5, payload, t_ns)
+        writer.finish()
+    return shots
+
+
+def content(path: Path) -> dict[str, list]:
+    """Every channel by the stock reader: what each message is, and what it says of itself."""
+    out: dict[str, list] = {}
+    with path.open("rb") as stream:
+        for schema, channel, message in make_reader(stream, validate_crcs=True).iter_messages():
+            out.setdefault(channel.topic, []).append(
+                (schema.name, schema.data, channel.metadata, message.log_time, message.publish_time, message.sequence, message.data)
+            )  # fmt: skip
+    return out
+
+
+def mcaptrack(*words: object) -> None:
+    assert not app([str(word) for word in words], standalone_mode=False), words
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory) -> Path:
+    """A log with one camera. Not to be changed."""
+    path = tmp_path_factory.mktemp("theirs") / "robot.mcap"
+    write_log(path, IMAGES)
+    return path
+
+
+@pytest.fixture
+def robot(recorded, tmp_path) -> Path:
+    return Path(shutil.copy(recorded, tmp_path / "robot.mcap"))
+
+
+def annotations(path: Path, topic: str) -> list[tuple[int, ImageAnnotations]]:
+    return [(row[3], ImageAnnotations.FromString(row[6])) for row in content(path)[topic + SUFFIX]]
+
+
+def test_stages_in_place_leave_all_that_was_there_and_draw_at_the_pictures_stamps(robot):
+    before = content(robot)
+    for words in (("detect", "--topic", IMAGES), ("track",), ("retrack",)):
+        mcaptrack(words[0], robot, "-q", *words[1:])
+    after = content(robot)
+    assert after[IMAGES] == before[IMAGES]
+    prefix = "/robot/front"
+    with log.read(robot) as opened:
+        made = Provenance.from_metadata(opened.channel(f"{prefix}/detections").metadata)
+        assert (made.transform, made.input) == ("detect", IMAGES)
+        found = opened.frames(f"{prefix}/detections", DETECTIONS)
+        assert [f.t_ns for f in found] == [row[3] for row in before[IMAGES]]
+        assert [f.index for f in found] == list(range(len(found)))
+        assert sum(len(f.rows) for f in found) > 20
+        assert any(len(f.rows) for f in opened.frames(f"{prefix}/retracks", TRACKS))
+        assert pipeline.find_camera(opened, None) == prefix
+    for name in ("detections", "tracks", "retracks", "retracks/predictions"):
+        drawn = annotations(robot, f"{prefix}/{name}")
+        assert [t_ns for t_ns, _ in drawn] == [row[3] for row in before[IMAGES]]
+        for number, (_, message) in enumerate(drawn):
+            for part in (message, *message.points, *message.texts):
+                assert part.timestamp.ToNanoseconds() == stamp_of(number)
+    layout = json.loads(robot.with_suffix(".layout.json").read_text())
+    assert layout["configById"]["Image!picture"]["imageMode"]["imageTopic"] == IMAGES
+
+
+def test_people_are_found_where_they_are(robot):
+    shots = list(small_scene(5.0).shots())
+    mcaptrack("detect", robot, "-q", "--topic", IMAGES)
+    with log.read(robot) as opened:
+        frames = opened.frames("/robot/front/detections", DETECTIONS)
+    near = total = 0
+    for shot, frame in list(zip(shots, frames, strict=True))[20:]:
+        for row in frame.rows:
+            x, y = row["x_px"] + row["w_px"] / 2, row["y_px"] + row["h_px"] / 2
+            centres = shot.boxes[:, :2] + shot.boxes[:, 2:] / 2
+            near += bool(len(centres) and np.hypot(*(centres - [x, y]).T).min() < 15)
+            total += 1
+    assert total > 20
+    assert near / total > 0.7
+
+
+def test_run_begins_with_the_only_pictures_there_are_and_says_so(robot, capsys):
+    mcaptrack("run", robot, "--no-tables")
+    said = capsys.readouterr().err
+    assert f"/robot/front/video is missing: taking the pictures of {IMAGES}" in said
+    with log.read(robot) as opened:
+        assert "/robot/front/retracks/predictions" in opened.channels
+    before = robot.read_bytes()
+    mcaptrack("run", robot, "--no-tables")
+    assert "nothing to do" in capsys.readouterr().err
+    assert robot.read_bytes() == before
+
+
+def test_run_with_a_topic_equals_run_without_where_there_is_one(robot, tmp_path):
+    shutil.copy(robot, tmp_path / "b.mcap")
+    mcaptrack("run", robot, "-q", "--topic", IMAGES)
+    mcaptrack("run", tmp_path / "b.mcap", "-q")
+    assert robot.read_bytes() == (tmp_path / "b.mcap").read_bytes()
+    assert (tmp_path / "robot.tables").is_dir()
+
+
+def test_of_several_cameras_one_has_to_be_chosen(tmp_path):
+    path = tmp_path / "two.mcap"
+    write_log(path, "/left/image", "/right/image")
+    with log.read(path) as opened, pytest.raises(McaptrackError) as error:
+        pipeline.plan_all(opened, pipeline.find_camera(opened, None))
+    assert str(error.value) == (
+        f"{path} has no channel /camera/video for detect; it has pictures in /left/image, /right/image. "
+        "choose one with --topic"
+    )
+    mcaptrack("run", path, "-q", "--topic", "/left/image")
+    mcaptrack("detect", path, "-q", "--topic", "/right/image")
+    mcaptrack("track", path, "-q", "--camera", "right")
+    with log.read(path) as opened:
+        assert pipeline.picture_topic(opened, "/right") == "/right/image"
+        assert {"/left/retracks", "/right/tracks", "/right/tracks" + SUFFIX} <= set(opened.channels)
+        assert "/right/retracks" not in opened.channels
+
+
+def test_boxes_of_others_are_tracked(tmp_path):
+    path = tmp_path / "boxes.mcap"
+    shots = write_log(path, "/eye/image", boxes="/eye/detections")
+    before = content(path)
+    mcaptrack("track", path, "-q", "--topic", "/eye/detections")
+    after = content(path)
+    assert {topic: after[topic] for topic in before} == before
+    with log.read(path) as opened:
+        tracks = opened.frames("/eye/tracks", TRACKS)
+        assert [f.t_ns for f in tracks] == [row[3] for row in before["/eye/detections"]]
+        seen = [int(f.rows["observed"].sum()) for f in tracks]
+        assert sum(seen) > 0.7 * sum(len(shot.boxes) for shot in shots)
+    for number, (_, message) in enumerate(annotations(path, "/eye/tracks")):
+        assert message.timestamp.ToNanoseconds() == stamp_of(number)
+    mcaptrack("run", path, "-q", "--topic", "/eye/detections", "--no-tables")
+    with log.read(path) as opened:
+        assert "/eye/retracks" in opened.channels
+
+
+def test_what_others_recorded_is_never_replaced(tmp_path):
+    path = tmp_path / "boxes.mcap"
+    write_log(path, "/eye/image", boxes="/eye/detections")
+    before = path.read_bytes()
+    with log.read(path) as opened:
+        with pytest.raises(
+            McaptrackError, match=r"detect would replace /eye/detections, which others recorded \(vision"
+        ):
+            pipeline.plan_stage(opened, "/eye", "detect", Detect(), "/eye/image")
+        with pytest.raises(McaptrackError, match="/eye/detections is there and was not made by detect; leave --topic"):
+            pipeline.plan_all(opened, "/eye", source="/eye/image")
+    mcaptrack("detect", path, "-q", "--topic", "/eye/image", "--to", "/eye/found")
+    assert content(path)["/eye/detections"] == content_of(before, tmp_path)["/eye/detections"]
+    assert [m.timestamp.ToNanoseconds() for _, m in annotations(path, "/eye/found")] == [stamp_of(n) for n in range(50)]
+
+
+def content_of(data: bytes, folder: Path) -> dict[str, list]:
+    (folder / "before.mcap").write_bytes(data)
+    return content(folder / "before.mcap")
+
+
+def test_detections_are_made_again_from_other_pictures(tmp_path, capsys):
+    path = tmp_path / "two.mcap"
+    write_log(path, "/eye/left", "/eye/right")
+    mcaptrack("run", path, "-q", "--no-tables", "--topic", "/eye/left")
+    mcaptrack("run", path, "--no-tables", "--topic", "/eye/right")
+    assert "/eye/detections was made from /eye/left: running detect again, from /eye/right" in capsys.readouterr().err
+    with log.read(path) as opened:
+        assert Provenance.from_metadata(opened.channel("/eye/detections").metadata).input == "/eye/right"
+        assert not [topic for topic in opened.channels if pipeline.is_stale(opened, topic)]
+
+
+def test_channels_that_hold_something_else_say_what(robot, tmp_path):
+    path = tmp_path / "boxes.mcap"
+    write_log(path, "/eye/image", boxes="/eye/boxes")
+    with log.read(path) as opened:
+        with pytest.raises(
+            McaptrackError,
+            match=r"/eye/boxes holds vision_msgs/msg/Detection2DArray; detect reads foxglove\.CompressedVideo or .* or sensor_msgs/Image$",
+        ):
+            pipeline.plan_stage(opened, "/eye", "detect", Detect(), "/eye/boxes")
+        with pytest.raises(
+            McaptrackError,
+            match=r"/eye/image holds sensor_msgs/msg/CompressedImage; track reads mcaptrack\.Detections or vision_msgs/Detection2DArray",
+        ):
+            pipeline.plan_stage(opened, "/eye", "track", Sort(), "/eye/image")
+
+
+@pytest.mark.parametrize("payload", [b"", b"\0\1\0\0garbage", None])
+def test_a_message_that_is_damaged_is_named_and_the_log_left_alone(robot, tmp_path, payload):
+    path = tmp_path / "bad.mcap"
+    ros = Ros("sensor_msgs/CompressedImage")
+    broken = ros.pack(ros.new("sensor_msgs/CompressedImage", ros.header(), "jpeg", pixels(b"no picture")))
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        schema = writer.register_schema(ros.kind.name, "ros2msg", ros.kind.schema)
+        channel = writer.register_channel("/eye/image", "cdr", schema)
+        writer.add_message(channel, 77, broken if payload is None else payload, 77)
+        writer.finish()
+    before = path.read_bytes()
+    with log.read(path) as opened, pytest.raises(McaptrackError, match=r"bad\.mcap: /eye/image at 77 ns: ") as error:
+        pipeline.run(opened, "/eye", pipeline.plan_stage(opened, "/eye", "detect", Detect()))
+    assert "\n" not in str(error.value)
+    assert path.read_bytes() == before
+
+
+def test_a_real_log_of_images_is_processed_in_place(data, tmp_path):
+    path = Path(shutil.copyfile(data / "mcap/images/custom-camera-model.mcap", tmp_path / "real.mcap"))
+    before = content(path)
+    mcaptrack("detect", path, "-q", "--topic", "/image/compressed")
+    mcaptrack("track", path, "-q")
+    mcaptrack("retrack", path, "-q")
+    after = content(path)
+    assert {topic: after[topic] for topic in before} == before
+    assert len(after["/image/detections"]) == 10
+    for row, (t_ns, message) in zip(before["/image/compressed"], annotations(path, "/image/detections"), strict=True):
+        said = json.loads(row[6])["timestamp"]
+        assert (t_ns, message.timestamp.ToNanoseconds()) == (row[3], said["sec"] * 10**9 + said["nsec"])
+    with log.read(path) as opened:
+        assert "/image/retracks" in opened.channels
