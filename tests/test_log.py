@@ -332,7 +332,11 @@ def _chunk_with(compression: str, data: bytes, size: int, crc: int = 0) -> bytes
     ("chunk", "words"),
     [
         (_chunk_with("zstd", zstandard.compress(bytes(200 << 20)), 1000), "a chunk of 1001 bytes that says 1000"),
-        (_chunk_with("", b"abc", 2**40), "a chunk of 1099511627776 bytes; at most"),
+        (_chunk_with("", b"abc", 2**40), "a chunk of 3 bytes that says 1099511627776"),
+        (
+            _chunk_with("zstd", b"abc", 2**63),
+            "a chunk of 9223372036854775808 bytes, of at most 256 MiB that are opened",
+        ),
         (_chunk_with("br", b"abc", 3), "compressed with 'br', which is not known here"),
         (_chunk_with("zstd", b"no zstd at all", 10), "a chunk can't be decompressed"),
         (_chunk_with("lz4", b"no lz4 at all", 10), "a chunk can't be decompressed"),
@@ -352,6 +356,65 @@ def test_hostile_chunks_are_refused_before_they_cost_anything(tmp_path, chunk, w
     with pytest.raises(McaptrackError, match=words):
         our_messages(path)
     assert time.monotonic() - started < 20
+
+
+def test_what_counts_as_too_large_a_chunk_can_be_said(tmp_path, monkeypatch):
+    path = tmp_path / "a.mcap"
+    write_stock(path, [("a", 1, 1, bytes(3 * 2**20))], chunk_size=2**20)
+    monkeypatch.setenv("MCAPTRACK_MAX_CHUNK_MIB", "2")
+    with pytest.raises(McaptrackError, match=r"of at most 2 MiB that are opened .* MCAPTRACK_MAX_CHUNK_MIB"):
+        our_messages(path)
+    monkeypatch.setenv("MCAPTRACK_MAX_CHUNK_MIB", "4")
+    assert len(our_messages(path)["a"]) == 1
+
+
+@pytest.mark.parametrize("options", STOCK_OPTIONS.values(), ids=STOCK_OPTIONS)
+@given(messages=MESSAGES, span=st.tuples(st.integers(0, 2**62), st.integers(0, 2**62)))
+@settings(max_examples=20)
+def test_a_span_of_time_over_several_channels_is_what_the_stock_reader_gives(tmp_path_factory, options, messages, span):
+    path = tmp_path_factory.mktemp("log") / "a.mcap"
+    write_stock(path, messages, **options)
+    start_ns, end_ns = sorted(span)
+    with log.read(path) as opened:
+        found = [
+            (t, m.t_ns, m.sequence, m.payload)
+            for t, m in opened.merged({"a", "c"} & opened.channels.keys(), start_ns, end_ns)
+        ]
+    wanted = [m for m in messages if m[0] in "ac" and start_ns <= m[1] < end_ns]
+    assert sorted(found) == sorted(wanted)
+    assert [m[1] for m in found] == sorted(m[1] for m in wanted)
+
+
+def test_chunks_outside_of_the_span_are_not_touched(tmp_path):
+    path = tmp_path / "a.mcap"
+    write_stock(path, [("a", t, t, bytes([t]) * 300) for t in range(100)], chunk_size=1000)
+    with log.read(path) as opened:
+        chunk = opened.index.chunks[-1]
+    raw = bytearray(path.read_bytes())
+    raw[chunk.offset + 70 : chunk.offset + 80] = bytes(10)
+    path.write_bytes(raw)
+    with log.read(path) as opened:
+        assert [m.t_ns for m in opened.messages("a", 10, 20)] == list(range(10, 20))
+        with pytest.raises(McaptrackError, match=r"is damaged: byte .*`mcaptrack recover .*` saves what is whole"):
+            list(opened.messages("a", 10))
+
+
+def test_chunks_that_all_overlap_are_not_all_open(tmp_path, monkeypatch):
+    from mcaptrack.log import messages as reading
+
+    path = tmp_path / "a.mcap"
+    times = [(t * 37) % 400 for t in range(400)]
+    write_stock(path, [("a", t, t, bytes([t % 256]) * 100) for t in times], chunk_size=1000)
+    opened_chunks = []
+    opening = reading.open_chunk
+    monkeypatch.setattr(reading, "open_chunk", lambda *where: opened_chunks.append(where) or opening(*where))
+    with log.read(path) as opened:
+        chunks = len(opened.index.chunks)
+        assert [m.t_ns for m in opened.messages("a")] == sorted(times)
+        assert len(opened_chunks) == chunks > 30
+        monkeypatch.setattr(reading, "OPEN_BYTES", 4000)
+        assert [(m.t_ns, m.payload[0]) for m in opened.messages("a")] == [(t, t % 256) for t in sorted(times)]
+        assert len(opened_chunks) > 3 * chunks  # closed and opened again
 
 
 def test_the_same_messages_give_the_same_bytes(tmp_path):

@@ -6,7 +6,8 @@ with create(path) as writer: ...        a new one
 """
 
 from mcaptrack.log.change import extend
-from mcaptrack.log.reader import Channel, Columns, Log, Message, read, topics_with_schema
+from mcaptrack.log.messages import Columns, Message
+from mcaptrack.log.reader import Channel, Log, read, topics_with_schema
 from mcaptrack.log.writer import LogWriter, create
 
 __all__ = ["Channel", "Columns", "Log", "LogWriter", "Message", "create", "extend", "read", "topics_with_schema"]

@@ -11,7 +11,6 @@ from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final
 
 import numpy as np
 from mcap.opcode import Opcode
@@ -23,10 +22,8 @@ from mcaptrack.log.chunks import chunk_entries, chunk_record, forget, message_he
 from mcaptrack.log.index import Index
 from mcaptrack.log.journal import new_end
 from mcaptrack.log.reader import Log
-from mcaptrack.log.records import MAGIC, ChunkIndexRecord, Damaged, Record, walk
+from mcaptrack.log.records import BLOCK, MAGIC, ChunkIndexRecord, Damaged, Record, walk
 from mcaptrack.log.writer import LogWriter, Sink, verify
-
-_BLOCK: Final = 8 * 2**20
 
 
 @contextmanager
@@ -97,8 +94,8 @@ def _as_copy(log: Log, change: _Change, output: Path | None) -> Iterator[LogWrit
 
 
 def _pass_on(buffer: memoryview, end: int, stream: Sink) -> None:
-    for at in range(0, end, _BLOCK):
-        until = min(at + _BLOCK, end)
+    for at in range(0, end, BLOCK):
+        until = min(at + BLOCK, end)
         stream.write(buffer[at:until])  # type: ignore[arg-type]  # any bytes will do
         forget(buffer, at, until)
 
@@ -106,8 +103,8 @@ def _pass_on(buffer: memoryview, end: int, stream: Sink) -> None:
 def _compare(buffer: memoryview, copy: Path, end: int) -> None:
     """What was passed on is what was read. Raises McaptrackError otherwise."""
     with copy.open("rb") as stream:
-        for at in range(0, end, _BLOCK):
-            until = min(at + _BLOCK, end)
+        for at in range(0, end, BLOCK):
+            until = min(at + BLOCK, end)
             if stream.read(until - at) != buffer[at:until]:
                 raise McaptrackError(f"{copy} is not what was written to it; the disk can't be relied on")
             forget(buffer, at, until)

@@ -6,6 +6,7 @@ Letters: M messages.
 from __future__ import annotations
 
 import mmap
+import os
 import zlib
 from typing import Final, NamedTuple
 
@@ -14,12 +15,14 @@ from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from mcaptrack.log import records
-from mcaptrack.log.records import ChunkIndexRecord, Damaged, Reader, Record, walk
+from mcaptrack.log.records import ChunkIndexRecord, Damaged, Record, walk
 
 Ints = NDArray[np.int64]
+Entries = NDArray[np.uint64]
 
-#: A chunk that says it is larger than this is not decompressed.
-MAX_CHUNK_BYTES: Final = 256 * 2**20
+#: A chunk that says it is larger is not decompressed, unless the environment allows it.
+MAX_CHUNK_MIB: Final = 256
+ENVIRONMENT: Final = "MCAPTRACK_MAX_CHUNK_MIB"
 #: A message record up to its payload.
 HEAD: Final = np.dtype(
     [
@@ -31,7 +34,6 @@ HEAD: Final = np.dtype(
         ("publish_ns", "<u8"),
     ]
 )
-_MAX_NS: Final = 2**63 - 1
 
 
 class Heads(NamedTuple):
@@ -62,8 +64,11 @@ def chunk_record(buffer: memoryview, chunk: ChunkIndexRecord) -> Record:
 def open_chunk(buffer: memoryview, record: Record) -> memoryview:
     """The records inside a chunk, decompressed and checked. Memory is bounded by what the chunk says of itself."""
     head = records.read_chunk(buffer, record)
-    if head.uncompressed_size > MAX_CHUNK_BYTES:
-        raise Damaged(f"byte {record.start}: a chunk of {head.uncompressed_size} bytes; at most {MAX_CHUNK_BYTES}")
+    if head.compression and head.uncompressed_size > _most_mib() * 2**20:
+        raise Damaged(
+            f"byte {record.start}: a chunk of {head.uncompressed_size} bytes, of at most {_most_mib()} MiB that are "
+            f"opened (the variable {ENVIRONMENT} sets another limit)"
+        )
     data = buffer[head.start : head.end]
     content = _decompress(data, head.compression, head.uncompressed_size, record.start)
     if len(content) != head.uncompressed_size:
@@ -71,6 +76,11 @@ def open_chunk(buffer: memoryview, record: Record) -> memoryview:
     if head.uncompressed_crc and zlib.crc32(content) != head.uncompressed_crc:
         raise Damaged(f"byte {record.start}: the checksum of a chunk is wrong")
     return content
+
+
+def _most_mib() -> int:
+    given = os.environ.get(ENVIRONMENT, "")
+    return int(given) if given.isdecimal() else MAX_CHUNK_MIB
 
 
 def _decompress(data: memoryview, compression: str, size: int, where: int) -> memoryview:
@@ -107,29 +117,21 @@ def forget(buffer: memoryview, start: int, end: int) -> None:
         mapped.madvise(mmap.MADV_DONTNEED, first, end - first)
 
 
-def message_times(buffer: memoryview, chunk: ChunkIndexRecord, channel_id: int) -> tuple[Ints, Ints]:
-    """Log times and offsets inside the chunk of one channel's messages, (M,) each."""
-    at = chunk.message_index_offsets[channel_id]
-    if at:
-        record = records.record_at(buffer, at)
-        reader = Reader(buffer, record.body, record.end)
-        if record.opcode != Opcode.MESSAGE_INDEX or reader.number(2) != channel_id:
-            raise Damaged(f"byte {at}: no message index of channel {channel_id} where one belongs")
-        listed = reader.raw()
-        if len(listed) % 16:
-            raise Damaged(f"byte {at}: a message index of {len(listed)} bytes")
-        entries = np.frombuffer(listed, "<u8").reshape(-1, 2)
-    else:
-        content = open_chunk(buffer, chunk_record(buffer, chunk))
-        entries = chunk_entries(content).get(channel_id, np.empty((0, 2), "<u8"))
-    if len(entries) and entries.max() > _MAX_NS:
-        raise Damaged("a message has a time beyond the year 2262")
+def listed_entries(buffer: memoryview, at: int, channel_id: int) -> Entries:
+    """What the message index at ``at`` lists of a channel: log time and offset inside the chunk, (M, 2)."""
+    record = records.record_at(buffer, at)
+    channel, listed = records.read_message_entries(buffer, record)
+    if channel != channel_id:
+        raise Damaged(f"byte {at}: no message index of channel {channel_id} where one belongs")
+    if len(listed) % 16:
+        raise Damaged(f"byte {at}: a message index of {len(listed)} bytes")
+    entries = np.frombuffer(listed, "<u8").reshape(-1, 2)
     if len(np.unique(entries[:, 1])) != len(entries):
         raise Damaged(f"byte {at}: a message index that lists a message twice")
-    return entries[:, 0].astype(np.int64), entries[:, 1].astype(np.int64)
+    return entries
 
 
-def chunk_entries(content: memoryview) -> dict[int, NDArray[np.uint64]]:
+def chunk_entries(content: memoryview) -> dict[int, Entries]:
     """What the message indexes of a chunk have to say: for each channel log time and offset of its messages, (M, 2)."""
     found: dict[int, list[tuple[int, int]]] = {}
     for record in walk(content, 0, len(content)):

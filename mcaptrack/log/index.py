@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import zlib
+from array import array
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
+import numpy as np
 from mcap.opcode import Opcode
 
 from mcaptrack.log import records
-from mcaptrack.log.chunks import chunk_entries, forget, message_head, open_chunk
+from mcaptrack.log.chunks import Entries, chunk_entries, forget, message_head, open_chunk
 from mcaptrack.log.records import (
+    BLOCK,
     MAGIC,
     ChannelRecord,
     ChunkIndexRecord,
@@ -37,7 +41,8 @@ class Listed(NamedTuple):
 class Index:
     """The contents of a log. ``data_end`` is where the data section ends, ``data_crc`` its CRC if the file has one.
 
-    ``regular`` logs have a summary that reading can rely on, and all their messages in indexed chunks.
+    ``regular`` logs have a summary that reading can rely on, and all their messages in indexed chunks. For other logs
+    times and offsets of messages are kept here, by channel: offsets in the chunk, or in the file outside of chunks.
     """
 
     data_end: int = 0
@@ -46,7 +51,8 @@ class Index:
     schemas: dict[int, SchemaRecord] = field(default_factory=dict)
     channels: dict[int, ChannelRecord] = field(default_factory=dict)
     chunks: list[ChunkIndexRecord] = field(default_factory=list)
-    loose: list[Record] = field(default_factory=list)  # messages outside of chunks
+    entries: dict[int, dict[int, Entries]] = field(default_factory=dict)  # of chunks at these offsets, where scanned
+    loose: dict[int, Entries] = field(default_factory=dict)  # of messages outside of chunks
     counts: dict[int, int] = field(default_factory=dict)  # messages of each channel
     attachments: list[Listed] = field(default_factory=list)
     metadata: list[Listed] = field(default_factory=list)
@@ -132,16 +138,16 @@ def _take(index: Index, buffer: memoryview, record: Record) -> None:
 def _from_scan(buffer: memoryview) -> Index:
     """The contents from every record of the file, chunks opened."""
     index = Index()
+    loose: dict[int, array[int]] = {}
+    done = 0
     for record in walk(buffer, len(MAGIC), len(buffer) - len(MAGIC)):
         if record.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
             _take(index, buffer, record)  # those of the summary count too: some writers put them nowhere else
         elif record.opcode == Opcode.CHUNK:
             _scan_chunk(index, buffer, record)
-            forget(buffer, record.start, record.end)
         elif record.opcode == Opcode.MESSAGE:
-            index.loose.append(record)
             channel, _, t_ns, _ = message_head(buffer, record)
-            _count(index, channel, 1, t_ns, t_ns)
+            loose.setdefault(channel, array("Q")).extend((t_ns, record.start))
         elif record.opcode == Opcode.ATTACHMENT:
             index.attachments.append(list_attachment(buffer, record, record.start))
         elif record.opcode == Opcode.METADATA:
@@ -149,6 +155,11 @@ def _from_scan(buffer: memoryview) -> Index:
         elif record.opcode == Opcode.DATA_END:
             index.data_end = record.start
             index.data_crc = Reader(buffer, record.body, record.end).number(4)
+        if record.end - done >= BLOCK:
+            forget(buffer, done, record.end)
+            done = record.end
+    index.loose = {channel: np.array(entries, "<u8").reshape(-1, 2) for channel, entries in loose.items()}
+    _count(index, index.loose)
     missing = set(index.counts) - set(index.channels)
     if missing:
         raise Damaged(f"there are messages of channel {min(missing)}, which is not described anywhere")
@@ -157,11 +168,14 @@ def _from_scan(buffer: memoryview) -> Index:
     return index
 
 
-def _count(index: Index, channel: int, messages: int, first_ns: int, last_ns: int) -> None:
-    if not index.counts:
-        index.start_ns, index.end_ns = first_ns, last_ns
-    index.start_ns, index.end_ns = min(index.start_ns, first_ns), max(index.end_ns, last_ns)
-    index.counts[channel] = index.counts.get(channel, 0) + messages
+def _count(index: Index, found: Mapping[int, Entries]) -> None:
+    """Add messages to the numbers of each channel and to the span of time."""
+    for channel, entries in found.items():
+        first_ns, last_ns = int(entries[:, 0].min()), int(entries[:, 0].max())
+        if not index.counts:
+            index.start_ns, index.end_ns = first_ns, last_ns
+        index.start_ns, index.end_ns = min(index.start_ns, first_ns), max(index.end_ns, last_ns)
+        index.counts[channel] = index.counts.get(channel, 0) + len(entries)
 
 
 def _scan_chunk(index: Index, buffer: memoryview, record: Record) -> None:
@@ -171,8 +185,8 @@ def _scan_chunk(index: Index, buffer: memoryview, record: Record) -> None:
         if inner.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
             _take(index, content, inner)
     entries = chunk_entries(content)
-    for channel, found in entries.items():
-        _count(index, channel, len(found), int(found[:, 0].min()), int(found[:, 0].max()))
+    _count(index, entries)
+    index.entries[record.start] = entries
     index.chunks.append(
         ChunkIndexRecord(
             head.start_ns,

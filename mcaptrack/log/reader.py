@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
+import heapq
 import mmap
 import os
-from collections.abc import Iterator, Sequence
-from itertools import islice
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple, Self
 
 import numpy as np
-from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.log import journal, records
-from mcaptrack.log.chunks import Heads, chunk_record, forget, heads_at, message_head, message_times, open_chunk
 from mcaptrack.log.index import Index, read_index
-from mcaptrack.log.records import ChunkIndexRecord, Damaged, Record, walk
-from mcaptrack.schema import Frame, Rows, Schema
+from mcaptrack.log.messages import Columns, Message, Messages
+from mcaptrack.log.records import Damaged
+from mcaptrack.schema import Frame, Schema
 
 Ints = NDArray[np.int64]
 
@@ -32,24 +32,6 @@ class Channel(NamedTuple):
     message_encoding: str
     metadata: dict[str, str]
     messages: int
-
-
-class Message(NamedTuple):
-    """A message as it stands in a log; times in nanoseconds."""
-
-    t_ns: int
-    sequence: int
-    publish_ns: int
-    payload: bytes
-
-
-class Columns(NamedTuple):
-    """All rows of a channel by time, and of each message its time, sequence number and how many rows are its own."""
-
-    rows: Rows
-    t_ns: Ints
-    sequence: Ints
-    counts: Ints
 
 
 class Log:
@@ -75,9 +57,10 @@ class Log:
                 raise Damaged("it is empty")
             self._buffer = memoryview(mmap.mmap(self._file.fileno(), 0, access=mmap.ACCESS_READ))
             self.index: Index = read_index(self._buffer)
+            self._messages = Messages(self._buffer, self.index)
         except Damaged as error:
             self._file.close()
-            raise McaptrackError(f"{path} can't be read as an MCAP file: {error}") from None
+            raise McaptrackError(f"{path} can't be read as an MCAP file: {error}; {_recover(path)}") from None
         self.channels: dict[str, Channel] = {}
         for record in self.index.channels.values():
             schema = self.index.schemas.get(record.schema_id)
@@ -151,18 +134,27 @@ class Log:
         found = [listed.offset for listed in self.index.metadata if listed.name == name]
         if not found:
             return None
-        try:
+        with self._mending():
             return records.read_metadata(self._buffer, records.record_at(self._buffer, found[-1]))[1]
-        except Damaged as error:
-            raise McaptrackError(f"{self.path} is damaged: {error}") from None
 
-    def messages(self, topic: str) -> Iterator[Message]:
-        """The messages of a channel in the order of their times. Raises McaptrackError where the file is damaged."""
+    def messages(self, topic: str, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Message]:
+        """The messages of a channel by time, from ``start_ns`` to before ``end_ns``, all of them without these.
+
+        Chunks outside of that span are not touched. Raises McaptrackError where the file is damaged.
+        """
         channel = self.channel(topic)
-        try:
-            yield from self._loose(channel.id) if self.index.loose else self._chunked(channel.id)
-        except Damaged as error:
-            raise McaptrackError(f"{self.path} is damaged: {error}") from None
+        with self._mending():
+            yield from self._messages.by_time(channel.id, (start_ns, end_ns))
+
+    def merged(
+        self, topics: Iterable[str], start_ns: int | None = None, end_ns: int | None = None
+    ) -> Iterator[tuple[str, Message]]:
+        """The messages of several channels by time, with their topics; those of one time in the order of topics."""
+
+        def named(topic: str) -> Iterator[tuple[str, Message]]:
+            return ((topic, message) for message in self.messages(topic, start_ns, end_ns))
+
+        return heapq.merge(*map(named, topics), key=lambda found: found[1].t_ns)
 
     def rows(self, topic: str, schema: Schema) -> Columns:
         """All rows of a channel as one array. Raises McaptrackError if the channel holds something else."""
@@ -170,13 +162,13 @@ class Log:
         if channel.schema_name != schema.name or channel.message_encoding != "protobuf":
             raise McaptrackError(f"{self.path}: {topic} holds {channel.schema_name or 'no schema'}, not {schema.name}")
         try:
-            found = None if self.index.loose else self._columns(channel.id, schema)
+            found = self._messages.columns(channel.id, schema)
             if found is not None:
                 return found
             messages = list(self.messages(topic))
             rows, counts = schema.codec.decode_all([message.payload for message in messages])
         except (Damaged, ValueError) as error:
-            raise McaptrackError(f"{self.path}: {topic} is damaged: {error}") from None
+            raise McaptrackError(f"{self.path}: {topic} is damaged: {error}; {_recover(self.path)}") from None
         t_ns = np.array([message.t_ns for message in messages], np.int64)
         return Columns(rows, t_ns, np.array([message.sequence for message in messages], np.int64), counts)
 
@@ -191,94 +183,20 @@ class Log:
     def times(self, topic: str) -> Ints:
         """The times of a channel's messages, rising, without reading them."""
         channel = self.channel(topic)
-        if self.index.loose:
-            return np.array([message.t_ns for message in self.messages(topic)], np.int64)
+        with self._mending():
+            return self._messages.times(channel.id)
+
+    @contextmanager
+    def _mending(self) -> Iterator[None]:
+        """What is damaged is said, with what can be done."""
         try:
-            return np.sort(np.concatenate([np.empty(0, np.int64), *(t for t, _ in self._entries(channel.id)[1])]))
+            yield
         except Damaged as error:
-            raise McaptrackError(f"{self.path} is damaged: {error}") from None
+            raise McaptrackError(f"{self.path} is damaged: {error}; {_recover(self.path)}") from None
 
-    def _entries(self, channel_id: int) -> tuple[list[ChunkIndexRecord], list[tuple[Ints, Ints]]]:
-        """The chunks that hold messages of a channel, and the times and places of these messages."""
-        holders = [chunk for chunk in self.index.chunks if channel_id in chunk.message_index_offsets]
-        entries = [message_times(self._buffer, chunk, channel_id) for chunk in holders]
-        listed, said = sum(len(times) for times, _ in entries), self.index.counts.get(channel_id, 0)
-        if listed != said:
-            raise Damaged(f"its indexes list {listed} messages of channel {channel_id}, and there are {said}")
-        return holders, entries
 
-    def _columns(self, channel_id: int, schema: Schema) -> Columns | None:
-        """Rows without a loop over messages; None where a message is laid out otherwise than ours."""
-        holders, entries = self._entries(channel_id)
-        parts: list[Columns] = []
-        for chunk, (t_ns, offset) in zip(holders, entries, strict=True):
-            content = open_chunk(self._buffer, chunk_record(self._buffer, chunk))
-            found = heads_at(content, channel_id, t_ns, offset)
-            decoded = schema.codec.decode_at(np.frombuffer(content, np.uint8), found.start, found.end)
-            if decoded is None:
-                return None
-            parts.append(Columns(decoded[0], t_ns, found.head["sequence"].astype(np.int64), decoded[1]))
-        if not parts:
-            return Columns(schema.empty(), *(np.empty(0, np.int64) for _ in range(3)))
-        rows = schema.codec.join([part.rows for part in parts])
-        times, sequence, counts = (np.concatenate(column) for column in list(zip(*parts, strict=True))[1:])
-        order = np.argsort(times, kind="stable")
-        if (np.diff(order) != 1).any():
-            first, kept = (np.cumsum(counts) - counts)[order], counts[order]
-            rows = rows[np.repeat(first - (np.cumsum(kept) - kept), kept) + np.arange(len(rows))]
-        rows.flags.writeable = False
-        return Columns(rows, times[order], sequence[order], counts[order])
-
-    def _chunked(self, channel_id: int) -> Iterator[Message]:
-        """By time; messages of one time as they stand in the file. A chunk is open while its messages are due."""
-        holders, entries = self._entries(channel_id)
-        if not any(len(times) for times, _ in entries):
-            return
-        t_ns = np.concatenate([times for times, _ in entries])
-        chunk_of = np.repeat(np.arange(len(entries)), [len(times) for times, _ in entries])
-        due = np.bincount(chunk_of, minlength=len(entries)).tolist()
-        opened: dict[int, Iterator[Message]] = {}
-        in_order = chunk_of[np.argsort(t_ns, kind="stable")]
-        # Chunks rarely overlap: as long as one goes on, its messages are passed on without a look at the others.
-        turns = np.flatnonzero(np.diff(in_order)) + 1
-        starts = np.concatenate([[0], turns, [len(in_order)]])
-        for number, run in zip(in_order[starts[:-1]].tolist(), np.diff(starts).tolist(), strict=True):
-            if number not in opened:
-                opened[number] = self._messages_of(holders[number], channel_id, *entries[number])
-            yield from islice(opened[number], run)
-            due[number] -= run
-            if not due[number]:
-                del opened[number]
-                forget(self._buffer, holders[number].offset, holders[number].offset + holders[number].length)
-
-    def _messages_of(self, chunk: ChunkIndexRecord, channel_id: int, t_ns: Ints, offset: Ints) -> Iterator[Message]:
-        """One channel's messages in a chunk, by time."""
-        order = np.argsort(t_ns, kind="stable")
-        content = open_chunk(self._buffer, chunk_record(self._buffer, chunk))
-        found: Heads = heads_at(content, channel_id, t_ns[order], offset[order])
-        whole = content.obj
-        data = whole if isinstance(whole, bytes) and len(whole) == len(content) else content
-        spans = zip(found.start.tolist(), found.end.tolist(), strict=True)
-        payloads = (bytes(data[start:end]) for start, end in spans)
-        head = found.head
-        return map(Message, head["t_ns"].tolist(), head["sequence"].tolist(), head["publish_ns"].tolist(), payloads)
-
-    def _loose(self, channel_id: int) -> Iterator[Message]:
-        """For files in which messages stand outside of chunks."""
-        found = [self._message(self._buffer, record, channel_id) for record in self.index.loose]
-        for chunk in self.index.chunks:
-            content = open_chunk(self._buffer, chunk_record(self._buffer, chunk))
-            found += [self._message(content, record, channel_id) for record in walk(content, 0, len(content))]
-        yield from sorted((message for message in found if message), key=lambda message: message.t_ns)
-
-    @staticmethod
-    def _message(buffer: memoryview, record: Record, channel_id: int) -> Message | None:
-        if record.opcode != Opcode.MESSAGE:
-            return None
-        channel, sequence, t_ns, publish_ns = message_head(buffer, record)
-        if channel != channel_id:
-            return None
-        return Message(t_ns, sequence, publish_ns, bytes(buffer[record.body + records.MESSAGE_HEAD.size : record.end]))
+def _recover(path: Path) -> str:
+    return f"`mcaptrack recover {path}` saves what is whole"
 
 
 def read(path: Path) -> Log:

@@ -15,6 +15,8 @@ from mcap.opcode import Opcode
 from mcaptrack.errors import McaptrackError
 
 MAGIC: Final = b"\x89MCAP0\r\n"
+#: How much of a file is worked on at once where all of it is.
+BLOCK: Final = 8 * 2**20
 
 _HEAD: Final = struct.Struct("<BQ")
 MESSAGE_HEAD: Final = struct.Struct("<HIQQ")

@@ -25,7 +25,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.log import records
 from mcaptrack.log.chunks import forget
 from mcaptrack.log.index import Index, Listed, list_attachment, list_metadata, read_index
-from mcaptrack.log.records import MAGIC, ChannelRecord, ChunkIndexRecord, SchemaRecord
+from mcaptrack.log.records import BLOCK, MAGIC, ChannelRecord, ChunkIndexRecord, SchemaRecord
 
 Kind = Literal["media", "rows"]
 
@@ -33,7 +33,6 @@ _CHUNK_BYTES: Final[Mapping[Kind, int]] = {"media": 4 * 2**20, "rows": 2**20}
 _ZSTD_LEVEL: Final = 3
 _MAX_NS: Final = 2**63 - 1
 _MAX_ID: Final = 2**16 - 1
-_BLOCK: Final = 8 * 2**20
 
 
 class Sink(Protocol):
@@ -328,7 +327,7 @@ def verify(path: Path, writer: LogWriter, messages: int, start: int = 0, crc: in
     index = read_index(buffer)
     at = start
     while at < index.data_end:
-        end = min(at + _BLOCK, index.data_end)
+        end = min(at + BLOCK, index.data_end)
         crc = zlib.crc32(buffer[at:end], crc)
         forget(buffer, at, end)
         at = end
