@@ -1,0 +1,190 @@
+"""The messages of a channel, by time: found by index, opened a chunk at a time, within bounds of memory.
+
+Letters: M messages.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Iterator
+from itertools import islice
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaptrack.log.chunks import Entries, chunk_record, forget, heads_at, listed_entries, open_chunk
+from mcaptrack.log.index import Index
+from mcaptrack.log.records import BLOCK, ChunkIndexRecord, Damaged
+from mcaptrack.schema import Rows, Schema
+
+Ints = NDArray[np.int64]
+Span = tuple[int | None, int | None]
+
+#: Beyond this much, chunks that overlap are closed and opened again when their turn comes.
+OPEN_BYTES: Final = 128 * 2**20
+_MAX_NS: Final = 2**63 - 1
+
+
+class Message(NamedTuple):
+    """A message as it stands in a log; times in nanoseconds."""
+
+    t_ns: int
+    sequence: int
+    publish_ns: int
+    payload: bytes
+
+
+class Columns(NamedTuple):
+    """All rows of a channel by time, and of each message its time, sequence number and how many rows are its own."""
+
+    rows: Rows
+    t_ns: Ints
+    sequence: Ints
+    counts: Ints
+
+
+class _Source(NamedTuple):
+    """Messages of one channel in a chunk, or in the file outside of chunks: times and places, by time, (M,) each.
+
+    ``start`` and ``end`` are the part of the file that reading them touches.
+    """
+
+    chunk: ChunkIndexRecord | None
+    start: int
+    end: int
+    t_ns: Ints
+    offset: Ints
+
+    @property
+    def size(self) -> int:
+        """The memory that it takes to have it open."""
+        return self.chunk.uncompressed_size if self.chunk and self.chunk.compression else 0
+
+
+class Messages:
+    """What is in the chunks of a log. Everything here raises Damaged where the bytes are not what the index says."""
+
+    def __init__(self, buffer: memoryview, index: Index) -> None:
+        self._buffer, self._index = buffer, index
+        self._opened: OrderedDict[int, memoryview] = OrderedDict()  # contents of the last chunks, for other channels
+
+    def times(self, channel_id: int, span: Span = (None, None)) -> Ints:
+        """The times of a channel's messages, rising, (M,)."""
+        return np.sort(np.concatenate([np.empty(0, np.int64), *(s.t_ns for s in self._sources(channel_id, span))]))
+
+    def by_time(self, channel_id: int, span: Span = (None, None)) -> Iterator[Message]:
+        """Messages by time; those of one time as they stand in the file. ``span`` is from the first to before the last.
+
+        A chunk is open while its messages are due, unless too many are.
+        """
+        sources = self._sources(channel_id, span)
+        if not any(len(source.t_ns) for source in sources):
+            return
+        t_ns = np.concatenate([source.t_ns for source in sources])
+        source_of = np.repeat(np.arange(len(sources)), [len(source.t_ns) for source in sources])
+        in_order = source_of[np.argsort(t_ns, kind="stable")]
+        # Chunks rarely overlap: as long as one goes on, its messages are passed on without a look at the others.
+        turns = np.flatnonzero(np.diff(in_order)) + 1
+        starts = np.concatenate([[0], turns, [len(in_order)]])
+        opened: OrderedDict[int, Iterator[Message]] = OrderedDict()
+        taken = [0] * len(sources)
+        size = 0
+        for number, run in zip(in_order[starts[:-1]].tolist(), np.diff(starts).tolist(), strict=True):
+            source = sources[number]
+            if number not in opened:
+                size += source.size
+                while size > OPEN_BYTES and opened:
+                    size -= sources[opened.popitem(last=False)[0]].size
+                opened[number] = self._read(source, channel_id, taken[number])
+            opened.move_to_end(number)
+            yield from islice(opened[number], run)
+            taken[number] += run
+            if taken[number] == len(source.t_ns):
+                del opened[number]
+                size -= source.size
+                forget(self._buffer, source.start, source.end)
+
+    def columns(self, channel_id: int, schema: Schema) -> Columns | None:
+        """Rows without a loop over messages; None where a message is laid out otherwise than ours."""
+        parts: list[Columns] = []
+        for source in self._sources(channel_id):
+            content = self._open(source)
+            found = heads_at(content, channel_id, source.t_ns, source.offset)
+            decoded = schema.codec.decode_at(np.frombuffer(content, np.uint8), found.start, found.end)
+            if decoded is None:
+                return None
+            parts.append(Columns(decoded[0], source.t_ns, found.head["sequence"].astype(np.int64), decoded[1]))
+        if not parts:
+            return Columns(schema.empty(), *(np.empty(0, np.int64) for _ in range(3)))
+        rows = schema.codec.join([part.rows for part in parts])
+        times, sequence, counts = (np.concatenate(column) for column in list(zip(*parts, strict=True))[1:])
+        order = np.argsort(times, kind="stable")
+        if (np.diff(order) != 1).any():
+            first, kept = (np.cumsum(counts) - counts)[order], counts[order]
+            rows = rows[np.repeat(first - (np.cumsum(kept) - kept), kept) + np.arange(len(rows))]
+        rows.flags.writeable = False
+        return Columns(rows, times[order], sequence[order], counts[order])
+
+    def _sources(self, channel_id: int, span: Span = (None, None)) -> list[_Source]:
+        """Where the messages of a channel stand; only chunks that reach into the span are looked at."""
+        first, last = span
+        is_all = first is None and last is None
+        found, listed = [], 0
+        for chunk in self._index.chunks:
+            at = chunk.message_index_offsets.get(channel_id)
+            if at is None or (last is not None and chunk.start_ns >= last):
+                continue
+            if first is not None and chunk.end_ns < first:
+                continue
+            if at:
+                entries = listed_entries(self._buffer, at, channel_id)
+            else:
+                entries = self._index.entries[chunk.offset][channel_id]
+            listed += len(entries)
+            found.append(_source(chunk, chunk.offset, chunk.offset + chunk.length, entries, span))
+        loose = self._index.loose.get(channel_id, np.empty((0, 2), "<u8"))
+        listed += len(loose)
+        # Outside of chunks, pieces of the file stand for them.
+        turns = np.flatnonzero(np.diff(loose[:, 1] // BLOCK)) + 1
+        pieces = np.split(loose, turns) if len(loose) else []
+        found += [_source(None, int(piece[0, 1]), int(piece[-1, 1]), piece, span) for piece in pieces]
+        said = self._index.counts.get(channel_id, 0)
+        if is_all and listed != said:
+            raise Damaged(f"its indexes list {listed} messages of channel {channel_id}, and there are {said}")
+        return found
+
+    def _open(self, source: _Source) -> memoryview:
+        """The records around the messages of a source."""
+        if source.chunk is None:
+            return self._buffer
+        content = self._opened.pop(source.start, None)
+        if content is None:
+            content = open_chunk(self._buffer, chunk_record(self._buffer, source.chunk))
+        self._opened[source.start] = content
+        while sum(map(len, self._opened.values())) > OPEN_BYTES // 4 and len(self._opened) > 1:
+            self._opened.popitem(last=False)
+        return content
+
+    def _read(self, source: _Source, channel_id: int, skip: int) -> Iterator[Message]:
+        """The messages of a source without the first ``skip``."""
+        content = self._open(source)
+        found = heads_at(content, channel_id, source.t_ns[skip:], source.offset[skip:])
+        whole = content.obj
+        data = whole if isinstance(whole, bytes) and len(whole) == len(content) else content
+        spans = zip(found.start.tolist(), found.end.tolist(), strict=True)
+        payloads = (bytes(data[start:end]) for start, end in spans)
+        head = found.head
+        return map(Message, head["t_ns"].tolist(), head["sequence"].tolist(), head["publish_ns"].tolist(), payloads)
+
+
+def _source(chunk: ChunkIndexRecord | None, start: int, end: int, entries: Entries, span: Span) -> _Source:
+    if len(entries) and entries.max() > _MAX_NS:
+        raise Damaged("a message has a time beyond the year 2262")
+    t_ns, offset = entries.astype(np.int64).T
+    first, last = span
+    if first is not None or last is not None:
+        inside = (t_ns >= (0 if first is None else first)) & (t_ns < (_MAX_NS if last is None else last))
+        t_ns, offset = t_ns[inside], offset[inside]
+    order = np.argsort(t_ns, kind="stable")
+    return _Source(chunk, start, end, t_ns[order], offset[order])
