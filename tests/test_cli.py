@@ -17,7 +17,8 @@ import pytest
 from mcaptrack import __version__, demo
 from tests.worlds import small_scene, write_clip
 
-COMMANDS = ["ingest", "detect", "track", "sample", "predict", "retrack", "run", "evaluate", "export", "info", "demo"]
+STAGES = ["detect", "track", "sample", "predict", "retrack", "run"]
+COMMANDS = ["ingest", *STAGES, "evaluate", "export", "info", "check", "recover", "drop", "demo"]
 
 
 def start(*words, folder: Path | None = None, environment: dict[str, str] | None = None) -> subprocess.Popen:
@@ -443,3 +444,58 @@ def test_the_demonstration(tmp_path, monkeypatch):
     again = subprocess.run(run, capture_output=True, text=True, check=False)
     assert again.returncode == 1
     assert "exists; give another folder with -o, or --force" in again.stderr
+
+
+def test_a_log_is_checked_and_what_is_wrong_stands_in_a_table(finished, tmp_path):
+    out, err = done("check", finished)
+    assert out.startswith(f"{finished}: sound; ")
+    assert "error" not in out + err
+    raw = bytearray(finished.read_bytes())
+    raw[len(raw) // 3] ^= 1
+    (tmp_path / "bad.mcap").write_bytes(raw)
+    code, out, err = call("check", finished, tmp_path / "bad.mcap")
+    assert (code, err) == (1, "")
+    assert f"{tmp_path / 'bad.mcap'}: damaged; " in out
+    assert "the checksum of a chunk is wrong" in out
+    code, out, _ = call("check", tmp_path / "bad.mcap", "--json")
+    (result,) = json.loads(out)["results"]
+    assert (code, result["sound"]) == (1, False)
+    assert {"level", "kind", "byte", "times", "words"} == set(result["findings"][0])
+
+
+def test_what_is_whole_is_recovered_and_what_is_lost_makes_the_exit_code_three(finished, tmp_path):
+    damaged = tmp_path / "bad.mcap"
+    whole = finished.read_bytes()
+    damaged.write_bytes(whole[: len(whole) * 2 // 3])
+    code, _, err = call("info", damaged)
+    assert code == 1
+    assert f"`mcaptrack recover {damaged}` saves what is whole" in err
+    code, out, err = call("recover", damaged, "--json")
+    (result,) = json.loads(out)["results"]
+    assert code == 3
+    assert result["output"] == str(tmp_path / "bad.recovered.mcap")
+    assert "chunks are saved" in err
+    assert f"lost: {result['lost'][0]}" in err
+    done("check", result["output"])
+    code, _, err = call("recover", damaged)
+    assert code == 1
+    assert "bad.recovered.mcap exists; give another name with -o, or --force to replace it" in err
+    code, _, err = call("recover", finished, "-o", finished, "--force")
+    assert code == 1
+    assert "is both input and output" in err
+    _, err = done("recover", finished, "-o", tmp_path / "all.mcap")
+    assert "nothing was lost" in err
+
+
+def test_channels_are_dropped_with_their_views_and_nothing_else(finished, tmp_path):
+    before = json.loads(done("info", finished, "--json")[0])["results"][0]["channels"]
+    out, _ = done("drop", finished, "/camera/retracks*", "/camera/video", "-o", tmp_path / "small.mcap", "--json")
+    (result,) = json.loads(out)["results"]
+    after = json.loads(done("info", tmp_path / "small.mcap", "--json")[0])["results"][0]["channels"]
+    assert {c["topic"] for c in before} - {c["topic"] for c in after} == set(result["dropped"])
+    assert "/camera/retracks/view/image" in result["dropped"]
+    assert [c for c in before if c["topic"] not in result["dropped"]] == after
+    assert result["bytes"] == (tmp_path / "small.mcap").stat().st_size < finished.stat().st_size
+    code, _, err = call("drop", finished, "/nothing/*")
+    assert code == 1
+    assert "has no channel /nothing/*; it has /camera/detections" in err

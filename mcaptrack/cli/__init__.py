@@ -13,6 +13,7 @@ from mcaptrack import __version__
 from mcaptrack.cli.common import register
 from mcaptrack.cli.demo import demo
 from mcaptrack.cli.evaluate import evaluate
+from mcaptrack.cli.files import check, drop, recover
 from mcaptrack.cli.ingest import ingest
 from mcaptrack.cli.show import export, info
 from mcaptrack.cli.stages import add_stages
@@ -49,4 +50,7 @@ add_stages(app)
 register(app, "evaluate", evaluate)
 register(app, "export", export)
 register(app, "info", info)
+register(app, "check", check)
+register(app, "recover", recover)
+register(app, "drop", drop)
 register(app, "demo", demo)

@@ -3,11 +3,31 @@
 with read(path) as log:                 channels, messages, frames
     with extend(log) as writer: ...     the same file with channels added or left out
 with create(path) as writer: ...        a new one
+check(path)                             is it sound
+recover(path, output)                   what is whole in it, as a new one
 """
 
 from mcaptrack.log.change import extend
+from mcaptrack.log.check import Checked, check
+from mcaptrack.log.check_summary import Finding
 from mcaptrack.log.messages import Columns, Message
 from mcaptrack.log.reader import Channel, Log, read, topics_with_schema
+from mcaptrack.log.recover import Recovered, recover
 from mcaptrack.log.writer import LogWriter, create
 
-__all__ = ["Channel", "Columns", "Log", "LogWriter", "Message", "create", "extend", "read", "topics_with_schema"]
+__all__ = [
+    "Channel",
+    "Checked",
+    "Columns",
+    "Finding",
+    "Log",
+    "LogWriter",
+    "Message",
+    "Recovered",
+    "check",
+    "create",
+    "extend",
+    "read",
+    "recover",
+    "topics_with_schema",
+]

@@ -23,6 +23,8 @@ Entries = NDArray[np.uint64]
 #: A chunk that says it is larger is not decompressed, unless the environment allows it.
 MAX_CHUNK_MIB: Final = 256
 ENVIRONMENT: Final = "MCAPTRACK_MAX_CHUNK_MIB"
+#: The last time that a log can hold, in nanoseconds: a signed number of 64 bits, in the year 2262.
+MAX_NS: Final = 2**63 - 1
 #: A message record up to its payload.
 HEAD: Final = np.dtype(
     [
@@ -84,29 +86,38 @@ def _most_mib() -> int:
 
 
 def _decompress(data: memoryview, compression: str, size: int, where: int) -> memoryview:
-    """At most one byte more than ``size``, however much the data would give."""
+    """The data of a chunk that is ``size`` bytes long, or one byte more where it would be longer."""
     if compression == "":
         return data
     try:
         if compression == "zstd":
-            return memoryview(_zstd(data, size + 1))
+            return memoryview(_zstd(data, size))
         if compression == "lz4":
-            import lz4.frame
-
-            return memoryview(lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1))
+            return memoryview(_lz4(data, size))
     except RuntimeError as error:
         raise Damaged(f"byte {where}: a chunk can't be decompressed ({error})") from None
     raise Damaged(f"byte {where}: a chunk is compressed with {compression!r}, which is not known here")
 
 
-def _zstd(data: memoryview, most: int) -> bytes:
+def _zstd(data: memoryview, size: int) -> bytes:
     import zstandard
 
     try:
-        with zstandard.ZstdDecompressor(max_window_size=2**27).stream_reader(data) as stream:
-            return stream.read(most)
+        if zstandard.frame_content_size(data) > size:  # -1 where the data don't say; then the limit holds
+            return bytes(size + 1)
+        return zstandard.ZstdDecompressor(max_window_size=2**27).decompress(data, max_output_size=max(size, 1))
     except zstandard.ZstdError as error:
         raise RuntimeError(str(error)) from None
+
+
+def _lz4(data: memoryview, size: int) -> bytes:
+    import lz4.frame
+
+    frame = lz4.frame.LZ4FrameDecompressor()
+    content: bytes = frame.decompress(data, max_length=size + 1)
+    if len(content) <= size and not frame.eof:
+        raise RuntimeError("it is cut off")
+    return content
 
 
 def forget(buffer: memoryview, start: int, end: int) -> None:
@@ -126,9 +137,17 @@ def listed_entries(buffer: memoryview, at: int, channel_id: int) -> Entries:
     if len(listed) % 16:
         raise Damaged(f"byte {at}: a message index of {len(listed)} bytes")
     entries = np.frombuffer(listed, "<u8").reshape(-1, 2)
+    if len(entries) and entries[:, 1].max() > MAX_NS:
+        raise Damaged(f"byte {at}: a message index that points beyond any chunk")
     if len(np.unique(entries[:, 1])) != len(entries):
         raise Damaged(f"byte {at}: a message index that lists a message twice")
     return entries
+
+
+def check_times(entries: Entries) -> None:
+    """Raises Damaged if a message is later than any time that is worked with."""
+    if len(entries) and entries[:, 0].max() > MAX_NS:
+        raise Damaged("a message has a time beyond the year 2262")
 
 
 def chunk_entries(content: memoryview) -> dict[int, Entries]:
@@ -144,8 +163,9 @@ def chunk_entries(content: memoryview) -> dict[int, Entries]:
 def heads_at(content: memoryview, channel_id: int, t_ns: Ints, offset: Ints) -> Heads:
     """The messages that an index says stand at these offsets, at these times. Raises Damaged where one does not."""
     room = len(content) - HEAD.itemsize
-    if len(offset) and (room < 0 or offset.max() > room):
-        raise Damaged(f"a message is said to stand at byte {offset.max()} of a chunk of {len(content)}")
+    outside = offset[(offset < 0) | (offset > room)]
+    if len(outside):
+        raise Damaged(f"a message is said to stand at byte {outside[0]} of a chunk of {len(content)}")
     raw = np.frombuffer(content, np.uint8)
     if len(offset):
         head = np.lib.stride_tricks.sliding_window_view(raw, HEAD.itemsize)[offset].view(HEAD)[:, 0]

@@ -26,7 +26,7 @@ from mcaptrack.log.records import (
 )
 
 FOOTER_SIZE: Final = 9 + records.FOOTER_BODY.size + len(MAGIC)
-_DATA_END_SIZE: Final = 9 + 4
+DATA_END_SIZE: Final = 9 + 4
 
 
 class Listed(NamedTuple):
@@ -75,17 +75,17 @@ def read_summary(buffer: memoryview) -> Index | None:
     if at < len(MAGIC) or buffer[at] != Opcode.FOOTER:
         raise Damaged("it has no footer where one belongs")
     summary_start, _, summary_crc = records.FOOTER_BODY.unpack_from(buffer, at + 9)
-    data_end = summary_start - _DATA_END_SIZE
+    data_end = summary_start - DATA_END_SIZE
     if not len(MAGIC) <= data_end < at or buffer[data_end] != Opcode.DATA_END:
         return None
     if summary_crc and zlib.crc32(buffer[summary_start : len(buffer) - len(MAGIC) - 4]) != summary_crc:
         return None  # the data section says the same, with checksums of its own
     index, statistics = Index(data_end), None
-    index.data_crc = Reader(buffer, data_end + 9, data_end + _DATA_END_SIZE).number(4)
+    index.data_crc = Reader(buffer, data_end + 9, data_end + DATA_END_SIZE).number(4)
     for record in walk(buffer, summary_start, at):
         if record.opcode == Opcode.STATISTICS:
             statistics = record
-        _take(index, buffer, record)
+        take(index, buffer, record)
     index.chunks.sort(key=lambda chunk: chunk.offset)
     index.regular = statistics is not None and _adds_up(index, Reader(buffer, statistics.body, statistics.end))
     return index if index.regular else None
@@ -110,7 +110,7 @@ def _adds_up(index: Index, statistics: Reader) -> bool:
     return said == found and described and indexed and apart
 
 
-def _take(index: Index, buffer: memoryview, record: Record) -> None:
+def take(index: Index, buffer: memoryview, record: Record) -> None:
     """Add a record of the summary to the index."""
     reader = Reader(buffer, record.body, record.end)
     if record.opcode == Opcode.SCHEMA:
@@ -139,10 +139,10 @@ def _from_scan(buffer: memoryview) -> Index:
     """The contents from every record of the file, chunks opened."""
     index = Index()
     loose: dict[int, array[int]] = {}
-    done = 0
+    done = crc = 0
     for record in walk(buffer, len(MAGIC), len(buffer) - len(MAGIC)):
         if record.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-            _take(index, buffer, record)  # those of the summary count too: some writers put them nowhere else
+            take(index, buffer, record)  # those of the summary count too: some writers put them nowhere else
         elif record.opcode == Opcode.CHUNK:
             _scan_chunk(index, buffer, record)
         elif record.opcode == Opcode.MESSAGE:
@@ -155,7 +155,10 @@ def _from_scan(buffer: memoryview) -> Index:
         elif record.opcode == Opcode.DATA_END:
             index.data_end = record.start
             index.data_crc = Reader(buffer, record.body, record.end).number(4)
+            if index.data_crc and index.data_crc != zlib.crc32(buffer[done : record.start], crc):
+                raise Damaged("the checksum of its data section is wrong")
         if record.end - done >= BLOCK:
+            crc = zlib.crc32(buffer[done : record.end], crc)
             forget(buffer, done, record.end)
             done = record.end
     index.loose = {channel: np.array(entries, "<u8").reshape(-1, 2) for channel, entries in loose.items()}
@@ -183,7 +186,7 @@ def _scan_chunk(index: Index, buffer: memoryview, record: Record) -> None:
     content = open_chunk(buffer, record)
     for inner in walk(content, 0, len(content)):
         if inner.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-            _take(index, content, inner)
+            take(index, content, inner)
     entries = chunk_entries(content)
     _count(index, entries)
     index.entries[record.start] = entries

@@ -13,7 +13,16 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaptrack.log.chunks import Entries, chunk_record, forget, heads_at, listed_entries, open_chunk
+from mcaptrack.log.chunks import (
+    MAX_NS,
+    Entries,
+    check_times,
+    chunk_record,
+    forget,
+    heads_at,
+    listed_entries,
+    open_chunk,
+)
 from mcaptrack.log.index import Index
 from mcaptrack.log.records import BLOCK, ChunkIndexRecord, Damaged
 from mcaptrack.schema import Rows, Schema
@@ -23,7 +32,6 @@ Span = tuple[int | None, int | None]
 
 #: Beyond this much, chunks that overlap are closed and opened again when their turn comes.
 OPEN_BYTES: Final = 128 * 2**20
-_MAX_NS: Final = 2**63 - 1
 
 
 class Message(NamedTuple):
@@ -179,12 +187,11 @@ class Messages:
 
 
 def _source(chunk: ChunkIndexRecord | None, start: int, end: int, entries: Entries, span: Span) -> _Source:
-    if len(entries) and entries.max() > _MAX_NS:
-        raise Damaged("a message has a time beyond the year 2262")
+    check_times(entries)
     t_ns, offset = entries.astype(np.int64).T
     first, last = span
     if first is not None or last is not None:
-        inside = (t_ns >= (0 if first is None else first)) & (t_ns < (_MAX_NS if last is None else last))
+        inside = (t_ns >= (0 if first is None else first)) & (t_ns < (MAX_NS if last is None else last))
         t_ns, offset = t_ns[inside], offset[inside]
     order = np.argsort(t_ns, kind="stable")
     return _Source(chunk, start, end, t_ns[order], offset[order])

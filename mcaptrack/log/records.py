@@ -136,13 +136,15 @@ class Reader:
 
 
 def walk(buffer: memoryview, start: int, end: int) -> Iterator[Record]:
-    """The records that stand one after another between two offsets. Raises Damaged where one reaches beyond the end."""
+    """The records that stand one after another between two offsets. Raises Damaged where there is none."""
     at = start
     while at < end:
         if end - at < _HEAD.size:
             raise Damaged(f"byte {at}: {end - at} bytes are too few for a record")
         opcode, length = _HEAD.unpack_from(buffer, at)
         body = at + _HEAD.size
+        if opcode == 0:
+            raise Damaged(f"byte {at}: no record begins with 0")
         if length > end - body:
             raise Damaged(f"byte {at}: a record of {length} bytes where {end - body} are left")
         yield Record(opcode, at, body, body + length)

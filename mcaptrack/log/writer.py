@@ -23,7 +23,7 @@ from mcaptrack import __version__
 from mcaptrack.atomic import publish_stream
 from mcaptrack.errors import McaptrackError
 from mcaptrack.log import records
-from mcaptrack.log.chunks import forget
+from mcaptrack.log.chunks import MAX_NS, forget
 from mcaptrack.log.index import Index, Listed, list_attachment, list_metadata, read_index
 from mcaptrack.log.records import BLOCK, MAGIC, ChannelRecord, ChunkIndexRecord, SchemaRecord
 
@@ -31,7 +31,6 @@ Kind = Literal["media", "rows"]
 
 _CHUNK_BYTES: Final[Mapping[Kind, int]] = {"media": 4 * 2**20, "rows": 2**20}
 _ZSTD_LEVEL: Final = 3
-_MAX_NS: Final = 2**63 - 1
 _MAX_ID: Final = 2**16 - 1
 
 
@@ -79,10 +78,12 @@ class LogWriter:
 
     # Adding
 
-    def header(self, profile: str = "") -> None:
-        """The first bytes; ``profile`` as in the MCAP registry, "" for none."""
+    def header(self, profile: str = "", record: bytes | None = None) -> None:
+        """The first bytes; ``profile`` as in the MCAP registry, "" for none; ``record`` the header of another log."""
         self.write(MAGIC)
-        self.write(records.pack(Opcode.HEADER, records.text(profile), records.text(f"mcaptrack {__version__}")))
+        self.write(
+            record or records.pack(Opcode.HEADER, records.text(profile), records.text(f"mcaptrack {__version__}"))
+        )
 
     def add_channel(
         self,
@@ -117,8 +118,8 @@ class LogWriter:
         self, channel_id: int, t_ns: int, sequence: int, payload: bytes, publish_ns: int | None = None
     ) -> None:
         """A message of a channel that was added. Raises McaptrackError for times that no log can hold."""
-        if not 0 <= t_ns <= _MAX_NS:
-            raise McaptrackError(f"{t_ns} ns is no time for a log; times run from 0 (1970) to {_MAX_NS} ns (2262)")
+        if not 0 <= t_ns <= MAX_NS:
+            raise McaptrackError(f"{t_ns} ns is no time for a log; times run from 0 (1970) to {MAX_NS} ns (2262)")
         group = self._groups[channel_id]
         chunk = self._open.get(group) or self._new_chunk(group)
         entries = chunk.entries.get(channel_id)
@@ -306,11 +307,11 @@ def _free_id(taken: Mapping[int, object], first: int, what: str) -> int:
 
 
 @contextmanager
-def create(path: Path, profile: str = "") -> Iterator[LogWriter]:
-    """A new log at ``path``, there once the block has ended well."""
+def create(path: Path, profile: str = "", *, header: bytes | None = None) -> Iterator[LogWriter]:
+    """A new log at ``path``, there once the block has ended well. ``header`` is the header record of another."""
     with publish_stream(path) as stream:
         writer = LogWriter(stream)
-        writer.header(profile)
+        writer.header(profile, header)
         yield writer
         messages = writer.finish()
         stream.flush()

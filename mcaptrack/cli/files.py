@@ -1,0 +1,196 @@
+"""``mcaptrack check``, ``recover`` and ``drop``: is a log sound, what of it can be saved, what is left out of it."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from mcaptrack.cli import common
+from mcaptrack.errors import McaptrackError
+
+if TYPE_CHECKING:
+    from mcaptrack.log import Checked, Log
+
+_SHOWN = 20
+
+
+@common.one_line
+def check(
+    logs: common.Logs,
+    output: common.Printed = None,
+    force: common.Force = False,
+    json: common.Json = False,
+    quiet: common.Quiet = False,
+    verbose: common.Verbose = False,
+    config: common.Config = None,
+) -> None:
+    """Look at every byte of a log: structure, checksums, indexes, statistics, the order of messages.
+
+    Errors make the exit code 1; warnings say what could be better. `mcaptrack recover` saves what is whole.
+
+    Example: mcaptrack check log.mcap
+    """
+    from mcaptrack import log
+
+    with common.Talk(quiet, verbose).open() as talk:
+        checked = [log.check(path, talk.progress) for path in common.expand(logs)]
+    with common.printed_to(output, force):
+        if json:
+            common.print_json({"results": [_checked_as_data(one) for one in checked]})
+        else:
+            for one in checked:
+                _print_checked(one, quiet)
+    if not all(one.is_sound for one in checked):
+        raise typer.Exit(common.REFUSED)
+
+
+def _checked_as_data(checked: Checked) -> dict[str, object]:
+    return {
+        "log": str(checked.path),
+        "sound": checked.is_sound,
+        "messages": checked.messages,
+        "chunks": checked.chunks,
+        "findings": [
+            {"level": f.level, "kind": f.kind, "byte": f.where, "times": f.times, "words": f.words}
+            for f in checked.findings
+        ],
+    }
+
+
+def _print_checked(checked: Checked, quiet: bool) -> None:
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    path = common.printable(str(checked.path))
+    if not quiet:
+        verdict = "sound" if checked.is_sound else "damaged"
+        print(f"{path}: {verdict}; {checked.messages} messages in {checked.chunks} chunks")
+    findings = [found for found in checked.findings if not quiet or found.level == "error"]
+    if not findings:
+        return
+    table = Table(box=None, pad_edge=False)
+    for name, justify in (("", "left"), ("byte", "right"), ("times", "right"), ("kind", "left"), ("", "left")):
+        table.add_column(name, justify=justify)  # type: ignore[arg-type]
+    for found in findings:
+        style = "red" if found.level == "error" else "yellow"
+        words = common.printable(found.words)
+        table.add_row(
+            Text(found.level, style), str(found.where), str(found.times), found.kind, Text(words, overflow="fold")
+        )
+    Console(file=sys.stdout, width=None if sys.stdout.isatty() else 160).print(table)
+
+
+@common.one_line
+def recover(
+    logs: common.Logs,
+    output: common.Output = None,
+    force: common.Force = False,
+    json: common.Json = False,
+    quiet: common.Quiet = False,
+    verbose: common.Verbose = False,
+    config: common.Config = None,
+) -> None:
+    """Save what is whole in a damaged log to LOG.recovered.mcap; the damaged log stays as it is.
+
+    Every chunk that can be opened and whose checksum is right is kept as it stands, with new indexes. What is lost is
+    named, and the exit code is 3 then.
+
+    Example: mcaptrack recover broken.mcap -o saved.mcap
+    """
+    from mcaptrack import log
+    from mcaptrack.atomic import refuse_overwrite
+
+    paths = common.expand(logs)
+    common.only_one_output(paths, output)
+    reports = []
+    with common.Talk(quiet, verbose).open() as talk:
+        for path in paths:
+            target = output or path.with_suffix(".recovered.mcap")
+            if target.exists() and path.exists() and target.samefile(path):
+                raise McaptrackError(f"{path} is both input and output; give another name with -o")
+            refuse_overwrite(target, force)
+            report = log.recover(path, target, talk.progress)
+            reports.append(report)
+            talk.say(f"{target}: {report.messages} messages in {report.chunks} chunks are saved")
+            for words in report.lost if verbose else report.lost[:_SHOWN]:
+                talk.say(f"lost: {words}")
+            if len(report.lost) > _SHOWN and not verbose:
+                talk.say(f"lost: {len(report.lost) - _SHOWN} more; -v shows them")
+            if not report.lost:
+                talk.say("nothing was lost")
+    if json:
+        results = [
+            {"log": str(r.path), "output": str(r.output), "messages": r.messages, "chunks": r.chunks, "lost": r.lost}
+            for r in reports
+        ]
+        common.print_json({"results": results})
+    if any(report.lost for report in reports):
+        raise typer.Exit(common.LOST)
+
+
+@common.one_line
+def drop(
+    path: Annotated[Path, typer.Argument(metavar="LOG", help="The log.", show_default=False)],
+    topics: Annotated[
+        list[str],
+        typer.Argument(metavar="TOPIC...", help="Channels to leave out; patterns such as '/camera/*' are several."),
+    ],
+    output: common.Output = None,
+    force: common.Force = False,
+    json: common.Json = False,
+    quiet: common.Quiet = False,
+    verbose: common.Verbose = False,
+    config: common.Config = None,
+) -> None:
+    """Leave channels out of a log, in place or in a copy; all others stay as they are, to the byte.
+
+    With a channel goes what was made only to show it, its `/view/`.
+
+    Example: mcaptrack drop log.mcap /camera/video -o small.mcap
+    """
+    from mcaptrack import log
+    from mcaptrack.atomic import refuse_overwrite
+
+    if output is not None:
+        refuse_overwrite(output, force)
+        if output.exists() and path.exists() and output.samefile(path):
+            raise McaptrackError(f"{path} is both input and output; leave -o out to change it in place")
+    with common.Talk(quiet, verbose).open() as talk:
+        with log.read(path) as opened:
+            dropped = _chosen(opened, topics)
+            gone = [channel.id for channel in opened.index.channels.values() if channel.topic in dropped]
+            messages = sum(opened.index.counts.get(number, 0) for number in gone)
+            before = path.stat().st_size
+            with log.extend(opened, output, drop=dropped):
+                pass
+        after = (output or path).stat().st_size
+        talk.say(
+            f"{output or path}: {', '.join(sorted(dropped))} with {messages} messages left out; "
+            f"{before} bytes became {after}"
+        )
+    if json:
+        result = {"log": str(output or path), "dropped": sorted(dropped), "messages": messages, "bytes": after}
+        common.print_json({"results": [result]})
+
+
+def _chosen(opened: Log, patterns: list[str]) -> set[str]:
+    """The topics that fit any of the patterns, with their views. Raises McaptrackError for one that fits none."""
+    from fnmatch import fnmatchcase
+
+    from mcaptrack.provenance import Provenance
+
+    chosen: set[str] = set()
+    for pattern in patterns:
+        found = {topic for topic in opened.channels if topic == pattern or fnmatchcase(topic, pattern)}
+        if not found:
+            opened.channel(pattern)  # says what there is
+        chosen |= found
+    for topic, channel in opened.channels.items():
+        made = Provenance.from_metadata(channel.metadata)
+        if made and made.transform == "view" and made.input in chosen:
+            chosen.add(topic)
+    return chosen

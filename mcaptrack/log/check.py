@@ -1,0 +1,285 @@
+"""Is a log sound? Every record is looked at, whatever the summary says; then the summary is held against them.
+
+Letters: M messages.
+"""
+
+from __future__ import annotations
+
+import mmap
+import zlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from mcap.opcode import Opcode
+
+from mcaptrack.errors import McaptrackError
+from mcaptrack.log import journal, records
+from mcaptrack.log.check_summary import Finding, Findings, check_summary, record_name
+from mcaptrack.log.chunks import (
+    HEAD,
+    Entries,
+    chunk_entries,
+    forget,
+    heads_at,
+    listed_entries,
+    message_head,
+    open_chunk,
+)
+from mcaptrack.log.index import (
+    Index,
+    list_attachment,
+    list_metadata,
+)
+from mcaptrack.log.records import MAGIC, ChunkIndexRecord, Damaged, Reader, Record, walk
+
+Progress = Callable[[str, int, int], None]
+
+
+@dataclass
+class Checked:
+    """What was found in a log."""
+
+    path: Path
+    messages: int = 0
+    chunks: int = 0
+    findings: list[Finding] = field(default_factory=list)
+
+    @property
+    def is_sound(self) -> bool:
+        """Whether nothing is wrong; what could be better doesn't count."""
+        return all(finding.level != "error" for finding in self.findings)
+
+
+def check(path: Path, progress: Progress = lambda *_: None) -> Checked:
+    """Look at every byte of a log. Raises McaptrackError only if there is no file to look at.
+
+    Checksums, sizes and times of chunks, message indexes, the order of each channel's messages, attachments, and
+    everything that the summary and the footer say. What is found is grouped by kind.
+    """
+    journal.settle(path.resolve())
+    with open_bytes(path) as buffer:
+        look = _Look(buffer, progress)
+        look.at_everything()
+    findings = sorted(look.findings, key=lambda found: (found.level, found.where))
+    return Checked(path, sum(look.found.counts.values()), len(look.found.chunks), findings)
+
+
+class open_bytes:  # noqa: N801  # a context manager that reads as a verb
+    """The bytes of a file, mapped. Raises McaptrackError if it is none or empty."""
+
+    def __init__(self, path: Path) -> None:
+        if path.is_dir():
+            raise McaptrackError(f"{path} is a folder, not an MCAP file")
+        try:
+            self._file = path.open("rb")
+        except OSError as error:
+            raise McaptrackError(f"{path} can't be opened: {error.strerror}") from None
+        if path.stat().st_size == 0:
+            self._file.close()
+            raise McaptrackError(f"{path} is empty")
+
+    def __enter__(self) -> memoryview:
+        return memoryview(mmap.mmap(self._file.fileno(), 0, access=mmap.ACCESS_READ))
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
+
+
+class _Look:
+    """One look at a file; ``found`` is what its records say, the way an index would say it."""
+
+    def __init__(self, buffer: memoryview, progress: Progress) -> None:
+        self.found = Index()
+        self.findings = Findings()
+        self._find = self.findings.add
+        self._buffer, self._progress = buffer, progress
+        self._chunk: tuple[Record, dict[int, int]] | None = None  # the last one, and the indexes behind it
+        self._latest: dict[int, int] = {}  # log time, of each channel
+
+    def at_everything(self) -> None:
+        buffer = self._buffer
+        if bytes(buffer[: len(MAGIC)]) != MAGIC:
+            self._find("magic", 0, "the file does not begin as an MCAP file does")
+            return
+        ends_well = len(buffer) >= 2 * len(MAGIC) and bytes(buffer[-len(MAGIC) :]) == MAGIC
+        if not ends_well:
+            self._find("cut-off", len(buffer), "the file is cut off: the magic bytes at its end are missing")
+        end = len(buffer) - len(MAGIC) if ends_well else len(buffer)
+        try:
+            self._at_data(end)
+        except Damaged as error:
+            self._find("structure", 0, f"{error}; what follows can't be looked at")
+        self._close_chunk()
+        if ends_well:
+            check_summary(buffer, self.found, self.findings)
+
+    # The data section
+
+    def _at_data(self, end: int) -> None:
+        buffer, is_first = self._buffer, True
+        crc, checked = 0, 0
+        for record in walk(buffer, len(MAGIC), end):
+            if is_first and record.opcode != Opcode.HEADER:
+                self._find("no-header", record.start, "the first record is not a header")
+            is_first = False
+            if record.opcode != Opcode.MESSAGE_INDEX:
+                self._close_chunk()
+            if record.opcode == Opcode.DATA_END:
+                crc = zlib.crc32(buffer[checked : record.start], crc)
+                self.found.data_end = record.start
+                self.found.data_crc = Reader(buffer, record.body, record.end).number(4)
+                if self.found.data_crc and self.found.data_crc != crc:
+                    self._find("data-checksum", record.start, "the checksum of the data section is wrong")
+                return
+            try:
+                self._at_record(record)
+            except Damaged as error:
+                self._find(f"bad-{record_name(record.opcode)}", record.start, str(error))
+            if record.end - checked >= records.BLOCK:
+                crc = zlib.crc32(buffer[checked : record.end], crc)
+                forget(buffer, checked, record.end)
+                checked = record.end
+                self._progress("check", checked, len(buffer))
+        self._find("no-data-end", end, "the data section has no end: records are missing")
+
+    def _at_record(self, record: Record) -> None:
+        buffer, found = self._buffer, self.found
+        if record.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+            self._describe(buffer, record, record.start)
+        elif record.opcode == Opcode.CHUNK:
+            self._chunk = (record, {})
+        elif record.opcode == Opcode.MESSAGE_INDEX:
+            channel, _ = records.read_message_entries(buffer, record)
+            if self._chunk is None:
+                self._find("stray-index", record.start, "a message index that stands behind no chunk")
+            elif channel in self._chunk[1]:
+                self._find("double-index", record.start, f"two message indexes of channel {channel} behind one chunk")
+            else:
+                self._chunk[1][channel] = record.start
+        elif record.opcode == Opcode.MESSAGE:
+            channel, _, t_ns, _ = message_head(buffer, record)
+            self._find("unchunked", record.start, "a message outside of chunks: finding it takes a scan", "warning")
+            self._count({channel: np.array([[t_ns, record.start]], "<u8")}, record.start)
+        elif record.opcode == Opcode.ATTACHMENT:
+            said = records.number(zlib.crc32(buffer[record.body : record.end - 4]), 4)
+            known = bytes(buffer[record.end - 4 : record.end])
+            if known not in (said, bytes(4)):
+                self._find("attachment-checksum", record.start, "the checksum of an attachment is wrong")
+            found.attachments.append(list_attachment(buffer, record, record.start))
+        elif record.opcode == Opcode.METADATA:
+            found.metadata.append(list_metadata(buffer, record, record.start))
+        elif record.opcode == Opcode.HEADER:
+            records.read_header(buffer, record)
+        elif record.opcode == 0 or record.opcode in (Opcode.FOOTER, Opcode.STATISTICS, Opcode.CHUNK_INDEX):
+            self._find("misplaced", record.start, f"a {record_name(record.opcode)} record in the data section")
+        elif record.opcode < 0x80 and record.opcode > Opcode.DATA_END:
+            self._find("unknown", record.start, f"a record of kind {record.opcode:#04x}, which is not known", "warning")
+
+    def _describe(self, buffer: memoryview, record: Record, where: int) -> None:
+        """A schema or channel, which is the same wherever it stands."""
+        if record.opcode == Opcode.SCHEMA:
+            schema = records.read_schema(buffer, record)
+            if schema.id == 0:
+                self._find("schema-zero", where, "a schema of number 0, which means none")
+            elif self.found.schemas.setdefault(schema.id, schema) != schema:
+                self._find("two-schemas", where, f"schema {schema.id} is described in two ways")
+        else:
+            channel = records.read_channel(buffer, record)
+            if channel.schema_id and channel.schema_id not in self.found.schemas:
+                self._find("no-schema", where, f"{channel.topic} has schema {channel.schema_id}, not described before")
+            if self.found.channels.setdefault(channel.id, channel) != channel:
+                self._find("two-channels", where, f"channel {channel.id} ({channel.topic}) is described in two ways")
+
+    def _close_chunk(self) -> None:
+        """Look into the last chunk, now that its indexes are known."""
+        if self._chunk is None:
+            return
+        (record, indexes), self._chunk = self._chunk, None
+        try:
+            self._at_chunk(record, indexes)
+        except Damaged as error:
+            self._find("bad-chunk", record.start, str(error))
+
+    def _at_chunk(self, record: Record, indexes: Mapping[int, int]) -> None:
+        buffer = self._buffer
+        head = records.read_chunk(buffer, record)
+        content = open_chunk(buffer, record)
+        if not head.uncompressed_crc and len(content):
+            self._find("no-checksum", record.start, "a chunk without a checksum: damage goes unseen", "warning")
+        entries = self._indexed(record, content, indexes) if indexes else chunk_entries(content)
+        if not indexes:
+            self._describe_all(content, record.start)
+            if entries:
+                words = "a chunk without message indexes: finding a message takes a scan"
+                self._find("no-message-index", record.start, words, "warning")
+        self._count(entries, record.start)
+        times = [int(edge) for e in entries.values() if len(e) for edge in (e[:, 0].min(), e[:, 0].max())]
+        span = (min(times), max(times)) if times else (0, 0)
+        if (head.start_ns, head.end_ns) != span:
+            words = (
+                f"a chunk says it runs from {head.start_ns} to {head.end_ns} ns; its messages {span[0]} to {span[1]}"
+            )
+            self._find("chunk-times", record.start, words)
+        last = max((records.record_at(buffer, at).end for at in indexes.values()), default=record.end)
+        sizes = (head.compression, head.end - head.start, head.uncompressed_size)
+        place = (record.start, record.end - record.start, dict(indexes), last - record.end)
+        self.found.chunks.append(ChunkIndexRecord(head.start_ns, head.end_ns, *place, *sizes))
+
+    def _describe_all(self, content: memoryview, where: int) -> None:
+        for inner in walk(content, 0, len(content)):
+            if inner.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                self._describe(content, inner, where)
+
+    def _indexed(self, record: Record, content: memoryview, indexes: Mapping[int, int]) -> dict[int, Entries]:
+        """What the indexes of a chunk list, which is all of its messages and nothing else."""
+        entries: dict[int, Entries] = {}
+        starts, ends = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
+        for channel, at in indexes.items():
+            listed = listed_entries(self._buffer, at, channel)
+            try:
+                heads = heads_at(content, channel, *(column.astype(np.int64) for column in listed.T))
+            except Damaged as error:
+                self._find("wrong-index", at, f"a message index does not fit its chunk: {error}")
+                self._describe_all(content, record.start)
+                return chunk_entries(content)
+            entries[channel] = listed[np.argsort(listed[:, 1], kind="stable")]
+            starts.append(heads.start - HEAD.itemsize)
+            ends.append(heads.end)
+        start, end = np.sort(np.concatenate(starts)), np.sort(np.concatenate(ends))
+        # Between the messages that are listed stand the others, and what describes them.
+        gap_from = np.concatenate([[0], end])
+        gap_to = np.concatenate([start, [len(content)]])
+        for low, high in zip(*(edge[gap_from != gap_to].tolist() for edge in (gap_from, gap_to)), strict=True):
+            for inner in walk(content, low, high):
+                if inner.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                    self._describe(content, inner, record.start)
+                elif inner.opcode == Opcode.MESSAGE:
+                    channel, _, t_ns, _ = message_head(content, inner)
+                    self._find("not-listed", record.start, f"a message of channel {channel} that no index lists")
+                    entry = np.array([[t_ns, inner.start]], "<u8")
+                    entries[channel] = np.concatenate([entries.get(channel, entry[:0]), entry])
+        return entries
+
+    def _count(self, entries: Mapping[int, Entries], where: int) -> None:
+        """Add messages, in the order in which they stand, to what was found."""
+        for channel, listed in entries.items():
+            if not len(listed):
+                continue
+            if channel not in self.found.channels:
+                self._find("no-channel", where, f"messages of channel {channel}, which was not described before")
+            t_ns = listed[:, 0]
+            latest = self._latest.get(channel, 0)
+            late = int((t_ns < np.maximum(np.maximum.accumulate(t_ns), np.uint64(latest))).sum())
+            if late:
+                known = self.found.channels.get(channel)
+                topic = known.topic if known else f"channel {channel}"
+                words = f"messages of {topic} that stand behind later ones"
+                self._find("order", where, words, "warning", late)
+            self._latest[channel] = max(latest, int(t_ns.max()))
+            if not self.found.counts:
+                self.found.start_ns = int(t_ns.min())
+            self.found.start_ns = min(self.found.start_ns, int(t_ns.min()))
+            self.found.end_ns = max(self.found.end_ns, int(t_ns.max()))
+            self.found.counts[channel] = self.found.counts.get(channel, 0) + len(listed)

@@ -1,0 +1,189 @@
+"""A summary, held against what is in the log; and what a look at a log finds."""
+
+from __future__ import annotations
+
+import zlib
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from typing import Final, Literal, NamedTuple
+
+from mcap.opcode import Opcode
+
+from mcaptrack.log import records
+from mcaptrack.log.index import DATA_END_SIZE, FOOTER_SIZE, Index, take
+from mcaptrack.log.records import MAGIC, Damaged, Reader, walk
+
+Level = Literal["error", "warning"]
+
+#: The numbers of a statistics record, in their order, and their sizes.
+_STATISTICS: Final = {
+    "messages": 8,
+    "schemas": 2,
+    "channels": 4,
+    "attachments": 4,
+    "metadata": 4,
+    "chunks": 4,
+    "first log time": 8,
+    "last log time": 8,
+}
+
+
+class Finding(NamedTuple):
+    """What is wrong, or could be better: where first (a byte of the file), and how often."""
+
+    level: Level
+    kind: str
+    where: int
+    words: str
+    times: int = 1
+
+
+class Findings:
+    """What was found, one of each kind."""
+
+    def __init__(self) -> None:
+        self._first: dict[tuple[Level, str], tuple[int, str]] = {}
+        self._times: Counter[tuple[Level, str]] = Counter()
+
+    def __iter__(self) -> Iterator[Finding]:
+        for (level, kind), (where, words) in self._first.items():
+            yield Finding(level, kind, where, words, self._times[level, kind])
+
+    def add(self, kind: str, where: int, words: str, level: Level = "error", times: int = 1) -> None:
+        """One more of a kind."""
+        self._first.setdefault((level, kind), (where, words))
+        self._times[level, kind] += times
+
+
+def record_name(opcode: int) -> str:
+    """What a kind of records is called."""
+    try:
+        return Opcode(opcode).name.lower().replace("_", "-")
+    except ValueError:
+        return f"{opcode:#04x}"
+
+
+def check_summary(buffer: memoryview, found: Index, findings: Findings) -> None:
+    """Look at the summary and the footer of a log, ``found`` being what its data section holds."""
+    try:
+        _Look(buffer, found, findings).at_summary()
+    except Damaged as error:
+        findings.add("summary-structure", found.data_end, f"the summary can't be read: {error}")
+
+
+class _Look:
+    def __init__(self, buffer: memoryview, found: Index, findings: Findings) -> None:
+        self._buffer, self._found, self._find = buffer, found, findings.add
+
+    def at_summary(self) -> None:
+        buffer, found = self._buffer, self._found
+        at = len(buffer) - FOOTER_SIZE
+        if at < len(MAGIC) or buffer[at] != Opcode.FOOTER:
+            self._find("no-footer", max(at, 0), "no footer where one belongs")
+            return
+        start, offsets_start, crc = records.FOOTER_BODY.unpack_from(buffer, at + 9)
+        behind = found.data_end + DATA_END_SIZE
+        if start == 0:
+            words = "there is no summary: opening the log takes a scan"
+            self._find("no-summary", at, words, "warning")
+            if behind != at and found.data_end:
+                self._find("footer", at, "records behind the data section that the footer does not know")
+            return
+        if not len(MAGIC) <= start <= at or (found.data_end and start != behind):
+            self._find("footer", at, f"the summary is said to start at byte {start}; the data section ends at {behind}")
+            return
+        if crc and zlib.crc32(buffer[start : len(buffer) - len(MAGIC) - 4]) != crc:
+            self._find("summary-checksum", start, "the checksum of the summary is wrong")
+        if not crc:
+            self._find("no-summary-checksum", start, "the summary has no checksum: damage goes unseen", "warning")
+        if offsets_start and not start <= offsets_start <= at:
+            self._find("footer", at, f"the summary offsets are said to start at byte {offsets_start}")
+            offsets_start = 0
+        groups: dict[int, tuple[int, int, int]] = {}  # where the records of a kind start and end, and their size
+        said, statistics = Index(), None
+        for record in walk(buffer, start, offsets_start or at):
+            low, _, kinds = groups.get(record.opcode, (record.start, 0, 0))
+            groups[record.opcode] = (low, record.end, kinds + record.end - record.start)
+            statistics = record if record.opcode == Opcode.STATISTICS else statistics
+            take(said, buffer, record)
+        self._compare(said, start)
+        if statistics is None:
+            self._find("no-statistics", start, "there are no statistics: counting takes a scan", "warning")
+        else:
+            self._compare_statistics(Reader(buffer, statistics.body, statistics.end), said, statistics.start)
+        if offsets_start:
+            self._compare_offsets(offsets_start, at, groups)
+
+    def _compare(self, said: Index, where: int) -> None:
+        found = self._found
+        for name, theirs, ours in (
+            ("schema", said.schemas, found.schemas),
+            ("channel", said.channels, found.channels),
+        ):
+            for number, record in theirs.items():
+                if ours.get(number, record) != record:
+                    self._find(f"summary-{name}", where, f"{name} {number} in the summary is not that of the data")
+            missing = ours.keys() - theirs.keys()
+            if missing and theirs:
+                words = f"{name} {min(missing)} is missing in the summary"
+                self._find(f"summary-no-{name}", where, words, "error" if name == "channel" else "warning")
+        self._compare_chunks(said, where)
+        for name, listed, there in (
+            ("attachment", said.attachments, found.attachments),
+            ("metadata", said.metadata, found.metadata),
+        ):
+            if listed and sorted(part.entry for part in listed) != sorted(part.entry for part in there):
+                self._find(f"{name}-index", where, f"the index of {name} is not that of the {name} in the log")
+            if there and not listed:
+                self._find(f"no-{name}-index", where, f"the summary does not list {len(there)} {name}", "warning")
+
+    def _compare_chunks(self, said: Index, where: int) -> None:
+        ours = {chunk.offset: chunk for chunk in self._found.chunks}
+        if ours and not said.chunks:
+            words = "the summary lists no chunks: finding a message takes a scan"
+            self._find("no-chunk-index", where, words, "warning")
+            return
+        for chunk in said.chunks:
+            known = ours.pop(chunk.offset, None)
+            if known is None:
+                self._find(
+                    "chunk-index", where, f"the summary lists a chunk at byte {chunk.offset}; none is whole there"
+                )
+            elif chunk != known:
+                names = [n for n, a, b in zip(chunk._fields, chunk, known, strict=True) if a != b]
+                words = f"the summary says otherwise of the chunk at byte {chunk.offset}: {', '.join(names)}"
+                self._find("chunk-index", where, words)
+        if ours:
+            self._find("chunk-not-listed", min(ours), "a chunk that the summary does not list", times=len(ours))
+
+    def _compare_statistics(self, reader: Reader, said: Index, where: int) -> None:
+        found = self._found
+        loose = [sum(found.counts.values()), len(found.schemas), len(found.channels), len(found.attachments)]
+        there = [*loose, len(found.metadata), len(found.chunks), found.start_ns, found.end_ns]
+        for (name, size), number in zip(_STATISTICS.items(), there, strict=True):
+            value = reader.number(size)
+            only_described = name in ("schemas", "channels") and value == len(getattr(said, name))
+            if value != number and not only_described:
+                self._find("statistics", where, f"the statistics say {value} for {name}, and there is {number}")
+        if {n: count for n, count in said.counts.items() if count} != found.counts:
+            self._find("statistics-counts", where, "the statistics count other messages of a channel than there are")
+
+    def _compare_offsets(self, start: int, end: int, groups: Mapping[int, tuple[int, int, int]]) -> None:
+        listed = set()
+        for record in walk(self._buffer, start, end):
+            if record.opcode != Opcode.SUMMARY_OFFSET:
+                self._find("summary-offset", record.start, f"a {record_name(record.opcode)} among summary offsets")
+                continue
+            reader = Reader(self._buffer, record.body, record.end)
+            opcode, low, size = reader.number(1), reader.number(8), reader.number(8)
+            listed.add(opcode)
+            if size == 0:
+                words = f"a summary offset of no {record_name(opcode)} records; some readers take it for damage"
+                self._find("empty-group", record.start, words, "warning")
+            elif groups.get(opcode) != (low, low + size, size):
+                words = f"the {record_name(opcode)} records are not where their summary offset says"
+                self._find("summary-offset", record.start, words)
+        missing = groups.keys() - listed
+        if missing:
+            words = f"the {record_name(min(missing))} records have no summary offset"
+            self._find("no-summary-offset", start, words, "warning")

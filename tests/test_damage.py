@@ -1,0 +1,356 @@
+"""Damaged logs: all damage is seen, all that is whole is saved, nothing wrong is taken for right."""
+
+from __future__ import annotations
+
+import random
+import subprocess
+import sys
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+
+from mcaptrack import log
+from mcaptrack.errors import McaptrackError
+from mcaptrack.log import records
+from mcaptrack.log.records import MAGIC
+from tests.test_log import MESSAGES, SCHEMA, SOME, STOCK_OPTIONS, our_messages, stock_messages, write_log, write_stock
+
+#: Forty messages of three channels, each of which could be told from all others.
+FORTY = [("abc"[n % 3], n * 10, n, bytes([n]) * 40) for n in range(40)]
+WITH_CHECKSUMS = {
+    "small chunks": {"chunk_size": 100, "enable_data_crcs": True},
+    "no chunks, a checksum": {"use_chunking": False, "enable_data_crcs": True},
+}
+
+
+def some_logs(folder: Path) -> Iterator[tuple[str, bytes]]:
+    """Logs with the forty messages, ours and of the stock writer in all its ways."""
+    path = folder / "good.mcap"
+    write_log(path, FORTY)
+    yield "ours", path.read_bytes()
+    write_log(path, FORTY, "media")
+    yield "media", path.read_bytes()
+    write_stock(path, FORTY, chunk_size=300)
+    with log.read(path) as opened, log.extend(opened) as writer:
+        number = writer.add_channel("new", SCHEMA, "json", {})
+        for count in range(10):
+            writer.add_message(number, count, count, b"new" * count)
+    yield "extended", path.read_bytes()
+    for name, options in {**STOCK_OPTIONS, **WITH_CHECKSUMS}.items():
+        write_stock(path, FORTY, **options)
+        yield name, path.read_bytes()
+
+
+def kinds_of(checked: log.Checked) -> set[str]:
+    return {found.kind for found in checked.findings if found.level == "error"}
+
+
+def triples(path: Path) -> Counter[tuple[str, int, bytes]]:
+    return Counter((topic, t, payload) for topic, found in our_messages(path).items() for t, _, payload in found)
+
+
+def test_a_sound_log_is_said_to_be_sound_and_is_saved_whole(tmp_path):
+    path, saved = tmp_path / "a.mcap", tmp_path / "b.mcap"
+    for name, whole in some_logs(tmp_path):
+        path.write_bytes(whole)
+        checked = log.check(path)
+        assert checked.is_sound, (name, checked.findings)
+        report = log.recover(path, saved)
+        assert report.lost == [], name
+        assert triples(saved) == triples(path), name
+        assert log.check(saved).is_sound, name
+        with path.open("rb") as first, saved.open("rb") as second:
+            one, other = make_reader(first), make_reader(second)
+            assert one.get_header() == other.get_header()
+            for theirs, ours in (
+                (list(one.iter_attachments()), list(other.iter_attachments())),
+                (list(one.iter_metadata()), list(other.iter_metadata())),
+            ):
+                assert theirs in ([], ours)  # the stock reader goes by indexes, which not every log has
+                assert len(ours) == (name not in ("ours", "media"))
+
+
+@given(messages=MESSAGES, at=st.floats(0, 1, exclude_max=True), bit=st.integers(0, 7))
+@settings(max_examples=150)
+def test_no_flipped_bit_goes_unseen(tmp_path_factory, messages, at, bit):
+    path = tmp_path_factory.mktemp("log") / "a.mcap"
+    write_log(path, messages)
+    raw = bytearray(path.read_bytes())
+    raw[int(at * len(raw))] ^= 1 << bit
+    path.write_bytes(raw)
+    assert not log.check(path).is_sound
+
+
+@pytest.fixture
+def chunked(tmp_path) -> Path:
+    """A log of four chunks and more, of which each can be damaged alone."""
+    path = tmp_path / "a.mcap"
+    write_stock(path, FORTY, chunk_size=600, enable_data_crcs=True)
+    return path
+
+
+def _damages(path: Path) -> dict[str, tuple[bytes, set[str]]]:
+    """Damaged logs, and the errors that must be among those that are found."""
+    whole = path.read_bytes()
+    with log.read(path) as opened:
+        chunk, other = opened.index.chunks[1:3]
+        summary = opened.index.data_end + 13
+        at_index = chunk.offset + chunk.length
+        attachment = opened.index.attachments[0].offset
+
+    def put(at: int, data: bytes) -> bytes:
+        return whole[:at] + data + whole[at + len(data) :]
+
+    twice = whole[chunk.offset : other.offset]
+    return {
+        "not an MCAP file": (b"x" + whole[1:], {"magic"}),
+        "cut off in a chunk": (whole[: chunk.offset + 100], {"cut-off", "structure"}),
+        "cut off in the summary": (whole[: summary + 30], {"cut-off"}),
+        "a chunk's data": (put(chunk.offset + 80, bytes(8)), {"bad-chunk", "data-checksum"}),
+        "a chunk's times": (put(chunk.offset + 9, bytes(8)), {"chunk-times", "data-checksum"}),
+        "a chunk's declared size": (put(chunk.offset + 25, b"\xff" * 8), {"bad-chunk"}),
+        "a message index": (put(at_index + 15, b"\xff" * 8), {"wrong-index"}),
+        "a message index of another channel": (put(at_index + 9, b"\x09"), {"wrong-index", "not-listed", "no-channel"}),
+        "an attachment": (whole.replace(b"hello", b"hallo"), {"attachment-checksum", "data-checksum"}),
+        "an attachment's length": (put(attachment + 1, b"\xff" * 8), {"structure"}),
+        "a record of another kind": (put(chunk.offset, b"\x02"), {"misplaced", "stray-index"}),
+        "the summary": (put(summary + 40, b"\xff"), {"summary-checksum"}),
+        "where the summary is": (put(len(whole) - 8 - 20, b"\x00\x01"), {"footer"}),
+        "a chunk twice": (whole[: other.offset] + twice + whole[other.offset :], {"data-checksum", "footer"}),
+    }
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        "not an MCAP file",
+        "cut off in a chunk",
+        "cut off in the summary",
+        "a chunk's data",
+        "a chunk's times",
+        "a chunk's declared size",
+        "a message index",
+        "an attachment",
+        "an attachment's length",
+        "a record of another kind",
+        "the summary",
+        "where the summary is",
+        "a chunk twice",
+    ],
+)
+def test_damage_is_found_by_name_and_what_is_whole_is_saved(chunked, tmp_path, kind):
+    true = triples(chunked)
+    damaged, errors = _damages(chunked)[kind]
+    chunked.write_bytes(damaged)
+    assert errors <= kinds_of(log.check(chunked))
+    report = log.recover(chunked, tmp_path / "saved.mcap")
+    saved = triples(tmp_path / "saved.mcap")
+    assert saved <= true
+    assert report.messages == saved.total() >= (6 if kind == "cut off in a chunk" else 25)
+    harmless = {"the summary", "where the summary is", "cut off in the summary"}
+    assert bool(report.lost) == (kind not in harmless)
+    if kind in harmless | {
+        "a chunk's times",
+        "not an MCAP file",
+        "an attachment",
+        "a chunk twice",
+        "an attachment's length",
+    }:
+        assert saved == true
+    assert log.check(tmp_path / "saved.mcap").is_sound
+    assert sorted((t, ns, data) for t, ns, _, data in stock_messages(tmp_path / "saved.mcap")) == sorted(
+        saved.elements()
+    )
+    assert chunked.read_bytes() == damaged
+
+
+def test_what_is_lost_is_named(chunked, tmp_path):
+    with log.read(chunked) as opened:
+        chunk = opened.index.chunks[1]
+        channels = chunk.message_index_offsets
+        held = [m for m in FORTY if chunk.start_ns <= m[1] <= chunk.end_ns]
+    raw = bytearray(chunked.read_bytes())
+    raw[chunk.offset + 80 : chunk.offset + 90] = bytes(10)
+    chunked.write_bytes(raw)
+    report = log.recover(chunked, tmp_path / "saved.mcap")
+    assert len(channels) == 3
+    assert report.messages == 40 - len(held)
+    assert f"byte {chunk.offset} to " in report.lost[0]
+    assert "it held messages of a, b, c from 0.000 to 0.000 s" in report.lost[0]
+    lost = Counter(topic for topic, *_ in held)
+    total = Counter(topic for topic, *_ in FORTY)
+    assert report.lost[1:] == [f"{t}: {total[t] - lost[t]} of {total[t]} messages are saved" for t in "abc"]
+
+
+def test_a_log_that_is_cut_off_keeps_every_chunk_that_is_complete(chunked, tmp_path):
+    path, saved = tmp_path / "cut.mcap", tmp_path / "saved.mcap"
+    whole = chunked.read_bytes()
+    with log.read(chunked) as opened:
+        chunks = [(c.offset + c.length, c.start_ns, c.end_ns) for c in opened.index.chunks]
+        data_end = opened.index.data_end + 13
+    for percent in range(1, 100):
+        path.write_bytes(whole[: len(whole) * percent // 100])
+        spans = [(low, high) for end, low, high in chunks if end <= path.stat().st_size]
+        there = Counter((t, ns, data) for t, ns, _, data in FORTY if any(low <= ns <= high for low, high in spans))
+        if not spans:
+            with pytest.raises(McaptrackError, match="no message in it is whole"):
+                log.recover(path, saved)
+            continue
+        report = log.recover(path, saved)
+        assert triples(saved) == there
+        is_whole = path.stat().st_size >= data_end
+        assert is_whole or "the file is cut off" in report.lost[-1]
+
+
+def test_a_cut_log_without_chunks_keeps_every_message_that_is_complete(tmp_path):
+    path, saved = tmp_path / "a.mcap", tmp_path / "saved.mcap"
+    write_stock(path, FORTY, use_chunking=False)
+    whole = path.read_bytes()
+    ends = {whole.index(payload) + len(payload): (t, ns, payload) for t, ns, _, payload in FORTY}
+    for percent in range(20, 70):
+        path.write_bytes(whole[: len(whole) * percent // 100])
+        there = Counter(m for end, m in ends.items() if end <= path.stat().st_size)
+        log.recover(path, saved)
+        assert triples(saved) == there
+
+
+def mutated(whole: bytes, chance: random.Random) -> bytes:
+    """With a few bits flipped, cut off, overwritten by a telling number, or with a piece of it put somewhere else."""
+    raw, kind = bytearray(whole), chance.random()
+    at = chance.randrange(len(raw))
+    if kind < 0.5:
+        for _ in range(chance.choice([1, 1, 2, 5])):
+            raw[chance.randrange(len(raw))] ^= 1 << chance.randrange(8)
+    elif kind < 0.65:
+        del raw[max(at, 1) :]
+    elif kind < 0.8:
+        numbers = (0, 2**40, 2**63, 2**64 - 1)
+        raw[at : at + 8] = chance.choice(numbers).to_bytes(8, "little")
+    else:
+        low, high = sorted((chance.randrange(len(raw)), chance.randrange(len(raw))))
+        raw[at:at] = raw[low:high]
+    return bytes(raw)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_no_mutation_gives_a_wrong_message_or_a_traceback(tmp_path, seed):
+    """Neither when it is read, nor when it is extended, nor when it is saved; and what is lost is said."""
+    chance = random.Random(seed)
+    path, saved = tmp_path / "a.mcap", tmp_path / "saved.mcap"
+    kinds = dict(some_logs(tmp_path))
+    new = Counter(("new", count, b"new" * count) for count in range(10))
+    true = Counter((topic, ns, payload) for topic, ns, _, payload in FORTY)
+    unguarded = {"no chunks", "no message index", "no repeated channels", "no statistics"}
+    for _ in range(100):
+        name, whole = chance.choice(list(kinds.items()))
+        raw = mutated(whole, chance)
+        path.write_bytes(raw)
+        good = true + new if name == "extended" else true
+        guarded = name not in unguarded and name not in WITH_CHECKSUMS
+        try:
+            assert triples(path) <= good or not guarded, name
+            with log.read(path) as opened, log.extend(opened, drop=["a"]) as writer:
+                writer.add_message(writer.add_channel("more", SCHEMA, "json", {}), 5, 1, b"zz")
+            assert triples(path) <= good + Counter([("more", 5, b"zz")]) or not guarded, name
+        except McaptrackError as error:
+            assert "\n" not in str(error)
+        path.write_bytes(raw)
+        is_sound = log.check(path).is_sound
+        try:
+            report = log.recover(path, saved)
+        except McaptrackError as error:
+            assert "no message in it is whole" in str(error)
+            assert not is_sound
+            continue
+        found = triples(saved)
+        assert found.total() == report.messages == len(stock_messages(saved))
+        assert found <= good or not guarded, name
+        assert log.check(saved).is_sound
+        if name in ("ours", "media", *WITH_CHECKSUMS) and raw != whole:
+            assert not is_sound, name
+            assert report.lost or found == good, name
+
+
+_HOSTILE = """
+import resource, sys, time
+resource.setrlimit(resource.RLIMIT_AS, (2 << 30, 2 << 30))
+from pathlib import Path
+from mcaptrack import errors, log
+def all_of(path):
+    with log.read(path) as opened:
+        for topic in opened.channels:
+            for _ in opened.messages(topic): pass
+            opened.times(topic)
+for path in map(Path, sys.argv[1:]):
+    for look in (all_of, log.check, lambda p: log.recover(p, p.with_suffix(".out"))):
+        started = time.monotonic()
+        try: look(path)
+        except errors.McaptrackError as error: assert "\\n" not in str(error)
+        assert time.monotonic() - started < 5, path
+used = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+assert used < 1 << 20, used
+"""
+
+
+def test_hostile_logs_cost_neither_time_nor_memory(tmp_path):
+    import lz4.frame
+    import zstandard
+
+    header = records.pack(1, records.text(""), records.text("x"))
+    end = records.pack(15, bytes(4)) + records.pack(2, bytes(20)) + MAGIC
+    zeros = bytes(200 << 20)
+    zstd, lz = zstandard.compress(zeros), lz4.frame.compress(zeros)
+    channel = records.pack(4, (1).to_bytes(2, "little"), bytes(2), records.text("/a"), records.text(""), bytes(4))
+    other = records.pack(4, (1).to_bytes(2, "little"), bytes(2), records.text("/b"), records.text(""), bytes(4))
+    message = records.pack(5, (1).to_bytes(2, "little"), bytes(4), b"\xff" * 8, b"\xff" * 8)
+    bodies = {
+        "zstd bomb": records.pack_chunk((0, 0, 100, 0), "zstd", zstd),
+        "zstd bomb that says so": records.pack_chunk((0, 0, len(zeros), 0), "zstd", zstd),
+        "many zstd bombs": records.pack_chunk((0, 0, len(zeros), 0), "zstd", zstd) * 8,
+        "lz4 bomb": records.pack_chunk((0, 0, 100, 0), "lz4", lz),
+        "lz4 bomb that says so": records.pack_chunk((0, 0, len(zeros), 0), "lz4", lz),
+        "2^40": records.pack_chunk((0, 0, 2**40, 0), "zstd", zstd),
+        "2^63": records.pack_chunk((0, 0, 2**63, 0), "lz4", lz),
+        "record of 2^63": b"\x06" + (2**63).to_bytes(8, "little") + bytes(100),
+        "map of 2^31": records.pack(4, bytes(4), records.text("/a"), records.text(""), (2**31).to_bytes(4, "little")),
+        "two of one number": channel + other + message,
+        "absurd times": channel + message,
+        "absurd times in a chunk": channel + records.pack_chunk((0, 2**64 - 1, len(message), 0), "", message),
+        "a million empty records": records.pack(0x80) * 1_000_000,
+        "a million beginnings of chunks": (b"\x06" + bytes(40)) * 100_000,
+        "a chunk in itself": records.pack_chunk((0, 0, len(channel), 0), "", records.pack_chunk((0, 0, 0, 0), "", b"")),
+    }
+    paths = []
+    for number, body in enumerate(bodies.values()):
+        paths.append(tmp_path / f"{number}.mcap")
+        paths[-1].write_bytes(MAGIC + header + body + end)
+    done = subprocess.run([sys.executable, "-c", _HOSTILE, *paths], check=False, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_what_nobody_can_save_is_said(tmp_path):
+    for name, data in {"text.mcap": b"I am no log\n" * 9, "magic.mcap": MAGIC}.items():
+        (tmp_path / name).write_bytes(data)
+        with pytest.raises(McaptrackError, match="no message in it is whole"):
+            log.recover(tmp_path / name, tmp_path / "saved.mcap")
+    (tmp_path / "empty.mcap").write_bytes(b"")
+    for verb in (log.check, lambda path: log.recover(path, tmp_path / "saved.mcap")):
+        with pytest.raises(McaptrackError, match="is empty"):
+            verb(tmp_path / "empty.mcap")
+        with pytest.raises(McaptrackError, match="can't be opened: No such file"):
+            verb(tmp_path / "none.mcap")
+    assert not (tmp_path / "saved.mcap").exists()
+
+
+def test_a_journal_that_is_damaged_itself_does_not_keep_what_is_whole(tmp_path):
+    path = tmp_path / "a.mcap"
+    write_log(path, SOME)
+    (tmp_path / "a.mcap.journal").write_bytes(b"mcaptrack journal 1\nand then nothing")
+    with pytest.raises(McaptrackError, match=r"`mcaptrack recover .*a\.mcap` saves what is whole"):
+        log.read(path)
+    assert log.recover(path, tmp_path / "saved.mcap").messages == len(SOME)
