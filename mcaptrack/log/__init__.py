@@ -8,6 +8,20 @@ with create(path) as writer: ...        a new one
 from mcaptrack.log.change import extend
 from mcaptrack.log.messages import Columns, Message
 from mcaptrack.log.reader import Channel, Log, read, topics_with_schema
+from mcaptrack.log.stream import pass_on_extras, profile, stream
 from mcaptrack.log.writer import LogWriter, create
 
-__all__ = ["Channel", "Columns", "Log", "LogWriter", "Message", "create", "extend", "read", "topics_with_schema"]
+__all__ = [
+    "Channel",
+    "Columns",
+    "Log",
+    "LogWriter",
+    "Message",
+    "create",
+    "extend",
+    "pass_on_extras",
+    "profile",
+    "read",
+    "stream",
+    "topics_with_schema",
+]
