@@ -10,7 +10,6 @@ from __future__ import annotations
 import sqlite3
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path, PurePath
 from tempfile import TemporaryDirectory
@@ -18,30 +17,18 @@ from typing import Any, Final
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
+from mcaptrack.ingest.bag_metadata import METADATA, Bag, read_metadata
 from mcaptrack.ingest.source import Connection, Found, Source
 from mcaptrack.provenance import CLOCK
 
-METADATA: Final = "metadata.yaml"
 _MCAP_MAGIC, _SQLITE_MAGIC, _ZSTD_MAGIC = b"\x89MCAP0\r\n", b"SQLite format 3\0", b"\x28\xb5\x2f\xfd"
 #: A message that is larger decompressed is not read.
 _MAX_MESSAGE_BYTES: Final = 2**28
 
 
-@dataclass
-class Bag:
-    """What a metadata.yaml says of a bag."""
-
-    text: bytes = b""
-    distro: str = ""
-    #: Whether each message is compressed by itself.
-    packed: bool = False
-    #: Topic, type, serialization, quality of service, type hash, and how many messages the bag holds.
-    topics: Sequence[tuple[str, str, str, str, str, int]] = ()
-
-
 def open_bag(folder: Path) -> Source:
     """The bag in a folder with a metadata.yaml. Raises McaptrackError if it can't be read or is incomplete."""
-    bag, names = _read_metadata(folder / METADATA)
+    bag, names = read_metadata(folder / METADATA)
     paths = [folder / PurePath(name).name for name in names]
     paths = [path if path.exists() else path.with_name(path.name + ".zstd") for path in paths]
     missing = [str(path).removesuffix(".zstd") for path in paths if not path.exists()]
@@ -110,53 +97,10 @@ def _bag_around(paths: Sequence[Path]) -> Bag:
     """What the metadata.yaml beside a single file says of it, if there is one that names it: not how much there is."""
     beside = paths[0].with_name(METADATA)
     if len(paths) == 1 and beside.is_file() and b"rosbag2_bagfile_information" in beside.read_bytes():
-        bag, names = _read_metadata(beside)
+        bag, names = read_metadata(beside)
         if paths[0].name.removesuffix(".zstd") in [PurePath(name).name.removesuffix(".zstd") for name in names]:
             return Bag(distro=bag.distro, packed=bag.packed)
     return Bag()
-
-
-def _read_metadata(path: Path) -> tuple[Bag, list[str]]:
-    """A metadata.yaml, and the files that it names."""
-    from ruamel.yaml import YAML
-    from ruamel.yaml.error import YAMLError
-
-    try:
-        text = path.read_bytes()
-        said = YAML(typ="safe", pure=True).load(text.decode("utf-8"))["rosbag2_bagfile_information"]
-        mode, compression = str(said.get("compression_mode") or ""), str(said.get("compression_format") or "")
-        topics = []
-        for entry in said.get("topics_with_message_count") or []:
-            topic = entry["topic_metadata"]
-            encoding, qos = (
-                str(topic.get("serialization_format", "cdr")),
-                _yaml(topic.get("offered_qos_profiles") or ""),
-            )
-            digest = str(topic.get("type_description_hash") or "")
-            topics.append((str(topic["name"]), str(topic["type"]), encoding, qos, digest, int(entry["message_count"])))
-        names = [str(name) for name in said["relative_file_paths"]]
-        bag = Bag(text, str(said.get("ros_distro") or ""), mode.lower() == "message", topics)
-    except OSError as error:
-        raise McaptrackError(f"{path} can't be read: {error.strerror}") from None
-    except (YAMLError, UnicodeDecodeError, KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
-        why = " ".join(str(error).split())[:120]
-        raise McaptrackError(f"{path} is no metadata of a rosbag2 bag ({why})") from None
-    if mode.lower() not in ("", "none") and compression.lower() != "zstd":
-        raise McaptrackError(f"{path}: the bag is compressed with {compression!r}; zstd is read")
-    return bag, names
-
-
-def _yaml(value: Any) -> str:
-    """Words as they are; anything else, as it is since ROS 2 Jazzy, as YAML."""
-    if isinstance(value, str):
-        return value
-    from io import StringIO
-
-    from ruamel.yaml import YAML
-
-    out = StringIO()
-    YAML(typ="safe", pure=True).dump(value, out)
-    return out.getvalue()
 
 
 class _Files:
@@ -276,6 +220,11 @@ class Databases(_Files):
         if not topics >= wanted or not messages >= {"topic_id", "timestamp", "data"}:
             raise McaptrackError(f"{path} is a database, but none of rosbag2: it has no topics and messages")
         counts = dict(self._ask(number, "SELECT topic_id, count(*) FROM messages GROUP BY topic_id"))
+        ((total,),) = self._ask(number, "SELECT count(*) FROM messages")  # by the index of times, if there is one
+        if total != sum(counts.values()):
+            raise McaptrackError(
+                f"{path} does not add up: its index counts {total} messages, and {sum(counts.values())} are there"
+            )
         definitions = self._definitions(number)
         columns = [name if name in topics else "''" for name in ("offered_qos_profiles", "type_description_hash")]
         known: dict[int, Connection] = {}
@@ -329,8 +278,9 @@ class Databases(_Files):
     def _ask(self, number: int, query: str) -> Iterator[tuple[Any, ...]]:
         try:
             yield from self._databases[number].execute(query)
-        except sqlite3.Error as error:
-            raise McaptrackError(f"{self.paths[number]} is damaged: {error}") from None
+        except (sqlite3.Error, UnicodeDecodeError) as error:  # SQLite quotes what is damaged
+            why = "it can't be understood" if isinstance(error, UnicodeDecodeError) else str(error)
+            raise McaptrackError(f"{self.paths[number]} is damaged: {why}") from None
 
     def _columns(self, number: int, table: str) -> set[str]:
         return {_text(row[1]) for row in self._ask(number, f"PRAGMA table_info({table})")}

@@ -88,7 +88,8 @@ def open_source(path: Path) -> Source | None:
 
 
 def _open_folder(path: Path) -> Source | None:
-    from mcaptrack.ingest.rosbag2 import METADATA, open_bag, open_files
+    from mcaptrack.ingest.bag_metadata import METADATA
+    from mcaptrack.ingest.rosbag2 import open_bag, open_files
 
     metadata = path / METADATA
     if metadata.is_file() and b"rosbag2_bagfile_information" in metadata.read_bytes():
