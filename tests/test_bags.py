@@ -541,9 +541,10 @@ class TestInto:
         kept = [message for message in other if message[0] == "/image"]
         assert recorded(tmp_path / "a.mcap") == sorted(said + kept)
 
-    def test_an_mcap_file_is_added_with_all_that_is_in_it(self, tmp_path):
+    @pytest.mark.parametrize("chunks", [True, False])
+    def test_an_mcap_file_is_added_with_all_that_is_in_it(self, tmp_path, chunks):
         with (tmp_path / "a.mcap").open("wb") as stream:
-            writer = McapWriter(stream, compression=CompressionType.LZ4)
+            writer = McapWriter(stream, compression=CompressionType.LZ4, use_chunking=chunks)
             writer.start()
             channel = writer.register_channel("/a", "json", 0, {"k": "v"})
             for number in range(5):

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator
+from contextlib import contextmanager
 
 from mcap.opcode import Opcode
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.log import records
-from mcaptrack.log.chunks import chunk_record, forget, message_head, open_chunk
+from mcaptrack.log.chunks import forget, message_head, open_chunk
 from mcaptrack.log.messages import Message
 from mcaptrack.log.reader import Log
 from mcaptrack.log.records import MAGIC, Damaged, Record, walk
@@ -20,20 +21,16 @@ def stream(log: Log) -> Iterator[tuple[int, Message]]:
 
     Raises McaptrackError where the log is damaged.
     """
-    chunks = [(chunk.offset, chunk_record(log.buffer, chunk)) for chunk in log.index.chunks]
-    loose = [(record.start, record) for record in log.index.loose]
-    try:
-        for _, record in sorted([*chunks, *loose]):
+    with _mending(log):
+        for record in walk(log.buffer, len(MAGIC), log.index.data_end):
             if record.opcode == Opcode.MESSAGE:
                 yield _message(log.buffer, record)
-                continue
-            content = open_chunk(log.buffer, record)
-            for inner in walk(content, 0, len(content)):
-                if inner.opcode == Opcode.MESSAGE:
-                    yield _message(content, inner)
-            forget(log.buffer, record.start, record.end)
-    except Damaged as error:
-        raise McaptrackError(f"{log.path} is damaged: {error}") from None
+            elif record.opcode == Opcode.CHUNK:
+                content = open_chunk(log.buffer, record)
+                for inner in walk(content, 0, len(content)):
+                    if inner.opcode == Opcode.MESSAGE:
+                        yield _message(content, inner)
+                forget(log.buffer, record.start, record.end)
 
 
 def _message(buffer: memoryview, record: Record) -> tuple[int, Message]:
@@ -44,22 +41,29 @@ def _message(buffer: memoryview, record: Record) -> tuple[int, Message]:
 
 def profile(log: Log) -> str:
     """The profile that the log's header names."""
-    try:
+    with _mending(log):
         return records.read_header(log.buffer, records.record_at(log.buffer, len(MAGIC)))[0]
-    except Damaged as error:
-        raise McaptrackError(f"{log.path} is damaged: {error}") from None
 
 
 def pass_on_extras(log: Log, writer: LogWriter, *, without: Collection[str] = ()) -> None:
     """Write the log's attachments, and its metadata records of all names but these, as they are."""
-    try:
+    with _mending(log):
         for listed in log.index.metadata:
             if listed.name not in without:
                 writer.put_metadata(_whole(log, listed.offset))
         for listed in log.index.attachments:
             writer.put_attachment(_whole(log, listed.offset))
+
+
+@contextmanager
+def _mending(log: Log) -> Iterator[None]:
+    """What is damaged is said, with what can be done."""
+    try:
+        yield
     except Damaged as error:
-        raise McaptrackError(f"{log.path} is damaged: {error}") from None
+        raise McaptrackError(
+            f"{log.path} is damaged: {error}; `mcaptrack recover {log.path}` saves what is whole"
+        ) from None
 
 
 def _whole(log: Log, offset: int) -> bytes:
