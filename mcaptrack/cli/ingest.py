@@ -14,7 +14,9 @@ from mcaptrack.errors import McaptrackError
 Inputs = Annotated[
     list[Path],
     typer.Argument(
-        metavar="INPUT...", help="Videos, folders of images, or label files; each becomes a log.", show_default=False
+        metavar="INPUT...",
+        help="Videos, folders of images, ROS bags, MCAP files, or label files; each becomes a log.",
+        show_default=False,
     ),
 ]
 LabelFile = Annotated[Path | None, common.option(help="Labels that belong to the pictures.", show_default=False)]
@@ -69,10 +71,13 @@ def ingest(
     verbose: common.Verbose = False,
     config: common.Config = None,
 ) -> None:
-    """Make a log of a video, a folder of images, or a label file.
+    """Make a log of a video, a folder of images, a ROS bag, an MCAP file, or a label file.
 
     Writes /camera/video, /camera/ground_plane, /camera/detections, /camera/tracks and /camera/truth, as far as they are
     given. An H.264 stream that viewers can play is passed on as it is; others are encoded again.
+
+    Of a ROS 1 bag, a rosbag2 folder or database, or an MCAP file every message stays as it is, with its times; labels
+    stand beside the pictures of its only camera, or of the one that --camera names.
 
     Example: mcaptrack ingest video.mp4 --ground-plane homography.txt --truth gt.txt -o log.mcap
     """

@@ -34,6 +34,8 @@ __all__ = [
     "detections",
     "holds_detections",
     "holds_pictures",
+    "is_compressed",
+    "is_picture",
     "picture_decoder",
     "pictures",
     "stamps",
@@ -71,7 +73,17 @@ class Picture(NamedTuple):
 
 def holds_pictures(channel: log.Channel) -> bool:
     """Whether a channel's messages are pictures, by the name of their schema."""
-    return plain_name(channel.schema_name) in PICTURES_READ
+    return is_picture(channel.schema_name)
+
+
+def is_picture(schema_name: str) -> bool:
+    """Whether messages of this schema are pictures."""
+    return plain_name(schema_name) in PICTURES_READ
+
+
+def is_compressed(schema_name: str) -> bool:
+    """Whether messages of this schema are pictures that are compressed already."""
+    return plain_name(schema_name) in _COMPRESSED
 
 
 def holds_detections(channel: log.Channel) -> bool:

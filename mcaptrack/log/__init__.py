@@ -13,6 +13,7 @@ from mcaptrack.log.check_summary import Finding
 from mcaptrack.log.messages import Columns, Message
 from mcaptrack.log.reader import Channel, Log, read, topics_with_schema
 from mcaptrack.log.recover import Recovered, recover
+from mcaptrack.log.stream import pass_on_extras, profile, stream
 from mcaptrack.log.writer import LogWriter, create
 
 __all__ = [
@@ -27,7 +28,10 @@ __all__ = [
     "check",
     "create",
     "extend",
+    "pass_on_extras",
+    "profile",
     "read",
     "recover",
+    "stream",
     "topics_with_schema",
 ]

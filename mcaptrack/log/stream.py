@@ -1,0 +1,71 @@
+"""A whole log as it stands in its file, for whoever passes everything on."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+
+from mcap.opcode import Opcode
+
+from mcaptrack.errors import McaptrackError
+from mcaptrack.log import records
+from mcaptrack.log.chunks import forget, message_head, open_chunk
+from mcaptrack.log.messages import Message
+from mcaptrack.log.reader import Log
+from mcaptrack.log.records import MAGIC, Damaged, Record, walk
+from mcaptrack.log.writer import LogWriter
+
+
+def stream(log: Log) -> Iterator[tuple[int, Message]]:
+    """The channel (its id) and the message of all messages, a chunk in memory at a time.
+
+    Raises McaptrackError where the log is damaged.
+    """
+    with _mending(log):
+        for record in walk(log.buffer, len(MAGIC), log.index.data_end):
+            if record.opcode == Opcode.MESSAGE:
+                yield _message(log.buffer, record)
+            elif record.opcode == Opcode.CHUNK:
+                content = open_chunk(log.buffer, record)
+                for inner in walk(content, 0, len(content)):
+                    if inner.opcode == Opcode.MESSAGE:
+                        yield _message(content, inner)
+                forget(log.buffer, record.start, record.end)
+
+
+def _message(buffer: memoryview, record: Record) -> tuple[int, Message]:
+    channel, sequence, t_ns, publish_ns = message_head(buffer, record)
+    payload = bytes(buffer[record.body + records.MESSAGE_HEAD.size : record.end])
+    return channel, Message(t_ns, sequence, publish_ns, payload)
+
+
+def profile(log: Log) -> str:
+    """The profile that the log's header names."""
+    with _mending(log):
+        return records.read_header(log.buffer, records.record_at(log.buffer, len(MAGIC)))[0]
+
+
+def pass_on_extras(log: Log, writer: LogWriter, *, without: Collection[str] = ()) -> None:
+    """Write the log's attachments, and its metadata records of all names but these, as they are."""
+    with _mending(log):
+        for listed in log.index.metadata:
+            if listed.name not in without:
+                writer.put_metadata(_whole(log, listed.offset))
+        for listed in log.index.attachments:
+            writer.put_attachment(_whole(log, listed.offset))
+
+
+@contextmanager
+def _mending(log: Log) -> Iterator[None]:
+    """What is damaged is said, with what can be done."""
+    try:
+        yield
+    except Damaged as error:
+        raise McaptrackError(
+            f"{log.path} is damaged: {error}; `mcaptrack recover {log.path}` saves what is whole"
+        ) from None
+
+
+def _whole(log: Log, offset: int) -> bytes:
+    record = records.record_at(log.buffer, offset)
+    return bytes(log.buffer[record.start : record.end])

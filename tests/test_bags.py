@@ -1,0 +1,617 @@
+"""Recordings become logs with everything that is in them: read again by the stock MCAP library, message for message."""
+
+from __future__ import annotations
+
+import sqlite3
+import struct
+from collections import Counter
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import CompressionType
+from mcap.writer import Writer as McapWriter
+from rosbags.highlevel import AnyReader
+from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
+from rosbags.rosbag1 import Reader as Reader1
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
+from rosbags.rosbag2 import Writer as Writer2
+from rosbags.typesys import Stores, get_typestore
+from typer.testing import CliRunner
+
+from mcaptrack import log
+from mcaptrack.cli import app
+from mcaptrack.errors import McaptrackError
+from mcaptrack.ingest import IngestOptions, ingest
+from mcaptrack.schema import GROUND_PLANE, TRACKS
+from mcaptrack.schema.ground import rows_to_plane
+
+T0 = 1_700_000_000_123_456_789
+ROS1, ROS2 = get_typestore(Stores.ROS1_NOETIC), get_typestore(Stores.ROS2_HUMBLE)
+STRING1 = "std_msgs/msg/String"
+
+
+def recorded(path: Path) -> list[tuple[str, int, int, bytes]]:
+    """Topic, log time, publish time and payload of all messages, as the stock reader finds them, by time."""
+    with path.open("rb") as stream:
+        found = [(c.topic, m.log_time, m.publish_time, m.data) for _, c, m in make_reader(stream).iter_messages()]
+    return sorted(found)
+
+
+def summary(path: Path):
+    with path.open("rb") as stream:
+        reader = make_reader(stream)
+        return reader.get_header(), reader.get_summary()
+
+
+def channels(path: Path) -> list[tuple]:
+    """Topic, encoding, schema and metadata of all channels, and how many messages they have."""
+    _, found = summary(path)
+    counts = found.statistics.channel_message_counts
+    out = []
+    for channel in found.channels.values():
+        schema = found.schemas.get(channel.schema_id)
+        words = (schema.name, schema.encoding, schema.data) if schema else None
+        out.append((channel.topic, channel.message_encoding, words, channel.metadata, counts.get(channel.id, 0)))
+    return out
+
+
+def make(source: Path, output: Path, **options):
+    return ingest(source, output, IngestOptions(**options))
+
+
+def bag1(path: Path, messages: int = 60, size: int = 40_000, compression: str | None = None) -> list:
+    """A bag of several chunks with two publishers of one topic, and one who says nothing; returns what is in it."""
+    noise = np.random.default_rng(7)
+    writer = Writer1(path)
+    writer.chunk_threshold = 200_000
+    if compression:
+        writer.set_compression(Writer1.CompressionFormat[compression])
+    out = []
+    with writer:
+        left = writer.add_connection("/talk", STRING1, typestore=ROS1, callerid="/left", latching=1)
+        right = writer.add_connection("/talk", STRING1, typestore=ROS1, callerid="/right", latching=0)
+        writer.add_connection("/silent", "sensor_msgs/msg/Image", typestore=ROS1)
+        for number in range(messages):
+            payload = noise.integers(0, 200, size, np.uint8).tobytes()
+            t_ns = T0 + 1_000_000 * (number ^ 1)  # neighbours change places: a bag is in no strict order
+            writer.write((left, right)[number % 3 == 0], t_ns, payload)
+            out.append(("/talk", t_ns, t_ns, payload))
+    return out
+
+
+class TestRos1:
+    @pytest.mark.parametrize("compression", [None, "BZ2", "LZ4"])
+    def test_every_message_is_there(self, tmp_path, compression):
+        bag = tmp_path / "a.bag"
+        said = bag1(bag, size=9_000, compression=compression)
+        report = make(bag, tmp_path / "a.mcap")
+        assert recorded(tmp_path / "a.mcap") == sorted(said)
+        assert report.messages == {"/talk": 60, "/silent": 0}
+        assert report.lost == []
+
+    def test_a_channel_for_each_connection(self, tmp_path):
+        bag1(tmp_path / "a.bag")
+        make(tmp_path / "a.bag", tmp_path / "a.mcap")
+        left, right, silent = channels(tmp_path / "a.mcap")
+        assert summary(tmp_path / "a.mcap")[0].profile == "ros1"
+        definition, md5 = ROS1.generate_msgdef(STRING1)
+        assert left[:3] == right[:3] == ("/talk", "ros1", ("std_msgs/String", "ros1msg", definition.encode()))
+        assert left[3].items() >= {"callerid": "/left", "latching": "true", "md5sum": md5}.items()
+        assert right[3].items() >= {"callerid": "/right", "latching": "false", "md5sum": md5}.items()
+        assert (left[4], right[4]) == (40, 20)
+        assert silent[0] == "/silent"
+        assert b"MSG: std_msgs/Header" in silent[2][2]
+        assert silent[4] == 0
+
+    def test_an_empty_bag(self, tmp_path):
+        with Writer1(tmp_path / "a.bag"):
+            pass
+        assert make(tmp_path / "a.bag", tmp_path / "a.mcap").messages == {}
+        assert recorded(tmp_path / "a.mcap") == []
+
+    @pytest.mark.parametrize("compression", [None, "BZ2", "LZ4"])
+    def test_of_a_cut_bag_what_is_complete_is_read(self, tmp_path, compression):
+        whole = tmp_path / "whole.bag"
+        said = bag1(whole, 30, 20_000, compression)
+        data, seen = whole.read_bytes(), set()
+        for share in (0.1, 0.35, 0.5, 0.77, 0.9):
+            cut = tmp_path / f"{share}.bag"
+            cut.write_bytes(data[: int(len(data) * share)])
+            report = make(cut, tmp_path / f"{share}.mcap")
+            there = recorded(tmp_path / f"{share}.mcap")
+            assert there == sorted(said[: len(there)])
+            assert f"{cut} is cut off" in report.lost[0]
+            seen.add(len(there))
+            # Not more than a chunk is lost, and without compression not more than a message.
+            complete = len(said) * share
+            assert len(there) >= complete - (2 if compression is None else 12)
+        assert len(seen) >= 3
+
+    def test_a_recording_that_was_killed_is_read_to_its_end(self, tmp_path):
+        """As the recorder leaves it: no index, and the last chunk says that it has 0 bytes."""
+        said = bag1(tmp_path / "a.bag", 30, 20_000)
+        data = bytearray((tmp_path / "a.bag").read_bytes())
+        with Reader1(tmp_path / "a.bag") as reader:
+            last = max(reader.chunk_infos, key=lambda chunk: chunk.pos).pos
+            size = reader.chunks[last].datasize
+        index = data.index(b"index_pos=") + 10
+        end = struct.unpack("<Q", data[index : index + 8])[0]
+        head = struct.unpack("<I", data[last : last + 4])[0]
+        data[index : index + 8] = bytes(8)
+        data[last + 4 + head : last + 8 + head] = bytes(4)
+        said_size = data.index(b"size=", last) + 5
+        data[said_size : said_size + 4] = bytes(4)
+        assert last + 8 + head + size < end
+        (tmp_path / "a.bag.active").write_bytes(data[: last + 8 + head + size])
+        report = make(tmp_path / "a.bag.active", tmp_path / "b.mcap")
+        assert recorded(tmp_path / "b.mcap") == sorted(said)
+        assert report.lost == []
+        assert "was never closed" in report.notes[0]
+
+    def test_of_a_damaged_chunk_the_others_are_read(self, tmp_path):
+        said = bag1(tmp_path / "a.bag", 60, 20_000, "BZ2")
+        data = bytearray((tmp_path / "a.bag").read_bytes())
+        with Reader1(tmp_path / "a.bag") as reader:
+            position = sorted(reader.chunks)[2]
+            chunk = reader.chunks[position]
+            gone = sum(next(c for c in reader.chunk_infos if c.pos == position).connection_counts.values())
+        data[chunk.datapos : chunk.datapos + 4] = b"...."
+        (tmp_path / "a.bag").write_bytes(data)
+        report = make(tmp_path / "a.bag", tmp_path / "a.mcap")
+        there = recorded(tmp_path / "a.mcap")
+        assert len(there) == len(said) - gone
+        assert set(there) < set(said)
+        assert "can't be decompressed" in report.lost[0]
+        assert sum(int(words.split(": ")[-1].split(" of ")[0]) for words in report.lost[1:]) == gone
+
+    def test_an_index_that_counts_otherwise_is_refused(self, tmp_path):
+        bag1(tmp_path / "a.bag", 5, 100)
+        data = (tmp_path / "a.bag").read_bytes()
+        # The last chunk info ends with pairs of connection and count; one message more than there is.
+        right = data[:-4] + struct.pack("<I", struct.unpack("<I", data[-4:])[0] + 1)
+        (tmp_path / "a.bag").write_bytes(right)
+        with pytest.raises(McaptrackError, match="does not add up: its index counts"):
+            make(tmp_path / "a.bag", tmp_path / "a.mcap")
+        assert not (tmp_path / "a.mcap").exists()
+
+    def test_definitions_in_latin_letters_become_readable(self, tmp_path):
+        with Writer1(tmp_path / "a.bag") as writer:
+            writer.add_connection("/t", "a/msg/B", msgdef="string x # 20 ~~C", md5sum="0" * 32)
+        data = (tmp_path / "a.bag").read_bytes().replace(b"20 ~~C", b"20 \xb0\xb0C")
+        (tmp_path / "a.bag").write_bytes(data)
+        make(tmp_path / "a.bag", tmp_path / "a.mcap")
+        assert channels(tmp_path / "a.mcap")[0][2][2].decode() == "string x # 20 \u00b0\u00b0C"
+
+    @pytest.mark.parametrize(
+        ("data", "words"),
+        [
+            (b"", "is empty"),
+            (b"#ROSBAG V1.2\nwhatever", "of version 1.2; 2.0 is read"),
+            (b"#ROSBAG V2.0\n", "a record is cut off"),
+            (b"#ROSBAG V2.0\n" + b"\xff" * 5000, "a record is cut off, or is none"),
+            (b"hello", "does not begin as one does"),
+        ],
+    )
+    def test_what_is_no_bag_is_refused_in_a_line(self, tmp_path, data, words):
+        (tmp_path / "a.bag").write_bytes(data)
+        with pytest.raises(McaptrackError, match=words):
+            make(tmp_path / "a.bag", tmp_path / "a.mcap")
+        assert not (tmp_path / "a.mcap").exists()
+
+    def test_whatever_is_done_to_a_bag_it_is_read_or_refused(self, tmp_path):
+        said = set(bag1(tmp_path / "a.bag", 12, 500))
+        data = (tmp_path / "a.bag").read_bytes()
+        dice = np.random.default_rng(11)
+        outcomes = Counter()
+        for _ in range(150):
+            broken = bytearray(data)
+            for at in dice.integers(0, len(data), 4):
+                broken[at] = dice.integers(256)
+            (tmp_path / "b.bag").write_bytes(broken)
+            try:
+                report = make(tmp_path / "b.bag", tmp_path / "b.mcap")
+            except McaptrackError as error:
+                assert "\n" not in str(error)
+                outcomes["refused"] += 1
+            else:
+                there = recorded(tmp_path / "b.mcap")
+                assert len(there) == 12 or report.lost
+                outcomes["lost" if report.lost else "whole"] += 1
+                # Times and payloads have no checksum in a bag.
+                assert report.lost or len(set(there) & said) >= len(there) - 4
+        assert min(outcomes[word] for word in ("refused", "lost", "whole")) > 0
+
+
+QOS = [
+    Qos(
+        QosHistory.KEEP_LAST,
+        10,
+        QosReliability.RELIABLE,
+        QosDurability.TRANSIENT_LOCAL,
+        QosTime(1, 2),
+        QosTime(3, 4),
+        QosLiveliness.AUTOMATIC,
+        QosTime(5, 6),
+        False,
+    )
+]
+
+
+def bag2(
+    folder: Path, storage: str = "SQLITE3", compression: str | None = None, version: int = 9, start: int = 0
+) -> list:
+    """A rosbag2 folder; returns what is in it."""
+    writer = Writer2(folder, version=version, storage_plugin=StoragePlugin[storage])
+    if compression:
+        writer.set_compression(CompressionMode[compression], CompressionFormat.ZSTD)
+    out = []
+    with writer:
+        talk = writer.add_connection("/talk", STRING1, typestore=ROS2, offered_qos_profiles=QOS)
+        image = writer.add_connection("/image", "sensor_msgs/msg/CompressedImage", typestore=ROS2)
+        writer.add_connection("/silent", "geometry_msgs/msg/Twist", typestore=ROS2)
+        for number in range(start, start + 40):
+            words = ROS2.types[STRING1](data=f"number {number} " * 50)
+            payload = bytes(ROS2.serialize_cdr(words, STRING1))
+            writer.write((talk, image)[number % 4 == 0], T0 + number, payload)
+            out.append((("/talk", "/image")[number % 4 == 0], T0 + number, T0 + number, payload))
+    return out
+
+
+def database(path: Path, version: int, messages: list[tuple[int, int, bytes]], topics: list[tuple]) -> None:
+    """A database as rosbag2 laid it out in that version of its schema, by hand."""
+    columns = "id INTEGER PRIMARY KEY, name TEXT NOT NULL, type TEXT NOT NULL, serialization_format TEXT NOT NULL"
+    columns += ", offered_qos_profiles TEXT NOT NULL" * (version >= 2)
+    columns += ", type_description_hash TEXT NOT NULL" * (version >= 4)
+    with sqlite3.connect(path) as db:
+        db.execute(f"CREATE TABLE topics({columns})")
+        db.execute("CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, data BLOB)")
+        if version >= 3:
+            db.execute("CREATE TABLE schema(schema_version INTEGER PRIMARY KEY, ros_distro TEXT NOT NULL)")
+            db.execute("INSERT INTO schema VALUES (?, 'humble')", (version,))
+        for topic in topics:
+            db.execute(f"INSERT INTO topics VALUES ({', '.join('?' * len(topic))})", topic)
+        db.executemany("INSERT INTO messages(topic_id, timestamp, data) VALUES (?, ?, ?)", messages)
+    db.close()
+
+
+class TestRosbag2:
+    @pytest.mark.parametrize("version", [8, 9])
+    @pytest.mark.parametrize("storage", ["SQLITE3", "MCAP"])
+    def test_a_folder_is_kept_whole(self, tmp_path, storage, version):
+        said = bag2(tmp_path / "bag", storage, version=version)
+        report = make(tmp_path / "bag", tmp_path / "a.mcap")
+        assert recorded(tmp_path / "a.mcap") == sorted(said)
+        assert report.messages == {"/talk": 30, "/image": 10, "/silent": 0}
+        header, _ = summary(tmp_path / "a.mcap")
+        assert header.profile == "ros2"
+        kept = {
+            topic: (encoding, schema, metadata)
+            for topic, encoding, schema, metadata, _ in channels(tmp_path / "a.mcap")
+        }
+        encoding, schema, _ = kept["/image"]
+        definition = ROS2.generate_msgdef("sensor_msgs/msg/CompressedImage", ros_version=2)[0]
+        assert (encoding, schema[:2]) == ("cdr", ("sensor_msgs/msg/CompressedImage", "ros2msg"))
+        assert schema[2].decode().split() == definition.split()
+        assert "depth: 10" in kept["/talk"][2]["offered_qos_profiles"]
+        if storage == "SQLITE3":
+            assert kept["/talk"][2]["topic_type_hash"] == ROS2.hash_rihs01(STRING1)
+        with (tmp_path / "a.mcap").open("rb") as stream:
+            attached = {a.name: a.data for a in make_reader(stream).iter_attachments()}
+        assert attached == {"metadata.yaml": (tmp_path / "bag" / "metadata.yaml").read_bytes()}
+
+    @pytest.mark.parametrize("mode", ["FILE", "MESSAGE"])
+    def test_compressed_databases(self, tmp_path, mode):
+        said = bag2(tmp_path / "bag", compression=mode)
+        make(tmp_path / "bag", tmp_path / "a.mcap")
+        assert recorded(tmp_path / "a.mcap") == sorted(said)
+        single = next(path for path in (tmp_path / "bag").iterdir() if ".db3" in path.name)
+        make(single, tmp_path / "b.mcap")
+        assert recorded(tmp_path / "b.mcap") == sorted(said)
+        (tmp_path / "bag" / "metadata.yaml").unlink()
+        make(single, tmp_path / "c.mcap")
+        assert recorded(tmp_path / "c.mcap") == sorted(said)
+
+    @pytest.mark.parametrize("with_metadata", [True, False])
+    @pytest.mark.parametrize("storage", ["SQLITE3", "MCAP"])
+    def test_parts_become_one(self, tmp_path, storage, with_metadata):
+        said, names = [], []
+        (tmp_path / "bag").mkdir()
+        for part in range(11):
+            said += bag2(tmp_path / f"part{part}", storage, start=40 * part)
+            suffix = "db3" if storage == "SQLITE3" else "mcap"
+            file = next((tmp_path / f"part{part}").glob(f"*.{suffix}"))
+            names.append(f"bag_{part}.{suffix}")
+            file.rename(tmp_path / "bag" / names[-1])
+        if with_metadata:
+            text = (tmp_path / "part0" / "metadata.yaml").read_text().splitlines()
+            at = next(number for number, line in enumerate(text) if "relative_file_paths" in line)
+            indent = text[at][: len(text[at]) - len(text[at].lstrip())]
+            text[at : at + 2] = [f"{indent}relative_file_paths:", *(f"{indent}  - {name}" for name in names)]
+            (tmp_path / "bag" / "metadata.yaml").write_text("\n".join(text) + "\n")
+        report = make(tmp_path / "bag", tmp_path / "a.mcap")
+        assert recorded(tmp_path / "a.mcap") == sorted(said)
+        assert [(topic, count) for topic, *_, count in channels(tmp_path / "a.mcap")] == [
+            ("/talk", 330),
+            ("/image", 110),
+            ("/silent", 0),
+        ]
+        assert report.lost == []
+        (tmp_path / "bag" / names[5]).unlink()
+        if with_metadata:
+            with pytest.raises(McaptrackError, match=f"names .*{names[5]}, which does not exist"):
+                make(tmp_path / "bag", tmp_path / "b.mcap")
+
+    @pytest.mark.parametrize("version", [1, 2, 3, 4])
+    def test_databases_without_definitions_get_those_of_their_distribution(self, tmp_path, version):
+        extra = [("qos",), ("qos",), ("qos",), ("qos", "")][version - 1] if version >= 2 else ()
+        types = [STRING1, "sensor_msgs/msg/Image", "robot_msgs/msg/Secret", STRING1]
+        topics = [(n + 1, name, kind, "cdr", *extra) for n, (name, kind) in enumerate(zip("abca", types, strict=True))]
+        messages = [(1 + number % 4, T0 + number, b"\0\1\0\0" + bytes([number])) for number in range(9)]
+        database(tmp_path / "a.db3", version, messages, topics)
+        report = make(tmp_path / "a.db3", tmp_path / "a.mcap")
+        assert recorded(tmp_path / "a.mcap") == sorted(("abca"[key - 1], t, t, data) for key, t, data in messages)
+        found = channels(tmp_path / "a.mcap")
+        assert [(channel[0], channel[2][0], channel[4]) for channel in found] == [
+            ("a", STRING1, 3),
+            ("b", types[1], 2),
+            ("c", types[2], 2),
+            ("a", STRING1, 2),
+        ]
+        assert found[1][2][1] == "ros2msg"
+        assert b"MSG: std_msgs/Header" in found[1][2][2]
+        assert found[2][2] == ("robot_msgs/msg/Secret", "", b"")
+        assert found[0][3]["offered_qos_profiles"] == ("qos" if version >= 2 else "")
+        words = " ".join(report.notes)
+        assert "does not say what sensor_msgs/msg/Image is; its definition is that of ROS 2" in words
+        assert ("Humble" in words) == (version >= 3)
+        assert "robot_msgs/msg/Secret is; nobody here knows its definition" in words
+
+    def test_definitions_are_kept_as_they_are(self, tmp_path):
+        idl = "=" * 80 + "\nIDL: robot_msgs/msg/Secret\nmodule robot_msgs {};"
+        database(tmp_path / "a.db3", 4, [], [(1, "/s", "robot_msgs/msg/Secret", "cdr", "", "")])
+        with sqlite3.connect(tmp_path / "a.db3") as db:
+            db.execute(
+                "CREATE TABLE message_definitions(id INTEGER PRIMARY KEY, topic_type TEXT, encoding TEXT,"
+                " encoded_message_definition TEXT, type_description_hash TEXT)"
+            )
+            db.execute(
+                "INSERT INTO message_definitions VALUES (1, 'robot_msgs/msg/Secret', 'ros2idl', ?, 'RIHS01_x')", (idl,)
+            )
+        db.close()
+        make(tmp_path / "a.db3", tmp_path / "a.mcap")
+        ((_, _, schema, metadata, count),) = channels(tmp_path / "a.mcap")
+        assert schema == ("robot_msgs/msg/Secret", "ros2idl", idl.encode())
+        assert metadata["topic_type_hash"] == "RIHS01_x"
+        assert count == 0
+
+    def test_a_definition_of_another_hash_is_not_taken(self, tmp_path):
+        topics = [(1, "/a", STRING1, "cdr", "", "RIHS01_" + "0" * 64)]
+        topics.append((2, "/b", "sensor_msgs/msg/Image", "cdr", "", ROS2.hash_rihs01("sensor_msgs/msg/Image")))
+        database(tmp_path / "a.db3", 4, [], topics)
+        make(tmp_path / "a.db3", tmp_path / "a.mcap")
+        first, second = channels(tmp_path / "a.mcap")
+        assert first[2] == (STRING1, "", b"")
+        assert second[2][1] == "ros2msg"
+
+    def test_what_a_killed_recorder_left_beside_its_database_is_read(self, tmp_path):
+        database(tmp_path / "a.db3", 3, [], [(1, "/a", STRING1, "cdr", "")])
+        db = sqlite3.connect(tmp_path / "a.db3", isolation_level=None)
+        db.execute("PRAGMA journal_mode=WAL")
+        db.execute("PRAGMA wal_autocheckpoint=0")
+        db.execute("INSERT INTO messages(topic_id, timestamp, data) VALUES (1, 5, x'00010000')")
+        (tmp_path / "left").mkdir()
+        for name in ("a.db3", "a.db3-wal"):
+            (tmp_path / "left" / name).write_bytes((tmp_path / name).read_bytes())
+        db.close()
+        make(tmp_path / "left" / "a.db3", tmp_path / "a.mcap")
+        assert recorded(tmp_path / "a.mcap") == [("/a", 5, 5, b"\0\1\0\0")]
+
+    def test_messages_of_no_topic_are_missed(self, tmp_path):
+        database(tmp_path / "a.db3", 3, [(1, 5, b"a"), (7, 6, b"b")], [(1, "/a", STRING1, "cdr", "")])
+        report = make(tmp_path / "a.db3", tmp_path / "a.mcap")
+        assert recorded(tmp_path / "a.mcap") == [("/a", 5, 5, b"a")]
+        assert "1 messages of topic 7, which is not described" in report.lost[0]
+
+    def test_messages_that_metadata_counts_and_nobody_finds_are_missed(self, tmp_path):
+        bag2(tmp_path / "bag")
+        text = (tmp_path / "bag" / "metadata.yaml").read_text()
+        (tmp_path / "bag" / "metadata.yaml").write_text(text.replace("message_count: 30", "message_count: 33"))
+        report = make(tmp_path / "bag", tmp_path / "a.mcap")
+        assert report.lost == [f"{tmp_path / 'bag'}: metadata.yaml counts 33 messages of /talk, and 30 are there"]
+
+    def test_faults_are_lines(self, tmp_path):
+        faults = {
+            "a.db3": b"SQLite format 3\0" + bytes(500),
+            "b.db3": b"x",
+            "c.mcap": b"\x89MCAP0\r\nxx",
+            "d.mcap": b"",
+        }
+        for name, data in faults.items():
+            (tmp_path / name).write_bytes(data)
+            with pytest.raises(McaptrackError, match=rf"{name} (is|can't)[^\n]*$"):
+                make(tmp_path / name, tmp_path / "out.mcap")
+        sqlite3.connect(tmp_path / "e.db3").execute("CREATE TABLE cats(name)").connection.close()
+        with pytest.raises(McaptrackError, match="is a database, but none of rosbag2"):
+            make(tmp_path / "e.db3", tmp_path / "out.mcap")
+        (tmp_path / "f").mkdir()
+        (tmp_path / "f" / "metadata.yaml").write_text("rosbag2_bagfile_information: [1, 2]")
+        with pytest.raises(McaptrackError, match=r"metadata\.yaml is no metadata of a rosbag2 bag"):
+            make(tmp_path / "f", tmp_path / "out.mcap")
+        (tmp_path / "g").mkdir()
+        for name in ("one.mcap", "two.mcap"):
+            (tmp_path / "g" / name).write_bytes(b"")
+        with pytest.raises(McaptrackError, match=r"has no metadata\.yaml, and its 2 logs are no parts of one"):
+            make(tmp_path / "g", tmp_path / "out.mcap")
+        assert not (tmp_path / "out.mcap").exists()
+
+
+def picture(number: int) -> bytes:
+    """A JPEG of 64 x 48 pixels on which a bright box moves."""
+    image = np.full((48, 64), 40, np.uint8)
+    image[20:36, 2 + number : 12 + number] = 220
+    return cv2.imencode(".jpg", image)[1].tobytes()
+
+
+def camera_bag(path: Path, *topics: str, frames: int = 30) -> list[int]:
+    """A ROS 1 bag with pictures; returns their times."""
+    kind, header, time = (
+        ROS1.types[f"{name}"]
+        for name in ("sensor_msgs/msg/CompressedImage", "std_msgs/msg/Header", "builtin_interfaces/msg/Time")
+    )
+    with Writer1(path) as writer:
+        known = [writer.add_connection(topic, kind.__msgtype__, typestore=ROS1) for topic in topics]
+        for number in range(frames):
+            for connection in known:
+                stamp = time(sec=1000 + number // 10, nanosec=number % 10 * 100_000_000)
+                data = np.frombuffer(picture(number), np.uint8)
+                message = kind(header=header(seq=number, stamp=stamp, frame_id="cam"), format="jpeg", data=data)
+                payload = ROS1.serialize_ros1(message, kind.__msgtype__)
+                writer.write(connection, T0 + number * 100_000_000, bytes(payload))
+    return [T0 + number * 100_000_000 for number in range(frames)]
+
+
+MOT = "".join(f"{frame},7,{1 + frame},20,10,16,1,-1,-1,-1\n" for frame in range(1, 21))
+PLANE = "0.1 0 0\n0 0.1 0\n0 0 1\n"
+
+
+class TestBesideLabels:
+    @pytest.fixture
+    def files(self, tmp_path) -> dict[str, Path]:
+        (tmp_path / "gt.txt").write_text(MOT)
+        (tmp_path / "plane.txt").write_text(PLANE)
+        return {"labels": {"truth": tmp_path / "gt.txt"}, "ground_plane": tmp_path / "plane.txt"}
+
+    def test_labels_have_the_times_of_pictures(self, tmp_path, files):
+        """Of a bag, of the log made of it, and of the bag added to another log: the same."""
+        times = camera_bag(tmp_path / "a.bag", "/robot/front/image/compressed")
+        make(tmp_path / "a.bag", tmp_path / "a.mcap", **files)
+        make(tmp_path / "a.bag", tmp_path / "plain.mcap")
+        make(tmp_path / "plain.mcap", tmp_path / "b.mcap", **files)
+        with log.create(tmp_path / "c.mcap"):
+            pass
+        with log.read(tmp_path / "c.mcap") as opened:
+            ingest(tmp_path / "a.bag", tmp_path / "c.mcap", IngestOptions(**files), into=opened)
+        for name in ("a.mcap", "b.mcap", "c.mcap"):
+            with log.read(tmp_path / name) as opened:
+                frames = opened.frames("/robot/front/image/truth", TRACKS)
+                assert [frame.t_ns for frame in frames] == times
+                assert [frame.rows["x_px"].tolist() for frame in frames] == [[2 + n] for n in range(20)] + [[]] * 10
+                assert frames[0].rows["x_m"].tolist() == pytest.approx([0.7])
+                (plane,) = opened.frames("/robot/front/image/ground_plane", GROUND_PLANE)
+                plane = rows_to_plane(plane.rows)
+                assert (plane.width_px, plane.height_px) == (64, 48)
+                assert opened.channel("/robot/front/image/compressed").messages == 30
+
+    def test_run_finds_people_in_the_pictures_of_a_bag(self, tmp_path, files):
+        camera_bag(tmp_path / "a.bag", "/robot/image")
+        make(tmp_path / "a.bag", tmp_path / "a.mcap", **files)
+        result = CliRunner().invoke(app, ["run", str(tmp_path / "a.mcap"), "-q"])
+        assert result.exit_code == 0, result.output
+        with log.read(tmp_path / "a.mcap") as opened:
+            assert opened.channel("/robot/detections").messages == 30
+            assert opened.channel("/robot/truth").messages == 30
+
+    def test_of_several_cameras_one_is_chosen(self, tmp_path, files):
+        camera_bag(tmp_path / "a.bag", "/left/image", "/right/image")
+        with pytest.raises(McaptrackError, match=r"the log has /left/image, /right/image. Choose one with --camera"):
+            make(tmp_path / "a.bag", tmp_path / "a.mcap", **files)
+        assert not (tmp_path / "a.mcap").exists()
+        assert make(tmp_path / "a.bag", tmp_path / "a.mcap", camera="right", **files).messages["/right/truth"] == 30
+
+    def test_without_pictures_there_is_nothing_to_label(self, tmp_path, files):
+        bag1(tmp_path / "a.bag", 5, 100)
+        with pytest.raises(McaptrackError, match="the log has none"):
+            make(tmp_path / "a.bag", tmp_path / "a.mcap", **files)
+
+
+class TestInto:
+    def test_a_bag_is_added_to_a_log_and_to_no_log_twice(self, tmp_path):
+        said = bag1(tmp_path / "a.bag", 10, 100)
+        other = bag2(tmp_path / "bag")
+        make(tmp_path / "bag", tmp_path / "a.mcap")
+        words = ["ingest", str(tmp_path / "a.bag"), "--into", str(tmp_path / "a.mcap")]
+        result = CliRunner().invoke(app, words)
+        assert result.exit_code == 1
+        assert "has /silent, /talk already; --force replaces them" in result.stderr
+        assert CliRunner().invoke(app, [*words, "--force"]).exit_code == 0
+        kept = [message for message in other if message[0] == "/image"]
+        assert recorded(tmp_path / "a.mcap") == sorted(said + kept)
+
+    @pytest.mark.parametrize("chunks", [True, False])
+    def test_an_mcap_file_is_added_with_all_that_is_in_it(self, tmp_path, chunks):
+        with (tmp_path / "a.mcap").open("wb") as stream:
+            writer = McapWriter(stream, compression=CompressionType.LZ4, use_chunking=chunks)
+            writer.start()
+            channel = writer.register_channel("/a", "json", 0, {"k": "v"})
+            for number in range(5):
+                writer.add_message(channel, 10 + number, b"{}", 3, sequence=90 + number)
+            writer.add_metadata("m", {"a": "b"})
+            writer.add_attachment(1, 2, "file", "text/plain", b"hello")
+            writer.finish()
+        bag2(tmp_path / "bag")
+        make(tmp_path / "bag", tmp_path / "b.mcap")
+        with log.read(tmp_path / "b.mcap") as opened:
+            report = ingest(tmp_path / "a.mcap", tmp_path / "b.mcap", IngestOptions(), into=opened)
+        assert report.messages == {"/a": 5}
+        with (tmp_path / "b.mcap").open("rb") as stream:
+            reader = make_reader(stream)
+            found = [
+                (m.log_time, m.publish_time, m.sequence, c.metadata) for _, c, m in reader.iter_messages(topics=["/a"])
+            ]
+            assert found == [(10 + number, 3, 90 + number, {"k": "v"}) for number in range(5)]
+            assert ("m", {"a": "b"}) in [(m.name, m.metadata) for m in reader.iter_metadata()]
+            assert (1, 2, "file", b"hello") in [
+                (a.create_time, a.log_time, a.name, a.data) for a in reader.iter_attachments()
+            ]
+        with log.read(tmp_path / "b.mcap") as opened, pytest.raises(McaptrackError, match="can't be added to itself"):
+            ingest(tmp_path / "b.mcap", tmp_path / "x.mcap", IngestOptions(), into=opened)
+
+
+@pytest.mark.parametrize(
+    ("option", "value"), [("--fps", "10"), ("--start-time", "5"), ("--image-format", "png"), ("--as", "truth")]
+)
+def test_what_makes_no_sense_for_a_log_is_refused_in_a_line(tmp_path, option, value):
+    bag1(tmp_path / "a.bag", 5, 100)
+    result = CliRunner().invoke(app, ["ingest", str(tmp_path / "a.bag"), "-o", str(tmp_path / "a.mcap"), option, value])
+    assert result.exit_code == 1
+    assert f"leave {option} out" in result.stderr
+    assert result.stderr.count("\n") == 1
+    assert not (tmp_path / "a.mcap").exists()
+
+
+def test_a_cut_bag_exits_with_3(tmp_path):
+    bag1(tmp_path / "a.bag", 10, 1000)
+    data = (tmp_path / "a.bag").read_bytes()
+    (tmp_path / "a.bag").write_bytes(data[:-300])
+    result = CliRunner().invoke(app, ["ingest", str(tmp_path / "a.bag"), "-o", str(tmp_path / "a.mcap")])
+    assert result.exit_code == 3
+    assert "lost: " in result.stderr
+
+
+def test_real_recordings_are_kept_whole(data, tmp_path):
+    """Every message of every recording there is, by rosbags and by the stock reader."""
+    seen = 0
+    for path in sorted((data / "mcap").glob("*/*")):
+        out = tmp_path / (path.name + ".out.mcap")
+        if path.suffix == ".bag":
+            with AnyReader([path]) as reader:
+                said = sorted((c.topic, t, t, bytes(raw)) for c, t, raw in reader.messages())
+        elif path.suffix == ".db3":
+            db = sqlite3.connect(f"file:{path}?immutable=1", uri=True)
+            query = "SELECT name, timestamp, timestamp, data FROM messages JOIN topics ON topics.id = topic_id"
+            said = sorted(db.execute(query))
+            db.close()
+        elif path.suffix == ".mcap":
+            said = recorded(path)
+        else:
+            continue
+        report = make(path, out)
+        assert recorded(out) == said
+        assert sum(report.messages.values()) == len(said)
+        assert report.lost == []
+        seen += 1
+    assert seen >= 10
