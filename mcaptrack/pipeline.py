@@ -6,6 +6,7 @@ made first; what was made from a channel that has changed since is made again, w
 
 from __future__ import annotations
 
+import heapq
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
@@ -28,6 +29,8 @@ from mcaptrack.video import Encoded, brightness
 Ints = NDArray[np.int64]
 Progress = Callable[[str, int, int], None]
 Say = Callable[[str], None]
+#: Log time, number of the channel, sequence and payload of a message.
+Numbered = tuple[int, int, int, bytes]
 
 DEFAULT_CAMERA: Final = "camera"
 
@@ -470,14 +473,15 @@ def _write(
         known = Provenance.from_metadata(opened.channel(truth).metadata)
         shown[truth] = (TRACKS, opened.frames(truth, TRACKS), known.digest if known else "")
     outdated = {topic + views.SUFFIX for topic in made}
+    streams: list[Iterator[Numbered]] = []
     with log.extend(opened, output, drop={*made, *outdated}, drop_attachments=[LAYOUT]) as writer:
         for topic, channel in made.items():
             record = (channel.schema.name, "protobuf", channel.schema.descriptor)
             made_by = channel.provenance.transform  # results of one stage share chunks, so that they can go together
             number = writer.add_channel(topic, record, "protobuf", channel.provenance.to_metadata(), group=made_by)
-            for message in channel.messages:
-                writer.add_message(number, *message)
+            streams.append(_with_number(number, channel.messages))
         if video is None or not len(picture_ns):
+            _write_by_time(writer, streams)
             return None
         topics = [topic for topic in opened.channels if topic.endswith(views.SUFFIX) and topic not in outdated]
         for topic, (schema, frames, made_from) in shown.items():
@@ -487,12 +491,23 @@ def _write(
             record = foxglove.schema_record(foxglove.ANNOTATIONS)
             made_by = made[topic].provenance.transform if topic in made else ""
             number = writer.add_channel(topic + views.SUFFIX, record, "protobuf", metadata, group=made_by)
-            for message in views.view(topic, schema, frames, picture_ns, planes, stamp_ns):
-                writer.add_message(number, *message)
+            view = views.view(topic, schema, frames, picture_ns, planes, stamp_ns)
+            streams.append(_with_number(number, view))
             topics.append(topic + views.SUFFIX)
+        _write_by_time(writer, streams)
         layout_file = layout(prefix, topics, video)
         writer.add_attachment(LAYOUT, "application/json", layout_file)
     return layout_file
+
+
+def _with_number(number: int, messages: Iterable[tuple[int, int, bytes]]) -> Iterator[Numbered]:
+    return ((t_ns, number, sequence, data) for t_ns, sequence, data in messages)
+
+
+def _write_by_time(writer: log.LogWriter, streams: Iterable[Iterator[Numbered]]) -> None:
+    """Messages of several channels, each by time, all together by time: so that those shown together stand together."""
+    for t_ns, number, sequence, data in heapq.merge(*streams, key=lambda message: message[0]):
+        writer.add_message(number, t_ns, sequence, data)
 
 
 #: Channels without a view: they show what others show, at fewer times.

@@ -36,6 +36,9 @@ Output = Annotated[
     Path | None, option("--output", "-o", shared=True, help="Write to this instead; the input stays as it is.")
 ]
 Printed = Annotated[Path | None, option("--output", "-o", shared=True, help="Print to this file.")]
+Sidecar = Annotated[
+    bool, option("--sidecar", shared=True, help="Write results to LOG.results.mcap, from now on; LOG stays as it is.")
+]
 Force = Annotated[bool, option("--force", shared=True, help="Replace what is there.")]
 Json = Annotated[bool, option("--json", shared=True, help="Print data for programs.")]
 Quiet = Annotated[bool, option("--quiet", "-q", shared=True, help="Say nothing but errors.")]

@@ -160,7 +160,7 @@ def drop(
         if output.exists() and path.exists() and output.samefile(path):
             raise McaptrackError(f"{path} is both input and output; leave -o out to change it in place")
     with common.Talk(quiet, verbose).open() as talk:
-        with log.read(path) as opened:
+        with log.read(path, sidecar=False) as opened:
             dropped = _chosen(opened, topics)
             gone = [channel.id for channel in opened.index.channels.values() if channel.topic in dropped]
             messages = sum(opened.index.counts.get(number, 0) for number in gone)

@@ -70,8 +70,9 @@ def _as_data(opened: Log) -> dict[str, Any]:
         "bytes": opened.path.stat().st_size,
         "start_ns": opened.start_ns,
         "end_ns": opened.end_ns,
-        "messages": sum(opened.index.counts.values()),
-        "attachments": [listed.name for listed in opened.index.attachments],
+        "results": str(opened.results.path) if opened.results else None,
+        "messages": sum(sum(part.index.counts.values()) for part in opened.parts),
+        "attachments": [listed.name for part in opened.parts for listed in part.index.attachments],
         "channels": channels,
     }
 
@@ -86,6 +87,8 @@ def _print(opened: Log, verbose: bool) -> None:
     seconds = (data["end_ns"] - data["start_ns"]) / 1e9
     name = escape(common.printable(data["log"]))
     console.print(f"[bold]{name}[/bold]  {data['bytes']:,} bytes, {data['messages']:,} messages, {seconds:.3f} s")
+    if data["results"]:
+        console.print(f"with results in {escape(common.printable(data['results']))}")
     table = Table(box=None, pad_edge=False)
     for column in ("topic", "schema", "messages"):
         table.add_column(column, justify="right" if column == "messages" else "left", overflow="fold")

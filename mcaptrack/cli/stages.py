@@ -83,6 +83,7 @@ def _stage_command(name: str, kind: type[Transform]) -> Callable[..., None]:
         _parameter("to", Annotated[str | None, to], None),
         _parameter("camera", common.Camera, None),
         _parameter("output", common.Output, None),
+        _parameter("sidecar", common.Sidecar, False),
         _parameter("force", common.Force, False),
         _parameter("json", common.Json, False),
         _parameter("quiet", common.Quiet, False),
@@ -108,6 +109,7 @@ def run_all(
     topic: Topic = None,
     camera: common.Camera = None,
     output: common.Output = None,
+    sidecar: common.Sidecar = False,
     tables: Annotated[bool, common.option("--tables/--no-tables", help="Write Parquet tables beside the log.")] = True,
     force: common.Force = False,
     json: common.Json = False,
@@ -122,8 +124,8 @@ def run_all(
 
     Example: mcaptrack run log.mcap
     """
-    given = {"logs": logs, "camera": camera, "output": output, "topic": topic, "force": force, "json": json}
-    _run_on_logs(given | {"quiet": quiet, "verbose": verbose}, lambda plan: plan.all(topic), tables)
+    given = {"logs": logs, "camera": camera, "output": output, "sidecar": sidecar, "topic": topic, "force": force}
+    _run_on_logs(given | {"json": json, "quiet": quiet, "verbose": verbose}, lambda plan: plan.all(topic), tables)
 
 
 class _Plan:
@@ -153,6 +155,8 @@ def _run_on_logs(given: Mapping[str, Any], make_plan: Callable[[_Plan], Any], ta
     paths = common.expand(given["logs"])
     output: Path | None = given["output"]
     common.only_one_output(paths, output)
+    if output and given["sidecar"]:
+        raise McaptrackError("--sidecar and -o are two places for the same results; give one of them")
     reports = []
     with common.Talk(given["quiet"], given["verbose"]).open() as talk:
         for path in paths:
@@ -161,7 +165,7 @@ def _run_on_logs(given: Mapping[str, Any], make_plan: Callable[[_Plan], Any], ta
                 if output.exists() and path.exists() and output.samefile(path):
                     raise McaptrackError(f"{path} is both input and output; leave -o out to add to it in place")
                 refuse_overwrite(output, given["force"])
-            with log.read(path) as opened:
+            with log.read(path, sidecar=given["sidecar"] or None) as opened:
                 if output is None:
                     opened.lock()  # a second writer is turned away before it computes anything
                 prefix = pipeline.find_camera(opened, given["camera"], given["topic"])

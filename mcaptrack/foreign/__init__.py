@@ -115,7 +115,8 @@ def detections(opened: log.Log, topic: str) -> list[Frame]:
 
 def _decoded(opened: log.Log, topic: str, make: Callable[[Kind], Callable[[bytes], Any]]) -> Iterator[tuple[Any, Any]]:
     channel = opened.channel(topic)
-    schema = opened.index.schemas.get(opened.index.channels[channel.id].schema_id)
+    index = opened.part(channel.topic).index
+    schema = index.schemas.get(index.channels[channel.id].schema_id)
     words = (schema.name, schema.encoding, bytes(schema.data)) if schema else ("", "", b"")
     try:
         decode = make(Kind(*words, channel.message_encoding))

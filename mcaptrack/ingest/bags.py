@@ -104,10 +104,11 @@ class LogJob(PictureJob):
     def check(self, output: Path) -> None:
         """Every channel has the messages that were given to it."""
         with log.read(output) as done:
+            index = done.parts[-1].index
             for number, count in self._written.items():
-                there = done.index.counts.get(number, 0)
+                there = index.counts.get(number, 0)
                 if there != count:
-                    topic = done.index.channels[number].topic if number in done.index.channels else "a channel"
+                    topic = index.channels[number].topic if number in index.channels else "a channel"
                     raise McaptrackError(
                         f"{output} is not complete: {there} messages of {topic} where {self.source} has {count}"
                     )

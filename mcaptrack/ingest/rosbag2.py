@@ -304,7 +304,7 @@ class Logs(_Files):
             log.pass_on_extras(opened, writer, without=[CLOCK] if has_clock else [])
 
     def _open(self, number: int) -> None:
-        opened = self.closing.enter_context(log.read(self.paths[number]))
+        opened = self.closing.enter_context(log.read(self.paths[number], sidecar=False))
         self.logs.append(opened)
         known: dict[int, Connection] = {}
         twins: dict[object, int] = {}

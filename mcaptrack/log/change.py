@@ -23,7 +23,7 @@ from mcaptrack.log.index import Index
 from mcaptrack.log.journal import new_end
 from mcaptrack.log.reader import Log
 from mcaptrack.log.records import BLOCK, MAGIC, ChunkIndexRecord, Damaged, Record, walk
-from mcaptrack.log.writer import LogWriter, Sink, verify
+from mcaptrack.log.writer import LogWriter, Sink, refuse_earlier_results, verify
 
 
 @contextmanager
@@ -37,9 +37,14 @@ def extend(
 ) -> Iterator[LogWriter]:
     """The log with channels added and these topics, metadata and attachments left out, there once the block ends well.
 
-    ``output`` is another file to write it to; the log itself stays as it is then. Raises McaptrackError if the log is
-    damaged, can't be written to, or is being written to by another process.
+    ``output`` is another file to write it to; the log itself stays as it is then. Where results stand in a log beside
+    it, that is extended instead. Raises McaptrackError if the log is damaged, can't be written to, or is being written
+    to by another process.
     """
+    if log.results is not None:
+        if output is not None:
+            raise McaptrackError(f"{log.path} has its results in {log.results.path}; they can't also go to {output}")
+        log = log.results
     if output is None:
         log.lock()
     try:
@@ -72,6 +77,8 @@ def _in_place(log: Log, change: _Change) -> Iterator[LogWriter]:
 @contextmanager
 def _as_copy(log: Log, change: _Change, output: Path | None) -> Iterator[LogWriter]:
     """Beside its final name, which it takes when it is complete, checked and on the disk."""
+    if output is not None:
+        refuse_earlier_results(output)
     with publish_stream(output or log.real_path) as stream:
         if change.cut > len(MAGIC):
             _pass_on(log.buffer, change.cut, stream)

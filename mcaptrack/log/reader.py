@@ -18,6 +18,7 @@ from mcaptrack.log import journal, records
 from mcaptrack.log.index import Index, read_index
 from mcaptrack.log.messages import Columns, Message, Messages
 from mcaptrack.log.records import Damaged
+from mcaptrack.log.writer import RESULTS, create, results_of
 from mcaptrack.schema import Frame, Schema
 
 Ints = NDArray[np.int64]
@@ -37,10 +38,11 @@ class Channel(NamedTuple):
 class Log:
     """An MCAP file, open for reading. A context manager.
 
-    Channels are found by topic; where several channels share one, the first that has messages counts.
+    Channels are found by topic; where several channels share one, the first that has messages counts. With ``results``,
+    another log beside it, channels of both are there, those of the results first; what is added goes to the results.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, results: Log | None = None) -> None:
         self.path = path
         self.real_path = path.resolve()
         self._lock: int | None = None
@@ -61,6 +63,8 @@ class Log:
         except Damaged as error:
             self._file.close()
             raise McaptrackError(f"{path} can't be read as an MCAP file: {error}; {_recover(path)}") from None
+        self.results = results
+        self.is_new = False  # made a moment ago, and to be removed if nothing comes into it
         self.channels: dict[str, Channel] = {}
         for record in self.index.channels.values():
             schema = self.index.schemas.get(record.schema_id)
@@ -70,6 +74,8 @@ class Log:
             )
             if record.topic not in self.channels or (count and not self.channels[record.topic].messages):
                 self.channels[record.topic] = channel
+        if results is not None:
+            self.channels |= results.channels
 
     def __enter__(self) -> Self:
         return self
@@ -79,18 +85,28 @@ class Log:
             os.close(self._lock)
             self._lock = None
         self._file.close()
+        if self.results is not None:
+            self.results.__exit__()
+            if self.results.is_new:
+                with Log(self.results.path) as left:
+                    is_empty = not left.channels
+                if is_empty:
+                    self.results.path.unlink()
 
     def lock(self) -> int:
         """Be the only one to write to this log until it is closed; returns a handle to write with.
 
         Raises McaptrackError if somebody else is, or if nobody may.
         """
+        if self.results is not None:
+            return self.results.lock()
         if self._lock is None:
             try:
                 handle = os.open(self.real_path, os.O_RDWR)
             except OSError as error:
                 raise McaptrackError(
-                    f"{self.path} can't be written to: {error.strerror}; write to another file with -o"
+                    f"{self.path} can't be written to: {error.strerror}; "
+                    "write to another file with -o, or beside it with --sidecar"
                 ) from None
             try:
                 journal.lock(self.real_path, handle)
@@ -110,14 +126,23 @@ class Log:
         return self._buffer
 
     @property
+    def parts(self) -> tuple[Log, ...]:
+        """The log, and its results if they stand in another."""
+        return (self,) if self.results is None else (self, self.results)
+
+    def part(self, topic: str) -> Log:
+        """The part that holds the channel of that topic."""
+        return self.results if self.results is not None and topic in self.results.channels else self
+
+    @property
     def start_ns(self) -> int:
         """The time of the first message."""
-        return self.index.start_ns
+        return min((part.index.start_ns for part in self.parts if part.index.counts), default=0)
 
     @property
     def end_ns(self) -> int:
         """The time of the last message."""
-        return self.index.end_ns
+        return max(part.index.end_ns for part in self.parts)
 
     def channel(self, topic: str) -> Channel:
         """The channel of that topic. Raises McaptrackError, with what there is, if there is none."""
@@ -131,6 +156,8 @@ class Log:
 
     def metadata(self, name: str) -> dict[str, str] | None:
         """The last metadata record of that name."""
+        if self.results is not None and (of_results := self.results.metadata(name)) is not None:
+            return of_results
         found = [listed.offset for listed in self.index.metadata if listed.name == name]
         if not found:
             return None
@@ -142,6 +169,9 @@ class Log:
 
         Chunks outside of that span are not touched. Raises McaptrackError where the file is damaged.
         """
+        if (part := self.part(topic)) is not self:
+            yield from part.messages(topic, start_ns, end_ns)
+            return
         channel = self.channel(topic)
         with self._mending():
             yield from self._messages.by_time(channel.id, (start_ns, end_ns))
@@ -158,6 +188,8 @@ class Log:
 
     def rows(self, topic: str, schema: Schema) -> Columns:
         """All rows of a channel as one array. Raises McaptrackError if the channel holds something else."""
+        if (part := self.part(topic)) is not self:
+            return part.rows(topic, schema)
         channel = self.channel(topic)
         if channel.schema_name != schema.name or channel.message_encoding != "protobuf":
             raise McaptrackError(f"{self.path}: {topic} holds {channel.schema_name or 'no schema'}, not {schema.name}")
@@ -182,6 +214,8 @@ class Log:
 
     def times(self, topic: str) -> Ints:
         """The times of a channel's messages, rising, without reading them."""
+        if (part := self.part(topic)) is not self:
+            return part.times(topic)
         channel = self.channel(topic)
         with self._mending():
             return self._messages.times(channel.id)
@@ -199,9 +233,23 @@ def _recover(path: Path) -> str:
     return f"`mcaptrack recover {path}` saves what is whole"
 
 
-def read(path: Path) -> Log:
-    """Open a log. Raises McaptrackError, in one line, if it is none or is damaged."""
-    return Log(path)
+def read(path: Path, *, sidecar: bool | None = None) -> Log:
+    """Open a log, with its results if they stand beside it; with ``sidecar`` they do from now on, without it never.
+
+    Raises McaptrackError, in one line, if it is none or is damaged.
+    """
+    beside = results_of(path)
+    if path.name.endswith(RESULTS) or sidecar is False or not (sidecar or beside.exists()):
+        return Log(path)
+    if not path.exists():
+        return Log(path)  # which says so
+    is_new = not beside.exists()
+    if is_new:
+        with create(beside):
+            pass
+    results = Log(beside)
+    results.is_new = is_new
+    return Log(path, results)
 
 
 def topics_with_schema(log: Log, names: Sequence[str]) -> list[Channel]:

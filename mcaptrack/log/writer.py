@@ -27,6 +27,9 @@ from mcaptrack.log.chunks import MAX_NS, forget
 from mcaptrack.log.index import Index, Listed, list_attachment, list_metadata, read_index
 from mcaptrack.log.records import BLOCK, MAGIC, ChannelRecord, ChunkIndexRecord, SchemaRecord
 
+#: How the name of a log ends that holds the results of another.
+RESULTS: Final = ".results.mcap"
+
 Kind = Literal["media", "rows"]
 
 _CHUNK_BYTES: Final[Mapping[Kind, int]] = {"media": 4 * 2**20, "rows": 2**20}
@@ -306,9 +309,25 @@ def _free_id(taken: Mapping[int, object], first: int, what: str) -> int:
     return free
 
 
+def results_of(path: Path) -> Path:
+    """Where the results of a log stand if they are not in it."""
+    return path.with_name(path.name.removesuffix(".mcap") + RESULTS)
+
+
+def refuse_earlier_results(path: Path) -> None:
+    """Raise McaptrackError if a new log at ``path`` would be read with results that were made from another."""
+    beside = results_of(path)
+    if not path.name.endswith(RESULTS) and beside.exists():
+        raise McaptrackError(
+            f"{beside} holds results of an earlier {path.name} and would be read with the new one; remove it first, or "
+            "choose another name"
+        )
+
+
 @contextmanager
 def create(path: Path, profile: str = "", *, header: bytes | None = None) -> Iterator[LogWriter]:
     """A new log at ``path``, there once the block has ended well. ``header`` is the header record of another."""
+    refuse_earlier_results(path)
     with publish_stream(path) as stream:
         writer = LogWriter(stream)
         writer.header(profile, header)
