@@ -1,4 +1,4 @@
-"""The main job on real footage, where it is at hand (see ``data`` in conftest.py): a public square, filmed in 2009."""
+"""Real footage and other people's logs, where they are at hand (see ``data`` in conftest.py)."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import json
 
 import pytest
 
+from mcaptrack import log
+from mcaptrack.log import records
 from tests.test_cli import done
 
 
@@ -29,3 +31,83 @@ def test_retracking_keeps_more_identities_and_takes_switches_away(scores):
     sort, retracked = (scores[name, "metres", 1.0] for name in ("samples", "retracks"))
     assert retracked["IDF1"] >= sort["IDF1"] + 0.05
     assert retracked["IDSW"] <= sort["IDSW"] * 5 / 6
+
+
+def _fields(records: list[dict], kind: str) -> list[dict]:
+    return [dict(record["fields"]) for record in records if record["type"] == kind]
+
+
+def _data(value: list[str]) -> bytes:
+    return bytes(map(int, value))
+
+
+def test_every_file_of_the_conformance_suite_holds_what_is_written_beside_it(data):
+    """Header, schemas, channels, messages, attachments, metadata, statistics, chunk indexes and checksums."""
+    files = sorted((data / "mcap" / "conformance").glob("*/*.mcap"))
+    assert len(files) > 300
+    for path in files:
+        said = json.loads(path.with_suffix(".json").read_text())["records"]
+        schemas = {int(f["id"]): f for f in _fields(said, "Schema")}
+        channels = {int(f["id"]): f for f in _fields(said, "Channel")}
+        with log.read(path) as opened:
+            index, buffer = opened.index, opened.buffer
+            (header,) = _fields(said, "Header")
+            assert records.read_header(buffer, records.record_at(buffer, 8)) == (header["profile"], header["library"])
+            assert {number: (f["name"], f["encoding"], _data(f["data"])) for number, f in schemas.items()} == {
+                number: tuple(schema)[1:] for number, schema in index.schemas.items()
+            }
+            assert {
+                number: (int(f["schema_id"]), f["topic"], f["message_encoding"], f["metadata"])
+                for number, f in channels.items()
+            } == {number: tuple(channel)[1:] for number, channel in index.channels.items()}
+            for number, channel in channels.items():
+                wanted = [
+                    log.Message(int(f["log_time"]), int(f["sequence"]), int(f["publish_time"]), _data(f["data"]))
+                    for f in _fields(said, "Message")
+                    if int(f["channel_id"]) == number
+                ]
+                assert list(opened.messages(channel["topic"])) == sorted(wanted, key=lambda m: m.t_ns), path
+            for f in _fields(said, "Metadata"):
+                assert opened.metadata(f["name"]) == f["metadata"]
+            there = [records.read_attachment(buffer, records.record_at(buffer, a.offset)) for a in index.attachments]
+            assert [
+                (log_ns, create_ns, name, kind, bytes(content)) for log_ns, create_ns, name, kind, content in there
+            ] == [
+                (int(f["log_time"]), int(f["create_time"]), f["name"], f["media_type"], _data(f["data"]))
+                for f in _fields(said, "Attachment")
+            ]
+            for f in _fields(said, "Statistics"):
+                assert int(f["message_count"]) == sum(index.counts.values())
+                assert (int(f["message_start_time"]), int(f["message_end_time"])) == (index.start_ns, index.end_ns)
+                assert {int(n): int(c) for n, c in f["channel_message_counts"].items() if c != "0"} == index.counts
+            chunks = {chunk.offset: chunk for chunk in index.chunks}
+            for f in _fields(said, "ChunkIndex"):
+                chunk = chunks[int(f["chunk_start_offset"])]
+                names = (
+                    "chunk_length",
+                    "compressed_size",
+                    "uncompressed_size",
+                    "message_start_time",
+                    "message_end_time",
+                )
+                assert [int(f[name]) for name in names] == [
+                    chunk.length,
+                    chunk.compressed_size,
+                    chunk.uncompressed_size,
+                    chunk.start_ns,
+                    chunk.end_ns,
+                ]
+            (end,) = _fields(said, "DataEnd")
+            assert int(end["data_section_crc"]) == index.data_crc
+
+
+def test_what_others_recorded_is_checked_without_a_complaint_and_recovered_whole(data, tmp_path):
+    wrong_by_its_writer = {"convert_a__rewriter_a_0.mcap"}  # says it starts at 1 ms, and has messages at 0
+    for path in sorted((data / "mcap").glob("*/**/*.mcap")):
+        assert log.check(path).is_sound or path.name in wrong_by_its_writer, path
+        report = log.recover(path, tmp_path / "saved.mcap")
+        assert report.lost == [], path
+        with log.read(path) as theirs, log.read(tmp_path / "saved.mcap") as ours:
+            assert ours.index.channels == theirs.index.channels
+            for topic in theirs.channels:
+                assert list(theirs.messages(topic)) == list(ours.messages(topic)), path
