@@ -22,7 +22,7 @@ from mcaptrack.plane import GroundPlane, Planes, assumed_plane
 from mcaptrack.provenance import CLOCK, Provenance, digest
 from mcaptrack.schema import DETECTIONS, GROUND_PLANE, PREDICTIONS, SCHEMAS, TRACKS, VIDEO, Frame, Schema
 from mcaptrack.schema.ground import plane_to_rows, rows_to_plane
-from mcaptrack.transforms import TRANSFORMS, Transform
+from mcaptrack.transforms import TRANSFORMS, Transform, choice, chosen
 from mcaptrack.video import Encoded, brightness
 
 Ints = NDArray[np.int64]
@@ -241,9 +241,9 @@ def is_stale(opened: log.Log, topic: str) -> bool:
 def _transform_of(stage: str, channel: log.Channel) -> Transform:
     """The transform that made a channel, with the parameters it had as far as they are known today."""
     made = Provenance.from_metadata(channel.metadata)
-    kind = TRANSFORMS[stage]
-    names = {f.name for f in fields(kind) if not f.metadata.get("context")}
     had = made.parameters if made else {}
+    kind = chosen(stage, had)
+    names = {f.name for f in fields(kind) if not f.metadata.get("context")}
     return kind(**{key: value for key, value in had.items() if key in names})
 
 
@@ -314,7 +314,7 @@ def run(
             if topic not in job.kept():
                 continue
             messages = [(f.t_ns, f.index, schema.codec.encode(schema.check(f.rows))) for f in channel]
-            parameters = json.loads(json.dumps(asdict(transform)))
+            parameters = json.loads(json.dumps(choice(job.stage, transform) | asdict(transform)))
             provenance = Provenance(job.stage, parameters, job.source, input_digest(), digest(messages), weights)
             made[topic] = Made(schema, channel, provenance, messages)
             report.frames[topic] = len(channel)

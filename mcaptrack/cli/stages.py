@@ -12,13 +12,13 @@ import typer
 
 from mcaptrack.cli import common
 from mcaptrack.errors import McaptrackError
-from mcaptrack.transforms import PROFILES, TRANSFORMS, Transform
+from mcaptrack.transforms import ALTERNATIVES, PROFILES, TRANSFORMS, Transform
 from mcaptrack.transforms.protocol import bare_type
 
 #: What a command says of itself, beyond its transform.
 _WORDS: Final = {
     "detect": ("Example: mcaptrack detect log.mcap --method mog2", "{camera}/video", "{camera}/detections"),
-    "track": ("Example: mcaptrack track log.mcap --max-age-s 2", "{camera}/detections", "{camera}/tracks"),
+    "track": ("Example: mcaptrack track log.mcap --tracker bytetrack", "{camera}/detections", "{camera}/tracks"),
     "sample": ("Example: mcaptrack sample log.mcap --rate-hz 2.5", "{camera}/tracks", "{camera}/samples"),
     "predict": ("Example: mcaptrack predict log.mcap --predictor cv", "{camera}/samples", "{camera}/predictions"),
     "retrack": ("Example: mcaptrack retrack log.mcap --profile authors", "{camera}/samples", "{camera}/retracks"),
@@ -44,16 +44,27 @@ def _help(name: str, kind: type[Transform]) -> str:
     where = (
         f"From {source.format(camera='/camera')} to {target.format(camera='/camera')}. A missing input is made first."
     )
-    return f"{inspect.cleandoc(kind.__doc__ or '')}\n\n{where}\n\n{example}"
+    others = [] if name not in ALTERNATIVES else [k for k in ALTERNATIVES[name].kinds.values() if k is not kind]
+    words = [inspect.cleandoc(one.__doc__ or "") for one in (kind, *others)]
+    return "\n\n".join([*words, where, example])
 
 
-def _option(name: str, annotation: Any, default: Any, words: str) -> inspect.Parameter:
-    """An option that is None unless it is given, and whose help shows what happens then."""
+def _option(name: str, annotation: Any, default: Any, words: str, whose: str = "") -> inspect.Parameter:
+    """An option that is None unless it is given, and whose help shows what happens then.
+
+    ``whose`` names the one of several transforms that it belongs to, if it doesn't belong to all.
+    """
     flag = "--" + name.replace("_", "-")
     names = (flag, f"--no-{flag[2:]}") if bare_type(annotation) is bool else (flag,)
     shown = "none" if default is None else str(default).lower() if isinstance(default, bool) else f"{default}"
-    info = common.option(*names, help=words[:1].upper() + words[1:] + ".", show_default=shown)
+    panel: dict[str, Any] = {"rich_help_panel": f"Options of {whose} alone"} if whose else {}
+    info = common.option(*names, help=words[:1].upper() + words[1:] + ".", show_default=shown, **panel)
     return _parameter(name, Annotated[bare_type(annotation) | None, info], None)
+
+
+def _options_of(kind: type[Transform]) -> dict[str, Any]:
+    """The parameters of a transform that are options, by name."""
+    return {f.name: f for f in fields(kind) if not f.metadata.get("context")}
 
 
 def _parameter(name: str, annotation: Any, default: Any) -> inspect.Parameter:
@@ -62,21 +73,29 @@ def _parameter(name: str, annotation: Any, default: Any) -> inspect.Parameter:
 
 def _stage_command(name: str, kind: type[Transform]) -> Callable[..., None]:
     """The function behind a stage's command: its signature is made of what the transform declares."""
-    hints = get_type_hints(kind)
-    own = [f for f in fields(kind) if not f.metadata.get("context")]
-    defaults = PROFILES["default"] if name == "retrack" else kind()
+    several = ALTERNATIVES.get(name)
+    kinds = dict(several.kinds) if several else {name: kind}
+    defaults = {one: PROFILES["default"] if one == "retrack" else made() for one, made in kinds.items()}
+    own = {one: _options_of(made) for one, made in kinds.items()}
     parameters = [_parameter("logs", common.Logs, inspect.Parameter.empty)]
-    extra: list[inspect.Parameter] = []
-    if name == "track":
-        words = common.option("--tracker", help="Which tracker.")
-        extra.append(_parameter("tracker", Annotated[Literal["sort"], words], "sort"))
+    if several:
+        words = common.option("--" + several.option, help=f"Which {several.option}.")
+        default = next(one for one, made in kinds.items() if made is kind)
+        parameters.append(_parameter(several.option, Annotated[Literal[tuple(kinds)], words], default))
     if name == "retrack":
         words = common.option("--profile", help="Whose reading: ours, the paper's, or its authors' program's.")
-        extra.append(_parameter("profile", Annotated[Literal[tuple(PROFILES)], words], "default"))
+        parameters.append(_parameter("profile", Annotated[Literal[tuple(PROFILES)], words], "default"))
         words = common.option("--mode", help="With all the log knows (offline), from the past alone (online), or both.")
-        extra.append(_parameter("mode", Annotated[Mode, words], "both"))
-    parameters += extra
-    parameters += [_option(f.name, hints[f.name], getattr(defaults, f.name), f.metadata["help"]) for f in own]
+        parameters.append(_parameter("mode", Annotated[Mode, words], "both"))
+    there: dict[str, list[str]] = {}
+    for one, found in own.items():
+        for f in found:
+            there.setdefault(f, []).append(one)
+    for option, those in there.items():
+        one = those[0]
+        help_text = own[one][option].metadata["help"]
+        hint, shown = get_type_hints(kinds[one])[option], getattr(defaults[one], option)
+        parameters.append(_option(option, hint, shown, help_text, one if len(those) < len(kinds) else ""))
     to = common.option("--to", shared=True, help="Write this channel instead of the usual one.")
     parameters += [
         _parameter("topic", Topic, None),
@@ -91,9 +110,14 @@ def _stage_command(name: str, kind: type[Transform]) -> Callable[..., None]:
     ]
 
     def command(**given: Any) -> None:
-        base: Transform = PROFILES[given["profile"]] if name == "retrack" else kind()
-        chosen = {f.name: given[f.name] for f in own if given[f.name] is not None}
-        transform = replace(base, **chosen)
+        one = given[several.option] if several else name
+        base: Transform = PROFILES[given["profile"]] if name == "retrack" else kinds[one]()
+        wanted = {option: given[option] for option in there if given[option] is not None}
+        for option in wanted:
+            if option not in own[one]:
+                flag = "--" + option.replace("_", "-")
+                raise McaptrackError(f"{flag} is an option of {' and '.join(there[option])}, not of {one}")
+        transform = replace(base, **wanted)
         keep = _OUTPUTS_OF[given["mode"]] if name == "retrack" else None
         _run_on_logs(given, lambda plan: plan.stage(name, transform, given["topic"], given["to"], keep))
 
