@@ -38,6 +38,10 @@ IOU_THRESHOLD: Final = 0.5
 DEFAULT_GATES_M: Final = (0.5, 1.0, 2.0)
 #: The truth is interpolated over no longer hole than this.
 _MAX_HOLE_S: Final = 2.0
+#: Sizes that differ by more than this factor, where nothing ever meets, are in different units.
+_OTHER_UNIT: Final = 8.0
+#: Positions further apart than twice this have nothing to do with each other.
+_FAR_M: Final = 5.0
 _MODES: Final = {"online": "online", "": "offline"}
 
 
@@ -61,6 +65,7 @@ class Candidate:
     frames: Sequence[Frame]
     forecasts: Sequence[Frame] | None = None
     forecasts_name: str = ""
+    group: str = ""  # what tracks of several sequences have in common, if not their name
 
 
 @dataclass
@@ -84,6 +89,7 @@ class Result:
     rules: Rules
     score: Score
     displacement: Displacement | None = None
+    group: str = ""
 
     def to_json(self) -> dict[str, Any]:
         """As ``evaluate --json`` prints it."""
@@ -160,7 +166,7 @@ def evaluate(
 def _combined(results: Sequence[Result]) -> list[Result]:
     groups: dict[tuple[Any, ...], list[Result]] = {}
     for one in results:
-        groups.setdefault((one.tracks, one.mode, one.similarity, one.gate, one.rules), []).append(one)
+        groups.setdefault((one.group or one.tracks, one.mode, one.similarity, one.gate, one.rules), []).append(one)
     out = []
     for (tracks, mode, similarity, gate, rules), members in groups.items():
         forecasts = [member.displacement for member in members if member.displacement is not None]
@@ -197,10 +203,20 @@ def _score(sequence: Sequenced, candidate: Candidate, options: EvaluateOptions, 
                 )
             continue
         gates = (options.min_iou,) if similarity == "iou" else options.gates_m
+        notes += _strangers(sequence, candidate, truth, tracks, similarity)
         for gate in gates:
             score = metrics.score(matchup(truth, tracks, similarity, gate), options.rules)
             results.append(
-                Result(sequence.name, candidate.name, candidate.mode, similarity, gate, options.rules, score)
+                Result(
+                    sequence.name,
+                    candidate.name,
+                    candidate.mode,
+                    similarity,
+                    gate,
+                    options.rules,
+                    score,
+                    group=candidate.group,
+                )
             )
     if not results:
         notes.append(f"{sequence.name}: {candidate.name} and the truth share neither boxes nor positions in metres")
@@ -209,6 +225,33 @@ def _score(sequence: Sequenced, candidate: Candidate, options: EvaluateOptions, 
         for result in results:
             result.displacement = errors if result.similarity == "metres" else None
     return results
+
+
+def _strangers(
+    sequence: Sequenced, candidate: Candidate, truth: Sequence[Frame], tracks: Sequence[Frame], similarity: Similarity
+) -> list[str]:
+    """Words on tracks that never come near anybody. Raises McaptrackError if that is because units differ."""
+    both = {f"the truth of {sequence.name}": truth, candidate.name: tracks}
+    if not all(any(len(frame.rows) for frame in frames) for frames in both.values()):
+        return []
+    if similarity == "iou":
+        alike = matchup(truth, tracks, "iou", IOU_THRESHOLD)
+        sizes = [float(np.nanmedian(np.concatenate([f.rows["h_px"] for f in frames]))) for frames in both.values()]
+        what, unit = "boxes", "px high"
+    else:
+        alike = matchup(truth, tracks, "metres", _FAR_M)
+        spans = [np.concatenate([_xy(f.rows) for f in frames]) for frames in both.values()]
+        sizes = [float(np.nanmedian(np.abs(xy - np.nanmedian(xy, axis=0)))) for xy in spans]
+        what, unit = "positions", "m from their middle"
+    if len(alike.pairs.frame):
+        return []
+    small, large = sorted(sizes)
+    if large > _OTHER_UNIT * max(small, 1e-9):
+        (a, b), (m, n) = both, sizes
+        raise McaptrackError(
+            f"{what} of {a} are {m:.3g} {unit}, those of {b} {n:.3g}, and none ever meet: they are not in the same unit"
+        )
+    return [f"{sequence.name}: {candidate.name} and the truth never come near each other"]
 
 
 def _has(frames: Sequence[Frame], column: str) -> bool:
@@ -312,6 +355,9 @@ def _displacement(sequence: Sequenced, candidate: Candidate) -> Displacement | N
     return displacement(positions(_resampled(sequence.truth, ticks)), positions(candidate.frames), forecasts)
 
 
-def sequence_of_files(tracks: Path, truth_frames: Sequence[Frame], track_frames: Sequence[Frame]) -> Sequenced:
-    """A label file of tracks and its truth, as one sequence."""
-    return Sequenced(tracks.stem, truth_frames, [Candidate(tracks.name, None, track_frames)])
+def sequence_of_files(
+    name: str, tracks: Path, truth_frames: Sequence[Frame], track_frames: Sequence[Frame], files: int
+) -> Sequenced:
+    """A file of tracks, one of ``files``, and its truth as one sequence."""
+    group = f"{files} files" if files > 1 else ""
+    return Sequenced(name, truth_frames, [Candidate(tracks.name, None, track_frames, group=group)])
