@@ -32,6 +32,16 @@ def iou(a: Floats, b: Floats) -> Floats:
     return np.where(either > 0, both / np.where(either > 0, either, 1.0), 0.0)
 
 
+def iou_of_pairs(a: Floats, b: Floats) -> Floats:
+    """Intersection over union (N,) of each box of ``a`` (N, 4) with the one of ``b`` (N, 4) in its place."""
+    (ax, ay, aw, ah), (bx, by, bw, bh) = a.T, b.T
+    wide = np.minimum(ax + aw, bx + bw) - np.maximum(ax, bx)
+    high = np.minimum(ay + ah, by + bh) - np.maximum(ay, by)
+    both = np.clip(wide, 0, None) * np.clip(high, 0, None)
+    either = aw * ah + bw * bh - both
+    return np.where(either > 0, both / np.where(either > 0, either, 1.0), 0.0)
+
+
 def overlapping(a: Floats, b: Floats) -> tuple[Ints, Ints, Floats]:
     """The pairs of boxes that overlap, and their intersection over union.
 

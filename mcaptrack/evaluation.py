@@ -11,13 +11,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack import log, metrics
-from mcaptrack.boxes import columns_to_boxes, iou
+from mcaptrack.boxes import columns_to_boxes, iou_of_pairs
 from mcaptrack.clock import NS_PER_S, seconds_to_ns
 from mcaptrack.errors import McaptrackError
 from mcaptrack.metrics import Matchup, Rules, Score
@@ -42,6 +42,8 @@ _MAX_HOLE_S: Final = 2.0
 _OTHER_UNIT: Final = 8.0
 #: Positions further apart than twice this have nothing to do with each other.
 _FAR_M: Final = 5.0
+#: How many pairs of boxes are compared in one go, to bound the memory that takes.
+_PAIRS_AT_ONCE: Final = 1_000_000
 _MODES: Final = {"online": "online", "": "offline"}
 
 
@@ -203,9 +205,10 @@ def _score(sequence: Sequenced, candidate: Candidate, options: EvaluateOptions, 
                 )
             continue
         gates = (options.min_iou,) if similarity == "iou" else options.gates_m
-        notes += _strangers(sequence, candidate, truth, tracks, similarity)
         for gate in gates:
             score = metrics.score(matchup(truth, tracks, similarity, gate), options.rules)
+            if gate == gates[-1] and score.hota["HOTA_TP"][0] == 0:
+                notes += _strangers(sequence, candidate, truth, tracks, similarity)
             results.append(
                 Result(
                     sequence.name,
@@ -294,29 +297,59 @@ def _xy(rows: Rows) -> Floats:
 def matchup(truth: Sequence[Frame], tracks: Sequence[Frame], similarity: Similarity, gate: float) -> Matchup:
     """Truth and tracks at the same times as a matchup: boxes by overlap, or positions by distance."""
     column = "x_px" if similarity == "iou" else "x_m"
-
-    def usable(frames: Sequence[Frame]) -> list[Rows]:
-        return [frame.rows[np.isfinite(frame.rows[column])] for frame in frames]
-
-    true_rows, track_rows = usable(truth), usable(tracks)
-    true_ids, track_ids = (
-        np.unique(np.concatenate([np.empty(0, np.int64), *(rows["track_id"] for rows in part)]))
-        for part in (true_rows, track_rows)
-    )
-    alike = []
-    for people, found in zip(true_rows, track_rows, strict=True):
-        if similarity == "iou":
-            alike.append(iou(columns_to_boxes(people), columns_to_boxes(found)))
-        else:
-            alike.append(metrics.metres_to_similarity(metrics.distances(_xy(people), _xy(found)), gate))
+    (people, true_ids, true_ends), (found, track_ids, track_ends) = (_usable(part, column) for part in (truth, tracks))
+    places = columns_to_boxes if similarity == "iou" else _xy
+    a, b = places(people), places(found)
+    alike: list[Floats] = []
+    step = max(1, round(_PAIRS_AT_ONCE / max(1.0, len(a) * len(b) / max(1, len(truth)) ** 2)))
+    for first in range(0, len(truth), step):
+        alike += _similarities(a, b, true_ends[first : first + step + 1], track_ends[first : first + step + 1], gate)
     return Matchup(
-        tuple(np.searchsorted(true_ids, rows["track_id"]) for rows in true_rows),
-        tuple(np.searchsorted(track_ids, rows["track_id"]) for rows in track_rows),
+        tuple(np.split(true_ids.where, true_ends[1:-1])),
+        tuple(np.split(track_ids.where, track_ends[1:-1])),
         tuple(alike),
         gate if similarity == "iou" else 0.5,
-        len(true_ids),
-        len(track_ids),
+        true_ids.count,
+        track_ids.count,
     )
+
+
+class _Ids(NamedTuple):
+    """Ids as dense numbers from 0 on (N,), and how many there are."""
+
+    where: Ints
+    count: int
+
+
+def _usable(frames: Sequence[Frame], column: str) -> tuple[Rows, _Ids, Ints]:
+    """The rows of all frames that have a place, their ids, and where the rows of each frame begin and end."""
+    ends = np.cumsum([0] + [len(frame.rows) for frame in frames])
+    rows = TRACKS.empty(int(ends[-1]))
+    for low, frame in zip(ends.tolist(), frames, strict=False):
+        rows[low : low + len(frame.rows)] = frame.rows
+    usable = np.isfinite(rows[column])
+    if not usable.all():
+        ends, rows = np.concatenate([[0], usable.cumsum()])[ends], rows[usable]
+    names, where = np.unique(rows["track_id"], return_inverse=True)
+    return rows, _Ids(where, len(names)), ends
+
+
+def _similarities(a: Floats, b: Floats, a_ends: Ints, b_ends: Ints, gate: float) -> list[Floats]:
+    """How alike are the boxes or places in ``a`` and ``b`` of some frames, (G, H) a frame; all pairs in one go."""
+    people, found = np.diff(a_ends), np.diff(b_ends)
+    size = people * found
+    ends = np.cumsum(size)
+    frame = np.repeat(np.arange(len(size)), size)
+    within = np.arange(len(frame)) - (ends - size)[frame]
+    row = a_ends[frame] + within // found[frame]
+    column = b_ends[frame] + within % found[frame]
+    if a.shape[1] == 4:
+        alike = iou_of_pairs(a[row], b[column])
+    else:
+        apart = a[row] - b[column]
+        alike = metrics.metres_to_similarity(np.hypot(apart[:, 0], apart[:, 1]), gate)
+    spans = zip((ends - size).tolist(), ends.tolist(), people.tolist(), found.tolist(), strict=True)
+    return [alike[low:high].reshape(g, h) for low, high, g, h in spans]
 
 
 def _displacement(sequence: Sequenced, candidate: Candidate) -> Displacement | None:
