@@ -114,14 +114,20 @@ class Outcome:
     notes: list[str] = field(default_factory=list)
 
 
-def sequence_of_log(opened: log.Log, prefix: str, topics: Sequence[str]) -> Sequenced:
-    """The truth of a log and its tracks: those of the video's rate, and those of the clock of prediction."""
-    truth_topic = f"{prefix}/truth"
-    if truth_topic not in opened.channels:
+def truth_of_log(opened: log.Log, prefix: str) -> list[Frame]:
+    """The true tracks in a log. Raises McaptrackError if there are none."""
+    topic = f"{prefix}/truth"
+    if topic not in opened.channels:
         raise McaptrackError(
-            f"{opened.path} has no channel {truth_topic}; "
+            f"{opened.path} has no channel {topic}; "
             f"add one with `mcaptrack ingest FILE --as truth --into {opened.path}`"
         )
+    return opened.frames(topic, TRACKS)
+
+
+def sequence_of_log(opened: log.Log, prefix: str, topics: Sequence[str]) -> Sequenced:
+    """The truth of a log and its tracks: those of the video's rate, and those of the clock of prediction."""
+    truth = truth_of_log(opened, prefix)
     usual = [f"{prefix}/{name}" for name in ("tracks", "samples", "retracks/online", "retracks")]
     chosen = list(topics) or [topic for topic in usual if topic in opened.channels]
     if not chosen:
@@ -139,7 +145,7 @@ def sequence_of_log(opened: log.Log, prefix: str, topics: Sequence[str]) -> Sequ
         name = forecasts_of.get(topic, "")
         forecasts = opened.frames(name, PREDICTIONS) if name in opened.channels else None
         candidates.append(Candidate(topic, mode, opened.frames(topic, TRACKS), forecasts, name))
-    return Sequenced(opened.path.stem, opened.frames(truth_topic, TRACKS), candidates)
+    return Sequenced(opened.path.stem, truth, candidates)
 
 
 def evaluate(
@@ -309,8 +315,8 @@ def matchup(truth: Sequence[Frame], tracks: Sequence[Frame], similarity: Similar
         tuple(np.split(track_ids.where, track_ends[1:-1])),
         tuple(alike),
         gate if similarity == "iou" else 0.5,
-        true_ids.count,
-        track_ids.count,
+        true_ids.total,
+        track_ids.total,
     )
 
 
@@ -318,7 +324,7 @@ class _Ids(NamedTuple):
     """Ids as dense numbers from 0 on (N,), and how many there are."""
 
     where: Ints
-    count: int
+    total: int
 
 
 def _usable(frames: Sequence[Frame], column: str) -> tuple[Rows, _Ids, Ints]:

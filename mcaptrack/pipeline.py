@@ -403,6 +403,21 @@ def _pictures(
     return total.hexdigest, brightness(encoded())
 
 
+def input_of(
+    opened: log.Log, prefix: str, stage: str, transform: Transform, source: str | None = None
+) -> tuple[list[Frame], dict[str, Any]]:
+    """What a stage would read from a log, and what the log knows for it (the fields made with ``context``).
+
+    Raises McaptrackError if the input isn't there.
+    """
+    topic = source or f"{prefix}/{ROUTES[stage].reads}"
+    job = Job(stage, transform, topic, f"{prefix}/{ROUTES[stage].writes}")
+    _check_inputs(opened, prefix, [job])
+    known = _in_context(opened, prefix, job, {}, read_planes(opened, prefix) or ())
+    context = {f.name: getattr(known, f.name) for f in fields(known) if f.metadata.get("context")}
+    return _frames(opened, topic, transform.reads), context
+
+
 def read_planes(opened: log.Log, prefix: str) -> Planes | None:
     """The ground planes of a camera with the times from which they hold; None if there are none."""
     topic = f"{prefix}/ground_plane"

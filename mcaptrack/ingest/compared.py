@@ -25,6 +25,7 @@ from mcaptrack.ingest.labels import KITTI_HEIGHT_PX, Aside, Labels, Role, read_h
 from mcaptrack.match import solve
 from mcaptrack.plane import GroundPlane, Point
 from mcaptrack.schema import Frame
+from mcaptrack.video import seqinfo_fps
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -80,7 +81,7 @@ def compare_files(
     point: Point = "foot",
     topics: Sequence[str] = (),
 ) -> Compared:
-    """Two files as frames. Raises McaptrackError, with what is wrong and where, if they can't be read or compared."""
+    """Tracks and truth as frames. Raises McaptrackError, with what is wrong, if they can't be read or compared."""
     both: dict[Role, tuple[Path, Labels]] = {
         "truth": (truth, _read(truth, "truth", topics)),
         "tracks": (tracks, _read(tracks, "tracks", topics)),
@@ -93,6 +94,39 @@ def compare_files(
         frames = ingest.label_frames({"tracks": tracks, "truth": truth}, fps, ground_plane, point)
         return Compared(frames["truth"], frames["tracks"], notes)
     return _by_number(both, ground_plane, point, notes)
+
+
+@dataclass
+class Detected:
+    """Detections and truth as frames on one clock, and the ground plane, if there is one."""
+
+    detections: list[Frame]
+    truth: list[Frame]
+    planes: tuple[tuple[int, GroundPlane], ...]
+
+
+def detections_and_truth(
+    detections: Path, truth: Path, fps: Fraction | None, ground_plane: Path | None, point: Point
+) -> Detected:
+    """A file of detections and the truth as frames, at the times that the frame rate gives them.
+
+    Raises McaptrackError if they can't be read, or if nothing says how many frames a second there are.
+    """
+    found, true = read_labels(detections, role="detections"), _read(truth, "truth", ())
+    if found.boxes_px is None or true.boxes_px is None:
+        raise McaptrackError(f"{detections} and {truth} have to hold boxes in pixels, both")
+    fps = fps or seqinfo_fps(detections.parent) or seqinfo_fps(truth.parent)
+    if fps is None:
+        raise McaptrackError(f"{detections} has no clock of its own; give the frames per second with --fps")
+    plane = _plane(ground_plane, point, true, found)
+    out: list[list[Frame]] = []
+    parts: tuple[tuple[Role, Labels], ...] = (("detections", found), ("truth", true))
+    for role, labels in parts:
+        there = labels.frame - labels.first_frame
+        numbers = np.arange(int(there.min()), int(there.max()) + 1)
+        frames = _frames(labels, numbers, there, plane, role)
+        out.append([frame._replace(t_ns=round(frame.index / fps * NS_PER_S)) for frame in frames])
+    return Detected(out[0], out[1], ((0, plane),) if plane else ())
 
 
 def _read(path: Path, role: Role, topics: Sequence[str]) -> Labels:
