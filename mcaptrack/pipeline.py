@@ -136,14 +136,16 @@ def plan_stage(
     target: str | None = None,
     keep: tuple[str, ...] | None = None,
     say: Say = lambda _: None,
+    defaults: Mapping[str, Transform] = {},
 ) -> list[Job]:
     """The jobs that run one stage, whether or not its channel stands, and before it what is missing or out of date.
 
-    ``source`` and ``target`` are topics other than the usual ones. Raises McaptrackError if there is nothing to start
+    ``source`` and ``target`` are topics other than the usual ones; ``defaults`` are transforms for stages that are
+    missing, where they are not to be the usual ones. Raises McaptrackError if there is nothing to start
     from.
     """
     route = ROUTES[stage]
-    planner = _Planner(opened, prefix, say)
+    planner = _Planner(opened, prefix, say, defaults=defaults)
     source = source or planner.source_of(stage)
     planner.ensure(source)
     planner.jobs.append(Job(stage, transform, source, target or f"{prefix}/{route.writes}", keep))
@@ -151,13 +153,19 @@ def plan_stage(
     return planner.jobs
 
 
-def plan_all(opened: log.Log, prefix: str, say: Say = lambda _: None, source: str | None = None) -> list[Job]:
+def plan_all(
+    opened: log.Log,
+    prefix: str,
+    say: Say = lambda _: None,
+    source: str | None = None,
+    defaults: Mapping[str, Transform] = {},
+) -> list[Job]:
     """The jobs that bring everything about a camera up to date; none if it is.
 
-    ``source`` is a topic with pictures or with boxes that others detected, to begin with. Raises McaptrackError as
-    ``plan_stage`` does.
+    ``source`` is a topic with pictures or with boxes that others detected, to begin with; ``defaults`` as in
+    ``plan_stage``. Raises McaptrackError as that does.
     """
-    planner = _Planner(opened, prefix, say, {_stage_from(opened, source): source} if source else {})
+    planner = _Planner(opened, prefix, say, {_stage_from(opened, source): source} if source else {}, defaults)
     for target in ("predictions", "retracks"):
         planner.ensure(f"{prefix}/{target}")
     _check_inputs(opened, prefix, planner.jobs)
@@ -171,10 +179,21 @@ def _stage_from(opened: log.Log, source: str) -> str:
 
 
 class _Planner:
-    """Collects the jobs that make channels stand and be up to date. ``sources`` are inputs of stages but the usual."""
+    """Collects the jobs that make channels stand and be up to date.
 
-    def __init__(self, opened: log.Log, prefix: str, say: Say, sources: Mapping[str, str] = {}) -> None:
+    ``sources`` are inputs of stages and ``defaults`` transforms of stages, where they are not the usual ones.
+    """
+
+    def __init__(
+        self,
+        opened: log.Log,
+        prefix: str,
+        say: Say,
+        sources: Mapping[str, str] = {},
+        defaults: Mapping[str, Transform] = {},
+    ) -> None:
         self.jobs: list[Job] = []
+        self._defaults = defaults
         self._opened, self._prefix, self._say = opened, prefix, say
         self._sources = sources
         self._changes: dict[str, bool] = {}
@@ -209,7 +228,7 @@ class _Planner:
             source = self.source_of(stage)
             self.ensure(source)
             self._say(f"{topic} is missing: running {stage}")
-            self.jobs.append(Job(stage, TRANSFORMS[stage](), source, topic))
+            self.jobs.append(Job(stage, self._defaults.get(stage) or TRANSFORMS[stage](), source, topic))
             return True
         made = Provenance.from_metadata(channel.metadata)
         had = made.input if made else self.source_of(stage)

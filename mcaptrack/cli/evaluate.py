@@ -92,9 +92,9 @@ def evaluate(
     or of MOT16 and later where the truth names classes), KITTI tracking, Parquet as `mcaptrack export` writes it, and
     the label files that `mcaptrack ingest` reads. Distances are on the ground, overlaps are those of boxes.
 
-    Examples: mcaptrack evaluate log.mcap --similarity metres --gate-m 1
+    Example: mcaptrack evaluate log.mcap --similarity metres --gate-m 1
 
-    mcaptrack evaluate tracks.txt --truth gt.txt --fail-under idf1=0.7
+    Example: mcaptrack evaluate tracks.txt --truth gt.txt --fail-under idf1=0.7
     """
     from mcaptrack.evaluation import EvaluateOptions
     from mcaptrack.evaluation import evaluate as score

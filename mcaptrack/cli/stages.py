@@ -11,6 +11,7 @@ from typing import Annotated, Any, Final, Literal, get_type_hints
 import typer
 
 from mcaptrack.cli import common
+from mcaptrack.cli.config import NAME, settings_of
 from mcaptrack.errors import McaptrackError
 from mcaptrack.transforms import ALTERNATIVES, PROFILES, TRANSFORMS, Transform
 from mcaptrack.transforms.protocol import bare_type
@@ -150,6 +151,23 @@ def run_all(
     _run_on_logs(given | {"quiet": quiet, "verbose": verbose}, lambda plan: plan.all(topic), tables)
 
 
+def _configured() -> dict[str, Transform]:
+    """The stages as mcaptrack.toml wants them, for those that a command makes on its way; others aren't listed."""
+    out: dict[str, Transform] = {}
+    for name, default in TRANSFORMS.items():
+        settings = settings_of(name)
+        several = ALTERNATIVES.get(name)
+        wanted = settings.get(several.option) if several else None
+        if several and wanted is not None and wanted not in several.kinds:
+            raise McaptrackError(f"{NAME}: {several.option} is one of {', '.join(several.kinds)}, not {wanted!r}")
+        kind = several.kinds[wanted] if several and wanted else default
+        base = PROFILES[settings["profile"]] if name == "retrack" and settings.get("profile") in PROFILES else kind()
+        chosen = {option: value for option, value in settings.items() if option in _options_of(kind)}
+        if chosen or settings.keys() & {"tracker", "profile"}:
+            out[name] = replace(base, **chosen)
+    return out
+
+
 class _Plan:
     """What to do on one log, once it is open."""
 
@@ -161,12 +179,14 @@ class _Plan:
     ) -> Any:
         from mcaptrack import pipeline
 
-        return pipeline.plan_stage(self._opened, self._prefix, name, transform, topic, to, keep, self._say)
+        return pipeline.plan_stage(
+            self._opened, self._prefix, name, transform, topic, to, keep, self._say, _configured()
+        )
 
     def all(self, topic: str | None) -> Any:
         from mcaptrack import pipeline
 
-        return pipeline.plan_all(self._opened, self._prefix, self._say, topic)
+        return pipeline.plan_all(self._opened, self._prefix, self._say, topic, _configured())
 
 
 def _run_on_logs(given: Mapping[str, Any], make_plan: Callable[[_Plan], Any], tables: bool = False) -> None:
