@@ -6,6 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
+Ints = NDArray[np.intp]
+
+#: From so many pairs on it pays to look first for those that can overlap.
+_MANY = 1500
 
 
 def columns_to_boxes(rows: NDArray[np.void]) -> Floats:
@@ -26,3 +30,52 @@ def iou(a: Floats, b: Floats) -> Floats:
     both = extent[..., 0] * extent[..., 1]
     either = (a[:, 2] * a[:, 3])[:, None] + (b[:, 2] * b[:, 3])[None, :] - both
     return np.where(either > 0, both / np.where(either > 0, either, 1.0), 0.0)
+
+
+def iou_of_pairs(a: Floats, b: Floats) -> Floats:
+    """Intersection over union (N,) of each box of ``a`` (N, 4) with the one of ``b`` (N, 4) in its place."""
+    (ax, ay, aw, ah), (bx, by, bw, bh) = a.T, b.T
+    wide = np.minimum(ax + aw, bx + bw) - np.maximum(ax, bx)
+    high = np.minimum(ay + ah, by + bh) - np.maximum(ay, by)
+    both = np.clip(wide, 0, None) * np.clip(high, 0, None)
+    either = aw * ah + bw * bh - both
+    return np.where(either > 0, both / np.where(either > 0, either, 1.0), 0.0)
+
+
+def overlapping(a: Floats, b: Floats) -> tuple[Ints, Ints, Floats]:
+    """The pairs of boxes that overlap, and their intersection over union.
+
+    ``a`` (4, M) and ``b`` (4, N) are left, top, right, bottom. Returns which of ``a`` (P,), rising, which of ``b``
+    (P,), and how much (P,).
+    """
+    if a.shape[1] * b.shape[1] > _MANY:
+        first, second = _side_by_side(a, b)
+        extent = np.minimum(a[2:, first], b[2:, second]) - np.maximum(a[:2, first], b[:2, second])
+        np.maximum(extent, 0.0, out=extent)
+        extent[0] *= extent[1]
+        at = extent[0].nonzero()[0]
+        first, second, shared = first[at], second[at], extent[0, at]
+    else:
+        extent = np.minimum(a[2:, :, None], b[2:, None, :])
+        extent -= np.maximum(a[:2, :, None], b[:2, None, :])
+        np.maximum(extent, 0.0, out=extent)
+        extent[0] *= extent[1]
+        both = extent[0].ravel()
+        at = both.nonzero()[0]
+        shared = both[at]
+        first = at // (b.shape[1] or 1)
+        second = at - first * b.shape[1]
+    area_a, area_b = (a[2] - a[0]) * (a[3] - a[1]), (b[2] - b[0]) * (b[3] - b[1])
+    return first, second, shared / (area_a[first] + area_b[second] - shared)
+
+
+def _side_by_side(a: Floats, b: Floats) -> tuple[Ints, Ints]:
+    """Pairs of boxes of which no other pair overlaps: those that a sweep from left to right finds near each other."""
+    order = b[0].argsort(kind="stable")
+    left = b[0, order]
+    low = left.searchsorted(a[0] - (b[2] - b[0]).max(), "left")
+    high = left.searchsorted(a[2], "right")
+    count = high - low
+    first = np.arange(len(count)).repeat(count)
+    within = np.arange(len(first)) - (count.cumsum() - count).repeat(count)
+    return first, order[low.repeat(count) + within]

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left, insort
 from collections import deque
-from statistics import median_high
 from typing import Final
 
 NS_PER_S: Final = 1_000_000_000
 #: How many intervals the usual one is taken from.
 _MEMORY: Final = 25
+#: From how many intervals on the usual one is sure enough to notice that it has changed, and by what factor then.
+_SURE: Final = 8
+_CHANGED: Final = 1.5
 
 
 def seconds_to_ns(seconds: float) -> int:
@@ -19,26 +22,48 @@ def seconds_to_ns(seconds: float) -> int:
 class FrameClock:
     """Counts frames by their timestamps.
 
-    The usual interval is the median of the last 25, so a gap does not move it, and it is known from the past alone. A
-    step that is n usual intervals long counts as n frames; stamps that are off by less than a tenth of an interval
-    change no count.
+    The usual interval is the mean of the middle half of the last 25, so neither a gap nor stamps that come early and
+    late in turn move it, and it is known from the past alone. A step that is n usual intervals long counts as n frames;
+    stamps that are off by less than a tenth of an interval change no count.
+
+    ``interval_ns`` is the usual interval, 0 while it isn't known. ``stretch`` is how much longer, since the last tick,
+    is what is called a frame: 1 but for the tick at which a new frame rate has set in; jitter never changes it.
     """
 
     def __init__(self) -> None:
         self._last_ns: int | None = None
-        self._intervals: deque[int] = deque(maxlen=_MEMORY)
+        self._intervals: deque[int] = deque()
+        self._sorted: list[int] = []
+        self._anchor_ns = 0
+        self.interval_ns = 0
+        self.stretch = 1.0
 
     def tick(self, t_ns: int) -> int:
         """Take the time of the next frame; returns how many frames on it is, at least 1."""
         passed = 0 if self._last_ns is None else t_ns - self._last_ns
-        self._last_ns = t_ns
+        self._last_ns, self.stretch = t_ns, 1.0
         if passed <= 0:
             return 1
-        self._intervals.append(passed)
-        return max(1, round(passed / median_high(self._intervals)))
+        intervals, in_order = self._intervals, self._sorted
+        if len(intervals) == _MEMORY:
+            del in_order[bisect_left(in_order, intervals.popleft())]
+        intervals.append(passed)
+        insort(in_order, passed)
+        count = len(in_order)
+        cut = min((count + 3) // 4, (count - 1) // 2)
+        middle = in_order[cut : count - cut]
+        self.interval_ns = usual = max(sum(middle) // len(middle), 1)
+        if count >= _SURE:
+            self._notice_change(usual, in_order[count // 2])
+        return max(1, round(passed / usual))
+
+    def _notice_change(self, usual: int, median: int) -> None:
+        anchor = self._anchor_ns
+        if anchor and not anchor < usual * _CHANGED < anchor * _CHANGED**2:
+            self.stretch, self._anchor_ns = median / anchor, median
+        elif not anchor:
+            self._anchor_ns = usual
 
     def frames(self, seconds: float) -> int:
         """How many frames a time span is, at least 1; so far as the usual interval is known, otherwise 1."""
-        if not self._intervals:
-            return 1
-        return max(1, round(seconds_to_ns(seconds) / median_high(self._intervals)))
+        return max(1, round(seconds_to_ns(seconds) / self.interval_ns)) if self.interval_ns else 1

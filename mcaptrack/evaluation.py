@@ -11,13 +11,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack import log, metrics
-from mcaptrack.boxes import columns_to_boxes, iou
+from mcaptrack.boxes import columns_to_boxes, iou_of_pairs
 from mcaptrack.clock import NS_PER_S, seconds_to_ns
 from mcaptrack.errors import McaptrackError
 from mcaptrack.metrics import Matchup, Rules, Score
@@ -38,6 +38,12 @@ IOU_THRESHOLD: Final = 0.5
 DEFAULT_GATES_M: Final = (0.5, 1.0, 2.0)
 #: The truth is interpolated over no longer hole than this.
 _MAX_HOLE_S: Final = 2.0
+#: Sizes that differ by more than this factor, where nothing ever meets, are in different units.
+_OTHER_UNIT: Final = 8.0
+#: Positions further apart than twice this have nothing to do with each other.
+_FAR_M: Final = 5.0
+#: How many pairs of boxes are compared in one go, to bound the memory that takes.
+_PAIRS_AT_ONCE: Final = 1_000_000
 _MODES: Final = {"online": "online", "": "offline"}
 
 
@@ -61,6 +67,7 @@ class Candidate:
     frames: Sequence[Frame]
     forecasts: Sequence[Frame] | None = None
     forecasts_name: str = ""
+    group: str = ""  # what tracks of several sequences have in common, if not their name
 
 
 @dataclass
@@ -84,6 +91,7 @@ class Result:
     rules: Rules
     score: Score
     displacement: Displacement | None = None
+    group: str = ""
 
     def to_json(self) -> dict[str, Any]:
         """As ``evaluate --json`` prints it."""
@@ -106,14 +114,20 @@ class Outcome:
     notes: list[str] = field(default_factory=list)
 
 
-def sequence_of_log(opened: log.Log, prefix: str, topics: Sequence[str]) -> Sequenced:
-    """The truth of a log and its tracks: those of the video's rate, and those of the clock of prediction."""
-    truth_topic = f"{prefix}/truth"
-    if truth_topic not in opened.channels:
+def truth_of_log(opened: log.Log, prefix: str) -> list[Frame]:
+    """The true tracks in a log. Raises McaptrackError if there are none."""
+    topic = f"{prefix}/truth"
+    if topic not in opened.channels:
         raise McaptrackError(
-            f"{opened.path} has no channel {truth_topic}; "
+            f"{opened.path} has no channel {topic}; "
             f"add one with `mcaptrack ingest FILE --as truth --into {opened.path}`"
         )
+    return opened.frames(topic, TRACKS)
+
+
+def sequence_of_log(opened: log.Log, prefix: str, topics: Sequence[str]) -> Sequenced:
+    """The truth of a log and its tracks: those of the video's rate, and those of the clock of prediction."""
+    truth = truth_of_log(opened, prefix)
     usual = [f"{prefix}/{name}" for name in ("tracks", "samples", "retracks/online", "retracks")]
     chosen = list(topics) or [topic for topic in usual if topic in opened.channels]
     if not chosen:
@@ -131,7 +145,7 @@ def sequence_of_log(opened: log.Log, prefix: str, topics: Sequence[str]) -> Sequ
         name = forecasts_of.get(topic, "")
         forecasts = opened.frames(name, PREDICTIONS) if name in opened.channels else None
         candidates.append(Candidate(topic, mode, opened.frames(topic, TRACKS), forecasts, name))
-    return Sequenced(opened.path.stem, opened.frames(truth_topic, TRACKS), candidates)
+    return Sequenced(opened.path.stem, truth, candidates)
 
 
 def evaluate(
@@ -160,7 +174,7 @@ def evaluate(
 def _combined(results: Sequence[Result]) -> list[Result]:
     groups: dict[tuple[Any, ...], list[Result]] = {}
     for one in results:
-        groups.setdefault((one.tracks, one.mode, one.similarity, one.gate, one.rules), []).append(one)
+        groups.setdefault((one.group or one.tracks, one.mode, one.similarity, one.gate, one.rules), []).append(one)
     out = []
     for (tracks, mode, similarity, gate, rules), members in groups.items():
         forecasts = [member.displacement for member in members if member.displacement is not None]
@@ -199,8 +213,19 @@ def _score(sequence: Sequenced, candidate: Candidate, options: EvaluateOptions, 
         gates = (options.min_iou,) if similarity == "iou" else options.gates_m
         for gate in gates:
             score = metrics.score(matchup(truth, tracks, similarity, gate), options.rules)
+            if gate == gates[-1] and score.hota["HOTA_TP"][0] == 0:
+                notes += _strangers(sequence, candidate, truth, tracks, similarity)
             results.append(
-                Result(sequence.name, candidate.name, candidate.mode, similarity, gate, options.rules, score)
+                Result(
+                    sequence.name,
+                    candidate.name,
+                    candidate.mode,
+                    similarity,
+                    gate,
+                    options.rules,
+                    score,
+                    group=candidate.group,
+                )
             )
     if not results:
         notes.append(f"{sequence.name}: {candidate.name} and the truth share neither boxes nor positions in metres")
@@ -209,6 +234,33 @@ def _score(sequence: Sequenced, candidate: Candidate, options: EvaluateOptions, 
         for result in results:
             result.displacement = errors if result.similarity == "metres" else None
     return results
+
+
+def _strangers(
+    sequence: Sequenced, candidate: Candidate, truth: Sequence[Frame], tracks: Sequence[Frame], similarity: Similarity
+) -> list[str]:
+    """Words on tracks that never come near anybody. Raises McaptrackError if that is because units differ."""
+    both = {f"the truth of {sequence.name}": truth, candidate.name: tracks}
+    if not all(any(len(frame.rows) for frame in frames) for frames in both.values()):
+        return []
+    if similarity == "iou":
+        alike = matchup(truth, tracks, "iou", IOU_THRESHOLD)
+        sizes = [float(np.nanmedian(np.concatenate([f.rows["h_px"] for f in frames]))) for frames in both.values()]
+        what, unit = "boxes", "px high"
+    else:
+        alike = matchup(truth, tracks, "metres", _FAR_M)
+        spans = [np.concatenate([_xy(f.rows) for f in frames]) for frames in both.values()]
+        sizes = [float(np.nanmedian(np.abs(xy - np.nanmedian(xy, axis=0)))) for xy in spans]
+        what, unit = "positions", "m from their middle"
+    if len(alike.pairs.frame):
+        return []
+    small, large = sorted(sizes)
+    if large > _OTHER_UNIT * max(small, 1e-9):
+        (a, b), (m, n) = both, sizes
+        raise McaptrackError(
+            f"{what} of {a} are {m:.3g} {unit}, those of {b} {n:.3g}, and none ever meet: they are not in the same unit"
+        )
+    return [f"{sequence.name}: {candidate.name} and the truth never come near each other"]
 
 
 def _has(frames: Sequence[Frame], column: str) -> bool:
@@ -251,29 +303,59 @@ def _xy(rows: Rows) -> Floats:
 def matchup(truth: Sequence[Frame], tracks: Sequence[Frame], similarity: Similarity, gate: float) -> Matchup:
     """Truth and tracks at the same times as a matchup: boxes by overlap, or positions by distance."""
     column = "x_px" if similarity == "iou" else "x_m"
-
-    def usable(frames: Sequence[Frame]) -> list[Rows]:
-        return [frame.rows[np.isfinite(frame.rows[column])] for frame in frames]
-
-    true_rows, track_rows = usable(truth), usable(tracks)
-    true_ids, track_ids = (
-        np.unique(np.concatenate([np.empty(0, np.int64), *(rows["track_id"] for rows in part)]))
-        for part in (true_rows, track_rows)
-    )
-    alike = []
-    for people, found in zip(true_rows, track_rows, strict=True):
-        if similarity == "iou":
-            alike.append(iou(columns_to_boxes(people), columns_to_boxes(found)))
-        else:
-            alike.append(metrics.metres_to_similarity(metrics.distances(_xy(people), _xy(found)), gate))
+    (people, true_ids, true_ends), (found, track_ids, track_ends) = (_usable(part, column) for part in (truth, tracks))
+    places = columns_to_boxes if similarity == "iou" else _xy
+    a, b = places(people), places(found)
+    alike: list[Floats] = []
+    step = max(1, round(_PAIRS_AT_ONCE / max(1.0, len(a) * len(b) / max(1, len(truth)) ** 2)))
+    for first in range(0, len(truth), step):
+        alike += _similarities(a, b, true_ends[first : first + step + 1], track_ends[first : first + step + 1], gate)
     return Matchup(
-        tuple(np.searchsorted(true_ids, rows["track_id"]) for rows in true_rows),
-        tuple(np.searchsorted(track_ids, rows["track_id"]) for rows in track_rows),
+        tuple(np.split(true_ids.where, true_ends[1:-1])),
+        tuple(np.split(track_ids.where, track_ends[1:-1])),
         tuple(alike),
         gate if similarity == "iou" else 0.5,
-        len(true_ids),
-        len(track_ids),
+        true_ids.total,
+        track_ids.total,
     )
+
+
+class _Ids(NamedTuple):
+    """Ids as dense numbers from 0 on (N,), and how many there are."""
+
+    where: Ints
+    total: int
+
+
+def _usable(frames: Sequence[Frame], column: str) -> tuple[Rows, _Ids, Ints]:
+    """The rows of all frames that have a place, their ids, and where the rows of each frame begin and end."""
+    ends = np.cumsum([0] + [len(frame.rows) for frame in frames])
+    rows = TRACKS.empty(int(ends[-1]))
+    for low, frame in zip(ends.tolist(), frames, strict=False):
+        rows[low : low + len(frame.rows)] = frame.rows
+    usable = np.isfinite(rows[column])
+    if not usable.all():
+        ends, rows = np.concatenate([[0], usable.cumsum()])[ends], rows[usable]
+    names, where = np.unique(rows["track_id"], return_inverse=True)
+    return rows, _Ids(where, len(names)), ends
+
+
+def _similarities(a: Floats, b: Floats, a_ends: Ints, b_ends: Ints, gate: float) -> list[Floats]:
+    """How alike are the boxes or places in ``a`` and ``b`` of some frames, (G, H) a frame; all pairs in one go."""
+    people, found = np.diff(a_ends), np.diff(b_ends)
+    size = people * found
+    ends = np.cumsum(size)
+    frame = np.repeat(np.arange(len(size)), size)
+    within = np.arange(len(frame)) - (ends - size)[frame]
+    row = a_ends[frame] + within // found[frame]
+    column = b_ends[frame] + within % found[frame]
+    if a.shape[1] == 4:
+        alike = iou_of_pairs(a[row], b[column])
+    else:
+        apart = a[row] - b[column]
+        alike = metrics.metres_to_similarity(np.hypot(apart[:, 0], apart[:, 1]), gate)
+    spans = zip((ends - size).tolist(), ends.tolist(), people.tolist(), found.tolist(), strict=True)
+    return [alike[low:high].reshape(g, h) for low, high, g, h in spans]
 
 
 def _displacement(sequence: Sequenced, candidate: Candidate) -> Displacement | None:
@@ -312,6 +394,9 @@ def _displacement(sequence: Sequenced, candidate: Candidate) -> Displacement | N
     return displacement(positions(_resampled(sequence.truth, ticks)), positions(candidate.frames), forecasts)
 
 
-def sequence_of_files(tracks: Path, truth_frames: Sequence[Frame], track_frames: Sequence[Frame]) -> Sequenced:
-    """A label file of tracks and its truth, as one sequence."""
-    return Sequenced(tracks.stem, truth_frames, [Candidate(tracks.name, None, track_frames)])
+def sequence_of_files(
+    name: str, tracks: Path, truth_frames: Sequence[Frame], track_frames: Sequence[Frame], files: int
+) -> Sequenced:
+    """A file of tracks, one of ``files``, and its truth as one sequence."""
+    group = f"{files} files" if files > 1 else ""
+    return Sequenced(name, truth_frames, [Candidate(tracks.name, None, track_frames, group=group)])

@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import cache
+from typing import Final
+
 import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 Pairs = tuple[NDArray[np.intp], NDArray[np.intp]]
+
+#: Up to so many pairs it costs less to solve the whole than to look for what needs solving.
+_SMALL: Final = 600
 
 
 def solve(cost: Floats) -> Pairs:
@@ -14,10 +21,16 @@ def solve(cost: Floats) -> Pairs:
     if cost.shape[0] == 1 or cost.shape[1] == 1:  # common, and not worth a solver
         best = np.unravel_index(np.argmin(cost), cost.shape)
         return np.array([best[0]]), np.array([best[1]])
+    rows, columns = _solver()(cost)
+    return rows, columns
+
+
+@cache
+def _solver() -> Callable[[Floats], Pairs]:
+    """SciPy's solver, loaded once it is needed."""
     from scipy.optimize import linear_sum_assignment
 
-    rows, columns = linear_sum_assignment(cost)
-    return rows, columns
+    return linear_sum_assignment  # type: ignore[no-any-return]
 
 
 def assign(cost: Floats, gate: float) -> Pairs:
@@ -41,3 +54,48 @@ def assign(cost: Floats, gate: float) -> Pairs:
     rows, columns = solve(np.where(ok, part - lowest, forbidden))
     kept = ok[rows, columns]
     return row_at[rows[kept]], column_at[columns[kept]]
+
+
+def one_to_one(rows: NDArray[np.intp], columns: NDArray[np.intp]) -> bool:
+    """Whether no row and no column is in two pairs."""
+    return len(set(rows.tolist())) == len(rows) == len(set(columns.tolist()))
+
+
+def heaviest(pairs: Pairs, weight: Floats, shape: tuple[int, int]) -> NDArray[np.intp]:
+    """Which of the pairs (P,) to take so that no row and no column is taken twice, for the largest total weight (P,).
+
+    Weights are positive; ``shape`` is (M, N). Pairs that compete with no other are taken at once: only the rest needs
+    the solver, however large the whole is.
+    """
+    rows, columns = pairs
+    if one_to_one(rows, columns):
+        return np.arange(len(rows))
+    if shape[0] * shape[1] <= _SMALL:
+        return _solved(rows, columns, weight, np.arange(len(rows)), shape)
+    free = (np.bincount(rows)[rows] == 1) & (np.bincount(columns)[columns] == 1)
+    left = np.flatnonzero(~free)
+    row_at, column_at = _compact(rows[left]), _compact(columns[left])
+    taken = _solved(row_at, column_at, weight[left], left, (int(row_at.max()) + 1, int(column_at.max()) + 1))
+    return np.sort(np.concatenate([np.flatnonzero(free), taken]))
+
+
+def _solved(
+    rows: NDArray[np.intp],
+    columns: NDArray[np.intp],
+    weight: Floats,
+    names: NDArray[np.intp],
+    shape: tuple[int, int],
+) -> NDArray[np.intp]:
+    """The names of the pairs (P,) that the solver takes. What it makes of places without a pair does not matter."""
+    dense, pair = np.zeros(shape), np.full(shape, -1)
+    dense[rows, columns] = -weight
+    pair[rows, columns] = names
+    taken = pair[solve(dense)]
+    return taken[taken >= 0]
+
+
+def _compact(numbers: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Whole numbers renamed 0, 1, 2... in their order."""
+    there = np.zeros(int(numbers.max()) + 1, np.intp)
+    there[numbers] = 1
+    return (np.cumsum(there) - 1)[numbers]

@@ -23,7 +23,7 @@ from mcaptrack.plane import GroundPlane, Planes, assumed_plane
 from mcaptrack.provenance import CLOCK, Provenance, digest
 from mcaptrack.schema import DETECTIONS, GROUND_PLANE, PREDICTIONS, SCHEMAS, TRACKS, VIDEO, Frame, Schema
 from mcaptrack.schema.ground import plane_to_rows, rows_to_plane
-from mcaptrack.transforms import TRANSFORMS, Transform
+from mcaptrack.transforms import TRANSFORMS, Transform, choice, chosen
 from mcaptrack.video import Encoded, brightness
 
 Ints = NDArray[np.int64]
@@ -139,14 +139,16 @@ def plan_stage(
     target: str | None = None,
     keep: tuple[str, ...] | None = None,
     say: Say = lambda _: None,
+    defaults: Mapping[str, Transform] = {},
 ) -> list[Job]:
     """The jobs that run one stage, whether or not its channel stands, and before it what is missing or out of date.
 
-    ``source`` and ``target`` are topics other than the usual ones. Raises McaptrackError if there is nothing to start
+    ``source`` and ``target`` are topics other than the usual ones; ``defaults`` are transforms for stages that are
+    missing, where they are not to be the usual ones. Raises McaptrackError if there is nothing to start
     from.
     """
     route = ROUTES[stage]
-    planner = _Planner(opened, prefix, say)
+    planner = _Planner(opened, prefix, say, defaults=defaults)
     source = source or planner.source_of(stage)
     planner.ensure(source)
     planner.jobs.append(Job(stage, transform, source, target or f"{prefix}/{route.writes}", keep))
@@ -154,13 +156,19 @@ def plan_stage(
     return planner.jobs
 
 
-def plan_all(opened: log.Log, prefix: str, say: Say = lambda _: None, source: str | None = None) -> list[Job]:
+def plan_all(
+    opened: log.Log,
+    prefix: str,
+    say: Say = lambda _: None,
+    source: str | None = None,
+    defaults: Mapping[str, Transform] = {},
+) -> list[Job]:
     """The jobs that bring everything about a camera up to date; none if it is.
 
-    ``source`` is a topic with pictures or with boxes that others detected, to begin with. Raises McaptrackError as
-    ``plan_stage`` does.
+    ``source`` is a topic with pictures or with boxes that others detected, to begin with; ``defaults`` as in
+    ``plan_stage``. Raises McaptrackError as that does.
     """
-    planner = _Planner(opened, prefix, say, {_stage_from(opened, source): source} if source else {})
+    planner = _Planner(opened, prefix, say, {_stage_from(opened, source): source} if source else {}, defaults)
     for target in ("predictions", "retracks"):
         planner.ensure(f"{prefix}/{target}")
     _check_inputs(opened, prefix, planner.jobs)
@@ -174,10 +182,21 @@ def _stage_from(opened: log.Log, source: str) -> str:
 
 
 class _Planner:
-    """Collects the jobs that make channels stand and be up to date. ``sources`` are inputs of stages but the usual."""
+    """Collects the jobs that make channels stand and be up to date.
 
-    def __init__(self, opened: log.Log, prefix: str, say: Say, sources: Mapping[str, str] = {}) -> None:
+    ``sources`` are inputs of stages and ``defaults`` transforms of stages, where they are not the usual ones.
+    """
+
+    def __init__(
+        self,
+        opened: log.Log,
+        prefix: str,
+        say: Say,
+        sources: Mapping[str, str] = {},
+        defaults: Mapping[str, Transform] = {},
+    ) -> None:
         self.jobs: list[Job] = []
+        self._defaults = defaults
         self._opened, self._prefix, self._say = opened, prefix, say
         self._sources = sources
         self._changes: dict[str, bool] = {}
@@ -212,7 +231,7 @@ class _Planner:
             source = self.source_of(stage)
             self.ensure(source)
             self._say(f"{topic} is missing: running {stage}")
-            self.jobs.append(Job(stage, TRANSFORMS[stage](), source, topic))
+            self.jobs.append(Job(stage, self._defaults.get(stage) or TRANSFORMS[stage](), source, topic))
             return True
         made = Provenance.from_metadata(channel.metadata)
         had = made.input if made else self.source_of(stage)
@@ -244,9 +263,9 @@ def is_stale(opened: log.Log, topic: str) -> bool:
 def _transform_of(stage: str, channel: log.Channel) -> Transform:
     """The transform that made a channel, with the parameters it had as far as they are known today."""
     made = Provenance.from_metadata(channel.metadata)
-    kind = TRANSFORMS[stage]
-    names = {f.name for f in fields(kind) if not f.metadata.get("context")}
     had = made.parameters if made else {}
+    kind = chosen(stage, had)
+    names = {f.name for f in fields(kind) if not f.metadata.get("context")}
     return kind(**{key: value for key, value in had.items() if key in names})
 
 
@@ -317,7 +336,7 @@ def run(
             if topic not in job.kept():
                 continue
             messages = [(f.t_ns, f.index, schema.codec.encode(schema.check(f.rows))) for f in channel]
-            parameters = json.loads(json.dumps(asdict(transform)))
+            parameters = json.loads(json.dumps(choice(job.stage, transform) | asdict(transform)))
             provenance = Provenance(job.stage, parameters, job.source, input_digest(), digest(messages), weights)
             made[topic] = Made(schema, channel, provenance, messages)
             report.frames[topic] = len(channel)
@@ -404,6 +423,21 @@ def _pictures(
             progress(stage, index + 1, channel.messages)
 
     return total.hexdigest, brightness(encoded())
+
+
+def input_of(
+    opened: log.Log, prefix: str, stage: str, transform: Transform, source: str | None = None
+) -> tuple[list[Frame], dict[str, Any]]:
+    """What a stage would read from a log, and what the log knows for it (the fields made with ``context``).
+
+    Raises McaptrackError if the input isn't there.
+    """
+    topic = source or f"{prefix}/{ROUTES[stage].reads}"
+    job = Job(stage, transform, topic, f"{prefix}/{ROUTES[stage].writes}")
+    _check_inputs(opened, prefix, [job])
+    known = _in_context(opened, prefix, job, {}, read_planes(opened, prefix) or ())
+    context = {f.name: getattr(known, f.name) for f in fields(known) if f.metadata.get("context")}
+    return _frames(opened, topic, transform.reads), context
 
 
 def read_planes(opened: log.Log, prefix: str) -> Planes | None:

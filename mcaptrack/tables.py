@@ -140,6 +140,37 @@ def table_to_frames(schema: Schema, rows: Any, frames: Any, topic: str) -> list[
     return [Frame(t_ns, index, members[low:high]) for t_ns, index, low, high in spans]
 
 
+def read_columns(path: Path, names: Sequence[str]) -> dict[str, NDArray[Any]]:
+    """Columns of a Parquet file as arrays, missing numbers as NaN.
+
+    Raises McaptrackError if it is no Parquet file or lacks a column.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        with path.open("rb") as stream:  # a file alone: what its folders are called is no column
+            table = pq.read_table(stream)
+    except OSError as error:
+        raise McaptrackError(f"{path} can't be read: {error.strerror or error}") from None
+    except pa.ArrowException as error:
+        raise McaptrackError(f"{path} is no Parquet file that can be read: {str(error).splitlines()[0]}") from None
+    missing = [name for name in names if name not in table.column_names]
+    if missing:
+        raise McaptrackError(
+            f"{path} has no column {', '.join(missing)}; a table of tracks as `mcaptrack export` writes it has"
+        )
+    out = {}
+    for name in names:
+        column = table.column(name)
+        if pa.types.is_dictionary(column.type):
+            column = column.cast(pa.string())
+        if pa.types.is_floating(column.type):
+            column = column.fill_null(np.nan)
+        out[name] = column.to_numpy()
+    return out
+
+
 def write(path: Path, table: Any, provenance: Mapping[str, str]) -> None:
     """Write an Arrow table as Parquet, there once it is complete and can be read back.
 

@@ -10,12 +10,12 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from mcaptrack.boxes import iou
+from mcaptrack import kalman
+from mcaptrack.boxes import iou, overlapping
 from mcaptrack.clock import FrameClock, seconds_to_ns
 from mcaptrack.errors import McaptrackError
 from mcaptrack.history import Histories, Holt, fill_holes, rebuild
-from mcaptrack.kalman import BoxFilter, boxes_to_state, state_to_boxes
-from mcaptrack.match import assign, solve
+from mcaptrack.match import assign, heaviest, solve
 from mcaptrack.plane import GroundPlane, assumed_plane, plane_at
 from mcaptrack.resample import looked_at, resample
 from mcaptrack.scene import demo_scene
@@ -139,6 +139,42 @@ def test_the_solver_finds_the_least_total(cost):
     assert cost[rows, columns].sum() == pytest.approx(least)
 
 
+@given(hnp.arrays(float, (4, 5), elements=st.integers(0, 6).map(float)), st.integers(0, 5))
+def test_the_heaviest_pairs_are_those_of_every_combination(table, rows):
+    """By brute force, in a small table and in the same one as a part of a large one with pairs of its own."""
+    table = table[:rows]
+    at = np.nonzero(table)
+    taken = heaviest(at, table[at], table.shape)
+    least = -min((solve_by_hand(-table),), default=0.0)
+    assert table[at][taken].sum() == pytest.approx(least)
+    assert len(set(at[0][taken])) == len(set(at[1][taken])) == len(taken)
+    wide = np.zeros((40, 40))
+    wide[: len(table), :5] = table
+    wide[np.arange(10, 40), np.arange(39, 9, -1)] = 1.0
+    at = np.nonzero(wide)
+    assert wide[at][heaviest(at, wide[at], wide.shape)].sum() == pytest.approx(least + 30)
+
+
+def solve_by_hand(cost):
+    return min(
+        sum(cost[pair] for pair in zip(chosen, others, strict=True))
+        for chosen in itertools.combinations(range(cost.shape[0]), min(cost.shape))
+        for others in itertools.permutations(range(cost.shape[1]), min(cost.shape))
+    )
+
+
+@pytest.mark.parametrize("count", [0, 1, 7, 60])
+def test_overlapping_boxes_are_those_of_the_table_of_overlaps(count):
+    rng = np.random.default_rng(count)
+    a, b = (np.concatenate([rng.uniform(0, 300, (n, 2)), rng.uniform(1, 60, (n, 2))], axis=1) for n in (count, 50))
+    table = iou(a, b)
+    first, second, much = overlapping(*(np.concatenate([x[:, :2], x[:, :2] + x[:, 2:]], axis=1).T for x in (a, b)))
+    wanted = np.nonzero(table)
+    assert sorted(zip(first, second, strict=True)) == sorted(zip(*wanted, strict=True))
+    np.testing.assert_allclose(much, table[first, second])
+    assert (np.diff(first) >= 0).all()
+
+
 class TestFrameClock:
     def test_a_steady_clock_counts_one_frame_at_a_time(self):
         clock = FrameClock()
@@ -161,6 +197,25 @@ class TestFrameClock:
         clock = FrameClock()
         assert [clock.tick(t) for t in (100, 100, 50, 150)] == [1, 1, 1, 1]
 
+    def test_stamps_that_come_early_and_late_in_turn_count_one_frame_each(self):
+        """As at 24 frames a second on a clock of 60: 33 ms, 50 ms, 33 ms."""
+        clock = FrameClock()
+        times = np.cumsum([33, 50] * 30)
+        assert {clock.tick(int(t)) for t in times} == {1}
+        assert clock.stretch == 1.0
+
+    def test_a_new_frame_rate_is_noticed_once_and_jitter_never(self):
+        rng = np.random.default_rng(2)
+        times = np.cumsum([1000] * 60 + [2000] * 60).astype(float)
+        clock, factors = FrameClock(), []
+        for t in times + rng.uniform(-150, 150, len(times)):
+            clock.tick(int(t))
+            factors.append(clock.stretch)
+        changes = [(n, f) for n, f in enumerate(factors) if f != 1.0]
+        assert len(changes) == 1
+        assert 60 < changes[0][0] < 90
+        assert changes[0][1] == pytest.approx(2.0, rel=0.2)
+
     def test_before_two_frames_nothing_is_known(self):
         assert FrameClock().frames(100.0) == 1
 
@@ -170,36 +225,54 @@ class TestBoxFilter:
         """The decoupled filter against plain matrices."""
         rng = np.random.default_rng(1)
         boxes = np.abs(rng.normal(50, 10, (30, 4))) + np.arange(30)[:, None] * [1.5, 0.5, 0.2, 0.3]
+        measured = kalman.measure(boxes.T)
         move = np.eye(7) + np.diag([1.0, 1, 1], 4)[:7, :7]
         see = np.eye(4, 7)
         noise_seen = np.diag([1.0, 1, 10, 10])
         noise_move = np.diag([1, 1, 1, 1, 0.01, 0.01, 1e-4])
-        state = np.append(boxes_to_state(boxes[:1])[0], [0, 0, 0])
+        mean = np.append(measured[:, 0], [0, 0, 0])
         cov = np.diag([10.0, 10, 10, 10, 1e4, 1e4, 1e4])
-        ours = BoxFilter.born(boxes[:1])
-        for number, box in enumerate(boxes[1:]):
-            state, cov = move @ state, move @ cov @ move.T + noise_move
-            ours.predict()
-            if number % 4 != 3:  # some frames are missed
-                seen = boxes_to_state(box[None])[0]
+        ours = np.empty((kalman.STATE_ROWS, 1))
+        kalman.start(ours, measured[:, :1])
+        for number in range(1, 30):
+            mean, cov = move @ mean, move @ cov @ move.T + noise_move
+            kalman.predict(ours)
+            if number % 4:  # some frames are missed
+                seen = measured[:, number]
                 gain = cov @ see.T @ np.linalg.inv(see @ cov @ see.T + noise_seen)
-                state, cov = state + gain @ (seen - see @ state), (np.eye(7) - gain @ see) @ cov
-                ours.correct(np.array([0]), box[None])
-            np.testing.assert_allclose(ours.mean[0], state, rtol=1e-9)
-            np.testing.assert_allclose(ours.centre[0], [cov[0, 0], cov[0, 4], cov[4, 4]], rtol=1e-9)
-            np.testing.assert_allclose(ours.area[0], [cov[2, 2], cov[2, 6], cov[6, 6]], rtol=1e-9)
-            np.testing.assert_allclose(ours.ratio[0], cov[3, 3], rtol=1e-9)
+                mean, cov = mean + gain @ (seen - see @ mean), (np.eye(7) - gain @ see) @ cov
+                kalman.correct(ours, measured[:, number : number + 1])
+            np.testing.assert_allclose(ours[:7, 0], mean, rtol=1e-9)
+            of_centre, of_area, of_ratio = ours[8:, 0].reshape(3, 3).T
+            np.testing.assert_allclose(of_centre, [cov[0, 0], cov[0, 4], cov[4, 4]], rtol=1e-9)
+            np.testing.assert_allclose(of_area, [cov[2, 2], cov[2, 6], cov[6, 6]], rtol=1e-9)
+            np.testing.assert_allclose(of_ratio, [cov[3, 3], 0, 0], rtol=1e-9)
 
-    @given(hnp.arrays(float, (3, 4), elements=st.floats(1, 500)))
+    @given(hnp.arrays(float, (4, 3), elements=st.floats(1, 500)))
     def test_boxes_there_and_back(self, boxes):
-        np.testing.assert_allclose(state_to_boxes(boxes_to_state(boxes)), boxes, rtol=1e-9)
+        state = np.empty((kalman.STATE_ROWS, 3))
+        kalman.start(state, kalman.measure(boxes))
+        corners = kalman.corners(state)
+        np.testing.assert_allclose(np.concatenate([corners[:2], corners[2:] - corners[:2]]), boxes, rtol=1e-9)
 
     def test_an_area_that_would_vanish_stops_shrinking(self):
-        filter_ = BoxFilter.born(np.array([[0.0, 0, 4, 4]]))
-        filter_.mean[0, 6] = -20.0
-        filter_.predict()
-        assert filter_.mean[0, 2] == 16
-        assert filter_.mean[0, 6] == 0
+        state = np.empty((kalman.STATE_ROWS, 1))
+        kalman.start(state, kalman.measure(np.array([[0.0], [0], [4], [4]])))
+        state[6] = -20.0
+        kalman.predict(state)
+        assert state[2, 0] == 16
+        assert state[6, 0] == 0
+
+    def test_a_frame_that_takes_twice_as_long_is_two_frames(self):
+        """Where a box is expected, and how sure that is but for the noise, does not depend on what is called a frame."""
+        state = np.full((kalman.STATE_ROWS, 1), 3.0)
+        longer = state.copy()
+        kalman.predict(state)
+        kalman.predict(state)
+        kalman.stretch(longer, 2.0)
+        kalman.predict(longer)
+        np.testing.assert_allclose(longer[:3], state[:3])
+        np.testing.assert_allclose(longer[8:11], state[8:11], rtol=0.2)
 
 
 class TestHistories:

@@ -18,7 +18,7 @@ from mcaptrack import __version__, demo
 from tests.worlds import small_scene, write_clip
 
 STAGES = ["detect", "track", "sample", "predict", "retrack", "run"]
-COMMANDS = ["ingest", *STAGES, "evaluate", "export", "info", "check", "recover", "drop", "demo"]
+COMMANDS = ["ingest", *STAGES, "evaluate", "tune", "export", "info", "check", "recover", "drop", "demo"]
 
 
 def start(*words, folder: Path | None = None, environment: dict[str, str] | None = None) -> subprocess.Popen:
@@ -107,6 +107,16 @@ class TestTheUsualWay:
         _, err = done("run", finished)
         assert "nothing to do, everything is up to date" in err
         assert finished.read_bytes() == before
+
+    def test_another_tracker_replaces_the_tracks(self, finished, tmp_path):
+        path = tmp_path / "other.mcap"
+        done("track", finished, "--tracker", "bytetrack", "--new-score", 0.3, "-o", path)
+        channels = {c["topic"]: c for c in json.loads(done("info", path, "--json")[0])["results"][0]["channels"]}
+        assert channels["/camera/tracks"]["parameters"]["tracker"] == "bytetrack"
+        assert channels["/camera/tracks"]["parameters"]["new_score"] == 0.3
+        code, _, err = call("track", path, "--tracker", "ocsort", "--new-score", 0.3)
+        assert code == 1
+        assert err == "mcaptrack: --new-score is an option of bytetrack, not of ocsort\n"
 
     def test_a_stage_says_what_it_has_to_make_first(self, fresh):
         _, err = done("track", fresh)

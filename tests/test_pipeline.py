@@ -18,7 +18,7 @@ from mcaptrack.ingest import IngestOptions, ingest
 from mcaptrack.provenance import Provenance
 from mcaptrack.schema import DETECTIONS, GROUND_PLANE, PREDICTIONS, TRACKS
 from mcaptrack.schema.ground import rows_to_plane
-from mcaptrack.transforms import PROFILES, Detect, Predict, Retrack, Sample, Sort
+from mcaptrack.transforms import PROFILES, ByteTrack, Detect, OcSort, Predict, Retrack, Sample, Sort
 from tests.worlds import small_scene
 
 ROWS = ("detections", "tracks", "samples", "predictions", "retracks", "retracks/online", "retracks/predictions")
@@ -123,6 +123,22 @@ def test_what_was_made_from_something_replaced_is_said_and_made_again_as_it_was(
         assert made["/camera/tracks"].parameters["max_age_s"] == 0.7
         assert made["/camera/detections"].parameters["method"] == "mog2"
         assert [topic for topic in opened.channels if pipeline.is_stale(opened, topic)] == []
+
+
+def test_tracks_remember_their_tracker(fresh):
+    run_stage(fresh, "track", ByteTrack(low_min_iou=0.4))
+    run_all(fresh)
+    run_stage(fresh, "track", OcSort(inertia=0.1))
+    with log.read(fresh) as opened:
+        made = Provenance.from_metadata(opened.channel("/camera/tracks").metadata).parameters
+        assert (made["tracker"], made["inertia"]) == ("ocsort", 0.1)
+        assert "low_min_iou" not in made
+    run_stage(fresh, "detect", Detect(method="mog2"))
+    run_all(fresh)  # again, as before
+    with log.read(fresh) as opened:
+        made = Provenance.from_metadata(opened.channel("/camera/tracks").metadata).parameters
+        assert (made["tracker"], made["inertia"]) == ("ocsort", 0.1)
+        assert not pipeline.is_stale(opened, "/camera/tracks")
 
 
 def test_other_topics_can_be_read_and_written(fresh):

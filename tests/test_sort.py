@@ -5,16 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from mcaptrack.errors import McaptrackError
 from mcaptrack.plane import GroundPlane
 from mcaptrack.schema import DETECTIONS, Frame
-from mcaptrack.transforms.sort import Sort
+from mcaptrack.transforms.sort import TRACKERS, ByteTrack, OcSort, Sort
 from tests.worlds import boxes_at, detections, ids, ns
 
 FRAMES = {"max_age_frames": 2, "min_hits_frames": 2, "min_iou": 0.3}
 
 
-def run(frames, **options):
-    return [frame for (frame,) in Sort(**(FRAMES | options))(frames)]
+def run(frames, kind=Sort, **options):
+    return [frame for (frame,) in kind(**(FRAMES | options))(frames)]
 
 
 def test_one_who_walks_keeps_one_id():
@@ -96,6 +97,145 @@ def test_scores_and_metres_go_along():
     np.testing.assert_allclose([frame.rows["x_m"][0], frame.rows["y_m"][0]], [5.0, 7.0], atol=1e-6)
     (plain,) = list(Sort()(frames))[-1]
     assert np.isnan(plain.rows["x_m"]).all()
+
+
+def test_a_jitter_of_the_clock_changes_no_age():
+    """Ages and streaks in seconds come out the same, to the frame, however the stamps tremble."""
+    rng = np.random.default_rng(4)
+    frames = detections(lambda n: [] if 10 <= n < 19 else [(50, 60)], 40)
+    for age in (0.8, 0.9, 1.0):
+        wanted = [ids(frame) for (frame,) in Sort(max_age_s=age, min_hits_s=0.3)(frames)]
+        for _ in range(10):
+            shaken = [frame._replace(t_ns=frame.t_ns + int(rng.integers(-4_000_000, 4_000_000))) for frame in frames]
+            assert [ids(frame) for (frame,) in Sort(max_age_s=age, min_hits_s=0.3)(shaken)] == wanted
+    assert wanted[-1] == [1]
+
+
+def test_ages_are_seconds_even_where_the_frame_rate_changes():
+    """Somebody is away for 0.9 s: at 10 frames a second, and after the rate has risen to 30."""
+    times = [n / 10 for n in range(40)] + [4 + n / 30 for n in range(120)]
+    away = [(2.0, 2.9), (6.0, 6.9)]
+    frames = [
+        Frame(ns(t), n, boxes_at([] if any(a <= t < b for a, b in away) else [(50, 60)])) for n, t in enumerate(times)
+    ]
+    assert ids([f for (f,) in Sort(max_age_s=1.2, min_hits_s=0.1)(frames)][-1]) == [1]
+    assert ids([f for (f,) in Sort(max_age_s=0.6, min_hits_s=0.1)(frames)][-1]) == [3]
+
+
+def test_a_log_that_pauses_for_an_hour_does_not_go_on_with_who_was_there():
+    frames = detections(lambda n: [(50, 60)], 40)
+    late = [f._replace(t_ns=f.t_ns + (ns(3600) if f.index >= 20 else 0)) for f in frames]
+    out = [f for (f,) in Sort(max_age_s=1.0, min_hits_s=0.1)(late)]
+    assert (ids(out[19]), ids(out[-1])) == ([1], [2])
+
+
+def test_small_and_fast_boxes_are_followed_by_distance():
+    """Boxes of 8 px that move by 12 px a frame never overlap; their centres are near enough."""
+    frames = [Frame(ns(n / 10), n, boxes_at([(20 + 12 * n, 50), (20 + 12 * n, 130)], (8, 8))) for n in range(30)]
+    assert len({who for frame in run(frames) for who in ids(frame)}) > 2
+    out = run(frames, cost="pixels", max_distance_px=20.0)
+    assert {tuple(ids(frame)) for frame in out} == {(1, 2)}
+
+
+def test_distance_on_the_ground_is_not_distance_in_the_picture():
+    """Far away a metre is 2 px high: a jump of 12 px is a jump of 6 m there, and nothing near by."""
+    plane = GroundPlane((0.01, 0, 0, 0, 0.5, 0, 0, 0, 1), 640, 480)
+    frames = detections(lambda n: [(50, 50 if n < 10 else 62), (200 if n < 10 else 240, 300)], 20)
+    out = run(frames, cost="metres", max_distance_m=2.0, ground_planes=((0, plane),))
+    assert ids(out[9]) == [1, 2]
+    assert ids(out[-1]) == [2, 3]
+    with pytest.raises(McaptrackError, match="cost metres needs a ground plane"):
+        run(frames, cost="metres")
+
+
+def test_gates_of_class_and_score():
+    rows = boxes_at([(50, 50), (120, 50), (190, 50)])
+    rows["score"], rows["class_id"] = [0.9, 0.3, np.nan], [1, 1, 2]
+    frames = [Frame(ns(n / 10), n, rows) for n in range(6)]
+    assert ids(run(frames)[-1]) == [1, 2, 3]
+    assert ids(run(frames, min_score=0.5)[-1]) == [1, 2]  # one without a score passes
+    assert ids(run(frames, class_id=2)[-1]) == [1]
+    assert run(frames, class_id=2)[-1].rows["x_px"][0] == pytest.approx(180)
+
+
+def test_a_track_goes_on_with_boxes_of_its_class_only():
+    frames = detections(lambda n: [(50, 50)], 20)
+    for frame in frames[10:]:
+        frame.rows["class_id"] = 3
+    assert ids(run(frames)[-1]) == [2]
+    assert ids(run(frames, mix_classes=True)[-1]) == [1]
+
+
+def test_bytetrack_goes_on_with_doubtful_boxes_and_begins_nobody_with_them():
+    """One walks behind a hedge, where the detector doubts; something that is never sure stands beside."""
+    frames = detections(lambda n: [(50 + 4 * n, 50), (300, 50)], 40)
+    for frame in frames:
+        frame.rows["score"] = [0.2 if 10 <= frame.index < 30 else 0.9, 0.3]
+    out = run(frames, kind=ByteTrack)
+    assert {tuple(ids(frame)) for frame in out} == {(1,)}
+    sure = run(frames, min_score=0.5)
+    assert ids(sure[-1]) == [2]
+    assert [ids(frame) for frame in sure[15:25]] == [[]] * 10
+
+
+def test_bytetrack_gives_doubtful_boxes_to_who_was_just_there_only():
+    frames = detections(lambda n: [] if 10 <= n < 12 else [(50, 50)], 20)
+    for frame in frames[12:]:
+        frame.rows["score"] = 0.3
+    assert [ids(frame) for frame in run(frames, kind=ByteTrack)[12:]] == [[]] * 8
+
+
+def test_ocsort_finds_one_who_stops_behind_something_where_he_was_seen_last():
+    """The filter walks on while nobody is seen; the observation doesn't."""
+
+    def path(n):
+        return [] if 20 <= n < 32 else [(50 + 6 * min(n, 20), 50)]
+
+    options = {"max_age_frames": 30, "min_iou": 0.3}
+    assert ids(run(detections(path, 50), **options)[-1]) == [2]
+    assert ids(run(detections(path, 50), kind=OcSort, **options)[-1]) == [1]
+    assert ids(run(detections(path, 50), kind=OcSort, recover=False, **options)[-1]) == [2]
+
+
+def test_ocsort_forgets_what_the_filter_made_up():
+    """Found again, a track goes on as if it had been seen on the straight line all the while it was hidden."""
+
+    def path(n):
+        return (50 + 3 * n, 100) if n <= 19 else (107 - (n - 19), 100 + 0.5 * (n - 19))
+
+    options = {"max_age_frames": 30, "min_hits_frames": 0, "min_iou": 0.05, "kind": OcSort}
+    seen = run(detections(lambda n: [path(n)], 34), **options)
+    hidden = run(detections(lambda n: [] if 20 <= n < 29 else [path(n)], 34), **options)
+    dreamt = run(detections(lambda n: [] if 20 <= n < 29 else [path(n)], 34), reupdate=False, **options)
+    for n in range(29, 34):
+        for name in ("x_px", "y_px", "w_px", "h_px"):
+            np.testing.assert_allclose(hidden[n].rows[name], seen[n].rows[name], atol=1e-9)
+    assert abs(dreamt[30].rows["x_px"] - seen[30].rows["x_px"]) > 0.01
+
+
+def test_ocsort_prefers_who_comes_the_way_it_goes():
+    """Two boxes overlap a track alike; one lies ahead, one behind."""
+    frames = detections(lambda n: [(100 + 8 * n, 100)], 12)
+    last = 100 + 8 * 11
+    ahead, behind = (last + 8 + 6, 100), (last + 8 - 6.5, 100)
+    frames += [Frame(ns(1.2), 12, boxes_at([behind, ahead]))]
+    options = {"min_hits_frames": 0, "max_age_frames": 5, "direction_frames": 1}
+
+    def follower(**more):
+        rows = run(frames, kind=OcSort, **options, **more)[-1].rows
+        return float(rows["x_px"][rows["track_id"] == 1][0]) + 10
+
+    assert follower(inertia=0.6) > last + 8
+    assert follower(inertia=3.0) > last + 8
+
+
+def test_with_nothing_that_tells_them_apart_the_trackers_agree():
+    """Sure boxes, nobody lost: the three are one."""
+    frames = detections(lambda n: [(50 + 3 * n, 50), (300 - 3 * n, 150)], 30)
+    outs = [run(frames, kind=kind) for kind in TRACKERS.values()]
+    for out in outs[1:]:
+        for a, b in zip(outs[0], out, strict=True):
+            np.testing.assert_allclose(a.rows["x_px"], b.rows["x_px"])
 
 
 @pytest.mark.parametrize(

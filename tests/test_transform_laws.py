@@ -14,7 +14,7 @@ from mcaptrack.clock import NS_PER_S
 from mcaptrack.errors import McaptrackError
 from mcaptrack.plane import GroundPlane
 from mcaptrack.schema import TRACKS, VIDEO, Frame
-from mcaptrack.transforms import PROFILES, TRANSFORMS, Retrack, Transform
+from mcaptrack.transforms import PROFILES, TRACKERS, TRANSFORMS, Retrack, Transform
 from tests.worlds import boxes_at, ns
 
 PLANE = GroundPlane((0.05, 0, 0, 0, 0.05, 0, 0, 0, 1), 640, 480)
@@ -39,7 +39,9 @@ def boxes(rng: np.random.Generator) -> list[Frame]:
     for number in range(30):
         now += 0.1 * rng.choice([1, 1, 1, 1, 1, 4]) + rng.uniform(-0.01, 0.01)
         centres = [*(start + speed * number)[rng.random(4) > 0.25], *rng.uniform(0, 600, (rng.poisson(0.3), 2))]
-        frames.append(Frame(ns(now), number, boxes_at(rng.permutation(np.array(centres).reshape(-1, 2)))))
+        rows = boxes_at(rng.permutation(np.array(centres).reshape(-1, 2)))
+        rows["score"] = rng.uniform(0.2, 1.0, len(rows))
+        frames.append(Frame(ns(now), number, rows))
     return frames
 
 
@@ -82,7 +84,10 @@ def variants() -> list[tuple[str, Transform]]:
     out += [("retrack", Retrack(distance="first", min_history=1, backfill="none", max_age_s=1.0))]
     out += [("predict", TRANSFORMS["predict"](predictor=name)) for name in ("cv", "holt-cv")]
     out += [("detect", TRANSFORMS["detect"](method=name, stabilise=False)) for name in ("mog2", "frame-difference")]
-    out += [("track", TRANSFORMS["track"](max_age_frames=1, min_hits_frames=3, ground_planes=((0, PLANE),)))]
+    plane = {"ground_planes": ((0, PLANE),)}
+    out += [("track", kind()) for kind in TRACKERS.values()]
+    out += [("track", kind(max_age_frames=9, min_hits_frames=3, cost="metres", **plane)) for kind in TRACKERS.values()]
+    out += [("track", TRACKERS["sort"](cost="pixels", min_score=0.4, class_id=1))]
     return out
 
 
@@ -198,7 +203,10 @@ def test_frames_in_the_middle_may_be_silent(name, transform):
     assert sum(rows[-5:]) > 0
 
 
-@pytest.mark.parametrize("kind", TRANSFORMS.values(), ids=TRANSFORMS)
+KINDS = dict(TRANSFORMS) | dict(TRACKERS)
+
+
+@pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS)
 def test_every_parameter_says_what_it_is_and_refuses_what_it_can_not_be(kind):
     for parameter in fields(kind):
         if parameter.metadata.get("context"):

@@ -17,6 +17,7 @@ from mcaptrack.cli.files import check, drop, recover
 from mcaptrack.cli.ingest import ingest
 from mcaptrack.cli.show import export, info
 from mcaptrack.cli.stages import add_stages
+from mcaptrack.cli.tune import tune
 
 app = typer.Typer(
     name="mcaptrack",
@@ -48,6 +49,7 @@ def _main(
 register(app, "ingest", ingest)
 add_stages(app)
 register(app, "evaluate", evaluate)
+register(app, "tune", tune)
 register(app, "export", export)
 register(app, "info", info)
 register(app, "check", check)

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import difflib
 import tomllib
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Any, Final
 
 import typer
 
 NAME: Final = "mcaptrack.toml"
+#: The tables of the file that was read for the running command.
+_TABLES: Final[ContextVar[dict[str, Any]]] = ContextVar("tables", default={})  # noqa: B039
 
 
 def read_config(context: typer.Context, path: Path | None) -> Path | None:
@@ -41,9 +44,16 @@ def read_config(context: typer.Context, path: Path | None) -> Path | None:
                 raise typer.BadParameter(
                     f"{source}: {name} has no option {key}{_nearest(key.replace('_', '-'), options)}"
                 )
+    _TABLES.set(tables)
     mine = tables.get(context.info_name or "", {})
     context.default_map = {key.replace("-", "_"): value for key, value in mine.items()}
     return path
+
+
+def settings_of(command: str) -> dict[str, Any]:
+    """What the file that was read for the running command says of another one, by parameter; {} if nothing."""
+    table = _TABLES.get().get(command, {})
+    return {key.replace("-", "_"): value for key, value in table.items()}
 
 
 def _nearest(name: str, known: Any) -> str:

@@ -31,12 +31,14 @@ _FORECAST_COLUMNS: Final = {
 def evaluate(
     inputs: Annotated[
         list[Path],
-        typer.Argument(metavar="LOG|TRACKS...", help="Logs, or label files of tracks.", show_default=False),
+        typer.Argument(metavar="LOG|TRACKS...", help="Logs, or files of tracks.", show_default=False),
     ],
     truth: Annotated[
         list[Path] | None,
         common.option(
-            "--truth", help="True tracks for label files, one for each, in the same order.", show_default=False
+            "--truth",
+            help="True tracks for files of tracks: one for each, matched by name or in order.",
+            show_default=False,
         ),
     ] = None,
     similarity: Annotated[
@@ -86,10 +88,13 @@ def evaluate(
 ) -> None:
     """Score tracks and forecasts against the truth.
 
-    Reads /camera/truth and the tracks of a log; or label files of tracks, with --truth. Distances are on the ground,
-    for tracks on the clock of prediction; overlaps are those of boxes.
+    Reads /camera/truth and the tracks of a log; or files of tracks, with --truth: MOTChallenge (by the rules of MOT15,
+    or of MOT16 and later where the truth names classes), KITTI tracking, Parquet as `mcaptrack export` writes it, and
+    the label files that `mcaptrack ingest` reads. Distances are on the ground, overlaps are those of boxes.
 
     Example: mcaptrack evaluate log.mcap --similarity metres --gate-m 1
+
+    Example: mcaptrack evaluate tracks.txt --truth gt.txt --fail-under idf1=0.7
     """
     from mcaptrack.evaluation import EvaluateOptions
     from mcaptrack.evaluation import evaluate as score
@@ -105,8 +110,8 @@ def evaluate(
     with common.Talk(quiet, verbose).open() as talk:
         paths = common.expand(inputs)
         if truth:
-            plane_options = {"ground_plane": ground_plane, "point": point, "fps": fps}
-            sequences = _from_files(paths, common.expand(truth), plane_options)
+            plane_options = {"ground_plane": ground_plane, "point": point, "fps": fps, "topics": options.topics}
+            sequences = _from_files(paths, common.expand(truth), plane_options, talk)
         else:
             sequences = _from_logs(paths, camera, options.topics)
         outcome = score(sequences, options, talk.detail)
@@ -169,17 +174,22 @@ def _from_logs(paths: Sequence[Path], camera: str | None, topics: tuple[str, ...
     return sequences
 
 
-def _from_files(tracks: Sequence[Path], truths: Sequence[Path], given: dict[str, Any]) -> list[Sequenced]:
+def _from_files(
+    tracks: Sequence[Path], truths: Sequence[Path], given: dict[str, Any], talk: common.Talk
+) -> list[Sequenced]:
     from mcaptrack.cli.ingest import _fps
     from mcaptrack.evaluation import sequence_of_files
-    from mcaptrack.ingest import label_frames
+    from mcaptrack.ingest.compared import compare_files, pair_files
 
-    if len(tracks) != len(truths):
-        raise McaptrackError(f"{len(tracks)} files of tracks and {len(truths)} of truth; give one truth for each")
+    pairs, words = pair_files(tracks, truths)
+    if words:
+        talk.say(words)
     sequences = []
-    for path, truth in zip(tracks, truths, strict=True):
-        both = label_frames({"tracks": path, "truth": truth}, _fps(given["fps"]), given["ground_plane"], given["point"])
-        sequences.append(sequence_of_files(path, both["truth"], both["tracks"]))
+    for name, path, truth in pairs:
+        both = compare_files(path, truth, _fps(given["fps"]), given["ground_plane"], given["point"], given["topics"])
+        for note in both.notes:
+            talk.say(note)
+        sequences.append(sequence_of_files(name, path, both.truth, both.tracks, len(pairs)))
     return sequences
 
 

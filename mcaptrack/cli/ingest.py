@@ -55,7 +55,8 @@ def ingest(
     tracks: LabelFile = None,
     truth: LabelFile = None,
     label_format: Annotated[
-        Literal["auto", "mot", "sdd", "trajnet", "obsmat"], common.option("--format", help="Format of the label files.")
+        Literal["auto", "mot", "kitti", "sdd", "trajnet", "obsmat"],
+        common.option("--format", help="Format of the label files."),
     ] = "auto",
     role: Annotated[
         Literal["detections", "tracks", "truth"] | None,

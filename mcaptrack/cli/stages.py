@@ -11,14 +11,15 @@ from typing import Annotated, Any, Final, Literal, get_type_hints
 import typer
 
 from mcaptrack.cli import common
+from mcaptrack.cli.config import NAME, settings_of
 from mcaptrack.errors import McaptrackError
-from mcaptrack.transforms import PROFILES, TRANSFORMS, Transform
+from mcaptrack.transforms import ALTERNATIVES, PROFILES, TRANSFORMS, Transform
 from mcaptrack.transforms.protocol import bare_type
 
 #: What a command says of itself, beyond its transform.
 _WORDS: Final = {
     "detect": ("Example: mcaptrack detect log.mcap --method mog2", "{camera}/video", "{camera}/detections"),
-    "track": ("Example: mcaptrack track log.mcap --max-age-s 2", "{camera}/detections", "{camera}/tracks"),
+    "track": ("Example: mcaptrack track log.mcap --tracker bytetrack", "{camera}/detections", "{camera}/tracks"),
     "sample": ("Example: mcaptrack sample log.mcap --rate-hz 2.5", "{camera}/tracks", "{camera}/samples"),
     "predict": ("Example: mcaptrack predict log.mcap --predictor cv", "{camera}/samples", "{camera}/predictions"),
     "retrack": ("Example: mcaptrack retrack log.mcap --profile authors", "{camera}/samples", "{camera}/retracks"),
@@ -44,16 +45,27 @@ def _help(name: str, kind: type[Transform]) -> str:
     where = (
         f"From {source.format(camera='/camera')} to {target.format(camera='/camera')}. A missing input is made first."
     )
-    return f"{inspect.cleandoc(kind.__doc__ or '')}\n\n{where}\n\n{example}"
+    others = [] if name not in ALTERNATIVES else [k for k in ALTERNATIVES[name].kinds.values() if k is not kind]
+    words = [inspect.cleandoc(one.__doc__ or "") for one in (kind, *others)]
+    return "\n\n".join([*words, where, example])
 
 
-def _option(name: str, annotation: Any, default: Any, words: str) -> inspect.Parameter:
-    """An option that is None unless it is given, and whose help shows what happens then."""
+def _option(name: str, annotation: Any, default: Any, words: str, whose: str = "") -> inspect.Parameter:
+    """An option that is None unless it is given, and whose help shows what happens then.
+
+    ``whose`` names the one of several transforms that it belongs to, if it doesn't belong to all.
+    """
     flag = "--" + name.replace("_", "-")
     names = (flag, f"--no-{flag[2:]}") if bare_type(annotation) is bool else (flag,)
     shown = "none" if default is None else str(default).lower() if isinstance(default, bool) else f"{default}"
-    info = common.option(*names, help=words[:1].upper() + words[1:] + ".", show_default=shown)
+    panel: dict[str, Any] = {"rich_help_panel": f"Options of {whose} alone"} if whose else {}
+    info = common.option(*names, help=words[:1].upper() + words[1:] + ".", show_default=shown, **panel)
     return _parameter(name, Annotated[bare_type(annotation) | None, info], None)
+
+
+def _options_of(kind: type[Transform]) -> dict[str, Any]:
+    """The parameters of a transform that are options, by name."""
+    return {f.name: f for f in fields(kind) if not f.metadata.get("context")}
 
 
 def _parameter(name: str, annotation: Any, default: Any) -> inspect.Parameter:
@@ -62,21 +74,29 @@ def _parameter(name: str, annotation: Any, default: Any) -> inspect.Parameter:
 
 def _stage_command(name: str, kind: type[Transform]) -> Callable[..., None]:
     """The function behind a stage's command: its signature is made of what the transform declares."""
-    hints = get_type_hints(kind)
-    own = [f for f in fields(kind) if not f.metadata.get("context")]
-    defaults = PROFILES["default"] if name == "retrack" else kind()
+    several = ALTERNATIVES.get(name)
+    kinds = dict(several.kinds) if several else {name: kind}
+    defaults = {one: PROFILES["default"] if one == "retrack" else made() for one, made in kinds.items()}
+    own = {one: _options_of(made) for one, made in kinds.items()}
     parameters = [_parameter("logs", common.Logs, inspect.Parameter.empty)]
-    extra: list[inspect.Parameter] = []
-    if name == "track":
-        words = common.option("--tracker", help="Which tracker.")
-        extra.append(_parameter("tracker", Annotated[Literal["sort"], words], "sort"))
+    if several:
+        words = common.option("--" + several.option, help=f"Which {several.option}.")
+        default = next(one for one, made in kinds.items() if made is kind)
+        parameters.append(_parameter(several.option, Annotated[Literal[tuple(kinds)], words], default))
     if name == "retrack":
         words = common.option("--profile", help="Whose reading: ours, the paper's, or its authors' program's.")
-        extra.append(_parameter("profile", Annotated[Literal[tuple(PROFILES)], words], "default"))
+        parameters.append(_parameter("profile", Annotated[Literal[tuple(PROFILES)], words], "default"))
         words = common.option("--mode", help="With all the log knows (offline), from the past alone (online), or both.")
-        extra.append(_parameter("mode", Annotated[Mode, words], "both"))
-    parameters += extra
-    parameters += [_option(f.name, hints[f.name], getattr(defaults, f.name), f.metadata["help"]) for f in own]
+        parameters.append(_parameter("mode", Annotated[Mode, words], "both"))
+    there: dict[str, list[str]] = {}
+    for one, found in own.items():
+        for f in found:
+            there.setdefault(f, []).append(one)
+    for option, those in there.items():
+        one = those[0]
+        help_text = own[one][option].metadata["help"]
+        hint, shown = get_type_hints(kinds[one])[option], getattr(defaults[one], option)
+        parameters.append(_option(option, hint, shown, help_text, one if len(those) < len(kinds) else ""))
     to = common.option("--to", shared=True, help="Write this channel instead of the usual one.")
     parameters += [
         _parameter("topic", Topic, None),
@@ -92,9 +112,14 @@ def _stage_command(name: str, kind: type[Transform]) -> Callable[..., None]:
     ]
 
     def command(**given: Any) -> None:
-        base: Transform = PROFILES[given["profile"]] if name == "retrack" else kind()
-        chosen = {f.name: given[f.name] for f in own if given[f.name] is not None}
-        transform = replace(base, **chosen)
+        one = given[several.option] if several else name
+        base: Transform = PROFILES[given["profile"]] if name == "retrack" else kinds[one]()
+        wanted = {option: given[option] for option in there if given[option] is not None}
+        for option in wanted:
+            if option not in own[one]:
+                flag = "--" + option.replace("_", "-")
+                raise McaptrackError(f"{flag} is an option of {' and '.join(there[option])}, not of {one}")
+        transform = replace(base, **wanted)
         keep = _OUTPUTS_OF[given["mode"]] if name == "retrack" else None
         _run_on_logs(given, lambda plan: plan.stage(name, transform, given["topic"], given["to"], keep))
 
@@ -128,6 +153,23 @@ def run_all(
     _run_on_logs(given | {"json": json, "quiet": quiet, "verbose": verbose}, lambda plan: plan.all(topic), tables)
 
 
+def _configured() -> dict[str, Transform]:
+    """The stages as mcaptrack.toml wants them, for those that a command makes on its way; others aren't listed."""
+    out: dict[str, Transform] = {}
+    for name, default in TRANSFORMS.items():
+        settings = settings_of(name)
+        several = ALTERNATIVES.get(name)
+        wanted = settings.get(several.option) if several else None
+        if several and wanted is not None and wanted not in several.kinds:
+            raise McaptrackError(f"{NAME}: {several.option} is one of {', '.join(several.kinds)}, not {wanted!r}")
+        kind = several.kinds[wanted] if several and wanted else default
+        base = PROFILES[settings["profile"]] if name == "retrack" and settings.get("profile") in PROFILES else kind()
+        chosen = {option: value for option, value in settings.items() if option in _options_of(kind)}
+        if chosen or settings.keys() & {"tracker", "profile"}:
+            out[name] = replace(base, **chosen)
+    return out
+
+
 class _Plan:
     """What to do on one log, once it is open."""
 
@@ -139,12 +181,14 @@ class _Plan:
     ) -> Any:
         from mcaptrack import pipeline
 
-        return pipeline.plan_stage(self._opened, self._prefix, name, transform, topic, to, keep, self._say)
+        return pipeline.plan_stage(
+            self._opened, self._prefix, name, transform, topic, to, keep, self._say, _configured()
+        )
 
     def all(self, topic: str | None) -> Any:
         from mcaptrack import pipeline
 
-        return pipeline.plan_all(self._opened, self._prefix, self._say, topic)
+        return pipeline.plan_all(self._opened, self._prefix, self._say, topic, _configured())
 
 
 def _run_on_logs(given: Mapping[str, Any], make_plan: Callable[[_Plan], Any], tables: bool = False) -> None:

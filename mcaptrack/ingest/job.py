@@ -145,7 +145,7 @@ class Job:
     def frames(self, role: Role, plane: GroundPlane | None, numbers: Ints, t_ns: Ints) -> list[Frame]:
         """The labels of the frames with these ``numbers`` in the file, at these times; empty ones too."""
         labels = self.labels[role][1]
-        rows = _label_rows(labels, role, plane)
+        rows = label_rows(labels, role, plane)
         first, last = (np.searchsorted(labels.frame, numbers, side) for side in ("left", "right"))
         columns = (t_ns, self.frame_index(labels, numbers), first, last)
         spans = zip(*(column.tolist() for column in columns), strict=True)
@@ -194,7 +194,8 @@ class PictureJob(Job):
         return known + labels.first_frame, np.array(times, np.int64)[known]
 
 
-def _label_rows(labels: Labels, role: Role, plane: GroundPlane | None) -> Rows:
+def label_rows(labels: Labels, role: Role, plane: GroundPlane | None) -> Rows:
+    """The N rows of labels as rows of detections or tracks; in metres too, given a plane."""
     if role == "detections" and labels.boxes_px is not None:
         x, y, w, h = labels.boxes_px.T
         return DETECTIONS.rows(

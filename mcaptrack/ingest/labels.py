@@ -1,11 +1,15 @@
-"""Label files -> rows: MOTChallenge, Stanford Drone annotations, TrajNet text, ETH obsmat.
+"""Label files -> rows: MOTChallenge, KITTI tracking, Stanford Drone annotations, TrajNet text, ETH obsmat.
 
 | format  | columns                                                                        | frames | unit |
 |---------|--------------------------------------------------------------------------------|--------|------|
 | mot     | frame, id, left, top, width, height[, score[, ...]]; 6 to 10, comma separated  | from 1 | px   |
+| kitti   | frame id type truncated occluded alpha left top right bottom ...; 17 or 18     | from 0 | px   |
 | sdd     | id xmin ymin xmax ymax frame lost occluded generated "label"; blank separated  | from 0 | px   |
 | trajnet | frame id x y; comma or blank separated                                         | from 0 | m    |
 | obsmat  | frame id x z y vx vz vy; blank separated                                       | from 0 | m    |
+
+MOTChallenge's truth names the class of a box in column 8 since MOT16; in MOT15, which has 10 columns, a position stands
+there. Truth also holds boxes of what isn't scored: see ``Aside``.
 
 Letters: N rows.
 """
@@ -22,13 +26,37 @@ from numpy.typing import NDArray
 
 from mcaptrack.errors import McaptrackError
 
-Format = Literal["auto", "mot", "sdd", "trajnet", "obsmat"]
+Format = Literal["auto", "mot", "kitti", "sdd", "trajnet", "obsmat"]
 Role = Literal["detections", "tracks", "truth"]
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
 
 _NO_ID: Final = -1
 _PEDESTRIAN: Final = 1
+
+
+#: Classes of MOT16, 17 and 20 that are people but none to be found: on a vehicle, standing still (a statue),
+#: distractors, reflections.
+_DISTRACTORS: Final = (2, 7, 8, 12)
+#: Occluded more than this, or truncated at all, KITTI's people don't count; boxes up to this height don't count against
+#: anybody.
+_KITTI_OCCLUDED: Final = 2
+KITTI_HEIGHT_PX: Final = 25.0
+
+
+@dataclass(frozen=True)
+class Aside:
+    """Labelled boxes that nobody has to find: frames (N,) as in the file, boxes (N, 4).
+
+    ``forgiven`` (N,): a track that is matched with the box counts neither for nor against; otherwise it counts as found
+    nobody. ``region`` (N,): so do tracks that match nobody and lie in the box.
+    """
+
+    frame: Ints
+    boxes_px: Floats
+    forgiven: Bools
+    region: Bools
 
 
 @dataclass(frozen=True)
@@ -37,7 +65,7 @@ class Labels:
 
     ``frame`` (N,) is the number in the file, which is ``first_frame`` for the video's first frame. ``id`` (N,) is -1 in
     detections. ``boxes_px`` (N, 4) or ``xy_m`` (N, 2) is None where the format has none. ``score`` (N,) is NaN where
-    there is none. ``left_out`` says what the file holds that is not of people.
+    there is none. ``left_out`` says what the file holds that is not of people; of truth, ``aside`` holds it.
     """
 
     format: Format
@@ -48,6 +76,7 @@ class Labels:
     xy_m: Floats | None
     score: Floats
     left_out: str = ""
+    aside: Aside | None = None
 
     @property
     def step(self) -> int:
@@ -101,6 +130,8 @@ def _guess(path: Path, number: int, line: str) -> Format:
         return "mot"
     if len(columns) == 10 and columns[-1].startswith('"'):
         return "sdd"
+    if len(columns) in (17, 18) and columns[2].isalpha():
+        return "kitti"
     if len(columns) == 4:
         return "trajnet"
     if len(columns) == 8 and "," not in line:
@@ -154,9 +185,10 @@ def _read_mot(path: Path, numbered: Sequence[tuple[int, str]], role: Role) -> La
     columns = "frame, id, left, top, width, height, score, ..."
     values, lines = _table(path, numbered, "MOTChallenge", 6, 10, columns)
     frame = _whole(path, lines, values[:, 0], "the frame", 0)
-    extra = np.full((len(values), 3), np.nan)  # score, class, visibility
+    extra = np.full((len(values), 2), np.nan)  # score, class
     for row, (number, line) in enumerate(numbered):
-        parts = _split(line)[6:9]
+        parts = _split(line)
+        parts = parts[6:8] if len(parts) < 10 else parts[6:7]  # 10 columns are MOT15's: no classes
         try:
             extra[row, : len(parts)] = [float(part) for part in parts]
         except ValueError:
@@ -167,11 +199,20 @@ def _read_mot(path: Path, numbered: Sequence[tuple[int, str]], role: Role) -> La
     ids = _whole(path, lines, values[:, 1], "the id", _NO_ID)
     kept = np.ones(len(values), bool)
     if role == "truth":
-        # MOT16 and later name the class of a box (-1 in MOT15); a score of 0 marks boxes that don't count.
-        kept = (extra[:, 0] != 0) & ((extra[:, 1] == _PEDESTRIAN) | ~(extra[:, 1] > 0))
+        kind = extra[:, 1]
+        if (kind == 0).all():
+            raise McaptrackError(
+                f"{path}: the class of all {len(kind)} boxes (column 8) is 0; pedestrians are 1 there since MOT16, and "
+                "-1 or no column 8 says that there are no classes"
+            )
+        # A score of 0 marks boxes that don't count.
+        kept = (extra[:, 0] != 0) & ((kind == _PEDESTRIAN) | (kind == _NO_ID) | np.isnan(kind))
         if not kept.any():
             raise McaptrackError(f"{path}: all {len(kept)} boxes are marked as not counting (score 0 or a class but 1)")
     gone = int((~kept).sum())
+    left = ~kept
+    forgiven = np.isin(extra[left, 1], _DISTRACTORS)
+    aside = Aside(frame[left], boxes[left], forgiven, np.zeros(gone, bool)) if (extra[:, 1] > 0).any() else None
     score = extra[:, 0] if role != "truth" else np.full(len(values), np.nan)
     return Labels(
         "mot",
@@ -182,6 +223,49 @@ def _read_mot(path: Path, numbered: Sequence[tuple[int, str]], role: Role) -> La
         None,
         score[kept],
         f"{gone} boxes that don't count (score 0 or a class but 1)" if gone else "",
+        aside,
+    )
+
+
+def _read_kitti(path: Path, numbered: Sequence[tuple[int, str]], role: Role) -> Labels:
+    """KITTI tracking: pedestrians. Scores (column 18) are those of a tracker's."""
+    columns = "frame id type truncated occluded alpha left top right bottom height width length x y z rotation score"
+    values = np.empty((len(numbered), 8))  # frame, id, truncated, occluded, corners
+    kind, score = np.empty(len(numbered), object), np.full(len(numbered), np.nan)
+    for row, (number, line) in enumerate(numbered):
+        parts = _split(line)
+        try:
+            if len(parts) not in (17, 18):
+                raise ValueError
+            values[row] = [float(parts[at]) for at in (0, 1, 3, 4, 6, 7, 8, 9)]
+            kind[row] = parts[2].lower()
+            score[row] = float(parts[17]) if len(parts) == 18 else np.nan
+        except ValueError:
+            raise McaptrackError(f"{path}:{number}: not KITTI tracking ({columns}): {line[:60]}") from None
+    lines = np.array([number for number, _ in numbered])
+    frame, who = _whole(path, lines, values[:, 0], "the frame", 0), _whole(path, lines, values[:, 1], "the id", _NO_ID)
+    corners = values[:, 4:8]
+    boxes = _boxes(path, lines, np.concatenate([corners[:, :2], corners[:, 2:] - corners[:, :2]], axis=1))
+    people = kind == "pedestrian"
+    if not people.any():
+        raise McaptrackError(f"{path} holds no pedestrians, only {', '.join(sorted(set(kind.tolist())))}")
+    seen = people.copy()
+    if role == "truth":
+        seen &= (values[:, 2] <= 0) & (values[:, 3] <= _KITTI_OCCLUDED)
+    region = kind == "dontcare"
+    left = ~seen & (people | (kind == "person_sitting") | (kind == "person") | region)
+    aside = Aside(frame[left], boxes[left], ~region[left], region[left])
+    gone = int((~seen).sum())
+    return Labels(
+        "kitti",
+        0,
+        frame[seen],
+        who[seen],
+        boxes[seen],
+        None,
+        score[seen],
+        f"{gone} boxes that don't count (no pedestrians, or hidden or cut off)" if gone else "",
+        aside if role == "truth" else None,
     )
 
 
@@ -243,6 +327,7 @@ def _refuse_twins(path: Path, labels: Labels) -> None:
 
 _READERS: Final[dict[str, Callable[[Path, Sequence[tuple[int, str]], Role], Labels]]] = {
     "mot": _read_mot,
+    "kitti": _read_kitti,
     "sdd": _read_sdd,
     "trajnet": _read_trajnet,
     "obsmat": _read_obsmat,

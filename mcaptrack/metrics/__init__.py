@@ -46,7 +46,10 @@ def combine(scores: Sequence[Score]) -> Score:
 
 
 def summary(part: Score) -> dict[str, Any]:
-    """The numbers that people compare: rates between 0 and 1, counts as whole numbers."""
+    """The numbers that people compare: rates between 0 and 1, counts as whole numbers.
+
+    Where the truth holds nobody MOTA is 0, as TrackEval has it; it means nothing there.
+    """
     c, h = part.counts, part.hota
     det_a = h["HOTA_TP"] / np.maximum(1, h["HOTA_TP"] + h["HOTA_FN"] + h["HOTA_FP"])
 
@@ -54,7 +57,7 @@ def summary(part: Score) -> dict[str, Any]:
         return a / max(b, 1.0)
 
     return {
-        "MOTA": ratio(c["TP"] - c["FP"] - c["IDSW"], c["TP"] + c["FN"]),
+        "MOTA": ratio(c["TP"] - c["FP"] - c["IDSW"], c["TP"] + c["FN"]) if c["TP"] + c["FN"] else 0.0,
         "IDF1": ratio(2 * c["IDTP"], 2 * c["IDTP"] + c["IDFP"] + c["IDFN"]),
         "IDP": ratio(c["IDTP"], c["IDTP"] + c["IDFP"]),
         "IDR": ratio(c["IDTP"], c["IDTP"] + c["IDFN"]),

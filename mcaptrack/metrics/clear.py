@@ -1,20 +1,25 @@
 """CLEAR MOT (Bernardin and Stiefelhagen 2008): misses, false tracks, identity switches, and how whole the tracks are.
 
-Two evaluators are in use and their rules differ; both are here, by name. Letters: G true people, H tracks in a frame.
+Two evaluators are in use and their rules differ; both are here, by name. What was before matters only in frames in
+which pairs compete; everything else is counted for all frames at once.
+
+Letters: G true people, H tracks in a frame; P pairs.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack.match import assign, solve
-from mcaptrack.metrics.matchup import Matchup
+from mcaptrack.metrics.matchup import Matchup, Pairs
 
 Rules = Literal["trackeval", "motmetrics"]
 Counts = dict[str, float]
+Ints = NDArray[np.intp]
 
 _EPS: Final = float(np.finfo(float).eps)
 _NOBODY: Final = -1
@@ -27,80 +32,91 @@ def clear(matchup: Matchup, rules: Rules = "trackeval") -> Counts:
     before where it can. "motmetrics" follows py-motmetrics: first every person keeps the track it had last, however
     long ago; then the others are assigned, as many as possible and then as near as possible.
     """
-    match = _Matcher(matchup.n_truth, rules)
-    frames = zip(matchup.truth, matchup.tracks, matchup.similarity, strict=True)
-    for people, tracks, similarity in frames:
-        match.frame(people, tracks, similarity, matchup.threshold)
-    present, tracked = match.present, match.tracked
-    ratio = tracked[present > 0] / present[present > 0]
-    mostly = ratio > 0.8 if rules == "trackeval" else ratio >= 0.8
+    pairs, by_devkit = matchup.pairs, rules == "trackeval"
+    near = pairs.similarity >= matchup.threshold - _EPS if by_devkit else pairs.similarity >= matchup.threshold
+    memory = _Memory(matchup, by_devkit)
+    found = matchup.solved(pairs.where(near), memory.pairs_trackeval if by_devkit else memory.pairs_motmetrics)
+
+    present = np.bincount(matchup.all_truth, minlength=matchup.n_truth)
+    tracked = np.bincount(found.who, minlength=matchup.n_truth)[present > 0]
+    ratio = tracked / present[present > 0]
+    mostly = ratio > 0.8 if by_devkit else ratio >= 0.8
     lost = ratio < 0.2
+    order = np.lexsort((found.frame, found.who))
+    who, by = found.who[order], found.by[order]
+    again = who[1:] == who[:-1]
     return {
-        "TP": match.tp,
-        "FP": matchup.track_rows - match.tp,
-        "FN": matchup.truth_rows - match.tp,
-        "IDSW": match.switches,
-        "Frag": match.fragmentations(),
+        "TP": len(who),
+        "FP": matchup.track_rows - len(who),
+        "FN": matchup.truth_rows - len(who),
+        "IDSW": int((again & (by[1:] != by[:-1])).sum()),
+        "Frag": _breaks_trackeval(matchup, found.where(order)) if by_devkit else _breaks_motmetrics(matchup, found),
         "MT": int(mostly.sum()),
         "PT": int((~mostly & ~lost).sum()),
         "ML": int(lost.sum()),
         "GT": int((present > 0).sum()),
-        "similarity_sum": match.similarity_sum,
+        "similarity_sum": float(found.similarity.sum()),
     }
 
 
-class _Matcher:
-    """The matching of one sequence, frame after frame, and what it has counted so far."""
+def _breaks_trackeval(matchup: Matchup, found: Pairs) -> int:
+    """How often people who were tracked began to be tracked again, after a frame without; ``found`` ordered by person.
 
-    def __init__(self, n_truth: int, rules: Rules) -> None:
-        self._rules = rules
-        self._last = np.full(n_truth, _NOBODY)  # the track each person had last
-        self._previous = np.full(n_truth, _NOBODY)  # the track each person had in the frame before
-        self._starts = np.zeros(n_truth, int)  # how often each person began to be tracked
-        self._pending = np.zeros(n_truth, int)  # motmetrics: misses that become a fragmentation if tracked again
-        self._is_tracked = np.zeros(n_truth, bool)
-        self._frag = 0
-        self.present = np.zeros(n_truth, int)
-        self.tracked = np.zeros(n_truth, int)
-        self.tp = self.switches = 0
-        self.similarity_sum = 0.0
+    Frames without people or without tracks are passed over, as the devkit does.
+    """
+    looked_at = np.cumsum((matchup.truth_counts > 0) & (matchup.track_counts > 0))[found.frame]
+    again = found.who[1:] == found.who[:-1]
+    return int((again & (np.diff(looked_at) > 1)).sum())
 
-    def frame(
-        self, people: NDArray[np.intp], tracks: NDArray[np.intp], similarity: NDArray[np.float64], threshold: float
-    ) -> None:
-        self.present[people] += 1
-        if len(people) == 0 or (len(tracks) == 0 and self._rules == "trackeval"):
-            return
-        if self._rules == "trackeval":
-            rows, columns = self._pairs_trackeval(people, tracks, similarity, threshold)
-        else:
-            rows, columns = self._pairs_motmetrics(people, tracks, similarity, threshold)
-        who, by = people[rows], tracks[columns]
-        self.tp += len(rows)
-        self.similarity_sum += float(similarity[rows, columns].sum())
-        self.switches += int(((self._last[who] != _NOBODY) & (self._last[who] != by)).sum())
-        self.tracked[who] += 1
-        if self._rules == "trackeval":
-            self._starts[who[self._previous[who] == _NOBODY]] += 1
-        else:
-            self._count_breaks(people, who)
-        self._last[who] = by
-        self._previous[:] = _NOBODY
-        self._previous[who] = by
 
-    def _pairs_trackeval(
-        self, people: NDArray[np.intp], tracks: NDArray[np.intp], similarity: NDArray[np.float64], threshold: float
-    ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        score = similarity + 1000.0 * (tracks[None, :] == self._previous[people][:, None])
-        score[similarity < threshold - _EPS] = 0
+def _breaks_motmetrics(matchup: Matchup, found: Pairs) -> int:
+    """How often people change from tracked to missed between the first and the last frame in which they are tracked."""
+    is_tracked = np.zeros(matchup.truth_rows, bool)
+    is_tracked[found.row] = True
+    order = np.argsort(matchup.all_truth, kind="stable")
+    who, flag = matchup.all_truth[order], is_tracked[order]
+    begins = flag.copy()
+    begins[1:] &= ~(flag[:-1] & (who[1:] == who[:-1]))
+    runs = np.bincount(who[begins], minlength=matchup.n_truth)
+    return int((runs[runs > 0] - 1).sum())
+
+
+class _Memory:
+    """The track that each person had, for the frames in which that decides."""
+
+    def __init__(self, matchup: Matchup, previous_only: bool) -> None:
+        self._matchup = matchup
+        self._last = np.full(matchup.n_truth, _NOBODY)
+        self._looked_at = ((matchup.truth_counts > 0) & (matchup.track_counts > 0)).nonzero()[0]
+        self._previous_only = previous_only
+
+    def _remember(self, number: int, taken: Sequence[Pairs]) -> None:
+        """Before frame ``number``: what was taken since the last call, by people's last or only by the frame before."""
+        if self._previous_only:
+            at = int(np.searchsorted(self._looked_at, number))
+            before = self._looked_at[at - 1] if at else _NOBODY
+            self._last[:] = _NOBODY
+            taken = [part.where(part.frame == before) for part in taken]
+        for part in taken:
+            self._last[part.who] = part.by  # the last one counts
+
+    def pairs_trackeval(self, number: int, taken: Sequence[Pairs]) -> tuple[Ints, Ints]:
+        """The pairs of the frame before are kept where they can be, then similarity counts."""
+        self._remember(number, taken)
+        matchup = self._matchup
+        people, tracks, similarity = matchup.truth[number], matchup.tracks[number], matchup.similarity[number]
+        score = similarity + 1000.0 * (tracks[None, :] == self._last[people][:, None])
+        score[similarity < matchup.threshold - _EPS] = 0
         rows, columns = solve(-score)
         kept = score[rows, columns] > _EPS
         return rows[kept], columns[kept]
 
-    def _pairs_motmetrics(
-        self, people: NDArray[np.intp], tracks: NDArray[np.intp], similarity: NDArray[np.float64], threshold: float
-    ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        ok = similarity >= threshold
+    def pairs_motmetrics(self, number: int, taken: Sequence[Pairs]) -> tuple[Ints, Ints]:
+        """Everybody keeps the track it had last, however long ago; then as many and as near pairs as there can be."""
+        self._remember(number, taken)
+        matchup = self._matchup
+        people, tracks, similarity = matchup.truth[number], matchup.tracks[number], matchup.similarity[number]
+        ok = similarity >= matchup.threshold
         kept_rows, kept_columns = np.nonzero(ok & (tracks[None, :] == self._last[people][:, None]))
         # Two people may have had the same track last; the first in order keeps it.
         kept_columns, first = np.unique(kept_columns, return_index=True)
@@ -110,17 +126,3 @@ class _Matcher:
         cost[:, kept_columns] = np.inf
         rows, columns = assign(cost, np.finfo(float).max)
         return np.concatenate([kept_rows, rows]), np.concatenate([kept_columns, columns])
-
-    def _count_breaks(self, people: NDArray[np.intp], who: NDArray[np.intp]) -> None:
-        """motmetrics: a fragmentation is a change from tracked to missed between first and last tracked frame."""
-        self._frag += int(self._pending[who].sum())
-        self._pending[who] = 0
-        missed = np.setdiff1d(people, who)
-        self._pending[missed[self._is_tracked[missed]]] += 1
-        self._is_tracked[people] = False
-        self._is_tracked[who] = True
-
-    def fragmentations(self) -> int:
-        if self._rules == "motmetrics":
-            return self._frag
-        return int((self._starts[self._starts > 0] - 1).sum())

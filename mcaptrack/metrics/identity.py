@@ -14,10 +14,11 @@ def identity(matchup: Matchup) -> dict[str, float]:
     IDTP is the weight of the best pairing of people with tracks, where a pair weighs the frames in which it is similar
     enough. The pairing is solved on the counts themselves: a pair that weighs nothing is the same as no pair.
     """
-    together = np.zeros((matchup.n_truth, matchup.n_tracks))
-    for people, tracks, similarity in zip(matchup.truth, matchup.tracks, matchup.similarity, strict=True):
-        rows, columns = np.nonzero(similarity >= matchup.threshold)
-        together[people[rows], tracks[columns]] += 1
+    shape = (matchup.n_truth, matchup.n_tracks)
+    pairs = matchup.pairs
+    near = pairs.similarity >= matchup.threshold
+    cell = pairs.who[near] * matchup.n_tracks + pairs.by[near]
+    together = np.bincount(cell, minlength=shape[0] * shape[1]).reshape(shape).astype(float)
     hits = 0.0
     if together.size:
         rows, columns = solve(-together)

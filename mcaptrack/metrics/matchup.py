@@ -1,11 +1,14 @@
 """What every score is computed from: who was there, who was tracked, and how alike they are, frame by frame.
 
-Letters: G true people, H tracks in one frame.
+Letters: G true people, H tracks in one frame; R true rows, C tracks' rows, P pairs in all frames.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,13 +17,40 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
 
 
+class Pairs(NamedTuple):
+    """Pairs of one true and one tracked row of a frame, in the order of the frames: arrays (P,).
+
+    ``row`` and ``column`` count the rows of truth and tracks through all frames; ``who`` and ``by`` are the person and
+    the track of these.
+    """
+
+    frame: Ints
+    row: Ints
+    column: Ints
+    who: Ints
+    by: Ints
+    similarity: Floats
+
+    def where(self, kept: NDArray[np.bool_] | Ints) -> Pairs:
+        """Some of the pairs."""
+        frame, row, column, who, by, similarity = self
+        return Pairs(frame[kept], row[kept], column[kept], who[kept], by[kept], similarity[kept])
+
+    def contested(self) -> NDArray[np.bool_]:
+        """Whether a pair (P,) shares its row or its column with another."""
+        contested: NDArray[np.bool_] = (np.bincount(self.row)[self.row] > 1) | (
+            np.bincount(self.column)[self.column] > 1
+        )
+        return contested
+
+
 @dataclass(frozen=True)
 class Matchup:
     """One sequence of true people against tracks.
 
     ``truth`` and ``tracks`` hold one array a frame: the people there, numbered densely from 0 to ``n_truth`` (and
     ``n_tracks``) - 1. ``similarity`` holds their likeness, (G, H) a frame, 1 for equal and 0 for unlike; pairs are
-    comparable at ``threshold`` and above.
+    comparable at ``threshold`` and above. Nobody is twice in a frame.
     """
 
     truth: tuple[Ints, ...]
@@ -33,12 +63,75 @@ class Matchup:
     @property
     def truth_rows(self) -> int:
         """How many boxes or positions the truth has over all frames."""
-        return sum(len(ids) for ids in self.truth)
+        return len(self.all_truth)
 
     @property
     def track_rows(self) -> int:
         """How many boxes or positions the tracks have over all frames."""
-        return sum(len(ids) for ids in self.tracks)
+        return len(self.all_tracks)
+
+    @cached_property
+    def all_truth(self) -> Ints:
+        """The people of all frames, one after the other (R,)."""
+        return _joined(self.truth)
+
+    @cached_property
+    def all_tracks(self) -> Ints:
+        """The tracks of all frames, one after the other (C,)."""
+        return _joined(self.tracks)
+
+    @cached_property
+    def truth_counts(self) -> Ints:
+        """How many people there are in each frame."""
+        return np.array([len(ids) for ids in self.truth], np.intp)
+
+    @cached_property
+    def track_counts(self) -> Ints:
+        """How many tracks there are in each frame."""
+        return np.array([len(ids) for ids in self.tracks], np.intp)
+
+    @cached_property
+    def pairs(self) -> Pairs:
+        """The pairs that are alike at all."""
+        people, tracks = self.truth_counts, self.track_counts
+        size = people * tracks
+        similarity = np.concatenate([np.empty(0), *(part.ravel() for part in self.similarity)])
+        at = similarity.nonzero()[0]
+        frame = np.repeat(np.arange(len(size)), size)[at]
+        within = at - (np.cumsum(size) - size)[frame]
+        local = within // tracks[frame]
+        row = (np.cumsum(people) - people)[frame] + local
+        column = (np.cumsum(tracks) - tracks)[frame] + within - local * tracks[frame]
+        return Pairs(frame, row, column, self.all_truth[row], self.all_tracks[column], similarity[at])
+
+    def solved(self, candidates: Pairs, solve_frame: Callable[[int, Sequence[Pairs]], tuple[Ints, Ints]]) -> Pairs:
+        """One assignment a frame among the candidates.
+
+        Where no candidate competes with another, all are taken. For every other frame ``solve_frame`` is asked, in
+        order: it gets the number of the frame and what has been taken in the frames since it was asked last, and
+        returns the rows and columns of the frame's table that go together.
+        """
+        frame = candidates.frame
+        taken: list[Pairs] = []
+        hard = np.unique(frame[candidates.contested()])
+        starts, ends = np.searchsorted(frame, hard, "left"), np.searchsorted(frame, hard, "right")
+        since = 0
+        row_of, column_of = (np.cumsum(part) - part for part in (self.truth_counts, self.track_counts))
+        for number, low, high in zip(hard.tolist(), starts.tolist(), ends.tolist(), strict=True):
+            news = [candidates.where(np.arange(since, low))] if since < low else []
+            rows, columns = solve_frame(number, [*taken[-1:], *news] if taken else news)
+            taken += news
+            who, by = self.truth[number][rows], self.tracks[number][columns]
+            near = self.similarity[number][rows, columns]
+            at = np.full(len(rows), number)
+            taken.append(Pairs(at, rows + row_of[number], columns + column_of[number], who, by, near))
+            since = high
+        taken.append(candidates.where(np.arange(since, len(frame))))
+        return Pairs(*(np.concatenate(parts) for parts in zip(*taken, strict=True)))
+
+
+def _joined(ids: Sequence[Ints]) -> Ints:
+    return np.concatenate([np.empty(0, np.intp), *ids])
 
 
 def metres_to_similarity(distance_m: Floats, gate_m: float) -> Floats:

@@ -41,9 +41,19 @@ class Transform(Protocol):
         ...
 
 
-def option(default: Any, help: str, *, least: float = -math.inf, most: float = math.inf) -> Any:  # noqa: A002
-    """A parameter of a transform: its default, what it means, and its range."""
-    return field(default=default, metadata={"help": help, "least": least, "most": most})
+def option(
+    default: Any,
+    help: str,  # noqa: A002
+    *,
+    least: float = -math.inf,
+    most: float = math.inf,
+    search: tuple[float, float] | None = None,
+) -> Any:
+    """A parameter of a transform: its default, what it means, and its range.
+
+    ``search`` is the part of the range that is worth a search (``mcaptrack tune``); None for what isn't tuned.
+    """
+    return field(default=default, metadata={"help": help, "least": least, "most": most, "search": search})
 
 
 def context(factory: Callable[[], Any]) -> Any:

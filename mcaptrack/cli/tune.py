@@ -1,0 +1,232 @@
+"""``mcaptrack tune``: the parameters of a stage that score best against the truth, as a mcaptrack.toml."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
+
+import typer
+
+from mcaptrack.cli import common
+from mcaptrack.cli.config import NAME
+from mcaptrack.errors import McaptrackError
+from mcaptrack.transforms import ALTERNATIVES, TRANSFORMS, Transform
+
+if TYPE_CHECKING:
+    from mcaptrack.tuning import Range, Task, Trial
+
+_SHOWN: Final = ("IDF1", "MOTA", "HOTA", "IDSW", "FP", "FN")
+
+
+@common.one_line
+def tune(
+    inputs: Annotated[
+        list[Path],
+        typer.Argument(metavar="LOG|DETECTIONS...", help="Logs, or files of detections.", show_default=False),
+    ],
+    truth: Annotated[
+        list[Path] | None,
+        common.option("--truth", help="True tracks for files of detections: by name or in order.", show_default=False),
+    ] = None,
+    stage: Annotated[Literal["track", "sample", "retrack"], common.option("--stage", help="What to tune.")] = "track",
+    tracker: Annotated[
+        Literal["sort", "bytetrack", "ocsort"], common.option("--tracker", help="Which tracker.")
+    ] = "sort",
+    metric: Annotated[
+        Literal["IDF1", "MOTA", "HOTA", "IDP", "IDR", "DetA", "AssA"],
+        common.option("--metric", help="What to make as large as can be.", case_sensitive=False),
+    ] = "IDF1",
+    trials: Annotated[
+        int, common.option("--trials", help="How many settings to try, the defaults first.", min=1)
+    ] = 100,
+    search: Annotated[
+        list[str] | None,
+        common.option(
+            "--search",
+            help="Search these parameters, in these ranges, as in min-iou=0.1:0.5; or only in name.",
+            show_default="all that the stage declares",
+        ),
+    ] = None,
+    seed: Annotated[int, common.option("--seed", help="Which chance.", min=0)] = 0,
+    study: Annotated[
+        Path | None,
+        common.option("--study", help="Keep trials in this file; go on with those in it.", show_default="beside -o"),
+    ] = None,
+    similarity: Annotated[
+        Literal["iou", "metres"] | None,
+        common.option("--similarity", help="What makes two boxes alike.", show_default="iou; metres after track"),
+    ] = None,
+    gate_m: Annotated[float, common.option("--gate-m", help="Within how many metres people count as found.")] = 1.0,
+    min_iou: Annotated[float, common.option("--match-iou", help="Overlap from which boxes count as alike.")] = 0.5,
+    fps: Annotated[
+        str | None, common.option("--fps", help="Frames per second of files.", show_default="as seqinfo.ini says")
+    ] = None,
+    ground_plane: Annotated[
+        Path | None, common.option("--ground-plane", help="3x3 homography, for files in pixels.", show_default=False)
+    ] = None,
+    point: Annotated[
+        Literal["center", "foot"], common.option("--point", help="What of a box stands on the ground.")
+    ] = "foot",
+    topic: Annotated[
+        str | None, common.option("--topic", shared=True, help="Read this channel instead of the usual one.")
+    ] = None,
+    camera: common.Camera = None,
+    output: Annotated[
+        Path, common.option("--output", "-o", shared=True, help="Write the settings to this file.")
+    ] = Path(NAME),
+    force: Annotated[bool, common.option("--force", shared=True, help="Forget earlier trials.")] = False,
+    json: common.Json = False,
+    quiet: common.Quiet = False,
+    verbose: common.Verbose = False,
+    config: common.Config = None,
+) -> None:
+    """Find the settings of a stage that score best against the truth.
+
+    Reads detections and truth: of logs, or files with --truth. Writes the best settings to mcaptrack.toml, which every
+    command reads; what else stands there stays. Ended and begun again, it goes on where it was. With Optuna installed
+    trials learn from each other, otherwise they are random. Score the settings on other recordings before you trust
+    them.
+
+    Example: mcaptrack tune log.mcap --tracker ocsort --metric hota --trials 200
+    """
+    from mcaptrack.evaluation import EvaluateOptions
+    from mcaptrack.tuning import tune as run
+    from mcaptrack.tuning import uses_optuna
+
+    kind = ALTERNATIVES[stage].kinds[tracker] if stage in ALTERNATIVES else TRANSFORMS[stage]
+    chosen = similarity or ("iou" if stage == "track" else "metres")
+    scoring = EvaluateOptions(similarities=(chosen,), gates_m=(gate_m,), min_iou=min_iou)
+    ranges = _ranges(kind, search or [])
+    which = tracker if stage in ALTERNATIVES else stage
+    trials_file = study or output.with_name(f"{output.stem}.{which}.trials.jsonl")
+    with common.Talk(quiet, verbose).open() as talk:
+        if truth:
+            given = {"fps": fps, "ground_plane": ground_plane, "point": point}
+            tasks = _tasks_of_files(common.expand(inputs), common.expand(truth), stage, given, talk)
+        else:
+            tasks = _tasks_of_logs(common.expand(inputs), camera, topic, stage, kind)
+        if force:
+            trials_file.unlink(missing_ok=True)
+        how = "Optuna" if uses_optuna() else "chance; with `pip install mcaptrack[tune]` they learn from each other"
+        talk.say(f"{stage}: {len(ranges)} parameters, {len(tasks)} sequences, trials by {how}")
+
+        def told(trial: Trial, best: Trial, total: int) -> None:
+            talk.progress("tune", trial.number + 1, total)
+            if trial is best:
+                talk.detail(f"trial {trial.number}: {metric} {trial.scores[metric]:.4f} {_words(trial.parameters)}")
+
+        first, best = run(
+            kind(), tasks, ranges, scoring, metric=metric, trials=trials, seed=seed, study=trials_file, told=told
+        )
+        settings = ({"tracker": tracker} if stage in ALTERNATIVES else {}) | dict(best.parameters)
+        if best is first:
+            talk.say(f"nothing that was tried beats the defaults ({metric} {first.scores[metric]:.4f}); {output} stays")
+        else:
+            _write(output, stage, settings)
+            talk.say(f"{output}: {metric} {first.scores[metric]:.4f} with the defaults, {best.scores[metric]:.4f} now")
+    if json:
+        row = {"stage": stage, "metric": metric, "settings": settings, "trials": trials, "best": best.number}
+        common.print_json({"results": [row | {"scores": dict(best.scores), "default_scores": dict(first.scores)}]})
+    else:
+        _print(first, best, settings)
+
+
+def _ranges(kind: type[Transform], wanted: Sequence[str]) -> dict[str, Range]:
+    """The ranges to search in: those that are asked for, or all that are declared."""
+    from mcaptrack.tuning import Range, declared_ranges
+
+    declared = declared_ranges(kind)
+    if not wanted:
+        return declared
+    out = {}
+    for text in wanted:
+        name, _, span = text.partition("=")
+        name = name.strip().lstrip("-").replace("-", "_")
+        if name not in declared:
+            known = ", ".join(one.replace("_", "-") for one in declared) or "none"
+            raise McaptrackError(f"--search {text}: no parameter that can be searched; there are {known}")
+        out[name] = declared[name]
+        if span:
+            try:
+                low, high = (float(part) for part in span.split(":"))
+            except ValueError:
+                low, high = 1.0, 0.0
+            if not low <= high:
+                raise McaptrackError(f"--search needs a range like {name.replace('_', '-')}=0.1:0.5, not {text}")
+            kind(**{name: int(low) if declared[name].whole else low})  # both ends have to be allowed
+            kind(**{name: int(high) if declared[name].whole else high})
+            out[name] = Range(low, high, declared[name].whole)
+    return out
+
+
+def _tasks_of_files(
+    paths: Sequence[Path], truths: Sequence[Path], stage: str, given: dict[str, Any], talk: common.Talk
+) -> list[Task]:
+    from mcaptrack.cli.ingest import _fps
+    from mcaptrack.ingest.compared import detections_and_truth, pair_files
+    from mcaptrack.tuning import Task
+
+    if stage != "track":
+        raise McaptrackError(f"files of detections are for --stage track; to tune {stage} give logs")
+    pairs, words = pair_files(paths, truths)
+    if words:
+        talk.say(words)
+    tasks = []
+    for name, path, truth in pairs:
+        found = detections_and_truth(path, truth, _fps(given["fps"]), given["ground_plane"], given["point"])
+        tasks.append(Task(name, found.detections, found.truth, {"ground_planes": found.planes}))
+    return tasks
+
+
+def _tasks_of_logs(
+    paths: Sequence[Path], camera: str | None, topic: str | None, stage: str, kind: type[Transform]
+) -> list[Task]:
+    from mcaptrack import log, pipeline
+    from mcaptrack.evaluation import truth_of_log
+    from mcaptrack.tuning import Task
+
+    tasks = []
+    for path in paths:
+        with log.read(path) as opened:
+            prefix = pipeline.find_camera(opened, camera, topic)
+            truth = truth_of_log(opened, prefix)
+            frames, context = pipeline.input_of(opened, prefix, stage, kind(), topic)
+            tasks.append(Task(path.stem, frames, truth, context))
+    return tasks
+
+
+def _write(path: Path, command: str, settings: dict[str, Any]) -> None:
+    import tomllib
+
+    from mcaptrack.atomic import publish_bytes
+    from mcaptrack.tuning import settings_to_toml
+
+    try:
+        text = path.read_text(encoding="utf-8") if path.exists() else ""
+        tomllib.loads(text)
+    except (OSError, ValueError) as error:
+        raise McaptrackError(f"{path} is there and is no TOML: {error}; write to another file with -o") from None
+    publish_bytes(path, settings_to_toml(text, command, settings).encode("utf-8"))
+
+
+def _words(parameters: Any) -> str:
+    return " ".join(f"{name.replace('_', '-')}={value}" for name, value in parameters.items())
+
+
+def _print(first: Trial, best: Trial, settings: dict[str, Any]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    table.add_column("")
+    for name in _SHOWN:
+        table.add_column(name, justify="right")
+    for words, trial in (("defaults", first), ("best", best)):
+        values = [trial.scores[name] for name in _SHOWN]
+        table.add_row(words, *(f"{100 * v:.1f}" if isinstance(v, float) else str(v) for v in values))
+    console = Console(width=120)
+    console.print(table)
+    console.print()
+    for name, value in settings.items():
+        console.print(f"{name.replace('_', '-')} = {value}")

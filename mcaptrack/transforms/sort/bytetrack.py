@@ -1,0 +1,48 @@
+"""ByteTrack (Zhang et al., ECCV 2022): boxes that a detector doubts go on with tracks, but begin none."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaptrack.transforms.protocol import option
+from mcaptrack.transforms.sort.affinity import pair
+from mcaptrack.transforms.sort.tracker import Moment, Sort
+from mcaptrack.transforms.sort.tracks import Seen
+
+Bools = NDArray[np.bool_]
+Ints = NDArray[np.intp]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ByteTrack(Sort):
+    """Track boxes over time: ByteTrack, which pairs in two stages.
+
+    Boxes with a high score are paired with all tracks first; then the doubtful ones with the tracks that are left and
+    were seen in the frame before: whoever is half hidden scores low, but is where he is expected.
+    """
+
+    high_score: float = option(0.5, "boxes from this score on are paired first; without a score too", search=(0.2, 0.9))
+    new_score: float = option(0.6, "boxes from this score on may begin a track", search=(0.2, 0.9))
+    low_min_iou: float = option(
+        0.5, "the least overlap for boxes with a lower score, paired second", least=0.0, most=1.0, search=(0.2, 0.8)
+    )
+
+    def _pair(self, moment: Moment) -> tuple[Ints, Ints]:
+        pairs, least = self._likeness(moment, self.min_iou)
+        high = ~(moment.seen.score < self.high_score)
+        if high.all():
+            return pair(pairs, least)
+        sure = high[pairs.box]
+        box, track = pair(pairs.where(sure), least)
+        left = moment.tracked.copy()
+        left[track] = False
+        rest = pairs.where(~sure & left[pairs.track])
+        low_box, low_track = pair(rest, self.low_min_iou if self.cost == "iou" else least)
+        return np.concatenate([box, low_box]), np.concatenate([track, low_track])
+
+    def _may_begin(self, seen: Seen) -> Bools:
+        begins: Bools = ~(seen.score < self.new_score)
+        return begins

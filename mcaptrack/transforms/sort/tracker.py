@@ -1,0 +1,208 @@
+"""SORT (Bewley et al., ICIP 2016), and the life of a track that it shares with its descendants.
+
+A Kalman filter a track says where its box will be; boxes and tracks are paired by their likeness; a track is shown once
+it has been seen for long enough and dropped when it has been missed for too long.
+
+Letters: N boxes, K tracks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from itertools import islice
+from types import MappingProxyType
+from typing import ClassVar, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaptrack import kalman
+from mcaptrack.clock import NS_PER_S, FrameClock
+from mcaptrack.errors import McaptrackError
+from mcaptrack.plane import GroundPlane, Planes, plane_at
+from mcaptrack.schema import DETECTIONS, TRACKS, Frame, Schema
+from mcaptrack.transforms.protocol import check_options, context, option
+from mcaptrack.transforms.sort.affinity import Cost, Pairs, by_distance, by_overlap, pair
+from mcaptrack.transforms.sort.tracks import CLASS, MISSED, SHARED_ROWS, STREAK, Seen, Tracks, look, write
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+Ints = NDArray[np.intp]
+
+#: How many frames are read and written at once.
+_BLOCK = 64
+
+
+class Moment(NamedTuple):
+    """A frame with its boxes and the tracks before they are paired.
+
+    ``expected`` is where the filters expect the tracks' boxes, left, top, right, bottom (4, K); ``tracked`` says which
+    tracks were seen in the frame before (K,); ``steps`` how many frames have passed since.
+    """
+
+    seen: Seen
+    tracks: Tracks
+    expected: Floats
+    tracked: Bools
+    steps: int
+    plane: GroundPlane | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sort:
+    """Track boxes over time: SORT.
+
+    Reads detections, writes tracks: one row for each person who is tracked and seen in a frame.
+    """
+
+    max_age_s: float = option(1.4, "a track is dropped after so long without a box", least=0.0, search=(0.2, 4.0))
+    max_age_frames: int | None = option(None, "the same in frames, instead of seconds", least=0)
+    min_hits_s: float = option(0.3, "a track is shown after so long of unbroken boxes", least=0.0, search=(0.0, 1.0))
+    min_hits_frames: int | None = option(None, "the same in frames, instead of seconds", least=0)
+    cost: Cost = option("iou", "what boxes and tracks are paired by: overlap, or distance in pixels or on the ground")
+    min_iou: float = option(
+        0.2, "the least overlap of a box with a track's expected one", least=0.0, most=1.0, search=(0.05, 0.6)
+    )
+    max_distance_px: float = option(60.0, "the same for --cost pixels: how far centres may be apart", least=0.0)
+    max_distance_m: float = option(1.0, "the same for --cost metres: how far feet may be apart", least=0.0)
+    min_score: float | None = option(None, "boxes with a lower score are passed over")
+    class_id: int | None = option(None, "boxes of other classes than this are passed over", least=0)
+    mix_classes: bool = option(False, "a track may go on with a box of another class")
+    ground_planes: Planes = context(tuple)
+
+    reads: ClassVar[Schema] = DETECTIONS
+    writes: ClassVar[Mapping[str, Schema]] = MappingProxyType({"": TRACKS})
+    latency_s: ClassVar[Mapping[str, float]] = MappingProxyType({"": 0.0})
+
+    def __post_init__(self) -> None:
+        check_options(self)
+
+    def __call__(self, frames: Iterable[Frame]) -> Iterator[tuple[Frame, ...]]:
+        life = _Life(self, self._no_tracks())
+        coming = iter(frames)
+        while block := list(islice(coming, _BLOCK)):
+            shows = look(block, self.min_score, self.class_id)
+            shown = [self._step(life, frame, seen) for frame, seen in zip(block, shows, strict=True)]
+            yield from ((frame,) for frame in write(block, shown, self.ground_planes))
+
+    def _step(self, life: _Life, frame: Frame, seen: Seen) -> Floats:
+        """Take one frame; returns the columns of the tracks that are shown in it."""
+        tracks, steps = life.tracks, life.tick(frame.t_ns)
+        tracked = self._age(life, steps)
+        plane = plane_at(self.ground_planes, frame.t_ns) if self.cost == "metres" else None
+        moment = Moment(seen, tracks, kalman.corners(tracks.state), tracked, steps, plane)
+        box, track = self._pair(moment)
+        if len(box):
+            self._see(tracks, track, seen.take(box), life.hit, steps)
+        if len(box) < len(seen):
+            new = np.ones(len(seen), bool)
+            new[box] = False
+            born = seen.take((new & self._may_begin(seen)).nonzero()[0])
+            self._begin(tracks, life.next_id, born)
+            life.next_id += len(born)
+        table = tracks.table
+        missed = table[MISSED]
+        here = missed == 0
+        if not life.early:
+            here &= table[STREAK] >= life.min_hits
+        shown: Floats = table[:SHARED_ROWS].compress(here, axis=1)
+        if len(missed) and missed.max() > life.max_age:
+            tracks.keep(missed <= life.max_age)
+        return shown
+
+    @staticmethod
+    def _age(life: _Life, steps: int) -> Bools:
+        """Move all tracks ``steps`` frames on; returns which were seen in the frame before."""
+        tracks = life.tracks
+        table = tracks.table
+        tracked: Bools = table[MISSED] == 0
+        table[STREAK] *= tracked
+        table[MISSED] += life.age
+        if steps > 1:  # a gap in the log: who would have been dropped in it is dropped
+            kept = table[MISSED] <= life.max_age + life.frame_age
+            tracks.keep(kept)
+            tracked = tracked[kept]
+        if life.clock.stretch != 1.0:
+            kalman.stretch(tracks.state, life.clock.stretch)
+        for _ in range(steps):  # frames that nobody saw still move people
+            kalman.predict(tracks.state)
+        return tracked
+
+    def _likeness(self, moment: Moment, least: float) -> tuple[Pairs, float]:
+        """The pairs of a moment that are possible at all, and from which likeness on they may be paired."""
+        seen = moment.seen
+        if self.cost == "iou":
+            pairs = by_overlap(seen.corners, moment.expected)
+        elif self.cost == "pixels":
+            pairs, least = by_distance(seen.corners, moment.expected, self.max_distance_px, None), 0.0
+        elif moment.plane is None:
+            raise McaptrackError("cost metres needs a ground plane; give one with `mcaptrack ingest --ground-plane`")
+        else:
+            pairs, least = by_distance(seen.corners, moment.expected, self.max_distance_m, moment.plane), 0.0
+        return self._of_one_class(moment, pairs), least
+
+    def _of_one_class(self, moment: Moment, pairs: Pairs) -> Pairs:
+        """Without the pairs of a box and a track of different classes, unless these may mix."""
+        if self.mix_classes or not len(pairs.box):
+            return pairs
+        same = moment.seen.class_id[pairs.box] == moment.tracks.table[CLASS, pairs.track]
+        return pairs if same.all() else pairs.where(same)
+
+    # What the descendants do otherwise.
+
+    def _no_tracks(self) -> Tracks:
+        return Tracks()
+
+    def _pair(self, moment: Moment) -> tuple[Ints, Ints]:
+        """Boxes and tracks that belong together."""
+        return pair(*self._likeness(moment, self.min_iou))
+
+    def _may_begin(self, seen: Seen) -> Bools:
+        """Which boxes may begin a track if they belong to none."""
+        return np.ones(len(seen), bool)
+
+    def _begin(self, tracks: Tracks, first_id: int, seen: Seen) -> None:
+        tracks.add(first_id, seen)
+
+    def _see(self, tracks: Tracks, at: Ints, seen: Seen, hit: float, steps: int) -> None:
+        """Track ``at[i]`` is seen in box i, ``steps`` frames after the frame before."""
+        tracks.see(at, seen, hit)
+
+
+class _Life:
+    """A run: its tracks and its clock, and what ages and streaks are at the frame that is being looked at.
+
+    They are nanoseconds, or frames where frames were asked for. ``age`` is by how much tracks age, ``frame_age`` by how
+    much in a usual frame; ``hit`` is what being seen adds to a streak; ``early`` says that no streak can be long yet.
+    """
+
+    def __init__(self, options: Sort, tracks: Tracks) -> None:
+        self.tracks, self.clock, self.next_id = tracks, FrameClock(), 1
+        self.age = self.frame_age = self.max_age = self.hit = self.min_hits = 0.0
+        self.early = True
+        self._options = options
+        self._count = 0
+        self._first_ns = self._last_ns = 0
+
+    def tick(self, t_ns: int) -> int:
+        """Take the time of the next frame; returns how many frames on it is."""
+        options = self._options
+        if self._count == 0:
+            self._first_ns = self._last_ns = t_ns
+        steps, passed_ns, usual_ns = self.clock.tick(t_ns), t_ns - self._last_ns, self.clock.interval_ns
+        self._count, self._last_ns = self._count + 1, t_ns
+        if options.max_age_frames is not None:
+            self.age, self.frame_age, self.max_age = steps, 1, options.max_age_frames
+        else:
+            # Where time stands still a miss is one all the same. To half a frame an age is what was asked for.
+            self.age, self.frame_age = max(passed_ns, 1), usual_ns
+            self.max_age = options.max_age_s * NS_PER_S + usual_ns / 2
+        if options.min_hits_frames is not None:
+            self.hit, self.min_hits = 1, options.min_hits_frames
+            self.early = self._count <= self.min_hits
+        else:
+            self.hit = min(max(passed_ns, 0), 2 * usual_ns)
+            self.min_hits = options.min_hits_s * NS_PER_S - usual_ns / 2
+            self.early = t_ns - self._first_ns < self.min_hits
+        return steps

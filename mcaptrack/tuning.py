@@ -1,0 +1,276 @@
+"""Look for the parameters of a transform that score best against the truth.
+
+A search asks for parameters within the ranges that the transform declares, runs the transform on every sequence, scores
+what comes out, and writes each trial to a file as soon as it is known; begun again with the same file it goes on where
+it was. Optuna proposes the trials where it is installed; without it they are drawn at random.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any, Final, Literal, Protocol, get_type_hints
+
+import numpy as np
+
+from mcaptrack.errors import McaptrackError
+from mcaptrack.evaluation import Candidate, EvaluateOptions, Sequenced, evaluate
+from mcaptrack.schema import Frame
+from mcaptrack.transforms import Transform
+from mcaptrack.transforms.protocol import bare_type
+
+Metric = Literal["IDF1", "MOTA", "HOTA", "IDP", "IDR", "DetA", "AssA"]
+
+#: Parameters are drawn to so many digits, so that what is written is exactly what was tried.
+_DIGITS: Final = 3
+_VERSION: Final = 1
+
+
+@dataclass(frozen=True)
+class Range:
+    """What a parameter may be in a search, both ends included; whole numbers only if ``whole``."""
+
+    low: float
+    high: float
+    whole: bool
+
+    def draw(self, rng: np.random.Generator) -> float | int:
+        """Any of them, all equally likely."""
+        if self.whole:
+            return int(rng.integers(round(self.low), round(self.high) + 1))
+        return round(float(rng.uniform(self.low, self.high)), _DIGITS)
+
+
+@dataclass(frozen=True)
+class Task:
+    """One sequence of a search: what the transform reads, its truth, and the transform's context for it."""
+
+    name: str
+    frames: Sequence[Frame]
+    truth: Sequence[Frame]
+    context: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Trial:
+    """Parameters that were tried, and the scores of what came out, over all sequences. Trial 0 is the defaults."""
+
+    number: int
+    parameters: Mapping[str, Any]
+    scores: Mapping[str, float]
+
+
+def declared_ranges(kind: type[Transform]) -> dict[str, Range]:
+    """The ranges that a transform declares for a search, by parameter."""
+    hints = get_type_hints(kind)
+    return {
+        parameter.name: Range(low, high, bare_type(hints[parameter.name]) is int)
+        for parameter in fields(kind)
+        if parameter.metadata.get("search")
+        for low, high in [parameter.metadata["search"]]
+    }
+
+
+def tune(
+    base: Transform,
+    tasks: Sequence[Task],
+    ranges: Mapping[str, Range],
+    scoring: EvaluateOptions,
+    *,
+    metric: Metric = "IDF1",
+    trials: int = 100,
+    seed: int = 0,
+    study: Path | None = None,
+    told: Callable[[Trial, Trial, int], None] = lambda *_: None,
+) -> tuple[Trial, Trial]:
+    """Search, and return the first trial (``base`` as it is) and the best one; of equals the earliest.
+
+    ``told`` hears of each new trial: the trial, the best so far, and how many there are to be. Trials in ``study``
+    count as made. Raises McaptrackError if there is nothing to search in, or if ``study`` is of another search.
+    """
+    if not ranges:
+        raise McaptrackError(f"{type(base).__name__.lower()} declares no ranges to search in")
+    known = _Study(study, _about(base, tasks, ranges, scoring))
+    made = known.trials
+    propose = _proposer(ranges, metric, seed, made)
+    while len(made) < trials:
+        number = len(made)
+        parameters = {} if number == 0 else propose.ask(number)
+        trial = Trial(number, parameters, _scores(replace(base, **parameters), tasks, scoring))
+        propose.tell(trial)
+        known.add(trial)
+        told(trial, _best(made, metric), trials)
+    return made[0], _best(made, metric)
+
+
+def _best(made: Sequence[Trial], metric: str) -> Trial:
+    return max(made, key=lambda trial: trial.scores[metric])
+
+
+def _scores(transform: Transform, tasks: Sequence[Task], scoring: EvaluateOptions) -> dict[str, float]:
+    """The scores of a transform's main output, over all sequences together."""
+
+    def sequences() -> Iterator[Sequenced]:
+        for task in tasks:
+            out = [result[0] for result in replace(transform, **task.context)(task.frames)]
+            yield Sequenced(task.name, task.truth, [Candidate("tracks", None, out)])
+
+    row = evaluate(sequences(), scoring).results[-1].to_json()
+    return {name: value for name, value in row.items() if isinstance(value, int | float) and name != "gate"}
+
+
+def _about(
+    base: Transform, tasks: Sequence[Task], ranges: Mapping[str, Range], scoring: EvaluateOptions
+) -> dict[str, Any]:
+    """What a study is a study of; trials of another one say nothing here."""
+    digest = hashlib.sha256()
+    for task in tasks:
+        for part in (task.frames, task.truth):
+            digest.update(task.name.encode())
+            for frame in part:
+                digest.update(frame.t_ns.to_bytes(8, "little", signed=True) + frame.rows.tobytes())
+    fixed = {f.name: getattr(base, f.name) for f in fields(base) if not f.metadata.get("context")}
+    return {
+        "version": _VERSION,
+        "transform": type(base).__name__,
+        "parameters": fixed,
+        "ranges": {name: [part.low, part.high] for name, part in ranges.items()},
+        "similarities": list(scoring.similarities),
+        "gates_m": list(scoring.gates_m),
+        "min_iou": scoring.min_iou,
+        "rules": scoring.rules,
+        "input": digest.hexdigest(),
+    }
+
+
+class _Study:
+    """The trials of a search and the file they are kept in: a line that says what of, then a line a trial."""
+
+    def __init__(self, path: Path | None, about: Mapping[str, Any]) -> None:
+        self.trials: list[Trial] = []
+        self._path = path
+        if path is None:
+            return
+        head = json.dumps(about, sort_keys=True)
+        try:
+            if path.exists() and path.stat().st_size:
+                self._read(path, json.loads(head))
+            else:
+                path.write_text(head + "\n", encoding="utf-8")
+        except OSError as error:
+            raise McaptrackError(f"{path} can't be used for a study: {error.strerror}") from None
+
+    def _read(self, path: Path, about: Mapping[str, Any]) -> None:
+        raw = path.read_bytes()
+        whole = raw[: raw.rfind(b"\n") + 1]  # the last line is cut where a run was ended while it wrote
+        try:
+            head, *lines = (json.loads(line) for line in whole.decode("utf-8").splitlines())
+            self.trials = [Trial(line["number"], line["parameters"], line["scores"]) for line in lines]
+        except (ValueError, KeyError, TypeError):
+            raise McaptrackError(f"{path} is no study of `mcaptrack tune`") from None
+        differs = sorted(name for name in about if head.get(name) != about[name]) if isinstance(head, dict) else ["all"]
+        if differs:
+            raise McaptrackError(
+                f"{path} is a study of something else ({', '.join(differs)} differ); give another file with --study"
+            )
+        if len(whole) < len(raw):
+            path.write_bytes(whole)
+
+    def add(self, trial: Trial) -> None:
+        self.trials.append(trial)
+        if self._path is not None:
+            line = {"number": trial.number, "parameters": trial.parameters, "scores": trial.scores}
+            with self._path.open("a", encoding="utf-8") as stream:
+                stream.write(json.dumps(line) + "\n")
+
+
+class _Proposer(Protocol):
+    def ask(self, number: int) -> dict[str, Any]: ...
+
+    def tell(self, trial: Trial) -> None: ...
+
+
+class _Random:
+    """Proposes at random; trial n of a seed is the same whenever it is asked for."""
+
+    def __init__(self, ranges: Mapping[str, Range], seed: int) -> None:
+        self._ranges, self._seed = ranges, seed
+
+    def ask(self, number: int) -> dict[str, Any]:
+        rng = np.random.default_rng([self._seed, number])
+        return {name: part.draw(rng) for name, part in self._ranges.items()}
+
+    def tell(self, trial: Trial) -> None:
+        """Takes no notice."""
+
+
+class _Optuna:
+    """Proposes with Optuna's tree-structured Parzen estimator."""
+
+    def __init__(self, ranges: Mapping[str, Range], metric: str, seed: int, made: Sequence[Trial]) -> None:
+        import optuna
+
+        optuna.logging.set_verbosity(optuna.logging.ERROR)
+        distributions = optuna.distributions
+        self._optuna, self._metric = optuna, metric
+        self._space: dict[str, Any] = {
+            name: distributions.IntDistribution(round(part.low), round(part.high))
+            if part.whole
+            else distributions.FloatDistribution(part.low, part.high)
+            for name, part in ranges.items()
+        }
+        sampler = optuna.samplers.TPESampler(seed=seed + len(made), n_startup_trials=min(10, 2 * len(ranges)))
+        self._study = optuna.create_study(direction="maximize", sampler=sampler)
+        for trial in made:
+            self.tell(trial)
+
+    def ask(self, number: int) -> dict[str, Any]:
+        asked = self._study.ask(self._space).params
+        return {name: value if isinstance(value, int) else round(value, _DIGITS) for name, value in asked.items()}
+
+    def tell(self, trial: Trial) -> None:
+        value = trial.scores[self._metric]
+        if set(trial.parameters) == set(self._space) and math.isfinite(value):
+            self._study.add_trial(
+                self._optuna.trial.create_trial(params=dict(trial.parameters), distributions=self._space, value=value)
+            )
+
+
+def _proposer(ranges: Mapping[str, Range], metric: str, seed: int, made: Sequence[Trial]) -> _Proposer:
+    try:
+        return _Optuna(ranges, metric, seed, made)
+    except ImportError:
+        return _Random(ranges, seed)
+
+
+def uses_optuna() -> bool:
+    """Whether Optuna is there to propose trials."""
+    from importlib.util import find_spec
+
+    return find_spec("optuna") is not None
+
+
+def settings_to_toml(text: str, command: str, settings: Mapping[str, Any]) -> str:
+    """The text of a mcaptrack.toml with these settings of a command; all else in it stays as it is."""
+    new = [f"{name.replace('_', '-')} = {json.dumps(value)}" for name, value in settings.items()]
+    names = {name.replace("_", "-") for name in settings}
+    lines, out, inside, written = text.splitlines(), [], False, False
+    for line in lines:
+        bare = line.strip()
+        if bare.startswith("["):
+            inside = bare.split("#")[0].strip() == f"[{command}]"
+            out.append(line)
+            if inside:
+                out += new
+                written = True
+            continue
+        if inside and bare.split("=")[0].strip().strip('"').replace("_", "-") in names and "=" in bare:
+            continue
+        out.append(line)
+    if not written:
+        out += ([""] if out else []) + [f"[{command}]", *new]
+    return "\n".join(out) + "\n"

@@ -1,0 +1,191 @@
+"""Plain files of tracks against plain files of truth."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from mcaptrack import tables
+from mcaptrack.errors import McaptrackError
+from mcaptrack.evaluation import EvaluateOptions, evaluate, sequence_of_files
+from mcaptrack.ingest.compared import compare_files, pair_files
+from mcaptrack.schema import TRACKS, Frame
+from tests.test_cli import call, done
+from tests.test_evaluation import boxed
+from tests.worlds import ns
+
+
+def write(path: Path, *rows) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text("".join(",".join(map(str, row)) + "\n" for row in rows))
+    return path
+
+
+def scores(tracks: Path, truth: Path, **options) -> tuple[dict, list[str]]:
+    both = compare_files(tracks, truth, **options)
+    outcome = evaluate([sequence_of_files("x", tracks, both.truth, both.tracks, 1)], EvaluateOptions(("iou",)))
+    return outcome.results[0].to_json(), both.notes + outcome.notes
+
+
+def line(frame, who, x, *more, y=10):
+    """A row of MOTChallenge: a box of 20 x 50 and what follows it."""
+    return frame, who, x, y, 20, 50, *more
+
+
+WALK = [line(n, 1, 10 + n, 1, -1, -1, -1) for n in range(1, 11)]
+FOUND = [line(n, 5, 10 + n, 0.9) for n in range(1, 11)]
+
+
+def test_mot15_and_its_positions_are_no_classes(tmp_path):
+    """The last three of ten columns are a position in the world, whatever numbers stand there."""
+    truth = write(tmp_path / "gt.txt", *(line(n, 1, 10 + n, 1, 4.48, 5.5, 0) for n in range(1, 11)))
+    row, _ = scores(write(tmp_path / "t.txt", *FOUND), truth)
+    assert (row["MOTA"], row["GT"], row["FN"]) == (1.0, 1, 0)
+
+
+def test_frames_outside_of_the_truth_count_as_trackeval_counts_them(tmp_path):
+    early = [line(n, 9, 300, 0.9) for n in range(1, 4)]
+    truth = write(tmp_path / "gt.txt", *WALK[4:])
+    row, _ = scores(write(tmp_path / "t.txt", *FOUND, *early), truth)
+    assert (row["FP"], row["FN"]) == (7, 0)  # four of the walker before he is labelled, three of a ghost
+
+
+def test_mot17_distractors_count_neither_way(tmp_path):
+    """Beside a pedestrian: a statue, a car, somebody who isn't to be considered, each with a track of its own."""
+    truth = []
+    for n in range(1, 6):
+        truth += [line(n, 1, 10 + n, 1, 1, 0.9), line(n, 2, 100, 0, 7, 1.0), line(n, 3, 200, 0, 3, 1.0)]
+        truth += [line(n, 4, 300, 0, 1, 0.1)]
+    found = [line(n, who, x) for n in range(1, 6) for who, x in ((11, 10 + n), (12, 101), (13, 201), (14, 301))]
+    row, notes = scores(write(tmp_path / "t.txt", *found), write(tmp_path / "gt.txt", *truth))
+    assert (row["GT"], row["FN"]) == (1, 0)
+    assert row["FP"] == 10  # the car's and the other's; the statue's is forgiven
+    assert any("5 boxes of" in note and "count neither way" in note for note in notes)
+
+
+def test_a_track_between_a_pedestrian_and_a_statue_is_the_pedestrians(tmp_path):
+    """The assignment that forgives is one over all: whoever finds a pedestrian isn't taken away by a statue near by."""
+    truth = [line(1, 1, 10, 1, 1, 1), line(1, 2, 16, 0, 7, 1)]
+    row, _ = scores(write(tmp_path / "t.txt", line(1, 8, 11), line(1, 9, 16)), write(tmp_path / "gt.txt", *truth))
+    assert (row["FP"], row["FN"]) == (0, 0)
+
+
+def kitti(frame, who, kind, x, *, truncated=0, occluded=0, height=50.0, more=()):
+    box = (x, 10.0, x + 20.0, 10.0 + height)
+    return " ".join(map(str, (frame, who, kind, truncated, occluded, 0.1, *box, 1.7, 0.5, 0.5, 1, 1, 1, 0.0, *more)))
+
+
+def test_kitti_counts_pedestrians_and_forgives_what_it_says(tmp_path):
+    truth, found = [], []
+    for n in range(5):
+        truth += [kitti(n, 1, "Pedestrian", 10), kitti(n, 2, "Car", 100), kitti(n, 3, "Person_sitting", 200)]
+        truth += [kitti(n, 4, "Pedestrian", 300, occluded=3), kitti(n, -1, "DontCare", 400, height=300)]
+        found += [kitti(n, who, "Pedestrian", x, more=(0.9,)) for who, x in ((1, 10), (2, 100), (3, 200), (4, 300))]
+        found += [kitti(n, 5, "Pedestrian", 402), kitti(n, 6, "Pedestrian", 600, height=20.0), kitti(n, 7, "Car", 700)]
+    a, b = tmp_path / "t.txt", tmp_path / "gt.txt"
+    a.write_text("\n".join(found))
+    b.write_text("\n".join(truth))
+    row, _ = scores(a, b)
+    assert (row["GT"], row["FN"], row["FP"]) == (1, 0, 5)  # false: who stands where the car is
+    b.write_text("\n".join(kitti(0, 1, "Car", 1.0) for _ in range(2)))
+    with pytest.raises(McaptrackError, match="holds no pedestrians, only car"):
+        compare_files(a, b)
+
+
+def test_frames_that_count_from_0_meet_those_that_count_from_1(tmp_path):
+    row, notes = scores(
+        write(tmp_path / "t.txt", *((n - 1, *rest) for n, *rest in FOUND)), write(tmp_path / "gt.txt", *WALK)
+    )
+    assert (row["FP"], row["FN"], row["MOTA"]) == (0, 0, 1.0)
+    assert any("counts frames from 0" in note for note in notes)
+
+
+def test_tables_of_our_own(tmp_path):
+    truth = [Frame(ns(n / 10), n, boxed({1: (10 + n, 10)})) for n in range(10)]
+    tracks = [Frame(ns(n / 10), n, boxed({7: (11 + n, 10)})) for n in range(10)]
+    path = tmp_path / "part-0.parquet"
+    tables.write(path, tables.rows_table(TRACKS, {"/camera/truth": truth, "/camera/tracks": tracks}), {})
+    row, _ = scores(path, path)
+    assert (row["MOTA"], row["GT"]) == (1.0, 1)
+    gt = write(tmp_path / "gt.txt", *((n + 1, 1, 10 + n, 10, 10, 20, 1, -1, -1, -1) for n in range(10)))
+    row, _ = scores(path, gt)  # a table counts frames from 0, MOTChallenge from 1
+    assert row["MOTA"] == 1.0
+    more = {"/camera/tracks": tracks, "/camera/samples": tracks[::4]}
+    tables.write(path, tables.rows_table(TRACKS, more), {})
+    with pytest.raises(McaptrackError, match=r"holds /camera/samples, /camera/tracks; choose one with --topic"):
+        scores(path, gt)
+    assert scores(path, gt, topics=("/camera/tracks",))[0]["MOTA"] == 1.0
+    (tmp_path / "no.parquet").write_bytes(b"PAR1 but not really")
+    with pytest.raises(McaptrackError, match="is no Parquet file"):
+        scores(tmp_path / "no.parquet", gt)
+
+
+def test_a_tracker_that_found_nobody_is_scored(tmp_path):
+    row, _ = scores(write(tmp_path / "t.txt"), write(tmp_path / "gt.txt", *WALK))
+    assert (row["FN"], row["FP"], row["ML"], row["MOTA"]) == (10, 0, 1, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("found", "truth", "said"),
+    [
+        (FOUND, [line(n, 1, 10, 1, 0, 1) for n in range(1, 9)], r"the class of all 8 boxes \(column 8\) is 0"),
+        (FOUND, [line(n, 1, 10, 0, 1, 1) for n in range(1, 9)], "all 8 boxes are marked as not counting"),
+        (
+            FOUND,
+            [line(n + 500, *rest) for n, *rest in ((1, 1, 5, 1), (2, 1, 5, 1))],
+            r"gt.txt \(500 to 501\) and .*t.txt",
+        ),
+        ([(n, 5, 0.1, 0.1, 0.02, 0.05) for n in range(1, 9)], WALK, "50 px high, those of t.txt 0.05, and none ever"),
+        ([line(1, 5, 10), line(1, 5, 90)], WALK, "id 5 appears twice in frame 1"),
+        ([line(1, -1, 10)], WALK, "says of nobody who it is"),
+        (FOUND, [], "gt.txt holds no labels"),
+    ],
+    ids=["all classes 0", "none considered", "other frames", "other units", "twins", "no ids", "no truth"],
+)
+def test_what_can_not_be_scored_is_said(tmp_path, found, truth, said):
+    with pytest.raises(McaptrackError, match=said):
+        scores(write(tmp_path / "t.txt", *found), write(tmp_path / "gt.txt", *truth))
+
+
+def test_positions_in_metres_are_no_boxes(tmp_path):
+    """Boxes in pixels against positions in metres: nothing can be compared, and that is said."""
+    truth = tmp_path / "gt.txt"
+    truth.write_text("".join(f"{n} 1 {n / 10} 2.0\n" for n in range(1, 11)))
+    code, _, err = call("evaluate", write(tmp_path / "t.txt", *FOUND), "--truth", truth)
+    assert code == 1
+    assert "share neither boxes nor positions in metres" in err
+
+
+def test_tracks_that_meet_nobody_are_scored_and_it_is_said(tmp_path):
+    row, notes = scores(
+        write(tmp_path / "t.txt", *(line(n, 5, 800) for n in range(1, 11))), write(tmp_path / "gt.txt", *WALK)
+    )
+    assert (row["FP"], row["FN"]) == (10, 10)
+    assert notes == ["x: t.txt and the truth never come near each other"]
+
+
+def test_files_are_paired_by_name_or_in_order(tmp_path):
+    made = [tmp_path / "b.txt", tmp_path / "a.txt"]
+    truth = [tmp_path / name / "gt" / "gt.txt" for name in ("a", "b")]
+    assert [(n, t.parent.parent.name) for n, _, t in pair_files(made, truth)[0]] == [("b", "b"), ("a", "a")]
+    pairs, words = pair_files(made, [tmp_path / "x.txt", tmp_path / "y.txt"])
+    assert [(n, t.name) for n, _, t in pairs] == [("b", "x.txt"), ("a", "y.txt")]
+    assert "taken in the order given" in words
+    with pytest.raises(McaptrackError, match="2 files of tracks and 1 of truth"):
+        pair_files(made, truth[:1])
+
+
+def test_several_files_at_the_command_line(tmp_path):
+    for name in ("a", "b"):
+        write(tmp_path / name / "gt" / "gt.txt", *WALK)
+        write(tmp_path / f"{name}.txt", *(FOUND if name == "a" else FOUND[:5]))
+    words = ("evaluate", tmp_path / "[ab].txt", "--truth", tmp_path / "*/gt/gt.txt", "--json")
+    out, _ = done(*words)
+    rows = json.loads(out)["results"]
+    assert [(row["sequence"], row["FN"]) for row in rows] == [("a", 0), ("b", 5), ("COMBINED", 5)]
+    assert rows[-1]["tracks"] == "2 files"
+    code, _, err = call(*words, "--fail-under", "mota=0.8")
+    assert code == 4
+    assert "MOTA 0.7500 is under 0.8" in err

@@ -1,0 +1,181 @@
+"""The search for settings that score best."""
+
+from __future__ import annotations
+
+import json
+import sys
+import tomllib
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from mcaptrack.errors import McaptrackError
+from mcaptrack.evaluation import EvaluateOptions
+from mcaptrack.schema import Frame
+from mcaptrack.transforms import TRACKERS, TRANSFORMS, Sort
+from mcaptrack.tuning import Range, Task, declared_ranges, settings_to_toml, tune
+from tests.test_cli import call, done
+from tests.test_evaluation import boxed
+from tests.worlds import boxes_at, detections, ns
+
+IOU = EvaluateOptions(similarities=("iou",))
+
+
+def scene() -> Task:
+    """Somebody walks, and is hidden for 2.5 s: who forgets later than that keeps the identity."""
+    path = [(50 + 0.5 * n, 50) for n in range(80)]
+    found = detections(lambda n: [] if 30 <= n < 55 else [path[n]], 80)
+    truth = [Frame(ns(n / 10), n, boxed({1: (x - 5, y - 10)})) for n, (x, y) in enumerate(path)]
+    return Task(
+        "scene", [f._replace(rows=boxes_at([path[n]] * len(f.rows), (10, 20))) for n, f in enumerate(found)], truth, {}
+    )
+
+
+@pytest.fixture
+def chance(monkeypatch):
+    """Without Optuna, whether or not it is installed."""
+    monkeypatch.setitem(sys.modules, "optuna", None)
+
+
+def test_every_tracker_declares_ranges_that_it_accepts():
+    for kind in {**TRANSFORMS, **TRACKERS}.values():
+        for name, part in declared_ranges(kind).items():
+            for value in (part.low, part.high):
+                kind(**{name: int(value) if part.whole else value})
+    assert {"max_age_s", "min_iou"} <= set(declared_ranges(Sort))
+    assert "inertia" in declared_ranges(TRACKERS["ocsort"])
+    assert "high_score" in declared_ranges(TRACKERS["bytetrack"])
+
+
+def test_the_search_finds_the_age_that_keeps_an_identity(chance):
+    first, best = tune(Sort(), [scene()], {"max_age_s": Range(0.1, 6.0, False)}, IOU, trials=25)
+    assert first.number == 0
+    assert first.parameters == {}
+    assert best.parameters["max_age_s"] > 2.4
+    assert best.scores["IDF1"] > first.scores["IDF1"] + 0.2
+
+
+def test_optuna_finds_it_too():
+    pytest.importorskip("optuna")
+    _, best = tune(Sort(), [scene()], {"max_age_s": Range(0.1, 6.0, False)}, IOU, trials=25)
+    assert best.parameters["max_age_s"] > 2.4
+
+
+@pytest.mark.parametrize("with_optuna", [False, True])
+def test_a_search_that_was_ended_goes_on_where_it_was(with_optuna, tmp_path, monkeypatch):
+    if with_optuna:
+        pytest.importorskip("optuna")
+    else:
+        monkeypatch.setitem(sys.modules, "optuna", None)
+    path, ranges, task = tmp_path / "study.jsonl", {"max_age_s": Range(0.1, 6.0, False)}, scene()
+    told = []
+    tune(Sort(), [task], ranges, IOU, trials=4, study=path, told=lambda trial, *_: told.append(trial.number))
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-7])  # ended while the fourth was written
+    tune(Sort(), [task], ranges, IOU, trials=6, study=path, told=lambda trial, *_: told.append(trial.number))
+    assert told == [0, 1, 2, 3, 3, 4, 5]
+    assert [json.loads(line).get("number") for line in path.read_text().splitlines()] == [None, 0, 1, 2, 3, 4, 5]
+    if not with_optuna:  # chance draws the same whenever it is asked
+        whole_way = tmp_path / "other.jsonl"
+        tune(Sort(), [task], ranges, IOU, trials=6, study=whole_way)
+        assert whole_way.read_bytes() == path.read_bytes()
+
+
+def test_a_study_of_something_else_is_not_gone_on_with(chance, tmp_path):
+    path, ranges = tmp_path / "study.jsonl", {"max_age_s": Range(0.1, 6.0, False)}
+    tune(Sort(), [scene()], ranges, IOU, trials=1, study=path)
+    with pytest.raises(McaptrackError, match=r"study of something else \(parameters differ\)"):
+        tune(Sort(min_iou=0.5), [scene()], ranges, IOU, trials=2, study=path)
+    path.write_text("frame,id\n1,2\n")
+    with pytest.raises(McaptrackError, match="is no study"):
+        tune(Sort(), [scene()], ranges, IOU, trials=2, study=path)
+    with pytest.raises(McaptrackError, match="declares no ranges"):
+        tune(Sort(), [scene()], {}, IOU)
+
+
+def test_what_is_tried_is_what_is_written(chance):
+    seen = []
+
+    @dataclass(frozen=True, kw_only=True)
+    class Watched(Sort):
+        def __post_init__(self):
+            seen.append((self.max_age_s, self.min_iou))
+
+    _, best = tune(
+        Watched(), [scene()], {"max_age_s": Range(0, 3, False), "min_iou": Range(0, 1, False)}, IOU, trials=5
+    )
+    assert (best.parameters.get("max_age_s", 1.4), best.parameters.get("min_iou", 0.2)) in seen
+
+
+def test_draws_keep_to_their_ranges():
+    rng = np.random.default_rng(0)
+    assert {Range(1, 3, True).draw(rng) for _ in range(100)} == {1, 2, 3}
+    assert all(0.2 <= Range(0.2, 0.4, False).draw(rng) <= 0.4 for _ in range(100))
+
+
+def test_settings_go_into_a_file_that_stands_and_leave_the_rest():
+    text = '# mine\n[track]  # tuned once\nmin-iou = 0.5  # old\nmax-age-frames = 3\n\n[retrack]\nprofile = "paper"\n'
+    out = settings_to_toml(text, "track", {"tracker": "sort", "min_iou": 0.25})
+    assert tomllib.loads(out) == {
+        "track": {"tracker": "sort", "min-iou": 0.25, "max-age-frames": 3},
+        "retrack": {"profile": "paper"},
+    }
+    assert "# mine" in out
+    assert tomllib.loads(settings_to_toml("", "track", {"min_iou": 0.1})) == {"track": {"min-iou": 0.1}}
+
+
+def write_files(folder):
+    (folder / "det.txt").write_text(
+        "".join(
+            f"{f.index + 1},-1,{r['x_px']},{r['y_px']},{r['w_px']},{r['h_px']},0.9\n"
+            for f in scene().frames
+            for r in f.rows
+        )
+    )
+    (folder / "gt.txt").write_text(
+        "".join(f"{f.index + 1},1,{r['x_px']},{r['y_px']},10,20,1,-1,-1,-1\n" for f in scene().truth for r in f.rows)
+    )
+
+
+def test_at_the_command_line_from_files_to_settings_that_commands_read(tmp_path):
+    write_files(tmp_path)
+    words = ("tune", "det.txt", "--truth", "gt.txt", "--fps", 10, "--trials", 12, "--search", "max-age-s=0.1:6")
+    out, err = done(*words, "--json", folder=tmp_path)
+    row = json.loads(out)["results"][0]
+    assert row["scores"]["IDF1"] > row["default_scores"]["IDF1"]
+    settings = tomllib.loads((tmp_path / "mcaptrack.toml").read_text())["track"]
+    assert settings["tracker"] == "sort"
+    assert settings["max-age-s"] == row["settings"]["max_age_s"]
+    assert "mcaptrack.toml: IDF1" in err
+    done("ingest", "det.txt", "--as", "detections", "--truth", "gt.txt", "--fps", 10, "-o", "a.mcap", folder=tmp_path)
+    done("run", "a.mcap", "--no-tables", "-q", folder=tmp_path)
+    channels = json.loads(done("info", "a.mcap", "--json", folder=tmp_path)[0])["results"][0]["channels"]
+    made = {channel["topic"]: channel["parameters"] for channel in channels}
+    assert made["/camera/tracks"]["max_age_s"] == settings["max-age-s"]
+
+
+def test_a_log_can_be_tuned_and_mistakes_are_said(tmp_path):
+    write_files(tmp_path)
+    log = tmp_path / "a.mcap"
+    done("ingest", tmp_path / "det.txt", "--as", "detections", "--fps", 10, "-o", log)
+    code, _, err = call("tune", log, "--trials", 2, folder=tmp_path)
+    assert code == 1
+    assert "has no channel /camera/truth" in err
+    done("ingest", tmp_path / "gt.txt", "--as", "truth", "--fps", 10, "--into", log)
+    out, _ = done("tune", log, "--trials", 2, "--tracker", "ocsort", "-q", folder=tmp_path)
+    assert "defaults" in out
+    code, _, err = call("tune", log, "--search", "speed=1:2", folder=tmp_path)
+    assert code == 1
+    assert "no parameter that can be searched; there are max-age-s" in err
+    code, _, err = call("tune", log, "--search", "min-iou=0.1:7", folder=tmp_path)
+    assert code == 1
+    assert "min_iou has to be from 0 to 1, not 7" in err
+
+
+def test_empty_tracks_are_a_score_too(chance):
+    """A setting with which nobody is tracked is worth nothing, and ends no search."""
+    task = scene()
+    empty = Task("x", [f._replace(rows=f.rows[:0]) for f in task.frames], task.truth, {})
+    first, _ = tune(Sort(), [empty], {"min_iou": Range(0, 1, False)}, IOU, trials=2)
+    assert first.scores["IDF1"] == 0.0
