@@ -201,6 +201,7 @@ class _Look:
             self._at_chunk(record, indexes)
         except Damaged as error:
             self._find("bad-chunk", record.start, str(error))
+        forget(self._buffer, record.start, record.end)
 
     def _at_chunk(self, record: Record, indexes: Mapping[int, int]) -> None:
         buffer = self._buffer
