@@ -18,6 +18,7 @@ from mcaptrack.cli.ingest import ingest
 from mcaptrack.cli.show import export, info
 from mcaptrack.cli.stages import add_stages
 from mcaptrack.cli.tune import tune
+from mcaptrack.cli.view import view
 
 app = typer.Typer(
     name="mcaptrack",
@@ -52,6 +53,7 @@ register(app, "evaluate", evaluate)
 register(app, "tune", tune)
 register(app, "export", export)
 register(app, "info", info)
+register(app, "view", view)
 register(app, "check", check)
 register(app, "recover", recover)
 register(app, "drop", drop)

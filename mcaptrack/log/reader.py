@@ -164,6 +164,16 @@ class Log:
         with self._mending():
             return records.read_metadata(self._buffer, records.record_at(self._buffer, found[-1]))[1]
 
+    def attachment(self, name: str) -> bytes | None:
+        """The data of the last attachment of that name."""
+        if self.results is not None and (of_results := self.results.attachment(name)) is not None:
+            return of_results
+        found = [listed.offset for listed in self.index.attachments if listed.name == name]
+        if not found:
+            return None
+        with self._mending():
+            return bytes(records.read_attachment(self._buffer, records.record_at(self._buffer, found[-1]))[4])
+
     def messages(self, topic: str, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Message]:
         """The messages of a channel by time, from ``start_ns`` to before ``end_ns``, all of them without these.
 
