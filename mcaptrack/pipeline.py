@@ -556,6 +556,33 @@ def layout(prefix: str, view_topics: Sequence[str], picture_topic: str) -> bytes
     """The layout for a camera's views over its pictures: the best that there is switched on."""
     names = {topic: topic.removeprefix(prefix + "/").removesuffix(views.SUFFIX) for topic in sorted(view_topics)}
     there = set(names.values())
-    on = {"retracks", "retracks/predictions"} if "retracks" in there else {next((n for n in _SHOWN if n in there), "")}
+    on = _switched_on(there)
     paths = [f"{prefix}/{name}.rows[:].x_m" for name in ("tracks", "retracks") if name in there]
     return foxglove.layout(picture_topic, {topic: name in on for topic, name in names.items()}, paths)
+
+
+def _switched_on(there: set[str]) -> list[str]:
+    """The best views of those that there are, below the prefix."""
+    best = (
+        ["retracks", "retracks/predictions"] if "retracks" in there else [name for name in _SHOWN if name in there][:1]
+    )
+    return [name for name in best if name in there]
+
+
+def find_views(opened: log.Log, prefix: str, topics: Sequence[str] = ()) -> list[str]:
+    """The topics of the views that a layout switches on, or those of these channels.
+
+    Raises McaptrackError if there are none.
+    """
+    if topics:
+        chosen = [topic if topic.endswith(views.SUFFIX) else topic + views.SUFFIX for topic in topics]
+        return [opened.channel(topic).topic for topic in chosen]
+    there = {
+        topic.removeprefix(prefix + "/").removesuffix(views.SUFFIX)
+        for topic in opened.channels
+        if topic.startswith(prefix + "/") and topic.endswith(views.SUFFIX)
+    }
+    found = [f"{prefix}/{name}{views.SUFFIX}" for name in _switched_on(there)]
+    if not found:
+        raise McaptrackError(f"{opened.path} has no views of {prefix} yet; `mcaptrack run {opened.path}` makes them")
+    return found

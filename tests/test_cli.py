@@ -18,7 +18,20 @@ from mcaptrack import __version__, demo
 from tests.worlds import small_scene, write_clip
 
 STAGES = ["detect", "track", "sample", "predict", "retrack", "run"]
-COMMANDS = ["ingest", *STAGES, "evaluate", "tune", "export", "info", "view", "check", "recover", "drop", "demo"]
+COMMANDS = [
+    "ingest",
+    *STAGES,
+    "evaluate",
+    "tune",
+    "export",
+    "info",
+    "view",
+    "render",
+    "check",
+    "recover",
+    "drop",
+    "demo",
+]
 
 
 def start(*words, folder: Path | None = None, environment: dict[str, str] | None = None) -> subprocess.Popen:

@@ -15,6 +15,7 @@ from mcaptrack.cli.demo import demo
 from mcaptrack.cli.evaluate import evaluate
 from mcaptrack.cli.files import check, drop, recover
 from mcaptrack.cli.ingest import ingest
+from mcaptrack.cli.render import render
 from mcaptrack.cli.show import export, info
 from mcaptrack.cli.stages import add_stages
 from mcaptrack.cli.tune import tune
@@ -54,6 +55,7 @@ register(app, "tune", tune)
 register(app, "export", export)
 register(app, "info", info)
 register(app, "view", view)
+register(app, "render", render)
 register(app, "check", check)
 register(app, "recover", recover)
 register(app, "drop", drop)

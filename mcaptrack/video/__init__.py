@@ -1,10 +1,10 @@
-"""Packets and pixels: video files and image folders in, brightness for detectors out, H.264 and JPEG between.
+"""Packets and pixels: video files and image folders in, brightness and colours out, H.264 and JPEG between.
 
 FFmpeg does the work, through PyAV; its wheels bring it along.
 """
 
-from mcaptrack.video.decode import Encoded, brightness
-from mcaptrack.video.encode import H264Encoder, Image, ImageFormat, encode_image, write_mp4
+from mcaptrack.video.decode import Encoded, brightness, colours
+from mcaptrack.video.encode import H264Encoder, Image, ImageFormat, encode_image, write_clip, write_mp4
 from mcaptrack.video.raw import RAW_ENCODINGS, Layout
 from mcaptrack.video.source import IMAGE_SUFFIXES, EncodedPicture, Video, open_video, seqinfo_fps
 
@@ -19,8 +19,10 @@ __all__ = [
     "Layout",
     "Video",
     "brightness",
+    "colours",
     "encode_image",
     "open_video",
     "seqinfo_fps",
+    "write_clip",
     "write_mp4",
 ]

@@ -1,8 +1,8 @@
-"""Encoded pictures -> brightness, for detectors."""
+"""Encoded pictures -> brightness, for detectors, and colours, for people."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from fractions import Fraction
 from typing import Any, Final, NamedTuple
 
@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 from mcaptrack.clock import NS_PER_S
 from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import Frame
-from mcaptrack.video.raw import Layout, raw_brightness
+from mcaptrack.video.raw import Layout, raw_brightness, raw_colours
+
+Pixels = NDArray[np.uint8]
 
 #: Names of formats in messages -> decoders of FFmpeg.
 _CODECS: Final = {"h264": "h264", "h265": "hevc", "vp9": "vp9", "av1": "av1"}
@@ -45,31 +47,43 @@ def brightness(pictures: Iterable[Encoded]) -> Iterator[Frame]:
 
     Raises McaptrackError for a format that can't be decoded and for pictures that are broken.
     """
+    return _decoded(pictures, raw_brightness, _luma, is_grey=True)
+
+
+def colours(pictures: Iterable[Encoded]) -> Iterator[Frame]:
+    """The same in colour: ``rows`` are (height, width, 3) uint8, blue, green, red."""
+    return _decoded(pictures, raw_colours, _bgr, is_grey=False)
+
+
+def _decoded(
+    pictures: Iterable[Encoded],
+    of_pixels: Callable[[str, bytes, Layout], Pixels],
+    of_frame: Callable[[Any], Pixels],
+    is_grey: bool,
+) -> Iterator[Frame]:
     decoder: _VideoDecoder | None = None
     for picture in pictures:
         if picture.layout:
-            yield Frame(picture.t_ns, picture.index, _pixels(picture, picture.layout))
+            try:
+                pixels = of_pixels(picture.format, picture.data, picture.layout)
+            except McaptrackError as error:
+                raise McaptrackError(f"{picture.name}: {error}") from None
+            yield Frame(picture.t_ns, picture.index, pixels)
         elif picture.format in _CODECS:
-            decoder = decoder or _VideoDecoder(picture.format)
+            decoder = decoder or _VideoDecoder(picture.format, of_frame)
             yield from decoder.decode(picture)
         else:
-            yield Frame(picture.t_ns, picture.index, _still(picture))
+            yield Frame(picture.t_ns, picture.index, _still(picture, is_grey))
     if decoder:
         yield from decoder.flush()
 
 
-def _pixels(picture: Encoded, layout: Layout) -> NDArray[np.uint8]:
-    try:
-        return raw_brightness(picture.format, picture.data, layout)
-    except McaptrackError as error:
-        raise McaptrackError(f"{picture.name}: {error}") from None
-
-
-def _still(picture: Encoded) -> NDArray[np.uint8]:
+def _still(picture: Encoded, is_grey: bool) -> Pixels:
     import cv2
 
     try:
-        image = cv2.imdecode(np.frombuffer(picture.data, np.uint8), cv2.IMREAD_GRAYSCALE)
+        how = cv2.IMREAD_GRAYSCALE if is_grey else cv2.IMREAD_COLOR
+        image = cv2.imdecode(np.frombuffer(picture.data, np.uint8), how)
     except cv2.error:  # of no bytes, or of a header that promises more pixels than there can be
         image = None
     if image is None:
@@ -78,8 +92,10 @@ def _still(picture: Encoded) -> NDArray[np.uint8]:
 
 
 class _VideoDecoder:
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str, of_frame: Callable[[Any], Pixels]) -> None:
         import av
+
+        self._of_frame = of_frame
 
         self._codec: Any = av.CodecContext.create(_CODECS[name], "r")
         self._codec.thread_type = "AUTO"
@@ -106,10 +122,14 @@ class _VideoDecoder:
         except av.error.FFmpegError as error:
             raise McaptrackError(f"{where} can't be decoded: {error.strerror or error}") from error
         for frame in decoded:
-            yield Frame(frame.pts, self._index.pop(frame.pts, 0), _luma(frame))
+            yield Frame(frame.pts, self._index.pop(frame.pts, 0), self._of_frame(frame))
 
 
-def _luma(frame: Any) -> NDArray[np.uint8]:
+def _bgr(frame: Any) -> Pixels:
+    return np.asarray(frame.to_ndarray(format="bgr24"), np.uint8)
+
+
+def _luma(frame: Any) -> Pixels:
     """The brightness of a decoded picture; its Y plane where it has one of 8 bits."""
     import cv2
 

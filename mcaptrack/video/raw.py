@@ -1,4 +1,4 @@
-"""Pixels that nobody compressed -> brightness.
+"""Pixels that nobody compressed -> brightness, or colours.
 
 Letters: H rows, W columns, B bytes a pixel.
 """
@@ -57,18 +57,9 @@ def raw_brightness(encoding: str, data: bytes, layout: Layout) -> Bytes:
 
     Raises McaptrackError for an encoding that is not read, and for a size that ``data`` does not hold.
     """
-    import cv2
-
     if encoding in _COLOURS:
         size, conversion = _COLOURS[encoding]
-        rows = _rows(data, layout, size)
-        if not conversion:
-            return rows
-        image: Any = rows if size == 1 else rows.reshape(*rows.shape[:1], -1, size)
-        try:
-            return np.asarray(cv2.cvtColor(image, getattr(cv2, conversion)), np.uint8)
-        except cv2.error:
-            raise McaptrackError(f"{layout.width_px} x {layout.height_px} pixels are no {encoding} picture") from None
+        return _converted(encoding, data, layout, size, conversion)
     if encoding in _LUMA_AT:
         return np.ascontiguousarray(_rows(data, layout, 2)[:, _LUMA_AT[encoding] :: 2])
     if encoding in _PLANAR:
@@ -83,6 +74,30 @@ def raw_brightness(encoding: str, data: bytes, layout: Layout) -> Bytes:
         shares = np.nan_to_num(np.asarray(values, np.float32)).clip(0, 1)
         return np.asarray(np.rint(shares * 255), np.uint8)
     raise McaptrackError(f"pixels of the encoding {encoding[:40]!r} are not read; {', '.join(RAW_ENCODINGS)} are")
+
+
+def raw_colours(encoding: str, data: bytes, layout: Layout) -> Bytes:
+    """Blue, green and red (H, W, 3) of a picture; grey where it is grey, or of an encoding that is rare."""
+    import cv2
+
+    size, conversion = _COLOURS.get(encoding, (0, ""))
+    if not conversion:
+        return np.asarray(cv2.cvtColor(raw_brightness(encoding, data, layout), cv2.COLOR_GRAY2BGR), np.uint8)
+    return _converted(encoding, data, layout, size, conversion.replace("2GRAY", "2BGR").replace("COLOR_BGR2BGR", ""))
+
+
+def _converted(encoding: str, data: bytes, layout: Layout, size: int, conversion: str) -> Bytes:
+    """Pixels after a conversion of OpenCV's, "" for none."""
+    import cv2
+
+    rows = _rows(data, layout, size)
+    image: Any = rows if size == 1 else rows.reshape(*rows.shape[:1], -1, size)
+    if not conversion:
+        return np.asarray(image, np.uint8)
+    try:
+        return np.asarray(cv2.cvtColor(image, getattr(cv2, conversion)), np.uint8)
+    except cv2.error:
+        raise McaptrackError(f"{layout.width_px} x {layout.height_px} pixels are no {encoding} picture") from None
 
 
 def _rows(data: bytes, layout: Layout, size: int) -> Bytes:

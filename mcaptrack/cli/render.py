@@ -1,0 +1,69 @@
+"""``mcaptrack render``: the annotated video."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from mcaptrack.cli import common
+from mcaptrack.errors import McaptrackError
+
+
+@common.one_line
+def render(
+    logs: common.Logs,
+    topic: Annotated[
+        list[str] | None,
+        common.option("--topic", help="Draw this view; several with several --topic.", show_default="as in the layout"),
+    ] = None,
+    width: Annotated[int | None, common.option("--width", help="Pixels across.", show_default="as the video")] = None,
+    max_fps: Annotated[
+        float | None, common.option("--max-fps", help="At most so many pictures a second.", show_default="all; GIF 10")
+    ] = None,
+    start_s: Annotated[float, common.option("--start-s", help="From this second on.")] = 0.0,
+    end_s: Annotated[float | None, common.option("--end-s", help="To this second.", show_default="the end")] = None,
+    gif: Annotated[bool, common.option("--gif", help="A GIF, if -o doesn't say.")] = False,
+    camera: common.Camera = None,
+    output: common.Output = None,
+    force: common.Force = False,
+    json: common.Json = False,
+    quiet: common.Quiet = False,
+    verbose: common.Verbose = False,
+    config: common.Config = None,
+) -> None:
+    """Draw what was found on the video of a log, for people without a viewer: LOG.mp4, or a GIF.
+
+    Boxes, trails and forecasts are those of the views in the log, in the same colours.
+
+    Example: mcaptrack render log.mcap -o walk.gif --width 480 --start-s 2 --end-s 8
+    """
+    from mcaptrack import log, pipeline, rendering
+    from mcaptrack.atomic import refuse_overwrite
+
+    paths = common.expand(logs)
+    common.only_one_output(paths, output)
+    _in_bounds("--width", width, 16, 16384)
+    _in_bounds("--max-fps", max_fps, 0.01, 1000)
+    _in_bounds("--start-s", start_s, 0, 1e9)
+    _in_bounds("--end-s", end_s, 0, 1e9)
+    options = rendering.RenderOptions(width_px=width, max_fps=max_fps, start_s=start_s, end_s=end_s)
+    results = []
+    with common.Talk(quiet, verbose).open() as talk:
+        for path in paths:
+            target = output or path.with_suffix(".gif" if gif else ".mp4")
+            refuse_overwrite(target, force)
+            with log.read(path) as opened:
+                prefix = pipeline.find_camera(opened, camera)
+                pictures = pipeline.picture_topic(opened, prefix)
+                if pictures is None:
+                    raise McaptrackError(f"{path} has no pictures of {prefix} to draw on; `mcaptrack info {path}`")
+                views = pipeline.find_views(opened, prefix, topic or ())
+                count = rendering.render(opened, pictures, views, target, options, talk.progress)
+            talk.say(f"{target}: {count} pictures with {', '.join(views) or 'nothing drawn'}")
+            results.append({"log": str(path), "output": str(target), "pictures": count, "views": views})
+    if json:
+        common.print_json({"results": results})
+
+
+def _in_bounds(name: str, value: float | None, low: float, high: float) -> None:
+    if value is not None and not low <= value <= high:
+        raise McaptrackError(f"{name} is a number from {low:g} to {high:g}, not {value:g}")
