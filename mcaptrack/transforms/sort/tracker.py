@@ -8,9 +8,9 @@ Letters: N boxes, K tracks.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from itertools import islice
+from itertools import islice, pairwise
 from types import MappingProxyType
 from typing import ClassVar, NamedTuple
 
@@ -32,6 +32,25 @@ Ints = NDArray[np.intp]
 
 #: How many frames are read and written at once.
 _BLOCK = 64
+
+
+#: The compiled loop, once somebody has asked for it.
+_compiled: list[Callable[..., tuple[Floats, Floats, NDArray[np.int64], int]]] = []
+
+
+def compile_sort() -> bool:
+    """Have SORT run compiled from now on, where that is possible; returns whether it is: whether Numba is installed.
+
+    It takes a second to load, and ten to compile for the first time, so it pays for whoever tracks again and again.
+    What comes out is the same.
+    """
+    if not _compiled:
+        try:
+            from mcaptrack.transforms.sort.compiled import track
+        except ImportError:
+            return False
+        _compiled.append(track)
+    return True
 
 
 class Moment(NamedTuple):
@@ -82,9 +101,37 @@ class Sort:
         life = _Life(self, self._no_tracks())
         coming = iter(frames)
         while block := list(islice(coming, _BLOCK)):
-            shows = look(block, self.min_score, self.class_id)
-            shown = [self._step(life, frame, seen) for frame, seen in zip(block, shows, strict=True)]
-            yield from ((frame,) for frame in write(block, shown, self.ground_planes))
+            columns, ends = look(block, self.min_score, self.class_id)
+            if _compiled and type(self) is Sort and self.cost == "iou":
+                shown, shown_ends = self._run_compiled(life, block, columns, ends)
+            else:
+                spans = pairwise(ends.tolist())
+                parts = [self._step(life, f, Seen(columns[:, a:b])) for f, (a, b) in zip(block, spans, strict=True)]
+                shown, shown_ends = np.concatenate(parts, axis=1), np.cumsum([0, *(p.shape[1] for p in parts)])
+            yield from ((frame,) for frame in write(block, shown, shown_ends.tolist(), self.ground_planes))
+
+    def _run_compiled(
+        self, life: _Life, frames: list[Frame], columns: Floats, ends: NDArray[np.int64]
+    ) -> tuple[Floats, NDArray[np.int64]]:
+        """As ``_step`` for each of the frames; the columns that are shown, and where those of each begin and end."""
+        moments = np.empty((8, len(frames)))
+        for at, frame in enumerate(frames):
+            steps = life.tick(frame.t_ns)
+            moments[:, at] = (
+                steps,
+                life.clock.stretch,
+                life.age,
+                life.frame_age,
+                life.max_age,
+                life.hit,
+                life.min_hits,
+                life.early,
+            )
+        run = _compiled[0]
+        life.tracks.table, shown, shown_ends, life.next_id = run(
+            life.tracks.table, columns, ends, moments, self.min_iou, self.mix_classes, life.next_id
+        )
+        return shown, shown_ends
 
     def _step(self, life: _Life, frame: Frame, seen: Seen) -> Floats:
         """Take one frame; returns the columns of the tracks that are shown in it."""
