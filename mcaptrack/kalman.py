@@ -74,8 +74,8 @@ def correct(state: Floats, seen: Floats) -> None:
     off = seen - place
     total = p + R
     gain, gain_rate = p / total, c / total
-    place += gain[_OF] * off
-    rate += gain_rate[_OF] * off
+    place += gain.take(_OF, axis=0) * off
+    rate += gain_rate.take(_OF, axis=0) * off
     v -= gain_rate * c
     c -= gain * c
     p -= gain * p

@@ -144,15 +144,18 @@ def test_the_heaviest_pairs_are_those_of_every_combination(table, rows):
     """By brute force, in a small table and in the same one as a part of a large one with pairs of its own."""
     table = table[:rows]
     at = np.nonzero(table)
-    taken = heaviest(at, table[at], table.shape)
+    (first, second), much = heaviest(at, table[at], table.shape)
     least = -min((solve_by_hand(-table),), default=0.0)
-    assert table[at][taken].sum() == pytest.approx(least)
-    assert len(set(at[0][taken])) == len(set(at[1][taken])) == len(taken)
+    assert table[first, second].tolist() == much.tolist()
+    assert much.sum() == pytest.approx(least)
+    assert len(set(first)) == len(set(second)) == len(much)
     wide = np.zeros((40, 40))
     wide[: len(table), :5] = table
     wide[np.arange(10, 40), np.arange(39, 9, -1)] = 1.0
     at = np.nonzero(wide)
-    assert wide[at][heaviest(at, wide[at], wide.shape)].sum() == pytest.approx(least + 30)
+    pairs, much = heaviest(at, wide[at], wide.shape)
+    assert wide[pairs].tolist() == much.tolist()
+    assert much.sum() == pytest.approx(least + 30)
 
 
 def solve_by_hand(cost):

@@ -67,7 +67,8 @@ def pair(pairs: Pairs, least: float) -> tuple[Ints, Ints]:
         near = pairs if count == len(close) else pairs.where(close)
         if one_to_one(near.box, near.track):
             return near.box, near.track
-    taken = heaviest((pairs.box, pairs.track), pairs.likeness, pairs.shape)
-    if count < len(close):
-        taken = taken[pairs.likeness[taken] >= least]
-    return pairs.box[taken], pairs.track[taken]
+    (box, track), likeness = heaviest((pairs.box, pairs.track), pairs.likeness, pairs.shape)
+    if count == len(close):
+        return box, track
+    enough = likeness >= least
+    return box[enough], track[enough]
