@@ -18,7 +18,7 @@ Ints = NDArray[np.intp]
 
 @dataclass(frozen=True, kw_only=True)
 class ByteTrack(Sort):
-    """Track boxes over time: ByteTrack, which pairs in two stages.
+    """ByteTrack pairs in two stages.
 
     Boxes with a high score are paired with all tracks first; then the doubtful ones with the tracks that are left and
     were seen in the frame before: whoever is half hidden scores low, but is where he is expected.

@@ -36,7 +36,7 @@ _PATH: Final = _AGO + 1
 
 @dataclass(frozen=True, kw_only=True)
 class OcSort(Sort):
-    """Track boxes over time: OC-SORT, which trusts observations more than the filter.
+    """OC-SORT trusts observations more than the filter.
 
     Pairs in the direction of a track count for more, tracks that are lost are looked for where they were seen last, and
     a track that comes back forgets what its filter made up in between.

@@ -72,9 +72,10 @@ class Moment(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Sort:
-    """Track boxes over time: SORT.
+    """Track boxes over time.
 
-    Reads detections, writes tracks: one row for each person who is tracked and seen in a frame.
+    Reads detections, writes tracks: one row for each person who is tracked and seen in a frame. SORT pairs boxes with
+    where a Kalman filter expects tracks.
     """
 
     max_age_s: float = option(1.4, "a track is dropped after so long without a box", least=0.0, search=(0.2, 4.0))
