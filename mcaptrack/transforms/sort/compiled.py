@@ -136,19 +136,17 @@ def _pairs(table: Floats, count: int, boxes: Floats, least: float, mix_classes: 
     many = boxes.shape[1]
     track_of = np.full(many, -1)
     likeness = np.zeros((many, count))
-    edges = np.empty((5, count))
+    edges = np.empty((4, count))
     for k in range(count):
         wide = np.sqrt(table[2, k] * table[3, k])
         high = table[2, k] / wide
         wide, high = wide * 0.5, high * 0.5
         edges[0, k], edges[1, k] = table[0, k] - wide, table[1, k] - high
         edges[2, k], edges[3, k] = wide + table[0, k], high + table[1, k]
-        edges[4, k] = (edges[2, k] - edges[0, k]) * (edges[3, k] - edges[1, k])
     rows, columns = np.zeros(many, np.int64), np.zeros(count, np.int64)
     close_rows, close_columns = np.zeros(many, np.int64), np.zeros(count, np.int64)
     near = False
     for box in range(many):
-        area = (boxes[2, box] - boxes[0, box]) * (boxes[3, box] - boxes[1, box])
         for k in range(count):
             wide = min(boxes[2, box], edges[2, k]) - max(boxes[0, box], edges[0, k])
             if wide <= 0:
@@ -159,7 +157,7 @@ def _pairs(table: Floats, count: int, boxes: Floats, least: float, mix_classes: 
             both = wide * high
             if both == 0:
                 continue
-            value = both / (area + edges[4, k] - both)
+            value = both / (boxes[6, box] + table[2, k] - both)
             likeness[box, k] = value
             rows[box] += 1
             columns[k] += 1

@@ -183,7 +183,7 @@ class Sort:
         """The pairs of a moment that are possible at all, and from which likeness on they may be paired."""
         seen = moment.seen
         if self.cost == "iou":
-            pairs = by_overlap(seen.corners, moment.expected)
+            pairs = by_overlap(seen.corners, moment.expected, seen.measured[2], moment.tracks.table[2])
         elif self.cost == "pixels":
             pairs, least = by_distance(seen.corners, moment.expected, self.max_distance_px, None), 0.0
         elif moment.plane is None:
