@@ -22,7 +22,7 @@ from mcaptrack.transforms.sort import compile_sort
 # This file's folder is where Python looks first, and this file is named like the peer.
 sys.path.pop(0)
 
-FPS, AGE, HITS, MIN_IOU = 30, 1, 3, 0.3
+FPS, HITS, MIN_IOU = 30, 3, 0.3
 
 
 def crowd(people: int, frames: int, seed: int = 7) -> list[np.ndarray]:
@@ -82,11 +82,11 @@ def timed(call: Callable[[], int]) -> float:
     return time.perf_counter() - start
 
 
-def pairs() -> dict[str, tuple[Callable[[], object], Callable[[], object]]]:
+def pairs(age: int) -> dict[str, tuple[Callable[[], object], Callable[[], object]]]:
     import trackers
 
-    mine = {"max_age_frames": AGE, "min_hits_frames": HITS, "min_iou": MIN_IOU}
-    ocsort = {"lost_track_buffer": AGE, "minimum_consecutive_frames": HITS}
+    mine = {"max_age_frames": age, "min_hits_frames": HITS, "min_iou": MIN_IOU}
+    ocsort = {"lost_track_buffer": age, "minimum_consecutive_frames": HITS}
     peer = ocsort | {"minimum_iou_threshold": MIN_IOU}
     return {
         "sort": (lambda: Sort(**mine), lambda: trackers.SORTTracker(**peer)),
@@ -100,9 +100,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--people", type=int, nargs="+", default=[6, 20, 50, 100])
+    parser.add_argument("--age", type=int, default=1, help="frames until a track is dropped; SORT's own is 1")
     parser.add_argument("--trackers", nargs="+", default=["sort", "bytetrack", "ocsort", "compiled"])
     options = parser.parse_args()
-    for name, (mine, peer) in pairs().items():
+    for name, (mine, peer) in pairs(options.age).items():
         if name not in options.trackers or (name == "compiled" and not compile_sort()):
             continue
         for people in options.people:
