@@ -42,11 +42,11 @@ def iou_of_pairs(a: Floats, b: Floats) -> Floats:
     return np.where(either > 0, both / np.where(either > 0, either, 1.0), 0.0)
 
 
-def overlapping(a: Floats, b: Floats) -> tuple[Ints, Ints, Floats]:
+def overlapping(a: Floats, b: Floats, area_a: Floats, area_b: Floats) -> tuple[Ints, Ints, Floats]:
     """The pairs of boxes that overlap, and their intersection over union.
 
-    ``a`` (4, M) and ``b`` (4, N) are left, top, right, bottom. Returns which of ``a`` (P,), rising, which of ``b``
-    (P,), and how much (P,).
+    ``a`` (4, M) and ``b`` (4, N) are left, top, right, bottom, with their areas (M,) and (N,). Returns which of ``a``
+    (P,), rising, which of ``b`` (P,), and how much (P,).
     """
     if a.shape[1] * b.shape[1] > _MANY:
         first, second = _side_by_side(a, b)
@@ -65,7 +65,6 @@ def overlapping(a: Floats, b: Floats) -> tuple[Ints, Ints, Floats]:
         shared = both[at]
         first = at // (b.shape[1] or 1)
         second = at - first * b.shape[1]
-    area_a, area_b = (a[2] - a[0]) * (a[3] - a[1]), (b[2] - b[0]) * (b[3] - b[1])
     return first, second, shared / (area_a[first] + area_b[second] - shared)
 
 

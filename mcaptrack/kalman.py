@@ -26,14 +26,14 @@ _PLACE, _RATE, _P, _C, _V = (slice(*ends) for ends in ((0, 4), (4, 8), (8, 11), 
 _AREA, _RATIO, _AREA_RATE = 2, 3, 6
 _COVARIANCE: Final = slice(_P.start, STATE_ROWS)
 #: Below this, in square pixels, an area has vanished.
-_LEAST_AREA: Final = 1e-9
+LEAST_AREA: Final = 1e-9
 #: Which of centre, area, ratio each of u, v, s, r is.
 _OF: Final = np.array([0, 0, 1, 2])
 
 # Diagonals of R, P0 and Q for (centre, area, ratio) and their rates, as SORT sets them.
-_R: Final = np.array([[1.0], [10.0], [10.0]])
-_START: Final = np.array([[0.0, 0, 0, 0, 10, 10, 10, 0, 0, 0, 1e4, 1e4, 0]]).T
-_NOISE: Final = np.array([[1.0, 1, 1, 0, 0, 0, 0.01, 1e-4, 0]]).T
+R: Final = np.array([[1.0], [10.0], [10.0]])
+START: Final = np.array([[0.0, 0, 0, 0, 10, 10, 10, 0, 0, 0, 1e4, 1e4, 0]]).T
+NOISE: Final = np.array([[1.0, 1, 1, 0, 0, 0, 0.01, 1e-4, 0]]).T
 
 
 def measure(boxes: Floats) -> Floats:
@@ -49,7 +49,7 @@ def measure(boxes: Floats) -> Floats:
 def start(state: Floats, seen: Floats) -> None:
     """Make states (17, N) begin at u, v, s, r (4, N), at rest and sure of nothing, in place."""
     state[_PLACE] = seen
-    state[_RATE.start :] = _START
+    state[_RATE.start :] = START
 
 
 def predict(state: Floats) -> None:
@@ -57,25 +57,25 @@ def predict(state: Floats) -> None:
     place, p, c = state[_PLACE], state[_P], state[_C]
     place += state[_RATE]
     area = place[_AREA]
-    if area.size and area.min() < _LEAST_AREA:
-        vanished = area < _LEAST_AREA
+    if area.size and area.min() < LEAST_AREA:
+        vanished = area < LEAST_AREA
         area[vanished] -= state[_AREA_RATE, vanished]
         state[_AREA_RATE, vanished] = 0
     p += c
     c += state[_V]
     p += c
     covariance = state[_COVARIANCE]
-    covariance += _NOISE
+    covariance += NOISE
 
 
 def correct(state: Floats, seen: Floats) -> None:
     """States (17, K) after seeing u, v, s, r (4, K), in place."""
     place, rate, p, c, v = state[_PLACE], state[_RATE], state[_P], state[_C], state[_V]
     off = seen - place
-    total = p + _R
+    total = p + R
     gain, gain_rate = p / total, c / total
-    place += gain[_OF] * off
-    rate += gain_rate[_OF] * off
+    place += gain.take(_OF, axis=0) * off
+    rate += gain_rate.take(_OF, axis=0) * off
     v -= gain_rate * c
     c -= gain * c
     p -= gain * p

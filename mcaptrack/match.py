@@ -61,41 +61,41 @@ def one_to_one(rows: NDArray[np.intp], columns: NDArray[np.intp]) -> bool:
     return len(set(rows.tolist())) == len(rows) == len(set(columns.tolist()))
 
 
-def heaviest(pairs: Pairs, weight: Floats, shape: tuple[int, int]) -> NDArray[np.intp]:
-    """Which of the pairs (P,) to take so that no row and no column is taken twice, for the largest total weight (P,).
+def heaviest(pairs: Pairs, weight: Floats, shape: tuple[int, int]) -> tuple[Pairs, Floats]:
+    """The pairs (P,) to take so that no row and no column is taken twice, for the largest total weight (P,).
 
     Weights are positive; ``shape`` is (M, N). Pairs that compete with no other are taken at once: only the rest needs
-    the solver, however large the whole is.
+    the solver, however large the whole is. Returns the pairs that are taken, and their weights.
     """
     rows, columns = pairs
-    if one_to_one(rows, columns):
-        return np.arange(len(rows))
     if shape[0] * shape[1] <= _SMALL:
-        return _solved(rows, columns, weight, np.arange(len(rows)), shape)
+        return _solved(rows, columns, weight, shape)
     free = (np.bincount(rows)[rows] == 1) & (np.bincount(columns)[columns] == 1)
+    if free.all():
+        return pairs, weight
     left = np.flatnonzero(~free)
-    row_at, column_at = _compact(rows[left]), _compact(columns[left])
-    taken = _solved(row_at, column_at, weight[left], left, (int(row_at.max()) + 1, int(column_at.max()) + 1))
-    return np.sort(np.concatenate([np.flatnonzero(free), taken]))
+    row_names, row_at = _compact(rows[left])
+    column_names, column_at = _compact(columns[left])
+    (more_rows, more_columns), more = _solved(row_at, column_at, weight[left], (len(row_names), len(column_names)))
+    taken_rows = np.concatenate([rows[free], row_names[more_rows]])
+    taken_columns = np.concatenate([columns[free], column_names[more_columns]])
+    return (taken_rows, taken_columns), np.concatenate([weight[free], more])
 
 
 def _solved(
-    rows: NDArray[np.intp],
-    columns: NDArray[np.intp],
-    weight: Floats,
-    names: NDArray[np.intp],
-    shape: tuple[int, int],
-) -> NDArray[np.intp]:
-    """The names of the pairs (P,) that the solver takes. What it makes of places without a pair does not matter."""
-    dense, pair = np.zeros(shape), np.full(shape, -1)
-    dense[rows, columns] = -weight
-    pair[rows, columns] = names
-    taken = pair[solve(dense)]
-    return taken[taken >= 0]
+    rows: NDArray[np.intp], columns: NDArray[np.intp], weight: Floats, shape: tuple[int, int]
+) -> tuple[Pairs, Floats]:
+    """The pairs (P,) that the solver takes, and their weights. What it makes of places without a pair is nothing."""
+    dense = np.zeros(shape)
+    dense[rows, columns] = weight
+    taken = solve(-dense)
+    much = dense[taken]
+    real = much > 0
+    return (taken[0][real], taken[1][real]), much[real]
 
 
-def _compact(numbers: NDArray[np.intp]) -> NDArray[np.intp]:
-    """Whole numbers renamed 0, 1, 2... in their order."""
+def _compact(numbers: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """The different ones of whole numbers, rising, and which of these each is."""
     there = np.zeros(int(numbers.max()) + 1, np.intp)
     there[numbers] = 1
-    return (np.cumsum(there) - 1)[numbers]
+    return there.nonzero()[0], (np.cumsum(there) - 1)[numbers]

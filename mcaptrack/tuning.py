@@ -100,7 +100,7 @@ def tune(
     while len(made) < trials:
         number = len(made)
         parameters = {} if number == 0 else propose.ask(number)
-        trial = Trial(number, parameters, _scores(replace(base, **parameters), tasks, scoring))
+        trial = Trial(number, parameters, trial_scores(replace(base, **parameters), tasks, scoring))
         propose.tell(trial)
         known.add(trial)
         told(trial, _best(made, metric), trials)
@@ -111,7 +111,7 @@ def _best(made: Sequence[Trial], metric: str) -> Trial:
     return max(made, key=lambda trial: trial.scores[metric])
 
 
-def _scores(transform: Transform, tasks: Sequence[Task], scoring: EvaluateOptions) -> dict[str, float]:
+def trial_scores(transform: Transform, tasks: Sequence[Task], scoring: EvaluateOptions) -> dict[str, float]:
     """The scores of a transform's main output, over all sequences together."""
 
     def sequences() -> Iterator[Sequenced]:

@@ -144,15 +144,18 @@ def test_the_heaviest_pairs_are_those_of_every_combination(table, rows):
     """By brute force, in a small table and in the same one as a part of a large one with pairs of its own."""
     table = table[:rows]
     at = np.nonzero(table)
-    taken = heaviest(at, table[at], table.shape)
+    (first, second), much = heaviest(at, table[at], table.shape)
     least = -min((solve_by_hand(-table),), default=0.0)
-    assert table[at][taken].sum() == pytest.approx(least)
-    assert len(set(at[0][taken])) == len(set(at[1][taken])) == len(taken)
+    assert table[first, second].tolist() == much.tolist()
+    assert much.sum() == pytest.approx(least)
+    assert len(set(first)) == len(set(second)) == len(much)
     wide = np.zeros((40, 40))
     wide[: len(table), :5] = table
     wide[np.arange(10, 40), np.arange(39, 9, -1)] = 1.0
     at = np.nonzero(wide)
-    assert wide[at][heaviest(at, wide[at], wide.shape)].sum() == pytest.approx(least + 30)
+    pairs, much = heaviest(at, wide[at], wide.shape)
+    assert wide[pairs].tolist() == much.tolist()
+    assert much.sum() == pytest.approx(least + 30)
 
 
 def solve_by_hand(cost):
@@ -168,7 +171,8 @@ def test_overlapping_boxes_are_those_of_the_table_of_overlaps(count):
     rng = np.random.default_rng(count)
     a, b = (np.concatenate([rng.uniform(0, 300, (n, 2)), rng.uniform(1, 60, (n, 2))], axis=1) for n in (count, 50))
     table = iou(a, b)
-    first, second, much = overlapping(*(np.concatenate([x[:, :2], x[:, :2] + x[:, 2:]], axis=1).T for x in (a, b)))
+    corners = (np.concatenate([x[:, :2], x[:, :2] + x[:, 2:]], axis=1).T for x in (a, b))
+    first, second, much = overlapping(*corners, a[:, 2] * a[:, 3], b[:, 2] * b[:, 3])
     wanted = np.nonzero(table)
     assert sorted(zip(first, second, strict=True)) == sorted(zip(*wanted, strict=True))
     np.testing.assert_allclose(much, table[first, second])

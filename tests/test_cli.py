@@ -308,6 +308,9 @@ class TestConfig:
         assert made(environment=environment)["min_iou"] == 0.33
         assert made("--min-iou", "0.1", environment=environment)["min_iou"] == 0.1
         (tmp_path / "other.toml").write_text("[track]\nmin-iou = 0.6\n")
+        (tmp_path / "third.toml").write_text('[track]\ntracker = "ocsort"\ninertia = 0.3\n')
+        assert made("--config", "third.toml")["inertia"] == 0.3
+        assert "inertia" not in made("--config", "third.toml", "--tracker", "sort")  # what is ocsort's alone stays out
         assert made("--config", "other.toml")["min_iou"] == 0.6
 
     @pytest.mark.parametrize(

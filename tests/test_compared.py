@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from mcaptrack import tables
@@ -189,3 +190,78 @@ def test_several_files_at_the_command_line(tmp_path):
     code, _, err = call(*words, "--fail-under", "mota=0.8")
     assert code == 4
     assert "MOTA 0.7500 is under 0.8" in err
+
+
+def by_trackeval(data) -> dict:
+    from trackeval.metrics import CLEAR, HOTA, Identity
+
+    metrics = CLEAR({"PRINT_CONFIG": False}), Identity({"PRINT_CONFIG": False}), HOTA()
+    return {name: float(np.mean(value)) for metric in metrics for name, value in metric.eval_sequence(data).items()}
+
+
+def same_as_trackeval(row: dict, theirs: dict) -> None:
+    for name, other in {"FP": "CLR_FP", "FN": "CLR_FN"}.items():
+        assert row[name] == theirs[other]
+    for name in ("MOTA", "IDF1", "HOTA", "DetA", "AssA", "LocA", "IDSW", "Frag", "MT", "ML"):
+        assert row[name] == pytest.approx(theirs[name], abs=1e-9), name
+
+
+def crowd(seed: int, kinds: list, frames: int = 30):
+    """Labelled boxes of several kinds and tracks near them: (frame, id, kind, box), (frame, id, box)."""
+    rng = np.random.default_rng(seed)
+    place, kind = rng.uniform(0, 300, (14, 2)), rng.choice(len(kinds), 14)
+    labels, found = [], []
+    for number in range(1, frames + 1):
+        place = place + rng.normal(0, 3, place.shape)
+        for who in range(14):
+            size = (20.0, 50.0) if who % 5 else (9.0, 20.0)
+            labels.append((number, who + 1, kinds[kind[who]], (*place[who].round(2), *size)))
+            if rng.random() < 0.8:
+                found.append((number, who + 101, (*(place[who] + rng.normal(0, 3, 2)).round(2), *size)))
+    return labels, found
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_mot17_is_scored_as_by_trackeval(seed, tmp_path, capsys):
+    datasets = pytest.importorskip("trackeval.datasets")
+    labels, found = crowd(seed, [(1, 1), (1, 1), (1, 1), (0, 1), (0, 2), (0, 3), (0, 7), (0, 8), (0, 12)])
+    name = "MOT17-01"
+    truth = write(
+        tmp_path / "gt/MOT17-train" / name / "gt/gt.txt",
+        *((n, who, *box, counts, kind, 1.0) for n, who, (counts, kind), box in labels),
+    )
+    tracks = write(
+        tmp_path / f"tr/MOT17-train/us/data/{name}.txt", *((n, who, *box, 1, -1, -1, -1) for n, who, box in found)
+    )
+    (tmp_path / "gt/MOT17-train" / name / "seqinfo.ini").write_text(f"[Sequence]\nname={name}\nseqLength=30\n")
+    (tmp_path / "gt/seqmaps").mkdir()
+    (tmp_path / "gt/seqmaps/MOT17-train.txt").write_text(f"name\n{name}\n")
+    folders = {"GT_FOLDER": str(tmp_path / "gt"), "TRACKERS_FOLDER": str(tmp_path / "tr"), "PRINT_CONFIG": False}
+    theirs = datasets.MotChallenge2DBox(folders | {"BENCHMARK": "MOT17", "SPLIT_TO_EVAL": "train"})
+    data = theirs.get_preprocessed_seq_data(theirs.get_raw_seq_data("us", name), "pedestrian")
+    same_as_trackeval(scores(tracks, truth)[0], by_trackeval(data))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_kitti_is_scored_as_by_trackeval(seed, tmp_path, capsys):
+    datasets = pytest.importorskip("trackeval.datasets")
+    kinds = [("Pedestrian", 0, 0)] * 4 + [("Pedestrian", 0, 3), ("Pedestrian", 1, 0), ("Person", 0, 0)]
+    labels, found = crowd(seed, [*kinds, ("Car", 0, 0), ("DontCare", -1, -1)])
+
+    def line(n, who, kind, cut, hidden, box, *score):
+        x, y, w, h = box
+        who = -1 if kind == "DontCare" else who
+        return f"{n} {who} {kind} {cut} {hidden} 0.1 {x} {y} {x + w} {y + h} 1.7 0.5 0.5 1 1 1 0.0 {' '.join(score)}"
+
+    truth, tracks = tmp_path / "gt/label_02/0000.txt", tmp_path / "tr/us/data/0000.txt"
+    for path, lines in (
+        (truth, [line(n - 1, who, *kind, box) for n, who, kind, box in labels]),
+        (tracks, [line(n - 1, who, "Pedestrian", 0, 0, box, "0.9") for n, who, box in found]),
+    ):
+        path.parent.mkdir(parents=True)
+        path.write_text("\n".join(text.strip() for text in lines) + "\n")
+    (tmp_path / "gt/evaluate_tracking.seqmap.training").write_text("0000 empty 000000 000030\n")
+    folders = {"GT_FOLDER": str(tmp_path / "gt"), "TRACKERS_FOLDER": str(tmp_path / "tr"), "PRINT_CONFIG": False}
+    theirs = datasets.Kitti2DBox(folders)
+    data = theirs.get_preprocessed_seq_data(theirs.get_raw_seq_data("us", "0000"), "pedestrian")
+    same_as_trackeval(scores(tracks, truth)[0], by_trackeval(data))

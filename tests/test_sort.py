@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.plane import GroundPlane
 from mcaptrack.schema import DETECTIONS, Frame
-from mcaptrack.transforms.sort import TRACKERS, ByteTrack, OcSort, Sort
+from mcaptrack.transforms.sort import TRACKERS, ByteTrack, OcSort, Sort, compile_sort, tracker
 from tests.worlds import boxes_at, detections, ids, ns
 
 FRAMES = {"max_age_frames": 2, "min_hits_frames": 2, "min_iou": 0.3}
@@ -236,6 +238,31 @@ def test_with_nothing_that_tells_them_apart_the_trackers_agree():
     for out in outs[1:]:
         for a, b in zip(outs[0], out, strict=True):
             np.testing.assert_allclose(a.rows["x_px"], b.rows["x_px"])
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=25)
+def test_compiled_it_is_the_same_to_the_bit(seed):
+    """Crowds in which everybody overlaps, frames that are missing, classes, and all the ways to say an age."""
+    pytest.importorskip("numba")
+    assert compile_sort()
+    rng = np.random.default_rng(seed)
+    now, frames = 0.0, []
+    for number in range(90):
+        now += rng.choice([0.1, 0.1, 0.1, 0.1, 0.4, 3.0]) if number < 40 else 0.033
+        rows = boxes_at(rng.uniform(0, 120, (rng.integers(0, 12), 2)), (30, 40))
+        rows["class_id"] = rng.integers(1, 3, len(rows))
+        frames.append(Frame(ns(now), number, rows))
+    ages = {"max_age_s": 0.5, "min_hits_s": 0.1} if rng.random() < 0.5 else {"max_age_frames": 3, "min_hits_frames": 1}
+    sort = Sort(**ages, min_iou=0.1, mix_classes=bool(rng.random() < 0.5))
+    fast = [frame for (frame,) in sort(frames)]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tracker, "_compiled", [])
+        plain = [frame for (frame,) in sort(frames)]
+    for a, b in zip(fast, plain, strict=True):
+        assert [a.rows[name].tobytes() for name in a.rows.dtype.names] == [
+            b.rows[name].tobytes() for name in b.rows.dtype.names
+        ]
 
 
 @pytest.mark.parametrize(

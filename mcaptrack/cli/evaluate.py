@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from mcaptrack.evaluation import Outcome, Sequenced
 
 _COLUMNS: Final = ("MOTA", "IDF1", "HOTA", "IDSW", "FP", "FN", "Frag")
+_FILES: Final = (".txt", ".csv", ".parquet", ".pq")
 _FORECAST_COLUMNS: Final = {
     "ADE_m": "ADE m",
     "FDE_m": "FDE m",
@@ -113,6 +114,9 @@ def evaluate(
             plane_options = {"ground_plane": ground_plane, "point": point, "fps": fps, "topics": options.topics}
             sequences = _from_files(paths, common.expand(truth), plane_options, talk)
         else:
+            for path in paths:
+                if path.suffix.lower() in _FILES:
+                    raise McaptrackError(f"{path} is no log; to score a file of tracks give the truth with --truth")
             sequences = _from_logs(paths, camera, options.topics)
         outcome = score(sequences, options, talk.detail)
         for words in outcome.notes:

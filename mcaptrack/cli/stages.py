@@ -115,8 +115,11 @@ def _stage_command(name: str, kind: type[Transform]) -> Callable[..., None]:
         one = given[several.option] if several else name
         base: Transform = PROFILES[given["profile"]] if name == "retrack" else kinds[one]()
         wanted = {option: given[option] for option in there if given[option] is not None}
-        for option in wanted:
+        for option in list(wanted):
             if option not in own[one]:
+                if settings_of(name).get(option) == wanted[option]:  # the file has it, for another one
+                    del wanted[option]
+                    continue
                 flag = "--" + option.replace("_", "-")
                 raise McaptrackError(f"{flag} is an option of {' and '.join(there[option])}, not of {one}")
         transform = replace(base, **wanted)

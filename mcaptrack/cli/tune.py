@@ -11,11 +11,14 @@ import typer
 from mcaptrack.cli import common
 from mcaptrack.cli.config import NAME
 from mcaptrack.errors import McaptrackError
-from mcaptrack.transforms import ALTERNATIVES, TRANSFORMS, Transform
+from mcaptrack.transforms import ALTERNATIVES, TRACKERS, TRANSFORMS, Transform
+from mcaptrack.transforms.sort import compile_sort
 
 if TYPE_CHECKING:
     from mcaptrack.tuning import Range, Task, Trial
 
+#: From so many frames on, over all trials, it pays to have SORT compiled first.
+_WORTH_COMPILING: Final = 100_000
 _SHOWN: Final = ("IDF1", "MOTA", "HOTA", "IDSW", "FP", "FN")
 
 
@@ -108,6 +111,8 @@ def tune(
             tasks = _tasks_of_logs(common.expand(inputs), camera, topic, stage, kind)
         if force:
             trials_file.unlink(missing_ok=True)
+        if kind is TRACKERS["sort"] and trials * sum(len(task.frames) for task in tasks) > _WORTH_COMPILING:
+            compile_sort()
         how = "Optuna" if uses_optuna() else "chance; with `pip install mcaptrack[tune]` they learn from each other"
         talk.say(f"{stage}: {len(ranges)} parameters, {len(tasks)} sequences, trials by {how}")
 

@@ -8,7 +8,6 @@ Letters: G true people, H tracks in a frame; P pairs.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Final, Literal
 
 import numpy as np
@@ -34,7 +33,7 @@ def clear(matchup: Matchup, rules: Rules = "trackeval") -> Counts:
     """
     pairs, by_devkit = matchup.pairs, rules == "trackeval"
     near = pairs.similarity >= matchup.threshold - _EPS if by_devkit else pairs.similarity >= matchup.threshold
-    memory = _Memory(matchup, by_devkit)
+    memory = _Memory(matchup)
     found = matchup.solved(pairs.where(near), memory.pairs_trackeval if by_devkit else memory.pairs_motmetrics)
 
     present = np.bincount(matchup.all_truth, minlength=matchup.n_truth)
@@ -84,37 +83,41 @@ def _breaks_motmetrics(matchup: Matchup, found: Pairs) -> int:
 class _Memory:
     """The track that each person had, for the frames in which that decides."""
 
-    def __init__(self, matchup: Matchup, previous_only: bool) -> None:
+    def __init__(self, matchup: Matchup) -> None:
         self._matchup = matchup
         self._last = np.full(matchup.n_truth, _NOBODY)
         self._looked_at = ((matchup.truth_counts > 0) & (matchup.track_counts > 0)).nonzero()[0]
-        self._previous_only = previous_only
+        self._number = _NOBODY
+        self._who = self._by = np.empty(0, np.intp)
 
-    def _remember(self, number: int, taken: Sequence[Pairs]) -> None:
-        """Before frame ``number``: what was taken since the last call, by people's last or only by the frame before."""
-        if self._previous_only:
-            at = int(np.searchsorted(self._looked_at, number))
-            before = self._looked_at[at - 1] if at else _NOBODY
-            self._last[:] = _NOBODY
-            taken = [part.where(part.frame == before) for part in taken]
-        for part in taken:
-            self._last[part.who] = part.by  # the last one counts
+    def _decided(self, number: int, rows: Ints, columns: Ints) -> tuple[Ints, Ints]:
+        self._number = number
+        self._who, self._by = self._matchup.truth[number][rows], self._matchup.tracks[number][columns]
+        return rows, columns
 
-    def pairs_trackeval(self, number: int, taken: Sequence[Pairs]) -> tuple[Ints, Ints]:
+    def pairs_trackeval(self, number: int, easy: Pairs, low: int, high: int) -> tuple[Ints, Ints]:
         """The pairs of the frame before are kept where they can be, then similarity counts."""
-        self._remember(number, taken)
-        matchup = self._matchup
+        matchup, last = self._matchup, self._last
+        at = int(np.searchsorted(self._looked_at, number))
+        before = int(self._looked_at[at - 1]) if at else _NOBODY
+        last[:] = _NOBODY
+        if before == self._number:
+            last[self._who] = self._by
+        else:
+            start = low + int(np.searchsorted(easy.frame[low:high], before))
+            last[easy.who[start:high]] = easy.by[start:high]
         people, tracks, similarity = matchup.truth[number], matchup.tracks[number], matchup.similarity[number]
-        score = similarity + 1000.0 * (tracks[None, :] == self._last[people][:, None])
+        score = similarity + 1000.0 * (tracks[None, :] == last[people][:, None])
         score[similarity < matchup.threshold - _EPS] = 0
         rows, columns = solve(-score)
         kept = score[rows, columns] > _EPS
-        return rows[kept], columns[kept]
+        return self._decided(number, rows[kept], columns[kept])
 
-    def pairs_motmetrics(self, number: int, taken: Sequence[Pairs]) -> tuple[Ints, Ints]:
+    def pairs_motmetrics(self, number: int, easy: Pairs, low: int, high: int) -> tuple[Ints, Ints]:
         """Everybody keeps the track it had last, however long ago; then as many and as near pairs as there can be."""
-        self._remember(number, taken)
         matchup = self._matchup
+        self._last[self._who] = self._by
+        self._last[easy.who[low:high]] = easy.by[low:high]  # of several the last one counts
         people, tracks, similarity = matchup.truth[number], matchup.tracks[number], matchup.similarity[number]
         ok = similarity >= matchup.threshold
         kept_rows, kept_columns = np.nonzero(ok & (tracks[None, :] == self._last[people][:, None]))
@@ -125,4 +128,4 @@ class _Memory:
         cost[kept_rows, :] = np.inf
         cost[:, kept_columns] = np.inf
         rows, columns = assign(cost, np.finfo(float).max)
-        return np.concatenate([kept_rows, rows]), np.concatenate([kept_columns, columns])
+        return self._decided(number, np.concatenate([kept_rows, rows]), np.concatenate([kept_columns, columns]))

@@ -5,14 +5,13 @@ Letters: P pairs, M pairs of a person and a track that are matched at least once
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack.match import solve
-from mcaptrack.metrics.matchup import Matchup, Pairs
+from mcaptrack.metrics.matchup import Matchup
 
 Ints = NDArray[np.intp]
 
@@ -31,7 +30,7 @@ def hota(matchup: Matchup) -> dict[str, NDArray[np.float64]]:
     shared = np.bincount(cell, share, minlength=n_truth * n_tracks).reshape(n_truth, n_tracks)
     alignment = shared / np.maximum(truth_count[:, None] + track_count[None, :] - shared, _EPS)
 
-    def solve_frame(number: int, _: Sequence[Pairs]) -> tuple[Ints, Ints]:
+    def solve_frame(number: int, *_: object) -> tuple[Ints, Ints]:
         who, by = matchup.truth[number], matchup.tracks[number]
         return solve(-(alignment[who[:, None], by] * matchup.similarity[number]))
 

@@ -44,6 +44,9 @@ class Pairs(NamedTuple):
         return contested
 
 
+SolveFrame = Callable[[int, Pairs, int, int], tuple[Ints, Ints]]
+
+
 @dataclass(frozen=True)
 class Matchup:
     """One sequence of true people against tracks.
@@ -95,7 +98,7 @@ class Matchup:
         """The pairs that are alike at all."""
         people, tracks = self.truth_counts, self.track_counts
         size = people * tracks
-        similarity = np.concatenate([np.empty(0), *(part.ravel() for part in self.similarity)])
+        similarity = self._all_similarity
         at = similarity.nonzero()[0]
         frame = np.repeat(np.arange(len(size)), size)[at]
         within = at - (np.cumsum(size) - size)[frame]
@@ -104,30 +107,38 @@ class Matchup:
         column = (np.cumsum(tracks) - tracks)[frame] + within - local * tracks[frame]
         return Pairs(frame, row, column, self.all_truth[row], self.all_tracks[column], similarity[at])
 
-    def solved(self, candidates: Pairs, solve_frame: Callable[[int, Sequence[Pairs]], tuple[Ints, Ints]]) -> Pairs:
-        """One assignment a frame among the candidates.
+    def solved(self, candidates: Pairs, solve_frame: SolveFrame) -> Pairs:
+        """One assignment a frame among the candidates, in no particular order.
 
         Where no candidate competes with another, all are taken. For every other frame ``solve_frame`` is asked, in
-        order: it gets the number of the frame and what has been taken in the frames since it was asked last, and
-        returns the rows and columns of the frame's table that go together.
+        order: it gets the number of the frame, the pairs that are taken without asking, and which of these lie between
+        the last frame that it was asked about and this one; it returns the rows and columns of the frame's table that
+        go together.
         """
-        frame = candidates.frame
-        taken: list[Pairs] = []
-        hard = np.unique(frame[candidates.contested()])
-        starts, ends = np.searchsorted(frame, hard, "left"), np.searchsorted(frame, hard, "right")
-        since = 0
-        row_of, column_of = (np.cumsum(part) - part for part in (self.truth_counts, self.track_counts))
-        for number, low, high in zip(hard.tolist(), starts.tolist(), ends.tolist(), strict=True):
-            news = [candidates.where(np.arange(since, low))] if since < low else []
-            rows, columns = solve_frame(number, [*taken[-1:], *news] if taken else news)
-            taken += news
-            who, by = self.truth[number][rows], self.tracks[number][columns]
-            near = self.similarity[number][rows, columns]
-            at = np.full(len(rows), number)
-            taken.append(Pairs(at, rows + row_of[number], columns + column_of[number], who, by, near))
-            since = high
-        taken.append(candidates.where(np.arange(since, len(frame))))
-        return Pairs(*(np.concatenate(parts) for parts in zip(*taken, strict=True)))
+        hard = np.zeros(len(self.truth), bool)
+        hard[candidates.frame[candidates.contested()]] = True
+        easy, numbers = candidates.where(~hard[candidates.frame]), hard.nonzero()[0]
+        ends = np.searchsorted(easy.frame, numbers)
+        found: list[tuple[Ints, Ints]] = []
+        low = 0
+        for number, high in zip(numbers.tolist(), ends.tolist(), strict=True):
+            found.append(solve_frame(number, easy, low, high))
+            low = high
+        if not found:
+            return easy
+        frame = np.repeat(numbers, [len(rows) for rows, _ in found])
+        rows, columns = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        people, tracks = self.truth_counts, self.track_counts
+        row = (np.cumsum(people) - people)[frame] + rows
+        column = (np.cumsum(tracks) - tracks)[frame] + columns
+        size = people * tracks
+        similarity = self._all_similarity[(np.cumsum(size) - size)[frame] + rows * tracks[frame] + columns]
+        solved = Pairs(frame, row, column, self.all_truth[row], self.all_tracks[column], similarity)
+        return Pairs(*(np.concatenate(both) for both in zip(easy, solved, strict=True)))
+
+    @cached_property
+    def _all_similarity(self) -> Floats:
+        return np.concatenate([np.empty(0), *(part.ravel() for part in self.similarity)])
 
 
 def _joined(ids: Sequence[Ints]) -> Ints:

@@ -1,8 +1,8 @@
 """Our trackers against those of Roboflow's `trackers` package, on walkers in crowds of several sizes.
 
 Needs `pip install trackers` (Apache-2.0) in the environment. Both get the same boxes in the form
-each of them reads and give tracks in the form each of them writes, with the same age, hits and overlap. Prints frames
-per second and ratios, the best of several rounds in turn.
+each of them reads and give tracks in the form each of them writes, with the same age, hits and overlap ("compiled" is
+our SORT with Numba, if that is installed). Prints frames per second and ratios, the best of several rounds in turn.
 """
 
 from __future__ import annotations
@@ -16,12 +16,13 @@ import numpy as np
 
 from mcaptrack.clock import NS_PER_S
 from mcaptrack.schema import DETECTIONS, Frame
-from mcaptrack.transforms import Sort
+from mcaptrack.transforms import ByteTrack, OcSort, Sort
+from mcaptrack.transforms.sort import compile_sort
 
 # This file's folder is where Python looks first, and this file is named like the peer.
 sys.path.pop(0)
 
-FPS, AGE, HITS, MIN_IOU = 30, 1, 3, 0.3
+FPS, HITS, MIN_IOU = 30, 3, 0.3
 
 
 def crowd(people: int, frames: int, seed: int = 7) -> list[np.ndarray]:
@@ -81,20 +82,30 @@ def timed(call: Callable[[], int]) -> float:
     return time.perf_counter() - start
 
 
-def pairs() -> dict[str, tuple[Callable[[], object], Callable[[], object]]]:
+def pairs(age: int) -> dict[str, tuple[Callable[[], object], Callable[[], object]]]:
     import trackers
 
-    mine = {"max_age_frames": AGE, "min_hits_frames": HITS, "min_iou": MIN_IOU}
-    peer = {"lost_track_buffer": AGE, "minimum_consecutive_frames": HITS, "minimum_iou_threshold": MIN_IOU}
-    return {"sort": (lambda: Sort(**mine), lambda: trackers.SORTTracker(**peer))}
+    mine = {"max_age_frames": age, "min_hits_frames": HITS, "min_iou": MIN_IOU}
+    ocsort = {"lost_track_buffer": age, "minimum_consecutive_frames": HITS}
+    peer = ocsort | {"minimum_iou_threshold": MIN_IOU}
+    return {
+        "sort": (lambda: Sort(**mine), lambda: trackers.SORTTracker(**peer)),
+        "bytetrack": (lambda: ByteTrack(**mine), lambda: trackers.ByteTrackTracker(**peer)),
+        "ocsort": (lambda: OcSort(**mine), lambda: trackers.OCSORTTracker(**ocsort)),
+        "compiled": (lambda: Sort(**mine), lambda: trackers.SORTTracker(**peer)),
+    }
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--people", type=int, nargs="+", default=[6, 20, 50, 100])
+    parser.add_argument("--age", type=int, default=1, help="frames until a track is dropped; SORT's own is 1")
+    parser.add_argument("--trackers", nargs="+", default=["sort", "bytetrack", "ocsort", "compiled"])
     options = parser.parse_args()
-    for name, (mine, peer) in pairs().items():
+    for name, (mine, peer) in pairs(options.age).items():
+        if name not in options.trackers or (name == "compiled" and not compile_sort()):
+            continue
         for people in options.people:
             boxes = crowd(people, max(60, 4000 // people))
             a, b = ours(boxes, mine), theirs(boxes, peer)

@@ -31,9 +31,12 @@ class Pairs(NamedTuple):
         return Pairs(self.box[kept], self.track[kept], self.likeness[kept], self.shape)
 
 
-def by_overlap(boxes: Floats, expected: Floats) -> Pairs:
-    """Pairs by the overlap of boxes (4, N) with tracks' expected boxes (4, K), both left, top, right, bottom."""
-    return Pairs(*overlapping(boxes, expected), (boxes.shape[1], expected.shape[1]))
+def by_overlap(boxes: Floats, expected: Floats, area: Floats, expected_area: Floats) -> Pairs:
+    """Pairs by the overlap of boxes (4, N) with tracks' expected boxes (4, K), both left, top, right, bottom.
+
+    Their areas are (N,) and (K,).
+    """
+    return Pairs(*overlapping(boxes, expected, area, expected_area), (boxes.shape[1], expected.shape[1]))
 
 
 def by_distance(boxes: Floats, expected: Floats, gate: float, plane: GroundPlane | None) -> Pairs:
@@ -67,7 +70,8 @@ def pair(pairs: Pairs, least: float) -> tuple[Ints, Ints]:
         near = pairs if count == len(close) else pairs.where(close)
         if one_to_one(near.box, near.track):
             return near.box, near.track
-    taken = heaviest((pairs.box, pairs.track), pairs.likeness, pairs.shape)
-    if count < len(close):
-        taken = taken[pairs.likeness[taken] >= least]
-    return pairs.box[taken], pairs.track[taken]
+    (box, track), likeness = heaviest((pairs.box, pairs.track), pairs.likeness, pairs.shape)
+    if count == len(close):
+        return box, track
+    enough = likeness >= least
+    return box[enough], track[enough]

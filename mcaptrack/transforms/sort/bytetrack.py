@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from mcaptrack.transforms.protocol import option
 from mcaptrack.transforms.sort.affinity import pair
 from mcaptrack.transforms.sort.tracker import Moment, Sort
-from mcaptrack.transforms.sort.tracks import Seen
+from mcaptrack.transforms.sort.tracks import MISSED, Seen
 
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.intp]
@@ -18,7 +18,7 @@ Ints = NDArray[np.intp]
 
 @dataclass(frozen=True, kw_only=True)
 class ByteTrack(Sort):
-    """Track boxes over time: ByteTrack, which pairs in two stages.
+    """ByteTrack pairs in two stages.
 
     Boxes with a high score are paired with all tracks first; then the doubtful ones with the tracks that are left and
     were seen in the frame before: whoever is half hidden scores low, but is where he is expected.
@@ -37,7 +37,7 @@ class ByteTrack(Sort):
             return pair(pairs, least)
         sure = high[pairs.box]
         box, track = pair(pairs.where(sure), least)
-        left = moment.tracked.copy()
+        left = moment.tracks.table[MISSED] == moment.age  # seen in the frame before
         left[track] = False
         rest = pairs.where(~sure & left[pairs.track])
         low_box, low_track = pair(rest, self.low_min_iou if self.cost == "iou" else least)

@@ -36,7 +36,7 @@ _PATH: Final = _AGO + 1
 
 @dataclass(frozen=True, kw_only=True)
 class OcSort(Sort):
-    """Track boxes over time: OC-SORT, which trusts observations more than the filter.
+    """OC-SORT trusts observations more than the filter.
 
     Pairs in the direction of a track count for more, tracks that are lost are looked for where they were seen last, and
     a track that comes back forgets what its filter made up in between.
@@ -94,7 +94,8 @@ class OcSort(Sort):
         box_left[box], track_left[track] = False, False
         boxes, tracks = np.flatnonzero(box_left), np.flatnonzero(track_left)
         last = moment.tracks.table[_LAST][:, tracks]
-        found = by_overlap(moment.seen.corners[:, boxes], last)
+        area = (last[2] - last[0]) * (last[3] - last[1])
+        found = by_overlap(moment.seen.corners[:, boxes], last, moment.seen.measured[2, boxes], area)
         pairs = Pairs(boxes[found.box], tracks[found.track], found.likeness, (len(box_left), len(track_left)))
         return self._of_one_class(moment, pairs)
 

@@ -8,9 +8,9 @@ Letters: N boxes, K tracks.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from itertools import islice
+from itertools import islice, pairwise
 from types import MappingProxyType
 from typing import ClassVar, NamedTuple
 
@@ -34,26 +34,48 @@ Ints = NDArray[np.intp]
 _BLOCK = 64
 
 
+#: The compiled loop, once somebody has asked for it.
+_compiled: list[Callable[..., tuple[Floats, Floats, NDArray[np.int64], int]]] = []
+
+
+def compile_sort() -> bool:
+    """Have SORT run compiled from now on, where that is possible; returns whether it is: whether Numba is installed.
+
+    It takes a second to load, and ten to compile for the first time, so it pays for whoever tracks again and again.
+    What comes out is the same.
+    """
+    if not _compiled:
+        try:
+            from mcaptrack.transforms.sort.compiled import track
+        except ImportError:
+            return False
+        _compiled.append(track)
+    return True
+
+
 class Moment(NamedTuple):
     """A frame with its boxes and the tracks before they are paired.
 
-    ``expected`` is where the filters expect the tracks' boxes, left, top, right, bottom (4, K); ``tracked`` says which
-    tracks were seen in the frame before (K,); ``steps`` how many frames have passed since.
+    ``expected`` is where the filters expect the tracks' boxes, left, top, right, bottom (4, K); ``age`` by how much
+    tracks have aged since the frame before, ``steps`` how many frames ago that was; ``one_class`` says that boxes so
+    far are of one class only.
     """
 
     seen: Seen
     tracks: Tracks
     expected: Floats
-    tracked: Bools
+    age: float
     steps: int
     plane: GroundPlane | None
+    one_class: bool
 
 
 @dataclass(frozen=True, kw_only=True)
 class Sort:
-    """Track boxes over time: SORT.
+    """Track boxes over time.
 
-    Reads detections, writes tracks: one row for each person who is tracked and seen in a frame.
+    Reads detections, writes tracks: one row for each person who is tracked and seen in a frame. SORT pairs boxes with
+    where a Kalman filter expects tracks.
     """
 
     max_age_s: float = option(1.4, "a track is dropped after so long without a box", least=0.0, search=(0.2, 4.0))
@@ -82,58 +104,86 @@ class Sort:
         life = _Life(self, self._no_tracks())
         coming = iter(frames)
         while block := list(islice(coming, _BLOCK)):
-            shows = look(block, self.min_score, self.class_id)
-            shown = [self._step(life, frame, seen) for frame, seen in zip(block, shows, strict=True)]
-            yield from ((frame,) for frame in write(block, shown, self.ground_planes))
+            columns, ends = look(block, self.min_score, self.class_id)
+            life.notice_classes(columns[9])
+            if _compiled and type(self) is Sort and self.cost == "iou":
+                shown, shown_ends = self._run_compiled(life, block, columns, ends)
+            else:
+                spans = pairwise(ends.tolist())
+                parts = [self._step(life, f, Seen(columns[:, a:b])) for f, (a, b) in zip(block, spans, strict=True)]
+                shown, shown_ends = np.concatenate(parts, axis=1), np.cumsum([0, *(p.shape[1] for p in parts)])
+            yield from ((frame,) for frame in write(block, shown, shown_ends.tolist(), self.ground_planes))
+
+    def _run_compiled(
+        self, life: _Life, frames: list[Frame], columns: Floats, ends: NDArray[np.int64]
+    ) -> tuple[Floats, NDArray[np.int64]]:
+        """As ``_step`` for each of the frames; the columns that are shown, and where those of each begin and end."""
+        moments = np.empty((8, len(frames)))
+        for at, frame in enumerate(frames):
+            steps = life.tick(frame.t_ns)
+            moments[:, at] = (
+                steps,
+                life.clock.stretch,
+                life.age,
+                life.frame_age,
+                life.max_age,
+                life.hit,
+                life.min_hits,
+                life.early,
+            )
+        run = _compiled[0]
+        life.tracks.table, shown, shown_ends, life.next_id = run(
+            life.tracks.table, columns, ends, moments, self.min_iou, self.mix_classes, life.next_id
+        )
+        return shown, shown_ends
 
     def _step(self, life: _Life, frame: Frame, seen: Seen) -> Floats:
         """Take one frame; returns the columns of the tracks that are shown in it."""
         tracks, steps = life.tracks, life.tick(frame.t_ns)
-        tracked = self._age(life, steps)
+        self._age(life, steps)
         plane = plane_at(self.ground_planes, frame.t_ns) if self.cost == "metres" else None
-        moment = Moment(seen, tracks, kalman.corners(tracks.state), tracked, steps, plane)
+        moment = Moment(seen, tracks, kalman.corners(tracks.state), life.age, steps, plane, life.one_class)
         box, track = self._pair(moment)
         if len(box):
             self._see(tracks, track, seen.take(box), life.hit, steps)
-        if len(box) < len(seen):
-            new = np.ones(len(seen), bool)
+        found = len(box)
+        if found < len(seen):
+            new = self._may_begin(seen)
             new[box] = False
-            born = seen.take((new & self._may_begin(seen)).nonzero()[0])
+            born = seen.take(new.nonzero()[0])
             self._begin(tracks, life.next_id, born)
             life.next_id += len(born)
+            found += len(born)
         table = tracks.table
+        if found == len(tracks):  # nobody is missed
+            return table[:SHARED_ROWS].compress(life.early | (table[STREAK] >= life.min_hits), axis=1)
         missed = table[MISSED]
         here = missed == 0
+        table[STREAK] *= here
         if not life.early:
             here &= table[STREAK] >= life.min_hits
         shown: Floats = table[:SHARED_ROWS].compress(here, axis=1)
-        if len(missed) and missed.max() > life.max_age:
+        if missed.max() > life.max_age:
             tracks.keep(missed <= life.max_age)
         return shown
 
     @staticmethod
-    def _age(life: _Life, steps: int) -> Bools:
-        """Move all tracks ``steps`` frames on; returns which were seen in the frame before."""
+    def _age(life: _Life, steps: int) -> None:
+        """Move all tracks ``steps`` frames on."""
         tracks = life.tracks
-        table = tracks.table
-        tracked: Bools = table[MISSED] == 0
-        table[STREAK] *= tracked
-        table[MISSED] += life.age
+        tracks.table[MISSED] += life.age
         if steps > 1:  # a gap in the log: who would have been dropped in it is dropped
-            kept = table[MISSED] <= life.max_age + life.frame_age
-            tracks.keep(kept)
-            tracked = tracked[kept]
+            tracks.keep(tracks.table[MISSED] <= life.max_age + life.frame_age)
         if life.clock.stretch != 1.0:
             kalman.stretch(tracks.state, life.clock.stretch)
         for _ in range(steps):  # frames that nobody saw still move people
             kalman.predict(tracks.state)
-        return tracked
 
     def _likeness(self, moment: Moment, least: float) -> tuple[Pairs, float]:
         """The pairs of a moment that are possible at all, and from which likeness on they may be paired."""
         seen = moment.seen
         if self.cost == "iou":
-            pairs = by_overlap(seen.corners, moment.expected)
+            pairs = by_overlap(seen.corners, moment.expected, seen.measured[2], moment.tracks.table[2])
         elif self.cost == "pixels":
             pairs, least = by_distance(seen.corners, moment.expected, self.max_distance_px, None), 0.0
         elif moment.plane is None:
@@ -144,7 +194,7 @@ class Sort:
 
     def _of_one_class(self, moment: Moment, pairs: Pairs) -> Pairs:
         """Without the pairs of a box and a track of different classes, unless these may mix."""
-        if self.mix_classes or not len(pairs.box):
+        if self.mix_classes or moment.one_class or not len(pairs.box):
             return pairs
         same = moment.seen.class_id[pairs.box] == moment.tracks.table[CLASS, pairs.track]
         return pairs if same.all() else pairs.where(same)
@@ -159,7 +209,7 @@ class Sort:
         return pair(*self._likeness(moment, self.min_iou))
 
     def _may_begin(self, seen: Seen) -> Bools:
-        """Which boxes may begin a track if they belong to none."""
+        """Which boxes may begin a track if they belong to none, as an array of its own."""
         return np.ones(len(seen), bool)
 
     def _begin(self, tracks: Tracks, first_id: int, seen: Seen) -> None:
@@ -182,8 +232,16 @@ class _Life:
         self.age = self.frame_age = self.max_age = self.hit = self.min_hits = 0.0
         self.early = True
         self._options = options
+        self._class_id: float | None = None
+        self.one_class = True
         self._count = 0
         self._first_ns = self._last_ns = 0
+
+    def notice_classes(self, class_id: Floats) -> None:
+        """Take the classes of the boxes to come."""
+        if len(class_id) and self.one_class:
+            self._class_id = class_id[0] if self._class_id is None else self._class_id
+            self.one_class = bool((class_id == self._class_id).all())
 
     def tick(self, t_ns: int) -> int:
         """Take the time of the next frame; returns how many frames on it is."""

@@ -70,10 +70,11 @@ class Seen:
         return Seen(self.columns.take(at, axis=1))
 
 
-def look(frames: Sequence[Frame], min_score: float | None, class_id: int | None) -> list[Seen]:
+def look(frames: Sequence[Frame], min_score: float | None, class_id: int | None) -> tuple[Floats, NDArray[np.int64]]:
     """What F frames show: boxes that are neither empty nor beyond all measure, that score enough and are of the class.
 
-    A box without a score passes.
+    A box without a score passes. Returns the columns of ``Seen`` for all frames, and where those of each begin and end
+    (F + 1,).
     """
     ends = np.cumsum([0] + [len(frame.rows) for frame in frames])
     rows = DETECTIONS.empty(int(ends[-1]))
@@ -92,8 +93,7 @@ def look(frames: Sequence[Frame], min_score: float | None, class_id: int | None)
     columns = np.concatenate(
         [boxes[:2], boxes[:2] + boxes[2:], kalman.measure(boxes), [rows["score"]], [rows["class_id"]]]
     )
-    spans = ends.tolist()
-    return [Seen(columns[:, low:high]) for low, high in pairwise(spans)]
+    return columns, ends
 
 
 class Tracks:
@@ -134,10 +134,8 @@ class Tracks:
         self.table[:, at] = table
 
 
-def write(frames: Sequence[Frame], shown: Sequence[Floats], planes: Planes) -> list[Frame]:
-    """The tracks that are ``shown``, the columns of a table for each of F frames, as rows of these frames."""
-    table = np.concatenate(shown, axis=1)
-    ends = np.cumsum([0] + [part.shape[1] for part in shown]).tolist()
+def write(frames: Sequence[Frame], table: Floats, ends: Sequence[int], planes: Planes) -> list[Frame]:
+    """The columns of a table that are shown in F frames, ``ends`` (F + 1,) of each, as rows of these frames."""
     boxes = kalman.corners(table)
     boxes[2:] -= boxes[:2]
     rows = TRACKS.empty(table.shape[1])
