@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import struct
+import subprocess
+import sys
 from fractions import Fraction
 
 import av
@@ -244,3 +246,21 @@ def test_brightness_is_full_range_whatever_it_came_from():
 def test_pictures_that_are_broken_say_which():
     with pytest.raises(McaptrackError, match="frame 7 can't be decoded as jpeg"):
         list(brightness([Encoded(0, 7, "jpeg", b"\xff\xd8 no picture")]))
+
+
+def test_a_decoder_that_is_let_go_while_its_threads_work_does_not_wait_for_ever(tmp_path):
+    """FFmpeg's threads give packets back; memory of Python's would need Python, which waits for these threads."""
+    code = (
+        "import sys, numpy as np\n"
+        "from fractions import Fraction\n"
+        "from mcaptrack.video import Encoded, H264Encoder, brightness\n"
+        "encoder = H264Encoder(640, 480, Fraction(10))\n"
+        "noise = np.random.default_rng(1).integers(0, 255, (480, 640, 3), np.uint8)\n"
+        "pictures = [Encoded(n, n, 'h264', encoder.encode(np.roll(noise, n, axis=1))) for n in range(12)]\n"
+        "for turn in range(60):\n"
+        "    frames = brightness(iter(pictures))\n"
+        "    for _ in range(1 + turn % 6): next(frames)\n"
+        "    frames.close()\n"
+        "    del frames\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=120)

@@ -105,7 +105,9 @@ class _VideoDecoder:
     def decode(self, picture: Encoded) -> Iterator[Frame]:
         import av
 
-        packet = av.Packet(picture.data)
+        # A copy in FFmpeg's own memory: its threads can't let go of Python's while Python waits for them to end.
+        packet = av.Packet(len(picture.data))
+        packet.update(picture.data)
         packet.pts = packet.dts = picture.t_ns
         packet.time_base = self._base
         self._index[picture.t_ns] = picture.index
