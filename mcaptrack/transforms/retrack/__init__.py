@@ -75,7 +75,9 @@ class Retrack:
     min_hits: int = option(1, "a track is shown online from so many matches in a row", least=0)
     min_track_s: float = option(2.0, "a track that lasts less than this is left out (probation)", least=0.0)
     link_s: float = option(14.0, "offline, ends and beginnings so far apart are put together; 0 for never", least=0.0)
-    link_cost: float = option(10.0, "offline, what putting together may cost, in squared standard deviations")
+    link_certainty: float = option(
+        0.5, "offline, what is put together is one person with at least this probability", least=0.01, most=0.99
+    )
     part: bool = option(True, "offline, decide anew who is who after two came near each other, from before and after")
     min_certainty: float = option(
         0.5, "offline, a track that is a person with less than this probability is left out", least=0.0, most=1.0

@@ -22,9 +22,15 @@ Ints = NDArray[np.int64]
 
 #: How many rows on the other side of a hole are looked at.
 _ROWS: Final = 5
-#: What a second of hole costs, and how fast people are at most in one.
-_PER_S: Final = 0.5
+#: How fast people are at most in a hole.
 _REACH_M_PER_S: Final = 2.5
+#: The log odds of a link: for each unit of evidence, for each second of hole, for the log odds that a track is of nobody,
+#: and without any, where 43 in 100 are right (tools/choose_retrack.py).
+_EVIDENCE, _HOLE, _NOBODY, _START, _USUAL = 0.152, -0.193, 0.119, 2.31, 0.43
+#: How far people move who stand, and what it costs to take it that they did, as a log likelihood of both sides.
+_STAY_M2_PER_S, _STAY_COST = 0.02, 3.0
+#: Links that are less likely than this by their log odds are not looked at.
+_LEAST: Final = -4.0
 
 
 def link(
@@ -34,13 +40,14 @@ def link(
     backward: State,
     step_s: float,
     max_hole_s: float,
-    cap: float,
+    least: float,
     odds: Floats,
 ) -> Ints:
     """For each track the one that goes on from it, or -1; (K,).
 
-    ``cap`` is what a link may cost, in squared standard deviations as ``Evidence`` counts; ``odds`` (K,) are the log
-    odds that a track is of a person, and count where they are against it.
+    ``odds`` (K,) are the log odds that a track is of a person. A link is made if it is right with a probability of
+    ``least``. How many links are right at all differs from log to log, from hardly any (where holes are short, and who
+    is gone has left) to most of them, and is found out from the links themselves (expectation maximisation).
     """
     first, last = paths.first[:-1], paths.first[1:] - 1
     begins, ends = paths.step[first], paths.step[last]
@@ -62,18 +69,35 @@ def link(
     back = backward.take(first[j])
     behind = _evidence(walker, paths, State(back.mean * [1, 1, -1, -1], back.cov), last[i], -1, hole_s, step_s)
     fresh = _fresh(walker, paths, first, 1, step_s)[j] + _fresh(walker, paths, last, -1, step_s)[i]
-    against = np.minimum(odds, 0.0)
-    # The sum of both sides is twice their mean, as `cap` is twice a log likelihood.
-    gain = ahead + behind - fresh + cap - _PER_S * hole_s + against[i] + against[j]
+    walked = ahead + behind - fresh
+    # Or they stood meanwhile, more or less.
+    spread = forward.cov[last[i], 0] + backward.cov[first[j], 0] + _STAY_M2_PER_S * hole_s
+    off = forward.mean[last[i], :2] - backward.mean[first[j], :2]
+    stayed = -(off**2).sum(axis=1) / spread - 2 * np.log(2 * np.pi * spread) - _STAY_COST
+    nobody = np.minimum(odds, 0.0)
+    gain = _START + _EVIDENCE * np.maximum(walked, stayed) + _HOLE * hole_s + _NOBODY * (nobody[i] + nobody[j]) - _LEAST
     good = gain > 0
     i, j, gain = i[good], j[good], gain[good]
+    best = np.full(count, -np.inf)
     for group in _components(i, j, count):
         who, them = np.unique(i[group]), np.unique(j[group])
         table = np.full((len(who), len(them)), -1.0)
         table[np.searchsorted(who, i[group]), np.searchsorted(them, j[group])] = np.round(gain[group], 6)
         row, column = pairs(table)
-        follows[who[row]] = them[column]
-    return follows
+        follows[who[row]], best[who[row]] = them[column], table[row, column] + _LEAST
+    return np.where(best + _usual_here(best[follows >= 0]) > np.log(least / (1 - least)), follows, -1)
+
+
+def _usual_here(odds: Floats) -> float:
+    """What to add to the log odds of links (E,) in this log, where others are right than usual."""
+    shift = 0.0
+    for _ in range(100):
+        right = (1 / (1 + np.exp(-(odds + shift)))).sum()
+        share = (right + 1) / (len(odds) + 3)
+        before, shift = shift, float(np.log(share / (1 - share)) - np.log(_USUAL / (1 - _USUAL)))
+        if abs(shift - before) < 1e-4:
+            break
+    return shift
 
 
 def _components(i: Ints, j: Ints, count: int) -> list[Ints]:

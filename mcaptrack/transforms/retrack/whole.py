@@ -130,7 +130,7 @@ def _linked(options: Retrack, walker: Walker, step: Ints, track: Ints, xy_m: Flo
     ids, _, paths = laid(step, track, xy_m, walker.noise_m)
     forward, backward, smoothed = smooth(walker, paths, step_s)
     odds = log_odds(walker, paths, smoothed, step_s)
-    follows = link(walker, paths, forward, backward, step_s, options.link_s, options.link_cost, odds)
+    follows = link(walker, paths, forward, backward, step_s, options.link_s, options.link_certainty, odds)
     root = np.arange(len(ids))
     order = np.argsort(paths.step[paths.first[:-1]], kind="stable")  # a track begins after the one that it goes on
     for one in order[follows[order] >= 0].tolist():
