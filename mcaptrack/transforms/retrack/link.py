@@ -24,7 +24,7 @@ Ints = NDArray[np.int64]
 _ROWS: Final = 5
 #: How fast people are at most in a hole.
 _REACH_M_PER_S: Final = 2.5
-#: The log odds of a link: for each unit of evidence, for each second of hole, for the log odds that a track is of nobody,
+#: The log odds of a link: for each unit of evidence, each second of hole, the log odds that a track is of nobody,
 #: and without any, where 43 in 100 are right (tools/choose_retrack.py).
 _EVIDENCE, _HOLE, _NOBODY, _START, _USUAL = 0.152, -0.193, 0.119, 2.31, 0.43
 #: How far people move who stand, and what it costs to take it that they did, as a log likelihood of both sides.
