@@ -84,7 +84,7 @@ CORRUPTIONS: Final = {
     "holes": replace(_BASE, noise_m=0.2, seen_s=1.9, swap=0.05, flicker=0.1),
     "very noisy": replace(_BASE, noise_m=0.35),
     "slow noise": replace(_BASE, noise_m=0.25, noise_s=1.5),
-    "hidden long": replace(_BASE, seen_s=12.0, hidden_s=(2.0, 7.0), standing=2.5, new_id=1.0),
+    "hidden long": replace(_BASE, seen_s=20.0, hidden_s=(2.0, 8.0), standing=2.0, new_id=1.0),
     "clutter": replace(_BASE, clutter=0.15, flicker=0.08),
     "doubles": replace(_BASE, doubles=0.12),
     "merges": replace(_BASE, merge_m=0.9, swap=0.0),

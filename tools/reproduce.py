@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import csv
+import itertools
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -112,7 +113,7 @@ def _tracked(path: Path, homographies: Path, fps: float) -> list[Frame]:
     rows = rows[np.argsort(rows[:, 0], kind="stable")]
     bounds = np.searchsorted(rows[:, 0], np.arange(int(rows[-1, 0]) + 2))
     frames = []
-    for number, (low, high) in enumerate(zip(bounds[:-1], bounds[1:], strict=True)):
+    for number, (low, high) in enumerate(itertools.pairwise(bounds)):
         x, y, w, h, score = rows[low:high, 2:7].T
         kind = np.ones(high - low, np.uint32)
         content = DETECTIONS.rows(x_px=x, y_px=y, w_px=w, h_px=h, score=score, class_id=kind)

@@ -24,8 +24,9 @@ Bools = NDArray[np.bool_]
 
 #: No noise of seen positions is smaller or larger than this.
 NOISE_M = (0.03, 0.8)
-#: The share of positions that noise is judged by.
+#: The share of positions that noise is judged by, and how fast it follows them in the end.
 _WIDE = 0.1
+_SLOWEST = 0.01
 
 
 @dataclass(frozen=True)
@@ -86,7 +87,8 @@ class Follower:
     hits: Ints = field(default_factory=lambda: np.empty(0, np.int64))
     missed: Ints = field(default_factory=lambda: np.empty(0, np.int64))
     next_id: int = 1
-    learning: float = 0.01
+    learning: bool = True
+    judged: int = 0
     known: set[int] = field(default_factory=set)
 
     def step(self, xy_m: Floats, source: Ints, passed: int) -> Seen:
@@ -124,7 +126,9 @@ class Follower:
             off = (xy_m - before.mean[:, :2])[settled]
             limit = -2 * np.log(_WIDE) * (before.cov[settled, 0] + self.walker.noise_m**2)
             wide = (off**2).sum(axis=1) > limit
-            log_noise = np.log(self.walker.noise_m) + self.learning * float((wide - _WIDE).sum())
+            self.judged += len(wide)
+            rate = max(_SLOWEST, 5 / (self.judged + 50))  # fast at first
+            log_noise = np.log(self.walker.noise_m) + rate * float((wide - _WIDE).sum())
             self.walker = replace(self.walker, noise_m=float(np.clip(np.exp(log_noise), *NOISE_M)))
 
     def _gain(self, xy_m: Floats, source: Ints) -> Floats:

@@ -41,7 +41,7 @@ class Following:
             max_age=max(1, round(options.max_age_s * rate)),
             sure_hits=self._sure,
             young_age=min(self._sure, max(1, round(options.max_age_s * rate))),
-            learning=0.01 if options.noise_m is None else 0.0,
+            learning=options.noise_m is None,
         )
         self.claims = Claims()
         self.samples: list[Rows] = []

@@ -65,15 +65,9 @@ def link(
     i, j, hole_s = i[near], j[near], hole_s[near]
     if len(i) == 0:
         return follows
-    ahead = _evidence(walker, paths, forward.take(last[i]), first[j], 1, hole_s, step_s)
-    back = backward.take(first[j])
-    behind = _evidence(walker, paths, State(back.mean * [1, 1, -1, -1], back.cov), last[i], -1, hole_s, step_s)
-    fresh = _fresh(walker, paths, first, 1, step_s)[j] + _fresh(walker, paths, last, -1, step_s)[i]
-    walked = ahead + behind - fresh
-    # Or they stood meanwhile, more or less.
-    spread = forward.cov[last[i], 0] + backward.cov[first[j], 0] + _STAY_M2_PER_S * hole_s
-    off = forward.mean[last[i], :2] - backward.mean[first[j], :2]
-    stayed = -(off**2).sum(axis=1) / spread - 2 * np.log(2 * np.pi * spread) - _STAY_COST
+    walked, stayed = evidence(
+        walker, paths, forward.take(last[i]), backward.take(first[j]), last[i], first[j], hole_s, step_s
+    )
     nobody = np.minimum(odds, 0.0)
     gain = _START + _EVIDENCE * np.maximum(walked, stayed) + _HOLE * hole_s + _NOBODY * (nobody[i] + nobody[j]) - _LEAST
     good = gain > 0
@@ -112,16 +106,29 @@ def _components(i: Ints, j: Ints, count: int) -> list[Ints]:
     return list(np.split(order, bounds)) if len(order) else []
 
 
-def _evidence(
-    walker: Walker, paths: Paths, state: State, start: Ints, way: int, hole_s: Floats, step_s: float
-) -> Floats:
-    """Log likelihood of the first rows from ``start`` on, going ``way``, for E people in ``state``."""
-    state = walker.predict(state, hole_s)
-    return _along(walker, paths, state, start, way, step_s)
+def evidence(
+    walker: Walker, paths: Paths, before: State, after: State, last: Ints, first: Ints, hole_s: Floats, step_s: float
+) -> tuple[Floats, Floats]:
+    """Log likelihoods (E,), of both sides together, that somebody walked on, or stood, against two different people.
+
+    ``before`` is who was there at the rows ``last`` by what came before, ``after`` who is at ``first`` by what comes
+    after.
+    """
+    turned = State(after.mean * [1, 1, -1, -1], after.cov)
+    ahead = _along(walker, paths, walker.predict(before, hole_s), first, 1, step_s)
+    behind = _along(walker, paths, walker.predict(turned, hole_s), last, -1, step_s)
+    walked = ahead + behind - _fresh(walker, paths, first, 1, step_s) - _fresh(walker, paths, last, -1, step_s)
+    spread = before.cov[:, 0] + after.cov[:, 0] + _STAY_M2_PER_S * hole_s
+    off = before.mean[:, :2] - after.mean[:, :2]
+    stayed = -(off**2).sum(axis=1) / spread - 2 * np.log(2 * np.pi * spread) - _STAY_COST
+    return walked, stayed
 
 
 def _fresh(walker: Walker, paths: Paths, start: Ints, way: int, step_s: float) -> Floats:
-    """The same for somebody new who was seen first at ``start``; the first position itself counts nothing."""
+    """Log likelihood of the first rows from ``start`` on, going ``way``, for somebody new who was seen first there.
+
+    The first position itself counts nothing.
+    """
     state = walker.born(paths.xy_m[start])
     return _along(walker, paths, state, start, way, step_s, skip=True)
 
