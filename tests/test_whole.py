@@ -200,6 +200,25 @@ class TestOfTheWholeLog:
         for who in ends[0]:
             assert abs(ends[0][who] - ends[1][who]) > 20
 
+    @pytest.mark.parametrize("name", [1, 2, 3])
+    def test_two_who_cross_and_are_one_box_for_two_seconds_are_who_they_were(self, name):
+        """While they are one box it stands in the middle, under anybody's name, which one of them has afterwards too."""
+
+        def crowd(n):
+            side = 0.15 * (22 - n)
+            a, b = (0.5 * n, side), (0.5 * n, -side)
+            if abs(side) >= 0.45:
+                return {1: a, 2: b} if n < 22 else {name: a, 7: b}
+            return {name: (0.5 * n, 0.0)}
+
+        for profile in (DEFAULT, replace(DEFAULT, part=False)):
+            offline, online, _ = (list(part) for part in zip(*profile(walk(crowd, 45)), strict=True))
+            for frames in (offline, online):
+                before, after = ({who: xy[1] > 0 for who, xy in places(frames[n]).items()} for n in (10, 40))
+                assert len(before) == 2
+                assert {who: not side for who, side in before.items()} == after
+                assert len(frames[22].rows) == 2  # both live while they are one box
+
     def test_smoothing_takes_noise_away(self):
         noise = np.random.default_rng(1).normal(0, 0.2, (60, 2))
         frames = self.offline(lambda n: {1: (0.5 * n + noise[n, 0], noise[n, 1])})

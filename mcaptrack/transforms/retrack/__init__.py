@@ -66,6 +66,10 @@ class Retrack:
         least=0.0,
     )
     max_age_s: float = option(2.0, "a track is dropped after so long without an observation (t_max)", least=0.0)
+    share_m: float = option(
+        1.0, "two tracks may be one sample (one box) that is so near to both, and between them; 0 for never", least=0.0
+    )
+    share_s: float = option(3.0, "for so long at most", least=0.0)
     sure_s: float = option(1.2, "a track is shown online once it was seen for so long (likelihood)", least=0.0)
     coast_s: float = option(1.2, "a track is shown online for so long where it is not seen (likelihood)", least=0.0)
     alpha: float = option(1.0, "smoothing of displacements, Eq. 3; 1 for none", least=0.0, most=1.0)

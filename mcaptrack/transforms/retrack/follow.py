@@ -35,7 +35,8 @@ class Evidence:
 
     ``cap`` is what a pair may cost at most, ``gate`` how many squared standard deviations it may be off. ``alone`` and
     ``crowded`` are what the same id of the input counts for, with nobody else within ``crowd_m`` and with somebody;
-    ``fresh`` speaks against a new id of the input that would go on a track that missed nothing.
+    ``fresh`` speaks against a new id of the input that would go on a track that missed nothing. ``floor_m`` is added to
+    the noise of positions. Two tracks are one sample for at most ``share_s`` where it is within ``share_m`` of both.
     """
 
     cap: float = 26.0
@@ -44,6 +45,8 @@ class Evidence:
     crowded: float = 4.0
     crowd_m: float = 1.7
     fresh: float = 4.0
+    share_m: float = 1.0
+    share_s: float = 3.0
     floor_m: float = 0.1
 
 
@@ -86,6 +89,7 @@ class Follower:
     source: Ints = field(default_factory=lambda: np.empty(0, np.int64))
     hits: Ints = field(default_factory=lambda: np.empty(0, np.int64))
     missed: Ints = field(default_factory=lambda: np.empty(0, np.int64))
+    shared: Ints = field(default_factory=lambda: np.empty(0, np.int64))
     next_id: int = 1
     learning: bool = True
     judged: int = 0
@@ -101,6 +105,7 @@ class Follower:
             self.state = self.walker.predict(self.state, passed * self.step_s)
         gain = self._gain(xy_m, source)
         track, row = pairs(gain)
+        before_m = self.state.mean[:, :2].copy()
         if len(track):
             before = self.state.take(track)
             self._learn(before, xy_m[row], track)
@@ -109,6 +114,8 @@ class Follower:
             self.missed[track] = 0
             self.hits[track] += 1
             self.source[track] = source[row]
+            self.shared[track] = 0
+        self._share(track, row, xy_m, passed, before_m)
         row_of = np.full(len(self.ids), -1)
         row_of[track] = row
         free = np.ones(len(xy_m), bool)
@@ -118,6 +125,36 @@ class Follower:
             self._start(xy_m[free], source[free])
         self.known.update(source.tolist())
         return Seen(self.ids, row_of, self.state.mean.copy(), self.hits.copy(), self.missed)
+
+    def _share(self, track: Ints, row: Ints, xy_m: Floats, passed: int, before_m: Floats) -> None:
+        """Who is lost where somebody else is seen, between the two, lives on there for a while: they are one box.
+
+        Where that is says little of who is lost, and what it is called says nothing of who is who once they part.
+        ``before_m`` (K, 2) is where everybody was expected.
+        """
+        lost = (self.missed > 0) & (self.hits >= self.sure_hits)
+        lost &= self.shared * self.step_s < self.evidence.share_s
+        sure = self.hits[track] >= self.sure_hits
+        track, row = track[sure], row[sure]
+        if not lost.any() or len(track) == 0:
+            return
+        guest = np.flatnonzero(lost)
+        off = self.state.mean[guest, None, :2] - xy_m[row][None]
+        far = np.einsum("knd,knd->kn", off, off)
+        host = far.argmin(axis=1)
+        inside = far[np.arange(len(guest)), host] < self.evidence.share_m**2
+        middle = (before_m[track[host]] + before_m[guest]) / 2
+        seen, alone = xy_m[row[host]], before_m[track[host]]
+        inside &= ((seen - middle) ** 2).sum(axis=1) < ((seen - alone) ** 2).sum(axis=1)
+        guest, host = guest[inside], host[inside]
+        if len(guest) == 0:
+            return
+        noise = np.full(len(guest), self.evidence.share_m / 2)
+        new, _ = self.walker.update(self.state.take(guest), xy_m[row[host]], noise)
+        self.state.mean[guest], self.state.cov[guest] = new
+        self.missed[guest] = np.maximum(self.missed[guest] - passed, 1)
+        self.shared[guest] += passed
+        self.source[track[host]] = -1
 
     def _learn(self, before: State, xy_m: Floats, track: Ints) -> None:
         """A share ``_WIDE`` of positions lies further off than so much, if the noise is what it is taken to be."""
@@ -161,8 +198,9 @@ class Follower:
         self.source = np.concatenate([self.source, source])
         self.hits = np.concatenate([self.hits, np.ones(count, np.int64)])
         self.missed = np.concatenate([self.missed, np.zeros(count, np.int64)])
+        self.shared = np.concatenate([self.shared, np.zeros(count, np.int64)])
 
     def _keep(self, kept: Bools) -> None:
         self.ids, self.source = self.ids[kept], self.source[kept]
-        self.hits, self.missed = self.hits[kept], self.missed[kept]
+        self.hits, self.missed, self.shared = self.hits[kept], self.missed[kept], self.shared[kept]
         self.state = self.state.take(kept)

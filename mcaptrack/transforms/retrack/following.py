@@ -36,7 +36,12 @@ class Following:
         self._sure = max(1, round(options.sure_s * rate) + 1)
         self._follower = Follower(
             walker=walker(options, USUAL_NOISE_M if options.noise_m is None else options.noise_m),
-            evidence=Evidence(alone=options.same_source, crowded=options.same_source / 3),
+            evidence=Evidence(
+                alone=options.same_source,
+                crowded=options.same_source / 3,
+                share_m=options.share_m,
+                share_s=options.share_s,
+            ),
             step_s=1 / rate,
             max_age=max(1, round(options.max_age_s * rate)),
             sure_hits=self._sure,
