@@ -105,17 +105,21 @@ class Follower:
             self.state = self.walker.predict(self.state, passed * self.step_s)
         gain = self._gain(xy_m, source)
         track, row = pairs(gain)
-        before_m = self.state.mean[:, :2].copy()
+        guest, host = self._sharing(track, row, xy_m)
+        if len(guest):
+            self._live_on(guest, xy_m[row[host]], passed)
         if len(track):
             before = self.state.take(track)
-            self._learn(before, xy_m[row], track)
-            new, _ = self.walker.update(before, xy_m[row])
+            noise_m = np.full(len(track), self.walker.noise_m)
+            noise_m[host] = self.evidence.share_m / 2
+            self._learn(before, xy_m[row], track, noise_m == self.walker.noise_m)
+            new, _ = self.walker.update(before, xy_m[row], noise_m)
             self.state.mean[track], self.state.cov[track] = new
             self.missed[track] = 0
             self.hits[track] += 1
-            self.source[track] = source[row]
             self.shared[track] = 0
-        self._share(track, row, xy_m, passed, before_m)
+            self.source[track] = source[row]
+            self.source[track[host]] = -1
         row_of = np.full(len(self.ids), -1)
         row_of[track] = row
         free = np.ones(len(xy_m), bool)
@@ -126,39 +130,39 @@ class Follower:
         self.known.update(source.tolist())
         return Seen(self.ids, row_of, self.state.mean.copy(), self.hits.copy(), self.missed)
 
-    def _share(self, track: Ints, row: Ints, xy_m: Floats, passed: int, before_m: Floats) -> None:
-        """Who is lost where somebody else is seen, between the two, lives on there for a while: they are one box.
+    def _sharing(self, track: Ints, row: Ints, xy_m: Floats) -> tuple[Ints, Ints]:
+        """Tracks that are lost where somebody else is seen between the two of them: both are one box. And in whose.
 
-        Where that is says little of who is lost, and what it is called says nothing of who is who once they part.
-        ``before_m`` (K, 2) is where everybody was expected.
+        Who they share it with is given as places in ``track``.
         """
-        lost = (self.missed > 0) & (self.hits >= self.sure_hits)
-        lost &= self.shared * self.step_s < self.evidence.share_s
-        sure = self.hits[track] >= self.sure_hits
-        track, row = track[sure], row[sure]
-        if not lost.any() or len(track) == 0:
-            return
+        nobody = np.empty(0, np.intp), np.empty(0, np.intp)
+        lost = (self.hits >= self.sure_hits) & (self.shared * self.step_s < self.evidence.share_s)
+        lost[track] = False
+        sure = np.flatnonzero(self.hits[track] >= self.sure_hits)
         guest = np.flatnonzero(lost)
-        off = self.state.mean[guest, None, :2] - xy_m[row][None]
+        if len(guest) == 0 or len(sure) == 0:
+            return nobody
+        seen, expected = xy_m[row[sure]], self.state.mean[:, :2]
+        off = expected[guest, None] - seen[None]
         far = np.einsum("knd,knd->kn", off, off)
         host = far.argmin(axis=1)
         inside = far[np.arange(len(guest)), host] < self.evidence.share_m**2
-        middle = (before_m[track[host]] + before_m[guest]) / 2
-        seen, alone = xy_m[row[host]], before_m[track[host]]
-        inside &= ((seen - middle) ** 2).sum(axis=1) < ((seen - alone) ** 2).sum(axis=1)
-        guest, host = guest[inside], host[inside]
-        if len(guest) == 0:
-            return
-        noise = np.full(len(guest), self.evidence.share_m / 2)
-        new, _ = self.walker.update(self.state.take(guest), xy_m[row[host]], noise)
+        own = expected[track[sure[host]]]
+        to_middle = seen[host] - (own + expected[guest]) / 2
+        inside &= (to_middle**2).sum(axis=1) < ((seen[host] - own) ** 2).sum(axis=1)
+        return guest[inside], sure[host[inside]]
+
+    def _live_on(self, guest: Ints, xy_m: Floats, passed: int) -> None:
+        """Where the box is says little of each, and what it is called says nothing of who is who once they part."""
+        noise_m = np.full(len(guest), self.evidence.share_m / 2)
+        new, _ = self.walker.update(self.state.take(guest), xy_m, noise_m)
         self.state.mean[guest], self.state.cov[guest] = new
         self.missed[guest] = np.maximum(self.missed[guest] - passed, 1)
         self.shared[guest] += passed
-        self.source[track[host]] = -1
 
-    def _learn(self, before: State, xy_m: Floats, track: Ints) -> None:
+    def _learn(self, before: State, xy_m: Floats, track: Ints, single: Bools) -> None:
         """A share ``_WIDE`` of positions lies further off than so much, if the noise is what it is taken to be."""
-        settled = self.hits[track] >= self.sure_hits
+        settled = (self.hits[track] >= self.sure_hits) & single
         if self.learning and settled.any():
             off = (xy_m - before.mean[:, :2])[settled]
             limit = -2 * np.log(_WIDE) * (before.cov[settled, 0] + self.walker.noise_m**2)
