@@ -112,7 +112,8 @@ class TestTheUsualWay:
         assert names == ["walk.layout.json", "walk.mcap", "walk.tables"]
         layout = json.loads((finished.parent / "walk.layout.json").read_text())
         shown = layout["configById"]["Image!picture"]["imageMode"]["annotations"]
-        assert shown["/camera/retracks/view/image"] == {"visible": True}
+        assert shown["/camera/retracks/full/view/image"] == {"visible": True}
+        assert shown["/camera/retracks/view/image"] == {"visible": False}
         assert shown["/camera/detections/view/image"] == {"visible": False}
 
     def test_running_again_has_nothing_to_do(self, finished):
