@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack import foreign, foxglove, log, views
+from mcaptrack.carry import carry
 from mcaptrack.clock import NS_PER_S
 from mcaptrack.errors import McaptrackError
 from mcaptrack.plane import GroundPlane, Planes, assumed_plane
@@ -51,6 +52,8 @@ ROUTES: Final[Mapping[str, Route]] = {
     "retrack": Route("samples", "retracks"),
 }
 _MAKER: Final = {route.writes: name for name, route in ROUTES.items()}
+#: Below the re-tracked tracks: the same at the video's rate.
+_FULL: Final = "/full"
 _ASSUME: Final = "assume-ground-plane"
 
 
@@ -69,7 +72,8 @@ class Job(NamedTuple):
 
     def kept(self) -> set[str]:
         """The topics that go into the log."""
-        return {f"{self.target}/{suffix}".rstrip("/") for suffix in self.keep or self.transform.writes}
+        kept = {f"{self.target}/{suffix}".rstrip("/") for suffix in self.keep or self.transform.writes}
+        return kept | {self.target + _FULL} if self.stage == "retrack" and self.target in kept else kept
 
 
 class Made(NamedTuple):
@@ -340,6 +344,8 @@ def run(
             provenance = Provenance(job.stage, parameters, job.source, input_digest(), digest(messages), weights)
             made[topic] = Made(schema, channel, provenance, messages)
             report.frames[topic] = len(channel)
+        if job.target + _FULL in job.kept():
+            made |= _carried(opened, job, made, planes or ())
         report.stages.append(job.stage)
     if made or output is not None:
         report.layout = _write(opened, prefix, made, planes or (), stamps, output)
@@ -349,6 +355,27 @@ def run(
         if topic not in made and known and known.transform in TRANSFORMS and known.input in digests:
             report.stale += [topic] if known.input_digest != digests[known.input] else []
     return report
+
+
+def _carried(opened: log.Log, job: Job, made: Mapping[str, Made], planes: Planes) -> dict[str, Made]:
+    """The re-tracked people at the rate of the tracks that their samples were made from; nothing if there are none."""
+    samples = (
+        made[job.source].provenance
+        if job.source in made
+        else Provenance.from_metadata(opened.channel(job.source).metadata)
+    )
+    source = samples.input if samples else ""
+    if source in made:
+        tracks = made[source].frames if made[source].schema is TRACKS else []
+    else:
+        there = source in opened.channels and opened.channels[source].schema_name == TRACKS.name
+        tracks = opened.frames(source, TRACKS) if there else []
+    if not tracks:
+        return {}
+    retracked = made[job.target]
+    frames = carry(tracks, retracked.frames, planes)
+    messages = [(f.t_ns, f.index, TRACKS.codec.encode(TRACKS.check(f.rows))) for f in frames]
+    return {job.target + _FULL: Made(TRACKS, frames, replace(retracked.provenance, digest=digest(messages)), messages)}
 
 
 def _in_context(opened: log.Log, prefix: str, job: Job, made: Mapping[str, Made], planes: Planes) -> Transform:
@@ -549,7 +576,7 @@ _NOT_SHOWN: Final = ("/samples", "/online")
 #: The attachment that holds the layout.
 LAYOUT: Final = "mcaptrack.layout.json"
 #: Views that a layout switches on, below the prefix; the others can be switched on by hand.
-_SHOWN: Final = ("retracks", "retracks/predictions", "tracks", "detections")
+_SHOWN: Final = ("retracks/full", "retracks", "tracks", "detections")
 
 
 def layout(prefix: str, view_topics: Sequence[str], picture_topic: str) -> bytes:
@@ -563,10 +590,8 @@ def layout(prefix: str, view_topics: Sequence[str], picture_topic: str) -> bytes
 
 def _switched_on(there: set[str]) -> list[str]:
     """The best views of those that there are, below the prefix."""
-    best = (
-        ["retracks", "retracks/predictions"] if "retracks" in there else [name for name in _SHOWN if name in there][:1]
-    )
-    return [name for name in best if name in there]
+    best = [name for name in _SHOWN if name in there][:1]
+    return best + [name for name in ("retracks/predictions",) if "retracks" in there and name in there]
 
 
 def find_views(opened: log.Log, prefix: str, topics: Sequence[str] = ()) -> list[str]:

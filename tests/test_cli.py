@@ -112,7 +112,8 @@ class TestTheUsualWay:
         assert names == ["walk.layout.json", "walk.mcap", "walk.tables"]
         layout = json.loads((finished.parent / "walk.layout.json").read_text())
         shown = layout["configById"]["Image!picture"]["imageMode"]["annotations"]
-        assert shown["/camera/retracks/view/image"] == {"visible": True}
+        assert shown["/camera/retracks/full/view/image"] == {"visible": True}
+        assert shown["/camera/retracks/view/image"] == {"visible": False}
         assert shown["/camera/detections/view/image"] == {"visible": False}
 
     def test_running_again_has_nothing_to_do(self, finished):
@@ -162,7 +163,7 @@ class TestTheUsualWay:
         (result,) = data["results"]
         channels = {channel["topic"]: channel for channel in result["channels"]}
         assert channels["/camera/retracks"]["input"] == "/camera/samples"
-        assert channels["/camera/retracks"]["parameters"]["distance"] == "now"
+        assert channels["/camera/retracks"]["parameters"]["distance"] == "likelihood"
         assert not any(channel["stale"] for channel in result["channels"])
         assert result["messages"] == sum(channel["messages"] for channel in result["channels"])
 
@@ -196,7 +197,7 @@ class TestTheUsualWay:
         (result,) = json.loads(done("info", tmp_path / "p.mcap", "--json")[0])["results"]
         made = {channel["topic"]: channel["parameters"] for channel in result["channels"]}
         assert (made["/camera/retracks"]["distance"], made["/camera/retracks"]["sigma_m"]) == ("mean", 2.0)
-        assert made["/camera/retracks/online"]["distance"] == "now"  # only the other output was made
+        assert made["/camera/retracks/online"]["distance"] == "likelihood"  # only the other output was made
 
 
 class TestEvaluate:

@@ -16,6 +16,18 @@ from mcaptrack.transforms.retrack.state import Motion
 from tests.worlds import ids, places, tracks_at, walk
 
 PAPER, AUTHORS, DEFAULT = PROFILES["paper"], PROFILES["authors"], PROFILES["default"]
+#: The expected and the seen position compared, Algorithm 1 otherwise, and nothing done afterwards.
+NOW = replace(
+    DEFAULT,
+    distance="now",
+    noise_m=0.5,
+    same_source=1.0,
+    max_age_s=4.8,
+    link_s=0.0,
+    part=False,
+    smooth=False,
+    min_certainty=0.0,
+)
 every_profile = pytest.mark.parametrize("profile", PROFILES.values(), ids=PROFILES)
 
 
@@ -31,6 +43,11 @@ def paths(frames) -> dict[int, dict[int, tuple[float, float]]]:
         for who, place in places(frame).items():
             out.setdefault(who, {})[tick] = place
     return out
+
+
+def along(path: dict[int, tuple[float, float]], truth: dict[int, tuple[float, float]]) -> bool:
+    """Whether a path has the ticks of another and is within 2 cm of it."""
+    return path.keys() == truth.keys() and all(np.hypot(*np.subtract(path[t], truth[t])) < 0.02 for t in truth)
 
 
 def line(start: float, step: float, count: int = 12) -> np.ndarray:
@@ -120,14 +137,14 @@ class TestBranches:
         offline, online, _ = run(profile, walk(lambda n: {7: (0.5 * n, 0.0)}, 20))
         assert set(paths(offline)) == {1}
         assert set(paths(online)) == {1}
-        assert paths(offline)[1] == {tick: (0.5 * tick, 0.0) for tick in range(20)}
+        assert along(paths(offline)[1], {tick: (0.5 * tick, 0.0) for tick in range(20)})
 
     @every_profile
     def test_identity_is_dropped_a_new_id_on_the_same_path_is_the_same_person(self, profile):
         frames = walk(lambda n: {7 if n < 10 else 8: (0.5 * n, 0.0)}, 24)
         offline, _, _ = run(profile, frames)
         (who,) = paths(offline)
-        assert paths(offline)[who] == {tick: (0.5 * tick, 0.0) for tick in range(24)}
+        assert along(paths(offline)[who], {tick: (0.5 * tick, 0.0) for tick in range(24)})
 
     @every_profile
     def test_unmatched_track_ages_and_is_matched_again_within_its_age(self, profile):
@@ -135,7 +152,7 @@ class TestBranches:
         frames = walk(lambda n: {7 if n < 10 else 8: (0.5 * n, 0.0)} if not 10 <= n < 13 else {}, 26)
         offline, _, _ = run(profile, frames)
         (who,) = paths(offline)
-        assert paths(offline)[who] == {tick: (0.5 * tick, 0.0) for tick in range(26)}
+        assert along(paths(offline)[who], {tick: (0.5 * tick, 0.0) for tick in range(26)})
         filled = [tick for tick, frame in enumerate(offline) if not frame.rows["observed"].all()]
         assert set(range(10, 13)) <= set(filled)
 
@@ -143,7 +160,7 @@ class TestBranches:
     def test_aged_out_is_somebody_else(self, profile):
         gone = range(10, 26)  # 6.4 s
         frames = walk(lambda n: {7 if n < 10 else 8: (0.5 * n, 0.0)} if n not in gone else {}, 40)
-        offline, _, _ = run(profile, frames)
+        offline, _, _ = run(replace(profile, link_s=0.0), frames)
         assert len(paths(offline)) == 2
         assert all(len(frame.rows) == 0 for frame in offline[10:26])
 
@@ -151,7 +168,7 @@ class TestBranches:
     def test_age_counts_seconds_not_frames_with_rows(self, profile):
         """The same hole, but the log has no frames there at all."""
         frames = [f for f in walk(lambda n: {7: (0.5 * n, 0.0)}, 40) if not 10 <= f.index < 26]
-        offline, _, _ = run(profile, frames)
+        offline, _, _ = run(replace(profile, link_s=0.0), frames)
         assert len(paths(offline)) == 2
 
     @every_profile
@@ -177,8 +194,8 @@ class TestBranches:
 
     def test_no_track_is_matched_further_than_it_can_have_jumped(self):
         frames = walk(lambda n: {7 if n < 10 else 8: (0.0, 0.0 if n < 10 else 4.0)} if not 10 <= n < 20 else {}, 32)
-        near, _, _ = run(replace(DEFAULT, max_jump_m=None), frames)
-        far, _, _ = run(DEFAULT, frames)
+        near, _, _ = run(replace(NOW, max_jump_m=None), frames)
+        far, _, _ = run(NOW, frames)
         assert len(paths(near)) == 1
         assert len(paths(far)) == 2
 
@@ -214,7 +231,7 @@ class TestBranches:
             "max_distance": 3.0,
             "same_source": 0.0,
         }
-        plain = replace(DEFAULT, **options, max_jump_m=None, noise_m=0.0, certain_distance=0.0)
+        plain = replace(NOW, **options, max_jump_m=None, noise_m=0.0, certain_distance=0.0)
         sure = replace(plain, certain_distance=0.15)
         by = [
             {f.rows["source_id"][k]: f.rows["track_id"][k] for f in run(p, frames)[1][8:] for k in range(len(f.rows))}
@@ -224,7 +241,7 @@ class TestBranches:
 
     def test_an_observation_needs_a_past(self):
         frames = walk(lambda n: {1: (0.5 * n, 0.0)} if n < 3 else {}, 10)
-        for profile, least in ((PAPER, 4), (DEFAULT, 2)):
+        for profile, least in ((PAPER, 4), (NOW, 2)):
             assert profile.min_history == least
             _, online, _ = run(replace(profile, min_track_s=0.0), frames)
             assert any(len(frame.rows) for frame in online) == (least <= 3 and profile.min_hits <= 1)
@@ -291,7 +308,7 @@ class TestFailuresOfThePaper:
 
         offline, _, _ = run(profile, walk(crowd, 30))
         truth = {tick: (0.5 * tick, 3.0 - 0.25 * tick) for tick in range(30)}
-        assert truth in paths(offline).values()
+        assert any(along(path, truth) for path in paths(offline).values())
         assert len(paths(offline)) == 2
 
     @pytest.mark.parametrize("profile", [AUTHORS, DEFAULT], ids=["authors", "default"])
@@ -329,7 +346,8 @@ class TestFailuresOfThePaper:
             offline, _, _ = run(profile, walk(crowd, 40))
             found = paths(offline).values()
             kept += sum(len(path) for path in found if next(iter(path.values()))[1] > 15)
-            assert {tick: (round(0.4 * tick, 3), 0.0) for tick in range(40)} in found
+            walker = {tick: (0.4 * tick, 0.0) for tick in range(40)}
+            assert any(along(path, walker) for path in found)
         assert kept <= (0 if profile == DEFAULT else 0.5 * 20 * 6)
 
     def test_noisy_track(self):

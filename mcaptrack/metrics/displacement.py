@@ -83,6 +83,12 @@ class Displacement:
         count = np.arange(1, len(order) + 1)
         return count / max(self.people, 1), np.cumsum(self.ade_m[order]) / count
 
+    def squared_at(self, recall: float) -> float:
+        """The squared ADE in m^2 (the paper's) of the pairs that agree best on the past, up to a recall; NaN beyond."""
+        count = round(recall * self.people)
+        best = np.argsort(self.d_obs_m2, kind="stable")[:count]
+        return float(self.ade_squared_m2[best].mean()) if 0 < count == len(best) else float("nan")
+
     def summary(self, tau_m2: float = TAU_M2) -> dict[str, float | None]:
         """The numbers at one threshold; None where there is nothing to average."""
         kept = self.d_obs_m2 < tau_m2

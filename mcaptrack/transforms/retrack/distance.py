@@ -15,7 +15,7 @@ from mcaptrack.predictors import Forecast
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-Distance = Literal["mean", "max", "first", "now"]
+Distance = Literal["mean", "max", "first", "now", "likelihood"]
 Covariance = Literal["paper", "predictor"]
 
 

@@ -1,0 +1,106 @@
+"""Re-tracked names at the video's rate, on scenes in words."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mcaptrack.carry import carry
+from mcaptrack.schema import TRACKS, Frame
+from tests.test_cli import done
+from tests.worlds import ns
+
+
+def boxes(people: dict[int, float]):
+    """Rows of tracks at 10 Hz: boxes of 10 x 30 px, 20 px to a metre, no metres yet."""
+    x = np.array(list(people.values()), float)
+    return TRACKS.rows(
+        track_id=list(people),
+        x_px=x * 20 - 5,
+        y_px=np.full(len(x), 100.0),
+        w_px=np.full(len(x), 10.0),
+        h_px=np.full(len(x), 30.0),
+        observed=np.ones(len(x), bool),
+        source_id=np.full(len(x), -1),
+    )
+
+
+def named(people: dict[int, tuple[int, float]]):
+    """Re-tracked rows: who, from which track, where."""
+    source, x = np.array(list(people.values()), float).reshape(-1, 2).T
+    rows = boxes(dict(zip(people, x, strict=True)))
+    rows["x_m"], rows["y_m"], rows["source_id"] = x, 0.0, source
+    rows["observed"] = source >= 0
+    return rows
+
+
+def full(tracks, retracks):
+    frames = carry(
+        [Frame(ns(n / 10), n, boxes(people)) for n, people in enumerate(tracks)],
+        [Frame(ns(0.4 * n), 4 * n, named(people)) for n, people in enumerate(retracks)],
+        (),
+    )
+    return [
+        {int(r["track_id"]): (int(r["source_id"]), round(float(r["x_px"] + 5) / 20, 6)) for r in f.rows} for f in frames
+    ]
+
+
+def test_every_box_gets_the_name_that_its_track_has():
+    out = full([{7: 0.1 * n} for n in range(9)], [{1: (7, 0.4 * n)} for n in range(3)])
+    assert out == [{1: (7, round(0.1 * n, 6))} for n in range(9)]
+
+
+def test_a_track_that_is_two_people_changes_its_name_half_way_between_the_ticks():
+    out = full([{7: 0.1 * n} for n in range(9)], [{1: (7, 0.0)}, {2: (7, 0.4)}, {2: (7, 0.8)}])
+    assert [[who for who, (source, _) in f.items() if source == 7] for f in out] == [[1]] * 3 + [[2]] * 6
+
+
+def test_two_tracks_that_are_one_person_have_one_name_and_the_hole_between_them_is_filled():
+    tracks = [{7: 0.1 * n} if n <= 5 else {8: 0.1 * n} if n >= 10 else {} for n in range(17)]
+    out = full(tracks, [{1: (7, 0.0)}, {1: (7, 0.4)}, {1: (-1, 0.8)}, {1: (8, 1.2)}, {1: (8, 1.6)}])
+    assert [set(f) for f in out] == [{1}] * 17
+    assert [f[1][0] for f in out] == [7] * 6 + [-1] * 4 + [8] * 7
+    np.testing.assert_allclose([f[1][1] for f in out], 0.1 * np.arange(17), atol=1e-6)
+
+
+def test_boxes_of_a_false_track_are_left_out():
+    out = full([{7: 0.1 * n, 9: 5.0} for n in range(9)], [{1: (7, 0.4 * n)} for n in range(3)])
+    assert all(set(f) == {1} for f in out)
+
+
+def test_nobody_re_tracked_nobody_shown_and_every_frame_there():
+    assert full([{7: 0.0}] * 4, [{}]) == [{}] * 4
+    assert carry([], [], ()) == []
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+@settings(max_examples=25)
+def test_nobody_is_at_two_places_and_no_box_is_two_people(seed):
+    rng = np.random.default_rng(seed)
+    tracks = [{int(i): float(i) for i in range(5) if rng.random() < 0.7} for _ in range(20)]
+    retracks = []
+    for _ in range(5):
+        sources = rng.permutation(5)[: rng.integers(0, 6)]
+        retracks.append({int(10 + rng.permutation(5)[k]) + 10 * k: (int(s), float(s)) for k, s in enumerate(sources)})
+    frames = [Frame(ns(n / 10), n, boxes(people)) for n, people in enumerate(tracks)]
+    out = carry(frames, [Frame(ns(0.4 * n), n, named(people)) for n, people in enumerate(retracks)], ())
+    for before, after in zip(frames, out, strict=True):
+        who, source = after.rows["track_id"].tolist(), after.rows["source_id"]
+        assert len(set(who)) == len(who)
+        used = source[source >= 0].tolist()
+        assert len(set(used)) == len(used)
+        assert set(used) <= set(before.rows["track_id"].tolist())
+
+
+def test_a_log_gets_them_beside_the_others(tmp_path):
+    rows = "".join(f"{frame},1,{10 + frame},20,10,30,1,-1,-1,-1\n" for frame in range(1, 41))
+    (tmp_path / "t.txt").write_text(rows)
+    done("ingest", tmp_path / "t.txt", "--as", "tracks", "--fps", 10, "-o", tmp_path / "l.mcap")
+    done("retrack", tmp_path / "l.mcap")
+    (result,) = json.loads(done("info", tmp_path / "l.mcap", "--json")[0])["results"]
+    channels = {channel["topic"]: channel for channel in result["channels"]}
+    assert channels["/camera/retracks/full"]["messages"] == channels["/camera/tracks"]["messages"] == 40
+    assert not channels["/camera/retracks/full"]["stale"]

@@ -1,0 +1,267 @@
+"""What re-tracking does once the log is known: motion, links, meetings, doubt; each against its law or by hand."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mcaptrack.transforms import PROFILES
+from mcaptrack.transforms.retrack.follow import pairs
+from mcaptrack.transforms.retrack.link import link
+from mcaptrack.transforms.retrack.motion import Paths, State, Walker, smooth
+from mcaptrack.transforms.retrack.part import exchanges
+from mcaptrack.transforms.retrack.whole import laid
+from tests.worlds import places, walk
+
+WALKER = Walker(noise_m=0.1, speed_m_per_s=1.5, drift=0.15, drift_share=0.0)
+STEP_S = 0.4
+DEFAULT = PROFILES["default"]
+
+
+def one_path(xy: np.ndarray, start: int = 0) -> Paths:
+    steps = start + np.arange(len(xy))
+    return Paths(np.array([0, len(xy)]), steps, xy, np.full(len(xy), WALKER.noise_m))
+
+
+def joint(xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mean (n, 2) and variance (n,) of every true position given all seen ones, from one big Gaussian: no filter."""
+    count = len(xy)
+    move = np.array([[1, STEP_S], [0, 1]])
+    noise = WALKER.drift**2 * np.array([[STEP_S**3 / 3, STEP_S**2 / 2], [STEP_S**2 / 2, STEP_S]])
+    seen = np.flatnonzero(np.isfinite(xy[:, 0]))
+    # a flat prior of the first position, as a filter that starts on its measurement has it
+    cov = np.zeros((2 * count, 2 * count))
+    cov[:2, :2] = np.diag([1e3, WALKER.speed_m_per_s**2])
+    for k in range(1, count):
+        row = move @ cov[2 * k - 2 : 2 * k, : 2 * k]
+        cov[2 * k : 2 * k + 2, : 2 * k] = row
+        cov[: 2 * k, 2 * k : 2 * k + 2] = row.T
+        cov[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = move @ cov[2 * k - 2 : 2 * k, 2 * k - 2 : 2 * k] @ move.T + noise
+    at = 2 * np.arange(count)
+    gain = cov[np.ix_(at, at[seen])] @ np.linalg.inv(
+        cov[np.ix_(at[seen], at[seen])] + WALKER.noise_m**2 * np.eye(len(seen))
+    )
+    variance = np.diag(cov[np.ix_(at, at)] - gain @ cov[np.ix_(at[seen], at)])
+    return gain @ xy[seen], variance
+
+
+class TestMotion:
+    def test_smoothing_is_the_mean_given_everything(self):
+        rng = np.random.default_rng(3)
+        xy = np.cumsum(rng.normal(0.4, 0.1, (14, 2)), axis=0)
+        xy[5:8] = np.nan
+        _, _, smoothed = smooth(WALKER, one_path(xy), STEP_S)
+        mean, variance = joint(xy)
+        np.testing.assert_allclose(smoothed.mean[:, :2], mean, atol=1e-3)
+        np.testing.assert_allclose(smoothed.cov[:, 0], variance, rtol=0.01)
+
+    def test_tracks_beside_each_other_do_not_touch(self):
+        rng = np.random.default_rng(4)
+        parts = [rng.normal(0, 3, (n, 2)) for n in (9, 1, 4)]
+        first = np.array([0, 9, 10, 14])
+        together = Paths(
+            first, np.concatenate([np.arange(n) for n in (9, 1, 4)]), np.concatenate(parts), np.full(14, 0.1)
+        )
+        whole = smooth(WALKER, together, STEP_S)
+        for k, part in enumerate(parts):
+            for a, b in zip(whole, smooth(WALKER, one_path(part), STEP_S), strict=True):
+                np.testing.assert_allclose(a.mean[first[k] : first[k + 1]], b.mean, atol=1e-9)
+
+    def test_backwards_is_forwards_of_the_film_run_backwards(self):
+        xy = np.cumsum(np.random.default_rng(5).normal(0.3, 0.2, (10, 2)), axis=0)
+        _, backward, _ = smooth(WALKER, one_path(xy), STEP_S)
+        forward, _, _ = smooth(WALKER, one_path(xy[::-1]), STEP_S)
+        np.testing.assert_allclose(backward.mean[:, :2], forward.mean[::-1, :2])
+        np.testing.assert_allclose(backward.mean[:, 2:], -forward.mean[::-1, 2:])
+
+    def test_prediction_in_two_steps_is_prediction_in_one(self):
+        state = State(np.array([[1.0, 2, 0.5, -1]]), np.array([[0.1, 0.02, 0.3]]))
+        one, two = WALKER.predict(state, 1.2), WALKER.predict(WALKER.predict(state, 0.4), 0.8)
+        np.testing.assert_allclose(one.mean, two.mean)
+        np.testing.assert_allclose(one.cov, two.cov)
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+@settings(max_examples=40)
+def test_pairs_are_the_best_there_are(seed):
+    """Against all ways to pair up to four with up to four."""
+    from itertools import permutations
+
+    rng = np.random.default_rng(seed)
+    gain = rng.normal(0, 1, rng.integers(1, 5, 2))
+    rows, columns = pairs(gain)
+    assert len(set(columns.tolist())) == len(columns)
+    wide = np.maximum(gain if gain.shape[0] <= gain.shape[1] else gain.T, 0)
+    best = max(sum(wide[k, c] for k, c in enumerate(order)) for order in permutations(range(wide.shape[1]), len(wide)))
+    assert gain[rows, columns].sum() == pytest.approx(best)
+    assert (gain[rows, columns] > 0).all()
+
+
+class TestLinks:
+    def follows(self, *people: tuple[int, np.ndarray], odds: float = 5.0) -> list[int]:
+        step = np.concatenate([start + np.arange(len(xy)) for start, xy in people])
+        track = np.repeat(np.arange(len(people)), [len(xy) for _, xy in people])
+        _, _, paths = laid(step, track, np.concatenate([xy for _, xy in people]), WALKER.noise_m)
+        forward, backward, _ = smooth(WALKER, paths, STEP_S)
+        return link(WALKER, paths, forward, backward, STEP_S, 14.0, 0.5, np.full(len(people), odds)).tolist()
+
+    def walking(self, x: float, y: float, steps: int = 12, speed: float = 0.5) -> np.ndarray:
+        return np.stack([x + speed * np.arange(steps), np.full(steps, y)], axis=-1)
+
+    def test_who_walks_on_behind_a_wall_is_the_same(self):
+        assert self.follows((0, self.walking(0, 0)), (22, self.walking(11, 0))) == [1, -1]
+
+    def test_who_stands_behind_a_wall_is_the_same(self):
+        assert self.follows((0, self.walking(0, 0, speed=0)), (25, self.walking(0.1, 0, speed=0))) == [1, -1]
+
+    def test_who_would_have_to_turn_round_is_somebody_else(self):
+        assert self.follows((0, self.walking(0, 0)), (16, self.walking(-6, 0, speed=-0.5))) == [-1, -1]
+
+    def test_nobody_is_linked_over_a_longer_time_than_that(self):
+        assert self.follows((0, self.walking(0, 0)), (60, self.walking(30, 0))) == [-1, -1]
+
+    def test_two_and_two_go_together_as_fits_all_best(self):
+        """The nearer beginning of each end is the other's only one."""
+        people = [
+            (0, self.walking(0, 0)),
+            (0, self.walking(0, 1.2)),
+            (18, self.walking(9, 0)),
+            (18, self.walking(9, 1.2)),
+        ]
+        assert self.follows(*people) == [2, 3, -1, -1]
+
+    def test_nobody_s_tracks_are_linked_less_easily(self):
+        people = (0, self.walking(0, 0)), (26, self.walking(14.2, 0.4))
+        assert self.follows(*people, odds=5.0) == [1, -1]
+        assert self.follows(*people, odds=-30.0) == [-1, -1]
+
+
+class TestMeetings:
+    def apart(self, exchanged: slice, noise: float, seed: int = 0) -> np.ndarray:
+        """Two pass each other 0.8 m apart; from then on, labels exchanged over some steps."""
+        steps = np.arange(40)
+        off = np.stack([6 - 0.3 * steps, np.full(40, 0.8)], axis=-1) + np.random.default_rng(seed).normal(
+            0, noise, (40, 2)
+        )
+        off[exchanged] *= -1
+        return off[None]
+
+    @pytest.mark.parametrize("since", [5, 18, 22, 30])
+    def test_an_exchange_is_found_to_the_step(self, since):
+        course, gain = exchanges(self.apart(slice(since, None), 0.05), np.full((1, 40), 5.0), STEP_S, 0.05, 1.5)
+        assert np.flatnonzero(course[0]).tolist() == list(range(since, 40))
+        assert gain[0] > 3
+
+    def test_there_and_back_again(self):
+        course, _ = exchanges(self.apart(slice(8, 15), 0.05), np.full((1, 40), 5.0), STEP_S, 0.05, 1.5)
+        assert np.flatnonzero(course[0]).tolist() == list(range(8, 15))
+
+    def test_where_nothing_was_exchanged_nothing_is(self):
+        for seed in range(20):
+            course, gain = exchanges(self.apart(slice(0, 0), 0.1, seed), np.full((1, 40), 5.0), STEP_S, 0.1, 1.5)
+            assert not course.any()
+            assert gain[0] <= 0
+
+    def test_encounters_do_not_touch_and_holes_are_bridged(self):
+        one, two = self.apart(slice(20, None), 0.05), self.apart(slice(0, 0), 0.05, 1)
+        one[0, 17:23] = np.nan
+        course, _ = exchanges(np.concatenate([one, two]), np.full((2, 40), 5.0), STEP_S, 0.05, 1.5)
+        assert course[0, 23:].all()
+        assert not course[0, :17].any()
+        assert not course[1].any()
+
+
+class TestOfTheWholeLog:
+    def offline(self, path, ticks=60, profile=DEFAULT):
+        return [result[0] for result in profile(walk(path, ticks))]
+
+    def test_hidden_for_six_seconds_and_found_again(self):
+        frames = self.offline(lambda n: {1 if n < 20 else 2: (0.5 * n, 0.0)} if not 20 <= n < 35 else {})
+        assert {who for frame in frames for who in places(frame)} == {1}
+        assert [len(frame.rows) for frame in frames] == [1] * 60
+        assert not any(frame.rows["observed"].any() for frame in frames[20:35])
+
+    def test_labels_that_the_input_exchanges_where_two_pass_are_put_right(self):
+        """Ids of the input change sides as two pass 0.5 m from each other, unseen for a moment."""
+
+        def crowd(n):
+            a, b = (0.4 * n, 0.0), (24 - 0.4 * n, 0.5)
+            if 29 <= n <= 31:
+                return {}
+            return {1: a, 2: b} if n < 30 else {1: b, 2: a}
+
+        frames = self.offline(crowd)
+        ends = [{who: xy[0] for who, xy in places(frames[n]).items()} for n in (0, 59)]
+        assert sorted(ends[0]) == sorted(ends[1])
+        for who in ends[0]:
+            assert abs(ends[0][who] - ends[1][who]) > 20
+
+    @pytest.mark.parametrize("name", [1, 2, 3])
+    def test_two_who_cross_and_are_one_box_for_two_seconds_are_who_they_were(self, name):
+        """While they are one box it stands in the middle, under anybody's name, which one of them has afterwards too."""
+
+        def crowd(n):
+            side = 0.15 * (22 - n)
+            a, b = (0.5 * n, side), (0.5 * n, -side)
+            if abs(side) >= 0.45:
+                return {1: a, 2: b} if n < 22 else {name: a, 7: b}
+            return {name: (0.5 * n, 0.0)}
+
+        for profile in (DEFAULT, replace(DEFAULT, part=False)):
+            offline, online, _ = (list(part) for part in zip(*profile(walk(crowd, 45)), strict=True))
+            for frames in (offline, online):
+                before, after = ({who: xy[1] > 0 for who, xy in places(frames[n]).items()} for n in (10, 40))
+                assert len(before) == 2
+                assert {who: not side for who, side in before.items()} == after
+                assert len(frames[22].rows) == 2  # both live while they are one box
+
+    def test_smoothing_takes_noise_away(self):
+        noise = np.random.default_rng(1).normal(0, 0.2, (60, 2))
+        frames = self.offline(lambda n: {1: (0.5 * n + noise[n, 0], noise[n, 1])})
+        off = np.array([np.subtract(places(f)[1], (0.5 * n, 0.0)) for n, f in enumerate(frames)])
+        raw = np.sqrt((noise**2).sum(axis=1).mean())
+        assert np.sqrt((off**2).sum(axis=1).mean()) < 0.7 * raw
+
+    def test_the_noise_is_found_out(self):
+        from mcaptrack.transforms.retrack.following import Following
+
+        for noise_m in (0.05, 0.35):
+            rng = np.random.default_rng(2)
+            frames = walk(
+                lambda n, rng=rng, noise_m=noise_m: {
+                    k: (0.5 * n + rng.normal(0, noise_m), 10.0 * k + rng.normal(0, noise_m)) for k in range(8)
+                },
+                120,
+            )
+            run = Following(DEFAULT)
+            for frame in frames:
+                run.tick(frame)
+            assert run.noise_m == pytest.approx(noise_m, rel=0.25)
+
+    @given(seed=st.integers(0, 2**32 - 1), cut=st.integers(5, 55))
+    @settings(max_examples=15)
+    def test_what_is_foretold_knows_nothing_of_the_future(self, seed, cut):
+        """Truncate the log anywhere, or let anything at all come after: forecasts up to there stay to the bit."""
+        rng = np.random.default_rng(seed)
+        start, speed = rng.uniform(-8, 8, (6, 2)), rng.normal(0, 0.4, (6, 2))
+        noise, there = rng.normal(0, 0.15, (60, 6, 2)), rng.random((60, 6)) > 0.25
+
+        def crowd(n):
+            return {k: tuple(start[k] + speed[k] * n + noise[n, k]) for k in range(6) if there[n, k]}
+
+        frames = walk(crowd, 60)
+        other = frames[:cut] + walk(lambda n: {k + 90: (n - 30.0, 3.0 * k) for k in range(4)}, 60)[cut:]
+        for profile in (DEFAULT, replace(DEFAULT, coast_s=3.0), PROFILES["authors"]):
+            runs = [
+                [(online, forecasts) for _, online, forecasts in profile(f)][:cut]
+                for f in (frames, frames[:cut], other)
+            ]
+            for whole, *others in zip(*runs, strict=True):
+                for part in others:
+                    for a, b in zip(whole, part, strict=True):
+                        for name in a.rows.dtype.names:
+                            assert a.rows[name].tobytes() == b.rows[name].tobytes()
