@@ -53,7 +53,7 @@ class Retrack:
     sigma_m: float = option(1.0, "the paper's sigma", least=1e-6)
     noise_m: float = option(0.5, "noise of a seen position, for distance now", least=0.0)
     max_distance: float = option(
-        3.0, "a track and an observation further apart than this (d_min) are not matched", least=0.0
+        2.5, "a track and an observation further apart than this (d_min) are not matched", least=0.0
     )
     certain_distance: float = option(
         0.0, "a pair nearer than this is matched before all others; 0 for never", least=0.0
