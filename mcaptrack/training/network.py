@@ -79,6 +79,12 @@ class _Half(nn.Module):
         self.embed = nn.Linear(2, _LSTM_HIDDEN)
         self.lstm = nn.LSTMCell(_LSTM_HIDDEN, _LSTM_HIDDEN)
 
+    def folded(self) -> tuple[Tensor, ...]:
+        """The weights of an LSTM cell that sees displacements: the linear layer before it folded in, once a batch."""
+        cell, embed = self.lstm, self.embed
+        into, bias = cell.weight_ih @ embed.weight, cell.weight_ih @ embed.bias + cell.bias_ih
+        return into, cell.weight_hh, bias, cell.bias_hh
+
 
 class LstmNetwork(nn.Module):
     """See ``mcaptrack.predictors.lstm``: 67 074 parameters, displacements in and out."""
@@ -101,11 +107,12 @@ class LstmNetwork(nn.Module):
     def forward(self, moves: Tensor) -> Tensor:
         """Past displacements (B, L, 2), the first of them 0, to future ones (B, T, 2)."""
         state = memory = moves.new_zeros(len(moves), _LSTM_HIDDEN)
+        encoder, decoder = self.encoder.folded(), self.decoder.folded()
         for step in range(moves.shape[1]):
-            state, memory = self.encoder.lstm(self.encoder.embed(moves[:, step]), (state, memory))
+            state, memory = torch.lstm_cell(moves[:, step], (state, memory), *encoder)
         memory, move, out = torch.zeros_like(memory), moves[:, -1], []
         for _ in range(self.steps):
-            state, memory = self.decoder.lstm(self.decoder.embed(move), (state, memory))
+            state, memory = torch.lstm_cell(move, (state, memory), *decoder)
             move = self.out(state)
             out.append(move)
         return torch.stack(out, dim=1)
