@@ -84,8 +84,8 @@ def train(
         Literal["auto", "cpu", "cuda", "mps"], common.option("--device", help="What to compute on.")
     ] = "auto",
     threads: Annotated[
-        int | None, common.option("--threads", help="Threads of the processor to use.", show_default="all", min=1)
-    ] = None,
+        int, common.option("--threads", help="Threads of the processor to use; more than one rarely helps.", min=1)
+    ] = 1,
     resume: Annotated[bool, common.option("--resume", help="Go on with the training in the folder.")] = False,
     topic: Annotated[
         str | None,

@@ -13,7 +13,7 @@ from mcaptrack.predictors.forecast import Forecast, Predictor
 from mcaptrack.predictors.linear import LinearPredictor
 from mcaptrack.predictors.own_clock import OnClock
 
-__all__ = ["NAMES", "Forecast", "Predictor", "PredictorName", "check", "make"]
+__all__ = ["NAMES", "Forecast", "Predictor", "PredictorName", "check", "make", "weights_sha256"]
 
 #: A predictor by name: one of NAMES, or a network with other weights, as in ``red:FILE``, ``lstm:FILE``, ``onnx:FILE``.
 PredictorName = str
@@ -43,6 +43,12 @@ def check(name: PredictorName) -> tuple[str, Path | None]:
     if file and not Path(file).is_file():
         raise McaptrackError(f"predictor {name}: there is no file {file}")
     return kind, Path(file) if file else None
+
+
+def weights_sha256(name: PredictorName) -> str:
+    """The digest of the weights of that predictor; "" where nothing was learned. Raises McaptrackError as ``make``."""
+    kind, file = check(name)
+    return (_network(kind, file).weights_sha256 or "") if kind in _WITH_FILE else ""
 
 
 def _network(kind: str, file: Path | None) -> Predictor:

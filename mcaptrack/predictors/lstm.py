@@ -65,28 +65,29 @@ class Lstm:
     def _layers(self) -> tuple[Floats, ...]:
         get = self.weights.get
         hidden = self.weights.tensors["out.weight"].shape[-1] if "out.weight" in self.weights.tensors else 0
-        half = np.repeat([0.5, 0.5, 1.0, 0.5], hidden)  # a sigmoid is a tanh of half the number
+        # A sigmoid is a tanh of half the number. Each gate is a matrix of its own: what belongs together lies together.
+        half = np.array([0.5, 0.5, 1.0, 0.5])[:, None, None]
         folded = {}
         for part in ("encoder", "decoder"):
             into = get(f"{part}.lstm.weight_ih", 4 * hidden, None)
             embed = get(f"{part}.embed.weight", into.shape[1], 2)
             bias = get(f"{part}.lstm.bias_ih", 4 * hidden) + get(f"{part}.lstm.bias_hh", 4 * hidden)
             bias = bias + into @ get(f"{part}.embed.bias", into.shape[1])
-            inside = get(f"{part}.lstm.weight_hh", 4 * hidden, hidden)
-            folded[part] = [(into @ embed) * half[:, None], bias * half, inside * half[:, None]]
+            folded[part] = (into @ embed, bias, get(f"{part}.lstm.weight_hh", 4 * hidden, hidden))
+
+        def by_gate(weights: Floats) -> Floats:
+            """(4 H, N) -> (4, N, H)"""
+            return np.ascontiguousarray(weights.reshape(4, hidden, -1).transpose(0, 2, 1) * half)
+
         out, out_bias = get("out.weight", 2, hidden), get("out.bias", 2)
-        into, bias, inside = folded["decoder"]
-        spread = get("spread", self.steps)
+        first, then = folded["encoder"], folded["decoder"]
         return (
-            *(np.ascontiguousarray(part.T) for part in folded["encoder"]),
-            np.ascontiguousarray(into.T),
-            bias,
-            np.ascontiguousarray(inside.T),
-            np.ascontiguousarray((inside + into @ out).T),
-            bias + into @ out_bias,
+            *(by_gate(part) for part in (*first, *then)),
+            by_gate(then[2] + then[0] @ out),
+            by_gate(then[1] + then[0] @ out_bias),
             np.ascontiguousarray(out.T),
             out_bias,
-            spread,
+            get("spread", self.steps),
         )
 
     def predict(self, xy_m: Floats, valid: Bools) -> Forecast:
@@ -94,13 +95,14 @@ class Lstm:
         into, bias, inside, into_d, bias_d, inside_d, fed, fed_bias, out, out_bias, spread = self._layers
         filled, _ = fill_holes(*last_positions(xy_m, valid, PAST))
         moves = np.diff(filled, axis=1, prepend=filled[:, :1])  # the first is 0, as the paper's program has it
-        batch = len(moves)
-        state = memory = np.zeros((batch, inside.shape[0]))
+        batch, hidden = len(moves), inside.shape[-1]
+        state: Floats = np.zeros((batch, hidden))
+        memory = np.zeros((batch, hidden))
         for step in range(moves.shape[1]):
             state, memory = _cell(moves[:, step] @ into + state @ inside + bias, memory)
         memory = np.zeros_like(memory)
         gates = moves[:, -1] @ into_d + state @ inside_d + bias_d
-        states = np.empty((batch, self.steps, inside.shape[0]))
+        states = np.empty((batch, self.steps, hidden))
         for step in range(self.steps):
             state, memory = _cell(gates, memory)
             states[:, step] = state
@@ -111,9 +113,11 @@ class Lstm:
 
 
 def _cell(gates: Floats, memory: Floats) -> tuple[Floats, Floats]:
-    """One step of an LSTM (Hochreiter and Schmidhuber 1997): state and memory (B, H) from gates (B, 4 H) i, f, g, o."""
-    hidden = memory.shape[1]
+    """One step of an LSTM (Hochreiter and Schmidhuber 1997): state and memory (B, H) from gates i, f, g, o (4, B, H)."""
     gates = np.tanh(gates)
-    enter, keep, leave = (0.5 + 0.5 * gates[:, k * hidden : (k + 1) * hidden] for k in (0, 1, 3))
-    memory = keep * memory + enter * gates[:, 2 * hidden : 3 * hidden]
+    new = gates[2].copy()
+    gates += 1.0
+    gates *= 0.5
+    enter, keep, _, leave = gates
+    memory = keep * memory + enter * new
     return leave * np.tanh(memory), memory

@@ -34,6 +34,8 @@ OUTPUTS: Final = 5
 WIDTH: Final = 2
 #: At this distance of the linear forecast's end, what depends on the direction counts half.
 _HALFWAY_M: Final = 0.3
+#: Less than anybody goes.
+_NOWHERE_M: Final = 1e-12
 #: The most that errors along and across can hang together.
 MOST_CORRELATED: Final = 0.95
 
@@ -63,18 +65,19 @@ def prepare(xy_m: Floats, valid: Bools, base_weights: Floats, base_spread: Float
     batch = len(valid)
     filled, known = fill_holes(xy_m, valid)
     now = filled[:, -1:]
-    ahead = base_weights[known] @ (filled - now)
-    end = ahead[:, -1]
-    far = np.hypot(end[:, 0], end[:, 1])
-    way = np.where(far[:, None] > 1e-9, end / np.maximum(far, 1e-9)[:, None], [1.0, 0.0])
+    place = filled - now
+    ahead = base_weights[known] @ place
+    east, north = ahead[:, -1, 0] + _NOWHERE_M, ahead[:, -1, 1]  # who goes nowhere goes east
+    far = np.hypot(east, north)
     turn = np.empty((batch, 2, 2))
-    turn[:, 0] = way
-    turn[:, 1, 0], turn[:, 1, 1] = -way[:, 1], way[:, 0]
-    place = (filled - now) @ turn.transpose(0, 2, 1)
-    features = np.empty((batch, PAST, FEATURES // PAIR))
+    turn[:, 0, 0] = turn[:, 1, 1] = east / far
+    turn[:, 0, 1] = north / far
+    turn[:, 1, 0] = -turn[:, 0, 1]
+    place = place @ turn.transpose(0, 2, 1)
+    features = np.zeros((batch, PAST, FEATURES // PAIR))
     features[:, :, :2] = place
-    features[:, 0, 2:4] = 0.0
-    features[:, 1:, 2:4] = 2 * (place[:, 1:] - place[:, :-1])
+    np.subtract(place[:, 1:], place[:, :-1], out=features[:, 1:, 2:4])
+    features[:, :, 2:4] *= 2.0
     features[:, :, 4] = valid
     pairs = PAST // PAIR
     whole = np.empty((batch, pairs, FEATURES))
@@ -117,19 +120,20 @@ class Red:
         hidden = self.weights.tensors["gru.weight_hh"].shape[-1] if "gru.weight_hh" in self.weights.tensors else 0
         into, inside = get("gru.weight_ih", 3 * hidden, FEATURES).T, get("gru.weight_hh", 3 * hidden, hidden).T
         bias, bias_inside = get("gru.bias_ih", 3 * hidden).copy(), get("gru.bias_hh", 3 * hidden)
-        # A sigmoid is a tanh of half the number: one call for both gates. All biases but the candidate's add up.
-        by_output = np.arange(steps * OUTPUTS).reshape(steps, OUTPUTS).T.ravel()
-        half = np.concatenate([np.full(2 * hidden, 0.5), np.ones(hidden)])
+        # A sigmoid is a tanh of half the number: one call for both gates. All biases but the candidate's add up. Each
+        # gate is a matrix of its own, so that what belongs together lies together: that alone makes it twice as fast.
+        half = np.array([0.5, 0.5, 1.0])[:, None, None]
         bias[: 2 * hidden] += bias_inside[: 2 * hidden]
+        by_output = np.arange(steps * OUTPUTS).reshape(steps, OUTPUTS).T
         return (
-            np.ascontiguousarray(into * half),
-            bias * half,
-            np.ascontiguousarray(inside * half),
+            np.ascontiguousarray(into.reshape(FEATURES, 3, hidden).transpose(1, 0, 2) * half),
+            bias.reshape(3, 1, hidden) * half,
+            np.ascontiguousarray(inside.reshape(hidden, 3, hidden).transpose(1, 0, 2) * half),
             bias_inside[2 * hidden :].copy(),
             np.ascontiguousarray(get("dense.weight", None, hidden).T),
             get("dense.bias", None),
-            np.ascontiguousarray(get("head.weight", steps * OUTPUTS, None)[by_output].T),
-            get("head.bias", steps * OUTPUTS)[by_output],
+            np.ascontiguousarray(get("head.weight", steps * OUTPUTS, None).T[:, by_output].transpose(1, 0, 2)),
+            get("head.bias", steps * OUTPUTS)[by_output][:, None],
             get("base.weights", PAST + 1, steps, PAST),
             get("base.spread", PAST + 1, steps),
         )
@@ -138,21 +142,26 @@ class Red:
         """The gated recurrent unit (Cho et al. 2014): (B, K, FEATURES) -> (B, H)."""
         into, bias, inside, bias_inside, *_ = self._layers
         batch, pairs, _ = features.shape
+        given = features.transpose(1, 0, 2).reshape(-1, FEATURES) @ into
+        given += bias
         hidden = len(bias_inside)
-        given = (features.reshape(-1, FEATURES) @ into + bias).reshape(batch, pairs, 3 * hidden)
-        state = np.zeros((batch, hidden))
+        given = given.reshape(3, pairs, batch, hidden)
+        state: Floats = np.zeros((batch, hidden))
         everybody: Bools = np.asarray(started.all(axis=0))
         for pair in range(pairs):
-            old = state @ inside if pair else np.zeros((batch, 3 * hidden))
-            gates = np.tanh(given[:, pair, : 2 * hidden] + old[:, : 2 * hidden])
+            old = state @ inside if pair else np.zeros((3, batch, hidden))
+            gates = given[:2, pair] + old[:2]
+            np.tanh(gates, out=gates)
             gates += 1.0
             gates *= 0.5
-            old = old[:, 2 * hidden :]
-            old += bias_inside
-            old *= gates[:, :hidden]
-            old += given[:, pair, 2 * hidden :]
-            candidate = np.tanh(old)
-            new = candidate + gates[:, hidden:] * (state - candidate)
+            candidate = old[2]
+            candidate += bias_inside
+            candidate *= gates[0]
+            candidate += given[2, pair]
+            np.tanh(candidate, out=candidate)
+            new = state - candidate
+            new *= gates[1]
+            new += candidate
             state = new if everybody[pair] else np.where(started[:, pair, None], new, state)
         return state
 
@@ -161,25 +170,18 @@ class Red:
         *_, dense, dense_bias, head, head_bias, base_weights, base_spread = self._layers
         inputs = prepare(xy_m, valid, base_weights, base_spread)
         state = self._encode(inputs.features, inputs.started)
-        out = np.tanh(state @ dense + dense_bias) @ head + head_bias
-        said = out.reshape(
-            len(out), OUTPUTS, base_spread.shape[1]
-        )  # the head is stored by output, so that these lie together
-        counts = np.empty((len(out), OUTPUTS, 1))
-        counts[:] = inputs.gate[:, None, None]
-        counts[:, WIDTH] = 1.0
-        said *= counts
-        off = said[:, :WIDTH] * inputs.spread[:, None]
-        mean = inputs.mean + off.transpose(0, 2, 1) @ inputs.turn
-        size = np.exp(said[:, WIDTH : WIDTH + 2])
-        size[:, 0] *= inputs.spread
-        along, across = size[:, 0] * size[:, 1], size[:, 0] / size[:, 1]
-        parts = np.empty((len(out), along.shape[1], 3))  # along the way, across, and both
+        said = np.tanh(state @ dense + dense_bias) @ head + head_bias  # (OUTPUTS, B, T)
+        gate, spread = inputs.gate[:, None], inputs.spread
+        off = said[:WIDTH] * (gate * spread)
+        mean = inputs.mean + off.transpose(1, 2, 0) @ inputs.turn
+        width, longer = spread * np.exp(said[WIDTH]), np.exp(gate * said[3])
+        along, across = width * longer, width / longer
+        parts = np.empty((*along.shape, 3))  # along the way, across, and both
         parts[:, :, 0] = along * along
         parts[:, :, 1] = across * across
-        parts[:, :, 2] = MOST_CORRELATED * np.tanh(said[:, 4]) * along * across
+        parts[:, :, 2] = MOST_CORRELATED * np.tanh(gate * said[4]) * along * across
         cos, sin = inputs.turn[:, 0, 0], inputs.turn[:, 0, 1]
-        turned = np.empty((len(out), 3, 4))  # parts to xx, xy, yx, yy
+        turned = np.empty((len(mean), 3, 4))  # parts to xx, xy, yx, yy
         both = cos * sin
         turned[:, 0, 0] = turned[:, 1, 3] = cos * cos
         turned[:, 0, 3] = turned[:, 1, 0] = sin * sin

@@ -14,7 +14,7 @@ import numpy as np
 
 from mcaptrack.clock import NS_PER_S
 from mcaptrack.history import Histories
-from mcaptrack.predictors import Predictor, PredictorName, check, make
+from mcaptrack.predictors import PredictorName, check, make
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame, Schema
 from mcaptrack.schema.predictions import forecast_to_rows
 from mcaptrack.transforms.protocol import check_options, context, option
@@ -43,16 +43,8 @@ class Predict:
         check_options(self)
         check(self.predictor)
 
-    def _predictor(self) -> Predictor:
-        return make(self.predictor, max(1, round(self.horizon_s * self.rate_hz)), 1 / self.rate_hz)
-
-    @property
-    def weights_sha256(self) -> str | None:
-        """The digest of learned weights, for the provenance of what they foretold."""
-        return self._predictor().weights_sha256
-
     def __call__(self, frames: Iterable[Frame]) -> Iterator[tuple[Frame, ...]]:
-        predictor = self._predictor()
+        predictor = make(self.predictor, max(1, round(self.horizon_s * self.rate_hz)), 1 / self.rate_hz)
         histories = Histories(max(predictor.past, self.min_history))
         last_ns = None
         for frame in frames:
