@@ -173,6 +173,9 @@ class TestSources:
         with log.read(path) as opened:
             export(opened, tmp_path / "tables")
         self.check(self.read(tmp_path / "tables"))
+        with log.read(path) as opened:
+            export(opened, path.with_suffix(".tables"))
+        self.check(self.read(path.parent))  # what is told twice counts once
         with pytest.raises(McaptrackError, match=r"t\.mcap has none of /camera/tracks"):
             self.read(path, topic="/camera/tracks")
 

@@ -113,7 +113,7 @@ class Lstm:
 
 
 def _cell(gates: Floats, memory: Floats) -> tuple[Floats, Floats]:
-    """One step of an LSTM (Hochreiter and Schmidhuber 1997): state and memory (B, H) from gates i, f, g, o (4, B, H)."""
+    """One step of an LSTM (Hochreiter, Schmidhuber 1997): state and memory (B, H) from gates i, f, g, o (4, B, H)."""
     gates = np.tanh(gates)
     new = gates[2].copy()
     gates += 1.0

@@ -319,9 +319,9 @@ class _Run:
             }
 
     def _fingerprint(self) -> str:
-        """What has to be the same for a training to go on: recipe, windows, device."""
+        """What has to be the same for a training to go on: recipe (but for its length), windows, device."""
         import hashlib
 
         total = hashlib.sha256(self._training.past.tobytes() + self._training.future.tobytes()).hexdigest()
         recipe = asdict(self._recipe)
-        return json.dumps([{k: v for k, v in recipe.items() if k != "patience"}, total, self._device], sort_keys=True)
+        return json.dumps([{k: v for k, v in recipe.items() if k not in ("patience", "epochs")}, total, self._device], sort_keys=True)

@@ -72,8 +72,10 @@ def _files(path: Path) -> list[Path]:
         return [path]
     kinds = (".txt", ".parquet", ".mcap")
     found = sorted(file for file in path.rglob("*") if file.suffix.lower() in kinds and file.is_file())
-    if any(file.suffix == ".parquet" for file in found):  # of a log's tables those of tracks
-        found = [file for file in found if file.suffix != ".parquet" or tables.holds_tracks(file)]
+    # Of tables those of tracks; and not those that tell again what the log beside them tells.
+    logs = {file.with_suffix(".tables") for file in found if file.suffix.lower() == ".mcap"}
+    found = [file for file in found if not logs & set(file.parents)]
+    found = [file for file in found if file.suffix.lower() != ".parquet" or tables.holds_tracks(file)]
     if not found:
         raise McaptrackError(f"{path} has no {', '.join(kinds)} to train on")
     return found

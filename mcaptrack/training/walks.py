@@ -25,7 +25,7 @@ _SETTLE_S: Final = 8.0
 _SCENES, _PEOPLE = 48, 24
 _WALKS_EACH: Final = 5
 #: The share of scenes where people are more restless than elsewhere, up to seven times.
-_RESTLESS: Final = 0.15
+_RESTLESS: Final = 0.1
 #: Shares of people by pace: those who mostly stand, who stroll, who walk, and who run or ride.
 _PACES: Final = (0.24, 0.12, 0.61, 0.03)
 
@@ -154,18 +154,15 @@ class _Crowd:
 
     def _room(self) -> Floats:
         """Making way: away from those who are near, and more from those ahead than from those behind."""
-        off = self.place[:, :, None] - self.place[:, None]
-        near = np.sqrt((off**2).sum(-1)) + 1e-6
-        strength = 2.0 * np.exp((0.5 - near) / 0.35)
+        east, north = (self.place[:, :, None, axis] - self.place[:, None, :, axis] for axis in (0, 1))
+        near = np.sqrt(east**2 + north**2) + 1e-6
+        strength = np.minimum(2.0 * np.exp((0.5 - near) / 0.35), 3.0)
         strength[:, np.arange(_PEOPLE), np.arange(_PEOPLE)] = 0
-        strength = np.minimum(strength, 3.0)
-        together = self.leader[:, :, None] == self.leader[:, None]
-        strength = np.where(together, 0.3 * strength, strength)
-        pace = np.hypot(self.speed[..., 0], self.speed[..., 1])
-        ahead = self.speed / np.maximum(pace, 0.3)[..., None]
-        facing = -(off * ahead[:, :, None]).sum(-1) / near
-        strength *= 0.4 + 0.6 * (1 + facing) / 2
-        return np.asarray((strength[..., None] * off / near[..., None]).sum(2))
+        strength *= np.where(self.leader[:, :, None] == self.leader[:, None], 0.3, 1.0)
+        ahead = self.speed / np.maximum(np.hypot(self.speed[..., 0], self.speed[..., 1]), 0.3)[..., None]
+        facing = -(east * ahead[:, :, None, 0] + north * ahead[:, :, None, 1]) / near
+        strength *= (0.4 + 0.3 * (1 + facing)) / near
+        return np.stack([np.einsum("smn,smn->sm", strength, off) for off in (east, north)], axis=-1)
 
 
 def walks(count: int, steps: int, step_s: float, seed: int) -> tuple[Floats, NDArray[np.int64]]:
