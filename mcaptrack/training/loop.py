@@ -324,4 +324,6 @@ class _Run:
 
         total = hashlib.sha256(self._training.past.tobytes() + self._training.future.tobytes()).hexdigest()
         recipe = asdict(self._recipe)
-        return json.dumps([{k: v for k, v in recipe.items() if k not in ("patience", "epochs")}, total, self._device], sort_keys=True)
+        return json.dumps(
+            [{k: v for k, v in recipe.items() if k not in ("patience", "epochs")}, total, self._device], sort_keys=True
+        )
