@@ -259,12 +259,14 @@ class _Run:
         """Calibrate the kept weights and write them, with their card.
 
         The covariance of every step is widened or narrowed until the 95 % ellipse holds 95 % of the validation windows,
-        half of them with noise. For ``lstm``, which says none, it is the Kalman filter's that is.
+        as they are or with noise, whichever takes less. For ``lstm``, which says none, it is the Kalman filter's.
         """
-        parts = Windows.join([validation, _noisy(validation)])
-        forecast = self._predictor(self._best).predict(parts.past, parts.known)
-        away = mahalanobis_squared(forecast.mean - parts.future, forecast.cov)
-        ratio = np.quantile(away, 0.95, axis=0) / (-2 * np.log(0.05))
+        ratios = []
+        for part in (validation, _noisy(validation)):
+            forecast = self._predictor(self._best).predict(part.past, part.known)
+            away = mahalanobis_squared(forecast.mean - part.future, forecast.cov)
+            ratios.append(np.quantile(away, 0.95, axis=0) / (-2 * np.log(0.05)))
+        ratio = np.minimum(*ratios)
         calibrated = dict(self._best)
         if self._recipe.network == "lstm":
             calibrated["spread"] = calibrated["spread"] * ratio

@@ -131,7 +131,7 @@ class _Crowd:
         rng, shape = self.rng, self.rest_s.shape
         ends = (self.rest_s > 0) & (self.rest_s <= dt)
         self.rest_s = np.maximum(self.rest_s - dt, 0.0)
-        stops = (self.rest_s == 0) & ~ends & (rng.random(shape) < dt / np.where(self.stands, 8.0, 200.0))
+        stops = (self.rest_s == 0) & ~ends & (rng.random(shape) < dt / np.where(self.stands, 8.0, 250.0))
         pause = np.where(self.stands, rng.exponential(45, shape), 4 * np.exp(rng.normal(0, 0.9, shape)))
         self.rest_s = np.where(stops, pause, self.rest_s)
         self._new_goal(ends & (rng.random(shape) < 0.5), spread=1.2)
@@ -140,7 +140,7 @@ class _Crowd:
         """Who is there goes somewhere else, mostly ahead; now and then people change their mind."""
         away = np.hypot(*np.moveaxis(self.goal - self.place, -1, 0))
         shape = away.shape
-        self._new_goal((away < 1.0) | (self.rng.random(shape) < self.restless * _FINE_S / 90), spread=0.4)
+        self._new_goal((away < 1.0) | (self.rng.random(shape) < self.restless * _FINE_S / 140), spread=0.35)
 
     def _new_goal(self, who: Bools, spread: float) -> None:
         rng, shape = self.rng, who.shape
