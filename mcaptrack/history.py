@@ -46,12 +46,24 @@ class Histories:
         return past, np.isfinite(past[:, :, 0])
 
 
+def last_positions(xy_m: Floats, valid: Bools, length: int) -> tuple[Floats, Bools]:
+    """The last ``length`` of positions (B, L, 2) and of what is known of them; not known before the first."""
+    xy_m, valid = xy_m[:, -length:], valid[:, -length:]
+    batch, short = len(valid), length - valid.shape[1]
+    if short == 0:
+        return xy_m, valid
+    nowhere, unknown = np.full((batch, short, 2), np.nan), np.zeros((batch, short), bool)
+    return np.concatenate([nowhere, xy_m], axis=1), np.concatenate([unknown, valid], axis=1)
+
+
 def fill_holes(xy_m: Floats, valid: Bools) -> tuple[Floats, Ints]:
     """Fill holes between known positions (B, L, 2) linearly; returns them and how many there are up to now (B,).
 
     What lies before the first known position is set to it. The last position has to be known.
     """
     batch, length = valid.shape
+    if valid.all():
+        return xy_m, np.full(batch, length)
     steps = np.arange(length)
     before = np.maximum.accumulate(np.where(valid, steps, -1), axis=1)
     after = np.minimum.accumulate(np.where(valid, steps, length)[:, ::-1], axis=1)[:, ::-1]

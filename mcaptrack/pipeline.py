@@ -21,6 +21,7 @@ from mcaptrack.carry import carry
 from mcaptrack.clock import NS_PER_S
 from mcaptrack.errors import McaptrackError
 from mcaptrack.plane import GroundPlane, Planes, assumed_plane
+from mcaptrack.predictors import weights_sha256
 from mcaptrack.provenance import CLOCK, Provenance, digest
 from mcaptrack.schema import DETECTIONS, GROUND_PLANE, PREDICTIONS, SCHEMAS, TRACKS, VIDEO, Frame, Schema
 from mcaptrack.schema.ground import plane_to_rows, rows_to_plane
@@ -335,7 +336,7 @@ def run(
         for result in transform(frames):
             for frame, channel in zip(result, outputs, strict=True):
                 channel.append(frame)
-        weights = getattr(transform, "weights_sha256", "") or ""
+        weights = weights_sha256(transform.predictor) if hasattr(transform, "predictor") else ""
         for (topic, schema), channel in zip(job.outputs().items(), outputs, strict=True):
             if topic not in job.kept():
                 continue

@@ -251,6 +251,8 @@ class TestEvaluate:
             "AADE_m",
             "false_forecasts_per_frame",
             "consistency_m",
+            "coverage_50",
+            "coverage_90",
             "coverage_95",
         }
         assert wanted <= set(displaced[0]["displacement"])

@@ -98,5 +98,6 @@ def test_the_wheel_carries_the_schemas(tmp_path):
     (artifact,) = WheelBuilder(str(ROOT)).build(directory=str(tmp_path), versions=["standard"])
     names = set(zipfile.ZipFile(artifact).namelist())
     assert {f"mcaptrack/schemas/{path.name}" for path in (ROOT / "schemas").glob("*.proto")} <= names
+    assert {"mcaptrack/predictors/trained/red.safetensors", "mcaptrack/predictors/trained/lstm.safetensors"} <= names
     assert "mcaptrack/py.typed" in names
     assert not any(name.startswith(("tests/", "tools/")) for name in names)

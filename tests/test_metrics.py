@@ -272,7 +272,8 @@ class TestDisplacement:
         assert found["FDE_m"] == pytest.approx(2.0)
         assert found["ADE_squared_m2"] == pytest.approx(3.0)
         assert found["recall"] == 1.0
-        assert found["coverage_95"] == pytest.approx(1.0)  # 2 m are within 2.45 sigma
+        # 1 m is within 1.18 sigma and 2 m are not; 2 m are within 2.15 and 2.45 sigma.
+        assert [found[f"coverage_{level}"] for level in (50, 90, 95)] == pytest.approx([1 / 3, 1, 1])
         assert result.d_obs_m2.tolist() == pytest.approx([0.01])
         assert found["false_forecasts_per_frame"] == 0.0
 

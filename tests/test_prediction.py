@@ -11,13 +11,26 @@ from hypothesis.extra import numpy as hnp
 from mcaptrack.errors import McaptrackError
 from mcaptrack.plane import GroundPlane
 from mcaptrack.predictors import make
-from mcaptrack.predictors.linear import DRIFT_M2_PER_S3, POSITION_NOISE_M, SPEED_M_PER_S, linear_variance
+from mcaptrack.predictors.linear import (
+    DRIFT_M2_PER_S3,
+    LEAST_SURPRISE,
+    MODEL_COUNT,
+    MOST_SURPRISE,
+    POSITION_NOISE_M,
+    SPEED_M_PER_S,
+    WIDENED,
+    LinearPredictor,
+    linear_variance,
+)
 from mcaptrack.schema import TRACKS, Frame
 from mcaptrack.transforms import Predict, Sample
 from tests.worlds import ids, ns, places, tracks_at, walk
 
-NAMES = ["cv", "holt-cv", "kalman"]
-every_predictor = pytest.mark.parametrize("name", NAMES)
+NETWORKS = ["red", "lstm"]
+LINEAR = ["cv", "holt-cv", "kalman"]
+every_linear = pytest.mark.parametrize("name", LINEAR)
+every_predictor = pytest.mark.parametrize("name", [*LINEAR, *NETWORKS])
+SEEDS = st.integers(0, 2**32 - 1)
 PASTS = hnp.arrays(float, st.tuples(st.integers(1, 4), st.integers(1, 10), st.just(2)), elements=st.floats(-50, 50))
 
 
@@ -95,16 +108,32 @@ class TestPredictors:
         predictor, known = make(name, 12, 0.4), np.ones(past.shape[:2], bool)
         here, there = predictor.predict(past, known), predictor.predict(past + shift, known)
         np.testing.assert_allclose(there.mean, here.mean + shift, atol=1e-6)
-        np.testing.assert_allclose(there.cov, here.cov)
+        np.testing.assert_allclose(there.cov, here.cov, rtol=1e-6, atol=1e-6)
 
-    @every_predictor
+    @pytest.mark.parametrize("name", [*LINEAR, "red"])
     @given(past=PASTS, angle=st.floats(0, 7))
     def test_turned_people_have_turned_futures(self, name, past, angle):
         turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
         predictor, known = make(name, 12, 0.4), np.ones(past.shape[:2], bool)
-        np.testing.assert_allclose(
-            predictor.predict(past @ turn.T, known).mean, predictor.predict(past, known).mean @ turn.T, atol=1e-6
-        )
+        turned, straight = predictor.predict(past @ turn.T, known), predictor.predict(past, known)
+        np.testing.assert_allclose(turned.mean, straight.mean @ turn.T, atol=1e-6)
+        np.testing.assert_allclose(turned.cov, turn @ straight.cov @ turn.T, rtol=1e-6, atol=1e-6)
+
+    @every_predictor
+    @given(past=PASTS, seed=SEEDS)
+    def test_what_is_not_known_does_not_matter_and_ellipses_are_ellipses(self, name, past, seed):
+        rng, predictor = np.random.default_rng(seed), make(name, 12, 0.4)
+        known = rng.random(past.shape[:2]) < 0.6
+        known[:, -1] = True
+        forecast = predictor.predict(np.where(known[..., None], past, np.nan), known)
+        other = predictor.predict(np.where(known[..., None], past, rng.normal(size=past.shape)), known)
+        np.testing.assert_array_equal(other.mean, forecast.mean)
+        np.testing.assert_array_equal(other.cov, forecast.cov)
+        assert (np.linalg.eigvalsh(forecast.cov) > 0).all()
+        np.testing.assert_array_equal(forecast.cov, forecast.cov.transpose(0, 1, 3, 2))
+        more = np.concatenate([rng.normal(size=(len(past), 12, 2)), past], axis=1)
+        padded = np.concatenate([np.zeros((len(past), 12), bool), known], axis=1)
+        np.testing.assert_allclose(predictor.predict(more, padded).mean, forecast.mean, atol=1e-9)
 
     @every_predictor
     @given(past=PASTS)
@@ -114,9 +143,9 @@ class TestPredictors:
         for number in range(len(past)):
             alone = predictor.predict(past[number : number + 1], known[number : number + 1])
             np.testing.assert_allclose(whole.mean[number], alone.mean[0], atol=1e-9)
-            np.testing.assert_allclose(whole.cov[number], alone.cov[0])
+            np.testing.assert_allclose(whole.cov[number], alone.cov[0], atol=1e-9)
 
-    @every_predictor
+    @every_linear
     def test_straight_lines_go_on(self, name):
         steps = np.arange(8)[:, None] * [0.5, -0.2]
         forecast = make(name, 12, 0.4).predict(steps[None], np.ones((1, 8), bool))
@@ -125,7 +154,7 @@ class TestPredictors:
         # The Kalman filter starts from "at rest, perhaps" and never quite forgets it.
         np.testing.assert_allclose(forecast.mean[0], wanted, rtol=0.02 if name == "kalman" else 1e-9)
 
-    @every_predictor
+    @every_linear
     def test_one_known_position_stays_and_is_uncertain(self, name):
         past = np.array([[[np.nan, np.nan], [3.0, 4.0]]])
         forecast = make(name, 12, 0.4).predict(past, np.array([[False, True]]))
@@ -133,6 +162,12 @@ class TestPredictors:
         spread = np.sqrt(forecast.cov[0, :, 0, 0])
         assert (np.diff(spread) > 0).all()
         assert spread[-1] > 4.8 * SPEED_M_PER_S
+
+    @every_predictor
+    def test_nobody_has_no_future(self, name):
+        forecast = make(name, 12, 0.4).predict(np.empty((0, 8, 2)), np.empty((0, 8), bool))
+        assert forecast.mean.shape == (0, 12, 2)
+        assert forecast.cov.shape == (0, 12, 2, 2)
 
     def test_the_mean_of_three_steps_by_hand(self):
         past = np.array([[[9.0, 0], [0, 0], [1, 0], [3, 0], [6, 3]]])
@@ -151,17 +186,20 @@ class TestPredictors:
         move = np.array([[1, step], [0, 1]])
         noise = DRIFT_M2_PER_S3 * np.array([[step**3 / 3, step**2 / 2], [step**2 / 2, step]])
         state, cov = np.array([seen[0], 0.0]), np.diag([POSITION_NOISE_M**2, SPEED_M_PER_S**2])
+        surprise = 0.0
         for value in seen[1:]:
             state, cov = move @ state, move @ cov @ move.T + noise
             gain = cov[:, 0] / (cov[0, 0] + POSITION_NOISE_M**2)
+            surprise += 2 * (value - state[0]) ** 2 / (cov[0, 0] + POSITION_NOISE_M**2)  # along x and along y
             state, cov = state + gain * (value - state[0]), cov - np.outer(gain, cov[0])
         forecast = make("kalman", 12, step).predict(np.stack([seen, seen], -1)[None], np.ones((1, 8), bool))
+        scale = WIDENED * np.clip((MODEL_COUNT + surprise) / (MODEL_COUNT + 14), LEAST_SURPRISE, MOST_SURPRISE)
         for ahead in range(1, 13):
             state, cov = move @ state, move @ cov @ move.T + noise
             np.testing.assert_allclose(forecast.mean[0, ahead - 1], state[0], rtol=1e-9)
-            np.testing.assert_allclose(forecast.cov[0, ahead - 1], cov[0, 0] * np.eye(2), rtol=1e-9)
+            np.testing.assert_allclose(forecast.cov[0, ahead - 1], scale * cov[0, 0] * np.eye(2), rtol=1e-9)
 
-    @every_predictor
+    @every_linear
     @pytest.mark.parametrize("known", [1, 2, 4, 8])
     def test_uncertainty_is_what_walkers_show(self, name, known):
         """Walkers of the stated kind, simulated: the errors spread as the forecast says."""
@@ -178,7 +216,20 @@ class TestPredictors:
         seen = path[:, :known] + rng.normal(0, POSITION_NOISE_M, (people, known))
         forecast = make(name, 12, step).predict(np.stack([seen, seen], -1), np.ones((people, known), bool))
         errors = forecast.mean[:, :, 0] - path[:, known:]
-        np.testing.assert_allclose(errors.std(axis=0), np.sqrt(forecast.cov[0, :, 0, 0]), rtol=0.04)
+        predictor = LinearPredictor(name, 12, step)
+        said = np.sqrt(predictor.table[1][min(known, predictor.past)])
+        np.testing.assert_allclose(errors.std(axis=0), said, rtol=0.04)
+
+    @every_linear
+    def test_who_has_surprised_is_more_uncertain_and_nobody_is_beyond_bounds(self, name):
+        """The same mean; a smooth past, a shaky one, one that leaps about."""
+        rng, line = np.random.default_rng(4), np.arange(8)[:, None] * [0.5, 0.0]
+        pasts = np.stack([line, line + rng.normal(0, 0.25, (8, 2)), line + rng.normal(0, 5, (8, 2))])
+        predictor = make(name, 12, 0.4)
+        scale = predictor.predict(pasts, np.ones((3, 8), bool)).cov[:, 0, 0, 0] / predictor.table[1][predictor.past, 0]
+        assert scale[0] == pytest.approx(WIDENED * LEAST_SURPRISE)
+        assert scale[0] < scale[1] < scale[2]
+        assert scale[2] == pytest.approx(WIDENED * MOST_SURPRISE)
 
     def test_variance_by_hand_for_standing_still(self):
         """One position, weight 1, foretold 1 s ahead: noise, speed and drift add up."""

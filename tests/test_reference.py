@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from mcaptrack import log
 from mcaptrack.log import records
+from mcaptrack.metrics.calibration import forecast_scores
+from mcaptrack.predictors import make
+from mcaptrack.training.recipe import RECIPES
+from mcaptrack.training.sources import SourceOptions, read_scenes, windows_of
+from mcaptrack.training.windows import ar1
 from tests.test_cli import done
 
 
@@ -111,3 +118,17 @@ def test_what_others_recorded_is_checked_without_a_complaint_and_recovered_whole
             assert ours.index.channels == theirs.index.channels
             for topic in theirs.channels:
                 assert list(theirs.messages(topic)) == list(ours.messages(topic)), path
+
+
+@pytest.mark.parametrize(("past", "noise_m", "most_m"), [(4, 0.0, 0.61), (8, 0.2, 0.90)])
+def test_weights_that_never_saw_a_recording_foretell_one(data, past, noise_m, most_m):
+    """Scenes of Stanford Drone: errors in metres, what the ellipses hold, and constant velocity beside it."""
+    recipe = replace(RECIPES["red"], past=past, least=past)
+    windows = windows_of(read_scenes([data / "sdd" / "val"], SourceOptions(), recipe.step_s), recipe)
+    seen = windows.past + noise_m * ar1(np.random.default_rng(3), *windows.known.shape)
+    red, cv = (
+        forecast_scores(*make(name, 12, 0.4).predict(seen, windows.known), windows.future) for name in ("red", "cv")
+    )
+    assert red["ADE_m"] < most_m
+    assert red["ADE_m"] < cv["ADE_m"]
+    assert 0.90 < red["coverage_95"] < 0.97

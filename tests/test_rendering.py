@@ -98,7 +98,7 @@ def test_pictures_of_every_kind_are_read_in_colour():
 def test_a_log_becomes_a_video_of_its_pictures(finished, tmp_path):  # noqa: F811
     out, _ = done("render", finished, "-o", tmp_path / "all.mp4", "--json")
     (result,) = json.loads(out)["results"]
-    assert result["views"] == ["/camera/retracks/view/image", "/camera/retracks/predictions/view/image"]
+    assert result["views"] == ["/camera/retracks/full/view/image", "/camera/retracks/predictions/view/image"]
     found = clip(tmp_path / "all.mp4")
     assert len(found) == result["pictures"]
     done(

@@ -18,6 +18,7 @@ from mcaptrack.cli.ingest import ingest
 from mcaptrack.cli.render import render
 from mcaptrack.cli.show import export, info
 from mcaptrack.cli.stages import add_stages
+from mcaptrack.cli.train import train
 from mcaptrack.cli.tune import tune
 from mcaptrack.cli.view import view
 
@@ -59,4 +60,5 @@ register(app, "render", render)
 register(app, "check", check)
 register(app, "recover", recover)
 register(app, "drop", drop)
+register(app, "train", train)
 register(app, "demo", demo)

@@ -24,6 +24,8 @@ _FORECAST_COLUMNS: Final = {
     "recall": "recall",
     "false_forecasts_per_frame": "false",
     "consistency_m": "drift m",
+    "coverage_50": "in 50 %",
+    "coverage_90": "in 90 %",
     "coverage_95": "in 95 %",
 }
 

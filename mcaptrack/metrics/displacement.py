@@ -19,14 +19,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack.match import solve
+from mcaptrack.metrics.calibration import LEVELS, mahalanobis_squared
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 #: The threshold of association at which single numbers are given, in m^2 (the paper's tau).
 TAU_M2: Final = 2.0
-#: The 95 % quantile of chi^2 with 2 degrees of freedom.
-_CHI2_95: Final = -2 * float(np.log(0.05))
+#: The quantiles of chi^2 with 2 degrees of freedom that belong to the levels of calibration.
+_CHI2: Final = -2 * np.log(1 - np.array(LEVELS))
 
 
 @dataclass(frozen=True)
@@ -71,7 +72,7 @@ class Displacement:
     ade_m: Floats
     fde_m: Floats
     ade_squared_m2: Floats
-    covered: Floats  # share of the future steps inside the 95 % ellipse; NaN without covariance
+    covered: Floats  # (P, 3): share of the future steps inside the 50, 90 and 95 % ellipse; NaN without covariance
     people: int
     false_forecasts: int
     frames: int
@@ -105,7 +106,7 @@ class Displacement:
             "AADE_m": mean(running[: int(kept.sum())]),
             "false_forecasts_per_frame": self.false_forecasts / self.frames if self.frames else None,
             "consistency_m": mean(self.drift_m),
-            "coverage_95": mean(self.covered[kept]),
+            **{f"coverage_{100 * p:g}": mean(self.covered[kept, k]) for k, p in enumerate(LEVELS)},
         }
 
 
@@ -164,7 +165,7 @@ def displacement(
         rows, columns = rows[kept], columns[kept]
         off = forecasts.mean_m[at[columns]] - future_true[subject[rows]]
         pairs.append((d_obs[rows, columns], *_errors(off, forecasts.cov_m2[at[columns]])))
-    pairs.append(tuple(np.empty(0) for _ in range(5)))
+    pairs.append((*(np.empty(0) for _ in range(4)), np.empty((0, len(LEVELS)))))
     d_obs_m2, ade_m, fde_m, squared_m2, covered = (np.concatenate(column) for column in zip(*pairs, strict=True))
     return Displacement(
         d_obs_m2=d_obs_m2,
@@ -189,15 +190,13 @@ def _window(positions: Floats, start: int, length: int) -> Floats:
 
 
 def _errors(off: Floats, cov: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-    """ADE, FDE, squared ADE and covered share of P pairs, from errors (P, T, 2) and covariances (P, T, 2, 2)."""
+    """ADE, FDE, squared ADE and covered shares of P pairs, from errors (P, T, 2) and covariances (P, T, 2, 2)."""
     squared = (off**2).sum(axis=-1)
     euclidean = np.sqrt(squared)
-    xx, xy, yy = cov[..., 0, 0], cov[..., 0, 1], cov[..., 1, 1]
-    x, y = off[..., 0], off[..., 1]
     with np.errstate(invalid="ignore", divide="ignore"):
-        mahalanobis = (yy * x**2 - 2 * xy * x * y + xx * y**2) / (xx * yy - xy**2)
-    inside = np.where(np.isfinite(mahalanobis), mahalanobis <= _CHI2_95, np.nan)
-    return euclidean.mean(axis=-1), euclidean[..., -1], squared.mean(axis=-1), inside.mean(axis=-1)
+        away = mahalanobis_squared(off, cov)[..., None]
+    inside = np.where(np.isfinite(away), away <= _CHI2, np.nan)
+    return euclidean.mean(axis=-1), euclidean[..., -1], squared.mean(axis=-1), inside.mean(axis=-2)
 
 
 def _drift(forecasts: Forecasts) -> Floats:

@@ -14,7 +14,7 @@ import numpy as np
 
 from mcaptrack.clock import NS_PER_S
 from mcaptrack.history import Histories
-from mcaptrack.predictors import PredictorName, make
+from mcaptrack.predictors import PredictorName, check, make
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame, Schema
 from mcaptrack.schema.predictions import forecast_to_rows
 from mcaptrack.transforms.protocol import check_options, context, option
@@ -27,7 +27,10 @@ class Predict:
     Reads tracks on the clock of prediction, writes predictions: for everybody seen often enough, one row a future step.
     """
 
-    predictor: PredictorName = option("kalman", "what predicts: cv, holt-cv or kalman")
+    predictor: PredictorName = option(
+        "red",
+        "what predicts: cv, holt-cv, kalman, lstm, red; or with weights of your own, red:FILE, lstm:FILE, onnx:FILE",
+    )
     horizon_s: float = option(4.8, "how far ahead", least=0.1, most=60.0)
     min_history: int = option(4, "past positions (with the present one) that a forecast needs", least=1)
     rate_hz: float = context(lambda: 2.5)
@@ -38,6 +41,7 @@ class Predict:
 
     def __post_init__(self) -> None:
         check_options(self)
+        check(self.predictor)
 
     def __call__(self, frames: Iterable[Frame]) -> Iterator[tuple[Frame, ...]]:
         predictor = make(self.predictor, max(1, round(self.horizon_s * self.rate_hz)), 1 / self.rate_hz)

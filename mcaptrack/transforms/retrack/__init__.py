@@ -34,7 +34,9 @@ class Retrack:
     the forecasts of these.
     """
 
-    predictor: PredictorName = option("kalman", "what predicts: cv, holt-cv or kalman")
+    predictor: PredictorName = option(
+        "kalman", "what predicts: cv, holt-cv, kalman, lstm, red; or red:FILE, lstm:FILE, onnx:FILE"
+    )
     horizon_s: float = option(4.8, "how far ahead", least=0.1, most=60.0)
     distance: Distance = option(
         "likelihood",

@@ -1,0 +1,219 @@
+"""``mcaptrack train``: learn a predictor from tracks, or from walks that are made up."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
+
+import typer
+
+from mcaptrack.cli import common
+from mcaptrack.errors import McaptrackError
+
+if TYPE_CHECKING:
+    from mcaptrack.training.loop import Trained
+    from mcaptrack.training.recipe import Recipe
+    from mcaptrack.training.windows import Windows
+
+_COLUMNS: Final = {
+    "ADE_m": "ADE m",
+    "FDE_m": "FDE m",
+    "ADE_squared_m2": "ADE m²",
+    "NLL": "NLL",
+    "coverage_50": "in 50 %",
+    "coverage_90": "in 90 %",
+    "coverage_95": "in 95 %",
+}
+_LICENCE: Final = "that of the data it was trained on"
+
+
+@common.one_line
+def train(
+    sources: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="SOURCE...",
+            help="Label files (TrajNet, Stanford Drone, ETH, MOTChallenge), Parquet tables, logs, folders of these, or "
+            "`synthetic`.",
+            show_default=False,
+        ),
+    ],
+    output: Annotated[
+        Path, common.option("--output", "-o", help="Folder for the weights, the log of epochs and the state.")
+    ] = Path("trained"),
+    recipe: Annotated[
+        Literal["red", "paper"], common.option("--recipe", help="Our network and training, or the paper's.")
+    ] = "red",
+    validate: Annotated[
+        list[Path] | None,
+        common.option(
+            "--validate", help="Sources to validate on.", show_default="a tenth of the windows, whole scenes apart"
+        ),
+    ] = None,
+    epochs: Annotated[
+        int | None, common.option("--epochs", help="Passes over the windows.", show_default="20; paper: 50")
+    ] = None,
+    batch: Annotated[
+        int | None, common.option("--batch", help="Windows a step.", show_default="256; paper: 60")
+    ] = None,
+    rate: Annotated[
+        float | None, common.option("--rate", help="Learning rate.", show_default="0.003; paper: 0.0001")
+    ] = None,
+    noise_m: Annotated[
+        float | None,
+        common.option("--noise-m", help="Most noise added to past positions.", show_default="0.4; paper: 0"),
+    ] = None,
+    gaps: Annotated[
+        float | None,
+        common.option("--gaps", help="Share of past positions taken away.", show_default="0.3; paper: 0"),
+    ] = None,
+    scale: Annotated[
+        float | None,
+        common.option("--scale", help="Most that people are scaled by, as a logarithm.", show_default="0.15; paper: 0"),
+    ] = None,
+    consistency_weight: Annotated[
+        float,
+        common.option("--consistency-weight", help="How much forecasts may not differ from one step to the next."),
+    ] = 0.0,
+    patience: Annotated[
+        int, common.option("--patience", help="End after so many epochs without a better one; 0 for never.")
+    ] = 0,
+    walks: Annotated[int, common.option("--walks", help="How many walks `synthetic` makes up.")] = 60_000,
+    seed: Annotated[int, common.option("--seed", help="The same seed gives the same weights.")] = 1,
+    device: Annotated[
+        Literal["auto", "cpu", "cuda", "mps"], common.option("--device", help="What to compute on.")
+    ] = "auto",
+    threads: Annotated[
+        int, common.option("--threads", help="Threads of the processor to use; more than one rarely helps.", min=1)
+    ] = 1,
+    resume: Annotated[bool, common.option("--resume", help="Go on with the training in the folder.")] = False,
+    topic: Annotated[
+        str | None,
+        common.option("--topic", help="The channel of logs and tables.", show_default="truth, or the best tracks"),
+    ] = None,
+    fps: Annotated[
+        str | None, common.option("--fps", help="Frames per second of label files.", show_default=False)
+    ] = None,
+    ground_plane: Annotated[
+        Path | None,
+        common.option("--ground-plane", help="3x3 homography, for label files in pixels.", show_default=False),
+    ] = None,
+    point: Annotated[
+        Literal["center", "foot"], common.option("--point", help="What of a box stands on the ground.")
+    ] = "foot",
+    force: common.Force = False,
+    json: common.Json = False,
+    quiet: common.Quiet = False,
+    verbose: common.Verbose = False,
+    config: common.Config = None,
+) -> None:
+    """Train a predictor on people's tracks, or on walks that are made up.
+
+    Leaves the weights (safetensors, with a model card in the header), a log of the epochs and a state to go on from in
+    a folder, and compares what was learned with constant velocity on the same windows. Use it with `mcaptrack predict
+    --predictor red:FOLDER/red.safetensors`. Needs torch: `pip install 'mcaptrack[train]'`.
+
+    Example: mcaptrack train synthetic -o trained
+    """
+    from mcaptrack.training.recipe import RECIPES
+
+    given = {"epochs": epochs, "batch": batch, "rate": rate, "patience": patience, "seed": seed}
+    given |= {"consistency_weight": consistency_weight}
+    corrupted = {"noise_m": noise_m, "gaps": gaps, "scale": scale}
+    chosen = RECIPES[recipe].changed(given, corrupted)
+    if output.exists() and not output.is_dir():
+        raise McaptrackError(f"{output} is a file; training needs a folder")
+    weights = output / f"{chosen.network}.safetensors"
+    state = output / "state.safetensors"
+    if resume and not state.exists():
+        raise McaptrackError(f"there is no training to resume in {output}")
+    if not resume and not force and (weights.exists() or state.exists()):
+        raise McaptrackError(f"{output} holds a training; --resume goes on with it, --force replaces it")
+    from mcaptrack.training.loop import find_device
+    from mcaptrack.training.loop import train as fit
+
+    where = find_device(device)  # before anything takes long
+    with common.Talk(quiet, verbose).open() as talk:
+        options = _options(fps, ground_plane, point, topic)
+        training, validation, card = _windows(chosen, sources, validate or [], walks, options, talk)
+        talk.say(f"training on {len(training)} windows, validating on {len(validation)}")
+        output.mkdir(parents=True, exist_ok=True)
+        trained = fit(chosen, training, validation, output, card, where, threads, resume, talk.progress, talk.say)
+    if json:
+        common.print_json(_as_json(trained))
+        return
+    _print(trained, chosen)
+
+
+def _options(fps: str | None, ground_plane: Path | None, point: Literal["center", "foot"], topic: str | None) -> Any:
+    from mcaptrack.cli.ingest import _fps
+    from mcaptrack.training.sources import SourceOptions
+
+    return SourceOptions(fps=_fps(fps), ground_plane=ground_plane, point=point, topic=topic)
+
+
+def _windows(
+    recipe: Recipe, sources: list[str], validate: list[Path], walks: int, options: Any, talk: common.Talk
+) -> tuple[Windows, Windows, dict[str, str]]:
+    """Windows to train and to validate on, and what the card says of them."""
+    from mcaptrack import __version__
+    from mcaptrack.training.sources import SYNTHETIC, read_scenes, split, synthetic, windows_of
+    from mcaptrack.training.windows import Windows
+
+    parts, words = [], []
+    if SYNTHETIC in sources:
+        if walks < 1000:
+            raise McaptrackError(f"--walks has to be at least 1000, not {walks}")
+        talk.say(f"making up {walks} walks ...")
+        parts.append(synthetic(recipe, walks, recipe.seed))
+        words.append(f"{walks} synthetic walks of mcaptrack {__version__}, seed {recipe.seed}")
+    paths = common.expand([Path(source) for source in sources if source != SYNTHETIC])
+    if paths:
+        scenes = read_scenes(paths, options, recipe.step_s)
+        first = 0 if not parts else int(parts[0].scene.max()) + 1
+        found = windows_of(scenes, recipe)
+        parts.append(Windows(found.past, found.known, found.future, found.scene + first))
+        words.append(f"{len(scenes)} scenes: {', '.join(scene.name for scene in scenes)[:500]}")
+    windows = Windows.join(parts)
+    if validate:
+        training = windows
+        validation = windows_of(read_scenes(common.expand(validate), options, recipe.step_s), recipe)
+    else:
+        training, validation = split(windows, 0.1, recipe.seed)
+    licence = "Apache-2.0" if not paths else _LICENCE
+    return training, validation, {"data": "; ".join(words), "licence": licence, "made_by": f"mcaptrack {__version__}"}
+
+
+def _as_json(trained: Trained) -> dict[str, Any]:
+    return {
+        "weights": str(trained.weights),
+        "epochs": trained.epochs,
+        "kept_epoch": trained.kept_epoch,
+        "windows": trained.windows,
+        "validation_windows": trained.validation_windows,
+        "seconds": trained.seconds,
+        "scores": trained.scores,
+    }
+
+
+def _print(trained: Trained, recipe: Recipe) -> None:
+    import sys
+
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console(width=None if sys.stdout.isatty() else 120)
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    table.add_column("validation windows", no_wrap=True)
+    table.add_column("predictor", no_wrap=True)
+    for name in _COLUMNS.values():
+        table.add_column(name, justify="right", no_wrap=True)
+    words = {"clean": "as they are", "noisy": "with 0.2 m of noise"}
+    for kind, scores in trained.scores.items():
+        for number, (predictor, values) in enumerate(scores.items()):
+            numbers = [f"{values[name]:.3f}" for name in _COLUMNS]
+            table.add_row(words[kind] if number == 0 else "", predictor, *numbers)
+    console.print(table)
+    minutes, seconds = divmod(round(trained.seconds), 60)
+    print(f"\n{trained.weights}: epoch {trained.kept_epoch} of {trained.epochs}, {minutes} min {seconds} s")
+    print(f"Use it:  mcaptrack predict log.mcap --predictor {recipe.network}:{trained.weights}")

@@ -1,0 +1,116 @@
+"""``onnx:FILE``: a user's own network, run by ONNX Runtime.
+
+Input: positions ``obs`` (B, L, 2) float32 in metres relative to the last one, and, if the network has a second input,
+``valid`` (B, L) bool. Output: positions (B, T, 2) relative to the same point, and, if there is a second one, covariance
+(B, T, 2, 2) in m^2. B is free. Metadata of the file may say ``step_s`` (0.4 otherwise).
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import Any, Final, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaptrack.errors import McaptrackError
+from mcaptrack.history import fill_holes, last_positions
+from mcaptrack.predictors.forecast import Forecast
+from mcaptrack.predictors.linear import LinearPredictor
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+_STEP_S: Final = 0.4
+
+
+@dataclass(frozen=True)
+class Onnx:
+    """See the module. A network without covariance has that of ``kalman``."""
+
+    path: Path
+    session: Any
+    past: int
+    steps: int
+    step_s: float
+    weights_sha256: str
+    name: str = "onnx"
+
+    @classmethod
+    def of(cls, path: Path) -> Self:
+        """Open and try the network. Raises McaptrackError if it can't be run or is of another shape."""
+        try:
+            data = path.read_bytes()
+        except OSError as error:
+            raise McaptrackError(f"{path} can't be read: {error.strerror}") from None
+        return cls._of(path, hashlib.sha256(data).hexdigest())
+
+    @classmethod
+    @lru_cache(maxsize=4)
+    def _of(cls, path: Path, sha256: str) -> Self:
+        try:
+            import onnxruntime
+        except ImportError:
+            raise McaptrackError(
+                f"onnx:{path} needs ONNX Runtime, which is not installed; `pip install 'mcaptrack[onnx]'` brings it"
+            ) from None
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = 1  # a batch is a frame's people: too little to share out
+        options.log_severity_level = 4
+        try:
+            session = onnxruntime.InferenceSession(path.read_bytes(), options, providers=["CPUExecutionProvider"])
+        except Exception as error:  # ONNX Runtime has no common base for what it raises
+            raise McaptrackError(f"{path} is no network that ONNX Runtime can run: {_first_line(error)}") from None
+        shape = session.get_inputs()[0].shape
+        if len(shape) != 3 or not isinstance(shape[1], int) or shape[2] != 2:
+            raise McaptrackError(f"{path}: its first input has to be B x L x 2 with a fixed L, not {shape}")
+        said = session.get_modelmeta().custom_metadata_map.get("step_s", "")
+        try:
+            step_s = float(said or _STEP_S)
+        except ValueError:
+            step_s = 0.0
+        if not 0 < step_s < float("inf"):
+            raise McaptrackError(f"{path}: its metadata say step_s = {said!r}, which is no number of seconds")
+        tried = cls(path, session, shape[1], 0, step_s, sha256)
+        steps = [tried._run(np.zeros((batch, shape[1], 2)), np.ones((batch, shape[1]), bool)) for batch in (1, 7)]
+        return cls(path, session, shape[1], steps[0][0].shape[1], step_s, sha256)
+
+    @cached_property
+    def _uncertain(self) -> LinearPredictor:
+        return LinearPredictor("kalman", self.steps, self.step_s)
+
+    def _run(self, xy_m: Floats, valid: Bools) -> list[Floats]:
+        given = (xy_m.astype(np.float32), valid)
+        inputs = {wanted.name: values for wanted, values in zip(self.session.get_inputs(), given, strict=False)}
+        try:
+            outputs = [np.asarray(output, np.float64) for output in self.session.run(None, inputs)[:2]]
+        except Exception as error:  # as above
+            raise McaptrackError(f"{self.path} can't be run: {_first_line(error)}") from None
+        mean = outputs[0]
+        fits = mean.ndim == 3 and len(mean) == len(xy_m) and mean.shape[1] > 0 and mean.shape[2] == 2
+        if fits and len(outputs) > 1:
+            fits = outputs[1].shape == (*mean.shape, 2)
+        if not fits:
+            shapes = " and ".join(str(output.shape) for output in outputs)
+            raise McaptrackError(f"{self.path} has to give (B, T, 2), and may give (B, T, 2, 2); it gives {shapes}")
+        if not all(np.isfinite(output).all() for output in outputs):
+            raise McaptrackError(f"{self.path} gives numbers that are not finite")
+        return outputs
+
+    def predict(self, xy_m: Floats, valid: Bools) -> Forecast:
+        """Positions (B, L', 2) of which ``valid`` (B, L') are known, the last one always -> forecasts."""
+        if len(valid) == 0:
+            return Forecast(np.empty((0, self.steps, 2)), np.empty((0, self.steps, 2, 2)))
+        padded, known = last_positions(xy_m, valid, self.past)
+        filled, _ = fill_holes(padded, known)
+        now = filled[:, -1:]
+        outputs = self._run(filled - now, known)
+        cov = outputs[1] if len(outputs) > 1 else self._uncertain.predict(xy_m, valid).cov
+        return Forecast(now + outputs[0], cov)
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).strip() or type(error).__name__).splitlines()[0]

@@ -1,0 +1,192 @@
+"""``red``: a recurrent encoder with a dense head (after Becker et al. 2018, "RED"), and a covariance for every step.
+
+The network corrects a linear forecast. It sees up to eight past positions, holes and short pasts masked, in a frame
+whose first axis is the way that the linear forecast goes, and says for each future step how far off that is, how wide
+the error is, how much wider along than across, and how these hang together. What depends on a direction fades with the
+speed, so that whoever stands has a round ellipse, and the whole turns with the people.
+
+Letters: B batch, L past positions (8), K pairs of them (4), T future steps, H hidden numbers.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Final, NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaptrack.history import fill_holes, last_positions
+from mcaptrack.predictors.forecast import Forecast
+from mcaptrack.predictors.weights import Weights
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+#: How many past positions the network looks at, and how many at a time.
+PAST: Final = 8
+PAIR: Final = 2
+#: How many numbers a pair of positions is: place, step and whether it was seen of each, and how far the forecast goes.
+FEATURES: Final = 5 * PAIR + 1
+#: What the head says of a step: two corrections, width, elongation, correlation.
+OUTPUTS: Final = 5
+WIDTH: Final = 2
+#: At this distance of the linear forecast's end, what depends on the direction counts half.
+_HALFWAY_M: Final = 0.3
+#: Less than anybody goes.
+_NOWHERE_M: Final = 1e-12
+#: The most that errors along and across can hang together.
+MOST_CORRELATED: Final = 0.95
+
+
+class Inputs(NamedTuple):
+    """What the network is given, and the linear forecast that it corrects.
+
+    ``features`` (B, K, FEATURES); ``started`` (B, K): whether the past begins before or in a pair; ``turn`` (B, 2, 2)
+    takes directions into the frame of the way; ``mean`` (B, T, 2) m; ``spread`` (B, T) m; ``gate`` (B,): how much
+    directions count.
+    """
+
+    features: Floats
+    started: Bools
+    turn: Floats
+    mean: Floats
+    spread: Floats
+    gate: Floats
+
+
+def prepare(xy_m: Floats, valid: Bools, base_weights: Floats, base_spread: Floats) -> Inputs:
+    """Positions (B, L', 2), of which ``valid`` (B, L') are known and the last one always is, as the network sees them.
+
+    ``base_weights`` (L + 1, T, L) and ``base_spread`` (L + 1, T): the linear forecast by the number of known positions.
+    """
+    xy_m, valid = last_positions(xy_m, valid, PAST)
+    batch = len(valid)
+    filled, known = fill_holes(xy_m, valid)
+    now = filled[:, -1:]
+    place = filled - now
+    ahead = base_weights[known] @ place
+    east, north = ahead[:, -1, 0] + _NOWHERE_M, ahead[:, -1, 1]  # who goes nowhere goes east
+    far = np.hypot(east, north)
+    turn = np.empty((batch, 2, 2))
+    turn[:, 0, 0] = turn[:, 1, 1] = east / far
+    turn[:, 0, 1] = north / far
+    turn[:, 1, 0] = -turn[:, 0, 1]
+    place = place @ turn.transpose(0, 2, 1)
+    features = np.zeros((batch, PAST, FEATURES // PAIR))
+    features[:, :, :2] = place
+    np.subtract(place[:, 1:], place[:, :-1], out=features[:, 1:, 2:4])
+    features[:, :, 2:4] *= 2.0
+    features[:, :, 4] = valid
+    pairs = PAST // PAIR
+    whole = np.empty((batch, pairs, FEATURES))
+    whole[:, :, :-1] = features.reshape(batch, pairs, FEATURES - 1)
+    whole[:, :, -1] = (far / 5)[:, None]
+    started = np.arange(1, pairs + 1) * PAIR > (PAST - known)[:, None]
+    return Inputs(whole, started, turn, now + ahead, base_spread[known], far / (far + _HALFWAY_M))
+
+
+@dataclass(frozen=True)
+class Red:
+    """The network in NumPy. The forecasts are those of the network that was trained, to the rounding of 64 bits."""
+
+    weights: Weights
+    name: str = "red"
+    past: int = PAST
+
+    @classmethod
+    def of(cls, weights: Weights) -> Self:
+        """Raises McaptrackError if the weights are not those of this network."""
+        made = cls(weights)
+        _ = made.steps, made._layers
+        return made
+
+    @property
+    def steps(self) -> int:
+        return self.weights.clock("red")[0]
+
+    @property
+    def step_s(self) -> float:
+        return self.weights.clock("red")[1]
+
+    @property
+    def weights_sha256(self) -> str:
+        return self.weights.sha256
+
+    @cached_property
+    def _layers(self) -> tuple[Floats, ...]:
+        get, steps = self.weights.get, self.steps
+        hidden = self.weights.tensors["gru.weight_hh"].shape[-1] if "gru.weight_hh" in self.weights.tensors else 0
+        into, inside = get("gru.weight_ih", 3 * hidden, FEATURES).T, get("gru.weight_hh", 3 * hidden, hidden).T
+        bias, bias_inside = get("gru.bias_ih", 3 * hidden).copy(), get("gru.bias_hh", 3 * hidden)
+        # A sigmoid is a tanh of half the number: one call for both gates. All biases but the candidate's add up. Each
+        # gate is a matrix of its own, so that what belongs together lies together: that alone makes it twice as fast.
+        half = np.array([0.5, 0.5, 1.0])[:, None, None]
+        bias[: 2 * hidden] += bias_inside[: 2 * hidden]
+        by_output = np.arange(steps * OUTPUTS).reshape(steps, OUTPUTS).T
+        return (
+            np.ascontiguousarray(into.reshape(FEATURES, 3, hidden).transpose(1, 0, 2) * half),
+            bias.reshape(3, 1, hidden) * half,
+            np.ascontiguousarray(inside.reshape(hidden, 3, hidden).transpose(1, 0, 2) * half),
+            bias_inside[2 * hidden :].copy(),
+            np.ascontiguousarray(get("dense.weight", None, hidden).T),
+            get("dense.bias", None),
+            np.ascontiguousarray(get("head.weight", steps * OUTPUTS, None).T[:, by_output].transpose(1, 0, 2)),
+            get("head.bias", steps * OUTPUTS)[by_output][:, None],
+            get("base.weights", PAST + 1, steps, PAST),
+            get("base.spread", PAST + 1, steps),
+        )
+
+    def _encode(self, features: Floats, started: Bools) -> Floats:
+        """The gated recurrent unit (Cho et al. 2014): (B, K, FEATURES) -> (B, H)."""
+        into, bias, inside, bias_inside, *_ = self._layers
+        batch, pairs, _ = features.shape
+        given = features.transpose(1, 0, 2).reshape(-1, FEATURES) @ into
+        given += bias
+        hidden = len(bias_inside)
+        given = given.reshape(3, pairs, batch, hidden)
+        state: Floats = np.zeros((batch, hidden))
+        everybody: Bools = np.asarray(started.all(axis=0))
+        for pair in range(pairs):
+            old = state @ inside if pair else np.zeros((3, batch, hidden))
+            gates = given[:2, pair] + old[:2]
+            np.tanh(gates, out=gates)
+            gates += 1.0
+            gates *= 0.5
+            candidate = old[2]
+            candidate += bias_inside
+            candidate *= gates[0]
+            candidate += given[2, pair]
+            np.tanh(candidate, out=candidate)
+            new = state - candidate
+            new *= gates[1]
+            new += candidate
+            state = new if everybody[pair] else np.where(started[:, pair, None], new, state)
+        return state
+
+    def predict(self, xy_m: Floats, valid: Bools) -> Forecast:
+        """Positions (B, L', 2) of which ``valid`` (B, L') are known, the last one always -> forecasts."""
+        *_, dense, dense_bias, head, head_bias, base_weights, base_spread = self._layers
+        inputs = prepare(xy_m, valid, base_weights, base_spread)
+        state = self._encode(inputs.features, inputs.started)
+        said = np.tanh(state @ dense + dense_bias) @ head + head_bias  # (OUTPUTS, B, T)
+        gate, spread = inputs.gate[:, None], inputs.spread
+        off = said[:WIDTH] * (gate * spread)
+        mean = inputs.mean + off.transpose(1, 2, 0) @ inputs.turn
+        width, longer = spread * np.exp(said[WIDTH]), np.exp(gate * said[3])
+        along, across = width * longer, width / longer
+        parts = np.empty((*along.shape, 3))  # along the way, across, and both
+        parts[:, :, 0] = along * along
+        parts[:, :, 1] = across * across
+        parts[:, :, 2] = MOST_CORRELATED * np.tanh(gate * said[4]) * along * across
+        cos, sin = inputs.turn[:, 0, 0], inputs.turn[:, 0, 1]
+        turned = np.empty((len(mean), 3, 4))  # parts to xx, xy, yx, yy
+        both = cos * sin
+        turned[:, 0, 0] = turned[:, 1, 3] = cos * cos
+        turned[:, 0, 3] = turned[:, 1, 0] = sin * sin
+        turned[:, 0, 1] = turned[:, 0, 2] = both
+        turned[:, 1, 1] = turned[:, 1, 2] = -both
+        turned[:, 2, 0], turned[:, 2, 3] = -2 * both, 2 * both
+        turned[:, 2, 1] = turned[:, 2, 2] = cos * cos - sin * sin
+        return Forecast(mean, (parts @ turned).reshape(*mean.shape, 2))

@@ -1,0 +1,95 @@
+"""Files of learned weights: safetensors, with a model card in the header. Nothing is ever unpickled."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaptrack.errors import McaptrackError
+
+Floats = NDArray[np.float64]
+
+#: Where the weights are that come with mcaptrack.
+SHIPPED: Final = Path(__file__).parent / "trained"
+
+
+@dataclass(frozen=True)
+class Weights:
+    """Named arrays, and what the card says of them: ``network``, ``steps``, ``step_s``, how they were trained."""
+
+    path: Path
+    tensors: Mapping[str, Floats]
+    card: Mapping[str, str]
+    sha256: str
+
+    def get(self, name: str, *shape: int | None) -> Floats:
+        """One array, with the shape it has to have (None for any). Raises McaptrackError."""
+        found = self.tensors.get(name)
+        if found is None:
+            raise McaptrackError(f"{self.path} has no {name}; it has {', '.join(sorted(self.tensors)) or 'nothing'}")
+        fits = len(shape) == found.ndim and all(a in (None, b) for a, b in zip(shape, found.shape, strict=True))
+        if not fits or not np.isfinite(found).all():
+            wanted = "x".join("n" if size is None else str(size) for size in shape)
+            has = "x".join(map(str, found.shape)) if not fits else "numbers that are not finite"
+            raise McaptrackError(f"{self.path}: {name} has to be {wanted}, not {has}")
+        return found
+
+    def clock(self, network: str) -> tuple[int, float]:
+        """Steps and their length in seconds, of weights of that network. Raises McaptrackError if they are others'."""
+        if self.card.get("network") != network:
+            what = self.card.get("network") or "no network that mcaptrack trained"
+            raise McaptrackError(f"{self.path} holds {what}, not {network}")
+        try:
+            steps, step_s = int(self.card["steps"]), float(self.card["step_s"])
+        except (KeyError, ValueError):
+            steps, step_s = 0, 0.0
+        if steps < 1 or not 0 < step_s < float("inf"):
+            raise McaptrackError(f"{self.path}: its card does not say how many steps it foretells, and how long ones")
+        return steps, step_s
+
+
+def load(path: Path) -> Weights:
+    """Read a file of weights. Raises McaptrackError if it is none."""
+    try:
+        stat = path.stat()
+    except OSError as error:
+        raise McaptrackError(f"{path} can't be read: {error.strerror}") from None
+    return _load(path, stat.st_mtime_ns, stat.st_size)
+
+
+@lru_cache(maxsize=16)
+def _load(path: Path, _changed: int, _size: int) -> Weights:
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, framework="numpy") as opened:
+            card = opened.metadata() or {}
+            tensors = {name: np.asarray(opened.get_tensor(name), np.float64) for name in opened.keys()}  # noqa: SIM118
+        return Weights(path, tensors, card, hashlib.sha256(path.read_bytes()).hexdigest())
+    except (SafetensorError, TypeError, ValueError) as error:
+        raise McaptrackError(f"{path} is no file of weights (safetensors): {error}") from None
+    except OSError as error:
+        raise McaptrackError(f"{path} can't be read: {error.strerror or error}") from None
+
+
+def save(path: Path, tensors: Mapping[str, NDArray[np.floating]], card: Mapping[str, str]) -> None:
+    """Write weights as 32-bit floats, with their card in the header; the same weights give the same bytes."""
+    import safetensors.numpy
+
+    from mcaptrack.atomic import publish_bytes
+
+    flat = {name: np.ascontiguousarray(value, np.float32) for name, value in sorted(tensors.items())}
+    data = safetensors.numpy.save(flat, dict(card))
+    # The library writes the header in an order that changes from run to run: write it anew, in one that does not.
+    length = int.from_bytes(data[:8], "little")
+    header = json.dumps(json.loads(data[8 : 8 + length]), sort_keys=True, separators=(",", ":")).encode()
+    header += b" " * (-len(header) % 8)
+    publish_bytes(path, len(header).to_bytes(8, "little") + header + data[8 + length :])

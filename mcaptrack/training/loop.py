@@ -1,0 +1,335 @@
+"""Training itself: epochs over windows, validation, the best weights, a state to go on from, a table at the end."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaptrack.atomic import publish_bytes
+from mcaptrack.errors import McaptrackError
+from mcaptrack.metrics.calibration import forecast_scores, mahalanobis_squared
+from mcaptrack.predictors import make, red
+from mcaptrack.predictors.forecast import Predictor
+from mcaptrack.predictors.lstm import Lstm
+from mcaptrack.predictors.weights import Weights, load, save
+from mcaptrack.training.recipe import Recipe
+from mcaptrack.training.windows import Windows, ar1
+
+Floats = NDArray[np.float64]
+
+_LOG: Final = "epochs.csv"
+_STATE: Final = "state.safetensors"
+_COLUMNS: Final = ("epoch", "loss", "validation_ade_m", "rate", "seconds")
+#: The noise that networks are validated and calibrated with, beside none.
+_NOISE_M: Final = 0.2
+
+Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True)
+class Trained:
+    """What a training left behind: the weights' file, their scores on the validation windows, and the epochs it took.
+
+    ``scores`` maps "clean" and "noisy" windows to predictors and these to their scores.
+    """
+
+    weights: Path
+    scores: dict[str, dict[str, dict[str, float]]]
+    epochs: int
+    kept_epoch: int
+    windows: int
+    validation_windows: int
+    seconds: float
+
+
+@dataclass
+class _State:
+    """Where a training is."""
+
+    epoch: int = 0
+    best_epoch: int = 0
+    best_ade_m: float = float("inf")
+    seconds: float = 0.0
+
+
+def train(
+    recipe: Recipe,
+    training: Windows,
+    validation: Windows,
+    folder: Path,
+    source: dict[str, str],
+    device: str = "auto",
+    threads: int | None = None,
+    resume: bool = False,
+    progress: Progress = lambda *_: None,
+    say: Callable[[str], None] = lambda _: None,
+) -> Trained:
+    """Train a network and leave weights, a log of the epochs and a state to go on from in ``folder``.
+
+    ``source`` says on the card what the windows came from. The same recipe, windows and device give the same weights,
+    also if the training was cut off and resumed. Raises McaptrackError if torch or the device is not there, or if the
+    state in the folder is of another training.
+    """
+    torch, where = _torch(), find_device(device)
+    if threads is not None:
+        torch.set_num_threads(threads)
+    for windows, what in ((training, "train on"), (validation, "validate on")):
+        if len(windows) == 0:
+            raise McaptrackError(f"there are no windows of {recipe.past + recipe.steps} positions to {what}")
+    run = _Run(torch, recipe, training, where, folder, source)
+    if resume:
+        run.resume()
+    rows = run.rows
+    while run.state.epoch < recipe.epochs:
+        began = time.monotonic()
+        loss = run.epoch()
+        ade_m = run.validate(validation)
+        took = time.monotonic() - began
+        run.state.seconds += took
+        rows.append(dict(zip(_COLUMNS, (run.state.epoch, loss, ade_m, run.rate, took), strict=True)))
+        run.save()
+        progress("train", run.state.epoch, recipe.epochs)
+        if recipe.patience and run.state.epoch - run.state.best_epoch >= recipe.patience:
+            say(f"no better for {recipe.patience} epochs: ending after {run.state.epoch}")
+            break
+    kept = run.state.best_epoch if recipe.kept == "best" else run.state.epoch
+    card = {"trained_epochs": str(run.state.epoch), "kept_epoch": str(kept)}
+    run.publish(validation, card)
+    scores = compare(make(f"{recipe.network}:{run.weights}", recipe.steps, recipe.step_s), validation, recipe)
+    run.publish(validation, card | {f"scores_{k}": _brief(part[recipe.network]) for k, part in scores.items()})
+    return Trained(
+        run.weights, scores, run.state.epoch, kept, len(training), len(validation), round(run.state.seconds, 1)
+    )
+
+
+def compare(predictor: Predictor, windows: Windows, recipe: Recipe) -> dict[str, dict[str, dict[str, float]]]:
+    """Scores of a predictor, constant velocity and the Kalman filter on the same windows, clean and with noise."""
+    rivals = [predictor, *(make(name, recipe.steps, recipe.step_s) for name in ("cv", "kalman"))]
+    return {
+        name: {rival.name: forecast_scores(*rival.predict(part.past, part.known), part.future) for rival in rivals}
+        for name, part in (("clean", windows), ("noisy", _noisy(windows)))
+    }
+
+
+def _noisy(windows: Windows) -> Windows:
+    """The same windows, their past seen with noise."""
+    noise = _NOISE_M * ar1(np.random.default_rng(0), *windows.known.shape)
+    return Windows(windows.past + noise, windows.known, windows.future, windows.scene)
+
+
+def _brief(scores: dict[str, float]) -> str:
+    return " ".join(f"{name}={value:.3f}" for name, value in scores.items())
+
+
+def _torch() -> Any:
+    try:
+        import torch
+    except ImportError:
+        raise McaptrackError(
+            "training needs torch, which is not installed; `pip install 'mcaptrack[train]'` brings it"
+        ) from None
+    return torch
+
+
+def find_device(name: str) -> str:
+    """What to compute on: the device of that name, or for "auto" the best there is.
+
+    Raises McaptrackError if it is not there, or torch isn't.
+    """
+    torch, there = _torch(), ["cpu"]
+    if torch.cuda.is_available():
+        there.insert(0, "cuda")
+    if torch.backends.mps.is_available():
+        there.insert(0, "mps")
+    if name == "auto":
+        return there[0]
+    if name not in there:
+        raise McaptrackError(f"there is no device {name}; there is {', '.join(there)}")
+    return name
+
+
+class _Run:
+    """One training: network, optimiser, and the files that they go to."""
+
+    def __init__(
+        self, torch: Any, recipe: Recipe, training: Windows, device: str, folder: Path, source: dict[str, str]
+    ) -> None:
+        from mcaptrack.training.network import LstmNetwork, RedNetwork
+
+        torch.manual_seed(recipe.seed)
+        ours = recipe.network == "red"
+        self.network: Any = RedNetwork(recipe.steps, recipe.step_s) if ours else LstmNetwork(recipe.steps)
+        self.network.to(device)
+        self.optimiser = torch.optim.Adam(self.network.parameters(), lr=recipe.rate)
+        self.state = _State()
+        self.rows: list[dict[str, Any]] = []
+        self.weights = folder / f"{recipe.network}.safetensors"
+        self.card = {
+            "network": recipe.network,
+            "past": str(recipe.past),
+            "steps": str(recipe.steps),
+            "step_s": str(recipe.step_s),
+            "recipe": json.dumps(recipe.words(), sort_keys=True),
+            **source,
+        }
+        self.rate = recipe.rate
+        self._torch, self._recipe, self._device, self._folder = torch, recipe, device, folder
+        self._training = training
+        self._best: dict[str, Any] = {}
+
+    def epoch(self) -> float:
+        """One pass over the windows, corrupted anew; returns the mean loss of a window."""
+        recipe = self._recipe
+        rng = np.random.default_rng([recipe.seed, self.state.epoch])
+        given = self._prepare(recipe.corruption(self._training, rng))
+        later = None
+        if recipe.consistency_weight:
+            given, later = self._consecutive(rng)
+        count = len(given["future"])
+        batches = max(1, round(count / recipe.batch))
+        order = self._torch.tensor(rng.permutation(count), device=self._device)
+        total = 0.0
+        for number, at in enumerate(self._torch.tensor_split(order, batches)):
+            self.rate = recipe.rate_at(self.state.epoch * batches + number, batches)
+            for group in self.optimiser.param_groups:
+                group["lr"] = self.rate
+            batch = {name: part[at] for name, part in given.items()}
+            if recipe.loss == "displacements":
+                loss = self.network.loss(batch, 2 * np.pi * rng.normal())
+                total += loss.item()
+            else:
+                loss, mean = self.network.loss(batch, recipe.distance_weight)
+                if later is not None:
+                    more, then = self.network.loss({k: part[at] for k, part in later.items()}, recipe.distance_weight)
+                    apart = self._torch.sqrt(((mean[:, 1:] - then[:, :-1]) ** 2).sum(-1) + 1e-6).mean()
+                    loss = (loss + more) / 2 + recipe.consistency_weight * apart
+                total += loss.item() * len(at)
+            if not np.isfinite(total):
+                raise McaptrackError(f"the loss is {total} in epoch {self.state.epoch + 1}; try a lower --rate")
+            self.optimiser.zero_grad()
+            loss.backward()
+            if recipe.loss == "likelihood":
+                self._torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
+            self.optimiser.step()
+        self.state.epoch += 1
+        return total / count
+
+    def _prepare(self, windows: Windows) -> dict[str, Any]:
+        return {name: part.to(self._device) for name, part in self.network.prepare(windows).items()}
+
+    def _consecutive(self, rng: np.random.Generator) -> tuple[dict[str, Any], dict[str, Any]]:
+        """The same people twice, the second time a step later, with the same noise on what was seen both times."""
+        whole, recipe = self._training, self._recipe
+        path = np.concatenate([whole.past, whole.future[:, :1]], axis=1)
+        known = np.concatenate([whole.known, np.ones((len(whole), 1), bool)], axis=1)
+        later = recipe.corruption(Windows(path, known, whole.future, whole.scene), rng)
+        # Where somebody stands a step later is told by the uncorrupted future, whose first step it is.
+        length = whole.past.shape[1]
+        now = Windows(later.past[:, :length], later.known[:, :length].copy(), later.future, whole.scene)
+        now.known[:, -1] = True
+        # Of the last step, a step later, nothing is known: it goes on as the one before.
+        end = 2 * later.future[:, -1:] - later.future[:, -2:-1]
+        ahead = np.concatenate([later.future[:, 1:], end], axis=1)
+        then = Windows(later.past[:, 1:], later.known[:, 1:], ahead, whole.scene)
+        return self._prepare(now), self._prepare(then)
+
+    def validate(self, validation: Windows) -> float:
+        """Keep the weights if they are the best so far, or if the last ones are wanted; returns their error in m."""
+        tensors = {name: np.array(part) for name, part in self.network.tensors().items()}
+        predictor = self._predictor(tensors)
+        parts = (validation, _noisy(validation))
+        off = [predictor.predict(part.past, part.known).mean - part.future for part in parts]
+        ade_m = float(np.mean([np.hypot(one[..., 0], one[..., 1]).mean() for one in off]))
+        if ade_m < self.state.best_ade_m:
+            self.state.best_epoch, self.state.best_ade_m = self.state.epoch, ade_m
+        if self._recipe.kept == "last" or self.state.best_epoch == self.state.epoch:
+            self._best = tensors
+        return ade_m
+
+    def publish(self, validation: Windows, card: dict[str, str]) -> None:
+        """Calibrate the kept weights and write them, with their card.
+
+        The covariance of every step is widened or narrowed until the 95 % ellipse holds 95 % of the validation windows:
+        as they are or with noise, whichever takes less, since ``red`` tells one from the other. For ``lstm``, which
+        says no covariance, the Kalman filter's is, on both together.
+        """
+        parts = [validation, _noisy(validation)]
+        if self._recipe.network == "lstm":
+            parts = [Windows.join(parts)]
+        ratios = []
+        for part in parts:
+            forecast = self._predictor(self._best).predict(part.past, part.known)
+            away = mahalanobis_squared(forecast.mean - part.future, forecast.cov)
+            ratios.append(np.quantile(away, 0.95, axis=0) / (-2 * np.log(0.05)))
+        ratio = np.min(ratios, axis=0)
+        calibrated = dict(self._best)
+        if self._recipe.network == "lstm":
+            calibrated["spread"] = calibrated["spread"] * ratio
+        else:
+            bias = calibrated["head.bias"].copy()
+            bias[red.WIDTH :: red.OUTPUTS] += np.log(ratio) / 2
+            calibrated["head.bias"] = bias
+        save(self.weights, calibrated, self.card | card)
+
+    def _predictor(self, tensors: dict[str, Any]) -> Predictor:
+        """The network as it is used, without a file in between."""
+        weights = Weights(self.weights, {k: np.asarray(v, np.float64) for k, v in tensors.items()}, self.card, "")
+        return red.Red.of(weights) if self._recipe.network == "red" else Lstm.of(weights)
+
+    def save(self) -> None:
+        """Everything that the training needs to go on, and the log of its epochs."""
+        tensors = {f"network.{name}": part for name, part in self.network.tensors().items()}
+        tensors |= {f"best.{name}": part for name, part in self._best.items()}
+        for number, parameter in enumerate(self.network.parameters()):
+            for name, value in self.optimiser.state[parameter].items():
+                tensors[f"optimiser.{number}.{name}"] = np.atleast_1d(value.detach().cpu().numpy())
+        said = {"training": self._fingerprint(), "state": json.dumps(asdict(self.state)), "rows": json.dumps(self.rows)}
+        save(self._folder / _STATE, tensors, said)
+        text = io.StringIO()
+        writer = csv.DictWriter(text, fieldnames=_COLUMNS, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(self.rows)
+        publish_bytes(self._folder / _LOG, text.getvalue().encode())
+
+    def resume(self) -> None:
+        """Go on from the state in the folder. Raises McaptrackError if it is of another training."""
+        stored = load(self._folder / _STATE)
+        if stored.card.get("training") != self._fingerprint():
+            raise McaptrackError(
+                f"{stored.path} is of a training with another recipe or other data; leave --resume out"
+            )
+        torch = self._torch
+        self.state, self.rows = _State(**json.loads(stored.card["state"])), json.loads(stored.card["rows"])
+        parts: dict[str, dict[str, Any]] = {"network": {}, "best": {}, "optimiser": {}}
+        for name, value in stored.tensors.items():
+            group, _, rest = name.partition(".")
+            parts[group][rest] = value.astype(np.float32)
+        had = self.network.state_dict()
+        self.network.load_state_dict({name: torch.tensor(parts["network"][name]) for name in had})
+        self._best = parts["best"]
+        for number, parameter in enumerate(self.network.parameters()):
+            self.optimiser.state[parameter] = {
+                name: torch.tensor(parts["optimiser"][f"{number}.{name}"], device=self._device).reshape(
+                    () if name == "step" else parameter.shape
+                )
+                for name in ("step", "exp_avg", "exp_avg_sq")
+            }
+
+    def _fingerprint(self) -> str:
+        """What has to be the same for a training to go on: recipe (but for its length), windows, device."""
+        import hashlib
+
+        total = hashlib.sha256(self._training.past.tobytes() + self._training.future.tobytes()).hexdigest()
+        recipe = asdict(self._recipe)
+        return json.dumps(
+            [{k: v for k, v in recipe.items() if k not in ("patience", "epochs")}, total, self._device], sort_keys=True
+        )

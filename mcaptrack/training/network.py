@@ -1,0 +1,135 @@
+"""The networks in torch, for training; ``mcaptrack.predictors`` runs them in NumPy.
+
+Letters: B batch, L past positions, K pairs of them, T future steps, H hidden numbers.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import torch
+from torch import nn
+
+from mcaptrack.predictors import red
+from mcaptrack.predictors.linear import LinearPredictor
+from mcaptrack.training.windows import Windows
+
+#: A torch.Tensor. torch is not there when the types are checked.
+Tensor = Any
+
+_LSTM_HIDDEN = 64
+
+
+class RedNetwork(nn.Module):
+    """See ``mcaptrack.predictors.red``. A fresh one forecasts as the Kalman filter does."""
+
+    def __init__(self, steps: int, step_s: float, hidden: int = 64, dense: int = 128) -> None:
+        super().__init__()
+        self.steps, self.hidden = steps, hidden
+        self.gru = nn.GRUCell(red.FEATURES, hidden)
+        self.dense = nn.Linear(hidden, dense)
+        self.head = nn.Linear(dense, steps * red.OUTPUTS)
+        nn.init.zeros_(self.head.weight)
+        nn.init.zeros_(self.head.bias)
+        weights, variance = LinearPredictor("kalman", steps, step_s).table
+        self.base = (weights.astype(np.float32), np.sqrt(variance).astype(np.float32))
+
+    def prepare(self, windows: Windows) -> dict[str, Tensor]:
+        """What ``forward`` needs of windows, and their future, as tensors whose first axis is the window."""
+        inputs = red.prepare(windows.past, windows.known, *(part.astype(np.float64) for part in self.base))
+        out = {name: torch.tensor(part) for name, part in inputs._asdict().items()}
+        out["future"] = torch.tensor(windows.future)
+        return {name: part.float() if part.is_floating_point() else part for name, part in out.items()}
+
+    def forward(self, given: dict[str, Tensor]) -> tuple[Tensor, ...]:
+        """Means (B, T, 2) in m; spreads (B, T) along and across the way; their correlation (B, T)."""
+        features, started = given["features"], given["started"]
+        state = features.new_zeros(len(features), self.hidden)
+        for pair in range(features.shape[1]):
+            new = self.gru(features[:, pair], state)
+            state = torch.where(started[:, pair, None], new, state)
+        said = self.head(torch.tanh(self.dense(state))).reshape(-1, self.steps, red.OUTPUTS)
+        gate, spread = given["gate"][:, None], given["spread"]
+        mean = given["mean"] + (said[..., :2] * (gate * spread)[..., None]) @ given["turn"]
+        width, longer = spread * torch.exp(said[..., 2]), torch.exp(gate * said[..., 3])
+        return mean, width * longer, width / longer, red.MOST_CORRELATED * torch.tanh(gate * said[..., 4])
+
+    def loss(self, given: dict[str, Tensor], distance_weight: float) -> tuple[Tensor, Tensor]:
+        """The mean loss of a batch, and the forecasts (B, T, 2) that it is of."""
+        mean, along, across, tied = self(given)
+        off = (given["future"] - mean) @ given["turn"].transpose(1, 2)
+        x, y, free = off[..., 0] / along, off[..., 1] / across, 1 - tied**2
+        nll = (x * x + y * y - 2 * tied * x * y) / (2 * free) + torch.log(along * across) + torch.log(free) / 2
+        distance = torch.sqrt((off**2).sum(-1) + 1e-6)
+        return nll.mean() + distance_weight * distance.mean(), mean
+
+    def tensors(self) -> dict[str, Any]:
+        """The weights by the names that ``mcaptrack.predictors.red`` reads."""
+        weights, spread = self.base
+        return _to_numpy(self) | {"base.weights": weights, "base.spread": spread}
+
+
+class _Half(nn.Module):
+    """The encoder or the decoder of the paper's network."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.embed = nn.Linear(2, _LSTM_HIDDEN)
+        self.lstm = nn.LSTMCell(_LSTM_HIDDEN, _LSTM_HIDDEN)
+
+    def folded(self) -> tuple[Tensor, ...]:
+        """The weights of an LSTM cell that sees displacements: the linear layer before it folded in, once a batch."""
+        cell, embed = self.lstm, self.embed
+        into, bias = cell.weight_ih @ embed.weight, cell.weight_ih @ embed.bias + cell.bias_ih
+        return into, cell.weight_hh, bias, cell.bias_hh
+
+
+class LstmNetwork(nn.Module):
+    """See ``mcaptrack.predictors.lstm``: 67 074 parameters, displacements in and out."""
+
+    def __init__(self, steps: int) -> None:
+        super().__init__()
+        self.steps = steps
+        self.encoder, self.decoder = _Half(), _Half()
+        self.out = nn.Linear(_LSTM_HIDDEN, 2)
+        self.spread = np.ones(steps, np.float32)
+
+    def prepare(self, windows: Windows) -> dict[str, Tensor]:
+        """As that of ``RedNetwork``: displacements of the past and of the future."""
+        path = np.concatenate([windows.past, windows.future], axis=1)
+        moves = np.diff(path, axis=1, prepend=path[:, :1])
+        length = windows.past.shape[1]
+        parts = {"past": moves[:, :length], "future": moves[:, length:]}
+        return {name: torch.tensor(part.astype(np.float32)) for name, part in parts.items()}
+
+    def forward(self, moves: Tensor) -> Tensor:
+        """Past displacements (B, L, 2), the first of them 0, to future ones (B, T, 2)."""
+        state = memory = moves.new_zeros(len(moves), _LSTM_HIDDEN)
+        encoder, decoder = self.encoder.folded(), self.decoder.folded()
+        for step in range(moves.shape[1]):
+            state, memory = torch.lstm_cell(moves[:, step], (state, memory), *encoder)
+        memory, move, out = torch.zeros_like(memory), moves[:, -1], []
+        for _ in range(self.steps):
+            state, memory = torch.lstm_cell(move, (state, memory), *decoder)
+            move = self.out(state)
+            out.append(move)
+        return torch.stack(out, dim=1)
+
+    def loss(self, given: dict[str, Tensor], angle: float | None) -> Tensor:
+        """The sum of squared errors of a batch as it is and, with an ``angle``, turned by it as well."""
+        past, future = given["past"], given["future"]
+        if angle is not None:
+            cos, sin = math.cos(angle), math.sin(angle)
+            turn = past.new_tensor([[cos, sin], [-sin, cos]])
+            past, future = torch.cat([past, past @ turn]), torch.cat([future, future @ turn])
+        return ((self(past) - future) ** 2).sum()
+
+    def tensors(self) -> dict[str, Any]:
+        """The weights by the names that ``mcaptrack.predictors.lstm`` reads."""
+        return _to_numpy(self) | {"spread": self.spread}
+
+
+def _to_numpy(network: nn.Module) -> dict[str, Any]:
+    return {name: part.detach().cpu().numpy() for name, part in network.state_dict().items()}

@@ -1,0 +1,183 @@
+"""What predictors are trained on: label files, Parquet tables, logs' own tracks, or walks that are made up.
+
+Letters: I people, S steps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaptrack import log, pipeline, tables
+from mcaptrack.clock import NS_PER_S
+from mcaptrack.errors import McaptrackError
+from mcaptrack.ingest import label_frames
+from mcaptrack.ingest.labels import read_labels
+from mcaptrack.plane import Planes
+from mcaptrack.schema import TRACKS, Frame
+from mcaptrack.training.recipe import Recipe
+from mcaptrack.training.walks import walks
+from mcaptrack.training.windows import Windows
+from mcaptrack.transforms import Sample
+
+Floats = NDArray[np.float64]
+
+SYNTHETIC: Final = "synthetic"
+#: The channels of a log that are trained on, the best first.
+_BEST: Final = ("truth", "retracks", "samples", "tracks")
+_SDD_FPS: Final = Fraction(30)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """People on a regular clock: ``xy_m`` (I, S, 2), NaN where they are not seen."""
+
+    name: str
+    xy_m: Floats
+
+    def cut(self, recipe: Recipe, number: int) -> Windows:
+        """The windows that a recipe trains on."""
+        return Windows.cut(self.xy_m, recipe.past, recipe.steps, recipe.least, recipe.stride, number)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SourceOptions:
+    """How to read sources that don't say it: frames per second, where the ground is, which channel of a log."""
+
+    fps: Fraction | None = None
+    ground_plane: Path | None = None
+    point: Literal["foot", "center"] = "foot"
+    topic: str | None = None
+
+
+def read_scenes(paths: Sequence[Path], options: SourceOptions, step_s: float) -> list[Scene]:
+    """The scenes in files and folders: one a label file, and one a channel of tracks. Raises McaptrackError."""
+    scenes: list[Scene] = []
+    for path in paths:
+        members = _files(path)
+        for file in members:
+            scenes += _READERS.get(file.suffix.lower(), _from_labels)(file, options, step_s)
+    return scenes
+
+
+def _files(path: Path) -> list[Path]:
+    """The files of a folder that can be sources, or the file itself."""
+    if not path.is_dir():
+        return [path]
+    kinds = (".txt", ".parquet", ".mcap")
+    found = sorted(file for file in path.rglob("*") if file.suffix.lower() in kinds and file.is_file())
+    # Of tables those of tracks; and not those that tell again what the log beside them tells.
+    logs = {file.with_suffix(".tables") for file in found if file.suffix.lower() == ".mcap"}
+    found = [file for file in found if not logs & set(file.parents)]
+    found = [file for file in found if file.suffix.lower() != ".parquet" or tables.holds_tracks(file)]
+    if not found:
+        raise McaptrackError(f"{path} has no {', '.join(kinds)} to train on")
+    return found
+
+
+def _from_labels(path: Path, options: SourceOptions, step_s: float) -> list[Scene]:
+    labels = read_labels(path, role="truth")
+    if not labels.identified:
+        raise McaptrackError(f"{path} has boxes but doesn't say whose they are; predictors learn from tracks")
+    fps = options.fps
+    if fps is None and labels.format == "sdd":
+        fps = _SDD_FPS
+    if fps is None and labels.format == "mot":
+        raise McaptrackError(f"{path}: how many frames a second? Say it with --fps")
+    if fps is None:  # annotated on the clock of prediction
+        fps = Fraction(labels.step / step_s).limit_denominator(1000)
+    plane = options.ground_plane
+    if labels.xy_m is None and plane is None:
+        raise McaptrackError(f"{path} is in pixels; give its homography with --ground-plane")
+    frames = label_frames({"truth": path}, fps, plane, options.point)["truth"]
+    return [_scene(path.stem, frames, step_s, ())]
+
+
+def _from_log(path: Path, options: SourceOptions, step_s: float) -> list[Scene]:
+    with log.read(path) as opened:
+        prefix = pipeline.find_camera(opened, None, options.topic)
+        topics = [options.topic] if options.topic else [f"{prefix}/{name}" for name in _BEST]
+        found = [topic for topic in topics if topic in opened.channels and opened.channels[topic].messages]
+        if not found:
+            raise McaptrackError(f"{path} has none of {', '.join(topics)}; `mcaptrack run {path}` makes tracks")
+        if opened.channels[found[0]].schema_name != TRACKS.name:
+            raise McaptrackError(f"{path}: {found[0]} holds {opened.channels[found[0]].schema_name}, not {TRACKS.name}")
+        planes = pipeline.read_planes(opened, prefix) or ()
+        return [_scene(f"{path.stem}{found[0]}", opened.frames(found[0], TRACKS), step_s, planes)]
+
+
+def _from_parquet(path: Path, options: SourceOptions, step_s: float) -> list[Scene]:
+    channels = tables.read_tracks(path)
+    if options.topic:
+        channels = {topic: frames for topic, frames in channels.items() if topic == options.topic}
+        if not channels:
+            raise McaptrackError(f"{path} has no rows of {options.topic}")
+    else:
+        best = min(channels, key=_rank)
+        channels = {best: channels[best]}
+    return [_scene(f"{path.parent.name or path.stem}{topic}", frames, step_s, ()) for topic, frames in channels.items()]
+
+
+def _rank(topic: str) -> int:
+    name = topic.rpartition("/")[2]
+    return _BEST.index(name) if name in _BEST else len(_BEST)
+
+
+def _scene(name: str, frames: Iterable[Frame], step_s: float, planes: Planes) -> Scene:
+    """Frames of tracks as a scene; what was only filled in counts as not seen."""
+    sampled = [frame for (frame,) in Sample(rate_hz=1 / step_s, ground_planes=tuple(planes))(frames)]
+    if not sampled:
+        return Scene(name, np.empty((0, 0, 2)))
+    start = sampled[0].t_ns
+    step = [round((frame.t_ns - start) / (step_s * NS_PER_S)) for frame in sampled]
+    rows = np.concatenate([frame.rows for frame in sampled])
+    at = np.repeat(np.array(step, np.int64), [len(frame.rows) for frame in sampled])
+    seen = rows["observed"] & np.isfinite(rows["x_m"])
+    ids, who = np.unique(rows["track_id"][seen], return_inverse=True)
+    xy_m = np.full((len(ids), step[-1] + 1, 2), np.nan)
+    xy_m[who, at[seen]] = np.stack([rows["x_m"][seen], rows["y_m"][seen]], axis=-1)
+    return Scene(name, xy_m)
+
+
+_READERS: Final[dict[str, Callable[[Path, SourceOptions, float], list[Scene]]]] = {
+    ".mcap": _from_log,
+    ".parquet": _from_parquet,
+}
+
+
+def synthetic(recipe: Recipe, count: int, seed: int) -> Windows:
+    """Windows of made-up walks."""
+    paths, scene = walks(count, recipe.past + recipe.steps, recipe.step_s, seed)
+    return Windows.of(paths, recipe.past, scene)
+
+
+def windows_of(scenes: Sequence[Scene], recipe: Recipe) -> Windows:
+    """All windows of several scenes. Raises McaptrackError if there are none."""
+    windows = Windows.join([scene.cut(recipe, number) for number, scene in enumerate(scenes)])
+    if len(windows) == 0:
+        seconds = (recipe.least + recipe.steps) * recipe.step_s
+        raise McaptrackError(f"nobody is seen for {seconds:g} s without a break in {', '.join(s.name for s in scenes)}")
+    return windows
+
+
+def split(windows: Windows, share: float, seed: int) -> tuple[Windows, Windows]:
+    """Windows to train on and to validate on: whole scenes apart, about ``share`` of the windows in the second.
+
+    A single scene is split by its windows' order, which is that of people.
+    """
+    scenes, count = np.unique(windows.scene, return_counts=True)
+    if len(scenes) == 1:
+        last = np.arange(len(windows)) >= round((1 - share) * len(windows))
+        return windows[~last], windows[last]
+    order = np.random.default_rng(seed).permutation(len(scenes))
+    kept = np.cumsum(count[order]) <= share * len(windows)
+    kept[0] = True
+    kept[-1] = False
+    held = np.isin(windows.scene, scenes[order[kept]])
+    return windows[~held], windows[held]

@@ -1,0 +1,127 @@
+"""Windows: what was seen of people, and where they went then. Cut from paths; corrupted as trackers corrupt.
+
+Letters: N windows, L past positions (the last one is now), T future steps.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+Ints = NDArray[np.int64]
+
+#: How fast the noise of a tracker forgets itself, from one step to the next.
+_NOISE_MEMORY: Final = 0.5
+
+
+@dataclass(frozen=True)
+class Windows:
+    """``past`` (N, L, 2) in m, of which ``known`` (N, L) were seen, ``future`` (N, T, 2) in m, ``scene`` (N,)."""
+
+    past: Floats
+    known: Bools
+    future: Floats
+    scene: Ints
+
+    def __len__(self) -> int:
+        return len(self.past)
+
+    def __getitem__(self, at: Ints | Bools) -> Windows:
+        return Windows(self.past[at], self.known[at], self.future[at], self.scene[at])
+
+    @classmethod
+    def of(cls, paths: Floats, past: int, scene: Ints | None = None) -> Windows:
+        """Whole paths (N, L + T, 2), all of them seen."""
+        known = np.ones((len(paths), past), bool)
+        return cls(paths[:, :past], known, paths[:, past:], np.zeros(len(paths), np.int64) if scene is None else scene)
+
+    @classmethod
+    def cut(cls, xy_m: Floats, past: int, steps: int, least: int, stride: int = 1, scene: int = 0) -> Windows:
+        """All windows in the paths (I, S, 2) of a scene, NaN where somebody is not seen, every ``stride`` steps.
+
+        The present and the ``steps`` after it have to be known, and at least ``least`` past positions.
+        """
+        people, length = xy_m.shape[:2]
+        padded = np.concatenate([np.full((people, past - 1, 2), np.nan), xy_m], axis=1)
+        if people == 0 or length < steps + 1:
+            return cls.of(np.empty((0, past + steps, 2)), past)
+        windows = np.lib.stride_tricks.sliding_window_view(padded, past + steps, axis=1).transpose(0, 1, 3, 2)
+        known = np.isfinite(windows[..., 0])
+        whole = known[:, :, past - 1 :].all(axis=2) & (known[:, :, :past].sum(axis=2) >= least)
+        rank = np.cumsum(whole, axis=1) - 1  # of each person's own windows
+        who, start = np.nonzero(whole & (rank % stride == 0))
+        found, seen = windows[who, start], known[who, start, :past]
+        return cls(found[:, :past], seen, found[:, past:], np.full(len(found), scene))
+
+    @classmethod
+    def join(cls, parts: list[Windows]) -> Windows:
+        """Windows of several scenes as one set."""
+        return cls(
+            *(np.concatenate([getattr(part, name) for part in parts]) for name in ("past", "known", "future", "scene"))
+        )
+
+    def last(self, count: int) -> Windows:
+        """Only the last ``count`` past positions."""
+        return Windows(self.past[:, -count:], self.known[:, -count:], self.future, self.scene)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Corruption:
+    """How windows are made harder, drawn anew every time: what a network is to bear.
+
+    ``noise_m`` the most noise of a seen position (per axis; that of a window is anything below it, little more often
+    than much, on a share ``noisy`` of them, correlated from step to step), ``gaps`` the share of past positions that
+    were not seen, ``least`` the shortest past, ``scale`` the most that people are made larger or smaller (as a
+    logarithm), ``turn`` and ``mirror`` whether windows are turned and mirrored.
+    """
+
+    noise_m: float = 0.0
+    noisy: float = 0.95
+    gaps: float = 0.0
+    least: int | None = None
+    scale: float = 0.0
+    turn: bool = True
+    mirror: bool = True
+
+    def __call__(self, windows: Windows, rng: np.random.Generator) -> Windows:
+        """The same windows, made harder, around the present position."""
+        count, length = windows.known.shape
+        now = windows.past[:, -1:]
+        past, future = windows.past - now, windows.future - now
+        matrix: Floats = np.tile(np.eye(2), (count, 1, 1))
+        if self.turn:
+            angle = rng.uniform(0, 2 * np.pi, count)
+            turned = np.stack([np.cos(angle), -np.sin(angle), np.sin(angle), np.cos(angle)], axis=-1)
+            matrix = turned.reshape(-1, 2, 2)
+        if self.mirror:
+            flips = np.stack([np.ones(count), rng.choice([-1.0, 1.0], count)], axis=-1)
+            matrix = matrix * flips[:, None]
+        if self.scale:
+            matrix = matrix * np.exp(rng.uniform(-self.scale, self.scale, count))[:, None, None]
+        past, future = past @ matrix.transpose(0, 2, 1), future @ matrix.transpose(0, 2, 1)
+        if self.noise_m:
+            spread = self.noise_m * rng.random((count, 1, 1)) ** 2 * (rng.random((count, 1, 1)) < self.noisy)
+            past = past + spread * ar1(rng, count, length)
+        known = windows.known.copy()
+        if self.gaps:
+            known &= rng.random((count, length)) >= self.gaps * (rng.random((count, 1)) < 0.5)
+        if self.least is not None:
+            keep = rng.integers(self.least, length + 1, count)
+            known &= np.arange(length) >= (length - keep)[:, None]
+        known[:, -1] = True
+        return Windows(past, known, future, windows.scene)
+
+
+def ar1(rng: np.random.Generator, count: int, length: int, memory: float = _NOISE_MEMORY) -> Floats:
+    """Noise (N, L, 2) of spread 1 that remembers a share ``memory`` of itself from step to step."""
+    fresh = rng.normal(size=(count, length, 2))
+    out = np.empty_like(fresh)
+    out[:, 0] = fresh[:, 0]
+    for step in range(1, length):
+        out[:, step] = memory * out[:, step - 1] + np.sqrt(1 - memory**2) * fresh[:, step]
+    return out

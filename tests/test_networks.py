@@ -1,0 +1,314 @@
+"""Networks: against torch, with files that are damaged, on other clocks, and in ONNX."""
+
+from __future__ import annotations
+
+import base64
+import json
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mcaptrack import log, pipeline
+from mcaptrack.errors import McaptrackError
+from mcaptrack.ingest import IngestOptions, ingest
+from mcaptrack.metrics.calibration import coverage, forecast_scores, mahalanobis_squared
+from mcaptrack.predictors import make
+from mcaptrack.predictors.linear import LinearPredictor
+from mcaptrack.predictors.lstm import Lstm
+from mcaptrack.predictors.own_clock import OnClock
+from mcaptrack.predictors.red import Red
+from mcaptrack.predictors.weights import SHIPPED, Weights, load, save
+from mcaptrack.provenance import Provenance
+from mcaptrack.training.walks import walks
+from mcaptrack.training.windows import Windows, ar1
+from mcaptrack.transforms import Predict
+from tests.worlds import walk
+
+#: Small networks, and what torch made of the same numbers.
+TORCH = json.loads((Path(__file__).parent / "networks.json").read_text())
+STORED = {name: {key: np.array(value) for key, value in TORCH[name]["tensors"].items()} for name in ("red", "lstm")}
+CARDS = {name: {"network": name, "steps": "3", "step_s": "0.4"} for name in ("red", "lstm")}
+PAST, KNOWN = np.array(TORCH["past"]), np.array(TORCH["known"], bool)
+
+# Networks in ONNX, made with its own helpers: constant velocity of the last step for three steps, from four positions;
+# the same with a covariance of as many m^2 as positions are known; the same with its axes in the wrong order.
+LINE = (
+    "CAgSADraAQokCgNvYnMSAXQiCVRyYW5zcG9zZSoPCgRwZXJtQABAAkABoAEHChEKAXQKAVcSAW0iBk1hdE11bAolCgFtEgRtZWFuIglUcmFuc3"
+    "Bvc2UqDwoEcGVybUAAQAJAAaABBxIBZyo7CAQIAxABQgFXSjAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAIC/AAAAwAAAQMAAAABAAABAQAAA"
+    "gEBaGgoDb2JzEhMKEQgBEg0KAxIBQgoCCAQKAggCYhwKBG1lYW4SFAoSCAESDgoDEgFCCgMSAVMKAggCQgQKABAN"
+)
+WITH_COV = (
+    "CAgSADqEBAokCgNvYnMSAXQiCVRyYW5zcG9zZSoPCgRwZXJtQABAAkABoAEHChEKAXQKAVcSAW0iBk1hdE11bAolCgFtEgRtZWFuIglUcmFuc3"
+    "Bvc2UqDwoEcGVybUAAQAJAAaABBwobCgV2YWxpZBIBdiIEQ2FzdCoJCgJ0bxgBoAECCiYKAXYKAmF4EgFuIglSZWR1Y2VTdW0qDwoIa2VlcGRp"
+    "bXMYAKABAgoUCgFuCgJzaBICbjQiB1Jlc2hhcGUKEQoCbjQKAUUSA2NvdiIDTXVsEgFnKjsIBAgDEAFCAVdKMAAAAAAAAAAAAAAAAAAAAAAAAA"
+    "AAAAAAAAAAgL8AAADAAABAwAAAAEAAAEBAAACAQCoSCAEQB0ICYXhKCAEAAAAAAAAAKioIBBAHQgJzaEog//////////8BAAAAAAAAAAEAAAAA"
+    "AAAAAQAAAAAAAAAqPwgBCAMIAggCEAFCAUVKMAAAgD8AAAAAAAAAAAAAgD8AAIA/AAAAAAAAAAAAAIA/AACAPwAAAAAAAAAAAACAP1oaCgNvYn"
+    "MSEwoRCAESDQoDEgFCCgIIBAoCCAJaGAoFdmFsaWQSDwoNCAkSCQoDEgFCCgIIBGIcCgRtZWFuEhQKEggBEg4KAxIBQgoDEgFTCgIIAmIfCgNj"
+    "b3YSGAoWCAESEgoDEgFCCgMSAVMKAggCCgIIAkIECgAQDQ=="
+)
+WRONG = (
+    "CAgSADrbAQokCgNvYnMSAXQiCVRyYW5zcG9zZSoPCgRwZXJtQABAAkABoAEHChEKAXQKAVcSAW0iBk1hdE11bAolCgFtEgRtZWFuIglUcmFuc3"
+    "Bvc2UqDwoEcGVybUABQAJAAKABBxIBZyo7CAQIAxABQgFXSjAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAIC/AAAAwAAAQMAAAABAAABAQAAA"
+    "gEBaGgoDb2JzEhMKEQgBEg0KAxIBQgoCCAQKAggCYh0KBG1lYW4SFQoTCAESDwoDEgFTCgMSAVQKAxIBVUIECgAQDQ=="
+)
+
+
+def weights(name: str, **changes: np.ndarray | None) -> Weights:
+    tensors = {key: value for key, value in (STORED[name] | changes).items() if value is not None}
+    return Weights(Path("w.safetensors"), tensors, CARDS[name], "")
+
+
+class TestAgainstTorch:
+    def test_red_is_what_torch_makes_of_it(self):
+        forecast = Red.of(weights("red")).predict(PAST, KNOWN)
+        np.testing.assert_allclose(forecast.mean, TORCH["red"]["mean"], atol=1e-8)
+        np.testing.assert_allclose(forecast.cov, TORCH["red"]["cov"], atol=1e-8)
+
+    def test_the_folded_lstm_is_what_torch_makes_of_it_unfolded(self):
+        forecast = Lstm.of(weights("lstm")).predict(PAST[:, -4:], np.ones((len(PAST), 4), bool))
+        np.testing.assert_allclose(forecast.mean, TORCH["lstm"]["mean"], atol=1e-8)
+
+    def test_the_spread_of_the_lstm_is_the_filters_times_what_was_measured(self):
+        wider = weights("lstm", spread=np.array([1.0, 2.0, 4.0]))
+        known = np.ones((len(PAST), 8), bool)
+        kalman = LinearPredictor("kalman", 3, 0.4).predict(PAST, known).cov
+        factor = np.array([1.0, 2.0, 4.0])[:, None, None]
+        np.testing.assert_allclose(Lstm.of(wider).predict(PAST, known).cov, kalman * factor)
+
+    def test_both_are_still_so_in_the_networks_that_are_trained(self):
+        torch = pytest.importorskip("torch", reason="training needs torch")
+        from mcaptrack.training.network import LstmNetwork, RedNetwork
+
+        torch.manual_seed(1)
+        path = walks(32, 20, 0.4, seed=3)[0]
+        windows = Windows.of(path, 8)
+        for network, kind, card in (
+            (RedNetwork(12, 0.4), Red, {"network": "red", "steps": "12", "step_s": "0.4"}),
+            (LstmNetwork(12), Lstm, {"network": "lstm", "steps": "12", "step_s": "0.4"}),
+        ):
+            with torch.no_grad():
+                for parameter in network.parameters():
+                    parameter.normal_(0, 0.2)
+                part = windows if kind is Red else windows.last(4)
+                given = network.prepare(part)
+                there = network(given)[0] if kind is Red else network(given["past"]).cumsum(1)
+            tensors = {name: np.asarray(value, float) for name, value in network.tensors().items()}
+            here = kind.of(Weights(Path("w"), tensors, card, "")).predict(part.past, part.known).mean
+            here = here if kind is Red else here - part.past[:, -1:]
+            np.testing.assert_allclose(here, there.numpy(), atol=2e-4)
+
+
+class TestShippedWeights:
+    @pytest.mark.parametrize("name", ["red", "lstm"])
+    def test_they_are_small_and_say_where_they_come_from(self, name):
+        shipped = load(SHIPPED / f"{name}.safetensors")
+        assert sum(file.stat().st_size for file in SHIPPED.glob("*.safetensors")) < 500_000
+        assert shipped.card["network"] == name
+        assert shipped.card["licence"] == "Apache-2.0"
+        assert "synthetic walks" in shipped.card["data"]
+        assert "ADE_m" in shipped.card["scores_clean"]
+        assert make(name, 12, 0.4).weights_sha256 == shipped.sha256
+
+    def test_red_errs_less_than_linear_predictors_and_its_ellipses_hold_what_they_say(self):
+        """On walks that it was not trained on, as they are and with the noise of a tracker."""
+        windows = Windows.of(walks(3000, 20, 0.4, seed=12345)[0], 8)
+        noise = 0.2 * ar1(np.random.default_rng(0), 3000, 8)
+        for seen in (windows.past, windows.past + noise):
+            scores = {
+                name: forecast_scores(*make(name, 12, 0.4).predict(seen, windows.known), windows.future)
+                for name in ("red", "cv", "kalman")
+            }
+            assert scores["red"]["ADE_m"] < 0.95 * min(scores["cv"]["ADE_m"], scores["kalman"]["ADE_m"])
+            assert scores["red"]["NLL"] < min(scores["cv"]["NLL"], scores["kalman"]["NLL"]) - 0.3
+            assert 0.93 < scores["red"]["coverage_95"] < 0.97
+
+    def test_what_was_foretold_says_by_which_weights(self, tmp_path):
+        lines = [f"{12 * n} 1 {0.4 * n} 0" for n in range(20)]
+        (tmp_path / "t.txt").write_text("\n".join(lines))
+        path = tmp_path / "t.mcap"
+        ingest(tmp_path / "t.txt", path, IngestOptions(fps=Fraction(30), role="tracks"))
+        for name in ("red", "kalman"):
+            with log.read(path) as opened:
+                pipeline.run(
+                    opened, "/camera", pipeline.plan_stage(opened, "/camera", "predict", Predict(predictor=name))
+                )
+            with log.read(path) as opened:
+                made = Provenance.from_metadata(opened.channels["/camera/predictions"].metadata)
+            shipped = load(SHIPPED / "red.safetensors").sha256
+            assert made.weights_sha256 == (shipped if name == "red" else "")
+
+
+class TestFiles:
+    def test_weights_come_back_with_their_card(self, tmp_path):
+        save(tmp_path / "w.safetensors", STORED["red"], CARDS["red"])
+        back = load(tmp_path / "w.safetensors")
+        assert back.card == CARDS["red"]
+        assert all(np.allclose(back.tensors[name], value) for name, value in STORED["red"].items())
+        predictor = make(f"red:{tmp_path / 'w.safetensors'}", 3, 0.4)
+        np.testing.assert_allclose(predictor.predict(PAST, KNOWN).mean, TORCH["red"]["mean"], atol=1e-5)
+
+    @pytest.mark.parametrize("damage", ["empty", "text", "cut", "pickle"])
+    def test_what_is_no_file_of_weights_is_refused_in_one_line(self, tmp_path, damage):
+        path = tmp_path / "w.safetensors"
+        save(path, STORED["red"], CARDS["red"])
+        data = path.read_bytes()
+        path.write_bytes(
+            {"empty": b"", "text": b"not weights", "cut": data[:-40], "pickle": b"\x80\x04cos\nsystem\n."}[damage]
+        )
+        with pytest.raises(McaptrackError, match=r"w\.safetensors is no file of weights"):
+            make(f"red:{path}", 3, 0.4)
+
+    @pytest.mark.parametrize(
+        ("changes", "words"),
+        [
+            ({"head.bias": None}, "has no head.bias"),
+            ({"head.bias": np.zeros(7)}, "head.bias has to be 15, not 7"),
+            ({"gru.weight_hh": np.zeros((9, 4))}, "gru.weight_ih has to be 12x11, not 9x11"),
+            ({"base.spread": np.full((9, 3), np.nan)}, "base.spread has to be 9x3, not numbers that are not finite"),
+        ],
+    )
+    def test_weights_that_do_not_fit_are_refused_by_name(self, changes, words):
+        with pytest.raises(McaptrackError, match=words):
+            Red.of(weights("red", **changes))
+
+    def test_weights_of_another_network_are_refused(self, tmp_path):
+        save(tmp_path / "w.safetensors", STORED["lstm"], CARDS["lstm"])
+        with pytest.raises(McaptrackError, match=r"w\.safetensors holds lstm, not red"):
+            make(f"red:{tmp_path / 'w.safetensors'}", 3, 0.4)
+        save(tmp_path / "x.safetensors", STORED["red"], CARDS["red"] | {"steps": "many"})
+        with pytest.raises(McaptrackError, match="its card does not say how many steps"):
+            make(f"red:{tmp_path / 'x.safetensors'}", 3, 0.4)
+
+    @pytest.mark.parametrize("name", ["ret", "red:", "cv:file", "onnx", "", ":x"])
+    def test_names_that_mean_nothing_are_refused_before_anything_runs(self, name):
+        with pytest.raises(McaptrackError, match="predictor is one of cv, holt-cv, kalman, lstm, red, or lstm:FILE"):
+            Predict(predictor=name)
+
+    def test_a_file_that_is_not_there_is_refused_before_anything_runs(self):
+        with pytest.raises(McaptrackError, match=r"there is no file nowhere\.safetensors"):
+            Predict(predictor="red:nowhere.safetensors")
+
+
+class _Straight:
+    """Goes on as in the last step, and is as uncertain as the square of the time; its steps are 0.4 s."""
+
+    name, past, steps, step_s, weights_sha256 = "straight", 4, 3, 0.4, None
+
+    def predict(self, xy_m, valid):
+        self.seen, self.valid = xy_m, valid
+        ahead = np.arange(1, 4)[:, None]
+        mean = xy_m[:, -1:] + ahead * (xy_m[:, -1:] - xy_m[:, -2:-1])
+        return mean, np.tile(np.eye(2) * (ahead[:, :, None] ** 2), (len(xy_m), 1, 1, 1))
+
+
+class TestOwnClock:
+    @pytest.mark.parametrize(
+        ("step_s", "steps"), [(0.1, 30), (0.2, 4), (0.4, 2), (0.4, 8), (0.3, 5), (0.8, 3), (1.0, 4)]
+    )
+    def test_who_walks_straight_goes_on_straight_at_any_rate(self, step_s, steps):
+        inner = _Straight()
+        outer = OnClock(_Forecasts(inner), steps, step_s)
+        times = np.arange(-12, 1) * step_s
+        past = np.stack([2 * times + 1, -times], axis=-1)[None]
+        forecast = outer.predict(past, np.ones((1, 13), bool))
+        ahead = step_s * np.arange(1, steps + 1)
+        np.testing.assert_allclose(forecast.mean[0], np.stack([2 * ahead + 1, -ahead], axis=-1), atol=1e-9)
+        spread = np.sqrt(forecast.cov[0, :, 0, 0])
+        assert (np.diff(spread) > 0).all()
+        beyond = ahead > 1.2
+        np.testing.assert_allclose(spread[beyond], 3 * ahead[beyond] / 1.2)  # grows with the time
+        assert inner.valid.all()
+        np.testing.assert_allclose(inner.seen[0, -4:, 0], 2 * 0.4 * np.arange(-3, 1) + 1, atol=1e-9)
+
+    def test_between_positions_of_which_one_is_not_known_nothing_is(self):
+        inner = _Straight()
+        known = np.ones((1, 7), bool)
+        known[0, 3] = False  # 0.9 s ago: between 0.8 s and 1.2 s lie positions 0.6, 0.9 and 1.2 s ago
+        OnClock(_Forecasts(inner), 2, 0.3).predict(np.zeros((1, 7, 2)), known)
+        assert inner.valid.tolist() == [[True, False, True, True]]
+
+    def test_how_far_back_it_looks(self):
+        assert [OnClock(_Forecasts(_Straight()), 3, step_s).past for step_s in (0.1, 0.3, 0.4, 1.0)] == [13, 5, 4, 3]
+
+    def test_predictions_at_five_a_second_lie_between_those_at_two_and_a_half(self):
+        path = walk(lambda n: {1: (0.2 * n, 0.0)}, 40, rate_hz=5.0)
+        (last,) = list(Predict(rate_hz=5.0, horizon_s=6.0)(path))[-1]
+        assert last.rows["step"].tolist() == list(range(1, 31))
+        assert (np.diff(last.rows["x_m"]) > 0).all()
+        assert (np.diff(last.rows["cov_xx_m2"]) > 0).all()
+
+
+class _Forecasts:
+    """A predictor whose answer is a plain tuple, as the protocol has it."""
+
+    def __init__(self, inner):
+        self._inner = inner
+
+    def __getattr__(self, name):
+        return getattr(self._inner, name)
+
+    def predict(self, xy_m, valid):
+        from mcaptrack.predictors import Forecast
+
+        return Forecast(*self._inner.predict(xy_m, valid))
+
+
+class TestOnnx:
+    def file(self, folder, text):
+        pytest.importorskip("onnxruntime", reason="networks in ONNX need ONNX Runtime")
+        path = folder / "net.onnx"
+        path.write_bytes(base64.b64decode(text))
+        return f"onnx:{path}"
+
+    def test_a_network_of_ones_own(self, tmp_path):
+        predictor = make(self.file(tmp_path, LINE), 3, 0.4)
+        past = np.array([[[5.0, 5.0], [np.nan, np.nan], [7.0, 5.5]]])
+        forecast = predictor.predict(past, np.array([[True, False, True]]))
+        np.testing.assert_allclose(forecast.mean[0], [[8, 5.75], [9, 6.0], [10, 6.25]], atol=1e-5)
+        kalman = make("kalman", 3, 0.4).predict(past, np.array([[True, False, True]]))
+        np.testing.assert_allclose(forecast.cov, kalman.cov)
+        assert len(predictor.weights_sha256) == 64
+
+    def test_a_covariance_of_its_own_and_what_it_knows_of_holes(self, tmp_path):
+        predictor = make(self.file(tmp_path, WITH_COV), 3, 0.4)
+        known = np.array([[True, False, False, True], [True, True, True, True]])
+        cov = predictor.predict(np.zeros((2, 4, 2)), known).cov
+        np.testing.assert_allclose(cov[:, 0], [2 * np.eye(2), 4 * np.eye(2)])
+
+    def test_what_can_not_be_used_is_refused_in_one_line(self, tmp_path):
+        name = self.file(tmp_path, WRONG)
+        with pytest.raises(McaptrackError, match=r"net\.onnx has to give \(B, T, 2\)"):
+            make(name, 3, 0.4)
+        (tmp_path / "net.onnx").write_bytes(b"nothing of the kind")
+        with pytest.raises(McaptrackError, match=r"net\.onnx is no network that ONNX Runtime can run"):
+            make(name, 3, 0.4)
+
+    def test_without_onnx_runtime_it_says_what_to_install(self, tmp_path, monkeypatch):
+        (tmp_path / "other.onnx").write_bytes(b"x")
+        monkeypatch.setitem(__import__("sys").modules, "onnxruntime", None)
+        with pytest.raises(McaptrackError, match=r"needs ONNX Runtime, which is not installed; `pip install"):
+            make(f"onnx:{tmp_path / 'other.onnx'}", 3, 0.4)
+
+
+class TestCalibration:
+    def test_by_hand(self):
+        off = np.array([[[3.0, 4.0], [0.0, 0.0]]])
+        cov = np.tile(np.diag([9.0, 4.0]), (1, 2, 1, 1))
+        assert mahalanobis_squared(off, cov).tolist() == [[5.0, 0.0]]
+        scores = forecast_scores(off, cov, np.zeros((1, 2, 2)))
+        assert scores["ADE_m"] == 2.5
+        assert scores["FDE_m"] == 0.0
+        assert scores["ADE_squared_m2"] == 12.5
+        # -log of a Gaussian: half the squared length, half the log of the determinant, log 2 pi
+        assert scores["NLL"] == pytest.approx(1.25 + np.log(36) / 2 + np.log(2 * np.pi))
+        # chi^2 with two degrees of freedom has its quantiles at 1.386, 4.605 and 5.991
+        assert [scores[f"coverage_{level}"] for level in (50, 90, 95)] == [0.5, 0.5, 1.0]
+
+    def test_ellipses_of_gaussian_errors_hold_what_they_say(self):
+        scipy_stats = pytest.importorskip("scipy.stats")
+        cov = np.array([[2.0, 0.7], [0.7, 1.0]])
+        off = scipy_stats.multivariate_normal([0, 0], cov).rvs(40_000, random_state=1)
+        for level in (0.5, 0.9, 0.95):
+            assert coverage(off, cov, level) == pytest.approx(level, abs=0.006)

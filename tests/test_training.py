@@ -1,0 +1,348 @@
+"""Training: made-up walks, windows, sources, recipes, and what a training leaves behind."""
+
+from __future__ import annotations
+
+import csv
+import json
+import sys
+from dataclasses import replace
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from mcaptrack import log, tables
+from mcaptrack.cli import app
+from mcaptrack.errors import McaptrackError
+from mcaptrack.export import export
+from mcaptrack.ingest import IngestOptions, ingest
+from mcaptrack.predictors.weights import load
+from mcaptrack.training.recipe import RECIPES, Recipe
+from mcaptrack.training.sources import Scene, SourceOptions, read_scenes, split, synthetic, windows_of
+from mcaptrack.training.walks import walks
+from mcaptrack.training.windows import Corruption, Windows, ar1
+
+RED, PAPER = RECIPES["red"], RECIPES["paper"]
+SMALL = replace(RED, epochs=3, batch=64)
+
+
+@pytest.fixture(scope="module")
+def crowd() -> Windows:
+    return synthetic(RED, 1500, seed=1)
+
+
+class TestWalks:
+    def test_the_same_seed_gives_the_same_walks_and_another_others(self, crowd):
+        same, other = (synthetic(RED, 50, seed) for seed in (1, 2))
+        np.testing.assert_array_equal(same.past, crowd.past[:50])
+        np.testing.assert_array_equal(same.future, crowd.future[:50])
+        assert not np.isclose(other.past, same.past).any()
+
+    def test_people_walk_as_people_do(self):
+        """Speeds of pedestrians by Weidmann: 1.3 m/s; some stand; nobody leaps, and people keep out of each other."""
+        paths, scene = walks(5760, 20, 0.4, 3)
+        speed = np.linalg.norm(np.diff(paths, axis=1), axis=-1) / 0.4
+        mean = speed.mean(axis=1)
+        assert 0.1 < (mean < 0.1).mean() < 0.35
+        assert 1.0 < np.median(mean[(mean > 0.5) & (mean < 2)]) < 1.4
+        assert speed.max() < 6
+        change = np.linalg.norm(np.diff(paths, 2, axis=1), axis=-1) / 0.4
+        assert np.quantile(change, 0.99) < 1.5
+        assert len(np.unique(scene)) == 48
+        first = paths.reshape(48, 24, 5, 20, 2)[:, :, 0, 0]  # everybody of each scene at one time
+        apart = np.linalg.norm(first[:, :, None] - first[:, None], axis=-1)[:, *np.triu_indices(24, 1)]
+        assert np.quantile(apart, 0.01) > 0.4
+        assert (apart < 1.2).any(axis=1).mean() > 0.9  # groups
+
+
+class TestWindows:
+    def test_cutting_by_hand(self):
+        """Two people over six steps; one past position is missing, and one future one."""
+        xy = np.arange(24.0).reshape(2, 6, 2)
+        xy[0, 1] = np.nan
+        xy[1, 5] = np.nan
+        found = Windows.cut(xy, past=3, steps=2, least=2, scene=7)
+        assert found.past[:, -1, 0].tolist() == [4 + 0.0, 6 + 0.0, 14.0, 16.0]  # present positions
+        assert found.known.tolist() == [[True, False, True], [False, True, True], [False, True, True], [True] * 3]
+        assert found.future[:, :, 0].tolist() == [[6, 8], [8, 10], [16, 18], [18, 20]]
+        assert found.scene.tolist() == [7] * 4
+        assert len(Windows.cut(xy, past=3, steps=2, least=3)) == 1
+        assert Windows.cut(xy, past=3, steps=2, least=2, stride=2).past[:, -1, 0].tolist() == [4, 14]
+        assert len(Windows.cut(xy[:, :2], past=3, steps=2, least=1)) == 0
+        assert len(Windows.cut(np.empty((0, 9, 2)), past=3, steps=2, least=1)) == 0
+
+    def test_turned_mirrored_and_scaled_people_are_as_far_apart_as_before(self, crowd):
+        out = Corruption()(crowd, np.random.default_rng(1))
+        for name in ("past", "future"):
+            before, after = getattr(crowd, name), getattr(out, name)
+            np.testing.assert_allclose(
+                np.linalg.norm(np.diff(after, axis=1), axis=-1), np.linalg.norm(np.diff(before, axis=1), axis=-1)
+            )
+        assert np.all(out.past[:, -1] == 0)
+        same = np.isclose(out.future[:, -1], crowd.future[:, -1] - crowd.past[:, -1], atol=1e-3).all(axis=1)
+        assert same.mean() < 0.05
+        larger = Corruption(scale=0.2)(crowd, np.random.default_rng(1)).future[:, -1]
+        ratio = np.linalg.norm(larger, axis=1) / np.linalg.norm(out.future[:, -1], axis=1)
+        assert np.exp(-0.2) <= ratio.min() < 0.85
+        assert 1.17 < ratio.max() <= np.exp(0.2)
+
+    def test_noise_and_gaps_touch_the_past_alone(self, crowd):
+        quiet = Corruption(turn=False, mirror=False)
+        plain = quiet(crowd, np.random.default_rng(1))
+        hard = replace(quiet, noise_m=0.4, noisy=0.5, gaps=0.5, least=2)(crowd, np.random.default_rng(1))
+        np.testing.assert_array_equal(hard.future, plain.future)
+        noise = hard.past - plain.past
+        assert (noise == 0).all(axis=(1, 2)).mean() == pytest.approx(0.5, abs=0.05)
+        assert noise.std() < 0.4
+        assert hard.known[:, -1].all()
+        assert 0.2 < hard.known[:, :-1].mean() < 0.8
+
+    def test_the_noise_of_a_tracker_is_of_spread_one_and_remembers(self):
+        noise = ar1(np.random.default_rng(1), 20_000, 6)
+        np.testing.assert_allclose(noise.std(axis=0), 1, atol=0.02)
+        for back, wanted in ((1, 0.5), (2, 0.25)):
+            assert (noise[:, back:] * noise[:, :-back]).mean() == pytest.approx(wanted, abs=0.02)
+
+    def test_scenes_are_held_out_whole(self):
+        part = Windows.of(np.zeros((100, 20, 2)), 8, np.repeat(np.arange(10), 10))
+        training, validation = split(part, 0.2, seed=1)
+        assert not set(training.scene) & set(validation.scene)
+        assert sorted({*training.scene, *validation.scene}) == list(range(10))
+        assert len(validation) == 20
+        one = Windows.of(np.zeros((100, 20, 2)), 8)
+        assert [len(part) for part in split(one, 0.2, seed=1)] == [80, 20]
+
+
+PATHS = {1: lambda n: (0.5 * n, 1.0), 2: lambda n: (3.0, 0.25 * n), 7: lambda n: (-0.3 * n, -0.2 * n)}
+
+
+class TestSources:
+    """The same people, told in different files."""
+
+    def check(self, scenes: list[Scene], atol: float = 1e-6):
+        (scene,) = scenes
+        assert scene.xy_m.shape == (3, 25, 2)
+        for row, path in zip(scene.xy_m, PATHS.values(), strict=True):
+            np.testing.assert_allclose(row, [path(n) for n in range(25)], atol=atol)
+
+    def lines(self, words):
+        return "\n".join(words(who, n, *path(n)) for n in range(25) for who, path in PATHS.items())
+
+    def read(self, path, **options):
+        return read_scenes([path], SourceOptions(**options), 0.4)
+
+    def test_trajnet(self, tmp_path):
+        (tmp_path / "t.txt").write_text(self.lines(lambda who, n, x, y: f"{12 * n} {who} {x} {y}"))
+        self.check(self.read(tmp_path / "t.txt"))
+        self.check(self.read(tmp_path / "t.txt", fps=Fraction(30)))
+        self.check(self.read(tmp_path))
+
+    def test_eth(self, tmp_path):
+        (tmp_path / "obsmat.txt").write_text(self.lines(lambda who, n, x, y: f"{780 + 6 * n} {who} {x} 0 {y} 0 0 0"))
+        self.check(self.read(tmp_path / "obsmat.txt"))
+
+    def test_boxes_need_their_rate_and_their_ground(self, tmp_path):
+        (tmp_path / "gt.txt").write_text(
+            self.lines(lambda who, n, x, y: f"{4 * n + 1},{who},{10 * x + 99},{10 * y + 40},2,20,1,1,1")
+        )
+        (tmp_path / "h.txt").write_text("0.1 0 -10\n0 0.1 -6\n0 0 1")
+        options = {"fps": Fraction(10), "ground_plane": tmp_path / "h.txt"}
+        self.check(self.read(tmp_path / "gt.txt", **options))
+        with pytest.raises(McaptrackError, match=r"gt\.txt: how many frames a second\? Say it with --fps"):
+            self.read(tmp_path / "gt.txt")
+        with pytest.raises(McaptrackError, match=r"gt\.txt is in pixels; give its homography with --ground-plane"):
+            self.read(tmp_path / "gt.txt", fps=Fraction(10))
+
+    def test_stanford_drone(self, tmp_path):
+        text = self.lines(
+            lambda who, n, x, y: (
+                f'{who} {100 * x + 999:.0f} {100 * y + 999:.0f} {100 * x + 1001:.0f} {100 * y + 1001:.0f} {12 * n} 0 0 0 "Pedestrian"'
+            )
+        )
+        (tmp_path / "annotations.txt").write_text(text)
+        (tmp_path / "h.txt").write_text("0.01 0 -10\n0 0.01 -10\n0 0 1")
+        self.check(self.read(tmp_path / "annotations.txt", ground_plane=tmp_path / "h.txt", point="center"), 1e-2)
+
+    def test_logs_and_their_tables(self, tmp_path):
+        (tmp_path / "t.txt").write_text(self.lines(lambda who, n, x, y: f"{12 * n} {who} {x} {y}"))
+        path = tmp_path / "out" / "t.mcap"
+        path.parent.mkdir()
+        ingest(tmp_path / "t.txt", path, IngestOptions(fps=Fraction(30), role="truth"))
+        self.check(self.read(path))
+        with log.read(path) as opened:
+            export(opened, tmp_path / "tables")
+        self.check(self.read(tmp_path / "tables"))
+        with log.read(path) as opened:
+            export(opened, path.with_suffix(".tables"))
+        self.check(self.read(path.parent))  # what is told twice counts once
+        with pytest.raises(McaptrackError, match=r"t\.mcap has none of /camera/tracks"):
+            self.read(path, topic="/camera/tracks")
+
+    def test_tables_of_others(self, tmp_path):
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        rows = [(int(4e8) * n, who, *path(n)) for n in range(25) for who, path in PATHS.items()]
+        columns = dict(zip(("t_ns", "track_id", "x_m", "y_m"), zip(*rows, strict=True), strict=True))
+        pq.write_table(pa.table({name: list(values) for name, values in columns.items()}), tmp_path / "a.parquet")
+        self.check(self.read(tmp_path / "a.parquet"))
+        assert tables.holds_tracks(tmp_path / "a.parquet")
+        pq.write_table(pa.table({"t_ns": [1], "id": [1]}), tmp_path / "b.parquet")
+        with pytest.raises(McaptrackError, match=r"b\.parquet has no column track_id, x_m, y_m"):
+            self.read(tmp_path / "b.parquet")
+        (tmp_path / "c.parquet").write_bytes(b"PAR1")
+        with pytest.raises(McaptrackError, match=r"c\.parquet can't be read as Parquet"):
+            self.read(tmp_path / "c.parquet")
+
+    def test_nothing_to_train_on(self, tmp_path):
+        with pytest.raises(McaptrackError, match=r"has no \.txt"):
+            self.read(tmp_path)
+        with pytest.raises(McaptrackError, match=r"nobody is seen for 5\.6 s without a break in short"):
+            windows_of([Scene("short", np.zeros((2, 9, 2)))], RED)
+
+
+class TestRecipes:
+    def test_the_papers_rate(self):
+        assert (PAPER.epochs, PAPER.loss, PAPER.network) == (50, "displacements", "lstm")
+        rates = [PAPER.rate_at(epoch * 10 + 3, 10) for epoch in (0, 39, 40, 49)]
+        np.testing.assert_allclose(rates, [1e-4, 1e-4, 2e-5, 2e-5])
+
+    def test_our_rate_rises_and_falls(self):
+        rates = [RED.rate_at(step, 10) for step in range(RED.epochs * 10)]
+        assert max(rates) == pytest.approx(RED.rate_at(RED.epochs, 10)) == pytest.approx(RED.rate)
+        assert (np.diff(rates[1:21]) > 0).all()
+        assert (np.diff(rates[20:]) <= 0).all()
+
+    @pytest.mark.parametrize(
+        ("given", "corrupted", "words"),
+        [
+            ({"epochs": 0}, {}, "epochs has to be at least 1, not 0"),
+            ({"rate": -1.0}, {}, "rate has to be at least"),
+            ({"rate": float("nan")}, {}, "rate has to be at least"),
+            ({}, {"gaps": 1.5}, "gaps has to be from 0 to 0.9, not 1.5"),
+            ({}, {"noise_m": float("nan")}, "noise-m has to be from 0"),
+        ],
+    )
+    def test_parameters_out_of_range_are_refused(self, given, corrupted, words):
+        with pytest.raises(McaptrackError, match=words):
+            RED.changed(given, corrupted)
+
+    def test_the_paper_compares_displacements_alone(self):
+        with pytest.raises(McaptrackError, match="consistency weight needs the recipe red"):
+            PAPER.changed({"consistency_weight": 0.3}, {})
+
+    def test_a_card_says_what_was_changed(self):
+        assert RED.words() == {}
+        assert RED.changed({"epochs": 7}, {"gaps": 0.1}).words() == {"epochs": "7", "gaps": "0.1"}
+
+
+@pytest.fixture
+def fit():
+    pytest.importorskip("torch", reason="training needs torch")
+    from mcaptrack.training.loop import train
+
+    def run(recipe: Recipe, windows: Windows, folder, **options):
+        folder.mkdir(exist_ok=True)
+        training, validation = split(windows, 0.2, 1)
+        return train(recipe, training, validation, folder, {"data": "a test"}, "cpu", 1, **options)
+
+    return run
+
+
+class TestTraining:
+    def test_a_short_training_beats_what_it_began_with(self, fit, crowd, tmp_path):
+        trained = fit(replace(SMALL, epochs=8), crowd, tmp_path)
+        noisy = {name: scores["ADE_m"] for name, scores in trained.scores["noisy"].items()}
+        assert noisy["red"] < min(noisy["kalman"], noisy["cv"])  # a fresh network is the Kalman filter
+        # Each step is calibrated on whichever windows take less: neither are held by more than 95 %.
+        held = [scores["red"]["coverage_95"] for scores in trained.scores.values()]
+        assert max(held) == pytest.approx(0.95, abs=0.02)
+        assert max(held) < 0.955
+        card = load(trained.weights).card
+        assert (card["data"], card["network"], json.loads(card["recipe"])["epochs"]) == ("a test", "red", "8")
+        rows = list(csv.DictReader((tmp_path / "epochs.csv").read_text().splitlines()))
+        assert [int(row["epoch"]) for row in rows] == list(range(1, 9))
+        errors = [float(row["validation_ade_m"]) for row in rows]
+        assert trained.kept_epoch == 1 + errors.index(min(errors))
+
+    @pytest.mark.parametrize("recipe", [SMALL, replace(PAPER, epochs=3), replace(SMALL, consistency_weight=1.0)])
+    def test_resumed_is_as_if_it_had_not_been_cut_off(self, fit, crowd, tmp_path, recipe):
+        windows = crowd if recipe.network == "red" else crowd.last(4)
+        whole = fit(recipe, windows, tmp_path / "whole")
+        stop = iter([None, KeyboardInterrupt()])
+
+        def interrupt(*_):
+            if error := next(stop, None):
+                raise error
+
+        with pytest.raises(KeyboardInterrupt):
+            fit(recipe, windows, tmp_path / "cut", progress=interrupt)
+        resumed = fit(recipe, windows, tmp_path / "cut", resume=True)
+        assert resumed.epochs == whole.epochs == 3
+        assert resumed.weights.read_bytes() == whole.weights.read_bytes()
+        with pytest.raises(McaptrackError, match="is of a training with another recipe or"):
+            fit(replace(recipe, seed=5), windows, tmp_path / "cut", resume=True)
+
+    def test_it_ends_when_nothing_gets_better(self, fit, crowd, tmp_path):
+        said = []
+        patient = replace(SMALL, epochs=60, rate=0.05, patience=2)  # steps so wide that it soon gets worse
+        trained = fit(patient, crowd, tmp_path, say=said.append)
+        assert trained.kept_epoch == trained.epochs - 2 < 58
+        assert "no better for 2 epochs" in said[0]
+
+    def test_a_rate_that_is_too_high_is_said(self, fit, crowd, tmp_path):
+        with pytest.raises(McaptrackError, match=r"the loss is (nan|inf) in epoch"):
+            fit(replace(PAPER, rate=1e30), crowd.last(4), tmp_path)
+
+    def test_more_consistency_makes_forecasts_drift_less(self, fit, crowd, tmp_path):
+        from mcaptrack.predictors import make
+
+        drift = []
+        for number, weight in enumerate((0.0, 30.0)):
+            trained = fit(replace(SMALL, consistency_weight=weight), crowd, tmp_path / str(number))
+            predictor = make(f"red:{trained.weights}", 12, 0.4)
+            path = np.concatenate([crowd.past, crowd.future[:, :1]], axis=1)
+            path = path + 0.2 * ar1(np.random.default_rng(0), *path.shape[:2])
+            now, then = (predictor.predict(path[:, k : k + 8], crowd.known).mean for k in (0, 1))
+            drift.append(np.linalg.norm(now[:, 1:] - then[:, :-1], axis=-1).mean())
+        assert drift[1] < 0.9 * drift[0]
+
+
+class TestCommand:
+    def run(self, *words):
+        return CliRunner().invoke(app, ["train", *map(str, words)])
+
+    def test_from_files_to_a_table_and_back_into_predict(self, tmp_path):
+        pytest.importorskip("torch", reason="training needs torch")
+        paths, scene = walks(1440, 20, 0.4, 5)
+        for number in range(6):
+            rows = [
+                f"{12 * step} {who} {x:.3f} {y:.3f}"
+                for who, path in enumerate(paths[scene == number * 2][:60])
+                for step, (x, y) in enumerate(path)
+            ]
+            (tmp_path / f"s{number}.txt").write_text("\n".join(rows))
+        words = (tmp_path, "-o", tmp_path / "out", "--epochs", 2, "--device", "cpu", "--threads", 1)
+        result = self.run(*words)
+        assert result.exit_code == 0, result.output
+        lines = result.stdout.splitlines()
+        assert [line.split("  ")[0].strip() for line in lines[1:7:3]] == ["as they are", "with 0.2 m of noise"]
+        assert f"predict log.mcap --predictor red:{tmp_path / 'out' / 'red.safetensors'}" in result.stdout
+        assert load(tmp_path / "out" / "red.safetensors").card["licence"] == "that of the data it was trained on"
+        assert "holds a training; --resume goes on with it, --force replaces it" in self.run(*words).stderr
+        again = self.run(*words, "--resume", "--json", "-q")
+        assert again.exit_code == 0, again.output
+        assert json.loads(again.stdout)["epochs"] == 2
+
+    def test_mistakes_are_one_line(self, tmp_path, monkeypatch):
+        (tmp_path / "file").write_text("")
+        assert "training needs a folder" in self.run("synthetic", "-o", tmp_path / "file").stderr
+        assert "there is no training to resume" in self.run("synthetic", "-o", tmp_path, "--resume").stderr
+        monkeypatch.setitem(sys.modules, "torch", None)
+        result = self.run("synthetic", "-o", tmp_path / "new")
+        assert result.exit_code == 1
+        assert result.stderr == (
+            "mcaptrack: training needs torch, which is not installed; `pip install 'mcaptrack[train]'` brings it\n"
+        )
+        assert not (tmp_path / "new").exists()
