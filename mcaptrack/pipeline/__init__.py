@@ -1,0 +1,37 @@
+"""Stages in order: which channel feeds which transform, what has to run first, and what it leaves in the log.
+
+A stage runs on a log that stands and adds its channels to it, with what they were made from and how.
+"""
+
+from mcaptrack.pipeline.plan import (
+    DEFAULT_CAMERA,
+    ROUTES,
+    Job,
+    Route,
+    find_camera,
+    is_stale,
+    picture_topic,
+    plan_all,
+    plan_stage,
+)
+from mcaptrack.pipeline.run import Report, input_of, read_planes, run
+from mcaptrack.pipeline.write import LAYOUT, find_views, layout
+
+__all__ = [
+    "DEFAULT_CAMERA",
+    "LAYOUT",
+    "ROUTES",
+    "Job",
+    "Report",
+    "Route",
+    "find_camera",
+    "find_views",
+    "input_of",
+    "is_stale",
+    "layout",
+    "picture_topic",
+    "plan_all",
+    "plan_stage",
+    "read_planes",
+    "run",
+]
