@@ -115,24 +115,31 @@ class Messages:
 
     def columns(self, channel_id: int, schema: Schema) -> Columns | None:
         """Rows without a loop over messages; None where a message is laid out otherwise than ours."""
-        parts: list[Columns] = []
-        for source in self._sources(channel_id):
+        sources = self._sources(channel_id)
+        t_ns = np.concatenate([np.empty(0, np.int64), *(source.t_ns for source in sources)])
+        sequence, counts = np.empty_like(t_ns), np.empty_like(t_ns)
+        rows, done, taken = schema.empty(), 0, 0
+        for source in sources:
             content = self._open(source)
             found = heads_at(content, channel_id, source.t_ns, source.offset)
             decoded = schema.codec.decode_at(np.frombuffer(content, np.uint8), found.start, found.end)
             if decoded is None:
                 return None
-            parts.append(Columns(decoded[0], source.t_ns, found.head["sequence"].astype(np.int64), decoded[1]))
-        if not parts:
-            return Columns(schema.empty(), *(np.empty(0, np.int64) for _ in range(3)))
-        rows = schema.codec.join([part.rows for part in parts])
-        times, sequence, counts = (np.concatenate(column) for column in list(zip(*parts, strict=True))[1:])
-        order = np.argsort(times, kind="stable")
+            part, counts_of = decoded
+            until = done + len(source.t_ns)
+            sequence[done:until], counts[done:until] = found.head["sequence"], counts_of
+            if taken + len(part) > len(rows):  # as many more as the messages to come have if they are like those so far
+                share = (len(t_ns) - done) / max(until - done, 1)
+                rows = schema.codec.longer(rows, taken, taken + int(len(part) * share * 1.02) + 1)
+            schema.codec.put(rows, taken, part)
+            done, taken = until, taken + len(part)
+        rows = rows[:taken]
+        order = np.argsort(t_ns, kind="stable")
         if (np.diff(order) != 1).any():
             first, kept = (np.cumsum(counts) - counts)[order], counts[order]
             rows = rows[np.repeat(first - (np.cumsum(kept) - kept), kept) + np.arange(len(rows))]
         rows.flags.writeable = False
-        return Columns(rows, times[order], sequence[order], counts[order])
+        return Columns(rows, t_ns[order], sequence[order], counts[order])
 
     def _sources(self, channel_id: int, span: Span = (None, None)) -> list[_Source]:
         """Where the messages of a channel stand; only chunks that reach into the span are looked at."""
@@ -169,6 +176,8 @@ class Messages:
         content = self._opened.pop(source.start, None)
         if content is None:
             content = open_chunk(self._buffer, chunk_record(self._buffer, source.chunk))
+        if len(source.chunk.message_index_offsets) == 1:
+            return content  # nobody else will ask for it
         self._opened[source.start] = content
         while sum(map(len, self._opened.values())) > OPEN_BYTES // 4 and len(self._opened) > 1:
             self._opened.popitem(last=False)

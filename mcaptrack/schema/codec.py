@@ -63,6 +63,8 @@ class RowCodec:
         self._fixed = fixed
         self._data = np.where(fixed == 0xFF, 0, 0xFF).astype(np.uint8)
         self._tags = self._template.tobytes()
+        fixed_at = np.flatnonzero(fixed).tolist()
+        self._fixed_bytes = [(at, fixed[at], self._template[at] & fixed[at]) for at in fixed_at]
 
     def encode(self, rows: Rows) -> bytes:
         """One payload of N rows. ``rows`` must have the columns of the schema, in any memory layout."""
@@ -110,15 +112,23 @@ class RowCodec:
             return np.empty(0, self.dtype), counts
         first = np.repeat(start - size * (np.cumsum(counts) - counts), counts) + size * np.arange(total)
         block = np.lib.stride_tricks.sliding_window_view(raw, size)[first]
-        if ((block & self._fixed) != (self._template & self._fixed)).any():
+        # A column at a time: few bytes of a row are fixed.
+        if any(((block[:, at] & mask) != tag).any() for at, mask, tag in self._fixed_bytes):
             return None
         return block.view(self.dtype)[:, 0], counts
 
-    def join(self, parts: Sequence[Rows]) -> Rows:
-        """Arrays of this layout as one; as bytes, since NumPy joins structured arrays field by field."""
-        size = self.dtype.itemsize
-        raw = [np.ascontiguousarray(part).view(np.uint8).reshape(-1, size) for part in parts]
-        return np.concatenate([np.empty((0, size), np.uint8), *raw]).view(self.dtype)[:, 0]
+    def longer(self, rows: Rows, taken: int, length: int) -> Rows:
+        """An array of this length that begins with the first ``taken`` rows; what follows is not set."""
+        out = np.empty((length, self.dtype.itemsize), np.uint8)
+        out[:taken] = self._bytes(rows[:taken])
+        return out.view(self.dtype)[:, 0]
+
+    def put(self, rows: Rows, at: int, part: Rows) -> None:
+        """Rows of this layout into others; as bytes, since NumPy copies structured arrays field by field."""
+        self._bytes(rows)[at : at + len(part)] = self._bytes(part)
+
+    def _bytes(self, rows: Rows) -> NDArray[np.uint8]:
+        return np.asarray(rows.view(np.uint8).reshape(-1, self.dtype.itemsize), np.uint8)
 
     def _is_ours(self, payload: bytes) -> bool:
         """Whether every tag stands where our encoder puts it: then each byte between them is what we say it is."""
