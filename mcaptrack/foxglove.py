@@ -38,6 +38,7 @@ PICTURES: Final = (VIDEO, IMAGE)
 # Okabe and Ito's colours, which stay apart for colour-blind people, without black; then again, lighter and darker.
 _HUES: Final = ("E69F00", "56B4E9", "009E73", "F0E442", "0072B2", "D55E00", "CC79A7")
 _SHADES: Final = (1.0, 1.35, 0.7)
+_LIGHT: Final = 0.55
 _INVISIBLE: Final = (0.0, 0.0, 0.0, 0.0)
 
 
@@ -142,7 +143,8 @@ def pack_annotations(
             text = message.texts.add(text=str(name), font_size=12)
             text.timestamp.CopyFrom(message.timestamp)
             text.position.x, text.position.y = x1, y1
-            _paint(text.text_color, (1.0, 1.0, 1.0, 1.0))
+            is_light = 0.299 * shade[0] + 0.587 * shade[1] + 0.114 * shade[2] > _LIGHT
+            _paint(text.text_color, (0.0, 0.0, 0.0, 1.0) if is_light else (1.0, 1.0, 1.0, 1.0))
             _paint(text.background_color, (*shade[:3], 0.6))
     for path in paths:
         points = path.points.round(2).tolist()
