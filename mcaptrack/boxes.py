@@ -50,11 +50,12 @@ def overlapping(a: Floats, b: Floats, area_a: Floats, area_b: Floats) -> tuple[I
     """
     if a.shape[1] * b.shape[1] > _MANY:
         first, second = _side_by_side(a, b)
-        extent = np.minimum(a[2:, first], b[2:, second]) - np.maximum(a[:2, first], b[:2, second])
+        extent = np.minimum(a[2:].take(first, axis=1), b[2:].take(second, axis=1))
+        extent -= np.maximum(a[:2].take(first, axis=1), b[:2].take(second, axis=1))
         np.maximum(extent, 0.0, out=extent)
         extent[0] *= extent[1]
         at = extent[0].nonzero()[0]
-        first, second, shared = first[at], second[at], extent[0, at]
+        first, second, shared = first.take(at), second.take(at), extent[0].take(at)
     else:
         extent = np.minimum(a[2:, :, None], b[2:, None, :])
         extent -= np.maximum(a[:2, :, None], b[:2, None, :])
@@ -62,10 +63,13 @@ def overlapping(a: Floats, b: Floats, area_a: Floats, area_b: Floats) -> tuple[I
         extent[0] *= extent[1]
         both = extent[0].ravel()
         at = both.nonzero()[0]
-        shared = both[at]
-        first = at // (b.shape[1] or 1)
-        second = at - first * b.shape[1]
-    return first, second, shared / (area_a[first] + area_b[second] - shared)
+        shared = both.take(at)
+        first, second = np.divmod(at, b.shape[1] or 1)
+    either = area_a.take(first)
+    either += area_b.take(second)
+    either -= shared
+    shared /= either
+    return first, second, shared
 
 
 def _side_by_side(a: Floats, b: Floats) -> tuple[Ints, Ints]:

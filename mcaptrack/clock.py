@@ -45,14 +45,16 @@ class FrameClock:
         if passed <= 0:
             return 1
         intervals, in_order = self._intervals, self._sorted
-        if len(intervals) == _MEMORY:
-            del in_order[bisect_left(in_order, intervals.popleft())]
+        oldest = intervals.popleft() if len(intervals) == _MEMORY else None
         intervals.append(passed)
-        insort(in_order, passed)
-        count = len(in_order)
-        cut = min((count + 3) // 4, (count - 1) // 2)
-        middle = in_order[cut : count - cut]
-        self.interval_ns = usual = max(sum(middle) // len(middle), 1)
+        count, usual = len(intervals), self.interval_ns
+        if oldest != passed:  # otherwise they are the same intervals as before
+            if oldest is not None:
+                del in_order[bisect_left(in_order, oldest)]
+            insort(in_order, passed)
+            cut = min((count + 3) // 4, (count - 1) // 2)
+            middle = in_order[cut : count - cut]
+            self.interval_ns = usual = max(sum(middle) // len(middle), 1)
         if count >= _SURE:
             self._notice_change(usual, in_order[count // 2])
         return max(1, round(passed / usual))
