@@ -12,13 +12,12 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
 from mcap.opcode import Opcode
 
 from mcaptrack.atomic import publish_stream
 from mcaptrack.errors import McaptrackError
 from mcaptrack.log import records
-from mcaptrack.log.chunks import chunk_entries, chunk_record, forget, message_head, open_chunk
+from mcaptrack.log.chunks import chunk_record, forget, message_head, open_chunk
 from mcaptrack.log.index import Index
 from mcaptrack.log.journal import new_end
 from mcaptrack.log.reader import Log
@@ -268,10 +267,11 @@ class _Change:
                 index = records.record_at(buffer, offset - base)
                 channel, entries = records.read_message_entries(buffer, index)
                 indexes[channel] = bytes(entries)
-        elif content is not None:
-            indexes = {channel: entries.tobytes() for channel, entries in chunk_entries(content).items()}
-            low = min((int(np.frombuffer(entries, "<u8")[::2].min()) for entries in indexes.values()), default=0)
-            high = max((int(np.frombuffer(entries, "<u8")[::2].max()) for entries in indexes.values()), default=0)
+        else:
+            found = self.index.entries[known.offset]
+            indexes = {channel: entries.tobytes() for channel, entries in found.items()}
+            low = min((int(entries[:, 0].min()) for entries in found.values()), default=0)
+            high = max((int(entries[:, 0].max()) for entries in found.values()), default=0)
             known = known._replace(start_ns=low, end_ns=high)
         writer.put_chunk(bytes(buffer[record.start : record.end]), known, indexes)
 

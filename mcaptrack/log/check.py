@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import mmap
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -66,25 +67,19 @@ def check(path: Path, progress: Progress = lambda *_: None) -> Checked:
     return Checked(path, sum(look.found.counts.values()), len(look.found.chunks), findings)
 
 
-class open_bytes:  # noqa: N801  # a context manager that reads as a verb
+@contextmanager
+def open_bytes(path: Path) -> Iterator[memoryview]:
     """The bytes of a file, mapped. Raises McaptrackError if it is none or empty."""
-
-    def __init__(self, path: Path) -> None:
-        if path.is_dir():
-            raise McaptrackError(f"{path} is a folder, not an MCAP file")
-        try:
-            self._file = path.open("rb")
-        except OSError as error:
-            raise McaptrackError(f"{path} can't be opened: {error.strerror}") from None
+    if path.is_dir():
+        raise McaptrackError(f"{path} is a folder, not an MCAP file")
+    try:
+        opened = path.open("rb")
+    except OSError as error:
+        raise McaptrackError(f"{path} can't be opened: {error.strerror}") from None
+    with opened:
         if path.stat().st_size == 0:
-            self._file.close()
             raise McaptrackError(f"{path} is empty")
-
-    def __enter__(self) -> memoryview:
-        return memoryview(mmap.mmap(self._file.fileno(), 0, access=mmap.ACCESS_READ))
-
-    def __exit__(self, *_: object) -> None:
-        self._file.close()
+        yield memoryview(mmap.mmap(opened.fileno(), 0, access=mmap.ACCESS_READ))
 
 
 class _Look:
@@ -163,9 +158,7 @@ class _Look:
             self._find("unchunked", record.start, "a message outside of chunks: finding it takes a scan", "warning")
             self._count({channel: np.array([[t_ns, record.start]], "<u8")}, record.start)
         elif record.opcode == Opcode.ATTACHMENT:
-            said = records.number(zlib.crc32(buffer[record.body : record.end - 4]), 4)
-            known = bytes(buffer[record.end - 4 : record.end])
-            if known not in (said, bytes(4)):
+            if not records.attachment_is_whole(buffer, record):
                 self._find("attachment-checksum", record.start, "the checksum of an attachment is wrong")
             found.attachments.append(list_attachment(buffer, record, record.start))
         elif record.opcode == Opcode.METADATA:

@@ -128,6 +128,15 @@ def forget(buffer: memoryview, start: int, end: int) -> None:
         mapped.madvise(mmap.MADV_DONTNEED, first, end - first)
 
 
+def crc_of(buffer: memoryview, start: int, end: int, crc: int = 0) -> int:
+    """The checksum of a part of a file, going on from that of what stands before; the memory is let go of again."""
+    for at in range(start, end, records.BLOCK):
+        until = min(at + records.BLOCK, end)
+        crc = zlib.crc32(buffer[at:until], crc)
+        forget(buffer, at, until)
+    return crc
+
+
 def listed_entries(buffer: memoryview, at: int, channel_id: int) -> Entries:
     """What the message index at ``at`` lists of a channel: log time and offset inside the chunk, (M, 2)."""
     record = records.record_at(buffer, at)

@@ -161,7 +161,7 @@ class Log:
         found = [listed.offset for listed in self.index.metadata if listed.name == name]
         if not found:
             return None
-        with self._mending():
+        with self.mending():
             return records.read_metadata(self._buffer, records.record_at(self._buffer, found[-1]))[1]
 
     def attachment(self, name: str) -> bytes | None:
@@ -171,7 +171,7 @@ class Log:
         found = [listed.offset for listed in self.index.attachments if listed.name == name]
         if not found:
             return None
-        with self._mending():
+        with self.mending():
             return bytes(records.read_attachment(self._buffer, records.record_at(self._buffer, found[-1]))[4])
 
     def messages(self, topic: str, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Message]:
@@ -183,7 +183,7 @@ class Log:
             yield from part.messages(topic, start_ns, end_ns)
             return
         channel = self.channel(topic)
-        with self._mending():
+        with self.mending():
             yield from self._messages.by_time(channel.id, (start_ns, end_ns))
 
     def merged(
@@ -227,12 +227,12 @@ class Log:
         if (part := self.part(topic)) is not self:
             return part.times(topic)
         channel = self.channel(topic)
-        with self._mending():
+        with self.mending():
             return self._messages.times(channel.id)
 
     @contextmanager
-    def _mending(self) -> Iterator[None]:
-        """What is damaged is said, with what can be done."""
+    def mending(self) -> Iterator[None]:
+        """What is found damaged in the block is said of this log, with what can be done; for this package alone."""
         try:
             yield
         except Damaged as error:

@@ -230,6 +230,12 @@ def read_attachment(buffer: memoryview, record: Record) -> tuple[int, int, str, 
     return r.number(8), r.number(8), r.text(), r.text(), r.raw(8)
 
 
+def attachment_is_whole(buffer: memoryview, record: Record) -> bool:
+    """Whether the checksum of an attachment is right, or 0 for none."""
+    crc = int.from_bytes(buffer[record.end - 4 : record.end], "little")
+    return not crc or zlib.crc32(buffer[record.body : record.end - 4]) == crc
+
+
 def read_header(buffer: memoryview, record: Record) -> tuple[str, str]:
     """Profile and library."""
     r = Reader(buffer, record.body, record.end)

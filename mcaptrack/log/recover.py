@@ -25,7 +25,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.log import journal, records
 from mcaptrack.log.check import open_bytes
 from mcaptrack.log.check_summary import record_name
-from mcaptrack.log.chunks import Entries, check_times, chunk_entries, forget, message_head, open_chunk
+from mcaptrack.log.chunks import Entries, check_times, chunk_entries, crc_of, forget, message_head, open_chunk
 from mcaptrack.log.index import DATA_END_SIZE, FOOTER_SIZE, Index, take
 from mcaptrack.log.records import MAGIC, ChannelRecord, ChunkIndexRecord, Damaged, Reader, Record, SchemaRecord, walk
 from mcaptrack.log.writer import LogWriter, create
@@ -196,8 +196,8 @@ class _Rescue:
                     return True
         return False
 
-    def _end(self, record: Record) -> bool:
-        """Whether the data section ends here, and as it should."""
+    def _end(self, record: Record) -> None:
+        """The data section ends here, unless more of it follows."""
         buffer = self._buffer
         if self._places:
             self._ended = record.start >= self._places[-1]
@@ -205,12 +205,11 @@ class _Rescue:
             self._said = _summary(buffer, record.end) or self._said  # its offsets may be wrong, its numbers are not
             self._ended = record.end == len(buffer) or buffer[record.end] not in _NOT_BEHIND
         said = Reader(buffer, record.body, record.end).number(4)
-        if self._ended and said and not self._report.lost and said != _crc(buffer, record.start):
+        if self._ended and said and not self._report.lost and said != crc_of(buffer, 0, record.start):
             self._report.lost.append(
                 f"byte {record.start}: the checksum of the data section is wrong; chunks with checksums of their own "
                 "are as they were, other records may not be"
             )
-        return True
 
     def _save(self, record: Record) -> tuple[int, bool]:
         """Pass a record on, or say that it is lost. Returns where it ends, and whether that is certain."""
@@ -219,7 +218,8 @@ class _Rescue:
             if record.opcode == Opcode.CHUNK:
                 return self._save_chunk(record), True
             if record.opcode == Opcode.DATA_END:
-                return record.end, self._end(record)
+                self._end(record)
+                return record.end, True
             if record.opcode == Opcode.MESSAGE:
                 check_times(np.array([[message_head(buffer, record)[2], 0]], "<u8"))
                 if self._is_chunked:  # a flipped bit makes one of a message index
@@ -230,8 +230,7 @@ class _Rescue:
                 self._describe(record)
             elif record.opcode == Opcode.ATTACHMENT:
                 records.read_attachment(buffer, record)
-                crc = int.from_bytes(buffer[record.end - 4 : record.end], "little")
-                if crc and zlib.crc32(buffer[record.body : record.end - 4]) != crc:
+                if not records.attachment_is_whole(buffer, record):
                     raise Damaged("the checksum of an attachment is wrong")
                 writer.put_attachment(bytes(buffer[record.start : record.end]))
             elif record.opcode == Opcode.METADATA:
@@ -358,14 +357,6 @@ def _agree(known: dict[int, Described], record: Described) -> None:
     """Raises Damaged if a schema or channel of that number is known as another."""
     if known.setdefault(record.id, record) != record:
         raise Damaged(f"schema or channel {record.id} is described otherwise than elsewhere")
-
-
-def _crc(buffer: memoryview, end: int) -> int:
-    crc = 0
-    for at in range(0, end, records.BLOCK):
-        crc = zlib.crc32(buffer[at : min(at + records.BLOCK, end)], crc)
-        forget(buffer, at, min(at + records.BLOCK, end))
-    return crc
 
 
 def _summary_start(buffer: memoryview) -> int:

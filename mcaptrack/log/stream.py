@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator
-from contextlib import contextmanager
 
 from mcap.opcode import Opcode
 
-from mcaptrack.errors import McaptrackError
 from mcaptrack.log import records
 from mcaptrack.log.chunks import forget, message_head, open_chunk
 from mcaptrack.log.messages import Message
 from mcaptrack.log.reader import Log
-from mcaptrack.log.records import MAGIC, Damaged, Record, walk
+from mcaptrack.log.records import MAGIC, Record, walk
 from mcaptrack.log.writer import LogWriter
 
 
@@ -21,7 +19,7 @@ def stream(log: Log) -> Iterator[tuple[int, Message]]:
 
     Raises McaptrackError where the log is damaged.
     """
-    with _mending(log):
+    with log.mending():
         for record in walk(log.buffer, len(MAGIC), log.index.data_end):
             if record.opcode == Opcode.MESSAGE:
                 yield _message(log.buffer, record)
@@ -41,29 +39,18 @@ def _message(buffer: memoryview, record: Record) -> tuple[int, Message]:
 
 def profile(log: Log) -> str:
     """The profile that the log's header names."""
-    with _mending(log):
+    with log.mending():
         return records.read_header(log.buffer, records.record_at(log.buffer, len(MAGIC)))[0]
 
 
 def pass_on_extras(log: Log, writer: LogWriter, *, without: Collection[str] = ()) -> None:
     """Write the log's attachments, and its metadata records of all names but these, as they are."""
-    with _mending(log):
+    with log.mending():
         for listed in log.index.metadata:
             if listed.name not in without:
                 writer.put_metadata(_whole(log, listed.offset))
         for listed in log.index.attachments:
             writer.put_attachment(_whole(log, listed.offset))
-
-
-@contextmanager
-def _mending(log: Log) -> Iterator[None]:
-    """What is damaged is said, with what can be done."""
-    try:
-        yield
-    except Damaged as error:
-        raise McaptrackError(
-            f"{log.path} is damaged: {error}; `mcaptrack recover {log.path}` saves what is whole"
-        ) from None
 
 
 def _whole(log: Log, offset: int) -> bytes:

@@ -23,9 +23,9 @@ from mcaptrack import __version__
 from mcaptrack.atomic import publish_stream
 from mcaptrack.errors import McaptrackError
 from mcaptrack.log import records
-from mcaptrack.log.chunks import MAX_NS, forget
+from mcaptrack.log.chunks import MAX_NS, crc_of
 from mcaptrack.log.index import Index, Listed, list_attachment, list_metadata, read_index
-from mcaptrack.log.records import BLOCK, MAGIC, ChannelRecord, ChunkIndexRecord, SchemaRecord
+from mcaptrack.log.records import MAGIC, ChannelRecord, ChunkIndexRecord, SchemaRecord
 
 #: How the name of a log ends that holds the results of another.
 RESULTS: Final = ".results.mcap"
@@ -345,14 +345,8 @@ def verify(path: Path, writer: LogWriter, messages: int, start: int = 0, crc: in
     with path.open("rb") as stream:
         buffer = memoryview(mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ))
     index = read_index(buffer)
-    at = start
-    while at < index.data_end:
-        end = min(at + BLOCK, index.data_end)
-        crc = zlib.crc32(buffer[at:end], crc)
-        forget(buffer, at, end)
-        at = end
     readable = sum(index.counts.values())
-    if crc != writer.crc or readable != messages:
+    if crc_of(buffer, start, index.data_end, crc) != writer.crc or readable != messages:
         raise McaptrackError(
             f"of {messages} messages that were written {readable} can be read again, or others; "
             "the log does not add up, and is left as it was"

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Final, Self
+from typing import ClassVar, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from mcaptrack.history import fill_holes, last_positions
 from mcaptrack.predictors.forecast import Forecast
 from mcaptrack.predictors.linear import LinearPredictor
-from mcaptrack.predictors.weights import Weights
+from mcaptrack.predictors.weights import Network
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -28,34 +28,14 @@ PAST: Final = 4
 
 
 @dataclass(frozen=True)
-class Lstm:
+class Lstm(Network):
     """The network in NumPy, folded. What is uncertain about it is what is about ``kalman``, times what was measured.
 
     Holes are filled linearly; before the first known position people are taken to have stood.
     """
 
-    weights: Weights
-    name: str = "lstm"
-    past: int = PAST
-
-    @classmethod
-    def of(cls, weights: Weights) -> Self:
-        """Raises McaptrackError if the weights are not those of this network."""
-        made = cls(weights)
-        _ = made.steps, made._layers
-        return made
-
-    @property
-    def steps(self) -> int:
-        return self.weights.clock("lstm")[0]
-
-    @property
-    def step_s(self) -> float:
-        return self.weights.clock("lstm")[1]
-
-    @property
-    def weights_sha256(self) -> str:
-        return self.weights.sha256
+    name: ClassVar[str] = "lstm"
+    past: ClassVar[int] = PAST
 
     @cached_property
     def _uncertain(self) -> LinearPredictor:

@@ -12,14 +12,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Final, NamedTuple, Self
+from typing import ClassVar, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack.history import fill_holes, last_positions
 from mcaptrack.predictors.forecast import Forecast
-from mcaptrack.predictors.weights import Weights
+from mcaptrack.predictors.weights import Network
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -88,31 +88,11 @@ def prepare(xy_m: Floats, valid: Bools, base_weights: Floats, base_spread: Float
 
 
 @dataclass(frozen=True)
-class Red:
+class Red(Network):
     """The network in NumPy. The forecasts are those of the network that was trained, to the rounding of 64 bits."""
 
-    weights: Weights
-    name: str = "red"
-    past: int = PAST
-
-    @classmethod
-    def of(cls, weights: Weights) -> Self:
-        """Raises McaptrackError if the weights are not those of this network."""
-        made = cls(weights)
-        _ = made.steps, made._layers
-        return made
-
-    @property
-    def steps(self) -> int:
-        return self.weights.clock("red")[0]
-
-    @property
-    def step_s(self) -> float:
-        return self.weights.clock("red")[1]
-
-    @property
-    def weights_sha256(self) -> str:
-        return self.weights.sha256
+    name: ClassVar[str] = "red"
+    past: ClassVar[int] = PAST
 
     @cached_property
     def _layers(self) -> tuple[Floats, ...]:

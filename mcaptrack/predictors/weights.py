@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Final
+from typing import ClassVar, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,6 +54,38 @@ class Weights:
         if steps < 1 or not 0 < step_s < float("inf"):
             raise McaptrackError(f"{self.path}: its card does not say how many steps it foretells, and how long ones")
         return steps, step_s
+
+
+@dataclass(frozen=True)
+class Network:
+    """A network that was trained, run in NumPy: what its weights say of it."""
+
+    weights: Weights
+    name: ClassVar[str]
+
+    @classmethod
+    def of(cls, weights: Weights) -> Self:
+        """Raises McaptrackError if the weights are not those of this network."""
+        made = cls(weights)
+        _ = made.steps, made._layers
+        return made
+
+    @property
+    def _layers(self) -> tuple[Floats, ...]:
+        """The arrays of the network, as they are multiplied."""
+        raise NotImplementedError
+
+    @property
+    def steps(self) -> int:
+        return self.weights.clock(self.name)[0]
+
+    @property
+    def step_s(self) -> float:
+        return self.weights.clock(self.name)[1]
+
+    @property
+    def weights_sha256(self) -> str:
+        return self.weights.sha256
 
 
 def load(path: Path) -> Weights:
