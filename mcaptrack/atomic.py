@@ -82,6 +82,11 @@ def sync_folder(folder: Path) -> None:
         os.close(handle)
 
 
+def is_same_file(one: Path, other: Path) -> bool:
+    """Whether two paths lead to one file that is there."""
+    return one.exists() and other.exists() and one.samefile(other)
+
+
 def refuse_overwrite(path: Path, force: bool) -> None:
     """Raise McaptrackError if ``path`` can't be written to, or exists and ``force`` is not given."""
     if path.is_dir():

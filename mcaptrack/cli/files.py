@@ -102,7 +102,7 @@ def recover(
     Example: mcaptrack recover broken.mcap -o saved.mcap
     """
     from mcaptrack import log
-    from mcaptrack.atomic import refuse_overwrite
+    from mcaptrack.atomic import is_same_file, refuse_overwrite
 
     paths = common.expand(logs)
     common.only_one_output(paths, output)
@@ -110,7 +110,7 @@ def recover(
     with common.Talk(quiet, verbose).open() as talk:
         for path in paths:
             target = output or path.with_suffix(".recovered.mcap")
-            if target.exists() and path.exists() and target.samefile(path):
+            if is_same_file(target, path):
                 raise McaptrackError(f"{path} is both input and output; give another name with -o")
             refuse_overwrite(target, force)
             report = log.recover(path, target, talk.progress)
@@ -153,11 +153,11 @@ def drop(
     Example: mcaptrack drop log.mcap /camera/video -o small.mcap
     """
     from mcaptrack import log
-    from mcaptrack.atomic import refuse_overwrite
+    from mcaptrack.atomic import is_same_file, refuse_overwrite
 
     if output is not None:
         refuse_overwrite(output, force)
-        if output.exists() and path.exists() and output.samefile(path):
+        if is_same_file(output, path):
             raise McaptrackError(f"{path} is both input and output; leave -o out to change it in place")
     with common.Talk(quiet, verbose).open() as talk:
         with log.read(path, sidecar=False) as opened:

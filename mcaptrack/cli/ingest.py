@@ -83,7 +83,7 @@ def ingest(
     Example: mcaptrack ingest video.mp4 --ground-plane homography.txt --truth gt.txt -o log.mcap
     """
     from mcaptrack import log
-    from mcaptrack.atomic import refuse_overwrite
+    from mcaptrack.atomic import is_same_file, refuse_overwrite
     from mcaptrack.ingest import IngestOptions
     from mcaptrack.ingest import ingest as make_log
 
@@ -108,7 +108,7 @@ def ingest(
         for source in sources:
             target = into or output or Path((source.name if source.is_dir() else source.stem) + ".mcap")
             if into is None:
-                refuse_overwrite(target, force or (target.exists() and source.exists() and target.samefile(source)))
+                refuse_overwrite(target, force or is_same_file(target, source))
                 report = make_log(source, target, options, progress=talk.progress)
             else:
                 with log.read(into) as opened:

@@ -196,7 +196,7 @@ class _Plan:
 
 def _run_on_logs(given: Mapping[str, Any], make_plan: Callable[[_Plan], Any], tables: bool = False) -> None:
     from mcaptrack import log, pipeline
-    from mcaptrack.atomic import publish_bytes, refuse_overwrite
+    from mcaptrack.atomic import is_same_file, publish_bytes, refuse_overwrite
     from mcaptrack.export import default_folder, export
 
     paths = common.expand(given["logs"])
@@ -209,7 +209,7 @@ def _run_on_logs(given: Mapping[str, Any], make_plan: Callable[[_Plan], Any], ta
         for path in paths:
             target = output or path
             if output is not None:
-                if output.exists() and path.exists() and output.samefile(path):
+                if is_same_file(output, path):
                     raise McaptrackError(f"{path} is both input and output; leave -o out to add to it in place")
                 refuse_overwrite(output, given["force"])
             with log.read(path, sidecar=given["sidecar"] or None) as opened:

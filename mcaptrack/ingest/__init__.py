@@ -12,6 +12,7 @@ from typing import Final
 import numpy as np
 
 from mcaptrack import foxglove, log
+from mcaptrack.atomic import is_same_file
 from mcaptrack.clock import NS_PER_S
 from mcaptrack.errors import McaptrackError
 from mcaptrack.ingest.bags import LogJob
@@ -48,7 +49,7 @@ def ingest(
         raise McaptrackError(f"a camera's name is made of letters, digits, _, - and /, not {options.camera!r}")
     if not source.exists():
         raise McaptrackError(f"{source} does not exist")
-    if into is None and output.exists() and source.exists() and output.samefile(source):
+    if into is None and is_same_file(output, source):
         raise McaptrackError(f"{source} is both input and output; give another name with -o")
     with _job(source, options, progress) as job:
         with job.opened(output, into, force) as writer:
