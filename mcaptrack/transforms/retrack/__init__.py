@@ -83,7 +83,7 @@ class Retrack:
         False, "offline, leave out what a track matched after it was last matched min_hits times in a row"
     )
     min_track_s: float = option(2.0, "a track that lasts less than this is left out (probation)", least=0.0)
-    link_s: float = option(14.0, "offline, ends and beginnings so far apart are put together; 0 for never", least=0.0)
+    link_s: float = option(20.0, "offline, ends and beginnings so far apart are put together; 0 for never", least=0.0)
     link_certainty: float = option(
         0.5, "offline, what is put together is one person with at least this probability", least=0.01, most=0.99
     )
