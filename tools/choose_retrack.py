@@ -20,7 +20,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parent))
 from corruptions import CORRUPTIONS, STEP_S, corrupt, whole_people
 
-from mcaptrack.evaluation import matchup
+from mcaptrack.evaluation.aligned import matchup
 from mcaptrack.match import assign
 from mcaptrack.metrics import combine, score, summary
 from mcaptrack.schema import TRACKS, Frame
