@@ -115,7 +115,9 @@ def find_events(
     counts = _counts(t_ns, own, events, events_ns, both)
     numbers = [index.get(at, 0) for at in t_ns.tolist()]
     ends = np.searchsorted(events_ns, t_ns, "right")
-    return Found(_framed(t_ns, numbers, events, ends), _framed(t_ns, numbers, counts, np.arange(1, len(t_ns) + 1)), rule, notes)
+    return Found(
+        _framed(t_ns, numbers, events, ends), _framed(t_ns, numbers, counts, np.arange(1, len(t_ns) + 1)), rule, notes
+    )
 
 
 def _framed(t_ns: Ints, index: list[int], rows: Rows, ends: Ints) -> list[Frame]:
@@ -200,6 +202,7 @@ class _Own:
         change = ids[1:] != ids[:-1]
         self._first = order[np.append(True, change)[: len(order)]]
         self._last = order[np.append(change, True)[: len(order)]]
+        self._size = np.unique(ids, return_counts=True)[1]
 
     def births(self) -> tuple[Ints, Rows]:
         """The first row of every track."""
@@ -211,8 +214,9 @@ class _Own:
         until = self.row_ns[self._last]
         kept = until < (self.frame_ns[-1] if len(self.frame_ns) else 0)
         there, until, since = self.rows[self._last][kept], until[kept], self.row_ns[self._first][kept]
-        lasted = (until - since) / NS_PER_S
-        return until, _events(EventKind.END, there, track_id=there["track_id"], duration_s=lasted)
+        lasted = (until - since + _usual_ns(self.frame_ns)) / NS_PER_S
+        size = self._size[kept]
+        return until, _events(EventKind.END, there, track_id=there["track_id"], duration_s=lasted, frames=size)
 
     def repairs(self) -> tuple[Ints, Rows]:
         """Where a track goes on from another source (joined), and where a source goes on as a track that is new."""
@@ -271,7 +275,8 @@ def _runs(track: Ints, source: Ints, t_ns: Ints) -> tuple[Ints, Ints]:
 def _between_s(frame_ns: Ints, last_ns: Ints, next_ns: Ints) -> Floats:
     """How long it was from the frame after ``last_ns`` to ``next_ns`` (R,): 0 from one frame to the next."""
     after = np.minimum(np.searchsorted(frame_ns, last_ns, "right"), max(len(frame_ns) - 1, 0))
-    return np.maximum(next_ns - frame_ns[after], 0) / NS_PER_S
+    apart: Floats = np.maximum(next_ns - frame_ns[after], 0) / NS_PER_S
+    return apart
 
 
 def _switches(both: _Truth) -> tuple[Ints, Rows]:
@@ -290,21 +295,52 @@ def _switches(both: _Truth) -> tuple[Ints, Rows]:
 
 
 def _misses(both: _Truth) -> tuple[Ints, Rows]:
-    """Spells in which a true person has no track."""
-    t_ns, places, frames, lasts = _spells(both.compared.truth, both.found.row, both.t_ns)
-    who = places["track_id"]
-    return t_ns, _events(EventKind.MISS, places, truth_id=who, frames=frames, duration_s=lasts)
+    """Spells in which a true person has no track; ``previous_id`` is the track they had."""
+    found, (_, truth, tracks) = both.found, both.compared
+    t_ns, places, spells = _spells(truth, found.row, both.t_ns)
+    had = _before(found.who, found.frame, found.by, spells.who, spells.frame, tracks.names)
+    return t_ns, _events(EventKind.MISS, places, truth_id=places["track_id"], previous_id=had, **spells.columns())
 
 
 def _false_tracks(both: _Truth) -> tuple[Ints, Rows]:
-    """Spells in which a track is nobody."""
-    t_ns, places, frames, lasts = _spells(both.compared.tracks, both.found.column, both.t_ns)
-    who = places["track_id"]
-    return t_ns, _events(EventKind.FALSE_TRACK, places, track_id=who, frames=frames, duration_s=lasts)
+    """Spells in which a track is nobody; ``previous_id`` is the person that it was."""
+    found, (_, truth, tracks) = both.found, both.compared
+    t_ns, places, spells = _spells(tracks, found.column, both.t_ns)
+    order = np.lexsort((found.frame, found.by))
+    had = _before(found.by[order], found.frame[order], found.who[order], spells.who, spells.frame, truth.names)
+    return t_ns, _events(
+        EventKind.FALSE_TRACK, places, track_id=places["track_id"], previous_id=had, **spells.columns()
+    )
 
 
-def _spells(side: Placed, matched: Ints, frame_ns: Ints) -> tuple[Ints, Rows, Ints, Floats]:
-    """Spells in which the same id has no match: time and row of the beginning, rows without a match, seconds.
+def _before(mine: Ints, frame: Ints, other: Ints, who: Ints, at: Ints, names: Ints) -> Ints:
+    """The name of whom each of ``who`` (R,) was matched with last before the frame ``at``; -1 for nobody.
+
+    Matches are ``mine`` with ``other`` (P,), ordered by ``mine`` and ``frame``.
+    """
+    out = np.full(len(who), _NOBODY)
+    if len(mine):
+        width = int(max(frame.max(), at.max(initial=0))) + 1
+        place = np.searchsorted(mine * width + frame, who * width + at) - 1
+        known = (place >= 0) & (mine[place] == who)
+        out[known] = names[other[place[known]]]
+    return out
+
+
+class _Spells(NamedTuple):
+    """Spells of one id without a match: dense number, first frame, frames without a match, seconds (R,)."""
+
+    who: Ints
+    frame: Ints
+    frames: Ints
+    duration_s: Floats
+
+    def columns(self) -> dict[str, Ints | Floats]:
+        return {"frames": self.frames, "duration_s": self.duration_s}
+
+
+def _spells(side: Placed, matched: Ints, frame_ns: Ints) -> tuple[Ints, Rows, _Spells]:
+    """Spells in which the same id has no match, with time and row of the beginning.
 
     Matches that last less than a moment don't end a spell.
     """
@@ -313,14 +349,14 @@ def _spells(side: Placed, matched: Ints, frame_ns: Ints) -> tuple[Ints, Rows, In
     at = np.repeat(np.arange(len(frame_ns)), np.diff(side.ends))[alone]
     rows, who = side.rows[alone], side.who[alone]
     order = np.lexsort((at, who))
-    rows, who, t_ns = rows[order], who[order], frame_ns[at[order]]
-    usual = _usual_ns(frame_ns)
+    rows, who, at = rows[order], who[order], at[order]
+    t_ns, usual = frame_ns[at], _usual_ns(frame_ns)
     pause = max(seconds_to_ns(_SAME_S), round(1.5 * usual))
     begins = np.append(True, (who[1:] != who[:-1]) | (np.diff(t_ns) > pause))[: len(who)]
     start = np.flatnonzero(begins)
     end = np.append(start[1:], len(who)) if len(start) else start
     lasts = (t_ns[end - 1] - t_ns[start] + usual) / NS_PER_S
-    return t_ns[start], rows[start], end - start, lasts
+    return t_ns[start], rows[start], _Spells(who[start], at[start], end - start, lasts)
 
 
 def _counts(t_ns: Ints, own: _Own, events: Rows, events_ns: Ints, both: _Truth | None) -> Rows:

@@ -256,7 +256,7 @@ def check_inputs(opened: log.Log, prefix: str, jobs: Sequence[Job]) -> None:
             name = channel.schema_name
             fits = foreign.holds_pictures(channel) if reads is VIDEO else theirs or name == reads.name
         else:
-            there = [topic for topic in sorted(opened.channels) if not topic.endswith(views.SUFFIX)]
+            there = [topic for topic in sorted(opened.channels) if "/view/" not in topic]
             hint = f"`mcaptrack info {opened.path}` shows more"
             if job.source == f"{prefix}/video":
                 hint = f"add pictures with `mcaptrack ingest VIDEO --into {opened.path}`, or name theirs with --topic"
