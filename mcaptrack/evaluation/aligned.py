@@ -168,11 +168,17 @@ def compare(truth: Sequence[Frame], tracks: Sequence[Frame], similarity: Similar
     return Compared(matched, people, found)
 
 
-def _placed(frames: Sequence[Frame], column: str) -> Placed:
+def join_rows(frames: Sequence[Frame]) -> tuple[Rows, Ints]:
+    """The rows of all frames (N,), and where those of each frame begin and the last ones end."""
     ends = np.cumsum([0] + [len(frame.rows) for frame in frames])
     rows = TRACKS.empty(int(ends[-1]))
     for low, frame in zip(ends.tolist(), frames, strict=False):
         rows[low : low + len(frame.rows)] = frame.rows
+    return rows, ends
+
+
+def _placed(frames: Sequence[Frame], column: str) -> Placed:
+    rows, ends = join_rows(frames)
     usable = np.isfinite(rows[column])
     if not usable.all():
         ends, rows = np.concatenate([[0], usable.cumsum()])[ends], rows[usable]

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, Final, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,21 +27,19 @@ from mcaptrack.evaluation.aligned import (
     compare,
     frame_times,
     has,
+    join_rows,
     share_times,
     strangers,
     without,
 )
+from mcaptrack.evaluation.lives import NOBODY, SAME_S, Lives, between_s, event_rows, usual_ns
 from mcaptrack.metrics.clear import matches, switched
 from mcaptrack.metrics.matchup import Pairs
-from mcaptrack.schema import COUNTS, EVENTS, TRACKS, EventKind, Frame, Rows
+from mcaptrack.schema import COUNTS, EVENTS, EventKind, Frame, Rows
 
 Bools = NDArray[np.bool_]
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
-
-#: What is the same again after less than this is one event.
-_SAME_S: Final = 1.0
-_NOBODY: Final = -1
 
 
 @dataclass(frozen=True)
@@ -65,13 +63,15 @@ class Rule(NamedTuple):
 class Found(NamedTuple):
     """Events and counts, a frame each for every frame of the tracks and of the truth that they were compared with.
 
-    ``rule`` is None where they were not compared with any; ``notes`` say why, and what else is odd.
+    ``rule`` is None where they were not compared with any; ``notes`` say why, and what else is odd. ``usual_s`` is what
+    lies between two frames that were compared.
     """
 
     events: list[Frame]
     counts: list[Frame]
     rule: Rule | None
     notes: list[str]
+    usual_s: float
 
     def parameters(self, options: EventOptions) -> dict[str, Any]:
         """How they were made, as the provenance says it: what was asked for, and what came of it."""
@@ -104,10 +104,10 @@ def find_events(
     index = {frame.t_ns: frame.index for frame in truth or () if both is not None} | {f.t_ns: f.index for f in tracks}
     seen_ns = both.t_ns if both else np.empty(0, np.int64)
     t_ns = np.unique(np.concatenate([frame_times(tracks), seen_ns]))
-    rows = np.concatenate([TRACKS.empty(), *(frame.rows for frame in tracks)])
-    row_ns = np.repeat(frame_times(tracks), [len(frame.rows) for frame in tracks])
+    rows, bounds = join_rows(tracks)
+    row_ns = np.repeat(frame_times(tracks), np.diff(bounds))
     order = np.lexsort((rows["track_id"], row_ns))
-    own = _Own(rows[order], row_ns[order], np.unique(frame_times(tracks)))
+    own = Lives(rows[order], row_ns[order], np.unique(frame_times(tracks)))
     parts = [own.births(), own.ends(), own.repairs()]
     if both:
         parts += [_switches(both), _misses(both), _false_tracks(both)]
@@ -116,7 +116,11 @@ def find_events(
     numbers = [index.get(at, 0) for at in t_ns.tolist()]
     ends = np.searchsorted(events_ns, t_ns, "right")
     return Found(
-        _framed(t_ns, numbers, events, ends), _framed(t_ns, numbers, counts, np.arange(1, len(t_ns) + 1)), rule, notes
+        _framed(t_ns, numbers, events, ends),
+        _framed(t_ns, numbers, counts, np.arange(1, len(t_ns) + 1)),
+        rule,
+        notes,
+        usual_ns(seen_ns) / NS_PER_S,
     )
 
 
@@ -174,123 +178,18 @@ def _in_order(parts: Sequence[tuple[Ints, Rows]]) -> tuple[Rows, Ints]:
     return EVENTS.check(rows[order]), t_ns[order]
 
 
-def _events(kind: EventKind, places: Rows, **columns: Ints | Floats) -> Rows:
-    """Events of one kind, a row each; they happened where the rows of tracks or truth in ``places`` (R,) stand."""
-    out = EVENTS.empty(len(places))
-    out["kind"] = kind
-    for name in ("track_id", "truth_id", "previous_id", "source_id"):
-        out[name] = _NOBODY
-    out["x_m"], out["y_m"] = places["x_m"], places["y_m"]
-    out["x_px"], out["y_px"] = places["x_px"] + places["w_px"] / 2, places["y_px"] + places["h_px"] / 2
-    out["duration_s"] = np.nan
-    for name, values in columns.items():
-        out[name] = values
-    return out
-
-
-def _usual_ns(t_ns: Ints) -> int:
-    return int(np.median(np.diff(t_ns))) if len(t_ns) > 1 else 0
-
-
-class _Own:
-    """What tracks say of themselves: all their rows by time and id, the time of each, and the times of all frames."""
-
-    def __init__(self, rows: Rows, row_ns: Ints, frame_ns: Ints) -> None:
-        self.rows, self.row_ns, self.frame_ns = rows, row_ns, frame_ns
-        order = np.lexsort((row_ns, rows["track_id"]))
-        ids = rows["track_id"][order]
-        change = ids[1:] != ids[:-1]
-        self._first = order[np.append(True, change)[: len(order)]]
-        self._last = order[np.append(change, True)[: len(order)]]
-        self._size = np.unique(ids, return_counts=True)[1]
-
-    def births(self) -> tuple[Ints, Rows]:
-        """The first row of every track."""
-        there = self.rows[self._first]
-        return self.row_ns[self._first], _events(EventKind.BIRTH, there, track_id=there["track_id"])
-
-    def ends(self) -> tuple[Ints, Rows]:
-        """The last row of every track that doesn't go on to the last frame, with how long it was there."""
-        until = self.row_ns[self._last]
-        kept = until < (self.frame_ns[-1] if len(self.frame_ns) else 0)
-        there, until, since = self.rows[self._last][kept], until[kept], self.row_ns[self._first][kept]
-        lasted = (until - since + _usual_ns(self.frame_ns)) / NS_PER_S
-        size = self._size[kept]
-        return until, _events(EventKind.END, there, track_id=there["track_id"], duration_s=lasted, frames=size)
-
-    def repairs(self) -> tuple[Ints, Rows]:
-        """Where a track goes on from another source (joined), and where a source goes on as a track that is new."""
-        said = self.rows["source_id"] >= 0
-        rows, t_ns = self.rows[said], self.row_ns[said]
-        order = np.lexsort((t_ns, rows["track_id"]))
-        rows, t_ns = rows[order], t_ns[order]
-        start, end = _runs(rows["track_id"], rows["source_id"], t_ns)
-        track, source = rows["track_id"][start], rows["source_id"][start]
-        joined = np.zeros(len(start), bool)
-        joined[1:] = track[1:] == track[:-1]
-        before = np.maximum(np.arange(len(start)) - 1, 0)
-        at = start[joined]
-        moved = _events(
-            EventKind.JOINED,
-            rows[at],
-            track_id=track[joined],
-            previous_id=source[before][joined],
-            source_id=source[joined],
-            duration_s=self._between_s(t_ns[end[before]][joined], t_ns[at]),
-        )
-        by_source = np.lexsort((t_ns[start], source))
-        whose = np.full(len(start), _NOBODY)
-        same = source[by_source][1:] == source[by_source][:-1]
-        whose[by_source[1:][same]] = track[by_source[:-1]][same]
-        parted = ~joined & (whose >= 0) & (whose != track)
-        split = _events(
-            EventKind.PARTED,
-            rows[start[parted]],
-            track_id=track[parted],
-            previous_id=whose[parted],
-            source_id=source[parted],
-        )
-        return np.concatenate([t_ns[at], t_ns[start[parted]]]), np.concatenate([moved, split])
-
-    def _between_s(self, last_ns: Ints, next_ns: Ints) -> Floats:
-        return _between_s(self.frame_ns, last_ns, next_ns)
-
-
-def _runs(track: Ints, source: Ints, t_ns: Ints) -> tuple[Ints, Ints]:
-    """First and last rows of the runs in which a track has one source; rows are by track and time.
-
-    Runs shorter than a moment, between two of one source, are passed over: nothing is another way after them.
-    """
-    starts = np.flatnonzero(np.append(True, (track[1:] != track[:-1]) | (source[1:] != source[:-1]))[: len(track)])
-    lasts = np.append(starts[1:], len(track)) - 1 if len(starts) else starts
-    who, what, at = track[starts], source[starts], t_ns[starts]
-    brief = np.zeros(len(starts), bool)
-    brief[1:-1] = (who[2:] == who[:-2]) & (what[2:] == what[:-2]) & (at[2:] - at[1:-1] < seconds_to_ns(_SAME_S))
-    starts, lasts, who, what = starts[~brief], lasts[~brief], who[~brief], what[~brief]
-    first = np.append(True, (who[1:] != who[:-1]) | (what[1:] != what[:-1]))[: len(who)]
-    last = np.append(first[1:], True)[: len(who)]
-    return starts[first], lasts[last]
-
-
-def _between_s(frame_ns: Ints, last_ns: Ints, next_ns: Ints) -> Floats:
-    """How long it was from the frame after ``last_ns`` to ``next_ns`` (R,): 0 from one frame to the next."""
-    after = np.minimum(np.searchsorted(frame_ns, last_ns, "right"), max(len(frame_ns) - 1, 0))
-    apart: Floats = np.maximum(next_ns - frame_ns[after], 0) / NS_PER_S
-    return apart
-
-
 def _switches(both: _Truth) -> tuple[Ints, Rows]:
     """One event for every switch that CLEAR counts."""
     at = np.flatnonzero(switched(both.found))
     found, (_, truth, tracks) = both.found, both.compared
     now_ns, before_ns = both.t_ns[found.frame[at]], both.t_ns[found.frame[at - 1]]
-    return now_ns, _events(
+    return now_ns, event_rows(
         EventKind.SWITCH,
         truth.rows[found.row[at]],
         truth_id=truth.names[found.who[at]],
         track_id=tracks.names[found.by[at]],
         previous_id=tracks.names[found.by[at - 1]],
-        duration_s=_between_s(both.t_ns, before_ns, now_ns),
+        duration_s=between_s(both.t_ns, before_ns, now_ns),
     )
 
 
@@ -299,7 +198,7 @@ def _misses(both: _Truth) -> tuple[Ints, Rows]:
     found, (_, truth, tracks) = both.found, both.compared
     t_ns, places, spells = _spells(truth, found.row, both.t_ns)
     had = _before(found.who, found.frame, found.by, spells.who, spells.frame, tracks.names)
-    return t_ns, _events(EventKind.MISS, places, truth_id=places["track_id"], previous_id=had, **spells.columns())
+    return t_ns, event_rows(EventKind.MISS, places, truth_id=places["track_id"], previous_id=had, **spells.columns())
 
 
 def _false_tracks(both: _Truth) -> tuple[Ints, Rows]:
@@ -308,7 +207,7 @@ def _false_tracks(both: _Truth) -> tuple[Ints, Rows]:
     t_ns, places, spells = _spells(tracks, found.column, both.t_ns)
     order = np.lexsort((found.frame, found.by))
     had = _before(found.by[order], found.frame[order], found.who[order], spells.who, spells.frame, truth.names)
-    return t_ns, _events(
+    return t_ns, event_rows(
         EventKind.FALSE_TRACK, places, track_id=places["track_id"], previous_id=had, **spells.columns()
     )
 
@@ -318,7 +217,7 @@ def _before(mine: Ints, frame: Ints, other: Ints, who: Ints, at: Ints, names: In
 
     Matches are ``mine`` with ``other`` (P,), ordered by ``mine`` and ``frame``.
     """
-    out = np.full(len(who), _NOBODY)
+    out = np.full(len(who), NOBODY)
     if len(mine):
         width = int(max(frame.max(), at.max(initial=0))) + 1
         place = np.searchsorted(mine * width + frame, who * width + at) - 1
@@ -350,8 +249,8 @@ def _spells(side: Placed, matched: Ints, frame_ns: Ints) -> tuple[Ints, Rows, _S
     rows, who = side.rows[alone], side.who[alone]
     order = np.lexsort((at, who))
     rows, who, at = rows[order], who[order], at[order]
-    t_ns, usual = frame_ns[at], _usual_ns(frame_ns)
-    pause = max(seconds_to_ns(_SAME_S), round(1.5 * usual))
+    t_ns, usual = frame_ns[at], usual_ns(frame_ns)
+    pause = max(seconds_to_ns(SAME_S), round(1.5 * usual))
     begins = np.append(True, (who[1:] != who[:-1]) | (np.diff(t_ns) > pause))[: len(who)]
     start = np.flatnonzero(begins)
     end = np.append(start[1:], len(who)) if len(start) else start
@@ -359,7 +258,7 @@ def _spells(side: Placed, matched: Ints, frame_ns: Ints) -> tuple[Ints, Rows, _S
     return t_ns[start], rows[start], _Spells(who[start], at[start], end - start, lasts)
 
 
-def _counts(t_ns: Ints, own: _Own, events: Rows, events_ns: Ints, both: _Truth | None) -> Rows:
+def _counts(t_ns: Ints, own: Lives, events: Rows, events_ns: Ints, both: _Truth | None) -> Rows:
     """A row for each of the times (F,)."""
     total = len(t_ns)
     out = COUNTS.empty(total)

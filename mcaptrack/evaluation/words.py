@@ -10,8 +10,6 @@ from collections.abc import Iterator, Sequence
 from math import isnan
 from typing import Any, Final, Literal
 
-import numpy as np
-
 from mcaptrack import foxglove
 from mcaptrack.clock import NS_PER_S
 from mcaptrack.schema import EventKind, Frame
@@ -32,10 +30,13 @@ _LEVELS: Final[dict[EventKind, Level]] = {
 _BRIEF_S: Final = 1.0
 
 
-def log_messages(events: Sequence[Frame], tracks_topic: str, start_ns: int) -> Iterator[tuple[int, int, bytes]]:
-    """foxglove.Log messages (time, frame, payload) of all events; seconds in the words count from ``start_ns``."""
-    times = [frame.t_ns for frame in events]
-    usual_s = float(np.median(np.diff(times))) / NS_PER_S if len(times) > 1 else 0.0
+def log_messages(
+    events: Sequence[Frame], tracks_topic: str, start_ns: int, usual_s: float
+) -> Iterator[tuple[int, int, bytes]]:
+    """foxglove.Log messages (time, frame, payload) of all events.
+
+    Seconds in the words count from ``start_ns``; ``usual_s`` is what lies between two frames that were compared.
+    """
     happened = [(frame.t_ns, row) for frame in events for row in frame.rows]
     together = _Together(happened)
     for frame in events:

@@ -81,7 +81,7 @@ def make_events(
             STAGE, parameters, topic, tracks_digest, reference=truth.topic, reference_digest=truth.digest
         )
         out[topic + _EVENTS] = events = _made(EVENTS, found.events, provenance)
-        words_of = list(log_messages(found.events, topic, opened.start_ns))
+        words_of = list(log_messages(found.events, topic, opened.start_ns, found.usual_s))
         view = Provenance("view", {}, topic + _EVENTS, events.provenance.digest)
         out[topic + _EVENTS + SUFFIX] = Made(EVENTS, [], view, words_of, foxglove.schema_record(foxglove.LOG))
         out[topic + _COUNTS] = _made(COUNTS, found.counts, provenance)
