@@ -23,6 +23,7 @@ from mcaptrack.evaluation.words import log_messages
 from mcaptrack.provenance import Provenance, digest
 from mcaptrack.schema import COUNTS, EVENT_KINDS, EVENTS, TRACKS, EventKind, Frame
 from mcaptrack.schema.proto import parse
+from mcaptrack.transforms import PROFILES
 from tests.test_evaluation import boxed
 from tests.worlds import ns, tracks_at, walk
 
@@ -512,6 +513,23 @@ def test_channels_that_are_named_are_watched_from_then_on(tmp_path):
     watched(path, "/camera/retracks/online", again=True)
     replaced(path, "/camera/retracks/online", TRUTH)
     assert watched(path)[0].events["/camera/retracks/online"]["identity switch"] == 0
+
+
+def test_tracks_that_are_made_again_leave_events_out_of_date_until_the_next_run(tmp_path):
+    """The samples of true tracks, re-tracked in two ways."""
+    path = written(tmp_path / "a.mcap", samples=walk(lambda n: {5 + n // 40: (n / 4, 0.0)}, 80), truth=[])
+
+    def retrack(profile, watch=None):
+        with log.read(path) as opened:
+            jobs = pipeline.plan_stage(opened, "/camera", "retrack", PROFILES[profile], keep=("",))
+            return pipeline.run(opened, "/camera", jobs, watch=watch)
+
+    assert retrack("default", pipeline.Watch()).stages == ["retrack", "events"]
+    assert retrack("default").stale == []
+    assert retrack("paper").stale == ["/camera/retracks/counts", "/camera/retracks/events"]
+    with log.read(path) as opened:
+        report = pipeline.run(opened, "/camera", [], watch=pipeline.Watch())
+    assert (report.stages, report.stale) == (["events"], [])
 
 
 def test_a_log_of_tracks_without_rows(tmp_path):
