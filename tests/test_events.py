@@ -203,10 +203,11 @@ def test_a_source_that_is_another_for_a_moment_is_no_repair():
     assert happened(found, *OWN) == [(2.4, EventKind.JOINED, 1, -1, 5)]
 
 
-def test_a_swap_that_re_tracking_undid_is_two_joins():
+def test_a_swap_that_re_tracking_undid_is_two_joins_and_one_message():
     source = lambda n: {1: 5 if n < 30 else 6, 2: 6 if n < 30 else 5}  # noqa: E731
     found = find_events(follow(lambda n: {1: (n / 10, 0.0), 2: (n / 10, 2.0)}, source, 60), None)
     assert happened(found, *OWN) == [(3.0, EventKind.JOINED, 1, -1, 5), (3.0, EventKind.JOINED, 2, -1, 6)]
+    assert said(found)[2:] == [("WARNING", "tracks 1 and 2: the tracker swapped its 5 and 6 at 3.00 s, (3.0, 0.0) m")]
 
 
 # What is compared with what
@@ -552,6 +553,10 @@ def test_the_command_writes_drop_takes_along_and_tables_have_what_happened(place
     call("events", place, "--topic", "/camera/tracks")
     assert CliRunner().invoke(app, ["events", str(place), "--gate", "0.5"]).exit_code == 1
     assert CliRunner().invoke(app, ["events", str(place), "--gate", "1.5", "--similarity", "iou"]).exit_code == 1
+    (place.parent / "odd.toml").write_text('[events]\nsimilarity = "iou"\ngate = "much"\n')
+    odd = CliRunner().invoke(app, ["run", str(place), "--config", str(place.parent / "odd.toml")])
+    assert odd.exit_code == 1
+    assert "--gate is a share of overlap up to 1, or a distance in metres, not 'much'" in odd.output
     call("export", place, "-o", place.parent / "tables")
     table = pq.read_table(place.parent / "tables" / "events" / "recording=a" / "part-0.parquet").to_pylist()
     assert [(row["topic"], row["kind"], row["truth_id"]) for row in table if row["kind"] == SWITCH] == [

@@ -168,13 +168,19 @@ def run_all(
     )
 
 
-def watched(similarity: Literal["iou", "metres"] | None, gate: float | None, **chosen: Any) -> Watch:
-    """What `mcaptrack events` and `run` are to look for. Raises McaptrackError for a gate that can't be one."""
+def watched(similarity: Any, gate: Any, **chosen: Any) -> Watch:
+    """What `mcaptrack events` and `run` are to look for.
+
+    Raises McaptrackError for what can't be a similarity or a gate: in a file may stand anything.
+    """
     from mcaptrack.evaluation.events import EventOptions
     from mcaptrack.pipeline import Watch
 
-    if gate is not None and not 0 < gate <= (1 if similarity == "iou" else 1e6):
-        raise McaptrackError(f"--gate is a share of overlap up to 1, or a distance in metres, not {gate:g}")
+    if similarity not in (None, "iou", "metres"):
+        raise McaptrackError(f"--similarity is iou or metres, not {similarity!r}")
+    most = 1 if similarity == "iou" else 1e6
+    if gate is not None and not (isinstance(gate, float | int) and 0 < gate <= most):
+        raise McaptrackError(f"--gate is a share of overlap up to 1, or a distance in metres, not {gate!r}")
     if gate is not None and similarity is None:
         raise McaptrackError("--gate needs --similarity: it is a share of overlap for iou, a distance for metres")
     return Watch(EventOptions(similarity, gate), **chosen)

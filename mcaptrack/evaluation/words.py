@@ -65,6 +65,16 @@ class _Together:
         lost = {(t_ns, int(row["previous_id"]), int(row["track_id"])): float(row["duration_s"]) for t_ns, row in false}
         #: Time, person and track of those that lost each other, and how long the track is nobody.
         self._apart_s = {key: seconds for key, seconds in lost.items() if key in misses}
+        joins = {
+            (t_ns, int(row["previous_id"]), int(row["source_id"])): int(row["track_id"])
+            for t_ns, row in of_kind[EventKind.JOINED]
+        }
+        #: Time, and sources before and after, of tracks that exchanged these with another track, and which that is.
+        self._swapped = {
+            (t_ns, before, after): joins[t_ns, after, before]
+            for t_ns, before, after in joins
+            if (t_ns, after, before) in joins
+        }
 
     def say(self, t_ns: int, row: Any, where: str, usual_s: float) -> tuple[Level, str] | None:
         """Level and words of an event; None where those of another say it."""
@@ -88,6 +98,13 @@ class _Together:
             if track_s is not None:
                 words = f"person {person} and track {before} are apart {_span(row, usual_s)} {where}"
                 lasts = max(lasts, track_s)
+        elif kind is EventKind.JOINED:
+            source = int(row["source_id"])
+            other = self._swapped.get((t_ns, before, source))
+            if other is not None and other < track:
+                return None
+            if other is not None:
+                words = f"tracks {track} and {other}: the tracker swapped its {before} and {source} {where}"
         is_brief = kind in (EventKind.MISS, EventKind.FALSE_TRACK) and lasts < _BRIEF_S
         return "DEBUG" if is_brief else _LEVELS[kind], words
 
