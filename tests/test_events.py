@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from contextvars import copy_context
 from pathlib import Path
 
 import numpy as np
@@ -554,7 +555,8 @@ def test_the_command_writes_drop_takes_along_and_tables_have_what_happened(place
     assert CliRunner().invoke(app, ["events", str(place), "--gate", "0.5"]).exit_code == 1
     assert CliRunner().invoke(app, ["events", str(place), "--gate", "1.5", "--similarity", "iou"]).exit_code == 1
     (place.parent / "odd.toml").write_text('[events]\nsimilarity = "iou"\ngate = "much"\n')
-    odd = CliRunner().invoke(app, ["run", str(place), "--config", str(place.parent / "odd.toml")])
+    words = ["run", str(place), "--config", str(place.parent / "odd.toml")]
+    odd = copy_context().run(CliRunner().invoke, app, words)  # what the file says is for this command alone
     assert odd.exit_code == 1
     assert "--gate is a share of overlap up to 1, or a distance in metres, not 'much'" in odd.output
     call("export", place, "-o", place.parent / "tables")
