@@ -32,6 +32,7 @@ Rgba = tuple[float, float, float, float]
 VIDEO: Final = "foxglove.CompressedVideo"
 IMAGE: Final = "foxglove.CompressedImage"
 ANNOTATIONS: Final = "foxglove.ImageAnnotations"
+LOG: Final = "foxglove.Log"
 #: Schemas whose messages are pictures.
 PICTURES: Final = (VIDEO, IMAGE)
 
@@ -205,3 +206,12 @@ def layout(image_topic: str, annotation_topics: Mapping[str, bool], plots: Seque
         },
     }
     return json.dumps(tree, indent=1, sort_keys=True).encode() + b"\n"
+
+
+def pack_log(t_ns: int, level: str, name: str, words: str) -> bytes:
+    """A Log message; ``level`` is "INFO", "WARNING" or "ERROR", ``name`` says whom it comes from."""
+    kind = _message_class(LOG)
+    message = kind(level=kind.Level.Value(level), name=name, message=words)
+    _stamp(message, t_ns)
+    payload: bytes = message.SerializeToString(deterministic=True)
+    return payload

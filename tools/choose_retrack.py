@@ -23,7 +23,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 from corruptions import CORRUPTIONS, STEP_S, corrupt, whole_people
 from reproduce import on_clock
 
-from mcaptrack.evaluation import matchup
+from mcaptrack.evaluation.aligned import matchup
 from mcaptrack.match import assign, solve
 from mcaptrack.metrics import combine, score, summary
 from mcaptrack.schema import Frame
@@ -148,8 +148,7 @@ def fit(everything: dict[str, World]) -> None:
             share = np.add.reduceat((owner >= 0).astype(float), first) / count
             people.append(np.column_stack([doubt.features(who, paths, smoothed, STEP_S), share, count]))
             if kind in LINKED:
-                odds = doubt.log_odds(who, paths, smoothed, STEP_S)
-                pairs.append(_pairs(LINKED.index(kind), who, paths, forward, backward, odds, owner))
+                pairs.append(_pairs(LINKED.index(kind), who, paths, forward, backward, owner))
     rows = np.concatenate(people)
     weights = _logistic(rows[:, :-2], rows[:, -2], rows[:, -1]).round(3).tolist()
     print("doubt:", dict(zip((*doubt.NAMES, "1"), weights, strict=True)))
@@ -176,10 +175,10 @@ class Pairs(NamedTuple):
     right: np.ndarray
 
 
-def _pairs(kind: int, who: Walker, paths: Paths, forward: State, backward: State, odds: np.ndarray, owner: np.ndarray):
+def _pairs(kind: int, who: Walker, paths: Paths, forward: State, backward: State, owner: np.ndarray):
     first, last = paths.first[:-1], paths.first[1:] - 1
     i, j, hole_s = link.candidates(paths, forward, backward, STEP_S, MAX_HOLE_S)
-    found = link.features(who, forward.take(last[i]), backward.take(first[j]), hole_s, odds[i], odds[j])
+    found = link.features(who, forward.take(last[i]), backward.take(first[j]), hole_s)
     ends, begins = (np.array([_usual(owner, paths, k, way) for k in range(len(first))]) for way in (-1, 1))
     same = np.flatnonzero((ends[i] >= 0) & (ends[i] == begins[j]))
     nearest = same[np.lexsort((hole_s[same], i[same]))]

@@ -49,7 +49,8 @@ def demo(
         ingest(footage.video, target, options, progress=talk.progress)
         with log.read(target) as opened:
             prefix = pipeline.find_camera(opened, None)
-            report = pipeline.run(opened, prefix, pipeline.plan_all(opened, prefix), progress=talk.progress)
+            jobs, watch = pipeline.plan_all(opened, prefix), pipeline.Watch()
+            report = pipeline.run(opened, prefix, jobs, progress=talk.progress, watch=watch)
         layout = target.with_suffix(".layout.json")
         if report.layout:
             publish_bytes(layout, report.layout)

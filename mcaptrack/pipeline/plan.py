@@ -219,11 +219,19 @@ def _made_by_stage(channel: log.Channel) -> bool:
 
 
 def is_stale(opened: log.Log, topic: str) -> bool:
-    """Whether the channel that ``topic`` was made from has been replaced since."""
+    """Whether the channel that ``topic`` was made from, or compared with, has been replaced since."""
     made = Provenance.from_metadata(opened.channel(topic).metadata)
-    source = opened.channels.get(made.input) if made else None
-    now = Provenance.from_metadata(source.metadata) if source else None
-    return bool(made and now and now.digest and now.digest != made.input_digest)
+    if made is None:
+        return False
+    if made.reference and (made.reference in opened.channels) != bool(made.reference_digest):
+        return True
+    pairs = ((made.input, made.input_digest), (made.reference, made.reference_digest))
+    for name, then in pairs:
+        source = opened.channels.get(name)
+        now = Provenance.from_metadata(source.metadata) if source else None
+        if now and now.digest and now.digest != then:
+            return True
+    return False
 
 
 def _transform_of(stage: str, channel: log.Channel) -> Transform:
@@ -248,7 +256,7 @@ def check_inputs(opened: log.Log, prefix: str, jobs: Sequence[Job]) -> None:
             name = channel.schema_name
             fits = foreign.holds_pictures(channel) if reads is VIDEO else theirs or name == reads.name
         else:
-            there = [topic for topic in sorted(opened.channels) if not topic.endswith(views.SUFFIX)]
+            there = [topic for topic in sorted(opened.channels) if "/view/" not in topic]
             hint = f"`mcaptrack info {opened.path}` shows more"
             if job.source == f"{prefix}/video":
                 hint = f"add pictures with `mcaptrack ingest VIDEO --into {opened.path}`, or name theirs with --topic"

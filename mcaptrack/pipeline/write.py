@@ -23,12 +23,13 @@ Numbered = tuple[int, int, int, bytes]
 
 
 class Made(NamedTuple):
-    """A channel that was just made."""
+    """A channel that was just made; ``record`` is its schema record, if that is not the schema's own."""
 
     schema: Schema
     frames: list[Frame]
     provenance: Provenance
     messages: list[tuple[int, int, bytes]]
+    record: tuple[str, str, bytes] | None = None
 
 
 def _stamps(opened: log.Log, topic: str, known: Sequence[int]) -> Ints:
@@ -63,7 +64,7 @@ def write(
     streams: list[Iterator[Numbered]] = []
     with log.extend(opened, output, drop={*made, *outdated}, drop_attachments=[LAYOUT]) as writer:
         for topic, channel in made.items():
-            record = (channel.schema.name, "protobuf", channel.schema.descriptor)
+            record = channel.record or (channel.schema.name, "protobuf", channel.schema.descriptor)
             made_by = channel.provenance.transform  # results of one stage share chunks, so that they can go together
             number = writer.add_channel(topic, record, "protobuf", channel.provenance.to_metadata(), group=made_by)
             streams.append(_with_number(number, channel.messages))

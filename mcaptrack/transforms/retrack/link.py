@@ -23,11 +23,11 @@ Ints = NDArray[np.int64]
 #: How fast people are at most in a hole.
 _REACH_M_PER_S: Final = 2.5
 #: What a link is judged by, see ``features``.
-NAMES: Final = ("miss", "misfit", "hole", "misfit or stay", "turn", "way and speed", "misfit and speed", "nobody")
+NAMES: Final = ("miss", "misfit", "hole", "misfit or stay", "turn", "way and speed", "misfit and speed")
 #: What each says for a link, as a log odds ratio; the log odds without any, in logs where a share of ``_USUAL`` of the
 #: best links is right (tools/choose_retrack.py).
-_WEIGHTS: Final = (-1.001, -0.758, -0.203, -0.302, 0.221, 0.542, -0.360, -0.094)
-_BIAS, _USUAL = 3.554, 0.665
+_WEIGHTS: Final = (-0.996, -0.798, -0.205, -0.304, 0.247, 0.482, -0.324)
+_BIAS, _USUAL = 3.702, 0.666
 #: Distances and speeds below these are as good as none.
 _NEAR_M, _SPEED_M_PER_S = 0.3, 0.15
 #: Links that are less likely than this by their log odds are not looked at.
@@ -42,20 +42,19 @@ def link(
     step_s: float,
     max_hole_s: float,
     least: float,
-    odds: Floats,
 ) -> Ints:
     """For each track the one that goes on from it, or -1; (K,).
 
-    ``odds`` (K,) are the log odds that a track is of a person. A link is made if it is right with a probability of
-    ``least``. How many links are right at all differs from log to log, from hardly any (where holes are short, and who
-    is gone has left) to most of them, and is found out from the links themselves (expectation maximisation).
+    A link is made if it is right with a probability of ``least``. How many links are right at all differs from log to
+    log, from hardly any (where holes are short, and who is gone has left) to most of them, and is found out from the
+    links themselves (expectation maximisation).
     """
     first, last = paths.first[:-1], paths.first[1:] - 1
     follows = np.full(len(first), -1)
     i, j, hole_s = candidates(paths, forward, backward, step_s, max_hole_s)
     if len(i) == 0:
         return follows
-    found = features(walker, forward.take(last[i]), backward.take(first[j]), hole_s, odds[i], odds[j])
+    found = features(walker, forward.take(last[i]), backward.take(first[j]), hole_s)
     gain = found @ np.array(_WEIGHTS) + _BIAS - _LEAST
     good = gain > 0
     i, j, gain = i[good], j[good], gain[good]
@@ -110,13 +109,12 @@ def _components(i: Ints, j: Ints, count: int) -> list[Ints]:
     return list(np.split(order, bounds)) if len(order) else []
 
 
-def features(walker: Walker, before: State, after: State, hole_s: Floats, odds: Floats, other_odds: Floats) -> Floats:
+def features(walker: Walker, before: State, after: State, hole_s: Floats) -> Floats:
     """What tells right links from wrong ones, (E, F): see ``NAMES``.
 
     ``before`` is who was there where the hole begins by what came before it, ``after`` who is there where it ends by
-    what comes after it; ``odds`` (E,) of the tracks on its two sides are the log odds that they are of people. A miss
-    is how far off one side is of where the other, going straight on, expects it, the nearer of the two; a misfit, how
-    far off one walks with the mean of both velocities.
+    what comes after it. A miss is how far off one side is of where the other, going straight on, expects it, the nearer
+    of the two; a misfit, how far off one walks with the mean of both velocities.
     """
     span = hole_s[:, None]
     way = after.mean[:, :2] - before.mean[:, :2]
@@ -137,7 +135,6 @@ def features(walker: Walker, before: State, after: State, hole_s: Floats, odds: 
             np.log(_length(came - left) + _SPEED_M_PER_S),
             np.log(stay + _NEAR_M) * walking,
             np.log(misfit + _NEAR_M) * walking,
-            np.minimum(odds, 0.0) + np.minimum(other_odds, 0.0),
         ],
         axis=1,
     )

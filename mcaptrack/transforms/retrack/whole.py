@@ -142,9 +142,8 @@ def laid(step: Ints, track: Ints, xy_m: Floats, noise_m: float) -> tuple[Ints, I
 def _linked(options: Retrack, walker: Walker, step: Ints, track: Ints, xy_m: Floats, step_s: float) -> Ints:
     """The claims' tracks with those put together that are one person."""
     ids, _, paths = laid(step, track, xy_m, walker.noise_m)
-    forward, backward, smoothed = smooth(walker, paths, step_s)
-    odds = log_odds(walker, paths, smoothed, step_s)
-    follows = link(walker, paths, forward, backward, step_s, options.link_s, options.link_certainty, odds)
+    forward, backward, _ = smooth(walker, paths, step_s)
+    follows = link(walker, paths, forward, backward, step_s, options.link_s, options.link_certainty)
     root = np.arange(len(ids))
     order = np.argsort(paths.step[paths.first[:-1]], kind="stable")  # a track begins after the one that it goes on
     for one in order[follows[order] >= 0].tolist():
