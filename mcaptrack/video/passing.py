@@ -21,7 +21,6 @@ from mcaptrack.video.streams import CODECS
 _PIXELS: Final = ("yuv420p", "yuvj420p")
 _WORDS: Final = {"h264": "H.264", "h265": "H.265", "vp9": "VP9", "av1": "AV1"}
 _ONLY_SOME: Final = "it is H.265, which viewers play only where the hardware does (--image-format h265 keeps it)"
-_DEFAULT_FPS: Final = Fraction(30)
 
 
 class Passed(NamedTuple):
@@ -68,9 +67,16 @@ def fraction(ratio: Any) -> Fraction | None:
     return Fraction(ratio.numerator, ratio.denominator) if ratio else None
 
 
-def has_no_times(opened: Any) -> bool:
-    """Whether what a container gives as times is no more than the order in which pictures are decoded."""
+def has_slots(opened: Any) -> bool:
+    """Whether a container has no times but slots for pictures, in the order of decoding; some may be empty."""
     return "avi" in opened.format.name.split(",")
+
+
+def indexed(opened: Any) -> int:
+    """How many pictures the parts of a fragmented MP4 list that were read so far; 0 if it is none."""
+    stream = opened.streams.video[0]
+    is_mp4 = "mp4" in opened.format.name.split(",")
+    return len(stream.index_entries) if is_mp4 and hasattr(stream, "index_entries") else 0
 
 
 def packets(opened: Any, image_format: str) -> Iterator[Passed]:
@@ -82,7 +88,7 @@ def packets(opened: Any, image_format: str) -> Iterator[Passed]:
     name = CODECS[image_format].annex_b
     to_annex_b = BitStreamFilterContext(name, stream) if name else None
     base = fraction(stream.time_base) or Fraction(1)
-    found = opened.demux(stream)
+    slots, found = has_slots(opened), opened.demux(stream)
     while True:
         try:
             packet = next(found, None)
@@ -92,7 +98,8 @@ def packets(opened: Any, image_format: str) -> Iterator[Passed]:
             return
         if packet.size == 0:
             continue
-        seconds = None if packet.pts is None else packet.pts * base
+        ticks = packet.dts if slots else packet.pts
+        seconds = None if ticks is None else ticks * base
         flags = (packet.is_keyframe, packet.is_discard, packet.is_corrupt, _has_new_sets(packet))
         try:
             units = to_annex_b.filter(packet) if to_annex_b else [packet]  # takes the packet's contents with it
@@ -117,8 +124,7 @@ def look(path: Path, keep: Keep) -> Stream:
         if why_not:
             return Stream(image_format, why_not)
         found = Stream(image_format, "", _outside(image_format, context))
-        rate = keep.fps or (fraction(stream.average_rate) or _DEFAULT_FPS if has_no_times(opened) else None)
-        found.why_not = _look_at(packets(opened, image_format), found, rate, Fraction(keep.key_within_s))
+        found.why_not = _look_at(packets(opened, image_format), found, keep.fps, Fraction(keep.key_within_s))
         if image_format == "h265" and keep.image_format != "h265" and not found.why_not:
             found.why_not = _ONLY_SOME
         return found

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from mcaptrack.clock import NS_PER_S
 from mcaptrack.errors import McaptrackError
 from mcaptrack.video.encode import H264Encoder, Keep, StillFormat, encode_image
-from mcaptrack.video.passing import container, fraction, has_no_times, look, packets
+from mcaptrack.video.passing import container, fraction, has_slots, indexed, look, packets
 from mcaptrack.video.streams import CODECS
 
 Image = NDArray[np.uint8]
@@ -70,7 +70,7 @@ class Video:
     images: list[Path] = field(default_factory=list)
     lost: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
-    has_no_times: bool = False
+    has_slots: bool = False
     length_s: Fraction | None = None
 
     def pictures(self, start_ns: int = 0) -> Iterator[EncodedPicture]:
@@ -85,6 +85,8 @@ class Video:
 
     def note_missing(self, read: int, hidden: int = 0, last_s: Fraction | None = None) -> None:
         """Compare what was read with what the container claims; ``hidden`` is what it says not to show."""
+        if self.has_slots and self.fps and last_s is not None:
+            hidden += round(last_s * self.fps) + 1 - read  # slots that are empty
         if self.frames and read + hidden < self.frames:
             self.lost.append(f"{self.path} claims {self.frames} frames; {read} could be read")
         elif not self.frames and self.length_s and last_s is not None and self.fps:
@@ -98,7 +100,7 @@ class _Clock:
     """Times of pictures: from the container, exact in its time base; or evenly spaced."""
 
     def __init__(self, video: Video, start_ns: int) -> None:
-        self.fps = video.keep.fps or (video.fps if video.images or video.has_no_times else None)
+        self.fps = video.keep.fps or (video.fps if video.images else None)
         self._where = video.path
         self._start_ns = start_ns
         self._first: Fraction | None = None
@@ -149,7 +151,7 @@ def open_video(path: Path, keep: Keep = Keep()) -> Video:  # noqa: B008  # froze
             stream.frames,
             _creation_ns(opened.metadata.get("creation_time") or stream.metadata.get("creation_time")),
             f"it is turned by {first.rotation} degrees" if first.rotation else "",
-            has_no_times=has_no_times(opened),
+            has_slots=has_slots(opened),
             length_s=_length_s(opened, stream),
         )
         if first.interlaced_frame:
@@ -240,6 +242,7 @@ def _pass_on(video: Video, clock: _Clock) -> Iterator[EncodedPicture]:
             seconds = packet.seconds
             yield EncodedPicture(clock.time(index, seconds), index, data)
             index += 1
+        video.frames = video.frames or indexed(opened)
     video.note_missing(index, last_s=seconds)
 
 
@@ -293,7 +296,8 @@ def _folder_images(video: Video) -> Iterator[Shown]:
 def _decoded(video: Video) -> Iterator[Shown]:
     import av
 
-    read, damaged, hidden, seconds = 0, 0, 0, None
+    read, damaged, hidden, cut_off, seconds = 0, 0, 0, 0, None
+    slots: list[int] = []
     with container(video.path) as opened:
         stream = opened.streams.video[0]
         stream.thread_type = "AUTO"
@@ -306,15 +310,22 @@ def _decoded(video: Video) -> Iterator[Shown]:
                 if packet is None:
                     break
                 hidden += packet.is_discard
+                cut_off += packet.is_corrupt
+                if video.has_slots and packet.size:
+                    slots.append(len(slots) if packet.dts is None else packet.dts)
                 frames = packet.decode()
             except av.error.FFmpegError as error:
                 video.lost.append(f"{video.path}: a packet can't be decoded ({error.strerror or error})")
                 continue
             for frame in frames:
-                seconds = None if frame.pts is None else frame.pts * base
+                ticks = slots[min(read, len(slots) - 1)] if slots else frame.pts
+                seconds = None if ticks is None else ticks * base
                 damaged += frame.is_corrupt
                 read += 1
                 yield Shown(seconds, frame)
+        video.frames = video.frames or indexed(opened)
+    if cut_off:
+        video.lost.append(f"{video.path}: {cut_off} packets are cut off or damaged")
     if damaged:
         video.lost.append(f"{video.path}: {damaged} of {read} frames are damaged; they are kept as far as they decode")
     video.note_missing(read, hidden, seconds)
