@@ -69,13 +69,13 @@ class Pictures:
         if wanted and not 0 <= wanted[0] <= wanted[-1] < len(self.t_ns):
             raise McaptrackError(f"{self._opened.path}: {self._topic} has {len(self.t_ns)} pictures, not {wanted[-1]}")
         while wanted:
-            start, fed = self._entry(wanted[0]), list[int]()
+            start, fed = self._entry(wanted[0]), dict[int, bool]()
             missing = set(wanted)
             for frame in pixels(self._run(start, wanted, fed), set(wanted)):
                 missing.discard(frame.index)
                 yield frame
-            for number in fed:
-                if number in missing:
+            for number, has_picture in fed.items():
+                if has_picture and number in missing:
                     yield self._from_before(number, start, pixels)
             wanted = wanted[len(fed) :]
 
@@ -85,22 +85,26 @@ class Pictures:
         while end > 0:
             start = max(0, end - step)
             for at, picture in reversed(list(self._read(start, end))):
-                found, has_sets = entry(picture.format, picture.data)
-                is_key |= found
-                if is_key and has_sets:
+                head = entry(picture.format, picture.data)
+                is_key |= head.is_key
+                if is_key and head.has_sets:
                     return at
             end, step = start, _STEP if step == 1 else min(step * _FURTHER, _MOST)
         return 0
 
-    def _run(self, start: int, wanted: list[int], fed: list[int]) -> Iterator[Encoded]:
-        """What has to be decoded from ``start`` on, as far as it is of use; ``fed`` gets what it has of ``wanted``."""
+    def _run(self, start: int, wanted: list[int], fed: dict[int, bool]) -> Iterator[Encoded]:
+        """What has to be decoded from ``start`` on, as far as it is of use.
+
+        ``fed`` gets what that has of ``wanted``, and whether it holds a picture.
+        """
         waiting: list[Encoded] = []
         for number, picture in self._read(start, len(self.t_ns)):
             if number < wanted[0]:
                 self.decoded += 1
                 yield picture
                 continue
-            begins = number > start and all(entry(picture.format, picture.data))
+            head = entry(picture.format, picture.data)
+            begins = number > start and head.is_key and head.has_sets
             if begins and not picture.is_video:
                 waiting.clear()
             elif begins and waiting:
@@ -110,7 +114,7 @@ class Pictures:
                 self.decoded += len(waiting)
                 yield from waiting
                 waiting.clear()
-                fed.append(number)
+                fed[number] = head.has_picture
                 if len(fed) == len(wanted) or wanted[len(fed)] - number > _NEAR:
                     return
 
@@ -120,7 +124,7 @@ class Pictures:
             if start == 0:
                 break
             start = self._entry(start - 1)
-            for frame in pixels(self._run(start, [number], []), {number}):
+            for frame in pixels(self._run(start, [number], {}), {number}):
                 return frame
         where = f"{self._opened.path}: {self._topic} at {int(self.t_ns[number])} ns"
         raise McaptrackError(f"{where} can't be decoded, from the key picture before it on")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Final, NamedTuple
 
-from mcaptrack.video.units import Unit
+from mcaptrack.video.units import Entry, Unit
 
 _SEQUENCE, _DELIMITER, _FRAME_HEADER, _FRAME = 1, 2, 3, 6
 _KEY_FRAME: Final = 0
@@ -53,14 +53,14 @@ def inspect(data: bytes) -> Unit:
     return Unit(pictures, is_key, tuple(sets), bool(sets))
 
 
-def entry(data: bytes) -> tuple[bool, bool]:
-    """Whether a message begins with a key picture that is shown, and whether it holds a sequence header before it."""
+def entry(data: bytes) -> Entry:
+    """What a message begins with; a key picture is one that is shown."""
     has_sequence = False
     for obu in _obus(data):
         has_sequence |= obu.kind == _SEQUENCE
         if obu.kind in (_FRAME_HEADER, _FRAME) and obu.body < len(data):
-            return _header(data[obu.body])[1], has_sequence
-    return False, has_sequence
+            return Entry(True, _header(data[obu.body])[1], has_sequence)
+    return Entry(False, False, has_sequence)
 
 
 def with_sets(data: bytes, sets: tuple[bytes, ...]) -> bytes:

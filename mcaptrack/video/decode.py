@@ -108,18 +108,22 @@ class _VideoDecoder:
         self._codec: Any = av.CodecContext.create(CODECS[name].decoder, "r")
         self._codec.thread_type = "AUTO"
         self._base = Fraction(1, NS_PER_S)
-        self._count = 0
+        self._count, self._sets = 0, b""
         self._waiting: dict[int, tuple[int, int]] = {}
 
     def decode(self, picture: Encoded) -> Iterator[Frame]:
         import av
 
+        if not CODECS[picture.format].entry(picture.data).has_picture:
+            self._sets += picture.data  # some robots send these apart; FFmpeg takes them with a picture
+            return
         # A copy in FFmpeg's own memory: its threads can't let go of Python's while Python waits for them to end.
-        packet = av.Packet(len(picture.data))
-        packet.update(picture.data)
+        data = self._sets + picture.data
+        packet = av.Packet(len(data))
+        packet.update(data)
         packet.pts = packet.dts = self._count  # not its time: messages of others may share one
         packet.time_base = self._base
-        self._waiting[self._count] = picture.t_ns, picture.index
+        self._waiting[self._count], self._sets = (picture.t_ns, picture.index), b""
         self._count += 1
         yield from self._frames(packet, picture.name)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from mcaptrack.video.units import Bits, Unit, nal_starts, nal_units
+from mcaptrack.video.units import Bits, Entry, Unit, nal_starts, nal_units
 
 _SLICE, _PARTITION, _IDR, _SPS, _PPS, _DELIMITER = 1, 2, 5, 7, 8, 9
 _PICTURES: Final = (_SLICE, _PARTITION, _IDR)
@@ -29,15 +29,15 @@ def inspect(data: bytes) -> Unit:
     return Unit(pictures, is_key, tuple(sets), set(sets.values()) == _SETS, has_b)
 
 
-def entry(data: bytes) -> tuple[bool, bool]:
-    """Whether a message holds a key picture, and whether parameter sets, by what stands before its slices."""
+def entry(data: bytes) -> Entry:
+    """What a message begins with; nothing behind the head of its first slice is looked at."""
     found: set[int] = set()
     for start in nal_starts(data):
         kind = data[start] & 0x1F if start < len(data) else 0
         if kind in _PICTURES:
-            return kind == _IDR, found >= _SETS
+            return Entry(True, kind == _IDR, found >= _SETS)
         found.add(kind)
-    return False, found >= _SETS
+    return Entry(False, False, found >= _SETS)
 
 
 def with_sets(data: bytes, sets: tuple[bytes, ...]) -> bytes:

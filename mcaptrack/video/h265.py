@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from mcaptrack.video.units import Unit, nal_starts, nal_units
+from mcaptrack.video.units import Entry, Unit, nal_starts, nal_units
 
 _SETS: Final = frozenset((32, 33, 34))  # VPS, SPS, PPS
 _DELIMITER: Final = 35
@@ -35,15 +35,15 @@ def inspect(data: bytes) -> Unit:
     return Unit(pictures, is_key, tuple(sets), set(sets.values()) == _SETS, is_leading)
 
 
-def entry(data: bytes) -> tuple[bool, bool]:
-    """Whether a message holds a key picture, and whether parameter sets, by what stands before its slices."""
+def entry(data: bytes) -> Entry:
+    """What a message begins with; nothing behind the head of its first slice is looked at."""
     found: set[int] = set()
     for start in nal_starts(data):
         kind = _kind(data, start)
         if kind <= _LAST_PICTURE:
-            return kind in _RANDOM_ACCESS, found >= _SETS
+            return Entry(True, kind in _RANDOM_ACCESS, found >= _SETS)
         found.add(kind)
-    return False, found >= _SETS
+    return Entry(False, False, found >= _SETS)
 
 
 def with_sets(data: bytes, sets: tuple[bytes, ...]) -> bytes:

@@ -237,8 +237,8 @@ def _pass_on(video: Video, clock: _Clock) -> Iterator[EncodedPicture]:
                 continue
             data = packet.data
             if video.sets:
-                is_key, has_sets = codec.entry(data)
-                data = codec.with_sets(data, video.sets) if is_key and not has_sets else data
+                head = codec.entry(data)
+                data = codec.with_sets(data, video.sets) if head.is_key and not head.has_sets else data
             seconds = packet.seconds
             yield EncodedPicture(clock.time(index, seconds), index, data)
             index += 1

@@ -6,21 +6,21 @@ from collections.abc import Callable, Mapping
 from typing import Final, NamedTuple
 
 from mcaptrack.video import av1, h264, h265, vp9
-from mcaptrack.video.units import Unit
+from mcaptrack.video.units import Entry, Unit
 
 
 class Codec(NamedTuple):
     """What is done with the bytes of one codec. ``name`` is FFmpeg's, ``decoder`` that of what decodes it there.
 
-    ``annex_b`` is the filter that makes messages of a container's packets, "" where these are the same. ``entry`` says
-    of a message whether it holds a key picture and whether it holds the parameter sets, from its first bytes alone.
+    ``annex_b`` is the filter that makes messages of a container's packets, "" where these are the same. ``entry`` looks
+    at the first bytes of a message alone.
     """
 
     name: str
     decoder: str
     annex_b: str
     inspect: Callable[[bytes], Unit]
-    entry: Callable[[bytes], tuple[bool, bool]]
+    entry: Callable[[bytes], Entry]
     with_sets: Callable[[bytes, tuple[bytes, ...]], bytes]
 
 
@@ -33,7 +33,7 @@ CODECS: Final[Mapping[str, Codec]] = {
 }
 
 
-def entry(image_format: str, data: bytes) -> tuple[bool, bool]:
-    """Whether decoding can begin at a message, and whether the parameter sets for that are in it; stills always do."""
+def entry(image_format: str, data: bytes) -> Entry:
+    """What a message of this format begins with; decoding can begin at every still."""
     codec = CODECS.get(image_format)
-    return codec.entry(data) if codec else (True, True)
+    return codec.entry(data) if codec else Entry(True, True, True)

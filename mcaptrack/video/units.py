@@ -28,6 +28,17 @@ class Unit(NamedTuple):
     size: tuple[int, int] | None = None
 
 
+class Entry(NamedTuple):
+    """What the first bytes of a message say.
+
+    Whether it holds a picture, whether decoding can begin with that, given parameter sets, and whether it holds these.
+    """
+
+    has_picture: bool
+    is_key: bool
+    has_sets: bool
+
+
 class Bits:
     """The bits of ``data``, from the first on; zeros where it has ended."""
 

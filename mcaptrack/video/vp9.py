@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Final
 
-from mcaptrack.video.units import Bits, Unit
+from mcaptrack.video.units import Bits, Entry, Unit
 
 _SYNC: Final = 0x498342
 _RGB: Final = 7
@@ -23,9 +23,9 @@ def inspect(data: bytes) -> Unit:
     return Unit(pictures, is_key, size=size)
 
 
-def entry(data: bytes) -> tuple[bool, bool]:
-    """Whether a message holds a key picture; parameter sets it needs none."""
-    return _header(data[:_HEAD])[1], True
+def entry(data: bytes) -> Entry:
+    """What a message begins with; it needs no parameter sets."""
+    return Entry(True, _header(data[:_HEAD])[1], True)
 
 
 def _frames(data: bytes) -> Iterator[tuple[int, int]]:
