@@ -96,14 +96,14 @@ def test_what_is_seen_at_a_time_is_the_last_picture_until_then(made):
             list(pictures.frames([60]))
 
 
-def foreign_log(path, topic, messages):
-    """A log of others: messages are log time and data of H.264."""
+def foreign_log(path, topic, messages, image_format="h264"):
+    """A log of others: messages are log time and data."""
     with log.create(path) as writer:
         schema = ("foxglove.CompressedVideo", "jsonschema", b"{}")
         channel = writer.add_channel(topic, schema, "json", {}, kind="media")
         for number, (t_ns, data) in enumerate(messages):
             stamp = {"sec": t_ns // 10**9, "nsec": t_ns % 10**9}
-            words = {"timestamp": stamp, "frame_id": "a", "format": "h264", "data": list(data)}
+            words = {"timestamp": stamp, "frame_id": "a", "format": image_format, "data": list(data)}
             writer.add_message(channel, t_ns, number, json.dumps(words).encode())
 
 
@@ -131,6 +131,29 @@ def test_parameter_sets_in_messages_of_their_own_are_found(tmp_path):
             (frame,) = pictures.frames([numbers[shown]])
             assert shade(frame) == shown
             assert pictures.decoded <= 11
+
+
+@pytest.mark.parametrize("is_open", [False, True])
+@pytest.mark.parametrize("image_format", ["h264", "h265"])
+def test_streams_with_b_frames_and_open_groups_that_others_recorded_are_read_too(tmp_path, image_format, is_open):
+    """Against the rules of Foxglove, and found in logs: messages stand in the order of decoding."""
+    options = {"bf": "2", "g": "10", "x264-params": f"scenecut=0:open-gop={int(is_open)}"}
+    x265 = f"keyint=10:min-keyint=10:bframes=3:scenecut=0:open-gop={int(is_open)}:log-level=none"
+    codec = "libx264" if image_format == "h264" else "libx265"
+    write_clip(
+        tmp_path / "a.ts", frames=40, codec=codec, options=options if image_format == "h264" else {"x265-params": x265}
+    )
+    with av.open(str(tmp_path / "a.ts")) as container:
+        images = {frame.pts: frame.to_ndarray(format="bgr24") for frame in container.decode(video=0)}
+    with av.open(str(tmp_path / "a.ts")) as container:
+        packets = [(packet.pts, bytes(packet)) for packet in container.demux(video=0) if packet.size]
+    messages = [(number * 10**8, data) for number, (_, data) in enumerate(packets)]
+    foreign_log(tmp_path / "a.mcap", "/v", messages, image_format)
+    with log.read(tmp_path / "a.mcap") as opened:
+        for number in (0, 1, 9, 10, 11, 12, 13, 25, 39):
+            (frame,) = Pictures(opened, "/v").frames([number])
+            np.testing.assert_array_equal(frame.rows, images[packets[number][0]])
+        assert sorted(frame.index for frame in Pictures(opened, "/v").frames(range(40))) == list(range(40))
 
 
 def test_messages_that_share_a_time_are_told_apart(tmp_path):

@@ -46,6 +46,7 @@ VIDEO_SUFFIXES: Final = (
 )
 #: The step of labels in formats that are annotated on the clock of prediction.
 _LABEL_STEP_S: Final = Fraction(2, 5)
+_FOXGLOVE_ALONE: Final = {"vp9": "VP9", "av1": "AV1"}
 _SDD_FPS: Final = Fraction(30)
 
 
@@ -121,6 +122,9 @@ class _VideoJob(PictureJob):
             words |= {"encoded_again_because": video.why_transcode}
             words |= {"crf": keep.crf, "keyframe_interval_s": keep.key_every_s}
             self.report.said.append(f"{video.path} is encoded again, as H.264: {video.why_transcode}")
+        elif video.format in _FOXGLOVE_ALONE:
+            kept = f"{video.path} is kept as {_FOXGLOVE_ALONE[video.format]}, which Foxglove plays"
+            self.report.said.append(f"{kept} and Lichtblick does not (--image-format h264 is for both)")
         elif video.format == "jpeg":
             words["quality"] = keep.jpeg_quality
         channel = writer.add_channel(
