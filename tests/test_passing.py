@@ -215,7 +215,7 @@ def test_h264_alone_is_h264_alone(tmp_path):
 
 def test_a_stream_without_times_needs_a_rate_and_is_passed_on_with_one(tmp_path):
     path = made("a.h264", options=X264)(tmp_path)
-    with pytest.raises(McaptrackError, match="picture 0 has no time in its container; space them evenly with --fps"):
+    with pytest.raises(McaptrackError, match=r"a\.h264 has no times of its own; give the frames per second with --fps"):
         ingest(path, tmp_path / "a.mcap", IngestOptions())
     report = ingest(path, tmp_path / "a.mcap", IngestOptions(fps=Fraction(10)))
     assert report.said == []

@@ -208,7 +208,7 @@ def test_a_video_without_frames_is_refused(tmp_path):
     with av.open(str(path)) as source, av.open(str(tmp_path / "b.mkv"), "w") as target:
         target.add_stream_from_template(source.streams.video[0])
         target.start_encoding()
-    with pytest.raises(McaptrackError, match=r"without frames|can't be read as a video"):
+    with pytest.raises(McaptrackError, match="is a video without frames"):
         open_video(tmp_path / "b.mkv")
 
 

@@ -19,6 +19,7 @@ from mcaptrack.video.encode import Keep
 from mcaptrack.video.streams import CODECS
 
 _PIXELS: Final = ("yuv420p", "yuvj420p")
+_NO_TIMESTAMPS: Final = 0x80  # AVFMT_NOTIMESTAMPS
 _WORDS: Final = {"h264": "H.264", "h265": "H.265", "vp9": "VP9", "av1": "AV1"}
 _ONLY_SOME: Final = "it is H.265, which viewers play only where the hardware does (--image-format h265 keeps it)"
 
@@ -55,6 +56,8 @@ def container(path: Path) -> Iterator[Any]:
     try:
         with av.open(str(path)) as opened:
             yield opened
+    except av.error.EOFError:
+        raise McaptrackError(f"{path} is a video without frames") from None
     except av.error.FFmpegError as error:
         raise McaptrackError(
             f"{path} can't be read as a video ({error.strerror or error}); "
@@ -70,6 +73,11 @@ def fraction(ratio: Any) -> Fraction | None:
 def has_slots(opened: Any) -> bool:
     """Whether a container has no times but slots for pictures, in the order of decoding; some may be empty."""
     return "avi" in opened.format.name.split(",")
+
+
+def has_times(opened: Any) -> bool:
+    """Whether pictures have times at all; what FFmpeg gives for raw streams it makes up."""
+    return not int(opened.format.flags) & _NO_TIMESTAMPS
 
 
 def indexed(opened: Any) -> int:

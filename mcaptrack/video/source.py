@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from mcaptrack.clock import NS_PER_S
 from mcaptrack.errors import McaptrackError
 from mcaptrack.video.encode import H264Encoder, Keep, StillFormat, encode_image
-from mcaptrack.video.passing import container, fraction, has_slots, indexed, look, packets
+from mcaptrack.video.passing import container, fraction, has_slots, has_times, indexed, look, packets
 from mcaptrack.video.streams import CODECS
 
 Image = NDArray[np.uint8]
@@ -127,8 +127,8 @@ def open_video(path: Path, keep: Keep = Keep()) -> Video:  # noqa: B008  # froze
         return _open_folder(path, keep)
     with container(path) as opened:
         if not opened.streams.video:
-            kinds = sorted({stream.type for stream in opened.streams}) or ["no streams"]
-            raise McaptrackError(f"{path} holds no video, only {', '.join(kinds)}")
+            kinds = ", ".join(sorted({stream.type for stream in opened.streams}))
+            raise McaptrackError(f"{path} holds no video, {f'only {kinds}' if kinds else 'and nothing else'}")
         stream = opened.streams.video[0]
         context = stream.codec_context
         if context is None:
@@ -140,6 +140,8 @@ def open_video(path: Path, keep: Keep = Keep()) -> Video:  # noqa: B008  # froze
         first = next(opened.decode(stream), None)
         if first is None:
             raise McaptrackError(f"{path} is a video without frames")
+        if not (has_times(opened) or keep.fps):
+            raise McaptrackError(f"{path} has no times of its own; give the frames per second with --fps")
         sideways = first.rotation % 180 != 0
         video = Video(
             path,
