@@ -352,6 +352,52 @@ def test_one_core_or_all_the_bytes_are_the_same(tmp_path):
     assert len(run[0].stdout.strip()) == len(hashlib.sha256().hexdigest())
 
 
+def vp9_header(bits):
+    text = bits.replace(" ", "")
+    return int(text.ljust(8 * -(-len(text) // 8), "0"), 2).to_bytes(-(-len(text) // 8), "big")
+
+
+def test_vp9_headers_by_hand():
+    """Frame marker, profile 0, nothing from before, inter or not, shown, resilient; then as in 6.2 and 7.2 of VP9."""
+    inspect = CODECS["vp9"].inspect
+    size = f"{640 - 1:016b} {360 - 1:016b}"
+    key = inspect(vp9_header(f"10 00 0 0 1 0 {0x498342:024b} 001 0 {size}"))
+    assert (key.pictures, key.is_key, key.size) == (1, True, (640, 360))
+    references = "11111111 0000 0010 0100"
+    same = inspect(vp9_header(f"10 00 0 1 1 0 00 {references} 1 {size}"))
+    assert (same.pictures, same.is_key, same.size) == (1, False, None)
+    other = inspect(vp9_header(f"10 00 0 1 1 1 {references} 000 {size}"))
+    assert (other.pictures, other.is_key, other.size) == (1, False, (640, 360))
+    hidden = inspect(vp9_header(f"10 00 0 1 0 0 1 00 {0x498342:024b} 11111111 {size}"))
+    assert (hidden.pictures, hidden.is_key, hidden.size) == (0, False, (640, 360))
+    again = inspect(vp9_header("10 00 1 000"))
+    assert (again.pictures, again.is_key) == (1, False)
+
+
+def test_words_in_a_file_that_are_not_utf_8_are_no_obstacle(tmp_path):
+    path = made("a.mp4", options=X264)(tmp_path)
+    path.write_bytes(path.read_bytes().replace(b"VideoHandler", b"VideoHandl\xe9r"))
+    assert len(list(open_video(path).pictures())) == 20
+
+
+@pytest.mark.parametrize("name", ["a.mp4", "a.webm", "a.avi"])
+def test_a_file_with_bytes_that_changed_is_read_or_refused_in_a_line(tmp_path, name):
+    path = tmp_path / name
+    write_clip(path, **({"codec": "libvpx-vp9", "options": {"g": "10"}} if name == "a.webm" else {"options": X264}))
+    whole, rng = path.read_bytes(), np.random.default_rng(3)
+    outcomes = set()
+    for _ in range(25):
+        data = bytearray(whole)
+        for at in rng.integers(0, len(data), 5).tolist():
+            data[at] = int(rng.integers(0, 256))
+        path.write_bytes(data)
+        try:
+            outcomes.add(len(list(open_video(path).pictures())) <= 40)
+        except McaptrackError as error:
+            outcomes.add(str(error).count("\n") == 0)
+    assert outcomes == {True}
+
+
 @given(
     st.sampled_from(sorted(CODECS)), st.binary(max_size=60), st.sampled_from([b"", b"\0\0\1", b"\0\0\1\x67", b"\x0a"])
 )

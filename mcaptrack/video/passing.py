@@ -54,7 +54,7 @@ def container(path: Path) -> Iterator[Any]:
     import av
 
     try:
-        with av.open(str(path)) as opened:
+        with av.open(str(path), metadata_errors="replace") as opened:
             yield opened
     except av.error.EOFError:
         raise McaptrackError(f"{path} is a video without frames") from None

@@ -16,10 +16,10 @@ def inspect(data: bytes) -> Unit:
     """What a packet holds: a frame, or several of which one is shown."""
     pictures, is_key, size = 0, False, None
     for number, (start, end) in enumerate(_frames(data)):
-        shown, key, extent = _header(data[start : min(end, start + _HEAD)])
+        shown, key, said = _header(data[start : min(end, start + _HEAD)])
         pictures += shown
-        if number == 0:
-            is_key, size = key, extent
+        is_key |= key and number == 0
+        size = said or size
     return Unit(pictures, is_key, size=size)
 
 
@@ -45,7 +45,7 @@ def _frames(data: bytes) -> Iterator[tuple[int, int]]:
 
 
 def _header(head: bytes) -> tuple[bool, bool, tuple[int, int] | None]:
-    """Of an uncompressed header: is the frame shown, is it a key frame, and then what are its width and height."""
+    """Of an uncompressed header: is the frame shown, is it a key frame, what width and height does it say?"""
     bits = Bits(head)
     if bits.take(2) != 2:
         return False, False, None
@@ -54,10 +54,31 @@ def _header(head: bytes) -> tuple[bool, bool, tuple[int, int] | None]:
         bits.take(1)
     if bits.take(1):
         return True, False, None  # a frame from before is shown
-    is_inter, is_shown = bits.take(1), bool(bits.take(1))
-    bits.take(1)
-    if is_inter or bits.take(24) != _SYNC:
-        return is_shown, False, None
+    is_inter, is_shown, is_resilient = bits.take(1), bool(bits.take(1)), bits.take(1)
+    if not is_inter:
+        if bits.take(24) != _SYNC:
+            return is_shown, False, None
+        _pass_colours(bits, profile)
+        return is_shown, True, _size(bits)
+    is_intra_only = not is_shown and bool(bits.take(1))
+    if not is_resilient:
+        bits.take(2)
+    if is_intra_only:
+        bits.take(24)
+        if profile:
+            _pass_colours(bits, profile)
+        bits.take(8)
+        return is_shown, False, _size(bits)
+    bits.take(8 + 3 * 4)  # what it is kept as, what it refers to
+    has_size_of_another = any(bits.take(1) for _ in range(3))
+    return is_shown, False, None if has_size_of_another else _size(bits)
+
+
+def _size(bits: Bits) -> tuple[int, int]:
+    return bits.take(16) + 1, bits.take(16) + 1
+
+
+def _pass_colours(bits: Bits, profile: int) -> None:
     if profile >= 2:
         bits.take(1)
     if bits.take(3) != _RGB:
@@ -66,4 +87,3 @@ def _header(head: bytes) -> tuple[bool, bool, tuple[int, int] | None]:
             bits.take(3)
     elif profile in (1, 3):
         bits.take(1)
-    return is_shown, True, (bits.take(16) + 1, bits.take(16) + 1)
