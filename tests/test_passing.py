@@ -13,6 +13,7 @@ from pathlib import Path
 import av
 import numpy as np
 import pytest
+from av.bitstream import BitStreamFilterContext
 from hypothesis import given
 from hypothesis import strategies as st
 from mcap.reader import make_reader
@@ -372,6 +373,19 @@ def test_vp9_headers_by_hand():
     assert (hidden.pictures, hidden.is_key, hidden.size) == (0, False, (640, 360))
     again = inspect(vp9_header("10 00 1 000"))
     assert (again.pictures, again.is_key) == (1, False)
+
+
+def test_vp9_superframes_are_taken_apart_as_ffmpeg_does(tmp_path):
+    with av.open(str(made("a.webm", codec="libvpx-vp9", options={"g": "10"})(tmp_path))) as container:
+        stream = container.streams.video[0]
+        one, two = [bytes(packet) for packet in container.demux(stream) if packet.size][:2]
+        marker = bytes([0b110_01_001])  # two frames, their sizes in two bytes each
+        index = marker + len(one).to_bytes(2, "little") + len(two).to_bytes(2, "little") + marker
+        split = BitStreamFilterContext("vp9_superframe_split", stream).filter(av.Packet(one + two + index))
+        assert [bytes(part) for part in split] == [one, two]
+    unit = CODECS["vp9"].inspect(one + two + index)
+    assert (unit.pictures, unit.is_key, unit.size) == (2, True, (64, 48))
+    assert CODECS["vp9"].inspect(two + two + index).is_key is False
 
 
 def test_words_in_a_file_that_are_not_utf_8_are_no_obstacle(tmp_path):

@@ -17,8 +17,7 @@ class Unit(NamedTuple):
     ``pictures`` is how many pictures a decoder shows of it. ``is_key``: everything before can be forgotten, given the
     parameter sets. ``sets`` are the parameter sets (H.264, H.265) or the sequence header (AV1) that stand in it, and
     ``has_sets`` says whether these are all that a decoder needs. ``reorders``: pictures are shown in another order than
-    they stand in. ``size`` is the width and height that a picture says, where no parameter set says
-    them.
+    they stand in. ``size`` is the width and height that a picture says, where no parameter set says them.
     """
 
     pictures: int
