@@ -62,25 +62,30 @@ class Pictures:
     def frames(self, numbers: Iterable[int], pixels: Pixels = colours) -> Iterator[Frame]:
         """The pictures with these numbers, rising, each once; ``index`` is the number.
 
-        Rows are (height, width, 3) uint8, blue, green, red, or with ``pixels=brightness`` (height, width). Raises
-        McaptrackError for pictures that are damaged or can't be decoded.
+        Rows are (height, width, 3) uint8, blue, green, red, or with ``pixels=brightness`` (height, width). Pictures of
+        a video before the first that decoding can begin with are left out. Raises McaptrackError for pictures that are
+        damaged or can't be decoded.
         """
         wanted = sorted(set(numbers))
         if wanted and not 0 <= wanted[0] <= wanted[-1] < len(self.t_ns):
             raise McaptrackError(f"{self._opened.path}: {self._topic} has {len(self.t_ns)} pictures, not {wanted[-1]}")
         while wanted:
-            start, fed = self._entry(wanted[0]), dict[int, bool]()
+            entered, fed = self._entry(wanted[0]), dict[int, bool]()
+            start = entered or 0  # without a key picture from the beginning, since some streams refresh bit by bit
             missing = set(wanted)
             for frame in pixels(self._run(start, wanted, fed), set(wanted)):
                 missing.discard(frame.index)
                 yield frame
             for number, has_picture in fed.items():
-                if has_picture and number in missing:
+                if has_picture and number in missing and entered is not None:
                     yield self._from_before(number, start, pixels)
             wanted = wanted[len(fed) :]
 
-    def _entry(self, number: int) -> int:
-        """Where decoding begins that is to show a picture: the last key picture up to it, or where its sets stand."""
+    def _entry(self, number: int) -> int | None:
+        """Where decoding begins that is to show a picture: the last key picture up to it, or where its sets stand.
+
+        None if there is none.
+        """
         step, end, is_key = 1, number + 1, False
         while end > 0:
             start = max(0, end - step)
@@ -90,7 +95,7 @@ class Pictures:
                 if is_key and head.has_sets:
                     return at
             end, step = start, _STEP if step == 1 else min(step * _FURTHER, _MOST)
-        return 0
+        return None
 
     def _run(self, start: int, wanted: list[int], fed: dict[int, bool]) -> Iterator[Encoded]:
         """What has to be decoded from ``start`` on, as far as it is of use.
@@ -123,7 +128,7 @@ class Pictures:
         for _ in range(_BACK):
             if start == 0:
                 break
-            start = self._entry(start - 1)
+            start = self._entry(start - 1) or 0
             for frame in pixels(self._run(start, [number], {}), {number}):
                 return frame
         where = f"{self._opened.path}: {self._topic} at {int(self.t_ns[number])} ns"

@@ -15,7 +15,8 @@ from mcaptrack import foxglove, log, rendering
 from mcaptrack.errors import McaptrackError
 from mcaptrack.ingest import IngestOptions, ingest
 from mcaptrack.pictures import Pictures
-from mcaptrack.video import H264Encoder, brightness
+from mcaptrack.video import Encoded, H264Encoder, Keep, brightness, open_video
+from tests.test_cli import done
 from tests.test_passing import SVT, X265
 from tests.worlds import write_clip
 
@@ -171,11 +172,35 @@ def test_a_stream_without_a_second_key_picture_is_decoded_from_the_first(tmp_pat
         assert pictures.decoded <= 702
 
 
-def test_a_picture_that_its_key_picture_does_not_show_is_said(tmp_path):
-    messages = [(number * 10**8, data) for number, data in enumerate(encoded())][5:9]
+@pytest.mark.parametrize("name", ["h264", "h265", "vp9", "av1"])
+def test_a_recording_that_begins_within_a_group_is_shown_from_its_first_key_picture_on(tmp_path, name):
+    clip, options = KINDS[name]
+    path = tmp_path / ("a.webm" if name == "vp9" else "a.mkv")
+    write_clip(path, frames=30, **clip)
+    data = [picture.data for picture in open_video(path, Keep(**options)).pictures()]
+    with av.open(str(path)) as container:
+        images = [frame.to_ndarray(format="bgr24") for frame in container.decode(video=0)]
+    foreign_log(tmp_path / "a.mcap", "/v", [(n * 10**8, part) for n, part in enumerate(data[7:])], name)
+    with log.read(tmp_path / "a.mcap") as opened:
+        found = list(Pictures(opened, "/v").frames(range(23)))
+        assert [frame.index for frame in found] == list(range(3, 23))
+        for frame in found:
+            np.testing.assert_array_equal(frame.rows, images[7 + frame.index])
+        assert list(Pictures(opened, "/v").frames([1])) == []
+    seen = brightness(Encoded(number, number, name, part) for number, part in enumerate(data[7:]))
+    assert [frame.index for frame in seen] == list(range(3, 23))
+    _, err = done("detect", tmp_path / "a.mcap", "--topic", "/v", "--to", "/boxes")
+    assert "/v: 3 of 23 messages were left out: a video has to begin with a key picture" in err
+    with log.read(tmp_path / "a.mcap") as opened:
+        assert opened.times("/boxes").tolist() == [number * 10**8 for number in range(3, 23)]
+
+
+def test_a_picture_that_is_damaged_is_said(tmp_path):
+    messages = [(number * 10**8, data) for number, data in enumerate(encoded())]
+    messages[15] = (messages[15][0], messages[15][1][:5] + b"\xff" * 40)
     foreign_log(tmp_path / "a.mcap", "/v", messages)
     with log.read(tmp_path / "a.mcap") as opened, pytest.raises(McaptrackError, match=r"a\.mcap: /v at \d+ ns"):
-        list(Pictures(opened, "/v").frames([2]))
+        list(Pictures(opened, "/v").frames([15]))
 
 
 def test_a_late_part_is_rendered_without_decoding_what_is_before_it(tmp_path, monkeypatch):

@@ -49,6 +49,7 @@ class Encoded(NamedTuple):
 def brightness(pictures: Iterable[Encoded], wanted: Container[int] | None = None) -> Iterator[Frame]:
     """Frames whose ``rows`` are the brightness of the picture, (height, width) uint8 from 0 to 255.
 
+    Pictures of a video before the first that decoding can begin with are left out, as all viewers leave them out.
     With ``wanted`` those of other indexes are decoded, where the next ones need them, and left out. Raises
     McaptrackError for a format that can't be decoded and for pictures that are broken.
     """
@@ -108,15 +109,19 @@ class _VideoDecoder:
         self._codec: Any = av.CodecContext.create(CODECS[name].decoder, "r")
         self._codec.thread_type = "AUTO"
         self._base = Fraction(1, NS_PER_S)
-        self._count, self._sets = 0, b""
+        self._count, self._sets, self._begun = 0, b"", False
         self._waiting: dict[int, tuple[int, int]] = {}
 
     def decode(self, picture: Encoded) -> Iterator[Frame]:
         import av
 
-        if not CODECS[picture.format].entry(picture.data).has_picture:
+        head = CODECS[picture.format].entry(picture.data)
+        self._begun |= head.has_sets
+        if not head.has_picture:
             self._sets += picture.data  # some robots send these apart; FFmpeg takes them with a picture
             return
+        if not self._begun:
+            return  # a recording may begin anywhere; nothing can be made of what is before the first parameter sets
         # A copy in FFmpeg's own memory: its threads can't let go of Python's while Python waits for them to end.
         data = self._sets + picture.data
         packet = av.Packet(len(data))

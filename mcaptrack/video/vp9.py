@@ -24,8 +24,9 @@ def inspect(data: bytes) -> Unit:
 
 
 def entry(data: bytes) -> Entry:
-    """What a message begins with; it needs no parameter sets."""
-    return Entry(True, _header(data[:_HEAD])[1], True)
+    """What a message begins with; key pictures are their own parameter sets."""
+    is_key = _header(data[:_HEAD])[1]
+    return Entry(True, is_key, is_key)
 
 
 def _frames(data: bytes) -> Iterator[tuple[int, int]]:
