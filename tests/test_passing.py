@@ -14,6 +14,7 @@ import av
 import numpy as np
 import pytest
 from av.bitstream import BitStreamFilterContext
+from av.stream import Disposition
 from hypothesis import given
 from hypothesis import strategies as st
 from mcap.reader import make_reader
@@ -356,6 +357,35 @@ def test_one_core_or_all_the_bytes_are_the_same(tmp_path):
 def vp9_header(bits):
     text = bits.replace(" ", "")
     return int(text.ljust(8 * -(-len(text) // 8), "0"), 2).to_bytes(-(-len(text) // 8), "big")
+
+
+def several(path, cover=False):
+    """A file with two videos of 12 and 9 pictures, or with a cover picture before one of 9."""
+    counts = (1, 9) if cover else (12, 9)
+    with av.open(str(path), "w") as container:
+        streams = []
+        for is_cover in (cover, False):
+            stream = container.add_stream("mjpeg" if is_cover else "libx264", rate=10, options={} if is_cover else X264)
+            stream.width, stream.height, stream.pix_fmt = 64, 48, "yuvj420p" if is_cover else "yuv420p"
+            streams.append(stream)
+        if cover:
+            streams[0].disposition = Disposition.attached_pic
+        for stream, count in zip(streams, counts, strict=True):
+            for number in range(count):
+                frame = av.VideoFrame.from_ndarray(np.full((48, 64, 3), 9 * number, np.uint8), format="bgr24")
+                container.mux(stream.encode(frame))
+            container.mux(stream.encode(None))
+    return path
+
+
+def test_of_several_videos_the_first_is_taken_and_that_is_said(tmp_path):
+    report = ingest(several(tmp_path / "a.mkv"), tmp_path / "a.mcap", IngestOptions())
+    assert (report.messages, "holds 2 videos; the first is taken" in report.said[0]) == ({"/camera/video": 12}, True)
+
+
+def test_a_cover_picture_is_no_video(tmp_path):
+    report = ingest(several(tmp_path / "a.mp4", cover=True), tmp_path / "a.mcap", IngestOptions())
+    assert (report.messages, report.said) == ({"/camera/video": 9}, [])
 
 
 def test_vp9_headers_by_hand():

@@ -19,6 +19,7 @@ from mcaptrack.video.encode import Keep
 from mcaptrack.video.streams import CODECS
 
 _PIXELS: Final = ("yuv420p", "yuvj420p")
+_COVER: Final = 0x400  # AV_DISPOSITION_ATTACHED_PIC
 _NO_TIMESTAMPS: Final = 0x80  # AVFMT_NOTIMESTAMPS
 _WORDS: Final = {"h264": "H.264", "h265": "H.265", "vp9": "VP9", "av1": "AV1"}
 _ONLY_SOME: Final = "it is H.265, which viewers play only where the hardware does (--image-format h265 keeps it)"
@@ -65,6 +66,11 @@ def container(path: Path) -> Iterator[Any]:
         ) from error
 
 
+def videos(opened: Any) -> list[Any]:
+    """The streams of pictures in a container, without cover pictures."""
+    return [stream for stream in opened.streams.video if not int(stream.disposition) & _COVER]
+
+
 def fraction(ratio: Any) -> Fraction | None:
     """A ratio of FFmpeg's; None for one that is not known."""
     return Fraction(ratio.numerator, ratio.denominator) if ratio else None
@@ -82,7 +88,7 @@ def has_times(opened: Any) -> bool:
 
 def indexed(opened: Any) -> int:
     """How many pictures the parts of a fragmented MP4 list that were read so far; 0 if it is none."""
-    stream = opened.streams.video[0]
+    stream = videos(opened)[0]
     is_mp4 = "mp4" in opened.format.name.split(",")
     return len(stream.index_entries) if is_mp4 and hasattr(stream, "index_entries") else 0
 
@@ -92,7 +98,7 @@ def packets(opened: Any, image_format: str) -> Iterator[Passed]:
     import av
     from av.bitstream import BitStreamFilterContext
 
-    stream = opened.streams.video[0]
+    stream = videos(opened)[0]
     name = CODECS[image_format].annex_b
     to_annex_b = BitStreamFilterContext(name, stream) if name else None
     base = fraction(stream.time_base) or Fraction(1)
@@ -124,7 +130,7 @@ def _has_new_sets(packet: Any) -> bool:
 def look(path: Path, keep: Keep) -> Stream:
     """Whether and how the first video stream of a file can be passed on, from one pass over its packets."""
     with container(path) as opened:
-        stream = opened.streams.video[0]
+        stream = videos(opened)[0]
         context = stream.codec_context
         name = context.codec.canonical_name
         image_format = next((key for key, codec in CODECS.items() if codec.name == name), "")

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from mcaptrack.clock import NS_PER_S
 from mcaptrack.errors import McaptrackError
 from mcaptrack.video.encode import H264Encoder, Keep, StillFormat, encode_image
-from mcaptrack.video.passing import container, fraction, has_slots, has_times, indexed, look, packets
+from mcaptrack.video.passing import container, fraction, has_slots, has_times, indexed, look, packets, videos
 from mcaptrack.video.streams import CODECS
 
 Image = NDArray[np.uint8]
@@ -126,10 +126,11 @@ def open_video(path: Path, keep: Keep = Keep()) -> Video:  # noqa: B008  # froze
     if path.is_dir():
         return _open_folder(path, keep)
     with container(path) as opened:
-        if not opened.streams.video:
-            kinds = ", ".join(sorted({stream.type for stream in opened.streams}))
+        there = videos(opened)
+        if not there:
+            kinds = ", ".join(sorted({stream.type for stream in opened.streams if stream.type != "video"}))
             raise McaptrackError(f"{path} holds no video, {f'only {kinds}' if kinds else 'and nothing else'}")
-        stream = opened.streams.video[0]
+        stream = there[0]
         context = stream.codec_context
         if context is None:
             raise McaptrackError(f"{path} holds video in a codec that is not known here; convert it to H.264 first")
@@ -156,6 +157,8 @@ def open_video(path: Path, keep: Keep = Keep()) -> Video:  # noqa: B008  # froze
             has_slots=has_slots(opened),
             length_s=_length_s(opened, stream),
         )
+        if len(there) > 1:
+            video.notes.append(f"{path} holds {len(there)} videos; the first is taken")
         if first.interlaced_frame:
             video.why_transcode = video.why_transcode or "it is interlaced"
     if keep.is_still:
@@ -301,7 +304,7 @@ def _decoded(video: Video) -> Iterator[Shown]:
     read, damaged, hidden, cut_off, seconds = 0, 0, 0, 0, None
     slots: list[int] = []
     with container(video.path) as opened:
-        stream = opened.streams.video[0]
+        stream = videos(opened)[0]
         stream.thread_type = "AUTO"
         stream.codec_context.thread_count = _THREADS
         base = fraction(stream.time_base) or Fraction(1)
