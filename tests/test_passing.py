@@ -359,6 +359,37 @@ def vp9_header(bits):
     return int(text.ljust(8 * -(-len(text) // 8), "0"), 2).to_bytes(-(-len(text) // 8), "big")
 
 
+@pytest.mark.parametrize(
+    ("matrix", "is_full", "pixels"),
+    [
+        (1, False, "yuv420p"),
+        (5, False, "yuv420p"),
+        (1, True, "yuvj420p"),
+        (9, False, "yuv420p10le"),
+        (1, False, "yuv444p"),
+    ],
+)
+def test_colours_stay_what_they_are_whatever_the_numbers_mean(tmp_path, matrix, is_full, pixels):
+    """BT.709, BT.601 and BT.2020, limited and full range."""
+    path, colours = tmp_path / "a.mp4", ((30, 60, 200), (200, 160, 40))
+    image = np.repeat(np.array(colours, np.uint8), 64, axis=0)[None].repeat(96, axis=0)
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=10, options={"bf": "2"})
+        stream.width, stream.height, stream.pix_fmt = 128, 96, pixels
+        stream.codec_context.colorspace, stream.codec_context.color_range = matrix, 2 if is_full else 1
+        for _ in range(3):
+            frame = av.VideoFrame.from_ndarray(image, format="bgr24")
+            ranges = {"dst_colorspace": matrix, "dst_color_range": 2 if is_full else 1}
+            container.mux(stream.encode(frame.reformat(format=pixels, **ranges)))
+        container.mux(stream.encode(None))
+    video = open_video(path)
+    assert video.why_transcode != ""
+    one = decoder("h264")
+    (seen,) = shown(one, next(video.pictures()).data)
+    for at, colour in zip((32, 96), colours, strict=True):
+        assert np.abs(seen[48, at].astype(int) - colour).max() <= 6
+
+
 def several(path, cover=False):
     """A file with two videos of 12 and 9 pictures, or with a cover picture before one of 9."""
     counts = (1, 9) if cover else (12, 9)

@@ -237,8 +237,8 @@ def _pass_on(video: Video, clock: _Clock) -> Iterator[EncodedPicture]:
     index, seconds = 0, None
     with container(video.path) as opened:
         for packet in packets(opened, video.format):
-            if packet.is_damaged:  # the last one: it was cut off
-                video.lost.append(f"{video.path}: the last packet is cut off; it is left out")
+            if packet.is_damaged:  # the last one
+                video.lost.append(f"{video.path} is cut off or damaged after {index} frames; the rest is left out")
                 continue
             data = packet.data
             if video.sets:
