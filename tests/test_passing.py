@@ -14,7 +14,6 @@ import av
 import numpy as np
 import pytest
 from av.bitstream import BitStreamFilterContext
-from av.stream import Disposition
 from hypothesis import given
 from hypothesis import strategies as st
 from mcap.reader import make_reader
@@ -400,6 +399,8 @@ def several(path, cover=False):
             stream.width, stream.height, stream.pix_fmt = 64, 48, "yuvj420p" if is_cover else "yuv420p"
             streams.append(stream)
         if cover:
+            from av.stream import Disposition  # not in the oldest versions that do
+
             streams[0].disposition = Disposition.attached_pic
         for stream, count in zip(streams, counts, strict=True):
             for number in range(count):

@@ -61,7 +61,7 @@ def ingest(
         float | None,
         common.option(
             "--keyframe-interval-s",
-            help="Key pictures are at most so far apart, in seconds; H.264 that has fewer is encoded again.",
+            help="Key pictures are at most so far apart, in seconds; a stream that has fewer is encoded again.",
             show_default="2 in what is kept as it is, 1 in what is encoded",
         ),
     ] = None,

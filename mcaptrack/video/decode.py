@@ -109,7 +109,7 @@ class _VideoDecoder:
         self._codec: Any = av.CodecContext.create(CODECS[name].decoder, "r")
         self._codec.thread_type = "AUTO"
         self._base = Fraction(1, NS_PER_S)
-        self._count, self._sets, self._begun = 0, b"", False
+        self._count, self._sets, self._begun, self._last = 0, b"", False, "the video"
         self._waiting: dict[int, tuple[int, int]] = {}
 
     def decode(self, picture: Encoded) -> Iterator[Frame]:
@@ -130,10 +130,11 @@ class _VideoDecoder:
         packet.time_base = self._base
         self._waiting[self._count], self._sets = (picture.t_ns, picture.index), b""
         self._count += 1
+        self._last = picture.name
         yield from self._frames(packet, picture.name)
 
     def flush(self) -> Iterator[Frame]:
-        yield from self._frames(None, "the end of the video")
+        yield from self._frames(None, self._last)
 
     def _frames(self, packet: Any, where: str) -> Iterator[Frame]:
         import av

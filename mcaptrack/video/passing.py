@@ -68,7 +68,12 @@ def container(path: Path) -> Iterator[Any]:
 
 def videos(opened: Any) -> list[Any]:
     """The streams of pictures in a container, without cover pictures."""
-    return [stream for stream in opened.streams.video if not int(stream.disposition) & _COVER]
+    return [stream for stream in opened.streams.video if not _bits(getattr(stream, "disposition", 0)) & _COVER]
+
+
+def _bits(flags: Any) -> int:
+    """Flags of FFmpeg's, which PyAV gives as a number or not, by its version."""
+    return int(getattr(flags, "value", flags))
 
 
 def fraction(ratio: Any) -> Fraction | None:
@@ -83,7 +88,7 @@ def has_slots(opened: Any) -> bool:
 
 def has_times(opened: Any) -> bool:
     """Whether pictures have times at all; what FFmpeg gives for raw streams it makes up."""
-    return not int(opened.format.flags) & _NO_TIMESTAMPS
+    return not _bits(opened.format.flags) & _NO_TIMESTAMPS
 
 
 def indexed(opened: Any) -> int:
