@@ -77,6 +77,12 @@ def run(
         for result in transform(frames):
             for frame, channel in zip(result, outputs, strict=True):
                 channel.append(frame)
+        seen = len(stamps.get(job.source, ())) if job.source not in made else 0
+        if job.transform.reads is VIDEO and seen > len(outputs[0]):
+            say(
+                f"{job.source}: {seen - len(outputs[0])} of {seen} messages were left out: a video has to begin with a "
+                "key picture that has its parameter sets"
+            )
         weights = weights_sha256(transform.predictor) if hasattr(transform, "predictor") else ""
         for (topic, schema), channel in zip(job.outputs().items(), outputs, strict=True):
             if topic not in job.kept():
