@@ -23,7 +23,7 @@ def topic_folder(topic: str) -> str:
         "".join(c if c.isascii() and (c.isalnum() or c in "_-") else _escaped(c) for c in p) for p in body.split("/")
     )
     name = ".".join(parts)
-    return _cut(name if topic.startswith("/") and name.strip(".") else "%2D" + name)
+    return _cut(name if topic.startswith("/") and name.strip(".") else "~" + name)
 
 
 def _escaped(character: str) -> str:

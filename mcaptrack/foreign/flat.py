@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -25,6 +25,10 @@ _MAX_DEPTH: Final = 32
 _MAX_DESCRIPTOR: Final = 4 * 2**20
 #: How the parts of a time are called: in ROS 1, ROS 2, JSON of bridges, protobuf.
 _TIMES: Final = (("secs", "nsecs"), ("sec", "nsec"), ("sec", "nanosec"), ("seconds", "nanos"))
+
+
+class _Messages(tuple[Any, ...]):
+    """A list of messages: JSON even where it is empty, so that a column keeps its type."""
 
 
 def kind_of(opened: log.Log, topic: str) -> Kind:
@@ -108,10 +112,16 @@ def _fields(value: Any) -> Mapping[str, Any] | None:
         return value
     if hasattr(value, "DESCRIPTOR"):
         return {field.name: _member(value, field) for field in value.DESCRIPTOR.fields}
-    names = getattr(value, "__dataclass_fields__", None)
-    if names is not None:
-        return {name: getattr(value, name) for name in names if name != "__msgtype__"}
+    fields = getattr(value, "__dataclass_fields__", None)
+    if fields is not None:  # constants of the definition stand among the fields, and say so
+        kinds = {name: str(field.type) for name, field in fields.items()}
+        return {name: _ros(getattr(value, name), kind) for name, kind in kinds.items() if "ClassVar" not in kind}
     return None
+
+
+def _ros(value: Any, kind: str) -> Any:
+    """A field of a ROS message."""
+    return _Messages(value) if isinstance(value, list) and "__" in kind else value
 
 
 def _member(message: Any, field: Any) -> Any:
@@ -119,6 +129,8 @@ def _member(message: Any, field: Any) -> Any:
     if field.has_presence and not message.HasField(field.name):
         return None
     value = getattr(message, field.name)
+    if field.message_type is not None and isinstance(value, Sequence):
+        return _Messages(value)
     if field.enum_type is None:
         return value
     names = field.enum_type.values_by_number
@@ -148,7 +160,9 @@ def _value(value: Any) -> Value:
     if hasattr(value, "items"):  # a map of protobuf
         return _json({str(key): member for key, member in value.items()})
     members = list(value)
-    if all(isinstance(member, bool | int | float | str | np.generic) for member in members):
+    if not isinstance(value, _Messages) and all(
+        isinstance(member, bool | int | float | str | np.generic) for member in members
+    ):
         return [member.item() if isinstance(member, np.generic) else member for member in members]
     return _json(members)
 

@@ -6,7 +6,6 @@ and "NaN", as protobuf writes them. Times are text of ISO 8601 with nanoseconds.
 
 from __future__ import annotations
 
-import csv
 import hashlib
 import io
 import json
@@ -27,10 +26,8 @@ def write(path: Path, table: Any, form: str) -> None:
             stream.write(piece)
     with path.open("rb") as stream:
         found = hashlib.file_digest(stream, "sha256").hexdigest()
-    with path.open(encoding="utf-8", newline="") as text:
-        lines = sum(1 for _ in csv.reader(text)) - 1 if form == "csv" else sum(1 for _ in text)
-    if found != written.hexdigest() or lines != table.num_rows:
-        raise RuntimeError(f"{path}: {table.num_rows} rows were written and {lines} can be read, or not the same")
+    if found != written.hexdigest():
+        raise RuntimeError(f"{path}: what was written can't be read back")
 
 
 def _json_lines(table: Any) -> Iterator[bytes]:
