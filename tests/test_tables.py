@@ -130,7 +130,7 @@ def test_rows_of_a_track_stand_together_and_the_file_says_in_which_order(tmp_pat
     keys = list(zip(*(read.column(name).to_pylist() for name in order), strict=True))
     assert keys == sorted(keys)
     file = pq.ParquetFile(tmp_path / "t.parquet")
-    ways, nulls = pq.SortingColumn.to_ordering(file.schema_arrow, file.metadata.row_group(0).sorting_columns)
+    ways, _ = pq.SortingColumn.to_ordering(file.schema_arrow, file.metadata.row_group(0).sorting_columns)
     assert [name for name, _ in ways] == list(order)
     assert read.column("row").to_pylist() == [2, 5, 8, 11, 1, 4, 7, 10, 0, 3, 6, 9]
 
@@ -291,7 +291,7 @@ def test_summaries_are_what_duckdb_makes_of_the_rows(data):
         st.integers(0, 3), st.tuples(*[st.floats(-50, 50) | st.just(float("nan"))] * 2), max_size=4
     )
     frames = [Frame(ns(n), n, tracks_at(who)) for n, who in enumerate(data.draw(st.lists(people, max_size=8)))]
-    rows = tables.rows_table(TRACKS, {"/a": frames})
+    rows = tables.rows_table(TRACKS, {"/a": frames})  # noqa: F841  # DuckDB finds it by name
     summary = tables.summary_table({"/a": tables.build.frames_to_part(TRACKS, frames)})
     wanted = duckdb.sql("""
         with known as (select *, lag(x_m) over w as px, lag(y_m) over w as py, lag(t_ns) over w as pt from rows
@@ -412,9 +412,9 @@ def test_when_the_disk_is_full_or_somebody_interrupts_it_is_the_old_file(tmp_pat
             def __getattr__(self, name):
                 return getattr(self.stream, name)
 
-        def opened(self, mode="r", *rest, Failing=Failing, **named):
+        def opened(self, mode="r", *rest, failing=Failing, **named):
             stream = real(self, mode, *rest, **named)
-            return Failing(stream) if mode == "xb" else stream
+            return failing(stream) if mode == "xb" else stream
 
         with monkeypatch.context() as patch:
             patch.setattr(Path, "open", opened)

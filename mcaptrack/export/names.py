@@ -23,6 +23,7 @@ def topic_folder(topic: str) -> str:
         "".join(c if c.isascii() and (c.isalnum() or c in "_-") else _escaped(c) for c in p) for p in body.split("/")
     )
     name = ".".join(parts)
+    name = name or "%2F" * len(topic)
     return _cut(name if topic.startswith("/") and name.strip(".") else "~" + name)
 
 

@@ -191,8 +191,15 @@ def digest(schema: Any, pieces: Iterable[Any]) -> str:
         start += piece.num_rows
     total = hashlib.sha256(start.to_bytes(8, "little"))
     for field, column in zip(schema, columns, strict=True):
-        total.update(f"{field.name}\0{field.type}\0{column.digest()}\0".encode())
+        total.update(f"{field.name}\0{_kind(field.type)}\0{column.digest()}\0".encode())
     return total.hexdigest()
+
+
+def _kind(kind: Any) -> str:
+    """A type, without what Parquet and Arrow call differently: the members of lists."""
+    import pyarrow as pa
+
+    return f"list<{_kind(kind.value_type)}>" if pa.types.is_list(kind) else str(kind)
 
 
 class _ColumnDigest:
