@@ -8,6 +8,7 @@ import re
 
 import duckdb
 import numpy as np
+import pandas as pd
 import polars as pl
 import pyarrow.parquet as pq
 import pytest
@@ -234,10 +235,30 @@ def test_tables_of_channels_that_are_gone_go(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "recording"), [("../../etc/x.mcap", "x"), ("a=b c.mcap", "a_b_c"), ("...mcap", "log"), ("ü.1.mcap", "ü.1")]
+    ("name", "recording"),
+    [
+        ("../../etc/x.mcap", "x"),
+        ("a=b c.mcap", "a_b_c"),
+        ("...mcap", "log"),
+        ("ü.1.mcap", "ü.1"),
+        ("0001.mcap", "log-0001"),
+    ],
 )
 def test_names_of_logs_never_climb_out_of_the_folder(tmp_path, name, recording):
     assert recording_name(tmp_path / name) == recording
+
+
+@pytest.mark.parametrize(
+    "stem", ["0001", "1.5", "1e5", "2026-05-01", "2026-05-01 10:00:00", "true", "NaN", "-7", "walk_07"]
+)
+def test_no_reader_takes_the_name_of_a_log_for_something_else(tmp_path, stem):
+    name = recording_name(tmp_path / f"{stem}.mcap")
+    path = tmp_path / "t" / f"recording={name}" / "part-0.parquet"
+    tables.write(path, tables.rows_table(TRACKS, {"/a": [Frame(1, 0, tracks_at({1: (0, 0)}))]}), {})
+    assert ask("select recording from '@/t/*/*.parquet'", tmp_path) == [(name,)]
+    assert pl.read_parquet(tmp_path / "t", hive_partitioning=True)["recording"].to_list() == [name]
+    assert pq.read_table(tmp_path / "t").column("recording").to_pylist() == [name]
+    assert pd.read_parquet(tmp_path / "t")["recording"].tolist() == [name]
 
 
 EVIL = [

@@ -439,7 +439,7 @@ def test_what_reads_back_differently_is_not_published(tmp_path, monkeypatch):
         monkeypatch.setattr(
             pq.ParquetWriter, "write_table", lambda self, _, wrong=wrong, **k: real(self, wrong.cast(new.schema), **k)
         )
-        with pytest.raises(McaptrackError, match="does not hold what was written"):
+        with pytest.raises(McaptrackError, match="does not read back the same"):
             tables.write(path, new, {})
         assert path.read_bytes() == before
 

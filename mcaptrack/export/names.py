@@ -11,9 +11,18 @@ from typing import Final
 _MAX_BYTES: Final = 200
 
 
+#: Words that readers of partitions take for something else than text.
+_NO_TEXT: Final = ("nan", "inf", "infinity", "true", "false", "null", "none")
+
+
 def recording_name(path: Path) -> str:
-    """The name of a log as it can stand in a path and in a partition: no slash, no equals sign, nothing that climbs."""
-    return _cut(re.sub(r"[^\w.\-]+", "_", path.stem).lstrip(".") or "log")
+    """The name of a log as it can stand in a path and in a partition: no slash, no equals sign, nothing that climbs.
+
+    Names that readers would take for numbers or dates (0001 would become 1) get "log-" before them.
+    """
+    name = _cut(re.sub(r"[^\w.\-]+", "_", path.stem).lstrip(".") or "log")
+    is_text = re.search(r"[^\W\d_]", name) and not re.fullmatch(r"[-\d._]*e[-\d]+", name, re.IGNORECASE)
+    return name if is_text and name.lower().lstrip("-") not in _NO_TEXT else f"log-{name}"
 
 
 def topic_folder(topic: str) -> str:

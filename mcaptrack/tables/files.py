@@ -55,9 +55,15 @@ def write(
                     from mcaptrack.tables import text
 
                     text.write(part, table, form)
-                found = verify(part, form) if form in _DESCRIBED else table.num_rows
+                try:
+                    found = verify(part, form) if form in _DESCRIBED else table.num_rows
+                except McaptrackError:
+                    found = -1
                 if found != table.num_rows:
-                    raise RuntimeError(f"{path}: {table.num_rows} rows were written and {found} can be read")
+                    raise McaptrackError(
+                        f"{path} can't be written: what was written does not read back the same; the disk or the "
+                        "memory of this machine may be at fault"
+                    )
         except OSError as error:
             raise McaptrackError(f"{path} can't be written: {error.strerror or error}") from error
     return True
