@@ -34,9 +34,6 @@ Similarity = Literal["iou", "metres"]
 
 SCHEMA_VERSION: Final = 1
 COMBINED: Final = "COMBINED"
-#: The channels of a camera that are scored, and those of the forecasts made from them.
-SCORED: Final = ("tracks", "samples", "retracks/online", "retracks")
-FORECASTS: Final = ("predictions", "retracks/predictions")
 IOU_THRESHOLD: Final = 0.5
 DEFAULT_GATES_M: Final = (0.5, 1.0, 2.0)
 #: The truth is interpolated over no longer hole than this.
@@ -48,6 +45,9 @@ _FAR_M: Final = 5.0
 #: How many pairs of boxes are compared in one go, to bound the memory that takes.
 _PAIRS_AT_ONCE: Final = 1_000_000
 _MODES: Final = {"online": "online", "": "offline"}
+#: The channels of a camera that are scored, and those of the forecasts made from them.
+SCORED: Final = ("tracks", "samples", "retracks/online", "retracks")
+FORECASTS: Final = ("predictions", "retracks/predictions")
 
 
 @dataclass(frozen=True)
