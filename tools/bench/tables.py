@@ -1,10 +1,10 @@
 """Ten million rows of tracks as Parquet, against what pyarrow does by default.
 
 Boxes of people who walk are tracked by SORT; its tracks, moved about and with other ids, are repeated up to the number
-of rows. Twice: as a hundred logs, a file each, as `mcaptrack export` leaves them, and as one log. Prints seconds and
+of rows. Twice: as a hundred logs, a file each, as `mcaptrack export` leaves them, and as one log. Prints CPU seconds and
 megabytes, as ratios to `pq.write_table(table, path)` and to the same with `compression="zstd"`, written in turn in one
 process, the best of three each: writing alone, and with what stands between a table and a file that can be trusted
-(adding up the content, reading back, comparing, fsync). Then how long DuckDB takes for the rows of one track.
+(adding up the content, reading back, comparing). Then how long DuckDB takes for the rows of one track, in one thread.
 
     .venv/bin/python tools/bench/tables.py [ROWS]
 
@@ -81,13 +81,13 @@ def repeated(frames: list[Frame], rows: int, rng: np.random.Generator, first: in
 
 
 def timed(calls: dict[str, Callable[[], object]]) -> dict[str, float]:
-    """The best seconds of each, in turns."""
+    """The least CPU seconds of each, in turns; what else the machine does hardly counts."""
     best = dict.fromkeys(calls, float("inf"))
     for _ in range(ROUNDS):
         for name, call in calls.items():
-            begun = time.perf_counter()
+            begun = time.process_time()
             call()
-            best[name] = min(best[name], time.perf_counter() - begun)
+            best[name] = min(best[name], time.process_time() - begun)
     return best
 
 
@@ -133,17 +133,18 @@ def write_all(folder: Path, parts: Iterable[Part]) -> None:
             took[key] = took.get(key, 0.0) + seconds
         for key, path in paths.items():
             size[key] = size.get(key, 0) + path.stat().st_size
-    print(f"{rows:,} rows in {number + 1} files; seconds of 1 thread where not said otherwise")
+    print(f"{rows:,} rows in {number + 1} files; CPU seconds")
     print(f"ours: {took['alone']:.2f} s, {size['ours'] / 1e6:.0f} MB")
     for peer in ("snappy", "zstd"):
         print(
             f"pyarrow, {peer}: {took[peer]:.2f} s, {size[peer] / 1e6:.0f} MB; ours is "
             f"{took[peer] / took['alone']:.2f} times as fast and {size[peer] / size['ours']:.2f} times as small"
         )
-    print(f"ours with digest, reading back, comparing and fsync, 2 threads: {took['ours']:.2f} s")
+    print(f"ours with digest, reading back and comparing: {took['ours']:.2f} s")
     print(f"before that, rows of the log -> table in its order: {took['put in order']:.2f} s")
     who = int(part.rows["track_id"][len(part.rows) // 2])
     with duckdb.connect() as connection:
+        connection.sql("set threads = 1")
         for key in ("ours", "zstd"):
             for where in (f"track_id = {who}", f"recording = {number} and track_id = {who}"):
                 query = f"select * from '{folder}/{key}/*/*.parquet' where {where}"
