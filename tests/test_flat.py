@@ -138,6 +138,8 @@ def test_bytes_are_kept_where_they_are_asked_for(tmp_path, state):
     with log.create(tmp_path / "a.mcap") as writer:
         number = writer.add_channel("/x", ("robot.State", "protobuf", schema), "protobuf", {})
         writer.add_message(number, 0, 0, make(picture=b"\x00\xff").SerializeToString())
+        other = writer.add_channel("/y", ("robot.State", "protobuf", schema), "protobuf", {})
+        writer.add_message(other, 0, 0, make(picture=b"\x01").SerializeToString())
     from mcaptrack.export import export
 
     with log.read(tmp_path / "a.mcap") as opened:
@@ -145,9 +147,12 @@ def test_bytes_are_kept_where_they_are_asked_for(tmp_path, state):
         assert done.notes == ["/x: picture left out, bytes; --blobs keeps them"]
         export(opened, tmp_path / "t", topics=["/x"], blobs=True)
         assert export(opened, tmp_path / "t").written == []  # and they stay
+        assert export(opened, tmp_path / "t", topics=["/y"], blobs=True).rows["topics/y"] == 1
+        (words,) = export(opened, tmp_path / "t", topics=["/y"]).notes
+        assert words == "/y: picture left out, bytes; --blobs keeps them"  # of /y alone
     import pyarrow.parquet as pq
 
-    (file,) = (tmp_path / "t" / "topics").rglob("*.parquet")
+    (file,) = (tmp_path / "t" / "topics" / "x").rglob("*.parquet")
     assert pq.ParquetFile(file).read().column("picture").to_pylist() == [b"\x00\xff"]
 
 

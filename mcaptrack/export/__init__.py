@@ -69,7 +69,7 @@ def export(
         job.table(name)
         progress("export", count, total)
     for count, topic in enumerate(wanted, start=len(TABLES)):
-        job.messages(topic, blobs or (topic not in topics and known[topic]))
+        job.messages(topic, blobs if topic in topics else known[topic])
         progress("export", count, total)
     job.remove([topic for topic in known if topic not in wanted])
     job.table(last)

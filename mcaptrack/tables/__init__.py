@@ -10,7 +10,6 @@ read_tracks(path), read_columns(...) the way back, for files of others too
 from mcaptrack.tables.build import (
     Part,
     Pointers,
-    concatenated,
     frames_table,
     only,
     records_table,
@@ -22,7 +21,7 @@ from mcaptrack.tables.build import (
     with_recording,
 )
 from mcaptrack.tables.fields import RECORDING, TABLE_VERSION, TABLES, Field, Table
-from mcaptrack.tables.files import FORMATS, Format, described, is_made_from, verify, write
+from mcaptrack.tables.files import FORMATS, Format, described, verify, write
 from mcaptrack.tables.messages import messages_table
 from mcaptrack.tables.read import holds_tracks, read_columns, read_tracks
 
@@ -36,11 +35,9 @@ __all__ = [
     "Part",
     "Pointers",
     "Table",
-    "concatenated",
     "described",
     "frames_table",
     "holds_tracks",
-    "is_made_from",
     "messages_table",
     "only",
     "read_columns",

@@ -222,13 +222,6 @@ def with_recording(table: Any, recording: str) -> Any:
     return table.append_column(RECORDING.arrow, _repeated([recording], [table.num_rows]))
 
 
-def concatenated(tables: Sequence[Any]) -> Any:
-    """Tables with the same columns, one below the other."""
-    import pyarrow as pa
-
-    return pa.concat_tables(tables).unify_dictionaries()
-
-
 def only(table: Any, topic: str) -> Any:
     """The rows of one channel."""
     import pyarrow.compute as pc

@@ -140,12 +140,6 @@ def described(path: Path, form: Format) -> dict[str, str] | None:
     return {key.removeprefix(_PREFIX): value for key, value in pairs if key.startswith(_PREFIX)}
 
 
-def is_made_from(path: Path, form: Format, source: str) -> bool:
-    """Whether a file is there whose metadata say that it was made from ``source`` by this version of tables."""
-    known = described(path, form) if path.is_file() else None
-    return known is not None and (known.get("source"), known.get("table_version")) == (source, TABLE_VERSION)
-
-
 def verify(path: Path, form: Format = "parquet") -> int:
     """Read a whole file and hold its content against the digest in its metadata; returns the number of rows.
 

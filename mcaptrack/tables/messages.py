@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Final
 
 from mcaptrack.tables.build import Pointers, frames_table
-from mcaptrack.tables.fields import TABLES
 
 Path = tuple[str, ...]
 
@@ -126,7 +125,3 @@ def _arrow(kind: str) -> Any:
         "str": pa.string(),
     }
     return kinds[kind]
-
-
-#: What tables of messages begin with.
-HEAD: Final = tuple(field.name for field in TABLES["frames"].fields if field.name != "rows")

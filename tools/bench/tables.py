@@ -1,10 +1,11 @@
 """Ten million rows of tracks as Parquet, against what pyarrow does by default.
 
-Boxes of people who walk are tracked by SORT; its tracks, moved about and with other ids, are repeated up to the number
-of rows. Twice: as a hundred logs, a file each, as `mcaptrack export` leaves them, and as one log. Prints CPU seconds and
-megabytes, as ratios to `pq.write_table(table, path)` and to the same with `compression="zstd"`, written in turn in one
-process, the best of three each: writing alone, and with what stands between a table and a file that can be trusted
-(adding up the content, reading back, comparing). Then how long DuckDB takes for the rows of one track, in one thread.
+Boxes of people who walk are tracked by SORT; its tracks, moved about and with other ids, are repeated up to the
+number of rows. Twice: as a hundred logs, a file each, as `mcaptrack export` leaves them, and as one log. Prints CPU
+seconds and megabytes, as ratios to `pq.write_table(table, path)` and to the same with `compression="zstd"`, written in
+turn in one process, the best of three each: writing alone, and with what stands between a table and a file that can be
+trusted (adding up the content, reading back, comparing). Then how long DuckDB takes for the rows of one track, in one
+thread.
 
     .venv/bin/python tools/bench/tables.py [ROWS]
 
