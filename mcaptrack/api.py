@@ -128,12 +128,7 @@ class Recording:
         channel = self._pictures(topic)
         wanted = None if times is None else self._shown(channel, times)
         frames = self._decoded(channel, wanted, colour)
-        if wanted is None:
-            yield from frames
-            return
-        for frame in frames:
-            for _ in range(wanted.get(frame.index, 0)):
-                yield frame
+        return frames if wanted is None else (frame for frame in frames for _ in range(wanted[frame.index]))
 
     def fetch(self, row: Mapping[str, Any]) -> FetchedMessage:
         """The message that a row of ``frames`` points to, or of any table with its columns; one chunk is read.

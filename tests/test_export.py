@@ -355,6 +355,8 @@ def test_what_a_channel_can_not_be_read_as_is_said_with_its_time(tmp_path):
         writer.add_message(number, 5, 0, b"{")
     with pytest.raises(McaptrackError, match=r"/x at 5 ns: 1 bytes are no json message"):
         exported(tmp_path / "a.mcap", tmp_path / "t", topics=["/x"])
+    outcome = CliRunner().invoke(app, ["export", str(tmp_path / "a.mcap"), "--blobs"])
+    assert (outcome.exit_code, "with --topic" in outcome.stderr) == (1, True)
     with pytest.raises(McaptrackError, match="has no channel /y"):
         exported(tmp_path / "a.mcap", tmp_path / "t", topics=["/y"])
 

@@ -147,7 +147,7 @@ def export(
     verbose: common.Verbose = False,
     config: common.Config = None,
 ) -> None:
-    """Write what is in a log as Parquet tables, one row an object a frame.
+    """Write what is in a log as tables (Parquet), one row an object a frame.
 
     One folder a table (frames, detections, tracks, track_summary, predictions, events, metrics, channels, recordings
     and others), one file a log in it; several logs can share a folder. Exporting again replaces what has changed.
@@ -165,6 +165,8 @@ def export(
     paths = common.expand(logs)
     if output is not None and output.exists() and not output.is_dir():
         raise McaptrackError(f"{output} is a file; tables go to a folder")
+    if blobs and not topic:
+        raise McaptrackError("--blobs is about the fields of a channel; say of which with --topic")
     folders: dict[tuple[Path, str], Path] = {}
     for path in paths:
         other = folders.setdefault((output or default_folder(path), recording_name(path)), path)
