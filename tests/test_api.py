@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import subprocess
 import sys
@@ -10,9 +11,11 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from typer.testing import CliRunner
 
 import mcaptrack
 from mcaptrack import ingest, log, pipeline, tables
+from mcaptrack.cli import app
 from mcaptrack.demo import draw
 from mcaptrack.errors import McaptrackError
 from tests.test_export import some_log
@@ -190,4 +193,14 @@ def test_the_document_runs_from_top_to_bottom(tmp_path, monkeypatch):
     assert isinstance(names["frame"], pd.DataFrame)
     assert names["picture"].rows.ndim == 3
     assert names["message"].topic == "/camera/video"
-    assert len(names["scores"]) > 3
+    results = json.loads(CliRunner().invoke(app, ["evaluate", "log.mcap", "--json"]).stdout)["results"]
+    rows = {(row["topic"], row["similarity"], row["gate"]): row for row in names["scores"]}
+    assert len(rows) == len(results) > 3
+    assert any("displacement" in result for result in results)
+    for result in results:
+        row = rows[result["tracks"], result["similarity"], result["gate"]]
+        said = result | result.get("displacement", {})
+        assert {name: said.get(name) for name in row if name in said} == {
+            name: row[name] for name in row if name in said
+        }
+        assert (row["recall"] is None) == ("displacement" not in result)
