@@ -180,7 +180,7 @@ def test_what_is_no_log_is_said_in_a_line(tmp_path):
 
 
 def test_the_document_runs_from_top_to_bottom(tmp_path, monkeypatch):
-    footage, path = draw(small_scene(), tmp_path), tmp_path / "log.mcap"
+    footage, path = draw(small_scene(12.0), tmp_path), tmp_path / "log.mcap"
     ingest.ingest(
         footage.video, path, ingest.IngestOptions(ground_plane=footage.ground_plane, labels={"truth": footage.truth})
     )
