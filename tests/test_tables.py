@@ -1,37 +1,69 @@
-"""Rows as Parquet and back, read by DuckDB too."""
+"""Rows as Parquet and back to the bit, read by DuckDB, Polars and pandas too."""
 
 from __future__ import annotations
 
+import csv
+import datetime as dt
+import errno
+import importlib.util
+import io
 import json
+import os
+import resource
+import signal
+from pathlib import Path
 
 import duckdb
 import numpy as np
+import pandas as pd
+import polars as pl
+import pyarrow as pa
+import pyarrow.dataset as ds
 import pyarrow.parquet as pq
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mcaptrack import export, log, tables
+from mcaptrack import tables
 from mcaptrack.errors import McaptrackError
-from mcaptrack.provenance import Provenance
-from mcaptrack.schema import DETECTIONS, PREDICTIONS, SCHEMAS, TRACKS, Frame
+from mcaptrack.schema import PREDICTIONS, SCHEMAS, TRACKS, Frame
+from mcaptrack.tables import TABLES, Pointers
 from tests.strategies import columns
-from tests.worlds import boxes_at, tracks_at
+from tests.worlds import ns, tracks_at
 
+ROOT = Path(__file__).parent.parent
 ALL = st.sampled_from(sorted(SCHEMAS.values(), key=lambda schema: schema.name))
+TIMES = st.integers(0, 2**63 - 1)
+DOUBLES = st.floats(allow_nan=False) | st.sampled_from([-0.0, 5e-324, -2.2e-308, float("inf"), -float("inf"), 0.1])
+
+
+def pointers(frames):
+    """Where these frames might stand in a log."""
+    numbers = [np.array(part, np.int64) for part in zip(*((f.t_ns, f.index, len(f.rows)) for f in frames), strict=True)]
+    t_ns, index, rows = numbers or [np.empty(0, np.int64)] * 3
+    return Pointers("a.mcap", t_ns, index, rows, np.full(len(t_ns), 8), np.arange(len(t_ns)) * 100)
+
+
+def some_tracks(people):
+    """A table of tracks, a frame a dictionary of people."""
+    return tables.rows_table(TRACKS, {"/a": [Frame(n, n, tracks_at(who)) for n, who in enumerate(people)]})
 
 
 @given(st.data())
-def test_rows_survive_parquet_to_the_bit_with_frames_in_which_nobody_was(tmp_path_factory, data):
+@settings(max_examples=60)
+def test_rows_survive_files_to_the_bit_with_frames_in_which_nobody_was(tmp_path_factory, data):
     folder, schema = tmp_path_factory.mktemp("tables"), data.draw(ALL)
+    form = data.draw(st.sampled_from(["parquet", "arrow"]))
     channels = {}
     for topic in ("/a", "/b/c"):
-        times = sorted(data.draw(st.sets(st.integers(0, 2**62), max_size=4)))
+        times = sorted(data.draw(st.lists(st.integers(0, 2**62), max_size=4)))  # one time may come twice
         channels[topic] = [Frame(t, n, schema.rows(**data.draw(columns(schema, 4)))) for n, t in enumerate(times)]
-    entries = {topic: [(f.t_ns, f.index, len(f.rows)) for f in frames] for topic, frames in channels.items()}
-    tables.write(folder / "rows.parquet", tables.rows_table(schema, channels), {})
-    tables.write(folder / "frames.parquet", tables.frames_table(entries), {})
-    rows, frames = pq.read_table(folder / "rows.parquet"), pq.read_table(folder / "frames.parquet")
+    table = tables.rows_table(schema, channels)
+    tables.write(folder / "rows", table, {}, tables.table_of(schema).order, form)
+    tables.write(folder / "frames", tables.frames_table({t: pointers(f) for t, f in channels.items()}), {}, (), form)
+    read = pq.read_table if form == "parquet" else lambda path: pa.ipc.open_file(pa.memory_map(str(path))).read_all()
+    rows, frames = (read(folder / name) for name in ("rows", "frames"))
+    assert rows.schema.remove_metadata() == table.schema.remove_metadata()
     for topic, wanted in channels.items():
         found = tables.table_to_frames(schema, rows, frames, topic)
         assert [(f.t_ns, f.index, schema.codec.encode(f.rows)) for f in found] == [
@@ -39,98 +71,247 @@ def test_rows_survive_parquet_to_the_bit_with_frames_in_which_nobody_was(tmp_pat
         ]
 
 
-def some_log(path):
-    with log.create(path) as writer:
-        for topic, schema, frames in (
-            ("/camera/detections", DETECTIONS, [Frame(123_456_789_012_345_678, 0, boxes_at([(5, 5), (9, 9)]))]),
-            ("/camera/tracks", TRACKS, [Frame(10, 0, tracks_at({4: (1.5, 2.5)})), Frame(20, 1, TRACKS.empty())]),
-            ("/camera/retracks", TRACKS, [Frame(10, 0, tracks_at({1: (1.5, 2.5)}))]),
-        ):
-            made = Provenance("track", {"max_age_s": 1.4}, "/camera/detections").to_metadata()
-            number = writer.add_channel(topic, (schema.name, "protobuf", schema.descriptor), "protobuf", made)
-            for frame in frames:
-                writer.add_message(number, frame.t_ns, frame.index, schema.codec.encode(frame.rows))
-    return path
-
-
-def test_a_log_becomes_a_folder_that_duckdb_reads(tmp_path):
-    with log.read(some_log(tmp_path / "walk = 1.mcap")) as opened:
-        rows = export.export(opened, tmp_path / "tables")
-    assert rows == {
-        "channels": 3,
-        "detections": 2,
-        "events": 0,
-        "frames": 4,
-        "ground_planes": 0,
-        "predictions": 0,
-        "tracks": 2,
-    }
-
-    def ask(query: str):
-        return duckdb.sql(query.replace("@", f"{tmp_path}/tables")).fetchall()
-
-    assert ask(
-        "select recording, topic, frame, t_ns, track_id, x_m, x_px from '@/tracks/*/*.parquet' order by topic"
-    ) == [
-        ("walk_1", "/camera/retracks", 0, 10, 1, 1.5, None),
-        ("walk_1", "/camera/tracks", 0, 10, 4, 1.5, None),
+@given(st.lists(st.tuples(TIMES, DOUBLES, st.none() | DOUBLES), min_size=1, max_size=12))
+@settings(max_examples=40)
+def test_others_read_the_same_bits_and_nanoseconds(tmp_path_factory, given_rows):
+    path = tmp_path_factory.mktemp("t") / "t.parquet"
+    frames = []
+    for number, (t_ns, x, y) in enumerate(sorted(given_rows, key=lambda row: row[0])):
+        rows = TRACKS.empty(1)
+        rows["x_m"], rows["y_m"] = x, np.nan if y is None else y
+        for name in ("x_px", "y_px", "w_px", "h_px", "score"):
+            rows[name] = np.nan
+        rows["source_id"] = np.iinfo(np.int64).min
+        frames.append(Frame(t_ns, number, rows))
+    tables.write(path, tables.rows_table(TRACKS, {"/a": frames}), {})
+    wanted = [
+        (f.t_ns, f.rows["x_m"].view("<u8")[0], None if np.isnan(f.rows["y_m"][0]) else f.rows["y_m"].view("<u8")[0])
+        for f in frames
     ]
-    assert ask("select topic, t_ns, rows from '@/frames/*/*.parquet' where rows = 0") == [("/camera/tracks", 20, 0)]
-    assert ask("select count(*) from '@/predictions/*/*.parquet'") == [(0,)]
-    assert ask("select transform, input from '@/channels/*/*.parquet' where topic = '/camera/tracks'") == [
-        ("track", "/camera/detections")
-    ]
-    joined = (
-        "select count(*) from '@/tracks/*/*.parquet' join '@/frames/*/*.parquet' using (recording, topic, frame, t_ns)"
-    )
-    assert ask(joined) == [(2,)]
-    assert ask("select epoch_ns(t) - t_ns from '@/detections/*/*.parquet'") == [(0,), (0,)]
+
+    def bits(values):
+        return [None if v is None or v is pd.NA or v != v else np.float64(v).view("<u8") for v in values]
+
+    of_duckdb = duckdb.sql(f"select epoch_ns(t), t_ns, x_m, y_m from '{path}'").fetchall()
+    t, t_ns, x, y = zip(*of_duckdb, strict=True)
+    assert list(t) == list(t_ns)
+    assert list(zip(t_ns, bits(x), bits(y), strict=True)) == wanted
+
+    polars = pl.read_parquet(path)
+    assert polars.schema["t"] == pl.Datetime("ns", "UTC")
+    assert polars["t"].dt.timestamp("ns").to_list() == polars["t_ns"].to_list()
+    assert list(zip(polars["t_ns"], bits(polars["x_m"]), bits(polars["y_m"]), strict=True)) == wanted
+
+    pandas = pd.read_parquet(path)
+    assert str(pandas["t"].dtype) == "datetime64[ns, UTC]"
+    assert pandas["t"].astype("int64").to_list() == pandas["t_ns"].to_list()
+    assert list(zip(pandas["t_ns"].tolist(), bits(pandas["x_m"]), bits(pandas["y_m"]), strict=True)) == wanted
+    assert set(pandas["source_id"]) == {np.iinfo(np.int64).min}
 
 
-def test_units_meaning_and_provenance_are_in_the_file(tmp_path):
-    with log.read(some_log(tmp_path / "a.mcap")) as opened:
-        export.export(opened, tmp_path / "tables")
-    schema = pq.read_schema(tmp_path / "tables" / "tracks" / "recording=a" / "part-0.parquet")
-    assert schema.field("x_m").metadata == {b"unit": b"m", b"description": b"position on the ground plane, first axis"}
-    assert schema.field("t_ns").metadata[b"unit"] == b"ns"
-    assert str(schema.field("t").type) == "timestamp[ns, tz=UTC]"
-    lineage = json.loads(schema.metadata[b"mcaptrack.lineage"])
-    assert lineage["/camera/tracks"] == {
-        "transform": "track",
-        "input": "/camera/detections",
-        "parameters": {"max_age_s": 1.4},
-    }
-    assert schema.metadata[b"mcaptrack.recording"] == b"a.mcap"
+def test_missing_is_null_and_null_is_missing_whatever_bits_a_nan_has():
+    rows = tracks_at({1: (0.0, 0.0), 2: (0.0, 0.0)}).copy()
+    rows["x_m"] = np.array([0x7FF8_0000_DEAD_BEEF, 0xFFF0_0000_0000_0001], np.uint64).view(float)
+    table = tables.rows_table(TRACKS, {"/a": [Frame(1, 0, rows)]})
+    assert table.column("x_m").null_count == 2
+    assert table.column("y_m").null_count == 0
+    (frame,) = tables.table_to_frames(TRACKS, table, tables.frames_table({"/a": pointers([Frame(1, 0, rows)])}), "/a")
+    assert np.isnan(frame.rows["x_m"]).all()
+
+
+# What stands in a file
+
+
+def test_rows_of_a_track_stand_together_and_the_file_says_in_which_order(tmp_path):
+    people = [{5: (n, 0), 3: (0, n), -2: (1, 1)} for n in range(4)]
+    order = TABLES["tracks"].order
+    tables.write(tmp_path / "t.parquet", some_tracks(people), {}, order)
+    read = pq.read_table(tmp_path / "t.parquet")
+    keys = list(zip(*(read.column(name).to_pylist() for name in order), strict=True))
+    assert keys == sorted(keys)
+    file = pq.ParquetFile(tmp_path / "t.parquet")
+    ways, _ = pq.SortingColumn.to_ordering(file.schema_arrow, file.metadata.row_group(0).sorting_columns)
+    assert [name for name, _ in ways] == list(order)
+    assert read.column("row").to_pylist() == [2, 5, 8, 11, 1, 4, 7, 10, 0, 3, 6, 9]
+
+
+@given(st.lists(st.integers(-(2**63), 2**63 - 1) | st.integers(-3, 70_000), max_size=40))
+def test_whole_numbers_are_ordered_as_a_stable_sort_does(values):
+    from mcaptrack.tables.build import _stable_order
+
+    array = np.array(values, np.int64)
+    assert _stable_order(array).tolist() == np.argsort(array, kind="stable").tolist()
+
+
+def test_columns_are_compressed_and_described_as_they_should_be(tmp_path):
+    people = [{n: (n / 7, n / 3) for n in range(50)} for _ in range(40)]
+    tables.write(tmp_path / "t.parquet", some_tracks(people), {}, TABLES["tracks"].order)
+    group = pq.read_metadata(tmp_path / "t.parquet").row_group(0)
+    for number in range(group.num_columns):
+        column = group.column(number)
+        assert column.compression == "ZSTD"
+        assert column.is_stats_set
+        assert column.has_offset_index
+        if column.physical_type in ("DOUBLE", "FLOAT"):
+            assert "BYTE_STREAM_SPLIT" in column.encodings
+        if column.physical_type == "INT64":
+            assert "DELTA_BINARY_PACKED" in column.encodings
+
+
+@pytest.mark.parametrize("table", TABLES.values(), ids=list(TABLES))
+def test_every_column_says_its_unit_and_meaning(table):
+    for field in table.arrow:
+        words = {key.decode(): value.decode() for key, value in field.metadata.items()}
+        assert words["description"].strip(), field.name
+        assert "unit" in words, field.name
+        tail = field.name.rpartition("_")[2]
+        if tail in ("px", "m", "s", "ns", "m2") and "_m_s" not in field.name:
+            assert words["unit"] == {"m2": "m^2"}.get(tail, tail), field.name
+        if pa.types.is_integer(field.type) or pa.types.is_floating(field.type):
+            assert words["unit"], field.name
+    assert set(table.key) <= {*table.arrow.names, "recording"}
+    assert set(table.order) <= set(table.arrow.names)
+
+
+def test_the_document_of_the_tables_is_what_the_schemas_say():
+    spec = importlib.util.spec_from_file_location("tables_doc", ROOT / "tools" / "tables_doc.py")
+    tool = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(tool)
+    text = (ROOT / "docs" / "tables.md").read_text()
+    assert tool.with_tables(text) == text, "run tools/tables_doc.py"
 
 
 def test_tables_without_rows_keep_their_columns(tmp_path):
     tables.write(tmp_path / "a.parquet", tables.rows_table(PREDICTIONS, {}), {})
     read = pq.read_table(tmp_path / "a.parquet")
     assert read.num_rows == 0
-    assert read.schema.names == ["topic", "frame", "t", "t_ns", *(column.name for column in PREDICTIONS.columns)]
+    assert read.schema.names == ["topic", "frame", "t", "t_ns", "row", *(column.name for column in PREDICTIONS.columns)]
+    assert tables.verify(tmp_path / "a.parquet") == 0
 
 
-def test_the_same_log_gives_the_same_tables(tmp_path):
-    for name in ("x", "y"):
-        with log.read(some_log(tmp_path / "a.mcap")) as opened:
-            export.export(opened, tmp_path / name)
-    for file in (tmp_path / "x").rglob("*.parquet"):
-        assert file.read_bytes() == (tmp_path / "y" / file.relative_to(tmp_path / "x")).read_bytes()
+# Columns that are added later
 
 
-def test_exporting_again_replaces_and_leaves_other_logs_alone(tmp_path):
-    with log.read(some_log(tmp_path / "a.mcap")) as a, log.read(some_log(tmp_path / "b.mcap")) as b:
-        for _ in range(2):
-            export.export(a, tmp_path / "tables")
-            export.export(b, tmp_path / "tables")
-    assert len(list((tmp_path / "tables").rglob("*"))) == 7 * (1 + 2 + 2)
+def test_old_files_and_new_ones_are_read_together(tmp_path):
+    new = some_tracks([{1: (0.5, 1.5)}, {1: (1.0, 2.0)}])
+    old = new.drop_columns(["row", "source_id"])
+    for name, table in (("new", new), ("old", old)):
+        tables.write(tmp_path / "tracks" / f"recording={name}" / "part-0.parquet", table, {})
+    files = f"{tmp_path}/tracks/*/*.parquet"
+    wanted = [("new", 1), ("new", 1), ("old", 1), ("old", 1)]
+
+    found = duckdb.sql(f"from read_parquet('{files}', union_by_name=true) order by recording")
+    assert found.select("recording, track_id").fetchall() == wanted
+    assert found.select("source_id").fetchall() == [(-1,), (-1,), (None,), (None,)]
+
+    polars = pl.scan_parquet(files, hive_partitioning=True, missing_columns="insert").collect().sort("recording")
+    assert polars.select("recording", "track_id").rows() == wanted
+    assert polars["source_id"].to_list() == [-1, -1, None, None]
+
+    paths = sorted((tmp_path / "tracks").rglob("*.parquet"))
+    schema = pa.unify_schemas([pq.read_schema(path) for path in paths])
+    arrow = ds.dataset(paths, schema=schema).to_table()
+    assert arrow.column("source_id").to_pylist() == [-1, -1, None, None]
 
 
-@pytest.mark.parametrize(
-    ("name", "recording"), [("../../etc/x.mcap", "x"), ("a=b c.mcap", "a_b_c"), ("...mcap", "log"), ("ü.1.mcap", "ü.1")]
+# Text
+
+
+WORDS = st.text(st.characters(codec="utf-8"), max_size=12) | st.sampled_from(
+    ['a"b', "a,b", "a\nb", "a\r\nb", "", "=1+1", "ü"]
 )
-def test_names_of_logs_never_climb_out_of_the_folder(tmp_path, name, recording):
-    assert export.recording_name(tmp_path / name) == recording
+
+
+@given(st.lists(st.tuples(WORDS, st.none() | DOUBLES, TIMES), max_size=6))
+@settings(max_examples=60)
+def test_text_is_read_back_by_others_as_it_was(tmp_path_factory, rows):
+    folder = tmp_path_factory.mktemp("text")
+    words, numbers, times = zip(*rows, strict=True) if rows else ((), (), ())
+    table = pa.table(
+        {
+            "w": pa.array(words, pa.string()),
+            "x": pa.array(numbers, pa.float64()),
+            "t": pa.array(times, pa.int64()).cast(pa.timestamp("ns", "UTC")),
+            "l": pa.array([[number] for number in times], pa.list_(pa.int64())),
+        }
+    )
+    for form in ("csv", "jsonl"):
+        tables.write(folder / f"a.{form}", table, {}, (), form)
+    raw = (folder / "a.csv").read_bytes().decode("utf-8")
+    read = list(csv.reader(io.StringIO(raw, newline="")))
+    assert read[0] == ["w", "x", "t", "l"]
+    assert [row[0] for row in read[1:]] == list(words)
+    assert [None if row[1] == "" else float(row[1]) for row in read[1:]] == list(numbers)
+    assert [row[2] for row in read[1:]] == [iso(t) for t in times]
+    assert [json.loads(row[3]) for row in read[1:]] == [[t] for t in times]
+    lines = [json.loads(line) for line in (folder / "a.jsonl").read_bytes().splitlines()]
+    assert [line["w"] for line in lines] == list(words)
+    assert [None if line["x"] is None else float(line["x"]) for line in lines] == list(numbers)
+    assert [(line["t"], line["l"]) for line in lines] == [(iso(t), [t]) for t in times]
+
+
+def iso(t_ns):
+    second = dt.datetime.fromtimestamp(0, dt.UTC) + dt.timedelta(seconds=t_ns // 10**9)
+    return f"{second:%Y-%m-%dT%H:%M:%S}.{t_ns % 10**9:09}Z"
+
+
+# Summaries
+
+
+def test_a_track_is_summed_up(tmp_path):
+    places = {1: [(0, 0), (3, 4), (3, 4), (3, 5)], 7: [None, (1, 1), None, (1, 3)]}
+    frames = []
+    for number in range(4):
+        there = {who: path[number] for who, path in places.items() if path[number]}
+        frames.append(Frame(ns(number / 2), 10 + number, tracks_at(there, observed=number != 1)))
+    first, second = tables.summary_table({"/a": tables.build.frames_to_part(TRACKS, frames)}).to_pylist()
+    assert (first["track_id"], first["rows"], first["path_m"], first["duration_s"]) == (1, 4, 6.0, 1.5)
+    assert (first["mean_speed_m_s"], first["max_speed_m_s"]) == (4.0, 10.0)
+    assert (first["first_t_ns"], first["last_t_ns"], first["first_frame"], first["last_frame"]) == (0, ns(1.5), 10, 13)
+    assert (first["first_x_m"], first["first_y_m"], first["last_x_m"], first["last_y_m"]) == (0, 0, 3, 5)
+    assert (first["observed_share"], second["observed_share"]) == (0.75, 0.5)
+    assert (second["path_m"], second["mean_speed_m_s"], second["max_speed_m_s"]) == (2.0, 2.0, 2.0)
+    assert second["first_x_px"] is None
+
+
+def test_a_track_that_is_nowhere_has_no_path_and_one_that_is_seen_once_no_speed():
+    rows = tracks_at({1: (np.nan, np.nan), 2: (5.0, 6.0)})
+    nowhere, once = tables.summary_table({"/a": tables.build.frames_to_part(TRACKS, [Frame(5, 0, rows)])}).to_pylist()
+    assert [nowhere[name] for name in ("path_m", "mean_speed_m_s", "max_speed_m_s", "first_x_m", "last_y_m")] == [
+        None
+    ] * 5
+    assert (once["path_m"], once["mean_speed_m_s"], once["max_speed_m_s"], once["last_x_m"]) == (0.0, None, None, 5.0)
+    assert tables.summary_table({}).num_rows == 0
+
+
+@given(st.data())
+@settings(max_examples=30)
+def test_summaries_are_what_duckdb_makes_of_the_rows(data):
+    people = st.dictionaries(
+        st.integers(0, 3), st.tuples(*[st.floats(-50, 50) | st.just(float("nan"))] * 2), max_size=4
+    )
+    frames = [Frame(ns(n), n, tracks_at(who)) for n, who in enumerate(data.draw(st.lists(people, max_size=8)))]
+    rows = tables.rows_table(TRACKS, {"/a": frames})  # noqa: F841  # DuckDB finds it by name
+    summary = tables.summary_table({"/a": tables.build.frames_to_part(TRACKS, frames)})
+    wanted = duckdb.sql("""
+        with known as (select *, lag(x_m) over w as px, lag(y_m) over w as py, lag(t_ns) over w as pt from rows
+                       where x_m is not null and y_m is not null window w as (partition by track_id order by t_ns)),
+             paths as (select track_id, coalesce(sum(sqrt((x_m - px)^2 + (y_m - py)^2)), 0) as path,
+                              max(sqrt((x_m - px)^2 + (y_m - py)^2) / ((t_ns - pt) / 1e9)) as fastest
+                       from known group by track_id)
+        select track_id, min(t_ns), max(t_ns), count(*), any_value(path), any_value(fastest)
+        from rows left join paths using (track_id) group by track_id order by track_id
+    """).fetchall()
+    names = ("track_id", "first_t_ns", "last_t_ns", "rows", "path_m", "max_speed_m_s")
+    found = list(zip(*(summary.column(name).to_pylist() for name in names), strict=True))
+    assert [row[:4] for row in found] == [row[:4] for row in wanted]
+    for mine, theirs in zip(found, wanted, strict=True):
+        assert [value is None for value in mine] == [value is None for value in theirs]
+        known = [pair for pair in zip(mine[4:], theirs[4:], strict=True) if pair[0] is not None]
+        assert all(a == pytest.approx(b, rel=1e-9, abs=1e-12) for a, b in known)
+
+
+# Faults
 
 
 def test_a_folder_that_can_not_be_written_is_said(tmp_path):
@@ -139,26 +320,146 @@ def test_a_folder_that_can_not_be_written_is_said(tmp_path):
         tables.write(tmp_path / "file" / "t.parquet", tables.rows_table(TRACKS, {}), {})
 
 
-def test_half_a_table_is_never_left(tmp_path, monkeypatch):
-    path = tmp_path / "t.parquet"
-    tables.write(path, tables.rows_table(TRACKS, {"/a": [Frame(1, 0, tracks_at({1: (0, 0)}))]}), {})
+def two_tables():
+    """A table of which the file has several pages, and another."""
+    rng = np.random.default_rng(0)
+    return [
+        some_tracks([{k: tuple(rng.normal(size=2)) for k in range(count)} for _ in range(60)]) for count in (40, 50)
+    ]
+
+
+def same(path, form, table):
+    """Whether the file is whole and holds the table."""
+    assert tables.verify(path, form) == table.num_rows if form in ("parquet", "arrow") else path.stat().st_size
+    read = {
+        "parquet": pq.read_table,
+        "arrow": lambda p: pa.ipc.open_file(p).read_all(),
+        "csv": lambda p: pl.read_csv(p).to_arrow(),
+        "jsonl": lambda p: pl.read_ndjson(p).to_arrow(),
+    }[form](path)
+    return read.column("track_id").to_pylist() == table.column("track_id").to_pylist()
+
+
+@pytest.mark.parametrize("form", tables.FORMATS)
+def test_killed_at_any_byte_or_call_the_file_is_the_old_one_or_the_new_one(tmp_path, monkeypatch, form):
+    path, (old, new) = tmp_path / "t", two_tables()
+    tables.write(path, new, {}, (), form)
+    size, seen = path.stat().st_size, set()
+    tables.write(path, old, {}, (), form)
     before = path.read_bytes()
+    # At a file size the kernel stops the writer, whoever writes; at a call we do.
+    deaths = [("size", size * k // 4) for k in range(4)] + [("call", n) for n in range(1, 4)] + [("none", 0)]
+    for way, at in deaths:
+        path.write_bytes(before)
+        child = os.fork()
+        if child == 0:
+            if way == "size":
+                signal.signal(signal.SIGXFSZ, signal.SIG_DFL)
+                resource.setrlimit(resource.RLIMIT_FSIZE, (at, at))
+            calls = []
 
-    def interrupted(*args, **kwargs):
-        args[1].write_bytes(b"PAR1 half a table")
-        raise KeyboardInterrupt
+            def counted(real, calls=calls, at=at, way=way):
+                def call(*args, **kwargs):
+                    calls.append(real)
+                    if way == "call" and len(calls) == at:
+                        os.kill(os.getpid(), signal.SIGKILL)
+                    return real(*args, **kwargs)
 
-    monkeypatch.setattr(pq, "write_table", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        tables.write(path, tables.rows_table(TRACKS, {}), {})
-    assert path.read_bytes() == before
+                return call
+
+            for name in ("fsync", "replace"):
+                setattr(os, name, counted(getattr(os, name)))
+            try:
+                tables.write(path, new, {}, (), form)
+            finally:
+                os._exit(0)
+        _, status = os.waitpid(child, 0)
+        assert (status == 0) == (way == "none"), (way, at)
+        is_new = path.read_bytes() != before
+        assert same(path, form, new if is_new else old)
+        seen.add(is_new)
+    assert seen == {True, False}
+    tables.write(path, old, {}, (), form)  # sweeps away what the killed ones left
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_floats_are_floats_and_missing_is_null(tmp_path):
-    frame = Frame(1, 0, tracks_at({1: (0.1, 0.2)}))
-    tables.write(tmp_path / "t.parquet", tables.rows_table(TRACKS, {"/a": [frame]}), {})
-    table = pq.read_table(tmp_path / "t.parquet")
-    assert table.column("x_px").null_count == 1
-    assert np.isnan(frame.rows["x_px"]).all()
-    assert table.column("x_m").to_pylist() == [0.1]
+@pytest.mark.parametrize("form", tables.FORMATS)
+@pytest.mark.parametrize("error", [OSError(errno.ENOSPC, "No space left on device"), KeyboardInterrupt()])
+def test_when_the_disk_is_full_or_somebody_interrupts_it_is_the_old_file(tmp_path, monkeypatch, form, error):
+    path, (old, new) = tmp_path / "t", two_tables()
+    tables.write(path, old, {}, (), form)
+    before, real = path.read_bytes(), Path.open
+    for at in range(1, 5):
+        calls = []
+
+        class Failing:
+            def __init__(self, stream, calls=calls, at=at):
+                self.stream, self.calls, self.at = stream, calls, at
+
+            def write(self, data):
+                self.calls.append(1)
+                if len(self.calls) == self.at:
+                    self.stream.write(bytes(data)[: len(data) // 2])
+                    raise error
+                return self.stream.write(data)
+
+            def __enter__(self):
+                return self
+
+            def __exit__(self, *_):
+                self.stream.close()
+
+            def __getattr__(self, name):
+                return getattr(self.stream, name)
+
+        def opened(self, mode="r", *rest, failing=Failing, **named):
+            stream = real(self, mode, *rest, **named)
+            return failing(stream) if mode == "xb" else stream
+
+        with monkeypatch.context() as patch:
+            patch.setattr(Path, "open", opened)
+            try:
+                tables.write(path, new, {}, (), form)
+            except (McaptrackError, KeyboardInterrupt) as raised:
+                assert "\n" not in str(raised)
+            finished = len(calls) < at
+        assert (path.read_bytes() == before) != finished
+        assert list(tmp_path.iterdir()) == [path]
+        if finished:
+            break
+    assert at > 1
+
+
+def test_what_reads_back_differently_is_not_published(tmp_path, monkeypatch):
+    path, (old, new) = tmp_path / "t.parquet", two_tables()
+    tables.write(path, old, {})
+    before = path.read_bytes()
+    real = pq.ParquetWriter.write_table
+    for wrong in (new.slice(1), new.set_column(6, "x_px", pa.array(np.zeros(new.num_rows)))):
+        monkeypatch.setattr(
+            pq.ParquetWriter, "write_table", lambda self, _, wrong=wrong, **k: real(self, wrong.cast(new.schema), **k)
+        )
+        with pytest.raises(McaptrackError, match="does not read back the same"):
+            tables.write(path, new, {})
+        assert path.read_bytes() == before
+
+
+@given(st.data())
+@settings(max_examples=60)
+def test_a_byte_that_changed_on_the_disk_is_noticed(tmp_path_factory, data):
+    path = tmp_path_factory.mktemp("t") / "t.parquet"
+    table = some_tracks([{k: (k / 3, n / 7) for k in range(30)} for n in range(30)])
+    tables.write(path, table, {})
+    raw = bytearray(path.read_bytes())
+    low = pq.read_metadata(path).row_group(0).column(0).dictionary_page_offset or 4
+    footer = int.from_bytes(raw[-8:-4], "little") + 8
+    at = data.draw(st.integers(low, len(raw) - footer - 1))
+    raw[at] ^= 1 << data.draw(st.integers(0, 7))
+    path.write_bytes(raw)
+    try:
+        rows = tables.verify(path)
+    except McaptrackError as error:
+        assert "\n" not in str(error)
+    else:  # page headers and indexes hold bits that nobody needs to read the rows
+        assert rows == table.num_rows
+        assert pq.read_table(path).equals(table.replace_schema_metadata(pq.read_schema(path).metadata))

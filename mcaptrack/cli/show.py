@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from mcaptrack.cli import common
 from mcaptrack.errors import McaptrackError
@@ -131,33 +131,58 @@ def export(
         Path | None,
         common.option("--output", "-o", help="Folder for the tables.", show_default="LOG.tables beside the log"),
     ] = None,
+    form: Annotated[
+        Literal["parquet", "arrow", "csv", "jsonl"], common.option("--format", help="What kind of files.")
+    ] = "parquet",
+    topic: Annotated[
+        list[str] | None,
+        common.option("--topic", help="A table of this channel's messages too, whatever they are.", show_default=False),
+    ] = None,
+    blobs: Annotated[
+        bool, common.option("--blobs", help="With --topic: keep fields of bytes, as pictures and point clouds are.")
+    ] = False,
     force: common.Force = False,
     json: common.Json = False,
     quiet: common.Quiet = False,
     verbose: common.Verbose = False,
     config: common.Config = None,
 ) -> None:
-    """Write the rows of a log as Parquet tables.
+    """Write what is in a log as tables (Parquet), one row an object a frame.
 
-    One folder a table (frames, detections, tracks, predictions, ground_planes, events, channels), one file a log in it;
-    several logs can share a folder. Tables that were exported before are replaced.
+    One folder a table (frames, detections, tracks, track_summary, predictions, events, metrics, channels, recordings
+    and others), one file a log in it; several logs can share a folder. Exporting again replaces what has changed.
+    docs/tables.md lists all columns.
 
     Example: mcaptrack export log.mcap -o tables/
+
+    Example: mcaptrack export robot.mcap --topic /imu --format csv
     """
     from mcaptrack import log
-    from mcaptrack.export import default_folder
+    from mcaptrack.export import default_folder, recording_name
     from mcaptrack.export import export as write_tables
 
     results = []
     paths = common.expand(logs)
     if output is not None and output.exists() and not output.is_dir():
         raise McaptrackError(f"{output} is a file; tables go to a folder")
+    if blobs and not topic:
+        raise McaptrackError("--blobs is about the fields of a channel; say of which with --topic")
+    folders: dict[tuple[Path, str], Path] = {}
+    for path in paths:
+        other = folders.setdefault((output or default_folder(path), recording_name(path)), path)
+        if other.resolve() != path.resolve():
+            raise McaptrackError(
+                f"{other} and {path} would both be {recording_name(path)} in the tables; export them to two folders"
+            )
     with common.Talk(quiet, verbose).open() as talk:
         for path in paths:
             folder = output or default_folder(path)
             with log.read(path) as opened:
-                written = write_tables(opened, folder, talk.progress)
-            talk.say(f"{folder}: " + ", ".join(f"{name} {rows}" for name, rows in written.items()))
-            results.append({"log": str(path), "folder": str(folder), "rows": written})
+                done = write_tables(opened, folder, talk.progress, form=form, topics=topic or (), blobs=blobs)
+            for words in done.notes:
+                talk.say(words)
+            talk.say(f"{folder}: " + ", ".join(f"{name} {rows}" for name, rows in done.rows.items()))
+            talk.detail(f"{folder}: written {', '.join(done.written) or 'nothing, all tables are up to date'}")
+            results.append({"log": str(path), "folder": str(folder), "rows": done.rows, "written": done.written})
     if json:
         common.print_json({"results": results})

@@ -267,7 +267,7 @@ def run_on_logs(
             if tables:
                 with log.read(target) as opened:
                     folder = default_folder(target)
-                    written = export(opened, folder, talk.progress)
+                    written = export(opened, folder, talk.progress).rows
                 talk.detail(f"{folder}: {', '.join(f'{name} {rows}' for name, rows in written.items())}")
             done = ", ".join(report.stages) or "nothing to do, everything is up to date"
             talk.say(f"{target}: {done}")

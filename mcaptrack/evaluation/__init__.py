@@ -44,6 +44,9 @@ SCHEMA_VERSION: Final = 1
 COMBINED: Final = "COMBINED"
 DEFAULT_GATES_M: Final = (0.5, 1.0, 2.0)
 _MODES: Final = {"online": "online", "": "offline"}
+#: The channels of a camera that are scored, and those of the forecasts made from them.
+SCORED: Final = ("tracks", "samples", "retracks/online", "retracks")
+FORECASTS: Final = ("predictions", "retracks/predictions")
 
 
 @dataclass(frozen=True)
@@ -127,7 +130,7 @@ def truth_of_log(opened: log.Log, prefix: str) -> list[Frame]:
 def sequence_of_log(opened: log.Log, prefix: str, topics: Sequence[str]) -> Sequenced:
     """The truth of a log and its tracks: those of the video's rate, and those of the clock of prediction."""
     truth = truth_of_log(opened, prefix)
-    usual = [f"{prefix}/{name}" for name in ("tracks", "samples", "retracks/online", "retracks")]
+    usual = [f"{prefix}/{name}" for name in SCORED]
     chosen = list(topics) or [topic for topic in usual if topic in opened.channels]
     if not chosen:
         raise McaptrackError(f"{opened.path} has no tracks to score; run `mcaptrack run {opened.path}`")

@@ -10,7 +10,7 @@ recover(path, output)                   what is whole in it, as a new one
 from mcaptrack.log.change import extend
 from mcaptrack.log.check import Checked, check
 from mcaptrack.log.check_summary import Finding
-from mcaptrack.log.messages import Columns, Message
+from mcaptrack.log.messages import Columns, Message, Places
 from mcaptrack.log.reader import Channel, Log, read, topics_with_schema
 from mcaptrack.log.recover import Recovered, recover
 from mcaptrack.log.stream import pass_on_extras, profile, stream
@@ -24,6 +24,7 @@ __all__ = [
     "Log",
     "LogWriter",
     "Message",
+    "Places",
     "Recovered",
     "check",
     "create",

@@ -11,6 +11,7 @@ from itertools import islice
 from typing import Final, NamedTuple
 
 import numpy as np
+from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from mcaptrack.log.chunks import (
@@ -21,10 +22,11 @@ from mcaptrack.log.chunks import (
     forget,
     heads_at,
     listed_entries,
+    message_head,
     open_chunk,
 )
 from mcaptrack.log.index import Index
-from mcaptrack.log.records import BLOCK, ChunkIndexRecord, Damaged
+from mcaptrack.log.records import BLOCK, MESSAGE_HEAD, ChunkIndexRecord, Damaged, record_at
 from mcaptrack.schema import Rows, Schema
 
 Ints = NDArray[np.int64]
@@ -32,6 +34,7 @@ Span = tuple[int | None, int | None]
 
 #: Beyond this much, chunks that overlap are closed and opened again when their turn comes.
 OPEN_BYTES: Final = 128 * 2**20
+_NONE: Final = np.empty(0, np.int64)
 
 
 class Message(NamedTuple):
@@ -50,6 +53,17 @@ class Columns(NamedTuple):
     t_ns: Ints
     sequence: Ints
     counts: Ints
+
+
+class Places(NamedTuple):
+    """Where the messages of a channel stand, by time, (M,): chunks in the file, messages in their chunk, uncompressed.
+
+    Outside of chunks ``chunk_offset`` is -1 and ``offset`` a place in the file.
+    """
+
+    t_ns: Ints
+    chunk_offset: Ints
+    offset: Ints
 
 
 class _Source(NamedTuple):
@@ -80,6 +94,31 @@ class Messages:
     def times(self, channel_id: int, span: Span = (None, None)) -> Ints:
         """The times of a channel's messages, rising, (M,)."""
         return np.sort(np.concatenate([np.empty(0, np.int64), *(s.t_ns for s in self._sources(channel_id, span))]))
+
+    def places(self, channel_id: int) -> Places:
+        """Where the messages of a channel stand, in the order of ``by_time``."""
+        sources = self._sources(channel_id)
+        t_ns = np.concatenate([_NONE, *(source.t_ns for source in sources)])
+        offset = np.concatenate([_NONE, *(source.offset for source in sources)])
+        starts = np.array([source.chunk.offset if source.chunk else -1 for source in sources], np.int64)
+        chunk_offset = np.repeat(starts, [len(source.t_ns) for source in sources])
+        order = np.argsort(t_ns, kind="stable")
+        return Places(t_ns[order], chunk_offset[order], offset[order])
+
+    def at(self, chunk_offset: int | None, offset: int) -> tuple[int, Message]:
+        """The message that stands at a place, and the number of its channel."""
+        content = self._buffer
+        if chunk_offset is not None:
+            chunk = next((chunk for chunk in self._index.chunks if chunk.offset == chunk_offset), None)
+            if chunk is None:
+                raise Damaged(f"no chunk begins at byte {chunk_offset}")
+            content = self._open(_Source(chunk, chunk.offset, chunk.offset + chunk.length, _NONE, _NONE))
+        record = record_at(content, offset)
+        if record.opcode != Opcode.MESSAGE:
+            raise Damaged(f"no message stands at byte {offset} of the chunk at {chunk_offset}")
+        channel, sequence, t_ns, publish_ns = message_head(content, record)
+        payload = bytes(content[record.body + MESSAGE_HEAD.size : record.end])
+        return channel, Message(t_ns, sequence, publish_ns, payload)
 
     def by_time(self, channel_id: int, span: Span = (None, None)) -> Iterator[Message]:
         """Messages by time; those of one time as they stand in the file. ``span`` is from the first to before the last.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import heapq
 import mmap
 import os
@@ -15,8 +16,9 @@ from numpy.typing import NDArray
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.log import journal, records
+from mcaptrack.log.fingerprint import fingerprint
 from mcaptrack.log.index import Index, read_index
-from mcaptrack.log.messages import Columns, Message, Messages
+from mcaptrack.log.messages import Columns, Message, Messages, Places
 from mcaptrack.log.records import Damaged
 from mcaptrack.log.writer import RESULTS, create, results_of
 from mcaptrack.schema import Frame, Schema
@@ -229,6 +231,38 @@ class Log:
         channel = self.channel(topic)
         with self.mending():
             return self._messages.times(channel.id)
+
+    def places(self, topic: str) -> Places:
+        """Where the messages of a channel stand in the file of its part, by time, without reading them."""
+        if (part := self.part(topic)) is not self:
+            return part.places(topic)
+        channel = self.channel(topic)
+        with self.mending():
+            return self._messages.places(channel.id)
+
+    def message_at(self, chunk_offset: int | None, offset: int) -> tuple[str, Message]:
+        """The message at a place in this file, results aside, and its topic; one chunk is opened.
+
+        Raises McaptrackError if none stands there.
+        """
+        with self.mending():
+            channel, message = self._messages.at(chunk_offset, offset)
+            if channel not in self.index.channels:
+                raise Damaged(f"a message of channel {channel}, which is not described anywhere")
+            return self.index.channels[channel].topic, message
+
+    def fingerprint(self, topic: str | None = None) -> str:
+        """SHA-256 of what the file says a channel, or all of it, is: another one when anything of it has changed.
+
+        Made of records and checksums, so that no message is read but where checksums are missing.
+        """
+        if topic is not None and (part := self.part(topic)) is not self:
+            return part.fingerprint(topic)
+        with self.mending():
+            if topic is not None:
+                return fingerprint(self._buffer, self.index, self.channel(topic).id)
+            whole = [fingerprint(part.buffer, part.index) for part in self.parts]
+            return whole[0] if len(whole) == 1 else hashlib.sha256("".join(whole).encode()).hexdigest()
 
     @contextmanager
     def mending(self) -> Iterator[None]:

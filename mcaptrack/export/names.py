@@ -1,0 +1,47 @@
+"""Names of logs and channels as names of folders: whatever they hold, nothing climbs and nothing collides by chance."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from pathlib import Path
+from typing import Final
+
+#: Names that are longer are cut, with a digest of the whole behind them; file systems take 255 bytes.
+_MAX_BYTES: Final = 200
+
+
+#: Words that readers of partitions take for something else than text.
+_NO_TEXT: Final = ("nan", "inf", "infinity", "true", "false", "null", "none")
+
+
+def recording_name(path: Path) -> str:
+    """The name of a log as it can stand in a path and in a partition: no slash, no equals sign, nothing that climbs.
+
+    Names that readers would take for numbers or dates (0001 would become 1) get "log-" before them.
+    """
+    name = _cut(re.sub(r"[^\w.\-]+", "_", path.stem).lstrip(".") or "log")
+    is_text = re.search(r"[^\W\d_]", name) and not re.fullmatch(r"[-\d._]*e[-\d]+", name, re.IGNORECASE)
+    return name if is_text and name.lower().lstrip("-") not in _NO_TEXT else f"log-{name}"
+
+
+def topic_folder(topic: str) -> str:
+    """The folder of a channel's table: /imu/data -> imu.data; other signs as %XX, so that no two channels share one."""
+    body = topic.removeprefix("/")
+    parts = (
+        "".join(c if c.isascii() and (c.isalnum() or c in "_-") else _escaped(c) for c in p) for p in body.split("/")
+    )
+    name = ".".join(parts)
+    name = name or "%2F" * len(topic)
+    return _cut(name if topic.startswith("/") and name.strip(".") else "~" + name)
+
+
+def _escaped(character: str) -> str:
+    return "".join(f"%{byte:02X}" for byte in character.encode("utf-8", "surrogatepass"))
+
+
+def _cut(name: str) -> str:
+    raw = name.encode("utf-8", "surrogatepass")
+    if len(raw) <= _MAX_BYTES:
+        return name
+    return raw[:_MAX_BYTES].decode("utf-8", "ignore") + "-" + hashlib.sha256(raw).hexdigest()[:16]

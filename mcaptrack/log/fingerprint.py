@@ -1,0 +1,54 @@
+"""Whether a log, or a channel of one, is still the one it was: told from records and checksums, not from messages."""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Any
+
+from mcaptrack.log import records
+from mcaptrack.log.chunks import chunk_record
+from mcaptrack.log.index import Index
+from mcaptrack.log.records import ChunkIndexRecord, record_at
+
+
+def fingerprint(buffer: memoryview, index: Index, channel_id: int | None = None) -> str:
+    """SHA-256 of a channel, or of everything: descriptions, and of each chunk its times and checksum.
+
+    Where a chunk or attachment has no checksum, and outside of chunks, the bytes themselves count.
+    """
+    total = hashlib.sha256()
+
+    def say(*words: object) -> None:
+        total.update(repr(words).encode())
+
+    for number in sorted(index.channels) if channel_id is None else [channel_id]:
+        channel = index.channels[number]
+        schema = index.schemas.get(channel.schema_id)
+        described = (schema.name, schema.encoding, hashlib.sha256(schema.data).hexdigest()) if schema else ()
+        kept = sorted(channel.metadata.items())
+        say(channel.topic, channel.message_encoding, kept, described, index.counts.get(number, 0))
+    for chunk in index.chunks:
+        if channel_id is None or channel_id in chunk.message_index_offsets:
+            # Where a chunk stands matters to those who look for messages, not to those who read a channel's rows.
+            place = (chunk.offset, *sorted(chunk.message_index_offsets)) if channel_id is None else ()
+            say(place, chunk.start_ns, chunk.end_ns, chunk.uncompressed_size, _checksum(buffer, chunk))
+    for number in sorted(index.loose) if channel_id is None else [channel_id]:
+        for offset in index.loose[number][:, 1].tolist() if number in index.loose else []:
+            record = record_at(buffer, offset)
+            total.update(buffer[record.start : record.end])
+    if channel_id is None:
+        for listed in index.metadata:
+            record = record_at(buffer, listed.offset)
+            total.update(buffer[record.start : record.end])
+        for listed in index.attachments:
+            record = record_at(buffer, listed.offset)
+            checksum = bytes(buffer[record.end - 4 : record.end])
+            say(listed.name, listed.offset, record.end - record.start, checksum)
+            if checksum == bytes(4):
+                total.update(buffer[record.start : record.end])
+    return total.hexdigest()
+
+
+def _checksum(buffer: memoryview, chunk: ChunkIndexRecord) -> Any:
+    head = records.read_chunk(buffer, chunk_record(buffer, chunk))
+    return head.uncompressed_crc or hashlib.sha256(buffer[head.start : head.end]).hexdigest()

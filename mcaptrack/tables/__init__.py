@@ -1,0 +1,54 @@
+"""Rows as tables, and tables as files: one row an object a frame, with units, meaning and provenance in the metadata.
+
+TABLES                               what tables there are, with their columns
+rows_table(schema, channels)         rows -> Arrow; missing numbers are null in tables and NaN in rows
+write(path, table, provenance)       Arrow -> Parquet, Arrow IPC, CSV or JSON lines
+verify(path)                         is a file what was written
+read_tracks(path), read_columns(...) the way back, for files of others too
+"""
+
+from mcaptrack.tables.build import (
+    Part,
+    Pointers,
+    frames_table,
+    only,
+    records_table,
+    rows_table,
+    summary_table,
+    table_of,
+    table_to_array,
+    table_to_frames,
+    with_recording,
+)
+from mcaptrack.tables.fields import RECORDING, TABLE_VERSION, TABLES, Field, Table
+from mcaptrack.tables.files import FORMATS, Format, described, verify, write
+from mcaptrack.tables.messages import messages_table
+from mcaptrack.tables.read import holds_tracks, read_columns, read_tracks
+
+__all__ = [
+    "FORMATS",
+    "RECORDING",
+    "TABLES",
+    "TABLE_VERSION",
+    "Field",
+    "Format",
+    "Part",
+    "Pointers",
+    "Table",
+    "described",
+    "frames_table",
+    "holds_tracks",
+    "messages_table",
+    "only",
+    "read_columns",
+    "read_tracks",
+    "records_table",
+    "rows_table",
+    "summary_table",
+    "table_of",
+    "table_to_array",
+    "table_to_frames",
+    "verify",
+    "with_recording",
+    "write",
+]

@@ -1,0 +1,287 @@
+"""Arrays and records -> Arrow tables, as ``fields`` has them; and the way back.
+
+Letters: N rows, M messages.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaptrack.schema import Frame, Rows, Schema
+from mcaptrack.tables.fields import RECORDING, TABLES, Table
+
+Ints = NDArray[np.int64]
+Floats = NDArray[np.float64]
+
+_BITS: Final = 16
+
+
+class Part(NamedTuple):
+    """The rows of one channel (N,), and of each message (M,) its time, frame and how many rows are its own."""
+
+    rows: Rows
+    t_ns: Ints
+    frame: Ints
+    counts: Ints
+
+
+class Pointers(NamedTuple):
+    """The messages of one channel (M,): time, frame, rows (-1 for pictures), and where they stand in which file.
+
+    ``chunk_offset`` is -1 for messages outside of chunks.
+    """
+
+    file: str
+    t_ns: Ints
+    frame: Ints
+    rows: Ints
+    chunk_offset: Ints
+    message_offset: Ints
+
+
+def frames_to_part(schema: Schema, frames: Sequence[Frame]) -> Part:
+    """Frames as the arrays that tables are made of."""
+    t_ns, index = (np.array([getattr(frame, name) for frame in frames], np.int64) for name in ("t_ns", "index"))
+    counts = np.array([len(frame.rows) for frame in frames], np.int64)
+    return Part(np.concatenate([schema.empty(), *(frame.rows for frame in frames)]), t_ns, index, counts)
+
+
+def table_of(schema: Schema) -> Table:
+    """The table that the rows of a schema go to."""
+    return next(table for table in TABLES.values() if table.rows_of is schema)
+
+
+def rows_table(schema: Schema, channels: Mapping[str, Part | Sequence[Frame]]) -> Any:
+    """All rows of channels of one schema as one Arrow table, in the table's order; missing numbers are null."""
+    import pyarrow as pa
+
+    table = table_of(schema)
+    members = {
+        topic: part if isinstance(part, tuple) else frames_to_part(schema, part)
+        for topic, part in sorted(channels.items())
+    }
+    pieces = [_rows_of(schema, table, Part(*part)) for part in members.values()]
+    names = [field.name for field in table.arrow if field.name != "topic"]
+    columns = {
+        name: pa.chunked_array([piece[name] for piece in pieces], table.arrow.field(name).type) for name in names
+    }
+    columns["topic"] = _repeated(list(members), [len(part[0]) for part in members.values()])
+    return pa.table([columns[field.name] for field in table.arrow], schema=table.arrow)
+
+
+def _rows_of(schema: Schema, table: Table, part: Part) -> dict[str, Any]:
+    """The columns of one channel, but its topic."""
+    import pyarrow as pa
+
+    message = np.repeat(np.arange(len(part.t_ns)), part.counts)
+    rows, order = part.rows, None
+    if "track_id" in table.order:
+        order = _stable_order(rows["track_id"])
+        message = message[order]
+    t_ns = part.t_ns[message]
+    number = np.arange(len(rows)) if order is None else order
+    out = {"frame": pa.array(part.frame[message]), "t": _times(t_ns), "t_ns": pa.array(t_ns), "row": pa.array(number)}
+    for column in schema.columns:
+        values = np.ascontiguousarray(rows[column.name]) if order is None else rows[column.name][order]
+        missing = np.isnan(values) if column.optional else None
+        out[column.name] = pa.array(values, mask=missing if missing is not None and missing.any() else None)
+    return out
+
+
+def _stable_order(values: NDArray[Any]) -> Ints:
+    """What sorts whole numbers, equal ones as they stand: 16 bits at a time, which NumPy sorts by counting."""
+    if len(values) == 0:
+        return np.empty(0, np.int64)
+    low, high = int(values.min()), int(values.max())
+    order = np.arange(len(values))
+    rest = values.astype(np.uint64) - np.uint64(low % 2**64)
+    for shift in range(0, max((high - low).bit_length(), 1), _BITS):
+        digit = (rest >> np.uint64(shift)).astype(np.uint16)
+        order = order[np.argsort(digit[order], kind="stable")]
+    return order
+
+
+def frames_table(channels: Mapping[str, Pointers]) -> Any:
+    """The table ``frames`` of channels, by topic."""
+    import pyarrow as pa
+
+    parts = dict(sorted(channels.items()))
+    counts = [len(part.t_ns) for part in parts.values()]
+
+    def joined(name: str) -> Ints:
+        return np.concatenate([np.empty(0, np.int64), *(getattr(part, name) for part in parts.values())])
+
+    t_ns, rows, chunk = joined("t_ns"), joined("rows"), joined("chunk_offset")
+    schema = TABLES["frames"].arrow
+    columns = {
+        "topic": _repeated(list(parts), counts),
+        "frame": pa.array(joined("frame")),
+        "t": _times(t_ns),
+        "t_ns": pa.array(t_ns),
+        "rows": pa.array(rows, mask=rows < 0),
+        "file": _repeated([part.file for part in parts.values()], counts),
+        "chunk_offset": pa.array(chunk, mask=chunk < 0),
+        "message_offset": pa.array(joined("message_offset")),
+    }
+    return pa.table([columns[name] for name in schema.names], schema=schema)
+
+
+def summary_table(channels: Mapping[str, Part]) -> Any:
+    """The table ``track_summary`` of channels of tracks."""
+    import pyarrow as pa
+
+    table = TABLES["track_summary"]
+    parts = {topic: _summary(part) for topic, part in sorted(channels.items())}
+    columns = {}
+    for field in table.fields[1:]:
+        values = np.concatenate([part[field.name] for part in parts.values()]) if parts else np.empty(0)
+        if field.kind == "time":
+            columns[field.name] = _times(values.astype(np.int64))
+            continue
+        missing = np.isnan(values) if field.nullable else None
+        columns[field.name] = pa.array(values, table.arrow.field(field.name).type, mask=missing)
+    columns["topic"] = _repeated(list(parts), [len(part["rows"]) for part in parts.values()])
+    return pa.table([columns[name] for name in table.arrow.names], schema=table.arrow)
+
+
+def _summary(part: Part) -> dict[str, NDArray[Any]]:
+    """One row a track of a channel."""
+    order = _stable_order(part.rows["track_id"])
+    rows = part.rows[order]
+    message = np.repeat(np.arange(len(part.t_ns)), part.counts)[order]
+    t_ns, frame = part.t_ns[message], part.frame[message]
+    who, first, count = np.unique(rows["track_id"], return_index=True, return_counts=True)
+    last = first + count - 1
+    out: dict[str, NDArray[Any]] = {"track_id": who, "rows": count}
+    for name, at in (("first", first), ("last", last)):
+        out |= {f"{name}_t_ns": t_ns[at], f"{name}_t": t_ns[at], f"{name}_frame": frame[at]}
+    out["duration_s"] = (t_ns[last] - t_ns[first]) / 1e9
+    share = np.bincount(np.repeat(np.arange(len(who)), count), rows["observed"], len(who))
+    out["observed_share"] = share / np.maximum(count, 1)
+    place = np.stack([rows["x_m"], rows["y_m"]], axis=-1)
+    out |= _motion(place, t_ns, np.repeat(np.arange(len(who)), count), len(who))
+    for unit in ("m", "px"):
+        ends = _ends(np.isfinite(rows[f"x_{unit}"]) & np.isfinite(rows[f"y_{unit}"]), first, last)
+        for name, at in zip(("first", "last"), ends, strict=True):
+            for axis in "xy":
+                found = rows[f"{axis}_{unit}"][at] if len(rows) else np.empty(0)
+                out[f"{name}_{axis}_{unit}"] = np.where(at < 0, np.nan, found)
+    return out
+
+
+def _motion(place: Floats, t_ns: Ints, track: Ints, tracks: int) -> dict[str, Floats]:
+    """Path and speeds of tracks, over the positions that are known; NaN for a track without any."""
+    known = np.isfinite(place).all(axis=1)
+    place, t_ns, track = place[known], t_ns[known], track[known]
+    same = track[1:] == track[:-1]
+    step_m = np.hypot(*(place[1:] - place[:-1]).T)[same]
+    step_s, of = (t_ns[1:] - t_ns[:-1])[same] / 1e9, track[1:][same]
+    has = np.bincount(track, minlength=tracks) > 0
+    path = np.where(has, np.bincount(of, step_m, tracks), np.nan)
+    passed = np.bincount(of, step_s, tracks)
+    fastest = np.full(tracks, -1.0)
+    moving = step_s > 0
+    np.maximum.at(fastest, of[moving], step_m[moving] / step_s[moving])
+    mean = np.divide(path, passed, out=np.full(tracks, np.nan), where=passed > 0)
+    return {"path_m": path, "mean_speed_m_s": mean, "max_speed_m_s": np.where(fastest < 0, np.nan, fastest)}
+
+
+def _ends(known: NDArray[np.bool_], first: Ints, last: Ints) -> tuple[Ints, Ints]:
+    """For each stretch from ``first`` to ``last``, the first and the last place that is known; -1 where none is."""
+    at = np.flatnonzero(known)
+    if len(at) == 0:
+        return np.full(len(first), -1), np.full(len(first), -1)
+    low = np.searchsorted(at, first)
+    high = np.searchsorted(at, last, "right") - 1
+    none = low > high
+    return tuple(np.where(none, -1, at[np.clip(end, 0, len(at) - 1)]) for end in (low, high))  # type: ignore[return-value]
+
+
+def records_table(table: Table, records: Sequence[Mapping[str, Any]]) -> Any:
+    """A table about a log from its rows; what a record lacks is null."""
+    import pyarrow as pa
+
+    kinds = {field.name: field.type for field in table.arrow}
+    columns = []
+    for name, kind in kinds.items():
+        values = [record.get(name) for record in records]
+        columns.append(
+            pa.array(values, pa.string()).dictionary_encode().cast(kind)
+            if pa.types.is_dictionary(kind)
+            else pa.array(values, kind)
+        )
+    return pa.table(columns, schema=table.arrow)
+
+
+def with_recording(table: Any, recording: str) -> Any:
+    """The table with the column that reading a folder adds, at the end as there."""
+    return table.append_column(RECORDING.arrow, _repeated([recording], [table.num_rows]))
+
+
+def only(table: Any, topic: str) -> Any:
+    """The rows of one channel."""
+    import pyarrow.compute as pc
+
+    return table.filter(pc.equal(table.column("topic").cast("string"), topic))
+
+
+def table_to_array(table: Any) -> NDArray[Any]:
+    """A table as a structured array: times as datetime64[ns], text as such, missing numbers as NaN.
+
+    Whole numbers of which some are missing become float64.
+    """
+    import pyarrow as pa
+
+    arrays = {}
+    for field in table.schema:
+        column = table.column(field.name)
+        if pa.types.is_dictionary(field.type) or pa.types.is_string(field.type):
+            words = column.cast(pa.string())
+            arrays[field.name] = np.array(words.fill_null("").to_pylist(), np.str_).reshape(-1)
+        elif pa.types.is_timestamp(field.type):
+            arrays[field.name] = column.cast(pa.int64()).to_numpy().astype("datetime64[ns]")
+        elif pa.types.is_floating(field.type) and column.null_count:
+            arrays[field.name] = column.fill_null(np.nan).to_numpy()
+        else:
+            arrays[field.name] = column.to_numpy()
+    out = np.empty(table.num_rows, [(name, values.dtype) for name, values in arrays.items()])
+    for name, values in arrays.items():
+        out[name] = values
+    return out
+
+
+def table_to_frames(schema: Schema, rows: Any, frames: Any, topic: str) -> list[Frame]:
+    """The way back: the frames of one channel, empty ones too, from its table of rows and the table of frames."""
+    rows, frames = only(rows, topic), only(frames, topic)
+    order = np.argsort(rows.column("row").to_numpy(), kind="stable")
+    columns = {}
+    for column in schema.columns:
+        values = rows.column(column.name).combine_chunks()
+        values = values.fill_null(np.nan) if column.optional else values
+        columns[column.name] = values.to_numpy(zero_copy_only=False)[order]
+    members = schema.rows(**columns)
+    ends = np.cumsum(np.array(frames.column("rows").to_pylist(), np.int64)).tolist()
+    spans = zip(
+        frames.column("t_ns").to_pylist(), frames.column("frame").to_pylist(), [0, *ends][:-1], ends, strict=True
+    )
+    return [Frame(t_ns, index, members[low:high]) for t_ns, index, low, high in spans]
+
+
+def _repeated(names: Sequence[str], counts: Sequence[int]) -> Any:
+    """Each name as often as it is said, as an Arrow dictionary of the different ones."""
+    import pyarrow as pa
+
+    different = list(dict.fromkeys(names))
+    numbers = np.array([different.index(name) for name in names], np.int32)
+    at = np.repeat(numbers, np.array(counts, np.int64))
+    return pa.DictionaryArray.from_arrays(pa.array(at, pa.int32()), pa.array(different, pa.string()))
+
+
+def _times(t_ns: Ints) -> Any:
+    import pyarrow as pa
+
+    return pa.array(t_ns).cast(pa.timestamp("ns", tz="UTC"))

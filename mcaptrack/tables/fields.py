@@ -1,0 +1,271 @@
+"""What the tables are: columns with units and meaning, keys, and the order of rows.
+
+Columns are only ever added, and what is added may be missing; then old files and new ones read together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+from mcaptrack.schema import SCHEMAS, Schema
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+#: Version of the tables' columns: the second number grows when columns are added.
+TABLE_VERSION: Final = "1.1"
+
+#: The unit of numbers that count or name something.
+_NONE: Final = "1"
+#: The types that columns are declared with.
+_TEXT, _NAME, _INT, _FLOAT, _TIME, _FLAG = "text", "name", "int64", "float64", "time", "flag"
+
+
+@dataclass(frozen=True)
+class Field:
+    """One column. ``kind`` is text, name (text that repeats), int64, float64, time or flag."""
+
+    name: str
+    kind: str
+    description: str
+    unit: str = ""
+    nullable: bool = False
+
+    @property
+    def arrow(self) -> pa.Field:
+        """The column in Arrow, with unit and description as metadata."""
+        import pyarrow as pa
+
+        kinds = {
+            _TEXT: pa.string(),
+            _NAME: pa.dictionary(pa.int32(), pa.string()),
+            _INT: pa.int64(),
+            _FLOAT: pa.float64(),
+            _TIME: pa.timestamp("ns", tz="UTC"),
+            _FLAG: pa.bool_(),
+        }
+        unit = self.unit or (_NONE if self.kind in (_INT, _FLOAT) else "")
+        words = {"unit": unit, "description": self.description}
+        return pa.field(self.name, kinds[self.kind], nullable=self.nullable, metadata=words)
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table: what a row of it is, which columns name one row of a recording, and how rows are ordered.
+
+    ``rows_of`` is the schema of the channels whose rows it holds, None for tables about a log.
+    """
+
+    name: str
+    doc: str
+    key: tuple[str, ...]
+    order: tuple[str, ...]
+    fields: tuple[Field, ...] = ()
+    rows_of: Schema | None = None
+
+    @property
+    def arrow(self) -> pa.Schema:
+        """The Arrow schema of the table, without ``recording``, which is in the name of the folder."""
+        import pyarrow as pa
+
+        fields = [field.arrow for field in self.fields]
+        if self.rows_of is not None:
+            fields += [_with_unit(field) for field in self.rows_of.arrow]
+        return pa.schema(fields)
+
+
+def _with_unit(field: Any) -> Any:
+    """A field of a row schema, with a unit where it has none."""
+    import pyarrow as pa
+
+    known = {key.decode(): value.decode() for key, value in (field.metadata or {}).items()}
+    unit = "" if pa.types.is_boolean(field.type) else _NONE
+    return field.with_metadata({"unit": unit} | known)
+
+
+_TOPIC: Final = Field("topic", _NAME, "channel of the log that the row comes from")
+_FRAME: Final = Field("frame", _INT, "number of the frame: of the picture in the video, from 0")
+_T: Final = Field("t", _TIME, "log time", "ns")
+_T_NS: Final = Field("t_ns", _INT, "log time as a whole number since 1970, exact wherever it is read", "ns")
+#: What every table of rows begins with.
+TIMES: Final = (_TOPIC, _FRAME, _T, _T_NS)
+_ROW: Final = Field("row", _INT, "number of the row in its channel, in the order of the log, from 0")
+
+#: The column that says which log a row is of; in files it is in the name of the folder.
+RECORDING: Final = Field("recording", _NAME, "the log, by name; the same in all tables")
+
+_FRAMES: Final = Table(
+    "frames",
+    "One row a message of a channel of rows or pictures: where in the log it stands, and how many rows it holds. With "
+    "it a frame in which nothing was seen is told from one at which nobody looked.",
+    ("topic", "t_ns", "message_offset", "chunk_offset"),
+    ("topic", "t_ns"),
+    (
+        *TIMES,
+        Field("rows", _INT, "rows of the message; null for a picture", nullable=True),
+        Field("file", _NAME, "name of the log file that holds the message", nullable=True),
+        Field("chunk_offset", _INT, "where its chunk begins in that file; null outside of chunks", "byte", True),
+        Field(
+            "message_offset",
+            _INT,
+            "where its record begins in the uncompressed chunk; in the file, outside of chunks",
+            "byte",
+            True,
+        ),
+    ),
+)
+
+_SUMMARY: Final = Table(
+    "track_summary",
+    "One row a track of a channel of tracks.",
+    ("topic", "track_id"),
+    ("topic", "track_id"),
+    (
+        _TOPIC,
+        Field("track_id", _INT, "identity, constant over time within one channel"),
+        Field("first_t", _TIME, "log time of the first row", "ns"),
+        Field("last_t", _TIME, "log time of the last row", "ns"),
+        Field("first_t_ns", _INT, "log time of the first row, exact", "ns"),
+        Field("last_t_ns", _INT, "log time of the last row, exact", "ns"),
+        Field("first_frame", _INT, "frame of the first row"),
+        Field("last_frame", _INT, "frame of the last row"),
+        Field("duration_s", _FLOAT, "from the first row to the last", "s"),
+        Field("rows", _INT, "how many rows it has"),
+        Field("observed_share", _FLOAT, "share of rows that a detection stands behind, between 0 and 1"),
+        Field("path_m", _FLOAT, "length of the path over all known positions, straight over holes", "m", True),
+        Field("mean_speed_m_s", _FLOAT, "path by the time between the first and the last known position", "m/s", True),
+        Field("max_speed_m_s", _FLOAT, "largest distance by time from one known position to the next", "m/s", True),
+        Field("first_x_m", _FLOAT, "first known position on the ground plane, first axis", "m", True),
+        Field("first_y_m", _FLOAT, "first known position on the ground plane, second axis", "m", True),
+        Field("last_x_m", _FLOAT, "last known position on the ground plane, first axis", "m", True),
+        Field("last_y_m", _FLOAT, "last known position on the ground plane, second axis", "m", True),
+        Field("first_x_px", _FLOAT, "left edge of the first known box", "px", True),
+        Field("first_y_px", _FLOAT, "top edge of the first known box", "px", True),
+        Field("last_x_px", _FLOAT, "left edge of the last known box", "px", True),
+        Field("last_y_px", _FLOAT, "top edge of the last known box", "px", True),
+    ),
+)
+
+_METRICS: Final = Table(
+    "metrics",
+    "One row a channel of tracks, similarity and gate: its scores against the truth of its camera, the numbers of "
+    "`mcaptrack evaluate --json`. No rows where the log has no truth.",
+    ("topic", "similarity", "gate"),
+    ("topic", "similarity", "gate"),
+    (
+        Field("topic", _NAME, "the tracks that are scored"),
+        Field("truth", _NAME, "the channel that they are scored against"),
+        Field("mode", _TEXT, "online or offline for re-tracked tracks; null for others", nullable=True),
+        Field("similarity", _TEXT, "iou: overlap of boxes; metres: distance on the ground"),
+        Field("gate", _FLOAT, "from which overlap, or within which distance in metres, two can be one"),
+        Field("rules", _TEXT, "whose rules for counting switches and fragments"),
+        Field("MOTA", _FLOAT, "CLEAR: 1 less misses, false positives and switches by true rows"),
+        Field("IDF1", _FLOAT, "identity: F1 of rows under the best assignment of tracks to people"),
+        Field("IDP", _FLOAT, "identity: precision"),
+        Field("IDR", _FLOAT, "identity: recall"),
+        Field("HOTA", _FLOAT, "higher order tracking accuracy, mean over thresholds"),
+        Field("DetA", _FLOAT, "HOTA: accuracy of detection"),
+        Field("AssA", _FLOAT, "HOTA: accuracy of association"),
+        Field("LocA", _FLOAT, "HOTA: accuracy of place"),
+        Field("IDSW", _INT, "identity switches"),
+        Field("FP", _INT, "false positives"),
+        Field("FN", _INT, "misses"),
+        Field("Frag", _INT, "fragments"),
+        Field("MT", _INT, "people tracked for at least 80 % of their time"),
+        Field("PT", _INT, "people tracked for a part of their time"),
+        Field("ML", _INT, "people tracked for less than 20 % of their time"),
+        Field("GT", _INT, "true people"),
+        Field("ADE_m", _FLOAT, "forecasts: mean distance from the truth", "m", True),
+        Field("FDE_m", _FLOAT, "forecasts: mean distance from the truth at the last step", "m", True),
+        Field("ADE_squared_m2", _FLOAT, "forecasts: mean squared distance, as in the paper", "m^2", True),
+        Field("recall", _FLOAT, "forecasts: share of true people that have one", nullable=True),
+        Field("AADE_m", _FLOAT, "forecasts: ADE averaged over recalls", "m", True),
+        Field("false_forecasts_per_frame", _FLOAT, "forecasts of nobody, by frames", nullable=True),
+        Field("consistency_m", _FLOAT, "forecasts: how far one lies from the one before of the same track", "m", True),
+        Field("coverage_50", _FLOAT, "share of true futures in the 50 % ellipses", nullable=True),
+        Field("coverage_90", _FLOAT, "share of true futures in the 90 % ellipses", nullable=True),
+        Field("coverage_95", _FLOAT, "share of true futures in the 95 % ellipses", nullable=True),
+    ),
+)
+
+_CHANNELS: Final = Table(
+    "channels",
+    "One row a channel of the log, and how it was made.",
+    ("topic",),
+    ("topic",),
+    (
+        Field("topic", _TEXT, "name of the channel"),
+        Field("schema", _TEXT, "name of its schema", nullable=True),
+        Field("messages", _INT, "how many messages it holds"),
+        Field("transform", _TEXT, "what made it; null if it was recorded", nullable=True),
+        Field("input", _TEXT, "topic it was made from", nullable=True),
+        Field("version", _TEXT, "version of mcaptrack that made it", nullable=True),
+        Field("parameters", _TEXT, "parameters it was made with, as JSON", nullable=True),
+        Field("digest", _TEXT, "SHA-256 of its messages", nullable=True),
+        Field("input_digest", _TEXT, "SHA-256 of the messages it was made from", nullable=True),
+        Field("encoding", _TEXT, "encoding of its messages", nullable=True),
+        Field("weights_sha256", _TEXT, "SHA-256 of the weights it was made with", nullable=True),
+    ),
+)
+
+_RECORDINGS: Final = Table(
+    "recordings",
+    "One row a log.",
+    ("recording",),
+    (),
+    (
+        Field("file", _TEXT, "name of the log file"),
+        Field("start_t", _TIME, "log time of the first message", "ns", True),
+        Field("end_t", _TIME, "log time of the last message", "ns", True),
+        Field("start_t_ns", _INT, "log time of the first message, exact", "ns", True),
+        Field("end_t_ns", _INT, "log time of the last message, exact", "ns", True),
+        Field("duration_s", _FLOAT, "from the first message to the last", "s"),
+        Field("messages", _INT, "messages of all channels"),
+        Field("size_bytes", _INT, "size of the log file, and of its results beside it", "byte"),
+        Field(
+            "digest",
+            _TEXT,
+            "SHA-256 of what the log says it holds: channels, chunks with times, counts and checksums, attachments; "
+            "another one when anything in the log changes",
+        ),
+        Field(
+            "results_file", _TEXT, "name of the log beside it that holds its results, if there is one", nullable=True
+        ),
+        Field(
+            "ground_plane",
+            _TEXT,
+            "given: somebody measured it; assumed: guessed from the size of people; mixed: some of each; null: none",
+            nullable=True,
+        ),
+        Field(
+            "source", _TEXT, "what the log was made from: for each ingested channel its file, as JSON", nullable=True
+        ),
+        Field("mcaptrack_version", _TEXT, "version of mcaptrack that exported it"),
+    ),
+)
+
+#: How the rows of a track stand together in a file; tables that are not here go by time.
+_BY_TRACK: Final = ("tracks", "predictions")
+
+
+def _plural(schema: Schema) -> str:
+    """GroundPlane -> ground_planes, Tracks -> tracks."""
+    words = "".join(f"_{c.lower()}" if c.isupper() else c for c in schema.name.rpartition(".")[2]).lstrip("_")
+    return words if words.endswith("s") else words + "s"
+
+
+def _of_rows(schema: Schema) -> Table:
+    name = _plural(schema)
+    order = ("topic", "track_id", "t_ns") if name in _BY_TRACK else ("topic", "t_ns")
+    return Table(name, schema.definition.doc, ("topic", "row"), order, (*TIMES, _ROW), schema)
+
+
+def _all_tables() -> Iterator[Table]:
+    yield from (_FRAMES, *(_of_rows(schema) for schema in SCHEMAS.values()), _SUMMARY, _METRICS, _CHANNELS)
+    yield _RECORDINGS  # last: what a log has become is written when the rest is
+
+
+#: All tables of a log by name, in the order in which they are written.
+TABLES: Final = {table.name: table for table in _all_tables()}

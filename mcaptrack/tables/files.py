@@ -1,0 +1,251 @@
+"""Tables as files: there once they are complete and were read back, the same to the bit.
+
+Parquet: floats are split by byte and whole numbers stored as differences, which makes files smaller and writing faster
+than the defaults; pages have checksums and an index. What a file was made from stands in its metadata as ``source``, a
+digest of the content as ``digest``; a file that would be the same is not touched.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any, Final, Literal, get_args
+
+import numpy as np
+
+from mcaptrack.atomic import publish
+from mcaptrack.errors import McaptrackError
+from mcaptrack.tables.fields import TABLE_VERSION
+
+Format = Literal["parquet", "arrow", "csv", "jsonl"]
+FORMATS: Final[tuple[Format, ...]] = get_args(Format)
+#: Formats that carry metadata, so that it can be told whether they are up to date.
+_DESCRIBED: Final = ("parquet", "arrow")
+
+_ROW_GROUP: Final = 128 * 1024
+_ZSTD_LEVEL: Final = 1  # what is left of floats when their bytes are split hardly gets smaller with more
+_PREFIX: Final = "mcaptrack."
+
+
+def write(
+    path: Path, table: Any, provenance: Mapping[str, str], order: Sequence[str] = (), form: Format = "parquet"
+) -> bool:
+    """Write an Arrow table, there once it is complete and reads back the same. Returns whether it was needed.
+
+    ``provenance`` goes into the metadata, ``order`` says by which columns rows are sorted. A file that has the same
+    content and metadata already is left as it is. Raises McaptrackError if the file can't be written.
+    """
+    words = {"table_version": TABLE_VERSION} | dict(provenance)
+    with ThreadPoolExecutor(1) as beside:  # adding up goes on while the file is written
+        content = beside.submit(digest, table.schema, _pieces(table))
+        if form in _DESCRIBED:
+            known = described(path, form)
+            if known is not None and _same(known, words | {"digest": content.result()}):
+                return False
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with publish(path) as part:
+                if form == "parquet":
+                    _write_parquet(part, table, words, order, content)
+                elif form == "arrow":
+                    _write_arrow(part, table, words | {"digest": content.result()})
+                else:
+                    from mcaptrack.tables import text
+
+                    text.write(part, table, form)
+                try:
+                    found = verify(part, form) if form in _DESCRIBED else table.num_rows
+                except McaptrackError:
+                    found = -1
+                if found != table.num_rows:
+                    raise McaptrackError(
+                        f"{path} can't be written: what was written does not read back the same; the disk or the "
+                        "memory of this machine may be at fault"
+                    )
+        except OSError as error:
+            raise McaptrackError(f"{path} can't be written: {error.strerror or error}") from error
+    return True
+
+
+def _same(known: Mapping[str, str], words: Mapping[str, str]) -> bool:
+    """Whether metadata say the same; what it was made from may be another, if the content is the same."""
+    return {**known, "source": ""} == {**words, "source": ""}
+
+
+def _write_parquet(part: Path, table: Any, words: Mapping[str, str], order: Sequence[str], content: Any) -> None:
+    import pyarrow.parquet as pq
+
+    metadata = {_PREFIX + key: value for key, value in words.items()}
+    ways = [(name, "ascending") for name in order]
+    with part.open("xb") as stream:
+        writer = pq.ParquetWriter(
+            stream,
+            table.schema.with_metadata(metadata),
+            compression="zstd",
+            compression_level=_ZSTD_LEVEL,
+            sorting_columns=pq.SortingColumn.from_ordering(table.schema, ways) if ways else None,
+            write_page_index=True,
+            write_page_checksum=True,
+            store_schema=True,
+            **_encodings(table.schema),
+        )
+        writer.write_table(table, row_group_size=_ROW_GROUP)
+        writer.add_key_value_metadata({_PREFIX + "digest": content.result()})
+        # Not in a finally: closing writes the footer, and half a table with a footer looks like a whole one.
+        writer.close()
+
+
+def _encodings(schema: Any) -> dict[str, Any]:
+    """How each column is stored: text by dictionary, floats split by byte, whole numbers as differences."""
+    import pyarrow as pa
+
+    encodings, dictionaries = {}, []
+    for field in schema:
+        if pa.types.is_floating(field.type):
+            encodings[field.name] = "BYTE_STREAM_SPLIT"
+        elif (pa.types.is_integer(field.type) and field.type.bit_width >= 32) or pa.types.is_timestamp(field.type):
+            encodings[field.name] = "DELTA_BINARY_PACKED"
+        elif pa.types.is_string(field.type) or pa.types.is_dictionary(field.type):
+            dictionaries.append(field.name)
+    return {"use_dictionary": dictionaries, "column_encoding": encodings}
+
+
+def _write_arrow(part: Path, table: Any, words: Mapping[str, str]) -> None:
+    import pyarrow as pa
+
+    schema = table.schema.with_metadata({_PREFIX + key: value for key, value in words.items()})
+    options = pa.ipc.IpcWriteOptions(compression="zstd", unify_dictionaries=True)
+    with part.open("xb") as stream, pa.ipc.new_file(stream, schema, options=options) as writer:
+        writer.write_table(table.combine_chunks())
+
+
+def described(path: Path, form: Format) -> dict[str, str] | None:
+    """What the metadata of a file say of it, read from its end; None where it is not there or is no such file."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        if form == "parquet":
+            found = pq.read_metadata(path).metadata or {}
+        elif form == "arrow":
+            with pa.OSFile(str(path)) as file:
+                found = pa.ipc.open_file(file).schema.metadata or {}
+        else:
+            return None
+    except (OSError, pa.ArrowException):
+        return None
+    pairs = ((key.decode("utf-8", "replace"), value.decode("utf-8", "replace")) for key, value in found.items())
+    return {key.removeprefix(_PREFIX): value for key, value in pairs if key.startswith(_PREFIX)}
+
+
+def verify(path: Path, form: Format = "parquet") -> int:
+    """Read a whole file and hold its content against the digest in its metadata; returns the number of rows.
+
+    Raises McaptrackError if it can't be read, has no digest or holds something else.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    said = (described(path, form) or {}).get("digest")
+    if said is None:
+        raise McaptrackError(f"{path} is no table with a digest as `mcaptrack export` writes it")
+    rows = [0]
+
+    def counted(pieces: Iterable[Any]) -> Iterator[Any]:
+        for piece in pieces:
+            rows[0] += piece.num_rows
+            yield piece
+
+    try:
+        if form == "parquet":
+            with pq.ParquetFile(path, page_checksum_verification=True) as file:
+                groups = (file.read_row_group(number) for number in range(file.num_row_groups))
+                found = digest(file.schema_arrow, counted(groups))
+        else:
+            with pa.OSFile(str(path)) as stream:
+                table = pa.ipc.open_file(stream).read_all()
+            found = digest(table.schema, counted(_pieces(table)))
+    except (OSError, pa.ArrowException) as error:
+        raise McaptrackError(f"{path} can't be read back: {str(error).splitlines()[0]}") from None
+    if found != said:
+        raise McaptrackError(f"{path} does not hold what was written to it; export it again")
+    return rows[0]
+
+
+def _pieces(table: Any) -> Iterator[Any]:
+    """A table in pieces that are worked on without copying it as a whole."""
+    for start in range(0, table.num_rows, _ROW_GROUP):
+        yield table.slice(start, _ROW_GROUP)
+
+
+def digest(schema: Any, pieces: Iterable[Any]) -> str:
+    """SHA-256 of the content of a table: names, types and values, however it is cut into pieces."""
+    columns = [_ColumnDigest() for _ in schema]
+    start = 0
+    for piece in pieces:
+        for column, values in zip(columns, piece.columns, strict=True):
+            for chunk in values.chunks:
+                column.add(chunk)
+        start += piece.num_rows
+    total = hashlib.sha256(start.to_bytes(8, "little"))
+    for field, column in zip(schema, columns, strict=True):
+        total.update(f"{field.name}\0{_kind(field.type)}\0{column.digest()}\0".encode())
+    return total.hexdigest()
+
+
+def _kind(kind: Any) -> str:
+    """A type, without what Parquet and Arrow call differently: the members of lists."""
+    import pyarrow as pa
+
+    return f"list<{_kind(kind.value_type)}>" if pa.types.is_list(kind) else str(kind)
+
+
+class _ColumnDigest:
+    """Adds up the values of a column: bits of numbers, bytes of text, and which rows are null."""
+
+    def __init__(self) -> None:
+        self._values, self._missing, self._lengths = hashlib.sha256(), hashlib.sha256(), hashlib.sha256()
+        self._rows = 0
+        self._within: _ColumnDigest | None = None
+
+    def add(self, array: Any) -> None:
+        """The next values, an Arrow array."""
+        import pyarrow as pa
+        import pyarrow.compute as pc
+
+        if array.null_count:
+            at = np.flatnonzero(array.is_null().to_numpy(zero_copy_only=False)) + self._rows
+            self._missing.update(at.astype("<i8").tobytes())
+        self._rows += len(array)
+        kind = array.type
+        if pa.types.is_dictionary(kind):
+            self._add_dictionary(array)
+        elif pa.types.is_string(kind) or pa.types.is_binary(kind) or pa.types.is_large_string(kind):
+            filled = array.fill_null("" if not pa.types.is_binary(kind) else b"")
+            self._lengths.update(pc.binary_length(filled).to_numpy().astype("<i8").tobytes())
+            for value in filled.cast(pa.large_binary()).to_pylist():
+                self._values.update(value)
+        elif pa.types.is_list(kind):
+            self._lengths.update(pc.list_value_length(array).fill_null(0).to_numpy().astype("<i8").tobytes())
+            self._within = self._within or _ColumnDigest()
+            self._within.add(array.flatten())
+        elif pa.types.is_null(kind):
+            pass
+        else:
+            filled = array.fill_null(False if pa.types.is_boolean(kind) else 0) if array.null_count else array
+            numbers = filled.cast(pa.int64()) if pa.types.is_timestamp(kind) else filled
+            self._values.update(np.ascontiguousarray(numbers.to_numpy(zero_copy_only=False)).view(np.uint8).data)
+
+    def _add_dictionary(self, array: Any) -> None:
+        names = array.dictionary.to_pylist()
+        short = [hashlib.sha256(str(name).encode("utf-8", "surrogatepass")).digest()[:8] for name in names]
+        known = np.frombuffer(b"".join([*short, bytes(8)]), "<u8")
+        at = array.indices.fill_null(len(names)).to_numpy()
+        self._values.update(known[at].tobytes())
+
+    def digest(self) -> str:
+        """What they add up to."""
+        parts = [self._values.hexdigest(), self._missing.hexdigest(), self._lengths.hexdigest()]
+        return " ".join([*parts, self._within.digest() if self._within else ""])

@@ -1,0 +1,206 @@
+"""A log in Python: tables, arrays, pictures, and messages by where they stand."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from typer.testing import CliRunner
+
+import mcaptrack
+from mcaptrack import ingest, log, pipeline, tables
+from mcaptrack.cli import app
+from mcaptrack.demo import draw
+from mcaptrack.errors import McaptrackError
+from tests.test_export import some_log
+from tests.worlds import small_scene, write_clip
+
+ROOT = Path(__file__).parent.parent
+
+
+def test_importing_is_light():
+    code = "import sys, mcaptrack; print(sorted({'numpy', 'pyarrow', 'av', 'cv2', 'mcap'} & set(sys.modules)))"
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
+    assert found.stdout.strip() == "[]"
+    with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
+        mcaptrack.nonsense  # noqa: B018
+
+
+def test_tables_carry_the_name_of_the_log_as_reading_the_folder_does(tmp_path):
+    with mcaptrack.open(str(some_log(tmp_path / "a.mcap"))) as opened:
+        assert opened.tables == tuple(tables.TABLES)
+        for name in opened.tables:
+            table = opened.table(name)
+            assert table.column_names[-1] == "recording"
+            assert set(table.column("recording").to_pylist()) <= {"a"}
+        assert opened.table("tracks", "/camera/truth").num_rows == 6
+        assert opened.table("/imu").column("gyro_x").to_pylist() == [0.5] * 4
+        with pytest.raises(McaptrackError, match="has no table nothing; there are frames, detections"):
+            opened.table("nothing")
+        with pytest.raises(McaptrackError, match="has no channel /nowhere"):
+            opened.table("tracks", "/nowhere")
+
+
+def test_arrays_hold_the_rows_with_times(tmp_path):
+    path = some_log(tmp_path / "a.mcap")
+    with mcaptrack.open(path) as opened, log.read(path) as raw:
+        rows = opened.array("tracks", "/camera/tracks")
+        wanted = raw.rows("/camera/tracks", mcaptrack.schema.TRACKS)
+        rows.sort(order="row")
+        for name in wanted.rows.dtype.names:
+            np.testing.assert_array_equal(rows[name], wanted.rows[name])
+        assert rows["t"].dtype == np.dtype("datetime64[ns]")
+        assert (
+            rows["t"].astype(np.int64).tolist()
+            == rows["t_ns"].tolist()
+            == np.repeat(wanted.t_ns, wanted.counts).tolist()
+        )
+        assert np.isnan(rows["x_px"]).all()
+        assert opened.array("predictions").shape == (0,)
+
+
+def clip_log(tmp_path):
+    images = write_clip(tmp_path / "clip.mp4", frames=30, options={"g": "10", "qp": "0"})
+    ingest.ingest(tmp_path / "clip.mp4", tmp_path / "clip.mcap", ingest.IngestOptions())
+    return tmp_path / "clip.mcap", images
+
+
+def test_pictures_are_decoded_with_their_times(tmp_path):
+    path, images = clip_log(tmp_path)
+    with mcaptrack.open(path) as opened, log.read(path) as raw:
+        frames = list(opened.frames("video"))
+        assert [frame.index for frame in frames] == list(range(30))
+        assert [frame.t_ns for frame in frames] == raw.times("/camera/video").tolist()
+        for frame, image in zip(frames, images, strict=True):
+            assert np.abs(frame.rows.astype(int) - image).mean() < 6
+        (rgb,) = opened.frames("/camera/video", times=[0], colour="rgb")
+        assert (rgb.rows == frames[0].rows[..., ::-1]).all()
+        (grey,) = opened.frames("camera/video", times=[0], colour="grey")
+        assert grey.rows.shape == frames[0].rows.shape[:2]
+
+
+def test_pictures_at_times_are_those_shown_then(tmp_path):
+    path, _ = clip_log(tmp_path)
+    with mcaptrack.open(path) as opened:
+        all_frames = list(opened.frames())
+        t_ns = [frame.t_ns for frame in all_frames]
+        found = list(opened.frames(times=[t_ns[25] + 1, t_ns[3], t_ns[3], t_ns[29] + 10**12]))
+        assert [frame.index for frame in found] == [3, 3, 25, 29]
+        for frame in found:
+            assert (frame.rows == all_frames[frame.index].rows).all()
+        assert list(opened.frames(times=[])) == []
+        with pytest.raises(McaptrackError, match="has no picture at -5 ns yet"):
+            opened.frames(times=[-5])
+
+
+def test_a_channel_without_pictures_is_said(tmp_path):
+    with mcaptrack.open(some_log(tmp_path / "a.mcap")) as opened, pytest.raises(McaptrackError, match="no pictures"):
+        opened.frames("video")
+
+
+def test_every_message_is_fetched_from_where_the_table_says(tmp_path):
+    path, _ = clip_log(tmp_path)
+    with mcaptrack.open(path) as opened, log.read(path) as raw:
+        pointers = opened.table("frames")
+        wanted = {topic: list(raw.messages(topic)) for topic in opened.topics}
+        assert pointers.num_rows == sum(map(len, wanted.values()))
+        for row in pointers.to_pylist():
+            message = wanted[row["topic"]].pop(0)
+            found = opened.fetch(row)
+            assert found == (row["topic"], message.t_ns, message.publish_ns, message.sequence, message.payload)
+        first = pointers.to_pandas().iloc[0]  # a row of pandas, as numbers of its own
+        assert opened.fetch(first).t_ns == first["t_ns"]
+
+
+def test_messages_outside_of_chunks_and_from_results_are_fetched_too(tmp_path):
+    from mcap.writer import Writer
+
+    path = tmp_path / "loose.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream, use_chunking=False)
+        writer.start()
+        schema = writer.register_schema("foxglove.CompressedImage", "jsonschema", b"{}")
+        channel = writer.register_channel("/image", "json", schema)
+        for n in range(3):
+            writer.add_message(channel, n, b"{}", n)
+        writer.finish()
+    with log.read(path, sidecar=True) as opened, log.extend(opened) as results:
+        number = results.add_channel("/result", ("foxglove.CompressedImage", "jsonschema", b"{}"), "json", {})
+        results.add_message(number, 8, 0, b'{"a": 1}')
+    with mcaptrack.open(path) as opened:
+        rows = opened.table("frames").to_pandas()
+        assert rows["chunk_offset"].isna().tolist() == [True, True, True, False]
+        found = [opened.fetch(row) for _, row in rows.iterrows()]
+        assert [(f.topic, f.t_ns, f.payload) for f in found] == [
+            *(("/image", n, b"{}") for n in range(3)),
+            ("/result", 8, b'{"a": 1}'),
+        ]
+
+
+def test_pointers_into_a_log_that_has_changed_are_told(tmp_path):
+    path = some_log(tmp_path / "a.mcap")
+    with mcaptrack.open(path) as opened:
+        rows = opened.table("frames").to_pylist()
+    with log.read(path) as old, log.extend(old, drop=["/imu"]):
+        pass
+    with mcaptrack.open(path) as opened:
+        for row in rows:
+            try:
+                found = opened.fetch(row)
+            except McaptrackError as error:
+                assert "export its tables again" in str(error)
+            else:
+                assert (found.topic, found.t_ns) == (row["topic"], row["t_ns"])
+        for wrong in (
+            {"chunk_offset": 3},
+            {"message_offset": 1},
+            {"message_offset": 2**62},
+            {"t_ns": 5},
+            {"topic": "/x"},
+            {"message_offset": -9},
+        ):
+            with pytest.raises(McaptrackError, match="no such message stands there"):
+                opened.fetch(opened.table("frames").to_pylist()[0] | wrong)
+        with pytest.raises(McaptrackError, match="not of this log"):
+            opened.fetch(rows[0] | {"file": "b.mcap"})
+        with pytest.raises(McaptrackError, match="points to no message"):
+            opened.fetch({"t_ns": 5})
+
+
+def test_what_is_no_log_is_said_in_a_line(tmp_path):
+    (tmp_path / "a.mcap").write_bytes(b"no log")
+    with pytest.raises(mcaptrack.McaptrackError, match="can't be read as an MCAP file"):
+        mcaptrack.open(tmp_path / "a.mcap")
+
+
+def test_the_document_runs_from_top_to_bottom(tmp_path, monkeypatch):
+    footage, path = draw(small_scene(12.0), tmp_path), tmp_path / "log.mcap"
+    ingest.ingest(
+        footage.video, path, ingest.IngestOptions(ground_plane=footage.ground_plane, labels={"truth": footage.truth})
+    )
+    with log.read(path) as opened:
+        pipeline.run(opened, "/camera", pipeline.plan_all(opened, "/camera"))
+    monkeypatch.chdir(tmp_path)
+    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "python.md").read_text(), re.S)
+    names: dict[str, object] = {}
+    exec(compile("\n".join(blocks), "docs/python.md", "exec"), names)
+    assert isinstance(names["frame"], pd.DataFrame)
+    assert names["picture"].rows.ndim == 3
+    assert names["message"].topic == "/camera/video"
+    results = json.loads(CliRunner().invoke(app, ["evaluate", "log.mcap", "--json"]).stdout)["results"]
+    rows = {(row["topic"], row["similarity"], row["gate"]): row for row in names["scores"]}
+    assert len(rows) == len(results) > 3
+    assert any("displacement" in result for result in results)
+    for result in results:
+        row = rows[result["tracks"], result["similarity"], result["gate"]]
+        said = result | result.get("displacement", {})
+        assert {name: said.get(name) for name in row if name in said} == {
+            name: row[name] for name in row if name in said
+        }
+        assert (row["recall"] is None) == ("displacement" not in result)

@@ -1,0 +1,408 @@
+"""A log as a folder of tables: complete, joined, and written only where something changed."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+
+import duckdb
+import numpy as np
+import pandas as pd
+import polars as pl
+import pyarrow.parquet as pq
+import pytest
+from typer.testing import CliRunner
+
+from mcaptrack import log, tables
+from mcaptrack.cli import app
+from mcaptrack.errors import McaptrackError
+from mcaptrack.export import Contents, export, recording_name, topic_folder
+from mcaptrack.plane import GroundPlane
+from mcaptrack.provenance import Provenance
+from mcaptrack.schema import DETECTIONS, GROUND_PLANE, TRACKS, Frame
+from mcaptrack.schema.ground import plane_to_rows
+from tests.worlds import boxes_at, ns, tracks_at
+
+IMU = {
+    "header": {"stamp": {"sec": 1, "nanosec": 5}, "frame_id": "imu"},
+    "gyro": {"x": 0.5, "y": -0.0},
+    "cov": [1.5, 2.0],
+}
+
+
+def add_rows(writer, topic, schema, frames, transform="track", source="/camera/detections"):
+    made = Provenance(transform, {"max_age_s": 1.4}, source).to_metadata()
+    number = writer.add_channel(topic, (schema.name, "protobuf", schema.descriptor), "protobuf", made, group=topic)
+    for frame in frames:
+        writer.add_message(number, frame.t_ns, frame.index, schema.codec.encode(frame.rows))
+
+
+def some_log(path, **more):
+    """Two people who walk, detected and tracked, and an IMU that others recorded."""
+    people = [{4: (n * 0.5, 2.5), 9: (1.0, n * 0.25)} for n in range(3)]
+    walk = [Frame(ns(n), n, tracks_at(who)) for n, who in enumerate(people)]
+    with log.create(path) as writer:
+        imu = writer.add_channel("/imu", ("robot/Imu", "jsonschema", b"{}"), "json", {}, group="imu")
+        for n in range(4):
+            writer.add_message(imu, ns(n) + 7, n, json.dumps(IMU | {"n": n}).encode())
+        boxes = [Frame(ns(n), n, boxes_at([(5, 5), (9, 9)][: 2 - n])) for n in range(3)]
+        add_rows(writer, "/camera/detections", DETECTIONS, boxes, "detect", "/camera/video")
+        add_rows(writer, "/camera/tracks", TRACKS, [*walk, Frame(ns(3), 3, TRACKS.empty())])
+        add_rows(writer, "/camera/truth", TRACKS, walk, "ingest", "")
+        for topic, (schema, frames) in more.items():
+            add_rows(writer, topic, schema, frames)
+    return path
+
+
+def ask(query, folder):
+    return duckdb.sql(query.replace("@", str(folder))).fetchall()
+
+
+def exported(path, folder, **options):
+    with log.read(path) as opened:
+        return export(opened, folder, **options)
+
+
+def test_a_log_becomes_a_folder_that_duckdb_joins(tmp_path):
+    done = exported(some_log(tmp_path / "walk = 1.mcap"), tmp_path / "tables")
+    assert done.rows == dict.fromkeys(tables.TABLES, 0) | {
+        "channels": 4,
+        "detections": 3,
+        "frames": 10,
+        "metrics": 3,
+        "recordings": 1,
+        "track_summary": 4,
+        "tracks": 12,
+    }
+    folder = tmp_path / "tables"
+    assert ask("select topic, t_ns, rows from '@/frames/*/*.parquet' where rows = 0 order by all", folder) == [
+        ("/camera/detections", ns(2), 0),
+        ("/camera/tracks", ns(3), 0),
+    ]
+    joined = "select count(*) from '@/tracks/*/*.parquet' join '@/frames/*/*.parquet' using (recording, topic, frame, t_ns, t)"
+    assert ask(joined, folder) == [(12,)]
+    assert ask("select count(*) from '@/predictions/*/*.parquet'", folder) == [(0,)]
+    assert ask(
+        "select track_id, s.rows, path_m, s.duration_s, mean_speed_m_s, input, version is not null, start_t_ns "
+        "from '@/track_summary/*/*.parquet' s join '@/channels/*/*.parquet' using (recording, topic) "
+        "join '@/recordings/*/*.parquet' using (recording) where topic = '/camera/tracks' order by track_id",
+        folder,
+    ) == [(4, 3, 1.0, 2.0, 0.5, "/camera/detections", True, 0), (9, 3, 0.5, 2.0, 0.25, "/camera/detections", True, 0)]
+    for name, table in tables.TABLES.items():
+        key = ", ".join(dict.fromkeys(("recording", *table.key)))
+        assert ask(f"select {key} from '@/{name}/*/*.parquet' group by all having count(*) > 1", folder) == [], name
+
+
+def test_scores_are_those_of_evaluate(tmp_path):
+    path = some_log(tmp_path / "a.mcap")
+    exported(path, tmp_path / "tables")
+    outcome = CliRunner().invoke(app, ["evaluate", str(path), "--json"])
+    wanted = json.loads(outcome.stdout)["results"]
+    rows = pq.read_table(tmp_path / "tables/metrics/recording=a/part-0.parquet").to_pylist()
+    assert len(rows) == len(wanted) == 3
+    for result in wanted:
+        (row,) = (r for r in rows if (r["topic"], r["gate"]) == (result["tracks"], result["gate"]))
+        shared = set(row) & set(result)
+        assert {name: row[name] for name in shared} == {name: result[name] for name in shared}
+        assert {"MOTA", "IDF1", "HOTA", "IDSW", "GT", "similarity", "rules", "mode"} <= shared
+    assert set(wanted[0]) - {"sequence", "tracks", "displacement"} <= set(rows[0])
+
+
+def test_a_truth_that_nothing_can_be_scored_against_leaves_no_scores_and_says_why(tmp_path):
+    with log.create(tmp_path / "a.mcap") as writer:
+        add_rows(writer, "/camera/truth", TRACKS, [Frame(0, 0, tracks_at({1: (0, 0)}))], "ingest", "")
+    done = exported(tmp_path / "a.mcap", tmp_path / "tables")
+    assert done.rows["metrics"] == 0
+    assert "has no tracks to score" in done.notes[0]
+
+
+def test_recordings_say_what_the_log_is(tmp_path):
+    plane = GroundPlane((0.1, 0, 0, 0, 0.1, 0, 0, 0, 1), 320, 180, "foot", True)
+    plain = some_log(tmp_path / "plain.mcap")
+    planar = some_log(
+        tmp_path / "p.mcap", **{"/camera/ground_plane": (GROUND_PLANE, [Frame(0, 0, plane_to_rows(plane))])}
+    )
+    with log.read(plain) as a, log.read(planar) as b:
+        first, second = (Contents(opened).table("recordings").to_pylist()[0] for opened in (a, b))
+    assert (first["file"], first["messages"], first["duration_s"], first["ground_plane"]) == (
+        "plain.mcap",
+        14,
+        3.000000007,
+        None,
+    )
+    assert first["size_bytes"] == plain.stat().st_size
+    assert second["ground_plane"] == "assumed"
+    assert json.loads(first["source"]) == {"/camera/truth": {"max_age_s": 1.4}}
+    assert re.fullmatch("[0-9a-f]{64}", first["digest"])
+    assert first["digest"] != second["digest"]
+
+
+def test_units_meaning_and_provenance_are_in_the_file(tmp_path):
+    exported(some_log(tmp_path / "a.mcap"), tmp_path / "tables")
+    schema = pq.read_schema(tmp_path / "tables" / "tracks" / "recording=a" / "part-0.parquet")
+    assert schema.field("x_m").metadata == {b"unit": b"m", b"description": b"position on the ground plane, first axis"}
+    lineage = json.loads(schema.metadata[b"mcaptrack.lineage"])
+    assert lineage["/camera/tracks"] == {
+        "transform": "track",
+        "input": "/camera/detections",
+        "parameters": {"max_age_s": 1.4},
+    }
+    assert set(lineage) == {"/camera/tracks", "/camera/truth", "/camera/detections"}  # back to what was recorded
+    assert schema.metadata[b"mcaptrack.recording"] == b"a.mcap"
+
+
+def test_tables_without_writing_them_are_those_of_the_folder(tmp_path):
+    path = some_log(tmp_path / "a.mcap")
+    exported(path, tmp_path / "tables")
+    with log.read(path) as opened:
+        contents = Contents(opened)
+        for name in tables.TABLES:
+            (file,) = (tmp_path / "tables" / name).rglob("*.parquet")
+            made = contents.table(name)
+            assert made.schema.equals(pq.read_schema(file), check_metadata=False)
+            with file.open("rb") as stream:  # a file alone: what its folders are called is no column
+                assert made.to_pylist() == pq.read_table(stream).to_pylist()
+            assert [f.metadata[b"description"] for f in made.schema] == [
+                f.metadata[b"description"] for f in pq.read_schema(file)
+            ]
+
+
+# Again
+
+
+def stamps(folder):
+    return {str(path.relative_to(folder)): path.stat().st_mtime_ns for path in folder.rglob("part-0.*")}
+
+
+def test_the_same_log_gives_the_same_tables(tmp_path):
+    for name in ("x", "y"):
+        exported(some_log(tmp_path / "a.mcap"), tmp_path / name)
+    for file in (tmp_path / "x").rglob("*.parquet"):
+        assert file.read_bytes() == (tmp_path / "y" / file.relative_to(tmp_path / "x")).read_bytes()
+
+
+def test_exporting_again_writes_what_changed_and_touches_nothing_else(tmp_path):
+    path, folder = some_log(tmp_path / "a.mcap"), tmp_path / "tables"
+    exported(path, folder, topics=["/imu"])
+    exported(some_log(tmp_path / "b.mcap"), folder)
+    before = stamps(folder)
+    assert len(before) == 2 * len(tables.TABLES) + 1
+    assert exported(path, folder).written == []
+    assert stamps(folder) == before
+
+    with log.read(path) as opened, log.extend(opened, drop=["/camera/tracks"]) as writer:
+        add_rows(writer, "/camera/tracks", TRACKS, [Frame(0, 0, tracks_at({4: (7.0, 7.0)}))])
+    done = exported(path, folder)
+    assert set(done.written) == {"frames", "tracks", "track_summary", "metrics", "channels", "recordings"}
+    changed = {name for name, at in stamps(folder).items() if at != before[name]}
+    assert changed == {f"{name}/recording=a/part-0.parquet" for name in done.written}
+    assert pl.read_parquet(f"{folder}/tracks/*/*.parquet", hive_partitioning=True).filter(
+        recording="a", topic="/camera/tracks"
+    )["x_m"].to_list() == [7.0]
+
+
+def test_a_log_that_was_written_anew_with_the_same_rows_changes_no_table_of_rows(tmp_path):
+    path, folder = some_log(tmp_path / "a.mcap"), tmp_path / "tables"
+    exported(path, folder)
+    with log.read(path) as opened, log.extend(opened, drop=["/imu"]):
+        pass
+    done = exported(path, folder)
+    assert set(done.written) == {"frames", "channels", "recordings"}
+
+
+def test_a_table_that_was_damaged_or_lost_is_made_again(tmp_path):
+    path, folder = some_log(tmp_path / "a.mcap"), tmp_path / "tables"
+    exported(path, folder)
+    (folder / "tracks/recording=a/part-0.parquet").write_bytes(b"PAR1 half a table")
+    (folder / "events/recording=a/part-0.parquet").unlink()
+    assert set(exported(path, folder).written) == {"tracks", "events"}
+
+
+def test_tables_of_channels_that_are_gone_go(tmp_path):
+    path, folder = some_log(tmp_path / "a.mcap"), tmp_path / "tables"
+    exported(path, folder, topics=["/imu"])
+    assert (folder / "topics/imu/recording=a/part-0.parquet").is_file()
+    with log.read(path) as opened, log.extend(opened, drop=["/imu", "/camera/detections"]):
+        pass
+    done = exported(path, folder)
+    assert done.removed == ["topics/imu"]
+    assert not (folder / "topics/imu").exists()
+    assert ask("select count(*) from '@/detections/*/*.parquet'", folder) == [(0,)]
+
+
+# Names
+
+
+@pytest.mark.parametrize(
+    ("name", "recording"),
+    [
+        ("../../etc/x.mcap", "x"),
+        ("a=b c.mcap", "a_b_c"),
+        ("...mcap", "log"),
+        ("ü.1.mcap", "ü.1"),
+        ("0001.mcap", "log-0001"),
+    ],
+)
+def test_names_of_logs_never_climb_out_of_the_folder(tmp_path, name, recording):
+    assert recording_name(tmp_path / name) == recording
+
+
+@pytest.mark.parametrize(
+    "stem", ["0001", "1.5", "1e5", "2026-05-01", "2026-05-01 10:00:00", "true", "NaN", "-7", "walk_07"]
+)
+def test_no_reader_takes_the_name_of_a_log_for_something_else(tmp_path, stem):
+    name = recording_name(tmp_path / f"{stem}.mcap")
+    path = tmp_path / "t" / f"recording={name}" / "part-0.parquet"
+    tables.write(path, tables.rows_table(TRACKS, {"/a": [Frame(1, 0, tracks_at({1: (0, 0)}))]}), {})
+    assert ask("select recording from '@/t/*/*.parquet'", tmp_path) == [(name,)]
+    assert pl.read_parquet(tmp_path / "t", hive_partitioning=True)["recording"].to_list() == [name]
+    assert pq.read_table(tmp_path / "t").column("recording").to_pylist() == [name]
+    assert pd.read_parquet(tmp_path / "t")["recording"].tolist() == [name]
+
+
+EVIL = [
+    "/../../etc/x",
+    "..",
+    "/",
+    "",
+    "/a/b",
+    "/a.b",
+    "a/b",
+    "/a/../b",
+    "/a\\b",
+    "/a\0b",
+    "/ü",
+    "/a=b",
+    "//a",
+    "/.",
+    "/" + "x/" * 300,
+]
+
+
+def test_topics_become_folders_of_their_own_that_stay_where_they_belong(tmp_path):
+    names = [topic_folder(topic) for topic in EVIL]
+    assert len(set(names)) == len(EVIL)
+    for name in names:
+        assert not set(name) & set("/\\\0=")
+        assert name.strip(".")
+        assert len(name.encode()) < 240
+        assert (tmp_path / name).resolve().parent == tmp_path.resolve()
+    assert topic_folder("/imu/data_raw") == "imu.data_raw"
+
+
+def test_a_topic_with_an_evil_name_is_exported_inside_of_the_folder(tmp_path):
+    with log.create(tmp_path / "a.mcap") as writer:
+        number = writer.add_channel("/../../x", ("", "", b""), "json", {})
+        writer.add_message(number, 1, 0, b'{"../y": "=cmd()", "a\\nb": 1}')
+    exported(tmp_path / "a.mcap", tmp_path / "in" / "tables", topics=["/../../x"])
+    assert {path.name for path in tmp_path.iterdir()} == {"a.mcap", "in"}
+    assert {path.name for path in (tmp_path / "in").iterdir()} == {"tables"}
+
+
+def test_two_logs_of_one_name_are_not_mixed_up(tmp_path):
+    one, other = some_log(tmp_path / "a b.mcap"), some_log(tmp_path / "a_b.mcap")
+    exported(one, tmp_path / "tables")
+    with pytest.raises(McaptrackError, match=r"holds the tables of a b.mcap, not of a_b.mcap"):
+        exported(other, tmp_path / "tables")
+    (tmp_path / "day").mkdir()
+    again = some_log(tmp_path / "day" / "a_b.mcap")
+    outcome = CliRunner().invoke(app, ["export", str(other), str(again), "-o", str(tmp_path / "both")])
+    assert outcome.exit_code == 1
+    assert "would both be a_b in the tables" in outcome.stderr
+    assert not (tmp_path / "both").exists()
+
+
+# Channels of others
+
+
+def test_a_channel_of_others_becomes_a_table_with_names_that_sql_takes(tmp_path):
+    done = exported(some_log(tmp_path / "a.mcap"), tmp_path, topics=["/imu"])
+    assert done.rows["topics/imu"] == 4
+    query = "select frame, t_ns, header_stamp_ns, header_frame_id, gyro_x, cov[2], n from '@/topics/imu/*/*.parquet' order by n"
+    assert ask(query, tmp_path) == [(n, ns(n) + 7, ns(1) + 5, "imu", 0.5, 2.0, n) for n in range(4)]
+    field = pq.read_schema(tmp_path / "topics/imu/recording=a/part-0.parquet").field("gyro_x")
+    assert field.metadata[b"path"] == b"gyro.x"
+
+
+@pytest.mark.parametrize("form", ["csv", "jsonl", "arrow"])
+def test_other_formats_hold_the_same(tmp_path, form):
+    path = some_log(tmp_path / "a.mcap")
+    outcome = CliRunner().invoke(
+        app, ["export", str(path), "-o", str(tmp_path / "t"), "--format", form, "--topic", "/imu", "--json"]
+    )
+    assert outcome.exit_code == 0, outcome.stderr
+    assert json.loads(outcome.stdout)["results"][0]["rows"]["tracks"] == 12
+    read = {
+        "csv": lambda p: pl.read_csv(p, schema_overrides={"gyro_y": pl.Float64}),
+        "jsonl": pl.read_ndjson,
+        "arrow": pl.read_ipc,
+    }[form]
+    with log.read(path) as opened:
+        wanted = Contents(opened).table("tracks")
+        imu = Contents(opened).messages("/imu")[0]
+    found = read(tmp_path / "t" / "tracks" / "recording=a" / f"part-0.{form}")
+    for name in ("topic", "t_ns", "track_id", "x_m", "observed"):
+        assert found[name].to_list() == wanted.column(name).to_pylist()
+    found = read(tmp_path / "t" / "topics" / "imu" / "recording=a" / f"part-0.{form}")
+    assert found.columns == imu.column_names
+    assert np.array_equal(np.signbit(found["gyro_y"].to_numpy()), [True] * 4)
+
+
+def test_what_a_channel_can_not_be_read_as_is_said_with_its_time(tmp_path):
+    with log.create(tmp_path / "a.mcap") as writer:
+        number = writer.add_channel("/x", ("", "", b""), "json", {})
+        writer.add_message(number, 5, 0, b"{")
+    with pytest.raises(McaptrackError, match=r"/x at 5 ns: 1 bytes are no json message"):
+        exported(tmp_path / "a.mcap", tmp_path / "t", topics=["/x"])
+    outcome = CliRunner().invoke(app, ["export", str(tmp_path / "a.mcap"), "--blobs"])
+    assert (outcome.exit_code, "with --topic" in outcome.stderr) == (1, True)
+    with pytest.raises(McaptrackError, match="has no channel /y"):
+        exported(tmp_path / "a.mcap", tmp_path / "t", topics=["/y"])
+
+
+def test_results_beside_a_log_are_in_its_tables(tmp_path):
+    path = some_log(tmp_path / "a.mcap")
+    raw = path.read_bytes()
+    with log.read(path, sidecar=True) as opened, log.extend(opened) as writer:
+        add_rows(writer, "/camera/retracks", TRACKS, [Frame(0, 0, tracks_at({1: (1.0, 2.0)}))], "retrack")
+    assert path.read_bytes() == raw
+    exported(path, tmp_path / "t")
+    query = "select topic, file from '@/frames/*/*.parquet' where topic like '%tracks' group by all order by all"
+    assert ask(query, tmp_path / "t") == [("/camera/retracks", "a.results.mcap"), ("/camera/tracks", "a.mcap")]
+    assert ask("select results_file from '@/recordings/*/*.parquet'", tmp_path / "t") == [("a.results.mcap",)]
+
+
+def test_cut_off_at_any_table_the_next_export_completes_it(tmp_path, monkeypatch):
+    path, folder = some_log(tmp_path / "a.mcap"), tmp_path / "tables"
+    exported(path, folder)
+    with log.read(path) as opened, log.extend(opened, drop=["/camera/tracks"]) as writer:
+        add_rows(writer, "/camera/tracks", TRACKS, [Frame(0, 0, tracks_at({4: (7.0, 7.0)}))])
+    old = {file: file.read_bytes() for file in folder.rglob("*.parquet")}
+    with log.read(path) as opened:
+        digest = opened.fingerprint()
+    real, calls = os.replace, []
+    for at in range(1, 8):
+        for file, data in old.items():
+            file.write_bytes(data)
+        calls.clear()
+
+        def replace(*args, at=at):
+            calls.append(args)
+            if len(calls) == at:
+                raise KeyboardInterrupt
+            return real(*args)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(os, "replace", replace)
+            try:
+                exported(path, folder)
+            except KeyboardInterrupt:
+                assert ask("select digest from '@/recordings/*/*.parquet'", folder) != [(digest,)]
+            else:
+                break
+        exported(path, folder)
+        assert ask("select digest from '@/recordings/*/*.parquet'", folder) == [(digest,)]
+        assert ask("select x_m from '@/tracks/*/*.parquet' where topic = '/camera/tracks'", folder) == [(7.0,)]
+        assert not [file for file in folder.rglob("*") if file.name.endswith(".part")]
+    assert at == 7

@@ -1,0 +1,243 @@
+"""Channels of any schema as flat tables: protobuf, JSON, ROS 1 and ROS 2, written by their own libraries."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+from google.protobuf.descriptor_pb2 import FileDescriptorSet
+from grpc_tools import protoc
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+import mcaptrack
+from mcaptrack import log
+from mcaptrack.errors import McaptrackError
+from mcaptrack.foreign import Kind
+from mcaptrack.foreign.flat import flattener
+
+PROTO = """
+syntax = "proto3";
+package robot;
+import "google/protobuf/timestamp.proto";
+import "google/protobuf/duration.proto";
+enum Mode { IDLE = 0; DRIVE = 1; }
+message Point { double x = 1; float y = 2; }
+message Track { Point at = 1; bytes blob = 2; repeated Point more = 3; }
+message State {
+  google.protobuf.Timestamp stamp = 1;
+  google.protobuf.Duration took = 2;
+  Track track = 3;
+  repeated sint32 ids = 4;
+  repeated Mode modes = 5;
+  Mode mode = 6;
+  uint64 big = 7;
+  optional double maybe = 8;
+  map<string, int32> counts = 9;
+  string words = 10;
+  bytes picture = 11;
+  repeated Point points = 12;
+  State inner = 13;
+}
+"""
+ROS1_IMU = """std_msgs/Header header
+geometry_msgs/Vector3 angular_velocity
+float64[9] angular_velocity_covariance
+uint8[] raw
+string[] names
+geometry_msgs/Vector3[] more
+duration took
+================================================================================
+MSG: std_msgs/Header
+uint32 seq
+time stamp
+string frame_id
+================================================================================
+MSG: geometry_msgs/Vector3
+float64 x
+float64 y
+float64 z
+"""
+
+
+def one_channel(path, name, encoding, schema, message_encoding, payloads):
+    with log.create(path) as writer:
+        number = writer.add_channel("/x", (name, encoding, schema), message_encoding, {})
+        for n, payload in enumerate(payloads):
+            writer.add_message(number, n, n, payload)
+    with mcaptrack.open(path) as opened:
+        return opened.table("/x")
+
+
+def fields(table):
+    """The columns after those that say when and where."""
+    return table.column_names[7:-1]
+
+
+@pytest.fixture(scope="module")
+def state(tmp_path_factory):
+    """The class of robot.State and its schema record, made by protoc."""
+    from google.protobuf.descriptor_pool import DescriptorPool
+    from google.protobuf.message_factory import GetMessageClass
+
+    folder = tmp_path_factory.mktemp("proto")
+    (folder / "robot.proto").write_text(PROTO)
+    include = str(__import__("pathlib").Path(protoc.__file__).parent / "_proto")
+    words = [
+        "",
+        f"-I{folder}",
+        f"-I{include}",
+        "--include_imports",
+        f"--descriptor_set_out={folder / 'out'}",
+        "robot.proto",
+    ]
+    assert protoc.main(words) == 0
+    schema = (folder / "out").read_bytes()
+    pool = DescriptorPool()
+    for file in FileDescriptorSet.FromString(schema).file:
+        pool.Add(file)
+    return GetMessageClass(pool.FindMessageTypeByName("robot.State")), schema
+
+
+def test_protobuf_is_read_by_the_definition_in_the_log(tmp_path, state):
+    make, schema = state
+    full = make(mode=1, modes=[0, 1], big=2**64 - 1, maybe=-0.0, words='a,"b"\n', picture=b"\x00\xff", ids=[-1, 2])
+    full.stamp.seconds, full.stamp.nanos = 5, 7
+    full.took.seconds, full.took.nanos = -1, -5
+    full.track.at.x, full.track.at.y = 5e-324, 0.1
+    full.track.more.add(x=math.inf)
+    full.counts["a"] = 3
+    full.inner.words = "within"
+    table = one_channel(
+        tmp_path / "a.mcap", "robot.State", "protobuf", schema, "protobuf", [full.SerializeToString(), b""]
+    )
+    first, second = table.to_pylist()
+    assert (first["stamp_ns"], first["took_ns"]) == (5_000_000_007, -1_000_000_005)
+    assert (first["track_at_x"], first["track_at_y"]) == (5e-324, float(np.float32(0.1)))
+    assert (first["ids"], first["modes"], first["mode"], first["big"]) == (
+        [-1, 2],
+        ["IDLE", "DRIVE"],
+        "DRIVE",
+        2**64 - 1,
+    )
+    assert math.copysign(1, first["maybe"]) == -1
+    assert (json.loads(first["counts"]), first["words"], first["inner_words"]) == ({"a": 3}, 'a,"b"\n', "within")
+    assert json.loads(first["track_more"]) == [{"x": "Infinity", "y": 0.0}]
+    assert json.loads(first["points"]) == json.loads(second["points"]) == []
+    assert (second["maybe"], second["stamp_ns"], second["mode"], second["big"]) == (None, None, "IDLE", 0)
+    assert "picture" not in fields(table)
+    assert str(table.schema.field("track_at_y").metadata[b"path"], "utf-8") == "track.at.y"
+    assert table.column("frame").to_pylist() == [0, 1]
+
+
+def test_bytes_are_kept_where_they_are_asked_for(tmp_path, state):
+    make, schema = state
+    with log.create(tmp_path / "a.mcap") as writer:
+        number = writer.add_channel("/x", ("robot.State", "protobuf", schema), "protobuf", {})
+        writer.add_message(number, 0, 0, make(picture=b"\x00\xff").SerializeToString())
+        other = writer.add_channel("/y", ("robot.State", "protobuf", schema), "protobuf", {})
+        writer.add_message(other, 0, 0, make(picture=b"\x01").SerializeToString())
+    from mcaptrack.export import export
+
+    with log.read(tmp_path / "a.mcap") as opened:
+        done = export(opened, tmp_path / "t", topics=["/x"])
+        assert done.notes == ["/x: picture left out, bytes; --blobs keeps them"]
+        export(opened, tmp_path / "t", topics=["/x"], blobs=True)
+        assert export(opened, tmp_path / "t").written == []  # and they stay
+        assert export(opened, tmp_path / "t", topics=["/y"], blobs=True).rows["topics/y"] == 1
+        (words,) = export(opened, tmp_path / "t", topics=["/y"]).notes
+        assert words == "/y: picture left out, bytes; --blobs keeps them"  # of /y alone
+    import pyarrow.parquet as pq
+
+    (file,) = (tmp_path / "t" / "topics" / "x").rglob("*.parquet")
+    assert pq.ParquetFile(file).read().column("picture").to_pylist() == [b"\x00\xff"]
+
+
+@pytest.mark.parametrize("encoding", ["ros1", "cdr"])
+def test_ros_messages_are_read_by_their_definition(tmp_path, encoding):
+    text = ROS1_IMU
+    if encoding == "cdr":
+        text = text.replace("uint32 seq\ntime stamp", "builtin_interfaces/Time stamp").replace(
+            "\nduration", "\nbuiltin_interfaces/Duration"
+        )
+    store = get_typestore(Stores.ROS1_NOETIC if encoding == "ros1" else Stores.LATEST)
+    store.register(get_types_from_msg(text, "robot/msg/Imu"))
+    types = store.types
+    header = {"stamp": types["builtin_interfaces/msg/Time"](sec=3, nanosec=9), "frame_id": "imu"}
+    if encoding == "ros1":
+        header["seq"] = 1
+    duration = "builtin_interfaces/msg/Duration"
+    vector = types["geometry_msgs/msg/Vector3"]
+    message = types["robot/msg/Imu"](
+        header=types["std_msgs/msg/Header"](**header),
+        angular_velocity=vector(x=0.5, y=math.nan, z=-math.inf),
+        angular_velocity_covariance=np.arange(9.0),
+        raw=np.array([1, 255], np.uint8),
+        names=["a", "b"],
+        more=[vector(x=1.0, y=2.0, z=3.0)],
+        took=types[duration](sec=-1, nanosec=5),
+    )
+    write = store.serialize_ros1 if encoding == "ros1" else store.serialize_cdr
+    payload = bytes(write(message, "robot/msg/Imu"))
+    name, kind = ("robot/Imu", "ros1msg") if encoding == "ros1" else ("robot/msg/Imu", "ros2msg")
+    table = one_channel(tmp_path / "a.mcap", name, kind, text.encode(), encoding, [payload])
+    (row,) = table.to_pylist()
+    assert (row["header_stamp_ns"], row["header_frame_id"], row["took_ns"]) == (3_000_000_009, "imu", -999_999_995)
+    assert (row["angular_velocity_x"], row["angular_velocity_z"]) == (0.5, -math.inf)
+    assert math.isnan(row["angular_velocity_y"])
+    assert (row["angular_velocity_covariance"], row["names"]) == (list(range(9)), ["a", "b"])
+    assert json.loads(row["more"]) == [{"x": 1.0, "y": 2.0, "z": 3.0}]
+    assert "raw" not in fields(table)
+
+
+def test_columns_of_json_take_the_narrowest_type_that_holds_all_values(tmp_path):
+    rows = [
+        {"i": 1, "f": 1, "m": 1, "b": True, "a.b": 1, "t": 5, "T_2": 6, "only": [], "half": "\ud800x", "huge": 2**63},
+        {"i": -(2**63), "f": 0.5, "m": "x", "b": False, "a": {"b": 2}, "deep": {"l": [1, 2.5]}, "huge": 1},
+        {"i": None, "mixed": [1, {"a": 1}], "wide": 2**70},
+    ]
+    payloads = [json.dumps(row).encode() for row in rows]
+    table = one_channel(tmp_path / "a.mcap", "", "", b"", "json", payloads)
+    got = {name: table.column(name).to_pylist() for name in fields(table)}
+    assert got["i"] == [1, -(2**63), None]
+    assert got["f"] == [1.0, 0.5, None]
+    assert got["m"] == ["1", '"x"', None]
+    assert got["b"] == [True, False, None]
+    assert (got["a.b"], got["a_b"]) == ([1, None, None], [None, 2, None])
+    assert (got["t_2"], got["T_2_2"]) == ([5, None, None], [6, None, None])  # t is the log's time; capitals don't count
+    assert got["deep_l"] == [None, [1.0, 2.5], None]
+    assert got["mixed"] == [None, None, '[1,{"a":1}]']
+    assert got["half"] == ["?x", None, None]
+    assert got["huge"] == [2**63, 1, None]
+    assert got["wide"] == [None, None, str(2**70)]
+
+
+SCALARS = st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=4)
+JSON = st.deferred(
+    lambda: SCALARS | st.lists(JSON, max_size=3) | st.dictionaries(st.text(max_size=3), JSON, max_size=3)
+)
+
+
+@given(st.lists(JSON, max_size=5))
+@settings(max_examples=100)
+def test_whatever_json_holds_becomes_a_table(tmp_path_factory, values):
+    path = tmp_path_factory.mktemp("j") / "a.mcap"
+    table = one_channel(path, "", "", b"", "json", [json.dumps(value).encode() for value in values])
+    assert table.num_rows == len(values)
+    lowered = [name.lower() for name in table.column_names]
+    assert len(set(lowered)) == len(lowered)
+
+
+@given(st.binary(max_size=40), st.sampled_from(["protobuf", "json", "ros1", "cdr"]))
+@settings(max_examples=100)
+def test_any_bytes_are_a_message_or_a_fault_in_one_line(state, payload, encoding):
+    schema = {"protobuf": state[1], "json": b"", "ros1": ROS1_IMU.encode(), "cdr": b"float64[] x\nstring s"}[encoding]
+    name = {"protobuf": "robot.State", "json": "", "ros1": "robot/Imu", "cdr": "robot/msg/S"}[encoding]
+    read = flattener(Kind(name, {"ros1": "ros1msg", "cdr": "ros2msg"}.get(encoding, encoding), schema, encoding))
+    try:
+        assert isinstance(read(payload), dict)
+    except McaptrackError as error:
+        assert "\n" not in str(error)
