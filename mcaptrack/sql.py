@@ -3,7 +3,7 @@
     with Database([Path("log.mcap")]) as database:
         answer = database.ask("select topic, count(distinct track_id) from tracks group by topic")
 
-A table is there from when a query names it: from the Parquet file beside the log where that is up to date, otherwise from
+A table comes in when a query names it: from the Parquet file beside the log where that is up to date, otherwise from
 the log. Any channel is a table too, under its name in double quotes. DuckDB is known to this module alone.
 """
 

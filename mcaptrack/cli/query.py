@@ -64,10 +64,10 @@ def query(
 ) -> None:
     """Ask a log in SQL: who was where, how fast, how long, how well.
 
-    The tables are those of `mcaptrack export` (docs/tables.md); `recording` tells several logs apart. They are read from
-    the files beside the log where those are up to date, otherwise from the log. Any other channel is a table under its
-    name in double quotes. Queries read nothing else and change nothing. Needs DuckDB (`pip install "mcaptrack[sql]"`);
-    docs/sql.md has queries for what people ask.
+    The tables are those of `mcaptrack export` (docs/tables.md); `recording` tells several logs apart. They are read
+    from the files beside the log where those are up to date, otherwise from the log. Any other channel is a table under
+    its name in double quotes. Queries read nothing else and change nothing. Needs DuckDB (`pip install duckdb`).
+    docs/sql.md answers what people ask.
 
     Example: mcaptrack query log.mcap "select topic, count(distinct track_id) from tracks group by topic"
 
@@ -141,7 +141,7 @@ def _form(form: Form | None, output: Path | None, json: bool) -> Form:
     if json and form not in (None, "json"):
         raise McaptrackError(f"--json and --format {form} can't both be; leave one out")
     end = output.suffix.removeprefix(".").lower() if output is not None else ""
-    known: dict[str, Form] = {name: name for name in ("csv", "json", "jsonl", "parquet", "arrow")}  # type: ignore[misc]
+    known: dict[str, Form] = {name: name for name in ("csv", "json", "jsonl", "parquet", "arrow")}
     chosen: Form = "json" if json else form or known.get(end, "table")
     if chosen in ("parquet", "arrow") and output is None:
         raise McaptrackError(f"--format {chosen} is no text; give a file with -o")
@@ -227,7 +227,7 @@ def _fitting(names: Sequence[str], rows: Sequence[Sequence[str | None]], width: 
 def _print_tables(database: Database | None, json: bool) -> None:
     from mcaptrack.tables import RECORDING, TABLES
 
-    listed = []
+    listed: list[dict[str, Any]] = []
     for table in TABLES.values():
         columns = [*table.arrow, RECORDING.arrow]
         listed.append(
