@@ -248,7 +248,7 @@ class Database:
             raise McaptrackError(f"{path}: tables are read from files that end with {', '.join(_READERS)}")
         if name.lower() in TABLES or not re.fullmatch(r"[A-Za-z_]\w*", name):
             raise McaptrackError(
-                f"{name} can't be the name of a table; give letters and digits, and no table's of a log"
+                f"{name} can't name a table; take letters and digits, and no name that a log's table has"
             )
         if not path.is_file():
             raise McaptrackError(f"{path} can't be read: no such file")
@@ -294,9 +294,11 @@ def _duckdb() -> Any:
 
 def _different(paths: Sequence[Path]) -> list[Path]:
     """Paths, each once; the results of a log that is among them are part of it."""
-    by_place = {path.resolve(): path for path in reversed(paths)}
+    by_place: dict[Path, Path] = {}
+    for path in paths:
+        by_place.setdefault(path.resolve(), path)
     results = {results_of(place) for place in by_place}
-    return [path for place, path in reversed(by_place.items()) if place not in results]
+    return [path for place, path in by_place.items() if place not in results]
 
 
 def _told_apart(sources: Sequence[_Source]) -> list[str]:

@@ -5,13 +5,10 @@ from __future__ import annotations
 import csv
 import io
 import json
-import os
 import re
 import shlex
-import signal
 import subprocess
 import sys
-import threading
 from pathlib import Path
 
 import duckdb
@@ -81,7 +78,13 @@ def square(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("square")
     footage = demo.draw(demo_scene(), folder, video=False)
     options = IngestOptions(fps=demo_scene().fps, ground_plane=footage.ground_plane, role="truth")
-    ingest(footage.truth, folder / "demo.mcap", options)
+    ingest(footage.truth, folder / "labels.mcap", options)
+    with log.read(folder / "labels.mcap") as opened:
+        # Labels alone begin with frame 1; beside a video the first is that of the first picture.
+        step = opened.start_ns
+        frames = [Frame(f.t_ns - step, f.index - 1, f.rows) for f in opened.frames("/camera/truth", TRACKS)]
+        made = Provenance.from_metadata(opened.channel("/camera/truth").metadata)
+    write_log(folder / "demo.mcap", {"/camera/truth": (TRACKS, made, frames)})
     with log.read(folder / "demo.mcap") as opened:
         export(opened, folder / "demo.tables")
     return folder
@@ -148,11 +151,9 @@ def test_the_answers_of_the_page_are_true():
 
 def write_log(path, channels):
     with log.create(path) as writer:
-        for topic, (schema, made, source, frames) in channels.items():
-            words = Provenance(made, {"max_age_s": 1.4}, source).to_metadata()
-            number = writer.add_channel(
-                topic, (schema.name, "protobuf", schema.descriptor), "protobuf", words, group=topic
-            )
+        for topic, (schema, made, frames) in channels.items():
+            described = (schema.name, "protobuf", schema.descriptor)
+            number = writer.add_channel(topic, described, "protobuf", made.to_metadata(), group=topic)
             for frame in frames:
                 writer.add_message(number, frame.t_ns, frame.index, schema.codec.encode(frame.rows))
     return path
@@ -186,13 +187,17 @@ def known_log(path, tracked=(7, 8)):
     return write_log(
         path,
         {
-            "/camera/truth": (TRACKS, "ingest", "", people),
-            "/camera/tracks": (TRACKS, "track", "/camera/detections", samples),
-            "/camera/samples": (TRACKS, "sample", "/camera/tracks", samples),
-            "/camera/retracks": (TRACKS, "retrack", "/camera/samples", samples),
-            "/camera/retracks/full": (TRACKS, "carry", "/camera/retracks", whole),
-            "/camera/predictions": (PREDICTIONS, "predict", "/camera/samples", [Frame(0, 0, forecasts(ahead))]),
-            "/camera/tracks/events": (EVENTS, "events", "/camera/tracks", told),
+            "/camera/truth": (TRACKS, Provenance("ingest", {}, ""), people),
+            "/camera/tracks": (TRACKS, Provenance("track", {}, "/camera/detections"), samples),
+            "/camera/samples": (TRACKS, Provenance("sample", {}, "/camera/tracks"), samples),
+            "/camera/retracks": (TRACKS, Provenance("retrack", {}, "/camera/samples"), samples),
+            "/camera/retracks/full": (TRACKS, Provenance("carry", {}, "/camera/retracks"), whole),
+            "/camera/predictions": (
+                PREDICTIONS,
+                Provenance("predict", {}, "/camera/samples"),
+                [Frame(0, 0, forecasts(ahead))],
+            ),
+            "/camera/tracks/events": (EVENTS, Provenance("events", {}, "/camera/tracks"), told),
         },
     )
 
@@ -237,6 +242,7 @@ def test_two_runs_beside_each_other(tmp_path):
     known_log(tmp_path / "before.mcap")
     known_log(tmp_path / "after.mcap", tracked=(7,))
     outcome = run(tmp_path / "*.mcap", query, "--format", "jsonl")
+    assert outcome.exit_code == 0, outcome.output
     rows = {row["topic"]: row for row in map(json.loads, outcome.stdout.splitlines())}
     # Of 22 true rows 11 are found: MOTA is a half, IDF1 is 2 * 11 / (11 + 22).
     assert rows["/camera/samples"] == {"topic": "/camera/samples", "IDF1": -0.33, "MOTA": -0.5, "IDSW": 0}
@@ -441,13 +447,20 @@ def test_a_file_is_a_table_where_it_is_given(known, tmp_path):
 
 
 def test_ctrl_c_ends_a_query_and_leaves_the_database(known):
-    with Database([known]) as database:
-        timer = threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT))
-        timer.start()
-        with pytest.raises(KeyboardInterrupt):
-            database.ask("select count(*) from range(10000000000) a, range(1000000) b where a.range % 7 = b.range % 11")
-        timer.join()
-        assert rows_of(database.ask("select 1 as a"))[1] == [[1]]
+    program = (
+        "import os, signal, sys, threading\n"
+        "from pathlib import Path\n"
+        "from mcaptrack.sql import Database\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "with Database([Path(sys.argv[1])]) as database:\n"
+        "    threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT)).start()\n"
+        "    try:\n"
+        "        database.ask('select count(*) from range(10000000000) a, range(1000000) b where a.range % 7 = b.range')\n"
+        "    except KeyboardInterrupt:\n"
+        "        print(database.ask('select 42 as a').to_pylist())\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program, known], check=True, capture_output=True, text=True)
+    assert done.stdout == "[{'a': 42}]\n"
 
 
 # What people see
@@ -456,7 +469,7 @@ def test_ctrl_c_ends_a_query_and_leaves_the_database(known):
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["select * from trakcs"], "no table trakcs (did you mean tracks?); there are frames"),
+        (["select * from trakcs"], r"no table trakcs \(did you mean tracks\?\); there are frames"),
         (['select * from "/camera/trakcs"'], "did you mean /camera/tracks"),
         (["select x_n from tracks"], '"x_n" not found.*"x_m"'),
         (['select x_m from tracks where topic = "/camera/truth"'], "single quotes"),
@@ -476,7 +489,7 @@ def test_mistakes_are_said_in_one_line(known, words, said):
     line = refusal(known, *words)
     if "date_trunc" in str(words) and int(duckdb.__version__[0]) < 2:
         return
-    assert re.search(said.replace("(", r"\(").replace(")", r"\)").replace("?)", r"\?)").replace(r"\?\)", r"\?\)"), line)
+    assert re.search(said, line)
     assert "LINE" not in line
 
 
@@ -494,7 +507,7 @@ def test_a_damaged_table_is_said(square, tmp_path):
     damaged.parent.mkdir(parents=True)
     source = square / "demo.tables/tracks/recording=demo/part-0.parquet"
     content = bytearray(source.read_bytes())
-    where = pq.read_metadata(source).row_group(0).column(9)  # x_m
+    where = pq.read_metadata(source).row_group(0).column(10)
     assert where.path_in_schema == "x_m"
     content[where.data_page_offset + where.total_compressed_size // 2] ^= 0xFF
     damaged.write_bytes(content)
@@ -533,7 +546,7 @@ def test_answers_are_exact_in_every_form(known, tmp_path):
         "words": 'a"b,\n',
         "yes": True,
     }
-    assert row | {"d": row["d"]} == wanted
+    assert row == wanted
     assert json.loads(run(known, EVERYTHING, "--format", "json").stdout) == [wanted]
     whole = json.loads(run(known, EVERYTHING, "--json").stdout)
     assert (whole["schema_version"], whole["results"]) == (1, [wanted])

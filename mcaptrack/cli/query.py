@@ -114,7 +114,7 @@ def _asked(words: Sequence[str], file: Path | None, tables: bool) -> tuple[list[
         if file is not None:
             raise McaptrackError("--tables needs no query; leave -f out")
         return [Path(name) for name in names], ""
-    if not words or (not from_file and Path(words[-1]).exists()):
+    if not words or (not from_file and _is_there(words[-1])):
         raise McaptrackError(
             "there is no query; give it as the last word, in quotes, or with -f FILE (--tables: what there is)"
         )
@@ -134,6 +134,13 @@ def _asked(words: Sequence[str], file: Path | None, tables: bool) -> tuple[list[
     if not sql.strip(" \t\r\n;"):
         raise McaptrackError("the query is empty")
     return [Path(name) for name in names], sql
+
+
+def _is_there(word: str) -> bool:
+    try:
+        return Path(word).exists()
+    except (OSError, ValueError):  # too long for a name, as queries are
+        return False
 
 
 def _form(form: Form | None, output: Path | None, json: bool) -> Form:

@@ -11,6 +11,7 @@ import io
 import json
 import math
 from collections.abc import Iterator
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -87,6 +88,8 @@ def _plain(value: Any) -> Any:
         return [_plain(member) for member in value]
     if isinstance(value, dict):
         return {name: _plain(member) for name, member in value.items()}
+    if isinstance(value, Decimal):
+        return float(value)
     if value is not None and not isinstance(value, str | int | float):
         return str(value)  # dates within lists
     return value
