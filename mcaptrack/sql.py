@@ -36,7 +36,7 @@ _CLOSED: Final = {
 }
 #: Statements that ask, or that make something which is gone with the database.
 _ASKING: Final = ("SELECT", "EXPLAIN", "CREATE", "SET", "VARIABLE_SET", "RELATION", "MULTI")
-_ANSWERING: Final = ("SELECT", "EXPLAIN", "RELATION")
+_ANSWERING: Final = ("SELECT", "EXPLAIN", "RELATION", "MULTI")
 #: Files that can be given as tables, by the end of their name, and the method that reads them.
 _READERS: Final = {
     ".parquet": "read_parquet",
@@ -163,6 +163,8 @@ class Database:
 
     def _answer(self, query: str) -> Any:
         """The answer of the last statement that gives one, Arrow or None."""
+        if re.match(r"\s*show\s+(all\s+)?tables\b", query, re.IGNORECASE):
+            raise McaptrackError("tables come in when a query names them; `mcaptrack query LOG --tables` lists them")
         statements = self._connection.extract_statements(query)
         _refuse_writing([statement.type.name for statement in statements])
         answer = None

@@ -432,6 +432,23 @@ def test_what_is_made_within_a_query_is_gone_after_it(known):
         database.ask("from two")
 
 
+def test_statements_of_all_kinds_bring_tables_in(known):
+    with Database([known]) as database:
+        found = database.ask("pivot Tracks on topic using count(*) group by observed")
+        assert found.column("/camera/truth").to_pylist() in ([22, None], [None, 22], [22, 0], [0, 22])
+        assert "x_m" in database.ask("describe predictions").column("column_name").to_pylist()
+        assert database.ask("summarize select x_m, kind from events").num_rows == 2
+        assert database.ask("explain from metrics").num_rows
+        query = "with tracks as (from main.track_summary) from (select count(*) as n, (select count(*) from frames) from tracks)"
+        assert rows_of(database.ask(query))[1][0][0] == 9
+        assert rows_of(
+            database.ask("set variable who = 7; select count(*) from tracks where track_id = getvariable('who')")
+        ) == (
+            ["count_star()"],
+            [[33]],
+        )
+
+
 def test_a_file_is_a_table_where_it_is_given(known, tmp_path):
     (tmp_path / "zones.csv").write_text("zone,low_m,high_m\nleft,-1,2\nright,2.1,9\n")
     query = (
@@ -482,6 +499,7 @@ def test_ctrl_c_ends_a_query_and_leaves_the_database(known):
         (["select 1", "--format", "parquet"], "-o"),
         (["select 1", "-f", "none.sql"], "."),
         (["select error('sorry')"], "sorry"),
+        (["show tables"], "--tables"),
     ],
 )
 def test_mistakes_are_said_in_one_line(known, words, said):
@@ -643,4 +661,5 @@ def test_the_tables_are_listed_with_columns_units_and_meanings(known):
             assert field.name in words
     (tracks,) = (table for table in listed["results"] if table["table"] == "tracks")
     column = next(column for column in tracks["columns"] if column["name"] == "x_m")
+    assert "timestamp[ns, tz=UTC]" in words
     assert (column["unit"], column["meaning"]) == ("m", "position on the ground plane, first axis")

@@ -266,7 +266,7 @@ def _print_tables(database: Database | None, json: bool) -> None:
         console.print(Text(one["meaning"], "dim"))
         shown = Table(box=None, show_header=False, pad_edge=False, padding=(0, 2, 0, 0))
         for column in one["columns"]:
-            shown.add_row(*(Text(f"  {column['name']}"), column["type"], column["unit"], Text(column["meaning"])))
+            shown.add_row(*map(Text, (f"  {column['name']}", column["type"], column["unit"], column["meaning"])))
         console.print(shown)
         console.print()
     for what, names in found.items():
