@@ -33,14 +33,14 @@ _ASSUME: Final = "assume-ground-plane"
 
 @dataclass
 class Report:
-    """What a run did: the stages that ran, the frames of each topic they made, and the layout for their views.
+    """What a run did: the stages that ran, the frames of each topic they made, and the layouts for their views.
 
     ``stale`` are the channels that were made from something that has now been replaced.
     """
 
     stages: list[str] = field(default_factory=list)
     frames: dict[str, int] = field(default_factory=dict)
-    layout: bytes | None = None
+    layouts: dict[str, bytes] = field(default_factory=dict)
     stale: list[str] = field(default_factory=list)
 
 
@@ -83,7 +83,7 @@ def run(
             made |= _carried(opened, job, made, planes or ())
         report.stages.append(job.stage)
     if made or output is not None:
-        report.layout = write(opened, prefix, made, planes or (), stamps, output)
+        report.layouts = write(opened, prefix, made, planes or (), stamps, output)
     digests = {topic: channel.provenance.digest for topic, channel in made.items()}
     for topic, there in sorted(opened.channels.items()):
         known = Provenance.from_metadata(there.metadata)
