@@ -116,7 +116,7 @@ class Template:
 
     def filled(self, count: int, **columns: Any) -> NDArray[np.void]:
         """``count`` messages; columns for slots, ``a__b`` for what stands inside a slot ``a`` that is there often."""
-        out = np.frombuffer(self._data * count, np.uint8).copy().view(self.dtype)
+        out = np.frombuffer(bytearray(self._data) * count, self.dtype)
         for name, values in columns.items():
             target: Any = out
             *outer, last = name.split("__")
@@ -170,14 +170,14 @@ def _put(layout: _Layout, field: Any, value: Any) -> None:
 class Group(NamedTuple):
     """Parts of messages, equally long: ``data`` are their bytes, ``at`` (F + 1,) where those of each frame begin."""
 
-    data: bytes
+    data: memoryview
     at: list[int]
 
 
 def group(parts: NDArray[np.void], frame: Ints, frames: int) -> Group:
     """Parts (N,) that belong to frames (N,), in rising order, of so many frames."""
     at = np.searchsorted(frame, np.arange(frames + 1)) * parts.dtype.itemsize
-    return Group(parts.tobytes(), at.tolist())
+    return Group(parts.view(np.uint8).data, at.tolist())
 
 
 def nested(number: int, content: bytes) -> bytes:

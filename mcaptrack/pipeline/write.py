@@ -63,6 +63,10 @@ def write(
     drawn = _Drawn(prefix, picture_ns, stamp_ns, planes)
     if any(channel.schema is not DETECTIONS for channel in shown.values()):
         outdated.add(drawn.frame_topic)
+    # All that is read, before anything is written: the log is changed in place.
+    start_ns = _start_ns(opened, prefix, shown, picture_ns)
+    eye = layouts.eye_on(_places(opened, prefix, shown), planes, start_ns)
+    last_step = _last_step(opened, prefix, shown)
     with log.extend(opened, output, drop={*made, *outdated}, drop_attachments=ATTACHMENTS) as writer:
         streams: list[Iterator[Numbered]] = []
         for topic, channel in made.items():
@@ -70,15 +74,14 @@ def write(
             made_by = channel.provenance.transform  # results of one stage share chunks, so that they can go together
             number = writer.add_channel(topic, record, "protobuf", channel.provenance.to_metadata(), group=made_by)
             streams.append(_with_number(number, channel.messages))
-        for view in drawn.views(shown, _start_ns(opened, prefix, shown, picture_ns)):
+        for view in drawn.views(shown, start_ns):
             record = foxglove.schema_record(view.schema_name)
             metadata = view.provenance.to_metadata()
             number = writer.add_channel(view.topic, record, "protobuf", metadata, "views", view.group)
             streams.append(_with_number(number, view.messages))
         _write_by_time(writer, streams)
         there = {channel.topic for channel in writer.channels.values()} | set(opened.channels) - outdated
-        eye = layouts.eye_on(_places(opened, prefix, shown), planes, int(picture_ns[0]) if video else 0)
-        layout_files = layouts.make(drawn.there(there, video, eye, _last_step(opened, prefix, shown)))
+        layout_files = layouts.make(drawn.there(there, video, eye, last_step))
         for name, layout_file in layout_files.items():
             writer.add_attachment(attachment_of(name), "application/json", layout_file)
     return layout_files
@@ -140,18 +143,14 @@ class _Drawn:
                 yield View(topic + views.SCENE_SUFFIX, foxglove.SCENE, made_from, group, outline)
             if channel.schema not in views.DRAWN or topic.endswith(_NOT_SHOWN):
                 continue
+            drawing = views.Drawing(topic, channel.schema, channel.frames, self._planes, channel.made_by)
             if len(self._picture_ns):
-                drawn = views.view(
-                    topic, channel.schema, channel.frames, self._picture_ns, self._planes, self._stamp_ns,
-                    channel.made_by, trails=not is_full_elsewhere,
-                )  # fmt: skip
+                drawn = drawing.on_pictures(self._picture_ns, self._stamp_ns, trails=not is_full_elsewhere)
                 yield View(topic + views.SUFFIX, foxglove.ANNOTATIONS, made_from, group, drawn)
             if channel.schema is not DETECTIONS and not is_full_elsewhere:
                 own_ns = np.array([frame.t_ns for frame in channel.frames], np.int64)
                 t_ns = self._picture_ns if len(self._picture_ns) else own_ns
-                scene = views.scene(
-                    topic, channel.schema, channel.frames, t_ns, self._planes, self._frame_id, channel.made_by
-                )
+                scene = drawing.on_ground(t_ns, self._frame_id)
                 yield View(topic + views.SCENE_SUFFIX, foxglove.SCENE, made_from, group, scene)
         on_ground = {topic: channel for topic, channel in shown.items() if channel.schema is not DETECTIONS}
         if on_ground:

@@ -19,11 +19,11 @@ from mcaptrack.views import looks
 from mcaptrack.views.image import View, fade
 from mcaptrack.views.looks import Look
 from mcaptrack.views.people import (
+    People,
     by_count,
     ellipses,
     forecasts,
     latest,
-    people_at,
     pieces,
     shown_at,
     trails,
@@ -32,7 +32,7 @@ from mcaptrack.views.people import (
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-_BATCH: Final = 256
+_BATCH: Final = 128
 _WHITE: Final = (1.0, 1.0, 1.0)
 _FORECAST_PX: Final = 3.0
 #: A picture's outline ends where pixels are so many times as large on the ground as in the middle of its lower edge:
@@ -74,10 +74,12 @@ class _Instants:
         yield from zip(self.t_ns[span].tolist(), range(span.start, span.stop), scene.messages(), strict=True)
 
 
-def tracks(frames: Sequence[Frame], t_ns: Ints, frame_id: str, planes: Planes, look: Look) -> View:
-    """Cylinders with their numbers, fainter where nobody was seen, and where people were before, fading."""
+def tracks(people: People, t_ns: Ints, frame_id: str, look: Look) -> View:
+    """Cylinders with their numbers, fainter where nobody was seen, and where people were before, fading.
+
+    ``people`` are those at these times.
+    """
     instants = _Instants(t_ns, frame_id)
-    people = people_at(frames, t_ns, planes)
     known = np.asarray(np.isfinite(people.at_m).all(axis=1), np.bool_)
     lines = trails(people, known, t_ns)
     longest = lines.row.shape[1] - 1

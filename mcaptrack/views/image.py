@@ -19,13 +19,13 @@ from mcaptrack.views import looks
 from mcaptrack.views.looks import Look
 from mcaptrack.views.people import (
     Forecasts,
+    People,
     around,
     by_count,
     by_plane,
     ellipses,
     forecasts,
     latest,
-    people_at,
     pieces,
     shown_at,
     trails,
@@ -36,7 +36,7 @@ Ints = NDArray[np.int64]
 View = Iterator[tuple[int, int, bytes]]
 
 #: Messages are made for so many pictures at a time.
-_BATCH: Final = 256
+_BATCH: Final = 128
 _WORDS_PX: Final = 12.0
 #: Where nobody knows a box, a place is marked by a rhombus of this size.
 _MARK_PX: Final = 4.0
@@ -79,7 +79,7 @@ def detections(frames: Sequence[Frame], pictures: Pictures, planes: Planes) -> V
         near = frames[int(first) : int(last)]
         number = np.searchsorted(at, times[first:last])
         hit = at[np.minimum(number, len(at) - 1)] == times[first:last]
-        rows = np.concatenate([DETECTIONS.empty(), *(f.rows for f, ok in zip(near, hit.tolist(), strict=True) if ok)])
+        rows = DETECTIONS.joined([f.rows for f, ok in zip(near, hit.tolist(), strict=True) if ok])
         of = np.repeat(number[hit], [len(f.rows) for f, ok in zip(near, hit.tolist(), strict=True) if ok])
         boxes = columns_to_boxes(rows)
         fine = np.isfinite(boxes).all(axis=1)
@@ -88,10 +88,11 @@ def detections(frames: Sequence[Frame], pictures: Pictures, planes: Planes) -> V
         yield from pictures.numbered(span, drawn)
 
 
-def tracks(frames: Sequence[Frame], pictures: Pictures, planes: Planes, look: Look) -> View:
-    """Boxes with their numbers, fainter where nobody was seen, and where people were in the last seconds, fading."""
-    unit = looks.unit(frames, planes)
-    people = people_at(frames, pictures.t_ns, planes)
+def tracks(people: People, pictures: Pictures, unit: float, look: Look) -> View:
+    """Boxes with their numbers, fainter where nobody was seen, and where people were in the last seconds, fading.
+
+    ``people`` are those at the times of the pictures; lines of one are ``unit`` pixels thick.
+    """
     has_place = _near(people.foot_px)
     has_box = _near(people.box_px)
     lines = trails(people, has_place, pictures.t_ns)

@@ -22,7 +22,7 @@ Ints = NDArray[np.int64]
 
 #: How far trails go back, and how many lines they are made of.
 _TRAIL_S: Final = 2.0
-_TRAIL_LINES: Final = 5
+_TRAIL_LINES: Final = 4
 _MAX_HOLE_S: Final = 2.0
 #: Forecasts are shown until the next ones are due.
 _FORECAST_S: Final = 1.0
@@ -125,7 +125,7 @@ def by_count(count: Ints) -> Iterator[tuple[int, Ints]]:
 
 def forecasts(frames: Sequence[Frame]) -> Iterator[Forecasts]:
     """The futures in a channel of predictions, for each number of steps that they have."""
-    rows = np.concatenate([PREDICTIONS.empty(), *(frame.rows for frame in frames)])
+    rows = PREDICTIONS.joined([frame.rows for frame in frames])
     message = np.repeat(np.arange(len(frames)), [len(frame.rows) for frame in frames])
     order = np.lexsort((rows["step"], rows["track_id"], message))
     rows, message = rows[order], message[order]
