@@ -167,7 +167,15 @@ NAMES = [
     {"truth", "truth/view/scene", "tracks", "tracks/view/scene", "ground_plane/view/scene"},
     {"detections", "detections/view/image"},
     {"predictions", "predictions/view/scene", "samples"},
-    {"tracks", "tracks/view/image", "tracks/counts", "events", "events/view/log", "retracks", "retracks/view/image"},
+    {
+        "tracks",
+        "tracks/view/image",
+        "tracks/counts",
+        "tracks/events",
+        "tracks/events/view/log",
+        "retracks",
+        "retracks/view/image",
+    },
     set(),
 ]
 
@@ -183,6 +191,12 @@ def test_layouts_name_only_what_there_is(names, pictures):
         layout = json.loads(content)
         assert sorted(leaves(layout["layout"])) == sorted(layout["configById"])
         assert topics_in(layout) <= {f"/c/{name}" for name in names} | {pictures}
+
+
+def test_a_log_line_is_what_the_generated_class_reads():
+    message = foxglove.unpack(foxglove.LOG, foxglove.pack_log(5_000_000_001, "WARNING", "tracks", "two swapped"))
+    assert (message.level, message.name, message.message) == (3, "tracks", "two swapped")
+    assert message.timestamp.ToNanoseconds() == 5_000_000_001
 
 
 def test_the_eye_looks_where_the_camera_looks():

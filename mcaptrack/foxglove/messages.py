@@ -68,6 +68,15 @@ def pack_transform(t_ns: int, parent_frame_id: str, frame_id: str) -> bytes:
     return payload
 
 
+def pack_log(t_ns: int, level: str, name: str, words: str) -> bytes:
+    """A Log message; ``level`` is "INFO", "WARNING" or "ERROR", ``name`` says whom it comes from."""
+    kind = message_class(LOG)
+    message = kind(level=kind.Level.Value(level), name=name, message=words)
+    _stamp(message, t_ns)
+    payload: bytes = message.SerializeToString(deterministic=True)
+    return payload
+
+
 def unpack(schema_name: str, payload: bytes) -> Any:
     """A message of a foxglove schema. Raises McaptrackError if it is none."""
     from google.protobuf.message import DecodeError

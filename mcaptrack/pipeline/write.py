@@ -26,12 +26,13 @@ Numbered = tuple[int, int, int, bytes]
 
 
 class Made(NamedTuple):
-    """A channel that was just made."""
+    """A channel that was just made; ``record`` is its schema record, if that is not the schema's own."""
 
     schema: Schema
     frames: list[Frame]
     provenance: Provenance
     messages: list[tuple[int, int, bytes]]
+    record: tuple[str, str, bytes] | None = None
 
 
 def _stamps(opened: log.Log, topic: str, known: Sequence[int]) -> Ints:
@@ -61,7 +62,7 @@ def write(
     shown = _shown(opened, prefix, made)
     outdated = {topic + suffix for topic in shown for suffix in views.SUFFIXES}
     drawn = _Drawn(prefix, picture_ns, stamp_ns, planes)
-    if any(channel.schema is not DETECTIONS for channel in shown.values()):
+    if any(channel.schema in _ON_GROUND for channel in shown.values()):
         outdated.add(drawn.frame_topic)
     # All that is read, before anything is written: the log is changed in place.
     start_ns = _start_ns(opened, prefix, shown, picture_ns)
@@ -70,7 +71,7 @@ def write(
     with log.extend(opened, output, drop={*made, *outdated}, drop_attachments=ATTACHMENTS) as writer:
         streams: list[Iterator[Numbered]] = []
         for topic, channel in made.items():
-            record = (channel.schema.name, "protobuf", channel.schema.descriptor)
+            record = channel.record or (channel.schema.name, "protobuf", channel.schema.descriptor)
             made_by = channel.provenance.transform  # results of one stage share chunks, so that they can go together
             number = writer.add_channel(topic, record, "protobuf", channel.provenance.to_metadata(), group=made_by)
             streams.append(_with_number(number, channel.messages))
@@ -147,12 +148,12 @@ class _Drawn:
             if len(self._picture_ns):
                 drawn = drawing.on_pictures(self._picture_ns, self._stamp_ns, trails=not is_full_elsewhere)
                 yield View(topic + views.SUFFIX, foxglove.ANNOTATIONS, made_from, group, drawn)
-            if channel.schema is not DETECTIONS and not is_full_elsewhere:
+            if channel.schema in _ON_GROUND and not is_full_elsewhere:
                 own_ns = np.array([frame.t_ns for frame in channel.frames], np.int64)
                 t_ns = self._picture_ns if len(self._picture_ns) else own_ns
                 scene = drawing.on_ground(t_ns, self._frame_id)
                 yield View(topic + views.SCENE_SUFFIX, foxglove.SCENE, made_from, group, scene)
-        on_ground = {topic: channel for topic, channel in shown.items() if channel.schema is not DETECTIONS}
+        on_ground = {topic: channel for topic, channel in shown.items() if channel.schema in _ON_GROUND}
         if on_ground:
             frame = foxglove.pack_transform(start_ns, views.ground.world_of(self._prefix), self._frame_id)
             topic, channel = next(iter(on_ground.items()))
@@ -215,6 +216,8 @@ def _write_by_time(writer: log.LogWriter, streams: Iterable[Iterator[Numbered]])
 
 #: Channels without a view: they show what others show, at fewer times.
 _NOT_SHOWN: Final = ("/samples", "/online")
+#: What has a view in metres.
+_ON_GROUND: Final = (TRACKS, PREDICTIONS, GROUND_PLANE)
 #: What made the channels that came into the log with labels.
 _INGESTED: Final = "ingest"
 

@@ -31,6 +31,8 @@ _KINDS: Final = (
     ("Truth", ("truth",)),
 )
 _TILT_DEG: Final = 45.0
+#: Below a channel of tracks: what happened to them, in words.
+_EVENTS: Final = "/events/view/log"
 
 
 class There(NamedTuple):
@@ -54,6 +56,10 @@ class There(NamedTuple):
         """Whether there is a view of a channel."""
         return bool({name + "/view/image", name + "/view/scene"} & self.names)
 
+    def is_seen(self) -> bool:
+        """Whether there is any view."""
+        return any(name.endswith(("/view/image", "/view/scene")) for name in self.names)
+
 
 def best(names: Collection[str]) -> list[str]:
     """The channels to look at first, of those below the prefix: the best tracks, and their forecasts."""
@@ -73,13 +79,13 @@ def eye_on(places_m: Floats, planes: Planes, t_ns: int) -> Eye:
         ahead_x, ahead_y = (sight[1] - sight[0]).tolist()
         bearing = degrees(atan2(ahead_x, ahead_y)) if isfinite(ahead_x) and hypot(ahead_x, ahead_y) else 0.0
     return Eye(
-        round(float(middle[0]), 1), round(float(middle[1]), 1), round(2.0 * radius, 1), _TILT_DEG, round(bearing, 1)
+        round(float(middle[0]), 1), round(float(middle[1]), 1), round(2.4 * radius, 1), _TILT_DEG, round(bearing, 1)
     )
 
 
 def make(there: There) -> dict[str, bytes]:
     """The layout files that make sense for a log, by their names; none if there is nothing to see."""
-    if not any("/view/" in name for name in there.names):
+    if not there.is_seen():
         return {}
     made = {TRACKING: _tracking(there)}
     if sum(any(there.drawn(name) for name in names) for _, names in _KINDS) > 1:
@@ -110,6 +116,8 @@ def _comparing(there: There) -> bytes:
                 there, panels, f"ground{number}", title, found
             )
     lower = [*_ground(there, panels, "ground", "All", shown), *_plots(there, panels)]
+    told = [part for title, names in _KINDS for part in _events(there, panels, title, names)]
+    lower += [beside(told, "column")] if told else []
     return _file(panels, ("column", beside(upper), beside(lower), 50.0) if lower else beside(upper))
 
 
@@ -167,13 +175,20 @@ def _plots(there: There, panels: dict[str, Any]) -> list[Tree]:
     return ["Plot!people"]
 
 
+def _events(there: There, panels: dict[str, Any], title: str, names: Collection[str]) -> list[Tree]:
+    """What happened to the first of these channels of which that is told."""
+    found = [f"{name}{_EVENTS}" for name in names if f"{name}{_EVENTS}" in there.names][:1]
+    for topic in found:
+        panels[f"RosOut!{title}"] = layouts.log_panel(f"{title}: events", f"{there.prefix}/{topic}")
+    return [f"RosOut!{title}" for _ in found]
+
+
 def _words(there: There, panels: dict[str, Any]) -> list[Tree]:
-    topic = "events/view/log"
-    if topic in there.names:
-        panels["RosOut!events"] = layouts.log_panel("Events", f"{there.prefix}/{topic}")
-        return ["RosOut!events"]
-    panels["SourceInfo!log"] = layouts.panel("Log", {})
-    return ["SourceInfo!log"]
+    """What happened, where it is told; otherwise what is in the log."""
+    found = _events(there, panels, "Tracking", ("retracks/full", "retracks", "tracks"))
+    if not found:
+        panels["SourceInfo!log"] = layouts.panel("Log", {})
+    return found or ["SourceInfo!log"]
 
 
 def _columns(left: Sequence[Tree], right: Sequence[Tree], share: float) -> Tree:
