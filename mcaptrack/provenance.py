@@ -20,7 +20,10 @@ CLOCK: Final = "mcaptrack.clock"
 
 @dataclass(frozen=True)
 class Provenance:
-    """What made a channel, from what, and how. ``digest`` is of its own messages, ``input_digest`` of its input's."""
+    """What made a channel, from what, and how. ``digest`` is of its own messages, ``input_digest`` of its input's.
+
+    ``reference`` is what the input was compared with; its digest is empty where there was nothing of that name.
+    """
 
     transform: str
     parameters: Mapping[str, Any]
@@ -28,6 +31,8 @@ class Provenance:
     input_digest: str = ""
     digest: str = ""
     weights_sha256: str = ""
+    reference: str = ""
+    reference_digest: str = ""
     version: str = __version__
 
     def to_metadata(self) -> dict[str, str]:
@@ -40,6 +45,8 @@ class Provenance:
             "input_digest": self.input_digest,
             "digest": self.digest,
             "weights_sha256": self.weights_sha256,
+            "reference": self.reference,
+            "reference_digest": self.reference_digest,
         }
         return {_PREFIX + key: value for key, value in values.items() if value}
 

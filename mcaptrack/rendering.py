@@ -16,10 +16,11 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaptrack import foreign, foxglove, log
+from mcaptrack import foxglove, log
 from mcaptrack.clock import NS_PER_S, seconds_to_ns
 from mcaptrack.errors import McaptrackError
-from mcaptrack.video import Encoded, colours, write_clip
+from mcaptrack.pictures import Pictures
+from mcaptrack.video import write_clip
 
 Image = NDArray[np.uint8]
 
@@ -57,16 +58,18 @@ def render(
     """
     if output.suffix.lower() not in (".mp4", ".gif"):
         raise McaptrackError(f"{output}: a video is rendered to .mp4 or .gif, not to {output.suffix or 'no suffix'}")
-    times = opened.times(picture_topic)
+    pictures = Pictures(opened, picture_topic)
+    times = pictures.t_ns
     if not len(times):
         raise McaptrackError(f"{opened.path}: {picture_topic} has no pictures")
     first = int(times[0]) + seconds_to_ns(options.start_s)
     last = int(times[-1]) if options.end_s is None else int(times[0]) + seconds_to_ns(options.end_s)
-    chosen = times[(times >= first) & (times <= last)]
+    numbers = np.flatnonzero((times >= first) & (times <= last))
     max_fps = options.max_fps or (_GIF_FPS if output.suffix.lower() == ".gif" else None)
-    if max_fps is not None and len(chosen):
-        ticks = np.floor((chosen - chosen[0]) / NS_PER_S * max_fps + 1e-6)
-        chosen = chosen[np.flatnonzero(np.diff(ticks, prepend=-1))]
+    if max_fps is not None and len(numbers):
+        ticks = np.floor((times[numbers] - times[numbers[0]]) / NS_PER_S * max_fps + 1e-6)
+        numbers = numbers[np.flatnonzero(np.diff(ticks, prepend=-1))]
+    chosen = times[numbers]
     if not len(chosen):
         span = f"{(int(times[-1]) - int(times[0])) / NS_PER_S:.3f} s"
         raise McaptrackError(f"{opened.path}: no picture lies in the seconds that were asked for; there are {span}")
@@ -74,12 +77,9 @@ def render(
     fps = Fraction(NS_PER_S, int(np.median(rest))).limit_denominator(1001) if len(rest) else Fraction(1)
 
     def drawn() -> Iterator[tuple[int, Image]]:
-        wanted = set(chosen.tolist())
-        views = [_at_times(opened.messages(topic)) for topic in view_topics]
-        done = 0
-        for frame in colours(_encoded(opened, picture_topic, last)):
-            if frame.t_ns not in wanted:
-                continue
+        span = int(chosen[0]), int(chosen[-1]) + 1
+        views = [_at_times(opened.messages(topic, *span)) for topic in view_topics]
+        for done, frame in enumerate(pictures.frames(numbers.tolist()), 1):
             image = _scaled(np.asarray(frame.rows, np.uint8), options.width_px)
             scale = image.shape[1] / frame.rows.shape[1]
             for view in views:
@@ -87,19 +87,9 @@ def render(
                 if payload is not None:
                     image = draw(image, foxglove.unpack(foxglove.ANNOTATIONS, payload), scale)
             yield frame.t_ns, image
-            done += 1
             progress("render", done, len(chosen))
 
     return write_clip(output, drawn(), fps)
-
-
-def _encoded(opened: log.Log, topic: str, last_ns: int) -> Iterator[Encoded]:
-    """Pictures from the first on: those of a video can't be decoded without those before."""
-    for index, (message, picture) in enumerate(foreign.pictures(opened, topic)):
-        if message.t_ns > last_ns:
-            return
-        where = f"{opened.path}: {topic} at {message.t_ns} ns"
-        yield Encoded(message.t_ns, index, picture.format, picture.data, picture.layout, where)
 
 
 def _at_times(messages: Iterator[log.Message]) -> Callable[[int], bytes | None]:

@@ -14,7 +14,8 @@ from pathlib import Path
 
 import pytest
 
-from mcaptrack import __version__, demo
+from mcaptrack import __version__, demo, log
+from mcaptrack.schema import COUNTS, EVENTS, EventKind
 from tests.worlds import small_scene, write_clip
 
 LAYOUTS = [".comparing.layout.json", ".layout.json"]
@@ -22,6 +23,7 @@ STAGES = ["detect", "track", "sample", "predict", "retrack", "run"]
 COMMANDS = [
     "ingest",
     *STAGES,
+    "events",
     "evaluate",
     "tune",
     "export",
@@ -519,6 +521,24 @@ def test_what_is_whole_is_recovered_and_what_is_lost_makes_the_exit_code_three(f
     assert "is both input and output" in err
     _, err = done("recover", finished, "-o", tmp_path / "all.mcap")
     assert "nothing was lost" in err
+
+
+def test_events_follow_a_run_unless_they_are_not_wanted(fresh, finished):
+    """A log with pictures: events and counts add up to what evaluate prints, by overlap."""
+    scores = json.loads(done("evaluate", finished, "--json", "--similarity", "iou", "--topic", "/camera/tracks")[0])
+    (score,) = scores["results"]
+    with log.read(finished) as opened:
+        counts = opened.rows("/camera/tracks/counts", COUNTS).rows
+        events = opened.rows("/camera/tracks/events", EVENTS).rows
+        assert "/camera/retracks/events/view/log" in opened.channels
+    assert counts["mota"][-1] == pytest.approx(score["MOTA"], abs=1e-12)
+    assert (counts["misses"].sum(), counts["false_tracks"].sum()) == (score["FN"], score["FP"])
+    assert (events["kind"] == EventKind.SWITCH).sum() == counts["switches"][-1] == score["IDSW"]
+    done("run", fresh, "--no-events", "--no-tables")
+    out, _ = done("run", fresh, "--no-tables", "--json")
+    (result,) = json.loads(out)["results"]
+    assert result["stages"] == ["events"]
+    assert result["events"]["/camera/tracks"]["birth"] == counts["born"][-1]
 
 
 def test_channels_are_dropped_with_their_views_and_nothing_else(finished, tmp_path):

@@ -255,10 +255,9 @@ class TestTraining:
         trained = fit(replace(SMALL, epochs=8), crowd, tmp_path)
         noisy = {name: scores["ADE_m"] for name, scores in trained.scores["noisy"].items()}
         assert noisy["red"] < min(noisy["kalman"], noisy["cv"])  # a fresh network is the Kalman filter
-        # Each step is calibrated on whichever windows take less: neither are held by more than 95 %.
+        # Every step is calibrated on windows as they are and with noise together.
         held = [scores["red"]["coverage_95"] for scores in trained.scores.values()]
-        assert max(held) == pytest.approx(0.95, abs=0.02)
-        assert max(held) < 0.955
+        assert np.mean(held) == pytest.approx(0.95, abs=0.005)
         card = load(trained.weights).card
         assert (card["data"], card["network"], json.loads(card["recipe"])["epochs"]) == ("a test", "red", "8")
         rows = list(csv.DictReader((tmp_path / "epochs.csv").read_text().splitlines()))

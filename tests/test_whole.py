@@ -102,12 +102,12 @@ def test_pairs_are_the_best_there_are(seed):
 
 
 class TestLinks:
-    def follows(self, *people: tuple[int, np.ndarray], odds: float = 5.0) -> list[int]:
+    def follows(self, *people: tuple[int, np.ndarray]) -> list[int]:
         step = np.concatenate([start + np.arange(len(xy)) for start, xy in people])
         track = np.repeat(np.arange(len(people)), [len(xy) for _, xy in people])
         _, _, paths = laid(step, track, np.concatenate([xy for _, xy in people]), WALKER.noise_m)
         forward, backward, _ = smooth(WALKER, paths, STEP_S)
-        return link(WALKER, paths, forward, backward, STEP_S, 14.0, 0.5, np.full(len(people), odds)).tolist()
+        return link(WALKER, paths, forward, backward, STEP_S, 14.0, 0.5).tolist()
 
     def walking(self, x: float, y: float, steps: int = 12, speed: float = 0.5) -> np.ndarray:
         return np.stack([x + speed * np.arange(steps), np.full(steps, y)], axis=-1)
@@ -133,11 +133,6 @@ class TestLinks:
             (18, self.walking(9, 1.2)),
         ]
         assert self.follows(*people) == [2, 3, -1, -1]
-
-    def test_nobody_s_tracks_are_linked_less_easily(self):
-        people = (0, self.walking(0, 0)), (26, self.walking(14.2, 0.4))
-        assert self.follows(*people, odds=5.0) == [1, -1]
-        assert self.follows(*people, odds=-30.0) == [-1, -1]
 
 
 class TestMeetings:

@@ -35,7 +35,14 @@ PAPER, AUTHORS, DEFAULT = PROFILES["paper"], PROFILES["authors"], PROFILES["defa
 #: Nothing done after the fact.
 _PLAIN = {"link_s": 0.0, "part": False, "smooth": False, "min_certainty": 0.0}
 _NOW = replace(
-    AUTHORS, distance="now", certain_distance=0.0, birth="raw", filled=False, min_history=2, backfill="unclaimed"
+    AUTHORS,
+    distance="now",
+    certain_distance=0.0,
+    birth="raw",
+    filled=False,
+    min_history=2,
+    backfill="unclaimed",
+    confirm=False,
 )
 #: The way from the paper to the default, one step a row; each row's options are those of `mcaptrack retrack`.
 ABLATION: dict[str, tuple[str, Retrack]] = {
@@ -43,7 +50,7 @@ ABLATION: dict[str, tuple[str, Retrack]] = {
     "authors": ("--profile authors", AUTHORS),
     "expected against seen position now": (
         "--profile authors --distance now --certain-distance 0 --birth raw --no-filled --min-history 2 "
-        "--backfill unclaimed",
+        "--backfill unclaimed --no-confirm",
         _NOW,
     ),
     "computed covariance": (

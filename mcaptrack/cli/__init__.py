@@ -13,6 +13,7 @@ from mcaptrack import __version__
 from mcaptrack.cli.common import register
 from mcaptrack.cli.demo import demo
 from mcaptrack.cli.evaluate import evaluate
+from mcaptrack.cli.events import events
 from mcaptrack.cli.files import check, drop, recover
 from mcaptrack.cli.ingest import ingest
 from mcaptrack.cli.render import render
@@ -51,6 +52,7 @@ def _main(
 
 register(app, "ingest", ingest)
 add_stages(app)
+register(app, "events", events)
 register(app, "evaluate", evaluate)
 register(app, "tune", tune)
 register(app, "export", export)

@@ -49,7 +49,8 @@ def demo(
         ingest(footage.video, target, options, progress=talk.progress)
         with log.read(target) as opened:
             prefix = pipeline.find_camera(opened, None)
-            report = pipeline.run(opened, prefix, pipeline.plan_all(opened, prefix), progress=talk.progress)
+            jobs, watch = pipeline.plan_all(opened, prefix), pipeline.Watch()
+            report = pipeline.run(opened, prefix, jobs, progress=talk.progress, watch=watch)
         layouts = [pipeline.layout_path(target, name) for name in report.layouts]
         for path, content in zip(layouts, report.layouts.values(), strict=True):
             publish_bytes(path, content)

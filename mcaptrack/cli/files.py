@@ -148,7 +148,7 @@ def drop(
 ) -> None:
     """Leave channels out of a log, in place or in a copy; all others stay as they are, to the byte.
 
-    With a channel goes what was made only to show it, its `/view/`.
+    With a channel goes what was made only to show it and to tell of it: its `/view/`, its `/events`, its `/counts`.
 
     Example: mcaptrack drop log.mcap /camera/video -o small.mcap
     """
@@ -178,7 +178,10 @@ def drop(
 
 
 def _chosen(opened: Log, patterns: list[str]) -> set[str]:
-    """The topics that fit any of the patterns, with their views. Raises McaptrackError for one that fits none."""
+    """The topics that fit any of the patterns, with what only tells of them.
+
+    Raises McaptrackError for a pattern that fits none.
+    """
     from fnmatch import fnmatchcase
 
     from mcaptrack.provenance import Provenance
@@ -189,8 +192,7 @@ def _chosen(opened: Log, patterns: list[str]) -> set[str]:
         if not found:
             opened.channel(pattern)  # says what there is
         chosen |= found
-    for topic, channel in opened.channels.items():
-        made = Provenance.from_metadata(channel.metadata)
-        if made and made.transform == "view" and made.input in chosen:
-            chosen.add(topic)
+    made = {topic: Provenance.from_metadata(channel.metadata) for topic, channel in opened.channels.items()}
+    for transform in ("events", "view"):  # in this order: events have views
+        chosen |= {topic for topic, how in made.items() if how and how.transform == transform and how.input in chosen}
     return chosen

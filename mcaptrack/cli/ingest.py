@@ -42,8 +42,29 @@ def ingest(
         ),
     ] = None,
     image_format: Annotated[
-        Literal["h264", "jpeg", "png"], common.option("--image-format", help="How pictures are kept.")
-    ] = "h264",
+        Literal["auto", "h264", "h265", "jpeg", "png"],
+        common.option(
+            "--image-format",
+            help="How pictures are kept. auto: H.264, VP9 and AV1 as they are where viewers play them, else as H.264; "
+            "h264: nothing but H.264; h265: as auto, and H.265 as it is; jpeg, png: every picture alone.",
+        ),
+    ] = "auto",
+    quality: Annotated[
+        int | None,
+        common.option(
+            "--quality",
+            help="Of what is encoded: H.264's constant rate factor, 1 (best) to 51; JPEG's quality, 1 to 100 (best).",
+            show_default="23; JPEG 90",
+        ),
+    ] = None,
+    keyframe_interval_s: Annotated[
+        float | None,
+        common.option(
+            "--keyframe-interval-s",
+            help="Key pictures are at most so far apart, in seconds; a stream that has fewer is encoded again.",
+            show_default="2 in what is kept as it is, 1 in what is encoded",
+        ),
+    ] = None,
     ground_plane: Annotated[
         Path | None,
         common.option("--ground-plane", help="3x3 homography from pixels to metres.", show_default=False),
@@ -75,7 +96,8 @@ def ingest(
     """Make a log of a video, a folder of images, a ROS bag, an MCAP file, or a label file.
 
     Writes /camera/video, /camera/ground_plane, /camera/detections, /camera/tracks and /camera/truth, as far as they are
-    given. An H.264 stream that viewers can play is passed on as it is; others are encoded again.
+    given. A stream that viewers can play (H.264, VP9, AV1) is passed on as it is; others are encoded again, as H.264,
+    and the reason is said. Times are those of the file, to the nanosecond.
 
     Of a ROS 1 bag, a rosbag2 folder or database, or an MCAP file every message stays as it is, with its times; labels
     stand beside the pictures of its only camera, or of the one that --camera names.
@@ -97,6 +119,8 @@ def ingest(
         fps=_fps(fps),
         start_ns=_start_ns(start_time),
         image_format=image_format,
+        quality=quality,
+        keyframe_interval_s=keyframe_interval_s,
         ground_plane=ground_plane,
         point=point,
         labels={name: path for name, path in given.items() if path is not None},  # type: ignore[misc]
@@ -114,6 +138,8 @@ def ingest(
                 with log.read(into) as opened:
                     opened.lock()
                     report = make_log(source, target, options, into=opened, force=force, progress=talk.progress)
+            for words in report.said:
+                talk.say(words)
             for words in report.notes:
                 talk.detail(words)
             for words in report.lost:
@@ -121,7 +147,12 @@ def ingest(
             lost |= bool(report.lost)
             talk.say(f"{target}: " + ", ".join(f"{topic} {count}" for topic, count in report.messages.items()))
             results.append(
-                {"log": str(target), "messages": report.messages, "notes": report.notes, "lost": report.lost}
+                {
+                    "log": str(target),
+                    "messages": report.messages,
+                    "notes": report.said + report.notes,
+                    "lost": report.lost,
+                }
             )
     if json:
         common.print_json({"results": results})

@@ -6,7 +6,7 @@ import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, get_type_hints
 
 import typer
 
@@ -15,6 +15,9 @@ from mcaptrack.cli.config import NAME, settings_of
 from mcaptrack.errors import McaptrackError
 from mcaptrack.transforms import ALTERNATIVES, PROFILES, TRANSFORMS, Transform
 from mcaptrack.transforms.protocol import bare_type
+
+if TYPE_CHECKING:
+    from mcaptrack.pipeline import Watch
 
 #: What a command says of itself, beyond its transform.
 _WORDS: Final = {
@@ -124,7 +127,7 @@ def _stage_command(name: str, kind: type[Transform]) -> Callable[..., None]:
                 raise McaptrackError(f"{flag} is an option of {' and '.join(there[option])}, not of {one}")
         transform = replace(base, **wanted)
         keep = _OUTPUTS_OF[given["mode"]] if name == "retrack" else None
-        _run_on_logs(given, lambda plan: plan.stage(name, transform, given["topic"], given["to"], keep))
+        run_on_logs(given, lambda plan: plan.stage(name, transform, given["topic"], given["to"], keep))
 
     command.__name__ = name
     command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
@@ -138,6 +141,7 @@ def run_all(
     camera: common.Camera = None,
     output: common.Output = None,
     sidecar: common.Sidecar = False,
+    events: Annotated[bool, common.option("--events/--no-events", help="Tell what happened to identities.")] = True,
     tables: Annotated[bool, common.option("--tables/--no-tables", help="Write Parquet tables beside the log.")] = True,
     force: common.Force = False,
     json: common.Json = False,
@@ -145,15 +149,41 @@ def run_all(
     verbose: common.Verbose = False,
     config: common.Config = None,
 ) -> None:
-    """Run all stages that are missing or out of date, then views and tables.
+    """Run all stages that are missing or out of date, then events, views and tables.
 
     From /camera/video (or whatever of detections, tracks and samples there is) to /camera/predictions and
-    /camera/retracks, and Parquet tables beside the log. With --topic from the pictures, or the boxes, of that channel.
+    /camera/retracks, what happened to identities (see `mcaptrack events`), and Parquet tables beside the log. With
+    --topic from the pictures, or the boxes, of that channel.
 
     Example: mcaptrack run log.mcap
     """
     given = {"logs": logs, "camera": camera, "output": output, "sidecar": sidecar, "topic": topic, "force": force}
-    _run_on_logs(given | {"json": json, "quiet": quiet, "verbose": verbose}, lambda plan: plan.all(topic), tables)
+    settings = settings_of("events")
+    given |= {"json": json, "quiet": quiet, "verbose": verbose}
+    run_on_logs(
+        given,
+        lambda plan: plan.all(topic),
+        tables,
+        watched(settings.get("similarity"), settings.get("gate")) if events else None,
+    )
+
+
+def watched(similarity: Any, gate: Any, **chosen: Any) -> Watch:
+    """What `mcaptrack events` and `run` are to look for.
+
+    Raises McaptrackError for what can't be a similarity or a gate: in a file may stand anything.
+    """
+    from mcaptrack.evaluation.events import EventOptions
+    from mcaptrack.pipeline import Watch
+
+    if similarity not in (None, "iou", "metres"):
+        raise McaptrackError(f"--similarity is iou or metres, not {similarity!r}")
+    most = 1 if similarity == "iou" else 1e6
+    if gate is not None and not (isinstance(gate, float | int) and 0 < gate <= most):
+        raise McaptrackError(f"--gate is a share of overlap up to 1, or a distance in metres, not {gate!r}")
+    if gate is not None and similarity is None:
+        raise McaptrackError("--gate needs --similarity: it is a share of overlap for iou, a distance for metres")
+    return Watch(EventOptions(similarity, gate), **chosen)
 
 
 def _configured() -> dict[str, Transform]:
@@ -194,7 +224,10 @@ class _Plan:
         return pipeline.plan_all(self._opened, self._prefix, self._say, topic, _configured())
 
 
-def _run_on_logs(given: Mapping[str, Any], make_plan: Callable[[_Plan], Any], tables: bool = False) -> None:
+def run_on_logs(
+    given: Mapping[str, Any], make_plan: Callable[[_Plan], Any], tables: bool = False, watch: Watch | None = None
+) -> None:
+    """Plan and run on every log, and say and print what came of it."""
     from mcaptrack import log, pipeline
     from mcaptrack.atomic import is_same_file, publish_bytes, refuse_overwrite
     from mcaptrack.export import default_folder, export
@@ -215,13 +248,17 @@ def _run_on_logs(given: Mapping[str, Any], make_plan: Callable[[_Plan], Any], ta
             with log.read(path, sidecar=given["sidecar"] or None) as opened:
                 if output is None:
                     opened.lock()  # a second writer is turned away before it computes anything
-                prefix = pipeline.find_camera(opened, given["camera"], given["topic"])
+                camera = given["camera"] or (pipeline.camera_of(opened, watch.topics) if watch else None)
+                prefix = pipeline.find_camera(opened, camera, given["topic"])
                 jobs = make_plan(_Plan(opened, prefix, talk.say))
-                report = pipeline.run(opened, prefix, jobs, output, talk.progress, talk.say)
+                report = pipeline.run(opened, prefix, jobs, output, talk.progress, talk.say, watch)
             for name, content in report.layouts.items():
                 publish_bytes(pipeline.layout_path(target, name), content)
             for topic, count in report.frames.items():
                 talk.detail(f"{target}: {topic} {count} frames")
+            for topic, kinds in report.events.items():
+                words = ", ".join(f"{kind} {count}" for kind, count in kinds.items() if count) or "nothing happened"
+                (talk.say if watch and watch.again else talk.detail)(f"{topic}: {words}")
             for topic in report.stale:
                 talk.say(
                     f"{topic} was made from what has just been replaced; `mcaptrack run {target}` brings it up to date"
@@ -234,6 +271,7 @@ def _run_on_logs(given: Mapping[str, Any], make_plan: Callable[[_Plan], Any], ta
                 talk.detail(f"{folder}: {', '.join(f'{name} {rows}' for name, rows in written.items())}")
             done = ", ".join(report.stages) or "nothing to do, everything is up to date"
             talk.say(f"{target}: {done}")
-            reports.append({"log": str(target), "stages": report.stages, "frames": report.frames, "tables": written})
+            data = {"stages": report.stages, "frames": report.frames, "events": report.events, "tables": written}
+            reports.append({"log": str(target)} | data)
     if given["json"]:
         common.print_json({"results": reports})

@@ -37,6 +37,7 @@ __all__ = [
     "is_compressed",
     "is_picture",
     "picture_decoder",
+    "picture_reader",
     "pictures",
     "stamps",
 ]
@@ -102,6 +103,11 @@ def pictures(opened: log.Log, topic: str) -> Iterator[tuple[log.Message, Picture
     yield from _decoded(opened, topic, picture_decoder)
 
 
+def picture_reader(opened: log.Log, topic: str) -> Callable[[log.Message], Picture]:
+    """What makes pictures of the messages of a channel; it and what it returns raise as ``pictures`` does."""
+    return _reader(opened, topic, picture_decoder)
+
+
 def stamps(opened: log.Log, topic: str) -> Ints:
     """The stamps of a channel's pictures, in the order of their log times."""
     return np.array([picture.stamp_ns for _, picture in pictures(opened, topic)], np.int64)
@@ -114,6 +120,13 @@ def detections(opened: log.Log, topic: str) -> list[Frame]:
 
 
 def _decoded(opened: log.Log, topic: str, make: Callable[[Kind], Callable[[bytes], Any]]) -> Iterator[tuple[Any, Any]]:
+    read = _reader(opened, topic, make)
+    return ((message, read(message)) for message in opened.messages(topic))
+
+
+def _reader(
+    opened: log.Log, topic: str, make: Callable[[Kind], Callable[[bytes], Any]]
+) -> Callable[[log.Message], Any]:
     channel = opened.channel(topic)
     index = opened.part(channel.topic).index
     schema = index.schemas.get(index.channels[channel.id].schema_id)
@@ -122,12 +135,14 @@ def _decoded(opened: log.Log, topic: str, make: Callable[[Kind], Callable[[bytes
         decode = make(Kind(*words, channel.message_encoding))
     except McaptrackError as error:
         raise McaptrackError(f"{opened.path}: {topic}: {error}") from None
-    for message in opened.messages(topic):
+
+    def read(message: log.Message) -> Any:
         try:
-            out = decode(message.payload)
+            return decode(message.payload)
         except McaptrackError as error:
             raise McaptrackError(f"{opened.path}: {topic} at {message.t_ns} ns: {error}") from None
-        yield message, out
+
+    return read
 
 
 def _guarded(kind: Kind, convert: Callable[[Any], Any]) -> Callable[[bytes], Any]:

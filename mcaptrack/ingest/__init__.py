@@ -26,9 +26,27 @@ from mcaptrack.video import IMAGE_SUFFIXES, ImageFormat, Video, open_video, seqi
 
 __all__ = ["Format", "ImageFormat", "IngestOptions", "Report", "Role", "ingest", "label_frames"]
 
-VIDEO_SUFFIXES: Final = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v", ".ts", ".h264", ".264", ".mpg", ".mpeg")
+VIDEO_SUFFIXES: Final = (
+    ".mp4",
+    ".mov",
+    ".mkv",
+    ".avi",
+    ".webm",
+    ".m4v",
+    ".ts",
+    ".h264",
+    ".264",
+    ".mpg",
+    ".mpeg",
+    ".h265",
+    ".265",
+    ".hevc",
+    ".ivf",
+    ".obu",
+)
 #: The step of labels in formats that are annotated on the clock of prediction.
 _LABEL_STEP_S: Final = Fraction(2, 5)
+_FOXGLOVE_ALONE: Final = {"vp9": "VP9", "av1": "AV1"}
 _SDD_FPS: Final = Fraction(30)
 
 
@@ -83,7 +101,7 @@ class _VideoJob(PictureJob):
         self._progress = progress
         if options.role:
             raise McaptrackError(f"{source} is no label file; --as is for those")
-        self.video: Video = open_video(source)
+        self.video: Video = open_video(source, options.keep)
         if self.video.images and not (options.fps or self.video.fps):
             raise McaptrackError(f"{source}: a folder of images has no clock; give the frames per second with --fps")
         self._plane = self.plane(self.video.width_px, self.video.height_px)
@@ -93,15 +111,22 @@ class _VideoJob(PictureJob):
         yield from super().topics()
 
     def write(self, writer: log.LogWriter, has_clock: bool) -> None:
-        options, video = self.options, self.video
+        options, video, keep = self.options, self.video, self.options.keep
         start_ns = video.start_ns if options.start_ns is None else options.start_ns
         start_ns = 0 if start_ns is None else start_ns
-        is_video = options.image_format == "h264"
-        schema_name = foxglove.VIDEO if is_video else foxglove.IMAGE
-        words = {"file": video.path.name, "image_format": options.image_format}
-        if is_video and video.why_transcode:
-            words["encoded_again_because"] = video.why_transcode
-            self.report.notes.append(f"{video.path} is encoded again: {video.why_transcode}")
+        schema_name = foxglove.IMAGE if keep.is_still else foxglove.VIDEO
+        words: dict[str, str | int | float] = {"file": video.path.name, "image_format": video.format}
+        if options.fps is not None:
+            words["fps"] = str(options.fps)
+        if video.why_transcode:
+            words |= {"encoded_again_because": video.why_transcode}
+            words |= {"crf": keep.crf, "keyframe_interval_s": keep.key_every_s}
+            self.report.said.append(f"{video.path} is encoded again, as H.264: {video.why_transcode}")
+        elif video.format in _FOXGLOVE_ALONE:
+            kept = f"{video.path} is kept as {_FOXGLOVE_ALONE[video.format]}, which Foxglove plays"
+            self.report.said.append(f"{kept} and Lichtblick does not (--image-format h264 is for both)")
+        elif video.format == "jpeg":
+            words["quality"] = keep.jpeg_quality
         channel = writer.add_channel(
             f"{self.prefix}/video",
             foxglove.schema_record(schema_name),
@@ -112,14 +137,15 @@ class _VideoJob(PictureJob):
         writer.add_metadata(CLOCK, {"start_ns": str(start_ns)})
         times: list[int] = []
         frame_id = self.prefix.lstrip("/")
-        for picture in video.pictures(options.image_format, options.fps, start_ns):
-            data = foxglove.pack_picture(schema_name, picture.t_ns, frame_id, options.image_format, picture.data)
+        for picture in video.pictures(start_ns):
+            data = foxglove.pack_picture(schema_name, picture.t_ns, frame_id, video.format, picture.data)
             writer.add_message(channel, picture.t_ns, picture.index, data)
             times.append(picture.t_ns)
             self._progress("ingest", len(times), max(video.frames, len(times)))
         if not times:
             raise McaptrackError(f"{video.path} is a video without frames")
         self.report.messages[f"{self.prefix}/video"] = len(times)
+        self.report.said += video.notes
         self.report.lost += video.lost
         self.write_plane(writer, self._plane, times[0])
         self.write_labels(writer, self._plane, {role: self.label_times(role, times) for role in self.labels})
@@ -135,8 +161,8 @@ class _LabelJob(Job):
         role = role or ("tracks" if labels.identified else "detections")
         if role in self.labels:
             raise McaptrackError(f"{source} and {self.labels[role][0]} are both {role}; say with --as what {source} is")
-        if options.image_format != "h264":
-            raise McaptrackError(f"{source} is a label file; --image-format is for videos")
+        if options.for_videos():
+            raise McaptrackError(f"{source} is a label file; {options.for_videos()} is for videos")
         self.labels = {role: (source, labels), **self.labels}
         self.check_labels()
         self._fps = {

@@ -29,7 +29,7 @@ class LogJob(PictureJob):
             for given, name in (
                 (options.fps, "--fps"),
                 (options.start_ns is not None, "--start-time"),
-                (options.image_format != "h264", "--image-format"),
+                (options.for_videos(), options.for_videos()),
                 (options.role, "--as"),
             ):
                 if given:

@@ -22,7 +22,7 @@ from mcaptrack.plane import GroundPlane, Point
 from mcaptrack.provenance import CLOCK, Provenance, digest
 from mcaptrack.schema import DETECTIONS, GROUND_PLANE, TRACKS, Frame, Rows, Schema
 from mcaptrack.schema.ground import plane_to_rows
-from mcaptrack.video import ImageFormat
+from mcaptrack.video import ImageFormat, Keep
 
 Ints = NDArray[np.int64]
 Progress = Callable[[str, int, int], None]
@@ -32,24 +32,49 @@ _SCHEMA_OF: Final[Mapping[Role, Schema]] = {"detections": DETECTIONS, "tracks": 
 
 @dataclass(frozen=True, kw_only=True)
 class IngestOptions:
-    """How to make a log. ``labels`` maps what a label file says to the file; ``role`` is for an input that is one."""
+    """How to make a log. ``labels`` maps what a label file says to the file; ``role`` is for an input that is one.
+
+    ``fps``, ``image_format``, ``quality`` and ``keyframe_interval_s`` are as in ``video.Keep``.
+    """
 
     camera: str = "camera"
     fps: Fraction | None = None
     start_ns: int | None = None
-    image_format: ImageFormat = "h264"
+    image_format: ImageFormat = "auto"
+    quality: int | None = None
+    keyframe_interval_s: float | None = None
     ground_plane: Path | None = None
     point: Point = "foot"
     labels: Mapping[Role, Path] = field(default_factory=dict)
     label_format: Format = "auto"
     role: Role | None = None
 
+    @property
+    def keep(self) -> Keep:
+        """How pictures are kept. Raises McaptrackError for what does not go together."""
+        return Keep(
+            image_format=self.image_format,
+            quality=self.quality,
+            keyframe_interval_s=self.keyframe_interval_s,
+            fps=self.fps,
+        )
+
+    def for_videos(self) -> str:
+        """The first option given that is about the pictures of videos; "" if there is none."""
+        given = {
+            "--image-format": self.image_format != "auto",
+            "--quality": self.quality is not None,
+            "--keyframe-interval-s": self.keyframe_interval_s is not None,
+        }
+        return next((name for name, is_given in given.items() if is_given), "")
+
 
 @dataclass
 class Report:
-    """What became of an input: messages by topic, words worth saying, and what was lost."""
+    """What became of an input: messages by topic, what to say of it (``notes``: to some), what was lost."""
 
     messages: dict[str, int] = field(default_factory=dict)
+    said: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     lost: list[str] = field(default_factory=list)
 

@@ -31,31 +31,41 @@ def clear(matchup: Matchup, rules: Rules = "trackeval") -> Counts:
     before where it can. "motmetrics" follows py-motmetrics: first every person keeps the track it had last, however
     long ago; then the others are assigned, as many as possible and then as near as possible.
     """
-    pairs, by_devkit = matchup.pairs, rules == "trackeval"
-    near = pairs.similarity >= matchup.threshold - _EPS if by_devkit else pairs.similarity >= matchup.threshold
-    memory = _Memory(matchup)
-    found = matchup.solved(pairs.where(near), memory.pairs_trackeval if by_devkit else memory.pairs_motmetrics)
-
+    by_devkit = rules == "trackeval"
+    found = matches(matchup, rules)
     present = np.bincount(matchup.all_truth, minlength=matchup.n_truth)
     tracked = np.bincount(found.who, minlength=matchup.n_truth)[present > 0]
     ratio = tracked / present[present > 0]
     mostly = ratio > 0.8 if by_devkit else ratio >= 0.8
     lost = ratio < 0.2
-    order = np.lexsort((found.frame, found.who))
-    who, by = found.who[order], found.by[order]
-    again = who[1:] == who[:-1]
     return {
-        "TP": len(who),
-        "FP": matchup.track_rows - len(who),
-        "FN": matchup.truth_rows - len(who),
-        "IDSW": int((again & (by[1:] != by[:-1])).sum()),
-        "Frag": _breaks_trackeval(matchup, found.where(order)) if by_devkit else _breaks_motmetrics(matchup, found),
+        "TP": len(found.who),
+        "FP": matchup.track_rows - len(found.who),
+        "FN": matchup.truth_rows - len(found.who),
+        "IDSW": int(switched(found).sum()),
+        "Frag": _breaks_trackeval(matchup, found) if by_devkit else _breaks_motmetrics(matchup, found),
         "MT": int(mostly.sum()),
         "PT": int((~mostly & ~lost).sum()),
         "ML": int(lost.sum()),
         "GT": int((present > 0).sum()),
         "similarity_sum": float(found.similarity.sum()),
     }
+
+
+def matches(matchup: Matchup, rules: Rules = "trackeval") -> Pairs:
+    """Who is matched with which track in which frame, by person and then by frame."""
+    pairs, by_devkit = matchup.pairs, rules == "trackeval"
+    near = pairs.similarity >= matchup.threshold - _EPS if by_devkit else pairs.similarity >= matchup.threshold
+    memory = _Memory(matchup)
+    found = matchup.solved(pairs.where(near), memory.pairs_trackeval if by_devkit else memory.pairs_motmetrics)
+    return found.where(np.lexsort((found.frame, found.who)))
+
+
+def switched(found: Pairs) -> NDArray[np.bool_]:
+    """Which of these matches (P,), ordered by person and frame, are with another track than the person's last."""
+    out = np.zeros(len(found.who), bool)
+    out[1:] = (found.who[1:] == found.who[:-1]) & (found.by[1:] != found.by[:-1])
+    return out
 
 
 def _breaks_trackeval(matchup: Matchup, found: Pairs) -> int:

@@ -3,6 +3,7 @@
 A stage runs on a log that stands and adds its channels to it, with what they were made from and how.
 """
 
+from mcaptrack.pipeline.events import Watch, camera_of
 from mcaptrack.pipeline.plan import (
     DEFAULT_CAMERA,
     ROUTES,
@@ -24,7 +25,9 @@ __all__ = [
     "Job",
     "Report",
     "Route",
+    "Watch",
     "attachment_of",
+    "camera_of",
     "find_camera",
     "find_views",
     "input_of",

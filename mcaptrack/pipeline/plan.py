@@ -219,11 +219,19 @@ def _made_by_stage(channel: log.Channel) -> bool:
 
 
 def is_stale(opened: log.Log, topic: str) -> bool:
-    """Whether the channel that ``topic`` was made from has been replaced since."""
+    """Whether the channel that ``topic`` was made from, or compared with, has been replaced since."""
     made = Provenance.from_metadata(opened.channel(topic).metadata)
-    source = opened.channels.get(made.input) if made else None
-    now = Provenance.from_metadata(source.metadata) if source else None
-    return bool(made and now and now.digest and now.digest != made.input_digest)
+    if made is None:
+        return False
+    if made.reference and (made.reference in opened.channels) != bool(made.reference_digest):
+        return True
+    pairs = ((made.input, made.input_digest), (made.reference, made.reference_digest))
+    for name, then in pairs:
+        source = opened.channels.get(name)
+        now = Provenance.from_metadata(source.metadata) if source else None
+        if now and now.digest and now.digest != then:
+            return True
+    return False
 
 
 def _transform_of(stage: str, channel: log.Channel) -> Transform:

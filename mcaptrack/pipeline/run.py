@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 from mcaptrack import foreign, log
 from mcaptrack.carry import carry
 from mcaptrack.clock import NS_PER_S
+from mcaptrack.pipeline.events import STAGE as EVENTS_STAGE
+from mcaptrack.pipeline.events import Watch, make_events, tally
 from mcaptrack.pipeline.plan import FULL, ROUTES, Job, check_inputs, picture_topic
 from mcaptrack.pipeline.write import Made, write
 from mcaptrack.plane import GroundPlane, Planes, assumed_plane
@@ -35,13 +37,15 @@ _ASSUME: Final = "assume-ground-plane"
 class Report:
     """What a run did: the stages that ran, the frames of each topic they made, and the layouts for their views.
 
-    ``stale`` are the channels that were made from something that has now been replaced.
+    ``stale`` are the channels that were made from something that has now been replaced. ``events`` says for each
+    channel of tracks how many events of each kind were found.
     """
 
     stages: list[str] = field(default_factory=list)
     frames: dict[str, int] = field(default_factory=dict)
     layouts: dict[str, bytes] = field(default_factory=dict)
     stale: list[str] = field(default_factory=list)
+    events: dict[str, dict[str, int]] = field(default_factory=dict)
 
 
 def run(
@@ -51,8 +55,11 @@ def run(
     output: Path | None = None,
     progress: Progress = lambda *_: None,
     say: Say = lambda _: None,
+    watch: Watch | None = None,
 ) -> Report:
     """Run the jobs and put their channels and the views of these into the log, or into a copy of it at ``output``.
+
+    With ``watch`` the events of tracks follow as the last stage, as far as they are missing or out of date.
 
     Nothing is written until everything is computed; then the log is replaced as a whole.
     """
@@ -70,6 +77,12 @@ def run(
         for result in transform(frames):
             for frame, channel in zip(result, outputs, strict=True):
                 channel.append(frame)
+        seen = len(stamps.get(job.source, ())) if job.source not in made else 0
+        if job.transform.reads is VIDEO and seen > len(outputs[0]):
+            say(
+                f"{job.source}: {seen - len(outputs[0])} of {seen} messages were left out: a video has to begin with a "
+                "key picture that has its parameter sets"
+            )
         weights = weights_sha256(transform.predictor) if hasattr(transform, "predictor") else ""
         for (topic, schema), channel in zip(job.outputs().items(), outputs, strict=True):
             if topic not in job.kept():
@@ -82,12 +95,18 @@ def run(
         if job.target + FULL in job.kept():
             made |= _carried(opened, job, made, planes or ())
         report.stages.append(job.stage)
+    if watch is not None:
+        happened = make_events(opened, prefix, made, watch, say)
+        made |= happened
+        report.frames |= {topic: len(channel.messages) for topic, channel in happened.items()}
+        report.events = tally(happened)
+        report.stages += [EVENTS_STAGE] if happened else []
     if made or output is not None:
         report.layouts = write(opened, prefix, made, planes or (), stamps, output)
     digests = {topic: channel.provenance.digest for topic, channel in made.items()}
     for topic, there in sorted(opened.channels.items()):
         known = Provenance.from_metadata(there.metadata)
-        if topic not in made and known and known.transform in TRANSFORMS and known.input in digests:
+        if topic not in made and known and known.transform in {*TRANSFORMS, EVENTS_STAGE} and known.input in digests:
             report.stale += [topic] if known.input_digest != digests[known.input] else []
     return report
 

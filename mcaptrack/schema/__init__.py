@@ -7,6 +7,7 @@ the schema record of its MCAP channel; no second description exists anywhere.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from enum import IntEnum
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
@@ -21,14 +22,17 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 __all__ = [
+    "COUNTS",
     "DETECTIONS",
     "EVENTS",
+    "EVENT_KINDS",
     "GROUND_PLANE",
     "PREDICTIONS",
     "SCHEMAS",
     "TRACKS",
     "VIDEO",
     "Column",
+    "EventKind",
     "Frame",
     "Rows",
     "Schema",
@@ -186,7 +190,32 @@ TRACKS: Final = Schema("mcaptrack.Tracks")
 PREDICTIONS: Final = Schema("mcaptrack.Predictions")
 GROUND_PLANE: Final = Schema("mcaptrack.GroundPlane")
 EVENTS: Final = Schema("mcaptrack.Events")
+COUNTS: Final = Schema("mcaptrack.Counts")
 #: Row schemas by name.
-SCHEMAS: Final = {schema.name: schema for schema in (DETECTIONS, TRACKS, PREDICTIONS, GROUND_PLANE, EVENTS)}
+SCHEMAS: Final = {schema.name: schema for schema in (DETECTIONS, TRACKS, PREDICTIONS, GROUND_PLANE, EVENTS, COUNTS)}
 #: Not rows but pictures: a transform that reads this gets the brightness of each frame.
 VIDEO: Final = Schema("foxglove.CompressedVideo")
+
+
+class EventKind(IntEnum):
+    """The column ``kind`` of events."""
+
+    MISS = 2
+    FALSE_TRACK = 3
+    SWITCH = 4
+    BIRTH = 5
+    END = 6
+    JOINED = 7
+    PARTED = 8
+
+
+#: The words for them, as the schema has them.
+EVENT_KINDS: Final = {
+    EventKind.MISS: "miss",
+    EventKind.FALSE_TRACK: "false track",
+    EventKind.SWITCH: "identity switch",
+    EventKind.BIRTH: "birth",
+    EventKind.END: "end",
+    EventKind.JOINED: "joined",
+    EventKind.PARTED: "parted",
+}

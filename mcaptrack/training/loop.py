@@ -258,19 +258,13 @@ class _Run:
     def publish(self, validation: Windows, card: dict[str, str]) -> None:
         """Calibrate the kept weights and write them, with their card.
 
-        The covariance of every step is widened or narrowed until the 95 % ellipse holds 95 % of the validation windows:
-        as they are or with noise, whichever takes less, since ``red`` tells one from the other. For ``lstm``, which
-        says no covariance, the Kalman filter's is, on both together.
+        The covariance of every step is widened or narrowed until the 95 % ellipse holds 95 % of the validation windows,
+        as they are and with noise together.
         """
-        parts = [validation, _noisy(validation)]
-        if self._recipe.network == "lstm":
-            parts = [Windows.join(parts)]
-        ratios = []
-        for part in parts:
-            forecast = self._predictor(self._best).predict(part.past, part.known)
-            away = mahalanobis_squared(forecast.mean - part.future, forecast.cov)
-            ratios.append(np.quantile(away, 0.95, axis=0) / (-2 * np.log(0.05)))
-        ratio = np.min(ratios, axis=0)
+        both = Windows.join([validation, _noisy(validation)])
+        forecast = self._predictor(self._best).predict(both.past, both.known)
+        away = mahalanobis_squared(forecast.mean - both.future, forecast.cov)
+        ratio = np.quantile(away, 0.95, axis=0) / (-2 * np.log(0.05))
         calibrated = dict(self._best)
         if self._recipe.network == "lstm":
             calibrated["spread"] = calibrated["spread"] * ratio

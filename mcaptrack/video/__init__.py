@@ -4,9 +4,10 @@ FFmpeg does the work, through PyAV; its wheels bring it along.
 """
 
 from mcaptrack.video.decode import Encoded, brightness, colours
-from mcaptrack.video.encode import H264Encoder, Image, ImageFormat, encode_image, write_clip, write_mp4
+from mcaptrack.video.encode import H264Encoder, Image, ImageFormat, Keep, encode_image, write_clip, write_mp4
 from mcaptrack.video.raw import RAW_ENCODINGS, Layout
 from mcaptrack.video.source import IMAGE_SUFFIXES, EncodedPicture, Video, open_video, seqinfo_fps
+from mcaptrack.video.streams import entry
 
 __all__ = [
     "IMAGE_SUFFIXES",
@@ -16,11 +17,13 @@ __all__ = [
     "H264Encoder",
     "Image",
     "ImageFormat",
+    "Keep",
     "Layout",
     "Video",
     "brightness",
     "colours",
     "encode_image",
+    "entry",
     "open_video",
     "seqinfo_fps",
     "write_clip",

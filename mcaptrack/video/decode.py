@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Container, Iterable, Iterator
 from fractions import Fraction
 from typing import Any, Final, NamedTuple
 
@@ -13,11 +13,10 @@ from mcaptrack.clock import NS_PER_S
 from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import Frame
 from mcaptrack.video.raw import Layout, raw_brightness, raw_colours
+from mcaptrack.video.streams import CODECS
 
 Pixels = NDArray[np.uint8]
 
-#: Names of formats in messages -> decoders of FFmpeg.
-_CODECS: Final = {"h264": "h264", "h265": "hevc", "vp9": "vp9", "av1": "av1"}
 _FULL_RANGE: Final = 2  # AVCOL_RANGE_JPEG
 # Video keeps brightness in 16..235; detectors see 0..255 whatever the picture came from.
 _LIMITED_TO_FULL: Final = np.clip(np.rint((np.arange(256) - 16) * (255 / 219)), 0, 255).astype(np.uint8)
@@ -37,41 +36,51 @@ class Encoded(NamedTuple):
     where: str = ""
 
     @property
+    def is_video(self) -> bool:
+        """Whether it may need pictures before it."""
+        return self.format in CODECS and not self.layout
+
+    @property
     def name(self) -> str:
         """The picture, as errors say it."""
         return self.where or f"frame {self.index}"
 
 
-def brightness(pictures: Iterable[Encoded]) -> Iterator[Frame]:
+def brightness(pictures: Iterable[Encoded], wanted: Container[int] | None = None) -> Iterator[Frame]:
     """Frames whose ``rows`` are the brightness of the picture, (height, width) uint8 from 0 to 255.
 
-    Raises McaptrackError for a format that can't be decoded and for pictures that are broken.
+    Pictures of a video before the first that decoding can begin with are left out, as all viewers leave them out.
+    With ``wanted`` those of other indexes are decoded, where the next ones need them, and left out. Raises
+    McaptrackError for a format that can't be decoded and for pictures that are broken.
     """
-    return _decoded(pictures, raw_brightness, _luma, is_grey=True)
+    return _decoded(pictures, raw_brightness, _luma, wanted, is_grey=True)
 
 
-def colours(pictures: Iterable[Encoded]) -> Iterator[Frame]:
+def colours(pictures: Iterable[Encoded], wanted: Container[int] | None = None) -> Iterator[Frame]:
     """The same in colour: ``rows`` are (height, width, 3) uint8, blue, green, red."""
-    return _decoded(pictures, raw_colours, _bgr, is_grey=False)
+    return _decoded(pictures, raw_colours, _bgr, wanted, is_grey=False)
 
 
 def _decoded(
     pictures: Iterable[Encoded],
     of_pixels: Callable[[str, bytes, Layout], Pixels],
     of_frame: Callable[[Any], Pixels],
+    wanted: Container[int] | None,
     is_grey: bool,
 ) -> Iterator[Frame]:
     decoder: _VideoDecoder | None = None
     for picture in pictures:
-        if picture.layout:
+        if picture.is_video:
+            decoder = decoder or _VideoDecoder(picture.format, of_frame, wanted)
+            yield from decoder.decode(picture)
+        elif wanted is not None and picture.index not in wanted:
+            continue
+        elif picture.layout:
             try:
                 pixels = of_pixels(picture.format, picture.data, picture.layout)
             except McaptrackError as error:
                 raise McaptrackError(f"{picture.name}: {error}") from None
             yield Frame(picture.t_ns, picture.index, pixels)
-        elif picture.format in _CODECS:
-            decoder = decoder or _VideoDecoder(picture.format, of_frame)
-            yield from decoder.decode(picture)
         else:
             yield Frame(picture.t_ns, picture.index, _still(picture, is_grey))
     if decoder:
@@ -92,29 +101,40 @@ def _still(picture: Encoded, is_grey: bool) -> Pixels:
 
 
 class _VideoDecoder:
-    def __init__(self, name: str, of_frame: Callable[[Any], Pixels]) -> None:
+    def __init__(self, name: str, of_frame: Callable[[Any], Pixels], wanted: Container[int] | None) -> None:
         import av
 
-        self._of_frame = of_frame
+        self._of_frame, self._wanted = of_frame, wanted
 
-        self._codec: Any = av.CodecContext.create(_CODECS[name], "r")
+        self._codec: Any = av.CodecContext.create(CODECS[name].decoder, "r")
         self._codec.thread_type = "AUTO"
         self._base = Fraction(1, NS_PER_S)
-        self._index: dict[int, int] = {}
+        self._count, self._sets, self._begun, self._last = 0, b"", False, "the video"
+        self._waiting: dict[int, tuple[int, int]] = {}
 
     def decode(self, picture: Encoded) -> Iterator[Frame]:
         import av
 
+        head = CODECS[picture.format].entry(picture.data)
+        self._begun |= head.has_sets
+        if not head.has_picture:
+            self._sets += picture.data  # some robots send these apart; FFmpeg takes them with a picture
+            return
+        if not self._begun:
+            return  # a recording may begin anywhere; nothing can be made of what is before the first parameter sets
         # A copy in FFmpeg's own memory: its threads can't let go of Python's while Python waits for them to end.
-        packet = av.Packet(len(picture.data))
-        packet.update(picture.data)
-        packet.pts = packet.dts = picture.t_ns
+        data = self._sets + picture.data
+        packet = av.Packet(len(data))
+        packet.update(data)
+        packet.pts = packet.dts = self._count  # not its time: messages of others may share one
         packet.time_base = self._base
-        self._index[picture.t_ns] = picture.index
+        self._waiting[self._count], self._sets = (picture.t_ns, picture.index), b""
+        self._count += 1
+        self._last = picture.name
         yield from self._frames(packet, picture.name)
 
     def flush(self) -> Iterator[Frame]:
-        yield from self._frames(None, "the end of the video")
+        yield from self._frames(None, self._last)
 
     def _frames(self, packet: Any, where: str) -> Iterator[Frame]:
         import av
@@ -124,7 +144,9 @@ class _VideoDecoder:
         except av.error.FFmpegError as error:
             raise McaptrackError(f"{where} can't be decoded: {error.strerror or error}") from error
         for frame in decoded:
-            yield Frame(frame.pts, self._index.pop(frame.pts, 0), self._of_frame(frame))
+            t_ns, index = self._waiting.pop(frame.pts)
+            if self._wanted is None or index in self._wanted:
+                yield Frame(t_ns, index, self._of_frame(frame))
 
 
 def _bgr(frame: Any) -> Pixels:

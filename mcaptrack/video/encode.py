@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -14,54 +15,154 @@ from mcaptrack.atomic import publish
 from mcaptrack.clock import NS_PER_S
 from mcaptrack.errors import McaptrackError
 
-ImageFormat = Literal["h264", "jpeg", "png"]
+ImageFormat = Literal["auto", "h264", "h265", "jpeg", "png"]
+StillFormat = Literal["jpeg", "png"]
 Image = NDArray[np.uint8]
 
 _MP4_BASE: Final = Fraction(1, 90_000)
 _GIF_BASE: Final = Fraction(1, 100)
 
+_BT601, _UNKNOWN = 6, 2  # AVCOL_SPC_SMPTE170M, and what all of these enumerations call unspecified
+_STILLS: Final = ("jpeg", "png")
 _JPEG_QUALITY: Final = 90
-# No B-frames, a key picture every second with its parameter sets, four slices whatever the machine's cores: the same
-# input gives the same bytes everywhere.
+_CRF: Final = 23
+_KEY_EVERY_S: Final = 1.0
+#: Viewers go back to the last key picture; from further away than this it takes long.
+_KEY_WITHIN_S: Final = 2.0
+#: JPEG's scale, and x264's constant rate factor: without 0, which browsers don't play.
+_QUALITIES: Final = {"jpeg": (1, 100), "h264": (1, 51)}
+_INTERVALS_S: Final = (0.01, 60.0)
+# No B-frames, key pictures with their parameter sets, four slices whatever the machine's cores: the same input gives
+# the same bytes everywhere.
 _X264: Final = {
     "preset": "veryfast",
     "tune": "zerolatency",
-    "crf": "23",
+    "crf": str(_CRF),
     "bf": "0",
     "x264-params": "scenecut=0:threads=4:sliced-threads=1",
 }
-_IN_MESSAGES: Final = {"x264-params": _X264["x264-params"] + ":repeat-headers=1:annexb=1"}
+_IN_MESSAGES: Final = {"x264-params": _X264["x264-params"] + ":repeat-headers=1:annexb=1", "forced-idr": "1"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Keep:
+    """How the pictures of a video are kept.
+
+    ``image_format`` "auto" passes H.264, VP9 and AV1 on as they are where viewers can play them, "h265" H.265 too,
+    "h264" H.264 alone; all else is encoded as H.264. ``quality`` is from 1 to 100 (best) for JPEG; for H.264 the
+    constant rate factor from 1 (best) to 51, and what has to have one is encoded. ``keyframe_interval_s`` is the
+    longest time between key pictures: of what is passed on (2 unless given) and of what is encoded (1 unless given).
+    ``fps`` spaces pictures evenly instead of by the times of the container.
+    """
+
+    image_format: ImageFormat = "auto"
+    quality: int | None = None
+    keyframe_interval_s: float | None = None
+    fps: Fraction | None = None
+
+    def __post_init__(self) -> None:
+        name = self.image_format
+        low, high = _QUALITIES.get(name, _QUALITIES["h264"])
+        if self.quality is not None and name == "png":
+            raise McaptrackError("--quality is for H.264 and JPEG; PNG keeps pictures exactly as they are")
+        if self.quality is not None and not low <= self.quality <= high:
+            scale = "JPEG's" if name == "jpeg" else "H.264's constant rate factor"
+            best = high if name == "jpeg" else low
+            raise McaptrackError(
+                f"--quality is {scale}, a number from {low} to {high} ({best} is best), not {self.quality}"
+            )
+        if self.keyframe_interval_s is not None:
+            if self.is_still:
+                raise McaptrackError(f"--keyframe-interval-s is for video; as {name}, every picture stands alone")
+            if not _INTERVALS_S[0] <= self.keyframe_interval_s <= _INTERVALS_S[1]:
+                raise McaptrackError(
+                    f"--keyframe-interval-s is a number from {_INTERVALS_S[0]:g} to {_INTERVALS_S[1]:g}, "
+                    f"not {self.keyframe_interval_s:g}"
+                )
+
+    @property
+    def is_still(self) -> bool:
+        """Whether every picture stands alone."""
+        return self.image_format in _STILLS
+
+    @property
+    def jpeg_quality(self) -> int:
+        """From 1 to 100."""
+        return _JPEG_QUALITY if self.quality is None else self.quality
+
+    @property
+    def crf(self) -> int:
+        """x264's constant rate factor."""
+        return _CRF if self.quality is None else self.quality
+
+    @property
+    def key_every_s(self) -> float:
+        """How often what is encoded has a key picture."""
+        return self.keyframe_interval_s or _KEY_EVERY_S
+
+    @property
+    def key_within_s(self) -> float:
+        """How far apart the key pictures may be of what is passed on."""
+        return self.keyframe_interval_s or _KEY_WITHIN_S
 
 
 class H264Encoder:
-    """Pictures -> H.264 in Annex B form, one access unit a picture, without B-frames."""
+    """Pictures -> H.264 in Annex B form, one access unit a picture, without B-frames.
 
-    def __init__(self, width_px: int, height_px: int, fps: Fraction) -> None:
+    Key pictures are at most ``key_every_s`` apart, by the times that pictures are given, without these by ``fps``. What
+    colours mean is said as a frame of FFmpeg's, ``like``, says it; images are converted as in ITU-R BT.601.
+    """
+
+    def __init__(
+        self,
+        width_px: int,
+        height_px: int,
+        fps: Fraction,
+        crf: int = _CRF,
+        key_every_s: float = _KEY_EVERY_S,
+        like: Any = None,
+    ) -> None:
         import av
 
         codec: Any = av.CodecContext.create("libx264", "w")
         codec.width, codec.height, codec.pix_fmt = width_px, height_px, "yuv420p"
         codec.time_base, codec.framerate = 1 / fps, fps
-        codec.options = _X264 | _IN_MESSAGES | {"g": str(max(1, round(fps)))}
+        if isinstance(like, av.VideoFrame):
+            codec.colorspace = like.colorspace
+            codec.color_primaries = getattr(like, "color_primaries", _UNKNOWN)  # older versions of PyAV don't tell
+            codec.color_trc = getattr(like, "color_trc", _UNKNOWN)
+        else:
+            codec.colorspace = _BT601
+        group = max(1, round(fps * Fraction(key_every_s)))
+        codec.options = _X264 | _IN_MESSAGES | {"g": str(group), "crf": str(crf)}
         self._codec = codec
         self._index = 0
+        self._key_every_ns, self._key_ns = round(key_every_s * NS_PER_S), 0
 
-    def encode(self, image: Image) -> bytes:
-        """One picture, BGR (height, width, 3)."""
+    def encode(self, image: Image | Any, t_ns: int | None = None) -> bytes:
+        """One picture, BGR (height, width, 3), or a frame of FFmpeg's of just this size."""
         import av
+        from av.video.frame import PictureType
 
-        frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="bgr24")
-        frame.pts = self._index
+        is_image = isinstance(image, np.ndarray)
+        frame: Any = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="bgr24") if is_image else image
+        if t_ns is not None and t_ns - self._key_ns >= self._key_every_ns:
+            frame.pict_type = PictureType.I
+        else:
+            frame.pict_type = PictureType.NONE
+        frame.pts, frame.time_base = self._index, self._codec.time_base
         self._index += 1
         packets = self._codec.encode(frame)
+        if t_ns is not None and any(packet.is_keyframe for packet in packets):
+            self._key_ns = t_ns
         return b"".join(bytes(packet) for packet in packets)
 
 
-def encode_image(image: Image, image_format: ImageFormat) -> bytes:
-    """One picture, BGR, as JPEG or PNG."""
+def encode_image(image: Image, image_format: StillFormat, quality: int = _JPEG_QUALITY) -> bytes:
+    """One picture, BGR, as JPEG or PNG. ``quality``, from 1 to 100, is JPEG's."""
     import cv2
 
-    options = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY] if image_format == "jpeg" else []
+    options = [cv2.IMWRITE_JPEG_QUALITY, quality] if image_format == "jpeg" else []
     ok, data = cv2.imencode(f".{image_format}", image, options)
     if not ok:
         raise McaptrackError(f"a picture of {image.shape[1]} x {image.shape[0]} can't be encoded as {image_format}")

@@ -1,16 +1,15 @@
 """Video files and image folders -> encoded pictures with exact times, one a message.
 
-A stream is passed on without re-encoding where every viewer can play it as it stands (H.264 without B-frames, closed
-short groups of pictures, 8-bit 4:2:0, upright); otherwise it is decoded and encoded again, and the reason is said.
+A stream is passed on without re-encoding where every viewer can play it as it stands (``passing``); otherwise it is
+decoded and encoded again, and the reason is said.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
-from datetime import datetime
+from datetime import UTC, datetime
 from fractions import Fraction
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -20,15 +19,17 @@ from numpy.typing import NDArray
 
 from mcaptrack.clock import NS_PER_S
 from mcaptrack.errors import McaptrackError
-from mcaptrack.video import h264
-from mcaptrack.video.encode import H264Encoder, ImageFormat, encode_image
+from mcaptrack.video.encode import H264Encoder, Keep, StillFormat, encode_image
+from mcaptrack.video.passing import container, fraction, has_slots, has_times, indexed, look, packets, videos
+from mcaptrack.video.streams import CODECS
 
 Image = NDArray[np.uint8]
 
 IMAGE_SUFFIXES: Final = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
-#: Viewers jump to the last key picture; further apart than this, jumping gets slow.
-_MAX_GOP_S: Final = 2.0
 _MAX_PIXELS: Final = 2**27
+#: As many on every machine, so that what is made of damaged streams is the same everywhere.
+_THREADS: Final = 4
+_FULL_RANGE, _LIMITED_RANGE = 2, 1  # AVCOL_RANGE_JPEG, AVCOL_RANGE_MPEG
 
 
 class EncodedPicture(NamedTuple):
@@ -39,92 +40,97 @@ class EncodedPicture(NamedTuple):
     data: bytes
 
 
+class Shown(NamedTuple):
+    """One picture as it is shown: its time in seconds, if it has one, and FFmpeg's frame or BGR (height, width, 3)."""
+
+    seconds: Fraction | None
+    picture: Any
+
+
 @dataclass
 class Video:
     """A video file or image folder that can be read; made by ``open_video``.
 
+    ``format`` is what its messages are: "h264", "vp9", "jpeg" and so on. ``width_px`` and ``height_px`` are of these.
     ``frames`` is what the container claims, 0 if nothing. ``start_ns`` is when the recording began, if it says.
-    ``why_transcode`` is empty where the H.264 stream can be passed on. ``lost`` collects, while pictures are read, what
-    could not be.
+    ``why_transcode`` is empty where the stream is passed on, or where stills are asked for. ``lost`` and ``notes``
+    collect, while pictures are read, what could not be, and what is worth saying.
     """
 
     path: Path
+    keep: Keep
+    format: str
     width_px: int
     height_px: int
     fps: Fraction | None
     frames: int
     start_ns: int | None
     why_transcode: str
+    sets: tuple[bytes, ...] = ()
     images: list[Path] = field(default_factory=list)
     lost: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+    has_slots: bool = False
+    length_s: Fraction | None = None
 
-    def pictures(self, image_format: ImageFormat, fps: Fraction | None, start_ns: int) -> Iterator[EncodedPicture]:
-        """All pictures in order. ``fps`` spaces them evenly instead of by the times of the container."""
-        clock = _Clock(self, fps, start_ns)
-        if image_format == "h264" and not self.why_transcode:
-            yield from _remux(self, clock)
-        elif image_format == "h264":
+    def pictures(self, start_ns: int = 0) -> Iterator[EncodedPicture]:
+        """All pictures in order, the first of them at ``start_ns``."""
+        clock = _Clock(self, start_ns)
+        if self.keep.is_still:
+            yield from _stills(self, clock)
+        elif self.why_transcode:
             yield from _transcode(self, clock)
         else:
-            for index, (pts, image) in enumerate(_images(self)):
-                yield EncodedPicture(clock.time(index, pts), index, encode_image(image, image_format))
+            yield from _pass_on(self, clock)
 
-    def note_missing(self, read: int) -> None:
-        """Compare what was read with what the container claims."""
-        if self.frames and read < self.frames:
+    def note_missing(self, read: int, hidden: int = 0, last_s: Fraction | None = None) -> None:
+        """Compare what was read with what the container claims; ``hidden`` is what it says not to show."""
+        if self.has_slots and self.fps and last_s is not None:
+            hidden += round(last_s * self.fps) + 1 - read  # slots that are empty
+        if self.frames and read + hidden < self.frames:
             self.lost.append(f"{self.path} claims {self.frames} frames; {read} could be read")
+        elif not self.frames and self.length_s and last_s is not None and self.fps:
+            gap = self.length_s - last_s
+            if gap > max(Fraction(1, 2), 3 / self.fps):
+                ends = f"its pictures end at {float(last_s):.2f} s"
+                self.lost.append(f"{self.path} says it is {float(self.length_s):.2f} s long; {ends}")
 
 
 class _Clock:
     """Times of pictures: from the container, exact in its time base; or evenly spaced."""
 
-    def __init__(self, video: Video, fps: Fraction | None, start_ns: int) -> None:
-        # AVI has no times: what FFmpeg reports there is the order of decoding.
-        self._fps = fps or (video.fps if video.images or video.path.suffix.lower() == ".avi" else None)
+    def __init__(self, video: Video, start_ns: int) -> None:
+        self.fps = video.keep.fps or (video.fps if video.images else None)
+        self._where = video.path
         self._start_ns = start_ns
         self._first: Fraction | None = None
         self._last = -1
 
-    def time(self, index: int, pts: Fraction | None) -> int:
-        if self._fps:
-            seconds = index / self._fps
-        elif pts is None:
-            raise McaptrackError(f"picture {index} has no time in its container; space them evenly with --fps")
+    def time(self, index: int, seconds: Fraction | None) -> int:
+        if self.fps:
+            seconds = index / self.fps
+        elif seconds is None:
+            raise McaptrackError(
+                f"{self._where}: picture {index} has no time in its container; space them evenly with --fps"
+            )
         else:
-            self._first = pts if self._first is None else self._first
-            seconds = pts - self._first
+            self._first = seconds if self._first is None else self._first
+            seconds -= self._first
         t_ns = self._start_ns + round(seconds * NS_PER_S)
         self._last = max(t_ns, self._last + 1)  # two pictures never share a time
         return self._last
 
 
-@contextmanager
-def _container(path: Path) -> Iterator[Any]:
-    import av
-
-    try:
-        with av.open(str(path)) as container:
-            yield container
-    except av.error.FFmpegError as error:
-        raise McaptrackError(
-            f"{path} can't be read as a video ({error.strerror or error}); "
-            "give an mp4, mov, mkv, avi or webm file that is whole"
-        ) from error
-
-
-def _fraction(ratio: Any) -> Fraction | None:
-    return Fraction(ratio.numerator, ratio.denominator) if ratio else None
-
-
-def open_video(path: Path) -> Video:
+def open_video(path: Path, keep: Keep = Keep()) -> Video:  # noqa: B008  # frozen
     """Look at a video file or image folder. Raises McaptrackError unless it holds pictures that can be decoded."""
     if path.is_dir():
-        return _open_folder(path)
-    with _container(path) as container:
-        if not container.streams.video:
-            kinds = sorted({stream.type for stream in container.streams}) or ["no streams"]
-            raise McaptrackError(f"{path} holds no video, only {', '.join(kinds)}")
-        stream = container.streams.video[0]
+        return _open_folder(path, keep)
+    with container(path) as opened:
+        there = videos(opened)
+        if not there:
+            kinds = ", ".join(sorted({stream.type for stream in opened.streams if stream.type != "video"}))
+            raise McaptrackError(f"{path} holds no video, {f'only {kinds}' if kinds else 'and nothing else'}")
+        stream = there[0]
         context = stream.codec_context
         if context is None:
             raise McaptrackError(f"{path} holds video in a codec that is not known here; convert it to H.264 first")
@@ -132,24 +138,55 @@ def open_video(path: Path) -> Video:
             raise McaptrackError(
                 f"{path} has pictures of {context.width} x {context.height}; at most {_MAX_PIXELS} pixels"
             )
-        first = next(container.decode(stream), None)
+        first = next(opened.decode(stream), None)
         if first is None:
             raise McaptrackError(f"{path} is a video without frames")
-        upright = (first.height, first.width) if first.rotation % 180 else (first.width, first.height)
+        if not (has_times(opened) or keep.fps):
+            raise McaptrackError(f"{path} has no times of its own; give the frames per second with --fps")
+        sideways = first.rotation % 180 != 0
         video = Video(
             path,
-            upright[0] + upright[0] % 2,
-            upright[1] + upright[1] % 2,
-            _fraction(stream.average_rate),
+            keep,
+            keep.image_format if keep.is_still else "h264",
+            first.height if sideways else first.width,
+            first.width if sideways else first.height,
+            fraction(stream.average_rate),
             stream.frames,
-            _creation_ns(container.metadata.get("creation_time") or stream.metadata.get("creation_time")),
+            _creation_ns(opened.metadata.get("creation_time") or stream.metadata.get("creation_time")),
             f"it is turned by {first.rotation} degrees" if first.rotation else "",
+            has_slots=has_slots(opened),
+            length_s=_length_s(opened, stream),
         )
-    video.why_transcode = video.why_transcode or _why_transcode(path)
+        if len(there) > 1:
+            video.notes.append(f"{path} holds {len(there)} videos; the first is taken")
+        if first.interlaced_frame:
+            video.why_transcode = video.why_transcode or "it is interlaced"
+    if keep.is_still:
+        video.why_transcode = ""
+    elif not video.why_transcode:
+        found = look(path, keep)
+        video.why_transcode, video.sets = found.why_not, found.sets
+        video.format = "h264" if found.why_not else found.format
+    _make_even(video)
     return video
 
 
-def _open_folder(path: Path) -> Video:
+def _make_even(video: Video) -> None:
+    """Pictures that are encoded as H.264 have an even number of rows and columns."""
+    if video.why_transcode:
+        video.width_px += video.width_px % 2
+        video.height_px += video.height_px % 2
+
+
+def _length_s(opened: Any, stream: Any) -> Fraction | None:
+    """How long a container says that its pictures are; None if it says it of all streams together."""
+    said = re.fullmatch(r"(\d+):(\d\d):(\d\d(?:\.\d+)?)", stream.metadata.get("DURATION", ""))
+    if said:
+        return int(said[1]) * 3600 + int(said[2]) * 60 + Fraction(said[3])
+    return Fraction(opened.duration, 1_000_000) if opened.duration and len(opened.streams) == 1 else None
+
+
+def _open_folder(path: Path, keep: Keep) -> Video:
     import cv2
 
     images = sorted((p for p in path.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES), key=_natural)
@@ -159,10 +196,11 @@ def _open_folder(path: Path) -> Video:
     if first is None:
         raise McaptrackError(f"{images[0]} can't be read as an image")
     height, width = first.shape[:2]
-    fps = seqinfo_fps(path)
-    return Video(
-        path, width + width % 2, height + height % 2, fps, len(images), None, "it is a folder of images", images
-    )
+    name = keep.image_format if keep.is_still else "h264"
+    why = "" if keep.is_still else "it is a folder of images"
+    video = Video(path, keep, name, width, height, seqinfo_fps(path), len(images), None, why, images=images)
+    _make_even(video)
+    return video
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:
@@ -182,93 +220,74 @@ def seqinfo_fps(folder: Path) -> Fraction | None:
 
 
 def _creation_ns(text: str | None) -> int | None:
+    """When a recording began, by its container, whose times are UTC; None if it says nothing or nothing possible."""
     try:
-        return round(datetime.fromisoformat(text).timestamp() * 1e6) * 1000 if text else None
+        moment = datetime.fromisoformat(text) if text else None
     except ValueError:
         return None
+    if moment is None:
+        return None
+    moment = moment if moment.tzinfo else moment.replace(tzinfo=UTC)
+    t_ns = round(moment.timestamp() * 1e6) * 1000
+    return t_ns if t_ns >= 0 else None
 
 
-def _why_transcode(path: Path) -> str:
-    """Why the stream can't be passed on as it is, from one pass over its packets; "" if it can."""
-    from av.bitstream import BitStreamFilterContext
-
-    with _container(path) as container:
-        stream = container.streams.video[0]
-        context = stream.codec_context
-        if context.name != "h264":
-            return f"it is {context.name}, not h264"
-        if context.pix_fmt not in ("yuv420p", "yuvj420p"):
-            return f"its pixels are {context.pix_fmt}, not 8-bit 4:2:0"
-        if context.has_b_frames:
-            return "it has B-frames"
-        to_annex_b = BitStreamFilterContext("h264_mp4toannexb", stream)
-        base, no_times = _fraction(stream.time_base) or Fraction(1), path.suffix.lower() == ".avi"
-        last_pts, key_at, count = None, None, 0
-        for packet in container.demux(stream):
-            if packet.size == 0:
+def _pass_on(video: Video, clock: _Clock) -> Iterator[EncodedPicture]:
+    codec = CODECS[video.format]
+    index, seconds = 0, None
+    with container(video.path) as opened:
+        for packet in packets(opened, video.format):
+            if packet.is_damaged:  # the last one
+                video.lost.append(f"{video.path} is cut off or damaged after {index} frames; the rest is left out")
                 continue
-            if packet.is_discard:
-                return "an edit list hides some of its frames"
-            if packet.pts is None and not no_times:
-                return "some of its frames have no time"
-            if last_pts is not None and packet.pts is not None and packet.pts <= last_pts:
-                return "its frames are not in the order of their times"
-            last_pts = packet.pts
-            seconds = Fraction(count) / (_fraction(stream.average_rate) or 30) if no_times else packet.pts * base
-            is_key = packet.is_keyframe
-            units = to_annex_b.filter(packet)  # takes the packet's contents with it
-            if len(units) != 1:
-                return "its packets are not one picture each"
-            picture = h264.inspect(bytes(units[0]))
-            if picture.has_b_slice:
-                return "it has B-frames"
-            if is_key and not (picture.has_idr and picture.has_parameter_sets):
-                return "not every key frame can be decoded on its own (open groups of pictures)"
-            if count == 0 and not is_key:
-                return "it does not begin with a key frame"
-            key_at = seconds if is_key else key_at
-            if key_at is not None and seconds - key_at > _MAX_GOP_S:
-                return f"its key frames are more than {_MAX_GOP_S:g} s apart"
-            count += 1
-    return ""
-
-
-def _remux(video: Video, clock: _Clock) -> Iterator[EncodedPicture]:
-    from av.bitstream import BitStreamFilterContext
-
-    with _container(video.path) as container:
-        stream = container.streams.video[0]
-        to_annex_b = BitStreamFilterContext("h264_mp4toannexb", stream)
-        base, index = _fraction(stream.time_base) or Fraction(1), 0
-        for packet in container.demux(stream):
-            if packet.size == 0:
-                continue
-            pts = None if packet.pts is None else packet.pts * base
-            (unit,) = to_annex_b.filter(packet)
-            yield EncodedPicture(clock.time(index, pts), index, bytes(unit))
+            data = packet.data
+            if video.sets:
+                head = codec.entry(data)
+                data = codec.with_sets(data, video.sets) if head.is_key and not head.has_sets else data
+            seconds = packet.seconds
+            yield EncodedPicture(clock.time(index, seconds), index, data)
             index += 1
-    video.note_missing(index)
+        video.frames = video.frames or indexed(opened)
+    video.note_missing(index, last_s=seconds)
 
 
 def _transcode(video: Video, clock: _Clock) -> Iterator[EncodedPicture]:
-    encoder = H264Encoder(video.width_px, video.height_px, clock._fps or video.fps or Fraction(30))
-    for index, (pts, image) in enumerate(_images(video)):
-        yield EncodedPicture(clock.time(index, pts), index, encoder.encode(image))
+    keep, encoder = video.keep, None
+    for index, (seconds, picture) in enumerate(_shown(video)):
+        t_ns = clock.time(index, seconds)
+        fitted = _fit(video, picture)
+        if encoder is None:
+            fps = clock.fps or video.fps or Fraction(30)
+            encoder = H264Encoder(video.width_px, video.height_px, fps, keep.crf, keep.key_every_s, like=fitted)
+        yield EncodedPicture(t_ns, index, encoder.encode(fitted, t_ns))
 
 
-def _images(video: Video) -> Iterator[tuple[Fraction | None, Image]]:
-    """Decoded pictures, BGR (height, width, 3), upright and of even size, with their times in seconds."""
-    read, corrupt = 0, 0
-    for pts, image, damaged in _folder_images(video) if video.images else _decoded(video):
-        corrupt += damaged
-        read += 1
-        yield pts, _fit(image, video.width_px, video.height_px)
-    if corrupt:
-        video.lost.append(f"{video.path}: {corrupt} of {read} frames are damaged; they are kept as far as they decode")
-    video.note_missing(read)
+def _stills(video: Video, clock: _Clock) -> Iterator[EncodedPicture]:
+    name: StillFormat = "jpeg" if video.format == "jpeg" else "png"
+    for index, (seconds, picture) in enumerate(_shown(video)):
+        image = _upright(picture)
+        yield EncodedPicture(clock.time(index, seconds), index, encode_image(image, name, video.keep.jpeg_quality))
 
 
-def _folder_images(video: Video) -> Iterator[tuple[None, Image, bool]]:
+def images(video: Video) -> Iterator[tuple[Fraction | None, Image]]:
+    """Decoded pictures, BGR (height, width, 3), upright, with their times in seconds."""
+    for seconds, picture in _shown(video):
+        yield seconds, _upright(picture)
+
+
+def _shown(video: Video) -> Iterator[Shown]:
+    """All pictures as they are shown; what could not be read is noted."""
+    if video.images:
+        read = 0
+        for shown in _folder_images(video):
+            yield shown
+            read += 1
+        video.note_missing(read)
+    else:
+        yield from _decoded(video)
+
+
+def _folder_images(video: Video) -> Iterator[Shown]:
     import cv2
 
     for path in video.images:
@@ -276,37 +295,78 @@ def _folder_images(video: Video) -> Iterator[tuple[None, Image, bool]]:
         if image is None:
             video.lost.append(f"{path} can't be read as an image; it is left out")
             continue
-        yield None, np.asarray(image, np.uint8), False
+        yield Shown(None, np.asarray(image, np.uint8))
 
 
-def _decoded(video: Video) -> Iterator[tuple[Fraction | None, Image, bool]]:
+def _decoded(video: Video) -> Iterator[Shown]:
     import av
 
-    with _container(video.path) as container:
-        stream = container.streams.video[0]
+    read, damaged, hidden, cut_off, seconds = 0, 0, 0, 0, None
+    slots: list[int] = []
+    with container(video.path) as opened:
+        stream = videos(opened)[0]
         stream.thread_type = "AUTO"
-        base = _fraction(stream.time_base) or Fraction(1)
-        packets = container.demux(stream)
+        stream.codec_context.thread_count = _THREADS
+        base = fraction(stream.time_base) or Fraction(1)
+        packets = opened.demux(stream)
         while True:
             try:
                 packet = next(packets, None)
                 if packet is None:
-                    return
+                    break
+                hidden += packet.is_discard
+                cut_off += packet.is_corrupt
+                if video.has_slots and packet.size:
+                    slots.append(len(slots) if packet.dts is None else packet.dts)
                 frames = packet.decode()
             except av.error.FFmpegError as error:
                 video.lost.append(f"{video.path}: a packet can't be decoded ({error.strerror or error})")
                 continue
             for frame in frames:
-                pts = None if frame.pts is None else frame.pts * base
-                image = np.rot90(frame.to_ndarray(format="bgr24"), frame.rotation // 90)
-                yield pts, image, bool(frame.is_corrupt)
+                ticks = slots[min(read, len(slots) - 1)] if slots else frame.pts
+                seconds = None if ticks is None else ticks * base
+                damaged += frame.is_corrupt
+                read += 1
+                yield Shown(seconds, frame)
+        video.frames = video.frames or indexed(opened)
+    if cut_off:
+        video.lost.append(f"{video.path}: {cut_off} packets are cut off or damaged")
+    if damaged:
+        video.lost.append(f"{video.path}: {damaged} of {read} frames are damaged; they are kept as far as they decode")
+    video.note_missing(read, hidden, seconds)
 
 
-def _fit(image: Image, width: int, height: int) -> Image:
-    """Pad the right and lower edge to the (even) size of the video; pictures of another size are refused."""
+def _upright(picture: Any) -> Image:
+    """BGR, as it is to be seen."""
+    if isinstance(picture, np.ndarray):
+        return picture
+    return np.rot90(picture.to_ndarray(format="bgr24"), picture.rotation // 90)
+
+
+def _fit(video: Video, picture: Any) -> Any:
+    """A picture as the encoder takes it, of the (even) size of the video.
+
+    One row or column that is missing is the one before it again. Pictures of other sizes are scaled, and that is noted.
+    """
+    width, height = video.width_px, video.height_px
+    if (
+        not isinstance(picture, np.ndarray)
+        and not picture.rotation
+        and (picture.width, picture.height) == (width, height)
+    ):
+        if picture.format.name == "yuv420p" and picture.color_range != _FULL_RANGE:
+            return picture
+        if picture.format.name.startswith(("yuv4", "yuvj4")):
+            is_full = picture.format.name.startswith("yuvj") or picture.color_range == _FULL_RANGE
+            ranges = {"src_color_range": _FULL_RANGE if is_full else _LIMITED_RANGE, "dst_color_range": _LIMITED_RANGE}
+            return picture.reformat(format="yuv420p", **ranges)
+    image = _upright(picture)
     right, below = width - image.shape[1], height - image.shape[0]
-    if not (0 <= right <= 1 and 0 <= below <= 1):
-        raise McaptrackError(
-            f"pictures change their size from {width} x {height} to {image.shape[1]} x {image.shape[0]}"
-        )
-    return np.pad(image, ((0, below), (0, right), (0, 0)), mode="edge") if right or below else image
+    if 0 <= right <= 1 and 0 <= below <= 1:
+        return np.pad(image, ((0, below), (0, right), (0, 0)), mode="edge") if right or below else image
+    import cv2
+
+    words = f"{video.path}: pictures change their size on the way; all are scaled to {width} x {height}"
+    if words not in video.notes:
+        video.notes.append(words)
+    return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)

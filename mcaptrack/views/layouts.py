@@ -168,6 +168,8 @@ def _plots(there: There, panels: dict[str, Any]) -> list[Tree]:
         for name, label in labels.items()
         if name in there.names and name != "retracks/full"
     }
+    if counted and "truth" in there.names:
+        counted[next(iter(counted)).replace(".tracked", ".people")] = "truth"
     if not counted and not places:
         return []
     title = "People" if counted else "Places"

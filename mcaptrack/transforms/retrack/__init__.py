@@ -79,8 +79,11 @@ class Retrack:
     birth: Literal["raw", "smoothed"] = option("raw", "what a new track foretells from: its past as seen, or smoothed")
     min_history: int = option(2, "past positions (with the present one) that an observation needs", least=1)
     min_hits: int = option(1, "a track is shown online from so many matches in a row", least=0)
+    confirm: bool = option(
+        False, "offline, leave out what a track matched after it was last matched min_hits times in a row"
+    )
     min_track_s: float = option(2.0, "a track that lasts less than this is left out (probation)", least=0.0)
-    link_s: float = option(14.0, "offline, ends and beginnings so far apart are put together; 0 for never", least=0.0)
+    link_s: float = option(20.0, "offline, ends and beginnings so far apart are put together; 0 for never", least=0.0)
     link_certainty: float = option(
         0.5, "offline, what is put together is one person with at least this probability", least=0.01, most=0.99
     )
@@ -139,11 +142,14 @@ _PAPER: Final = Retrack(
 
 #: Readings by name. "paper" is Algorithm 1 and Eq. 1 to 3 to the letter; where the paper gives no number (sigma, d_min,
 #: t_max, the probation) the authors' stands. "authors" is what their program does: the largest distance instead of the
-#: mean, certain pairs first, birth from the smoothed past. "default" is ours.
+#: mean, certain pairs first, birth from the smoothed past, and what two matches in a row confirm.
+#: "default" is ours.
 PROFILES: Final = MappingProxyType(
     {
         "default": Retrack(),
         "paper": _PAPER,
-        "authors": replace(_PAPER, distance="max", certain_distance=0.15, birth="smoothed", backfill="all"),
+        "authors": replace(
+            _PAPER, distance="max", certain_distance=0.15, birth="smoothed", backfill="all", confirm=True
+        ),
     }
 )

@@ -77,6 +77,8 @@ class Forecasting:
         track, observation = self._match(step, past[:, -1], seen, sources[row_at])
         self._update(step, track, past[observation, -1], sources[row_at[observation]])
         self.claims.add(step, self._tracks.ids[track], sources[row_at[observation]])
+        if self._options.confirm:
+            self.claims.confirm(step, self._tracks.ids[track[self._tracks.hits[track] >= self._options.min_hits]])
         new = np.setdiff1d(np.arange(len(row_at)), observation)
         self._start(step, past[new], valid[new], Forecast(seen.mean[new], seen.cov[new]), sources[row_at[new]])
         online = self._online(frame, step, np.concatenate([row_at[observation], row_at[new]]), track, len(new))
@@ -136,6 +138,8 @@ class Forecasting:
         hits = np.zeros(count, np.int64)
         self._tracks = self._tracks + Tracks(ids, np.full(count, step), hits, sources.copy(), motion, forecast)
         self.claims.add(step, ids, sources)
+        if self._options.confirm:
+            self.claims.confirm(step, ids)
         if self._options.backfill != "none":
             who, back = np.nonzero(valid[:, :-1][:, ::-1][:, : max(self._options.min_history, 4) - 1])
             self.claims.add(step - 1 - back, ids[who], sources[who])

@@ -49,8 +49,8 @@ def features(walker: Walker, paths: Paths, smoothed: State, step_s: float) -> Fl
 
 NAMES: Final = ("log length", "log count", "log extent", "log speed", "log rough", "seen", "inside")
 #: What each feature says for a person, as a log odds ratio, and the log odds without any (tools/choose_retrack.py).
-_WEIGHTS: Final = (0.575, 0.733, 0.609, 0.258, -0.641, 0.304, -0.834)
-_BIAS: Final = -2.956
+_WEIGHTS: Final = (1.58, -0.58, 1.736, -1.126, -0.559, 0.59, -1.993)
+_BIAS: Final = -3.342
 
 
 def log_odds(walker: Walker, paths: Paths, smoothed: State, step_s: float) -> Floats:

@@ -1,10 +1,10 @@
 """Putting together what belongs to one person: ends of tracks and later beginnings, over the whole log at once.
 
-A link is judged from both sides: how likely the first rows of the later track are for who was in the earlier one, and
-how likely the last rows of the earlier one are for who is in the later one, walking back; each against somebody new.
+A link is judged by how well what came before a hole and what comes after it fit together: people go on as they went, or
+stay where they stood.
 Where links are judged pair by pair the best set of them is one assignment of ends to beginnings.
 
-Letters: K tracks, E links, N rows, R rows that are looked at.
+Letters: K tracks, E links, F features.
 """
 
 from __future__ import annotations
@@ -20,17 +20,18 @@ from mcaptrack.transforms.retrack.motion import Paths, State, Walker
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-#: How many rows on the other side of a hole are looked at.
-_ROWS: Final = 5
 #: How fast people are at most in a hole.
 _REACH_M_PER_S: Final = 2.5
-#: The log odds of a link: for each unit of evidence, each second of hole, the log odds that a track is of nobody,
-#: and without any, where 43 in 100 are right (tools/choose_retrack.py).
-_EVIDENCE, _HOLE, _NOBODY, _START, _USUAL = 0.152, -0.193, 0.119, 2.31, 0.43
-#: How far people move who stand, and what it costs to take it that they did, as a log likelihood of both sides.
-_STAY_M2_PER_S, _STAY_COST = 0.02, 3.0
+#: What a link is judged by, see ``features``.
+NAMES: Final = ("miss", "misfit", "hole", "misfit or stay", "turn", "way and speed", "misfit and speed")
+#: What each says for a link, as a log odds ratio; the log odds without any, in logs where a share of ``_USUAL`` of the
+#: best links is right (tools/choose_retrack.py).
+_WEIGHTS: Final = (-0.996, -0.798, -0.205, -0.304, 0.247, 0.482, -0.324)
+_BIAS, _USUAL = 3.702, 0.666
+#: Distances and speeds below these are as good as none.
+_NEAR_M, _SPEED_M_PER_S = 0.3, 0.15
 #: Links that are less likely than this by their log odds are not looked at.
-_LEAST: Final = -4.0
+_LEAST: Final = -2.52
 
 
 def link(
@@ -41,39 +42,24 @@ def link(
     step_s: float,
     max_hole_s: float,
     least: float,
-    odds: Floats,
 ) -> Ints:
     """For each track the one that goes on from it, or -1; (K,).
 
-    ``odds`` (K,) are the log odds that a track is of a person. A link is made if it is right with a probability of
-    ``least``. How many links are right at all differs from log to log, from hardly any (where holes are short, and who
-    is gone has left) to most of them, and is found out from the links themselves (expectation maximisation).
+    A link is made if it is right with a probability of ``least``. How many links are right at all differs from log to
+    log, from hardly any (where holes are short, and who is gone has left) to most of them, and is found out from the
+    links themselves (expectation maximisation).
     """
     first, last = paths.first[:-1], paths.first[1:] - 1
-    begins, ends = paths.step[first], paths.step[last]
-    count = len(first)
-    follows = np.full(count, -1)
-    order = np.argsort(begins, kind="stable")
-    low = np.searchsorted(begins[order], ends + 1)
-    high = np.searchsorted(begins[order], ends + round(max_hole_s / step_s) + 1, "right")
-    many = high - low
-    i = np.repeat(np.arange(count), many)
-    j = order[np.arange(len(i)) - np.repeat(np.cumsum(many) - many, many) + low[i]]
-    hole_s = (begins[j] - ends[i]) * step_s
-    apart = np.hypot(*(forward.mean[last[i], :2] - backward.mean[first[j], :2]).T)
-    near = apart <= 1.0 + _REACH_M_PER_S * hole_s
-    i, j, hole_s = i[near], j[near], hole_s[near]
+    follows = np.full(len(first), -1)
+    i, j, hole_s = candidates(paths, forward, backward, step_s, max_hole_s)
     if len(i) == 0:
         return follows
-    walked, stayed = evidence(
-        walker, paths, forward.take(last[i]), backward.take(first[j]), last[i], first[j], hole_s, step_s
-    )
-    nobody = np.minimum(odds, 0.0)
-    gain = _START + _EVIDENCE * np.maximum(walked, stayed) + _HOLE * hole_s + _NOBODY * (nobody[i] + nobody[j]) - _LEAST
+    found = features(walker, forward.take(last[i]), backward.take(first[j]), hole_s)
+    gain = found @ np.array(_WEIGHTS) + _BIAS - _LEAST
     good = gain > 0
     i, j, gain = i[good], j[good], gain[good]
-    best = np.full(count, -np.inf)
-    for group in _components(i, j, count):
+    best = np.full(len(first), -np.inf)
+    for group in _components(i, j, len(first)):
         who, them = np.unique(i[group]), np.unique(j[group])
         table = np.full((len(who), len(them)), -1.0)
         table[np.searchsorted(who, i[group]), np.searchsorted(them, j[group])] = np.round(gain[group], 6)
@@ -82,12 +68,29 @@ def link(
     return np.where(best + _usual_here(best[follows >= 0]) > np.log(least / (1 - least)), follows, -1)
 
 
+def candidates(
+    paths: Paths, forward: State, backward: State, step_s: float, max_hole_s: float
+) -> tuple[Ints, Ints, Floats]:
+    """Pairs (E,) of a track and a later one that is within reach of its end, and the seconds between them."""
+    first, last = paths.first[:-1], paths.first[1:] - 1
+    begins, ends = paths.step[first], paths.step[last]
+    order = np.argsort(begins, kind="stable")
+    low = np.searchsorted(begins[order], ends + 1)
+    high = np.searchsorted(begins[order], ends + round(max_hole_s / step_s) + 1, "right")
+    many = high - low
+    i = np.repeat(np.arange(len(first)), many)
+    j = order[np.arange(len(i)) - np.repeat(np.cumsum(many) - many, many) + low[i]]
+    hole_s = (begins[j] - ends[i]) * step_s
+    near = _length(forward.mean[last[i], :2] - backward.mean[first[j], :2]) <= 1.0 + _REACH_M_PER_S * hole_s
+    return i[near], j[near], hole_s[near]
+
+
 def _usual_here(odds: Floats) -> float:
     """What to add to the log odds of links (E,) in this log, where others are right than usual."""
     shift = 0.0
     for _ in range(100):
         right = (1 / (1 + np.exp(-(odds + shift)))).sum()
-        share = (right + 1) / (len(odds) + 3)
+        share = (right + 0.3) / (len(odds) + 3)  # in most logs few are
         before, shift = shift, float(np.log(share / (1 - share)) - np.log(_USUAL / (1 - _USUAL)))
         if abs(shift - before) < 1e-4:
             break
@@ -106,49 +109,36 @@ def _components(i: Ints, j: Ints, count: int) -> list[Ints]:
     return list(np.split(order, bounds)) if len(order) else []
 
 
-def evidence(
-    walker: Walker, paths: Paths, before: State, after: State, last: Ints, first: Ints, hole_s: Floats, step_s: float
-) -> tuple[Floats, Floats]:
-    """Log likelihoods (E,), of both sides together, that somebody walked on, or stood, against two different people.
+def features(walker: Walker, before: State, after: State, hole_s: Floats) -> Floats:
+    """What tells right links from wrong ones, (E, F): see ``NAMES``.
 
-    ``before`` is who was there at the rows ``last`` by what came before, ``after`` who is at ``first`` by what comes
-    after.
+    ``before`` is who was there where the hole begins by what came before it, ``after`` who is there where it ends by
+    what comes after it. A miss is how far off one side is of where the other, going straight on, expects it, the nearer
+    of the two; a misfit, how far off one walks with the mean of both velocities.
     """
-    turned = State(after.mean * [1, 1, -1, -1], after.cov)
-    ahead = _along(walker, paths, walker.predict(before, hole_s), first, 1, step_s)
-    behind = _along(walker, paths, walker.predict(turned, hole_s), last, -1, step_s)
-    walked = ahead + behind - _fresh(walker, paths, first, 1, step_s) - _fresh(walker, paths, last, -1, step_s)
-    spread = before.cov[:, 0] + after.cov[:, 0] + _STAY_M2_PER_S * hole_s
-    off = before.mean[:, :2] - after.mean[:, :2]
-    stayed = -(off**2).sum(axis=1) / spread - 2 * np.log(2 * np.pi * spread) - _STAY_COST
-    return walked, stayed
+    span = hole_s[:, None]
+    way = after.mean[:, :2] - before.mean[:, :2]
+    left, came = before.mean[:, 2:], after.mean[:, 2:]
+    miss = np.minimum(_length(way - left * span), _length(way - came * span))
+    misfit, stay = _length(way - (left + came) / 2 * span), _length(way)
+    speed = np.maximum(_length(left), _length(came))
+    drift = (walker.drift + walker.drift_share * speed) ** 2
+    spread = before.cov[:, 0] + after.cov[:, 0] + hole_s**2 / 4 * (before.cov[:, 2] + after.cov[:, 2])
+    spread += drift * hole_s**3 / 12
+    walking = np.log(speed + _SPEED_M_PER_S)
+    return np.stack(
+        [
+            np.log(miss + _NEAR_M),
+            np.log1p(misfit**2 / spread / 2),
+            hole_s,
+            np.log(np.minimum(misfit, stay) + _NEAR_M) * np.log(hole_s + 0.4),
+            np.log(_length(came - left) + _SPEED_M_PER_S),
+            np.log(stay + _NEAR_M) * walking,
+            np.log(misfit + _NEAR_M) * walking,
+        ],
+        axis=1,
+    )
 
 
-def _fresh(walker: Walker, paths: Paths, start: Ints, way: int, step_s: float) -> Floats:
-    """Log likelihood of the first rows from ``start`` on, going ``way``, for somebody new who was seen first there.
-
-    The first position itself counts nothing.
-    """
-    state = walker.born(paths.xy_m[start])
-    return _along(walker, paths, state, start, way, step_s, skip=True)
-
-
-def _along(
-    walker: Walker, paths: Paths, state: State, start: Ints, way: int, step_s: float, skip: bool = False
-) -> Floats:
-    total = np.zeros(len(start))
-    track = np.searchsorted(paths.first, start, "right") - 1
-    low, high = paths.first[track], paths.first[track + 1]
-    for row in range(_ROWS):
-        at = start + way * row
-        there = (at >= low) & (at < high)
-        at = np.clip(at, low, high - 1)
-        if row:
-            state = walker.predict(state, step_s)
-        seen = there & np.isfinite(paths.xy_m[at, 0])
-        if skip and row == 0:
-            continue
-        new, evidence = walker.update(state.take(seen), paths.xy_m[at[seen]], paths.noise_m[at[seen]])
-        state.mean[seen], state.cov[seen] = new
-        total[seen] += evidence
-    return total
+def _length(vector: Floats) -> Floats:
+    return np.asarray(np.hypot(vector[:, 0], vector[:, 1]))

@@ -35,12 +35,17 @@ class Claims:
     _steps: list[Ints] = field(default_factory=list)
     _tracks: list[Ints] = field(default_factory=list)
     _sources: list[Ints] = field(default_factory=list)
+    _sure: list[tuple[int, Ints]] = field(default_factory=list)
 
     def add(self, step: Ints | int, tracks: Ints, sources: Ints) -> None:
         """``tracks`` (C,) have the samples of ``sources`` (C,), the ids of the input, at ``step``."""
         self._steps.append(np.broadcast_to(step, tracks.shape))
         self._tracks.append(tracks)
         self._sources.append(sources)
+
+    def confirm(self, step: int, tracks: Ints) -> None:
+        """What ``tracks`` (C,) claimed up to ``step`` stands; with the first call, what is never confirmed falls."""
+        self._sure.append((step, tracks))
 
     def on(self, samples: Rows, steps: Sequence[int], counts: Sequence[int]) -> tuple[Ints, Ints, Ints, Ints]:
         """Steps, tracks, sources and samples (rows of ``samples``, ``counts`` of them at each of ``steps``) of claims.
@@ -50,9 +55,18 @@ class Claims:
         nothing = [np.empty(0, np.int64)]
         step, track, source = (np.concatenate(p or nothing) for p in (self._steps, self._tracks, self._sources))
         key = _lookup(samples["track_id"], np.repeat(np.array(steps, np.int64), counts), source, step)
-        there = np.flatnonzero(key >= 0)
+        there = np.flatnonzero((key >= 0) & self._stands(step, track))
         kept = there[_first_of(track[there], step[there])]
         return step[kept], track[kept], source[kept], key[kept]
+
+    def _stands(self, step: Ints, track: Ints) -> NDArray[np.bool_]:
+        """Which claims (C,) are not later than the last time that their track was confirmed."""
+        if not self._sure:
+            return np.ones(len(step), bool)
+        until = np.full(int(track.max(initial=0)) + 1, np.iinfo(np.int64).min)
+        for when, tracks in self._sure:  # rising
+            until[tracks] = when
+        return step <= until[track]
 
 
 def whole_tracks(
@@ -128,9 +142,8 @@ def laid(step: Ints, track: Ints, xy_m: Floats, noise_m: float) -> tuple[Ints, I
 def _linked(options: Retrack, walker: Walker, step: Ints, track: Ints, xy_m: Floats, step_s: float) -> Ints:
     """The claims' tracks with those put together that are one person."""
     ids, _, paths = laid(step, track, xy_m, walker.noise_m)
-    forward, backward, smoothed = smooth(walker, paths, step_s)
-    odds = log_odds(walker, paths, smoothed, step_s)
-    follows = link(walker, paths, forward, backward, step_s, options.link_s, options.link_certainty, odds)
+    forward, backward, _ = smooth(walker, paths, step_s)
+    follows = link(walker, paths, forward, backward, step_s, options.link_s, options.link_certainty)
     root = np.arange(len(ids))
     order = np.argsort(paths.step[paths.first[:-1]], kind="stable")  # a track begins after the one that it goes on
     for one in order[follows[order] >= 0].tolist():

@@ -11,39 +11,38 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final, Literal, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack import log, metrics
-from mcaptrack.boxes import columns_to_boxes, iou_of_pairs
 from mcaptrack.clock import NS_PER_S, seconds_to_ns
 from mcaptrack.errors import McaptrackError
-from mcaptrack.metrics import Matchup, Rules, Score
+from mcaptrack.evaluation.aligned import (
+    IOU_THRESHOLD,
+    MAX_HOLE_S,
+    Similarity,
+    align,
+    matchup,
+    on_ground,
+    resampled,
+    strangers,
+    without,
+)
+from mcaptrack.metrics import Rules, Score
 from mcaptrack.metrics.displacement import Displacement, Forecasts, displacement
 from mcaptrack.metrics.displacement import Path as Positions
 from mcaptrack.metrics.displacement import combine as combine_displacements
 from mcaptrack.provenance import Provenance
-from mcaptrack.resample import looked_at, resample
-from mcaptrack.schema import PREDICTIONS, TRACKS, Frame, Rows
+from mcaptrack.resample import looked_at
+from mcaptrack.schema import PREDICTIONS, TRACKS, Frame
 
-Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
-Similarity = Literal["iou", "metres"]
 
 SCHEMA_VERSION: Final = 1
 COMBINED: Final = "COMBINED"
-IOU_THRESHOLD: Final = 0.5
 DEFAULT_GATES_M: Final = (0.5, 1.0, 2.0)
-#: The truth is interpolated over no longer hole than this.
-_MAX_HOLE_S: Final = 2.0
-#: Sizes that differ by more than this factor, where nothing ever meets, are in different units.
-_OTHER_UNIT: Final = 8.0
-#: Positions further apart than twice this have nothing to do with each other.
-_FAR_M: Final = 5.0
-#: How many pairs of boxes are compared in one go, to bound the memory that takes.
-_PAIRS_AT_ONCE: Final = 1_000_000
 _MODES: Final = {"online": "online", "": "offline"}
 
 
@@ -194,27 +193,23 @@ def _combined(results: Sequence[Result]) -> list[Result]:
 
 
 def _score(sequence: Sequenced, candidate: Candidate, options: EvaluateOptions, notes: list[str]) -> list[Result]:
-    truth, tracks = _aligned(sequence, candidate)
+    truth, tracks = align(sequence.name, candidate.name, sequence.truth, candidate.frames)
     wanted = options.similarities or ("iou", "metres")
     results = []
     for similarity in wanted:
-        column = "x_px" if similarity == "iou" else "x_m"
-        sides = {"the truth": truth, candidate.name: tracks}
-        without = [
-            name for name, frames in sides.items() if not _has(frames, column) and any(len(f.rows) for f in frames)
-        ]
-        if without:
+        lacking = without({"the truth": truth, candidate.name: tracks}, similarity)
+        if lacking:
             unit = "boxes" if similarity == "iou" else "positions in metres"
             if options.similarities:
                 raise McaptrackError(
-                    f"{sequence.name}: {' and '.join(without)} {'have' if len(without) > 1 else 'has'} no {unit}"
+                    f"{sequence.name}: {' and '.join(lacking)} {'have' if len(lacking) > 1 else 'has'} no {unit}"
                 )
             continue
         gates = (options.min_iou,) if similarity == "iou" else options.gates_m
         for gate in gates:
             score = metrics.score(matchup(truth, tracks, similarity, gate), options.rules)
             if gate == gates[-1] and score.hota["HOTA_TP"][0] == 0:
-                notes += _strangers(sequence, candidate, truth, tracks, similarity)
+                notes += strangers(sequence.name, candidate.name, truth, tracks, similarity)
             results.append(
                 Result(
                     sequence.name,
@@ -236,128 +231,6 @@ def _score(sequence: Sequenced, candidate: Candidate, options: EvaluateOptions, 
     return results
 
 
-def _strangers(
-    sequence: Sequenced, candidate: Candidate, truth: Sequence[Frame], tracks: Sequence[Frame], similarity: Similarity
-) -> list[str]:
-    """Words on tracks that never come near anybody. Raises McaptrackError if that is because units differ."""
-    both = {f"the truth of {sequence.name}": truth, candidate.name: tracks}
-    if not all(any(len(frame.rows) for frame in frames) for frames in both.values()):
-        return []
-    if similarity == "iou":
-        alike = matchup(truth, tracks, "iou", IOU_THRESHOLD)
-        sizes = [float(np.nanmedian(np.concatenate([f.rows["h_px"] for f in frames]))) for frames in both.values()]
-        what, unit = "boxes", "px high"
-    else:
-        alike = matchup(truth, tracks, "metres", _FAR_M)
-        spans = [np.concatenate([_xy(f.rows) for f in frames]) for frames in both.values()]
-        sizes = [float(np.nanmedian(np.abs(xy - np.nanmedian(xy, axis=0)))) for xy in spans]
-        what, unit = "positions", "m from their middle"
-    if len(alike.pairs.frame):
-        return []
-    small, large = sorted(sizes)
-    if large > _OTHER_UNIT * max(small, 1e-9):
-        (a, b), (m, n) = both, sizes
-        raise McaptrackError(
-            f"{what} of {a} are {m:.3g} {unit}, those of {b} {n:.3g}, and none ever meet: they are not in the same unit"
-        )
-    return [f"{sequence.name}: {candidate.name} and the truth never come near each other"]
-
-
-def _has(frames: Sequence[Frame], column: str) -> bool:
-    return any(np.isfinite(frame.rows[column]).any() for frame in frames)
-
-
-def _aligned(sequence: Sequenced, candidate: Candidate) -> tuple[list[Frame], list[Frame]]:
-    """Truth and tracks at the same times. Raises McaptrackError if they never overlap."""
-    truth_ns = np.array([frame.t_ns for frame in sequence.truth], np.int64)
-    tracks_ns = np.array([frame.t_ns for frame in candidate.frames], np.int64)
-    by_time = {frame.t_ns: frame for frame in candidate.frames}
-    if 2 * np.isin(truth_ns, tracks_ns).sum() >= len(truth_ns):
-        empty = TRACKS.empty()
-        return list(sequence.truth), [by_time.get(f.t_ns, Frame(f.t_ns, f.index, empty)) for f in sequence.truth]
-    kept = looked_at(truth_ns, tracks_ns, seconds_to_ns(_MAX_HOLE_S))
-    if not kept.any():
-        raise McaptrackError(
-            f"{sequence.name}: the truth ({_span(truth_ns)}) and {candidate.name} ({_span(tracks_ns)}) "
-            "never overlap in time"
-        )
-    at_ns = np.unique(tracks_ns[kept])
-    return _resampled(sequence.truth, at_ns), [by_time[t_ns] for t_ns in at_ns.tolist()]
-
-
-def _span(t_ns: Ints) -> str:
-    return f"{t_ns[0] / NS_PER_S:.3f} to {t_ns[-1] / NS_PER_S:.3f} s" if len(t_ns) else "no frames"
-
-
-def _resampled(frames: Sequence[Frame], at_ns: Ints) -> list[Frame]:
-    out, at = resample(frames, at_ns, seconds_to_ns(_MAX_HOLE_S))
-    ends = np.searchsorted(at, np.arange(len(at_ns)), "right").tolist()
-    spans = zip(at_ns.tolist(), [0, *ends][:-1], ends, strict=True)
-    return [Frame(t_ns, index, out[low:high]) for index, (t_ns, low, high) in enumerate(spans)]
-
-
-def _xy(rows: Rows) -> Floats:
-    return np.stack([rows["x_m"], rows["y_m"]], axis=-1)
-
-
-def matchup(truth: Sequence[Frame], tracks: Sequence[Frame], similarity: Similarity, gate: float) -> Matchup:
-    """Truth and tracks at the same times as a matchup: boxes by overlap, or positions by distance."""
-    column = "x_px" if similarity == "iou" else "x_m"
-    (people, true_ids, true_ends), (found, track_ids, track_ends) = (_usable(part, column) for part in (truth, tracks))
-    places = columns_to_boxes if similarity == "iou" else _xy
-    a, b = places(people), places(found)
-    alike: list[Floats] = []
-    step = max(1, round(_PAIRS_AT_ONCE / max(1.0, len(a) * len(b) / max(1, len(truth)) ** 2)))
-    for first in range(0, len(truth), step):
-        alike += _similarities(a, b, true_ends[first : first + step + 1], track_ends[first : first + step + 1], gate)
-    return Matchup(
-        tuple(np.split(true_ids.where, true_ends[1:-1])),
-        tuple(np.split(track_ids.where, track_ends[1:-1])),
-        tuple(alike),
-        gate if similarity == "iou" else 0.5,
-        true_ids.total,
-        track_ids.total,
-    )
-
-
-class _Ids(NamedTuple):
-    """Ids as dense numbers from 0 on (N,), and how many there are."""
-
-    where: Ints
-    total: int
-
-
-def _usable(frames: Sequence[Frame], column: str) -> tuple[Rows, _Ids, Ints]:
-    """The rows of all frames that have a place, their ids, and where the rows of each frame begin and end."""
-    ends = np.cumsum([0] + [len(frame.rows) for frame in frames])
-    rows = TRACKS.empty(int(ends[-1]))
-    for low, frame in zip(ends.tolist(), frames, strict=False):
-        rows[low : low + len(frame.rows)] = frame.rows
-    usable = np.isfinite(rows[column])
-    if not usable.all():
-        ends, rows = np.concatenate([[0], usable.cumsum()])[ends], rows[usable]
-    names, where = np.unique(rows["track_id"], return_inverse=True)
-    return rows, _Ids(where, len(names)), ends
-
-
-def _similarities(a: Floats, b: Floats, a_ends: Ints, b_ends: Ints, gate: float) -> list[Floats]:
-    """How alike are the boxes or places in ``a`` and ``b`` of some frames, (G, H) a frame; all pairs in one go."""
-    people, found = np.diff(a_ends), np.diff(b_ends)
-    size = people * found
-    ends = np.cumsum(size)
-    frame = np.repeat(np.arange(len(size)), size)
-    within = np.arange(len(frame)) - (ends - size)[frame]
-    row = a_ends[frame] + within // found[frame]
-    column = b_ends[frame] + within % found[frame]
-    if a.shape[1] == 4:
-        alike = iou_of_pairs(a[row], b[column])
-    else:
-        apart = a[row] - b[column]
-        alike = metrics.metres_to_similarity(np.hypot(apart[:, 0], apart[:, 1]), gate)
-    spans = zip((ends - size).tolist(), ends.tolist(), people.tolist(), found.tolist(), strict=True)
-    return [alike[low:high].reshape(g, h) for low, high, g, h in spans]
-
-
 def _displacement(sequence: Sequenced, candidate: Candidate) -> Displacement | None:
     """The errors of the forecasts made from a candidate; None if there are no forecasts at all."""
     frames = [frame for frame in candidate.forecasts or () if len(frame.rows)]
@@ -377,9 +250,9 @@ def _displacement(sequence: Sequenced, candidate: Candidate) -> Displacement | N
     last = int(to_step(clock_ns[-1:])[0])
     truth_ns = np.array([frame.t_ns for frame in sequence.truth], np.int64)
     ticks = start + np.rint(np.arange(last + 1) * step_ns).astype(np.int64)
-    ticks = ticks[looked_at(truth_ns, ticks, seconds_to_ns(_MAX_HOLE_S))]
+    ticks = ticks[looked_at(truth_ns, ticks, seconds_to_ns(MAX_HOLE_S))]
     made_ns = np.repeat(np.array([frame.t_ns for frame in frames], np.int64), [len(frame.rows) for frame in frames])
-    mean = _xy(rows).reshape(-1, horizon, 2)
+    mean = on_ground(rows).reshape(-1, horizon, 2)
     cov = np.stack([rows["cov_xx_m2"], rows["cov_xy_m2"], rows["cov_xy_m2"], rows["cov_yy_m2"]], axis=-1)
     forecasts = Forecasts(
         to_step(made_ns[::horizon]), rows["track_id"][::horizon], mean, cov.reshape(-1, horizon, 2, 2)
@@ -389,9 +262,9 @@ def _displacement(sequence: Sequenced, candidate: Candidate) -> Displacement | N
         kept = [frame.rows[np.isfinite(frame.rows["x_m"])] for frame in members]
         all_rows = np.concatenate([TRACKS.empty(), *kept])
         t_ns = np.repeat(np.array([frame.t_ns for frame in members], np.int64), [len(part) for part in kept])
-        return Positions(to_step(t_ns), all_rows["track_id"], _xy(all_rows))
+        return Positions(to_step(t_ns), all_rows["track_id"], on_ground(all_rows))
 
-    return displacement(positions(_resampled(sequence.truth, ticks)), positions(candidate.frames), forecasts)
+    return displacement(positions(resampled(sequence.truth, ticks)), positions(candidate.frames), forecasts)
 
 
 def sequence_of_files(

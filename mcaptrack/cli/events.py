@@ -1,0 +1,50 @@
+"""``mcaptrack events``: what happened to the identities of tracks."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from mcaptrack.cli import common
+from mcaptrack.cli.stages import run_on_logs, watched
+
+
+@common.one_line
+def events(
+    logs: common.Logs,
+    topic: Annotated[
+        list[str] | None,
+        common.option("--topic", help="Look at these channels of tracks.", show_default="tracks, retracks"),
+    ] = None,
+    similarity: Annotated[
+        Literal["iou", "metres"] | None,
+        common.option(
+            "--similarity",
+            help="What makes a person and a track alike.",
+            show_default="iou at the video's rate, otherwise metres",
+        ),
+    ] = None,
+    gate: Annotated[
+        float | None,
+        common.option("--gate", help="Least overlap, or distance in metres.", show_default="0.5, or 1 m"),
+    ] = None,
+    camera: common.Camera = None,
+    output: common.Output = None,
+    sidecar: common.Sidecar = False,
+    force: common.Force = False,
+    json: common.Json = False,
+    quiet: common.Quiet = False,
+    verbose: common.Verbose = False,
+    config: common.Config = None,
+) -> None:
+    """Write down what happened to identities: to jump to in a viewer, to query, to plot.
+
+    Where tracks begin and end, and which of them re-tracking joined or parted; where the log has /camera/truth also
+    who was missed, which tracks are nobody, and each identity switch, matched as `mcaptrack evaluate` does. To
+    /camera/tracks/events (rows), .../events/view/log (words) and /camera/tracks/counts (how it stands, frame by frame),
+    and the same for /camera/retracks. `mcaptrack run` does this too.
+
+    Example: mcaptrack events log.mcap --similarity metres --gate 1
+    """
+    watch = watched(similarity, gate, topics=tuple(topic or ()), again=True)
+    given = {"logs": logs, "camera": camera, "output": output, "sidecar": sidecar, "topic": None, "force": force}
+    run_on_logs(given | {"json": json, "quiet": quiet, "verbose": verbose}, lambda _: [], watch=watch)

@@ -1,0 +1,570 @@
+"""What happened to identities: worded scenes counted by hand, laws, and what it leaves in a log."""
+
+from __future__ import annotations
+
+import json
+import re
+from contextvars import copy_context
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from foxglove_schemas_protobuf.Log_pb2 import Log as LogMessage
+from hypothesis import given
+from hypothesis import strategies as st
+from typer.testing import CliRunner
+
+from mcaptrack import log, pipeline
+from mcaptrack.cli import app
+from mcaptrack.errors import McaptrackError
+from mcaptrack.evaluation import Candidate, EvaluateOptions, Sequenced, evaluate, sequence_of_log
+from mcaptrack.evaluation.events import EventOptions, Rule, find_events
+from mcaptrack.evaluation.words import log_messages
+from mcaptrack.provenance import Provenance, digest
+from mcaptrack.schema import COUNTS, EVENT_KINDS, EVENTS, TRACKS, EventKind, Frame
+from mcaptrack.schema.proto import parse
+from mcaptrack.transforms import PROFILES
+from tests.test_evaluation import boxed
+from tests.worlds import ns, tracks_at, walk
+
+BIRTH, END, MISS, FALSE, SWITCH = (
+    EventKind.BIRTH,
+    EventKind.END,
+    EventKind.MISS,
+    EventKind.FALSE_TRACK,
+    EventKind.SWITCH,
+)
+OWN = {BIRTH, END}
+
+
+def happened(found, *but) -> list[tuple]:
+    """(seconds, kind, track, person, previous) of all events, but those of some kinds."""
+    return [
+        (
+            frame.t_ns / 1e9,
+            EventKind(row["kind"]),
+            *(int(row[name]) for name in ("track_id", "truth_id", "previous_id")),
+        )
+        for frame in found.events
+        for row in frame.rows
+        if row["kind"] not in but
+    ]
+
+
+def rows_of(found, kind):
+    rows = np.concatenate([frame.rows for frame in found.events])
+    return rows[rows["kind"] == kind]
+
+
+def counted(found, name) -> list:
+    return [frame.rows[name].item() for frame in found.counts]
+
+
+def said(found, start_ns=0) -> list[tuple[str, str]]:
+    """Level and words of the messages."""
+    messages = [LogMessage.FromString(data) for *_, data in log_messages(found.events, "/t", start_ns, found.usual_s)]
+    return [
+        (LogMessage.DESCRIPTOR.fields_by_name["level"].enum_type.values_by_number[m.level].name, m.message)
+        for m in messages
+    ]
+
+
+def follow(path, source, ticks, rate_hz=10.0) -> list[Frame]:
+    """Frames of re-tracked tracks; ``source`` gives the source of each track at every tick, -1 for none."""
+    frames = []
+    for tick in range(ticks):
+        rows = tracks_at(path(tick))
+        rows["source_id"] = [source(tick)[who] for who in path(tick)]
+        frames.append(Frame(ns(tick / rate_hz), tick, rows))
+    return frames
+
+
+# Scenes
+
+
+def test_two_people_swap_their_tracks():
+    truth = walk(lambda n: {1: (n / 10, 0.0), 2: (n / 10, 4.0)}, 30, 10)
+    tracks = walk(lambda n: {(7 if n < 10 else 8): (n / 10, 0.0), (8 if n < 10 else 7): (n / 10, 4.0)}, 30, 10)
+    found = find_events(tracks, truth)
+    assert found.rule == Rule("metres", 1.0)
+    assert happened(found) == [
+        (0.0, BIRTH, 7, -1, -1),
+        (0.0, BIRTH, 8, -1, -1),
+        (1.0, SWITCH, 7, 2, 8),
+        (1.0, SWITCH, 8, 1, 7),
+    ]
+    assert said(found)[2:] == [
+        ("ERROR", "person 2: track 8 became track 7 at 1.00 s, (1.0, 4.0) m"),
+        ("ERROR", "person 1: track 7 became track 8 at 1.00 s, (1.0, 0.0) m"),
+    ]
+    assert counted(found, "switches") == [0] * 10 + [2] * 20
+    assert counted(found, "mota")[9:11] == [1.0, (22 - 2) / 22]
+
+
+def test_a_person_is_missed_for_three_seconds():
+    truth = walk(lambda n: {4: (n / 10, 2.0)}, 80, 10)
+    tracks = walk(lambda n: {} if 20 <= n < 50 else {1: (n / 10, 2.0)}, 80, 10)
+    found = find_events(tracks, truth)
+    assert happened(found, *OWN) == [(2.0, MISS, -1, 4, 1)]
+    (row,) = rows_of(found, MISS)
+    assert (row["duration_s"], row["frames"], row["x_m"], row["y_m"]) == (3.0, 30, 2.0, 2.0)
+    assert said(found)[-1] == ("WARNING", "person 4 is missed for 3.0 s at 2.00 s, (2.0, 2.0) m, track 1 had them")
+    assert counted(found, "misses") == [0] * 20 + [1] * 30 + [0] * 30
+
+
+def test_a_track_is_nobody_for_two_seconds():
+    truth = walk(lambda n: {4: (n / 10, 2.0)}, 50, 10)
+    tracks = walk(lambda n: {1: (n / 10, 2.0)} | ({9: (3.0, 30.0)} if 10 <= n < 30 else {}), 50, 10)
+    found = find_events(tracks, truth)
+    assert happened(found) == [
+        (0.0, BIRTH, 1, -1, -1),
+        (1.0, FALSE, 9, -1, -1),
+        (1.0, BIRTH, 9, -1, -1),
+        (2.9, END, 9, -1, -1),
+    ]
+    for row in (*rows_of(found, FALSE), *rows_of(found, END)):
+        assert (row["duration_s"], row["frames"]) == (2.0, 20)
+    assert said(found) == [  # its beginning and its end go without saying
+        ("INFO", "track 1 begins at 0.00 s, (0.0, 2.0) m"),
+        ("WARNING", "track 9 is nobody while it lasts, for 2.0 s at 1.00 s, (3.0, 30.0) m"),
+    ]
+    assert counted(found, "born") == [1] * 10 + [2] * 40
+    assert counted(found, "ended") == [0] * 29 + [1] * 21
+    assert counted(found, "false_tracks") == [0] * 10 + [1] * 20 + [0] * 20
+
+
+def test_a_track_that_drifts_off_is_one_message_and_comes_back():
+    truth = walk(lambda n: {4: (n / 10, 2.0)}, 60, 10)
+    tracks = walk(lambda n: {1: (n / 10, 2.0 + 5 * (20 <= n < 40))}, 60, 10)
+    found = find_events(tracks, truth)
+    assert happened(found, *OWN) == [(2.0, MISS, -1, 4, 1), (2.0, FALSE, 1, -1, 4)]
+    assert said(found)[1:] == [("WARNING", "person 4 and track 1 are apart for 2.0 s at 2.00 s, (2.0, 2.0) m")]
+
+
+def test_what_is_the_same_again_a_moment_later_is_one_event():
+    gone = {20, 21, 22, 26, 27, 28, 50}
+    truth = walk(lambda n: {4: (n / 10, 2.0)}, 80, 10)
+    tracks = walk(lambda n: {} if n in gone else {1: (n / 10, 2.0)}, 80, 10)
+    found = find_events(tracks, truth)
+    assert happened(found, *OWN) == [(2.0, MISS, -1, 4, 1), (5.0, MISS, -1, 4, 1)]
+    assert rows_of(found, MISS)["frames"].tolist() == [6, 1]
+    assert rows_of(found, MISS)["duration_s"].tolist() == pytest.approx([0.9, 0.1])
+    assert said(found)[1:] == [
+        ("DEBUG", "person 4 is missed in 6 of 9 frames over 0.9 s at 2.00 s, (2.0, 2.0) m, track 1 had them"),
+        ("DEBUG", "person 4 is missed for 0.1 s at 5.00 s, (5.0, 2.0) m, track 1 had them"),
+    ]
+
+
+def test_a_switch_says_how_long_nobody_held_the_person():
+    truth = walk(lambda n: {4: (n / 10, 2.0)}, 60, 10)
+    tracks = walk(lambda n: {} if 20 <= n < 32 else {(7 if n < 20 else 12): (n / 10, 2.0)}, 60, 10)
+    found = find_events(tracks, truth)
+    assert happened(found, *OWN) == [(2.0, MISS, -1, 4, 7), (3.2, SWITCH, 12, 4, 7)]
+    assert rows_of(found, SWITCH)["duration_s"].tolist() == pytest.approx([1.2])
+    assert ("ERROR", "person 4: track 7 became track 12 at 3.20 s, (3.2, 2.0) m, 1.2 s unseen") in said(found)
+
+
+def test_without_truth_there_are_births_and_ends_and_what_is_not_known_is_missing():
+    tracks = walk(lambda n: {1: (n / 10, 0.0)} if n < 25 else {2: (0.0, n / 10)}, 40, 10)
+    found = find_events(tracks, None)
+    assert (found.rule, found.notes) == (None, [])
+    assert happened(found) == [(0.0, BIRTH, 1, -1, -1), (2.4, END, 1, -1, -1), (2.5, BIRTH, 2, -1, -1)]
+    for name in ("people", "matches", "misses", "false_tracks", "switches", "mota"):
+        assert np.isnan(counted(found, name)).all()
+    assert counted(found, "tracked") == [1] * 40
+
+
+def test_boxes_without_metres_say_where_in_pixels():
+    found = find_events([Frame(0, 0, boxed({3: (20.0, 40.0)})), Frame(ns(2), 1, boxed({}))], None)
+    assert said(found, start_ns=0)[0] == ("INFO", "track 3 begins at 0.00 s, (25, 50) px")
+
+
+def test_what_re_tracking_joined_and_parted():
+    """Track 1 goes on from source 5 to 8 after a hole of 0.5 s; source 5 goes on as track 2, who is new."""
+    path = lambda n: {1: (n / 10, 0.0)} | ({2: (n / 10, 6.0)} if n >= 40 else {})  # noqa: E731
+    source = lambda n: {1: 5 if n < 20 else -1 if n < 25 else 8, 2: 5}  # noqa: E731
+    found = find_events(follow(path, source, 60), None)
+    assert happened(found, *OWN) == [(2.5, EventKind.JOINED, 1, -1, 5), (4.0, EventKind.PARTED, 2, -1, 1)]
+    assert rows_of(found, EventKind.JOINED)["source_id"].tolist() == [8]
+    assert rows_of(found, EventKind.JOINED)["duration_s"].tolist() == [0.5]
+    assert said(found)[1:] == [
+        ("WARNING", "track 1 joins the tracker's 5 and 8 at 2.50 s, (2.5, 0.0) m, 0.5 s unseen"),
+        ("INFO", "track 2 begins at 4.00 s, (4.0, 6.0) m"),
+        ("WARNING", "track 2 takes over the tracker's 5, which was track 1, at 4.00 s, (4.0, 6.0) m"),
+    ]
+    assert counted(found, "repaired") == [0] * 25 + [1] * 15 + [2] * 20
+
+
+def test_a_source_that_is_another_for_a_moment_is_no_repair():
+    flicker = lambda n: {1: 8 if n in (20, 21, 24, 25, 26) else 5}  # noqa: E731
+    assert happened(find_events(follow(lambda n: {1: (n / 10, 0.0)}, flicker, 60), None), *OWN) == []
+    lasting = lambda n: {1: 8 if n in (20, 21) or n >= 24 else 5}  # noqa: E731
+    found = find_events(follow(lambda n: {1: (n / 10, 0.0)}, lasting, 60), None)
+    assert happened(found, *OWN) == [(2.4, EventKind.JOINED, 1, -1, 5)]
+
+
+def test_a_swap_that_re_tracking_undid_is_two_joins_and_one_message():
+    source = lambda n: {1: 5 if n < 30 else 6, 2: 6 if n < 30 else 5}  # noqa: E731
+    found = find_events(follow(lambda n: {1: (n / 10, 0.0), 2: (n / 10, 2.0)}, source, 60), None)
+    assert happened(found, *OWN) == [(3.0, EventKind.JOINED, 1, -1, 5), (3.0, EventKind.JOINED, 2, -1, 6)]
+    assert said(found)[2:] == [("WARNING", "tracks 1 and 2: the tracker swapped its 5 and 6 at 3.00 s, (3.0, 0.0) m")]
+
+
+# What is compared with what
+
+
+def test_boxes_at_the_videos_rate_go_by_overlap_and_other_clocks_by_metres():
+    boxes = [Frame(ns(n / 10), n, boxed({1: (n * 1.0, 0.0)})) for n in range(30)]
+    assert find_events(boxes, boxes).rule == Rule("iou", 0.5)
+    metres = walk(lambda n: {1: (n / 10, 0.0)}, 30, 10)
+    assert find_events(metres, metres).rule == Rule("metres", 1.0)
+    both = [Frame(f.t_ns, f.index, g.rows.copy()) for f, g in zip(boxes, metres, strict=True)]
+    for frame, other in zip(both, boxes, strict=True):
+        for name in ("x_px", "y_px", "w_px", "h_px"):
+            frame.rows[name] = other.rows[name]
+    assert find_events(both, both).rule == Rule("iou", 0.5)
+    slow = [Frame(frame.t_ns + 10_000_000, n, frame.rows) for n, frame in enumerate(both[::4])]
+    assert find_events(slow, both).rule == Rule("metres", 1.0)
+    assert find_events(both, both, EventOptions("metres", 0.3)).rule == Rule("metres", 0.3)
+
+
+def test_truth_at_another_clock_is_brought_to_that_of_the_tracks():
+    truth = [Frame(ns(n / 7), n, tracks_at({1: (n / 7, 0.0)})) for n in range(71)]
+    tracks = walk(lambda n: {(3 if n < 10 else 4): (n / 2.5, 0.0)}, 25)
+    found = find_events(tracks, truth)
+    assert happened(found, *OWN) == [(4.0, SWITCH, 4, 1, 3)]
+    assert [frame.t_ns for frame in found.counts] == [frame.t_ns for frame in tracks]
+
+
+def test_tracks_at_more_times_than_the_truth_have_counts_there_and_no_scores():
+    truth = walk(lambda n: {1: (float(n), 0.0)}, 10)
+    tracks = [Frame(ns(n / 30), n, tracks_at({5: (n / 12, 0.0)})) for n in range(9 * 12 + 1)]
+    found = find_events(tracks, truth)
+    assert happened(found) == [(0.0, BIRTH, 5, -1, -1)]
+    assert len(found.counts) == len(tracks)
+    assert [n for n, value in enumerate(counted(found, "mota")) if not np.isnan(value)] == list(range(0, 109, 12))
+    assert counted(found, "tracked") == [1] * 109
+
+
+def test_frames_of_the_truth_that_tracks_lack_are_there_too():
+    truth = walk(lambda n: {1: (n / 10, 0.0)}, 30, 10)
+    found = find_events(truth[:20], truth)
+    assert happened(found, *OWN) == [(2.0, MISS, -1, 1, 1)]
+    assert counted(found, "tracked") == [1] * 20 + [0] * 10
+
+
+@pytest.mark.parametrize(
+    ("truth", "options", "words"),
+    [
+        ([Frame(ns(n), n, tracks_at({})) for n in range(5)], EventOptions(), "the truth holds nobody"),
+        (
+            [Frame(ns(900 + n), n, tracks_at({1: (0.0, 0.0)})) for n in range(5)],
+            EventOptions(),
+            "the truth (900.000 to 904.000 s) and /t (0.000 to 3.900 s) never overlap in time",
+        ),
+        (
+            [Frame(ns(n / 10), n, boxed({1: (0.0, 0.0)})) for n in range(40)],
+            EventOptions(),
+            "/t and the truth share neither boxes nor positions in metres",
+        ),
+        ([Frame(ns(n / 10), n, tracks_at({1: (0.0, 0.0)})) for n in range(40)], EventOptions("iou"), "have no boxes"),
+        (
+            [Frame(ns(n / 10), n, tracks_at({1: (5000.0 * n, 900.0)})) for n in range(40)],
+            EventOptions(),
+            "they are not in the same unit",
+        ),
+    ],
+)
+def test_truth_that_cannot_be_compared_is_said_and_left_out(truth, options, words):
+    tracks = walk(lambda n: {1: (n / 10, 0.0)}, 40, 10)
+    found = find_events(tracks, truth, options, "a", "/t")
+    (note,) = found.notes
+    assert words in note
+    assert found.rule is None
+    assert {kind for _, kind, *_ in happened(found)} == {BIRTH}
+    assert len(found.counts) == 40
+
+
+@pytest.mark.parametrize("truth", [None, []])
+def test_nothing_at_all_is_nothing(truth):
+    found = find_events([], truth)
+    assert (found.events, found.counts) == ([], [])
+    empty = find_events(walk(lambda _: {}, 3), truth)
+    assert [len(frame.rows) for frame in empty.events] == [0, 0, 0]
+    assert counted(empty, "tracked") == [0, 0, 0]
+
+
+def test_kinds_have_the_words_of_the_schema():
+    path = Path(__file__).parent.parent / "schemas" / "Events.proto"
+    (kind,) = [column for column in parse(path.read_text(), path.name).columns if column.name == "kind"]
+    assert dict(re.findall(r"(\d+) ([a-z ]+)", kind.doc)) == {str(int(k)): words for k, words in EVENT_KINDS.items()}
+    assert set(EVENT_KINDS) == set(EventKind)
+
+
+# Laws
+
+PEOPLE = st.dictionaries(st.integers(1, 4), st.tuples(st.integers(0, 4), st.integers(0, 2)), max_size=4)
+
+
+@st.composite
+def scenes(draw) -> tuple[list[Frame], list[Frame]]:
+    """Truth and tracks that come, go and swap as they like, in boxes and metres, each person in a place of their own."""
+
+    def frames(count: int) -> list[Frame]:
+        out = []
+        for number in range(count):
+            people = {who: (10.0 * x, 20.0 * y) for who, (x, y) in draw(PEOPLE).items()}
+            rows = boxed(people)
+            rows["x_m"], rows["y_m"] = rows["x_px"] / 10 + 0.01 * rows["track_id"], rows["y_px"] / 20
+            out.append(Frame(ns(number * 0.4), number, rows))
+        return out
+
+    count = draw(st.integers(1, 12))
+    return frames(count), frames(draw(st.integers(count // 2 + 1, count)))
+
+
+@pytest.mark.parametrize("similarity", ["iou", "metres"])
+@given(scene=scenes())
+def test_events_and_counts_add_up_to_the_scores(similarity, scene):
+    truth, tracks = scene
+    if not any(len(frame.rows) for frame in truth):
+        return
+    gate = 0.5 if similarity == "iou" else 1.0
+    found = find_events(tracks, truth, EventOptions(similarity, gate))
+    options = EvaluateOptions(similarities=(similarity,), gates_m=(gate,), min_iou=gate)
+    (result,) = evaluate([Sequenced("x", truth, [Candidate("t", None, tracks)])], options).results
+    score = result.to_json()
+    assert len(rows_of(found, SWITCH)) == counted(found, "switches")[-1] == score["IDSW"]
+    assert rows_of(found, MISS)["frames"].sum() == sum(counted(found, "misses")) == score["FN"]
+    assert rows_of(found, FALSE)["frames"].sum() == sum(counted(found, "false_tracks")) == score["FP"]
+    assert sum(counted(found, "matches")) + score["FN"] == sum(counted(found, "people"))
+    assert counted(found, "mota")[-1] == pytest.approx(score["MOTA"], abs=1e-12)
+    ids = {who for frame in tracks for who in frame.rows["track_id"].tolist()}
+    assert len(rows_of(found, BIRTH)) == counted(found, "born")[-1] == len(ids)
+    assert sum(counted(found, "tracked")) == sum(len(frame.rows) for frame in tracks)
+    assert len(said(found)) <= len(np.concatenate([frame.rows for frame in found.events]))
+
+
+@given(scene=scenes(), seed=st.integers(0, 99))
+def test_the_order_of_rows_does_not_matter(scene, seed):
+    rng = np.random.default_rng(seed)
+
+    def shuffled(frames):
+        return [Frame(f.t_ns, f.index, f.rows[rng.permutation(len(f.rows))]) for f in frames]
+
+    truth, tracks = scene
+    truth = [Frame(f.t_ns, f.index, f.rows.copy()) for f in truth]
+    for frame in truth:  # nobody is as near to one as to another
+        frame.rows["x_m"] += rng.uniform(0, 0.2, len(frame.rows))
+        frame.rows["y_m"] += rng.uniform(0, 0.2, len(frame.rows))
+    once = find_events(tracks, truth, EventOptions("metres"))
+    again = find_events(shuffled(tracks), shuffled(truth), EventOptions("metres"))
+    assert happened(once) == happened(again)
+    assert [f.rows.tobytes() for f in once.counts] == [f.rows.tobytes() for f in again.counts]
+
+
+# In a log
+
+
+def written(path: Path, made_by: str = "ingest", **channels: list[Frame]) -> Path:
+    """A log without pictures: channels of /camera, made by something; by nobody if that is empty."""
+    with log.create(path) as writer:
+        for name, frames in channels.items():
+            messages = [(f.t_ns, f.index, TRACKS.codec.encode(f.rows)) for f in frames]
+            how = Provenance(made_by, {}, digest=digest(messages)).to_metadata() if made_by else {}
+            topic = "/camera/" + name.replace("_", "/")
+            number = writer.add_channel(topic, (TRACKS.name, "protobuf", TRACKS.descriptor), "protobuf", how)
+            for t_ns, index, payload in messages:
+                writer.add_message(number, t_ns, index, payload)
+    return path
+
+
+def watched(path: Path, *topics: str, again: bool = False, output: Path | None = None, **options):
+    """What ``run`` does at the end, and ``mcaptrack events`` with ``again``."""
+    notes: list[str] = []
+    with log.read(path) as opened:
+        watch = pipeline.Watch(EventOptions(**options), topics, again)
+        return pipeline.run(opened, "/camera", [], output, say=notes.append, watch=watch), notes
+
+
+TRUTH = walk(lambda n: {1: (n / 10, 0.0), 2: (n / 10, 4.0)}, 60, 10)
+SWAPPED = walk(lambda n: {(7 if n < 30 else 8): (n / 10, 0.0), (8 if n < 30 else 7): (n / 10, 4.0)}, 60, 10)
+#: The topics of the events of /camera/tracks.
+TOPICS = {"/camera/tracks/events", "/camera/tracks/events/view/log", "/camera/tracks/counts"}
+
+
+@pytest.fixture
+def place(tmp_path) -> Path:
+    return written(tmp_path / "a.mcap", tracks=SWAPPED, truth=TRUTH)
+
+
+def test_events_words_and_counts_stand_beside_the_tracks(place):
+    report, notes = watched(place)
+    assert (report.stages, notes) == (["events"], [])
+    assert report.events == {
+        "/camera/tracks": dict.fromkeys(EVENT_KINDS.values(), 0) | {"birth": 2, "identity switch": 2}
+    }
+    assert log.check(place).is_sound
+    with log.read(place) as opened:
+        assert set(opened.channels) == TOPICS | {"/camera/tracks", "/camera/truth"}
+        events, counts = opened.frames("/camera/tracks/events", EVENTS), opened.frames("/camera/tracks/counts", COUNTS)
+        assert [f.t_ns for f in events] == [f.t_ns for f in counts] == [f.t_ns for f in SWAPPED]
+        (result,) = evaluate(
+            [sequence_of_log(opened, "/camera", ["/camera/tracks"])], EvaluateOptions(("metres",), (1.0,))
+        ).results
+        assert counts[-1].rows["mota"].item() == result.to_json()["MOTA"]
+        messages = list(opened.messages("/camera/tracks/events/view/log"))
+        parsed = [LogMessage.FromString(message.payload) for message in messages]
+        assert [m.t_ns for m in messages] == [p.timestamp.seconds * 10**9 + p.timestamp.nanos for p in parsed]
+        assert {p.name for p in parsed} == {"/camera/tracks"}
+        assert parsed[-1].message == "person 1: track 7 became track 8 at 3.00 s, (3.0, 0.0) m"
+        made = Provenance.from_metadata(opened.channel("/camera/tracks/events").metadata)
+        assert (made.transform, made.input, made.reference) == ("events", "/camera/tracks", "/camera/truth")
+        now = {topic: Provenance.from_metadata(opened.channel(topic).metadata).digest for topic in opened.channels}
+        assert (made.input_digest, made.reference_digest) == (now["/camera/tracks"], now["/camera/truth"])
+        assert made.parameters == {"asked": {"similarity": None, "gate": None}, "similarity": "metres", "gate": 1.0}
+
+
+def test_what_stands_is_left_and_what_is_made_again_is_the_same_to_the_byte(place):
+    watched(place)
+    once = place.read_bytes()
+    assert watched(place)[0].stages == []
+    assert place.read_bytes() == once
+    assert watched(place, again=True)[0].stages == ["events"]
+    assert place.read_bytes() == once
+
+
+def test_options_are_kept_until_others_are_asked_for(place):
+    def rule():
+        with log.read(place) as opened:
+            made = Provenance.from_metadata(opened.channel("/camera/tracks/counts").metadata)
+            return made.parameters["similarity"], made.parameters["gate"]
+
+    watched(place, again=True, similarity="metres", gate=0.25)
+    assert rule() == ("metres", 0.25)
+    assert watched(place)[0].stages == []
+    assert watched(place, similarity="metres")[0].stages == ["events"]
+    assert rule() == ("metres", 1.0)
+
+
+def replaced(path: Path, topic: str, frames: list[Frame]) -> None:
+    messages = [(f.t_ns, f.index, TRACKS.codec.encode(f.rows)) for f in frames]
+    how = Provenance("ingest", {}, digest=digest(messages)).to_metadata()
+    with log.read(path) as opened, log.extend(opened, drop=[topic]) as writer:
+        number = writer.add_channel(topic, (TRACKS.name, "protobuf", TRACKS.descriptor), "protobuf", how)
+        for t_ns, index, payload in messages:
+            writer.add_message(number, t_ns, index, payload)
+
+
+@pytest.mark.parametrize("topic", ["/camera/tracks", "/camera/truth"])
+def test_other_tracks_or_another_truth_make_events_out_of_date(place, topic):
+    watched(place)
+    replaced(place, topic, walk(lambda n: {1: (n / 10, 0.0), 2: (n / 10, 4.0)}, 50, 10))
+    with log.read(place) as opened:
+        assert {name for name in opened.channels if pipeline.is_stale(opened, name)} == TOPICS - {
+            "/camera/tracks/events/view/log"
+        }
+    assert watched(place)[0].stages == ["events"]
+    assert watched(place)[0].stages == []
+
+
+def test_truth_that_comes_or_goes_makes_events_anew(tmp_path):
+    path = written(tmp_path / "a.mcap", tracks=SWAPPED)
+    report, notes = watched(path)
+    assert (report.events["/camera/tracks"]["identity switch"], notes) == (0, [])
+    assert watched(path)[0].stages == []
+    replaced(path, "/camera/truth", TRUTH)
+    assert watched(path)[0].events["/camera/tracks"]["identity switch"] == 2
+    with log.read(path) as opened, log.extend(opened, drop=["/camera/truth"]):
+        pass
+    assert watched(path)[0].events["/camera/tracks"]["identity switch"] == 0
+    assert watched(path)[0].stages == []
+
+
+def test_a_truth_that_cannot_be_compared_fails_nothing_and_is_said_once(tmp_path):
+    late = [Frame(frame.t_ns + ns(900), frame.index, frame.rows) for frame in TRUTH]
+    path = written(tmp_path / "a.mcap", tracks=SWAPPED, truth=late)
+    report, notes = watched(path)
+    assert report.events["/camera/tracks"]["birth"] == 2
+    assert len(notes) == 1
+    assert "never overlap in time" in notes[0]
+    assert watched(path)[1] == []
+
+
+def test_tracks_that_others_wrote_are_watched_and_their_channels_are_never_replaced(tmp_path):
+    path = written(tmp_path / "a.mcap", made_by="", tracks=SWAPPED, truth=TRUTH)
+    assert watched(path)[0].events["/camera/tracks"]["identity switch"] == 2
+    assert watched(path)[0].stages == []
+    path = written(tmp_path / "b.mcap", made_by="", tracks=SWAPPED, tracks_events=TRUTH)
+    report, notes = watched(path)
+    assert report.stages == []
+    assert notes == ["no events of /camera/tracks: /camera/tracks/events was recorded by others"]
+    with pytest.raises(McaptrackError, match="would replace /camera/tracks/events, which others recorded"):
+        watched(path, "/camera/tracks", again=True)
+
+
+def test_channels_that_are_named_are_watched_from_then_on(tmp_path):
+    path = written(tmp_path / "a.mcap", retracks_online=SWAPPED, truth=TRUTH)
+    with pytest.raises(McaptrackError, match="has no tracks of /camera"):
+        watched(path, again=True)
+    with log.read(path) as opened:
+        assert pipeline.camera_of(opened, ["/camera/retracks/online"]) == "camera"
+        assert pipeline.camera_of(opened, ["/elsewhere/tracks"]) is None
+    assert watched(path)[0].stages == []
+    watched(path, "/camera/retracks/online", again=True)
+    replaced(path, "/camera/retracks/online", TRUTH)
+    assert watched(path)[0].events["/camera/retracks/online"]["identity switch"] == 0
+
+
+def test_tracks_that_are_made_again_leave_events_out_of_date_until_the_next_run(tmp_path):
+    """The samples of true tracks, re-tracked in two ways."""
+    path = written(tmp_path / "a.mcap", samples=walk(lambda n: {5 + n // 40: (n / 4, 0.0)}, 80), truth=[])
+
+    def retrack(profile, watch=None):
+        with log.read(path) as opened:
+            jobs = pipeline.plan_stage(opened, "/camera", "retrack", PROFILES[profile], keep=("",))
+            return pipeline.run(opened, "/camera", jobs, watch=watch)
+
+    assert retrack("default", pipeline.Watch()).stages == ["retrack", "events"]
+    assert retrack("default").stale == []
+    assert retrack("paper").stale == ["/camera/retracks/counts", "/camera/retracks/events"]
+    with log.read(path) as opened:
+        report = pipeline.run(opened, "/camera", [], watch=pipeline.Watch())
+    assert (report.stages, report.stale) == (["events"], [])
+
+
+def test_a_log_of_tracks_without_rows(tmp_path):
+    path = written(tmp_path / "a.mcap", tracks=[], truth=TRUTH)
+    report, _ = watched(path)
+    assert report.events == {"/camera/tracks": dict.fromkeys(EVENT_KINDS.values(), 0)}
+    assert watched(path)[0].stages == []
+    assert log.check(path).is_sound
+
+
+def test_the_command_writes_drop_takes_along_and_tables_have_what_happened(place):
+    def call(*words):
+        result = CliRunner().invoke(app, [str(word) for word in words], catch_exceptions=False)
+        assert result.exit_code == 0, result.output
+        return result
+
+    data = json.loads(call("events", place, "--json", "--similarity", "metres", "--gate", "0.5").stdout)
+    (result,) = data["results"]
+    assert (result["stages"], result["events"]["/camera/tracks"]["identity switch"]) == (["events"], 2)
+    call("events", place, "--topic", "/camera/tracks")
+    assert CliRunner().invoke(app, ["events", str(place), "--gate", "0.5"]).exit_code == 1
+    assert CliRunner().invoke(app, ["events", str(place), "--gate", "1.5", "--similarity", "iou"]).exit_code == 1
+    (place.parent / "odd.toml").write_text('[events]\nsimilarity = "iou"\ngate = "much"\n')
+    words = ["run", str(place), "--config", str(place.parent / "odd.toml")]
+    odd = copy_context().run(CliRunner().invoke, app, words)  # what the file says is for this command alone
+    assert odd.exit_code == 1
+    assert "--gate is a share of overlap up to 1, or a distance in metres, not 'much'" in odd.output
+    call("export", place, "-o", place.parent / "tables")
+    table = pq.read_table(place.parent / "tables" / "events" / "recording=a" / "part-0.parquet").to_pylist()
+    assert [(row["topic"], row["kind"], row["truth_id"]) for row in table if row["kind"] == SWITCH] == [
+        ("/camera/tracks/events", 4, 2),
+        ("/camera/tracks/events", 4, 1),
+    ]
+    call("drop", place, "/camera/tracks")
+    with log.read(place) as opened:
+        assert set(opened.channels) == {"/camera/truth"}
