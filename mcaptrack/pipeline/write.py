@@ -68,23 +68,35 @@ def write(
     start_ns = _start_ns(opened, prefix, shown, picture_ns)
     eye = layouts.eye_on(_places(opened, prefix, shown), planes, start_ns)
     last_step = _last_step(opened, prefix, shown)
-    with log.extend(opened, output, drop={*made, *outdated}, drop_attachments=ATTACHMENTS) as writer:
+    # What stays comes first: then what is made again finds the place that it had, and the bytes are the same.
+    drawn_first = list(drawn.views({topic: channel for topic, channel in shown.items() if topic not in made}, start_ns))
+    drawn_last = list(drawn.views({topic: channel for topic, channel in shown.items() if topic in made}, start_ns))
+    there = {*opened.channels} - outdated | {*made} | {view.topic for view in (*drawn_first, *drawn_last)}
+    layout_files = layouts.make(drawn.there(there, video, eye, last_step))
+    new = {attachment_of(name): content for name, content in layout_files.items()}
+    standing = {name for name, content in new.items() if opened.attachment(name) == content}
+    replaced = [name for name in ATTACHMENTS if name not in standing]
+    with log.extend(opened, output, drop={*made, *outdated}, drop_attachments=replaced) as writer:
         streams: list[Iterator[Numbered]] = []
+
+        def draw(some: Iterable[View]) -> None:
+            for view in some:
+                record = foxglove.schema_record(view.schema_name)
+                metadata = view.provenance.to_metadata()
+                number = writer.add_channel(view.topic, record, "protobuf", metadata, "views", view.group)
+                streams.append(_with_number(number, view.messages))
+
+        draw(drawn_first)
         for topic, channel in made.items():
             record = channel.record or (channel.schema.name, "protobuf", channel.schema.descriptor)
             made_by = channel.provenance.transform  # results of one stage share chunks, so that they can go together
             number = writer.add_channel(topic, record, "protobuf", channel.provenance.to_metadata(), group=made_by)
             streams.append(_with_number(number, channel.messages))
-        for view in drawn.views(shown, start_ns):
-            record = foxglove.schema_record(view.schema_name)
-            metadata = view.provenance.to_metadata()
-            number = writer.add_channel(view.topic, record, "protobuf", metadata, "views", view.group)
-            streams.append(_with_number(number, view.messages))
+        draw(drawn_last)
         _write_by_time(writer, streams)
-        there = {channel.topic for channel in writer.channels.values()} | set(opened.channels) - outdated
-        layout_files = layouts.make(drawn.there(there, video, eye, last_step))
-        for name, layout_file in layout_files.items():
-            writer.add_attachment(attachment_of(name), "application/json", layout_file)
+        for name, content in new.items():
+            if name not in standing:
+                writer.add_attachment(name, "application/json", content)
     return layout_files
 
 
@@ -98,7 +110,7 @@ class Shown(NamedTuple):
 
 
 def _shown(opened: log.Log, prefix: str, made: Mapping[str, Made]) -> dict[str, Shown]:
-    """The channels whose views are to be made: what was made, and what was ingested and has none yet."""
+    """The channels whose views are to be made: what was made, and what was ingested since, or has none yet."""
     shown = {
         topic: Shown(channel.schema, channel.frames, channel.provenance.digest, channel.provenance.transform)
         for topic, channel in made.items()
@@ -108,8 +120,10 @@ def _shown(opened: log.Log, prefix: str, made: Mapping[str, Made]) -> dict[str, 
         known = Provenance.from_metadata(channel.metadata)
         if topic in shown or not topic.startswith(prefix + "/") or not known or known.transform != _INGESTED:
             continue
-        suffix = views.SUFFIX if schema is DETECTIONS else views.SCENE_SUFFIX
-        if schema in (*views.DRAWN, GROUND_PLANE) and topic + suffix not in opened.channels:
+        drawn = opened.channels.get(topic + (views.SUFFIX if schema is DETECTIONS else views.SCENE_SUFFIX))
+        drawn_from = Provenance.from_metadata(drawn.metadata) if drawn else None
+        is_new = drawn_from is None or drawn_from.input_digest != known.digest
+        if schema in (*views.DRAWN, GROUND_PLANE) and is_new:
             shown[topic] = Shown(schema, opened.frames(topic, schema), known.digest, "")
     return shown
 
@@ -130,6 +144,7 @@ class _Drawn:
     def __init__(self, prefix: str, picture_ns: Ints, stamp_ns: Ints, planes: Planes) -> None:
         self._prefix, self._picture_ns, self._stamp_ns, self._planes = prefix, picture_ns, stamp_ns, planes
         self._frame_id = views.ground.frame_of(prefix)
+        self._is_framed = False
         #: Where the ground's frame is named.
         self.frame_topic = f"{prefix}/view/tf"
 
@@ -154,7 +169,8 @@ class _Drawn:
                 scene = drawing.on_ground(t_ns, self._frame_id)
                 yield View(topic + views.SCENE_SUFFIX, foxglove.SCENE, made_from, group, scene)
         on_ground = {topic: channel for topic, channel in shown.items() if channel.schema in _ON_GROUND}
-        if on_ground:
+        if on_ground and not self._is_framed:
+            self._is_framed = True
             frame = foxglove.pack_transform(start_ns, views.ground.world_of(self._prefix), self._frame_id)
             topic, channel = next(iter(on_ground.items()))
             made_from = Provenance("view", {}, topic, channel.digest)
