@@ -18,6 +18,7 @@ from mcaptrack import __version__, demo, log
 from mcaptrack.schema import COUNTS, EVENTS, EventKind
 from tests.worlds import small_scene, write_clip
 
+LAYOUTS = [".comparing.layout.json", ".layout.json"]
 STAGES = ["detect", "track", "sample", "predict", "retrack", "run"]
 COMMANDS = [
     "ingest",
@@ -111,7 +112,7 @@ class TestHelp:
 class TestTheUsualWay:
     def test_a_finished_log_has_its_companions(self, finished):
         names = sorted(path.name for path in finished.parent.iterdir())
-        assert names == ["walk.layout.json", "walk.mcap", "walk.tables"]
+        assert names == [f"walk{end}" for end in (*LAYOUTS, ".mcap", ".predictions.layout.json", ".tables")]
         layout = json.loads((finished.parent / "walk.layout.json").read_text())
         shown = layout["configById"]["Image!picture"]["imageMode"]["annotations"]
         assert shown["/camera/retracks/full/view/image"] == {"visible": True}
@@ -471,7 +472,11 @@ def test_the_demonstration(tmp_path, monkeypatch):
     for words in ("SORT", "re-tracked", "identity switches", "demo.mcap", "Lichtblick"):
         assert words in shown.stdout
     names = sorted(path.name for path in (tmp_path / "d").iterdir())
-    assert names == ["demo.layout.json", "demo.mcap", "demo.mp4", "demo.tables", "ground_plane.txt", "truth.txt"]
+    assert names == [
+        *(f"demo{end}" for end in (*LAYOUTS, ".mcap", ".mp4", ".predictions.layout.json", ".tables")),
+        "ground_plane.txt",
+        "truth.txt",
+    ]
     again = subprocess.run(run, capture_output=True, text=True, check=False)
     assert again.returncode == 1
     assert "exists; give another folder with -o, or --force" in again.stderr
