@@ -258,8 +258,7 @@ def find_views(opened: log.Log, prefix: str, topics: Sequence[str] = ()) -> list
     Raises McaptrackError if there are none.
     """
     if topics:
-        chosen = [topic if topic.endswith(views.SUFFIX) else topic + views.SUFFIX for topic in topics]
-        return [opened.channel(topic).topic for topic in chosen]
+        return [opened.channel(_view_of(opened, topic)).topic for topic in topics]
     there = {
         topic.removeprefix(prefix + "/").removesuffix(views.SUFFIX)
         for topic in opened.channels
@@ -269,3 +268,9 @@ def find_views(opened: log.Log, prefix: str, topics: Sequence[str] = ()) -> list
     if not found:
         raise McaptrackError(f"{opened.path} has no views of {prefix} yet; `mcaptrack run {opened.path}` makes them")
     return found
+
+
+def _view_of(opened: log.Log, topic: str) -> str:
+    """The view that shows a channel: its own, or that of the same at the video's rate."""
+    names = [topic] if topic.endswith(views.SUFFIX) else [topic + views.SUFFIX, topic + FULL + views.SUFFIX]
+    return next((name for name in names if name in opened.channels), names[0])
