@@ -22,8 +22,8 @@ CLOCK: Final = "mcaptrack.clock"
 class Provenance:
     """What made a channel, from what, and how. ``digest`` is of its own messages, ``input_digest`` of its input's.
 
-    ``references`` are the topics that the input was compared with, and the digest of each: empty where there was nothing
-    of that name.
+    ``references`` are the topics that the input was compared with, and the digest of each: empty where there was
+    nothing of that name.
     """
 
     transform: str

@@ -167,6 +167,8 @@ NAMES = [
     {"truth", "truth/view/scene", "tracks", "tracks/view/scene", "ground_plane/view/scene"},
     {"detections", "detections/view/image"},
     {"predictions", "predictions/view/scene", "samples"},
+    {"predictions", "predictions/view/scene", "predictions/scores", "samples", "tracks/events/view/log"},
+    {"retracks/predictions", "retracks/predictions/view/image", "retracks/predictions/scores", "retracks/full"},
     {
         "tracks",
         "tracks/view/image",

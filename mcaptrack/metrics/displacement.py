@@ -72,7 +72,7 @@ class _Paths(NamedTuple):
 
     def window(self, at: Ints, first: int, last: int) -> Floats:
         """The positions (M, last - first + 1, 2) from ``first`` to ``last`` steps after those at ``at`` (M,)."""
-        return self.xy_m[at[:, None] + np.arange(first, last + 1)]
+        return np.asarray(self.xy_m[at[:, None] + np.arange(first, last + 1)], np.float64)
 
 
 def _paths(path: Path, fill: bool) -> _Paths:
