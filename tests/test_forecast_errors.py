@@ -412,7 +412,7 @@ def test_forecasts_that_cannot_be_held_against_anything_fail_nothing(tmp_path):
 def test_a_channel_that_others_recorded_is_never_replaced(tmp_path):
     path = written(tmp_path / "a.mcap", **ALL)
     with log.read(path) as opened, log.extend(opened) as writer:
-        writer.add_message(writer.add_channel(SCORES, None, "json"), 0, 0, b"{}")
+        writer.add_message(writer.add_channel(SCORES, ("", "", b""), "json", {}), 0, 0, b"{}")
     notes: list[str] = []
     with log.read(path) as opened:
         pipeline.run(opened, "/camera", [], say=notes.append, watch=pipeline.Watch(again=True))

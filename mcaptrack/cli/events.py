@@ -42,8 +42,8 @@ def events(
     who was missed, which tracks are nobody, and each identity switch, matched as `mcaptrack evaluate` does. To
     /camera/tracks/events (rows), .../events/view/log (words) and /camera/tracks/counts (how it stands, frame by frame),
     and the same for /camera/retracks. Unless --topic names channels, also how far off each forecast was, from the truth
-    and from what re-tracking made of the tracks: to /camera/predictions/errors, and .../scores, frame by frame; the same
-    for /camera/retracks/predictions. `mcaptrack run` does all this too.
+    and from what re-tracking made of the tracks: to /camera/predictions/errors and, frame by frame, .../scores; and the
+    same for /camera/retracks/predictions. `mcaptrack run` does all this too.
 
     Example: mcaptrack events log.mcap --similarity metres --gate 1
     """
