@@ -116,7 +116,7 @@ class TestTheUsualWay:
         layout = json.loads((finished.parent / "walk.layout.json").read_text())
         shown = layout["configById"]["Image!picture"]["imageMode"]["annotations"]
         assert shown["/camera/retracks/full/view/image"] == {"visible": True}
-        assert shown["/camera/retracks/view/image"] == {"visible": False}
+        assert shown["/camera/tracks/view/image"] == {"visible": False}
         assert shown["/camera/detections/view/image"] == {"visible": False}
 
     def test_running_again_has_nothing_to_do(self, finished):
@@ -547,7 +547,7 @@ def test_channels_are_dropped_with_their_views_and_nothing_else(finished, tmp_pa
     (result,) = json.loads(out)["results"]
     after = json.loads(done("info", tmp_path / "small.mcap", "--json")[0])["results"][0]["channels"]
     assert {c["topic"] for c in before} - {c["topic"] for c in after} == set(result["dropped"])
-    assert "/camera/retracks/view/image" in result["dropped"]
+    assert "/camera/retracks/full/view/image" in result["dropped"]
     for channel in before:  # what was held against the re-tracked people has nothing to be held against any more
         channel["stale"] |= channel["topic"] in ("/camera/predictions/errors", "/camera/predictions/scores")
     assert [c for c in before if c["topic"] not in result["dropped"]] == after

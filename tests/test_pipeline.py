@@ -238,7 +238,7 @@ class TestTheWholeLine:
             pictures = opened.times("/camera/video").tolist()
             for name in ROWS:
                 assert f"/camera/{name}" in opened.channels
-            for name in ("detections", "tracks", "predictions", "retracks", "retracks/predictions", "truth"):
+            for name in ("detections", "tracks", "predictions", "retracks/full", "retracks/predictions", "truth"):
                 assert opened.times(f"/camera/{name}/view/image").tolist() == pictures
             assert [f.t_ns for f in opened.frames("/camera/detections", DETECTIONS)] == pictures
             ticks = opened.times("/camera/samples").tolist()

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
 
-from mcaptrack import foxglove
+from mcaptrack import foxglove, log
 from mcaptrack.errors import McaptrackError
+from mcaptrack.pipeline import find_views
 from mcaptrack.rendering import draw
 from mcaptrack.video import write_clip
 from mcaptrack.video.decode import Encoded, colours
@@ -203,3 +204,10 @@ def test_nothing_is_left_of_a_clip_that_fails(tmp_path):
         with pytest.raises(McaptrackError, match="half way"):
             write_clip(tmp_path / f"a{suffix}", broken(), Fraction(10))
     assert not list(tmp_path.iterdir())
+
+
+def test_re_tracked_people_are_drawn_at_the_rate_of_the_video(finished):  # noqa: F811
+    with log.read(finished) as opened:
+        assert find_views(opened, "/camera", ["/camera/retracks"]) == ["/camera/retracks/full/view/image"]
+        with pytest.raises(McaptrackError, match="has no channel /camera/nobody/view/image"):
+            find_views(opened, "/camera", ["/camera/nobody"])

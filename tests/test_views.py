@@ -120,8 +120,6 @@ def test_a_trail_leads_to_the_box_and_fades_into_the_past():
     assert opacity == sorted(opacity)
     assert opacity[0] < opacity[-1]
     assert message.texts[0].text == "2"
-    (alone,) = drawn(messages(*CHANNELS["retracks"], trails=False)[8])
-    assert alone == box
 
 
 def test_trails_stay_where_they_are_while_people_go_on_and_end_after_two_seconds():

@@ -153,17 +153,16 @@ class _Drawn:
         for topic, channel in shown.items():
             made_from = Provenance("view", {}, topic, channel.digest)
             group = channel.made_by
-            is_full_elsewhere = topic + FULL in shown
             if topic == f"{self._prefix}/ground_plane":
                 outline = views.ground.outlines(self._planes, start_ns, self._frame_id)
                 yield View(topic + views.SCENE_SUFFIX, foxglove.SCENE, made_from, group, outline)
-            if channel.schema not in views.DRAWN or topic.endswith(_NOT_SHOWN):
-                continue
+            if channel.schema not in views.DRAWN or topic.endswith(_NOT_SHOWN) or topic + FULL in shown:
+                continue  # others show the same at more times
             drawing = views.Drawing(topic, channel.schema, channel.frames, self._planes, channel.made_by)
             if len(self._picture_ns):
-                drawn = drawing.on_pictures(self._picture_ns, self._stamp_ns, trails=not is_full_elsewhere)
+                drawn = drawing.on_pictures(self._picture_ns, self._stamp_ns)
                 yield View(topic + views.SUFFIX, foxglove.ANNOTATIONS, made_from, group, drawn)
-            if channel.schema in _ON_GROUND and not is_full_elsewhere:
+            if channel.schema in _ON_GROUND:
                 own_ns = np.array([frame.t_ns for frame in channel.frames], np.int64)
                 t_ns = self._picture_ns if len(self._picture_ns) else own_ns
                 scene = drawing.on_ground(t_ns, self._frame_id)
@@ -270,8 +269,7 @@ def find_views(opened: log.Log, prefix: str, topics: Sequence[str] = ()) -> list
     Raises McaptrackError if there are none.
     """
     if topics:
-        chosen = [topic if topic.endswith(views.SUFFIX) else topic + views.SUFFIX for topic in topics]
-        return [opened.channel(topic).topic for topic in chosen]
+        return [opened.channel(_view_of(opened, topic)).topic for topic in topics]
     there = {
         topic.removeprefix(prefix + "/").removesuffix(views.SUFFIX)
         for topic in opened.channels
@@ -281,3 +279,9 @@ def find_views(opened: log.Log, prefix: str, topics: Sequence[str] = ()) -> list
     if not found:
         raise McaptrackError(f"{opened.path} has no views of {prefix} yet; `mcaptrack run {opened.path}` makes them")
     return found
+
+
+def _view_of(opened: log.Log, topic: str) -> str:
+    """The view that shows a channel: its own, or that of the same at the video's rate."""
+    names = [topic] if topic.endswith(views.SUFFIX) else [topic + views.SUFFIX, topic + FULL + views.SUFFIX]
+    return next((name for name in names if name in opened.channels), names[0])

@@ -38,15 +38,14 @@ class Drawing:
         self._look = look_of(topic, made_by)
         self._known: tuple[Ints, People] | None = None
 
-    def on_pictures(self, picture_ns: Ints, stamp_ns: Ints, trails: bool = True) -> View:
-        """Annotation messages, one for each picture; without ``trails`` boxes and numbers are drawn alone."""
+    def on_pictures(self, picture_ns: Ints, stamp_ns: Ints) -> View:
+        """Annotation messages, one for each picture."""
         pictures = image.Pictures(picture_ns, stamp_ns)
         if self._schema is DETECTIONS:
             yield from image.detections(self._frames, pictures, self._planes)
         elif self._schema is TRACKS:
-            look = self._look if trails else self._look._replace(dash=0.0)
             unit = looks.unit(self._frames, self._planes)
-            yield from image.tracks(self._people(picture_ns), pictures, unit, look)
+            yield from image.tracks(self._people(picture_ns), pictures, unit, self._look)
         elif self._schema is PREDICTIONS:
             yield from image.predictions(self._frames, pictures, self._planes)
 
@@ -72,16 +71,15 @@ def view(
     planes: Planes,
     stamp_ns: Ints | None = None,
     made_by: str = "",
-    trails: bool = True,
 ) -> View:
     """The annotation messages (time, frame, payload) of a channel, one for each picture.
 
     ``picture_ns`` are the times of the pictures, rising; ``stamp_ns`` what stands in them, by which viewers match what
     is drawn, if that is another time. Predictions need ``planes`` to come back to pixels. ``made_by`` is the stage that
-    made the channel. Without ``trails`` boxes and numbers are drawn alone.
+    made the channel.
     """
     stamps = picture_ns if stamp_ns is None else stamp_ns
-    return Drawing(topic, schema, frames, planes, made_by).on_pictures(picture_ns, stamps, trails)
+    return Drawing(topic, schema, frames, planes, made_by).on_pictures(picture_ns, stamps)
 
 
 def scene(

@@ -65,7 +65,8 @@ class There(NamedTuple):
 def best(names: Collection[str]) -> list[str]:
     """The channels to look at first, of those below the prefix: the best tracks, and their forecasts."""
     found = [name for name in _BEST if name in names][:1]
-    return found + [name for name in ("retracks/predictions",) if "retracks" in names and name in names]
+    of_these = "retracks/predictions"
+    return found + [of_these for name in found if name.startswith("retracks") and of_these in names]
 
 
 def eye_on(places_m: Floats, planes: Planes, t_ns: int) -> Eye:

@@ -62,7 +62,6 @@ def walkers() -> dict[str, tuple]:
         "/camera/tracks": (TRACKS, tracks),
         "/camera/truth": (TRACKS, tracks),
         "/camera/predictions": (PREDICTIONS, predictions),
-        "/camera/retracks": (TRACKS, tracks[::12]),
         "/camera/retracks/full": (TRACKS, tracks),
         "/camera/retracks/predictions": (PREDICTIONS, predictions),
     }
@@ -73,10 +72,9 @@ def all_views(channels: dict[str, tuple]) -> dict[str, list[tuple[int, int, byte
     at = np.array([round(n * 1e9 / FPS) for n in range(PICTURES)], np.int64)
     made = {}
     for topic, (schema, frames) in channels.items():
-        alone = topic.endswith("/retracks")
         drawing = views.Drawing(topic, schema, frames, PLANES)
-        made[topic + views.SUFFIX] = list(drawing.on_pictures(at, at, trails=not alone))
-        if schema is not DETECTIONS and not alone:
+        made[topic + views.SUFFIX] = list(drawing.on_pictures(at, at))
+        if schema is not DETECTIONS:
             made[topic + views.SCENE_SUFFIX] = list(drawing.on_ground(at, "camera/ground"))
     return made
 
