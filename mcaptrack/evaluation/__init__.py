@@ -169,11 +169,12 @@ def evaluate(
     if not outcome.results:
         raise McaptrackError("; ".join(outcome.notes) or "there is nothing to score")
     if count > 1:
-        outcome.results += _combined(outcome.results)
+        outcome.results += combined(outcome.results)
     return outcome
 
 
-def _combined(results: Sequence[Result]) -> list[Result]:
+def combined(results: Sequence[Result]) -> list[Result]:
+    """All sequences together: a result for each kind of tracks, similarity and gate."""
     groups: dict[tuple[Any, ...], list[Result]] = {}
     for one in results:
         groups.setdefault((one.group or one.tracks, one.mode, one.similarity, one.gate, one.rules), []).append(one)
@@ -228,13 +229,13 @@ def _score(sequence: Sequenced, candidate: Candidate, options: EvaluateOptions, 
     if not results:
         notes.append(f"{sequence.name}: {candidate.name} and the truth share neither boxes nor positions in metres")
     if candidate.forecasts is not None and any(result.similarity == "metres" for result in results):
-        errors = _displacement(sequence, candidate)
+        errors = forecast_errors(sequence, candidate)
         for result in results:
             result.displacement = errors if result.similarity == "metres" else None
     return results
 
 
-def _displacement(sequence: Sequenced, candidate: Candidate) -> Displacement | None:
+def forecast_errors(sequence: Sequenced, candidate: Candidate) -> Displacement | None:
     """The errors of the forecasts made from a candidate; None if there are no forecasts at all."""
     frames = [frame for frame in candidate.forecasts or () if len(frame.rows)]
     if not frames:
