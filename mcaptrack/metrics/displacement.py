@@ -174,7 +174,8 @@ def displacement(
         off = forecasts.mean_m[at[columns]] - future_true[subject[rows]]
         pairs.append((d_obs[rows, columns], *_errors(off, forecasts.cov_m2[at[columns]])))
     pairs.append((*(np.empty(0) for _ in range(4)), np.empty((0, len(LEVELS))), np.empty((0, horizon))))
-    d_obs_m2, ade_m, fde_m, squared_m2, covered, away_m = (np.concatenate(column) for column in zip(*pairs, strict=True))
+    columns_of_pairs = (np.concatenate(column) for column in zip(*pairs, strict=True))
+    d_obs_m2, ade_m, fde_m, squared_m2, covered, away_m = columns_of_pairs
     return Displacement(
         d_obs_m2=d_obs_m2,
         ade_m=ade_m,

@@ -14,14 +14,16 @@ from collections.abc import Sequence
 from importlib.resources import files
 from typing import Any, Final
 
+import numpy as np
+
 from mcaptrack import __version__, foxglove
 from mcaptrack.evaluation import SCHEMA_VERSION, Result
 from mcaptrack.metrics import summary
-from mcaptrack.report import sections
+from mcaptrack.report import lineage, sections, sights
 from mcaptrack.report.charts import Axis, beside, figure, pairs_chart, round_most
 from mcaptrack.report.contents import LogReport, gather
 from mcaptrack.report.headline import combined_results, headline, pair_of
-from mcaptrack.report.markup import Markup, counted, join, name, number, percent, script_json, table, tag
+from mcaptrack.report.markup import NONE, Markup, counted, join, name, number, percent, script_json, table, tag
 from mcaptrack.report.scenery import COLOURS
 
 __all__ = ["ELEMENT", "LogReport", "data", "gather", "page"]
@@ -60,7 +62,9 @@ def page(reports: Sequence[LogReport]) -> str:
         for k, report in enumerate(reports):
             words = tag("summary", tag("bdi", report.file), ": ", _in_short(report))
             body.append(tag("details", words, _log(report, k), class_="log", open="" if k == 0 else None))
-    made = tag("p", f"Made by mcaptrack {__version__}. All numbers are in this page as JSON, in the element ", class_="soft")
+    made = tag(
+        "p", f"Made by mcaptrack {__version__}. All numbers are in this page as JSON, in the element ", class_="soft"
+    )
     made = Markup(made[: -len("</p>")] + tag("code", f"#{ELEMENT}") + ".</p>")
     head = [
         tag("meta", charset="utf-8"),
@@ -72,7 +76,12 @@ def page(reports: Sequence[LogReport]) -> str:
         tag("title", "Report on ", title),
         tag("style", Markup(_style())),
     ]
-    whole = tag("html", tag("head", *head), tag("body", tag("main", *body), made, script_json(data(reports), ELEMENT)), lang="en")
+    whole = tag(
+        "html",
+        tag("head", *head),
+        tag("body", tag("main", *body), made, script_json(data(reports), ELEMENT)),
+        lang="en",
+    )
     return f"<!doctype html>\n{whole}\n"
 
 
@@ -89,11 +98,11 @@ def _log(report: LogReport, number_of: int) -> Markup:
     parts: list[object] = []
     for title, content in (
         ("Scores", sections.scores(report)),
-        ("Where people walked", sections.scene(report, number_of)),
-        ("What happened to identities", sections.moments(report)),
+        ("Where people walked", sights.scene(report, number_of)),
+        ("What happened to identities", sights.moments(report)),
         ("Forecasts", sections.forecasts(report)),
         ("How people move", sections.motion(report)),
-        ("How it was made", sections.provenance(report)),
+        ("How it was made", lineage.provenance(report)),
     ):
         parts += [tag("section", tag("h2", title), content)]
     if report.notes:
@@ -111,7 +120,8 @@ def _in_short(report: LogReport) -> str:
 
 def _comparison(reports: Sequence[LogReport]) -> Markup:
     """Scores by log, and the logs beside each other."""
-    rows, pairs = [], []
+    rows: list[tuple[object, ...]] = []
+    pairs = []
     for report in [*reports, None]:
         results = report.results if report else combined_results(reports)
         known = report or next((one for one in reports if one.results), None)
@@ -120,7 +130,7 @@ def _comparison(reports: Sequence[LogReport]) -> Markup:
         pair = pair_of(known, results) if results else None
         called = name(report.file) if report else tag("b", "all together")
         if pair is None:
-            rows.append((called, "no truth", *["–"] * 8))
+            rows.append((called, "no truth", *[NONE] * 8))
             continue
         cells: list[object] = []
         for key, is_share in (("IDSW", False), ("IDF1", True), ("MOTA", True), ("HOTA", True)):
@@ -138,10 +148,8 @@ def _comparison(reports: Sequence[LogReport]) -> Markup:
     parts.append(table("Scores of tracking and of re-tracking, by log", columns, rows, words=2))
     charts = []
     for key, label, is_share in (("IDSW", "identity switches", False), ("IDF1", "identities kept (IDF1), %", True)):
-        values = [(who, *map(float, pair.values(key))) for who, pair in pairs]
+        values = [(who, float(before), float(after)) for who, pair in pairs for before, after in [pair.values(key)]]
         if values:
-            import numpy as np
-
             axis = Axis(label, 1.0 if is_share else round_most([np.array([v[1:] for v in values]).ravel()]), is_share)
             drawn = pairs_chart(f"{label} by log", values, axis, ("tracked", "re-tracked"))
             charts.append(figure(drawn, tag("b", label)))

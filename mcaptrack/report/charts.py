@@ -1,4 +1,4 @@
-"""Charts as SVG: lines with bands, outlines of histograms, and pairs on a scale.
+"""Charts as SVG: lines with bands, histograms above each other, and pairs on a scale.
 
 Colours, and what of them changes in the dark, are classes of the page's style. A chart is about as wide as a phone, so
 that its words can be read there; where there is room the page puts several beside each other.
@@ -18,9 +18,9 @@ from mcaptrack.report.markup import Markup, join, number, tag
 
 Floats = NDArray[np.float64]
 
-WIDTH: Final = 440
+WIDTH: Final = 460
 HEIGHT: Final = 270
-_LEFT, _RIGHT, _TOP, _BOTTOM = 46, 112, 26, 40
+_LEFT, _RIGHT, _TOP, _BOTTOM = 46, 126, 26, 40
 #: Words beside each other need so much room.
 _LINE: Final = 14.0
 #: A line has no more points than this.
@@ -31,8 +31,7 @@ POINTS: Final = 160
 class Line:
     """A line through x and y (P,), with a band from ``low`` to ``high`` where they are given.
 
-    ``role`` chooses the colour, ``name`` stands at its end. ``steps`` draws it as the outline of a histogram: x are
-    then P + 1 edges.
+    ``role`` chooses the colour, ``name`` stands at its end.
     """
 
     name: str
@@ -42,7 +41,6 @@ class Line:
     low: Floats | None = None
     high: Floats | None = None
     dashed: bool = False
-    steps: bool = False
 
 
 @dataclass(frozen=True)
@@ -91,7 +89,7 @@ def line_chart(title: str, lines: Sequence[Line], x: Axis, y: Axis, diagonal: st
         parts.append(tag("polyline", points=place(np.array([0, top]), np.array([0, top])), class_="l s-truth dash"))
     ends: list[tuple[float, str, str]] = []
     for line in lines:
-        at_x, at_y = (_outline(line.x, line.y) if line.steps else (line.x, line.y)) if len(line.y) else (line.x, line.y)
+        at_x, at_y = line.x, line.y
         kept = np.isfinite(at_x) & np.isfinite(at_y)
         if line.low is not None and line.high is not None and kept.any():
             around = np.concatenate([at_x[kept], at_x[kept][::-1]])
@@ -101,8 +99,7 @@ def line_chart(title: str, lines: Sequence[Line], x: Axis, y: Axis, diagonal: st
             continue
         dash = " dash" if line.dashed else ""
         parts.append(tag("polyline", points=place(at_x[kept], at_y[kept]), class_=f"l s-{line.role}{dash}"))
-        last = at_y[kept][:-1] if line.steps else at_y[kept]
-        ends.append((_TOP + height - min(float(last[-1]) / y.most, 1) * height, line.name, line.role))
+        ends.append((_TOP + height - min(float(at_y[kept][-1]) / y.most, 1) * height, line.name, line.role))
     if diagonal:
         ends.append((_TOP + height - min(x.most, y.most) / y.most * height, diagonal, "truth"))
     parts += _labels(ends, _LEFT + width + 6, height)
@@ -112,11 +109,6 @@ def line_chart(title: str, lines: Sequence[Line], x: Axis, y: Axis, diagonal: st
 def chart(title: str, width: int, height: int, parts: Sequence[Markup]) -> Markup:
     """An SVG of that size that says what it shows to those who don't see it."""
     return tag("svg", tag("title", title), *parts, viewBox=f"0 0 {width} {height}", role="img", class_="chart")
-
-
-def _outline(edges: Floats, heights: Floats) -> tuple[Floats, Floats]:
-    """The outline of bars: up from zero, along each bar, and down again."""
-    return np.repeat(edges, 2), np.concatenate([[0.0], np.repeat(heights, 2), [0.0]])
 
 
 def _axes(x: Axis, y: Axis, width: float, height: float) -> Iterator[Markup]:
@@ -151,6 +143,53 @@ def _labels(ends: list[tuple[float, str, str]], x: float, height: float) -> Iter
         yield tag("text", words, x=x, y=f"{y + 4:.1f}", class_=f"name s-{role}")
 
 
+@dataclass(frozen=True)
+class Bars:
+    """One histogram: the shares (B,) of what lies in each bin, and where the middle is."""
+
+    name: str
+    role: str
+    shares: Floats
+    median: float
+    words: str
+
+
+def histogram_chart(title: str, rows: Sequence[Bars], edges: Floats, label: str) -> Markup:
+    """Histograms above each other in the same bins with ``edges`` (B + 1,), all of one scale."""
+    x = Axis(label, float(edges[-1]))
+    width, row = WIDTH - _RIGHT - 12, 74
+    top = max([1e-9, *(float(one.shares.max(initial=0)) for one in rows)])
+    bottom = row * len(rows) + 6
+
+    def at(value: float) -> float:
+        return 12 + min(max(value / x.most, 0), 1) * width
+
+    parts: list[Markup] = []
+    for k, one in enumerate(rows):
+        floor = row * (k + 1)
+        for low, high, share in zip(edges[:-1].tolist(), edges[1:].tolist(), one.shares.tolist(), strict=True):
+            tall = share / top * (row - 14)
+            if tall > 0:
+                wide = max(at(high) - at(low) - 1, 0.5)
+                size = {"width": f"{wide:.1f}", "height": f"{tall:.1f}"}
+                said = tag("title", f"{low:g} to {high:g}: {100 * share:.1f} %")
+                parts.append(
+                    tag("rect", said, x=f"{at(low):.1f}", y=f"{floor - tall:.1f}", **size, class_=f"bar s-{one.role}")
+                )
+        parts.append(tag("line", x1=12, x2=12 + width, y1=floor, y2=floor, class_="axis"))
+        middle = f"{at(one.median):.1f}"
+        parts.append(tag("line", x1=middle, x2=middle, y1=floor - row + 14, y2=floor, class_="middle"))
+        parts.append(tag("text", one.name, x=width + 20, y=floor - 30, class_=f"name s-{one.role}"))
+        parts.append(tag("text", one.words, x=width + 20, y=floor - 14))
+    for tick in x.ticks().tolist():
+        parts.append(
+            tag("line", x1=f"{at(tick):.1f}", x2=f"{at(tick):.1f}", y1=bottom - 6, y2=bottom - 2, class_="axis")
+        )
+        parts.append(tag("text", x.say(tick), x=f"{at(tick):.1f}", y=bottom + 11, class_="mid"))
+    parts.append(tag("text", label, x=12 + width / 2, y=bottom + 28, class_="mid what"))
+    return chart(title, WIDTH, bottom + 34, parts)
+
+
 def pairs_chart(title: str, rows: Sequence[tuple[str, float, float]], axis: Axis, names: tuple[str, str]) -> Markup:
     """From one value to another for each of several names, a row each; ``names`` say whose values these are."""
     width, row = WIDTH - _LEFT - 24, 34
@@ -179,7 +218,7 @@ def pairs_chart(title: str, rows: Sequence[tuple[str, float, float]], axis: Axis
 def thinned(*columns: Floats) -> tuple[Floats, ...]:
     """No more points than a chart can show, the first and the last among them."""
     count = len(columns[0])
-    kept = np.unique(np.linspace(0, count - 1, min(count, POINTS)).round().astype(int)) if count else []
+    kept = np.unique(np.linspace(0, max(count - 1, 0), min(count, POINTS)).round().astype(int))
     return tuple(column[kept] for column in columns)
 
 
@@ -188,14 +227,24 @@ def figure(content: object, *caption: object, class_: str | None = None) -> Mark
     return tag("figure", content, tag("figcaption", *caption), class_=class_)
 
 
-def beside(figures: Sequence[Markup]) -> Markup:
-    """Figures beside each other where there is room."""
-    return tag("div", join(figures), class_="grid") if figures else Markup("")
+def beside(figures: Sequence[Markup], class_: str = "grid") -> Markup:
+    """Figures beside each other where there is room; scenes need less than charts with words."""
+    return tag("div", join(figures), class_=class_) if figures else Markup("")
 
 
-def clock(seconds: float) -> str:
-    """Seconds from the beginning, for people."""
-    if seconds < 60:
+#: What lies between the marks of a timeline, in seconds.
+_MARKS_S: Final = (0.1, 0.2, 0.5, 1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 14400, 43200, 86400)
+
+
+def time_ticks(span_s: float) -> Floats:
+    """About six round times from 0 on."""
+    step = next((mark for mark in _MARKS_S if span_s / mark <= 6.5), round_step(span_s / 6))
+    return np.arange(0, span_s + step * 1e-6, step)
+
+
+def clock(seconds: float, span_s: float = 0.0) -> str:
+    """Seconds from the beginning, for people, all alike within a span."""
+    if max(seconds, span_s) < 60:
         return number(seconds, 0 if seconds == round(seconds) else 1, "s")
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)

@@ -13,7 +13,7 @@ from mcaptrack.clock import NS_PER_S
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation import EvaluateOptions, Result, Sequenced, evaluate, sequence_of_log
 from mcaptrack.evaluation.aligned import frame_times, has, resampled
-from mcaptrack.evaluation.events import EventOptions, find_events
+from mcaptrack.evaluation.events import EventOptions, Rule, find_events
 from mcaptrack.pictures import Pictures
 from mcaptrack.plane import Planes, plane_at
 from mcaptrack.provenance import Provenance
@@ -76,8 +76,8 @@ class LogReport:
     @property
     def clocked(self) -> dict[str, TrackSet]:
         """The tracks that are on the same clock: those of prediction, or else the tracker's."""
-        roles = [role for role in ("samples", "offline") if role in self.sets] or ["tracks"]
-        return {role: self.sets[role] for role in roles if role in self.sets}
+        there = {role: one for role, one in self.sets.items() if role in ("samples", "offline")}
+        return there or {role: one for role, one in self.sets.items() if role == "tracks"}
 
     @property
     def is_assumed(self) -> bool:
@@ -159,20 +159,23 @@ def _tell(opened: log.Log, out: LogReport) -> None:
         known = _recorded(opened, tracks.topic + "/events")
         if known is None:
             found = find_events(tracks.frames, truth, EventOptions(), out.name, tracks.topic)
-            known = found.events, tuple(found.rule) if found.rule else None
-        out.stories.append(tell(tracks.topic, *known, tracks.frames, truth, (out.start_ns, out.end_ns)))
+            known = found.events, found.rule
+        events, rule = known
+        out.stories.append(tell(tracks.topic, events, rule, tracks.frames, truth, (out.start_ns, out.end_ns)))
     out.shown = most_important(out.stories, _THUMBNAILS)
 
 
-def _recorded(opened: log.Log, topic: str) -> tuple[list[Frame], tuple[str, float] | None] | None:
+def _recorded(opened: log.Log, topic: str) -> tuple[list[Frame], Rule | None] | None:
     """Events that stand in the log and by what rule they were matched, unless they are out of date."""
     channel = opened.channels.get(topic)
     made = Provenance.from_metadata(channel.metadata) if channel else None
     if channel is None or made is None or channel.schema_name != EVENTS.name or pipeline.is_stale(opened, topic):
         return None
     similarity, gate = made.parameters.get("similarity"), made.parameters.get("gate")
-    is_rule = similarity in ("iou", "metres") and isinstance(gate, float | int)
-    return opened.frames(topic, EVENTS), (str(similarity), float(gate)) if is_rule else None
+    rule = None
+    if similarity in ("iou", "metres") and isinstance(gate, float | int):
+        rule = Rule(similarity, float(gate))
+    return opened.frames(topic, EVENTS), rule
 
 
 def _look(opened: log.Log, out: LogReport) -> None:

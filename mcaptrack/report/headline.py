@@ -116,11 +116,11 @@ def _without_truth(reports: Sequence[LogReport]) -> str:
 def _tiles(pair: Pair) -> Markup:
     def change(name: str, is_share: bool) -> str:
         values = pair.values(name)
-        said = [percent(value) if is_share else number(int(value)) for value in values]
-        return " → ".join(said)
+        said = [number(100 * value, 1) if is_share else number(int(value)) for value in values]
+        return "\N{NO-BREAK SPACE}→ ".join(said) + ("\N{NO-BREAK SPACE}%" if is_share else "")
 
-    both = "before → after re-tracking" if pair.plain and pair.repaired else "one of the two only"
-    tiles = [
+    both = "before → after re-tracking" if pair.plain and pair.repaired else None
+    tiles: list[tuple[str, str, str | None]] = [
         ("identity switches", change("IDSW", False), both),
         ("identities kept (IDF1)", change("IDF1", True), both),
         ("accuracy (MOTA)", change("MOTA", True), both),
@@ -132,7 +132,10 @@ def _tiles(pair: Pair) -> Markup:
         tiles.append(("forecast error (ADE)", number(said["ADE_m"], 2, "m"), f"at recall {percent(said['recall'], 0)}"))
     return tag(
         "dl",
-        *(tag("div", tag("dt", what), tag("dd", value, tag("small", note)), class_="tile") for what, value, note in tiles),
+        *(
+            tag("div", tag("dt", what), tag("dd", value, tag("small", note) if note else ""), class_="tile")
+            for what, value, note in tiles
+        ),
         class_="tiles",
     )
 

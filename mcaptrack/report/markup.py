@@ -14,6 +14,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Final
 
 _VOID: Final = frozenset({"meta", "link", "br"})
+#: What stands where there is no number.
+NONE: Final = "\N{EN DASH}"
+_BLANKS: Final = "\n\N{NO-BREAK SPACE}\N{NARROW NO-BREAK SPACE}"
 _MOST_DIGITS: Final = 1e6
 
 
@@ -27,7 +30,7 @@ def escape(words: object) -> Markup:
     """Words as text or as the value of an attribute; what would steer a reader (controls, bidi marks) is replaced."""
     if isinstance(words, Markup):
         return words
-    seen = "".join(c if c.isprintable() or c == "\n" else "\N{REPLACEMENT CHARACTER}" for c in str(words))
+    seen = "".join(c if c.isprintable() or c in _BLANKS else "\N{REPLACEMENT CHARACTER}" for c in str(words))
     return Markup(html.escape(seen, quote=True))
 
 
@@ -61,7 +64,7 @@ def command(words: str) -> Markup:
 def number(value: float | int | None, digits: int = 2, unit: str = "") -> str:
     """A number for people; a dash where there is none."""
     if value is None or not math.isfinite(value):
-        return "–"
+        return NONE
     if isinstance(value, int):
         said = f"{value:,}".replace(",", "\N{NARROW NO-BREAK SPACE}")
     else:
@@ -82,6 +85,17 @@ def times(count: int) -> str:
 def counted(count: int, one: str, many: str = "") -> str:
     """So many of something."""
     return f"{number(count)} {one if count == 1 else many or one + 's'}"
+
+
+def lack(words: str) -> Markup:
+    """What is missing in its place; what stands between backquotes is to be typed."""
+    parts = words.split("`")
+    return tag("p", *(tag("code", part) if k % 2 else part for k, part in enumerate(parts)), class_="lack")
+
+
+def short(words: str) -> str:
+    """What tracks are called where there is little room."""
+    return words.removesuffix(", sampled")
 
 
 def data_uri(jpeg: bytes) -> Markup:

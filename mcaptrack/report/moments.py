@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack.clock import NS_PER_S, seconds_to_ns
+from mcaptrack.evaluation.events import Rule
 from mcaptrack.evaluation.words import describe
 from mcaptrack.pictures import Pictures
 from mcaptrack.report.measures import by_track, usual_s
@@ -72,7 +73,7 @@ class Story:
     counts: dict[str, int]
     births: list[int]
     ends: list[int]
-    rule: tuple[str, float] | None
+    rule: Rule | None
     span_s: float
 
     def to_json(self) -> dict[str, Any]:
@@ -100,7 +101,7 @@ class Story:
 def tell(
     topic: str,
     events: Sequence[Frame],
-    rule: tuple[str, float] | None,
+    rule: Rule | None,
     tracks: Sequence[Frame],
     truth: Sequence[Frame] | None,
     span_ns: tuple[int, int],
@@ -163,7 +164,9 @@ def photograph(moments: Sequence[Moment], tracks: Sequence[Frame], pictures: Pic
     for moment in moments:
         event = moment.row
         is_join = int(event["kind"]) == EventKind.JOINED
-        old = _row_at(rows, t_ns, int(event["track_id" if is_join else "previous_id"]), moment.t_ns - 1)
+        # Seconds are rounded: a microsecond earlier is still after the frame before.
+        unseen_ns = seconds_to_ns(float(np.nan_to_num(event["duration_s"]))) + 1000
+        old = _row_at(rows, t_ns, int(event["track_id" if is_join else "previous_id"]), moment.t_ns - unseen_ns)
         new = _row_at(rows, t_ns, int(event["track_id"]), moment.t_ns)
         region = _region([found[1] for found in (old, new) if found], event)
         if region is None or not len(pictures.t_ns):
