@@ -60,8 +60,8 @@ def page(reports: Sequence[LogReport]) -> str:
     else:
         body.append(_comparison(reports))
         for k, report in enumerate(reports):
-            words = tag("summary", tag("bdi", report.file), ": ", _in_short(report))
-            body.append(tag("details", words, _log(report, k), class_="log", open="" if k == 0 else None))
+            words = tag("summary", tag("h2", tag("bdi", report.file), ": ", _in_short(report)))
+            body.append(tag("details", words, _log(report, k, 3), class_="log", open="" if k == 0 else None))
     made = tag(
         "p", f"Made by mcaptrack {__version__}. All numbers are in this page as JSON, in the element ", class_="soft"
     )
@@ -93,20 +93,22 @@ def _style() -> str:
     return files(__package__ or __name__).joinpath("style.css").read_text(encoding="utf-8") + by_identity
 
 
-def _log(report: LogReport, number_of: int) -> Markup:
-    """All sections on one log."""
+def _log(report: LogReport, number_of: int, level: int = 2) -> Markup:
+    """All sections on one log, with headings of this level."""
     parts: list[object] = []
     for title, content in (
         ("Scores", sections.scores(report)),
         ("Where people walked", sights.scene(report, number_of)),
-        ("What happened to identities", sights.moments(report)),
+        ("What happened to identities", sights.moments(report, level + 1)),
         ("Forecasts", sections.forecasts(report)),
         ("How people move", sections.motion(report)),
         ("How it was made", lineage.provenance(report)),
     ):
-        parts += [tag("section", tag("h2", title), content)]
+        parts += [tag("section", tag(f"h{level}", title), content)]
     if report.notes:
-        parts.append(tag("section", tag("h2", "Notes"), tag("ul", *(tag("li", words) for words in report.notes))))
+        parts.append(
+            tag("section", tag(f"h{level}", "Notes"), tag("ul", *(tag("li", words) for words in report.notes)))
+        )
     return join(parts)
 
 

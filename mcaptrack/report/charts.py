@@ -23,6 +23,7 @@ HEIGHT: Final = 270
 _LEFT, _RIGHT, _TOP, _BOTTOM = 46, 126, 26, 40
 #: Words beside each other need so much room.
 _LINE: Final = 14.0
+_MOST_LETTERS: Final = 48
 #: A line has no more points than this.
 POINTS: Final = 160
 
@@ -205,7 +206,8 @@ def pairs_chart(title: str, rows: Sequence[tuple[str, float, float]], axis: Axis
         parts.append(tag("text", axis.say(tick), x=f"{at(tick):.1f}", y=bottom + 17, class_="mid"))
     for number_of, (words, before, after) in enumerate(rows):
         y = 54 + row * number_of
-        parts.append(tag("text", words, x=left, y=y - 9, class_="what"))
+        shown = words if len(words) <= _MOST_LETTERS else words[: _MOST_LETTERS - 1] + "…"
+        parts.append(tag("text", shown, x=left, y=y - 9, class_="what"))
         parts.append(tag("line", x1=f"{at(before):.1f}", x2=f"{at(after):.1f}", y1=y, y2=y, class_="between"))
         for value, role in ((before, "tracks"), (after, "offline")):
             parts.append(tag("circle", cx=f"{at(value):.1f}", cy=y, r=5, class_=f"dot s-{role}"))

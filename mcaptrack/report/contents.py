@@ -103,6 +103,11 @@ def gather(opened: log.Log, camera: str | None, progress: Callable[[str], None] 
     return out
 
 
+def _said(error: McaptrackError, opened: log.Log) -> str:
+    """A fault in words; where the log lies on this machine is nobody's business who reads the page."""
+    return str(error).replace(str(opened.path), opened.path.name)
+
+
 def _read(opened: log.Log, out: LogReport) -> None:
     """The tracks, and the ground."""
     channel = opened.channels.get(f"{out.prefix}/tracks")
@@ -128,7 +133,7 @@ def _read(opened: log.Log, out: LogReport) -> None:
     try:
         out.planes = pipeline.read_planes(opened, out.prefix) or ()
     except McaptrackError as error:
-        out.notes.append(str(error))
+        out.notes.append(_said(error, opened))
 
 
 def _score(opened: log.Log, out: LogReport) -> None:
@@ -143,7 +148,7 @@ def _score(opened: log.Log, out: LogReport) -> None:
         out.sequence = sequence_of_log(opened, out.prefix, ())
         outcome = evaluate([out.sequence], EvaluateOptions())
     except McaptrackError as error:
-        out.lacks["scores"] = f"Nothing could be scored: {error}."
+        out.lacks["scores"] = f"Nothing could be scored: {_said(error, opened)}."
         return
     out.results = outcome.results
     out.notes += outcome.notes
@@ -190,7 +195,7 @@ def _look(opened: log.Log, out: LogReport) -> None:
             tracks = next(one for one in out.sets.values() if one.topic == story.topic)
             photograph(moments, tracks.frames, pictures, out.start_ns)
     except McaptrackError as error:
-        out.lacks["pictures"] = f"The pictures can't be shown: {error}"
+        out.lacks["pictures"] = f"The pictures can't be shown: {_said(error, opened)}"
         return
     if out.behind is None:
         out.lacks["pictures"] = f"{topic} holds no pictures"

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from mcaptrack.evaluation import COMBINED, Result, combined
+from mcaptrack.evaluation import Result, combined
 from mcaptrack.metrics import summary
 from mcaptrack.report.contents import LogReport, result_of
-from mcaptrack.report.markup import Markup, counted, number, percent, tag, times
+from mcaptrack.report.markup import Markup, counted, number, percent, sentence, tag, times
 
 #: The rules by which the headline counts, the first that both can be scored by.
 _RULES = (("metres", 1.0), ("iou", 0.5))
@@ -59,9 +59,9 @@ def headline(reports: Sequence[LogReport]) -> Markup:
     if scored:
         together = combined_results(reports)
         pair = pair_of(scored[0], together or scored[0].results)
-    sentence = _with_truth(reports, scored, pair) if pair and scored else _without_truth(reports)
+    said = _with_truth(reports, scored, pair) if pair and scored else _without_truth(reports)
     tiles = _tiles(pair) if pair else ""
-    return Markup(tag("p", sentence, class_="lead") + tiles)
+    return Markup(tag("p", sentence(said), class_="lead") + tiles)
 
 
 def _with_truth(reports: Sequence[LogReport], scored: Sequence[LogReport], pair: Pair) -> str:
@@ -74,9 +74,13 @@ def _with_truth(reports: Sequence[LogReport], scored: Sequence[LogReport], pair:
     where = ""
     if len(reports) > 1:
         where = f"In {counted(len(scored), 'log')} with truth, "
-        where = f"In all {len(reports)} logs together, " if len(scored) == len(reports) else where
+        where = (
+            f"In {'both' if len(reports) == 2 else f'all {len(reports)}'} logs together, "
+            if len(scored) == len(reports)
+            else where
+        )
     if pair.plain and pair.repaired:
-        said = f"{name} switched identities {times(int(switches[0]))}; re-tracked {times(int(switches[1]))}."
+        said = f"{name} switched identities {times(int(switches[0]))}, re-tracking {times(int(switches[1]))}."
     elif pair.plain:
         said = f"{name} switched identities {times(int(switches[0]))}; nothing has been re-tracked yet."
     else:
@@ -126,9 +130,8 @@ def _tiles(pair: Pair) -> Markup:
         ("accuracy (MOTA)", change("MOTA", True), both),
         ("HOTA", change("HOTA", True), both),
     ]
-    forecasts = next((r.displacement for r in (pair.plain, pair.repaired) if r and r.displacement), None)
-    if forecasts:
-        said = forecasts.summary()
+    if pair.plain and pair.plain.displacement:
+        said = pair.plain.displacement.summary()
         tiles.append(("forecast error (ADE)", number(said["ADE_m"], 2, "m"), f"at recall {percent(said['recall'], 0)}"))
     return tag(
         "dl",
@@ -138,6 +141,3 @@ def _tiles(pair: Pair) -> Markup:
         ),
         class_="tiles",
     )
-
-
-__all__ = ["COMBINED", "Pair", "combined_results", "headline", "pair_of", "rule_words"]

@@ -56,11 +56,6 @@ def name(words: object) -> Markup:
     return tag("bdi", tag("code", words))
 
 
-def command(words: str) -> Markup:
-    """Something to type."""
-    return tag("code", words)
-
-
 def number(value: float | int | None, digits: int = 2, unit: str = "") -> str:
     """A number for people; a dash where there is none."""
     if value is None or not math.isfinite(value):
@@ -88,9 +83,13 @@ def counted(count: int, one: str, many: str = "") -> str:
 
 
 def lack(words: str) -> Markup:
-    """What is missing in its place; what stands between backquotes is to be typed."""
-    parts = words.split("`")
-    return tag("p", *(tag("code", part) if k % 2 else part for k, part in enumerate(parts)), class_="lack")
+    """What is missing, in its place."""
+    return tag("p", sentence(words), class_="lack")
+
+
+def sentence(words: str) -> Markup:
+    """Words in which what stands between backquotes is to be typed."""
+    return join(tag("code", part) if k % 2 else part for k, part in enumerate(words.split("`")))
 
 
 def short(words: str) -> str:

@@ -186,10 +186,8 @@ def motion(report: LogReport) -> Markup:
         note = f"Between rows on the clock of prediction; holes left out.{guessed}"
         figures.append(_histogram(report, speeds, "Speed. ", "speed, m/s", note, "m/s", "step", 2))
     elif report.sets:
-        where = f"`mcaptrack ingest FILE --ground-plane H.txt --into {report.file}`"
-        figures.append(
-            lack(f"Speeds can't be said: nobody knows where on the ground people are. {where} adds a plane.")
-        )
+        words = "Speeds can't be said: nobody knows where on the ground people are"
+        figures.append(lack(words + "; `mcaptrack ingest --ground-plane` gives a ground plane."))
     if dwell:
         note = "From the first row of a track to its last."
         figures.append(_histogram(report, dwell, "Dwell. ", "time there, s", note, "s", "track", 1))

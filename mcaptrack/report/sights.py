@@ -49,7 +49,7 @@ def scene(report: LogReport, number_of: int) -> Markup:
     on_ground = [(one, ground_paths(one.frames)) for one in sets]
     on_ground = [(one, paths) for one, paths in on_ground if paths]
     if not on_ground:
-        where = f"`mcaptrack ingest FILE --ground-plane H.txt --into {report.file}` adds a ground plane"
+        where = "`mcaptrack ingest --ground-plane` gives a ground plane"
         return lack(
             f"Tracks can't be drawn: there is no picture, and nobody knows where on the ground they are; {where}."
         )
@@ -74,8 +74,8 @@ def _caption(one: TrackSet, count: int) -> tuple[Markup, str]:
     return tag("b", one.name, class_=f"s-{one.role}"), f": {counted(count, 'track')}"
 
 
-def moments(report: LogReport) -> Markup:
-    """The timeline of switches or repairs, and pictures of those that matter most."""
+def moments(report: LogReport, level: int = 3) -> Markup:
+    """The timeline of switches or repairs, and pictures of those that matter most, below headings of this level."""
     if not report.stories:
         return lack("There are no tracks that anything could happen to.")
     parts: list[Markup] = []
@@ -91,7 +91,7 @@ def moments(report: LogReport) -> Markup:
         called = _named(report, story)
         rest = len(story.moments) - len(shown)
         more = f", and {number(rest)} more" if rest else ""
-        parts.append(tag("h3", f"{called}: the {counted(len(shown), 'moment')} that matter most{more}"))
+        parts.append(tag(f"h{level}", f"{called}: the {counted(len(shown), 'moment')} that matter most{more}"))
         if not any(moment.before or moment.after for moment in shown):
             why = report.lacks.get("pictures", "These have no place in the picture")
             parts.append(lack(f"{why}; so there are words alone."))
@@ -111,8 +111,8 @@ def _named(report: LogReport, story: Story) -> str:
 
 def _what(story: Story) -> str:
     if story.rule:
-        return counted(len(story.moments), "identity switch", "identity switches")
-    return counted(len(story.moments), "repair")
+        return ": " + counted(len(story.moments), "identity switch", "identity switches")
+    return ": " + counted(len(story.moments), "repair") if story.moments else ""
 
 
 def _timeline(story: Story, shown: Sequence[Moment], report: LogReport) -> Markup:
@@ -120,7 +120,7 @@ def _timeline(story: Story, shown: Sequence[Moment], report: LogReport) -> Marku
     most = max([1, *story.births, *story.ends])
     span = story.span_s
     chosen = {id(moment) for moment in shown}
-    parts = [tag("title", f"{_named(report, story)}: {_what(story)} over {clock(span)}")]
+    parts = [tag("title", f"{_named(report, story)}{_what(story)} over {clock(span)}")]
     for k, (born, ended) in enumerate(zip(story.births, story.ends, strict=True)):
         x, wide = f"{100 * k / BARS:.2f}%", f"{80 / BARS:.2f}%"
         if born:
@@ -142,9 +142,9 @@ def _timeline(story: Story, shown: Sequence[Moment], report: LogReport) -> Marku
     drawing = tag("svg", *parts, role="img", class_="line")
     by = f", {rule_words(*story.rule)}" if story.rule else ""
     caption = (
-        tag("b", f"{_named(report, story)}: {_what(story)}", class_=f"s-{role}"),
+        tag("b", f"{_named(report, story)}{_what(story)}", class_=f"s-{role}"),
         f"{by}. Marks: when; long ones are shown below. Bars up: tracks that begin; down: that end, at most {most} in ",
-        clock(span / BARS),
+        number(span / BARS, 2, "s"),
         ".",
     )
     return figure(drawing, *caption)
