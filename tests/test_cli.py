@@ -29,6 +29,7 @@ COMMANDS = [
     "info",
     "view",
     "render",
+    "report",
     "check",
     "recover",
     "drop",

@@ -33,6 +33,10 @@ _MOST_POINTS: Final = 6000
 #: So many colours has ``foxglove.colour``: afterwards they come again.
 COLOURS: Final = 21
 _MARGIN: Final = 14
+#: Where there are more lines than this, they don't say whose they are.
+_MOST_NAMED: Final = 600
+#: The ground is shown no wider and no higher than this.
+_GROUND: Final = (460, 520)
 
 
 class Backdrop(NamedTuple):
@@ -99,13 +103,19 @@ def _split(rows: Rows, t_ns: NDArray[np.int64], at: Floats) -> list[tuple[int, F
 
 def simplified(paths: Sequence[Floats], tolerance: float) -> list[Floats]:
     """Lines with fewer points that stay within ``tolerance``, or more where there would still be too many points."""
+    while True:
+        out = [_simplified(path, tolerance) for path in paths]
+        if sum(map(len, out)) <= max(_MOST_POINTS, 2 * len(paths)) or tolerance > 1e4:
+            return out
+        tolerance *= 1.5
+
+
+def _simplified(path: Floats, tolerance: float) -> Floats:
     import cv2
 
-    while True:
-        out = [cv2.approxPolyDP(path.astype(np.float32)[:, None], tolerance, False)[:, 0] for path in paths]
-        if sum(map(len, out)) <= max(_MOST_POINTS, 2 * len(paths)) or tolerance > 1e4:
-            return [np.asarray(path, np.float64) for path in out]
-        tolerance *= 1.5
+    kept = cv2.approxPolyDP(path.astype(np.float32)[:, None], tolerance, False)[:, 0].astype(np.float64)
+    # A line that comes back to where it began is taken for one that is closed.
+    return kept if (kept[-1] == path[-1].astype(np.float32)).all() else np.concatenate([kept, path[-1:]])
 
 
 def scene_panel(
@@ -124,7 +134,7 @@ def scene_panel(
         picture = tag("image", href=uri, width=behind.width, height=behind.height, id=shared)
     low, high = np.array([-0.5, -0.5]) * behind.width, np.array([1.5, 1.5]) * behind.width
     points = [np.clip(path * behind.scale, low, high) for _, path, _ in paths]
-    lines = _lines(paths, simplified(points, 1.0), start_s, halo=True)
+    lines = _lines(paths, simplified(points, 1.0), start_s)
     return tag("svg", tag("title", title), picture, *lines, viewBox=box, role="img", class_="scene")
 
 
@@ -137,15 +147,19 @@ def ground_panel(
     """Tracks on the ground from ``span``'s lower to its upper corner in metres, the second axis up."""
     low, high = span
     size = np.maximum(high - low, 1e-6)
-    scale = (400 - 2 * _MARGIN) / float(size.max())
+    scale = float(((np.array(_GROUND) - 2 * _MARGIN) / size).min())
     width, height = (size * scale + 2 * _MARGIN).round().astype(int).tolist()
     points = [(path - low) * [scale, -scale] + [_MARGIN, height - _MARGIN] for _, path, _ in paths]
     bar_m = round_step(float(size.max()) / 6)
     bar = tag("line", x1=_MARGIN, x2=f"{_MARGIN + bar_m * scale:.1f}", y1=height + 8, y2=height + 8, class_="axis")
     label = tag("text", f"{bar_m:g} m", x=f"{_MARGIN + bar_m * scale + 6:.1f}", y=height + 12)
     frame = tag("rect", x=0, y=0, width=width, height=height, class_="ground")
-    lines = _lines(paths, simplified(points, 0.5), start_s, halo=False)
-    box = f"0 0 {width} {height + 18}"
+    lines = _lines(
+        paths,
+        simplified(points, 0.5),
+        start_s,
+    )
+    box = f"0 0 {_GROUND[0]} {height + 18}"
     return tag("svg", tag("title", title), frame, *lines, bar, label, viewBox=box, role="img", class_="chart")
 
 
@@ -159,17 +173,20 @@ def ground_span(all_paths: Sequence[Floats]) -> tuple[Floats, Floats]:
 
 
 def _lines(
-    paths: Sequence[tuple[int, Floats, tuple[float, float]]], drawn: Sequence[Floats], start_s: float, halo: bool
+    paths: Sequence[tuple[int, Floats, tuple[float, float]]], drawn: Sequence[Floats], start_s: float
 ) -> list[Markup]:
+    """All lines dark first, so that light and dark colours are seen on any ground; then each in its colour."""
     under, over = [], []
+    by_colour: dict[int, list[str]] = {}
     for (who, _, (first, last)), points in zip(paths, drawn, strict=True):
         at = np.rint(points).astype(int)
         kept = at[np.append(True, (np.diff(at, axis=0) != 0).any(axis=1))]
         steps = np.diff(kept, axis=0, prepend=kept[:1] * 0).tolist()
         way = "M" + "l".join(f"{x} {y}" for x, y in steps) + ("h0" if len(steps) == 1 else "")
         seconds = f"{number(first - start_s, 1)} to {number(last - start_s, 1, 's')}"
-        if halo:
-            under.append(way)
+        under.append(way)
+        by_colour.setdefault(who % COLOURS, []).append(way)
         over.append(tag("path", tag("title", f"{who}: {seconds}"), d=way, class_=f"c{who % COLOURS}"))
-    shade = [tag("path", d="".join(under), class_="halo")] if under else []
-    return [*shade, tag("g", *over, class_="paths")]
+    if len(over) > _MOST_NAMED:
+        over = [tag("path", d="".join(ways), class_=f"c{k}") for k, ways in sorted(by_colour.items())]
+    return [tag("path", d="".join(under), class_="halo"), tag("g", *over, class_="paths")]

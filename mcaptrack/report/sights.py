@@ -128,11 +128,13 @@ def _timeline(story: Story, shown: Sequence[Moment], report: LogReport) -> Marku
             parts.append(tag("rect", x=x, width=wide, y=f"{52 - high:.1f}", height=f"{high:.1f}", class_="born"))
         if ended:
             parts.append(tag("rect", x=x, width=wide, y=53, height=f"{12 * ended / most:.1f}", class_="ended"))
-    for moment in story.moments:
-        x = f"{100 * (moment.t_ns - report.start_ns) / NS_PER_S / span:.2f}%"
-        low, kind = (1, "tick") if id(moment) in chosen else (9, "tick minor")
-        said = tag("title", moment.words)
-        parts.append(tag("line", said, x1=x, x2=x, y1=low, y2=28, class_=f"{kind} s-{role}"))
+    places = [f"{100 * (moment.t_ns - report.start_ns) / NS_PER_S / span:.1f}%" for moment in story.moments]
+    minor = f"tick minor s-{role}"
+    parts += [tag("line", x1=x, x2=x, y1=9, y2=28, class_=minor) for x in dict.fromkeys(places)]
+    for moment, x in zip(story.moments, places, strict=True):
+        if id(moment) in chosen:
+            said = tag("title", moment.words)
+            parts.append(tag("line", said, x1=x, x2=x, y1=1, y2=28, class_=f"tick s-{role}"))
     parts.append(tag("line", x1="0", x2="100%", y1=30, y2=30, class_="grid"))
     for tick in time_ticks(span).tolist():
         x = f"{100 * tick / span:.2f}%"
