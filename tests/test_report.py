@@ -365,6 +365,20 @@ def test_a_truth_that_is_elsewhere_in_time_is_said_and_the_rest_is_there(tmp_pat
     assert str(tmp_path) not in "".join(reader.text)
 
 
+def test_pictures_that_are_damaged_are_said_and_the_ground_is_shown(tmp_path):
+    path = tmp_path / "torn.mcap"
+    frames = walk(lambda tick: {1: (tick * 0.4, 0.0)}, 20)
+    with log.create(path) as writer:
+        add(writer, "/camera/tracks", frames, TRACKS)
+        number = writer.add_channel("/camera/video", foxglove.schema_record(foxglove.IMAGE), "protobuf", {})
+        writer.add_message(number, 0, 0, foxglove.pack_picture(foxglove.IMAGE, 0, "camera", "jpeg", b"no picture"))
+    _, _, reader = report_on(path)
+    words = "".join(reader.text)
+    assert "The pictures can't be shown: torn.mcap: /camera/video" in words
+    assert "here is the ground instead" in words
+    assert len(reader.of("svg")) > 1
+
+
 def test_channels_of_others_under_our_names_are_left_out_and_named(tmp_path):
     path = write(tmp_path / "odd.mcap", {"/camera/tracks": [Frame(0, 0, PREDICTIONS.empty())]}, schema=PREDICTIONS)
     _, _, reader = report_on(path)
@@ -510,6 +524,10 @@ def test_the_page_stands_beside_the_log_and_is_not_replaced_unasked(finished, tm
     assert (tmp_path / "walk.report.html").read_bytes() == first
     assert path.read_bytes() == before
     assert sorted(p.name for p in tmp_path.iterdir()) == ["walk.mcap", "walk.report.html"]
+    code, _, err = call("report", path, "-o", path, "--force")
+    assert code == 1
+    assert "is a log" in err
+    assert path.read_bytes() == before
 
 
 def test_several_logs_need_a_name_for_their_page(finished):  # noqa: F811

@@ -33,20 +33,23 @@ def report(
     Example: mcaptrack report 'logs/*.mcap' -o report.html
     """
     from mcaptrack import log
-    from mcaptrack.atomic import publish_bytes, refuse_overwrite
-    from mcaptrack.report import data, gather, page
+    from mcaptrack.atomic import is_same_file, publish_bytes, refuse_overwrite
+    from mcaptrack.report import data, draw, gather, page
 
     paths = common.expand(logs)
     if output is None and len(paths) > 1:
         raise McaptrackError(f"{len(paths)} logs become one page; say which with -o")
     target = output or paths[0].with_suffix(".report.html")
+    if any(is_same_file(path, target) for path in paths):
+        raise McaptrackError(f"{target} is a log; give the page another name with -o")
     refuse_overwrite(target, force)
     reports = []
     with common.Talk(quiet, verbose).open() as talk:
         for done, path in enumerate(paths):
             talk.progress("report", done, len(paths))
             with log.read(path) as opened:
-                reports.append(gather(opened, camera, lambda words, path=path: talk.detail(f"{path}: {words}")))  # type: ignore[misc]
+                reports.append(gather(opened, camera, talk.detail))
+                draw(reports[-1], done, len(paths))
         whole = page(reports).encode("utf-8")
         publish_bytes(target, whole)
         talk.progress("report", len(paths), len(paths))

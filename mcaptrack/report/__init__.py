@@ -1,8 +1,9 @@
 """A report on logs that people read: one page that needs nothing else, and its numbers as JSON.
 
 gather(log, camera)      everything about a log, read and counted
-data(reports)            the numbers: as ``evaluate --json`` has them, and more
-page(reports)            the page, with these numbers inside
+draw(report, 0, 1)       its part of the page; lets go of its tracks and pictures
+page(reports)            the page, with all numbers inside
+data(reports)            the numbers alone: as ``evaluate --json`` has them, and more
 
 The same logs give the same bytes. The page loads nothing and runs nothing: its policy forbids both, so that a name in a
 log that got past the escaping still could not do anything.
@@ -26,7 +27,7 @@ from mcaptrack.report.headline import combined_results, headline, pair_of
 from mcaptrack.report.markup import NONE, Markup, counted, join, name, number, percent, script_json, table, tag
 from mcaptrack.report.scenery import COLOURS
 
-__all__ = ["ELEMENT", "LogReport", "data", "gather", "page"]
+__all__ = ["ELEMENT", "LogReport", "data", "draw", "gather", "page"]
 
 #: The id of the element that holds the numbers.
 ELEMENT: Final = "mcaptrack-report"
@@ -51,17 +52,31 @@ def _without_curve(result: Result) -> dict[str, Any]:
     return said
 
 
+def draw(report: LogReport, at: int, total: int) -> None:
+    """Draw the part of a page that is about one log, which is number ``at`` of ``total``.
+
+    After that the report no longer holds the tracks and pictures, so that many logs find room.
+    """
+    report.drawn = _log(report, at, 2 if total == 1 else 3)
+    report.behind, report.sequence, report.shown = None, None, []
+    for one in report.sets.values():
+        one.frames = []
+
+
 def page(reports: Sequence[LogReport]) -> str:
-    """The whole page."""
+    """The whole page; what has not been drawn yet is."""
+    for k, report in enumerate(reports):
+        if not report.drawn:
+            draw(report, k, len(reports))
     title = reports[0].name if len(reports) == 1 else counted(len(reports), "log")
     body = [tag("h1", "Report on ", tag("bdi", title)), headline(reports)]
     if len(reports) == 1:
-        body.append(_log(reports[0], 0))
+        body.append(Markup(reports[0].drawn))
     else:
         body.append(_comparison(reports))
         for k, report in enumerate(reports):
             words = tag("summary", tag("h2", tag("bdi", report.file), ": ", _in_short(report)))
-            body.append(tag("details", words, _log(report, k, 3), class_="log", open="" if k == 0 else None))
+            body.append(tag("details", words, Markup(report.drawn), class_="log", open="" if k == 0 else None))
     made = tag(
         "p", f"Made by mcaptrack {__version__}. All numbers are in this page as JSON, in the element ", class_="soft"
     )
@@ -93,7 +108,7 @@ def _style() -> str:
     return files(__package__ or __name__).joinpath("style.css").read_text(encoding="utf-8") + by_identity
 
 
-def _log(report: LogReport, number_of: int, level: int = 2) -> Markup:
+def _log(report: LogReport, number_of: int, level: int) -> Markup:
     """All sections on one log, with headings of this level."""
     parts: list[object] = []
     for title, content in (

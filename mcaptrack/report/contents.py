@@ -67,6 +67,7 @@ class LogReport:
     data: dict[str, Any] = field(default_factory=dict)
     lacks: dict[str, str] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
+    drawn: str = ""
 
     @property
     def start_s(self) -> float:
@@ -93,11 +94,11 @@ def gather(opened: log.Log, camera: str | None, progress: Callable[[str], None] 
     prefix = pipeline.find_camera(opened, camera)
     out = LogReport(opened.path.name, opened.path.stem, prefix, opened.start_ns, opened.end_ns)
     _read(opened, out)
-    progress("scores")
+    progress(f"{opened.path}: scores")
     _score(opened, out)
-    progress("events")
+    progress(f"{opened.path}: events")
     _tell(opened, out)
-    progress("pictures")
+    progress(f"{opened.path}: pictures")
     _look(opened, out)
     out.data = plain(_recording(opened) | {"name": out.name, "camera": prefix} | _numbers(out) | {"notes": out.notes})
     return out

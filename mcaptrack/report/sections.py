@@ -174,7 +174,9 @@ def _calibration(found: Sequence[tuple[str, str, list[dict[str, float]]]]) -> Ma
         f"{words}: " + ", ".join(f"{percent(part['held'], 0)} in {percent(part['nominal'], 0)}" for part in levels)
         for words, _, levels in found
     )
-    return figure(chart, tag("b", "Calibration. "), f"{said}. Below the dashed line forecasts are too sure.")
+    return figure(
+        chart, tag("b", "Calibration. "), f"{said}. Below the dashed line forecasts are too sure, above it too careful."
+    )
 
 
 def motion(report: LogReport) -> Markup:
