@@ -116,7 +116,7 @@ def _axes(x: Axis, y: Axis, width: float, height: float) -> Iterator[Markup]:
     bottom = _TOP + height
     for tick in y.ticks().tolist():
         at = bottom - tick / y.most * height
-        yield tag("line", x1=_LEFT, x2=_LEFT + width, y1=f"{at:.1f}", y2=f"{at:.1f}", class_="grid")
+        yield tag("line", x1=_LEFT, x2=_LEFT + width, y1=f"{at:.1f}", y2=f"{at:.1f}", class_="rule")
         yield tag("text", y.say(tick), x=_LEFT - 6, y=f"{at + 4:.1f}", class_="end")
     for tick in x.ticks().tolist():
         at = _LEFT + tick / x.most * width
@@ -202,7 +202,7 @@ def pairs_chart(title: str, rows: Sequence[tuple[str, float, float]], axis: Axis
 
     parts = []
     for tick in axis.ticks().tolist():
-        parts.append(tag("line", x1=f"{at(tick):.1f}", x2=f"{at(tick):.1f}", y1=28, y2=bottom, class_="grid"))
+        parts.append(tag("line", x1=f"{at(tick):.1f}", x2=f"{at(tick):.1f}", y1=28, y2=bottom, class_="rule"))
         parts.append(tag("text", axis.say(tick), x=f"{at(tick):.1f}", y=bottom + 17, class_="mid"))
     for number_of, (words, before, after) in enumerate(rows):
         y = 54 + row * number_of

@@ -185,7 +185,8 @@ def motion(report: LogReport) -> Markup:
     speeds, dwell = report.data["speed_m_per_s"], report.data["dwell_s"]
     guessed = " Metres are guessed from the size of people: nobody measured the ground." if report.is_assumed else ""
     if speeds:
-        note = f"Between rows on the clock of prediction; holes left out.{guessed}"
+        between = "From one row to the next" + (" on the clock of prediction" if "samples" in report.sets else "")
+        note = f"{between}; holes left out.{guessed}"
         figures.append(_histogram(report, speeds, "Speed. ", "speed, m/s", note, "m/s", "step", 2))
     elif report.sets:
         words = "Speeds can't be said: nobody knows where on the ground people are"
@@ -211,5 +212,6 @@ def _histogram(
         bars.append(Bars(short(one.name), one.role, shares, part["median"], words))
         beyond = f" ({number(part['above'])} of them beyond)" if part["above"] else ""
         said.append(f"{short(one.name)} {counted(part['n'], of)}{beyond}")
+    high = f"the highest bar is {percent(max(float(one.shares.max(initial=0)) for one in bars), 0)}"
     chart = histogram_chart(f"Histograms: {x}", bars, edges, x)
-    return figure(chart, tag("b", title), f"Shares of {', '.join(said)}; lines are medians. {note}")
+    return figure(chart, tag("b", title), f"Shares of {', '.join(said)}; {high}; lines are medians. {note}")

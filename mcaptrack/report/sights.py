@@ -135,7 +135,7 @@ def _timeline(story: Story, shown: Sequence[Moment], report: LogReport) -> Marku
         if id(moment) in chosen:
             said = tag("title", moment.words)
             parts.append(tag("line", said, x1=x, x2=x, y1=1, y2=28, class_=f"tick s-{role}"))
-    parts.append(tag("line", x1="0", x2="100%", y1=30, y2=30, class_="grid"))
+    parts.append(tag("line", x1="0", x2="100%", y1=30, y2=30, class_="rule"))
     for tick in time_ticks(span).tolist():
         x = f"{100 * tick / span:.2f}%"
         anchor = "end" if tick > 0.97 * span else "mid" if tick else None
