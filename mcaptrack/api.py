@@ -23,8 +23,9 @@ from numpy.typing import NDArray
 from mcaptrack import export, foreign, tables
 from mcaptrack import log as logs
 from mcaptrack.errors import McaptrackError
+from mcaptrack.pictures import Pictures
 from mcaptrack.schema import Frame
-from mcaptrack.video import Encoded, brightness, colours
+from mcaptrack.video import brightness, colours
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -173,26 +174,10 @@ class Recording:
         return dict(zip(numbers.tolist(), counts.tolist(), strict=True))
 
     def _decoded(self, topic: str, wanted: Mapping[int, int] | None, colour: Colour) -> Iterator[Frame]:
-        """Decoded pictures; where only some are wanted, no more than it takes to decode these."""
-        last = None if wanted is None else max(wanted, default=-1)
-
-        def encoded() -> Iterator[Encoded]:
-            for index, (message, picture) in enumerate(foreign.pictures(self._log, topic)):
-                if last is not None and index > last:
-                    return
-                stands_alone = picture.layout is not None or picture.format in _STILLS
-                if wanted is None or index in wanted or not stands_alone:
-                    where = f"{self.path}: {topic} at {message.t_ns} ns: frame {index}"
-                    yield Encoded(message.t_ns, index, picture.format, picture.data, picture.layout, where)
-
-        frames = brightness(encoded()) if colour == "grey" else colours(encoded())
-        for frame in frames:
-            if wanted is None or frame.index in wanted:
-                yield frame._replace(rows=frame.rows[..., ::-1]) if colour == "rgb" else frame
-
-
-#: Formats whose pictures are decoded one by one.
-_STILLS: Final = ("jpeg", "jpg", "png", "webp")
+        pixels = brightness if colour == "grey" else colours
+        found = Pictures(self._log, topic)
+        for frame in found.frames(range(len(found.t_ns)) if wanted is None else wanted, pixels):
+            yield frame._replace(rows=frame.rows[..., ::-1]) if colour == "rgb" else frame
 
 
 def _whole(value: Any) -> int | None:

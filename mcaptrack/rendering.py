@@ -24,7 +24,7 @@ from mcaptrack.video import write_clip
 
 Image = NDArray[np.uint8]
 
-_LINE_LOOP, _LINE_STRIP = 2, 3
+_LINE_LOOP, _LINE_STRIP, _LINE_LIST = 2, 3, 4
 #: Coordinates are drawn to this many binary places of a pixel.
 _SHIFT: Final = 4
 _GIF_FPS: Final = 10.0
@@ -133,13 +133,21 @@ def draw(image: Image, annotations: Any, scale: float = 1.0) -> Image:
         cv2.polylines(paint, [line], is_closed, bgr, thickness + 2, cv2.LINE_8, _SHIFT)
         cv2.polylines(cover, [line], is_closed, round(255 * rgba.a), thickness, cv2.LINE_AA, _SHIFT)
 
+    lines = []
     for part in annotations.points:
         points = np.array([(point.x, point.y) for point in part.points], np.float64).reshape(-1, 2) * scale
-        line = np.rint(points * 2**_SHIFT).clip(-(2**24), 2**24).astype(np.int32)
+        lines.append(np.rint(points * 2**_SHIFT).clip(-(2**24), 2**24).astype(np.int32))
+        if part.type == _LINE_LOOP and part.fill_color.a > 0:
+            image = _filled(image, lines[-1], part.fill_color)
+    for part, line in zip(annotations.points, lines, strict=True):
         thickness = max(1, round(part.thickness * max(scale, 0.5)))
         shades = part.outline_colors
         if part.type == _LINE_LOOP:
             stroke(line, part.outline_color, thickness, is_closed=True)
+        elif part.type == _LINE_LIST:
+            for pair in range(len(line) // 2):
+                shade = shades[pair] if len(shades) == len(line) // 2 else part.outline_color
+                stroke(line[2 * pair : 2 * pair + 2], shade, thickness)
         elif part.type == _LINE_STRIP and len(shades) == len(line):
             for start in range(len(line) - 1):
                 stroke(line[start : start + 2], shades[start + 1], thickness)
@@ -149,6 +157,23 @@ def draw(image: Image, annotations: Any, scale: float = 1.0) -> Image:
     image = np.rint(image * (1 - share) + paint * share).astype(np.uint8)
     for text in annotations.texts:
         _write(image, text, scale)
+    return image
+
+
+def _filled(image: Image, line: NDArray[np.int32], rgba: Any) -> Image:
+    """With the inside of a closed line painted; what others painted there before shows through."""
+    import cv2
+
+    cover = np.zeros(image.shape[:2], np.uint8)
+    cv2.fillPoly(cover, [line], round(255 * rgba.a), cv2.LINE_AA, _SHIFT)
+    rows, columns = (np.flatnonzero(cover.any(axis=axis)) for axis in (1, 0))
+    if not len(rows):
+        return image
+    part = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    share = cover[part][..., None].astype(np.float32) / 255
+    bgr = np.array([rgba.b, rgba.g, rgba.r], np.float32) * 255
+    image = image.copy()
+    image[part] = np.rint(image[part] * (1 - share) + bgr * share).astype(np.uint8)
     return image
 
 

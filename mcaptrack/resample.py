@@ -30,7 +30,7 @@ def resample(frames: Sequence[Frame], at_ns: Ints, max_hole_ns: int) -> tuple[Ro
     """
     frame_ns = np.array([frame.t_ns for frame in frames], np.int64)
     usual_ns = float(np.median(np.diff(frame_ns))) if len(frames) > 1 else 0.0
-    rows = np.concatenate([TRACKS.empty(), *(frame.rows for frame in frames)])
+    rows = TRACKS.joined([frame.rows for frame in frames])
     row_ns = np.repeat(frame_ns, [len(frame.rows) for frame in frames])
     order = np.lexsort((row_ns, rows["track_id"]))
     rows, row_ns = rows[order], row_ns[order]

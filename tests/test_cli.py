@@ -18,6 +18,7 @@ from mcaptrack import __version__, demo, log
 from mcaptrack.schema import COUNTS, EVENTS, EventKind
 from tests.worlds import small_scene, write_clip
 
+LAYOUTS = [".comparing.layout.json", ".layout.json"]
 STAGES = ["detect", "track", "sample", "predict", "retrack", "run"]
 COMMANDS = [
     "ingest",
@@ -112,11 +113,11 @@ class TestHelp:
 class TestTheUsualWay:
     def test_a_finished_log_has_its_companions(self, finished):
         names = sorted(path.name for path in finished.parent.iterdir())
-        assert names == ["walk.layout.json", "walk.mcap", "walk.tables"]
+        assert names == [f"walk{end}" for end in (*LAYOUTS, ".mcap", ".predictions.layout.json", ".tables")]
         layout = json.loads((finished.parent / "walk.layout.json").read_text())
         shown = layout["configById"]["Image!picture"]["imageMode"]["annotations"]
         assert shown["/camera/retracks/full/view/image"] == {"visible": True}
-        assert shown["/camera/retracks/view/image"] == {"visible": False}
+        assert shown["/camera/tracks/view/image"] == {"visible": False}
         assert shown["/camera/detections/view/image"] == {"visible": False}
 
     def test_running_again_has_nothing_to_do(self, finished):
@@ -472,7 +473,11 @@ def test_the_demonstration(tmp_path, monkeypatch):
     for words in ("SORT", "re-tracked", "identity switches", "demo.mcap", "Lichtblick"):
         assert words in shown.stdout
     names = sorted(path.name for path in (tmp_path / "d").iterdir())
-    assert names == ["demo.layout.json", "demo.mcap", "demo.mp4", "demo.tables", "ground_plane.txt", "truth.txt"]
+    assert names == [
+        *(f"demo{end}" for end in (*LAYOUTS, ".mcap", ".mp4", ".predictions.layout.json", ".tables")),
+        "ground_plane.txt",
+        "truth.txt",
+    ]
     again = subprocess.run(run, capture_output=True, text=True, check=False)
     assert again.returncode == 1
     assert "exists; give another folder with -o, or --force" in again.stderr
@@ -543,7 +548,7 @@ def test_channels_are_dropped_with_their_views_and_nothing_else(finished, tmp_pa
     (result,) = json.loads(out)["results"]
     after = json.loads(done("info", tmp_path / "small.mcap", "--json")[0])["results"][0]["channels"]
     assert {c["topic"] for c in before} - {c["topic"] for c in after} == set(result["dropped"])
-    assert "/camera/retracks/view/image" in result["dropped"]
+    assert "/camera/retracks/full/view/image" in result["dropped"]
     assert [c for c in before if c["topic"] not in result["dropped"]] == after
     assert result["bytes"] == (tmp_path / "small.mcap").stat().st_size < finished.stat().st_size
     code, _, err = call("drop", finished, "/nothing/*")

@@ -107,7 +107,7 @@ def test_stages_in_place_leave_all_that_was_there_and_draw_at_the_pictures_stamp
         assert sum(len(f.rows) for f in found) > 20
         assert any(len(f.rows) for f in opened.frames(f"{prefix}/retracks", TRACKS))
         assert pipeline.find_camera(opened, None) == prefix
-    for name in ("detections", "tracks", "retracks", "retracks/predictions"):
+    for name in ("detections", "tracks", "retracks/full", "retracks/predictions"):
         drawn = annotations(robot, f"{prefix}/{name}")
         assert [t_ns for t_ns, _ in drawn] == [row[3] for row in before[IMAGES]]
         for number, (_, message) in enumerate(drawn):

@@ -244,3 +244,19 @@ def test_a_log_that_may_not_be_written_to_says_what_to_do(tmp_path, monkeypatch)
     with log.read(path) as opened, log.extend(opened, tmp_path / "copy.mcap") as writer:
         writer.add_channel("/new", SCHEMA, "json", {})
     assert contents(path) == {"/video": contents(path)["/video"]}
+
+
+def test_damage_that_is_in_the_way_is_said_where_it_stands_and_nothing_changes(tmp_path):
+    path = tmp_path / "a.mcap"
+    recorded(path)
+    add_results(path, 1)
+    with log.read(path) as opened:
+        (chunk,) = opened.index.chunks[-1:]
+    whole = bytearray(path.read_bytes())
+    whole[chunk.offset + chunk.length - 1] ^= 1
+    path.write_bytes(whole)
+    with pytest.raises(
+        McaptrackError, match=rf"is damaged: byte {chunk.offset}: .*; `mcaptrack recover .*a.mcap` saves what is whole$"
+    ):
+        add_results(path, 2)
+    assert path.read_bytes() == bytes(whole)

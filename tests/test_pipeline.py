@@ -238,13 +238,17 @@ class TestTheWholeLine:
             pictures = opened.times("/camera/video").tolist()
             for name in ROWS:
                 assert f"/camera/{name}" in opened.channels
-            for name in ("detections", "tracks", "predictions", "retracks", "retracks/predictions", "truth"):
+            for name in ("detections", "tracks", "predictions", "retracks/full", "retracks/predictions", "truth"):
                 assert opened.times(f"/camera/{name}/view/image").tolist() == pictures
             assert [f.t_ns for f in opened.frames("/camera/detections", DETECTIONS)] == pictures
             ticks = opened.times("/camera/samples").tolist()
             assert ticks == [round(0.4e9 * n) for n in range(len(ticks))]
             assert opened.times("/camera/retracks").tolist() == opened.times("/camera/predictions").tolist() == ticks
-            assert [listed.name for listed in opened.index.attachments] == ["mcaptrack.layout.json"]
+            assert [listed.name for listed in opened.index.attachments] == [
+                "mcaptrack.layout.json",
+                "mcaptrack.comparing.layout.json",
+                "mcaptrack.predictions.layout.json",
+            ]
 
     def test_the_stock_reader_reads_it_equal(self, finished):
         with log.read(finished) as opened, finished.open("rb") as stream:

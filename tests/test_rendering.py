@@ -9,9 +9,11 @@ from pathlib import Path
 import av
 import numpy as np
 import pytest
+from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
 
-from mcaptrack import foxglove
+from mcaptrack import foxglove, log
 from mcaptrack.errors import McaptrackError
+from mcaptrack.pipeline import find_views
 from mcaptrack.rendering import draw
 from mcaptrack.video import write_clip
 from mcaptrack.video.decode import Encoded, colours
@@ -22,9 +24,28 @@ from tests.test_cli import call, done, finished, footage  # noqa: F401
 GREY = np.full((100, 200, 3), 100, np.uint8)
 
 
-def annotations(boxes, ids=None, paths=(), **options):
-    payload = foxglove.pack_annotations(1, np.array(boxes, float).reshape(-1, 4), ids, paths, **options)
-    return foxglove.unpack(foxglove.ANNOTATIONS, payload)
+def annotations(boxes=(), ids=None, strips=(), thickness=2.0):
+    """A message with boxes (left, top, width, height), their numbers, and lines of fading points."""
+    message = ImageAnnotations()
+    for number, (x, y, w, h) in enumerate(boxes):
+        part = message.points.add(type=2, thickness=thickness)
+        paint(part.outline_color, foxglove.colour(ids[number] if ids else 0))
+        for corner in ((x, y), (x + w, y), (x + w, y + h), (x, y + h)):
+            part.points.add(x=corner[0], y=corner[1])
+        if ids:
+            text = message.texts.add(text=str(ids[number]), font_size=12)
+            text.position.x, text.position.y = x, y
+            paint(text.background_color, foxglove.colour(ids[number]))
+    for points, opacity in strips:
+        part = message.points.add(type=3, thickness=thickness)
+        for point, alpha in zip(points, opacity, strict=True):
+            part.points.add(x=point[0], y=point[1])
+            paint(part.outline_colors.add(), (*foxglove.colour(0)[:3], alpha))
+    return message
+
+
+def paint(target, rgba):
+    target.r, target.g, target.b, target.a = rgba
 
 
 def clip(path: Path) -> list[tuple[float, np.ndarray]]:
@@ -46,8 +67,7 @@ def test_a_box_is_drawn_on_its_edges_in_the_colour_of_its_identity_and_nowhere_e
 
 
 def test_lines_fade_as_their_points_say():
-    path = foxglove.Path(0, np.array([[10.0, 50], [60, 50], [110, 50]]), [0.0, 0.2, 0.8])
-    image = draw(GREY, annotations([], None, [path])).astype(float)
+    image = draw(GREY, annotations(strips=[([(10, 50), (60, 50), (110, 50)], [0.0, 0.2, 0.8])])).astype(float)
     red, green, blue, _ = foxglove.colour(0)
     wanted = np.array([blue, green, red]) * 255
     assert abs(image[50, 35] - (0.2 * wanted + 0.8 * 100)).max() <= 2
@@ -62,8 +82,33 @@ def test_what_is_drawn_is_scaled_with_the_picture():
 
 
 def test_a_picture_where_nothing_is_stays_as_it_is():
-    assert np.array_equal(draw(GREY, annotations([])), GREY)
-    assert np.array_equal(draw(GREY, annotations([[np.nan] * 4], [1])), GREY)
+    assert np.array_equal(draw(GREY, annotations()), GREY)
+
+
+def test_lines_of_a_list_are_drawn_one_by_one_and_leave_gaps():
+    message = ImageAnnotations()
+    part = message.points.add(type=4, thickness=2)
+    for x in (20, 60, 100, 140):
+        part.points.add(x=x, y=50)
+    for alpha in (1.0, 0.5):
+        paint(part.outline_colors.add(), (1.0, 0.0, 0.0, alpha))
+    image = draw(GREY, message)
+    assert abs(image[50, 40].astype(int) - [0, 0, 255]).max() <= 2
+    assert abs(image[50, 120].astype(int) - [50, 50, 178]).max() <= 3
+    assert (image[:, 66:94] == 100).all()
+
+
+def test_what_is_inside_of_a_filled_line_shows_through_and_lines_of_others_stay():
+    message = annotations([[20, 20, 60, 60], [40, 40, 100, 50]])
+    for part in message.points:
+        paint(part.fill_color, (0.0, 0.0, 1.0, 0.25))
+    image = draw(GREY, message).astype(int)
+    once, twice = 100 * 0.75 + 255 * 0.25, (100 * 0.75 + 255 * 0.25) * 0.75 + 255 * 0.25
+    assert abs(image[30, 30, 0] - once) <= 1
+    assert abs(image[60, 60, 0] - twice) <= 1
+    outline = np.array(foxglove.colour(0)[2::-1]) * 255
+    assert abs(image[60, 80] - outline).max() <= 2  # of the first, inside the second
+    assert (image[5, :] == 100).all()
 
 
 @pytest.mark.parametrize("suffix", [".mp4", ".gif"])
@@ -159,3 +204,10 @@ def test_nothing_is_left_of_a_clip_that_fails(tmp_path):
         with pytest.raises(McaptrackError, match="half way"):
             write_clip(tmp_path / f"a{suffix}", broken(), Fraction(10))
     assert not list(tmp_path.iterdir())
+
+
+def test_re_tracked_people_are_drawn_at_the_rate_of_the_video(finished):  # noqa: F811
+    with log.read(finished) as opened:
+        assert find_views(opened, "/camera", ["/camera/retracks"]) == ["/camera/retracks/full/view/image"]
+        with pytest.raises(McaptrackError, match="has no channel /camera/nobody/view/image"):
+            find_views(opened, "/camera", ["/camera/nobody"])

@@ -171,6 +171,7 @@ def test_the_command_prints_links_that_lead_to_the_log_and_its_layout_until_it_i
     write_log(path, SOME)
     with log.read(path) as opened, log.extend(opened) as writer:
         writer.add_attachment("mcaptrack.layout.json", "application/json", b'{"layout": 1}')
+        writer.add_attachment("mcaptrack.comparing.layout.json", "application/json", b'{"layout": 2}')
     command = [sys.executable, "-m", "mcaptrack", "view", path, "--json", "--lichtblick", "http://localhost:8080/"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         lines = []
@@ -183,14 +184,22 @@ def test_the_command_prints_links_that_lead_to_the_log_and_its_layout_until_it_i
         assert (link.netloc, asked["ds"]) == ("localhost:8080", ["remote-file"])
         assert ask(asked["ds.url"][0])[2] == path.read_bytes()
         assert ask(asked["layoutUrl"][0])[2] == b'{"layout": 1}'
+        assert list(said["layouts"]) == list(said["lichtblick"]) == ["tracking", "comparing"]
+        other = parse_qs(urlsplit(said["lichtblick"]["comparing"]).query)
+        assert other["ds.url"] == asked["ds.url"]
+        assert ask(other["layoutUrl"][0])[2] == ask(said["layouts"]["comparing"])[2] == b'{"layout": 2}'
         process.send_signal(signal.SIGINT)
         _, err = process.communicate(timeout=20)
         assert process.returncode == 0
         assert err == "serving until Ctrl-C ...\ndone\n"
 
 
-def test_mistakes_are_said():
+def test_mistakes_are_said(tmp_path):
     code, _, err = call("view", "none.mcap")
     assert (code, "can't be opened: No such file" in err) == (1, True)
+    path = tmp_path / "a.mcap"
+    write_log(path, SOME)
+    code, _, err = call("view", path, "--layout", "none")
+    assert (code, f"{path} has no layout none; it has none" in err) == (1, True)
     code, _, err = call("view", __file__, "--lichtblick", "localhost")
     assert (code, "--lichtblick needs an address such as" in err) == (1, True)

@@ -103,7 +103,7 @@ def test_all_stages_run_beside_a_log_that_nobody_may_write_to(fresh, tmp_path): 
         summary = make_reader(stream).get_summary()
     theirs = {channel.topic for channel in summary.channels.values()}
     assert {"/camera/video", "/camera/truth"} & theirs == set()
-    assert {"/camera/detections", "/camera/retracks", "/camera/retracks/view/image"} <= theirs <= set(topics)
+    assert {"/camera/detections", "/camera/retracks", "/camera/retracks/full/view/image"} <= theirs <= set(topics)
     assert (tmp_path / "walk.tables").is_dir()
     out, _ = done("evaluate", fresh, "--json")
     assert json.loads(out)["results"]

@@ -2,25 +2,31 @@
 
 from __future__ import annotations
 
-import json
+from itertools import pairwise
 
 import numpy as np
 import pytest
 from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
+from hypothesis import given
+from hypothesis import strategies as st
 from mcap_protobuf.schema import build_file_descriptor_set
 
 from mcaptrack import foxglove
 from mcaptrack.plane import GroundPlane
 from mcaptrack.schema import DETECTIONS, PREDICTIONS, TRACKS, Frame
 from mcaptrack.views import view
-from tests.worlds import boxes_at, ns
+from mcaptrack.views.people import around, ellipses
+from tests.worlds import boxes_at, ns, tracks_at
 
 PLANE = [(0, GroundPlane((0.1, 0, 0, 0, 0.1, 0, 0, 0, 1), 640, 480))]
 PICTURES = np.array([ns(n / 7) for n in range(20)])
+LOOP, LIST = 2, 4
+#: Coordinates are written to a quarter of a pixel.
+PX = 0.126
 
 
-def track_rows(people):
+def track_rows(people, observed=True):
     """{id: (left, top)} with boxes of 10 x 20."""
     xy = np.array(list(people.values()), float).reshape(-1, 2)
     return TRACKS.rows(
@@ -29,14 +35,15 @@ def track_rows(people):
         y_px=xy[:, 1],
         w_px=np.full(len(xy), 10.0),
         h_px=np.full(len(xy), 20.0),
-        observed=np.ones(len(xy), bool),
+        observed=np.full(len(xy), observed),
         source_id=np.full(len(xy), -1),
     )
 
 
-def messages(topic, schema, frames, planes=PLANE) -> list[ImageAnnotations]:
+def messages(topic, schema, frames, planes=PLANE, **options) -> list[ImageAnnotations]:
     out = []
-    for (t_ns, index, payload), wanted in zip(view(topic, schema, frames, PICTURES, planes), PICTURES, strict=True):
+    found = view(topic, schema, frames, PICTURES, planes, **options)
+    for (t_ns, index, payload), wanted in zip(found, PICTURES, strict=True):
         message = ImageAnnotations.FromString(payload)
         assert t_ns == wanted
         assert PICTURES[index] == wanted
@@ -49,6 +56,10 @@ def messages(topic, schema, frames, planes=PLANE) -> list[ImageAnnotations]:
 
 def drawn(message) -> list:
     return [line for line in message.points if line.outline_color.a > 0]
+
+
+def xy(line) -> list[tuple[float, float]]:
+    return [(p.x, p.y) for p in line.points]
 
 
 FORECAST = PREDICTIONS.rows(
@@ -68,6 +79,8 @@ CHANNELS = {
     "truth": ("/c/truth", TRACKS, [Frame(int(PICTURES[4]), 4, track_rows({2: (1, 5)}))]),
     "predictions": ("/c/predictions", PREDICTIONS, [Frame(ns(0.4), 1, FORECAST)]),
     "nothing": ("/c/tracks", TRACKS, []),
+    "no detections": ("/c/detections", DETECTIONS, []),
+    "no predictions": ("/c/predictions", PREDICTIONS, []),
 }
 
 
@@ -82,39 +95,181 @@ def test_every_picture_has_a_message_with_its_time_and_never_an_empty_one(channe
 
 def test_boxes_stand_where_the_rows_say():
     (box,) = drawn(messages(*CHANNELS["detections"])[4])
-    assert box.type == 2  # a closed line
-    assert [(p.x, p.y) for p in box.points] == [(40, 40), (60, 40), (60, 80), (40, 80)]
+    assert box.type == LOOP
+    assert xy(box) == [(40, 40), (60, 40), (60, 80), (40, 80)]
 
 
 def test_tracks_move_with_the_pictures_between_the_ticks_of_their_clock():
     found = messages(*CHANNELS["retracks"])
     lefts = {n: drawn(message)[0].points[0].x for n, message in enumerate(found) if drawn(message)}
     for number, left in lefts.items():
-        assert left == pytest.approx(100 * number / 7, abs=0.01)  # 40 px a tick of 0.4 s
+        assert left == pytest.approx(100 * number / 7, abs=PX)  # 40 px a tick of 0.4 s
     assert sorted(lefts) == list(range(3, 9))
 
 
 def test_a_trail_leads_to_the_box_and_fades_into_the_past():
     message = messages(*CHANNELS["retracks"])[8]
     box, trail = drawn(message)
-    assert trail.type == 3
-    assert (trail.points[-1].x, trail.points[-1].y) == pytest.approx((box.points[0].x + 5, 25), abs=0.01)
+    assert trail.type == LIST
+    ends = xy(trail)
+    assert ends[-1] == pytest.approx((box.points[0].x + 5, 25), abs=2 * PX)
+    assert ends[1:-1:2] == ends[2::2]  # one line begins where the last ended
+    assert [x for x, _ in ends] == sorted(x for x, _ in ends)
     opacity = [colour.a for colour in trail.outline_colors]
+    assert len(opacity) == len(ends) / 2
     assert opacity == sorted(opacity)
+    assert opacity[0] < opacity[-1]
     assert message.texts[0].text == "2"
+
+
+def test_trails_stay_where_they_are_while_people_go_on_and_end_after_two_seconds():
+    frames = [Frame(int(PICTURES[n]), n, track_rows({2: (10 * n, 5), 30: (5, 10 * n)})) for n in range(20)]
+    found = messages("/c/retracks/full", TRACKS, frames)
+    for earlier, later in pairwise(found[15:]):
+        before, after = (set(xy(drawn(message)[-1])) for message in (earlier, later))
+        assert len(before & after) >= len(before) - 4  # of each person the tip, and now and then the end
+    for number, message in enumerate(found):
+        oldest = min(x for x, y in xy(drawn(message)[-1]) if y == 25) if number else None
+        assert oldest is None or 10 * (number - 14) <= oldest - 5 <= 10 * number
+
+
+def test_kinds_of_tracks_tell_apart():
+    rows = [Frame(int(PICTURES[n]), n, track_rows({2: (n, 5)})) for n in range(6)]
+    sort, retracked, true = (messages(f"/c/{name}", TRACKS, rows)[5] for name in ("tracks", "retracks/full", "truth"))
+    assert [line.type for line in drawn(sort)] == [LIST]  # sides and trail, and no closed line
+    sides = xy(drawn(sort)[0])
+    for x in (5, 15):
+        assert {(x, 5), (x, 25)} <= set(sides)
+    thick, thin = drawn(retracked)[0], drawn(true)[0]
+    assert (thick.type, thin.type) == (LOOP, LOOP)
+    assert thick.thickness > thin.thickness
+    assert (thin.outline_color.r, thin.outline_color.g, thin.outline_color.b) == (1, 1, 1)
+    colour = foxglove.colour(2)[:3]
+    for line in (thick.outline_color, drawn(sort)[0].outline_colors[0], retracked.texts[0].background_color):
+        assert (line.r, line.g, line.b) == colour
+    places = {(text.position.x, text.position.y) for message in (sort, retracked, true) for text in message.texts}
+    assert len(places) == 3  # no number hides another
+
+
+def test_who_was_not_seen_is_fainter():
+    for name in ("tracks", "retracks/full"):
+        rows = [Frame(int(PICTURES[n]), n, track_rows({2: (n, 5)}, observed=n != 4)) for n in range(6)]
+        alpha = []
+        for message in messages(f"/c/{name}", TRACKS, rows)[3:6]:
+            part = drawn(message)[0]
+            alpha.append(part.outline_color.a if part.type == LOOP else part.outline_colors[0].a)
+        assert alpha[0] == alpha[2] == 1
+        assert 0.1 < alpha[1] < 0.6
+
+
+def test_a_place_without_a_box_is_marked_with_its_number():
+    message = messages("/c/retracks", TRACKS, [Frame(int(PICTURES[3]), 3, tracks_at({7: (2.0, 3.0)}))])[3]
+    (mark,) = drawn(message)
+    assert np.mean(xy(mark), axis=0).tolist() == [20, 30]
+    assert [text.text for text in message.texts] == ["7"]
+
+
+def test_numbers_of_any_length_are_written():
+    people = {-4: (0, 0), 7: (10, 0), 12345: (20, 0), 2**40: (30, 0)}
+    message = messages("/c/tracks", TRACKS, [Frame(int(PICTURES[3]), 3, track_rows(people))])[3]
+    assert sorted(text.text for text in message.texts) == sorted(map(str, people))
+
+
+def test_wide_pictures_get_thick_lines_and_large_words():
+    wide = [(0, GroundPlane((0.1, 0, 0, 0, 0.1, 0, 0, 0, 1), 3840, 2160))]
+    small, large = (messages(*CHANNELS["retracks"], planes)[5] for planes in (PLANE, wide))
+    assert drawn(large)[0].thickness > 3 * drawn(small)[0].thickness
+    assert large.texts[0].font_size > 3 * small.texts[0].font_size
 
 
 def test_forecasts_come_back_to_pixels_and_fade_into_the_future():
     found = messages(*CHANNELS["predictions"])
-    line = drawn(found[3])[0]
-    assert [(p.x, p.y) for p in line.points] == [(10, 30), (20, 40)]
-    assert [colour.a for colour in line.outline_colors] == pytest.approx([0.9, 0.1])
+    ellipse, line = drawn(found[3])
+    assert (line.type, xy(line)) == (LIST, [(10, 30), (20, 40)])
+    assert ellipse.type == LOOP
     assert not drawn(found[2])  # not made yet
     assert not drawn(found[12])  # a second old
+    far = PREDICTIONS.rows(
+        track_id=np.repeat([3, 4], 6),
+        step=np.tile(np.arange(1, 7), 2),
+        ahead_s=np.tile(np.arange(1, 7) * 0.4, 2),
+        x_m=np.arange(12.0),
+        y_m=np.ones(12),
+    )
+    (both,) = drawn(messages("/c/predictions", PREDICTIONS, [Frame(ns(0.4), 1, far)])[3])  # no covariance, no ellipse
+    opacity = [colour.a for colour in both.outline_colors]
+    assert opacity[:4] == opacity[4:] == sorted(opacity[:4], reverse=True)
+    assert xy(both)[0] == (0, 10)
+    assert xy(both)[7] == (50, 10)
+
+
+def test_an_ellipse_is_as_wide_as_95_percent_ask_for():
+    """Axes of a known covariance under a known plane, by hand: 5.991 is the quantile of chi squared."""
+    rows = FORECAST.copy()
+    rows["cov_xx_m2"], rows["cov_yy_m2"] = 4.0, 1.0
+    ellipse = drawn(messages("/c/predictions", PREDICTIONS, [Frame(ns(0.4), 1, rows)])[3])[0]
+    points = np.array(xy(ellipse)) - [20, 40]  # 10 px a metre
+    assert abs(points[:, 0]).max() == pytest.approx(10 * np.sqrt(5.991 * 4), abs=PX)
+    inside = (points[:, 0] / (10 * np.sqrt(5.991 * 4))) ** 2 + (points[:, 1] / (10 * np.sqrt(5.991))) ** 2
+    np.testing.assert_allclose(inside, 1, atol=0.02)
+
+
+def test_an_ellipse_of_a_plane_in_perspective_is_mapped_point_by_point():
+    matrix = np.array([[0.05, 0.004, -12], [0.002, -0.08, 31], [0.0001, -0.0021, 1.0]])
+    planes = [(0, GroundPlane(tuple(matrix.ravel()), 640, 400))]
+    spread = np.array([[0.5, 0.2], [0.2, 0.3]])
+    centre = matrix @ [320, 300, 1]
+    centre = centre[:2] / centre[2]
+    rows = FORECAST.copy()
+    rows["x_m"], rows["y_m"] = centre
+    rows["cov_xx_m2"], rows["cov_xy_m2"], rows["cov_yy_m2"] = 0.5, 0.2, 0.3
+    ellipse = drawn(messages("/c/predictions", PREDICTIONS, [Frame(ns(0.4), 1, rows)], planes)[3])[0]
+    back = np.append(xy(ellipse), np.ones((len(ellipse.points), 1)), axis=1) @ matrix.T
+    away = back[:, :2] / back[:, 2:] - centre
+    np.testing.assert_allclose(np.einsum("ni,ij,nj->n", away, np.linalg.inv(spread), away), 5.991, rtol=0.05)
+
+
+@given(
+    st.floats(0.01, 20), st.floats(0.01, 20), st.floats(-np.pi, np.pi), st.floats(-50, 50), st.floats(-50, 50)
+)  # fmt: skip
+def test_points_of_an_ellipse_lie_as_far_out_as_its_covariance_says(long, short, turn, x, y):
+    rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    spread = rotation @ np.diag([long, short]) @ rotation.T
+    half, found = ellipses(spread[None])
+    assert half[0, 0] >= half[0, 1]
+    points = around(np.array([[x, y]]), half, found, 9)[0] - [x, y]
+    np.testing.assert_allclose(np.einsum("ni,ij,nj->n", points, np.linalg.inv(spread), points), 5.991464547, rtol=1e-6)
+
+
+def test_what_is_no_covariance_has_no_ellipse():
+    spread = np.array([[[np.nan, 0], [0, 1]], [[1, 5], [5, 1]], [[0, 0], [0, 0]]], float)
+    half, turn = ellipses(spread)
+    assert np.isnan(half[:2]).all()
+    assert np.isnan(turn[:2]).all()
+    assert half[2].tolist() == [0, 0]  # somebody is sure
 
 
 def test_without_a_plane_there_are_no_forecasts_to_draw():
     assert not any(drawn(message) for message in messages(*CHANNELS["predictions"], planes=()))
+
+
+def test_stamps_are_those_of_the_pictures_where_they_differ_from_the_log():
+    stamps = PICTURES + 1_600_000_000_123_456_789
+    found = list(view(*CHANNELS["retracks"], PICTURES, PLANE, stamps))
+    assert [t_ns for t_ns, _, _ in found] == PICTURES.tolist()
+    for (_, _, payload), stamp in zip(found, stamps.tolist(), strict=True):
+        message = ImageAnnotations.FromString(payload)
+        assert {part.timestamp.ToNanoseconds() for part in (message, *message.points, *message.texts)} == {stamp}
+
+
+def test_many_pictures_are_drawn_as_few_are():
+    """Messages are made in batches; where one ends is not to be seen."""
+    pictures = np.arange(600) * ns(0.1)
+    frames = [Frame(int(t), n, track_rows({2: (n, 5), 5: (5, n)})) for n, t in enumerate(pictures)]
+    whole = list(view("/c/tracks", TRACKS, frames, pictures, PLANE))
+    part = list(view("/c/tracks", TRACKS, frames[200:330], pictures[200:330], PLANE))
+    assert [payload for _, _, payload in whole[230:330]] == [payload for _, _, payload in part[30:]]
+    assert [index for _, index, _ in whole] == list(range(600))
 
 
 def test_one_identity_has_one_colour_and_neighbours_differ():
@@ -124,24 +279,13 @@ def test_one_identity_has_one_colour_and_neighbours_differ():
     assert all(0 <= part <= 1 for rgba in many for part in rgba)
     first = [foxglove.colour(n)[:3] for n in range(7)]
     assert min(sum(abs(a - b) for a, b in zip(x, y, strict=True)) for x in first for y in first if x != y) > 0.25
+    numbers = np.array([-1, 0, 5, 20, 21, 2**40])
+    assert foxglove.colours(numbers).tolist() == [list(foxglove.colour(int(n))[:3]) for n in numbers]
 
 
-@pytest.mark.parametrize("name", ["ImageAnnotations", "CompressedVideo", "CompressedImage"])
+@pytest.mark.parametrize("name", ["ImageAnnotations", "CompressedVideo", "CompressedImage", "SceneUpdate"])
 def test_schema_records_are_those_of_the_stock_library(name):
     schema_name, encoding, data = foxglove.schema_record(f"foxglove.{name}")
-    wanted = build_file_descriptor_set(foxglove._message_class(f"foxglove.{name}"))
+    wanted = build_file_descriptor_set(foxglove.message_class(f"foxglove.{name}"))
     assert (schema_name, encoding) == (f"foxglove.{name}", "protobuf")
     assert {f.name: f for f in FileDescriptorSet.FromString(data).file} == {f.name: f for f in wanted.file}
-
-
-def test_the_layout_names_the_topics_and_switches_them_on():
-    layout = json.loads(foxglove.layout("/c/video", {"/c/a": True, "/c/b": False}, ["/c/x.rows[:].x_m"]))
-    image = layout["configById"]["Image!picture"]
-    assert image["imageMode"]["imageTopic"] == "/c/video"
-    assert image["imageMode"]["annotations"] == {"/c/a": {"visible": True}, "/c/b": {"visible": False}}
-    assert image["synchronize"] is False
-
-    def leaves(node):
-        return [node] if isinstance(node, str) else leaves(node["first"]) + leaves(node["second"])
-
-    assert sorted(leaves(layout["layout"])) == sorted(layout["configById"])

@@ -24,7 +24,7 @@ def demo(
     """Draw a scene with known truth, run everything on it, and show what re-tracking mends.
 
     People cross, meet and part, one is hidden for a second, a tree sways and the camera shakes a little: the ways in
-    which tracking fails. Makes a video, a log, tables and a layout.
+    which tracking fails. Makes a video, a log, tables and layouts.
 
     Example: mcaptrack demo -o demo
     """
@@ -51,9 +51,9 @@ def demo(
             prefix = pipeline.find_camera(opened, None)
             jobs, watch = pipeline.plan_all(opened, prefix), pipeline.Watch()
             report = pipeline.run(opened, prefix, jobs, progress=talk.progress, watch=watch)
-        layout = target.with_suffix(".layout.json")
-        if report.layout:
-            publish_bytes(layout, report.layout)
+        layouts = [pipeline.layout_path(target, name) for name in report.layouts]
+        for path, content in zip(layouts, report.layouts.values(), strict=True):
+            publish_bytes(path, content)
         with log.read(target) as opened:
             export(opened, default_folder(target), talk.progress)
             topics = [f"{prefix}/samples", f"{prefix}/retracks"]
@@ -70,10 +70,10 @@ def demo(
         f"""
 video    {footage.video}
 log      {target}
-layout   {layout}
+layouts  {"  ".join(str(path) for path in layouts)}
 tables   {default_folder(target)}
 
-Open the log in Foxglove, or in Lichtblick (https://{_LICHTBLICK}): open local file, then import the layout.
+Open the log in Foxglove, or in Lichtblick (https://{_LICHTBLICK}): open local file, then import a layout.
 Ask the tables:  duckdb -c "from '{default_folder(target)}/tracks/*/*.parquet' limit 5"
 See more:        mcaptrack info {target}    mcaptrack evaluate {target}"""
     )

@@ -252,8 +252,8 @@ def run_on_logs(
                 prefix = pipeline.find_camera(opened, camera, given["topic"])
                 jobs = make_plan(_Plan(opened, prefix, talk.say))
                 report = pipeline.run(opened, prefix, jobs, output, talk.progress, talk.say, watch)
-            if report.layout:
-                publish_bytes(target.with_suffix(".layout.json"), report.layout)
+            for name, content in report.layouts.items():
+                publish_bytes(pipeline.layout_path(target, name), content)
             for topic, count in report.frames.items():
                 talk.detail(f"{target}: {topic} {count} frames")
             for topic, kinds in report.events.items():

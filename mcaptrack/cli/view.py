@@ -19,6 +19,10 @@ def view(
     lichtblick: Annotated[
         str, common.option("--lichtblick", help="Where Lichtblick is, if you have it installed yourself.")
     ] = LICHTBLICK,
+    layout: Annotated[
+        str | None,
+        common.option("--layout", help="The layout to print a link for.", metavar="NAME", show_default="all there are"),
+    ] = None,
     browser: Annotated[bool, common.option("--open/--no-open", help="Open Lichtblick in the browser.")] = False,
     json: common.Json = False,
     quiet: common.Quiet = False,
@@ -27,39 +31,56 @@ def view(
 ) -> None:
     """Serve a log to this machine's browser, and print links that open it in Lichtblick and Foxglove.
 
-    With the log goes its layout, which Lichtblick takes by itself and Foxglove imports (Layouts, Import from file).
-    Nothing but these files is served, to nobody but this machine, until Ctrl-C.
+    With the log go its layouts (tracking, comparing, predictions), which Lichtblick takes by itself and Foxglove
+    imports (Layouts, Import from file). Nothing but these files is served, to nobody but this machine, until Ctrl-C.
 
     Example: mcaptrack view log.mcap
     """
     import webbrowser
 
     from mcaptrack import log
-    from mcaptrack.pipeline import LAYOUT
+    from mcaptrack.pipeline import LAYOUTS, attachment_of, layout_path
     from mcaptrack.serving import Server
 
     if not lichtblick.startswith(("http://", "https://")):
         raise McaptrackError(f"--lichtblick needs an address such as http://localhost:8080, not {lichtblick!r}")
     with log.read(path) as opened:
-        served: dict[str, Path | bytes] = {part.path.name: part.real_path for part in opened.parts}
-        layout = opened.attachment(LAYOUT)
-    layout_name = path.with_suffix(".layout.json").name
-    if layout is not None:
-        served[layout_name] = layout
-    with common.Talk(quiet, verbose).open() as talk, Server(served, port) as server:
-        logs = [server.address(name) for name in served if name != layout_name or layout is None]
-        layout_address = server.address(layout_name) if layout is not None else None
-        links = viewer_links(logs, layout_address, lichtblick)
+        files: dict[str, Path | bytes] = {part.path.name: part.real_path for part in opened.parts}
+        found = {name: opened.attachment(attachment_of(name)) for name in LAYOUTS}
+    layouts = {name: content for name, content in found.items() if content is not None}
+    if layout is not None and layout not in layouts:
+        raise McaptrackError(f"{path} has no layout {layout}; it has {', '.join(layouts) or 'none'}")
+    layouts = {name: content for name, content in layouts.items() if layout in (None, name)}
+    with (
+        common.Talk(quiet, verbose).open() as talk,
+        Server(files | {layout_path(path, name).name: content for name, content in layouts.items()}, port) as server,
+    ):
+        logs = [server.address(name) for name in files]
+        addresses = {name: server.address(layout_path(path, name).name) for name in layouts}
+        ways = {name: viewer_links(logs, address, lichtblick) for name, address in addresses.items()}
+        first = next(iter(ways.values()), None) or viewer_links(logs, None, lichtblick)
         if json:
-            common.print_json({"log": logs[0], "logs": logs, "layout": layout_address, "links": links})
+            one = next(iter(addresses.values()), None)
+            each = {name: links["Lichtblick"] for name, links in ways.items()}
+            said = {
+                "log": logs[0],
+                "logs": logs,
+                "layout": one,
+                "layouts": addresses,
+                "links": first,
+                "lichtblick": each,
+            }
+            common.print_json(said)
         else:
-            for name, link in links.items():
-                print(f"{name:<11}{link}")
-            print(f"{'log':<11}{'  '.join(logs)}")
-            print(f"{'layout':<11}{layout_address or 'none yet: `mcaptrack run` makes one'}", flush=True)
+            lines = [(f"Lichtblick, {name}", links["Lichtblick"]) for name, links in ways.items()]
+            lines = [*(lines or [("Lichtblick", first["Lichtblick"])]), ("Foxglove", first["Foxglove"])]
+            lines += [("log", "  ".join(logs))] + [(f"layout, {name}", address) for name, address in addresses.items()]
+            lines += [] if addresses else [("layout", "none yet: `mcaptrack run` makes one")]
+            width = max(len(name) for name, _ in lines) + 2
+            print("\n".join(f"{name:<{width}}{what}" for name, what in lines), flush=True)
         talk.say("serving until Ctrl-C ...")
         if browser:
-            webbrowser.open(links["Lichtblick"])
+            webbrowser.open(first["Lichtblick"])
         try:
             server.serve_forever(poll_interval=0.2)
         except KeyboardInterrupt:

@@ -46,13 +46,11 @@ def extend(
         log = log.results
     if output is None:
         log.lock()
-    try:
+    with log.mending():
         change = _Change.plan(log, drop, drop_metadata, drop_attachments)
         opened = _in_place(log, change) if output is None and change.is_small else _as_copy(log, change, output)
         with opened as writer:
             yield writer
-    except Damaged as error:
-        raise McaptrackError(f"{log.path} is damaged: {error}") from None
 
 
 @contextmanager
@@ -194,6 +192,12 @@ class _Change:
 
     def replay(self, writer: LogWriter, buffer: memoryview, base: int) -> None:
         """Write what stays of the records from the cut on. ``buffer`` is the file from ``base`` to its data's end."""
+        try:
+            self._replay(writer, buffer, base)
+        except Damaged as error:
+            raise error.moved(base) from None
+
+    def _replay(self, writer: LogWriter, buffer: memoryview, base: int) -> None:
         chunks = {chunk.offset: chunk for chunk in self.index.chunks if chunk.offset >= self.cut}
         described = {channel for chunk in writer.chunks for channel in chunk.message_index_offsets}
         orphans: dict[int, None] = {}  # channels that stay, and that a chunk that went described
@@ -201,7 +205,7 @@ class _Change:
             if record.opcode == Opcode.CHUNK:
                 known = chunks.get(base + record.start)
                 if known is None:
-                    raise Damaged(f"byte {base + record.start}: a chunk that no index knows")
+                    raise Damaged("a chunk that no index knows", record.start)
                 self._replay_chunk(writer, buffer, base, record, known, orphans, described)
                 forget(buffer, record.start, record.end)
             elif record.opcode == Opcode.MESSAGE:

@@ -50,7 +50,7 @@ class Heads(NamedTuple):
 def message_head(buffer: memoryview, record: Record) -> tuple[int, int, int, int]:
     """Channel, sequence, log time and publish time of a message record."""
     if record.end - record.body < records.MESSAGE_HEAD.size:
-        raise Damaged(f"byte {record.start}: a message of {record.end - record.body} bytes")
+        raise Damaged(f"a message of {record.end - record.body} bytes", record.start)
     head: tuple[int, int, int, int] = records.MESSAGE_HEAD.unpack_from(buffer, record.body)
     return head
 
@@ -59,7 +59,7 @@ def chunk_record(buffer: memoryview, chunk: ChunkIndexRecord) -> Record:
     """The chunk that an index points to."""
     record = records.record_at(buffer, chunk.offset)
     if record.opcode != Opcode.CHUNK:
-        raise Damaged(f"byte {chunk.offset}: no chunk where one belongs")
+        raise Damaged("no chunk where one belongs", chunk.offset)
     return record
 
 
@@ -68,15 +68,16 @@ def open_chunk(buffer: memoryview, record: Record) -> memoryview:
     head = records.read_chunk(buffer, record)
     if head.compression and head.uncompressed_size > _most_mib() * 2**20:
         raise Damaged(
-            f"byte {record.start}: a chunk of {head.uncompressed_size} bytes, of at most {_most_mib()} MiB that are "
-            f"opened (the variable {ENVIRONMENT} sets another limit)"
+            f"a chunk of {head.uncompressed_size} bytes, of at most {_most_mib()} MiB that are "
+            f"opened (the variable {ENVIRONMENT} sets another limit)",
+            record.start,
         )
     data = buffer[head.start : head.end]
     content = _decompress(data, head.compression, head.uncompressed_size, record.start)
     if len(content) != head.uncompressed_size:
-        raise Damaged(f"byte {record.start}: a chunk of {len(content)} bytes that says {head.uncompressed_size}")
+        raise Damaged(f"a chunk of {len(content)} bytes that says {head.uncompressed_size}", record.start)
     if head.uncompressed_crc and zlib.crc32(content) != head.uncompressed_crc:
-        raise Damaged(f"byte {record.start}: the checksum of a chunk is wrong")
+        raise Damaged("the checksum of a chunk is wrong", record.start)
     return content
 
 
@@ -95,8 +96,8 @@ def _decompress(data: memoryview, compression: str, size: int, where: int) -> me
         if compression == "lz4":
             return memoryview(_lz4(data, size))
     except RuntimeError as error:
-        raise Damaged(f"byte {where}: a chunk can't be decompressed ({error})") from None
-    raise Damaged(f"byte {where}: a chunk is compressed with {compression!r}, which is not known here")
+        raise Damaged(f"a chunk can't be decompressed ({error})", where) from None
+    raise Damaged(f"a chunk is compressed with {compression!r}, which is not known here", where)
 
 
 def _zstd(data: memoryview, size: int) -> bytes:
@@ -142,14 +143,14 @@ def listed_entries(buffer: memoryview, at: int, channel_id: int) -> Entries:
     record = records.record_at(buffer, at)
     channel, listed = records.read_message_entries(buffer, record)
     if channel != channel_id:
-        raise Damaged(f"byte {at}: no message index of channel {channel_id} where one belongs")
+        raise Damaged(f"no message index of channel {channel_id} where one belongs", at)
     if len(listed) % 16:
-        raise Damaged(f"byte {at}: a message index of {len(listed)} bytes")
+        raise Damaged(f"a message index of {len(listed)} bytes", at)
     entries = np.frombuffer(listed, "<u8").reshape(-1, 2)
     if len(entries) and entries[:, 1].max() > MAX_NS:
-        raise Damaged(f"byte {at}: a message index that points beyond any chunk")
+        raise Damaged("a message index that points beyond any chunk", at)
     if len(np.unique(entries[:, 1])) != len(entries):
-        raise Damaged(f"byte {at}: a message index that lists a message twice")
+        raise Damaged("a message index that lists a message twice", at)
     return entries
 
 

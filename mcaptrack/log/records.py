@@ -74,7 +74,15 @@ class ChunkIndexRecord(NamedTuple):
 
 
 class Damaged(McaptrackError):
-    """Bytes that are no MCAP."""
+    """Bytes that are no MCAP, and at which byte, if that is known."""
+
+    def __init__(self, words: str, at: int | None = None) -> None:
+        super().__init__(words if at is None else f"byte {at}: {words}")
+        self._words, self._at = words, at
+
+    def moved(self, base: int) -> Damaged:
+        """The same, found in a part of a file that begins at byte ``base``."""
+        return Damaged(self._words, None if self._at is None else self._at + base)
 
 
 class Reader:
@@ -140,13 +148,13 @@ def walk(buffer: memoryview, start: int, end: int) -> Iterator[Record]:
     at = start
     while at < end:
         if end - at < _HEAD.size:
-            raise Damaged(f"byte {at}: {end - at} bytes are too few for a record")
+            raise Damaged(f"{end - at} bytes are too few for a record", at)
         opcode, length = _HEAD.unpack_from(buffer, at)
         body = at + _HEAD.size
         if opcode == 0:
-            raise Damaged(f"byte {at}: no record begins with 0")
+            raise Damaged("no record begins with 0", at)
         if length > end - body:
-            raise Damaged(f"byte {at}: a record of {length} bytes where {end - body} are left")
+            raise Damaged(f"a record of {length} bytes where {end - body} are left", at)
         yield Record(opcode, at, body, body + length)
         at = body + length
 
@@ -201,7 +209,7 @@ def read_chunk(buffer: memoryview, record: Record) -> ChunkHead:
     head = (r.number(8), r.number(8), r.number(8), r.number(4), r.text())
     size = r.number(8)
     if size > record.end - r.at:
-        raise Damaged(f"byte {record.start}: a chunk of {size} bytes in a record with {record.end - r.at} left")
+        raise Damaged(f"a chunk of {size} bytes in a record with {record.end - r.at} left", record.start)
     return ChunkHead(*head, r.at, r.at + size)
 
 
@@ -214,7 +222,7 @@ def read_message_index(buffer: memoryview, record: Record) -> tuple[int, int]:
 def read_message_entries(buffer: memoryview, record: Record) -> tuple[int, memoryview]:
     """The channel of a message index and its entries, log time and offset of 8 bytes each."""
     if record.opcode != Opcode.MESSAGE_INDEX:
-        raise Damaged(f"byte {record.start}: no message index where one belongs")
+        raise Damaged("no message index where one belongs", record.start)
     r = Reader(buffer, record.body, record.end)
     return r.number(2), r.raw()
 

@@ -1,8 +1,9 @@
 """Writing a log, record after record, and the summary behind them.
 
 Pictures go to chunks of their own, uncompressed, because they are compressed already; rows go to zstd chunks of the
-stage that made them, so that a stage that is run again leaves its old chunks out as they are. Every chunk describes the
-channels it holds: it can be read if it is all that is left.
+stage that made them, so that a stage that is run again leaves its old chunks out as they are. What is drawn of rows
+repeats itself from message to message, which a stronger compression finds. Every chunk describes the channels it holds:
+it can be read if it is all that is left.
 """
 
 from __future__ import annotations
@@ -30,10 +31,11 @@ from mcaptrack.log.records import MAGIC, ChannelRecord, ChunkIndexRecord, Schema
 #: How the name of a log ends that holds the results of another.
 RESULTS: Final = ".results.mcap"
 
-Kind = Literal["media", "rows"]
+Kind = Literal["media", "rows", "views"]
 
-_CHUNK_BYTES: Final[Mapping[Kind, int]] = {"media": 4 * 2**20, "rows": 2**20}
-_ZSTD_LEVEL: Final = 3
+_CHUNK_BYTES: Final[Mapping[Kind, int]] = {"media": 4 * 2**20, "rows": 2**20, "views": 2**20}
+#: Views say the same again and again: the quickest level makes them smaller than the usual one.
+_ZSTD_LEVEL: Final[Mapping[Kind, int]] = {"rows": 3, "views": 1}
 _MAX_ID: Final = 2**16 - 1
 
 
@@ -281,10 +283,10 @@ class LogWriter:
         first = min((int(entries[::2].min()) for entries in indexes.values()), default=0)
         last = max((int(entries[::2].max()) for entries in indexes.values()), default=0)
         compression, data = "", content
-        if chunk.kind == "rows":
+        if chunk.kind != "media":
             import zstandard
 
-            compression, data = "zstd", zstandard.ZstdCompressor(_ZSTD_LEVEL).compress(content)
+            compression, data = "zstd", zstandard.ZstdCompressor(_ZSTD_LEVEL[chunk.kind]).compress(content)
         record = records.pack_chunk((first, last, len(content), zlib.crc32(content)), compression, data)
         known = ChunkIndexRecord(first, last, 0, len(record), {}, 0, compression, len(data), len(content))
         self.put_chunk(record, known, {channel: entries.tobytes() for channel, entries in indexes.items()})

@@ -16,22 +16,23 @@ from mcaptrack.pipeline.plan import (
     plan_stage,
 )
 from mcaptrack.pipeline.run import Report, input_of, read_planes, run
-from mcaptrack.pipeline.write import LAYOUT, find_views, layout
+from mcaptrack.pipeline.write import LAYOUTS, attachment_of, find_views, layout_path
 
 __all__ = [
     "DEFAULT_CAMERA",
-    "LAYOUT",
+    "LAYOUTS",
     "ROUTES",
     "Job",
     "Report",
     "Route",
     "Watch",
+    "attachment_of",
     "camera_of",
     "find_camera",
     "find_views",
     "input_of",
     "is_stale",
-    "layout",
+    "layout_path",
     "picture_topic",
     "plan_all",
     "plan_stage",

@@ -269,7 +269,9 @@ def check_inputs(opened: log.Log, prefix: str, jobs: Sequence[Job]) -> None:
             theirs_too = foreign.DETECTIONS_READ if reads is DETECTIONS else ()
             wanted = " or ".join(foreign.PICTURES_READ if reads is VIDEO else (reads.name, *theirs_too))
             raise McaptrackError(f"{opened.path}: {job.source} holds {name or 'no schema'}; {job.stage} reads {wanted}")
-        for topic in sorted(name for kept in job.kept() for name in (kept, kept + views.SUFFIX)):
+        for topic in sorted(
+            name for kept in job.kept() for name in (kept, *(kept + suffix for suffix in views.SUFFIXES))
+        ):
             known = opened.channels.get(topic)
             if known and not Provenance.from_metadata(known.metadata):
                 raise McaptrackError(

@@ -35,7 +35,7 @@ _ASSUME: Final = "assume-ground-plane"
 
 @dataclass
 class Report:
-    """What a run did: the stages that ran, the frames of each topic they made, and the layout for their views.
+    """What a run did: the stages that ran, the frames of each topic they made, and the layouts for their views.
 
     ``stale`` are the channels that were made from something that has now been replaced. ``events`` says for each
     channel of tracks how many events of each kind were found.
@@ -43,7 +43,7 @@ class Report:
 
     stages: list[str] = field(default_factory=list)
     frames: dict[str, int] = field(default_factory=dict)
-    layout: bytes | None = None
+    layouts: dict[str, bytes] = field(default_factory=dict)
     stale: list[str] = field(default_factory=list)
     events: dict[str, dict[str, int]] = field(default_factory=dict)
 
@@ -102,7 +102,7 @@ def run(
         report.events = tally(happened)
         report.stages += [EVENTS_STAGE] if happened else []
     if made or output is not None:
-        report.layout = write(opened, prefix, made, planes or (), stamps, output)
+        report.layouts = write(opened, prefix, made, planes or (), stamps, output)
     digests = {topic: channel.provenance.digest for topic, channel in made.items()}
     for topic, there in sorted(opened.channels.items()):
         known = Provenance.from_metadata(there.metadata)

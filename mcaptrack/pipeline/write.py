@@ -1,4 +1,4 @@
-"""What stages made goes into the log, with what a person looks at: views, and a layout that shows them."""
+"""What stages made goes into the log, with what a person looks at: views, and layouts that show them."""
 
 from __future__ import annotations
 
@@ -12,10 +12,13 @@ from numpy.typing import NDArray
 
 from mcaptrack import foreign, foxglove, log, views
 from mcaptrack.errors import McaptrackError
+from mcaptrack.foxglove.layouts import Eye
+from mcaptrack.pipeline.plan import FULL
 from mcaptrack.pipeline.plan import picture_topic as find_pictures
 from mcaptrack.plane import Planes
 from mcaptrack.provenance import Provenance
-from mcaptrack.schema import DETECTIONS, PREDICTIONS, TRACKS, Frame, Schema
+from mcaptrack.schema import DETECTIONS, GROUND_PLANE, PREDICTIONS, SCHEMAS, TRACKS, Frame, Schema
+from mcaptrack.views import layouts
 
 Ints = NDArray[np.int64]
 #: Log time, number of the channel, sequence and payload of a message.
@@ -46,46 +49,174 @@ def write(
     planes: Planes,
     stamps: Mapping[str, Sequence[int]],
     output: Path | None,
-) -> bytes | None:
-    """Put what was made, and its views, into the log. Returns the layout, if there are pictures to draw on.
+) -> dict[str, bytes]:
+    """Put what was made, and its views, into the log. Returns the layouts for them by their names.
 
     ``stamps`` are those of pictures that were read on the way.
     """
     usual = f"{prefix}/video"
     video = usual if usual in opened.channels else next(iter(stamps), None) or find_pictures(opened, prefix)
-    truth = f"{prefix}/truth"
     picture_ns = opened.times(video) if video else np.empty(0, np.int64)
+    video = video if len(picture_ns) else None
     stamp_ns = _stamps(opened, video, stamps.get(video, ())) if video else picture_ns
-    shown = {topic: (channel.schema, channel.frames, channel.provenance.digest) for topic, channel in made.items()}
-    if truth in opened.channels and truth + views.SUFFIX not in opened.channels:
-        known = Provenance.from_metadata(opened.channel(truth).metadata)
-        shown[truth] = (TRACKS, opened.frames(truth, TRACKS), known.digest if known else "")
-    outdated = {topic + views.SUFFIX for topic in made}
-    streams: list[Iterator[Numbered]] = []
-    with log.extend(opened, output, drop={*made, *outdated}, drop_attachments=[LAYOUT]) as writer:
+    shown = _shown(opened, prefix, made)
+    outdated = {topic + suffix for topic in shown for suffix in views.SUFFIXES}
+    drawn = _Drawn(prefix, picture_ns, stamp_ns, planes)
+    if any(channel.schema in _ON_GROUND for channel in shown.values()):
+        outdated.add(drawn.frame_topic)
+    # All that is read, before anything is written: the log is changed in place.
+    start_ns = _start_ns(opened, prefix, shown, picture_ns)
+    eye = layouts.eye_on(_places(opened, prefix, shown), planes, start_ns)
+    last_step = _last_step(opened, prefix, shown)
+    # What stays comes first: then what is made again finds the place that it had, and the bytes are the same.
+    drawn_first = list(drawn.views({topic: channel for topic, channel in shown.items() if topic not in made}, start_ns))
+    drawn_last = list(drawn.views({topic: channel for topic, channel in shown.items() if topic in made}, start_ns))
+    there = {*opened.channels} - outdated | {*made} | {view.topic for view in (*drawn_first, *drawn_last)}
+    layout_files = layouts.make(drawn.there(there, video, eye, last_step))
+    new = {attachment_of(name): content for name, content in layout_files.items()}
+    standing = {name for name, content in new.items() if opened.attachment(name) == content}
+    replaced = [name for name in ATTACHMENTS if name not in standing]
+    with log.extend(opened, output, drop={*made, *outdated}, drop_attachments=replaced) as writer:
+        streams: list[Iterator[Numbered]] = []
+
+        def draw(some: Iterable[View]) -> None:
+            for view in some:
+                record = foxglove.schema_record(view.schema_name)
+                metadata = view.provenance.to_metadata()
+                number = writer.add_channel(view.topic, record, "protobuf", metadata, "views", view.group)
+                streams.append(_with_number(number, view.messages))
+
+        draw(drawn_first)
         for topic, channel in made.items():
             record = channel.record or (channel.schema.name, "protobuf", channel.schema.descriptor)
             made_by = channel.provenance.transform  # results of one stage share chunks, so that they can go together
             number = writer.add_channel(topic, record, "protobuf", channel.provenance.to_metadata(), group=made_by)
             streams.append(_with_number(number, channel.messages))
-        if video is None or not len(picture_ns):
-            _write_by_time(writer, streams)
-            return None
-        topics = [topic for topic in opened.channels if topic.endswith(views.SUFFIX) and topic not in outdated]
-        for topic, (schema, frames, made_from) in shown.items():
-            if schema not in (DETECTIONS, TRACKS, PREDICTIONS) or topic.endswith(_NOT_SHOWN):
-                continue
-            metadata = Provenance("view", {}, topic, made_from).to_metadata()
-            record = foxglove.schema_record(foxglove.ANNOTATIONS)
-            made_by = made[topic].provenance.transform if topic in made else ""
-            number = writer.add_channel(topic + views.SUFFIX, record, "protobuf", metadata, group=made_by)
-            view = views.view(topic, schema, frames, picture_ns, planes, stamp_ns)
-            streams.append(_with_number(number, view))
-            topics.append(topic + views.SUFFIX)
+        draw(drawn_last)
         _write_by_time(writer, streams)
-        layout_file = layout(prefix, topics, video)
-        writer.add_attachment(LAYOUT, "application/json", layout_file)
-    return layout_file
+        for name, content in new.items():
+            if name not in standing:
+                writer.add_attachment(name, "application/json", content)
+    return layout_files
+
+
+class Shown(NamedTuple):
+    """A channel to be drawn: ``digest`` is of its messages, ``made_by`` the stage that makes it now, if one does."""
+
+    schema: Schema
+    frames: list[Frame]
+    digest: str
+    made_by: str
+
+
+def _shown(opened: log.Log, prefix: str, made: Mapping[str, Made]) -> dict[str, Shown]:
+    """The channels whose views are to be made: what was made, and what was ingested since, or has none yet."""
+    shown = {
+        topic: Shown(channel.schema, channel.frames, channel.provenance.digest, channel.provenance.transform)
+        for topic, channel in made.items()
+    }
+    for topic, channel in sorted(opened.channels.items()):
+        schema = SCHEMAS.get(channel.schema_name)
+        known = Provenance.from_metadata(channel.metadata)
+        if topic in shown or not topic.startswith(prefix + "/") or not known or known.transform != _INGESTED:
+            continue
+        drawn = opened.channels.get(topic + (views.SUFFIX if schema is DETECTIONS else views.SCENE_SUFFIX))
+        drawn_from = Provenance.from_metadata(drawn.metadata) if drawn else None
+        is_new = drawn_from is None or drawn_from.input_digest != known.digest
+        if schema in (*views.DRAWN, GROUND_PLANE) and is_new:
+            shown[topic] = Shown(schema, opened.frames(topic, schema), known.digest, "")
+    return shown
+
+
+class View(NamedTuple):
+    """A channel that shows another."""
+
+    topic: str
+    schema_name: str
+    provenance: Provenance
+    group: str
+    messages: Iterator[tuple[int, int, bytes]]
+
+
+class _Drawn:
+    """The views of a camera's channels: on its pictures, and on the ground."""
+
+    def __init__(self, prefix: str, picture_ns: Ints, stamp_ns: Ints, planes: Planes) -> None:
+        self._prefix, self._picture_ns, self._stamp_ns, self._planes = prefix, picture_ns, stamp_ns, planes
+        self._frame_id = views.ground.frame_of(prefix)
+        self._is_framed = False
+        #: Where the ground's frame is named.
+        self.frame_topic = f"{prefix}/view/tf"
+
+    def views(self, shown: Mapping[str, Shown], start_ns: int) -> Iterator[View]:
+        """All views of these channels, and the frame in which scenes lie, which is there from the start."""
+        for topic, channel in shown.items():
+            made_from = Provenance("view", {}, topic, channel.digest)
+            group = channel.made_by
+            if topic == f"{self._prefix}/ground_plane":
+                outline = views.ground.outlines(self._planes, start_ns, self._frame_id)
+                yield View(topic + views.SCENE_SUFFIX, foxglove.SCENE, made_from, group, outline)
+            if channel.schema not in views.DRAWN or topic.endswith(_NOT_SHOWN) or topic + FULL in shown:
+                continue  # others show the same at more times
+            drawing = views.Drawing(topic, channel.schema, channel.frames, self._planes, channel.made_by)
+            if len(self._picture_ns):
+                drawn = drawing.on_pictures(self._picture_ns, self._stamp_ns)
+                yield View(topic + views.SUFFIX, foxglove.ANNOTATIONS, made_from, group, drawn)
+            if channel.schema in _ON_GROUND:
+                own_ns = np.array([frame.t_ns for frame in channel.frames], np.int64)
+                t_ns = self._picture_ns if len(self._picture_ns) else own_ns
+                scene = drawing.on_ground(t_ns, self._frame_id)
+                yield View(topic + views.SCENE_SUFFIX, foxglove.SCENE, made_from, group, scene)
+        on_ground = {topic: channel for topic, channel in shown.items() if channel.schema in _ON_GROUND}
+        if on_ground and not self._is_framed:
+            self._is_framed = True
+            frame = foxglove.pack_transform(start_ns, views.ground.world_of(self._prefix), self._frame_id)
+            topic, channel = next(iter(on_ground.items()))
+            made_from = Provenance("view", {}, topic, channel.digest)
+            yield View(self.frame_topic, foxglove.TRANSFORM, made_from, "", iter([(start_ns, 0, frame)]))
+
+    def there(self, topics: set[str], video: str | None, eye: Eye, last_step: int) -> layouts.There:
+        """What layouts can show."""
+        front = self._prefix + "/"
+        names = frozenset(topic.removeprefix(front) for topic in topics if topic.startswith(front))
+        return layouts.There(self._prefix, names, video, self._frame_id, eye, last_step)
+
+
+def _start_ns(opened: log.Log, prefix: str, shown: Mapping[str, Shown], picture_ns: Ints) -> int:
+    """When a camera's first picture or row is."""
+    known = [channel.topic for channel in opened.channels.values() if channel.schema_name in SCHEMAS]
+    times = [picture_ns, *(opened.times(topic) for topic in known if topic.startswith(prefix + "/"))]
+    times += [np.array([channel.frames[0].t_ns], np.int64) for channel in shown.values() if channel.frames]
+    return min((int(some[0]) for some in times if len(some)), default=0)
+
+
+def _frames(opened: log.Log, shown: Mapping[str, Shown], topic: str, schema: Schema) -> list[Frame]:
+    """What was made just now, or stands in the log; nothing if the channel isn't there."""
+    if topic in shown:
+        return shown[topic].frames
+    there = opened.channels.get(topic)
+    return opened.frames(topic, schema) if there and there.schema_name == schema.name else []
+
+
+def _last_step(opened: log.Log, prefix: str, shown: Mapping[str, Shown]) -> int:
+    """How many steps forecasts go ahead; 0 if there are none."""
+    for name in ("retracks/predictions", "predictions"):
+        frames = _frames(opened, shown, f"{prefix}/{name}", PREDICTIONS)
+        last = max((int(frame.rows["step"].max()) for frame in frames if len(frame.rows)), default=0)
+        if last:
+            return last
+    return 0
+
+
+def _places(opened: log.Log, prefix: str, shown: Mapping[str, Shown]) -> NDArray[np.float64]:
+    """Where people are (N, 2) m, by the first channel of tracks that knows."""
+    for name in ("retracks", "tracks", "truth", "samples"):
+        frames = _frames(opened, shown, f"{prefix}/{name}", TRACKS)
+        rows = np.concatenate([TRACKS.empty(), *(frame.rows for frame in frames)])
+        places = np.stack([rows["x_m"], rows["y_m"]], axis=-1)
+        if np.isfinite(places).all(axis=1).any():
+            return places
+    return np.empty((0, 2))
 
 
 def _with_number(number: int, messages: Iterable[tuple[int, int, bytes]]) -> Iterator[Numbered]:
@@ -100,25 +231,25 @@ def _write_by_time(writer: log.LogWriter, streams: Iterable[Iterator[Numbered]])
 
 #: Channels without a view: they show what others show, at fewer times.
 _NOT_SHOWN: Final = ("/samples", "/online")
-#: The attachment that holds the layout.
-LAYOUT: Final = "mcaptrack.layout.json"
-#: Views that a layout switches on, below the prefix; the others can be switched on by hand.
-_SHOWN: Final = ("retracks/full", "retracks", "tracks", "detections")
+#: What has a view in metres.
+_ON_GROUND: Final = (TRACKS, PREDICTIONS, GROUND_PLANE)
+#: What made the channels that came into the log with labels.
+_INGESTED: Final = "ingest"
 
 
-def layout(prefix: str, view_topics: Sequence[str], picture_topic: str) -> bytes:
-    """The layout for a camera's views over its pictures: the best that there is switched on."""
-    names = {topic: topic.removeprefix(prefix + "/").removesuffix(views.SUFFIX) for topic in sorted(view_topics)}
-    there = set(names.values())
-    on = _switched_on(there)
-    paths = [f"{prefix}/{name}.rows[:].x_m" for name in ("tracks", "retracks") if name in there]
-    return foxglove.layout(picture_topic, {topic: name in on for topic, name in names.items()}, paths)
+def layout_path(path: Path, name: str) -> Path:
+    """Where the layout of this name goes: beside the log."""
+    return path.with_suffix(layouts.FILES[name])
 
 
-def _switched_on(there: set[str]) -> list[str]:
-    """The best views of those that there are, below the prefix."""
-    best = [name for name in _SHOWN if name in there][:1]
-    return best + [name for name in ("retracks/predictions",) if "retracks" in there and name in there]
+def attachment_of(name: str) -> str:
+    """The attachment that holds the layout of this name."""
+    return f"mcaptrack{layouts.FILES[name]}"
+
+
+#: The names of the layouts that there can be, the first the usual one.
+LAYOUTS: Final = tuple(layouts.FILES)
+ATTACHMENTS: Final = tuple(attachment_of(name) for name in layouts.FILES)
 
 
 def find_views(opened: log.Log, prefix: str, topics: Sequence[str] = ()) -> list[str]:
@@ -127,14 +258,19 @@ def find_views(opened: log.Log, prefix: str, topics: Sequence[str] = ()) -> list
     Raises McaptrackError if there are none.
     """
     if topics:
-        chosen = [topic if topic.endswith(views.SUFFIX) else topic + views.SUFFIX for topic in topics]
-        return [opened.channel(topic).topic for topic in chosen]
+        return [opened.channel(_view_of(opened, topic)).topic for topic in topics]
     there = {
         topic.removeprefix(prefix + "/").removesuffix(views.SUFFIX)
         for topic in opened.channels
         if topic.startswith(prefix + "/") and topic.endswith(views.SUFFIX)
     }
-    found = [f"{prefix}/{name}{views.SUFFIX}" for name in _switched_on(there)]
+    found = [f"{prefix}/{name}{views.SUFFIX}" for name in layouts.best(there)]
     if not found:
         raise McaptrackError(f"{opened.path} has no views of {prefix} yet; `mcaptrack run {opened.path}` makes them")
     return found
+
+
+def _view_of(opened: log.Log, topic: str) -> str:
+    """The view that shows a channel: its own, or that of the same at the video's rate."""
+    names = [topic] if topic.endswith(views.SUFFIX) else [topic + views.SUFFIX, topic + FULL + views.SUFFIX]
+    return next((name for name in names if name in opened.channels), names[0])

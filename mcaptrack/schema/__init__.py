@@ -114,6 +114,12 @@ class Schema:
         """``count`` rows of zeros, to be filled."""
         return np.zeros(count, self.dtype)
 
+    def joined(self, parts: Sequence[Rows]) -> Rows:
+        """Rows of this schema laid end to end; as bytes where they are laid out alike, since NumPy goes by fields."""
+        if all(part.dtype == self.dtype for part in parts):
+            return np.frombuffer(bytearray().join(part.tobytes() for part in parts), self.dtype)
+        return np.concatenate([self.empty(), *parts])
+
     def rows(self, **columns: NDArray[Any] | Sequence[Any]) -> Rows:
         """Rows from columns, through the gate. Optional columns that are left out are missing (NaN).
 

@@ -1,0 +1,95 @@
+"""Foxglove's schemas: their records in a log, and whole messages of them."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any, Final
+
+from mcaptrack.clock import NS_PER_S
+from mcaptrack.errors import McaptrackError
+
+VIDEO: Final = "foxglove.CompressedVideo"
+IMAGE: Final = "foxglove.CompressedImage"
+ANNOTATIONS: Final = "foxglove.ImageAnnotations"
+SCENE: Final = "foxglove.SceneUpdate"
+TRANSFORM: Final = "foxglove.FrameTransform"
+LOG: Final = "foxglove.Log"
+#: Schemas whose messages are pictures.
+PICTURES: Final = (VIDEO, IMAGE)
+
+
+@cache
+def message_class(schema_name: str) -> Any:
+    """foxglove.X -> the generated class."""
+    from importlib import import_module
+
+    name = schema_name.removeprefix("foxglove.")
+    return getattr(import_module(f"foxglove_schemas_protobuf.{name}_pb2"), name)
+
+
+@cache
+def schema_record(schema_name: str) -> tuple[str, str, bytes]:
+    """Name, encoding and data of the MCAP schema record of a foxglove schema, with all that it imports."""
+    from google.protobuf.descriptor_pb2 import FileDescriptorSet
+
+    files = FileDescriptorSet()
+    done: set[str] = set()
+
+    def add(descriptor: Any) -> None:
+        for dependency in descriptor.dependencies:
+            if dependency.name not in done:
+                done.add(dependency.name)
+                add(dependency)
+        descriptor.CopyToProto(files.file.add())
+
+    add(message_class(schema_name).DESCRIPTOR.file)
+    return schema_name, "protobuf", files.SerializeToString(deterministic=True)
+
+
+def _stamp(message: Any, t_ns: int) -> None:
+    message.timestamp.seconds, message.timestamp.nanos = divmod(t_ns, NS_PER_S)
+
+
+def pack_picture(schema_name: str, t_ns: int, frame_id: str, image_format: str, data: bytes) -> bytes:
+    """A CompressedVideo or CompressedImage message."""
+    message = message_class(schema_name)(frame_id=frame_id, format=image_format, data=data)
+    _stamp(message, t_ns)
+    payload: bytes = message.SerializeToString(deterministic=True)
+    return payload
+
+
+def pack_transform(t_ns: int, parent_frame_id: str, frame_id: str) -> bytes:
+    """A FrameTransform message: a frame that lies in its parent as it is."""
+    message = message_class(TRANSFORM)(parent_frame_id=parent_frame_id, child_frame_id=frame_id)
+    _stamp(message, t_ns)
+    message.translation.SetInParent()
+    message.rotation.w = 1.0
+    payload: bytes = message.SerializeToString(deterministic=True)
+    return payload
+
+
+def pack_log(t_ns: int, level: str, name: str, words: str) -> bytes:
+    """A Log message; ``level`` is "INFO", "WARNING" or "ERROR", ``name`` says whom it comes from."""
+    kind = message_class(LOG)
+    message = kind(level=kind.Level.Value(level), name=name, message=words)
+    _stamp(message, t_ns)
+    payload: bytes = message.SerializeToString(deterministic=True)
+    return payload
+
+
+def unpack(schema_name: str, payload: bytes) -> Any:
+    """A message of a foxglove schema. Raises McaptrackError if it is none."""
+    from google.protobuf.message import DecodeError
+
+    message = message_class(schema_name)()
+    try:
+        message.ParseFromString(payload)
+    except DecodeError:
+        raise McaptrackError(f"{len(payload)} bytes are no {schema_name} message") from None
+    return message
+
+
+def unpack_picture(schema_name: str, payload: bytes) -> tuple[str, bytes]:
+    """Format and data of a CompressedVideo or CompressedImage message. Raises McaptrackError if it is none."""
+    message = unpack(schema_name, payload)
+    return message.format, message.data

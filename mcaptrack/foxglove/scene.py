@@ -1,0 +1,218 @@
+"""What is drawn on the ground plane, in metres: SceneUpdate messages, for many instants at once.
+
+Rules that viewers hold and that shape what is written here: after a seek only the last message of a topic is there, so
+each holds all that is to be seen and first removes what was; what is not replaced goes away by itself after its
+lifetime, which counts from the log time; a frame that no transform has named hides what lies in it.
+
+Letters: F instants, N people, P points of each.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import cache
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaptrack.clock import NS_PER_S
+from mcaptrack.foxglove.messages import SCENE, message_class
+from mcaptrack.foxglove.template import STAMP, Each, Group, Slot, Template, Word, group, joined, stamps
+from mcaptrack.foxglove.words import by_length
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+#: Coordinates are multiples of 1/64 m.
+PER_M: Final = 64
+_ALL: Final = 1  # SceneEntityDeletion.ALL
+_LINE_STRIP, _LINE_LOOP, _LINE_LIST = 0, 1, 2
+_UPRIGHT: Final = {"w": 1.0}
+
+
+class Figure(NamedTuple):
+    """How a person is shown: a cylinder so wide and so high, its number so high above the ground, with lines so many
+    pixels thick, whole or in pieces.
+    """
+
+    width_m: float
+    height_m: float
+    number_m: float
+    thickness_px: float
+    in_pieces: bool = False
+
+
+class Scene:
+    """The scenes of F instants, in one frame. What belongs to an instant is given by its number (N,), in rising order.
+
+    Everything is gone ``lifetime_ns`` after its instant.
+    """
+
+    def __init__(self, t_ns: Ints, frame_id: str, lifetime_ns: int) -> None:
+        self._count = len(t_ns)
+        self._frame_id, self._lifetime_ns = frame_id, lifetime_ns
+        self._seconds, self._nanos = stamps(t_ns)
+        self._groups: list[Group] = []
+        self._add(np.arange(self._count), _head())
+
+    def people(
+        self, frame: Ints, numbers: Ints, xy_m: Floats, rgb: Floats, alpha: Floats, figure: Figure, trail_m: Floats,
+        fade: Floats,
+    ) -> None:  # fmt: skip
+        """People at (N, 2) with their numbers, and a line through points (N, P, 2) where they were, oldest first.
+
+        ``fade`` (P,) is how opaque it is there. A line in pieces is drawn between the first and the second point, the
+        third and the fourth and so on. People whose lines have other numbers of points are given in another call.
+        """
+        xy, trail = _short(xy_m), _short(trail_m)
+        for length, chosen, words in by_length(numbers):
+            template = _person(self._frame_id, self._lifetime_ns, length, figure, trail.shape[1])
+            self._add(
+                frame[chosen], template, word=words, again=words, x=xy[chosen, 0], y=xy[chosen, 1],
+                text_x=xy[chosen, 0], text_y=xy[chosen, 1], a=alpha[chosen],
+                **_shades("", rgb[chosen]), **_shades("text_", rgb[chosen]), **_line(trail[chosen], rgb[chosen], fade),
+            )  # fmt: skip
+
+    def forecasts(
+        self, frame: Ints, numbers: Ints, path_m: Floats, rgb: Floats, fade: Floats, thickness_px: float,
+        ellipses: tuple[Floats, Floats, Floats] | None,
+    ) -> None:  # fmt: skip
+        """Lines through points (N, P, 2), so opaque (P,), and ellipses: centres (N, 2), half axes (N, 2), turns (N,).
+
+        A turn is in radians, from the first axis of the plane to the first of the ellipse.
+        """
+        path = _short(path_m)
+        for length, chosen, words in by_length(numbers):
+            template = _forecast(self._frame_id, self._lifetime_ns, length, path.shape[1], thickness_px, bool(ellipses))
+            more = {}
+            if ellipses:
+                (at, half, turn), shades = (part[chosen] for part in ellipses), _shades("", rgb[chosen])
+                size = np.maximum(_short(2 * half), 1 / PER_M)
+                more = {"x": _short(at[:, 0]), "y": _short(at[:, 1]), "wide": size[:, 0], "deep": size[:, 1], **shades}
+                more |= {"turn_z": _short(np.sin(turn / 2), 4096), "turn_w": _short(np.cos(turn / 2), 4096)}
+            line = _line(path[chosen], rgb[chosen], fade)
+            self._add(frame[chosen], template, word=words, **more, **line)
+
+    def outline(self, frame: int, name: str, xy_m: Floats, rgba: tuple[float, float, float, float]) -> None:
+        """A closed line through points (P, 2) on the ground."""
+        template = _outline(self._frame_id, self._lifetime_ns, name, len(xy_m), rgba)
+        xy = _short(xy_m)[None]
+        self._add(np.array([frame]), template, points__x=xy[..., 0], points__y=xy[..., 1])
+
+    def messages(self) -> Iterator[bytes]:
+        """The message of each instant, in order."""
+        for frame in range(self._count):
+            yield joined(self._groups, frame)
+
+    def _add(self, frame: Ints, template: Template, **columns: Any) -> None:
+        if len(frame):
+            stamp = {"seconds": self._seconds[frame], "nanos": self._nanos[frame]}
+            self._groups.append(group(template.filled(len(frame), **stamp, **columns), frame, self._count))
+
+
+def _short(values: Floats, parts: int = PER_M) -> Floats:
+    return np.rint(values * parts) / parts
+
+
+def _shades(front: str, rgb: Floats) -> dict[str, Floats]:
+    return {front + name: rgb[:, place] for place, name in enumerate("rgb")}
+
+
+def _line(points_m: Floats, rgb: Floats, fade: Floats) -> dict[str, Floats]:
+    """The columns of a line; a line of one point is none."""
+    if points_m.shape[1] < 2:
+        return {}
+    shades = {f"colours__{name}": rgb[:, place, None] for place, name in enumerate("rgb")}
+    return {"points__x": points_m[..., 0], "points__y": points_m[..., 1], "colours__a": _short(fade), **shades}
+
+
+def _template(content: dict[str, Any]) -> Template:
+    return Template(message_class(SCENE).DESCRIPTOR, content)
+
+
+def _paint(front: str = "") -> dict[str, Slot]:
+    return {name: Slot(front + name) for name in "rgba"}
+
+
+@cache
+def _head() -> Template:
+    return _template({"deletions": {"timestamp": STAMP, "type": _ALL}})
+
+
+def _entity(frame_id: str, lifetime_ns: int, name: Any, **content: Any) -> Template:
+    seconds, nanos = divmod(lifetime_ns, NS_PER_S)
+    lifetime = {"seconds": seconds, "nanos": nanos}
+    whole = {"timestamp": STAMP, "frame_id": frame_id, "id": name, "lifetime": lifetime}
+    return _template({"entities": {**whole, **content}})
+
+
+def _lines(count: int, thickness_px: float, in_pieces: bool = False) -> list[dict[str, Any]]:
+    if count < 2:
+        return []
+    return [
+        {
+            "type": _LINE_LIST if in_pieces else _LINE_STRIP,
+            "pose": {"position": {}, "orientation": _UPRIGHT},
+            "thickness": thickness_px,
+            "scale_invariant": True,
+            "points": Each("points", count, {"x": Slot("x"), "y": Slot("y")}),
+            "color": {},
+            "colors": Each("colours", count, _paint()),
+        }
+    ]
+
+
+@cache
+def _person(frame_id: str, lifetime_ns: int, length: int, figure: Figure, points: int) -> Template:
+    body = {
+        "pose": {"position": {"x": Slot("x"), "y": Slot("y"), "z": figure.height_m / 2}, "orientation": _UPRIGHT},
+        "size": {"x": figure.width_m, "y": figure.width_m, "z": figure.height_m},
+        "bottom_scale": 1.0,
+        "top_scale": 1.0,
+        "color": _paint(),
+    }
+    above = {"x": Slot("text_x"), "y": Slot("text_y"), "z": figure.number_m}
+    name = {
+        "pose": {"position": above, "orientation": _UPRIGHT},
+        "billboard": True,
+        "font_size": 14.0,
+        "scale_invariant": True,
+        "color": {**_paint("text_"), "a": 1.0},
+        "text": Word("again", length),
+    }
+    lines = _lines(points, figure.thickness_px, figure.in_pieces)
+    return _entity(frame_id, lifetime_ns, Word("word", length), cylinders=[body], texts=[name], lines=lines)
+
+
+@cache
+def _forecast(
+    frame_id: str, lifetime_ns: int, length: int, points: int, thickness_px: float, has_ellipse: bool
+) -> Template:
+    disc = {
+        "pose": {
+            "position": {"x": Slot("x"), "y": Slot("y"), "z": 0.02},
+            "orientation": {"z": Slot("turn_z"), "w": Slot("turn_w")},
+        },
+        "size": {"x": Slot("wide"), "y": Slot("deep"), "z": 0.01},
+        "bottom_scale": 1.0,
+        "top_scale": 1.0,
+        "color": {**_paint(), "a": 0.25},
+    }
+    lines, discs = _lines(points, thickness_px), [disc] if has_ellipse else []
+    return _entity(frame_id, lifetime_ns, Word("word", length), cylinders=discs, lines=lines)
+
+
+@cache
+def _outline(
+    frame_id: str, lifetime_ns: int, name: str, points: int, rgba: tuple[float, float, float, float]
+) -> Template:
+    line = {
+        "type": _LINE_LOOP,
+        "pose": {"position": {}, "orientation": _UPRIGHT},
+        "thickness": 2.0,
+        "scale_invariant": True,
+        "points": Each("points", points, {"x": Slot("x"), "y": Slot("y")}),
+        "color": dict(zip("rgba", rgba, strict=True)),
+    }
+    return _entity(frame_id, lifetime_ns, name, lines=[line])

@@ -1,0 +1,21 @@
+"""Numbers in words: those that are equally long together, since their messages are equally long too."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Ints = NDArray[np.int64]
+
+
+def by_length(numbers: Ints) -> Iterator[tuple[int, Ints, NDArray[Any]]]:
+    """Of numbers (N,), for each length that their words have: the length, which they are, and the words as bytes."""
+    known, which = np.unique(numbers, return_inverse=True)
+    words = np.array([str(number).encode() for number in known.tolist()] or [b""])
+    lengths = np.char.str_len(words)[which] if len(numbers) else np.empty(0, np.int64)
+    for length in np.unique(lengths).tolist():
+        chosen = np.flatnonzero(lengths == length)
+        yield length, chosen, words[which[chosen]]
