@@ -18,13 +18,14 @@ from hypothesis import strategies as st
 from mcaptrack import foxglove, log
 from mcaptrack.evaluation import Candidate, EvaluateOptions, Sequenced, evaluate
 from mcaptrack.evaluation.events import Rule, find_events
+from mcaptrack.foxglove.colours import COUNT as COLOURS
 from mcaptrack.metrics.displacement import Forecasts, combine, displacement
 from mcaptrack.metrics.displacement import Path as Positions
 from mcaptrack.provenance import Provenance
 from mcaptrack.report import ELEMENT, charts, data, gather, measures, page
 from mcaptrack.report.markup import Markup, escape, plain, script_json, tag
 from mcaptrack.report.moments import SIDE_PX, most_important, photograph, tell
-from mcaptrack.report.scenery import COLOURS, simplified
+from mcaptrack.report.scenery import simplified
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame
 from mcaptrack.transforms import Predict
 from tests.test_cli import call, done, finished, footage  # noqa: F401
@@ -209,6 +210,13 @@ def test_histograms_lose_nobody(values):
     assert (np.diff(edges) > 0).all()
     for part in found["series"]:
         assert sum(part["counts"]) + part["above"] == part["n"] == len(values[part["topic"]])
+
+
+def test_who_all_walk_at_one_speed_are_in_one_bin_of_a_histogram():
+    found = measures.histograms({"t": np.array([1.0, 1.0 + 1e-12, 1.0 - 1e-12] * 50)})
+    (part,) = found["series"]
+    assert part["above"] == 0
+    assert sorted(part["counts"])[-2:] in ([0, 150], [50, 100])
 
 
 @given(st.floats(1e-9, 1e9))

@@ -19,13 +19,13 @@ import numpy as np
 
 from mcaptrack import __version__, foxglove
 from mcaptrack.evaluation import SCHEMA_VERSION, Result
+from mcaptrack.foxglove.colours import COUNT as COLOURS
 from mcaptrack.metrics import summary
 from mcaptrack.report import lineage, sections, sights
 from mcaptrack.report.charts import Axis, beside, figure, pairs_chart, round_most
 from mcaptrack.report.contents import LogReport, gather
 from mcaptrack.report.headline import combined_results, headline, pair_of
 from mcaptrack.report.markup import NONE, Markup, counted, join, name, number, percent, script_json, table, tag
-from mcaptrack.report.scenery import COLOURS
 
 __all__ = ["ELEMENT", "LogReport", "data", "draw", "gather", "page"]
 

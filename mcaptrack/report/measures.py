@@ -87,7 +87,7 @@ def histograms(values: Mapping[str, Floats]) -> dict[str, Any] | None:
         return None
     most = max(float(np.percentile(part, _SHOWN)) for part in filled) or 1.0
     width = round_step(most / _BINS)
-    edges = np.arange(int(np.ceil(most / width - 1e-9)) + 1) * width
+    edges = np.arange(int(most / width + 1e-6) + 2) * width  # what is just at an edge is not beyond the last
     series = [
         {
             "topic": topic,

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from mcaptrack.boxes import columns_to_boxes
 from mcaptrack.clock import NS_PER_S
+from mcaptrack.foxglove.colours import COUNT as COLOURS
 from mcaptrack.pictures import Pictures
 from mcaptrack.plane import GroundPlane
 from mcaptrack.report.charts import round_step
@@ -30,8 +31,6 @@ _WIDTH_PX: Final = 800
 _QUALITY: Final = 72
 #: A panel shows no more points than this, so that the page stays small.
 _MOST_POINTS: Final = 6000
-#: So many colours has ``foxglove.colour``: afterwards they come again.
-COLOURS: Final = 21
 _MARGIN: Final = 14
 #: Where there are more lines than this, they don't say whose they are.
 _MOST_NAMED: Final = 600

@@ -6,13 +6,13 @@ from collections.abc import Sequence
 from typing import Final
 
 from mcaptrack.clock import NS_PER_S
+from mcaptrack.foxglove.colours import COUNT as COLOURS
 from mcaptrack.report.charts import beside, clock, figure, time_ticks
 from mcaptrack.report.contents import LogReport, TrackSet, plane_of
 from mcaptrack.report.headline import rule_words
 from mcaptrack.report.markup import Markup, counted, data_uri, join, lack, number, tag
 from mcaptrack.report.moments import BARS, SIDE_PX, Moment, Shot, Story
 from mcaptrack.report.scenery import (
-    COLOURS,
     ground_panel,
     ground_paths,
     ground_span,
@@ -90,8 +90,9 @@ def moments(report: LogReport, level: int = 3) -> Markup:
             continue
         called = _named(report, story)
         rest = len(story.moments) - len(shown)
+        most = "the moment that matters most" if len(shown) == 1 else f"the {len(shown)} moments that matter most"
         more = f", and {number(rest)} more" if rest else ""
-        parts.append(tag(f"h{level}", f"{called}: the {counted(len(shown), 'moment')} that matter most{more}"))
+        parts.append(tag(f"h{level}", f"{called}: {most}{more}"))
         if not any(moment.before or moment.after for moment in shown):
             why = report.lacks.get("pictures", "These have no place in the picture")
             parts.append(lack(f"{why}; so there are words alone."))
