@@ -30,6 +30,7 @@ COMMANDS = [
     "info",
     "view",
     "render",
+    "report",
     "check",
     "recover",
     "drop",

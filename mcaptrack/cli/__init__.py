@@ -18,6 +18,7 @@ from mcaptrack.cli.files import check, drop, recover
 from mcaptrack.cli.ingest import ingest
 from mcaptrack.cli.query import query
 from mcaptrack.cli.render import render
+from mcaptrack.cli.report import report
 from mcaptrack.cli.show import export, info
 from mcaptrack.cli.stages import add_stages
 from mcaptrack.cli.train import train
@@ -61,6 +62,7 @@ register(app, "query", query)
 register(app, "info", info)
 register(app, "view", view)
 register(app, "render", render)
+register(app, "report", report)
 register(app, "check", check)
 register(app, "recover", recover)
 register(app, "drop", drop)

@@ -161,11 +161,12 @@ def evaluate(
     if not outcome.results:
         raise McaptrackError("; ".join(outcome.notes) or "there is nothing to score")
     if count > 1:
-        outcome.results += _combined(outcome.results)
+        outcome.results += combined(outcome.results)
     return outcome
 
 
-def _combined(results: Sequence[Result]) -> list[Result]:
+def combined(results: Sequence[Result]) -> list[Result]:
+    """All sequences together: a result for each kind of tracks, similarity and gate."""
     groups: dict[tuple[Any, ...], list[Result]] = {}
     for one in results:
         groups.setdefault((one.group or one.tracks, one.mode, one.similarity, one.gate, one.rules), []).append(one)

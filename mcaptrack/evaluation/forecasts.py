@@ -169,7 +169,7 @@ def _hold(made: _Made, found: Paired, rows: Rows, who: str, front: str) -> NDArr
     at = found.forecast[near]
     rows[who][at] = found.person[near]
     off, cov = found.off_m[near], made.forecasts.cov_m2[at]
-    ade_m, fde_m, _, covered = errors(off, cov)
+    ade_m, fde_m, _, covered, _ = errors(off, cov)
     soon_m = _at_s(off, made.clock.step_s, _AHEAD_S)
     for measure, values in zip(_MEASURES, (ade_m, fde_m, soon_m, covered[:, _WITHIN]), strict=True):
         rows[front + measure][at] = values

@@ -118,6 +118,7 @@ class Displacement:
     false_forecasts: int
     frames: int
     drift_m: Floats  # |P_t - P_t+1| over the shared steps of consecutive forecasts of one track
+    away_m: Floats  # (P, T): how far each step is from the truth; NaN where another sequence foretells further
 
     def curve(self) -> tuple[Floats, Floats]:
         """Recall (P,) and ADE in m (P,): entry k holds for the k + 1 pairs that agree best on the past."""
@@ -130,6 +131,10 @@ class Displacement:
         count = round(recall * self.people)
         best = np.argsort(self.d_obs_m2, kind="stable")[:count]
         return float(self.ade_squared_m2[best].mean()) if 0 < count == len(best) else float("nan")
+
+    def away_by_step(self, tau_m2: float = TAU_M2) -> Floats:
+        """How far the steps of the pairs that count at one threshold are from the truth, (pairs, T) in m."""
+        return self.away_m[self.d_obs_m2 < tau_m2]
 
     def summary(self, tau_m2: float = TAU_M2) -> dict[str, float | None]:
         """The numbers at one threshold; None where there is nothing to average."""
@@ -157,6 +162,8 @@ def combine(parts: list[Displacement]) -> Displacement:
     def pooled(name: str) -> Floats:
         return np.concatenate([getattr(part, name) for part in parts])
 
+    furthest = max(part.away_m.shape[1] for part in parts)
+    away = [np.pad(p.away_m, ((0, 0), (0, furthest - p.away_m.shape[1])), constant_values=np.nan) for p in parts]
     return Displacement(
         d_obs_m2=pooled("d_obs_m2"),
         ade_m=pooled("ade_m"),
@@ -167,6 +174,7 @@ def combine(parts: list[Displacement]) -> Displacement:
         false_forecasts=sum(part.false_forecasts for part in parts),
         frames=sum(part.frames for part in parts),
         drift_m=pooled("drift_m"),
+        away_m=np.concatenate(away),
     )
 
 
@@ -274,7 +282,7 @@ def displacement(
     """
     found = pair(truth, tracks, forecasts, t_obs)
     known = np.isfinite(found.off_m).all(axis=(1, 2))
-    ade_m, fde_m, squared_m2, covered = errors(found.off_m[known], forecasts.cov_m2[found.forecast[known]])
+    ade_m, fde_m, squared_m2, covered, away_m = errors(found.off_m[known], forecasts.cov_m2[found.forecast[known]])
     return Displacement(
         d_obs_m2=found.d_obs_m2[known],
         ade_m=ade_m,
@@ -285,17 +293,21 @@ def displacement(
         false_forecasts=int(found.is_judged.sum() - (found.d_obs_m2 < tau_m2).sum()),
         frames=found.frames,
         drift_m=_drift(forecasts),
+        away_m=away_m,
     )
 
 
-def errors(off: Floats, cov: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-    """ADE, FDE, squared ADE and covered shares of P pairs, from errors (P, T, 2) and covariances (P, T, 2, 2)."""
+def errors(off: Floats, cov: Floats) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+    """ADE, FDE, squared ADE, covered shares and distances (P, T) of P pairs.
+
+    From errors (P, T, 2) and covariances (P, T, 2, 2).
+    """
     squared = (off**2).sum(axis=-1)
     euclidean = np.sqrt(squared)
     with np.errstate(invalid="ignore", divide="ignore"):
         away = mahalanobis_squared(off, cov)[..., None]
     inside = np.where(np.isfinite(away), away <= _CHI2, np.nan)
-    return euclidean.mean(axis=-1), euclidean[..., -1], squared.mean(axis=-1), inside.mean(axis=-2)
+    return euclidean.mean(axis=-1), euclidean[..., -1], squared.mean(axis=-1), inside.mean(axis=-2), euclidean
 
 
 def _drift(forecasts: Forecasts) -> Floats:

@@ -1,0 +1,544 @@
+"""The report: its numbers are those of `evaluate`, and nothing in a log can do anything to who reads it."""
+
+from __future__ import annotations
+
+import html
+import itertools
+import json
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mcaptrack import foxglove, log
+from mcaptrack.evaluation import Candidate, EvaluateOptions, Sequenced, evaluate
+from mcaptrack.evaluation.events import Rule, find_events
+from mcaptrack.foxglove.colours import COUNT as COLOURS
+from mcaptrack.metrics.displacement import Forecasts, combine, displacement
+from mcaptrack.metrics.displacement import Path as Positions
+from mcaptrack.provenance import Provenance
+from mcaptrack.report import ELEMENT, charts, data, gather, measures, page
+from mcaptrack.report.markup import Markup, escape, plain, script_json, tag
+from mcaptrack.report.moments import SIDE_PX, most_important, photograph, tell
+from mcaptrack.report.scenery import simplified
+from mcaptrack.schema import PREDICTIONS, TRACKS, Frame
+from mcaptrack.transforms import Predict
+from tests.test_cli import call, done, finished, footage  # noqa: F401
+from tests.worlds import ns, tracks_at, walk
+
+
+class Reader(HTMLParser):
+    """What a browser would make of a page: elements with attributes, text, and what stands in scripts."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.elements: list[tuple[str, dict[str, str | None]]] = []
+        self.text: list[str] = []
+        self.open: list[str] = []
+        self.scripts: list[str] = []
+        self.feed(text)
+        self.close()
+
+    def handle_starttag(self, tag, attrs):
+        self.elements.append((tag, dict(attrs)))
+        if tag not in ("meta", "link", "br"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        where = self.scripts if self.open and self.open[-1] == "script" else self.text
+        if not self.open or self.open[-1] != "style":
+            where.append(data)
+
+    def of(self, name):
+        return [attributes for element, attributes in self.elements if element == name]
+
+
+def report_on(*paths: Path) -> tuple[str, dict, Reader]:
+    reports = []
+    for path in paths:
+        with log.read(path) as opened:
+            reports.append(gather(opened, None))
+    text = page(reports)
+    return text, data(reports), Reader(text)
+
+
+def numbers_in(reader: Reader) -> dict:
+    (script,) = reader.scripts
+    return json.loads(script)
+
+
+INGESTED = Provenance("ingest", {})
+
+
+def write(path: Path, channels: dict[str, list[Frame]], made: Provenance = INGESTED, schema=TRACKS) -> Path:
+    with log.create(path) as writer:
+        for topic, frames in channels.items():
+            add(writer, topic, frames, schema, made)
+    return path
+
+
+def add(writer, topic, frames, schema, made=INGESTED):
+    number = writer.add_channel(topic, (schema.name, "protobuf", schema.descriptor), "protobuf", made.to_metadata())
+    for frame in frames:
+        writer.add_message(number, frame.t_ns, frame.index, schema.codec.encode(frame.rows))
+
+
+# Numbers
+
+
+def without_curves(results):
+    for result in results:
+        result["displacement"] = {k: v for k, v in result.get("displacement", {}).items() if "curve" not in k}
+    return results
+
+
+def test_its_scores_are_those_of_evaluate_and_json_prints_what_the_page_holds(finished, tmp_path):  # noqa: F811
+    target = tmp_path / "report.html"
+    printed = json.loads(done("report", finished, "-o", target, "--json")[0])
+    (scored,) = [json.loads(done("evaluate", finished, "--json")[0])["results"]]
+    assert len(scored) > 8
+    assert without_curves(printed["results"]) == without_curves(scored)
+    inside = numbers_in(Reader(target.read_text()))
+    inside["results"] = without_curves(inside["results"])
+    assert inside == printed
+
+
+def test_several_logs_are_combined_as_evaluate_combines_them(finished, tmp_path):  # noqa: F811
+    other = tmp_path / "other.mcap"
+    other.write_bytes(finished.read_bytes())
+    _, numbers, reader = report_on(finished, other)
+    scored = json.loads(done("evaluate", finished, other, "--json")[0])["results"]
+    assert without_curves(numbers["results"]) == without_curves(scored)
+    assert any(result["sequence"] == "COMBINED" for result in scored)
+    assert len([one for one in reader.of("details") if one.get("class") == "log"]) == 2
+    assert "both logs together" in "".join(reader.text)
+
+
+@pytest.fixture(scope="module")
+def foretold(tmp_path_factory) -> Path:
+    """Four people who turn, seen with noise and foretold, and their truth."""
+    noise = np.random.default_rng(5).normal(0, 0.1, (60, 5, 2))
+
+    def path(tick, seen):
+        turned = {who: 0.1 * who * max(tick - 12 * who, 0) for who in range(1, 5)}
+        xy = {who: (0.4 * tick + noise[tick, who, 0] * seen, 3 * who + y) for who, y in turned.items()}
+        return {who: (x, y + noise[tick, who, 1] * seen) for who, (x, y) in xy.items()}
+
+    samples = walk(lambda tick: path(tick, 1), 60)
+    tracks = {"/camera/truth": walk(lambda tick: path(tick, 0), 60), "/camera/samples": samples}
+    file = tmp_path_factory.mktemp("foretold") / "foretold.mcap"
+    with log.create(file) as writer:
+        for topic, frames in tracks.items():
+            add(writer, topic, frames, TRACKS)
+        add(writer, "/camera/predictions", [f for (f,) in Predict(predictor="kalman")(samples)], PREDICTIONS)
+    return file
+
+
+def test_the_curve_and_the_errors_by_horizon_are_those_of_the_scores(foretold):
+    _, numbers, _ = report_on(foretold)
+    scored = json.loads(done("evaluate", foretold, "--json")[0])["results"]
+    whole = next(r["displacement"] for r in scored if r["similarity"] == "metres")
+    (one,) = numbers["logs"][0]["forecasts"]
+    assert one["by_horizon"]["n"] > 50
+    assert one["by_horizon"]["mean_m"][-1] == pytest.approx(whole["FDE_m"])
+    assert np.mean(one["by_horizon"]["mean_m"]) == pytest.approx(whole["ADE_m"])
+    points = list(zip(one["curve_recall"], one["curve_ADE_m"], strict=True))
+    assert points[-1] == (whole["curve_recall"][-1], whole["curve_ADE_m"][-1])
+    assert set(points) <= set(zip(whole["curve_recall"], whole["curve_ADE_m"], strict=True))
+    assert [part["held"] for part in one["calibration"]] == [whole[f"coverage_{p}"] for p in (50, 90, 95)]
+
+
+def test_errors_by_horizon_of_two_scenes_go_as_far_as_the_longer_forecasts():
+    def away(steps):
+        zero, cov = np.zeros((1, steps, 2)), np.tile(np.eye(2), (1, steps, 1, 1))
+        path = Positions(np.arange(40), np.ones(40, int), np.stack([np.arange(40.0), np.zeros(40)], axis=1))
+        return displacement(path, path, Forecasts(np.array([10]), np.array([1]), zero, cov))
+
+    both = combine([away(3), away(5)])
+    assert both.away_m.tolist()[1] == [11.0, 12.0, 13.0, 14.0, 15.0]
+    assert both.away_m[0, :3].tolist() == [11.0, 12.0, 13.0]
+    assert np.isnan(both.away_m[0, 3:]).all()
+
+
+def test_walking_on_is_right_about_who_walks_on_and_not_about_who_turns():
+    def path(tick):
+        return {1: (0.4 * tick, 0.0), 2: (0.4 * min(tick, 12), 5.0 + 0.4 * max(tick - 12, 0))}
+
+    truth = walk(path, 40)
+
+    def error(frames, who):
+        members = [Frame(f.t_ns, f.index, f.rows[f.rows["track_id"] == who]) for f in frames]
+        wrong = [f for (f,) in Predict(predictor="kalman")(members)]
+        sequence = Sequenced("s", members, [Candidate("t", None, members, wrong, "p")])
+        results = evaluate([sequence], EvaluateOptions()).results
+        (found,) = measures.describe_forecasts(sequence, results)
+        return found["constant_velocity"]
+
+    straight, turning = error(truth, 1), error(truth, 2)
+    assert straight["n"] == 40 - 12 - 3
+    assert straight["mean_m"] == pytest.approx([0.0] * 12, abs=1e-9)
+    assert straight["ahead_s"] == pytest.approx(np.arange(1, 13) * 0.4)
+    assert turning["mean_m"][-1] > 1.0
+
+
+def test_speeds_and_stays_by_hand():
+    frames = walk(lambda tick: {7: (0.5 * tick, 0.0)} if tick != 3 else {}, 6, rate_hz=2.0)
+    frames[0] = Frame(0, 0, tracks_at({7: (0.0, 0.0), 9: (4.0, 4.0)}))
+    # 7 is there from 0 to 2.5 s with a hole at 1.5 s, over which its speed is not known; 9 for one frame.
+    assert measures.speeds_m_per_s(frames).tolist() == pytest.approx([1.0, 1.0, 1.0])
+    assert measures.lives_s(frames).tolist() == pytest.approx([3.0, 0.5])
+    said = measures.describe_tracks(frames)
+    assert (said["tracks"], said["rows"], said["longest_s"], said["observed_share"]) == (2, 6, 3.0, 1.0)
+
+
+@given(st.dictionaries(st.text(max_size=3), st.lists(st.floats(0, 1e6), max_size=60), max_size=3))
+def test_histograms_lose_nobody(values):
+    found = measures.histograms({topic: np.array(part) for topic, part in values.items()})
+    if not any(values.values()):
+        assert found is None
+        return
+    edges = np.array(found["edges"])
+    assert edges[0] == 0
+    assert (np.diff(edges) > 0).all()
+    for part in found["series"]:
+        assert sum(part["counts"]) + part["above"] == part["n"] == len(values[part["topic"]])
+
+
+def test_who_all_walk_at_one_speed_are_in_one_bin_of_a_histogram():
+    found = measures.histograms({"t": np.array([1.0, 1.0 + 1e-12, 1.0 - 1e-12] * 50)})
+    (part,) = found["series"]
+    assert part["above"] == 0
+    assert sorted(part["counts"])[-2:] in ([0, 150], [50, 100])
+
+
+@given(st.floats(1e-9, 1e9))
+def test_steps_of_axes_are_round_and_not_too_small(least):
+    step = charts.round_step(least)
+    assert least * (1 - 1e-9) <= step <= 2.5 * least
+    assert any(abs(step / 10**k / lead - 1) < 1e-9 for k in range(-10, 11) for lead in (1, 2, 2.5, 5))
+
+
+@given(st.lists(st.tuples(st.integers(0, 500), st.integers(0, 500)), min_size=2, max_size=40))
+def test_simplified_lines_keep_their_ends_and_stay_near(points):
+    path = np.array(points, float)
+    (line,) = simplified([path], 1.0)
+    assert line[0].tolist() == path[0].tolist()
+    assert line[-1].tolist() == path[-1].tolist()
+    for point in path:
+        gaps = []
+        for a, b in itertools.pairwise(line):
+            along = np.clip((point - a) @ (b - a) / max((b - a) @ (b - a), 1e-9), 0, 1)
+            gaps.append(np.hypot(*(point - a - along * (b - a))))
+        assert min(gaps, default=0.0) <= 1.0 + 1e-3
+
+
+# Moments
+
+
+def boxes(people):
+    """Rows of tracks whose boxes of 20 by 40 pixels stand at these left upper corners, by id."""
+    rows = tracks_at({who: (float("nan"), float("nan")) for who in people})
+    for row, (x, y) in zip(rows, people.values(), strict=True):
+        row["x_px"], row["y_px"], row["w_px"], row["h_px"] = x, y, 20, 40
+    return rows
+
+
+def switching(tick):
+    """Person 1 is track 1, then for two frames 9, then 1 again, and from frame 60 on track 5."""
+    return 9 if tick in (20, 21) else 5 if tick >= 60 else 1
+
+
+@pytest.fixture(scope="module")
+def story():
+    truth = [Frame(ns(t / 10), t, boxes({1: (40 + t, 60)})) for t in range(100)]
+    tracks = [Frame(ns(t / 10), t, boxes({switching(t): (40 + t, 60)})) for t in range(100)]
+    found = find_events(tracks, truth)
+    assert found.rule == Rule("iou", 0.5)
+    return tell("/camera/tracks", found.events, found.rule, tracks, truth, (0, ns(9.9))), tracks
+
+
+def test_what_lasts_matters_more_than_what_flickers(story):
+    told, _ = story
+    assert [moment.t_ns for moment in told.moments] == [ns(2.0), ns(2.2), ns(6.0)]
+    assert [moment.weight_s for moment in told.moments] == pytest.approx([0.2, 0.2, 3.8], abs=0.11)
+    ((most,),) = most_important([told], 1)
+    assert "track 1 became track 5 at 6.0 s" in most.words
+    both = most_important([told, told], 4)
+    assert [len(part) for part in both] == [2, 2]
+    assert [len(part) for part in most_important([told], 12)] == [3]
+
+
+class Film:
+    """Pictures in which what moves is white."""
+
+    def __init__(self):
+        self.t_ns = np.array([ns(t / 10) for t in range(100)])
+        self.decoded = []
+
+    def frames(self, numbers):
+        for number in sorted(set(numbers)):
+            self.decoded.append(number)
+            image = np.full((240, 320, 3), 20, np.uint8)
+            image[60:100, 40 + number : 60 + number] = 255
+            yield Frame(int(self.t_ns[number]), number, image)
+
+
+def test_thumbnails_show_who_it_was_before_and_after(story):
+    told, tracks = story
+    film = Film()
+    photograph(told.moments, tracks, film, 0)
+    assert film.decoded == [19, 20, 21, 22, 59, 60]
+    last = told.moments[-1]
+    assert (last.before.at_s, last.after.at_s) == pytest.approx((5.9, 6.0))
+    assert [(shot.box.identity, shot.box.label) for shot in (last.before, last.after)] == [(1, 1), (5, 5)]
+    for moment in told.moments:
+        for shot in (moment.before, moment.after):
+            seen = cv2.imdecode(np.frombuffer(shot.jpeg, np.uint8), cv2.IMREAD_GRAYSCALE)
+            assert seen.shape == (SIDE_PX, SIDE_PX)
+            x, y, w, h = shot.box.xywh
+            inside = np.zeros(seen.shape, bool)
+            inside[round(y) + 3 : round(y + h) - 3, round(x) + 3 : round(x + w) - 3] = True
+            around = np.ones(seen.shape, bool)
+            around[round(y) - 3 : round(y + h) + 3, round(x) - 3 : round(x + w) + 3] = False
+            assert seen[inside].mean() > 230
+            assert seen[around].mean() < 60
+
+
+def test_colours_are_those_of_viewers(finished):  # noqa: F811
+    text, _, reader = report_on(finished)
+    for identity in (0, 1, 8, 20, 21, 47):
+        red, green, blue, _ = (round(255 * part) for part in foxglove.colour(identity))
+        assert f".c{identity % COLOURS}{{stroke:#{red:02x}{green:02x}{blue:02x}}}" in text
+    assert {one["class"] for one in reader.of("path")} <= {"halo", *(f"c{k}" for k in range(COLOURS))}
+
+
+# What can't be said
+
+
+def test_an_empty_log_says_so_in_every_section(tmp_path):
+    path = write(tmp_path / "empty.mcap", {})
+    _, numbers, reader = report_on(path)
+    words = "".join(reader.text)
+    for said in ("no messages at all", "no truth", "no tracks to draw", "no channels", "forecasts", "nobody moves"):
+        assert said in words
+    assert numbers["results"] == []
+    assert not reader.of("svg")
+
+
+def test_without_truth_it_says_what_can_be_said_and_how_to_add_it(tmp_path):
+    frames = walk(lambda tick: {1: (tick * 0.4, 0.0), 2: (0.0, tick * 0.4)}, 20)
+    path = write(tmp_path / "two.mcap", {"/camera/tracks": frames})
+    _, numbers, reader = report_on(path)
+    words = "".join(reader.text)
+    assert "found 2 tracks" in words
+    assert "mcaptrack ingest LABELS --as truth --into two.mcap" in words
+    assert "no pictures" in words
+    assert numbers["logs"][0]["speed_m_per_s"]["series"][0]["median"] == pytest.approx(1.0)
+
+
+def test_without_metres_it_says_that_speeds_are_not_known(tmp_path):
+    frames = [Frame(ns(t / 10), t, boxes({1: (40 + t, 60)})) for t in range(30)]
+    _, numbers, reader = report_on(write(tmp_path / "pixels.mcap", {"/camera/tracks": frames}))
+    words = "".join(reader.text)
+    assert "Speeds can't be said" in words
+    assert "Tracks can't be drawn" in words
+    assert numbers["logs"][0]["speed_m_per_s"] is None
+    assert numbers["logs"][0]["dwell_s"]["series"][0]["median"] == pytest.approx(3.0)
+
+
+def test_without_forecasts_it_says_which_command_makes_them(finished, tmp_path):  # noqa: F811
+    less = tmp_path / "less.mcap"
+    done("drop", finished, "*predictions*", "-o", less, "-q")
+    _, numbers, reader = report_on(less)
+    assert "mcaptrack predict less.mcap" in "".join(reader.text)
+    assert numbers["logs"][0]["forecasts"] == []
+    assert all("displacement" not in result for result in numbers["results"])
+
+
+def test_a_truth_that_is_elsewhere_in_time_is_said_and_the_rest_is_there(tmp_path):
+    frames = walk(lambda tick: {1: (tick * 0.4, 0.0)}, 20)
+    later = [Frame(f.t_ns + ns(1000), f.index, f.rows) for f in frames]
+    path = write(tmp_path / "apart.mcap", {"/camera/tracks": frames, "/camera/truth": later})
+    _, numbers, reader = report_on(path)
+    assert "never overlap in time" in "".join(reader.text)
+    assert numbers["results"] == []
+    assert str(tmp_path) not in "".join(reader.text)
+
+
+def test_pictures_that_are_damaged_are_said_and_the_ground_is_shown(tmp_path):
+    path = tmp_path / "torn.mcap"
+    frames = walk(lambda tick: {1: (tick * 0.4, 0.0)}, 20)
+    with log.create(path) as writer:
+        add(writer, "/camera/tracks", frames, TRACKS)
+        number = writer.add_channel("/camera/video", foxglove.schema_record(foxglove.IMAGE), "protobuf", {})
+        writer.add_message(number, 0, 0, foxglove.pack_picture(foxglove.IMAGE, 0, "camera", "jpeg", b"no picture"))
+    _, _, reader = report_on(path)
+    words = "".join(reader.text)
+    assert "The pictures can't be shown: torn.mcap: /camera/video" in words
+    assert "here is the ground instead" in words
+    assert len(reader.of("svg")) > 1
+
+
+def test_channels_of_others_under_our_names_are_left_out_and_named(tmp_path):
+    path = write(tmp_path / "odd.mcap", {"/camera/tracks": [Frame(0, 0, PREDICTIONS.empty())]}, schema=PREDICTIONS)
+    _, _, reader = report_on(path)
+    assert "/camera/tracks holds mcaptrack.Predictions, not tracks" in "".join(reader.text)
+
+
+# Nothing gets out
+
+_NASTY = "/<script>alert(1)</script>\"'><img src=x onerror=alert(2)>javascript:alert(3)\u202egnp.\u0007\u2066&lt;]]>"
+_ELEMENTS = {
+    *(
+        "html",
+        "head",
+        "meta",
+        "link",
+        "title",
+        "style",
+        "body",
+        "main",
+        "script",
+        "section",
+        "div",
+        "p",
+        "ul",
+        "ol",
+        "li",
+    ),
+    *("h1", "h2", "h3", "h4", "b", "bdi", "code", "small", "span", "dl", "dt", "dd", "details", "summary", "figure"),
+    *("figcaption", "table", "caption", "thead", "tbody", "tr", "th", "td", "svg", "g", "line", "rect", "path", "text"),
+    *("polyline", "polygon", "circle", "image", "use"),
+}
+
+
+@pytest.fixture(scope="module")
+def nasty(tmp_path_factory) -> Path:
+    frames = walk(lambda tick: {1: (tick * 0.4, 0.0), 2: (0.0, tick * 0.4)}, 30)
+    swapped = walk(lambda tick: {1 + tick // 15: (tick * 0.4, 0.0)}, 30)
+    made = Provenance(
+        "ingest", {"file": _NASTY, "</script>": ["</ScRiPt x", float("nan")]}, input=_NASTY, version=_NASTY
+    )
+    file = "<img src=x onerror=alert(4)>\"'\u202e{x}.mcap"
+    channels = {_NASTY + "/tracks": swapped, _NASTY + "/truth": frames, _NASTY: frames}
+    return write(tmp_path_factory.mktemp("nasty") / file, channels, made)
+
+
+def holds(reader: Reader) -> None:
+    """Only our elements; one script, which is data; nothing that runs, loads, or leads out of the page."""
+    assert {element for element, _ in reader.elements} <= _ELEMENTS
+    assert reader.of("script") == [{"type": "application/json", "id": ELEMENT}]
+    for element, attributes in reader.elements:
+        for key, value in attributes.items():
+            assert not key.startswith("on")
+            assert key not in ("src", "srcset", "style", "action", "formaction", "xlink:href")
+            if key == "href":
+                assert re.fullmatch(r"data:(image/jpeg;base64,[\w+/=]+|,)|#scene-\d+", value), element
+            if key == "id":
+                assert re.fullmatch(rf"scene-\d+|{ELEMENT}", value)
+            if key == "class":
+                assert re.fullmatch(r"[\w -]+", value)
+    (policy,) = [one["content"] for one in reader.of("meta") if one.get("http-equiv")]
+    assert policy.startswith("default-src 'none'")
+    assert "script" not in policy
+    assert not reader.open
+
+
+def test_names_from_logs_are_words_and_nothing_else(nasty):
+    text, _, reader = report_on(nasty)
+    holds(reader)
+    assert not [c for c in text if not (c.isprintable() or c in "\n\u00a0\u202f")]
+    words = "".join(reader.text)
+    assert "<img src=x onerror=alert(2)>javascript:alert(3)" in words
+    assert numbers_in(reader)["logs"][0]["channels"][0]["topic"] == _NASTY
+
+
+def test_the_data_keep_names_as_they_are_and_what_is_not_a_number_as_null(nasty):
+    _, numbers, reader = report_on(nasty)
+    inside = numbers_in(reader)
+    assert inside == json.loads(json.dumps(numbers))
+    (entry,) = inside["logs"]
+    assert entry["log"] == nasty.name
+    assert {c["topic"] for c in entry["channels"]} == {_NASTY, _NASTY + "/tracks", _NASTY + "/truth"}
+    assert entry["channels"][0]["parameters"]["</script>"] == ["</ScRiPt x", None]
+
+
+def test_a_page_on_a_whole_log_loads_and_runs_nothing(finished):  # noqa: F811
+    text, _, reader = report_on(finished)
+    holds(reader)
+    assert not re.search(r"https?://|@import|url\(", text)
+    assert len(reader.of("image")) > 1
+    assert len(text) < 3e6
+
+
+@given(st.text() | st.text(alphabet="<>&\"'/!-=script javasonloadx\u202e\0\n"))
+def test_escaped_words_are_read_back_as_words(words):
+    reader = Reader(tag("p", words, title=words))
+    shown = "".join(c if c.isprintable() or c in "\n\u00a0\u202f" else "\ufffd" for c in words)
+    assert [element for element, _ in reader.elements] == ["p"]
+    assert "".join(reader.text) == shown
+    assert reader.elements[0][1] == {"title": shown}
+
+
+@given(
+    st.recursive(
+        st.none() | st.booleans() | st.floats() | st.text() | st.sampled_from(["</script>", "<!--<script>", "]]>"]),
+        lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(), inner, max_size=3),
+        max_leaves=8,
+    )
+)
+def test_data_in_the_page_are_read_back_as_they_were(value):
+    said = plain({"value": value})
+    element = script_json(said, "x")
+    assert element.count("<") == element.count(">") == 2
+    assert json.loads(element[element.index(">") + 1 : element.rindex("<")]) == said
+
+
+def test_markup_is_not_escaped_twice():
+    inner = tag("b", "<")
+    assert inner == "<b>&lt;</b>"
+    assert tag("p", inner, escape(inner)) == "<p><b>&lt;</b><b>&lt;</b></p>"
+    assert isinstance(escape("x"), Markup)
+    assert html.unescape(escape("a&b")) == "a&b"
+
+
+# Files
+
+
+def test_the_same_log_gives_the_same_bytes_wherever_it_lies(finished, tmp_path):  # noqa: F811
+    moved = tmp_path / finished.name
+    moved.write_bytes(finished.read_bytes())
+    assert report_on(finished)[0] == report_on(moved)[0]
+
+
+def test_the_page_stands_beside_the_log_and_is_not_replaced_unasked(finished, tmp_path):  # noqa: F811
+    path = tmp_path / "walk.mcap"
+    path.write_bytes(finished.read_bytes())
+    before = path.read_bytes()
+    done("report", path, "-q")
+    first = (tmp_path / "walk.report.html").read_bytes()
+    code, _, err = call("report", path)
+    assert code == 1
+    assert "--force" in err
+    done("report", path, "--force", "-q")
+    assert (tmp_path / "walk.report.html").read_bytes() == first
+    assert path.read_bytes() == before
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["walk.mcap", "walk.report.html"]
+    code, _, err = call("report", path, "-o", path, "--force")
+    assert code == 1
+    assert "is a log" in err
+    assert path.read_bytes() == before
+
+
+def test_several_logs_need_a_name_for_their_page(finished):  # noqa: F811
+    code, _, err = call("report", finished, finished)
+    assert code == 1
+    assert "-o" in err
