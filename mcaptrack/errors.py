@@ -7,3 +7,7 @@ class McaptrackError(Exception):
     The message is one line: what is wrong, where, what there is instead, and what to do. Every other exception is a
     fault of the program and keeps its traceback.
     """
+
+
+class DamagedError(McaptrackError):
+    """A file whose bytes are not what was written; what can be saved of it, `mcaptrack recover` saves."""

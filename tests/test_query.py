@@ -323,7 +323,13 @@ def test_files_and_logs_give_the_same_tables(known, tmp_path):
             )
             assert database.recordings == ("known", "other")
         assert here.equals(there), name
-        assert here.num_rows or name in ("detections", "counts", "ground_planes"), name
+        assert here.num_rows or name in (
+            "detections",
+            "counts",
+            "ground_planes",
+            "forecast_errors",
+            "forecast_scores",
+        ), name
 
 
 def test_logs_of_one_name_are_told_apart_by_their_folders(tmp_path):

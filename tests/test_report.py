@@ -542,3 +542,18 @@ def test_several_logs_need_a_name_for_their_page(finished):  # noqa: F811
     code, _, err = call("report", finished, finished)
     assert code == 1
     assert "-o" in err
+
+
+def test_a_damaged_log_is_refused_in_one_line(finished, tmp_path):  # noqa: F811
+    path = tmp_path / "broken.mcap"
+    with log.read(finished) as opened:
+        number = opened.channel("/camera/predictions").id
+        chunk = next(one for one in opened.index.chunks if number in one.message_index_offsets)
+    whole = bytearray(finished.read_bytes())
+    whole[chunk.offset + chunk.length - 1] ^= 1
+    path.write_bytes(whole)
+    code, _, err = call("report", path, folder=tmp_path)
+    assert code == 1
+    assert "is damaged: byte" in err
+    assert err.count("\n") == 1
+    assert not path.with_suffix(".report.html").exists()

@@ -61,6 +61,7 @@ def _as_data(opened: Log) -> dict[str, Any]:
                 "transform": made.transform if made else None,
                 "input": made.input or None if made else None,
                 "version": made.version if made else None,
+                "references": dict(made.references) if made else None,
                 "parameters": dict(made.parameters) if made else None,
                 "stale": is_stale(opened, topic),
             }

@@ -206,6 +206,7 @@ def _channel(channel: log.Channel) -> dict[str, object]:
         names = ("transform", "input", "version", "digest", "input_digest", "weights_sha256")
         out |= {name: getattr(made, name) or None for name in names}
         out["parameters"] = json.dumps(made.parameters, sort_keys=True, separators=(",", ":"))
+        out["compared_with"] = json.dumps(dict(made.references), sort_keys=True) if made.references else None
     return out
 
 

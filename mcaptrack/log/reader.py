@@ -14,7 +14,7 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaptrack.errors import McaptrackError
+from mcaptrack.errors import DamagedError, McaptrackError
 from mcaptrack.log import journal, records
 from mcaptrack.log.fingerprint import fingerprint
 from mcaptrack.log.index import Index, read_index
@@ -212,7 +212,7 @@ class Log:
             messages = list(self.messages(topic))
             rows, counts = schema.codec.decode_all([message.payload for message in messages])
         except (Damaged, ValueError) as error:
-            raise McaptrackError(f"{self.path}: {topic} is damaged: {error}; {_recover(self.path)}") from None
+            raise DamagedError(f"{self.path}: {topic} is damaged: {error}; {_recover(self.path)}") from None
         t_ns = np.array([message.t_ns for message in messages], np.int64)
         return Columns(rows, t_ns, np.array([message.sequence for message in messages], np.int64), counts)
 
@@ -270,7 +270,7 @@ class Log:
         try:
             yield
         except Damaged as error:
-            raise McaptrackError(f"{self.path} is damaged: {error}; {_recover(self.path)}") from None
+            raise DamagedError(f"{self.path} is damaged: {error}; {_recover(self.path)}") from None
 
 
 def _recover(path: Path) -> str:

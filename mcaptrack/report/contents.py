@@ -10,7 +10,7 @@ import numpy as np
 
 from mcaptrack import log, pipeline
 from mcaptrack.clock import NS_PER_S
-from mcaptrack.errors import McaptrackError
+from mcaptrack.errors import DamagedError, McaptrackError
 from mcaptrack.evaluation import EvaluateOptions, Result, Sequenced, evaluate, sequence_of_log
 from mcaptrack.evaluation.aligned import frame_times, has, resampled
 from mcaptrack.evaluation.events import EventOptions, Rule, find_events
@@ -133,6 +133,8 @@ def _read(opened: log.Log, out: LogReport) -> None:
         out.sets[role] = TrackSet(topic, role, names[role], opened.frames(topic, TRACKS))
     try:
         out.planes = pipeline.read_planes(opened, out.prefix) or ()
+    except DamagedError:
+        raise
     except McaptrackError as error:
         out.notes.append(_said(error, opened))
 
@@ -148,6 +150,8 @@ def _score(opened: log.Log, out: LogReport) -> None:
     try:
         out.sequence = sequence_of_log(opened, out.prefix, ())
         outcome = evaluate([out.sequence], EvaluateOptions())
+    except DamagedError:
+        raise
     except McaptrackError as error:
         out.lacks["scores"] = f"Nothing could be scored: {_said(error, opened)}."
         return
@@ -195,6 +199,8 @@ def _look(opened: log.Log, out: LogReport) -> None:
         for story, moments in zip(out.stories, out.shown, strict=True):
             tracks = next(one for one in out.sets.values() if one.topic == story.topic)
             photograph(moments, tracks.frames, pictures, out.start_ns)
+    except DamagedError:
+        raise
     except McaptrackError as error:
         out.lacks["pictures"] = f"The pictures can't be shown: {_said(error, opened)}"
         return
@@ -242,13 +248,14 @@ def _recording(opened: log.Log) -> dict[str, Any]:
 
 def _channel(opened: log.Log, channel: log.Channel) -> dict[str, Any]:
     made = Provenance.from_metadata(channel.metadata)
-    names = ("transform", "input", "reference", "version", "weights_sha256", "digest", "input_digest")
+    names = ("transform", "input", "version", "weights_sha256", "digest", "input_digest")
     return {
         "topic": channel.topic,
         "schema": channel.schema_name,
         "encoding": channel.message_encoding,
         "messages": channel.messages,
         **{key: (getattr(made, key) or None) if made else None for key in names},
+        "references": dict(made.references) if made else {},
         "parameters": dict(made.parameters) if made else None,
         "stale": pipeline.is_stale(opened, channel.topic),
     }

@@ -203,6 +203,12 @@ _CHANNELS: Final = Table(
         Field("input", _TEXT, "topic it was made from", nullable=True),
         Field("version", _TEXT, "version of mcaptrack that made it", nullable=True),
         Field("parameters", _TEXT, "parameters it was made with, as JSON", nullable=True),
+        Field(
+            "compared_with",
+            _TEXT,
+            "topics that its input was compared with, and the digest of each, as JSON",
+            nullable=True,
+        ),
         Field("digest", _TEXT, "SHA-256 of its messages", nullable=True),
         Field("input_digest", _TEXT, "SHA-256 of the messages it was made from", nullable=True),
         Field("encoding", _TEXT, "encoding of its messages", nullable=True),
