@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,14 +30,23 @@ class Footage:
     ground_plane: Path
 
 
-def draw(scene: Scene, folder: Path, progress: Callable[[str, int, int], None] = lambda *_: None) -> Footage:
-    """Draw a scene into a folder: what a person with a camera and much patience would have."""
+def draw(
+    scene: Scene,
+    folder: Path,
+    progress: Callable[[str, int, int], None] = lambda *_: None,
+    *,
+    video: bool = True,
+) -> Footage:
+    """Draw a scene into a folder: what a person with a camera and much patience would have.
+
+    Without ``video`` only the truth and the ground plane are written, the same ones.
+    """
     footage = Footage(folder / VIDEO, folder / TRUTH, folder / PLANE)
     lines: list[str] = []
     total = round(scene.seconds * scene.fps)
 
     def images() -> Iterator[Image]:
-        for number, shot in enumerate(scene.shots(), start=1):
+        for number, shot in enumerate(scene.shots(video), start=1):
             for who, box in zip(shot.ids, shot.boxes.tolist(), strict=True):
                 lines.append(",".join([str(number), str(who), *(f"{value:.2f}" for value in box), "1,1,1"]))
             progress("draw", number, total)
@@ -44,7 +54,10 @@ def draw(scene: Scene, folder: Path, progress: Callable[[str, int, int], None] =
 
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        write_mp4(footage.video, images(), scene.fps)
+        if video:
+            write_mp4(footage.video, images(), scene.fps)
+        else:
+            deque(images(), maxlen=0)
         _write_text(footage.truth, "\n".join(lines) + "\n")
         rows = np.array(scene.ground_plane().homography).reshape(3, 3).tolist()
         _write_text(footage.ground_plane, "\n".join(",".join(f"{value:.17g}" for value in row) for row in rows) + "\n")

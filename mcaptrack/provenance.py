@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Final, Self
 
 from mcaptrack import __version__
@@ -22,7 +22,8 @@ CLOCK: Final = "mcaptrack.clock"
 class Provenance:
     """What made a channel, from what, and how. ``digest`` is of its own messages, ``input_digest`` of its input's.
 
-    ``reference`` is what the input was compared with; its digest is empty where there was nothing of that name.
+    ``references`` are the topics that the input was compared with, and the digest of each: empty where there was
+    nothing of that name.
     """
 
     transform: str
@@ -31,9 +32,12 @@ class Provenance:
     input_digest: str = ""
     digest: str = ""
     weights_sha256: str = ""
-    reference: str = ""
-    reference_digest: str = ""
+    references: Mapping[str, str] = field(default_factory=dict)
     version: str = __version__
+
+    def made_from(self) -> dict[str, str]:
+        """All that it was made from and compared with, with their digests."""
+        return {self.input: self.input_digest, **self.references}
 
     def to_metadata(self) -> dict[str, str]:
         """As the metadata of an MCAP channel."""
@@ -45,9 +49,10 @@ class Provenance:
             "input_digest": self.input_digest,
             "digest": self.digest,
             "weights_sha256": self.weights_sha256,
-            "reference": self.reference,
-            "reference_digest": self.reference_digest,
+            "references": json.dumps(dict(self.references), sort_keys=True, separators=(",", ":")),
         }
+        if not self.references:
+            del values["references"]
         return {_PREFIX + key: value for key, value in values.items() if value}
 
     @classmethod
@@ -56,12 +61,18 @@ class Provenance:
         values = {key.removeprefix(_PREFIX): value for key, value in metadata.items() if key.startswith(_PREFIX)}
         if "transform" not in values:
             return None
-        try:
-            parameters = json.loads(values.pop("parameters", "{}"))
-        except ValueError:
-            parameters = {}
+        parameters, references = (_object(values.pop(key, "{}")) for key in ("parameters", "references"))
         known = {key: value for key, value in values.items() if key in cls.__dataclass_fields__}
-        return cls(parameters=parameters if isinstance(parameters, dict) else {}, **known)
+        return cls(parameters=parameters, references=references, **known)
+
+
+def _object(text: str) -> dict[str, Any]:
+    """A JSON object; an empty one for anything else."""
+    try:
+        value = json.loads(text)
+    except ValueError:
+        return {}
+    return value if isinstance(value, dict) else {}
 
 
 def digest(messages: Iterable[tuple[int, int, bytes]]) -> str:

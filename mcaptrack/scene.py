@@ -99,8 +99,11 @@ class Scene:
         homography = np.linalg.svd(np.array(rows))[2][-1]
         return GroundPlane(tuple((homography / homography[-1]).tolist()), self.width_px, self.height_px)
 
-    def shots(self) -> Iterator[Shot]:
-        """All pictures in order. The same scene draws the same pixels every time."""
+    def shots(self, draw: bool = True) -> Iterator[Shot]:
+        """All pictures in order. The same scene draws the same pixels every time.
+
+        Without ``draw`` they are empty, and who is where is the same.
+        """
         import cv2
 
         rng = np.random.default_rng(self.seed)
@@ -110,7 +113,7 @@ class Scene:
         shake = np.zeros(3)
         for number in range(round(self.seconds * self.fps)):
             now = number / self.fps
-            image = ground.copy()
+            image = ground.copy() if draw else ground
             people = [(walker, walker.at(now)) for walker in self.people]
             there = [(walker, place) for walker, place in people if place]
             boxes = {walker.id: self._figure(image, walker, place, now, draw=False) for walker, place in there}
@@ -119,9 +122,9 @@ class Scene:
                 (place[1], partial(self._figure, image, who, place, now, draw=True)) for who, place in there
             ]
             acts += [(block.y_m, partial(self._block, image, block)) for block in self.blocks]
-            for _, act in sorted(acts, key=lambda pair: -pair[0]):
+            for _, act in sorted(acts, key=lambda pair: -pair[0]) if draw else ():
                 act()
-            if self.tree_at_m:
+            if self.tree_at_m and draw:
                 self._tree(image, leaves, now)
             shake = 0.8 * shake + 0.6 * rng.normal(size=3)  # one unit of spread
             moved = np.eye(2, 3)
@@ -131,10 +134,12 @@ class Scene:
                 middle = np.array([self.width_px / 2, self.height_px / 2])
                 moved[:, 2] = middle - moved[:, :2] @ middle + self.shake_px * shake[:2]
                 size = (self.width_px, self.height_px)
-                image = np.asarray(cv2.warpAffine(image, moved, size, borderMode=cv2.BORDER_REFLECT), np.uint8)
+                if draw:
+                    image = np.asarray(cv2.warpAffine(image, moved, size, borderMode=cv2.BORDER_REFLECT), np.uint8)
             x, y = rng.integers(0, 64, 2)
-            noisy = image + grain[y : y + self.height_px, x : x + self.width_px]
-            image = np.clip(noisy, 0, 255).astype(np.uint8)
+            if draw:
+                noisy = image + grain[y : y + self.height_px, x : x + self.width_px]
+                image = np.clip(noisy, 0, 255).astype(np.uint8)
             ids = [walker.id for walker, _ in there]
             xywh = np.array([boxes[who] for who in ids]).reshape(-1, 4)
             corners = xywh[:, :2] + xywh[:, 2:] / 2

@@ -71,11 +71,13 @@ def test_who_was_not_seen_is_fainter_and_who_is_nowhere_is_left_out():
 
 
 def test_kinds_of_tracks_tell_apart():
-    shapes = set()
+    shapes, heights = set(), []
     for name in ("tracks", "retracks/full", "truth"):
         entity = scenes(f"/c/{name}", TRACKS, WALK)[10].entities[0]
+        heights.append(entity.texts[0].pose.position.z)
         shapes.add((entity.cylinders[0].size.x, entity.cylinders[0].size.z, entity.lines[0].type))
     assert len(shapes) == 3
+    assert min(np.diff(heights)) > 2.5  # numbers of one person stand one above the other and can all be read
     white = scenes("/c/truth", TRACKS, WALK)[10].entities[0].cylinders[0].color
     assert (white.r, white.g, white.b) == (1, 1, 1)
 
@@ -167,6 +169,8 @@ NAMES = [
     {"truth", "truth/view/scene", "tracks", "tracks/view/scene", "ground_plane/view/scene"},
     {"detections", "detections/view/image"},
     {"predictions", "predictions/view/scene", "samples"},
+    {"predictions", "predictions/view/scene", "predictions/scores", "samples", "tracks/events/view/log"},
+    {"retracks/predictions", "retracks/predictions/view/image", "retracks/predictions/scores", "retracks/full"},
     {
         "tracks",
         "tracks/view/image",

@@ -16,6 +16,7 @@ from mcaptrack.cli.evaluate import evaluate
 from mcaptrack.cli.events import events
 from mcaptrack.cli.files import check, drop, recover
 from mcaptrack.cli.ingest import ingest
+from mcaptrack.cli.query import query
 from mcaptrack.cli.render import render
 from mcaptrack.cli.report import report
 from mcaptrack.cli.show import export, info
@@ -57,6 +58,7 @@ register(app, "events", events)
 register(app, "evaluate", evaluate)
 register(app, "tune", tune)
 register(app, "export", export)
+register(app, "query", query)
 register(app, "info", info)
 register(app, "view", view)
 register(app, "render", render)

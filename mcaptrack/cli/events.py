@@ -1,4 +1,4 @@
-"""``mcaptrack events``: what happened to the identities of tracks."""
+"""``mcaptrack events``: what happened to the identities of tracks, and how far off forecasts were."""
 
 from __future__ import annotations
 
@@ -36,12 +36,14 @@ def events(
     verbose: common.Verbose = False,
     config: common.Config = None,
 ) -> None:
-    """Write down what happened to identities: to jump to in a viewer, to query, to plot.
+    """Write down what happened to identities, and how far off forecasts were: to jump to, to query, to plot.
 
     Where tracks begin and end, and which of them re-tracking joined or parted; where the log has /camera/truth also
     who was missed, which tracks are nobody, and each identity switch, matched as `mcaptrack evaluate` does. To
     /camera/tracks/events (rows), .../events/view/log (words) and /camera/tracks/counts (how it stands, frame by frame),
-    and the same for /camera/retracks. `mcaptrack run` does this too.
+    and the same for /camera/retracks. Unless --topic names channels, also how far off each forecast was, from the truth
+    and from what re-tracking made of the tracks: to /camera/predictions/errors and, frame by frame, .../scores; and the
+    same for /camera/retracks/predictions. `mcaptrack run` does all this too.
 
     Example: mcaptrack events log.mcap --similarity metres --gate 1
     """

@@ -148,7 +148,8 @@ def drop(
 ) -> None:
     """Leave channels out of a log, in place or in a copy; all others stay as they are, to the byte.
 
-    With a channel goes what was made only to show it and to tell of it: its `/view/`, its `/events`, its `/counts`.
+    With a channel goes what was made only to show it and to tell of it: its `/view/`, `/events`, `/counts`, `/errors`
+    and `/scores`.
 
     Example: mcaptrack drop log.mcap /camera/video -o small.mcap
     """

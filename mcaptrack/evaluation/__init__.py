@@ -17,25 +17,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack import log, metrics
-from mcaptrack.clock import NS_PER_S, seconds_to_ns
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation.aligned import (
     IOU_THRESHOLD,
-    MAX_HOLE_S,
     Similarity,
     align,
     matchup,
-    on_ground,
-    resampled,
     strangers,
     without,
 )
+from mcaptrack.evaluation.forecasts import MADE_FROM, score_forecasts
 from mcaptrack.metrics import Rules, Score
-from mcaptrack.metrics.displacement import Displacement, Forecasts, displacement
-from mcaptrack.metrics.displacement import Path as Positions
+from mcaptrack.metrics.displacement import Displacement
 from mcaptrack.metrics.displacement import combine as combine_displacements
 from mcaptrack.provenance import Provenance
-from mcaptrack.resample import looked_at
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame
 
 Ints = NDArray[np.int64]
@@ -46,7 +41,7 @@ DEFAULT_GATES_M: Final = (0.5, 1.0, 2.0)
 _MODES: Final = {"online": "online", "": "offline"}
 #: The channels of a camera that are scored, and those of the forecasts made from them.
 SCORED: Final = ("tracks", "samples", "retracks/online", "retracks")
-FORECASTS: Final = ("predictions", "retracks/predictions")
+FORECASTS: Final = tuple(MADE_FROM)
 
 
 @dataclass(frozen=True)
@@ -134,10 +129,7 @@ def sequence_of_log(opened: log.Log, prefix: str, topics: Sequence[str]) -> Sequ
     chosen = list(topics) or [topic for topic in usual if topic in opened.channels]
     if not chosen:
         raise McaptrackError(f"{opened.path} has no tracks to score; run `mcaptrack run {opened.path}`")
-    forecasts_of = {
-        f"{prefix}/samples": f"{prefix}/predictions",
-        f"{prefix}/retracks/online": f"{prefix}/retracks/predictions",
-    }
+    forecasts_of = {f"{prefix}/{tracks}": f"{prefix}/{name}" for name, tracks in MADE_FROM.items()}
     candidates = []
     for topic in chosen:
         made = Provenance.from_metadata(opened.channel(topic).metadata)
@@ -229,46 +221,10 @@ def _score(sequence: Sequenced, candidate: Candidate, options: EvaluateOptions, 
     if not results:
         notes.append(f"{sequence.name}: {candidate.name} and the truth share neither boxes nor positions in metres")
     if candidate.forecasts is not None and any(result.similarity == "metres" for result in results):
-        errors = forecast_errors(sequence, candidate)
+        errors = score_forecasts(candidate.forecasts, candidate.frames, sequence.truth, candidate.forecasts_name)
         for result in results:
             result.displacement = errors if result.similarity == "metres" else None
     return results
-
-
-def forecast_errors(sequence: Sequenced, candidate: Candidate) -> Displacement | None:
-    """The errors of the forecasts made from a candidate; None if there are no forecasts at all."""
-    frames = [frame for frame in candidate.forecasts or () if len(frame.rows)]
-    if not frames:
-        return None
-    rows = np.concatenate([frame.rows for frame in frames])
-    horizon = int(rows["step"].max())
-    step_s = float(rows["ahead_s"][0]) / int(rows["step"][0])
-    if len(rows) % horizon:
-        raise McaptrackError(f"{candidate.forecasts_name}: not all forecasts have {horizon} steps")
-    clock_ns = np.unique([frame.t_ns for frame in candidate.frames])
-    start, step_ns = int(clock_ns[0]), step_s * NS_PER_S
-
-    def to_step(t_ns: Ints) -> Ints:
-        return np.rint((t_ns - start) / step_ns).astype(np.int64)
-
-    last = int(to_step(clock_ns[-1:])[0])
-    truth_ns = np.array([frame.t_ns for frame in sequence.truth], np.int64)
-    ticks = start + np.rint(np.arange(last + 1) * step_ns).astype(np.int64)
-    ticks = ticks[looked_at(truth_ns, ticks, seconds_to_ns(MAX_HOLE_S))]
-    made_ns = np.repeat(np.array([frame.t_ns for frame in frames], np.int64), [len(frame.rows) for frame in frames])
-    mean = on_ground(rows).reshape(-1, horizon, 2)
-    cov = np.stack([rows["cov_xx_m2"], rows["cov_xy_m2"], rows["cov_xy_m2"], rows["cov_yy_m2"]], axis=-1)
-    forecasts = Forecasts(
-        to_step(made_ns[::horizon]), rows["track_id"][::horizon], mean, cov.reshape(-1, horizon, 2, 2)
-    )
-
-    def positions(members: Sequence[Frame]) -> Positions:
-        kept = [frame.rows[np.isfinite(frame.rows["x_m"])] for frame in members]
-        all_rows = np.concatenate([TRACKS.empty(), *kept])
-        t_ns = np.repeat(np.array([frame.t_ns for frame in members], np.int64), [len(part) for part in kept])
-        return Positions(to_step(t_ns), all_rows["track_id"], on_ground(all_rows))
-
-    return displacement(positions(resampled(sequence.truth, ticks)), positions(candidate.frames), forecasts)
 
 
 def sequence_of_files(

@@ -21,7 +21,7 @@ from mcaptrack.export.contents import Contents
 from mcaptrack.export.names import recording_name, topic_folder
 from mcaptrack.tables import TABLES, Format
 
-__all__ = ["TOPICS", "Contents", "Exported", "default_folder", "export", "recording_name", "topic_folder"]
+__all__ = ["TOPICS", "Contents", "Exported", "default_folder", "export", "recording_name", "standing", "topic_folder"]
 
 #: The folder of the tables of single channels.
 TOPICS: Final = "topics"
@@ -40,6 +40,15 @@ class Exported:
 def default_folder(path: Path) -> Path:
     """Where the tables of a log go unless said otherwise: log.mcap -> log.tables beside it."""
     return path.with_suffix(".tables")
+
+
+def standing(contents: Contents, folder: Path, name: str) -> Path | None:
+    """The Parquet file of a table in a folder, if it is what exporting the table now would write."""
+    path = folder.joinpath(name, f"recording={contents.recording}", "part-0.parquet")
+    known = tables.described(path, "parquet") or {}
+    said = (known.get("recording"), known.get("table_version"), known.get("source"))
+    now = (contents.opened.path.name, tables.TABLE_VERSION)
+    return path if said[:2] == now and said[2] == contents.source(name) else None
 
 
 def export(

@@ -13,7 +13,7 @@ Letters: N rows, S true people at one time, F forecasts at one time, T future st
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from mcaptrack.match import solve
 from mcaptrack.metrics.calibration import LEVELS, mahalanobis_squared
 
+Bools = NDArray[np.bool_]
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
@@ -28,6 +29,8 @@ Ints = NDArray[np.int64]
 TAU_M2: Final = 2.0
 #: The quantiles of chi^2 with 2 degrees of freedom that belong to the levels of calibration.
 _CHI2: Final = -2 * np.log(1 - np.array(LEVELS))
+#: How many pairs are compared in one go, to bound the memory that takes.
+_PAIRS_AT_ONCE: Final = 200_000
 
 
 @dataclass(frozen=True)
@@ -38,20 +41,58 @@ class Path:
     id: Ints
     xy_m: Floats
 
-    def table(self, fill: bool) -> tuple[Ints, int, Floats]:
-        """Ids (I,), first step, and positions (I, steps, 2) with NaN where there are none; holes filled on request."""
-        known, row = np.unique(self.id, return_inverse=True)
-        first, count = (int(self.step.min()), int(np.ptp(self.step)) + 1) if len(self.step) else (0, 0)
-        positions = np.full((len(known), count, 2), np.nan)
-        positions[row, self.step - first] = self.xy_m
-        if fill:
-            steps = np.arange(count)
-            for path in positions:
-                have = np.isfinite(path[:, 0])
-                inside = (steps >= have.argmax()) & (steps <= count - 1 - have[::-1].argmax()) & ~have
-                for axis in (0, 1):
-                    path[inside, axis] = np.interp(steps[inside], steps[have], path[have, axis])
-        return known, first, positions
+
+class _Paths(NamedTuple):
+    """Positions by id and step, one for each step of an id: ids (I,), and which of them, when and where (N,)."""
+
+    names: Ints
+    who: Ints
+    step: Ints
+    xy_m: Floats
+
+    def goes(self, by: int) -> Bools:
+        """Whether the same id has all positions from here to ``by`` steps on, or back."""
+        out = np.zeros(len(self.who), bool)
+        if abs(by) < len(out):
+            here, there = slice(max(-by, 0), len(out) - max(by, 0)), slice(max(by, 0), len(out) - max(-by, 0))
+            out[here] = (self.who[there] == self.who[here]) & (self.step[there] == self.step[here] + by)
+        return out
+
+    def find(self, names: Ints, step: Ints) -> Ints:
+        """Where the positions of these ids at these steps (M,) stand; -1 for those that there are none of."""
+        if not len(self.who):
+            return np.full(len(names), -1)
+        first, width = int(self.step.min()), int(np.ptp(self.step)) + 1
+        slot = np.minimum(np.searchsorted(self.names, names), len(self.names) - 1)
+        wanted = slot * width + (step - first)
+        keys = self.who * width + (self.step - first)
+        at = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
+        known = (self.names[slot] == names) & (step >= first) & (step < first + width) & (keys[at] == wanted)
+        return np.where(known, at, -1)
+
+    def window(self, at: Ints, first: int, last: int) -> Floats:
+        """The positions (M, last - first + 1, 2) from ``first`` to ``last`` steps after those at ``at`` (M,)."""
+        return np.asarray(self.xy_m[at[:, None] + np.arange(first, last + 1)], np.float64)
+
+
+def _paths(path: Path, fill: bool) -> _Paths:
+    """Positions in order; with ``fill`` holes are filled, on the straight line."""
+    known = np.isfinite(path.xy_m).all(axis=1)
+    names, who = np.unique(path.id[known], return_inverse=True)
+    step, xy_m = path.step[known], path.xy_m[known]
+    order = np.lexsort((step, who))
+    who, step, xy_m = who[order], step[order], xy_m[order]
+    last = np.append((who[1:] != who[:-1]) | (step[1:] != step[:-1]), True)[: len(who)]
+    who, step, xy_m = who[last], step[last], xy_m[last]
+    if fill and len(who) > 1:
+        ahead = np.append(np.where(who[1:] == who[:-1], np.diff(step), 1), 1)
+        row = np.repeat(np.arange(len(who)), ahead)
+        within = np.arange(len(row)) - np.repeat(np.cumsum(ahead) - ahead, ahead)
+        inside, share = within > 0, within / ahead[row]
+        filled = xy_m[row]
+        filled[inside] += share[inside, None] * (xy_m[row[inside] + 1] - filled[inside])
+        who, step, xy_m = who[row], step[row] + within, filled
+    return _Paths(names, who, step, xy_m)
 
 
 @dataclass(frozen=True)
@@ -137,6 +178,101 @@ def combine(parts: list[Displacement]) -> Displacement:
     )
 
 
+class Paired(NamedTuple):
+    """Who is whom: P pairs of forecasts and true people, by step and person, whether or not their future is known.
+
+    ``forecast`` (P,) is the number of the forecast, ``person`` (P,) the id, ``off_m`` (P, T, 2) how far the forecast is
+    off, NaN where the future is not known as a whole. ``is_judged`` (N,) says which forecasts could be paired,
+    ``people`` counts those who have past and future, at each of the ``frames`` times of a forecast.
+    """
+
+    forecast: Ints
+    person: Ints
+    d_obs_m2: Floats
+    off_m: Floats
+    is_judged: Bools
+    people: int
+    frames: int
+
+
+def pair(truth: Path, tracks: Path, forecasts: Forecasts, t_obs: int = 4) -> Paired:
+    """The forecasts made for tracks, with the true people they belong to by their past, of a clock that all share.
+
+    ``tracks`` are the positions that the forecasts were made from. The order of rows does not matter.
+    """
+    horizon = forecasts.mean_m.shape[1]
+    people, paths = _paths(truth, fill=False), _paths(tracks, fill=True)
+    steps = np.unique(forecasts.step)
+    has_past, has_future = people.goes(1 - t_obs), people.goes(horizon)
+    place = paths.find(forecasts.id, forecasts.step)
+    is_judged = (place >= 0) & paths.goes(1 - t_obs)[place] if len(paths.who) else np.zeros(len(place), bool)
+    subject = np.flatnonzero(has_past & np.isin(people.step, steps))
+    subject = subject[np.argsort(people.step[subject], kind="stable")]
+    made = np.flatnonzero(is_judged)
+    made = made[np.lexsort((forecasts.id[made], forecasts.step[made]))]
+    past_true = people.window(subject, 1 - t_obs, 0)
+    past = paths.window(place[made], 1 - t_obs, 0)
+    row, column, d_obs = _assigned(past_true, past, people.step[subject], forecasts.step[made], steps)
+    who, number = subject[row], made[column]
+    off = np.full((len(who), horizon, 2), np.nan)
+    known = has_future[who]
+    off[known] = forecasts.mean_m[number[known]] - people.window(who[known], 1, horizon)
+    counted = int(has_future[subject].sum())
+    return Paired(number, people.names[people.who[who]], d_obs, off, is_judged, counted, len(steps))
+
+
+def _assigned(past_true: Floats, past: Floats, true_step: Ints, step: Ints, steps: Ints) -> tuple[Ints, Ints, Floats]:
+    """Rows (P,) and columns (P,) of the pairs of least total squared distance at each of ``steps``, and that (P,).
+
+    Pasts (S, t_obs, 2) and (F, t_obs, 2) are at rising steps.
+    """
+    true_ends, ends = (np.searchsorted(those, np.append(steps, np.iinfo(np.int64).max)) for those in (true_step, step))
+    size = np.diff(true_ends) * np.diff(ends)
+    parts: list[tuple[Ints, Ints, Floats]] = [(np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0))]
+    block = (np.cumsum(size) - size) // _PAIRS_AT_ONCE
+    cuts = np.flatnonzero(np.diff(block)) + 1
+    for low, high in zip([0, *cuts.tolist()], [*cuts.tolist(), len(size)], strict=True):
+        at = slice(low, high + 1)
+        row, column, which = _all_pairs(true_ends[at], ends[at])
+        cost = ((past_true[row] - past[column]) ** 2).sum(axis=-1).mean(axis=-1)
+        best = _best(cost, row, column, which, np.diff(true_ends[at]), np.diff(ends[at]))
+        parts.append((row[best], column[best], cost[best]))
+    rows, columns, costs = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return rows, columns, costs
+
+
+def _all_pairs(true_ends: Ints, ends: Ints) -> tuple[Ints, Ints, Ints]:
+    """Row, column and time of all pairs of each time; those of time k are from ``ends[k]`` to ``ends[k + 1]``."""
+    across = np.diff(ends)
+    size = np.diff(true_ends) * across
+    which = np.repeat(np.arange(len(size)), size)
+    within = np.arange(len(which)) - (np.cumsum(size) - size)[which]
+    return true_ends[which] + within // across[which], ends[which] + within % across[which], which
+
+
+def _best(cost: Floats, row: Ints, column: Ints, which: Ints, down: Ints, across: Ints) -> Ints:
+    """The pairs to take of all: those of least total cost at each time, as many as the fewer of both sides.
+
+    Where the nearest to each of the fewer are different ones, these are they; only the rest needs the solver.
+    """
+    is_by_row = (down <= across)[which]
+    one, other = np.where(is_by_row, row, column), np.where(is_by_row, column, row)
+    order = np.lexsort((cost, one, which))
+    is_first = np.ones(len(order), bool)
+    is_first[1:] = (one[order][1:] != one[order][:-1]) | (which[order][1:] != which[order][:-1])
+    nearest = order[is_first[: len(order)]]
+    by_other = nearest[np.lexsort((other[nearest], which[nearest]))]
+    twice = (other[by_other][1:] == other[by_other][:-1]) & (which[by_other][1:] == which[by_other][:-1])
+    contested = np.unique(which[by_other][1:][twice])
+    taken = [nearest[~np.isin(which[nearest], contested)]]
+    size = down * across
+    start = np.cumsum(size) - size
+    for k in contested.tolist():
+        rows, columns = solve(cost[start[k] : start[k] + size[k]].reshape(down[k], across[k]))
+        taken.append(start[k] + rows * across[k] + columns)
+    return np.sort(np.concatenate(taken))
+
+
 def displacement(
     truth: Path, tracks: Path, forecasts: Forecasts, t_obs: int = 4, tau_m2: float = TAU_M2
 ) -> Displacement:
@@ -144,62 +280,24 @@ def displacement(
 
     All three share one clock. ``tracks`` are the positions that the forecasts were made from.
     """
-    horizon = forecasts.mean_m.shape[1]
-    _, truth_first, true_xy = truth.table(fill=False)
-    track_ids, track_first, track_xy = tracks.table(fill=True)
-    pairs: list[tuple[Floats, ...]] = []
-    people = false_forecasts = frames = 0
-    for step in np.unique(forecasts.step):
-        at = np.flatnonzero(forecasts.step == step)
-        past_true = _window(true_xy, int(step) - truth_first - t_obs + 1, t_obs)
-        future_true = _window(true_xy, int(step) - truth_first + 1, horizon)
-        whole = np.isfinite(past_true.sum(axis=(1, 2)))
-        scored = whole & np.isfinite(future_true.sum(axis=(1, 2)))
-        slot = np.searchsorted(track_ids, forecasts.id[at])
-        known = (slot < len(track_ids)) & (track_ids[np.minimum(slot, len(track_ids) - 1)] == forecasts.id[at])
-        past = _window(track_xy, int(step) - track_first - t_obs + 1, t_obs)[np.where(known, slot, 0)]
-        with_past = known & np.isfinite(past).all(axis=(1, 2))
-        at, past = at[with_past], past[with_past]
-        frames += 1
-        people += int(scored.sum())
-        subject = np.flatnonzero(whole)
-        if len(at) == 0 or len(subject) == 0:
-            false_forecasts += len(at)
-            continue
-        d_obs = ((past_true[subject][:, None] - past[None]) ** 2).sum(axis=-1).mean(axis=-1)
-        rows, columns = solve(d_obs)
-        false_forecasts += len(at) - int((d_obs[rows, columns] < tau_m2).sum())
-        kept = scored[subject[rows]]
-        rows, columns = rows[kept], columns[kept]
-        off = forecasts.mean_m[at[columns]] - future_true[subject[rows]]
-        pairs.append((d_obs[rows, columns], *_errors(off, forecasts.cov_m2[at[columns]])))
-    pairs.append((*(np.empty(0) for _ in range(4)), np.empty((0, len(LEVELS))), np.empty((0, horizon))))
-    columns_of_pairs = (np.concatenate(column) for column in zip(*pairs, strict=True))
-    d_obs_m2, ade_m, fde_m, squared_m2, covered, away_m = columns_of_pairs
+    found = pair(truth, tracks, forecasts, t_obs)
+    known = np.isfinite(found.off_m).all(axis=(1, 2))
+    ade_m, fde_m, squared_m2, covered, away_m = errors(found.off_m[known], forecasts.cov_m2[found.forecast[known]])
     return Displacement(
-        d_obs_m2=d_obs_m2,
+        d_obs_m2=found.d_obs_m2[known],
         ade_m=ade_m,
         fde_m=fde_m,
         ade_squared_m2=squared_m2,
         covered=covered,
-        people=people,
-        false_forecasts=false_forecasts,
-        frames=frames,
+        people=found.people,
+        false_forecasts=int(found.is_judged.sum() - (found.d_obs_m2 < tau_m2).sum()),
+        frames=found.frames,
         drift_m=_drift(forecasts),
         away_m=away_m,
     )
 
 
-def _window(positions: Floats, start: int, length: int) -> Floats:
-    """``length`` steps from ``start`` of positions (I, steps, 2); NaN where they reach outside."""
-    out = np.full((len(positions), length, 2), np.nan)
-    low, high = max(start, 0), min(start + length, positions.shape[1])
-    if low < high:
-        out[:, low - start : high - start] = positions[:, low:high]
-    return out
-
-
-def _errors(off: Floats, cov: Floats) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+def errors(off: Floats, cov: Floats) -> tuple[Floats, Floats, Floats, Floats, Floats]:
     """ADE, FDE, squared ADE, covered shares and distances (P, T) of P pairs.
 
     From errors (P, T, 2) and covariances (P, T, 2, 2).

@@ -1,14 +1,17 @@
-"""The last stage: what happened to the identities of tracks, beside each channel of them that is watched.
+"""The last stage: what became of tracks and of forecasts, beside their channels.
 
-<tracks>/events             rows of Events
+<tracks>/events             what happened to identities: rows of Events
 <tracks>/events/view/log    the same in words, for a viewer
 <tracks>/counts             how tracking stands, frame by frame
+<predictions>/errors        how far off each forecast was: rows of ForecastErrors
+<predictions>/scores        their means, frame by frame
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -16,11 +19,22 @@ import numpy as np
 from mcaptrack import foxglove, log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation.events import EventOptions, find_events
+from mcaptrack.evaluation.forecasts import MADE_FROM, find_forecast_errors
 from mcaptrack.evaluation.words import SUFFIX, log_messages
 from mcaptrack.pipeline.plan import is_stale
 from mcaptrack.pipeline.write import Made
 from mcaptrack.provenance import Provenance, digest
-from mcaptrack.schema import COUNTS, EVENT_KINDS, EVENTS, TRACKS, Frame, Schema
+from mcaptrack.schema import (
+    COUNTS,
+    EVENT_KINDS,
+    EVENTS,
+    FORECAST_ERRORS,
+    FORECAST_SCORES,
+    PREDICTIONS,
+    TRACKS,
+    Frame,
+    Schema,
+)
 
 Say = Callable[[str], None]
 
@@ -28,7 +42,10 @@ Say = Callable[[str], None]
 STAGE: Final = "events"
 #: What is watched unless something else is asked for, below the camera's prefix.
 WATCHED: Final = ("tracks", "retracks")
+#: What tracks became, with all that the log knows: forecasts are held against it, beside the truth.
+_BECAME: Final = "retracks"
 _EVENTS, _COUNTS = "/events", "/counts"
+_ERRORS, _SCORES = "/errors", "/scores"
 
 
 @dataclass(frozen=True)
@@ -51,7 +68,7 @@ def outputs(topic: str) -> tuple[str, ...]:
 def make_events(
     opened: log.Log, prefix: str, made: Mapping[str, Made], watch: Watch, say: Say = lambda _: None
 ) -> dict[str, Made]:
-    """The events of all channels that are watched and whose events are missing or out of date.
+    """The events of all channels that are watched and whose events are missing or out of date; so with forecasts.
 
     ``made`` are channels that were just made. What can't be compared with the truth is said, in a line, and left out.
     Raises McaptrackError for topics that were asked for and hold no tracks.
@@ -60,10 +77,15 @@ def make_events(
     topics = watch.topics or _watched(opened, prefix, made)
     if watch.again and not topics:
         raise McaptrackError(f"{opened.path} has no tracks of {prefix}; run `mcaptrack run {opened.path}`")
-    truth: _Truth | None = None
+
+    @cache
+    def truth() -> _Truth:
+        return _read_truth(opened, f"{prefix}/truth", say)
+
     for topic in topics:
         options = watch.options if watch.again else _asked(opened, topic, watch.options)
-        if not watch.again and not _is_due(opened, topic, made, options):
+        stands = _asked(opened, topic, EventOptions()) == options and not _is_due(opened, outputs(topic), made)
+        if stands and not watch.again:
             continue
         taken = [name for name in outputs(topic) if not _is_ours(opened, name)]
         if taken:
@@ -71,21 +93,57 @@ def make_events(
                 raise McaptrackError(f"{opened.path}: events would replace {taken[0]}, which others recorded")
             say(f"no events of {topic}: {taken[0]} was recorded by others")
             continue
-        frames, tracks_digest = _tracks(opened, topic, made)
-        truth = truth or _read_truth(opened, f"{prefix}/truth", say)
-        found = find_events(frames, truth.frames, options, opened.path.stem, topic)
+        frames, tracks_digest = _rows(opened, topic, made)
+        found = find_events(frames, truth().frames, options, opened.path.stem, topic)
         for words in found.notes:
             say(words)
         parameters = found.parameters(options)
-        provenance = Provenance(
-            STAGE, parameters, topic, tracks_digest, reference=truth.topic, reference_digest=truth.digest
-        )
+        provenance = Provenance(STAGE, parameters, topic, tracks_digest, references=truth().digests)
         out[topic + _EVENTS] = events = _made(EVENTS, found.events, provenance)
         words_of = list(log_messages(found.events, topic, opened.start_ns, found.usual_s))
         view = Provenance("view", {}, topic + _EVENTS, events.provenance.digest)
         out[topic + _EVENTS + SUFFIX] = Made(EVENTS, [], view, words_of, foxglove.schema_record(foxglove.LOG))
         out[topic + _COUNTS] = _made(COUNTS, found.counts, provenance)
+    if not watch.topics:
+        for name in MADE_FROM:
+            out |= _forecast_errors(opened, prefix, name, made, watch.again, truth, say)
     return out
+
+
+def _forecast_errors(
+    opened: log.Log,
+    prefix: str,
+    name: str,
+    made: Mapping[str, Made],
+    again: bool,
+    truth: Callable[[], _Truth],
+    say: Say,
+) -> dict[str, Made]:
+    """How far off the forecasts of one channel were, if they are there and that is missing or out of date."""
+    topic, tracks, later = (f"{prefix}/{one}" for one in (name, MADE_FROM[name], _BECAME))
+    if not _holds(opened, topic, made, PREDICTIONS) or not _holds(opened, tracks, made):
+        return {}
+    later = later if _holds(opened, later, made) else tracks
+    topics = (topic + _ERRORS, topic + _SCORES)
+    if not again and not _is_due(opened, topics, made) and later in _made_from(opened, topics[0]):
+        return {}
+    taken = [one for one in topics if not _is_ours(opened, one)]
+    if taken:
+        say(f"no errors of {topic}: {taken[0]} was recorded by others")
+        return {}
+    forecasts, digest_of_forecasts = _rows(opened, topic, made, PREDICTIONS)
+    (from_tracks, of_tracks), (became, of_later) = (_rows(opened, one, made) for one in (tracks, later))
+    try:
+        found = find_forecast_errors(forecasts, from_tracks, truth().frames, became, topic)
+    except McaptrackError as error:
+        say(f"no errors of forecasts: {error}")
+        return {}
+    references = truth().digests | {tracks: of_tracks, later: of_later}
+    provenance = Provenance(STAGE, {}, topic, digest_of_forecasts, references=references)
+    return {
+        topics[0]: _made(FORECAST_ERRORS, found.errors, provenance),
+        topics[1]: _made(FORECAST_SCORES, found.scores, provenance),
+    }
 
 
 def tally(happened: Mapping[str, Made]) -> dict[str, dict[str, int]]:
@@ -108,23 +166,24 @@ def camera_of(opened: log.Log, topics: Sequence[str]) -> str | None:
 
 
 class _Truth(NamedTuple):
-    """The true tracks of a camera, None if there are none; ``topic`` is empty where that holds something else."""
+    """The true tracks of a camera, None if there are none, and their digest by topic: nothing where that holds
+    something else.
+    """
 
     frames: list[Frame] | None
-    topic: str
-    digest: str
+    digests: dict[str, str]
 
 
 def _read_truth(opened: log.Log, topic: str, say: Say) -> _Truth:
     if topic not in opened.channels:
-        return _Truth(None, topic, "")
-    if not _holds_tracks(opened, topic):
-        return _Truth(None, "", "")
+        return _Truth(None, {topic: ""})
+    if not _holds(opened, topic):
+        return _Truth(None, {})
     try:
-        return _Truth(opened.frames(topic, TRACKS), topic, _digest(opened, topic))
+        return _Truth(opened.frames(topic, TRACKS), {topic: _digest(opened, topic)})
     except McaptrackError as error:
         say(f"no misses, false tracks and switches: {error}")
-        return _Truth(None, "", "")
+        return _Truth(None, {})
 
 
 def _made(schema: Schema, frames: list[Frame], provenance: Provenance) -> Made:
@@ -140,8 +199,7 @@ def _watched(opened: log.Log, prefix: str, made: Mapping[str, Made]) -> list[str
         for topic in sorted(opened.channels)
         if topic.startswith(prefix + "/") and topic.endswith(_EVENTS) and _is_ours(opened, topic)
     ]
-    there = {topic for topic, channel in made.items() if channel.schema is TRACKS}
-    return [topic for topic in dict.fromkeys(topics) if topic in there or _holds_tracks(opened, topic)]
+    return [topic for topic in dict.fromkeys(topics) if _holds(opened, topic, made)]
 
 
 def _asked(opened: log.Log, topic: str, given: EventOptions) -> EventOptions:
@@ -156,15 +214,19 @@ def _asked(opened: log.Log, topic: str, given: EventOptions) -> EventOptions:
     return EventOptions(similarity if similarity in ("iou", "metres") else None, gate if is_gate else None)
 
 
-def _is_due(opened: log.Log, topic: str, made: Mapping[str, Made], options: EventOptions) -> bool:
-    """Whether the events of a channel are missing, or were made from others than there are now, or otherwise."""
-    stand = [opened.channels.get(name) for name in outputs(topic)]
-    if not all(stand) or is_stale(opened, topic + _EVENTS):
+def _is_due(opened: log.Log, topics: Sequence[str], made: Mapping[str, Made]) -> bool:
+    """Whether one of what the first of these topics was made with is missing, or was made from others than there are
+    now.
+    """
+    if not all(topic in opened.channels for topic in topics) or is_stale(opened, topics[0]):
         return True
-    known = Provenance.from_metadata(opened.channel(topic + _EVENTS).metadata)
-    if known is None or _asked(opened, topic, EventOptions()) != options:
-        return True
-    return topic in made and made[topic].provenance.digest != known.input_digest
+    was = _made_from(opened, topics[0])
+    return not was or any(name in made and made[name].provenance.digest != then for name, then in was.items())
+
+
+def _made_from(opened: log.Log, topic: str) -> dict[str, str]:
+    known = Provenance.from_metadata(opened.channel(topic).metadata)
+    return known.made_from() if known else {}
 
 
 def _is_ours(opened: log.Log, topic: str) -> bool:
@@ -173,16 +235,21 @@ def _is_ours(opened: log.Log, topic: str) -> bool:
     return channel is None or Provenance.from_metadata(channel.metadata) is not None
 
 
-def _holds_tracks(opened: log.Log, topic: str) -> bool:
+def _holds(opened: log.Log, topic: str, made: Mapping[str, Made] = {}, schema: Schema = TRACKS) -> bool:
+    """Whether rows of a schema stand in a channel, or were just made for it."""
+    if topic in made:
+        return made[topic].schema is schema
     channel = opened.channels.get(topic)
-    return channel is not None and channel.schema_name == TRACKS.name and channel.message_encoding == "protobuf"
+    return channel is not None and channel.schema_name == schema.name and channel.message_encoding == "protobuf"
 
 
-def _tracks(opened: log.Log, topic: str, made: Mapping[str, Made]) -> tuple[Sequence[Frame], str]:
-    """The frames of a channel of tracks, and their digest."""
+def _rows(
+    opened: log.Log, topic: str, made: Mapping[str, Made], schema: Schema = TRACKS
+) -> tuple[Sequence[Frame], str]:
+    """The frames of a channel, and their digest."""
     if topic in made:
         return made[topic].frames, made[topic].provenance.digest
-    return opened.frames(topic, TRACKS), _digest(opened, topic)
+    return opened.frames(topic, schema), _digest(opened, topic)
 
 
 def _digest(opened: log.Log, topic: str) -> str:

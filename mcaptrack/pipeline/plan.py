@@ -223,10 +223,9 @@ def is_stale(opened: log.Log, topic: str) -> bool:
     made = Provenance.from_metadata(opened.channel(topic).metadata)
     if made is None:
         return False
-    if made.reference and (made.reference in opened.channels) != bool(made.reference_digest):
+    if any((name in opened.channels) != bool(then) for name, then in made.references.items()):
         return True
-    pairs = ((made.input, made.input_digest), (made.reference, made.reference_digest))
-    for name, then in pairs:
+    for name, then in made.made_from().items():
         source = opened.channels.get(name)
         now = Provenance.from_metadata(source.metadata) if source else None
         if now and now.digest and now.digest != then:

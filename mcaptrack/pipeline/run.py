@@ -106,8 +106,9 @@ def run(
     digests = {topic: channel.provenance.digest for topic, channel in made.items()}
     for topic, there in sorted(opened.channels.items()):
         known = Provenance.from_metadata(there.metadata)
-        if topic not in made and known and known.transform in {*TRANSFORMS, EVENTS_STAGE} and known.input in digests:
-            report.stale += [topic] if known.input_digest != digests[known.input] else []
+        if topic not in made and known and known.transform in {*TRANSFORMS, EVENTS_STAGE}:
+            is_late = any(digests.get(name, then) != then for name, then in known.made_from().items())
+            report.stale += [topic] if is_late else []
     return report
 
 

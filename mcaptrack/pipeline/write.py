@@ -17,7 +17,7 @@ from mcaptrack.pipeline.plan import FULL
 from mcaptrack.pipeline.plan import picture_topic as find_pictures
 from mcaptrack.plane import Planes
 from mcaptrack.provenance import Provenance
-from mcaptrack.schema import DETECTIONS, GROUND_PLANE, PREDICTIONS, SCHEMAS, TRACKS, Frame, Schema
+from mcaptrack.schema import DETECTIONS, FORECAST_SCORES, GROUND_PLANE, PREDICTIONS, SCHEMAS, TRACKS, Frame, Schema
 from mcaptrack.views import layouts
 
 Ints = NDArray[np.int64]
@@ -67,12 +67,12 @@ def write(
     # All that is read, before anything is written: the log is changed in place.
     start_ns = _start_ns(opened, prefix, shown, picture_ns)
     eye = layouts.eye_on(_places(opened, prefix, shown), planes, start_ns)
-    last_step = _last_step(opened, prefix, shown)
+    last_step, is_truth_known = _last_step(opened, prefix, shown), _is_truth_known(opened, prefix, shown)
     # What stays comes first: then what is made again finds the place that it had, and the bytes are the same.
     drawn_first = list(drawn.views({topic: channel for topic, channel in shown.items() if topic not in made}, start_ns))
     drawn_last = list(drawn.views({topic: channel for topic, channel in shown.items() if topic in made}, start_ns))
     there = {*opened.channels} - outdated | {*made} | {view.topic for view in (*drawn_first, *drawn_last)}
-    layout_files = layouts.make(drawn.there(there, video, eye, last_step))
+    layout_files = layouts.make(drawn.there(there, video, eye, last_step, is_truth_known))
     new = {attachment_of(name): content for name, content in layout_files.items()}
     standing = {name for name, content in new.items() if opened.attachment(name) == content}
     replaced = [name for name in ATTACHMENTS if name not in standing]
@@ -175,11 +175,13 @@ class _Drawn:
             made_from = Provenance("view", {}, topic, channel.digest)
             yield View(self.frame_topic, foxglove.TRANSFORM, made_from, "", iter([(start_ns, 0, frame)]))
 
-    def there(self, topics: set[str], video: str | None, eye: Eye, last_step: int) -> layouts.There:
+    def there(
+        self, topics: set[str], video: str | None, eye: Eye, last_step: int, is_truth_known: bool
+    ) -> layouts.There:
         """What layouts can show."""
         front = self._prefix + "/"
         names = frozenset(topic.removeprefix(front) for topic in topics if topic.startswith(front))
-        return layouts.There(self._prefix, names, video, self._frame_id, eye, last_step)
+        return layouts.There(self._prefix, names, video, self._frame_id, eye, last_step, is_truth_known)
 
 
 def _start_ns(opened: log.Log, prefix: str, shown: Mapping[str, Shown], picture_ns: Ints) -> int:
@@ -206,6 +208,15 @@ def _last_step(opened: log.Log, prefix: str, shown: Mapping[str, Shown]) -> int:
         if last:
             return last
     return 0
+
+
+def _is_truth_known(opened: log.Log, prefix: str, shown: Mapping[str, Shown]) -> bool:
+    """Whether any forecast is held against the truth."""
+    for name in ("retracks/predictions", "predictions"):
+        frames = _frames(opened, shown, f"{prefix}/{name}/scores", FORECAST_SCORES)
+        if any(np.isfinite(frame.rows["ade_m"]).any() for frame in frames):
+            return True
+    return False
 
 
 def _places(opened: log.Log, prefix: str, shown: Mapping[str, Shown]) -> NDArray[np.float64]:

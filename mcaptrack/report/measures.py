@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from mcaptrack.clock import NS_PER_S
 from mcaptrack.errors import McaptrackError
-from mcaptrack.evaluation import Candidate, Result, Sequenced, forecast_errors
+from mcaptrack.evaluation import Candidate, Result, Sequenced
 from mcaptrack.evaluation.aligned import frame_times, join_rows
+from mcaptrack.evaluation.forecasts import score_forecasts
 from mcaptrack.metrics.calibration import LEVELS
 from mcaptrack.metrics.displacement import Displacement
 from mcaptrack.report.charts import round_step, thinned
@@ -145,6 +146,6 @@ def _constant_velocity(sequence: Sequenced, candidate: Candidate, step_s: float,
     try:
         walking_on = Predict(predictor="cv", horizon_s=steps * step_s, rate_hz=1 / step_s)
         frames = [frame for (frame,) in walking_on(candidate.frames)]
-        return forecast_errors(sequence, Candidate(candidate.name, None, candidate.frames, frames, "cv"))
+        return score_forecasts(frames, candidate.frames, sequence.truth, "cv")
     except McaptrackError:  # a horizon or a rate that no predictor of ours has
         return None

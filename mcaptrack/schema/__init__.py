@@ -26,6 +26,8 @@ __all__ = [
     "DETECTIONS",
     "EVENTS",
     "EVENT_KINDS",
+    "FORECAST_ERRORS",
+    "FORECAST_SCORES",
     "GROUND_PLANE",
     "PREDICTIONS",
     "SCHEMAS",
@@ -191,8 +193,22 @@ PREDICTIONS: Final = Schema("mcaptrack.Predictions")
 GROUND_PLANE: Final = Schema("mcaptrack.GroundPlane")
 EVENTS: Final = Schema("mcaptrack.Events")
 COUNTS: Final = Schema("mcaptrack.Counts")
+FORECAST_ERRORS: Final = Schema("mcaptrack.ForecastErrors")
+FORECAST_SCORES: Final = Schema("mcaptrack.ForecastScores")
 #: Row schemas by name.
-SCHEMAS: Final = {schema.name: schema for schema in (DETECTIONS, TRACKS, PREDICTIONS, GROUND_PLANE, EVENTS, COUNTS)}
+SCHEMAS: Final = {
+    schema.name: schema
+    for schema in (
+        DETECTIONS,
+        TRACKS,
+        PREDICTIONS,
+        GROUND_PLANE,
+        EVENTS,
+        COUNTS,
+        FORECAST_ERRORS,
+        FORECAST_SCORES,
+    )
+}
 #: Not rows but pictures: a transform that reads this gets the brightness of each frame.
 VIDEO: Final = Schema("foxglove.CompressedVideo")
 

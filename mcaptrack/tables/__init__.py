@@ -4,6 +4,8 @@ TABLES                               what tables there are, with their columns
 rows_table(schema, channels)         rows -> Arrow; missing numbers are null in tables and NaN in rows
 write(path, table, provenance)       Arrow -> Parquet, Arrow IPC, CSV or JSON lines
 verify(path)                         is a file what was written
+join(parts)                          the same table of several logs as one
+write_answer(path, table, form)      what a database answered, as a file
 read_tracks(path), read_columns(...) the way back, for files of others too
 """
 
@@ -22,10 +24,13 @@ from mcaptrack.tables.build import (
 )
 from mcaptrack.tables.fields import RECORDING, TABLE_VERSION, TABLES, Field, Table
 from mcaptrack.tables.files import FORMATS, Format, described, verify, write
+from mcaptrack.tables.join import join
 from mcaptrack.tables.messages import messages_table
 from mcaptrack.tables.read import holds_tracks, read_columns, read_tracks
+from mcaptrack.tables.results import ANSWERS, cells, pieces, tidy, write_answer
 
 __all__ = [
+    "ANSWERS",
     "FORMATS",
     "RECORDING",
     "TABLES",
@@ -35,11 +40,14 @@ __all__ = [
     "Part",
     "Pointers",
     "Table",
+    "cells",
     "described",
     "frames_table",
     "holds_tracks",
+    "join",
     "messages_table",
     "only",
+    "pieces",
     "read_columns",
     "read_tracks",
     "records_table",
@@ -48,7 +56,9 @@ __all__ = [
     "table_of",
     "table_to_array",
     "table_to_frames",
+    "tidy",
     "verify",
     "with_recording",
     "write",
+    "write_answer",
 ]

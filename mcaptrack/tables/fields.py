@@ -247,7 +247,7 @@ _RECORDINGS: Final = Table(
 )
 
 #: How the rows of a track stand together in a file; tables that are not here go by time.
-_BY_TRACK: Final = ("tracks", "predictions")
+_BY_TRACK: Final = ("tracks", "predictions", "forecast_errors")
 
 
 def _plural(schema: Schema) -> str:

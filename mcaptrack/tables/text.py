@@ -11,6 +11,7 @@ import io
 import json
 import math
 from collections.abc import Iterator
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ def write(path: Path, table: Any, form: str) -> None:
     """Write a table as "csv" or "jsonl". Raises RuntimeError if reading it back gives something else."""
     written = hashlib.sha256()
     with path.open("xb") as stream:
-        for piece in _csv(table) if form == "csv" else _json_lines(table):
+        for piece in csv(table) if form == "csv" else json_lines(table):
             written.update(piece)
             stream.write(piece)
     with path.open("rb") as stream:
@@ -30,21 +31,23 @@ def write(path: Path, table: Any, form: str) -> None:
         raise RuntimeError(f"{path}: what was written can't be read back")
 
 
-def _json_lines(table: Any) -> Iterator[bytes]:
-    for row in _rows(table):
+def json_lines(table: Any) -> Iterator[bytes]:
+    """A table as JSON, an object a line."""
+    for row in rows(table):
         yield (json.dumps(row, ensure_ascii=False, allow_nan=False) + "\n").encode("utf-8")
 
 
-def _csv(table: Any) -> Iterator[bytes]:
+def csv(table: Any) -> Iterator[bytes]:
+    """A table as CSV, with a header."""
     import pyarrow as pa
     from pyarrow.csv import WriteOptions, write_csv
 
     for number, field in enumerate(table.schema):
         if pa.types.is_timestamp(field.type):
-            table = table.set_column(number, field.name, _iso(table.column(number)))
+            table = table.set_column(number, field.name, iso(table.column(number)))
         elif pa.types.is_dictionary(field.type):
             table = table.set_column(number, field.name, table.column(number).cast(pa.string()))
-        elif pa.types.is_list(field.type) or pa.types.is_binary(field.type):
+        elif pa.types.is_nested(field.type) or pa.types.is_binary(field.type):
             words = [None if value is None else json.dumps(_plain(value)) for value in table.column(number).to_pylist()]
             table = table.set_column(number, field.name, pa.array(words, pa.string()))
     for start in range(0, max(table.num_rows, 1), _PIECE):
@@ -53,22 +56,22 @@ def _csv(table: Any) -> Iterator[bytes]:
         yield piece.getvalue()
 
 
-def _iso(column: Any) -> Any:
-    """Times as text, all with nine digits after the point."""
+def iso(column: Any) -> Any:
+    """Times as text, with as many digits after the point as they have; a Z where they are known to be UTC."""
     import pyarrow as pa
     import pyarrow.compute as pc
 
-    words = column.cast(pa.timestamp("ns")).cast(pa.string())
-    return pc.binary_join_element_wise(pc.replace_substring(words, " ", "T"), "Z", "")
+    words = column.cast(pa.timestamp(column.type.unit)).cast(pa.string())
+    return pc.binary_join_element_wise(pc.replace_substring(words, " ", "T"), "Z" if column.type.tz else "", "")
 
 
-def _rows(table: Any) -> Iterator[dict[str, Any]]:
+def rows(table: Any) -> Iterator[dict[str, Any]]:
     """The rows of a table as JSON has them."""
     import pyarrow as pa
 
     for number, field in enumerate(table.schema):
         if pa.types.is_timestamp(field.type):
-            table = table.set_column(number, field.name, _iso(table.column(number)))
+            table = table.set_column(number, field.name, iso(table.column(number)))
     for batch in table.to_batches(_PIECE):
         for row in batch.to_pylist():
             yield {name: _plain(value) for name, value in row.items()}
@@ -81,6 +84,12 @@ def _plain(value: Any) -> Any:
         import base64
 
         return base64.b64encode(value).decode("ascii")
-    if isinstance(value, list):
+    if isinstance(value, list | tuple):
         return [_plain(member) for member in value]
+    if isinstance(value, dict):
+        return {name: _plain(member) for name, member in value.items()}
+    if isinstance(value, Decimal):
+        return float(value)
+    if value is not None and not isinstance(value, str | int | float):
+        return str(value)  # dates within lists
     return value

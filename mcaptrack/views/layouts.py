@@ -36,8 +36,8 @@ _EVENTS: Final = "/events/view/log"
 
 
 class There(NamedTuple):
-    """What a log has of a camera: its topics below the prefix, where the pictures are, how the ground is seen, and how
-    many steps forecasts go ahead.
+    """What a log has of a camera: its topics below the prefix, where the pictures are, how the ground is seen, how many
+    steps forecasts go ahead, and whether it is known how far off the truth they were.
     """
 
     prefix: str
@@ -46,6 +46,7 @@ class There(NamedTuple):
     frame_id: str
     eye: Eye
     last_step: int
+    is_truth_known: bool = False
 
     def topics(self, suffix: str, on: Collection[str]) -> dict[str, bool]:
         """The topics of all views of one kind, with which are on."""
@@ -131,14 +132,28 @@ def _predictions(there: There) -> bytes:
     last = f"{source}.rows[:]{{step=={there.last_step}}}"
     spread = {f"{last}.cov_{axis}_m2": f"variance at the end, {axis[0]} (m2)" for axis in ("xx", "yy")}
     panels["Plot!spread"] = layouts.plot_panel("How sure forecasts are", spread)
-    tracks = source.removesuffix("/predictions") if future.startswith("retracks") else f"{there.prefix}/samples"
-    paths = {f"{source}.rows[:]{{step==1}}.x_m": "next step, x (m)"}
-    if tracks.removeprefix(there.prefix + "/") in there.names:
-        paths[f"{tracks}.rows[:].x_m"] = "where people are, x (m)"
-    panels["Plot!steps"] = layouts.plot_panel("Foretold and happened", paths)
-    left = [*_image(there, panels, "picture", "Forecasts", on), "Plot!steps"]
-    right = [*_ground(there, panels, "ground", "Forecasts on the ground", on), "Plot!spread"]
+    told = "retracks" if future.startswith("retracks") else "tracks"
+    left = [*_image(there, panels, "picture", "Forecasts", on), *_errors(there, panels)]
+    right = [*_ground(there, panels, "ground", "Forecasts on the ground", on)]
+    right.append(beside(["Plot!spread", *_events(there, panels, "Tracking", (told,))]))
     return _file(panels, _columns(left, right, 50.0))
+
+
+def _errors(there: There, panels: dict[str, Any]) -> list[Tree]:
+    """How far off forecasts were: the truth, or if that is not known the tracks as they became."""
+    front = "" if there.is_truth_known else "later_"
+    labels = {"retracks/predictions": "re-tracked", "predictions": "SORT"}
+    paths = {
+        f"{there.prefix}/{name}/scores.rows[:].{front}{measure.lower()}_m": f"{label}: {measure} (m)"
+        for measure in ("ADE", "FDE")
+        for name, label in labels.items()
+        if f"{name}/scores" in there.names
+    }
+    if not paths:
+        return []
+    words = "the truth" if there.is_truth_known else "where tracks went"
+    panels["Plot!errors"] = layouts.plot_panel(f"Prediction errors, against {words}", paths)
+    return ["Plot!errors"]
 
 
 def _image(there: There, panels: dict[str, Any], name: str, title: str, on: Collection[str]) -> list[Tree]:

@@ -33,9 +33,10 @@ class Look(NamedTuple):
     figure: Figure
 
 
+#: On the ground numbers of a person in several channels stand so far above one another that all can be read.
 RETRACKED: Final = Look(2.5, False, 1.0, False, "above", Figure(0.4, 1.7, 2.2, 4.0))
 TRACKED: Final = Look(2.0, True, 0.6, False, "below", Figure(0.6, 0.06, -0.8, 3.0, in_pieces=True))
-TRUE: Final = Look(1.0, False, 0.0, True, "beside", Figure(0.12, 2.0, 3.2, 1.5))
+TRUE: Final = Look(1.0, False, 0.0, True, "beside", Figure(0.12, 4.6, 5.0, 1.5))
 #: How opaque what was seen is drawn, and what was filled in.
 SEEN, FILLED_IN = 1.0, 0.375
 

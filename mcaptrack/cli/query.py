@@ -1,0 +1,273 @@
+"""``mcaptrack query``: SQL on the tables of logs."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
+
+import typer
+
+from mcaptrack.cli import common
+from mcaptrack.errors import McaptrackError
+
+if TYPE_CHECKING:
+    from mcaptrack.sql import Database
+
+Form = Literal["table", "csv", "json", "jsonl", "parquet", "arrow"]
+#: Rows that a terminal is shown unless more are asked for.
+_SHOWN: Final = 60
+_WIDEST: Final = 60
+_KEYWORDS: Final = ("select", "from", "with", "describe", "summarize", "explain", "pivot", "show", "values")
+
+
+@common.one_line
+def query(
+    words: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="LOG... QUERY",
+            help="Logs, patterns or folders of tables, then the query in quotes; - takes it from standard input.",
+            show_default=False,
+        ),
+    ] = None,
+    file: Annotated[
+        Path | None,
+        common.option("--file", "-f", help="Take the query from this file; all words are logs.", show_default=False),
+    ] = None,
+    form: Annotated[
+        Form | None,
+        common.option("--format", help="What the answer is written as.", show_default="table, or what -o ends with"),
+    ] = None,
+    beside: Annotated[
+        list[str] | None,
+        common.option(
+            "--with", metavar="NAME=FILE", help="A CSV, JSON or Parquet file as one more table.", show_default=False
+        ),
+    ] = None,
+    rows: Annotated[
+        int | None,
+        common.option(
+            "--rows", min=0, help="As a table: show so many rows; 0 is all.", show_default="60 on a terminal"
+        ),
+    ] = None,
+    tables: Annotated[
+        bool, common.option("--tables", help="List the tables with their columns, units and meanings; no query.")
+    ] = False,
+    output: common.Printed = None,
+    force: common.Force = False,
+    json: common.Json = False,
+    quiet: common.Quiet = False,
+    verbose: common.Verbose = False,
+    config: common.Config = None,
+) -> None:
+    """Ask a log in SQL: who was where, how fast, how long, how well.
+
+    The tables are those of `mcaptrack export` (docs/tables.md); `recording` tells several logs apart. They are read
+    from the files beside the log where those are up to date, otherwise from the log. Any other channel is a table under
+    its name in double quotes. Queries read nothing else and change nothing. Needs DuckDB (`pip install duckdb`).
+    docs/sql.md answers what people ask.
+
+    Example: mcaptrack query log.mcap "select topic, count(distinct track_id) from tracks group by topic"
+
+    Example: mcaptrack query 'runs/*.mcap' -f speed.sql -o speed.csv
+    """
+    paths, sql = _asked(words or [], file, tables)
+    if tables and not paths:
+        _print_tables(None, json)
+        return
+    paths = common.expand(paths)
+    chosen = _form(form, output, json)
+    if output is not None:
+        from mcaptrack.atomic import is_same_file, refuse_overwrite
+
+        refuse_overwrite(output, force)
+        if any(is_same_file(output, path) for path in paths):
+            raise McaptrackError(f"{output} is both input and output; give another name with -o")
+    from mcaptrack.sql import Database
+
+    with common.Talk(quiet, verbose).open() as talk, Database(paths, _named(beside or [])) as database:
+        if tables:
+            _print_tables(database, json)
+            return
+        answer = database.ask(sql)
+        for note in database.notes:
+            talk.detail(note)
+        if chosen == "table":
+            limit = rows if rows is not None else _SHOWN if sys.stdout.isatty() and output is None else 0
+            with common.printed_to(output, force):
+                words_after = _print_answer(answer, limit, None if output is None else 0)
+            talk.say(words_after) if words_after else None
+        else:
+            _write(answer, chosen, output, json)
+
+
+def _asked(words: Sequence[str], file: Path | None, tables: bool) -> tuple[list[Path], str]:
+    """The logs and the query among the words of the command."""
+    from_file = file is not None or tables
+    names = list(words) if from_file else list(words[:-1])
+    stray = next((name for name in names if name.lower() in _KEYWORDS and not Path(name).exists()), None)
+    if stray is not None:
+        raise McaptrackError(f'{stray} is no log; the query is one word, in quotes: "{stray} ..."')
+    if tables:
+        if file is not None:
+            raise McaptrackError("--tables needs no query; leave -f out")
+        return [Path(name) for name in names], ""
+    if not words or (not from_file and _is_there(words[-1])):
+        raise McaptrackError(
+            "there is no query; give it as the last word, in quotes, or with -f FILE (--tables: what there is)"
+        )
+    if not names:
+        raise McaptrackError("there is no log; give logs or folders of tables before the query")
+    if file is None and words[-1] != "-":
+        sql = words[-1]
+    elif file is None or str(file) == "-":
+        sql = sys.stdin.read()
+    else:
+        try:
+            sql = file.read_text(encoding="utf-8-sig")
+        except OSError as error:
+            raise McaptrackError(f"{file} can't be read: {error.strerror or error}") from None
+        except UnicodeDecodeError:
+            raise McaptrackError(f"{file} is no text in UTF-8") from None
+    if not sql.strip(" \t\r\n;"):
+        raise McaptrackError("the query is empty")
+    return [Path(name) for name in names], sql
+
+
+def _is_there(word: str) -> bool:
+    try:
+        return Path(word).exists()
+    except (OSError, ValueError):  # too long for a name, as queries are
+        return False
+
+
+def _form(form: Form | None, output: Path | None, json: bool) -> Form:
+    """What the answer is written as: as is said, as the file's name ends, or for people."""
+    if json and form not in (None, "json"):
+        raise McaptrackError(f"--json and --format {form} can't both be; leave one out")
+    end = output.suffix.removeprefix(".").lower() if output is not None else ""
+    known: dict[str, Form] = {name: name for name in ("csv", "json", "jsonl", "parquet", "arrow")}
+    chosen: Form = "json" if json else form or known.get(end, "table")
+    if chosen in ("parquet", "arrow") and output is None:
+        raise McaptrackError(f"--format {chosen} is no text; give a file with -o")
+    return chosen
+
+
+def _named(beside: Sequence[str]) -> dict[str, Path]:
+    out = {}
+    for words in beside:
+        name, equals, path = words.partition("=")
+        if not equals or not path:
+            raise McaptrackError(f"--with {words}: give a name and a file, such as --with zones=zones.csv")
+        out[name] = Path(path)
+    return out
+
+
+def _write(answer: Any, form: Form, output: Path | None, json: bool) -> None:
+    from mcaptrack import tables
+
+    if json:
+        import json as codec
+
+        rows = codec.loads(b"".join(tables.pieces(answer, "json")))
+        columns = [{"name": field.name, "type": str(field.type)} for field in answer.schema]
+        with common.printed_to(output, force=True):
+            common.print_json({"columns": columns, "results": rows})
+    elif output is not None:
+        tables.write_answer(output, answer, form)
+    else:
+        for piece in tables.pieces(answer, form):  # type: ignore[arg-type]
+            sys.stdout.write(piece.decode("utf-8"))
+
+
+def _print_answer(answer: Any, limit: int, width: int | None) -> str:
+    """Print rows for people, as many columns as fit; returns what is to be said of those that aren't shown."""
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    from mcaptrack.tables import cells
+
+    shown = min(limit or answer.num_rows, answer.num_rows)
+    numbers, rows = cells(answer, shown)
+    rows = [[None if word is None else _cut(common.printable(word), limit) for word in row] for row in rows]
+    names = [common.printable(name) for name in answer.schema.names]
+    to_terminal = sys.stdout.isatty() and width is None
+    console = Console(file=sys.stdout, width=None if to_terminal else 100_000, highlight=False)
+    fitting = _fitting(names, rows, console.width) if to_terminal else len(names)
+    table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False)
+    for name, is_number in zip(names[:fitting], numbers, strict=False):
+        table.add_column(Text(name), justify="right" if is_number else "left", no_wrap=not to_terminal)
+    for row in rows:
+        table.add_row(*(Text("null", "dim") if word is None else Text(word) for word in row[:fitting]))
+    console.print(table)
+    said = []
+    if shown < answer.num_rows:
+        said.append(f"the first {shown} of {answer.num_rows} rows; --rows 0 shows all")
+    elif answer.num_rows == 0:
+        said.append("no rows")
+    if fitting < len(names):
+        said.append(f"{fitting} of {len(names)} columns fit; without: {', '.join(names[fitting:])}")
+    return "; ".join(said)
+
+
+def _cut(word: str, limit: int) -> str:
+    return (
+        word if not limit or len(word) <= _WIDEST or "\n" in word else word[: _WIDEST - 1] + "\N{HORIZONTAL ELLIPSIS}"
+    )
+
+
+def _fitting(names: Sequence[str], rows: Sequence[Sequence[str | None]], width: int) -> int:
+    """How many columns stand beside each other, at least one."""
+    used = 0
+    for at, name in enumerate(names):
+        lines = (line for row in rows for line in (row[at] or "null").splitlines())
+        used += max([len(name), *map(len, lines)]) + 2
+        if used > width and at:
+            return at
+    return len(names)
+
+
+def _print_tables(database: Database | None, json: bool) -> None:
+    from mcaptrack.tables import RECORDING, TABLES
+
+    listed: list[dict[str, Any]] = []
+    for table in TABLES.values():
+        columns = [*table.arrow, RECORDING.arrow]
+        listed.append(
+            {
+                "table": table.name,
+                "meaning": table.doc,
+                "columns": [
+                    {
+                        "name": field.name,
+                        "type": "text" if str(field.type).startswith(("dictionary", "string")) else str(field.type),
+                        "unit": field.metadata[b"unit"].decode(),
+                        "meaning": field.metadata[b"description"].decode(),
+                    }
+                    for field in columns
+                ],
+            }
+        )
+    found = {} if database is None else {"recordings": [*database.recordings], "channels": [*database.channels]}
+    if json:
+        common.print_json({"results": listed} | found)
+        return
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    console = Console(file=sys.stdout, width=None if sys.stdout.isatty() else 160, highlight=False)
+    for one in listed:
+        console.print(Text(one["table"], "bold"))
+        console.print(Text(one["meaning"], "dim"))
+        shown = Table(box=None, show_header=False, pad_edge=False, padding=(0, 2, 0, 0))
+        for column in one["columns"]:
+            shown.add_row(*map(Text, (f"  {column['name']}", column["type"], column["unit"], column["meaning"])))
+        console.print(shown)
+        console.print()
+    for what, names in found.items():
+        console.print(Text(f"{what}: {common.printable(', '.join(names))}"))

@@ -1,0 +1,665 @@
+"""Questions in SQL: answered from logs and from tables alike, and nothing but answered."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import duckdb
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from typer.testing import CliRunner
+
+from mcaptrack import demo, log, tables
+from mcaptrack.cli import app
+from mcaptrack.errors import McaptrackError
+from mcaptrack.export import default_folder, export
+from mcaptrack.ingest import IngestOptions, ingest
+from mcaptrack.provenance import Provenance
+from mcaptrack.scene import demo_scene
+from mcaptrack.schema import EVENTS, PREDICTIONS, TRACKS, Frame
+from mcaptrack.sql import Database
+from tests.worlds import ns, tracks_at
+
+PAGE = (Path(__file__).parent.parent / "docs" / "sql.md").read_text()
+PRELUDE = re.findall(r"```sql prelude\n(.*?)```", PAGE, re.S)[0]
+#: Queries of the page with the answers below them; those of examples are for the log below.
+QUERIES = re.findall(r"```sql\n(.*?)```\n\n(For example:\n\n)?((?:\|[^\n]*\n)+)", PAGE, re.S)
+SURE = [(query, answer) for query, example, answer in QUERIES if not example]
+EXAMPLES = [query for query, example, _ in QUERIES if example]
+ZONE = next(answer for query, answer in SURE if "visits" in query)
+BEGIN = next(answer for query, answer in SURE if "begin" in query)
+
+
+def parsed(answer):
+    """A table of the page: names and rows."""
+    head, _, *lines = ([cell.strip() for cell in line.strip(" |").split(" | ")] for line in answer.splitlines())
+    return head, [[word(cell) for cell in line] for line in lines]
+
+
+def word(cell):
+    return float(cell) if re.fullmatch(r"-?\d+(\.\d+)?", cell) else None if cell == "null" else cell
+
+
+def rows_of(table):
+    return table.schema.names, [list(row.values()) for row in table.to_pylist()]
+
+
+def agree(found, wanted):
+    assert found[0] == wanted[0]
+    assert len(found[1]) == len(wanted[1])
+    for one, other in zip(found[1], wanted[1], strict=True):
+        assert one == pytest.approx(other, abs=1e-9), (one, other)
+
+
+def run(*words, **options):
+    return CliRunner().invoke(app, ["query", *map(str, words)], **options)
+
+
+def refusal(*words):
+    outcome = run(*words)
+    assert outcome.exit_code == 1, outcome.output
+    (line,) = outcome.stderr.splitlines()
+    return line.removeprefix("mcaptrack: ")
+
+
+@pytest.fixture(scope="module")
+def square(tmp_path_factory) -> Path:
+    """The folder of the demonstration as far as no tracker has a hand in it: its truth, as log and as tables."""
+    folder = tmp_path_factory.mktemp("square")
+    footage = demo.draw(demo_scene(), folder, video=False)
+    options = IngestOptions(fps=demo_scene().fps, ground_plane=footage.ground_plane, role="truth")
+    ingest(footage.truth, folder / "labels.mcap", options)
+    with log.read(folder / "labels.mcap") as opened:
+        # Labels alone begin with frame 1; beside a video the first is that of the first picture.
+        step = opened.start_ns
+        frames = [Frame(f.t_ns - step, f.index - 1, f.rows) for f in opened.frames("/camera/truth", TRACKS)]
+        made = Provenance.from_metadata(opened.channel("/camera/truth").metadata)
+    write_log(folder / "demo.mcap", {"/camera/truth": (TRACKS, made, frames)})
+    with log.read(folder / "demo.mcap") as opened:
+        export(opened, folder / "demo.tables")
+    return folder
+
+
+@pytest.mark.parametrize(("query", "answer"), SURE, ids=[f"query{n}" for n in range(len(SURE))])
+def test_the_queries_of_the_page_give_its_answers(square, query, answer):
+    with Database([square / "demo.mcap"]) as database:
+        agree(rows_of(database.ask(query)), parsed(answer))
+
+
+def test_so_they_do_with_duckdb_alone(square):
+    program = (
+        "import duckdb, json, sys\n"
+        "prelude, queries = json.load(sys.stdin)\n"
+        "connection = duckdb.connect()\n"
+        "connection.execute(prelude)\n"
+        "answers = [connection.sql(query) for query in queries]\n"
+        "print(json.dumps([[answer.columns, answer.fetchall()] for answer in answers]))\n"
+        "assert not any(name.startswith('mcaptrack') for name in sys.modules)\n"
+    )
+    said = json.dumps([PRELUDE, [query for query, _ in SURE]])
+    command = [sys.executable, "-I", "-c", program]
+    done = subprocess.run(command, cwd=square, input=said, capture_output=True, text=True, check=True)
+    assert len(SURE) >= 10
+    for (names, rows), (_, answer) in zip(json.loads(done.stdout), SURE, strict=True):
+        agree((names, rows), parsed(answer))
+
+
+def test_the_prelude_names_all_tables():
+    assert set(re.findall(r"create view (\w+)", PRELUDE)) == set(tables.TABLES)
+
+
+def answer_to(*words):
+    """What the page answers to the one query that holds all these words."""
+    (found,) = (answer for query, answer in SURE if all(one in query for one in words))
+    return parsed(found)[1]
+
+
+def test_the_answers_of_the_page_are_true():
+    walkers = {walker.id: walker for walker in demo_scene().people}
+    for who, x_m, y_m in answer_to("t_ns = 10_000_000_000"):
+        assert walkers[who].at(10.0) == pytest.approx((x_m, y_m), abs=0.35), who
+    for who, mean, fastest in answer_to("fastest_m_s"):
+        (start, *_), (end, *_) = walkers[who].route[0], walkers[who].route[-1]
+        points = [walkers[who].at(min(start + 0.04 * n, end)) for n in range(round((end - start) / 0.04) + 1)]
+        steps = [((b[0] - a[0]) ** 2 + (b[1] - a[1]) ** 2) ** 0.5 for a, b in zip(points, points[25:], strict=False)]
+        assert mean == pytest.approx(sum(steps) / len(steps), abs=0.08)
+        assert fastest == pytest.approx(max(steps), abs=0.15)
+    for one, other, closest_m, at_s in answer_to("closest_m"):
+        (a, b), (c, d) = walkers[one].at(at_s), walkers[other].at(at_s)
+        assert closest_m == pytest.approx(((a - c) ** 2 + (b - d) ** 2) ** 0.5, abs=0.3)
+    ticks = [n / 25 for n in range(1000)]
+    for who, _, seconds in answer_to("visits"):
+        there = [walkers[who].at(t) for t in ticks]
+        inside = sum(1 for place in there if place and -2 <= place[0] <= 2 and 11 <= place[1] <= 14)
+        assert seconds == pytest.approx(inside / 25, abs=0.5)
+    for from_s, begin in answer_to("first_t_ns"):
+        assert begin == sum(from_s <= walker.route[0][0] < from_s + 10 for walker in walkers.values())
+
+
+# Examples: a log whose answers are known
+
+
+def write_log(path, channels):
+    with log.create(path) as writer:
+        for topic, (schema, made, frames) in channels.items():
+            described = (schema.name, "protobuf", schema.descriptor)
+            number = writer.add_channel(topic, described, "protobuf", made.to_metadata(), group=topic)
+            for frame in frames:
+                writer.add_message(number, frame.t_ns, frame.index, schema.codec.encode(frame.rows))
+    return path
+
+
+def forecasts(rows):
+    who, step, x_m, y_m = (list(column) for column in zip(*rows, strict=True))
+    return PREDICTIONS.rows(track_id=who, step=step, ahead_s=[0.4 * n for n in step], x_m=x_m, y_m=y_m)
+
+
+def happened(rows):
+    names = ("kind", "truth_id", "previous_id", "track_id", "duration_s")
+    columns = {name: list(column) for name, column in zip(names, zip(*rows, strict=True), strict=True)}
+    columns["duration_s"] = [float(value) for value in columns["duration_s"]]
+    count = len(rows)
+    return EVENTS.rows(**columns, source_id=[-1] * count, frames=[0] * count, x_m=[2.4] * count, y_m=[0.2] * count)
+
+
+def known_log(path, tracked=(7, 8)):
+    """Person 1 walks along the first axis, person 2 stands; track 8 stands half a metre beside them."""
+    ticks = range(11)
+    people = [Frame(ns(0.4 * n), n, tracks_at({1: (0.4 * n, 0.0), 2: (0.0, 10.0)})) for n in ticks]
+    tracks = {7: lambda n: (0.4 * n, 0.0), 8: lambda n: (0.0, 10.5)}
+    samples = [Frame(ns(0.4 * n), n, tracks_at({who: tracks[who](n) for who in tracked})) for n in ticks]
+    seen = [tracks_at({3: (0.0, 0.0)}, observed=n <= 10 or n >= 30) for n in range(40)]
+    whole = [Frame(ns(0.1 * n), n, rows) for n, rows in enumerate(seen)]
+    ahead = [(7, 1, 0.4, 0.3), (7, 2, 0.8, 0.0), (8, 1, 0.0, 10.5), (8, 2, 0.4, 10.8)]
+    told = [
+        Frame(ns(2.4), 6, happened([(4, 1, 7, 9, 0.4), (2, 1, 7, -1, 0.8), (2, 2, 8, -1, 0.4), (2, 1, 9, -1, 1.2)]))
+    ]
+    return write_log(
+        path,
+        {
+            "/camera/truth": (TRACKS, Provenance("ingest", {}, ""), people),
+            "/camera/tracks": (TRACKS, Provenance("track", {}, "/camera/detections"), samples),
+            "/camera/samples": (TRACKS, Provenance("sample", {}, "/camera/tracks"), samples),
+            "/camera/retracks": (TRACKS, Provenance("retrack", {}, "/camera/samples"), samples),
+            "/camera/retracks/full": (TRACKS, Provenance("carry", {}, "/camera/retracks"), whole),
+            "/camera/predictions": (
+                PREDICTIONS,
+                Provenance("predict", {}, "/camera/samples"),
+                [Frame(0, 0, forecasts(ahead))],
+            ),
+            "/camera/tracks/events": (EVENTS, Provenance("events", {}, "/camera/tracks"), told),
+        },
+    )
+
+
+KNOWN = {
+    "kind = 4": [[1, 7, 9, 2.4, 2.0, 0.0]],
+    "next_ns": [[3, 1.0, 2.0]],
+    "kind = 2": [[1, 2, 2.0], [2, 1, 0.4]],
+    "made.input": [[0.4, 2, 0.15], [0.8, 2, 0.25]],
+    "with about": [[0.4, 2, 0.4], [0.8, 2, 0.45]],
+    "recursive": [
+        ["/camera/retracks", "retrack", "/camera/samples"],
+        ["/camera/samples", "sample", "/camera/tracks"],
+        ["/camera/tracks", "track", "/camera/detections"],
+    ],
+    "from metrics": [["known", f"/camera/{name}", 1.0, 1.0, 0] for name in ("retracks", "samples", "tracks")],
+}
+
+
+@pytest.fixture(scope="module")
+def known(tmp_path_factory) -> Path:
+    return known_log(tmp_path_factory.mktemp("known") / "known.mcap")
+
+
+@pytest.mark.parametrize("part", KNOWN)
+def test_the_examples_of_the_page_are_right_where_the_answer_is_known(known, part):
+    (query,) = (query for query in EXAMPLES if part in query)
+    with Database([known]) as database:
+        found = [row for row in rows_of(database.ask(query))[1] if "/camera/retracks/full" not in row]
+    assert len(found) == len(KNOWN[part])
+    for one, other in zip(found, KNOWN[part], strict=True):
+        assert one == pytest.approx(other)
+
+
+def test_every_example_of_the_page_is_tried():
+    assert all(sum(part in query for part in KNOWN) == 1 for query in EXAMPLES)
+    assert len(EXAMPLES) == len(KNOWN)
+
+
+def test_two_runs_beside_each_other(tmp_path):
+    (query,) = re.findall(r"```sql two\n(.*?)```", PAGE, re.S)
+    known_log(tmp_path / "before.mcap")
+    known_log(tmp_path / "after.mcap", tracked=(7,))
+    outcome = run(tmp_path / "*.mcap", query, "--format", "jsonl")
+    assert outcome.exit_code == 0, outcome.output
+    rows = {row["topic"]: row for row in map(json.loads, outcome.stdout.splitlines())}
+    # Of 22 true rows 11 are found: MOTA is a half, IDF1 is 2 * 11 / (11 + 22).
+    assert rows["/camera/samples"] == {"topic": "/camera/samples", "IDF1": -0.33, "MOTA": -0.5, "IDSW": 0}
+
+
+@pytest.mark.parametrize("library", ["polars", "pandas"])
+def test_the_same_in_other_libraries(square, monkeypatch, library):
+    pytest.importorskip(library)
+    (block,) = re.findall(rf"```python {library}\n(.*?)```", PAGE, re.S)
+    monkeypatch.chdir(square)
+    names = {}
+    exec(block, names)
+    for name, answer in (("seconds", ZONE), ("begin", BEGIN)):
+        found = names[name].rows() if library == "polars" else list(names[name].items())
+        _, wanted = parsed(answer)
+        assert [row[0] for row in found] == [row[0] for row in wanted]
+        assert [row[-1] for row in found] == pytest.approx([row[-1] for row in wanted], abs=0.06)
+
+
+def test_the_commands_of_the_page_have_options_that_exist():
+    from typer.main import get_command
+
+    query = get_command(app).commands["query"]
+    options = {name for parameter in query.params for name in parameter.opts}
+    (block, *_) = re.findall(r"```sh\n(.*?)```", PAGE, re.S)
+    for line in block.splitlines():
+        words = shlex.split(line)
+        assert words[:2] == ["mcaptrack", "query"]
+        assert {one for one in words if one.startswith("-")} <= options
+
+
+# Where tables come from
+
+
+def test_only_what_a_query_names_is_read(known, tmp_path):
+    content = bytearray(known.read_bytes())
+    with log.read(known) as opened:
+        number = opened.channel("/camera/predictions").id
+        (chunk,) = (c for c in opened.index.chunks if number in c.message_index_offsets)
+    content[chunk.offset + 120] ^= 0xFF
+    damaged = tmp_path / "damaged.mcap"
+    damaged.write_bytes(content)
+    assert run(damaged, "select count(*) as n from tracks where topic = '/camera/truth'", "--format", "csv").stdout == (
+        '"n"\n22\n'
+    )
+    assert re.search(r"damaged\.mcap.*damaged.*recover", refusal(damaged, "select count(*) from predictions"))
+
+
+def test_tables_beside_a_log_are_read_while_they_are_up_to_date(tmp_path):
+    path = known_log(tmp_path / "a.mcap")
+    query = "select count(*) as n from tracks where topic = '/camera/samples'"
+    with Database([path]) as database:
+        assert rows_of(database.ask(query))[1] == [[22]]
+        assert "read from the log" in database.notes[0]
+    with log.read(path) as opened:
+        export(opened, default_folder(path))
+    with Database([path]) as database:
+        assert rows_of(database.ask(query))[1] == [[22]]
+        assert "a.tables" in database.notes[0]
+    known_log(path, tracked=(7,))
+    with Database([path]) as database:
+        assert rows_of(database.ask(query))[1] == [[11]]
+        assert "read from the log" in database.notes[0]
+
+
+def test_files_and_logs_give_the_same_tables(known, tmp_path):
+    other = tmp_path / "other.mcap"
+    other.write_bytes(known.read_bytes())
+    with log.read(other) as opened:
+        export(opened, tmp_path / "tables")
+    for name in tables.TABLES:
+        columns = "* exclude (recording, file, digest)" if name == "recordings" else "* exclude (recording)"
+        columns = "* exclude (recording, file)" if name == "frames" else columns
+        with Database([known, tmp_path / "tables"]) as database:
+            here, there = (
+                database.ask(f"select {columns} from {name} where recording = '{which}' order by all")
+                for which in ("known", "other")
+            )
+            assert database.recordings == ("known", "other")
+        assert here.equals(there), name
+        assert here.num_rows or name in ("detections", "counts", "ground_planes"), name
+
+
+def test_logs_of_one_name_are_told_apart_by_their_folders(tmp_path):
+    paths = [
+        known_log(folder / "walk.mcap") for folder in (tmp_path / "monday", tmp_path / "tuesday") if not folder.mkdir()
+    ]
+    with Database([*paths, paths[0]]) as database:
+        assert database.recordings == ("monday/walk", "tuesday/walk")
+        assert rows_of(database.ask("select distinct recording from tracks order by all"))[1] == [
+            ["monday/walk"],
+            ["tuesday/walk"],
+        ]
+
+
+@pytest.mark.parametrize("name", ["a'b", 'a"b; drop table tracks', "ä $x {0}", "%s? :1", "--x"])
+def test_names_of_logs_and_channels_are_no_sql(tmp_path, name):
+    path = known_log(tmp_path / f"{name}.mcap")
+    topic = f"/{name}"
+    with log.read(path) as opened, log.extend(opened) as writer:
+        number = writer.add_channel(topic, ("x", "jsonschema", b"{}"), "json", {}, group=topic)
+        writer.add_message(number, 5, 0, b'{"value": 3}')
+    with Database([path]) as database:
+        quoted = topic.replace('"', '""')
+        assert rows_of(database.ask(f'select value, t_ns from "{quoted}"')) == (["value", "t_ns"], [[3, 5]])
+        assert rows_of(database.ask("select count(distinct recording) from tracks"))[1] == [[1]]
+
+
+def test_the_channels_of_a_folder_are_tables_too(known, tmp_path):
+    path = tmp_path / "robot.mcap"
+    with log.create(path) as writer:
+        number = writer.add_channel("/imu", ("x", "jsonschema", b"{}"), "json", {}, group="imu")
+        for n in range(3):
+            writer.add_message(number, n, n, json.dumps({"value": n / 2}).encode())
+    with log.read(path) as opened:
+        export(opened, tmp_path / "tables", topics=["/imu"])
+    for source in (path, tmp_path / "tables"):
+        with Database([source, known]) as database:
+            assert rows_of(database.ask('select recording, sum(value) as s from "/imu" group by all'))[1] == [
+                ["robot", 1.5]
+            ]
+            assert "/imu" in database.channels
+
+
+def test_old_tables_have_new_columns_as_null(square, tmp_path):
+    old = tmp_path / "old" / "tracks" / "recording=old" / "part-0.parquet"
+    old.parent.mkdir(parents=True)
+    written = pq.ParquetFile(square / "demo.tables/tracks/recording=demo/part-0.parquet").read()
+    pq.write_table(written.drop_columns(["source_id"]), old)
+    with Database([tmp_path / "old", square / "demo.tables"]) as database:
+        found = database.ask(
+            "select recording, count(*) as n, count(source_id) as known from tracks group by all order by all"
+        )
+        assert rows_of(found)[1] == [["demo", 3168, 3168], ["old", 3168, 0]]
+        assert rows_of(database.ask("select count(*) from events"))[1] == [[0]]
+
+
+# Nothing else
+
+
+@pytest.mark.parametrize(
+    "query",
+    [
+        "copy tracks to 'new.csv'",
+        "copy (select 1) to 'new.parquet'",
+        "explain analyze copy (select 1) to 'new.csv'",
+        "export database 'new'",
+        "attach 'new.db'",
+        "attach 'secret.db' as other",
+        "install httpfs",
+        "load './new.duckdb_extension'",
+        "select * from read_csv('secret.csv')",
+        "select * from 'secret.csv'",
+        "select * from read_text('secret.csv')",
+        "select * from glob('*')",
+        "select * from parquet_schema('secret.parquet')",
+        "set enable_external_access = true",
+        "set temp_directory = 'new'; select 1",
+        "pragma enable_profiling; pragma profiling_output = 'new'; select 1",
+        "create persistent secret (type http); select 1",
+        "import database '.'",
+        "select 1; copy (select 1) to 'new.csv'",
+        "create view v as from read_csv('secret.csv'); from v",
+        "select * from query_table('secret.csv')",
+        "select * from environ",
+    ],
+)
+def test_queries_reach_nothing_but_the_logs(known, tmp_path, monkeypatch, query):
+    monkeypatch.chdir(tmp_path)
+    environ = duckdb.sql("select 'hush' as a").to_arrow_table()  # a name that Python knows  # noqa: F841
+    Path("secret.csv").write_text("a\nhush\n")
+    with duckdb.connect("secret.db") as connection:
+        connection.execute("create table hush as select 'hush' as a")
+        connection.execute("copy hush to 'secret.parquet'")
+    there = sorted(tmp_path.rglob("*"))
+    outcome = run(known, query)
+    assert outcome.exit_code == 1
+    assert "hush" not in outcome.output
+    assert sorted(tmp_path.rglob("*")) == there
+
+
+def test_what_is_made_within_a_query_is_gone_after_it(known):
+    with Database([known]) as database:
+        query = "create macro twice(a) as 2 * a; create view two as select twice(21) as n; from two"
+        assert rows_of(database.ask(query)) == (["n"], [[42]])
+    with Database([known]) as database, pytest.raises(McaptrackError, match="no table two"):
+        database.ask("from two")
+
+
+def test_statements_of_all_kinds_bring_tables_in(known):
+    with Database([known]) as database:
+        found = database.ask("pivot Tracks on topic using count(*) group by observed")
+        assert found.column("/camera/truth").to_pylist() in ([22, None], [None, 22], [22, 0], [0, 22])
+        assert "x_m" in database.ask("describe predictions").column("column_name").to_pylist()
+        assert database.ask("summarize select x_m, kind from events").num_rows == 2
+        assert database.ask("explain from metrics").num_rows
+        query = "with tracks as (from main.track_summary) from (select count(*) as n, (select count(*) from frames) from tracks)"
+        assert rows_of(database.ask(query))[1][0][0] == 9
+        assert rows_of(
+            database.ask("set variable who = 7; select count(*) from tracks where track_id = getvariable('who')")
+        ) == (
+            ["count_star()"],
+            [[33]],
+        )
+
+
+def test_a_file_is_a_table_where_it_is_given(known, tmp_path):
+    (tmp_path / "zones.csv").write_text("zone,low_m,high_m\nleft,-1,2\nright,2.1,9\n")
+    query = (
+        "select zone, count(*) as n from tracks join zones on x_m between low_m and high_m "
+        "where topic = '/camera/truth' group by all order by all"
+    )
+    outcome = run(known, query, "--with", f"zones={tmp_path / 'zones.csv'}", "--format", "csv")
+    assert outcome.stdout == '"zone","n"\n"left",17\n"right",5\n'
+    assert "no such file" in refusal(known, query, "--with", "zones=none.csv")
+    assert "give a name and a file" in refusal(known, query, "--with", "zones")
+    assert "can't name a table" in refusal(known, query, "--with", f"tracks={tmp_path / 'zones.csv'}")
+    assert "end with" in refusal(known, query, "--with", f"zones={known}")
+
+
+def test_ctrl_c_ends_a_query_and_leaves_the_database(known):
+    program = (
+        "import os, signal, sys, threading\n"
+        "from pathlib import Path\n"
+        "from mcaptrack.sql import Database\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "with Database([Path(sys.argv[1])]) as database:\n"
+        "    threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT)).start()\n"
+        "    try:\n"
+        "        database.ask('select count(*) from range(10000000000) a, range(1000000) b where a.range % 7 = b.range')\n"
+        "    except KeyboardInterrupt:\n"
+        "        print(database.ask('select 42 as a').to_pylist())\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program, known], check=True, capture_output=True, text=True)
+    assert done.stdout == "[{'a': 42}]\n"
+
+
+# What people see
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["select * from trakcs"], r"no table trakcs \(did you mean tracks\?\); there are frames"),
+        (['select * from "/camera/trakcs"'], "did you mean /camera/tracks"),
+        (["select x_n from tracks"], '"x_n" not found.*"x_m"'),
+        (['select x_m from tracks where topic = "/camera/truth"'], "single quotes"),
+        (["selct 1"], "syntax error at or near"),
+        (["select 1\n\nform tracks where\n"], "in line 3"),
+        (["  ;"], "empty"),
+        (["create view a as select 1"], "needs a SELECT"),
+        (["select", "x_m", "from", "tracks"], "select is no log.*in quotes"),
+        ([], "no query.*--tables"),
+        (["select 1", "--format", "parquet"], "-o"),
+        (["select 1", "-f", "none.sql"], "."),
+        (["select error('sorry')"], "sorry"),
+        (["show tables"], "--tables"),
+    ],
+)
+def test_mistakes_are_said_in_one_line(known, words, said):
+    line = refusal(known, *words)
+    assert re.search(said, line)
+    assert "LINE" not in line
+
+
+@pytest.mark.skipif(int(duckdb.__version__[0]) < 2, reason="DuckDB 1 cuts times to microseconds")
+def test_what_takes_no_nanoseconds_is_told_with_what_it_takes(known):
+    query = "select date_trunc('minute', t) from tracks limit 1"
+    assert "t::timestamptz" in refusal(known, query)
+    assert run(known, query.replace("t)", "t::timestamptz)")).exit_code == 0
+
+
+def test_logs_that_are_none_are_said(tmp_path):
+    (tmp_path / "empty.mcap").touch()
+    assert "it is empty" in refusal(tmp_path / "empty.mcap", "select 1")
+    assert "can't be opened" in refusal(tmp_path / "none.mcap", "select 1")
+    assert "no log" in refusal("select 1")
+    assert "a folder without tables" in refusal(tmp_path, "select 1")
+    assert "no file matches" in refusal(tmp_path / "x*.mcap", "select 1")
+
+
+def test_a_damaged_table_is_said(square, tmp_path):
+    damaged = tmp_path / "tracks/recording=a/part-0.parquet"
+    damaged.parent.mkdir(parents=True)
+    source = square / "demo.tables/tracks/recording=demo/part-0.parquet"
+    content = bytearray(source.read_bytes())
+    where = pq.read_metadata(source).row_group(0).column(10)
+    assert where.path_in_schema == "x_m"
+    content[where.data_page_offset + where.total_compressed_size // 2] ^= 0xFF
+    damaged.write_bytes(content)
+    assert refusal(tmp_path, "select sum(x_m) from tracks")
+    damaged.write_bytes(content[:5000])
+    assert "can't be read as Parquet" in refusal(tmp_path, "select sum(x_m) from tracks")
+
+
+def test_duckdb_that_is_missing_is_named_with_the_command_that_mends_it(known, monkeypatch):
+    monkeypatch.setitem(sys.modules, "duckdb", None)
+    assert re.search(r'pip install "mcaptrack\[sql\]"', refusal(known, "select 1"))
+
+
+EVERYTHING = """select t, t_ns, 0.1 + 0.2 as d, sum(track_id) over () as s, 1.25::decimal(9, 2) as e, date '2026-05-01' as f,
+interval '1 month 2 days 1.5 seconds' as g, [1.5, null] as h, {'a': 'b'} as i, null as j, 'inf'::double as k, 1 as t,
+12345678901234567890123::hugeint as big, 'a"b,\n' as words, true as yes
+from tracks where topic = '/camera/retracks/full' order by t_ns limit 1 offset 7"""
+
+
+def test_answers_are_exact_in_every_form(known, tmp_path):
+    (row,) = map(json.loads, run(known, EVERYTHING, "--format", "jsonl").stdout.splitlines())
+    wanted = {
+        "t": "1970-01-01T00:00:00.700000000Z" if int(duckdb.__version__[0]) > 1 else "1970-01-01T00:00:00.700000Z",
+        "t_ns": 700_000_000,
+        "d": 0.1 + 0.2,
+        "s": 120,
+        "e": 1.25,
+        "f": "2026-05-01",
+        "g": "1 month 2 days 00:00:01.5",
+        "h": [1.5, None],
+        "i": {"a": "b"},
+        "j": None,
+        "k": "Infinity",
+        "t_1": 1,
+        "big": "12345678901234567890123",
+        "words": 'a"b,\n',
+        "yes": True,
+    }
+    assert row == wanted
+    assert json.loads(run(known, EVERYTHING, "--format", "json").stdout) == [wanted]
+    whole = json.loads(run(known, EVERYTHING, "--json").stdout)
+    assert (whole["schema_version"], whole["results"]) == (1, [wanted])
+    assert [column["name"] for column in whole["columns"]] == list(wanted)
+    (cells,) = csv.DictReader(io.StringIO(run(known, EVERYTHING, "--format", "csv").stdout, newline=""))
+    assert (cells["t"], cells["big"], cells["h"], cells["i"]) == (
+        wanted["t"],
+        wanted["big"],
+        "[1.5, null]",
+        '{"a": "b"}',
+    )
+    assert (cells["words"], float(cells["d"]), cells["j"]) == ('a"b,\n', 0.1 + 0.2, "")
+    for form in ("parquet", "arrow"):
+        target = tmp_path / f"answer.{form}"
+        assert run(known, EVERYTHING, "-o", target).exit_code == 0
+        table = pq.read_table(target) if form == "parquet" else pa.ipc.open_file(target).read_all()
+        assert table.column("t_ns").to_pylist() == [700_000_000]
+        assert table.column("t").cast(pa.int64()).to_pylist()[0] in (700_000_000, 700_000)
+
+
+@given(
+    st.lists(
+        st.tuples(st.integers(-(2**63), 2**63 - 1), st.floats(allow_nan=False, allow_infinity=False), st.text()),
+        max_size=20,
+    )
+)
+def test_numbers_and_words_come_back_from_json_as_they_were(rows):
+    columns = [list(column) for column in zip(*rows, strict=True)] or [[], [], []]
+    try:
+        table = pa.table(
+            {
+                "a": pa.array(columns[0], pa.int64()),
+                "b": pa.array(columns[1], pa.float64()),
+                "c": pa.array(columns[2], pa.string()),
+            }
+        )
+    except UnicodeEncodeError:  # half of a pair of surrogates is no text
+        return
+    text = b"".join(tables.pieces(table, "json"))
+    assert [tuple(row.values()) for row in json.loads(text)] == rows
+
+
+def test_an_answer_goes_to_a_file_that_nothing_is_lost_of(known, tmp_path):
+    target = tmp_path / "a.csv"
+    assert run(known, "select 1 as a", "-o", target).exit_code == 0
+    assert target.read_text() == '"a"\n1\n'
+    assert "exists" in refusal(known, "select 2 as a", "-o", target)
+    assert run(known, "select error('no') from tracks", "-o", target, "--force").exit_code == 1
+    assert target.read_text() == '"a"\n1\n'
+    assert run(known, "select 2 as a", "-o", target, "--force").exit_code == 0
+    assert target.read_text() == '"a"\n2\n'
+    assert [path.name for path in tmp_path.iterdir()] == ["a.csv"]
+    copy = tmp_path / "known.mcap"
+    copy.write_bytes(known.read_bytes())
+    assert "both input and output" in refusal(copy, "select 1", "-o", copy, "--force")
+
+
+def test_a_query_comes_from_a_file_or_from_standard_input(known, tmp_path):
+    (tmp_path / "q.sql").write_text(
+        "\ufeff-- how many\nselect count(*) as n from tracks where topic = '/camera/truth';\n"
+    )
+    wanted = '"n"\n22\n'
+    assert run(known, "-f", tmp_path / "q.sql", "--format", "csv").stdout == wanted
+    text = (tmp_path / "q.sql").read_text(encoding="utf-8-sig")
+    assert run(known, "-", "--format", "csv", input=text).stdout == wanted
+    assert run(known, "-f", "-", "--format", "csv", input=text).stdout == wanted
+
+
+def test_answers_for_people(known):
+    query = "select track_id, x_m / 3 as third, null as nothing, '\x1b[31mred' as word from tracks where topic = '/camera/samples' order by row limit 3"
+    outcome = run(known, query)
+    lines = outcome.stdout.splitlines()
+    assert lines[0].split() == ["track_id", "third", "nothing", "word"]
+    assert lines[2].split() == ["7", "0", "null", "\N{REPLACEMENT CHARACTER}[31mred"]
+    assert lines[4].split()[1] == "0.133333"
+    shown = run(known, query, "--rows", "1")
+    assert len(shown.stdout.splitlines()) == 3
+    assert "the first 1 of 3 rows" in shown.stderr
+    assert "no rows" in run(known, "select 1 where false").stderr
+
+
+def test_the_tables_are_listed_with_columns_units_and_meanings(known):
+    words = run("--tables").stdout
+    listed = json.loads(run(known, "--tables", "--json").stdout)
+    assert [table["table"] for table in listed["results"]] == list(tables.TABLES)
+    assert listed["recordings"] == ["known"]
+    assert "/camera/predictions" in listed["channels"]
+    for table in tables.TABLES.values():
+        for field in table.arrow:
+            assert field.name in words
+    (tracks,) = (table for table in listed["results"] if table["table"] == "tracks")
+    column = next(column for column in tracks["columns"] if column["name"] == "x_m")
+    assert "timestamp[ns, tz=UTC]" in words
+    assert (column["unit"], column["meaning"]) == ("m", "position on the ground plane, first axis")
