@@ -242,13 +242,14 @@ def _recording(opened: log.Log) -> dict[str, Any]:
 
 def _channel(opened: log.Log, channel: log.Channel) -> dict[str, Any]:
     made = Provenance.from_metadata(channel.metadata)
-    names = ("transform", "input", "reference", "version", "weights_sha256", "digest", "input_digest")
+    names = ("transform", "input", "version", "weights_sha256", "digest", "input_digest")
     return {
         "topic": channel.topic,
         "schema": channel.schema_name,
         "encoding": channel.message_encoding,
         "messages": channel.messages,
         **{key: (getattr(made, key) or None) if made else None for key in names},
+        "references": dict(made.references) if made else None,
         "parameters": dict(made.parameters) if made else None,
         "stale": pipeline.is_stale(opened, channel.topic),
     }

@@ -63,8 +63,8 @@ def _made(channel: dict[str, Any]) -> tuple[object, ...]:
         how = [tag("b", channel["transform"]), f", mcaptrack {channel['version'] or '?'}"]
         if channel["input"]:
             how += [", from ", name(channel["input"])]
-        if channel["reference"]:
-            how += [", compared with ", name(channel["reference"])]
+        for topic in channel["references"] or ():
+            how += [", compared with ", name(topic)]
     if channel["stale"]:
         how.append(tag("span", " out of date", class_="stale"))
     said = {key: value for key, value in (channel["parameters"] or {}).items() if key != "ground_planes"}
