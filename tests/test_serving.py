@@ -5,6 +5,7 @@ from __future__ import annotations
 import http.client
 import io
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -173,7 +174,9 @@ def test_the_command_prints_links_that_lead_to_the_log_and_its_layout_until_it_i
         writer.add_attachment("mcaptrack.layout.json", "application/json", b'{"layout": 1}')
         writer.add_attachment("mcaptrack.comparing.layout.json", "application/json", b'{"layout": 2}')
     command = [sys.executable, "-m", "mcaptrack", "view", path, "--json", "--lichtblick", "http://localhost:8080/"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    usual = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
+    with subprocess.Popen(command, **pipes, env=usual) as process:
         lines = []
         while not (lines and lines[-1] == "}\n"):
             lines.append(process.stdout.readline())

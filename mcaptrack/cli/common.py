@@ -153,8 +153,8 @@ def printed_to(output: Path | None, force: bool) -> Iterator[None]:
 
 
 def print_json(data: dict[str, Any]) -> None:
-    """One object on stdout, with the version of its shape."""
-    print(json.dumps({"schema_version": SCHEMA_VERSION} | data, indent=2, allow_nan=False))
+    """One object on stdout, with the version of its shape; there at once, also for a program that goes on."""
+    print(json.dumps({"schema_version": SCHEMA_VERSION} | data, indent=2, allow_nan=False), flush=True)
 
 
 def expand(paths: Sequence[Path]) -> list[Path]:
