@@ -461,6 +461,25 @@ def test_an_interruption_at_any_moment_leaves_the_old_log_or_the_new_one(fresh, 
         assert not list(fresh.parent.glob(".*.part"))
 
 
+@pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM], ids=["Ctrl-C", "kill"])
+def test_an_interruption_is_not_lost_where_python_raises_nothing(sent):
+    """The signal comes while the collector calls back, whose exceptions Python ignores."""
+    code = (
+        "import os, sys, time, types, weakref\n"
+        "def app():\n"
+        "    class Thing: pass\n"
+        "    thing = Thing()\n"
+        f"    kept = weakref.ref(thing, lambda _: (os.kill(os.getpid(), {int(sent)}), time.sleep(0.01)))\n"
+        "    del thing\n"
+        "    time.sleep(20)\n"
+        "sys.modules['mcaptrack.cli'] = types.SimpleNamespace(app=app)\n"
+        "from mcaptrack.__main__ import main; main()\n"
+    )
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=15)
+    assert ended.returncode == 128 + sent
+    assert ended.stderr == ""
+
+
 def test_the_demonstration(tmp_path, monkeypatch):
     """Everything on a scene that it draws itself; a short one here."""
     code = (
