@@ -1,6 +1,8 @@
 """Find people in a video or a log, track them, repair the tracks, predict where they go, and write it all back."""
 
 __version__ = "0.1.0"
+#: Version of the shape of everything that is printed, or put into a page, as JSON.
+SCHEMA_VERSION = 1
 
 #: What the package gives beyond its parts, and where it stands.
 _LAZY = {"open": "mcaptrack.api", "Recording": "mcaptrack.api", "McaptrackError": "mcaptrack.errors"}

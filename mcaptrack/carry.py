@@ -36,7 +36,7 @@ def carry(tracks: Sequence[Frame], retracks: Sequence[Frame], planes: Planes) ->
     base, base_at = resample(retracks, frame_ns, round(1.5 * period))
     base["observed"], base["source_id"] = False, -1
 
-    seen = np.concatenate([TRACKS.empty(), *(frame.rows for frame in tracks)])
+    seen = TRACKS.joined([frame.rows for frame in tracks])
     at = np.repeat(np.arange(len(tracks)), [len(frame.rows) for frame in tracks])
     who, far = _owner(seen["track_id"], frame_ns[at], retracks, tick_ns)
     kept = (who >= 0) & (far <= 1.5 * period)
@@ -73,7 +73,7 @@ def _owner(track: Ints, t_ns: Ints, retracks: Sequence[Frame], tick_ns: Ints) ->
     """Whom rows of ``track`` (N,) at ``t_ns`` belong to by the tick that is nearest of those which say it, and how far
     that is in ns; -1 where none says it.
     """
-    rows = np.concatenate([TRACKS.empty(), *(frame.rows for frame in retracks)])
+    rows = TRACKS.joined([frame.rows for frame in retracks])
     row_ns = np.repeat(tick_ns, [len(frame.rows) for frame in retracks])
     said = rows["source_id"] >= 0
     source, owner, row_ns = rows["source_id"][said], rows["track_id"][said], row_ns[said]

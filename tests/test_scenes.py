@@ -12,7 +12,7 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from mcaptrack import foxglove, log
 from mcaptrack.plane import GroundPlane
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame
-from mcaptrack.views import ground, layouts, scene
+from mcaptrack.views import Drawing, ground, layouts
 from mcaptrack.views.layouts import There, make
 from tests.test_cli import done, finished, footage  # noqa: F401
 from tests.test_views import FORECAST, PICTURES, PLANE
@@ -25,7 +25,7 @@ WALK = [Frame(int(t), n, tracks_at({2: (0.1 * n, 1.0), 30: (5.0, 0.2 * n)})) for
 def scenes(topic, schema, frames, times=PICTURES, planes=PLANE) -> list[SceneUpdate]:
     out = []
     for (t_ns, index, payload), wanted in zip(
-        scene(topic, schema, frames, times, planes, "c/ground"), times, strict=True
+        Drawing(topic, schema, frames, planes).on_ground(times, "c/ground"), times, strict=True
     ):
         message = SceneUpdate.FromString(payload)
         assert t_ns == wanted == times[index]

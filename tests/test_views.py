@@ -15,7 +15,7 @@ from mcap_protobuf.schema import build_file_descriptor_set
 from mcaptrack import foxglove
 from mcaptrack.plane import GroundPlane
 from mcaptrack.schema import DETECTIONS, PREDICTIONS, TRACKS, Frame
-from mcaptrack.views import view
+from mcaptrack.views import Drawing
 from mcaptrack.views.people import around, ellipses
 from tests.worlds import boxes_at, ns, tracks_at
 
@@ -38,6 +38,11 @@ def track_rows(people, observed=True):
         observed=np.full(len(xy), observed),
         source_id=np.full(len(xy), -1),
     )
+
+
+def view(topic, schema, frames, picture_ns, planes, stamp_ns=None, made_by=""):
+    drawing = Drawing(topic, schema, frames, planes, made_by)
+    return drawing.on_pictures(picture_ns, picture_ns if stamp_ns is None else stamp_ns)
 
 
 def messages(topic, schema, frames, planes=PLANE, **options) -> list[ImageAnnotations]:

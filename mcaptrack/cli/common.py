@@ -11,10 +11,11 @@ from contextlib import contextmanager, redirect_stdout
 from functools import wraps
 from pathlib import Path
 from time import monotonic
-from typing import Annotated, Any, Final, ParamSpec
+from typing import Annotated, Any, ParamSpec
 
 import typer
 
+from mcaptrack import SCHEMA_VERSION
 from mcaptrack.atomic import publish_bytes, refuse_overwrite
 from mcaptrack.cli.config import read_config
 from mcaptrack.errors import McaptrackError
@@ -22,7 +23,6 @@ from mcaptrack.errors import McaptrackError
 P = ParamSpec("P")
 
 DONE, REFUSED, LOST, GATE_MISSED = 0, 1, 3, 4
-SCHEMA_VERSION: Final = 1
 
 
 def option(*names: str, shared: bool = False, **given: Any) -> Any:

@@ -35,10 +35,8 @@ from mcaptrack.schema import PREDICTIONS, TRACKS, Frame
 
 Ints = NDArray[np.int64]
 
-SCHEMA_VERSION: Final = 1
 COMBINED: Final = "COMBINED"
 DEFAULT_GATES_M: Final = (0.5, 1.0, 2.0)
-_MODES: Final = {"online": "online", "": "offline"}
 #: The channels of a camera that are scored, and those of the forecasts made from them.
 SCORED: Final = ("tracks", "samples", "retracks/online", "retracks")
 FORECASTS: Final = tuple(MADE_FROM)

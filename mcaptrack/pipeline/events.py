@@ -151,7 +151,7 @@ def tally(happened: Mapping[str, Made]) -> dict[str, dict[str, int]]:
     out = {}
     for topic, channel in happened.items():
         if channel.schema is EVENTS and channel.record is None:
-            kinds = np.concatenate([EVENTS.empty(), *(frame.rows for frame in channel.frames)])["kind"]
+            kinds = EVENTS.joined([frame.rows for frame in channel.frames])["kind"]
             counts = np.bincount(kinds, minlength=max(EVENT_KINDS) + 1).tolist()
             out[topic.removesuffix(_EVENTS)] = {words: counts[kind] for kind, words in EVENT_KINDS.items()}
     return out

@@ -223,7 +223,7 @@ def _places(opened: log.Log, prefix: str, shown: Mapping[str, Shown]) -> NDArray
     """Where people are (N, 2) m, by the first channel of tracks that knows."""
     for name in ("retracks", "tracks", "truth", "samples"):
         frames = _frames(opened, shown, f"{prefix}/{name}", TRACKS)
-        rows = np.concatenate([TRACKS.empty(), *(frame.rows for frame in frames)])
+        rows = TRACKS.joined([frame.rows for frame in frames])
         places = np.stack([rows["x_m"], rows["y_m"]], axis=-1)
         if np.isfinite(places).all(axis=1).any():
             return places

@@ -17,8 +17,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from mcaptrack import __version__, foxglove
-from mcaptrack.evaluation import SCHEMA_VERSION, Result
+from mcaptrack import SCHEMA_VERSION, __version__, foxglove
+from mcaptrack.evaluation import Result
 from mcaptrack.foxglove.colours import COUNT as COLOURS
 from mcaptrack.metrics import summary
 from mcaptrack.report import lineage, sections, sights

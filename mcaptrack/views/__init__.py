@@ -18,7 +18,7 @@ from mcaptrack.views.image import View
 from mcaptrack.views.looks import look_of
 from mcaptrack.views.people import People, people_at
 
-__all__ = ["DRAWN", "SCENE_SUFFIX", "SUFFIX", "SUFFIXES", "Drawing", "View", "ground", "scene", "view"]
+__all__ = ["DRAWN", "SCENE_SUFFIX", "SUFFIX", "SUFFIXES", "Drawing", "View", "ground"]
 
 Ints = NDArray[np.int64]
 
@@ -39,7 +39,11 @@ class Drawing:
         self._known: tuple[Ints, People] | None = None
 
     def on_pictures(self, picture_ns: Ints, stamp_ns: Ints) -> View:
-        """Annotation messages, one for each picture."""
+        """Annotation messages (time, frame, payload), one for each picture.
+
+        ``picture_ns`` are the times of the pictures, rising; ``stamp_ns`` what stands in them, by which viewers match
+        what is drawn.
+        """
         pictures = image.Pictures(picture_ns, stamp_ns)
         if self._schema is DETECTIONS:
             yield from image.detections(self._frames, pictures, self._planes)
@@ -50,7 +54,10 @@ class Drawing:
             yield from image.predictions(self._frames, pictures, self._planes)
 
     def on_ground(self, t_ns: Ints, frame_id: str) -> View:
-        """Scene messages, one for each time."""
+        """Scene messages (time, frame, payload) in metres, one for each of the rising times ``t_ns``.
+
+        ``frame_id`` is the coordinate frame that they lie in.
+        """
         if self._schema is TRACKS:
             yield from ground.tracks(self._people(t_ns), t_ns, frame_id, self._look)
         elif self._schema is PREDICTIONS:
@@ -61,38 +68,3 @@ class Drawing:
         if self._known is None or not np.array_equal(self._known[0], t_ns):
             self._known = t_ns, people_at(self._frames, t_ns, self._planes)
         return self._known[1]
-
-
-def view(
-    topic: str,
-    schema: Schema,
-    frames: Sequence[Frame],
-    picture_ns: Ints,
-    planes: Planes,
-    stamp_ns: Ints | None = None,
-    made_by: str = "",
-) -> View:
-    """The annotation messages (time, frame, payload) of a channel, one for each picture.
-
-    ``picture_ns`` are the times of the pictures, rising; ``stamp_ns`` what stands in them, by which viewers match what
-    is drawn, if that is another time. Predictions need ``planes`` to come back to pixels. ``made_by`` is the stage that
-    made the channel.
-    """
-    stamps = picture_ns if stamp_ns is None else stamp_ns
-    return Drawing(topic, schema, frames, planes, made_by).on_pictures(picture_ns, stamps)
-
-
-def scene(
-    topic: str,
-    schema: Schema,
-    frames: Sequence[Frame],
-    t_ns: Ints,
-    planes: Planes,
-    frame_id: str,
-    made_by: str = "",
-) -> View:
-    """The scene messages (time, frame, payload) of a channel in metres, one for each of the rising times ``t_ns``.
-
-    ``frame_id`` is the coordinate frame that they lie in; the rest as in ``view``.
-    """
-    return Drawing(topic, schema, frames, planes, made_by).on_ground(t_ns, frame_id)

@@ -82,7 +82,7 @@ def whole_tracks(
     ``sample_rows`` are the input rows of each of ``steps``. A sample that two tracks claim goes to the one that claimed
     it first as it happened; with ``backfill`` "all" both keep it, as in the authors' program.
     """
-    samples = np.concatenate([TRACKS.empty(), *sample_rows])
+    samples = TRACKS.joined(sample_rows)
     step, track, source, key = claims.on(samples, steps, [len(rows) for rows in sample_rows])
     if options.backfill != "all":
         kept = _first_of(key, np.zeros_like(key))
