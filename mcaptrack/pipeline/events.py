@@ -10,7 +10,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from typing import Any, Final, NamedTuple
 
@@ -22,8 +22,8 @@ from mcaptrack.evaluation.events import EventOptions, find_events
 from mcaptrack.evaluation.forecasts import MADE_FROM, find_forecast_errors
 from mcaptrack.evaluation.words import SUFFIX, log_messages
 from mcaptrack.pipeline.plan import is_stale
-from mcaptrack.pipeline.write import Made
-from mcaptrack.provenance import Provenance, digest
+from mcaptrack.pipeline.write import Made, digest_of
+from mcaptrack.provenance import Provenance
 from mcaptrack.schema import (
     COUNTS,
     EVENT_KINDS,
@@ -99,11 +99,11 @@ def make_events(
             say(words)
         parameters = found.parameters(options)
         provenance = Provenance(STAGE, parameters, topic, tracks_digest, references=truth().digests)
-        out[topic + _EVENTS] = events = _made(EVENTS, found.events, provenance)
+        out[topic + _EVENTS] = events = Made.of(EVENTS, found.events, provenance)
         words_of = list(log_messages(found.events, topic, opened.start_ns, found.usual_s))
         view = Provenance("view", {}, topic + _EVENTS, events.provenance.digest)
         out[topic + _EVENTS + SUFFIX] = Made(EVENTS, [], view, words_of, foxglove.schema_record(foxglove.LOG))
-        out[topic + _COUNTS] = _made(COUNTS, found.counts, provenance)
+        out[topic + _COUNTS] = Made.of(COUNTS, found.counts, provenance)
     if not watch.topics:
         for name in MADE_FROM:
             out |= _forecast_errors(opened, prefix, name, made, watch.again, truth, say)
@@ -141,8 +141,8 @@ def _forecast_errors(
     references = truth().digests | {tracks: of_tracks, later: of_later}
     provenance = Provenance(STAGE, {}, topic, digest_of_forecasts, references=references)
     return {
-        topics[0]: _made(FORECAST_ERRORS, found.errors, provenance),
-        topics[1]: _made(FORECAST_SCORES, found.scores, provenance),
+        topics[0]: Made.of(FORECAST_ERRORS, found.errors, provenance),
+        topics[1]: Made.of(FORECAST_SCORES, found.scores, provenance),
     }
 
 
@@ -180,15 +180,10 @@ def _read_truth(opened: log.Log, topic: str, say: Say) -> _Truth:
     if not _holds(opened, topic):
         return _Truth(None, {})
     try:
-        return _Truth(opened.frames(topic, TRACKS), {topic: _digest(opened, topic)})
+        return _Truth(opened.frames(topic, TRACKS), {topic: digest_of(opened, topic)})
     except McaptrackError as error:
         say(f"no misses, false tracks and switches: {error}")
         return _Truth(None, {})
-
-
-def _made(schema: Schema, frames: list[Frame], provenance: Provenance) -> Made:
-    messages = [(frame.t_ns, frame.index, schema.codec.encode(frame.rows)) for frame in frames]
-    return Made(schema, frames, replace(provenance, digest=digest(messages)), messages)
 
 
 def _watched(opened: log.Log, prefix: str, made: Mapping[str, Made]) -> list[str]:
@@ -249,11 +244,4 @@ def _rows(
     """The frames of a channel, and their digest."""
     if topic in made:
         return made[topic].frames, made[topic].provenance.digest
-    return opened.frames(topic, schema), _digest(opened, topic)
-
-
-def _digest(opened: log.Log, topic: str) -> str:
-    known = Provenance.from_metadata(opened.channel(topic).metadata)
-    if known and known.digest:
-        return known.digest
-    return digest((message.t_ns, message.sequence, message.payload) for message in opened.messages(topic))
+    return opened.frames(topic, schema), digest_of(opened, topic)

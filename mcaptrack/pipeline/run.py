@@ -17,10 +17,10 @@ from mcaptrack.clock import NS_PER_S
 from mcaptrack.pipeline.events import STAGE as EVENTS_STAGE
 from mcaptrack.pipeline.events import Watch, make_events, tally
 from mcaptrack.pipeline.plan import FULL, ROUTES, Job, check_inputs, picture_topic
-from mcaptrack.pipeline.write import Made, write
+from mcaptrack.pipeline.write import Made, digest_of, write
 from mcaptrack.plane import GroundPlane, Planes, assumed_plane
 from mcaptrack.predictors import weights_sha256
-from mcaptrack.provenance import CLOCK, Provenance, digest
+from mcaptrack.provenance import CLOCK, Provenance
 from mcaptrack.schema import DETECTIONS, GROUND_PLANE, SCHEMAS, TRACKS, VIDEO, Frame, Schema
 from mcaptrack.schema.ground import plane_to_rows, rows_to_plane
 from mcaptrack.transforms import TRANSFORMS, Transform, choice
@@ -87,10 +87,9 @@ def run(
         for (topic, schema), channel in zip(job.outputs().items(), outputs, strict=True):
             if topic not in job.kept():
                 continue
-            messages = [(f.t_ns, f.index, schema.codec.encode(schema.check(f.rows))) for f in channel]
             parameters = json.loads(json.dumps(choice(job.stage, transform) | asdict(transform)))
-            provenance = Provenance(job.stage, parameters, job.source, input_digest(), digest(messages), weights)
-            made[topic] = Made(schema, channel, provenance, messages)
+            provenance = Provenance(job.stage, parameters, job.source, input_digest(), weights_sha256=weights)
+            made[topic] = Made.of(schema, channel, provenance)
             report.frames[topic] = len(channel)
         if job.target + FULL in job.kept():
             made |= _carried(opened, job, made, planes or ())
@@ -129,8 +128,7 @@ def _carried(opened: log.Log, job: Job, made: Mapping[str, Made], planes: Planes
         return {}
     retracked = made[job.target]
     frames = carry(tracks, retracked.frames, planes)
-    messages = [(f.t_ns, f.index, TRACKS.codec.encode(TRACKS.check(f.rows))) for f in frames]
-    return {job.target + FULL: Made(TRACKS, frames, replace(retracked.provenance, digest=digest(messages)), messages)}
+    return {job.target + FULL: Made.of(TRACKS, frames, retracked.provenance)}
 
 
 def _in_context(opened: log.Log, prefix: str, job: Job, made: Mapping[str, Made], planes: Planes) -> Transform:
@@ -167,10 +165,7 @@ def _input(
     channel = opened.channel(job.source)
     if job.transform.reads is VIDEO:
         return _pictures(opened, channel, stamps.setdefault(channel.topic, []), job.stage, progress)
-    known = Provenance.from_metadata(channel.metadata)
-    said = known.digest if known else ""
-    if not said:
-        said = digest((m.t_ns, m.sequence, m.payload) for m in opened.messages(job.source))
+    said = digest_of(opened, job.source)
     frames = _frames(opened, job.source, job.transform.reads)
     return (lambda: said), _counted(frames, job.stage, progress)
 
@@ -254,7 +249,6 @@ def _assume_plane(opened: log.Log, prefix: str, made: dict[str, Made], source: s
         "give one with `mcaptrack ingest --ground-plane`"
     )
     start = frames[0].t_ns
-    messages = [(start, 0, GROUND_PLANE.codec.encode(plane_to_rows(plane)))]
-    provenance = Provenance(_ASSUME, {}, source, known.digest, digest(messages))
-    made[f"{prefix}/ground_plane"] = Made(GROUND_PLANE, [Frame(start, 0, plane_to_rows(plane))], provenance, messages)
+    provenance = Provenance(_ASSUME, {}, source, known.digest)
+    made[f"{prefix}/ground_plane"] = Made.of(GROUND_PLANE, [Frame(start, 0, plane_to_rows(plane))], provenance)
     return [(start, plane)]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -16,7 +17,7 @@ from mcaptrack.foxglove.layouts import Eye
 from mcaptrack.pipeline.plan import FULL
 from mcaptrack.pipeline.plan import picture_topic as find_pictures
 from mcaptrack.plane import Planes
-from mcaptrack.provenance import Provenance
+from mcaptrack.provenance import Provenance, digest
 from mcaptrack.schema import DETECTIONS, FORECAST_SCORES, GROUND_PLANE, PREDICTIONS, SCHEMAS, TRACKS, Frame, Schema
 from mcaptrack.views import layouts
 
@@ -33,6 +34,20 @@ class Made(NamedTuple):
     provenance: Provenance
     messages: list[tuple[int, int, bytes]]
     record: tuple[str, str, bytes] | None = None
+
+    @classmethod
+    def of(cls, schema: Schema, frames: list[Frame], provenance: Provenance) -> Made:
+        """Frames through the gate and as messages, whose digest goes into the provenance."""
+        messages = [(frame.t_ns, frame.index, schema.codec.encode(schema.check(frame.rows))) for frame in frames]
+        return cls(schema, frames, replace(provenance, digest=digest(messages)), messages)
+
+
+def digest_of(opened: log.Log, topic: str) -> str:
+    """The digest of a channel's messages: as its provenance says, or added up."""
+    known = Provenance.from_metadata(opened.channel(topic).metadata)
+    if known and known.digest:
+        return known.digest
+    return digest((message.t_ns, message.sequence, message.payload) for message in opened.messages(topic))
 
 
 def _stamps(opened: log.Log, topic: str, known: Sequence[int]) -> Ints:
