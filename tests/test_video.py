@@ -6,12 +6,14 @@ import struct
 import subprocess
 import sys
 from fractions import Fraction
+from pathlib import Path
 
 import av
 import cv2
 import numpy as np
 import pytest
 
+import mcaptrack
 from mcaptrack.errors import McaptrackError
 from mcaptrack.video import Encoded, H264Encoder, Keep, brightness, encode_image, open_video, write_mp4
 from mcaptrack.video.h264 import inspect
@@ -200,6 +202,43 @@ def test_what_is_no_video_is_refused(tmp_path, make, words):
     make(path)
     with pytest.raises(McaptrackError, match=words):
         open_video(path)
+
+
+@pytest.mark.parametrize("name", ["2026-05-01T12:30:00.mp4", "http:a.mp4", "pipe:0.mp4"])
+def test_a_name_with_a_colon_is_a_file_and_no_protocol(tmp_path, monkeypatch, name):
+    write_clip(tmp_path / "a.mp4", frames=3)
+    (tmp_path / "a.mp4").rename(tmp_path / name)
+    monkeypatch.chdir(tmp_path)
+    assert len(pictures(Path(name))) == 3
+    assert write_mp4(Path("12:30.mp4"), iter([np.zeros((16, 16, 3), np.uint8)] * 2), 10) == 2
+    assert len(pictures(Path("12:30.mp4"))) == 2
+
+
+def test_metadata_that_is_not_utf8_does_not_keep_a_video_from_being_read(tmp_path):
+    path = tmp_path / "a.mp4"
+    write_clip(path, options=NO_B)
+    wanted = [picture.data for picture in pictures(path)]
+    raw = path.read_bytes()
+    encoder = b"Lavf"
+    assert encoder in raw
+    path.write_bytes(raw.replace(encoder, b"L\xe4vf"))
+    assert [picture.data for picture in pictures(path)] == wanted
+
+
+def test_pictures_that_are_too_large_for_h264_are_refused_with_their_size(tmp_path):
+    (tmp_path / "frames").mkdir()
+    cv2.imwrite(str(tmp_path / "frames" / "1.png"), np.zeros((16, 17000, 3), np.uint8))
+    with pytest.raises(McaptrackError, match=r"pictures of 17000 x 16 can't be encoded as H\.264"):
+        pictures(tmp_path / "frames", fps=Fraction(10))
+    assert len(pictures(tmp_path / "frames", "png", fps=Fraction(10))) == 1
+    with pytest.raises(McaptrackError, match=r"pictures of 17000 x 16 can't be encoded as H\.264"):
+        write_mp4(tmp_path / "a.mp4", iter([np.zeros((16, 17000, 3), np.uint8)]), 10)
+
+
+def test_files_are_opened_with_pyav_in_one_place():
+    root = Path(mcaptrack.__file__).parent
+    opening = {path.relative_to(root).as_posix() for path in root.rglob("*.py") if "av.open(" in path.read_text()}
+    assert opening == {"video/container.py"}
 
 
 def test_a_video_without_frames_is_refused(tmp_path):

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from mcaptrack.atomic import publish
 from mcaptrack.clock import NS_PER_S
 from mcaptrack.errors import McaptrackError
+from mcaptrack.video.container import writing
 
 ImageFormat = Literal["auto", "h264", "h265", "jpeg", "png"]
 StillFormat = Literal["jpeg", "png"]
@@ -152,10 +153,21 @@ class H264Encoder:
             frame.pict_type = PictureType.NONE
         frame.pts, frame.time_base = self._index, self._codec.time_base
         self._index += 1
-        packets = self._codec.encode(frame)
+        try:
+            packets = self._codec.encode(frame)
+        except av.error.FFmpegError as error:
+            raise _refused(frame, error) from error
         if t_ns is not None and any(packet.is_keyframe for packet in packets):
             self._key_ns = t_ns
         return b"".join(bytes(packet) for packet in packets)
+
+
+def _refused(frame: Any, error: Exception) -> McaptrackError:
+    """What to say of a picture that the encoder doesn't take; libx264 wants at most 16384 rows and columns."""
+    why = getattr(error, "strerror", None) or error
+    return McaptrackError(
+        f"pictures of {frame.width} x {frame.height} can't be encoded as H.264 ({why}); jpeg and png can be larger"
+    )
 
 
 def encode_image(image: Image, image_format: StillFormat, quality: int = _JPEG_QUALITY) -> bytes:
@@ -184,12 +196,16 @@ def write_clip(path: Path, images: Iterable[tuple[int, Image]], fps: Fraction) -
 
     is_gif = path.suffix.lower() == ".gif"
     count, start = 0, 0
-    with publish(path) as part, av.open(str(part), "w", format="gif" if is_gif else "mp4") as container:
+    with publish(path) as part, writing(part, "gif" if is_gif else "mp4") as container:
         stream: Any = None
         palette = _Palette() if is_gif else None
 
         def put(frame: Any) -> None:
-            for packet in stream.encode(frame):
+            try:
+                packets = stream.encode(frame)
+            except av.error.FFmpegError as error:
+                raise (_refused(frame, error) if frame else error) from error
+            for packet in packets:
                 container.mux(packet)
 
         for t_ns, image in images:

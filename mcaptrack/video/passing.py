@@ -7,20 +7,17 @@ What viewers ask: one picture a message, none shown in another order than they s
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from mcaptrack.errors import McaptrackError
 from mcaptrack.video import av1, h264
+from mcaptrack.video.container import fraction, has_slots, reading, videos
 from mcaptrack.video.encode import Keep
 from mcaptrack.video.streams import CODECS
 
 _PIXELS: Final = ("yuv420p", "yuvj420p")
-_COVER: Final = 0x400  # AV_DISPOSITION_ATTACHED_PIC
-_NO_TIMESTAMPS: Final = 0x80  # AVFMT_NOTIMESTAMPS
 _WORDS: Final = {"h264": "H.264", "h265": "H.265", "vp9": "VP9", "av1": "AV1"}
 _ONLY_SOME: Final = "it is H.265, which viewers play only where the hardware does (--image-format h265 keeps it)"
 
@@ -47,55 +44,6 @@ class Stream:
     format: str
     why_not: str
     sets: tuple[bytes, ...] = ()
-
-
-@contextmanager
-def container(path: Path) -> Iterator[Any]:
-    """An open video file. Raises McaptrackError if it is none, or is damaged beyond reading."""
-    import av
-
-    try:
-        with av.open(str(path), metadata_errors="replace") as opened:
-            yield opened
-    except av.error.EOFError:
-        raise McaptrackError(f"{path} is a video without frames") from None
-    except av.error.FFmpegError as error:
-        raise McaptrackError(
-            f"{path} can't be read as a video ({error.strerror or error}); "
-            "give an mp4, mov, mkv, avi or webm file that is whole"
-        ) from error
-
-
-def videos(opened: Any) -> list[Any]:
-    """The streams of pictures in a container, without cover pictures."""
-    return [stream for stream in opened.streams.video if not _bits(getattr(stream, "disposition", 0)) & _COVER]
-
-
-def _bits(flags: Any) -> int:
-    """Flags of FFmpeg's, which PyAV gives as a number or not, by its version."""
-    return int(getattr(flags, "value", flags))
-
-
-def fraction(ratio: Any) -> Fraction | None:
-    """A ratio of FFmpeg's; None for one that is not known."""
-    return Fraction(ratio.numerator, ratio.denominator) if ratio else None
-
-
-def has_slots(opened: Any) -> bool:
-    """Whether a container has no times but slots for pictures, in the order of decoding; some may be empty."""
-    return "avi" in opened.format.name.split(",")
-
-
-def has_times(opened: Any) -> bool:
-    """Whether pictures have times at all; what FFmpeg gives for raw streams it makes up."""
-    return not _bits(opened.format.flags) & _NO_TIMESTAMPS
-
-
-def indexed(opened: Any) -> int:
-    """How many pictures the parts of a fragmented MP4 list that were read so far; 0 if it is none."""
-    stream = videos(opened)[0]
-    is_mp4 = "mp4" in opened.format.name.split(",")
-    return len(stream.index_entries) if is_mp4 and hasattr(stream, "index_entries") else 0
 
 
 def packets(opened: Any, image_format: str) -> Iterator[Passed]:
@@ -135,7 +83,7 @@ def _has_new_sets(packet: Any) -> bool:
 
 def look(path: Path, keep: Keep) -> Stream:
     """Whether and how the first video stream of a file can be passed on, from one pass over its packets."""
-    with container(path) as opened:
+    with reading(path) as opened:
         stream = videos(opened)[0]
         context = stream.codec_context
         name = context.codec.canonical_name

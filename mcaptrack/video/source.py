@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 
 from mcaptrack.clock import NS_PER_S
 from mcaptrack.errors import McaptrackError
+from mcaptrack.video.container import fraction, has_slots, has_times, indexed, reading, videos
 from mcaptrack.video.encode import H264Encoder, Keep, StillFormat, encode_image
-from mcaptrack.video.passing import container, fraction, has_slots, has_times, indexed, look, packets, videos
+from mcaptrack.video.passing import look, packets
 from mcaptrack.video.streams import CODECS
 
 Image = NDArray[np.uint8]
@@ -125,7 +126,7 @@ def open_video(path: Path, keep: Keep = Keep()) -> Video:  # noqa: B008  # froze
     """Look at a video file or image folder. Raises McaptrackError unless it holds pictures that can be decoded."""
     if path.is_dir():
         return _open_folder(path, keep)
-    with container(path) as opened:
+    with reading(path) as opened:
         there = videos(opened)
         if not there:
             kinds = ", ".join(sorted({stream.type for stream in opened.streams if stream.type != "video"}))
@@ -235,7 +236,7 @@ def _creation_ns(text: str | None) -> int | None:
 def _pass_on(video: Video, clock: _Clock) -> Iterator[EncodedPicture]:
     codec = CODECS[video.format]
     index, seconds = 0, None
-    with container(video.path) as opened:
+    with reading(video.path) as opened:
         for packet in packets(opened, video.format):
             if packet.is_damaged:  # the last one
                 video.lost.append(f"{video.path} is cut off or damaged after {index} frames; the rest is left out")
@@ -303,7 +304,7 @@ def _decoded(video: Video) -> Iterator[Shown]:
 
     read, damaged, hidden, cut_off, seconds = 0, 0, 0, 0, None
     slots: list[int] = []
-    with container(video.path) as opened:
+    with reading(video.path) as opened:
         stream = videos(opened)[0]
         stream.thread_type = "AUTO"
         stream.codec_context.thread_count = _THREADS

@@ -1,0 +1,85 @@
+"""Video files as PyAV opens them, and what its versions give differently. Only this module calls ``av.open``."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from fractions import Fraction
+from pathlib import Path
+from typing import Any, Final
+
+from mcaptrack.errors import McaptrackError
+
+_COVER: Final = 0x400  # AV_DISPOSITION_ATTACHED_PIC
+_NO_TIMESTAMPS: Final = 0x80  # AVFMT_NOTIMESTAMPS
+_LAST_WITH_METADATA_ERRORS: Final = 18
+
+
+@contextmanager
+def reading(path: Path) -> Iterator[Any]:
+    """An open video file. Raises McaptrackError if it is none, or is damaged beyond reading.
+
+    Metadata that is not UTF-8 comes with surrogates in every version of PyAV.
+    """
+    import av
+
+    major = int(av.__version__.partition(".")[0])
+    options: dict[str, Any] = {}
+    if major <= _LAST_WITH_METADATA_ERRORS:
+        options["metadata_errors"] = "surrogateescape"
+    try:
+        with av.open(_url(path), **options) as opened:
+            yield opened
+    except av.error.EOFError:
+        raise McaptrackError(f"{path} is a video without frames") from None
+    except av.error.FFmpegError as error:
+        raise McaptrackError(
+            f"{path} can't be read as a video ({error.strerror or error}); "
+            "give an mp4, mov, mkv, avi or webm file that is whole"
+        ) from error
+
+
+@contextmanager
+def writing(path: Path, name: str) -> Iterator[Any]:
+    """A new video file of the format that FFmpeg calls ``name``."""
+    import av
+
+    with av.open(_url(path), "w", format=name) as opened:
+        yield opened
+
+
+def _url(path: Path) -> str:
+    """A path as FFmpeg takes it: without the prefix it reads ``12:30.mp4`` as a file of the protocol ``12``."""
+    return f"file:{path}"
+
+
+def videos(opened: Any) -> list[Any]:
+    """The streams of pictures in a container, without cover pictures."""
+    return [stream for stream in opened.streams.video if not _bits(getattr(stream, "disposition", 0)) & _COVER]
+
+
+def _bits(flags: Any) -> int:
+    """Flags of FFmpeg's, which PyAV gives as a number or not, by its version."""
+    return int(getattr(flags, "value", flags))
+
+
+def fraction(ratio: Any) -> Fraction | None:
+    """A ratio of FFmpeg's; None for one that is not known, which PyAV gives as None or as 0/1, by its version."""
+    return Fraction(ratio.numerator, ratio.denominator) if ratio else None
+
+
+def has_slots(opened: Any) -> bool:
+    """Whether a container has no times but slots for pictures, in the order of decoding; some may be empty."""
+    return "avi" in opened.format.name.split(",")
+
+
+def has_times(opened: Any) -> bool:
+    """Whether pictures have times at all; what FFmpeg gives for raw streams it makes up."""
+    return not _bits(opened.format.flags) & _NO_TIMESTAMPS
+
+
+def indexed(opened: Any) -> int:
+    """How many pictures the parts of a fragmented MP4 list that were read so far; 0 if it is none."""
+    stream = videos(opened)[0]
+    is_mp4 = "mp4" in opened.format.name.split(",")
+    return len(stream.index_entries) if is_mp4 and hasattr(stream, "index_entries") else 0
