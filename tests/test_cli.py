@@ -104,7 +104,7 @@ class TestHelp:
         assert done("--version")[0].strip() == f"mcaptrack {__version__}"
 
     def test_parameters_of_transforms_are_options_with_their_defaults(self):
-        out, _ = done("track", "--help")
+        out, _ = done("track", "--help", environment={"COLUMNS": "160"})
         for option, default in (("--max-age-s", "1.4"), ("--min-iou", "0.2"), ("--min-hits-frames", "none")):
             assert option in out
             assert f"[default: ({default})]" in out

@@ -59,10 +59,10 @@ def _option(name: str, annotation: Any, default: Any, words: str, whose: str = "
     ``whose`` names the one of several transforms that it belongs to, if it doesn't belong to all.
     """
     flag = "--" + name.replace("_", "-")
-    names = (flag, f"--no-{flag[2:]}") if bare_type(annotation) is bool else (flag,)
+    names = f"{flag}/--no-{flag[2:]}" if bare_type(annotation) is bool else flag
     shown = "none" if default is None else str(default).lower() if isinstance(default, bool) else f"{default}"
     panel: dict[str, Any] = {"rich_help_panel": f"Options of {whose} alone"} if whose else {}
-    info = common.option(*names, help=words[:1].upper() + words[1:] + ".", show_default=shown, **panel)
+    info = common.option(names, help=words[:1].upper() + words[1:] + ".", show_default=shown, **panel)
     return _parameter(name, Annotated[bare_type(annotation) | None, info], None)
 
 

@@ -1,0 +1,58 @@
+"""The command line within the process of the tests, and a small log to run it on."""
+
+from __future__ import annotations
+
+import io
+from contextlib import redirect_stderr, redirect_stdout
+from pathlib import Path
+from typing import NamedTuple
+
+from typer.main import get_command
+
+from mcaptrack.cli import app
+from tests.worlds import write_clip
+
+GROUP = get_command(app)
+
+
+class Outcome(NamedTuple):
+    """What came of a command."""
+
+    code: int
+    out: str
+    err: str
+
+
+def called(*words: object) -> Outcome:
+    """Run a command here, which is quicker than in a process of its own."""
+    out, err = io.StringIO(), io.StringIO()
+    code: object = 0
+    with redirect_stdout(out), redirect_stderr(err):
+        try:
+            GROUP.main([str(word) for word in words], prog_name="mcaptrack")
+        except SystemExit as ended:
+            code = ended.code or 0
+    assert isinstance(code, int)
+    return Outcome(code, out.getvalue(), err.getvalue())
+
+
+def done(*words: object) -> Outcome:
+    """Run a command that has to succeed."""
+    outcome = called(*words)
+    assert outcome.code == 0, outcome.err
+    return outcome
+
+
+def made_log(folder: Path, frames: int = 30) -> Path:
+    """A log of two people who walk beside each other, found, tracked, predicted and re-tracked."""
+    write_clip(folder / "clip.mp4", frames)
+    rows = [
+        f"{frame + 1},{person + 1},{frame + 20 * person},24,8,8,1,1,1" for frame in range(frames) for person in (0, 1)
+    ]
+    (folder / "truth.txt").write_text("\n".join(rows) + "\n")
+    (folder / "plane.txt").write_text("0.1,0,0\n0,0.1,0\n0,0,1\n")
+    path = folder / "a.mcap"
+    labels = ["--truth", folder / "truth.txt", "--ground-plane", folder / "plane.txt"]
+    done("ingest", folder / "clip.mp4", *labels, "-o", path)
+    done("run", path)
+    return path

@@ -1,0 +1,135 @@
+"""Options do what they say, however they are given: on the command line, in the environment, in a file.
+
+The tests follow from what the code declares, so that an option that is added is tested, too.
+"""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, get_type_hints
+
+import pytest
+
+from mcaptrack import log
+from mcaptrack.predictors import NAMES
+from mcaptrack.provenance import Provenance
+from mcaptrack.transforms import PROFILES, TRACKERS, TRANSFORMS
+from mcaptrack.transforms.protocol import bare_type, choices
+from tests.commands import called, made_log
+
+
+@pytest.fixture(scope="session")
+def finished(tmp_path_factory) -> Path:
+    """A small log with everything in it. Not to be changed."""
+    return made_log(tmp_path_factory.mktemp("finished"))
+
+
+@pytest.fixture
+def folder(finished, tmp_path, monkeypatch) -> Path:
+    """The working folder of a command, with a log of its own."""
+    shutil.copy(finished, tmp_path / "a.mcap")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A command made of a transform, and what chooses that transform: ``chosen`` are options of the command."""
+
+    command: str
+    transform: Any
+    target: str
+    chosen: tuple[tuple[str, str], ...] = ()
+
+    def parameters(self) -> dict[str, Any]:
+        """The parameters that are options, with their defaults."""
+        options = [field.name for field in fields(self.transform) if not field.metadata.get("context")]
+        return {name: getattr(self.transform, name) for name in options}
+
+    def others(self) -> dict[str, Any]:
+        """For each parameter a value that isn't the default."""
+        hints = get_type_hints(type(self.transform))
+        out = {}
+        for field in fields(self.transform):
+            if field.name in (default := self.parameters()):
+                out[field.name] = _other(default[field.name], bare_type(hints[field.name]), field.metadata)
+        return out
+
+    def made(self, path: Path) -> dict[str, Any]:
+        """The parameters that the channel of this stage says it was made with."""
+        with log.read(path) as opened:
+            said = Provenance.from_metadata(opened.channel(self.target).metadata)
+        assert said is not None
+        return {name: value for name, value in said.parameters.items() if name in self.parameters()}
+
+
+def _other(default: Any, kind: Any, declared: Any) -> Any:
+    """A value of a parameter that differs from its default, and is allowed."""
+    if kind is bool:
+        return not default
+    if names := choices(kind):
+        return next(name for name in names if name != default)
+    if kind is str:
+        return next(name for name in NAMES if name != default)
+    least, most = declared["least"], declared["most"]
+    near = [default + 1, default / 2, default - 1] if default else [1, least, most]
+    return next(kind(value) for value in near if least <= value <= most and kind(value) != default)
+
+
+STAGES = [
+    Stage("detect", TRANSFORMS["detect"](), "/camera/detections"),
+    *(Stage("track", kind(), "/camera/tracks", (("tracker", name),)) for name, kind in TRACKERS.items()),
+    Stage("sample", TRANSFORMS["sample"](), "/camera/samples"),
+    Stage("predict", TRANSFORMS["predict"](), "/camera/predictions"),
+    *(Stage("retrack", made, "/camera/retracks", (("profile", name),)) for name, made in PROFILES.items()),
+]
+
+
+def flags(values: dict[str, Any]) -> list[str]:
+    """Values as options of a command line."""
+    out = []
+    for name, value in values.items():
+        flag = name.replace("_", "-")
+        out += [f"--{flag}" if value else f"--no-{flag}"] if isinstance(value, bool) else [f"--{flag}", str(value)]
+    return out
+
+
+def toml(command: str, values: dict[str, Any]) -> str:
+    """Values as a table of a mcaptrack.toml."""
+    lines = [f"{name.replace('_', '-')} = {_toml_value(value)}" for name, value in values.items()]
+    return "\n".join([f"[{command}]", *lines]) + "\n"
+
+
+def _toml_value(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    return f'"{value}"' if isinstance(value, str) else repr(value)
+
+
+@pytest.mark.parametrize("stage", STAGES, ids=lambda stage: "-".join([stage.command, *dict(stage.chosen).values()]))
+@pytest.mark.parametrize("way", ["flag", "environment", "file"])
+def test_every_parameter_of_a_stage_arrives_in_the_provenance(stage, way, folder, monkeypatch):
+    values = stage.others()
+    assert len(values) == len(stage.parameters())
+    words = [stage.command, "a.mcap", "-o", "b.mcap", *flags(dict(stage.chosen))]
+    if way == "flag":
+        words += flags(values)
+    elif way == "environment":
+        for name, value in values.items():
+            monkeypatch.setenv(f"MCAPTRACK_{stage.command}_{name}".upper(), str(value))
+    else:
+        Path("mcaptrack.toml").write_text(toml(stage.command, values))
+    code, _, err = called(*words)
+    assert code == 0, err
+    assert stage.made(folder / "b.mcap") == values
+
+
+@pytest.mark.parametrize("stage", STAGES, ids=lambda stage: "-".join([stage.command, *dict(stage.chosen).values()]))
+def test_the_default_can_be_said_and_changes_nothing(stage, folder):
+    """Also ``--smooth`` where it is on and ``--no-confirm`` where it is off."""
+    values = {name: value for name, value in stage.parameters().items() if value is not None}
+    code, _, err = called(stage.command, "a.mcap", "-o", "b.mcap", *flags(dict(stage.chosen) | values))
+    assert code == 0, err
+    assert stage.made(folder / "b.mcap") == stage.parameters()
