@@ -50,11 +50,16 @@ def _as_data(opened: Log) -> dict[str, Any]:
     from mcaptrack.provenance import Provenance
 
     channels = []
-    for topic, channel in sorted(opened.channels.items()):
+    every = [(channel, part) for part in opened.parts for channel in part.recorded]
+    for channel, part in sorted(every, key=lambda found: (found[0].topic, found[1] is opened, found[0].id)):
         made = Provenance.from_metadata(channel.metadata)
+        replaced = opened.part(channel.topic) is not part
         channels.append(
             {
-                "topic": topic,
+                "topic": channel.topic,
+                "id": channel.id,
+                "part": "log" if part is opened else "results",
+                "replaced": replaced,
                 "schema": channel.schema_name,
                 "encoding": channel.message_encoding,
                 "messages": channel.messages,
@@ -63,7 +68,7 @@ def _as_data(opened: Log) -> dict[str, Any]:
                 "version": made.version if made else None,
                 "references": dict(made.references) if made else None,
                 "parameters": dict(made.parameters) if made else None,
-                "stale": is_stale(opened, topic),
+                "stale": not replaced and is_stale(opened, channel.topic),
             }
         )
     return {
@@ -94,10 +99,12 @@ def _print(opened: Log, verbose: bool) -> None:
     for column in ("topic", "schema", "messages"):
         table.add_column(column, justify="right" if column == "messages" else "left", overflow="fold")
     for channel in data["channels"]:
-        words = (common.printable(channel["topic"]), common.printable(channel["schema"]), f"{channel['messages']:,}")
+        topic = common.printable(channel["topic"]) + ("  (replaced by the results)" if channel["replaced"] else "")
+        words = (topic, common.printable(channel["schema"]), f"{channel['messages']:,}")
         table.add_row(*(escape(word) for word in words))
     console.print(table)
-    console.print(_lineage(data["channels"], verbose))
+    shown = {channel["topic"]: channel for channel in reversed(data["channels"]) if not channel["replaced"]}
+    console.print(_lineage([*reversed(shown.values())], verbose))
 
 
 def _lineage(channels: list[dict[str, Any]], verbose: bool) -> Tree:

@@ -6,7 +6,7 @@ Letters: M messages.
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import islice
 from typing import Final, NamedTuple
 
@@ -72,6 +72,7 @@ class _Source(NamedTuple):
     ``start`` and ``end`` are the part of the file that reading them touches.
     """
 
+    channel: int
     chunk: ChunkIndexRecord | None
     start: int
     end: int
@@ -85,19 +86,22 @@ class _Source(NamedTuple):
 
 
 class Messages:
-    """What is in the chunks of a log. Everything here raises Damaged where the bytes are not what the index says."""
+    """What is in the chunks of a log. Everything here raises Damaged where the bytes are not what the index says.
+
+    Channels are given by their ids, one or several; the messages of several are read as those of one.
+    """
 
     def __init__(self, buffer: memoryview, index: Index) -> None:
         self._buffer, self._index = buffer, index
         self._opened: OrderedDict[int, memoryview] = OrderedDict()  # contents of the last chunks, for other channels
 
-    def times(self, channel_id: int, span: Span = (None, None)) -> Ints:
-        """The times of a channel's messages, rising, (M,)."""
-        return np.sort(np.concatenate([np.empty(0, np.int64), *(s.t_ns for s in self._sources(channel_id, span))]))
+    def times(self, channels: Sequence[int], span: Span = (None, None)) -> Ints:
+        """The times of messages, rising, (M,)."""
+        return np.sort(np.concatenate([np.empty(0, np.int64), *(s.t_ns for s in self._sources(channels, span))]))
 
-    def places(self, channel_id: int) -> Places:
-        """Where the messages of a channel stand, in the order of ``by_time``."""
-        sources = self._sources(channel_id)
+    def places(self, channels: Sequence[int]) -> Places:
+        """Where messages stand, in the order of ``by_time``."""
+        sources = self._sources(channels)
         t_ns = np.concatenate([_NONE, *(source.t_ns for source in sources)])
         offset = np.concatenate([_NONE, *(source.offset for source in sources)])
         starts = np.array([source.chunk.offset if source.chunk else -1 for source in sources], np.int64)
@@ -112,7 +116,7 @@ class Messages:
             chunk = next((chunk for chunk in self._index.chunks if chunk.offset == chunk_offset), None)
             if chunk is None:
                 raise Damaged(f"no chunk begins at byte {chunk_offset}")
-            content = self._open(_Source(chunk, chunk.offset, chunk.offset + chunk.length, _NONE, _NONE))
+            content = self._open(_Source(-1, chunk, chunk.offset, chunk.offset + chunk.length, _NONE, _NONE))
         record = record_at(content, offset)
         if record.opcode != Opcode.MESSAGE:
             raise Damaged(f"no message stands at byte {offset} of the chunk at {chunk_offset}")
@@ -120,12 +124,14 @@ class Messages:
         payload = bytes(content[record.body + MESSAGE_HEAD.size : record.end])
         return channel, Message(t_ns, sequence, publish_ns, payload)
 
-    def by_time(self, channel_id: int, span: Span = (None, None)) -> Iterator[Message]:
-        """Messages by time; those of one time as they stand in the file. ``span`` is from the first to before the last.
+    def by_time(self, channels: Sequence[int], span: Span = (None, None)) -> Iterator[Message]:
+        """Messages by time; those of one time channel by channel, as they stand in the file.
+
+        ``span`` is from the first to before the last.
 
         A chunk is open while its messages are due, unless too many are.
         """
-        sources = self._sources(channel_id, span)
+        sources = self._sources(channels, span)
         if not any(len(source.t_ns) for source in sources):
             return
         t_ns = np.concatenate([source.t_ns for source in sources])
@@ -143,7 +149,7 @@ class Messages:
                 size += source.size
                 while size > OPEN_BYTES and opened:
                     size -= sources[opened.popitem(last=False)[0]].size
-                opened[number] = self._read(source, channel_id, taken[number])
+                opened[number] = self._read(source, taken[number])
             opened.move_to_end(number)
             yield from islice(opened[number], run)
             taken[number] += run
@@ -152,15 +158,15 @@ class Messages:
                 size -= source.size
                 forget(self._buffer, source.start, source.end)
 
-    def columns(self, channel_id: int, schema: Schema) -> Columns | None:
+    def columns(self, channels: Sequence[int], schema: Schema) -> Columns | None:
         """Rows without a loop over messages; None where a message is laid out otherwise than ours."""
-        sources = self._sources(channel_id)
+        sources = self._sources(channels)
         t_ns = np.concatenate([np.empty(0, np.int64), *(source.t_ns for source in sources)])
         sequence, counts = np.empty_like(t_ns), np.empty_like(t_ns)
         rows, done, taken = schema.empty(), 0, 0
         for source in sources:
             content = self._open(source)
-            found = heads_at(content, channel_id, source.t_ns, source.offset)
+            found = heads_at(content, source.channel, source.t_ns, source.offset)
             decoded = schema.codec.decode_at(np.frombuffer(content, np.uint8), found.start, found.end)
             if decoded is None:
                 return None
@@ -180,7 +186,10 @@ class Messages:
         rows.flags.writeable = False
         return Columns(rows, t_ns[order], sequence[order], counts[order])
 
-    def _sources(self, channel_id: int, span: Span = (None, None)) -> list[_Source]:
+    def _sources(self, channels: Sequence[int], span: Span = (None, None)) -> list[_Source]:
+        return [source for channel_id in channels for source in self._sources_of(channel_id, span)]
+
+    def _sources_of(self, channel_id: int, span: Span) -> list[_Source]:
         """Where the messages of a channel stand; only chunks that reach into the span are looked at."""
         first, last = span
         is_all = first is None and last is None
@@ -196,13 +205,13 @@ class Messages:
             else:
                 entries = self._index.entries[chunk.offset][channel_id]
             listed += len(entries)
-            found.append(_source(chunk, chunk.offset, chunk.offset + chunk.length, entries, span))
+            found.append(_source(channel_id, chunk, chunk.offset, chunk.offset + chunk.length, entries, span))
         loose = self._index.loose.get(channel_id, np.empty((0, 2), "<u8"))
         listed += len(loose)
         # Outside of chunks, pieces of the file stand for them.
         turns = np.flatnonzero(np.diff(loose[:, 1] // BLOCK)) + 1
         pieces = np.split(loose, turns) if len(loose) else []
-        found += [_source(None, int(piece[0, 1]), int(piece[-1, 1]), piece, span) for piece in pieces]
+        found += [_source(channel_id, None, int(piece[0, 1]), int(piece[-1, 1]), piece, span) for piece in pieces]
         said = self._index.counts.get(channel_id, 0)
         if is_all and listed != said:
             raise Damaged(f"its indexes list {listed} messages of channel {channel_id}, and there are {said}")
@@ -222,10 +231,10 @@ class Messages:
             self._opened.popitem(last=False)
         return content
 
-    def _read(self, source: _Source, channel_id: int, skip: int) -> Iterator[Message]:
+    def _read(self, source: _Source, skip: int) -> Iterator[Message]:
         """The messages of a source without the first ``skip``."""
         content = self._open(source)
-        found = heads_at(content, channel_id, source.t_ns[skip:], source.offset[skip:])
+        found = heads_at(content, source.channel, source.t_ns[skip:], source.offset[skip:])
         whole = content.obj
         data = whole if isinstance(whole, bytes) and len(whole) == len(content) else content
         spans = zip(found.start.tolist(), found.end.tolist(), strict=True)
@@ -234,7 +243,9 @@ class Messages:
         return map(Message, head["t_ns"].tolist(), head["sequence"].tolist(), head["publish_ns"].tolist(), payloads)
 
 
-def _source(chunk: ChunkIndexRecord | None, start: int, end: int, entries: Entries, span: Span) -> _Source:
+def _source(
+    channel_id: int, chunk: ChunkIndexRecord | None, start: int, end: int, entries: Entries, span: Span
+) -> _Source:
     check_times(entries)
     t_ns, offset = entries.astype(np.int64).T
     first, last = span
@@ -242,4 +253,4 @@ def _source(chunk: ChunkIndexRecord | None, start: int, end: int, entries: Entri
         inside = (t_ns >= (0 if first is None else first)) & (t_ns < (MAX_NS if last is None else last))
         t_ns, offset = t_ns[inside], offset[inside]
     order = np.argsort(t_ns, kind="stable")
-    return _Source(chunk, start, end, t_ns[order], offset[order])
+    return _Source(channel_id, chunk, start, end, t_ns[order], offset[order])

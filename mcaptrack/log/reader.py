@@ -19,7 +19,7 @@ from mcaptrack.log import journal, records
 from mcaptrack.log.fingerprint import fingerprint
 from mcaptrack.log.index import Index, read_index
 from mcaptrack.log.messages import Columns, Message, Messages, Places
-from mcaptrack.log.records import Damaged
+from mcaptrack.log.records import ChannelRecord, Damaged
 from mcaptrack.log.writer import RESULTS, create, results_of
 from mcaptrack.schema import Frame, Schema
 
@@ -27,7 +27,7 @@ Ints = NDArray[np.int64]
 
 
 class Channel(NamedTuple):
-    """A channel of a log."""
+    """A channel of a log, or all channels of a topic: ``messages`` counts those of all, the rest is of the first."""
 
     id: int
     topic: str
@@ -40,8 +40,9 @@ class Channel(NamedTuple):
 class Log:
     """An MCAP file, open for reading. A context manager.
 
-    Channels are found by topic; where several channels share one, the first that has messages counts. With ``results``,
-    another log beside it, channels of both are there, those of the results first; what is added goes to the results.
+    Channels are found by topic; several channels of one topic and one message layout are read as one, by time. With
+    ``results``, another log beside it, channels of both are there, those of the results first; what is added goes to
+    the results.
     """
 
     def __init__(self, path: Path, results: Log | None = None) -> None:
@@ -67,15 +68,15 @@ class Log:
             raise McaptrackError(f"{path} can't be read as an MCAP file: {error}; {_recover(path)}") from None
         self.results = results
         self.is_new = False  # made a moment ago, and to be removed if nothing comes into it
+        #: Every channel of this file, also those that share a topic, and those that the results replace.
+        self.recorded: tuple[Channel, ...] = tuple(map(self._channel, self.index.channels.values()))
+        self._by_topic: dict[str, list[Channel]] = {}
+        for channel in self.recorded:
+            self._by_topic.setdefault(channel.topic, []).append(channel)
         self.channels: dict[str, Channel] = {}
-        for record in self.index.channels.values():
-            schema = self.index.schemas.get(record.schema_id)
-            count = self.index.counts.get(record.id, 0)
-            channel = Channel(
-                record.id, record.topic, schema.name if schema else "", record.message_encoding, record.metadata, count
-            )
-            if record.topic not in self.channels or (count and not self.channels[record.topic].messages):
-                self.channels[record.topic] = channel
+        for topic, those in self._by_topic.items():
+            first = next((channel for channel in those if channel.messages), those[0])
+            self.channels[topic] = first._replace(messages=sum(channel.messages for channel in those))
         if results is not None:
             self.channels |= results.channels
 
@@ -156,6 +157,39 @@ class Log:
             )
         return self.channels[topic]
 
+    def _channel(self, record: ChannelRecord) -> Channel:
+        schema = self.index.schemas.get(record.schema_id)
+        name, count = schema.name if schema else "", self.index.counts.get(record.id, 0)
+        return Channel(record.id, record.topic, name, record.message_encoding, record.metadata, count)
+
+    def _ids(self, topic: str) -> list[int]:
+        """The channels of a topic that hold messages, to be read as one.
+
+        Raises McaptrackError if there is no channel of that topic, or if their messages are laid out differently.
+        """
+        self.channel(topic)
+        those = [channel for channel in self._by_topic[topic] if channel.messages]
+        layouts = {self._layout(channel): channel for channel in reversed(those)}
+        if len(layouts) > 1:
+            kinds = ", ".join(
+                f"{channel.messages} of channel {channel.id} ({channel.schema_name or 'no schema'}, "
+                f"{channel.message_encoding or 'no encoding'})"
+                for channel in those
+            )
+            raise McaptrackError(f"{self.path}: messages of {topic} are laid out differently: {kinds}")
+        return [channel.id for channel in those]
+
+    def _layout(self, channel: Channel) -> tuple[str, ...]:
+        """What decides how a channel's messages are decoded. Comments and blanks in ROS definitions don't."""
+        schema = self.index.schemas.get(self.index.channels[channel.id].schema_id)
+        if schema is None:
+            return (channel.message_encoding,)
+        data = bytes(schema.data)
+        if schema.encoding in ("ros1msg", "ros2msg"):
+            data = b"\n".join(b" ".join(line.partition(b"#")[0].split()) for line in data.splitlines())
+            data = b"\n".join(filter(None, data.split(b"\n")))
+        return (channel.message_encoding, schema.name, schema.encoding, hashlib.sha256(data).hexdigest())
+
     def metadata(self, name: str) -> dict[str, str] | None:
         """The last metadata record of that name."""
         if self.results is not None and (of_results := self.results.metadata(name)) is not None:
@@ -184,9 +218,9 @@ class Log:
         if (part := self.part(topic)) is not self:
             yield from part.messages(topic, start_ns, end_ns)
             return
-        channel = self.channel(topic)
+        channels = self._ids(topic)
         with self.mending():
-            yield from self._messages.by_time(channel.id, (start_ns, end_ns))
+            yield from self._messages.by_time(channels, (start_ns, end_ns))
 
     def merged(
         self, topics: Iterable[str], start_ns: int | None = None, end_ns: int | None = None
@@ -206,7 +240,7 @@ class Log:
         if channel.schema_name != schema.name or channel.message_encoding != "protobuf":
             raise McaptrackError(f"{self.path}: {topic} holds {channel.schema_name or 'no schema'}, not {schema.name}")
         try:
-            found = self._messages.columns(channel.id, schema)
+            found = self._messages.columns(self._ids(topic), schema)
             if found is not None:
                 return found
             messages = list(self.messages(topic))
@@ -228,17 +262,17 @@ class Log:
         """The times of a channel's messages, rising, without reading them."""
         if (part := self.part(topic)) is not self:
             return part.times(topic)
-        channel = self.channel(topic)
+        channels = self._ids(topic)
         with self.mending():
-            return self._messages.times(channel.id)
+            return self._messages.times(channels)
 
     def places(self, topic: str) -> Places:
         """Where the messages of a channel stand in the file of its part, by time, without reading them."""
         if (part := self.part(topic)) is not self:
             return part.places(topic)
-        channel = self.channel(topic)
+        channels = self._ids(topic)
         with self.mending():
-            return self._messages.places(channel.id)
+            return self._messages.places(channels)
 
     def message_at(self, chunk_offset: int | None, offset: int) -> tuple[str, Message]:
         """The message at a place in this file, results aside, and its topic; one chunk is opened.
@@ -260,7 +294,9 @@ class Log:
             return part.fingerprint(topic)
         with self.mending():
             if topic is not None:
-                return fingerprint(self._buffer, self.index, self.channel(topic).id)
+                self.channel(topic)
+                those = [fingerprint(self._buffer, self.index, one.id) for one in self._by_topic[topic]]
+                return those[0] if len(those) == 1 else hashlib.sha256("".join(those).encode()).hexdigest()
             whole = [fingerprint(part.buffer, part.index) for part in self.parts]
             return whole[0] if len(whole) == 1 else hashlib.sha256("".join(whole).encode()).hexdigest()
 
