@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from mcaptrack import log, pipeline
+from mcaptrack import log, notices, pipeline
 from mcaptrack.cli import app
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation import Candidate, EvaluateOptions, Sequenced, evaluate, sequence_of_log
@@ -382,10 +382,12 @@ def written(path: Path, made_by: str = "ingest", **channels: list[Frame]) -> Pat
 
 def watched(path: Path, *topics: str, again: bool = False, output: Path | None = None, **options):
     """What ``run`` does at the end, and ``mcaptrack events`` with ``again``."""
-    notes: list[str] = []
-    with log.read(path) as opened:
+    heard: list[notices.Notice] = []
+    with log.read(path) as opened, notices.listening(heard.append):
         watch = pipeline.Watch(EventOptions(**options), topics, again)
-        return pipeline.run(opened, "/camera", [], output, say=notes.append, watch=watch), notes
+        report = pipeline.run(opened, "/camera", [], output, watch=watch)
+    assert report.warnings == heard
+    return report, [notice.message for notice in heard]
 
 
 TRUTH = walk(lambda n: {1: (n / 10, 0.0), 2: (n / 10, 4.0)}, 60, 10)

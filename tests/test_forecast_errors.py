@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.optimize import linear_sum_assignment
 from typer.testing import CliRunner
 
-from mcaptrack import log, pipeline
+from mcaptrack import log, notices, pipeline
 from mcaptrack.cli import app
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation import Candidate, EvaluateOptions, Sequenced, evaluate
@@ -401,10 +401,11 @@ def test_the_layout_plots_what_is_known(tmp_path):
 def test_forecasts_that_cannot_be_held_against_anything_fail_nothing(tmp_path):
     odd = predictions(lambda n: {1: [(0.0, 0.0)] * (2 if n == 5 else 3)} if n in (5, 6) else {}, 20)
     path = written(tmp_path / "a.mcap", **ALL | {"predictions": odd})
-    notes: list[str] = []
-    with log.read(path) as opened:
-        pipeline.run(opened, "/camera", [], say=notes.append, watch=pipeline.Watch())
-    assert notes == ["no errors of forecasts: /camera/predictions: not all forecasts have 3 steps"]
+    with log.read(path) as opened, notices.collected() as heard:
+        pipeline.run(opened, "/camera", [], watch=pipeline.Watch())
+    assert [notice.message for notice in heard] == [
+        "no errors of forecasts: /camera/predictions: not all forecasts have 3 steps"
+    ]
     with log.read(path) as opened:
         assert ERRORS not in opened.channels
 
@@ -413,10 +414,11 @@ def test_a_channel_that_others_recorded_is_never_replaced(tmp_path):
     path = written(tmp_path / "a.mcap", **ALL)
     with log.read(path) as opened, log.extend(opened) as writer:
         writer.add_message(writer.add_channel(SCORES, ("", "", b""), "json", {}), 0, 0, b"{}")
-    notes: list[str] = []
-    with log.read(path) as opened:
-        pipeline.run(opened, "/camera", [], say=notes.append, watch=pipeline.Watch(again=True))
-    assert notes == [f"no errors of /camera/predictions: {SCORES} was recorded by others"]
+    with log.read(path) as opened, notices.collected() as heard:
+        pipeline.run(opened, "/camera", [], watch=pipeline.Watch(again=True))
+    assert [notice.message for notice in heard] == [
+        f"no errors of /camera/predictions: {SCORES} was recorded by others"
+    ]
     with log.read(path) as opened:
         assert [message.payload for message in opened.messages(SCORES)] == [b"{}"]
         assert ERRORS not in opened.channels

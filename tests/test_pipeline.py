@@ -49,7 +49,7 @@ def finished(footage, tmp_path_factory) -> Path:
 def run_all(path: Path) -> tuple[pipeline.Report, list[str]]:
     said: list[str] = []
     with log.read(path) as opened:
-        return pipeline.run(opened, "/camera", pipeline.plan_all(opened, "/camera", said.append), say=said.append), said
+        return pipeline.run(opened, "/camera", pipeline.plan_all(opened, "/camera", said.append)), said
 
 
 def run_stage(
@@ -58,7 +58,7 @@ def run_stage(
     said: list[str] = []
     with log.read(path) as opened:
         jobs = pipeline.plan_stage(opened, "/camera", name, transform, say=said.append, **topics)
-        return pipeline.run(opened, "/camera", jobs, output, say=said.append), said
+        return pipeline.run(opened, "/camera", jobs, output), said
 
 
 def digests(path: Path) -> dict[str, str]:
@@ -195,8 +195,8 @@ def test_a_failure_in_the_middle_leaves_the_log_as_it_was(fresh, monkeypatch):
 def test_without_a_ground_plane_a_scale_is_guessed_said_and_kept(footage, tmp_path):
     path = tmp_path / "a.mcap"
     ingest(footage.video, path, IngestOptions())
-    _, said = run_all(path)
-    assert any("no ground plane is known: taking" in words for words in said)
+    report, _ = run_all(path)
+    assert "assumed-ground-plane" in [notice.code for notice in report.warnings]
     with log.read(path) as opened:
         (frame,) = opened.frames("/camera/ground_plane", GROUND_PLANE)
         plane = rows_to_plane(frame.rows)

@@ -8,19 +8,23 @@ import json
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout
+from contextvars import ContextVar
 from functools import wraps
 from pathlib import Path
 from time import monotonic
-from typing import Annotated, Any, ParamSpec
+from typing import Annotated, Any, Final, ParamSpec
 
 import typer
 
-from mcaptrack import SCHEMA_VERSION
+from mcaptrack import SCHEMA_VERSION, notices
 from mcaptrack.atomic import publish_bytes, refuse_overwrite
 from mcaptrack.cli.config import read_config
 from mcaptrack.errors import McaptrackError
+from mcaptrack.notices import Code, Notice
 
 P = ParamSpec("P")
+#: What the running command has warned of.
+_WARNED: Final[ContextVar[list[Notice]]] = ContextVar("warned")
 
 DONE, REFUSED, LOST, GATE_MISSED = 0, 1, 3, 4
 
@@ -41,7 +45,7 @@ Sidecar = Annotated[
 ]
 Force = Annotated[bool, option("--force", shared=True, help="Replace what is there.")]
 Json = Annotated[bool, option("--json", shared=True, help="Print data for programs.")]
-Quiet = Annotated[bool, option("--quiet", "-q", shared=True, help="Say nothing but errors.")]
+Quiet = Annotated[bool, option("--quiet", "-q", shared=True, help="Say nothing but errors and warnings.")]
 Verbose = Annotated[bool, option("--verbose", "-v", shared=True, help="Say more.")]
 Config = Annotated[
     Path | None,
@@ -66,7 +70,7 @@ def register(app: typer.Typer, name: str, command: Callable[..., None], words: s
 
 
 class Talk:
-    """Words and progress for people. Progress only on a terminal; nothing at all if ``quiet``."""
+    """Words and progress for people. Progress only on a terminal; nothing but warnings if ``quiet``."""
 
     def __init__(self, quiet: bool, verbose: bool = False) -> None:
         self.quiet, self.verbose = quiet, verbose
@@ -84,6 +88,14 @@ class Talk:
         """A line that only matters to some."""
         if self.verbose:
             self.say(words)
+
+    def warn(self, words: str, code: Code = "other") -> None:
+        """A line that is never hidden and stands in the command's JSON; see ``mcaptrack.notices``."""
+        notices.warn(words, code)
+
+    def _hear(self, notice: Notice) -> None:
+        self._stop()
+        _show_warning(notice)
 
     def progress(self, stage: str, done: int, total: int) -> None:
         """How far a stage is."""
@@ -114,11 +126,12 @@ class Talk:
 
     @contextmanager
     def open(self) -> Iterator[Talk]:
-        """Leaves the terminal as it was."""
-        try:
-            yield self
-        finally:
-            self._stop()
+        """Takes warnings; leaves the terminal as it was."""
+        with notices.listening(self._hear):
+            try:
+                yield self
+            finally:
+                self._stop()
 
 
 def printable(words: str) -> str:
@@ -127,17 +140,27 @@ def printable(words: str) -> str:
 
 
 def one_line(command: Callable[P, None]) -> Callable[P, None]:
-    """A fault that a user can mend becomes one line and exit code 1."""
+    """A fault that a user can mend becomes one line and exit code 1; warnings become lines and stand in the JSON."""
 
     @wraps(command)
     def guarded(*args: P.args, **kwargs: P.kwargs) -> None:
+        _WARNED.set([])
         try:
-            command(*args, **kwargs)
+            with notices.listening(_show_warning):
+                command(*args, **kwargs)
         except McaptrackError as error:
             print(f"mcaptrack: {printable(' '.join(str(error).split()))}", file=sys.stderr)
             raise typer.Exit(REFUSED) from None
 
     return guarded
+
+
+def _show_warning(notice: Notice) -> None:
+    """A warning on stderr, once."""
+    warned = _WARNED.get()
+    if notice not in warned:
+        warned.append(notice)
+        print(f"warning: {printable(str(notice))}", file=sys.stderr)
 
 
 @contextmanager
@@ -153,8 +176,11 @@ def printed_to(output: Path | None, force: bool) -> Iterator[None]:
 
 
 def print_json(data: dict[str, Any]) -> None:
-    """One object on stdout, with the version of its shape; there at once, also for a program that goes on."""
-    print(json.dumps({"schema_version": SCHEMA_VERSION} | data, indent=2, allow_nan=False), flush=True)
+    """One object on stdout, with the version of its shape and all warnings; there at once, also for a program that goes
+    on.
+    """
+    whole = {"schema_version": SCHEMA_VERSION} | data | {"warnings": [notice._asdict() for notice in _WARNED.get()]}
+    print(json.dumps(whole, indent=2, allow_nan=False), flush=True)
 
 
 def expand(paths: Sequence[Path]) -> list[Path]:

@@ -122,7 +122,7 @@ def evaluate(
             sequences = _from_logs(paths, camera, options.topics)
         outcome = score(sequences, options, talk.detail)
         for words in outcome.notes:
-            talk.say(words)
+            talk.warn(words, "not-compared")
     with common.printed_to(output, force):
         if json:
             common.print_json({"results": [result.to_json() for result in outcome.results]})

@@ -143,7 +143,7 @@ def ingest(
             for words in report.notes:
                 talk.detail(words)
             for words in report.lost:
-                talk.say(f"lost: {words}")
+                talk.warn(f"lost: {words}", "lost")
             lost |= bool(report.lost)
             talk.say(f"{target}: " + ", ".join(f"{topic} {count}" for topic, count in report.messages.items()))
             results.append(

@@ -188,7 +188,7 @@ def export(
             with log.read(path) as opened:
                 done = write_tables(opened, folder, talk.progress, form=form, topics=topic or (), blobs=blobs)
             for words in done.notes:
-                talk.say(words)
+                talk.warn(words, "left-out")
             talk.say(f"{folder}: " + ", ".join(f"{name} {rows}" for name, rows in done.rows.items()))
             talk.detail(f"{folder}: written {', '.join(done.written) or 'nothing, all tables are up to date'}")
             results.append({"log": str(path), "folder": str(folder), "rows": done.rows, "written": done.written})

@@ -228,50 +228,69 @@ def run_on_logs(
     given: Mapping[str, Any], make_plan: Callable[[_Plan], Any], tables: bool = False, watch: Watch | None = None
 ) -> None:
     """Plan and run on every log, and say and print what came of it."""
+    from mcaptrack import notices
+
+    paths = common.expand(given["logs"])
+    common.only_one_output(paths, given["output"])
+    if given["output"] and given["sidecar"]:
+        raise McaptrackError("--sidecar and -o are two places for the same results; give one of them")
+    results = []
+    with common.Talk(given["quiet"], given["verbose"]).open() as talk:
+        for path in paths:
+            with notices.about(given["output"] or path):
+                results.append(_run_on_log(path, given, make_plan, tables, watch, talk))
+    if given["json"]:
+        common.print_json({"results": results})
+
+
+def _run_on_log(
+    path: Path,
+    given: Mapping[str, Any],
+    make_plan: Callable[[_Plan], Any],
+    tables: bool,
+    watch: Watch | None,
+    talk: common.Talk,
+) -> dict[str, Any]:
+    """Plan and run on one log; what came of it, for programs."""
     from mcaptrack import log, pipeline
     from mcaptrack.atomic import is_same_file, publish_bytes, refuse_overwrite
     from mcaptrack.export import default_folder, export
 
-    paths = common.expand(given["logs"])
     output: Path | None = given["output"]
-    common.only_one_output(paths, output)
-    if output and given["sidecar"]:
-        raise McaptrackError("--sidecar and -o are two places for the same results; give one of them")
-    reports = []
-    with common.Talk(given["quiet"], given["verbose"]).open() as talk:
-        for path in paths:
-            target = output or path
-            if output is not None:
-                if is_same_file(output, path):
-                    raise McaptrackError(f"{path} is both input and output; leave -o out to add to it in place")
-                refuse_overwrite(output, given["force"])
-            with log.read(path, sidecar=given["sidecar"] or None) as opened:
-                if output is None:
-                    opened.lock()  # a second writer is turned away before it computes anything
-                camera = given["camera"] or (pipeline.camera_of(opened, watch.topics) if watch else None)
-                prefix = pipeline.find_camera(opened, camera, given["topic"])
-                jobs = make_plan(_Plan(opened, prefix, talk.say))
-                report = pipeline.run(opened, prefix, jobs, output, talk.progress, talk.say, watch)
-            for name, content in report.layouts.items():
-                publish_bytes(pipeline.layout_path(target, name), content)
-            for topic, count in report.frames.items():
-                talk.detail(f"{target}: {topic} {count} frames")
-            for topic, kinds in report.events.items():
-                words = ", ".join(f"{kind} {count}" for kind, count in kinds.items() if count) or "nothing happened"
-                (talk.say if watch and watch.again else talk.detail)(f"{topic}: {words}")
-            for topic in report.stale:
-                talk.say(
-                    f"{topic} was made from what has just been replaced; `mcaptrack run {target}` brings it up to date"
-                )
-            written = {}
-            if tables:
-                with log.read(target) as opened:
-                    folder = default_folder(target)
-                    written = export(opened, folder, talk.progress).rows
-                talk.detail(f"{folder}: {', '.join(f'{name} {rows}' for name, rows in written.items())}")
-            done = ", ".join(report.stages) or "nothing to do, everything is up to date"
-            talk.say(f"{target}: {done}")
-            data = {"stages": report.stages, "frames": report.frames, "events": report.events, "tables": written}
-            reports.append({"log": str(target)} | data)
-    if given["json"]:
-        common.print_json({"results": reports})
+    target = output or path
+    if output is not None:
+        if is_same_file(output, path):
+            raise McaptrackError(f"{path} is both input and output; leave -o out to add to it in place")
+        refuse_overwrite(output, given["force"])
+    with log.read(path, sidecar=given["sidecar"] or None) as opened:
+        if output is None:
+            opened.lock()  # a second writer is turned away before it computes anything
+        camera = given["camera"] or (pipeline.camera_of(opened, watch.topics) if watch else None)
+        prefix = pipeline.find_camera(opened, camera, given["topic"])
+        jobs = make_plan(_Plan(opened, prefix, talk.say))
+        report = pipeline.run(opened, prefix, jobs, output, talk.progress, watch)
+    for name, content in report.layouts.items():
+        publish_bytes(pipeline.layout_path(target, name), content)
+    for topic, count in report.frames.items():
+        talk.detail(f"{target}: {topic} {count} frames")
+    for topic, kinds in report.events.items():
+        words = ", ".join(f"{kind} {count}" for kind, count in kinds.items() if count) or "nothing happened"
+        (talk.say if watch and watch.again else talk.detail)(f"{topic}: {words}")
+    for topic in report.stale:
+        talk.warn(
+            f"{topic} was made from what has just been replaced; `mcaptrack run {target}` brings it up to date",
+            "out-of-date",
+        )
+    written = {}
+    if tables:
+        with log.read(target) as opened:
+            folder = default_folder(target)
+            exported = export(opened, folder, talk.progress)
+        written = exported.rows
+        for words in exported.notes:
+            talk.warn(words, "left-out")
+        talk.detail(f"{folder}: {', '.join(f'{name} {rows}' for name, rows in written.items())}")
+    done = ", ".join(report.stages) or "nothing to do, everything is up to date"
+    talk.say(f"{target}: {done}")
+    data = {"stages": report.stages, "frames": report.frames, "events": report.events, "tables": written}
+    return {"log": str(target)} | data

@@ -21,6 +21,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation.events import EventOptions, find_events
 from mcaptrack.evaluation.forecasts import MADE_FROM, find_forecast_errors
 from mcaptrack.evaluation.words import SUFFIX, log_messages
+from mcaptrack.notices import warn
 from mcaptrack.pipeline.plan import is_stale
 from mcaptrack.pipeline.write import Made, digest_of
 from mcaptrack.provenance import Provenance
@@ -35,8 +36,6 @@ from mcaptrack.schema import (
     Frame,
     Schema,
 )
-
-Say = Callable[[str], None]
 
 #: The name of the stage, in reports and in the provenance.
 STAGE: Final = "events"
@@ -65,12 +64,10 @@ def outputs(topic: str) -> tuple[str, ...]:
     return topic + _EVENTS, topic + _EVENTS + SUFFIX, topic + _COUNTS
 
 
-def make_events(
-    opened: log.Log, prefix: str, made: Mapping[str, Made], watch: Watch, say: Say = lambda _: None
-) -> dict[str, Made]:
+def make_events(opened: log.Log, prefix: str, made: Mapping[str, Made], watch: Watch) -> dict[str, Made]:
     """The events of all channels that are watched and whose events are missing or out of date; so with forecasts.
 
-    ``made`` are channels that were just made. What can't be compared with the truth is said, in a line, and left out.
+    ``made`` are channels that were just made. What can't be compared with the truth is left out, with a warning.
     Raises McaptrackError for topics that were asked for and hold no tracks.
     """
     out: dict[str, Made] = {}
@@ -80,7 +77,7 @@ def make_events(
 
     @cache
     def truth() -> _Truth:
-        return _read_truth(opened, f"{prefix}/truth", say)
+        return _read_truth(opened, f"{prefix}/truth")
 
     for topic in topics:
         options = watch.options if watch.again else _asked(opened, topic, watch.options)
@@ -91,12 +88,12 @@ def make_events(
         if taken:
             if watch.topics:
                 raise McaptrackError(f"{opened.path}: events would replace {taken[0]}, which others recorded")
-            say(f"no events of {topic}: {taken[0]} was recorded by others")
+            warn(f"no events of {topic}: {taken[0]} was recorded by others", "left-out")
             continue
         frames, tracks_digest = _rows(opened, topic, made)
         found = find_events(frames, truth().frames, options, opened.path.stem, topic)
         for words in found.notes:
-            say(words)
+            warn(words, "not-compared")
         parameters = found.parameters(options)
         provenance = Provenance(STAGE, parameters, topic, tracks_digest, references=truth().digests)
         out[topic + _EVENTS] = events = Made.of(EVENTS, found.events, provenance)
@@ -106,7 +103,7 @@ def make_events(
         out[topic + _COUNTS] = Made.of(COUNTS, found.counts, provenance)
     if not watch.topics:
         for name in MADE_FROM:
-            out |= _forecast_errors(opened, prefix, name, made, watch.again, truth, say)
+            out |= _forecast_errors(opened, prefix, name, made, watch.again, truth)
     return out
 
 
@@ -117,7 +114,6 @@ def _forecast_errors(
     made: Mapping[str, Made],
     again: bool,
     truth: Callable[[], _Truth],
-    say: Say,
 ) -> dict[str, Made]:
     """How far off the forecasts of one channel were, if they are there and that is missing or out of date."""
     topic, tracks, later = (f"{prefix}/{one}" for one in (name, MADE_FROM[name], _BECAME))
@@ -129,14 +125,14 @@ def _forecast_errors(
         return {}
     taken = [one for one in topics if not _is_ours(opened, one)]
     if taken:
-        say(f"no errors of {topic}: {taken[0]} was recorded by others")
+        warn(f"no errors of {topic}: {taken[0]} was recorded by others", "left-out")
         return {}
     forecasts, digest_of_forecasts = _rows(opened, topic, made, PREDICTIONS)
     (from_tracks, of_tracks), (became, of_later) = (_rows(opened, one, made) for one in (tracks, later))
     try:
         found = find_forecast_errors(forecasts, from_tracks, truth().frames, became, topic)
     except McaptrackError as error:
-        say(f"no errors of forecasts: {error}")
+        warn(f"no errors of forecasts: {error}", "not-compared")
         return {}
     references = truth().digests | {tracks: of_tracks, later: of_later}
     provenance = Provenance(STAGE, {}, topic, digest_of_forecasts, references=references)
@@ -174,7 +170,7 @@ class _Truth(NamedTuple):
     digests: dict[str, str]
 
 
-def _read_truth(opened: log.Log, topic: str, say: Say) -> _Truth:
+def _read_truth(opened: log.Log, topic: str) -> _Truth:
     if topic not in opened.channels:
         return _Truth(None, {topic: ""})
     if not _holds(opened, topic):
@@ -182,7 +178,7 @@ def _read_truth(opened: log.Log, topic: str, say: Say) -> _Truth:
     try:
         return _Truth(opened.frames(topic, TRACKS), {topic: digest_of(opened, topic)})
     except McaptrackError as error:
-        say(f"no misses, false tracks and switches: {error}")
+        warn(f"no misses, false tracks and switches: {error}", "not-compared")
         return _Truth(None, {})
 
 

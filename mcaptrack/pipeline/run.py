@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from mcaptrack import foreign, log
 from mcaptrack.carry import carry
 from mcaptrack.clock import NS_PER_S
+from mcaptrack.notices import Notice, collected, warn
 from mcaptrack.pipeline.events import STAGE as EVENTS_STAGE
 from mcaptrack.pipeline.events import Watch, make_events, tally
 from mcaptrack.pipeline.plan import FULL, ROUTES, Job, check_inputs, picture_topic
@@ -28,7 +29,6 @@ from mcaptrack.video import Encoded, brightness
 
 Ints = NDArray[np.int64]
 Progress = Callable[[str, int, int], None]
-Say = Callable[[str], None]
 
 _ASSUME: Final = "assume-ground-plane"
 
@@ -38,7 +38,7 @@ class Report:
     """What a run did: the stages that ran, the frames of each topic they made, and the layouts for their views.
 
     ``stale`` are the channels that were made from something that has now been replaced. ``events`` says for each
-    channel of tracks how many events of each kind were found.
+    channel of tracks how many events of each kind were found. ``warnings`` are what was assumed, left out or looks odd.
     """
 
     stages: list[str] = field(default_factory=list)
@@ -46,6 +46,7 @@ class Report:
     layouts: dict[str, bytes] = field(default_factory=dict)
     stale: list[str] = field(default_factory=list)
     events: dict[str, dict[str, int]] = field(default_factory=dict)
+    warnings: list[Notice] = field(default_factory=list)
 
 
 def run(
@@ -54,7 +55,6 @@ def run(
     jobs: Sequence[Job],
     output: Path | None = None,
     progress: Progress = lambda *_: None,
-    say: Say = lambda _: None,
     watch: Watch | None = None,
 ) -> Report:
     """Run the jobs and put their channels and the views of these into the log, or into a copy of it at ``output``.
@@ -63,6 +63,15 @@ def run(
 
     Nothing is written until everything is computed; then the log is replaced as a whole.
     """
+    with collected() as warnings:
+        report = _run(opened, prefix, jobs, output, progress, watch)
+    report.warnings = warnings
+    return report
+
+
+def _run(
+    opened: log.Log, prefix: str, jobs: Sequence[Job], output: Path | None, progress: Progress, watch: Watch | None
+) -> Report:
     made: dict[str, Made] = {}
     stamps: dict[str, list[int]] = {}
     report = Report()
@@ -70,7 +79,7 @@ def run(
     for job in jobs:
         # A guessed scale is guessed anew from new detections; a given one stands.
         if (planes is None and job.stage in ("track", "sample")) or (job.stage == "track" and _is_assumed(planes)):
-            planes = _assume_plane(opened, prefix, made, job.source, say)
+            planes = _assume_plane(opened, prefix, made, job.source)
         transform = _in_context(opened, prefix, job, made, planes or ())
         input_digest, frames = _input(opened, job, made, stamps, progress)
         outputs: list[list[Frame]] = [[] for _ in job.transform.writes]
@@ -79,9 +88,10 @@ def run(
                 channel.append(frame)
         seen = len(stamps.get(job.source, ())) if job.source not in made else 0
         if job.transform.reads is VIDEO and seen > len(outputs[0]):
-            say(
+            warn(
                 f"{job.source}: {seen - len(outputs[0])} of {seen} messages were left out: a video has to begin with a "
-                "key picture that has its parameter sets"
+                "key picture that has its parameter sets",
+                "left-out",
             )
         weights = weights_sha256(transform.predictor) if hasattr(transform, "predictor") else ""
         for (topic, schema), channel in zip(job.outputs().items(), outputs, strict=True):
@@ -95,7 +105,7 @@ def run(
             made |= _carried(opened, job, made, planes or ())
         report.stages.append(job.stage)
     if watch is not None:
-        happened = make_events(opened, prefix, made, watch, say)
+        happened = make_events(opened, prefix, made, watch)
         made |= happened
         report.frames |= {topic: len(channel.messages) for topic, channel in happened.items()}
         report.events = tally(happened)
@@ -230,7 +240,7 @@ def _is_assumed(planes: Planes | None) -> bool:
     return planes is not None and all(plane.assumed for _, plane in planes)
 
 
-def _assume_plane(opened: log.Log, prefix: str, made: dict[str, Made], source: str, say: Say) -> Planes | None:
+def _assume_plane(opened: log.Log, prefix: str, made: dict[str, Made], source: str) -> Planes | None:
     """Guess a scale from the boxes where nobody gave a ground plane; it becomes a channel that says so."""
     if source in made:
         frames, known = made[source].frames, made[source].provenance
@@ -244,9 +254,10 @@ def _assume_plane(opened: log.Log, prefix: str, made: dict[str, Made], source: s
     width, height = (int(np.nanmax(rows[a] + rows[b]).round()) for a, b in (("x_px", "w_px"), ("y_px", "h_px")))
     plane: GroundPlane = assumed_plane(rows["h_px"], width, height)
     metres = 1 / plane.homography[0]
-    say(
+    warn(
         f"no ground plane is known: taking {metres:.3g} px for a metre, since people are 1.7 m high; "
-        "give one with `mcaptrack ingest --ground-plane`"
+        "give one with `mcaptrack ingest --ground-plane`",
+        "assumed-ground-plane",
     )
     start = frames[0].t_ns
     provenance = Provenance(_ASSUME, {}, source, known.digest)
