@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from mcaptrack.cli import common
 from mcaptrack.errors import McaptrackError
 from mcaptrack.links import LICHTBLICK, viewer_links
+
+if TYPE_CHECKING:
+    from mcaptrack.log import Log
 
 
 @common.one_line
@@ -32,22 +35,22 @@ def view(
     """Serve a log to this machine's browser, and print links that open it in Lichtblick and Foxglove.
 
     With the log go its layouts (tracking, comparing, predictions), which Lichtblick takes by itself and Foxglove
-    imports (Layouts, Import from file). Nothing but these files is served, to nobody but this machine, until Ctrl-C.
+    imports (Layouts, Import from file). Layout files beside the log are served as they are, also while they are edited.
+    Only these files are served, only to this machine, until Ctrl-C.
 
     Example: mcaptrack view log.mcap
     """
     import webbrowser
 
     from mcaptrack import log
-    from mcaptrack.pipeline import LAYOUTS, attachment_of, layout_path
+    from mcaptrack.pipeline import layout_path
     from mcaptrack.serving import Server
 
     if not lichtblick.startswith(("http://", "https://")):
         raise McaptrackError(f"--lichtblick needs an address such as http://localhost:8080, not {lichtblick!r}")
     with log.read(path) as opened:
         files: dict[str, Path | bytes] = {part.path.name: part.real_path for part in opened.parts}
-        found = {name: opened.attachment(attachment_of(name)) for name in LAYOUTS}
-    layouts = {name: content for name, content in found.items() if content is not None}
+        layouts, notes = _layouts(path, opened)
     if layout is not None and layout not in layouts:
         raise McaptrackError(f"{path} has no layout {layout}; it has {', '.join(layouts) or 'none'}")
     layouts = {name: content for name, content in layouts.items() if layout in (None, name)}
@@ -55,6 +58,8 @@ def view(
         common.Talk(quiet, verbose).open() as talk,
         Server(files | {layout_path(path, name).name: content for name, content in layouts.items()}, port) as server,
     ):
+        for words in notes:
+            talk.say(words)
         logs = [server.address(name) for name in files]
         addresses = {name: server.address(layout_path(path, name).name) for name in layouts}
         ways = {name: viewer_links(logs, address, lichtblick) for name, address in addresses.items()}
@@ -85,3 +90,31 @@ def view(
             server.serve_forever(poll_interval=0.2)
         except KeyboardInterrupt:
             talk.say("done")
+
+
+def _layouts(path: Path, opened: Log) -> tuple[dict[str, Path | bytes], list[str]]:
+    """The layouts of a log: files beside it, otherwise what it keeps; and notes about files that were edited."""
+    from json import loads
+
+    from mcaptrack.notices import warn
+    from mcaptrack.pipeline import LAYOUTS, attachment_of, layout_path
+
+    found: dict[str, Path | bytes] = {}
+    notes = []
+    for name in LAYOUTS:
+        kept, file = opened.attachment(attachment_of(name)), layout_path(path, name)
+        try:
+            content = file.read_bytes() if file.is_file() else None
+            if content is not None:
+                loads(content)
+        except (OSError, ValueError, RecursionError) as error:
+            content = None
+            why = error.strerror if isinstance(error, OSError) else "it is not JSON"
+            warn(f"{file} can't be served ({why}); the log's own layout is used", "left-out")
+        if content is not None:
+            found[name] = file
+        elif kept is not None:
+            found[name] = kept
+        if content is not None and kept is not None and content != kept:
+            notes.append(f"{file} differs from the layout in the log; the file is served")
+    return found, notes
