@@ -331,7 +331,7 @@ def test_events_and_counts_add_up_to_the_scores(similarity, scene):
     if not any(len(frame.rows) for frame in truth):
         return
     gate = 0.5 if similarity == "iou" else 1.0
-    found = find_events(tracks, truth, EventOptions(similarity, gate))
+    found = find_events(tracks, truth, EventOptions(similarity, gate, gate))
     options = EvaluateOptions(similarities=(similarity,), gates_m=(gate,), min_iou=gate)
     (result,) = evaluate([Sequenced("x", truth, [Candidate("t", None, tracks)])], options).results
     score = result.to_json()
@@ -430,7 +430,11 @@ def test_events_words_and_counts_stand_beside_the_tracks(place):
         assert (made.transform, made.input, set(made.references)) == ("events", "/camera/tracks", {"/camera/truth"})
         now = {topic: Provenance.from_metadata(opened.channel(topic).metadata).digest for topic in opened.channels}
         assert made.made_from() == {topic: now[topic] for topic in ("/camera/tracks", "/camera/truth")}
-        assert made.parameters == {"asked": {"similarity": None, "gate": None}, "similarity": "metres", "gate": 1.0}
+        assert made.parameters == {
+            "asked": {"similarity": None, "gate_m": None, "min_iou": None},
+            "similarity": "metres",
+            "gate": 1.0,
+        }
 
 
 def test_what_stands_is_left_and_what_is_made_again_is_the_same_to_the_byte(place):
@@ -448,7 +452,7 @@ def test_options_are_kept_until_others_are_asked_for(place):
             made = Provenance.from_metadata(opened.channel("/camera/tracks/counts").metadata)
             return made.parameters["similarity"], made.parameters["gate"]
 
-    watched(place, again=True, similarity="metres", gate=0.25)
+    watched(place, again=True, similarity="metres", gate_m=0.25)
     assert rule() == ("metres", 0.25)
     assert watched(place)[0].stages == []
     assert watched(place, similarity="metres")[0].stages == ["events"]
@@ -555,17 +559,17 @@ def test_the_command_writes_drop_takes_along_and_tables_have_what_happened(place
         assert result.exit_code == 0, result.output
         return result
 
-    data = json.loads(call("events", place, "--json", "--similarity", "metres", "--gate", "0.5").stdout)
+    data = json.loads(call("events", place, "--json", "--similarity", "metres", "--gate-m", "0.5").stdout)
     (result,) = data["results"]
     assert (result["stages"], result["events"]["/camera/tracks"]["identity switch"]) == (["events"], 2)
     call("events", place, "--topic", "/camera/tracks")
-    assert CliRunner().invoke(app, ["events", str(place), "--gate", "0.5"]).exit_code == 1
+    assert CliRunner().invoke(app, ["events", str(place), "--gate-m", "0"]).exit_code == 1
     assert CliRunner().invoke(app, ["events", str(place), "--gate", "1.5", "--similarity", "iou"]).exit_code == 1
     (place.parent / "odd.toml").write_text('[events]\nsimilarity = "iou"\ngate = "much"\n')
     words = ["run", str(place), "--config", str(place.parent / "odd.toml")]
     odd = copy_context().run(CliRunner().invoke, app, words)  # what the file says is for this command alone
-    assert odd.exit_code == 1
-    assert "--gate is a share of overlap up to 1, or a distance in metres, not 'much'" in odd.output
+    assert odd.exit_code == 2
+    assert "[events] gate needs a number, not 'much'" in odd.output
     call("export", place, "-o", place.parent / "tables")
     table = pq.read_table(place.parent / "tables" / "events" / "recording=a" / "part-0.parquet").to_pylist()
     assert [(row["topic"], row["kind"], row["truth_id"]) for row in table if row["kind"] == SWITCH] == [

@@ -12,61 +12,119 @@ from contextvars import ContextVar
 from functools import wraps
 from pathlib import Path
 from time import monotonic
-from typing import Annotated, Any, Final, ParamSpec
+from typing import Annotated, Any, Final, Literal, ParamSpec
 
 import typer
 
 from mcaptrack import SCHEMA_VERSION, notices
 from mcaptrack.atomic import publish_bytes, refuse_overwrite
-from mcaptrack.cli.config import read_config
+from mcaptrack.cli.command import COMMON, Command, read_config
+from mcaptrack.cli.settings import Declared
+from mcaptrack.cli.text import printable
 from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import Code, Notice
 
 P = ParamSpec("P")
 #: What the running command has warned of.
 _WARNED: Final[ContextVar[list[Notice]]] = ContextVar("warned")
+#: The heading of options that say what is read and written.
+FILES: Final = "Input and output"
 
 DONE, REFUSED, LOST, GATE_MISSED = 0, 1, 3, 4
 
 
-def option(*names: str, shared: bool = False, **given: Any) -> Any:
-    """A Typer option; ``shared`` ones stand apart in the help. That all can come from the environment goes unsaid."""
-    if shared:
-        given |= {"rich_help_panel": "Options of all commands", "show_default": False}
-    return typer.Option(*names, show_envvar=False, **given)
+def option(
+    *names: str,
+    panel: str = "",
+    tuning: bool | str = False,
+    was: str = "",
+    was_if: tuple[str, str] | None = None,
+    **given: Any,
+) -> Any:
+    """A Typer option, below the heading ``panel`` of the help; for the others see ``Declared``.
+
+    The options of ``COMMON`` and of ``FILES`` show no defaults; that all can come from the environment goes unsaid.
+    """
+    if panel:
+        given["rich_help_panel"] = panel
+    if panel in (COMMON, FILES):
+        given.setdefault("show_default", False)
+    made: Any = typer.Option(*names, show_envvar=False, **given)
+    made.declared = Declared(tuning, was.lstrip("-"), was_if)
+    return made
 
 
 Output = Annotated[
-    Path | None, option("--output", "-o", shared=True, help="Write to this instead; the input stays as it is.")
+    Path | None, option("--output", "-o", panel=FILES, help="Write to this instead; the input stays as it is.")
 ]
-Printed = Annotated[Path | None, option("--output", "-o", shared=True, help="Print to this file.")]
+Printed = Annotated[Path | None, option("--output", "-o", panel=FILES, help="Print to this file.")]
 Sidecar = Annotated[
-    bool, option("--sidecar", shared=True, help="Write results to LOG.results.mcap, from now on; LOG stays as it is.")
+    bool, option("--sidecar", panel=FILES, help="Write results to LOG.results.mcap, from now on; LOG stays as it is.")
 ]
-Force = Annotated[bool, option("--force", shared=True, help="Replace what is there.")]
-Json = Annotated[bool, option("--json", shared=True, help="Print data for programs.")]
-Quiet = Annotated[bool, option("--quiet", "-q", shared=True, help="Say nothing but errors and warnings.")]
-Verbose = Annotated[bool, option("--verbose", "-v", shared=True, help="Say more.")]
+Force = Annotated[bool, option("--force", panel=FILES, help="Replace what is there.")]
+Json = Annotated[bool, option("--json", panel=COMMON, help="Print data for programs.")]
+Quiet = Annotated[bool, option("--quiet", "-q", panel=COMMON, help="Say nothing but errors and warnings.")]
+Verbose = Annotated[bool, option("--verbose", "-v", panel=COMMON, help="Say more.")]
 Config = Annotated[
     Path | None,
     option(
         "--config",
-        shared=True,
-        help="Options from this file; otherwise from mcaptrack.toml here, if there is one.",
+        panel=COMMON,
+        help="Read options from this file, instead of mcaptrack.toml here (tuning only) and in your config folder.",
         is_eager=True,
         callback=read_config,
     ),
 ]
-Camera = Annotated[str | None, option("--camera", shared=True, help="Which camera, if the log has several.")]
+Camera = Annotated[str | None, option("--camera", panel=FILES, help="Which camera, if the log has several.")]
+SimilarityName = Literal["iou", "metres"]
+GroundPlane = Annotated[
+    Path | None,
+    option(
+        "--ground-plane",
+        panel=FILES,
+        help="File with a 3x3 homography from pixels to metres.",
+    ),
+]
+Point = Annotated[
+    Literal["center", "foot"],
+    option("--point", tuning=True, help="Which point of a box touches the ground."),
+]
+FPS_PATTERN: Final = r"[0-9]+([.][0-9]+)?(/[0-9]+)?"
+LabelFps = Annotated[
+    str | None,
+    option(
+        "--fps", tuning=FPS_PATTERN, help="Frames per second of label files.", show_default="as seqinfo.ini beside them"
+    ),
+]
+
+
+def similarity(shown: str) -> Any:
+    """What makes a person and a track alike; ``shown`` says what happens unless it is given."""
+    words = "How a person and a track are compared: overlap of boxes (iou), or distance on the ground (metres)."
+    return option("--similarity", tuning=True, help=words, show_default=shown)
+
+
+def gate_m(shown: str | bool = True, tuning: str | bool = True, was: str = "") -> Any:
+    """The largest distance of a match."""
+    words = "Largest distance in metres at which a person and a track match."
+    return option("--gate-m", tuning=tuning, was=was, help=words, show_default=shown)
+
+
+def min_iou(was: str = "", was_if: tuple[str, str] | None = None) -> Any:
+    """The least overlap of a match."""
+    words = "Least overlap (IoU) at which a person and a track match."
+    return option("--min-iou", tuning=True, was=was, was_if=was_if, help=words, show_default="0.5")
+
+
 Logs = Annotated[
     list[Path], typer.Argument(metavar="LOG...", help="One or several logs, or a pattern.", show_default=False)
 ]
 
 
 def register(app: typer.Typer, name: str, command: Callable[..., None], words: str | None = None) -> None:
-    """Add a command whose options can also come from MCAPTRACK_NAME_OPTION."""
-    settings = {"auto_envvar_prefix": f"MCAPTRACK_{name.upper()}", "help_option_names": ["--help", "-h"]}
-    app.command(name, help=words, context_settings=settings)(command)
+    """Add a command whose options can also come from MCAPTRACK_NAME_OPTION and from files."""
+    settings = {"help_option_names": ["--help", "-h"]}
+    app.command(name, cls=Command, help=words, context_settings=settings)(command)
 
 
 class Talk:
@@ -132,11 +190,6 @@ class Talk:
                 yield self
             finally:
                 self._stop()
-
-
-def printable(words: str) -> str:
-    """Without what would steer a terminal: names from files may hold anything."""
-    return "".join(c if c.isprintable() or c == "\n" else "\N{REPLACEMENT CHARACTER}" for c in words)
 
 
 def one_line(command: Callable[P, None]) -> Callable[P, None]:

@@ -1,61 +1,84 @@
-"""mcaptrack.toml: options in a file, a table a command. Order: option, MCAPTRACK_*, file, default."""
+"""mcaptrack.toml: options in a file, a table a command. Which files are read, and how far each is trusted.
+
+A file that ``--config`` names, and one in the user's config folder, may set every option. One in the working folder may
+have come along with other people's data: it may tune, and nothing else.
+"""
 
 from __future__ import annotations
 
-import difflib
+import os
+import stat
 import tomllib
-from contextvars import ContextVar
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import typer
 
+from mcaptrack.cli.text import refuse_usage
+
 NAME: Final = "mcaptrack.toml"
-#: The tables of the file that was read for the running command.
-_TABLES: Final[ContextVar[dict[str, Any]]] = ContextVar("tables", default={})  # noqa: B039
+#: A larger file is refused before it is read.
+MAX_BYTES: Final = 2**20
 
 
-def read_config(context: typer.Context, path: Path | None) -> Path | None:
-    """Take the defaults of this command from ``path``, or from mcaptrack.toml in the current folder if there is one.
+class ConfigFile(NamedTuple):
+    """The tables of one file. Only a ``trusted`` one may set options that don't tune."""
 
-    An option's callback. Anything in the file that is no command or no option of its command is refused, with the
-    nearest name.
+    path: Path
+    tables: dict[str, Any]
+    trusted: bool
+
+
+def user_file() -> Path:
+    """The file in the user's config folder: ~/.config/mcaptrack/mcaptrack.toml on Linux."""
+    return Path(typer.get_app_dir("mcaptrack")) / NAME
+
+
+def read_files(named: Path | None) -> list[ConfigFile]:
+    """The files that apply, the strongest first: the one that is named, or those of the working folder and the user.
+
+    A file that can't be read ends the command with exit code 2.
     """
-    source = path or Path(NAME)
-    if path is None and not source.is_file():
-        return None
+    if named is not None:
+        tables = _read(named)
+        if tables is None:
+            refuse_usage(f"--config {named}: there is no such file")
+        return [ConfigFile(named, tables, trusted=True)]
+    own = user_file()
+    found = [(Path(NAME), _is_same(Path(NAME), own)), (own, True)]
+    if found[0][1]:
+        del found[0]
+    return [ConfigFile(path, tables, trusted) for path, trusted in found if (tables := _read(path)) is not None]
+
+
+def _is_same(one: Path, other: Path) -> bool:
     try:
-        tables = tomllib.loads(source.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise typer.BadParameter(f"{source} can't be read: {error.strerror}") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise typer.BadParameter(f"{source} is no TOML: {error}") from None
-    group: Any = context.parent.command if context.parent else None
-    commands = dict(group.commands) if group is not None else {}
-    for name, values in tables.items():
-        if name not in commands:
-            raise typer.BadParameter(f"{source}: there is no command {name}{_nearest(name, commands)}")
-        if not isinstance(values, dict):
-            raise typer.BadParameter(f"{source}: {name} is a command; write its options below [{name}]")
-        known = {p.name for p in commands[name].params if p.param_type_name == "option"} - {"config", "help"}
-        for key in values:
-            if key.replace("-", "_") not in known:
-                options = {option.replace("_", "-") for option in known}
-                raise typer.BadParameter(
-                    f"{source}: {name} has no option {key}{_nearest(key.replace('_', '-'), options)}"
-                )
-    _TABLES.set(tables)
-    mine = tables.get(context.info_name or "", {})
-    context.default_map = {key.replace("-", "_"): value for key, value in mine.items()}
-    return path
+        return one.samefile(other)
+    except OSError:
+        return False
 
 
-def settings_of(command: str) -> dict[str, Any]:
-    """What the file that was read for the running command says of another one, by parameter; {} if nothing."""
-    table = _TABLES.get().get(command, {})
-    return {key.replace("-", "_"): value for key, value in table.items()}
-
-
-def _nearest(name: str, known: Any) -> str:
-    close = difflib.get_close_matches(name, [str(word) for word in known], 1)
-    return f"; did you mean {close[0]}?" if close else ""
+def _read(path: Path) -> dict[str, Any] | None:
+    """The tables of a file; None if there is none. Opening a FIFO must not wait for a writer."""
+    try:
+        handle = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError) as error:
+        refuse_usage(f"{path} can't be read: {getattr(error, 'strerror', None) or error}")
+    with open(handle, "rb") as stream:
+        about = os.fstat(handle)
+        if not stat.S_ISREG(about.st_mode):
+            refuse_usage(f"{path} is no regular file; options are read from a file of TOML")
+        try:
+            data = stream.read(MAX_BYTES + 1)
+        except OSError as error:
+            refuse_usage(f"{path} can't be read: {error.strerror}")
+    if len(data) > MAX_BYTES:
+        refuse_usage(f"{path} has {about.st_size} bytes; a file of options has at most {MAX_BYTES}")
+    try:
+        return tomllib.loads(data.decode("utf-8-sig"))
+    except RecursionError:
+        refuse_usage(f"{path} is no TOML that can be read: it is nested too deeply")
+    except ValueError as error:
+        refuse_usage(f"{path} is no TOML: {error}")

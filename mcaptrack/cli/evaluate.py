@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 import typer
 
 from mcaptrack.cli import common
+from mcaptrack.cli.text import printable
 from mcaptrack.errors import McaptrackError
 
 if TYPE_CHECKING:
@@ -45,20 +46,13 @@ def evaluate(
         ),
     ] = None,
     similarity: Annotated[
-        Literal["iou", "metres"] | None,
-        common.option(
-            "--similarity",
-            help="What makes two boxes alike.",
-            show_default="both, as far as there are boxes and metres",
-        ),
+        common.SimilarityName | None, common.similarity("both, as far as there are boxes and metres")
     ] = None,
-    gate_m: Annotated[
-        str, common.option("--gate-m", help="Distances in metres within which people count as found.")
-    ] = "0.5,1,2",
-    min_iou: Annotated[float, common.option("--min-iou", help="Overlap from which boxes count as alike.")] = 0.5,
+    gate_m: Annotated[str, common.gate_m(tuning=r"[0-9.eE+, -]+")] = "0.5,1,2",
+    min_iou: Annotated[float, common.min_iou()] = 0.5,
     rules: Annotated[
         Literal["trackeval", "motmetrics"],
-        common.option("--rules", help="Whose rules for counting switches and fragments."),
+        common.option("--rules", tuning=True, help="Rules for counting switches and fragments."),
     ] = "trackeval",
     topic: Annotated[
         list[str] | None,
@@ -67,16 +61,9 @@ def evaluate(
         ),
     ] = None,
     camera: common.Camera = None,
-    ground_plane: Annotated[
-        Path | None,
-        common.option("--ground-plane", help="3x3 homography, for label files in pixels.", show_default=False),
-    ] = None,
-    point: Annotated[
-        Literal["center", "foot"], common.option("--point", help="What of a box stands on the ground.")
-    ] = "foot",
-    fps: Annotated[
-        str | None, common.option("--fps", help="Frames per second of label files.", show_default=False)
-    ] = None,
+    ground_plane: common.GroundPlane = None,
+    point: common.Point = "foot",
+    fps: common.LabelFps = None,
     fail_under: Annotated[
         list[str] | None,
         common.option("--fail-under", help="Exit 4 if a score is lower, as in idf1=0.7.", show_default=False),
@@ -220,8 +207,8 @@ def print_results(outcome: Outcome) -> None:
             table.add_row()
         previous = (result.sequence, by)
         numbers = [f"{100 * row[name]:.1f}" if isinstance(row[name], float) else str(row[name]) for name in _COLUMNS]
-        first = [escape(common.printable(result.sequence))] if several else []
-        table.add_row(*first, escape(common.printable(result.tracks)), by, *numbers)
+        first = [escape(printable(result.sequence))] if several else []
+        table.add_row(*first, escape(printable(result.tracks)), by, *numbers)
     console.print(table)
     forecasts: dict[tuple[str, str], dict[str, float | None]] = {}
     for result in outcome.results:
@@ -235,8 +222,8 @@ def print_results(outcome: Outcome) -> None:
             table.add_column(name, justify="right", no_wrap=True)
         for (sequence, tracks), values in forecasts.items():
             numbers = ["-" if values[name] is None else f"{values[name]:.3f}" for name in _FORECAST_COLUMNS]
-            first = [escape(common.printable(sequence))] if several else []
-            table.add_row(*first, escape(common.printable(tracks)), *numbers)
+            first = [escape(printable(sequence))] if several else []
+            table.add_row(*first, escape(printable(tracks)), *numbers)
         console.print()
         console.print(table)
 

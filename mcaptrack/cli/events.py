@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated
 
 from mcaptrack.cli import common
 from mcaptrack.cli.stages import run_on_logs, watched
@@ -16,17 +16,10 @@ def events(
         common.option("--topic", help="Look at these channels of tracks.", show_default="tracks, retracks"),
     ] = None,
     similarity: Annotated[
-        Literal["iou", "metres"] | None,
-        common.option(
-            "--similarity",
-            help="What makes a person and a track alike.",
-            show_default="iou at the video's rate, otherwise metres",
-        ),
+        common.SimilarityName | None, common.similarity("iou at the video's rate, otherwise metres")
     ] = None,
-    gate: Annotated[
-        float | None,
-        common.option("--gate", help="Least overlap, or distance in metres.", show_default="0.5, or 1 m"),
-    ] = None,
+    gate_m: Annotated[float | None, common.gate_m("1.0", was="--gate")] = None,
+    min_iou: Annotated[float | None, common.min_iou(was="--gate", was_if=("similarity", "iou"))] = None,
     camera: common.Camera = None,
     output: common.Output = None,
     sidecar: common.Sidecar = False,
@@ -45,8 +38,8 @@ def events(
     and from what re-tracking made of the tracks: to /camera/predictions/errors and, frame by frame, .../scores; and the
     same for /camera/retracks/predictions. `mcaptrack run` does all this too.
 
-    Example: mcaptrack events log.mcap --similarity metres --gate 1
+    Example: mcaptrack events log.mcap --similarity metres --gate-m 1
     """
-    watch = watched(similarity, gate, topics=tuple(topic or ()), again=True)
+    watch = watched(similarity, gate_m, min_iou, topics=tuple(topic or ()), again=True)
     given = {"logs": logs, "camera": camera, "output": output, "sidecar": sidecar, "topic": None, "force": force}
     run_on_logs(given | {"json": json, "quiet": quiet, "verbose": verbose}, lambda _: [], watch=watch)

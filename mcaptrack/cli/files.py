@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from mcaptrack.cli import common
+from mcaptrack.cli.text import printable
 from mcaptrack.errors import McaptrackError
 
 if TYPE_CHECKING:
@@ -65,7 +66,7 @@ def _print_checked(checked: Checked, quiet: bool) -> None:
     from rich.table import Table
     from rich.text import Text
 
-    path = common.printable(str(checked.path))
+    path = printable(str(checked.path))
     if not quiet:
         verdict = "sound" if checked.is_sound else "damaged"
         print(f"{path}: {verdict}; {checked.messages} messages in {checked.chunks} chunks")
@@ -77,7 +78,7 @@ def _print_checked(checked: Checked, quiet: bool) -> None:
         table.add_column(name, justify=justify)  # type: ignore[arg-type]
     for found in findings:
         style = "red" if found.level == "error" else "yellow"
-        words = common.printable(found.words)
+        words = printable(found.words)
         table.add_row(
             Text(found.level, style), str(found.where), str(found.times), found.kind, Text(words, overflow="fold")
         )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from fractions import Fraction
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -19,7 +19,10 @@ Inputs = Annotated[
         show_default=False,
     ),
 ]
-LabelFile = Annotated[Path | None, common.option(help="Labels that belong to the pictures.", show_default=False)]
+
+
+def _label_file(words: str) -> Any:
+    return common.option(panel=common.FILES, help=f"Label file of the pictures: {words}.")
 
 
 @common.one_line
@@ -31,7 +34,12 @@ def ingest(
     ] = "camera",
     fps: Annotated[
         str | None,
-        common.option("--fps", help="Frames per second, instead of the file's own times.", show_default=False),
+        common.option(
+            "--fps",
+            tuning=common.FPS_PATTERN,
+            help="Frames per second, instead of the file's own times.",
+            show_default=False,
+        ),
     ] = None,
     start_time: Annotated[
         str | None,
@@ -45,6 +53,7 @@ def ingest(
         Literal["auto", "h264", "h265", "jpeg", "png"],
         common.option(
             "--image-format",
+            tuning=True,
             help="How pictures are kept. auto: H.264, VP9 and AV1 as they are where viewers play them, else as H.264; "
             "h264: nothing but H.264; h265: as auto, and H.265 as it is; jpeg, png: every picture alone.",
         ),
@@ -53,6 +62,7 @@ def ingest(
         int | None,
         common.option(
             "--quality",
+            tuning=True,
             help="Of what is encoded: H.264's constant rate factor, 1 (best) to 51; JPEG's quality, 1 to 100 (best).",
             show_default="23; JPEG 90",
         ),
@@ -61,23 +71,19 @@ def ingest(
         float | None,
         common.option(
             "--keyframe-interval-s",
+            tuning=True,
             help="Key pictures are at most so far apart, in seconds; a stream that has fewer is encoded again.",
             show_default="2 in what is kept as it is, 1 in what is encoded",
         ),
     ] = None,
-    ground_plane: Annotated[
-        Path | None,
-        common.option("--ground-plane", help="3x3 homography from pixels to metres.", show_default=False),
-    ] = None,
-    point: Annotated[
-        Literal["center", "foot"], common.option("--point", help="What of a box stands on the ground.")
-    ] = "foot",
-    detections: LabelFile = None,
-    tracks: LabelFile = None,
-    truth: LabelFile = None,
+    ground_plane: common.GroundPlane = None,
+    point: common.Point = "foot",
+    detections: Annotated[Path | None, _label_file("boxes without ids")] = None,
+    tracks: Annotated[Path | None, _label_file("boxes or positions with the ids of a tracker")] = None,
+    truth: Annotated[Path | None, _label_file("boxes or positions with the true ids")] = None,
     label_format: Annotated[
         Literal["auto", "mot", "kitti", "sdd", "trajnet", "obsmat"],
-        common.option("--format", help="Format of the label files."),
+        common.option("--format", tuning=True, help="Format of the label files."),
     ] = "auto",
     role: Annotated[
         Literal["detections", "tracks", "truth"] | None,

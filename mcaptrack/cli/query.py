@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 import typer
 
 from mcaptrack.cli import common
+from mcaptrack.cli.text import printable
 from mcaptrack.errors import McaptrackError
 
 if TYPE_CHECKING:
@@ -193,8 +194,8 @@ def _print_answer(answer: Any, limit: int, width: int | None) -> str:
 
     shown = min(limit or answer.num_rows, answer.num_rows)
     numbers, rows = cells(answer, shown)
-    rows = [[None if word is None else _cut(common.printable(word), limit) for word in row] for row in rows]
-    names = [common.printable(name) for name in answer.schema.names]
+    rows = [[None if word is None else _cut(printable(word), limit) for word in row] for row in rows]
+    names = [printable(name) for name in answer.schema.names]
     to_terminal = sys.stdout.isatty() and width is None
     console = Console(file=sys.stdout, width=None if to_terminal else 100_000, highlight=False)
     fitting = _fitting(names, rows, console.width) if to_terminal else len(names)
@@ -270,4 +271,4 @@ def _print_tables(database: Database | None, json: bool) -> None:
         console.print(shown)
         console.print()
     for what, names in found.items():
-        console.print(Text(f"{what}: {common.printable(', '.join(names))}"))
+        console.print(Text(f"{what}: {printable(', '.join(names))}"))

@@ -15,12 +15,17 @@ def render(
         list[str] | None,
         common.option("--topic", help="Draw this view; several with several --topic.", show_default="as in the layout"),
     ] = None,
-    width: Annotated[int | None, common.option("--width", help="Pixels across.", show_default="as the video")] = None,
-    max_fps: Annotated[
-        float | None, common.option("--max-fps", help="At most so many pictures a second.", show_default="all; GIF 10")
+    width: Annotated[
+        int | None, common.option("--width", tuning=True, help="Pixels across.", show_default="as the video")
     ] = None,
-    start_s: Annotated[float, common.option("--start-s", help="From this second on.")] = 0.0,
-    end_s: Annotated[float | None, common.option("--end-s", help="To this second.", show_default="the end")] = None,
+    max_fps: Annotated[
+        float | None,
+        common.option("--max-fps", tuning=True, help="At most so many pictures a second.", show_default="all; GIF 10"),
+    ] = None,
+    start_s: Annotated[float, common.option("--start-s", tuning=True, help="From this second on.")] = 0.0,
+    end_s: Annotated[
+        float | None, common.option("--end-s", tuning=True, help="To this second.", show_default="the end")
+    ] = None,
     gif: Annotated[bool, common.option("--gif", help="A GIF, if -o doesn't say.")] = False,
     camera: common.Camera = None,
     output: common.Output = None,

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from mcaptrack.cli import common
+from mcaptrack.cli.text import printable
 from mcaptrack.errors import McaptrackError
 
 if TYPE_CHECKING:
@@ -91,16 +92,16 @@ def _print(opened: Log, verbose: bool) -> None:
     data = _as_data(opened)
     console = Console(width=None if sys.stdout.isatty() else 120)  # a pipe has no width to keep to
     seconds = (data["end_ns"] - data["start_ns"]) / 1e9
-    name = escape(common.printable(data["log"]))
+    name = escape(printable(data["log"]))
     console.print(f"[bold]{name}[/bold]  {data['bytes']:,} bytes, {data['messages']:,} messages, {seconds:.3f} s")
     if data["results"]:
-        console.print(f"with results in {escape(common.printable(data['results']))}")
+        console.print(f"with results in {escape(printable(data['results']))}")
     table = Table(box=None, pad_edge=False)
     for column in ("topic", "schema", "messages"):
         table.add_column(column, justify="right" if column == "messages" else "left", overflow="fold")
     for channel in data["channels"]:
-        topic = common.printable(channel["topic"]) + ("  (replaced by the results)" if channel["replaced"] else "")
-        words = (topic, common.printable(channel["schema"]), f"{channel['messages']:,}")
+        topic = printable(channel["topic"]) + ("  (replaced by the results)" if channel["replaced"] else "")
+        words = (topic, printable(channel["schema"]), f"{channel['messages']:,}")
         table.add_row(*(escape(word) for word in words))
     console.print(table)
     shown = {channel["topic"]: channel for channel in reversed(data["channels"]) if not channel["replaced"]}
@@ -118,10 +119,10 @@ def _lineage(channels: list[dict[str, Any]], verbose: bool) -> Tree:
     def add(parent: Tree, channel: dict[str, Any], above: frozenset[str]) -> None:
         how = f"  [dim]{escape(channel['transform'])}[/dim]" if channel["transform"] else ""
         late = "  [red]out of date[/red]" if channel["stale"] else ""
-        node = parent.add(f"{escape(common.printable(channel['topic']))}{how}{late}")
+        node = parent.add(f"{escape(printable(channel['topic']))}{how}{late}")
         if verbose and channel["parameters"]:
             words = ", ".join(f"{key}={value}" for key, value in sorted(channel["parameters"].items()))
-            node.add(f"[dim]{escape(common.printable(words))}[/dim]")
+            node.add(f"[dim]{escape(printable(words))}[/dim]")
         for other in channels:
             if other["input"] == channel["topic"] and other["topic"] not in above and other["transform"] != "view":
                 add(node, other, above | {other["topic"]})
@@ -149,7 +150,12 @@ def export(
     blobs: Annotated[
         bool, common.option("--blobs", help="With --topic: keep fields of bytes, as pictures and point clouds are.")
     ] = False,
-    force: common.Force = False,
+    force: Annotated[
+        bool,
+        common.option(
+            "--force", panel=common.FILES, help="Write all tables again, also over those of another log of this name."
+        ),
+    ] = False,
     json: common.Json = False,
     quiet: common.Quiet = False,
     verbose: common.Verbose = False,
@@ -186,7 +192,9 @@ def export(
         for path in paths:
             folder = output or default_folder(path)
             with log.read(path) as opened:
-                done = write_tables(opened, folder, talk.progress, form=form, topics=topic or (), blobs=blobs)
+                done = write_tables(
+                    opened, folder, talk.progress, form=form, topics=topic or (), blobs=blobs, force=force
+                )
             for words in done.notes:
                 talk.warn(words, "left-out")
             talk.say(f"{folder}: " + ", ".join(f"{name} {rows}" for name, rows in done.rows.items()))

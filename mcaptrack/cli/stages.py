@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import inspect
+import re
 from collections.abc import Callable, Mapping
-from dataclasses import fields, replace
+from dataclasses import Field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, get_type_hints
 
 import typer
 
 from mcaptrack.cli import common
-from mcaptrack.cli.config import NAME, settings_of
+from mcaptrack.cli.command import is_on_command_line, settings_of
 from mcaptrack.errors import McaptrackError
 from mcaptrack.transforms import ALTERNATIVES, PROFILES, TRANSFORMS, Transform
-from mcaptrack.transforms.protocol import bare_type
+from mcaptrack.transforms.protocol import bare_type, range_words
 
 if TYPE_CHECKING:
     from mcaptrack.pipeline import Watch
@@ -27,7 +28,9 @@ _WORDS: Final = {
     "predict": ("Example: mcaptrack predict log.mcap --predictor cv", "{camera}/samples", "{camera}/predictions"),
     "retrack": ("Example: mcaptrack retrack log.mcap --profile authors", "{camera}/samples", "{camera}/retracks"),
 }
-Topic = Annotated[str | None, common.option("--topic", shared=True, help="Read this channel instead of the usual one.")]
+Topic = Annotated[
+    str | None, common.option("--topic", panel=common.FILES, help="Read this channel instead of the usual one.")
+]
 Mode = Literal["both", "offline", "online"]
 _OUTPUTS_OF: Final[Mapping[str, tuple[str, ...]]] = {
     "both": ("", "online", "predictions"),
@@ -53,20 +56,27 @@ def _help(name: str, kind: type[Transform]) -> str:
     return "\n\n".join([*words, where, example])
 
 
-def _option(name: str, annotation: Any, default: Any, words: str, whose: str = "") -> inspect.Parameter:
+def _option(field: Field[Any], annotation: Any, default: Any, whose: str = "") -> inspect.Parameter:
     """An option that is None unless it is given, and whose help shows what happens then.
 
     ``whose`` names the one of several transforms that it belongs to, if it doesn't belong to all.
     """
-    flag = "--" + name.replace("_", "-")
-    names = f"{flag}/--no-{flag[2:]}" if bare_type(annotation) is bool else flag
+    kind, about = bare_type(annotation), field.metadata
+    flag = "--" + field.name.replace("_", "-")
+    names = f"{flag}/--no-{flag[2:]}" if kind is bool else flag
     shown = "none" if default is None else str(default).lower() if isinstance(default, bool) else f"{default}"
-    panel: dict[str, Any] = {"rich_help_panel": f"Options of {whose} alone"} if whose else {}
-    info = common.option(names, help=words[:1].upper() + words[1:] + ".", show_default=shown, **panel)
-    return _parameter(name, Annotated[bare_type(annotation) | None, info], None)
+    words = f"{about['help'][:1].upper()}{about['help'][1:]}. {range_words(field)}".rstrip()
+    info = common.option(
+        names,
+        panel=f"Options of {whose} alone" if whose else about["theme"],
+        tuning="|".join(map(re.escape, about["names"])) or False if kind is str else True,
+        help=words,
+        show_default=shown,
+    )
+    return _parameter(field.name, Annotated[kind | None, info], None)
 
 
-def _options_of(kind: type[Transform]) -> dict[str, Any]:
+def _options_of(kind: type[Transform]) -> dict[str, Field[Any]]:
     """The parameters of a transform that are options, by name."""
     return {f.name: f for f in fields(kind) if not f.metadata.get("context")}
 
@@ -83,13 +93,17 @@ def _stage_command(name: str, kind: type[Transform]) -> Callable[..., None]:
     own = {one: _options_of(made) for one, made in kinds.items()}
     parameters = [_parameter("logs", common.Logs, inspect.Parameter.empty)]
     if several:
-        words = common.option("--" + several.option, help=f"Which {several.option}.")
+        words = common.option("--" + several.option, tuning=True, help=f"Which {several.option}.")
         default = next(one for one, made in kinds.items() if made is kind)
         parameters.append(_parameter(several.option, Annotated[Literal[tuple(kinds)], words], default))
     if name == "retrack":
-        words = common.option("--profile", help="Whose reading: ours, the paper's, or its authors' program's.")
+        words = common.option(
+            "--profile", tuning=True, help="Parameters: ours, the paper's, or those of its authors' program."
+        )
         parameters.append(_parameter("profile", Annotated[Literal[tuple(PROFILES)], words], "default"))
-        words = common.option("--mode", help="With all the log knows (offline), from the past alone (online), or both.")
+        words = common.option(
+            "--mode", tuning=True, help="With the whole log known (offline), from the past alone (online), or both."
+        )
         parameters.append(_parameter("mode", Annotated[Mode, words], "both"))
     there: dict[str, list[str]] = {}
     for one, found in own.items():
@@ -97,10 +111,9 @@ def _stage_command(name: str, kind: type[Transform]) -> Callable[..., None]:
             there.setdefault(f, []).append(one)
     for option, those in there.items():
         one = those[0]
-        help_text = own[one][option].metadata["help"]
         hint, shown = get_type_hints(kinds[one])[option], getattr(defaults[one], option)
-        parameters.append(_option(option, hint, shown, help_text, one if len(those) < len(kinds) else ""))
-    to = common.option("--to", shared=True, help="Write this channel instead of the usual one.")
+        parameters.append(_option(own[one][option], hint, shown, one if len(those) < len(kinds) else ""))
+    to = common.option("--to", panel=common.FILES, help="Write this channel instead of the usual one.")
     parameters += [
         _parameter("topic", Topic, None),
         _parameter("to", Annotated[str | None, to], None),
@@ -120,11 +133,10 @@ def _stage_command(name: str, kind: type[Transform]) -> Callable[..., None]:
         wanted = {option: given[option] for option in there if given[option] is not None}
         for option in list(wanted):
             if option not in own[one]:
-                if settings_of(name).get(option) == wanted[option]:  # the file has it, for another one
-                    del wanted[option]
-                    continue
                 flag = "--" + option.replace("_", "-")
-                raise McaptrackError(f"{flag} is an option of {' and '.join(there[option])}, not of {one}")
+                if is_on_command_line(option):
+                    raise McaptrackError(f"{flag} is an option of {' and '.join(there[option])}, not of {one}")
+                del wanted[option]  # set in a file or in the environment, for when another one is chosen
         transform = replace(base, **wanted)
         keep = _OUTPUTS_OF[given["mode"]] if name == "retrack" else None
         run_on_logs(given, lambda plan: plan.stage(name, transform, given["topic"], given["to"], keep))
@@ -143,7 +155,10 @@ def run_all(
     sidecar: common.Sidecar = False,
     events: Annotated[bool, common.option("--events/--no-events", help="Tell what happened to identities.")] = True,
     tables: Annotated[bool, common.option("--tables/--no-tables", help="Write Parquet tables beside the log.")] = True,
-    force: common.Force = False,
+    force: Annotated[
+        bool,
+        common.option("--force", panel=common.FILES, help="Run everything again, and replace the file that -o names."),
+    ] = False,
     json: common.Json = False,
     quiet: common.Quiet = False,
     verbose: common.Verbose = False,
@@ -153,7 +168,8 @@ def run_all(
 
     From /camera/video (or whatever of detections, tracks and samples there is) to /camera/predictions and
     /camera/retracks, what happened to identities (see `mcaptrack events`), and Parquet tables beside the log. With
-    --topic from the pictures, or the boxes, of that channel.
+    --topic from the pictures, or the boxes, of that channel. What stands keeps the parameters it was made with; with
+    --force everything is made again, by what environment and files say now, otherwise with the parameters it had.
 
     Example: mcaptrack run log.mcap
     """
@@ -162,41 +178,36 @@ def run_all(
     given |= {"json": json, "quiet": quiet, "verbose": verbose}
     run_on_logs(
         given,
-        lambda plan: plan.all(topic),
+        lambda plan: plan.all(topic, force),
         tables,
-        watched(settings.get("similarity"), settings.get("gate")) if events else None,
+        watched(settings.get("similarity"), settings.get("gate_m"), settings.get("min_iou"), anew=force)
+        if events
+        else None,
     )
 
 
-def watched(similarity: Any, gate: Any, **chosen: Any) -> Watch:
-    """What `mcaptrack events` and `run` are to look for.
-
-    Raises McaptrackError for what can't be a similarity or a gate: in a file may stand anything.
-    """
+def watched(
+    similarity: common.SimilarityName | None, gate_m: float | None, min_iou: float | None, **chosen: Any
+) -> Watch:
+    """What `mcaptrack events` and `run` are to look for. Raises McaptrackError for what can't be a gate."""
     from mcaptrack.evaluation.events import EventOptions
     from mcaptrack.pipeline import Watch
 
-    if similarity not in (None, "iou", "metres"):
-        raise McaptrackError(f"--similarity is iou or metres, not {similarity!r}")
-    most = 1 if similarity == "iou" else 1e6
-    if gate is not None and not (isinstance(gate, float | int) and 0 < gate <= most):
-        raise McaptrackError(f"--gate is a share of overlap up to 1, or a distance in metres, not {gate!r}")
-    if gate is not None and similarity is None:
-        raise McaptrackError("--gate needs --similarity: it is a share of overlap for iou, a distance for metres")
-    return Watch(EventOptions(similarity, gate), **chosen)
+    if gate_m is not None and not 0 < gate_m <= 1e6:
+        raise McaptrackError(f"--gate-m is a distance in metres, more than 0, not {gate_m:g}")
+    if min_iou is not None and not 0 < min_iou <= 1:
+        raise McaptrackError(f"--min-iou is an overlap, more than 0 and at most 1, not {min_iou:g}")
+    return Watch(EventOptions(similarity, gate_m, min_iou), **chosen)
 
 
 def _configured() -> dict[str, Transform]:
-    """The stages as mcaptrack.toml wants them, for those that a command makes on its way; others aren't listed."""
+    """The stages as environment and files want them, for a command that makes them on its way; others aren't listed."""
     out: dict[str, Transform] = {}
     for name, default in TRANSFORMS.items():
         settings = settings_of(name)
         several = ALTERNATIVES.get(name)
-        wanted = settings.get(several.option) if several else None
-        if several and wanted is not None and wanted not in several.kinds:
-            raise McaptrackError(f"{NAME}: {several.option} is one of {', '.join(several.kinds)}, not {wanted!r}")
-        kind = several.kinds[wanted] if several and wanted else default
-        base = PROFILES[settings["profile"]] if name == "retrack" and settings.get("profile") in PROFILES else kind()
+        kind = several.kinds[settings[several.option]] if several and several.option in settings else default
+        base = PROFILES[settings.get("profile", "default")] if name == "retrack" else kind()
         chosen = {option: value for option, value in settings.items() if option in _options_of(kind)}
         if chosen or settings.keys() & {"tracker", "profile"}:
             out[name] = replace(base, **chosen)
@@ -218,10 +229,10 @@ class _Plan:
             self._opened, self._prefix, name, transform, topic, to, keep, self._say, _configured()
         )
 
-    def all(self, topic: str | None) -> Any:
+    def all(self, topic: str | None, anew: bool) -> Any:
         from mcaptrack import pipeline
 
-        return pipeline.plan_all(self._opened, self._prefix, self._say, topic, _configured())
+        return pipeline.plan_all(self._opened, self._prefix, self._say, topic, _configured(), anew)
 
 
 def run_on_logs(
@@ -285,7 +296,7 @@ def _run_on_log(
     if tables:
         with log.read(target) as opened:
             folder = default_folder(target)
-            exported = export(opened, folder, talk.progress)
+            exported = export(opened, folder, talk.progress, force=given["force"])
         written = exported.rows
         for words in exported.notes:
             talk.warn(words, "left-out")

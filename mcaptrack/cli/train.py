@@ -42,7 +42,8 @@ def train(
         Path, common.option("--output", "-o", help="Folder for the weights, the log of epochs and the state.")
     ] = Path("trained"),
     recipe: Annotated[
-        Literal["red", "paper"], common.option("--recipe", help="Our network and training, or the paper's.")
+        Literal["red", "paper"],
+        common.option("--recipe", tuning=True, help="Our network and training, or the paper's."),
     ] = "red",
     validate: Annotated[
         list[Path] | None,
@@ -51,56 +52,63 @@ def train(
         ),
     ] = None,
     epochs: Annotated[
-        int | None, common.option("--epochs", help="Passes over the windows.", show_default="20; paper: 50")
+        int | None,
+        common.option("--epochs", tuning=True, help="Passes over the windows.", show_default="20; paper: 50"),
     ] = None,
     batch: Annotated[
-        int | None, common.option("--batch", help="Windows a step.", show_default="256; paper: 60")
+        int | None, common.option("--batch", tuning=True, help="Windows a step.", show_default="256; paper: 60")
     ] = None,
     rate: Annotated[
-        float | None, common.option("--rate", help="Learning rate.", show_default="0.003; paper: 0.0001")
+        float | None, common.option("--rate", tuning=True, help="Learning rate.", show_default="0.003; paper: 0.0001")
     ] = None,
     noise_m: Annotated[
         float | None,
-        common.option("--noise-m", help="Most noise added to past positions.", show_default="0.4; paper: 0"),
+        common.option(
+            "--noise-m", tuning=True, help="Most noise added to past positions.", show_default="0.4; paper: 0"
+        ),
     ] = None,
     gaps: Annotated[
         float | None,
-        common.option("--gaps", help="Share of past positions taken away.", show_default="0.3; paper: 0"),
+        common.option("--gaps", tuning=True, help="Share of past positions taken away.", show_default="0.3; paper: 0"),
     ] = None,
     scale: Annotated[
         float | None,
-        common.option("--scale", help="Most that people are scaled by, as a logarithm.", show_default="0.15; paper: 0"),
+        common.option(
+            "--scale",
+            tuning=True,
+            help="Most that people are scaled by, as a logarithm.",
+            show_default="0.15; paper: 0",
+        ),
     ] = None,
     consistency_weight: Annotated[
         float,
-        common.option("--consistency-weight", help="How much forecasts may not differ from one step to the next."),
+        common.option(
+            "--consistency-weight", tuning=True, help="How much forecasts may not differ from one step to the next."
+        ),
     ] = 0.0,
     patience: Annotated[
-        int, common.option("--patience", help="End after so many epochs without a better one; 0 for never.")
+        int,
+        common.option("--patience", tuning=True, help="End after so many epochs without a better one; 0 for never."),
     ] = 0,
-    walks: Annotated[int, common.option("--walks", help="How many walks `synthetic` makes up.")] = 60_000,
-    seed: Annotated[int, common.option("--seed", help="The same seed gives the same weights.")] = 1,
+    walks: Annotated[int, common.option("--walks", tuning=True, help="How many walks `synthetic` makes up.")] = 60_000,
+    seed: Annotated[int, common.option("--seed", tuning=True, help="The same seed gives the same weights.")] = 1,
     device: Annotated[
-        Literal["auto", "cpu", "cuda", "mps"], common.option("--device", help="What to compute on.")
+        Literal["auto", "cpu", "cuda", "mps"], common.option("--device", tuning=True, help="What to compute on.")
     ] = "auto",
     threads: Annotated[
-        int, common.option("--threads", help="Threads of the processor to use; more than one rarely helps.", min=1)
+        int,
+        common.option(
+            "--threads", tuning=True, help="Threads of the processor to use; more than one rarely helps.", min=1
+        ),
     ] = 1,
     resume: Annotated[bool, common.option("--resume", help="Go on with the training in the folder.")] = False,
     topic: Annotated[
         str | None,
         common.option("--topic", help="The channel of logs and tables.", show_default="truth, or the best tracks"),
     ] = None,
-    fps: Annotated[
-        str | None, common.option("--fps", help="Frames per second of label files.", show_default=False)
-    ] = None,
-    ground_plane: Annotated[
-        Path | None,
-        common.option("--ground-plane", help="3x3 homography, for label files in pixels.", show_default=False),
-    ] = None,
-    point: Annotated[
-        Literal["center", "foot"], common.option("--point", help="What of a box stands on the ground.")
-    ] = "foot",
+    fps: common.LabelFps = None,
+    ground_plane: common.GroundPlane = None,
+    point: common.Point = "foot",
     force: common.Force = False,
     json: common.Json = False,
     quiet: common.Quiet = False,

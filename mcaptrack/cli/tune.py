@@ -32,53 +32,47 @@ def tune(
         list[Path] | None,
         common.option("--truth", help="True tracks for files of detections: by name or in order.", show_default=False),
     ] = None,
-    stage: Annotated[Literal["track", "sample", "retrack"], common.option("--stage", help="What to tune.")] = "track",
+    stage: Annotated[
+        Literal["track", "sample", "retrack"], common.option("--stage", tuning=True, help="What to tune.")
+    ] = "track",
     tracker: Annotated[
-        Literal["sort", "bytetrack", "ocsort"], common.option("--tracker", help="Which tracker.")
+        Literal["sort", "bytetrack", "ocsort"], common.option("--tracker", tuning=True, help="Which tracker.")
     ] = "sort",
     metric: Annotated[
         Literal["IDF1", "MOTA", "HOTA", "IDP", "IDR", "DetA", "AssA"],
-        common.option("--metric", help="What to make as large as can be.", case_sensitive=False),
+        common.option("--metric", tuning=True, help="What to make as large as can be.", case_sensitive=False),
     ] = "IDF1",
     trials: Annotated[
-        int, common.option("--trials", help="How many settings to try, the defaults first.", min=1)
+        int, common.option("--trials", tuning=True, help="How many settings to try, the defaults first.", min=1)
     ] = 100,
     search: Annotated[
         list[str] | None,
         common.option(
             "--search",
+            tuning=r"[A-Za-z0-9_-]+(=[0-9.eE+-]+:[0-9.eE+-]+)?",
             help="Search these parameters, in these ranges, as in min-iou=0.1:0.5; or only in name.",
             show_default="all that the stage declares",
         ),
     ] = None,
-    seed: Annotated[int, common.option("--seed", help="Which chance.", min=0)] = 0,
+    seed: Annotated[int, common.option("--seed", tuning=True, help="Which chance.", min=0)] = 0,
     study: Annotated[
         Path | None,
         common.option("--study", help="Keep trials in this file; go on with those in it.", show_default="beside -o"),
     ] = None,
-    similarity: Annotated[
-        Literal["iou", "metres"] | None,
-        common.option("--similarity", help="What makes two boxes alike.", show_default="iou; metres after track"),
-    ] = None,
-    gate_m: Annotated[float, common.option("--gate-m", help="Within how many metres people count as found.")] = 1.0,
-    min_iou: Annotated[float, common.option("--match-iou", help="Overlap from which boxes count as alike.")] = 0.5,
-    fps: Annotated[
-        str | None, common.option("--fps", help="Frames per second of files.", show_default="as seqinfo.ini says")
-    ] = None,
-    ground_plane: Annotated[
-        Path | None, common.option("--ground-plane", help="3x3 homography, for files in pixels.", show_default=False)
-    ] = None,
-    point: Annotated[
-        Literal["center", "foot"], common.option("--point", help="What of a box stands on the ground.")
-    ] = "foot",
+    similarity: Annotated[common.SimilarityName | None, common.similarity("iou; metres after track")] = None,
+    gate_m: Annotated[float, common.gate_m()] = 1.0,
+    min_iou: Annotated[float, common.min_iou(was="--match-iou")] = 0.5,
+    fps: common.LabelFps = None,
+    ground_plane: common.GroundPlane = None,
+    point: common.Point = "foot",
     topic: Annotated[
-        str | None, common.option("--topic", shared=True, help="Read this channel instead of the usual one.")
+        str | None, common.option("--topic", panel=common.FILES, help="Read this channel instead of the usual one.")
     ] = None,
     camera: common.Camera = None,
     output: Annotated[
-        Path, common.option("--output", "-o", shared=True, help="Write the settings to this file.")
+        Path, common.option("--output", "-o", panel=common.FILES, help="Write the settings to this file.")
     ] = Path(NAME),
-    force: Annotated[bool, common.option("--force", shared=True, help="Forget earlier trials.")] = False,
+    force: Annotated[bool, common.option("--force", panel=common.FILES, help="Forget earlier trials.")] = False,
     json: common.Json = False,
     quiet: common.Quiet = False,
     verbose: common.Verbose = False,

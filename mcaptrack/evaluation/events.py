@@ -44,13 +44,19 @@ Ints = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class EventOptions:
-    """What makes a person and a track alike; None is what suits the tracks (``usual_rule``).
+    """What makes a person and a track alike; ``similarity`` None is what suits the tracks (``usual_rule``).
 
-    ``gate`` is the least overlap for "iou", metres for "metres".
+    ``gate_m`` is the largest distance for "metres", ``min_iou`` the least overlap for "iou"; None is what is usual.
     """
 
     similarity: Similarity | None = None
-    gate: float | None = None
+    gate_m: float | None = None
+    min_iou: float | None = None
+
+    def rule(self, similarity: Similarity) -> Rule:
+        """By this similarity, within the gate that was asked for."""
+        gate, usual = (self.min_iou, IOU_THRESHOLD) if similarity == "iou" else (self.gate_m, GATE_M)
+        return Rule(similarity, usual if gate is None else gate)
 
 
 class Rule(NamedTuple):
@@ -139,11 +145,7 @@ def usual_rule(truth: Sequence[Frame], tracks: Sequence[Frame]) -> Rule | None:
     at_video_rate = share_times(frame_times(truth), frame_times(tracks))
     first: tuple[Similarity, ...] = ("iou", "metres") if at_video_rate and has(truth, "iou") else ("metres", "iou")
     chosen = next((one for one in first if one in shared), None)
-    return Rule(chosen, _usual_gate(chosen)) if chosen else None
-
-
-def _usual_gate(similarity: Similarity) -> float:
-    return IOU_THRESHOLD if similarity == "iou" else GATE_M
+    return EventOptions().rule(chosen) if chosen else None
 
 
 def _compared(
@@ -152,16 +154,14 @@ def _compared(
     """Raises McaptrackError if they can't be compared."""
     if not any(len(frame.rows) for frame in truth):
         raise McaptrackError("the truth holds nobody")
-    rule = usual_rule(truth, tracks)
-    if options.similarity is not None:
-        rule = Rule(options.similarity, _usual_gate(options.similarity))
-    if rule is None:
+    usual = usual_rule(truth, tracks)
+    similarity = options.similarity or (usual.similarity if usual else None)
+    if similarity is None:
         raise McaptrackError(f"{names[1]} and the truth share neither boxes nor positions in metres")
-    if lacking := without({"the truth": truth, names[1]: tracks}, rule.similarity):
-        unit = "boxes" if rule.similarity == "iou" else "positions in metres"
+    rule = options.rule(similarity)
+    if lacking := without({"the truth": truth, names[1]: tracks}, similarity):
+        unit = "boxes" if similarity == "iou" else "positions in metres"
         raise McaptrackError(f"{' and '.join(lacking)} {'have' if len(lacking) > 1 else 'has'} no {unit}")
-    if options.gate is not None:
-        rule = rule._replace(gate=options.gate)
     at_same = align(*names, truth, tracks)
     compared = compare(*at_same, *rule)
     found = matches(compared.matchup)

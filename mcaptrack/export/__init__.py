@@ -59,8 +59,11 @@ def export(
     form: Format = "parquet",
     topics: Sequence[str] = (),
     blobs: bool = False,
+    force: bool = False,
 ) -> Exported:
     """Bring the tables of a log in a folder up to date. Tables without rows are written too, with their columns.
+
+    With ``force`` all of them are made again, and those of another log of the same name are replaced.
 
     ``topics`` are channels of others that get tables of their own, with fields of bytes if ``blobs``; those that have
     one already are kept up to date, and go when their channel is gone. Raises McaptrackError if a channel isn't there
@@ -69,7 +72,7 @@ def export(
     contents = Contents(opened)
     for topic in topics:
         opened.channel(topic)
-    job = _Job(contents, folder, form, Exported())
+    job = _Job(contents, folder, form, force, Exported())
     *names, last = TABLES
     known = job.known_topics()
     wanted = sorted({*topics, *(topic for topic in known if topic in opened.channels)})
@@ -91,6 +94,7 @@ class _Job:
     contents: Contents
     folder: Path
     form: Format
+    force: bool
     done: Exported
 
     def path(self, *names: str) -> Path:
@@ -120,7 +124,9 @@ class _Job:
         self.done.notes += [f"{topic}: {left} left out, bytes; --blobs keeps them"] if left else []
 
     def _stands(self, name: str, path: Path, source: str) -> bool:
-        """Whether a table is there already as it would be."""
+        """Whether a table is there already as it would be, and may stay."""
+        if self.force:
+            return False
         known = tables.described(path, self.form) or {}
         file = self.contents.opened.path.name
         if known.get("recording", file) != file:

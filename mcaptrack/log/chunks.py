@@ -6,7 +6,6 @@ Letters: M messages.
 from __future__ import annotations
 
 import mmap
-import os
 import zlib
 from typing import Final, NamedTuple
 
@@ -14,6 +13,7 @@ import numpy as np
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
+from mcaptrack import environment
 from mcaptrack.log import records
 from mcaptrack.log.records import ChunkIndexRecord, Damaged, Record, walk
 
@@ -82,8 +82,7 @@ def open_chunk(buffer: memoryview, record: Record) -> memoryview:
 
 
 def _most_mib() -> int:
-    given = os.environ.get(ENVIRONMENT, "")
-    return int(given) if given.isdecimal() else MAX_CHUNK_MIB
+    return environment.whole_number(ENVIRONMENT, MAX_CHUNK_MIB)
 
 
 def _decompress(data: memoryview, compression: str, size: int, where: int) -> memoryview:

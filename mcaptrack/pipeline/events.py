@@ -51,12 +51,13 @@ _ERRORS, _SCORES = "/errors", "/scores"
 class Watch:
     """Which channels of tracks events are made of; none named are the usual ones, and those that have events.
 
-    With ``again`` they are made whether or not they stand.
+    With ``again`` they are made whether or not they stand; with ``anew``, too, as they were asked for before.
     """
 
     options: EventOptions = EventOptions()
     topics: tuple[str, ...] = ()
     again: bool = False
+    anew: bool = False
 
 
 def outputs(topic: str) -> tuple[str, ...]:
@@ -82,7 +83,7 @@ def make_events(opened: log.Log, prefix: str, made: Mapping[str, Made], watch: W
     for topic in topics:
         options = watch.options if watch.again else _asked(opened, topic, watch.options)
         stands = _asked(opened, topic, EventOptions()) == options and not _is_due(opened, outputs(topic), made)
-        if stands and not watch.again:
+        if stands and not (watch.again or watch.anew):
             continue
         taken = [name for name in outputs(topic) if not _is_ours(opened, name)]
         if taken:
@@ -103,7 +104,7 @@ def make_events(opened: log.Log, prefix: str, made: Mapping[str, Made], watch: W
         out[topic + _COUNTS] = Made.of(COUNTS, found.counts, provenance)
     if not watch.topics:
         for name in MADE_FROM:
-            out |= _forecast_errors(opened, prefix, name, made, watch.again, truth)
+            out |= _forecast_errors(opened, prefix, name, made, watch.again or watch.anew, truth)
     return out
 
 
@@ -200,9 +201,17 @@ def _asked(opened: log.Log, topic: str, given: EventOptions) -> EventOptions:
     asked: Any = known.parameters.get("asked") if known and known.transform == STAGE else None
     if given != EventOptions() or not isinstance(asked, dict):
         return given
-    similarity, gate = asked.get("similarity"), asked.get("gate")
-    is_gate = isinstance(gate, float | int) and gate > 0
-    return EventOptions(similarity if similarity in ("iou", "metres") else None, gate if is_gate else None)
+    similarity = asked.get("similarity")
+    if similarity not in ("iou", "metres"):
+        similarity = None
+    if "gate" in asked:  # as version 0.1 said it
+        asked = {"min_iou" if similarity == "iou" else "gate_m": asked["gate"]}
+    gates = {name: gate for name in ("gate_m", "min_iou") if _is_gate(gate := asked.get(name))}
+    return EventOptions(similarity, **gates)
+
+
+def _is_gate(value: Any) -> bool:
+    return isinstance(value, float | int) and not isinstance(value, bool) and value > 0
 
 
 def _is_due(opened: log.Log, topics: Sequence[str], made: Mapping[str, Made]) -> bool:

@@ -38,6 +38,8 @@ ROUTES: Final[Mapping[str, Route]] = {
     "predict": Route("samples", "predictions"),
     "retrack": Route("samples", "retracks"),
 }
+#: So many parameters that differ are named.
+_NAMED: Final = 3
 _MAKER: Final = {route.writes: name for name, route in ROUTES.items()}
 
 
@@ -128,13 +130,15 @@ def plan_all(
     say: Say = lambda _: None,
     source: str | None = None,
     defaults: Mapping[str, Transform] = {},
+    anew: bool = False,
 ) -> list[Job]:
     """The jobs that bring everything about a camera up to date; none if it is.
 
     ``source`` is a topic with pictures or with boxes that others detected, to begin with; ``defaults`` as in
-    ``plan_stage``. Raises McaptrackError as that does.
+    ``plan_stage``. With ``anew`` what is up to date is made again, too, as ``defaults`` say or else as before. Raises
+    McaptrackError as ``plan_stage`` does.
     """
-    planner = _Planner(opened, prefix, say, {_stage_from(opened, source): source} if source else {}, defaults)
+    planner = _Planner(opened, prefix, say, {_stage_from(opened, source): source} if source else {}, defaults, anew)
     for target in ("predictions", "retracks"):
         planner.ensure(f"{prefix}/{target}")
     check_inputs(opened, prefix, planner.jobs)
@@ -150,7 +154,8 @@ def _stage_from(opened: log.Log, source: str) -> str:
 class _Planner:
     """Collects the jobs that make channels stand and be up to date.
 
-    ``sources`` are inputs of stages and ``defaults`` transforms of stages, where they are not the usual ones.
+    ``sources`` are inputs of stages and ``defaults`` transforms of stages, where they are not the usual ones. With
+    ``anew`` all stages run, whether or not their channels stand.
     """
 
     def __init__(
@@ -160,9 +165,10 @@ class _Planner:
         say: Say,
         sources: Mapping[str, str] = {},
         defaults: Mapping[str, Transform] = {},
+        anew: bool = False,
     ) -> None:
         self.jobs: list[Job] = []
-        self._defaults = defaults
+        self._defaults, self._anew = defaults, anew
         self._opened, self._prefix, self._say = opened, prefix, say
         self._sources = sources
         self._changes: dict[str, bool] = {}
@@ -202,15 +208,31 @@ class _Planner:
         made = Provenance.from_metadata(channel.metadata)
         had = made.input if made else self.source_of(stage)
         source = self._sources.get(stage, had)
-        if not self.ensure(source) and not is_stale(self._opened, topic) and source == had:
+        stands = not self.ensure(source) and not is_stale(self._opened, topic) and source == had
+        before = _transform_of(stage, channel)
+        wanted = self._defaults.get(stage, before)
+        if self._anew:
+            before = wanted
+        elif differing := _differing(before, wanted):
+            self._say(f"{topic} was made with other settings than now ({differing}); `run --force` takes these")
+        if stands and not self._anew:
             return False
         if source != had:
             self._say(f"{topic} was made from {had}: running {stage} again, from {source}")
-            self.jobs.append(Job(stage, _transform_of(stage, channel), source, topic))
-            return True
-        self._say(f"{topic} was made from an earlier {source}: running {stage} again, as before")
-        self.jobs.append(Job(stage, _transform_of(stage, channel), source, topic))
+        elif not stands and not self._anew:
+            self._say(f"{topic} was made from an earlier {source}: running {stage} again, as before")
+        self.jobs.append(Job(stage, before, source, topic))
         return True
+
+
+def _differing(before: Transform, wanted: Transform) -> str:
+    """The parameters in which two transforms of a stage differ, in words; "" if there are none."""
+    if type(before) is not type(wanted):
+        return f"{type(wanted).__name__}, not {type(before).__name__}"
+    names = [f.name for f in fields(before) if not f.metadata.get("context")]
+    pairs = [(name, getattr(before, name), getattr(wanted, name)) for name in names]
+    words = [f"{name} {now}, not {then}" for name, then, now in pairs if then != now]
+    return "; ".join(words[:_NAMED]) + (f"; and {len(words) - _NAMED} more" if len(words) > _NAMED else "")
 
 
 def _made_by_stage(channel: log.Channel) -> bool:

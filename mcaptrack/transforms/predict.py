@@ -14,7 +14,7 @@ import numpy as np
 
 from mcaptrack.clock import NS_PER_S
 from mcaptrack.history import Histories
-from mcaptrack.predictors import PredictorName, check, make
+from mcaptrack.predictors import NAMES, PredictorName, check, make
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame, Schema
 from mcaptrack.schema.predictions import forecast_to_rows
 from mcaptrack.transforms.protocol import check_options, context, option
@@ -30,6 +30,7 @@ class Predict:
     predictor: PredictorName = option(
         "red",
         "what predicts: cv, holt-cv, kalman, lstm, red; or with weights of your own, red:FILE, lstm:FILE, onnx:FILE",
+        names=NAMES,
     )
     horizon_s: float = option(4.8, "how far ahead", least=0.1, most=60.0)
     min_history: int = option(4, "past positions (with the present one) that a forecast needs", least=1)

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import field, fields
+from dataclasses import Field, field, fields
 from types import UnionType
 from typing import Any, ClassVar, Literal, Protocol, get_args, get_origin, get_type_hints
 
@@ -48,12 +48,17 @@ def option(
     least: float = -math.inf,
     most: float = math.inf,
     search: tuple[float, float] | None = None,
+    names: tuple[str, ...] = (),
+    theme: str = "",
 ) -> Any:
     """A parameter of a transform: its default, what it means, and its range.
 
     ``search`` is the part of the range that is worth a search (``mcaptrack tune``); None for what isn't tuned.
+    ``names`` are the built-in values of a text that may also name a file. ``theme`` is a heading that parameters share
+    in the help of a command that has many.
     """
-    return field(default=default, metadata={"help": help, "least": least, "most": most, "search": search})
+    about = {"help": help, "least": least, "most": most, "search": search, "names": names, "theme": theme}
+    return field(default=default, metadata=about)
 
 
 def context(factory: Callable[[], Any]) -> Any:
@@ -95,5 +100,17 @@ def check_options(transform: Transform) -> None:
             raise McaptrackError(f"{name} needs {kind.__name__}, not {value!r}")
         least, most = parameter.metadata["least"], parameter.metadata["most"]
         if kind in (int, float) and not least <= value <= most:
-            limits = f"at least {least:g}" if most == math.inf else f"from {least:g} to {most:g}"
-            raise McaptrackError(f"{name} has to be {limits}, not {value:g}")
+            raise McaptrackError(f"{name} has to be {_limits(least, most)}, not {value}")
+
+
+def range_words(parameter: Field[Any]) -> str:
+    """The range of a parameter in words, as in "From 0 to 1."; "" if it has none."""
+    least, most = parameter.metadata["least"], parameter.metadata["most"]
+    words = _limits(least, most)
+    return f"{words[0].upper()}{words[1:]}." if words else ""
+
+
+def _limits(least: float, most: float) -> str:
+    if most == math.inf:
+        return "" if least == -math.inf else f"at least {least:g}"
+    return f"at most {most:g}" if least == -math.inf else f"from {least:g} to {most:g}"

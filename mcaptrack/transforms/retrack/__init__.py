@@ -17,7 +17,7 @@ from typing import ClassVar, Final, Literal
 import numpy as np
 
 from mcaptrack.plane import Planes
-from mcaptrack.predictors import PredictorName
+from mcaptrack.predictors import NAMES, PredictorName
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame, Schema
 from mcaptrack.transforms.protocol import check_options, context, option
 from mcaptrack.transforms.retrack.algorithm import Forecasting
@@ -35,7 +35,7 @@ class Retrack:
     """
 
     predictor: PredictorName = option(
-        "kalman", "what predicts: cv, holt-cv, kalman, lstm, red; or red:FILE, lstm:FILE, onnx:FILE"
+        "kalman", "what predicts: cv, holt-cv, kalman, lstm, red; or red:FILE, lstm:FILE, onnx:FILE", names=NAMES
     )
     horizon_s: float = option(4.8, "how far ahead", least=0.1, most=60.0)
     distance: Distance = option(

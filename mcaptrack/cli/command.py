@@ -1,0 +1,163 @@
+"""A command as Typer knows it, whose options also come from the environment and from files, and may have old names."""
+
+from __future__ import annotations
+
+import copy
+import sys
+from collections.abc import Callable, Mapping
+from contextvars import ContextVar
+from pathlib import Path
+from typing import Any, Final
+
+import typer
+from typer.core import TyperCommand
+
+from mcaptrack.cli.settings import Given, Setting, declared_settings, found_of, gather
+from mcaptrack.cli.text import printable, refuse_usage
+
+COMMON: Final = "Options of all commands"
+_RUNNING: Final[ContextVar[typer.Context]] = ContextVar("running")
+
+
+class Command(TyperCommand):
+    """See the module. ``settings`` are its options by name, also under the names that they had before."""
+
+    def __init__(self, name: str, **given: Any) -> None:
+        super().__init__(name, **given)
+        now = declared_settings(name, given["callback"], self.params)
+        self._renamed: dict[str, list[Setting]] = {}
+        for setting in now.values():
+            if setting.declared.was:
+                self._renamed.setdefault(setting.declared.was, []).append(setting)
+        self.settings: dict[str, Setting] = dict(now)
+        parameters = {parameter.name: parameter for parameter in self.params}
+        for old, targets in self._renamed.items():
+            hidden = _hidden(parameters[targets[0].parameter], old)
+            self.params.append(hidden)
+            first = targets[0]
+            self.settings[old] = Setting(name, old, hidden.name, first.kind, first.many, first.declared)
+        config = parameters["config"]
+        config.envvar = now["config"].variable  # the others are read with the files, once this is known
+
+    def get_help_option(self, ctx: Any) -> Any:
+        """``--help`` stands with the options that all commands have."""
+        option = super().get_help_option(ctx)
+        if option is not None:
+            option.rich_help_panel = COMMON
+        return option
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Take what was given under an old name for the new one."""
+        left = super().parse_args(ctx, args)
+        if not ctx.resilient_parsing:
+            found = found_of(self.name or "")
+            self.rename(ctx.params, lambda parameter: _rank(ctx, parameter, found), ctx.params.get("quiet"))
+        return left
+
+    def rename(self, values: dict[str, Any], rank_of: Callable[[str], tuple[int, str]], quiet: Any = False) -> None:
+        """Put what stands under old names in ``values`` under the new ones, unless that was given in a stronger way."""
+        for old, targets in self._renamed.items():
+            value = values.pop(_python_name(old), None)
+            rank, where = rank_of(_python_name(old))
+            if rank == _DEFAULT:
+                continue
+            new = _now(targets, values)
+            new_rank, _ = rank_of(new.parameter)
+            if new_rank == rank:
+                refuse_usage(f"{where or f'--{old}'} is the old name of --{new.name}; give one of them")
+            if rank < new_rank:
+                values[new.parameter] = value
+            if not quiet:
+                name = new.variable if rank == 1 else new.name if rank == 2 else f"--{new.name}"
+                words = f"{where or f'--{old}'} is called {name} now; the old name goes with the next release"
+                print(printable(words), file=sys.stderr)
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run it; with --verbose say first which options are not as usual, and where each was set."""
+        _RUNNING.set(ctx)
+        if ctx.params.get("verbose") and not ctx.params.get("quiet"):
+            print(printable(self._said(ctx)), file=sys.stderr)
+        return super().invoke(ctx)
+
+    def _said(self, ctx: Any) -> str:
+        found = found_of(self.name or "")
+        parts = []
+        for setting in self.settings.values():
+            rank, where = _rank(ctx, setting.parameter, found)
+            if rank != _DEFAULT and setting.parameter in ctx.params:
+                parts.append(f"{setting.name}={ctx.params[setting.parameter]} ({where or 'command line'})")
+        return f"options: {', '.join(parts)}"
+
+
+_DEFAULT: Final = 3
+
+
+def _rank(ctx: Any, parameter: str, found: Mapping[str, tuple[Setting, Given]]) -> tuple[int, str]:
+    """How strong the source of a value is, 0 the strongest, and where it is, unless on the command line."""
+    source = ctx.get_parameter_source(parameter)
+    if source is None or source.name == "DEFAULT":
+        return _DEFAULT, ""
+    if source.name == "DEFAULT_MAP":
+        return found[parameter][1].rank, found[parameter][1].where
+    return (1, "the environment") if source.name == "ENVIRONMENT" else (0, "")
+
+
+def _python_name(name: str) -> str:
+    return "old_" + name.replace("-", "_")
+
+
+def _hidden(parameter: Any, old: str) -> Any:
+    """The same option under the name that it had before."""
+    hidden = copy.copy(parameter)
+    hidden.name = _python_name(old)
+    hidden.opts = [f"--{old}"]
+    hidden.secondary_opts = [f"--no-{old}"] if parameter.secondary_opts else []
+    hidden.default, hidden.hidden = None, True
+    return hidden
+
+
+def _now(targets: list[Setting], values: Mapping[str, Any]) -> Setting:
+    """Which of the options that had one name before is meant."""
+    fitting = [s for s in targets if s.declared.was_if and values.get(s.declared.was_if[0]) == s.declared.was_if[1]]
+    return fitting[0] if fitting else next(s for s in targets if not s.declared.was_if)
+
+
+def read_config(context: typer.Context, path: Path | None) -> Path | None:
+    """Take what environment and files say for this command's options. The callback of ``--config``, the first."""
+    if context.resilient_parsing or context.parent is None:
+        return path
+    group: Any = context.parent.command
+    commands: dict[str, Command] = group.commands
+    gather({name: command.settings for name, command in commands.items()}, path)
+    context.default_map = converted(context, context.info_name or "")
+    return path
+
+
+def converted(context: Any, command: str) -> dict[str, Any]:
+    """What environment and files say of a command's options, by parameter, as the option takes it.
+
+    A value that the option doesn't take ends the command with exit code 2.
+    """
+    parameters = {parameter.name: parameter for parameter in context.parent.command.commands[command].params}
+    out = {}
+    for name, (_, given) in found_of(command).items():
+        try:
+            out[name] = parameters[name].process_value(context, given.value)
+        except typer.BadParameter as error:
+            refuse_usage(f"{given.where}: {error.message}")
+    return out
+
+
+def settings_of(command: str) -> dict[str, Any]:
+    """What environment and files say of another command's options, by parameter: for what the running one makes."""
+    context: Any = _RUNNING.get()
+    values, found = converted(context, command), found_of(command)
+    other: Command = context.parent.command.commands[command]
+    other.rename(values, lambda name: (found[name][1].rank, found[name][1].where) if name in found else (_DEFAULT, ""))
+    return values
+
+
+def is_on_command_line(parameter: str) -> bool:
+    """Whether an option of the running command was given on its command line."""
+    source = _RUNNING.get().get_parameter_source(parameter)
+    return source is not None and source.name == "COMMANDLINE"

@@ -1,0 +1,202 @@
+"""Options that come from the environment and from files: what may be set there, what is set, and where.
+
+The order is: command line, environment, the file that ``--config`` names (otherwise that of the working folder, then
+that of the user), default.
+"""
+
+from __future__ import annotations
+
+import difflib
+import inspect
+import os
+import re
+import reprlib
+import shlex
+from collections.abc import Iterable, Mapping
+from contextvars import ContextVar
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, Literal, NamedTuple, get_args, get_origin, get_type_hints
+
+from mcaptrack.cli.config import NAME, ConfigFile, read_files, user_file
+from mcaptrack.cli.text import refuse_usage
+from mcaptrack.environment import PREFIX, VARIABLES
+
+#: Options that belong to one call, not to a file or to another command.
+CALL_ONLY: Final = ("config", "help")
+_YES: Final = ("1", "true", "yes", "on")
+_NO: Final = ("0", "false", "no", "off")
+_LARGEST: Final = 2**63
+
+
+@dataclass(frozen=True)
+class Declared:
+    """What an option says of itself beyond what Typer knows.
+
+    ``tuning`` says that a file in the working folder may set it: numbers, choices and switches that change how results
+    are computed. For text it is a pattern that the whole value has to match, because text could name a file. ``was`` is
+    the name it had before, without dashes; where several options had it, ``was_if`` are another option and its value
+    that make it this one.
+    """
+
+    tuning: bool | str = False
+    was: str = ""
+    was_if: tuple[str, str] | None = None
+
+
+class Given(NamedTuple):
+    """A value that was given outside of the command line; ``rank`` is 1 for the environment, 2 for files."""
+
+    value: Any
+    where: str
+    rank: int
+
+
+@dataclass(frozen=True)
+class Setting:
+    """An option of a command: its names on the command line (``name``) and in Python, and the kind of its values."""
+
+    command: str
+    name: str
+    parameter: str
+    kind: Any
+    many: bool
+    declared: Declared
+
+    @property
+    def variable(self) -> str:
+        """The environment variable."""
+        return f"{PREFIX}{self.command}_{self.name}".upper().replace("-", "_")
+
+    def from_text(self, text: str) -> Any:
+        """The value of an environment variable. Raises ValueError with what is wrong."""
+        if self.many:
+            return shlex.split(text)
+        if self.kind is not bool:
+            return text
+        word = text.strip().lower()
+        if word not in _YES + _NO:
+            raise ValueError(f"needs true or false, not {reprlib.repr(text)}")
+        return word in _YES
+
+    def from_toml(self, value: Any) -> Any:
+        """A value of a file. Raises ValueError with what is wrong."""
+        if self.many:
+            return [self._one(member) for member in (value if isinstance(value, list) else [value])]
+        return self._one(value)
+
+    def _one(self, value: Any) -> Any:
+        is_number = isinstance(value, int | float) and not isinstance(value, bool)
+        if isinstance(value, int) and abs(value) >= _LARGEST:
+            raise ValueError("is larger than any number that TOML has")
+        if self.kind is bool:
+            fits, wanted = isinstance(value, bool), "true or false"
+        elif self.kind is int:
+            fits, wanted = is_number and isinstance(value, int), "a whole number"
+        elif self.kind is float:
+            fits, wanted = is_number, "a number"
+        elif self.kind is str and is_number:  # as in fps = 25
+            return str(value)
+        else:
+            fits, wanted = isinstance(value, str), "text in quotes"
+        if not fits:
+            raise ValueError(f"needs {wanted}, not {reprlib.repr(value)}")
+        return value
+
+    def may_tune(self, value: Any) -> bool:
+        """Whether a file in the working folder may give this value."""
+        pattern = self.declared.tuning
+        if not isinstance(pattern, str):
+            return pattern
+        members = value if self.many else [value]
+        return all(re.fullmatch(pattern, str(member)) is not None for member in members)
+
+
+#: For each command its options by name, those that were renamed under their old names, too.
+Settings = Mapping[str, Mapping[str, Setting]]
+_KNOWN: Final[ContextVar[tuple[Settings, dict[str, dict[str, Given]]]]] = ContextVar("known")
+
+
+def declared_settings(command: str, function: Any, parameters: Iterable[Any]) -> dict[str, Setting]:
+    """The options of a command, by name, from what its function declares. ``parameters`` are Typer's."""
+    hints = get_type_hints(inspect.unwrap(function), include_extras=True)
+    out = {}
+    for parameter in parameters:
+        if parameter.param_type_name != "option":
+            continue
+        annotation, *about = get_args(hints[parameter.name])
+        declared = next((found for one in about if (found := getattr(one, "declared", None))), Declared())
+        members = [part for part in get_args(annotation) if part is not type(None)]
+        kind = annotation if get_origin(annotation) is Literal or not members else members[0]
+        many = get_origin(kind) is list
+        name = max(parameter.opts, key=len).lstrip("-")
+        kind = get_args(kind)[0] if many else kind
+        out[name] = Setting(command, name, parameter.name, kind, many, declared)
+    return out
+
+
+def gather(settings: Settings, config: Path | None) -> dict[str, dict[str, Given]]:
+    """What environment and files say, by command and option, the strongest of each.
+
+    An unknown name, a value of the wrong kind, and what a file may not set end the command with exit code 2.
+    """
+    found: dict[str, dict[str, Given]] = {command: {} for command in settings}
+    for command, setting, given in _from_environment(settings):
+        found[command][setting.name] = given
+    for file in read_files(config):
+        for command, setting, given in _from_file(settings, file):
+            found[command].setdefault(setting.name, given)
+    _KNOWN.set((settings, found))
+    return found
+
+
+def _from_environment(settings: Settings) -> Iterable[tuple[str, Setting, Given]]:
+    by_variable = {setting.variable: setting for options in settings.values() for setting in options.values()}
+    for name, text in os.environ.items():
+        if not name.startswith(PREFIX) or name in VARIABLES:
+            continue
+        setting = by_variable.get(name)
+        if setting is None:
+            refuse_usage(f"the environment variable {name} is of no option{_nearest(name, [*by_variable, *VARIABLES])}")
+        if not text or setting.name in CALL_ONLY:
+            continue
+        try:
+            value = setting.from_text(text)
+        except ValueError as error:
+            refuse_usage(f"{name}: {error}")
+        yield setting.command, setting, Given(value, name, 1)
+
+
+def _from_file(settings: Settings, file: ConfigFile) -> Iterable[tuple[str, Setting, Given]]:
+    for command, values in file.tables.items():
+        if command not in settings:
+            refuse_usage(f"{file.path}: there is no command {command}{_nearest(command, settings)}")
+        if not isinstance(values, dict):
+            refuse_usage(f"{file.path}: {command} is a command; write its options below [{command}]")
+        known = {name: setting for name, setting in settings[command].items() if name not in CALL_ONLY}
+        for key, value in values.items():
+            name = key.replace("_", "-")
+            if name not in known:
+                refuse_usage(f"{file.path}: {command} has no option {key}{_nearest(name, known)}")
+            where = f"{file.path}: [{command}] {key}"
+            try:
+                taken = known[name].from_toml(value)
+            except ValueError as error:
+                refuse_usage(f"{where} {error}")
+            if not file.trusted and not known[name].may_tune(taken):
+                refuse_usage(
+                    f"{where} = {reprlib.repr(value)}: a {NAME} in the working folder may tune and nothing else; give "
+                    f"--{name} or {known[name].variable}, or put it into {user_file()} or a file for --config"
+                )
+            yield command, known[name], Given(taken, where, 2)
+
+
+def found_of(command: str) -> dict[str, tuple[Setting, Given]]:
+    """What environment and files say of a command, by parameter; for the command that runs, and for its helpers."""
+    settings, found = _KNOWN.get()
+    return {settings[command][name].parameter: (settings[command][name], one) for name, one in found[command].items()}
+
+
+def _nearest(name: str, known: Iterable[str]) -> str:
+    close = difflib.get_close_matches(name, list(known), 1)
+    return f"; did you mean {close[0]}?" if close else ""

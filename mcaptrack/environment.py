@@ -1,0 +1,38 @@
+"""The environment variables that are not options of a command, in one list: any other name is a mistake."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Final
+
+from mcaptrack.errors import McaptrackError
+
+PREFIX: Final = "MCAPTRACK_"
+#: Names and meanings.
+VARIABLES: Final[Mapping[str, str]] = MappingProxyType(
+    {
+        "MCAPTRACK_MAX_CHUNK_MIB": "chunks of a log that say they are larger than this are refused, in MiB",
+        "MCAPTRACK_DATA": "a folder with reference recordings, for the tests",
+    }
+)
+
+
+def variable(name: str) -> str:
+    """The value of one of ``VARIABLES``; "" where it is not set. Raises KeyError for a name that isn't listed."""
+    VARIABLES[name]
+    return os.environ.get(name, "")
+
+
+def whole_number(name: str, otherwise: int) -> int:
+    """The value of one of ``VARIABLES`` as a number, at least 1; ``otherwise`` where it is not set.
+
+    Raises McaptrackError for a value that is none.
+    """
+    text = variable(name)
+    if not text:
+        return otherwise
+    if not (text.isascii() and text.isdecimal() and len(text) <= 9 and int(text) > 0):
+        raise McaptrackError(f"{name} needs a whole number from 1 to 999999999, not {text[:20]!r}")
+    return int(text)
