@@ -43,6 +43,17 @@ def done(*words: object) -> Outcome:
     return outcome
 
 
+def toml_value(value: object) -> str:
+    """A value as TOML has it."""
+    return (
+        str(value).lower()
+        if isinstance(value, bool)
+        else repr(value)
+        if isinstance(value, int | float)
+        else f'"{value}"'
+    )
+
+
 def made_log(folder: Path, frames: int = 30) -> Path:
     """A log of two people who walk beside each other, found, tracked, predicted and re-tracked."""
     write_clip(folder / "clip.mp4", frames)

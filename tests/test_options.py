@@ -17,7 +17,7 @@ from mcaptrack.predictors import NAMES
 from mcaptrack.provenance import Provenance
 from mcaptrack.transforms import PROFILES, TRACKERS, TRANSFORMS
 from mcaptrack.transforms.protocol import bare_type, choices
-from tests.commands import called, made_log
+from tests.commands import called, made_log, toml_value
 
 
 @pytest.fixture(scope="session")
@@ -98,14 +98,8 @@ def flags(values: dict[str, Any]) -> list[str]:
 
 def toml(command: str, values: dict[str, Any]) -> str:
     """Values as a table of a mcaptrack.toml."""
-    lines = [f"{name.replace('_', '-')} = {_toml_value(value)}" for name, value in values.items()]
+    lines = [f"{name.replace('_', '-')} = {toml_value(value)}" for name, value in values.items()]
     return "\n".join([f"[{command}]", *lines]) + "\n"
-
-
-def _toml_value(value: Any) -> str:
-    if isinstance(value, bool):
-        return str(value).lower()
-    return f'"{value}"' if isinstance(value, str) else repr(value)
 
 
 @pytest.mark.parametrize("stage", STAGES, ids=lambda stage: "-".join([stage.command, *dict(stage.chosen).values()]))

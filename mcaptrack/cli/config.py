@@ -66,14 +66,16 @@ def _read(path: Path) -> dict[str, Any] | None:
         return None
     except (OSError, ValueError) as error:
         refuse_usage(f"{path} can't be read: {getattr(error, 'strerror', None) or error}")
-    with open(handle, "rb") as stream:
+    try:
         about = os.fstat(handle)
         if not stat.S_ISREG(about.st_mode):
             refuse_usage(f"{path} is no regular file; options are read from a file of TOML")
-        try:
+        with open(handle, "rb", closefd=False) as stream:
             data = stream.read(MAX_BYTES + 1)
-        except OSError as error:
-            refuse_usage(f"{path} can't be read: {error.strerror}")
+    except OSError as error:
+        refuse_usage(f"{path} can't be read: {error.strerror}")
+    finally:
+        os.close(handle)
     if len(data) > MAX_BYTES:
         refuse_usage(f"{path} has {about.st_size} bytes; a file of options has at most {MAX_BYTES}")
     try:

@@ -1,0 +1,383 @@
+"""Where options come from: the command line, the environment, files; which of them counts, and which is trusted.
+
+Every law is tried on all options of all commands, as the commands declare them.
+"""
+
+from __future__ import annotations
+
+import difflib
+import os
+import re
+import shlex
+from pathlib import Path
+from typing import Any, Literal, get_args, get_origin
+
+import pytest
+
+from mcaptrack import environment
+from mcaptrack.cli.config import MAX_BYTES, user_file
+from mcaptrack.cli.settings import CALL_ONLY, Setting
+from tests.commands import GROUP, called, toml_value
+
+COMMANDS = GROUP.commands
+#: Arguments of commands, as far as they need any.
+ARGUMENTS = {"drop": ["x.mcap", "/a"], "demo": []}
+EVERY_COMMAND = pytest.mark.parametrize("command", sorted(COMMANDS))
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch) -> Path:
+    """The working folder; the user's config folder is another one."""
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
+    (tmp_path / "work").mkdir()
+    monkeypatch.chdir(tmp_path / "work")
+    return tmp_path / "work"
+
+
+def options_of(command: str) -> list[Setting]:
+    """The options of a command that are not renamed ones under their old names."""
+    now = COMMANDS[command].settings.values()
+    return [setting for setting in now if setting.name not in CALL_ONLY and not setting.parameter.startswith("old_")]
+
+
+def parsed(command: str, *words: str) -> dict[str, Any]:
+    """What a command is called with, paths as text."""
+    group = GROUP.make_context("mcaptrack", [command])
+    given = [*words, *ARGUMENTS.get(command, ["x.mcap"])]
+    return {
+        name: as_text(value)
+        for name, value in COMMANDS[command].make_context(command, given, parent=group).params.items()
+    }
+
+
+def as_text(value: Any) -> Any:
+    """Paths as text, also within lists."""
+    if isinstance(value, list | tuple):
+        return [as_text(member) for member in value]
+    return str(value) if isinstance(value, Path) else value
+
+
+def another(setting: Setting, default: Any) -> Any:
+    """A value that isn't the default, as the command gets it."""
+    if setting.kind is bool:
+        return not default
+    if get_origin(setting.kind) is Literal:
+        one = next(name for name in get_args(setting.kind) if name != default)
+    elif setting.kind is str and isinstance(setting.declared.tuning, str):
+        pattern = setting.declared.tuning
+        one = next(word for word in ("cv", "25", "0.25", "min-iou") if re.fullmatch(pattern, word))
+    else:
+        one = {int: 7, float: 0.125, str: "a name", Path: "a file"}[setting.kind]
+    return [one, one] if setting.many else one
+
+
+def words_for(setting: Setting, value: Any) -> list[str]:
+    """A value on the command line."""
+    if setting.kind is bool:
+        return [f"--{setting.name}" if value else f"--no-{setting.name}"]
+    return [word for one in (value if setting.many else [value]) for word in (f"--{setting.name}", str(one))]
+
+
+def text_for(setting: Setting, value: Any) -> str:
+    """A value in the environment."""
+    return shlex.join(map(str, value)) if setting.many else str(value).lower() if setting.kind is bool else str(value)
+
+
+def table_for(setting: Setting, value: Any) -> str:
+    """A value in a file."""
+    word = f"[{', '.join(map(toml_value, value))}]" if setting.many else toml_value(value)
+    return f"[{setting.command}]\n{setting.name} = {word}\n"
+
+
+def put(path: Path, text: str) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
+    return path
+
+
+@EVERY_COMMAND
+def test_an_option_has_one_value_whichever_way_it_is_given(command, folder, monkeypatch):
+    usual = parsed(command)
+    for setting in options_of(command):
+        value = another(setting, usual[setting.parameter])
+        ways = {}
+        ways["command line"] = parsed(command, *words_for(setting, value))
+        with monkeypatch.context() as patch:
+            patch.setenv(setting.variable, text_for(setting, value))
+            ways["environment"] = parsed(command)
+        ways["--config"] = parsed(command, "--config", str(put(folder.parent / "a.toml", table_for(setting, value))))
+        put(user_file(), table_for(setting, value))
+        ways["config folder"] = parsed(command)
+        user_file().unlink()
+        if setting.declared.tuning:
+            put(folder / "mcaptrack.toml", table_for(setting, value))
+            ways["working folder"] = parsed(command)
+            (folder / "mcaptrack.toml").unlink()
+        for way, params in ways.items():
+            got = params[setting.parameter]
+            assert got == value, (way, setting.name)
+            rest = {name: was for name, was in usual.items() if name not in (setting.parameter, "config")}
+            assert {name: params[name] for name in rest} == rest, (way, setting.name)
+
+
+@EVERY_COMMAND
+def test_a_switch_can_be_turned_on_and_off_in_the_environment(command, monkeypatch):
+    for setting in options_of(command):
+        for word, value in (("1", True), ("TRUE", True), ("yes", True), ("on", True), ("0", False), ("off", False)):
+            if setting.kind is bool:
+                monkeypatch.setenv(setting.variable, word)
+                assert parsed(command)[setting.parameter] is value
+                monkeypatch.delenv(setting.variable)
+
+
+def test_the_nearest_source_counts(folder, monkeypatch):
+    def value(*words: str) -> Any:
+        return parsed("track", *words)["max_age_s"]
+
+    assert value() is None
+    put(user_file(), "[track]\nmax-age-s = 1\nmin-iou = 0.5\n")
+    assert value() == 1
+    put(folder / "mcaptrack.toml", "[track]\nmax-age-s = 2\n")
+    assert value() == 2
+    assert parsed("track")["min_iou"] == 0.5  # what the nearer file doesn't say
+    named = str(put(folder.parent / "named.toml", "[track]\nmax-age-s = 3\n"))
+    assert value("--config", named) == 3
+    assert parsed("track", "--config", named)["min_iou"] is None  # the file that is named is instead of both
+    monkeypatch.setenv("MCAPTRACK_TRACK_MAX_AGE_S", "4")
+    assert value("--config", named) == 4
+    assert value("--config", named, "--max-age-s", "5") == 5
+    monkeypatch.setenv("MCAPTRACK_TRACK_CONFIG", named)
+    monkeypatch.delenv("MCAPTRACK_TRACK_MAX_AGE_S")
+    assert value() == 3
+
+
+def refused(*words: str) -> str:
+    """The one line of a command that is refused because of its options, before it does anything."""
+    outcome = called(*words)
+    assert (outcome.code, outcome.out) == (2, ""), outcome
+    assert outcome.err.startswith("mcaptrack: ")
+    assert outcome.err.count("\n") == 1
+    return outcome.err
+
+
+class TestUnknownNames:
+    @EVERY_COMMAND
+    def test_the_nearest_name_is_said_in_whichever_way_it_was_given(self, command, folder, monkeypatch):
+        known = [setting.name for setting in options_of(command)]
+        for name in known:
+            wrong = name[:-1] if name[:-1] not in known and len(name) > 3 else name + "x"
+            nearest = difflib.get_close_matches(wrong, known, 1)
+            assert nearest, name
+            outcome = called(command, f"--{wrong}", "x")
+            assert outcome.code == 2
+            assert "No such option" in outcome.err
+            assert f"--{nearest[0]}" in outcome.err
+            put(folder / "mcaptrack.toml", f"[{command}]\n{wrong} = 1\n")
+            words = f"mcaptrack.toml: {command} has no option {wrong}; did you mean {nearest[0]}?"
+            assert words in refused("info", "x.mcap")
+            (folder / "mcaptrack.toml").unlink()
+            variable = f"MCAPTRACK_{command}_{wrong}".upper().replace("-", "_")
+            monkeypatch.setenv(variable, "1")
+            assert f"the environment variable {variable} is of no option; did you mean " in refused("info", "x.mcap")
+            monkeypatch.delenv(variable)
+
+    def test_a_variable_that_lacks_its_unit(self, monkeypatch):
+        monkeypatch.setenv("MCAPTRACK_TRACK_MAX_AGE", "2")
+        assert refused("run", "x.mcap").endswith("; did you mean MCAPTRACK_TRACK_MAX_AGE_S?\n")
+
+    def test_variables_that_are_no_options_stand_in_one_list(self, monkeypatch):
+        for name in environment.VARIABLES:
+            monkeypatch.setenv(name, "1")
+        assert called("info", "x.mcap").code == 1
+        package = Path(environment.__file__).parent
+        for path in package.rglob("*.py"):
+            if path.name not in ("environment.py", "settings.py"):
+                assert not re.search(r"environ\b|getenv", path.read_text()), path
+
+    def test_a_limit_that_is_no_number_is_refused(self, tmp_path, monkeypatch):
+        from tests.test_log import SOME, write_log
+
+        write_log(tmp_path / "a.mcap", SOME)
+        for text in ("many", "-1", "0", "9" * 5000):
+            monkeypatch.setenv("MCAPTRACK_MAX_CHUNK_MIB", text)
+            outcome = called("check", tmp_path / "a.mcap")
+            assert outcome.code == 1
+            assert "MCAPTRACK_MAX_CHUNK_MIB needs a whole number" in outcome.out + outcome.err
+
+
+#: What a text of the working folder's file must never be: a file, an address, a module, a command.
+HOSTILE = (
+    "red:weights.safetensors",
+    "onnx:a.onnx",
+    "/etc/passwd",
+    "a.txt",
+    "https://example.org",
+    "a:B",
+    "../x",
+    "*",
+    "",
+)
+
+
+class TestTrust:
+    """A file in the working folder may tune, and nothing else."""
+
+    @EVERY_COMMAND
+    def test_what_does_not_tune_is_refused_with_the_ways_to_say_it(self, command, folder):
+        usual = parsed(command)
+        for setting in options_of(command):
+            if setting.declared.tuning is not False:
+                continue
+            text = table_for(setting, another(setting, usual[setting.parameter]))
+            path = put(folder / "mcaptrack.toml", text)
+            words = refused("info", "x.mcap")  # whichever command is run
+            for part in (f"[{command}] {setting.name}", f"--{setting.name}", setting.variable, str(user_file())):
+                assert part in words
+            assert [*folder.iterdir()] == [path]
+
+    @EVERY_COMMAND
+    def test_what_tunes_is_a_number_a_switch_a_choice_or_a_text_that_names_no_file(self, command, folder):
+        for setting in options_of(command):
+            if setting.declared.tuning is False:
+                continue
+            assert setting.kind in (bool, int, float, str) or get_origin(setting.kind) is Literal, setting.name
+            assert setting.name not in ("output", "force", "config", "sidecar", "json", "quiet", "open"), setting.name
+            if setting.kind is str:
+                for text in HOSTILE:
+                    value = [text] if setting.many else text
+                    put(folder / "mcaptrack.toml", table_for(setting, value))
+                    assert f"[{command}] {setting.name}" in refused(command, *ARGUMENTS.get(command, ["x.mcap"]))
+
+    def test_the_file_of_the_config_folder_may_lie_in_the_working_folder(self, monkeypatch):
+        path = put(user_file(), '[info]\noutput = "a.txt"\n')
+        monkeypatch.chdir(path.parent)
+        assert parsed("info")["output"] == "a.txt"
+
+    def test_a_link_gives_no_trust(self, folder):
+        other = put(folder.parent / "other.toml", '[info]\noutput = "a.txt"\n')
+        (folder / "mcaptrack.toml").symlink_to(other)
+        assert "may tune and nothing else" in refused("info", "x.mcap")
+
+
+class TestFiles:
+    """A file that is none, or that is made to do harm, is one line."""
+
+    CASES = {
+        "nested deeply": b"[track]\nmax-age-s = " + b"[" * 5000 + b"]" * 5000,
+        "a number of 5000 digits": b"[track]\nmax-age-frames = " + b"9" * 5000,
+        "a number of 4000 digits": b"[track]\nmax-age-s = 1" + b"0" * 4000,
+        "no UTF-8": b"[track]\ncost = '\xff'",
+        "no TOML": b"[track\n",
+        "a command that is none": b"[trak]\nmin-iou = 1",
+        "an option without a command": b"min-iou = 1",
+        "a value instead of a table": b"track = 1",
+        "a name with a line end": b'[track]\n"a\\nb\\u001b[2J" = 1',
+        "a value with a line end": b'[track]\ncost = "a\\nb\\u001b[2J"',
+        "a value of many": b"[track]\nmax-age-s = [1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15]",
+        "bytes of nothing": b"\0" * 100,
+    }
+
+    @pytest.mark.parametrize("place", ["working folder", "config folder", "--config"])
+    @pytest.mark.parametrize("data", CASES.values(), ids=CASES)
+    def test_a_file_that_cannot_be_taken(self, data, place, folder):
+        path = {"working folder": folder / "mcaptrack.toml", "config folder": user_file()}.get(place, folder / "a.toml")
+        put(path, "").write_bytes(data)
+        words = refused("track", "x.mcap", *(["--config", str(path)] if place == "--config" else []))
+        assert path.name in words
+        assert len(words) < 500
+
+    def test_a_file_that_is_too_large_is_not_read(self, folder):
+        path = folder / "mcaptrack.toml"
+        with path.open("wb") as stream:
+            stream.truncate(2**33)
+        assert f"has {2**33} bytes; a file of options has at most {MAX_BYTES}" in refused("track", "x.mcap")
+
+    @pytest.mark.parametrize("named", [False, True])
+    def test_what_is_no_file(self, named, folder):
+        path = folder / "mcaptrack.toml"
+        words = ["track", "x.mcap", *(["--config", "mcaptrack.toml"] if named else [])]
+        os.mkfifo(path)
+        assert "is no regular file" in refused(*words)
+        path.unlink()
+        path.mkdir()
+        assert "is no regular file" in refused(*words)
+        path.rmdir()
+        path.symlink_to("/dev/zero")
+        assert "is no regular file" in refused(*words)
+        path.unlink()
+        path.symlink_to(path)
+        assert "can't be read" in refused(*words)
+
+    def test_a_file_that_is_named_has_to_be_there(self):
+        assert "there is no such file" in refused("track", "x.mcap", "--config", "none.toml")
+
+    @EVERY_COMMAND
+    def test_a_value_of_another_kind_is_refused(self, command, folder):
+        for setting in options_of(command):
+            wrong = {bool: ['"no"', "1"], int: ['"1"', "1.5", "true"], float: ['"1"', "true", "1979-05-27"]}
+            wrong |= {Path: ["1", "true", "{a = 1}"], str: ["true", "[[1]]", "1979-05-27"]}
+            for value in wrong.get(setting.kind, ["1", "true"]):
+                path = put(folder / "a.toml", f"[{command}]\n{setting.name} = {value}\n")
+                words = refused(command, *ARGUMENTS.get(command, ["x.mcap"]), "--config", str(path))
+                assert f"[{command}] {setting.name} needs " in words
+
+    @EVERY_COMMAND
+    def test_a_variable_of_another_kind_is_refused(self, command, monkeypatch):
+        for setting in options_of(command):
+            is_choice = get_origin(setting.kind) is Literal
+            if setting.kind in (bool, int, float) or is_choice:
+                monkeypatch.setenv(setting.variable, "much\x1b[2J")
+                assert setting.variable in refused(command, *ARGUMENTS.get(command, ["x.mcap"]))
+                monkeypatch.delenv(setting.variable)
+
+
+RENAMED = [
+    (command, setting, setting.declared.was, dict([setting.declared.was_if] if setting.declared.was_if else []))
+    for command in COMMANDS
+    for setting in options_of(command)
+    if setting.declared.was
+]
+
+
+@pytest.mark.parametrize(("command", "setting", "old", "beside"), RENAMED, ids=lambda part: getattr(part, "name", None))
+class TestRenamed:
+    """An option is taken under its old name, in every way, and a line says the new one."""
+
+    def params(self, command: str, beside: dict[str, str], *words: str) -> dict[str, Any]:
+        others = [word for name, value in beside.items() for word in (f"--{name}", value)]
+        return {name: value for name, value in parsed(command, *others, *words).items() if name != "config"}
+
+    def test_the_old_name_means_the_same(self, command, setting, old, beside, folder, monkeypatch, capsys):
+        value = another(setting, None)
+        wanted = self.params(command, beside, *words_for(setting, value))
+        assert capsys.readouterr().err == ""
+        line = " is called {} now; the old name goes with the next release\n"
+        assert self.params(command, beside, f"--{old}", str(value)) == wanted
+        assert capsys.readouterr().err == f"--{old}" + line.format(f"--{setting.name}")
+        variable = f"MCAPTRACK_{command}_{old}".upper().replace("-", "_")
+        monkeypatch.setenv(variable, str(value))
+        assert self.params(command, beside) == wanted
+        assert capsys.readouterr().err == variable + line.format(setting.variable)
+        monkeypatch.delenv(variable)
+        put(folder / "mcaptrack.toml", f"[{command}]\n{old} = {value}\n")
+        assert self.params(command, beside) == wanted
+        assert capsys.readouterr().err == f"mcaptrack.toml: [{command}] {old}" + line.format(setting.name)
+        assert self.params(command, beside, "-q") == wanted | {"quiet": True}
+        assert capsys.readouterr().err == ""
+
+    def test_the_stronger_source_counts_whatever_the_name(self, command, setting, old, beside, folder, monkeypatch):
+        variable = f"MCAPTRACK_{command}_{old}".upper().replace("-", "_")
+        monkeypatch.setenv(variable, "0.25")
+        assert self.params(command, beside, f"--{setting.name}", "0.5")[setting.parameter] == 0.5
+        put(folder / "mcaptrack.toml", f"[{command}]\n{setting.name} = 0.75\n")
+        assert self.params(command, beside)[setting.parameter] == 0.25
+
+    def test_both_names_at_once_are_refused(self, command, setting, old, beside):
+        others = [word for name, value in beside.items() for word in (f"--{name}", value)]
+        words = refused(command, "x.mcap", *others, f"--{old}", "0.1", f"--{setting.name}", "0.2")
+        assert f"--{old} is the old name of --{setting.name}; give one of them" in words
+
+    def test_the_help_knows_the_new_name_alone(self, command, setting, old, beside):
+        words = called(command, "--help").out
+        assert f"--{setting.name} " in words
+        assert not re.search(rf"--{old}\b(?!-)", words)
