@@ -5,11 +5,13 @@ The tests follow from what the code declares, so that an option that is added is
 
 from __future__ import annotations
 
+import json
 import shutil
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, get_type_hints
 
+import pyarrow.parquet as pq
 import pytest
 
 from mcaptrack import log
@@ -17,7 +19,7 @@ from mcaptrack.predictors import NAMES
 from mcaptrack.provenance import Provenance
 from mcaptrack.transforms import PROFILES, TRACKERS, TRANSFORMS
 from mcaptrack.transforms.protocol import bare_type, choices
-from tests.commands import called, made_log, toml_value
+from tests.commands import called, done, made_log, toml_value
 
 
 @pytest.fixture(scope="session")
@@ -127,3 +129,49 @@ def test_the_default_can_be_said_and_changes_nothing(stage, folder):
     code, _, err = called(stage.command, "a.mcap", "-o", "b.mcap", *flags(dict(stage.chosen) | values))
     assert code == 0, err
     assert stage.made(folder / "b.mcap") == stage.parameters()
+
+
+@pytest.mark.parametrize("stage", STAGES, ids=lambda stage: "-".join([stage.command, *dict(stage.chosen).values()]))
+@pytest.mark.parametrize("way", ["environment", "file"])
+def test_parameters_reach_the_stages_that_run_makes(stage, way, folder, monkeypatch):
+    """By ``run --force`` where the channel stands, and it is said where it doesn't come to that."""
+    values = stage.others() | dict(stage.chosen)
+    if way == "environment":
+        for name, value in values.items():
+            monkeypatch.setenv(f"MCAPTRACK_{stage.command}_{name}".upper(), str(value))
+    else:
+        Path("mcaptrack.toml").write_text(toml(stage.command, values))
+    before = (folder / "a.mcap").read_bytes()
+    left = json.loads(done("run", "a.mcap", "--no-tables", "--json", "-q").out)
+    assert (folder / "a.mcap").read_bytes() == before
+    assert [(one["code"], stage.target in one["message"]) for one in left["warnings"]] == [("other-settings", True)]
+    again = json.loads(done("run", "a.mcap", "--no-tables", "--force", "--json").out)
+    assert again["results"][0]["stages"] == ["detect", "track", "sample", "predict", "retrack", "events"]
+    assert stage.made(folder / "a.mcap") == stage.others()
+    assert json.loads(done("run", "a.mcap", "--no-tables", "--json").out)["warnings"] == []
+
+
+def test_everything_made_again_is_what_was_there(folder):
+    """With the parameters that each channel had, also where they are not the defaults."""
+    done("track", "a.mcap", "--tracker", "ocsort", "--max-age-s", 3)
+    done("events", "a.mcap", "--similarity", "metres", "--gate-m", 0.5)
+    done("run", "a.mcap")
+    before, (path,) = _content(folder / "a.mcap"), folder.glob("a.tables/tracks/*/part-0.parquet")
+    table, raw = pq.read_table(path), path.read_bytes()
+    broken = raw[:100] + bytes([raw[100] ^ 1]) + raw[101:]
+    path.write_bytes(broken)
+    done("run", "a.mcap")
+    assert path.read_bytes() == broken  # by what it says it is up to date
+    done("run", "a.mcap", "--force")
+    assert pq.read_table(path).equals(table)
+    assert _content(folder / "a.mcap") == before
+
+
+def _content(path: Path) -> dict[str, tuple[dict[str, str], list[tuple[int, bytes]]]]:
+    """What every channel says of itself and holds, but for the one that all views share: it names one of them."""
+    with log.read(path) as opened:
+        return {
+            topic: (dict(channel.metadata), [(m.t_ns, m.payload) for m in opened.messages(topic)])
+            for topic, channel in opened.channels.items()
+            if not topic.endswith("/view/tf")
+        }

@@ -648,7 +648,7 @@ def test_answers_for_people(known):
     outcome = run(known, query)
     lines = outcome.stdout.splitlines()
     assert lines[0].split() == ["track_id", "third", "nothing", "word"]
-    assert lines[2].split() == ["7", "0", "null", "\N{REPLACEMENT CHARACTER}[31mred"]
+    assert lines[2].split() == ["7", "0", "null", "\\x1b[31mred"]
     assert lines[4].split()[1] == "0.133333"
     shown = run(known, query, "--rows", "1")
     assert len(shown.stdout.splitlines()) == 3

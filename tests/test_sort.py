@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from mcaptrack import notices
 from mcaptrack.errors import McaptrackError
 from mcaptrack.plane import GroundPlane
 from mcaptrack.schema import DETECTIONS, Frame
@@ -14,6 +15,26 @@ from mcaptrack.transforms.sort import TRACKERS, ByteTrack, OcSort, Sort, compile
 from tests.worlds import boxes_at, detections, ids, ns
 
 FRAMES = {"max_age_frames": 2, "min_hits_frames": 2, "min_iou": 0.3}
+
+
+@pytest.mark.parametrize("kind", TRACKERS.values(), ids=TRACKERS)
+def test_tracks_that_are_empty_because_no_box_passes_are_said(kind):
+    rows = boxes_at([(50, 50), (90, 50)], score=0.5)
+    rows["class_id"] = [3, 1]
+    frames = [Frame(ns(n / 10), n, rows if n % 2 else rows[:0]) for n in range(200)]
+
+    def said(**options) -> list[str]:
+        with notices.collected() as found, notices.listening(found.append):
+            assert sum(len(frame.rows) for frame in run(frames, kind, **options)) == 0 or not found
+        return [notice.message for notice in found]
+
+    assert said(class_id=7) == ["no detection has class 7, so there are no tracks; the classes are 1, 3"]
+    assert said(min_score=0.6) == [
+        "no detection has a score of 0.6 or more, so there are no tracks; the highest is 0.5"
+    ]
+    assert said(class_id=3) == said(min_score=0.5) == said() == []
+    frames = frames[:1]
+    assert said(class_id=7) == []  # where nothing was detected at all
 
 
 def run(frames, kind=Sort, **options):

@@ -21,6 +21,7 @@ from mcaptrack.cli.render import render
 from mcaptrack.cli.report import report
 from mcaptrack.cli.show import export, info
 from mcaptrack.cli.stages import add_stages
+from mcaptrack.cli.text import show
 from mcaptrack.cli.train import train
 from mcaptrack.cli.tune import tune
 from mcaptrack.cli.view import view
@@ -36,7 +37,7 @@ app = typer.Typer(
 
 def _version(wanted: bool) -> None:
     if wanted:
-        print(f"mcaptrack {__version__}")
+        show(f"mcaptrack {__version__}")
         raise typer.Exit
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import sys
 from collections.abc import Callable, Mapping
 from contextvars import ContextVar
 from pathlib import Path
@@ -13,7 +12,7 @@ import typer
 from typer.core import TyperCommand
 
 from mcaptrack.cli.settings import Given, Setting, declared_settings, found_of, gather
-from mcaptrack.cli.text import printable, refuse_usage
+from mcaptrack.cli.text import refuse_usage, say
 
 COMMON: Final = "Options of all commands"
 _RUNNING: Final[ContextVar[typer.Context]] = ContextVar("running")
@@ -70,13 +69,13 @@ class Command(TyperCommand):
             if not quiet:
                 name = new.variable if rank == 1 else new.name if rank == 2 else f"--{new.name}"
                 words = f"{where or f'--{old}'} is called {name} now; the old name goes with the next release"
-                print(printable(words), file=sys.stderr)
+                say(words)
 
     def invoke(self, ctx: Any) -> Any:
         """Run it; with --verbose say first which options are not as usual, and where each was set."""
         _RUNNING.set(ctx)
         if ctx.params.get("verbose") and not ctx.params.get("quiet"):
-            print(printable(self._said(ctx)), file=sys.stderr)
+            say(self._said(ctx))
         return super().invoke(ctx)
 
     def _said(self, ctx: Any) -> str:
@@ -85,7 +84,9 @@ class Command(TyperCommand):
         for setting in self.settings.values():
             rank, where = _rank(ctx, setting.parameter, found)
             if rank != _DEFAULT and setting.parameter in ctx.params:
-                parts.append(f"{setting.name}={ctx.params[setting.parameter]} ({where or 'command line'})")
+                value = ctx.params[setting.parameter]
+                words = " ".join(map(str, value)) if setting.many else str(value)
+                parts.append(f"{setting.name}={words} ({where or 'command line'})")
         return f"options: {', '.join(parts)}"
 
 

@@ -20,7 +20,7 @@ from mcaptrack import SCHEMA_VERSION, notices
 from mcaptrack.atomic import publish_bytes, refuse_overwrite
 from mcaptrack.cli.command import COMMON, Command, read_config
 from mcaptrack.cli.settings import Declared
-from mcaptrack.cli.text import printable
+from mcaptrack.cli.text import say
 from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import Code, Notice
 
@@ -140,7 +140,7 @@ class Talk:
         """A line on stderr."""
         if not self.quiet:
             self._stop()
-            print(printable(words), file=sys.stderr)
+            say(words)
 
     def detail(self, words: str) -> None:
         """A line that only matters to some."""
@@ -202,7 +202,7 @@ def one_line(command: Callable[P, None]) -> Callable[P, None]:
             with notices.listening(_show_warning):
                 command(*args, **kwargs)
         except McaptrackError as error:
-            print(f"mcaptrack: {printable(' '.join(str(error).split()))}", file=sys.stderr)
+            say(f"mcaptrack: {str(error).strip()}")
             raise typer.Exit(REFUSED) from None
 
     return guarded
@@ -213,7 +213,7 @@ def _show_warning(notice: Notice) -> None:
     warned = _WARNED.get()
     if notice not in warned:
         warned.append(notice)
-        print(f"warning: {printable(str(notice))}", file=sys.stderr)
+        say(f"warning: {notice}")
 
 
 @contextmanager

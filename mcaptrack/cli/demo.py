@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Annotated, Final
 
 from mcaptrack.cli import common
+from mcaptrack.cli.text import show
 from mcaptrack.errors import McaptrackError
 
 _LICHTBLICK: Final = "lichtblick-suite.github.io/lichtblick"
@@ -65,21 +66,21 @@ def demo(
     if json:
         common.print_json({"results": [sort, retracked]})
         return
-    print(_side_by_side(sort, retracked))
-    print(
-        f"""
-video    {footage.video}
-log      {target}
-layouts  {"  ".join(str(path) for path in layouts)}
-tables   {default_folder(target)}
-
-Open the log in Foxglove, or in Lichtblick (https://{_LICHTBLICK}): open local file, then import a layout.
-Ask the tables:  duckdb -c "from '{default_folder(target)}/tracks/*/*.parquet' limit 5"
-See more:        mcaptrack info {target}    mcaptrack evaluate {target}"""
+    show(
+        *_side_by_side(sort, retracked),
+        "",
+        f"video    {footage.video}",
+        f"log      {target}",
+        f"layouts  {'  '.join(str(path) for path in layouts)}",
+        f"tables   {default_folder(target)}",
+        "",
+        f"Open the log in Foxglove, or in Lichtblick (https://{_LICHTBLICK}): open local file, then import a layout.",
+        f"Ask the tables:  duckdb -c \"from '{default_folder(target)}/tracks/*/*.parquet' limit 5\"",
+        f"See more:        mcaptrack info {target}    mcaptrack evaluate {target}",
     )
 
 
-def _side_by_side(sort: dict[str, float], retracked: dict[str, float]) -> str:
+def _side_by_side(sort: dict[str, float], retracked: dict[str, float]) -> list[str]:
     """SORT and re-tracking beside each other, within 1 m on the clock of prediction."""
     words = {
         "IDF1": "identity kept (IDF1)",
@@ -95,4 +96,4 @@ def _side_by_side(sort: dict[str, float], retracked: dict[str, float]) -> str:
             f"{100 * part[name]:.1f} %" if name in ("IDF1", "MOTA") else str(part[name]) for part in (sort, retracked)
         ]
         lines.append(f"{meaning:<36}{values[0]:>10}{values[1]:>14}")
-    return "\n".join(lines)
+    return lines

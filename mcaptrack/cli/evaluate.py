@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 import typer
 
 from mcaptrack.cli import common
-from mcaptrack.cli.text import printable
+from mcaptrack.cli.text import console, printable, say
 from mcaptrack.errors import McaptrackError
 
 if TYPE_CHECKING:
@@ -119,7 +119,7 @@ def evaluate(
             print_results(outcome)
     missed = [words for limit in limits for words in _misses(outcome, *limit)]
     for words in missed:
-        print(words, file=sys.stderr)
+        say(words)
     if missed:
         raise typer.Exit(common.GATE_MISSED)
 
@@ -188,11 +188,9 @@ def _from_files(
 
 def print_results(outcome: Outcome) -> None:
     """The scores as a table on stdout, and the forecasts below it."""
-    from rich.console import Console
-    from rich.markup import escape
     from rich.table import Table
 
-    console = Console(width=None if sys.stdout.isatty() else 120)  # a pipe has no width to keep to
+    out = console()
     table = Table(box=None, pad_edge=False, header_style="bold")
     several = len({result.sequence for result in outcome.results}) > 1
     for name in (*(("sequence",) if several else ()), "tracks", "by"):
@@ -207,9 +205,9 @@ def print_results(outcome: Outcome) -> None:
             table.add_row()
         previous = (result.sequence, by)
         numbers = [f"{100 * row[name]:.1f}" if isinstance(row[name], float) else str(row[name]) for name in _COLUMNS]
-        first = [escape(printable(result.sequence))] if several else []
-        table.add_row(*first, escape(printable(result.tracks)), by, *numbers)
-    console.print(table)
+        first = [result.sequence] if several else []
+        table.add_row(*first, result.tracks, by, *numbers)
+    out.print(table)
     forecasts: dict[tuple[str, str], dict[str, float | None]] = {}
     for result in outcome.results:
         if result.displacement is not None:
@@ -222,16 +220,17 @@ def print_results(outcome: Outcome) -> None:
             table.add_column(name, justify="right", no_wrap=True)
         for (sequence, tracks), values in forecasts.items():
             numbers = ["-" if values[name] is None else f"{values[name]:.3f}" for name in _FORECAST_COLUMNS]
-            first = [escape(printable(sequence))] if several else []
-            table.add_row(*first, escape(printable(tracks)), *numbers)
-        console.print()
-        console.print(table)
+            first = [sequence] if several else []
+            table.add_row(*first, tracks, *numbers)
+        out.print()
+        out.print(table)
 
 
 def _print_csv(outcome: Outcome) -> None:
     import csv
 
     rows = [{k: v for k, v in result.to_json().items() if k != "displacement"} for result in outcome.results]
+    rows = [{k: printable(v) if isinstance(v, str) else v for k, v in row.items()} for row in rows]
     writer = csv.DictWriter(sys.stdout, fieldnames=list(rows[0]), lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from mcaptrack.cli import common
-from mcaptrack.cli.text import printable
+from mcaptrack.cli.text import console, show
 from mcaptrack.errors import McaptrackError
 
 if TYPE_CHECKING:
@@ -62,27 +61,22 @@ def _checked_as_data(checked: Checked) -> dict[str, object]:
 
 
 def _print_checked(checked: Checked, quiet: bool) -> None:
-    from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
-    path = printable(str(checked.path))
     if not quiet:
         verdict = "sound" if checked.is_sound else "damaged"
-        print(f"{path}: {verdict}; {checked.messages} messages in {checked.chunks} chunks")
+        show(f"{checked.path}: {verdict}; {checked.messages} messages in {checked.chunks} chunks")
     findings = [found for found in checked.findings if not quiet or found.level == "error"]
     if not findings:
         return
     table = Table(box=None, pad_edge=False)
     for name, justify in (("", "left"), ("byte", "right"), ("times", "right"), ("kind", "left"), ("", "left")):
-        table.add_column(name, justify=justify)  # type: ignore[arg-type]
+        table.add_column(name, justify=justify, overflow="fold")  # type: ignore[arg-type]
     for found in findings:
         style = "red" if found.level == "error" else "yellow"
-        words = printable(found.words)
-        table.add_row(
-            Text(found.level, style), str(found.where), str(found.times), found.kind, Text(words, overflow="fold")
-        )
-    Console(file=sys.stdout, width=None if sys.stdout.isatty() else 160).print(table)
+        table.add_row(Text(found.level, style), str(found.where), str(found.times), found.kind, found.words)
+    console().print(table)
 
 
 @common.one_line

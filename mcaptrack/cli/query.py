@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 import typer
 
 from mcaptrack.cli import common
-from mcaptrack.cli.text import printable
+from mcaptrack.cli.text import console, printable, show
 from mcaptrack.errors import McaptrackError
 
 if TYPE_CHECKING:
@@ -19,7 +19,11 @@ if TYPE_CHECKING:
 Form = Literal["table", "csv", "json", "jsonl", "parquet", "arrow"]
 #: Rows that a terminal is shown unless more are asked for.
 _SHOWN: Final = 60
+#: Characters of a cell in a table, on a terminal and elsewhere.
 _WIDEST: Final = 60
+_WIDEST_UNBROKEN: Final = 1000
+#: The columns of a query's plan, a drawing of many lines.
+_PLAN: Final = ["explain_key", "explain_value"]
 _KEYWORDS: Final = ("select", "from", "with", "describe", "summarize", "explain", "pivot", "show", "values")
 
 
@@ -98,7 +102,7 @@ def query(
         if chosen == "table":
             limit = rows if rows is not None else _SHOWN if sys.stdout.isatty() and output is None else 0
             with common.printed_to(output, force):
-                words_after = _print_answer(answer, limit, None if output is None else 0)
+                words_after = _print_answer(answer, limit)
             talk.say(words_after) if words_after else None
         else:
             _write(answer, chosen, output, json)
@@ -180,13 +184,13 @@ def _write(answer: Any, form: Form, output: Path | None, json: bool) -> None:
         tables.write_answer(output, answer, form)
     else:
         for piece in tables.pieces(answer, form):  # type: ignore[arg-type]
-            sys.stdout.write(piece.decode("utf-8"))
+            words = piece.decode("utf-8")
+            sys.stdout.write("\n".join(map(printable, words.split("\n"))) if sys.stdout.isatty() else words)
 
 
-def _print_answer(answer: Any, limit: int, width: int | None) -> str:
+def _print_answer(answer: Any, limit: int) -> str:
     """Print rows for people, as many columns as fit; returns what is to be said of those that aren't shown."""
     from rich import box
-    from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
@@ -194,18 +198,23 @@ def _print_answer(answer: Any, limit: int, width: int | None) -> str:
 
     shown = min(limit or answer.num_rows, answer.num_rows)
     numbers, rows = cells(answer, shown)
-    rows = [[None if word is None else _cut(printable(word), limit) for word in row] for row in rows]
+    if answer.schema.names == _PLAN:
+        show(*(line for row in rows for line in (row[1] or "").splitlines()))
+        return ""
+    widest = _WIDEST if sys.stdout.isatty() else _WIDEST_UNBROKEN
+    rows = [[None if word is None else printable(word) for word in row] for row in rows]
+    were_cut = sum(len(word) > widest for row in rows for word in row if word is not None)
+    rows = [[None if word is None else _cut(word, widest) for word in row] for row in rows]
     names = [printable(name) for name in answer.schema.names]
-    to_terminal = sys.stdout.isatty() and width is None
-    console = Console(file=sys.stdout, width=None if to_terminal else 100_000, highlight=False)
-    fitting = _fitting(names, rows, console.width) if to_terminal else len(names)
+    out = console()
+    fitting = _fitting(names, rows, out.width) if sys.stdout.isatty() else len(names)
     table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False)
     for name, is_number in zip(names[:fitting], numbers, strict=False):
-        table.add_column(Text(name), justify="right" if is_number else "left", no_wrap=not to_terminal)
+        table.add_column(name, justify="right" if is_number else "left", no_wrap=not sys.stdout.isatty())
     for row in rows:
-        table.add_row(*(Text("null", "dim") if word is None else Text(word) for word in row[:fitting]))
-    console.print(table)
-    said = []
+        table.add_row(*(Text("null", "dim") if word is None else word for word in row[:fitting]))
+    out.print(table)
+    said = [f"{were_cut} long values are cut; --format json or csv has them in full"] if were_cut else []
     if shown < answer.num_rows:
         said.append(f"the first {shown} of {answer.num_rows} rows; --rows 0 shows all")
     elif answer.num_rows == 0:
@@ -215,18 +224,15 @@ def _print_answer(answer: Any, limit: int, width: int | None) -> str:
     return "; ".join(said)
 
 
-def _cut(word: str, limit: int) -> str:
-    return (
-        word if not limit or len(word) <= _WIDEST or "\n" in word else word[: _WIDEST - 1] + "\N{HORIZONTAL ELLIPSIS}"
-    )
+def _cut(word: str, widest: int) -> str:
+    return word if len(word) <= widest else word[: widest - 1] + "\N{HORIZONTAL ELLIPSIS}"
 
 
 def _fitting(names: Sequence[str], rows: Sequence[Sequence[str | None]], width: int) -> int:
     """How many columns stand beside each other, at least one."""
     used = 0
     for at, name in enumerate(names):
-        lines = (line for row in rows for line in (row[at] or "null").splitlines())
-        used += max([len(name), *map(len, lines)]) + 2
+        used += max([len(name), *(len(row[at] or "null") for row in rows)]) + 2
         if used > width and at:
             return at
     return len(names)
@@ -257,18 +263,17 @@ def _print_tables(database: Database | None, json: bool) -> None:
     if json:
         common.print_json({"results": listed} | found)
         return
-    from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
-    console = Console(file=sys.stdout, width=None if sys.stdout.isatty() else 160, highlight=False)
+    out = console()
     for one in listed:
-        console.print(Text(one["table"], "bold"))
-        console.print(Text(one["meaning"], "dim"))
+        out.print(Text(one["table"], "bold"))
+        out.print(Text(one["meaning"], "dim"))
         shown = Table(box=None, show_header=False, pad_edge=False, padding=(0, 2, 0, 0))
         for column in one["columns"]:
-            shown.add_row(*map(Text, (f"  {column['name']}", column["type"], column["unit"], column["meaning"])))
-        console.print(shown)
-        console.print()
+            shown.add_row(f"  {column['name']}", column["type"], column["unit"], column["meaning"])
+        out.print(shown)
+        out.print()
     for what, names in found.items():
-        console.print(Text(f"{what}: {printable(', '.join(names))}"))
+        out.print(f"{what}: {', '.join(names)}")

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from mcaptrack.cli import common
-from mcaptrack.cli.text import printable
+from mcaptrack.cli.text import console, printable
 from mcaptrack.errors import McaptrackError
 
 if TYPE_CHECKING:
@@ -85,44 +84,43 @@ def _as_data(opened: Log) -> dict[str, Any]:
 
 
 def _print(opened: Log, verbose: bool) -> None:
-    from rich.console import Console
-    from rich.markup import escape
     from rich.table import Table
+    from rich.text import Text
 
     data = _as_data(opened)
-    console = Console(width=None if sys.stdout.isatty() else 120)  # a pipe has no width to keep to
+    out = console()
     seconds = (data["end_ns"] - data["start_ns"]) / 1e9
-    name = escape(printable(data["log"]))
-    console.print(f"[bold]{name}[/bold]  {data['bytes']:,} bytes, {data['messages']:,} messages, {seconds:.3f} s")
+    name = Text(printable(data["log"]), "bold")
+    out.print(name, f" {data['bytes']:,} bytes, {data['messages']:,} messages, {seconds:.3f} s")
     if data["results"]:
-        console.print(f"with results in {escape(printable(data['results']))}")
+        out.print(f"with results in {data['results']}")
     table = Table(box=None, pad_edge=False)
     for column in ("topic", "schema", "messages"):
         table.add_column(column, justify="right" if column == "messages" else "left", overflow="fold")
     for channel in data["channels"]:
-        topic = printable(channel["topic"]) + ("  (replaced by the results)" if channel["replaced"] else "")
-        words = (topic, printable(channel["schema"]), f"{channel['messages']:,}")
-        table.add_row(*(escape(word) for word in words))
-    console.print(table)
+        topic = channel["topic"] + ("  (replaced by the results)" if channel["replaced"] else "")
+        table.add_row(topic, channel["schema"], f"{channel['messages']:,}")
+    out.print(table)
     shown = {channel["topic"]: channel for channel in reversed(data["channels"]) if not channel["replaced"]}
-    console.print(_lineage([*reversed(shown.values())], verbose))
+    out.print(_lineage([*reversed(shown.values())], verbose))
 
 
 def _lineage(channels: list[dict[str, Any]], verbose: bool) -> Tree:
     """What was made from what, as a tree whose roots are the channels that were recorded or ingested."""
-    from rich.markup import escape
+    from rich.text import Text
     from rich.tree import Tree
 
     topics = {channel["topic"] for channel in channels}
     root = Tree("lineage")
 
     def add(parent: Tree, channel: dict[str, Any], above: frozenset[str]) -> None:
-        how = f"  [dim]{escape(channel['transform'])}[/dim]" if channel["transform"] else ""
-        late = "  [red]out of date[/red]" if channel["stale"] else ""
-        node = parent.add(f"{escape(printable(channel['topic']))}{how}{late}")
+        label = Text(printable(channel["topic"]))
+        label.append(f"  {printable(channel['transform'])}" if channel["transform"] else "", "dim")
+        label.append("  out of date" if channel["stale"] else "", "red")
+        node = parent.add(label)
         if verbose and channel["parameters"]:
             words = ", ".join(f"{key}={value}" for key, value in sorted(channel["parameters"].items()))
-            node.add(f"[dim]{escape(printable(words))}[/dim]")
+            node.add(Text(printable(words), "dim"))
         for other in channels:
             if other["input"] == channel["topic"] and other["topic"] not in above and other["transform"] != "view":
                 add(node, other, above | {other["topic"]})

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 import typer
 
 from mcaptrack.cli import common
+from mcaptrack.cli.text import console, show
 from mcaptrack.errors import McaptrackError
 
 if TYPE_CHECKING:
@@ -205,12 +206,8 @@ def _as_json(trained: Trained) -> dict[str, Any]:
 
 
 def _print(trained: Trained, recipe: Recipe) -> None:
-    import sys
-
-    from rich.console import Console
     from rich.table import Table
 
-    console = Console(width=None if sys.stdout.isatty() else 120)
     table = Table(box=None, pad_edge=False, header_style="bold")
     table.add_column("validation windows", no_wrap=True)
     table.add_column("predictor", no_wrap=True)
@@ -221,7 +218,7 @@ def _print(trained: Trained, recipe: Recipe) -> None:
         for number, (predictor, values) in enumerate(scores.items()):
             numbers = [f"{values[name]:.3f}" for name in _COLUMNS]
             table.add_row(words[kind] if number == 0 else "", predictor, *numbers)
-    console.print(table)
+    console().print(table)
     minutes, seconds = divmod(round(trained.seconds), 60)
-    print(f"\n{trained.weights}: epoch {trained.kept_epoch} of {trained.epochs}, {minutes} min {seconds} s")
-    print(f"Use it:  mcaptrack predict log.mcap --predictor {recipe.network}:{trained.weights}")
+    show("", f"{trained.weights}: epoch {trained.kept_epoch} of {trained.epochs}, {minutes} min {seconds} s")
+    show(f"Use it:  mcaptrack predict log.mcap --predictor {recipe.network}:{trained.weights}")

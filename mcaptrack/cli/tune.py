@@ -10,6 +10,7 @@ import typer
 
 from mcaptrack.cli import common
 from mcaptrack.cli.config import NAME
+from mcaptrack.cli.text import console, show
 from mcaptrack.errors import McaptrackError
 from mcaptrack.transforms import ALTERNATIVES, TRACKERS, TRANSFORMS, Transform
 from mcaptrack.transforms.sort import compile_sort
@@ -214,7 +215,6 @@ def _words(parameters: Any) -> str:
 
 
 def _print(first: Trial, best: Trial, settings: dict[str, Any]) -> None:
-    from rich.console import Console
     from rich.table import Table
 
     table = Table(box=None, pad_edge=False, header_style="bold")
@@ -224,8 +224,5 @@ def _print(first: Trial, best: Trial, settings: dict[str, Any]) -> None:
     for words, trial in (("defaults", first), ("best", best)):
         values = [trial.scores[name] for name in _SHOWN]
         table.add_row(words, *(f"{100 * v:.1f}" if isinstance(v, float) else str(v) for v in values))
-    console = Console(width=120)
-    console.print(table)
-    console.print()
-    for name, value in settings.items():
-        console.print(f"{name.replace('_', '-')} = {value}")
+    console().print(table)
+    show("", *(f"{name.replace('_', '-')} = {value}" for name, value in settings.items()))

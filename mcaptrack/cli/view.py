@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from mcaptrack.cli import common
+from mcaptrack.cli.text import show
 from mcaptrack.errors import McaptrackError
 from mcaptrack.links import LICHTBLICK, viewer_links
 
@@ -82,7 +83,7 @@ def view(
             lines += [("log", "  ".join(logs))] + [(f"layout, {name}", address) for name, address in addresses.items()]
             lines += [] if addresses else [("layout", "none yet: `mcaptrack run` makes one")]
             width = max(len(name) for name, _ in lines) + 2
-            print("\n".join(f"{name:<{width}}{what}" for name, what in lines), flush=True)
+            show(*(f"{name:<{width}}{what}" for name, what in lines))
         talk.say("serving until Ctrl-C ...")
         if browser:
             webbrowser.open(first["Lichtblick"])

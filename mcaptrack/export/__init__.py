@@ -141,7 +141,7 @@ class _Job:
     def _write(self, name: str, path: Path, made: object, words: dict[str, str], order: Sequence[str]) -> None:
         rows = made.num_rows  # type: ignore[attr-defined]  # an Arrow table, which only tables knows
         words |= {"version": __version__, "recording": self.contents.opened.path.name, "rows": str(rows)}
-        if tables.write(path, made, words, order, self.form):
+        if tables.write(path, made, words, order, self.form, self.force):
             self.done.written.append(name)
         self.done.rows[name] = rows
 

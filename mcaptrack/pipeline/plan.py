@@ -12,6 +12,7 @@ from typing import Final, NamedTuple
 
 from mcaptrack import foreign, log, views
 from mcaptrack.errors import McaptrackError
+from mcaptrack.notices import warn
 from mcaptrack.provenance import Provenance
 from mcaptrack.schema import DETECTIONS, VIDEO, Schema
 from mcaptrack.transforms import TRANSFORMS, Transform, chosen
@@ -214,7 +215,10 @@ class _Planner:
         if self._anew:
             before = wanted
         elif differing := _differing(before, wanted):
-            self._say(f"{topic} was made with other settings than now ({differing}); `run --force` takes these")
+            warn(
+                f"{topic} was made with other settings than now ({differing}); `mcaptrack run --force` takes these",
+                "other-settings",
+            )
         if stands and not self._anew:
             return False
         if source != had:

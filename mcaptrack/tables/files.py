@@ -30,17 +30,23 @@ _PREFIX: Final = "mcaptrack."
 
 
 def write(
-    path: Path, table: Any, provenance: Mapping[str, str], order: Sequence[str] = (), form: Format = "parquet"
+    path: Path,
+    table: Any,
+    provenance: Mapping[str, str],
+    order: Sequence[str] = (),
+    form: Format = "parquet",
+    anew: bool = False,
 ) -> bool:
     """Write an Arrow table, there once it is complete and reads back the same. Returns whether it was needed.
 
     ``provenance`` goes into the metadata, ``order`` says by which columns rows are sorted. A file that has the same
-    content and metadata already is left as it is. Raises McaptrackError if the file can't be written.
+    content and metadata already is left as it is, unless it is to be written ``anew``. Raises McaptrackError if the
+    file can't be written.
     """
     words = {"table_version": TABLE_VERSION} | dict(provenance)
     with ThreadPoolExecutor(1) as beside:  # adding up goes on while the file is written
         content = beside.submit(digest, table.schema, _pieces(table))
-        if form in _DESCRIBED:
+        if form in _DESCRIBED and not anew:
             known = described(path, form)
             if known is not None and _same(known, words | {"digest": content.result()}):
                 return False

@@ -8,7 +8,7 @@ Letters: N boxes, K tracks.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice, pairwise
 from types import MappingProxyType
@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from mcaptrack import kalman
 from mcaptrack.clock import NS_PER_S, FrameClock
 from mcaptrack.errors import McaptrackError
+from mcaptrack.notices import warn
 from mcaptrack.plane import GroundPlane, Planes, plane_at
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame, Schema
 from mcaptrack.transforms.protocol import check_options, context, option
@@ -32,6 +33,8 @@ Ints = NDArray[np.intp]
 
 #: How many frames are read and written at once.
 _BLOCK = 64
+#: So many classes are named.
+_NAMED = 20
 
 
 #: The compiled loop, once somebody has asked for it.
@@ -101,10 +104,11 @@ class Sort:
         check_options(self)
 
     def __call__(self, frames: Iterable[Frame]) -> Iterator[tuple[Frame, ...]]:
-        life = _Life(self, self._no_tracks())
+        life, passed = _Life(self, self._no_tracks()), _Passed(self)
         coming = iter(frames)
         while block := list(islice(coming, _BLOCK)):
             columns, ends = look(block, self.min_score, self.class_id)
+            passed.count(block, int(ends[-1]))
             life.notice_classes(columns[9])
             if _compiled and type(self) is Sort and self.cost == "iou":
                 shown, shown_ends = self._run_compiled(life, block, columns, ends)
@@ -113,6 +117,7 @@ class Sort:
                 parts = [self._step(life, f, Seen(columns[:, a:b])) for f, (a, b) in zip(block, spans, strict=True)]
                 shown, shown_ends = np.concatenate(parts, axis=1), np.cumsum([0, *(p.shape[1] for p in parts)])
             yield from ((frame,) for frame in write(block, shown, shown_ends.tolist(), self.ground_planes))
+        passed.warn()
 
     def _run_compiled(
         self, life: _Life, frames: list[Frame], columns: Floats, ends: NDArray[np.int64]
@@ -218,6 +223,35 @@ class Sort:
     def _see(self, tracks: Tracks, at: Ints, seen: Seen, hit: float, steps: int) -> None:
         """Track ``at[i]`` is seen in box i, ``steps`` frames after the frame before."""
         tracks.see(at, seen, hit)
+
+
+class _Passed:
+    """Which boxes pass the class and the score that are asked for, to be said if there are none at all."""
+
+    def __init__(self, options: Sort) -> None:
+        self._options, self._seen, self._kept = options, 0, 0
+        self._classes: set[int] = set()
+        self._highest = -np.inf
+
+    def count(self, frames: Sequence[Frame], kept: int) -> None:
+        """Take notice of frames, of whose boxes so many passed."""
+        self._kept += kept
+        for rows in (frame.rows for frame in frames if len(frame.rows) and not self._kept):
+            self._seen += len(rows)
+            self._classes.update(rows["class_id"].tolist())
+            self._highest = max(self._highest, float(np.nanmax(rows["score"], initial=-np.inf)))
+
+    def warn(self) -> None:
+        """Warn of tracks that are empty because no box passed."""
+        wanted, least = self._options.class_id, self._options.min_score
+        if self._kept or not self._seen:
+            return
+        if wanted is not None and wanted not in self._classes:
+            there = ", ".join(map(str, sorted(self._classes)[:_NAMED]))
+            warn(f"no detection has class {wanted}, so there are no tracks; the classes are {there}", "left-out")
+        elif least is not None and self._highest < least:
+            words = f"the highest is {self._highest:g}"
+            warn(f"no detection has a score of {least:g} or more, so there are no tracks; {words}", "left-out")
 
 
 class _Life:

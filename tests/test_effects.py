@@ -1,0 +1,306 @@
+"""Every option does something: a command line with it ends otherwise than without it.
+
+What is seen is everything that a command leaves: exit code, stdout, stderr, and all files of its folder. That an option
+means the same whichever way it is given is tested in ``test_settings``, what parameters of transforms do in
+``test_options``.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import secrets
+import shlex
+import shutil
+import webbrowser
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+from mcaptrack import log, scene
+from mcaptrack.serving import Server
+from mcaptrack.transforms import ALTERNATIVES, TRANSFORMS
+from tests.commands import GROUP, called, done, made_log
+from tests.worlds import small_scene
+
+
+@dataclass(frozen=True)
+class Case:
+    """How to see an option: a command line without it, and what it adds."""
+
+    base: str
+    words: str
+
+
+def cases(base: str, **words: str | tuple[str, str]) -> dict[str, Case]:
+    """Options by name: words that are added to ``base``, or another base and words."""
+    pairs = {
+        name.replace("_", "-"): given if isinstance(given, tuple) else (base, given) for name, given in words.items()
+    }
+    return {name: Case(*pair) for name, pair in pairs.items()}
+
+
+def common(base: str, **others: str | tuple[str, str]) -> dict[str, Case]:
+    """The options that all commands have."""
+    return cases(base, json="--json", quiet=(f"{base} -v", "-q"), verbose="-v", config="--config verbose.toml") | cases(
+        base, **others
+    )
+
+
+def stage(command: str, **others: str | tuple[str, str]) -> dict[str, Case]:
+    """The options of a stage that its transform doesn't declare."""
+    base = f"{command} a.mcap"
+    return common(
+        base,
+        topic="--topic /other/detections" if command == "track" else "--topic /none",
+        to="--to /camera/others",
+        camera="--camera other",
+        output="-o b.mcap",
+        sidecar="--sidecar",
+        force=(f"{base} -o clip.mp4", "--force"),
+        **others,
+    )
+
+
+SCORED = "evaluate tall.txt --truth truth.txt"
+TUNED = "tune tall.txt --truth truth.txt --trials 1 --fps 10"
+#: For every option of every command, but parameters of transforms: a command line that it changes.
+CASES: dict[str, dict[str, Case]] = {
+    "ingest": common(
+        "ingest clip.mp4",
+        output="-o b.mcap",
+        camera="--camera left",
+        fps="--fps 5",
+        start_time="--start-time 2026-05-01T12:00:00Z",
+        image_format="--image-format jpeg",
+        quality="--quality 40",
+        keyframe_interval_s="--keyframe-interval-s 0.5",
+        ground_plane="--ground-plane plane.txt",
+        point=("ingest clip.mp4 --ground-plane plane.txt", "--point center"),
+        detections="--detections truth.txt",
+        tracks="--tracks truth.txt",
+        truth="--truth truth.txt",
+        format=("ingest truth.txt --fps 10", "--format kitti"),
+        **{"as": ("ingest truth.txt --fps 10", "--as truth")},
+        into=("ingest truth.txt --fps 10 --as tracks", "--into a.mcap"),
+        force=("ingest clip.mp4 -o a.mcap", "--force"),
+    ),
+    "detect": stage("detect"),
+    "track": stage("track", tracker="--tracker ocsort"),
+    "sample": stage("sample"),
+    "predict": stage("predict"),
+    "retrack": stage("retrack", profile="--profile paper", mode="--mode online"),
+    "run": common(
+        "run fresh.mcap --no-tables",
+        topic="--topic /none",
+        camera="--camera other",
+        output="-o b.mcap",
+        sidecar="--sidecar",
+        events="--no-events",
+        tables=("run a.mcap", "--no-tables"),
+        force=("run a.mcap", "--force"),
+    ),
+    "events": common(
+        "events a.mcap",
+        topic="--topic /camera/tracks",
+        similarity="--similarity metres",
+        gate_m=("events a.mcap --similarity metres", "--gate-m 0.01"),
+        min_iou=("events a.mcap --similarity iou", "--min-iou 0.99"),
+        camera="--camera other",
+        output="-o b.mcap",
+        sidecar="--sidecar",
+        force=("events a.mcap -o clip.mp4", "--force"),
+    ),
+    "evaluate": common(
+        "evaluate a.mcap",
+        truth=("evaluate truth.txt", "--truth truth.txt"),
+        similarity="--similarity iou",
+        gate_m="--gate-m 0.01",
+        min_iou="--min-iou 0.99",
+        rules=("evaluate a.mcap --json", "--rules motmetrics"),
+        topic="--topic /camera/samples",
+        camera="--camera other",
+        ground_plane=(SCORED, "--ground-plane plane.txt"),
+        point=(f"{SCORED} --ground-plane plane.txt --gate-m 0.1", "--point center"),
+        fps=("evaluate truth.txt --truth walk.txt --ground-plane plane.txt", "--fps 10"),
+        fail_under="--fail-under idf1=2",
+        csv="--csv",
+        output="-o scores.txt",
+        force=("evaluate a.mcap -o clip.mp4", "--force"),
+    ),
+    "tune": common(
+        "tune a.mcap --trials 2 --search min-iou",
+        truth=("tune truth.txt --trials 1", "--truth truth.txt"),
+        stage="--stage sample --search max-hole-s",
+        tracker="--tracker bytetrack",
+        metric="--metric mota",
+        trials="--trials 3",
+        search="--search max-age-s",
+        seed="--seed 3",
+        study="--study b.jsonl",
+        similarity="--similarity metres",
+        gate_m=("tune a.mcap --trials 1 --similarity metres", "--gate-m 0.01"),
+        min_iou=("tune a.mcap --trials 1", "--min-iou 0.99"),
+        fps=("tune truth.txt --truth truth.txt --trials 1", "--fps 1"),
+        ground_plane=(f"{TUNED} --similarity metres", "--ground-plane plane.txt"),
+        point=(f"{TUNED} --similarity metres --ground-plane plane.txt --gate-m 0.1", "--point center"),
+        topic="--topic /none",
+        camera="--camera other",
+        output="-o b.toml",
+        force=("tune a.mcap --trials 1 --study old.jsonl", "--force"),
+    ),
+    "export": common(
+        "export a.mcap",
+        output="-o b",
+        format="--format csv",
+        topic="--topic /others",
+        blobs=("export a.mcap --topic /others", "--blobs"),
+        force=("export a.mcap -o taken", "--force"),
+    ),
+    "query": common(
+        "query a.mcap 'select topic, t_ns from tracks order by all'",
+        file=("query a.mcap", "--file query.sql"),
+        format="--format csv",
+        **{"with": ("query a.mcap 'from more'", "--with more=more.csv")},
+        rows="--rows 2",
+        tables=("query a.mcap", "--tables"),
+        output="-o b.csv",
+        force=("query a.mcap 'select 1' -o clip.mp4", "--force"),
+        verbose=("query a.mcap 'select 1'", "-v"),
+    ),
+    "info": common("info a.mcap", output="-o b.txt", force=("info a.mcap -o clip.mp4", "--force")),
+    "view": common(
+        "view a.mcap",
+        port="--port 1",
+        lichtblick="--lichtblick http://localhost:1",
+        layout="--layout tracking",
+        open="--open",
+    ),
+    "render": common(
+        "render a.mcap",
+        topic="--topic /camera/detections/view/image",
+        width="--width 32",
+        max_fps="--max-fps 5",
+        start_s="--start-s 1",
+        end_s="--end-s 1",
+        gif="--gif",
+        camera="--camera other",
+        output="-o b.mp4",
+        force=("render a.mcap -o clip.mp4", "--force"),
+    ),
+    "report": common(
+        "report a.mcap", camera="--camera other", output="-o b.html", force=("report a.mcap -o clip.mp4", "--force")
+    ),
+    "check": common("check a.mcap", output="-o b.txt", force=("check a.mcap -o clip.mp4", "--force")),
+    "recover": common("recover a.mcap", output="-o b.mcap", force=("recover a.mcap -o clip.mp4", "--force")),
+    "drop": common(
+        "drop a.mcap /camera/retracks",
+        output="-o b.mcap",
+        force=("drop a.mcap /camera/retracks -o clip.mp4", "--force"),
+    ),
+    "demo": common("demo", output="-o b", force=("demo -o taken", "--force")),
+}
+
+
+class Seen(NamedTuple):
+    """All that came of a command."""
+
+    code: int
+    out: str
+    err: str
+    files: dict[str, str]
+
+
+def parameters(command: str) -> set[str]:
+    """The options of a stage that its transforms declare."""
+    if command not in TRANSFORMS:
+        return set()
+    kinds = ALTERNATIVES[command].kinds.values() if command in ALTERNATIVES else [TRANSFORMS[command]]
+    declared = [field for kind in kinds for field in fields(kind) if not field.metadata.get("context")]
+    return {field.name.replace("_", "-") for field in declared}
+
+
+def test_every_option_has_a_case():
+    for command, known in GROUP.commands.items():
+        if command == "train":  # needs torch: see test_training
+            continue
+        options = {name for name, setting in known.settings.items() if not setting.parameter.startswith("old_")}
+        assert set(CASES[command]) | parameters(command) == options, command
+
+
+@pytest.fixture(scope="module")
+def template(tmp_path_factory) -> Path:
+    """A folder with what commands are tried on. Not to be changed."""
+    folder = tmp_path_factory.mktemp("template")
+    made_log(folder)
+    done("ingest", folder / "clip.mp4", "--truth", folder / "truth.txt", "-o", folder / "fresh.mcap")
+    rows = [line.split(",") for line in (folder / "truth.txt").read_text().splitlines()]
+    tall = [[*row[:3], str(float(row[3]) - 6), row[4], "14", *row[6:]] for row in rows]  # as before on the ground
+    (folder / "tall.txt").write_text("\n".join(map(",".join, tall)) + "\n")
+    walk = [f"{row[0]} {row[1]} {0.1 * (float(row[2]) + 4)} 3.2" for row in rows]
+    (folder / "walk.txt").write_text("\n".join(walk) + "\n")
+    (folder / "query.sql").write_text("select count(*) as n from tracks")
+    (folder / "more.csv").write_text("a\n1\n")
+    (folder / "verbose.toml").write_text("\n".join(f"[{name}]\nverbose = true" for name in GROUP.commands))
+    _add_channels_of_others(folder / "a.mcap")
+    done("export", folder / "fresh.mcap", "-o", folder / "taken")
+    for path in [*(folder / "taken").glob("*/recording=fresh")]:
+        path.rename(path.with_name("recording=a"))
+    (folder / "taken" / "demo.mcap").write_text("")
+    done("tune", folder / "a.mcap", "--trials", 2, "--study", folder / "old.jsonl", "-o", folder / "x.toml")
+    return folder
+
+
+def _add_channels_of_others(path: Path) -> None:
+    """What a robot recorded beside the camera: messages with bytes in them, and boxes."""
+    with log.read(path) as opened, log.extend(opened) as writer:
+        channel = writer.add_channel("/others", ("", "", b""), "json", {})
+        writer.add_message(channel, 1, 1, b'{"a": 1}')
+
+
+@pytest.fixture
+def see(template, tmp_path, monkeypatch) -> Callable[[str], Seen]:
+    """Run a command line in a fresh copy of the template."""
+    monkeypatch.setattr(scene, "demo_scene", lambda: small_scene(2.0))
+    monkeypatch.setattr(Server, "serve_forever", _interrupted)
+    monkeypatch.setattr(secrets, "token_urlsafe", lambda _: "secret")
+    monkeypatch.setattr(webbrowser, "open", lambda address: print(f"opened {address}"))
+
+    def run(line: str) -> Seen:
+        folder = tmp_path / "work"
+        shutil.rmtree(folder, ignore_errors=True)
+        shutil.copytree(template, folder)
+        monkeypatch.chdir(folder)
+        code, out, err = called(*shlex.split(line))
+        out = re.sub(r"(?<=127\.0\.0\.1)(:|%3A)\d{5}\b", ":any", out)  # a port that was free
+        files = {str(path.relative_to(folder)): _digest(path) for path in folder.rglob("*") if path.is_file()}
+        monkeypatch.chdir(tmp_path)
+        return Seen(code, out, err, files)
+
+    return run
+
+
+def _digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def _interrupted(*_: object, **__: object) -> None:
+    raise KeyboardInterrupt
+
+
+#: What came of command lines without the option that is looked at.
+KNOWN: dict[str, Seen] = {}
+
+
+@pytest.mark.parametrize(("command", "option"), [(name, option) for name, known in CASES.items() for option in known])
+def test_an_option_is_seen(command, option, see):
+    case = CASES[command][option]
+    if case.base not in KNOWN:
+        KNOWN[case.base] = see(case.base)
+        assert see(case.base) == KNOWN[case.base]  # what differs is the option's doing
+    before, after = KNOWN[case.base], see(f"{case.base} {case.words}")
+    assert after.code != 2, after.err
+    assert before != after
