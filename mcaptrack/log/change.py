@@ -17,11 +17,12 @@ from mcap.opcode import Opcode
 from mcaptrack.atomic import publish_stream
 from mcaptrack.errors import McaptrackError
 from mcaptrack.log import records
-from mcaptrack.log.chunks import chunk_record, forget, message_head, open_chunk
+from mcaptrack.log.chunks import chunk_record, message_head, open_chunk
 from mcaptrack.log.index import Index
 from mcaptrack.log.journal import new_end
 from mcaptrack.log.reader import Log
-from mcaptrack.log.records import BLOCK, MAGIC, ChunkIndexRecord, Damaged, Record, walk
+from mcaptrack.log.records import BLOCK, MAGIC, Bytes, ChunkIndexRecord, Damaged, Record, crc_of, walk
+from mcaptrack.log.source import Source
 from mcaptrack.log.writer import LogWriter, Sink, refuse_earlier_results, verify
 
 
@@ -56,13 +57,11 @@ def extend(
 @contextmanager
 def _in_place(log: Log, change: _Change) -> Iterator[LogWriter]:
     index = log.index
-    crc = None
-    if index.data_crc:
-        crc = records.crc_before(index.data_crc, log.buffer[change.cut : index.data_end])
+    crc = change.crc_before()
     try:
         with new_end(log.real_path, log.lock(), change.cut) as end:
             writer = LogWriter(end, change.cut, crc, change.before())
-            change.replay(writer, end.old[: index.data_end - change.cut], change.cut)
+            change.replay(writer, end.old.part(0, index.data_end - change.cut), change.cut)
             yield writer
             messages = writer.finish()
             end.close()
@@ -77,41 +76,36 @@ def _as_copy(log: Log, change: _Change, output: Path | None) -> Iterator[LogWrit
     if output is not None:
         refuse_earlier_results(output)
     with publish_stream(output or log.real_path) as stream:
+        start, crc = 0, change.crc_before()
         if change.cut > len(MAGIC):
-            _pass_on(log.buffer, change.cut, stream)
-            crc = None
-            if log.index.data_crc:
-                crc = records.crc_before(log.index.data_crc, log.buffer[change.cut : log.index.data_end])
-            writer = LogWriter(stream, change.cut, crc, change.before())
+            start = change.cut
+            _pass_on(log.source, start, stream)
+            writer = LogWriter(stream, start, crc, change.before())
         else:
             crc = 0
             writer = LogWriter(stream, 0, 0, change.before())
             writer.write(MAGIC)
-        change.replay(writer, log.buffer[: log.index.data_end], 0)
+        change.replay(writer, log.source.part(0, log.index.data_end), 0)
         yield writer
         messages = writer.finish()
         stream.flush()
-        start = change.cut if change.cut > len(MAGIC) else 0
         copy = Path(stream.name)
-        _compare(log.buffer, copy, start)
+        _compare(log.source, copy, start)
         verify(copy, writer, messages, start, crc or 0)
 
 
-def _pass_on(buffer: memoryview, end: int, stream: Sink) -> None:
+def _pass_on(source: Source, end: int, stream: Sink) -> None:
     for at in range(0, end, BLOCK):
-        until = min(at + BLOCK, end)
-        stream.write(buffer[at:until])  # type: ignore[arg-type]  # any bytes will do
-        forget(buffer, at, until)
+        stream.write(bytes(source[at : min(at + BLOCK, end)]))
 
 
-def _compare(buffer: memoryview, copy: Path, end: int) -> None:
+def _compare(source: Source, copy: Path, end: int) -> None:
     """What was passed on is what was read. Raises McaptrackError otherwise."""
     with copy.open("rb") as stream:
         for at in range(0, end, BLOCK):
             until = min(at + BLOCK, end)
-            if stream.read(until - at) != buffer[at:until]:
+            if stream.read(until - at) != source[at:until]:
                 raise McaptrackError(f"{copy} is not what was written to it; the disk can't be relied on")
-            forget(buffer, at, until)
 
 
 @dataclass
@@ -123,7 +117,7 @@ class _Change:
     """
 
     index: Index
-    buffer: memoryview
+    source: Source
     dropped: set[int]
     metadata: Collection[str]
     attachments: Collection[str]
@@ -134,7 +128,7 @@ class _Change:
     def plan(cls, log: Log, drop: Collection[str], metadata: Collection[str], attachments: Collection[str]) -> _Change:
         index = log.index
         dropped = {channel.id for channel in index.channels.values() if channel.topic in drop}
-        change = cls(index, log.buffer, dropped, metadata, attachments)
+        change = cls(index, log.source, dropped, metadata, attachments)
         if not index.regular:
             change.open_all = True
             return change
@@ -144,9 +138,9 @@ class _Change:
         places += [listed.offset for listed in index.attachments if listed.name in attachments]
         undescribed = {channel for channel in dropped if not change._is_described_where_it_begins(channel)}
         if undescribed:
-            for record in walk(log.buffer, len(MAGIC), index.data_end):
+            for record in walk(log.source.front_to_back(), len(MAGIC), index.data_end):
                 if record.opcode == Opcode.CHANNEL:
-                    channel = records.read_channel(log.buffer, record).id
+                    channel = records.read_channel(log.source, record).id
                     places += [record.start] if channel in dropped else []
                     undescribed.discard(channel)
         change.open_all = bool(undescribed)
@@ -157,13 +151,21 @@ class _Change:
         """Whether the first chunk with messages of a channel also describes it: then nothing outside of chunks does."""
         for chunk in self.index.chunks:
             if channel_id in chunk.message_index_offsets:
-                return channel_id in _described_in(open_chunk(self.buffer, chunk_record(self.buffer, chunk)))[0]
+                return channel_id in _described_in(open_chunk(self.source, chunk_record(self.source, chunk)))[0]
         return False
 
     @property
     def is_small(self) -> bool:
         """Whether writing the end twice, to the journal and in place, is less than writing everything once."""
-        return self.index.regular and self.cut > len(self.buffer) - self.cut
+        return self.index.regular and self.cut > len(self.source) - self.cut
+
+    def crc_before(self) -> int | None:
+        """The checksum of everything before the cut; None if the log has none."""
+        index = self.index
+        if not index.data_crc:
+            return None
+        tail = crc_of(self.source, self.cut, index.data_end)
+        return records.crc_before(index.data_crc, tail, index.data_end - self.cut)
 
     def before(self) -> Index:
         """What is in the log before the cut, of what stays."""
@@ -178,7 +180,7 @@ class _Change:
         for chunk in index.chunks:
             if chunk.offset >= self.cut:
                 for offset in chunk.message_index_offsets.values():
-                    channel, count = records.read_message_index(self.buffer, records.record_at(self.buffer, offset))
+                    channel, count = records.read_message_index(self.source, records.record_at(self.source, offset))
                     counts[channel] = counts.get(channel, 0) - count
         return replace(
             index,
@@ -190,14 +192,14 @@ class _Change:
             metadata=[listed for listed in index.metadata if listed.offset < self.cut],
         )
 
-    def replay(self, writer: LogWriter, buffer: memoryview, base: int) -> None:
-        """Write what stays of the records from the cut on. ``buffer`` is the file from ``base`` to its data's end."""
+    def replay(self, writer: LogWriter, source: Source, base: int) -> None:
+        """Write what stays of the records from the cut on. ``source`` is the file from ``base`` to its data's end."""
         try:
-            self._replay(writer, buffer, base)
+            self._replay(writer, source.front_to_back(), base)
         except Damaged as error:
             raise error.moved(base) from None
 
-    def _replay(self, writer: LogWriter, buffer: memoryview, base: int) -> None:
+    def _replay(self, writer: LogWriter, buffer: Bytes, base: int) -> None:
         chunks = {chunk.offset: chunk for chunk in self.index.chunks if chunk.offset >= self.cut}
         described = {channel for chunk in writer.chunks for channel in chunk.message_index_offsets}
         orphans: dict[int, None] = {}  # channels that stay, and that a chunk that went described
@@ -207,7 +209,6 @@ class _Change:
                 if known is None:
                     raise Damaged("a chunk that no index knows", record.start)
                 self._replay_chunk(writer, buffer, base, record, known, orphans, described)
-                forget(buffer, record.start, record.end)
             elif record.opcode == Opcode.MESSAGE:
                 channel, _, t_ns, _ = message_head(buffer, record)
                 if channel not in self.dropped:
@@ -223,7 +224,7 @@ class _Change:
         for channel in orphans:
             writer.put_description(channel)
 
-    def _stays(self, buffer: memoryview, record: Record) -> bool:
+    def _stays(self, buffer: Bytes, record: Record) -> bool:
         if record.opcode == Opcode.SCHEMA:
             schema = records.read_schema(buffer, record).id
             users = {channel.id for channel in self.index.channels.values() if channel.schema_id == schema}
@@ -231,7 +232,7 @@ class _Change:
         if record.opcode == Opcode.CHANNEL:
             return records.read_channel(buffer, record).id not in self.dropped
         if record.opcode == Opcode.ATTACHMENT:
-            return records.read_attachment(buffer, record)[2] not in self.attachments
+            return records.read_attachment(buffer, record).name not in self.attachments
         if record.opcode == Opcode.METADATA:
             return records.read_metadata(buffer, record)[0] not in self.metadata
         return True
@@ -239,7 +240,7 @@ class _Change:
     def _replay_chunk(
         self,
         writer: LogWriter,
-        buffer: memoryview,
+        buffer: Bytes,
         base: int,
         record: Record,
         known: ChunkIndexRecord,
@@ -279,7 +280,7 @@ class _Change:
             known = known._replace(start_ns=low, end_ns=high)
         writer.put_chunk(bytes(buffer[record.start : record.end]), known, indexes)
 
-    def _kept(self, content: memoryview) -> Iterator[tuple[int, int, memoryview]]:
+    def _kept(self, content: Bytes) -> Iterator[tuple[int, int, memoryview]]:
         """The records of a chunk that stay: channel, -1 for no message, log time, and the record."""
         for inner in walk(content, 0, len(content)):
             whole = content[inner.start : inner.end]
@@ -291,7 +292,7 @@ class _Change:
                 yield -1, 0, whole
 
 
-def _described_in(content: memoryview) -> tuple[set[int], set[int]]:
+def _described_in(content: Bytes) -> tuple[set[int], set[int]]:
     """The channels and the schemas that a chunk describes."""
     channels, schemas = set(), set()
     for inner in walk(content, 0, len(content)):

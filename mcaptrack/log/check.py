@@ -5,8 +5,6 @@ Letters: M messages.
 
 from __future__ import annotations
 
-import mmap
-import zlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -22,18 +20,15 @@ from mcaptrack.log.chunks import (
     HEAD,
     Entries,
     chunk_entries,
-    forget,
     heads_at,
     listed_entries,
     message_head,
     open_chunk,
 )
-from mcaptrack.log.index import (
-    Index,
-    list_attachment,
-    list_metadata,
-)
-from mcaptrack.log.records import MAGIC, ChunkIndexRecord, Damaged, Reader, Record, walk
+from mcaptrack.log.index import Index, begins_as_log, ends_as_log, list_attachment, list_metadata
+from mcaptrack.log.opening import changed
+from mcaptrack.log.records import MAGIC, Bytes, ChunkIndexRecord, Damaged, Reader, Record, walk
+from mcaptrack.log.source import OpenFile, RunningChecksum, Signature, Source
 
 Progress = Callable[[str, int, int], None]
 
@@ -60,32 +55,36 @@ def check(path: Path, progress: Progress = lambda *_: None) -> Checked:
     everything that the summary and the footer say. What is found is grouped by kind.
     """
     journal.settle(path.resolve())
-    with open_bytes(path) as buffer:
-        look = _Look(buffer, progress)
-        look.at_everything()
+    with open_bytes(path) as (source, file):
+        signature = Signature.of(file.handle)
+        look = _Look(source.front_to_back(), progress)
+        try:
+            look.at_everything()
+        except Damaged as error:  # damage to the content is a finding
+            raise McaptrackError(f"{path} can't be read to its end: {error}") from None
+        if Signature.of(file.handle) != signature:
+            raise changed(path)
     findings = sorted(look.findings, key=lambda found: (found.level, found.where))
     return Checked(path, sum(look.found.counts.values()), len(look.found.chunks), findings)
 
 
 @contextmanager
-def open_bytes(path: Path) -> Iterator[memoryview]:
-    """The bytes of a file, mapped. Raises McaptrackError if it is none or empty."""
-    if path.is_dir():
-        raise McaptrackError(f"{path} is a folder, not an MCAP file")
+def open_bytes(path: Path) -> Iterator[tuple[Source, OpenFile]]:
+    """The bytes of a file. Raises McaptrackError if it is none or empty."""
+    file = OpenFile(path)
     try:
-        opened = path.open("rb")
-    except OSError as error:
-        raise McaptrackError(f"{path} can't be opened: {error.strerror}") from None
-    with opened:
-        if path.stat().st_size == 0:
+        source = Source.of(file)
+        if not len(source):
             raise McaptrackError(f"{path} is empty")
-        yield memoryview(mmap.mmap(opened.fileno(), 0, access=mmap.ACCESS_READ))
+        yield source, file
+    finally:
+        file.close()
 
 
 class _Look:
     """One look at a file; ``found`` is what its records say, the way an index would say it."""
 
-    def __init__(self, buffer: memoryview, progress: Progress) -> None:
+    def __init__(self, buffer: Source, progress: Progress) -> None:
         self.found = Index()
         self.findings = Findings()
         self._find = self.findings.add
@@ -95,10 +94,10 @@ class _Look:
 
     def at_everything(self) -> None:
         buffer = self._buffer
-        if bytes(buffer[: len(MAGIC)]) != MAGIC:
+        if not begins_as_log(buffer):
             self._find("magic", 0, "the file does not begin as an MCAP file does")
             return
-        ends_well = len(buffer) >= 2 * len(MAGIC) and bytes(buffer[-len(MAGIC) :]) == MAGIC
+        ends_well = ends_as_log(buffer)
         if not ends_well:
             self._find("cut-off", len(buffer), "the file is cut off: the magic bytes at its end are missing")
         end = len(buffer) - len(MAGIC) if ends_well else len(buffer)
@@ -113,30 +112,28 @@ class _Look:
     # The data section
 
     def _at_data(self, end: int) -> None:
-        buffer, is_first = self._buffer, True
-        crc, checked = 0, 0
+        buffer, is_first, shown = self._buffer, True, 0
+        checksum = RunningChecksum(buffer)
         for record in walk(buffer, len(MAGIC), end):
             if is_first and record.opcode != Opcode.HEADER:
                 self._find("no-header", record.start, "the first record is not a header")
             is_first = False
             if record.opcode != Opcode.MESSAGE_INDEX:
                 self._close_chunk()
+                checksum.pass_over(record.start)
             if record.opcode == Opcode.DATA_END:
-                crc = zlib.crc32(buffer[checked : record.start], crc)
                 self.found.data_end = record.start
                 self.found.data_crc = Reader(buffer, record.body, record.end).number(4)
-                if self.found.data_crc and self.found.data_crc != crc:
+                if self.found.data_crc and self.found.data_crc != checksum.upto(record.start):
                     self._find("data-checksum", record.start, "the checksum of the data section is wrong")
                 return
             try:
                 self._at_record(record)
             except Damaged as error:
                 self._find(f"bad-{record_name(record.opcode)}", record.start, str(error))
-            if record.end - checked >= records.BLOCK:
-                crc = zlib.crc32(buffer[checked : record.end], crc)
-                forget(buffer, checked, record.end)
-                checked = record.end
-                self._progress("check", checked, len(buffer))
+            if record.end - shown >= records.BLOCK:
+                shown = record.end
+                self._progress("check", shown, len(buffer))
         self._find("no-data-end", end, "the data section has no end: records are missing")
 
     def _at_record(self, record: Record) -> None:
@@ -170,7 +167,7 @@ class _Look:
         elif record.opcode < 0x80 and record.opcode > Opcode.DATA_END:
             self._find("unknown", record.start, f"a record of kind {record.opcode:#04x}, which is not known", "warning")
 
-    def _describe(self, buffer: memoryview, record: Record, where: int) -> None:
+    def _describe(self, buffer: Bytes, record: Record, where: int) -> None:
         """A schema or channel, which is the same wherever it stands."""
         if record.opcode == Opcode.SCHEMA:
             schema = records.read_schema(buffer, record)
@@ -194,7 +191,6 @@ class _Look:
             self._at_chunk(record, indexes)
         except Damaged as error:
             self._find("bad-chunk", record.start, str(error))
-        forget(self._buffer, record.start, record.end)
 
     def _at_chunk(self, record: Record, indexes: Mapping[int, int]) -> None:
         buffer = self._buffer
@@ -221,19 +217,19 @@ class _Look:
         place = (record.start, record.end - record.start, dict(indexes), last - record.end)
         self.found.chunks.append(ChunkIndexRecord(head.start_ns, head.end_ns, *place, *sizes))
 
-    def _describe_all(self, content: memoryview, where: int) -> None:
+    def _describe_all(self, content: Bytes, where: int) -> None:
         for inner in walk(content, 0, len(content)):
             if inner.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
                 self._describe(content, inner, where)
 
-    def _indexed(self, record: Record, content: memoryview, indexes: Mapping[int, int]) -> dict[int, Entries]:
+    def _indexed(self, record: Record, content: Bytes, indexes: Mapping[int, int]) -> dict[int, Entries]:
         """What the indexes of a chunk list, which is all of its messages and nothing else."""
         entries: dict[int, Entries] = {}
         starts, ends = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
         for channel, at in indexes.items():
             listed = listed_entries(self._buffer, at, channel)
             try:
-                heads = heads_at(content, channel, *(column.astype(np.int64) for column in listed.T))
+                heads = heads_at(content, channel, listed[:, 0], listed[:, 1].astype(np.int64))
             except Damaged as error:
                 self._find("wrong-index", at, f"a message index does not fit its chunk: {error}")
                 self._describe_all(content, record.start)

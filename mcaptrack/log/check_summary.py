@@ -9,9 +9,8 @@ from typing import Final, Literal, NamedTuple
 
 from mcap.opcode import Opcode
 
-from mcaptrack.log import records
-from mcaptrack.log.index import DATA_END_SIZE, FOOTER_SIZE, Index, take
-from mcaptrack.log.records import MAGIC, Damaged, Reader, walk
+from mcaptrack.log.index import DATA_END_SIZE, FOOTER_SIZE, Index, read_footer, take
+from mcaptrack.log.records import MAGIC, Bytes, Damaged, Reader, walk
 
 Level = Literal["error", "warning"]
 
@@ -63,7 +62,7 @@ def record_name(opcode: int) -> str:
         return f"{opcode:#04x}"
 
 
-def check_summary(buffer: memoryview, found: Index, findings: Findings) -> None:
+def check_summary(buffer: Bytes, found: Index, findings: Findings) -> None:
     """Look at the summary and the footer of a log, ``found`` being what its data section holds."""
     try:
         _Look(buffer, found, findings).at_summary()
@@ -72,16 +71,16 @@ def check_summary(buffer: memoryview, found: Index, findings: Findings) -> None:
 
 
 class _Look:
-    def __init__(self, buffer: memoryview, found: Index, findings: Findings) -> None:
+    def __init__(self, buffer: Bytes, found: Index, findings: Findings) -> None:
         self._buffer, self._found, self._find = buffer, found, findings.add
 
     def at_summary(self) -> None:
         buffer, found = self._buffer, self._found
-        at = len(buffer) - FOOTER_SIZE
-        if at < len(MAGIC) or buffer[at] != Opcode.FOOTER:
-            self._find("no-footer", max(at, 0), "no footer where one belongs")
+        footer = read_footer(buffer)
+        if footer is None:
+            self._find("no-footer", max(len(buffer) - FOOTER_SIZE, 0), "no footer where one belongs")
             return
-        start, offsets_start, crc = records.FOOTER_BODY.unpack_from(buffer, at + 9)
+        at, start, offsets_start, crc = footer
         behind = found.data_end + DATA_END_SIZE
         if start == 0:
             words = "there is no summary: opening the log takes a scan"

@@ -5,8 +5,6 @@ Letters: M messages.
 
 from __future__ import annotations
 
-import mmap
-import zlib
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -15,16 +13,22 @@ from numpy.typing import NDArray
 
 from mcaptrack import environment
 from mcaptrack.log import records
-from mcaptrack.log.records import ChunkIndexRecord, Damaged, Record, walk
+from mcaptrack.log.records import Bytes, ChunkHead, ChunkIndexRecord, Damaged, Record, crc_of, walk
+from mcaptrack.log.source import Source
 
 Ints = NDArray[np.int64]
+Times = NDArray[np.uint64]
 Entries = NDArray[np.uint64]
 
 #: A chunk that says it is larger is not decompressed, unless the environment allows it.
 MAX_CHUNK_MIB: Final = 256
 ENVIRONMENT: Final = "MCAPTRACK_MAX_CHUNK_MIB"
-#: The last time that a log can hold, in nanoseconds: a signed number of 64 bits, in the year 2262.
+#: A chunk that is not compressed and larger than this is not read into memory as a whole.
+_MOST_PLAIN_BYTES: Final = 64 * 2**20
+#: The last time that is worked with, in nanoseconds: a signed number of 64 bits, in the year 2262.
 MAX_NS: Final = 2**63 - 1
+#: The last time that a log can hold.
+LOG_MAX_NS: Final = 2**64 - 1
 #: A message record up to its payload.
 HEAD: Final = np.dtype(
     [
@@ -39,46 +43,69 @@ HEAD: Final = np.dtype(
 
 
 class Heads(NamedTuple):
-    """M messages of one channel in a chunk: their record heads (M,) of ``HEAD``, and where payloads start and end."""
+    """M messages of one channel: their record heads (M,) of ``HEAD``, and where payloads start and end."""
 
-    content: memoryview
     head: NDArray[np.void]
     start: Ints
     end: Ints
 
 
-def message_head(buffer: memoryview, record: Record) -> tuple[int, int, int, int]:
+def message_head(buffer: Bytes, record: Record) -> tuple[int, int, int, int]:
     """Channel, sequence, log time and publish time of a message record."""
     if record.end - record.body < records.MESSAGE_HEAD.size:
         raise Damaged(f"a message of {record.end - record.body} bytes", record.start)
-    head: tuple[int, int, int, int] = records.MESSAGE_HEAD.unpack_from(buffer, record.body)
+    head: tuple[int, int, int, int] = records.MESSAGE_HEAD.unpack(
+        buffer[record.body : record.body + records.MESSAGE_HEAD.size]
+    )
     return head
 
 
-def chunk_record(buffer: memoryview, chunk: ChunkIndexRecord) -> Record:
+def chunk_record(buffer: Bytes, chunk: ChunkIndexRecord) -> Record:
     """The chunk that an index points to."""
-    record = records.record_at(buffer, chunk.offset)
+    return _chunk_at(buffer, chunk.offset)
+
+
+def _chunk_at(buffer: Bytes, offset: int) -> Record:
+    record = records.record_at(buffer, offset)
     if record.opcode != Opcode.CHUNK:
-        raise Damaged("no chunk where one belongs", chunk.offset)
+        raise Damaged("no chunk where one belongs", offset)
     return record
 
 
-def open_chunk(buffer: memoryview, record: Record) -> memoryview:
-    """The records inside a chunk, decompressed and checked. Memory is bounded by what the chunk says of itself."""
-    head = records.read_chunk(buffer, record)
+def open_chunk(buffer: Bytes, record: Record, head: ChunkHead | None = None) -> Bytes:
+    """The records inside a chunk, decompressed and checked. Memory is bounded by what the chunk says of itself.
+
+    A chunk that is large and not compressed stays in the file; its records are read when they are asked for.
+    """
+    head = head or records.read_chunk(buffer, record)
     if head.compression and head.uncompressed_size > _most_mib() * 2**20:
         raise Damaged(
             f"a chunk of {head.uncompressed_size} bytes, of at most {_most_mib()} MiB that are "
             f"opened (the variable {ENVIRONMENT} sets another limit)",
             record.start,
         )
-    data = buffer[head.start : head.end]
-    content = _decompress(data, head.compression, head.uncompressed_size, record.start)
+    size = head.end - head.start
+    content: Bytes
+    if isinstance(buffer, Source) and is_left_in_file(head.compression, size):
+        content = buffer.part(head.start, head.end)
+    else:
+        content = _decompress(buffer[head.start : head.end], head.compression, head.uncompressed_size, record.start)
     if len(content) != head.uncompressed_size:
         raise Damaged(f"a chunk of {len(content)} bytes that says {head.uncompressed_size}", record.start)
-    if head.uncompressed_crc and zlib.crc32(content) != head.uncompressed_crc:
+    if head.uncompressed_crc and crc_of(content, 0, len(content)) != head.uncompressed_crc:
         raise Damaged("the checksum of a chunk is wrong", record.start)
     return content
+
+
+def is_left_in_file(compression: str, size: int) -> bool:
+    """Whether a chunk is opened without reading it into memory as a whole."""
+    return not compression and size > _MOST_PLAIN_BYTES
+
+
+def checksum_at(buffer: Bytes, offset: int) -> int:
+    """What tells the chunk at ``offset`` from another there: its checksum, or if it has none that of its bytes."""
+    head = records.read_chunk(buffer, _chunk_at(buffer, offset))
+    return head.uncompressed_crc or crc_of(buffer, head.start, head.end)
 
 
 def _most_mib() -> int:
@@ -120,24 +147,7 @@ def _lz4(data: memoryview, size: int) -> bytes:
     return content
 
 
-def forget(buffer: memoryview, start: int, end: int) -> None:
-    """Let go of the memory that reading a part of a mapped file took; the bytes stay readable."""
-    mapped = buffer.obj
-    first = -(-start // mmap.PAGESIZE) * mmap.PAGESIZE
-    if isinstance(mapped, mmap.mmap) and end - first >= mmap.PAGESIZE:
-        mapped.madvise(mmap.MADV_DONTNEED, first, end - first)
-
-
-def crc_of(buffer: memoryview, start: int, end: int, crc: int = 0) -> int:
-    """The checksum of a part of a file, going on from that of what stands before; the memory is let go of again."""
-    for at in range(start, end, records.BLOCK):
-        until = min(at + records.BLOCK, end)
-        crc = zlib.crc32(buffer[at:until], crc)
-        forget(buffer, at, until)
-    return crc
-
-
-def listed_entries(buffer: memoryview, at: int, channel_id: int) -> Entries:
+def listed_entries(buffer: Bytes, at: int, channel_id: int) -> Entries:
     """What the message index at ``at`` lists of a channel: log time and offset inside the chunk, (M, 2)."""
     record = records.record_at(buffer, at)
     channel, listed = records.read_message_entries(buffer, record)
@@ -153,13 +163,7 @@ def listed_entries(buffer: memoryview, at: int, channel_id: int) -> Entries:
     return entries
 
 
-def check_times(entries: Entries) -> None:
-    """Raises Damaged if a message is later than any time that is worked with."""
-    if len(entries) and entries[:, 0].max() > MAX_NS:
-        raise Damaged("a message has a time beyond the year 2262")
-
-
-def chunk_entries(content: memoryview) -> dict[int, Entries]:
+def chunk_entries(content: Bytes) -> dict[int, Entries]:
     """What the message indexes of a chunk have to say: for each channel log time and offset of its messages, (M, 2)."""
     found: dict[int, list[tuple[int, int]]] = {}
     for record in walk(content, 0, len(content)):
@@ -169,17 +173,19 @@ def chunk_entries(content: memoryview) -> dict[int, Entries]:
     return {channel: np.array(entries, "<u8") for channel, entries in found.items()}
 
 
-def heads_at(content: memoryview, channel_id: int, t_ns: Ints, offset: Ints) -> Heads:
+def heads_at(content: Bytes, channel_id: int, t_ns: Times, offset: Ints) -> Heads:
     """The messages that an index says stand at these offsets, at these times. Raises Damaged where one does not."""
     room = len(content) - HEAD.itemsize
     outside = offset[(offset < 0) | (offset > room)]
     if len(outside):
         raise Damaged(f"a message is said to stand at byte {outside[0]} of a chunk of {len(content)}")
-    raw = np.frombuffer(content, np.uint8)
-    if len(offset):
+    if not len(offset):
+        head = np.empty(0, HEAD)
+    elif isinstance(content, memoryview):
+        raw = np.frombuffer(content, np.uint8)
         head = np.lib.stride_tricks.sliding_window_view(raw, HEAD.itemsize)[offset].view(HEAD)[:, 0]
     else:
-        head = np.empty(0, HEAD)
+        head = np.frombuffer(b"".join(content[at : at + HEAD.itemsize] for at in offset.tolist()), HEAD)
     wrong = (head["opcode"] != Opcode.MESSAGE) | (head["channel"] != channel_id) | (head["t_ns"] != t_ns)
     wrong |= head["size"] < records.MESSAGE_HEAD.size
     start = offset + HEAD.itemsize
@@ -188,4 +194,4 @@ def heads_at(content: memoryview, channel_id: int, t_ns: Ints, offset: Ints) -> 
     if wrong.any():
         time = int(t_ns[wrong.argmax()])
         raise Damaged(f"no message of channel {channel_id} at {time} ns where the index says one is")
-    return Heads(content, head, start, start + head["size"].astype(np.int64) - records.MESSAGE_HEAD.size)
+    return Heads(head, start, start + head["size"].astype(np.int64) - records.MESSAGE_HEAD.size)

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import hashlib
-from typing import Any
 
 from mcaptrack.log import records
 from mcaptrack.log.chunks import chunk_record
 from mcaptrack.log.index import Index
-from mcaptrack.log.records import ChunkIndexRecord, record_at
+from mcaptrack.log.records import BLOCK, Bytes, ChunkIndexRecord, record_at
 
 
-def fingerprint(buffer: memoryview, index: Index, channel_id: int | None = None) -> str:
+def fingerprint(buffer: Bytes, index: Index, channel_id: int | None = None) -> str:
     """SHA-256 of a channel, or of everything: descriptions, and of each chunk its times and checksum.
 
     Where a chunk or attachment has no checksum, and outside of chunks, the bytes themselves count.
@@ -35,20 +34,29 @@ def fingerprint(buffer: memoryview, index: Index, channel_id: int | None = None)
     for number in sorted(index.loose) if channel_id is None else [channel_id]:
         for offset in index.loose[number][:, 1].tolist() if number in index.loose else []:
             record = record_at(buffer, offset)
-            total.update(buffer[record.start : record.end])
+            _take(total, buffer, record.start, record.end)
     if channel_id is None:
         for listed in index.metadata:
             record = record_at(buffer, listed.offset)
-            total.update(buffer[record.start : record.end])
+            _take(total, buffer, record.start, record.end)
         for listed in index.attachments:
             record = record_at(buffer, listed.offset)
             checksum = bytes(buffer[record.end - 4 : record.end])
             say(listed.name, listed.offset, record.end - record.start, checksum)
             if checksum == bytes(4):
-                total.update(buffer[record.start : record.end])
+                _take(total, buffer, record.start, record.end)
     return total.hexdigest()
 
 
-def _checksum(buffer: memoryview, chunk: ChunkIndexRecord) -> Any:
+def _checksum(buffer: Bytes, chunk: ChunkIndexRecord) -> int | str:
     head = records.read_chunk(buffer, chunk_record(buffer, chunk))
-    return head.uncompressed_crc or hashlib.sha256(buffer[head.start : head.end]).hexdigest()
+    if head.uncompressed_crc:
+        return head.uncompressed_crc
+    whole = hashlib.sha256()
+    _take(whole, buffer, head.start, head.end)
+    return whole.hexdigest()
+
+
+def _take(total: hashlib._Hash, buffer: Bytes, start: int, end: int) -> None:
+    for at in range(start, end, BLOCK):
+        total.update(buffer[at : min(at + BLOCK, end)])

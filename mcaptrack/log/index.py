@@ -12,10 +12,10 @@ import numpy as np
 from mcap.opcode import Opcode
 
 from mcaptrack.log import records
-from mcaptrack.log.chunks import Entries, chunk_entries, forget, message_head, open_chunk
+from mcaptrack.log.chunks import Entries, chunk_entries, message_head, open_chunk
 from mcaptrack.log.records import (
-    BLOCK,
     MAGIC,
+    Bytes,
     ChannelRecord,
     ChunkIndexRecord,
     Damaged,
@@ -24,6 +24,7 @@ from mcaptrack.log.records import (
     SchemaRecord,
     walk,
 )
+from mcaptrack.log.source import RunningChecksum, Source
 
 FOOTER_SIZE: Final = 9 + records.FOOTER_BODY.size + len(MAGIC)
 DATA_END_SIZE: Final = 9 + 4
@@ -59,35 +60,89 @@ class Index:
     start_ns: int = 0
     end_ns: int = 0
 
+    def agrees(self, other: Index, channel_id: int) -> bool:
+        """Whether another index says the same of a channel."""
+        for name in ("channels", "counts"):
+            if getattr(self, name).get(channel_id) != getattr(other, name).get(channel_id):
+                return False
+        if not _equal(self.loose.get(channel_id), other.loose.get(channel_id)):
+            return False
+        channel = self.channels.get(channel_id)
+        if channel and self.schemas.get(channel.schema_id) != other.schemas.get(channel.schema_id):
+            return False
+        ours, theirs = ([c for c in index.chunks if channel_id in c.message_index_offsets] for index in (self, other))
+        return ours == theirs and all(
+            _equal(self.entries[chunk.offset][channel_id], other.entries[chunk.offset][channel_id])
+            for chunk in ours
+            if chunk.offset in self.entries
+        )
 
-def read_index(buffer: memoryview) -> Index:
-    """The contents of the log in ``buffer``. Raises Damaged if it is none or is cut off."""
-    if bytes(buffer[: len(MAGIC)]) != MAGIC:
+    def agrees_in_all(self, other: Index) -> bool:
+        """Whether another index says the same of the log."""
+        plain = ("data_end", "data_crc", "schemas", "channels", "chunks", "counts", "attachments", "metadata")
+        if any(getattr(self, name) != getattr(other, name) for name in plain):
+            return False
+        ours, theirs = ({0: index.loose, **index.entries} for index in (self, other))
+        return ours.keys() == theirs.keys() and all(
+            ours[at].keys() == theirs[at].keys() and all(_equal(ours[at][n], theirs[at][n]) for n in ours[at])
+            for at in ours
+        )
+
+
+def _equal(one: Entries | None, other: Entries | None) -> bool:
+    return one is other or (one is not None and other is not None and np.array_equal(one, other))
+
+
+def read_index(source: Source) -> Index:
+    """The contents of a log. Raises Damaged if it is none or is cut off."""
+    if not begins_as_log(source):
         raise Damaged("it does not begin as an MCAP file does")
-    if len(buffer) < 2 * len(MAGIC) or bytes(buffer[-len(MAGIC) :]) != MAGIC:
+    if not ends_as_log(source):
         raise Damaged("it is cut off: the end of an MCAP file is missing")
-    return read_summary(buffer) or _from_scan(buffer)
+    return read_summary(source) or _from_scan(source.front_to_back())
 
 
-def read_summary(buffer: memoryview) -> Index | None:
-    """The contents as the summary has them; None where it lacks something that reading by index stands on."""
+def begins_as_log(buffer: Bytes) -> bool:
+    """Whether the first bytes are those of an MCAP file."""
+    return bytes(buffer[0 : len(MAGIC)]) == MAGIC
+
+
+def ends_as_log(buffer: Bytes) -> bool:
+    """Whether the last bytes are those of an MCAP file, and are not the first ones."""
+    return len(buffer) >= 2 * len(MAGIC) and bytes(buffer[len(buffer) - len(MAGIC) : len(buffer)]) == MAGIC
+
+
+def read_footer(buffer: Bytes) -> tuple[int, int, int, int] | None:
+    """Where the footer stands; where it says that the summary and its offsets start; the CRC of these. None if none."""
     at = len(buffer) - FOOTER_SIZE
     if at < len(MAGIC) or buffer[at] != Opcode.FOOTER:
+        return None
+    return at, *records.FOOTER_BODY.unpack(buffer[at + 9 : len(buffer) - len(MAGIC)])
+
+
+def read_summary(buffer: Bytes) -> Index | None:
+    """The contents as the summary has them; None where it lacks something that reading by index stands on."""
+    footer = read_footer(buffer)
+    if footer is None:
         raise Damaged("it has no footer where one belongs")
-    summary_start, _, summary_crc = records.FOOTER_BODY.unpack_from(buffer, at + 9)
+    at, summary_start, _, summary_crc = footer
     data_end = summary_start - DATA_END_SIZE
     if not len(MAGIC) <= data_end < at or buffer[data_end] != Opcode.DATA_END:
         return None
-    if summary_crc and zlib.crc32(buffer[summary_start : len(buffer) - len(MAGIC) - 4]) != summary_crc:
-        return None  # the data section says the same, with checksums of its own
     index, statistics = Index(data_end), None
     index.data_crc = Reader(buffer, data_end + 9, data_end + DATA_END_SIZE).number(4)
-    for record in walk(buffer, summary_start, at):
-        if record.opcode == Opcode.STATISTICS:
-            statistics = record
-        take(index, buffer, record)
+    summary = buffer[summary_start : len(buffer) - len(MAGIC) - 4]
+    if summary_crc and zlib.crc32(summary) != summary_crc:
+        return None  # the data section says the same, with checksums of its own
+    try:
+        for record in walk(summary, 0, at - summary_start):
+            if record.opcode == Opcode.STATISTICS:
+                statistics = record
+            take(index, summary, record)
+    except Damaged as error:
+        raise error.moved(summary_start) from None
     index.chunks.sort(key=lambda chunk: chunk.offset)
-    index.regular = statistics is not None and _adds_up(index, Reader(buffer, statistics.body, statistics.end))
+    index.regular = statistics is not None and _adds_up(index, Reader(summary, statistics.body, statistics.end))
     return index if index.regular else None
 
 
@@ -110,7 +165,7 @@ def _adds_up(index: Index, statistics: Reader) -> bool:
     return said == found and described and indexed and apart
 
 
-def take(index: Index, buffer: memoryview, record: Record) -> None:
+def take(index: Index, buffer: Bytes, record: Record) -> None:
     """Add a record of the summary to the index."""
     reader = Reader(buffer, record.body, record.end)
     if record.opcode == Opcode.SCHEMA:
@@ -135,12 +190,19 @@ def take(index: Index, buffer: memoryview, record: Record) -> None:
         index.metadata.append(Listed(reader.text(), offset, bytes(buffer[record.start : record.end])))
 
 
-def _from_scan(buffer: memoryview) -> Index:
+def _from_scan(buffer: Source) -> Index:
     """The contents from every record of the file, chunks opened."""
     index = Index()
     loose: dict[int, array[int]] = {}
-    done = crc = 0
+    checksum = RunningChecksum(buffer)
     for record in walk(buffer, len(MAGIC), len(buffer) - len(MAGIC)):
+        if record.opcode == Opcode.DATA_END:
+            index.data_end = record.start
+            index.data_crc = Reader(buffer, record.body, record.end).number(4)
+            if index.data_crc and index.data_crc != checksum.upto(record.start):
+                raise Damaged("the checksum of its data section is wrong")
+            continue
+        checksum.pass_over(record.end)
         if record.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
             take(index, buffer, record)  # those of the summary count too: some writers put them nowhere else
         elif record.opcode == Opcode.CHUNK:
@@ -152,15 +214,6 @@ def _from_scan(buffer: memoryview) -> Index:
             index.attachments.append(list_attachment(buffer, record, record.start))
         elif record.opcode == Opcode.METADATA:
             index.metadata.append(list_metadata(buffer, record, record.start))
-        elif record.opcode == Opcode.DATA_END:
-            index.data_end = record.start
-            index.data_crc = Reader(buffer, record.body, record.end).number(4)
-            if index.data_crc and index.data_crc != zlib.crc32(buffer[done : record.start], crc):
-                raise Damaged("the checksum of its data section is wrong")
-        if record.end - done >= BLOCK:
-            crc = zlib.crc32(buffer[done : record.end], crc)
-            forget(buffer, done, record.end)
-            done = record.end
     index.loose = {channel: np.array(entries, "<u8").reshape(-1, 2) for channel, entries in loose.items()}
     _count(index, index.loose)
     missing = set(index.counts) - set(index.channels)
@@ -181,7 +234,7 @@ def _count(index: Index, found: Mapping[int, Entries]) -> None:
         index.counts[channel] = index.counts.get(channel, 0) + len(entries)
 
 
-def _scan_chunk(index: Index, buffer: memoryview, record: Record) -> None:
+def _scan_chunk(index: Index, buffer: Bytes, record: Record) -> None:
     head = records.read_chunk(buffer, record)
     content = open_chunk(buffer, record)
     for inner in walk(content, 0, len(content)):
@@ -205,16 +258,16 @@ def _scan_chunk(index: Index, buffer: memoryview, record: Record) -> None:
     )
 
 
-def list_attachment(buffer: memoryview, record: Record, offset: int) -> Listed:
+def list_attachment(buffer: Bytes, record: Record, offset: int) -> Listed:
     """What indexes an attachment that stands at ``offset`` of a file."""
-    log_ns, create_ns, name, media_type, data = records.read_attachment(buffer, record)
-    numbers = (offset, record.end - record.start, log_ns, create_ns, len(data))
+    found = records.read_attachment(buffer, record)
+    numbers = (offset, record.end - record.start, found.log_ns, found.create_ns, found.end - found.start)
     packed = b"".join(records.number(value, 8) for value in numbers)
-    index = records.pack(Opcode.ATTACHMENT_INDEX, packed, records.text(name), records.text(media_type))
-    return Listed(name, offset, index)
+    index = records.pack(Opcode.ATTACHMENT_INDEX, packed, records.text(found.name), records.text(found.media_type))
+    return Listed(found.name, offset, index)
 
 
-def list_metadata(buffer: memoryview, record: Record, offset: int) -> Listed:
+def list_metadata(buffer: Bytes, record: Record, offset: int) -> Listed:
     """What indexes a metadata record that stands at ``offset`` of a file."""
     name = records.read_metadata(buffer, record)[0]
     packed = records.number(offset, 8) + records.number(record.end - record.start, 8)

@@ -7,7 +7,6 @@ goes when the new end is on the disk. Whoever finds a journal, and nobody at wor
 from __future__ import annotations
 
 import fcntl
-import mmap
 import os
 import struct
 import time
@@ -19,6 +18,7 @@ from typing import Final
 
 from mcaptrack.atomic import publish, sync_folder
 from mcaptrack.errors import McaptrackError
+from mcaptrack.log.source import OpenFile, Source
 
 _MAGIC: Final = b"mcaptrack journal 1\n"
 #: Where the old end starts, how long the file was, a CRC of the bytes before that end, a CRC of the end itself.
@@ -52,7 +52,7 @@ def lock(path: Path, handle: int) -> None:
 class End:
     """The end of a file, from ``start`` on, being written anew. ``old`` are the bytes that stood there."""
 
-    def __init__(self, handle: int, start: int, old: memoryview) -> None:
+    def __init__(self, handle: int, start: int, old: Source) -> None:
         self._handle, self.old = handle, old
         self._at = start
         self._waiting: list[bytes] = []
@@ -101,9 +101,8 @@ def new_end(path: Path, handle: int, start: int) -> Iterator[End]:
     except OSError as error:
         raise McaptrackError(f"{journal} can't be written: {error.strerror or error}") from error
     try:
-        with journal.open("rb") as stream:
-            kept = memoryview(mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ))
-        yield End(handle, start, kept[len(_MAGIC) + _HEAD.size + 4 :])
+        kept = Source.of(OpenFile(journal))
+        yield End(handle, start, kept.part(len(_MAGIC) + _HEAD.size + 4, len(kept)))
     except BaseException:
         _put_back(path, handle)
         raise

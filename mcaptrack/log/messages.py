@@ -5,6 +5,7 @@ Letters: M messages.
 
 from __future__ import annotations
 
+import zlib
 from collections import OrderedDict
 from collections.abc import Iterator, Sequence
 from itertools import islice
@@ -17,24 +18,39 @@ from numpy.typing import NDArray
 from mcaptrack.log.chunks import (
     MAX_NS,
     Entries,
-    check_times,
+    checksum_at,
     chunk_record,
-    forget,
     heads_at,
+    is_left_in_file,
     listed_entries,
     message_head,
     open_chunk,
 )
 from mcaptrack.log.index import Index
-from mcaptrack.log.records import BLOCK, MESSAGE_HEAD, ChunkIndexRecord, Damaged, record_at
+from mcaptrack.log.records import (
+    BLOCK,
+    MESSAGE_HEAD,
+    Bytes,
+    ChunkIndexRecord,
+    Damaged,
+    Record,
+    crc_of,
+    read_chunk,
+    record_at,
+)
+from mcaptrack.log.source import Source
 from mcaptrack.schema import Rows, Schema
 
 Ints = NDArray[np.int64]
+Times = NDArray[np.uint64]
 Span = tuple[int | None, int | None]
 
 #: Beyond this much, chunks that overlap are closed and opened again when their turn comes.
 OPEN_BYTES: Final = 128 * 2**20
+#: Messages outside of chunks that are further apart on the average are read one by one.
+_APART: Final = 16 * 2**10
 _NONE: Final = np.empty(0, np.int64)
+_NO_TIMES: Final = np.empty(0, np.uint64)
 
 
 class Message(NamedTuple):
@@ -66,23 +82,33 @@ class Places(NamedTuple):
     offset: Ints
 
 
-class _Source(NamedTuple):
-    """Messages of one channel in a chunk, or in the file outside of chunks: times and places, by time, (M,) each.
+class Late(Exception):
+    """So many messages of a channel are later than ``MAX_NS``, the first of them at ``t_ns``."""
 
-    ``start`` and ``end`` are the part of the file that reading them touches.
+    def __init__(self, count: int, t_ns: int) -> None:
+        super().__init__(count, t_ns)
+        self.count, self.t_ns = count, t_ns
+
+
+class _Batch(NamedTuple):
+    """Messages of one channel that are read together, by time, (M,) each: all in a chunk, or near each other elsewhere.
+
+    ``is_direct`` is for messages that are read from the file itself: those outside of chunks, and those in chunks that
+    are too large to be in memory.
     """
 
     channel: int
     chunk: ChunkIndexRecord | None
-    start: int
-    end: int
-    t_ns: Ints
+    is_direct: bool
+    t_ns: Times
     offset: Ints
 
     @property
     def size(self) -> int:
         """The memory that it takes to have it open."""
-        return self.chunk.uncompressed_size if self.chunk and self.chunk.compression else 0
+        if self.chunk is not None and not self.is_direct:
+            return self.chunk.uncompressed_size
+        return int(self.offset.max() - self.offset.min()) if len(self.offset) else 0
 
 
 class Messages:
@@ -91,38 +117,44 @@ class Messages:
     Channels are given by their ids, one or several; the messages of several are read as those of one.
     """
 
-    def __init__(self, buffer: memoryview, index: Index) -> None:
-        self._buffer, self._index = buffer, index
-        self._opened: OrderedDict[int, memoryview] = OrderedDict()  # contents of the last chunks, for other channels
+    def __init__(self, source: Source, index: Index) -> None:
+        self.source, self.index = source, index
+        self._opened: OrderedDict[int, Bytes] = OrderedDict()  # contents of the last chunks, for other channels
+        # What was read, to tell whether it still stands there: checksums of chunks, ends and checksums of pieces.
+        self._chunks: dict[int, int] = {}
+        self._pieces: dict[int, tuple[int, int]] = {}
 
     def times(self, channels: Sequence[int], span: Span = (None, None)) -> Ints:
         """The times of messages, rising, (M,)."""
-        return np.sort(np.concatenate([np.empty(0, np.int64), *(s.t_ns for s in self._sources(channels, span))]))
+        return np.sort(signed(np.concatenate([_NO_TIMES, *(b.t_ns for b in self._batches(channels, span))])))
 
     def places(self, channels: Sequence[int]) -> Places:
         """Where messages stand, in the order of ``by_time``."""
-        sources = self._sources(channels)
-        t_ns = np.concatenate([_NONE, *(source.t_ns for source in sources)])
-        offset = np.concatenate([_NONE, *(source.offset for source in sources)])
-        starts = np.array([source.chunk.offset if source.chunk else -1 for source in sources], np.int64)
-        chunk_offset = np.repeat(starts, [len(source.t_ns) for source in sources])
+        batches = self._batches(channels)
+        t_ns = signed(np.concatenate([_NO_TIMES, *(batch.t_ns for batch in batches)]))
+        offset = np.concatenate([_NONE, *(batch.offset for batch in batches)])
+        starts = np.array([batch.chunk.offset if batch.chunk else -1 for batch in batches], np.int64)
+        chunk_offset = np.repeat(starts, [len(batch.t_ns) for batch in batches])
         order = np.argsort(t_ns, kind="stable")
         return Places(t_ns[order], chunk_offset[order], offset[order])
 
     def at(self, chunk_offset: int | None, offset: int) -> tuple[int, Message]:
         """The message that stands at a place, and the number of its channel."""
-        content = self._buffer
+        content: Bytes = self.source
         if chunk_offset is not None:
-            chunk = next((chunk for chunk in self._index.chunks if chunk.offset == chunk_offset), None)
+            chunk = next((chunk for chunk in self.index.chunks if chunk.offset == chunk_offset), None)
             if chunk is None:
                 raise Damaged(f"no chunk begins at byte {chunk_offset}")
-            content = self._open(_Source(-1, chunk, chunk.offset, chunk.offset + chunk.length, _NONE, _NONE))
+            content = self._content(chunk)
         record = record_at(content, offset)
         if record.opcode != Opcode.MESSAGE:
             raise Damaged(f"no message stands at byte {offset} of the chunk at {chunk_offset}")
-        channel, sequence, t_ns, publish_ns = message_head(content, record)
-        payload = bytes(content[record.body + MESSAGE_HEAD.size : record.end])
-        return channel, Message(t_ns, sequence, publish_ns, payload)
+        whole = memoryview(bytes(content[record.start : record.end]))
+        if chunk_offset is None:
+            self._note(record.start, whole)
+        head = Record(record.opcode, 0, record.body - record.start, len(whole))
+        channel, sequence, t_ns, publish_ns = message_head(whole, head)
+        return channel, Message(t_ns, sequence, publish_ns, bytes(whole[head.body + MESSAGE_HEAD.size :]))
 
     def by_time(self, channels: Sequence[int], span: Span = (None, None)) -> Iterator[Message]:
         """Messages by time; those of one time channel by channel, as they stand in the file.
@@ -131,47 +163,46 @@ class Messages:
 
         A chunk is open while its messages are due, unless too many are.
         """
-        sources = self._sources(channels, span)
-        if not any(len(source.t_ns) for source in sources):
+        batches = self._batches(channels, span)
+        if not any(len(batch.t_ns) for batch in batches):
             return
-        t_ns = np.concatenate([source.t_ns for source in sources])
-        source_of = np.repeat(np.arange(len(sources)), [len(source.t_ns) for source in sources])
-        in_order = source_of[np.argsort(t_ns, kind="stable")]
+        t_ns = np.concatenate([batch.t_ns for batch in batches])
+        batch_of = np.repeat(np.arange(len(batches)), [len(batch.t_ns) for batch in batches])
+        in_order = batch_of[np.argsort(t_ns, kind="stable")]
         # Chunks rarely overlap: as long as one goes on, its messages are passed on without a look at the others.
         turns = np.flatnonzero(np.diff(in_order)) + 1
         starts = np.concatenate([[0], turns, [len(in_order)]])
         opened: OrderedDict[int, Iterator[Message]] = OrderedDict()
-        taken = [0] * len(sources)
+        taken = [0] * len(batches)
         size = 0
         for number, run in zip(in_order[starts[:-1]].tolist(), np.diff(starts).tolist(), strict=True):
-            source = sources[number]
+            batch = batches[number]
             if number not in opened:
-                size += source.size
+                size += batch.size
                 while size > OPEN_BYTES and opened:
-                    size -= sources[opened.popitem(last=False)[0]].size
-                opened[number] = self._read(source, taken[number])
+                    size -= batches[opened.popitem(last=False)[0]].size
+                opened[number] = self._read(batch, taken[number])
             opened.move_to_end(number)
             yield from islice(opened[number], run)
             taken[number] += run
-            if taken[number] == len(source.t_ns):
+            if taken[number] == len(batch.t_ns):
                 del opened[number]
-                size -= source.size
-                forget(self._buffer, source.start, source.end)
+                size -= batch.size
 
     def columns(self, channels: Sequence[int], schema: Schema) -> Columns | None:
         """Rows without a loop over messages; None where a message is laid out otherwise than ours."""
-        sources = self._sources(channels)
-        t_ns = np.concatenate([np.empty(0, np.int64), *(source.t_ns for source in sources)])
+        batches = self._batches(channels)
+        t_ns = signed(np.concatenate([_NO_TIMES, *(batch.t_ns for batch in batches)]))
         sequence, counts = np.empty_like(t_ns), np.empty_like(t_ns)
         rows, done, taken = schema.empty(), 0, 0
-        for source in sources:
-            content = self._open(source)
-            found = heads_at(content, source.channel, source.t_ns, source.offset)
+        for batch in batches:
+            content, offset = self._open(batch)
+            found = heads_at(content, batch.channel, batch.t_ns, offset)
             decoded = schema.codec.decode_at(np.frombuffer(content, np.uint8), found.start, found.end)
             if decoded is None:
                 return None
             part, counts_of = decoded
-            until = done + len(source.t_ns)
+            until = done + len(batch.t_ns)
             sequence[done:until], counts[done:until] = found.head["sequence"], counts_of
             if taken + len(part) > len(rows):  # as many more as the messages to come have if they are like those so far
                 share = (len(t_ns) - done) / max(until - done, 1)
@@ -186,55 +217,90 @@ class Messages:
         rows.flags.writeable = False
         return Columns(rows, t_ns[order], sequence[order], counts[order])
 
-    def _sources(self, channels: Sequence[int], span: Span = (None, None)) -> list[_Source]:
-        return [source for channel_id in channels for source in self._sources_of(channel_id, span)]
+    def are_in(self, source: Source) -> bool:
+        """Whether what was read so far stands in ``source`` as it did when it was read."""
+        pieces = all(crc_of(source, start, end) == crc for start, (end, crc) in self._pieces.items())
+        return pieces and all(checksum_at(source, start) == crc for start, crc in self._chunks.items())
 
-    def _sources_of(self, channel_id: int, span: Span) -> list[_Source]:
+    def _batches(self, channels: Sequence[int], span: Span = (None, None)) -> list[_Batch]:
+        return [batch for channel_id in channels for batch in self._batches_of(channel_id, span)]
+
+    def _batches_of(self, channel_id: int, span: Span) -> list[_Batch]:
         """Where the messages of a channel stand; only chunks that reach into the span are looked at."""
         first, last = span
-        is_all = first is None and last is None
         found, listed = [], 0
-        for chunk in self._index.chunks:
+        for chunk in self.index.chunks:
             at = chunk.message_index_offsets.get(channel_id)
             if at is None or (last is not None and chunk.start_ns >= last):
                 continue
             if first is not None and chunk.end_ns < first:
                 continue
             if at:
-                entries = listed_entries(self._buffer, at, channel_id)
+                entries = listed_entries(self.source, at, channel_id)
             else:
-                entries = self._index.entries[chunk.offset][channel_id]
+                entries = self.index.entries[chunk.offset][channel_id]
             listed += len(entries)
-            found.append(_source(channel_id, chunk, chunk.offset, chunk.offset + chunk.length, entries, span))
-        loose = self._index.loose.get(channel_id, np.empty((0, 2), "<u8"))
+            if is_left_in_file(chunk.compression, chunk.compressed_size):
+                found += _pieces(channel_id, chunk, entries, span)
+            else:
+                found.append(_batch(channel_id, chunk, False, entries, span))
+        loose = self.index.loose.get(channel_id, np.empty((0, 2), "<u8"))
+        found += _pieces(channel_id, None, loose, span)
         listed += len(loose)
-        # Outside of chunks, pieces of the file stand for them.
-        turns = np.flatnonzero(np.diff(loose[:, 1] // BLOCK)) + 1
-        pieces = np.split(loose, turns) if len(loose) else []
-        found += [_source(channel_id, None, int(piece[0, 1]), int(piece[-1, 1]), piece, span) for piece in pieces]
-        said = self._index.counts.get(channel_id, 0)
-        if is_all and listed != said:
+        said = self.index.counts.get(channel_id, 0)
+        if first is None and last is None and listed != said:
             raise Damaged(f"its indexes list {listed} messages of channel {channel_id}, and there are {said}")
         return found
 
-    def _open(self, source: _Source) -> memoryview:
-        """The records around the messages of a source."""
-        if source.chunk is None:
-            return self._buffer
-        content = self._opened.pop(source.start, None)
+    def _content(self, chunk: ChunkIndexRecord) -> Bytes:
+        """The records in a chunk."""
+        content = self._opened.pop(chunk.offset, None)
         if content is None:
-            content = open_chunk(self._buffer, chunk_record(self._buffer, source.chunk))
-        if len(source.chunk.message_index_offsets) == 1:
+            record = chunk_record(self.source, chunk)
+            head = read_chunk(self.source, record)
+            content = open_chunk(self.source, record, head)
+            self._chunks[chunk.offset] = head.uncompressed_crc or crc_of(self.source, head.start, head.end)
+        if len(chunk.message_index_offsets) == 1 and isinstance(content, memoryview):
             return content  # nobody else will ask for it
-        self._opened[source.start] = content
+        self._opened[chunk.offset] = content
         while sum(map(len, self._opened.values())) > OPEN_BYTES // 4 and len(self._opened) > 1:
             self._opened.popitem(last=False)
         return content
 
-    def _read(self, source: _Source, skip: int) -> Iterator[Message]:
-        """The messages of a source without the first ``skip``."""
-        content = self._open(source)
-        found = heads_at(content, source.channel, source.t_ns[skip:], source.offset[skip:])
+    def _open(self, batch: _Batch) -> tuple[memoryview, Ints]:
+        """The records of a batch in memory, perhaps with others, and where in there its messages stand."""
+        base = 0
+        if batch.chunk is not None:
+            content = self._content(batch.chunk)
+            if isinstance(content, memoryview):
+                return content, batch.offset
+            base = read_chunk(self.source, chunk_record(self.source, batch.chunk)).start
+            if not batch.is_direct:
+                raise Damaged("a chunk that is larger than the index says", batch.chunk.offset)
+        if not len(batch.offset):
+            return memoryview(b""), batch.offset
+        places = batch.offset + base
+        low, last = int(places.min()), int(places.max())
+        end = record_at(self.source, last).end
+        if end - low <= len(places) * _APART:
+            self._note(low, whole := self.source[low:end])
+            return whole, places - low
+        parts = {}  # with much of something else between them
+        for at in np.sort(places).tolist():
+            record = record_at(self.source, at)
+            self._note(at, whole := self.source[at : record.end])
+            parts[at] = whole
+        starts = np.cumsum([0, *map(len, parts.values())])[:-1]
+        return memoryview(b"".join(parts.values())), starts[np.searchsorted(list(parts), places)]
+
+    def _note(self, start: int, data: memoryview) -> None:
+        """Remember what was read where no chunk's checksum tells it."""
+        self._pieces[start] = (start + len(data), zlib.crc32(data))
+
+    def _read(self, batch: _Batch, skip: int) -> Iterator[Message]:
+        """The messages of a batch without the first ``skip``."""
+        content, offset = self._open(batch)
+        found = heads_at(content, batch.channel, batch.t_ns[skip:], offset[skip:])
         whole = content.obj
         data = whole if isinstance(whole, bytes) and len(whole) == len(content) else content
         spans = zip(found.start.tolist(), found.end.tolist(), strict=True)
@@ -243,14 +309,30 @@ class Messages:
         return map(Message, head["t_ns"].tolist(), head["sequence"].tolist(), head["publish_ns"].tolist(), payloads)
 
 
-def _source(
-    channel_id: int, chunk: ChunkIndexRecord | None, start: int, end: int, entries: Entries, span: Span
-) -> _Source:
-    check_times(entries)
-    t_ns, offset = entries.astype(np.int64).T
+def _batch(channel_id: int, chunk: ChunkIndexRecord | None, is_direct: bool, entries: Entries, span: Span) -> _Batch:
     first, last = span
+    t_ns, offset = entries.astype(np.uint64).T
     if first is not None or last is not None:
-        inside = (t_ns >= (0 if first is None else first)) & (t_ns < (MAX_NS if last is None else last))
+        inside = np.ones(len(t_ns), bool) if first is None or first <= 0 else t_ns >= first
+        if last is not None:
+            inside &= t_ns < max(last, 0)
         t_ns, offset = t_ns[inside], offset[inside]
     order = np.argsort(t_ns, kind="stable")
-    return _Source(channel_id, chunk, start, end, t_ns[order], offset[order])
+    return _Batch(channel_id, chunk, is_direct, t_ns[order], offset[order].astype(np.int64))
+
+
+def _pieces(channel_id: int, chunk: ChunkIndexRecord | None, entries: Entries, span: Span) -> list[_Batch]:
+    """Messages that are read from the file itself: those near each other together."""
+    if not len(entries):
+        return []
+    in_file = entries[np.argsort(entries[:, 1], kind="stable")]
+    turns = np.flatnonzero(np.diff(in_file[:, 1] // BLOCK)) + 1
+    return [_batch(channel_id, chunk, True, piece, span) for piece in np.split(in_file, turns)]
+
+
+def signed(t_ns: Times) -> Ints:
+    """Times as signed numbers, as all arithmetic has them. Raises Late where one is too late for that."""
+    if len(t_ns) and t_ns.max() > MAX_NS:
+        late = t_ns[t_ns > MAX_NS]
+        raise Late(len(late), int(late.min()))
+    return t_ns.astype(np.int64)

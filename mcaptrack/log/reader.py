@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import heapq
-import mmap
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import NamedTuple, Self
+from typing import NamedTuple, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,13 +16,16 @@ from numpy.typing import NDArray
 from mcaptrack.errors import DamagedError, McaptrackError
 from mcaptrack.log import journal, records
 from mcaptrack.log.fingerprint import fingerprint
-from mcaptrack.log.index import Index, read_index
-from mcaptrack.log.messages import Columns, Message, Messages, Places
+from mcaptrack.log.index import read_index
+from mcaptrack.log.messages import Columns, Late, Message, Messages, Places
+from mcaptrack.log.opening import changed, open_log, recover_words
 from mcaptrack.log.records import ChannelRecord, Damaged
+from mcaptrack.log.source import Signature, Source
 from mcaptrack.log.writer import RESULTS, create, results_of
 from mcaptrack.schema import Frame, Schema
 
 Ints = NDArray[np.int64]
+T = TypeVar("T")
 
 
 class Channel(NamedTuple):
@@ -49,23 +51,13 @@ class Log:
         self.path = path
         self.real_path = path.resolve()
         self._lock: int | None = None
-        if path.is_dir():
-            raise McaptrackError(f"{path} is a folder, not an MCAP file")
         journal.settle(self.real_path)
-        try:
-            self._file = path.open("rb")
-        except OSError as error:
-            raise McaptrackError(f"{path} can't be opened: {error.strerror}") from None
-        try:
-            size = path.stat().st_size
-            if size == 0:
-                raise Damaged("it is empty")
-            self._buffer = memoryview(mmap.mmap(self._file.fileno(), 0, access=mmap.ACCESS_READ))
-            self.index: Index = read_index(self._buffer)
-            self._messages = Messages(self._buffer, self.index)
-        except Damaged as error:
-            self._file.close()
-            raise McaptrackError(f"{path} can't be read as an MCAP file: {error}; {_recover(path)}") from None
+        opened = open_log(path)
+        self._file, self._signature, self._is_certain = opened.file, opened.signature, opened.is_certain
+        self.source, self.index = opened.source, opened.index
+        self._messages = Messages(self.source, self.index)
+        self._fresh: Messages | None = None  # the log as it was found when it had this signature
+        self._fresh_at: Signature | None = None
         self.results = results
         self.is_new = False  # made a moment ago, and to be removed if nothing comes into it
         #: Every channel of this file, also those that share a topic, and those that the results replace.
@@ -113,20 +105,13 @@ class Log:
                 ) from None
             try:
                 journal.lock(self.real_path, handle)
-                if not os.path.samestat(os.fstat(handle), os.fstat(self._file.fileno())) or os.fstat(
-                    handle
-                ).st_size != len(self._buffer):
+                if not os.path.samestat(os.fstat(handle), os.fstat(self._file.handle)) or not self._is_as_opened():
                     raise McaptrackError(f"{self.path} was replaced while it was being read; try again")
             except BaseException:
                 os.close(handle)
                 raise
             self._lock = handle
         return self._lock
-
-    @property
-    def buffer(self) -> memoryview:
-        """The bytes of the file."""
-        return self._buffer
 
     @property
     def parts(self) -> tuple[Log, ...]:
@@ -198,7 +183,8 @@ class Log:
         if not found:
             return None
         with self.mending():
-            return records.read_metadata(self._buffer, records.record_at(self._buffer, found[-1]))[1]
+            whole = self.record(found[-1])
+            return records.read_metadata(whole, records.record_at(whole, 0))[1]
 
     def attachment(self, name: str) -> bytes | None:
         """The data of the last attachment of that name."""
@@ -208,7 +194,9 @@ class Log:
         if not found:
             return None
         with self.mending():
-            return bytes(records.read_attachment(self._buffer, records.record_at(self._buffer, found[-1]))[4])
+            whole = self.record(found[-1])
+            attachment = records.read_attachment(whole, records.record_at(whole, 0))
+            return bytes(whole[attachment.start : attachment.end])
 
     def messages(self, topic: str, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Message]:
         """The messages of a channel by time, from ``start_ns`` to before ``end_ns``, all of them without these.
@@ -221,6 +209,7 @@ class Log:
         channels = self._ids(topic)
         with self.mending():
             yield from self._messages.by_time(channels, (start_ns, end_ns))
+            self._confirm(channels)
 
     def merged(
         self, topics: Iterable[str], start_ns: int | None = None, end_ns: int | None = None
@@ -239,14 +228,17 @@ class Log:
         channel = self.channel(topic)
         if channel.schema_name != schema.name or channel.message_encoding != "protobuf":
             raise McaptrackError(f"{self.path}: {topic} holds {channel.schema_name or 'no schema'}, not {schema.name}")
-        try:
-            found = self._messages.columns(self._ids(topic), schema)
+        channels = self._ids(topic)
+        with self._computing(topic):
+            found = self._messages.columns(channels, schema)
+            self._confirm(channels)
             if found is not None:
                 return found
             messages = list(self.messages(topic))
-            rows, counts = schema.codec.decode_all([message.payload for message in messages])
-        except (Damaged, ValueError) as error:
-            raise DamagedError(f"{self.path}: {topic} is damaged: {error}; {_recover(self.path)}") from None
+            try:
+                rows, counts = schema.codec.decode_all([message.payload for message in messages])
+            except ValueError as error:
+                raise Damaged(f"{topic}: {error}") from None
         t_ns = np.array([message.t_ns for message in messages], np.int64)
         return Columns(rows, t_ns, np.array([message.sequence for message in messages], np.int64), counts)
 
@@ -263,16 +255,16 @@ class Log:
         if (part := self.part(topic)) is not self:
             return part.times(topic)
         channels = self._ids(topic)
-        with self.mending():
-            return self._messages.times(channels)
+        with self._computing(topic):
+            return self._still(lambda messages: messages.times(channels), np.array_equal)
 
     def places(self, topic: str) -> Places:
         """Where the messages of a channel stand in the file of its part, by time, without reading them."""
         if (part := self.part(topic)) is not self:
             return part.places(topic)
         channels = self._ids(topic)
-        with self.mending():
-            return self._messages.places(channels)
+        with self._computing(topic):
+            return self._still(lambda messages: messages.places(channels), _are_equal)
 
     def message_at(self, chunk_offset: int | None, offset: int) -> tuple[str, Message]:
         """The message at a place in this file, results aside, and its topic; one chunk is opened.
@@ -283,6 +275,7 @@ class Log:
             channel, message = self._messages.at(chunk_offset, offset)
             if channel not in self.index.channels:
                 raise Damaged(f"a message of channel {channel}, which is not described anywhere")
+            self._confirm([channel])
             return self.index.channels[channel].topic, message
 
     def fingerprint(self, topic: str | None = None) -> str:
@@ -295,22 +288,104 @@ class Log:
         with self.mending():
             if topic is not None:
                 self.channel(topic)
-                those = [fingerprint(self._buffer, self.index, one.id) for one in self._by_topic[topic]]
+                those = [self._fingerprint(one.id) for one in self._by_topic[topic]]
                 return those[0] if len(those) == 1 else hashlib.sha256("".join(those).encode()).hexdigest()
-            whole = [fingerprint(part.buffer, part.index) for part in self.parts]
+            whole = [part._fingerprint() for part in self.parts]
             return whole[0] if len(whole) == 1 else hashlib.sha256("".join(whole).encode()).hexdigest()
 
+    def _fingerprint(self, channel_id: int | None = None) -> str:
+        return self._still(lambda messages: fingerprint(messages.source, messages.index, channel_id), str.__eq__)
+
+    def record(self, offset: int) -> memoryview:
+        """The record that stands at an offset of the file; for this package alone."""
+
+        def whole(messages: Messages) -> memoryview:
+            found = records.record_at(messages.source, offset)
+            return messages.source[found.start : found.end]
+
+        return self._still(whole, memoryview.__eq__)
+
     @contextmanager
-    def mending(self) -> Iterator[None]:
+    def mending(self, topic: str = "") -> Iterator[None]:
         """What is found damaged in the block is said of this log, with what can be done; for this package alone."""
         try:
             yield
         except Damaged as error:
-            raise DamagedError(f"{self.path} is damaged: {error}; {_recover(self.path)}") from None
+            if not self._is_as_opened():
+                raise changed(self.path) from None
+            where = f"{self.path}: {topic}" if topic else str(self.path)
+            raise DamagedError(f"{where} is damaged: {error}; {recover_words(self.path)}") from None
+
+    @contextmanager
+    def _computing(self, topic: str) -> Iterator[None]:
+        """The same for whoever takes times as signed numbers."""
+        try:
+            with self.mending(topic):
+                yield
+        except Late as late:
+            raise McaptrackError(
+                f"{self.path}: {topic} has {late.count} messages later than the year 2262, the first at {late.t_ns} "
+                "ns; they are kept as they are, but nothing is computed with such times "
+                f"(`mcaptrack drop {self.path} {topic}` leaves the channel out)"
+            ) from None
+
+    # While others write
+
+    def confirm(self) -> None:
+        """Raises McaptrackError if the file was changed since it was opened; for this package alone."""
+        if Signature.of(self._file.handle) != self._signature:
+            raise changed(self.path)
+
+    def _is_as_opened(self) -> bool:
+        """Whether the file still says what it said when it was opened."""
+        try:
+            now = self._now()
+        except (Damaged, McaptrackError):
+            return False
+        return now is None or self.index.agrees_in_all(now.index)
+
+    def _now(self) -> Messages | None:
+        """The log as it is now; None if nobody changed it.
+
+        Raises Damaged if it is no log any more, and McaptrackError if it is being changed.
+        """
+        now = Signature.of(self._file.handle)
+        is_certain = now.is_certain
+        if now == self._signature and self._is_certain:
+            return None
+        if now != self._fresh_at:
+            source = Source.of(self._file)
+            self._fresh, self._fresh_at = Messages(source, read_index(source)), None
+            if self.index.agrees_in_all(self._fresh.index) and self._messages.are_in(self._fresh.source):
+                self._signature, self._is_certain = now, is_certain
+            elif is_certain:
+                self._fresh_at = now
+            if Signature.of(self._file.handle) != now:
+                raise changed(self.path)
+        return self._fresh
+
+    def _confirm(self, channels: Sequence[int]) -> None:
+        """Raises McaptrackError if what was read may be half of what was there, and half of what is there now."""
+        try:
+            fresh = self._now()
+            if fresh is None:
+                return
+            if all(self.index.agrees(fresh.index, one) for one in channels) and self._messages.are_in(fresh.source):
+                return
+        except Damaged:
+            pass
+        raise changed(self.path)
+
+    def _still(self, look: Callable[[Messages], T], are_equal: Callable[[T, T], bool]) -> T:
+        """What is found in the log, and found once more if the file was changed meanwhile."""
+        found, fresh = look(self._messages), self._now()
+        if fresh is not None and not are_equal(found, look(fresh)):
+            raise changed(self.path)
+        return found
 
 
-def _recover(path: Path) -> str:
-    return f"`mcaptrack recover {path}` saves what is whole"
+def _are_equal(one: Places, other: Places) -> bool:
+    return all(map(np.array_equal, one, other))
 
 
 def read(path: Path, *, sidecar: bool | None = None) -> Log:

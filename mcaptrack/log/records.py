@@ -8,7 +8,7 @@ from __future__ import annotations
 import struct
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, Protocol, overload
 
 from mcap.opcode import Opcode
 
@@ -23,6 +23,22 @@ MESSAGE_HEAD: Final = struct.Struct("<HIQQ")
 RECORD_MESSAGE_HEAD: Final = struct.Struct("<BQHIQQ")
 FOOTER_BODY: Final = struct.Struct("<QQI")
 _CRC_POLYNOMIAL: Final = 0xEDB88320
+#: So much of a record is looked at together, so many records in a row, and so much is summed at once.
+_NEAR: Final = 1024
+_WALKED: Final = 64 * 2**10
+_SUMMED: Final = 2**20
+
+
+class Bytes(Protocol):
+    """Bytes that can be sliced: in memory (memoryview), or in a file (``Source``), where a slice is read."""
+
+    def __len__(self) -> int: ...
+
+    @overload
+    def __getitem__(self, key: int, /) -> int: ...
+
+    @overload
+    def __getitem__(self, key: slice, /) -> memoryview: ...
 
 
 class Record(NamedTuple):
@@ -88,8 +104,13 @@ class Damaged(McaptrackError):
 class Reader:
     """Reads fields of one record body; never beyond its end."""
 
-    def __init__(self, buffer: memoryview, start: int, end: int) -> None:
+    def __init__(self, buffer: Bytes, start: int, end: int) -> None:
         self._buffer, self.at, self._end = buffer, start, end
+        self._near, self._near_from = buffer[start : min(end, start + _NEAR)], start  # most records are short
+
+    def _at(self, at: int, size: int) -> memoryview:
+        low = at - self._near_from
+        return self._near[low : low + size] if low + size <= len(self._near) else self._buffer[at : at + size]
 
     def _take(self, size: int) -> int:
         at = self.at
@@ -99,16 +120,20 @@ class Reader:
         return at
 
     def number(self, size: int) -> int:
-        at = self._take(size)
-        return int.from_bytes(self._buffer[at : at + size], "little")
+        return int.from_bytes(self._at(self._take(size), size), "little")
 
     def skip(self, size: int) -> None:
         self._take(size)
 
-    def raw(self, length_size: int = 4) -> memoryview:
+    def span(self, length_size: int = 4) -> tuple[int, int]:
+        """Where bytes stand that have their length before them."""
         size = self.number(length_size)
         at = self._take(size)
-        return self._buffer[at : at + size]
+        return at, at + size
+
+    def raw(self, length_size: int = 4) -> memoryview:
+        start, end = self.span(length_size)
+        return self._at(start, end - start)
 
     def text(self) -> str:
         at = self.at
@@ -134,48 +159,55 @@ class Reader:
         return out
 
     def _inner(self) -> Reader:
-        size = self.number(4)
-        at = self._take(size)
-        return Reader(self._buffer, at, at + size)
+        return Reader(self._buffer, *self.span())
 
     @property
     def done(self) -> bool:
         return self.at >= self._end
 
 
-def walk(buffer: memoryview, start: int, end: int) -> Iterator[Record]:
+def walk(buffer: Bytes, start: int, end: int) -> Iterator[Record]:
     """The records that stand one after another between two offsets. Raises Damaged where there is none."""
-    at = start
+    at = base = start
+    near = buffer[start:start]
     while at < end:
-        if end - at < _HEAD.size:
-            raise Damaged(f"{end - at} bytes are too few for a record", at)
-        opcode, length = _HEAD.unpack_from(buffer, at)
-        body = at + _HEAD.size
-        if opcode == 0:
-            raise Damaged("no record begins with 0", at)
-        if length > end - body:
-            raise Damaged(f"a record of {length} bytes where {end - body} are left", at)
-        yield Record(opcode, at, body, body + length)
-        at = body + length
+        if at + _HEAD.size > base + len(near):
+            base, near = at, buffer[at : min(at + _WALKED, end)]
+        record = _record(near, at - base, at, end)
+        yield record
+        at = record.end
 
 
-def record_at(buffer: memoryview, offset: int) -> Record:
+def record_at(buffer: Bytes, offset: int) -> Record:
     """The record that stands at an offset. Raises Damaged if there is none."""
     if not 0 <= offset < len(buffer):
         raise Damaged(f"a record is said to stand at byte {offset} of {len(buffer)}")
-    return next(walk(buffer, offset, len(buffer)))
+    return _record(buffer[offset : offset + _HEAD.size], 0, offset, len(buffer))
 
 
-def crc_before(crc: int, tail: bytes | memoryview) -> int:
-    """The CRC-32 of some bytes, from that of the same bytes with ``tail`` behind them.
+def _record(near: memoryview, low: int, at: int, end: int) -> Record:
+    """The record that begins at byte ``at``, which is byte ``low`` of what is near."""
+    if end - at < _HEAD.size:
+        raise Damaged(f"{end - at} bytes are too few for a record", at)
+    opcode, length = _HEAD.unpack_from(near, low)
+    body = at + _HEAD.size
+    if opcode == 0:
+        raise Damaged("no record begins with 0", at)
+    if length > end - body:
+        raise Damaged(f"a record of {length} bytes where {end - body} are left", at)
+    return Record(opcode, at, body, body + length)
+
+
+def crc_before(crc: int, tail_crc: int, tail_size: int) -> int:
+    """The CRC-32 of some bytes, from that of the same bytes with a tail behind them, whose CRC and size are given.
 
     The CRC of a whole is that of its first part, shifted by as many zeros as the second part is long, plus that of the
     second part (as zlib's crc32_combine has it); a shift can be undone.
     """
-    shifted = crc ^ zlib.crc32(tail)
+    shifted = crc ^ tail_crc
     # One zero bit back, as what becomes of each of the 32 bits; squared, it goes back two, four, eight.
     back = [1 << bit + 1 for bit in range(31)] + [(1 << 31 ^ _CRC_POLYNOMIAL) << 1 & 0xFFFFFFFF | 1]
-    bits = 8 * len(tail)
+    bits = 8 * tail_size
     while bits:
         if bits & 1:
             shifted = _times(back, shifted)
@@ -194,17 +226,17 @@ def _times(columns: Sequence[int], vector: int) -> int:
     return out
 
 
-def read_schema(buffer: memoryview, record: Record) -> SchemaRecord:
+def read_schema(buffer: Bytes, record: Record) -> SchemaRecord:
     r = Reader(buffer, record.body, record.end)
     return SchemaRecord(r.number(2), r.text(), r.text(), bytes(r.raw()))
 
 
-def read_channel(buffer: memoryview, record: Record) -> ChannelRecord:
+def read_channel(buffer: Bytes, record: Record) -> ChannelRecord:
     r = Reader(buffer, record.body, record.end)
     return ChannelRecord(r.number(2), r.number(2), r.text(), r.text(), r.text_map())
 
 
-def read_chunk(buffer: memoryview, record: Record) -> ChunkHead:
+def read_chunk(buffer: Bytes, record: Record) -> ChunkHead:
     r = Reader(buffer, record.body, record.end)
     head = (r.number(8), r.number(8), r.number(8), r.number(4), r.text())
     size = r.number(8)
@@ -213,13 +245,13 @@ def read_chunk(buffer: memoryview, record: Record) -> ChunkHead:
     return ChunkHead(*head, r.at, r.at + size)
 
 
-def read_message_index(buffer: memoryview, record: Record) -> tuple[int, int]:
+def read_message_index(buffer: Bytes, record: Record) -> tuple[int, int]:
     """The channel of a message index and how many messages it lists."""
     channel, entries = read_message_entries(buffer, record)
     return channel, len(entries) // 16
 
 
-def read_message_entries(buffer: memoryview, record: Record) -> tuple[int, memoryview]:
+def read_message_entries(buffer: Bytes, record: Record) -> tuple[int, memoryview]:
     """The channel of a message index and its entries, log time and offset of 8 bytes each."""
     if record.opcode != Opcode.MESSAGE_INDEX:
         raise Damaged("no message index where one belongs", record.start)
@@ -227,24 +259,41 @@ def read_message_entries(buffer: memoryview, record: Record) -> tuple[int, memor
     return r.number(2), r.raw()
 
 
-def read_metadata(buffer: memoryview, record: Record) -> tuple[str, dict[str, str]]:
+def read_metadata(buffer: Bytes, record: Record) -> tuple[str, dict[str, str]]:
     r = Reader(buffer, record.body, record.end)
     return r.text(), r.text_map()
 
 
-def read_attachment(buffer: memoryview, record: Record) -> tuple[int, int, str, str, memoryview]:
-    """Log time, create time, name, media type and data of an attachment."""
+class AttachmentRecord(NamedTuple):
+    """An attachment without its data, which stand in the buffer from ``start`` to ``end``."""
+
+    log_ns: int
+    create_ns: int
+    name: str
+    media_type: str
+    start: int
+    end: int
+
+
+def read_attachment(buffer: Bytes, record: Record) -> AttachmentRecord:
     r = Reader(buffer, record.body, record.end)
-    return r.number(8), r.number(8), r.text(), r.text(), r.raw(8)
+    return AttachmentRecord(r.number(8), r.number(8), r.text(), r.text(), *r.span(8))
 
 
-def attachment_is_whole(buffer: memoryview, record: Record) -> bool:
+def crc_of(buffer: Bytes, start: int, end: int, crc: int = 0) -> int:
+    """The CRC-32 of a part of a file, going on from that of what stands before; a block in memory at a time."""
+    for at in range(start, end, _SUMMED):
+        crc = zlib.crc32(buffer[at : min(at + _SUMMED, end)], crc)
+    return crc
+
+
+def attachment_is_whole(buffer: Bytes, record: Record) -> bool:
     """Whether the checksum of an attachment is right, or 0 for none."""
     crc = int.from_bytes(buffer[record.end - 4 : record.end], "little")
-    return not crc or zlib.crc32(buffer[record.body : record.end - 4]) == crc
+    return not crc or crc_of(buffer, record.body, record.end - 4) == crc
 
 
-def read_header(buffer: memoryview, record: Record) -> tuple[str, str]:
+def read_header(buffer: Bytes, record: Record) -> tuple[str, str]:
     """Profile and library."""
     r = Reader(buffer, record.body, record.end)
     return r.text(), r.text()
@@ -309,7 +358,7 @@ def pack_chunk_index(index: ChunkIndexRecord) -> bytes:
     )
 
 
-def read_chunk_index(buffer: memoryview, record: Record) -> ChunkIndexRecord:
+def read_chunk_index(buffer: Bytes, record: Record) -> ChunkIndexRecord:
     r = Reader(buffer, record.body, record.end)
     head = (r.number(8), r.number(8), r.number(8), r.number(8))
     return ChunkIndexRecord(*head, r.number_map(2, 8), r.number(8), r.text(), r.number(8), r.number(8))

@@ -25,9 +25,22 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.log import journal, records
 from mcaptrack.log.check import open_bytes
 from mcaptrack.log.check_summary import record_name
-from mcaptrack.log.chunks import Entries, check_times, chunk_entries, crc_of, forget, message_head, open_chunk
-from mcaptrack.log.index import DATA_END_SIZE, FOOTER_SIZE, Index, take
-from mcaptrack.log.records import MAGIC, ChannelRecord, ChunkIndexRecord, Damaged, Reader, Record, SchemaRecord, walk
+from mcaptrack.log.chunks import Entries, chunk_entries, message_head, open_chunk
+from mcaptrack.log.index import DATA_END_SIZE, Index, begins_as_log, ends_as_log, read_footer, take
+from mcaptrack.log.records import (
+    BLOCK,
+    MAGIC,
+    Bytes,
+    ChannelRecord,
+    ChunkIndexRecord,
+    Damaged,
+    Reader,
+    Record,
+    SchemaRecord,
+    crc_of,
+    walk,
+)
+from mcaptrack.log.source import RunningChecksum, Source
 from mcaptrack.log.writer import LogWriter, create
 
 Progress = Callable[[str, int, int], None]
@@ -39,6 +52,10 @@ _CHUNK: Final = re.compile(
 )
 #: How a message outside of chunks begins: its opcode, and a size below 2^32.
 _MESSAGE: Final = re.compile(rb"\x05.{4}\0\0\0\0", re.DOTALL)
+#: How much is searched for a beginning first; then more each time.
+_FIRST_STEP: Final = 64 * 2**10
+#: No beginning is longer than this.
+_LONGEST: Final = 64
 #: So many messages in a row are no accident.
 _CHAIN: Final = 3
 _IN_DATA: Final = (
@@ -74,19 +91,22 @@ def recover(path: Path, output: Path, progress: Progress = lambda *_: None) -> R
     with suppress(McaptrackError):  # what can't be put back is damage like any other
         journal.settle(path.resolve())
     report = Recovered(path, output)
-    with open_bytes(path) as buffer, create(output, header=_header(buffer)) as writer:
-        report.messages = _Rescue(buffer, writer, report, progress).all()
+    with open_bytes(path) as (source, _), create(output, header=_header(source)) as writer:
+        try:
+            report.messages = _Rescue(source.front_to_back(), writer, report, progress).all()
+        except Damaged as error:  # damage that can be passed over was passed over
+            raise McaptrackError(f"{path} can't be read to its end: {error}") from None
         if not report.messages and report.lost:
             raise McaptrackError(f"{path}: no message in it is whole; {report.lost[0]}")
     report.chunks = len(writer.chunks)
     return report
 
 
-def _header(buffer: memoryview) -> bytes | None:
+def _header(buffer: Bytes) -> bytes | None:
     """The header record of a log, if it is whole."""
     try:
         record = records.record_at(buffer, len(MAGIC))
-        if record.opcode != Opcode.HEADER or bytes(buffer[: len(MAGIC)]) != MAGIC:
+        if record.opcode != Opcode.HEADER or not begins_as_log(buffer):
             return None
         records.read_header(buffer, record)
     except Damaged:
@@ -97,7 +117,7 @@ def _header(buffer: memoryview) -> bytes | None:
 class _Rescue:
     """Walks through a log and passes on what is whole."""
 
-    def __init__(self, buffer: memoryview, writer: LogWriter, report: Recovered, progress: Progress) -> None:
+    def __init__(self, buffer: Source, writer: LogWriter, report: Recovered, progress: Progress) -> None:
         self._buffer, self._writer, self._report, self._progress = buffer, writer, report, progress
         self._said = _summary(buffer, _summary_start(buffer)) or Index()
         places = {chunk.offset for chunk in self._said.chunks} | {self._said.data_end}
@@ -110,17 +130,19 @@ class _Rescue:
         self._saved: Counter[int] = Counter()  # messages of each channel
         self._waiting: Record | None = None  # a message outside of chunks, until what follows shows that it ends there
         self._is_chunked = bool(self._said.chunks)
+        self._checksum = RunningChecksum(buffer)
         self._ended = False
 
     def all(self) -> int:
         """Save what there is. Returns how many messages that was."""
         buffer = self._buffer
-        if bytes(buffer[: len(MAGIC)]) != MAGIC:
+        if not begins_as_log(buffer):
             self._lose(0, len(MAGIC), "these are not the first bytes of an MCAP file")
-        at = forgotten = len(MAGIC)
+        at = shown = len(MAGIC)
         doubtful: int | None = None  # where the last record starts, if there is but its own word for where it ends
         while at < len(buffer) and not self._ended:
             record = self._record_at(at)
+            self._checksum.pass_over(at)
             if record is None:
                 at = self._resume(at, doubtful)
                 doubtful = None
@@ -128,9 +150,8 @@ class _Rescue:
             self._pass_on_waiting()
             at, is_certain = self._save(record)
             doubtful = None if is_certain else record.start
-            if at - forgotten >= records.BLOCK:
-                forget(buffer, forgotten, at)
-                forgotten = at
+            if at - shown >= BLOCK:
+                shown = at
                 self._progress("recover", at, len(buffer))
         self._pass_on_waiting()
         if not self._ended and not self._places:
@@ -170,10 +191,16 @@ class _Rescue:
             following = bisect_right(self._places, start - 1)
             return self._places[following] if following < len(self._places) else len(self._buffer)
         pattern, is_one = (_CHUNK, self._is_chunk) if self._is_chunked else (_ANY, self._is_any)
-        found = pattern.search(self._buffer, start)
-        while found and not is_one(found.start()):
-            found = pattern.search(self._buffer, found.start() + 1)
-        return found.start() if found else len(self._buffer)
+        low, step, size = start, _FIRST_STEP, len(self._buffer)
+        while low < size:
+            block = self._buffer[low : min(low + step + _LONGEST, size)]  # what begins in this step may end in the next
+            found = pattern.search(block)
+            while found and found.start() < step:
+                if is_one(low + found.start()):
+                    return low + found.start()
+                found = pattern.search(block, found.start() + 1)
+            low, step = low + step, min(2 * step, BLOCK)
+        return size
 
     def _is_chunk(self, at: int) -> bool:
         try:
@@ -205,7 +232,7 @@ class _Rescue:
             self._said = _summary(buffer, record.end) or self._said  # its offsets may be wrong, its numbers are not
             self._ended = record.end == len(buffer) or buffer[record.end] not in _NOT_BEHIND
         said = Reader(buffer, record.body, record.end).number(4)
-        if self._ended and said and not self._report.lost and said != crc_of(buffer, 0, record.start):
+        if self._ended and said and not self._report.lost and said != self._checksum.upto(record.start):
             self._report.lost.append(
                 f"byte {record.start}: the checksum of the data section is wrong; chunks with checksums of their own "
                 "are as they were, other records may not be"
@@ -221,7 +248,7 @@ class _Rescue:
                 self._end(record)
                 return record.end, True
             if record.opcode == Opcode.MESSAGE:
-                check_times(np.array([[message_head(buffer, record)[2], 0]], "<u8"))
+                message_head(buffer, record)
                 if self._is_chunked:  # a flipped bit makes one of a message index
                     raise Damaged("a message outside of chunks, in a log with chunks")
                 self._waiting = record
@@ -259,7 +286,7 @@ class _Rescue:
         self._is_chunked = True
         head = records.read_chunk(self._buffer, record)
         content = open_chunk(self._buffer, record)
-        key = (head.end - record.start, zlib.crc32(self._buffer[record.body : head.end]))
+        key = (head.end - record.start, crc_of(self._buffer, record.body, head.end))
         if key in self._seen:
             raise Damaged("a chunk that stands here a second time, to the byte")
         schemas, channels = dict(self._schemas), dict(self._channels)
@@ -272,8 +299,6 @@ class _Rescue:
                 _agree(channels, channel)
                 described.add(channel.id)
         entries = chunk_entries(content)
-        for listed in entries.values():
-            check_times(listed)
         for number in entries.keys() | described:
             if number not in channels or channels[number].schema_id not in {0, *schemas}:
                 raise Damaged(f"messages of channel {number}, which is described nowhere")
@@ -359,27 +384,24 @@ def _agree(known: dict[int, Described], record: Described) -> None:
         raise Damaged(f"schema or channel {record.id} is described otherwise than elsewhere")
 
 
-def _summary_start(buffer: memoryview) -> int:
+def _summary_start(buffer: Bytes) -> int:
     """Where the summary is said to start; 0 if nobody says."""
-    at = len(buffer) - FOOTER_SIZE
-    if at < len(MAGIC) or bytes(buffer[-len(MAGIC) :]) != MAGIC or buffer[at] != Opcode.FOOTER:
-        return 0
-    start: int = records.FOOTER_BODY.unpack_from(buffer, at + 9)[0]
-    return start if len(MAGIC) < start <= at else 0
+    footer = read_footer(buffer) if ends_as_log(buffer) else None
+    return footer[1] if footer and len(MAGIC) < footer[1] <= footer[0] else 0
 
 
-def _summary(buffer: memoryview, start: int) -> Index | None:
+def _summary(buffer: Bytes, start: int) -> Index | None:
     """What the summary of a damaged log says, if it stands at ``start`` and a checksum shows that it is whole."""
-    at = len(buffer) - FOOTER_SIZE
-    if not len(MAGIC) < start <= at or buffer[at] != Opcode.FOOTER:
+    footer = read_footer(buffer)
+    if footer is None or not len(MAGIC) < start <= footer[0]:
         return None
-    body = buffer[start : len(buffer) - len(MAGIC) - 4]
-    crc = records.FOOTER_BODY.unpack_from(buffer, at + 9)[2]
-    if not crc or zlib.crc32(body) != crc:
+    at, _, _, crc = footer
+    summary = buffer[start : len(buffer) - len(MAGIC) - 4]
+    if not crc or zlib.crc32(summary) != crc:
         return None
     index = Index(start - DATA_END_SIZE)
     with suppress(Damaged):
-        for record in walk(buffer, start, at):
-            take(index, buffer, record)
+        for record in walk(summary, 0, at - start):
+            take(index, summary, record)
         return index
     return None

@@ -7,31 +7,32 @@ from collections.abc import Collection, Iterator
 from mcap.opcode import Opcode
 
 from mcaptrack.log import records
-from mcaptrack.log.chunks import forget, message_head, open_chunk
+from mcaptrack.log.chunks import message_head, open_chunk
 from mcaptrack.log.messages import Message
 from mcaptrack.log.reader import Log
-from mcaptrack.log.records import MAGIC, Record, walk
+from mcaptrack.log.records import MAGIC, Bytes, Record, walk
 from mcaptrack.log.writer import LogWriter
 
 
 def stream(log: Log) -> Iterator[tuple[int, Message]]:
     """The channel (its id) and the message of all messages, a chunk in memory at a time.
 
-    Raises McaptrackError where the log is damaged.
+    Raises McaptrackError where the log is damaged, and at the end if it was changed meanwhile.
     """
+    source = log.source.front_to_back()
     with log.mending():
-        for record in walk(log.buffer, len(MAGIC), log.index.data_end):
+        for record in walk(source, len(MAGIC), log.index.data_end):
             if record.opcode == Opcode.MESSAGE:
-                yield _message(log.buffer, record)
+                yield _message(source, record)
             elif record.opcode == Opcode.CHUNK:
-                content = open_chunk(log.buffer, record)
+                content = open_chunk(source, record)
                 for inner in walk(content, 0, len(content)):
                     if inner.opcode == Opcode.MESSAGE:
                         yield _message(content, inner)
-                forget(log.buffer, record.start, record.end)
+        log.confirm()
 
 
-def _message(buffer: memoryview, record: Record) -> tuple[int, Message]:
+def _message(buffer: Bytes, record: Record) -> tuple[int, Message]:
     channel, sequence, t_ns, publish_ns = message_head(buffer, record)
     payload = bytes(buffer[record.body + records.MESSAGE_HEAD.size : record.end])
     return channel, Message(t_ns, sequence, publish_ns, payload)
@@ -40,7 +41,8 @@ def _message(buffer: memoryview, record: Record) -> tuple[int, Message]:
 def profile(log: Log) -> str:
     """The profile that the log's header names."""
     with log.mending():
-        return records.read_header(log.buffer, records.record_at(log.buffer, len(MAGIC)))[0]
+        whole = log.record(len(MAGIC))
+        return records.read_header(whole, records.record_at(whole, 0))[0]
 
 
 def pass_on_extras(log: Log, writer: LogWriter, *, without: Collection[str] = ()) -> None:
@@ -48,11 +50,6 @@ def pass_on_extras(log: Log, writer: LogWriter, *, without: Collection[str] = ()
     with log.mending():
         for listed in log.index.metadata:
             if listed.name not in without:
-                writer.put_metadata(_whole(log, listed.offset))
+                writer.put_metadata(bytes(log.record(listed.offset)))
         for listed in log.index.attachments:
-            writer.put_attachment(_whole(log, listed.offset))
-
-
-def _whole(log: Log, offset: int) -> bytes:
-    record = records.record_at(log.buffer, offset)
-    return bytes(log.buffer[record.start : record.end])
+            writer.put_attachment(bytes(log.record(listed.offset)))

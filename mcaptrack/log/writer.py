@@ -8,7 +8,6 @@ it can be read if it is all that is left.
 
 from __future__ import annotations
 
-import mmap
 import zlib
 from array import array
 from collections.abc import Iterable, Iterator, Mapping
@@ -24,9 +23,10 @@ from mcaptrack import __version__
 from mcaptrack.atomic import publish_stream
 from mcaptrack.errors import McaptrackError
 from mcaptrack.log import records
-from mcaptrack.log.chunks import MAX_NS, crc_of
+from mcaptrack.log.chunks import LOG_MAX_NS
 from mcaptrack.log.index import Index, Listed, list_attachment, list_metadata, read_index
-from mcaptrack.log.records import MAGIC, ChannelRecord, ChunkIndexRecord, SchemaRecord
+from mcaptrack.log.records import MAGIC, ChannelRecord, ChunkIndexRecord, Damaged, SchemaRecord, crc_of
+from mcaptrack.log.source import OpenFile, Source
 
 #: How the name of a log ends that holds the results of another.
 RESULTS: Final = ".results.mcap"
@@ -123,8 +123,8 @@ class LogWriter:
         self, channel_id: int, t_ns: int, sequence: int, payload: bytes, publish_ns: int | None = None
     ) -> None:
         """A message of a channel that was added. Raises McaptrackError for times that no log can hold."""
-        if not 0 <= t_ns <= MAX_NS:
-            raise McaptrackError(f"{t_ns} ns is no time for a log; times run from 0 (1970) to {MAX_NS} ns (2262)")
+        if not 0 <= t_ns <= LOG_MAX_NS:
+            raise McaptrackError(f"{t_ns} ns is no time for a log; times run from 0 (1970) to 2^64 - 1 ns (2554)")
         group = self._groups[channel_id]
         chunk = self._open.get(group) or self._new_chunk(group)
         entries = chunk.entries.get(channel_id)
@@ -344,11 +344,17 @@ def verify(path: Path, writer: LogWriter, messages: int, start: int = 0, crc: in
 
     Raises McaptrackError if it is not what was written, or does not add up: then it must not stay.
     """
-    with path.open("rb") as stream:
-        buffer = memoryview(mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ))
-    index = read_index(buffer)
-    readable = sum(index.counts.values())
-    if crc_of(buffer, start, index.data_end, crc) != writer.crc or readable != messages:
+    file = OpenFile(path)
+    try:
+        source = Source.of(file)
+        index = read_index(source)
+        readable = sum(index.counts.values())
+        is_right = crc_of(source, start, index.data_end, crc) == writer.crc and readable == messages
+    except Damaged:
+        readable, is_right = 0, False
+    finally:
+        file.close()
+    if not is_right:
         raise McaptrackError(
             f"of {messages} messages that were written {readable} can be read again, or others; "
             "the log does not add up, and is left as it was"
