@@ -406,8 +406,8 @@ def test_chunks_that_all_overlap_are_not_all_open(tmp_path, monkeypatch):
     times = [(t * 37) % 400 for t in range(400)]
     write_stock(path, [("a", t, t, bytes([t % 256]) * 100) for t in times], chunk_size=1000)
     opened_chunks = []
-    opening = reading.open_chunk
-    monkeypatch.setattr(reading, "open_chunk", lambda *where: opened_chunks.append(where) or opening(*where))
+    opening = reading.open_and_mark
+    monkeypatch.setattr(reading, "open_and_mark", lambda *where: opened_chunks.append(where) or opening(*where))
     with log.read(path) as opened:
         chunks = len(opened.index.chunks)
         assert [m.t_ns for m in opened.messages("a")] == sorted(times)

@@ -72,28 +72,40 @@ def _chunk_at(buffer: Bytes, offset: int) -> Record:
     return record
 
 
-def open_chunk(buffer: Bytes, record: Record, head: ChunkHead | None = None) -> Bytes:
+def open_chunk(buffer: Bytes, record: Record) -> Bytes:
     """The records inside a chunk, decompressed and checked. Memory is bounded by what the chunk says of itself.
 
     A chunk that is large and not compressed stays in the file; its records are read when they are asked for.
     """
-    head = head or records.read_chunk(buffer, record)
+    head = records.read_chunk(buffer, record)
+    return _opened(head, _data(buffer, head), record.start)
+
+
+def open_and_mark(buffer: Bytes, record: Record) -> tuple[Bytes, int]:
+    """The same, and what ``checksum_at`` says of the chunk as it was read."""
+    head = records.read_chunk(buffer, record)
+    data = _data(buffer, head)
+    return _opened(head, data, record.start), head.uncompressed_crc or crc_of(data, 0, len(data))
+
+
+def _data(buffer: Bytes, head: ChunkHead) -> Bytes:
+    if isinstance(buffer, Source) and is_left_in_file(head.compression, head.end - head.start):
+        return buffer.part(head.start, head.end)
+    return buffer[head.start : head.end]
+
+
+def _opened(head: ChunkHead, data: Bytes, where: int) -> Bytes:
     if head.compression and head.uncompressed_size > _most_mib() * 2**20:
         raise Damaged(
             f"a chunk of {head.uncompressed_size} bytes, of at most {_most_mib()} MiB that are "
             f"opened (the variable {ENVIRONMENT} sets another limit)",
-            record.start,
+            where,
         )
-    size = head.end - head.start
-    content: Bytes
-    if isinstance(buffer, Source) and is_left_in_file(head.compression, size):
-        content = buffer.part(head.start, head.end)
-    else:
-        content = _decompress(buffer[head.start : head.end], head.compression, head.uncompressed_size, record.start)
+    content = _decompress(data, head.compression, head.uncompressed_size, where)
     if len(content) != head.uncompressed_size:
-        raise Damaged(f"a chunk of {len(content)} bytes that says {head.uncompressed_size}", record.start)
+        raise Damaged(f"a chunk of {len(content)} bytes that says {head.uncompressed_size}", where)
     if head.uncompressed_crc and crc_of(content, 0, len(content)) != head.uncompressed_crc:
-        raise Damaged("the checksum of a chunk is wrong", record.start)
+        raise Damaged("the checksum of a chunk is wrong", where)
     return content
 
 
@@ -112,15 +124,15 @@ def _most_mib() -> int:
     return environment.whole_number(ENVIRONMENT, MAX_CHUNK_MIB)
 
 
-def _decompress(data: memoryview, compression: str, size: int, where: int) -> memoryview:
+def _decompress(data: Bytes, compression: str, size: int, where: int) -> Bytes:
     """The data of a chunk that is ``size`` bytes long, or one byte more where it would be longer."""
     if compression == "":
         return data
     try:
         if compression == "zstd":
-            return memoryview(_zstd(data, size))
+            return memoryview(_zstd(data[0 : len(data)], size))
         if compression == "lz4":
-            return memoryview(_lz4(data, size))
+            return memoryview(_lz4(data[0 : len(data)], size))
     except RuntimeError as error:
         raise Damaged(f"a chunk can't be decompressed ({error})", where) from None
     raise Damaged(f"a chunk is compressed with {compression!r}, which is not known here", where)

@@ -24,7 +24,7 @@ from mcaptrack.log.chunks import (
     is_left_in_file,
     listed_entries,
     message_head,
-    open_chunk,
+    open_and_mark,
 )
 from mcaptrack.log.index import Index
 from mcaptrack.log.records import (
@@ -256,10 +256,8 @@ class Messages:
         """The records in a chunk."""
         content = self._opened.pop(chunk.offset, None)
         if content is None:
-            record = chunk_record(self.source, chunk)
-            head = read_chunk(self.source, record)
-            content = open_chunk(self.source, record, head)
-            self._chunks[chunk.offset] = head.uncompressed_crc or crc_of(self.source, head.start, head.end)
+            content, mark = open_and_mark(self.source, chunk_record(self.source, chunk))
+            self._chunks[chunk.offset] = mark
         if len(chunk.message_index_offsets) == 1 and isinstance(content, memoryview):
             return content  # nobody else will ask for it
         self._opened[chunk.offset] = content
