@@ -1,5 +1,6 @@
 # make demo   install into .venv and run everything on a scene that is drawn for it
 # make test   install into .venv and run all checks and tests
+# make mutants [ARGS="mcaptrack/metrics --count 20 --seed 2"]   change the code at random; print what no test notices
 
 PYTHON ?= python3
 VENV ?= .venv
@@ -9,7 +10,7 @@ BIN := $(VENV)/bin
 export PIP_CONSTRAINT := $(CURDIR)/constraints.txt
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: demo test clean
+.PHONY: demo test mutants clean
 
 demo: $(VENV)/installed
 	$(BIN)/mcaptrack demo --output mcaptrack-demo --force
@@ -20,6 +21,9 @@ test: $(VENV)/installed-for-tests
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/pytest --numprocesses auto --dist worksteal
+
+mutants: $(VENV)/installed-for-tests
+	$(BIN)/python -m tools.mutants $(ARGS)
 
 $(VENV)/installed: pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)

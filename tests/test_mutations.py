@@ -1,0 +1,78 @@
+"""The changes that tools/mutants.py tries."""
+
+from __future__ import annotations
+
+import ast
+
+import pytest
+
+from tools.mutations import find, mutants_of, sample
+
+SOURCE = b'''"""A docstring with 1 < 2."""
+from __future__ import annotations
+
+LIMIT: float = 3
+
+def f(a: tuple[int, 2], b=True):
+    """Another: a + b."""
+    if a < b and not a:
+        a.x = max(a, b) - min(b, 1)
+        g(a, b)
+    for _ in range(b, 2):
+        a **= 2
+        continue
+    return -a[1:], zip(a, b, strict=True)
+'''
+
+
+def changes(source: bytes) -> set[tuple[int, str, str]]:
+    return {(m.line, m.kind, m.new.decode()) for m in mutants_of("x.py", source)}
+
+
+def test_every_change_is_python_and_differs_in_one_place():
+    for mutant in mutants_of("x.py", SOURCE):
+        changed = mutant.applied(SOURCE)
+        assert ast.dump(ast.parse(changed)) != ast.dump(ast.parse(SOURCE))
+        kept = len(SOURCE) - mutant.end
+        assert changed[: mutant.start] == SOURCE[: mutant.start]
+        assert changed[len(changed) - kept :] == SOURCE[mutant.end :]
+
+
+@pytest.mark.parametrize(
+    "wanted",
+    [
+        (4, "constant", "4"),
+        (4, "constant", "2"),
+        (6, "constant", "False"),
+        (8, "compared", "<="),
+        (8, "compared", ">="),
+        (8, "and/or", "(a < b or not a)"),
+        (8, "negated", "(not (a < b and (not a)))"),
+        (8, "unary", "(a)"),
+        (9, "operator", "+"),
+        (9, "name", "min"),
+        (9, "deleted", "pass"),
+        (10, "swapped", "b, a"),
+        (11, "swapped", "2, b"),
+        (13, "deleted", "pass"),
+        (14, "unary", "(a[1:])"),
+    ],
+)
+def test_what_is_changed(wanted):
+    assert wanted in changes(SOURCE)
+
+
+def test_what_is_not_changed():
+    """Docstrings, annotations, imports, arguments that may stand either way, and strict= of zip()."""
+    found = changes(SOURCE)
+    assert not {line for line, _, _ in found} & {1, 2, 7}
+    assert (6, "constant", "3") not in found
+    assert not {new for line, kind, new in found if line == 9 and kind == "swapped"}
+    assert not {new for line, kind, new in found if line == 14 and new == "False"}
+
+
+def test_a_sample_is_the_same_for_the_same_seed_and_takes_no_place_twice():
+    everything = find(["mcaptrack/transforms/retrack"])
+    one, two, three = (sample(everything, 30, seed) for seed in (1, 1, 2))
+    assert one == two != three
+    assert len({(mutant.path, mutant.start) for mutant in one}) == len(one) == 30
