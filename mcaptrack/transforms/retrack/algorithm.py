@@ -95,8 +95,6 @@ class Forecasting:
     ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Pairs of tracks and observations (line 4 of Algorithm 1)."""
         options, tracks = self._options, self._tracks
-        if len(tracks.ids) == 0 or len(xy_m) == 0:
-            return np.empty(0, np.intp), np.empty(0, np.intp)
         age = step - tracks.seen_step
         sigma_m = options.sigma_m if options.covariance == "paper" else None
         kind = options.distance

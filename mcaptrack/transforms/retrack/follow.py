@@ -98,7 +98,7 @@ class Follower:
     def step(self, xy_m: Floats, source: Ints, passed: int) -> Seen:
         """Go on by ``passed`` steps and see rows at (N, 2) that the input calls ``source`` (N,)."""
         self.missed = self.missed + passed
-        old = np.where(self.hits >= self.sure_hits, self.max_age, self.young_age) < self.missed - 0
+        old = np.where(self.hits >= self.sure_hits, self.max_age, self.young_age) < self.missed
         if old.any():
             self._keep(~old)
         if len(self.ids):
@@ -113,7 +113,7 @@ class Follower:
             noise_m = np.full(len(track), self.walker.noise_m)
             noise_m[host] = self.evidence.share_m / 2
             self._learn(before, xy_m[row], track, noise_m == self.walker.noise_m)
-            new, _ = self.walker.update(before, xy_m[row], noise_m)
+            new = self.walker.update(before, xy_m[row], noise_m)
             self.state.mean[track], self.state.cov[track] = new
             self.missed[track] = 0
             self.hits[track] += 1
@@ -155,7 +155,7 @@ class Follower:
     def _live_on(self, guest: Ints, xy_m: Floats, passed: int) -> None:
         """Where the box is says little of each, and what it is called says nothing of who is who once they part."""
         noise_m = np.full(len(guest), self.evidence.share_m / 2)
-        new, _ = self.walker.update(self.state.take(guest), xy_m, noise_m)
+        new = self.walker.update(self.state.take(guest), xy_m, noise_m)
         self.state.mean[guest], self.state.cov[guest] = new
         self.missed[guest] = np.maximum(self.missed[guest] - passed, 1)
         self.shared[guest] += passed

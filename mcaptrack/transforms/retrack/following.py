@@ -26,6 +26,8 @@ Ints = NDArray[np.int64]
 
 #: Forecasts that are made at once: more take memory, fewer take time.
 _BATCH: Final = 4096
+#: A position or a velocity that is known exactly has a covariance that can't be inverted; so much (m, m/s) is little.
+_LEAST: Final = 1e-3
 
 
 class Following:
@@ -33,7 +35,7 @@ class Following:
 
     def __init__(self, options: Retrack) -> None:
         rate, self._options = options.rate_hz, options
-        self._sure = max(1, round(options.sure_s * rate) + 1)
+        self._sure = round(options.sure_s * rate) + 1
         self._follower = Follower(
             walker=walker(options, USUAL_NOISE_M if options.noise_m is None else options.noise_m),
             evidence=Evidence(
@@ -146,8 +148,8 @@ class Following:
         past = np.full((len(ids), length, 2), np.nan)
         for back in range(1, length):
             want = ids * width + steps - back
-            place = np.minimum(np.searchsorted(have, want), max(len(have) - 1, 0))
-            found = (have[place] == want) & (steps >= back) if len(have) else np.zeros(len(want), bool)
+            place = np.minimum(np.searchsorted(have, want), len(have) - 1)
+            found = (have[place] == want) & (steps >= back)
             rows = samples[key[place[found]]]
             past[found, length - 1 - back] = np.stack([rows["x_m"], rows["y_m"]], axis=-1)
         past[:, -1] = now_m
@@ -163,4 +165,5 @@ class Following:
 
 def walker(options: Retrack, noise_m: float) -> Walker:
     """How people move, with this noise."""
-    return Walker(noise_m, options.speed_m_per_s, options.drift, options.drift_share)
+    noise_m, speed_m_per_s = max(noise_m, _LEAST), max(options.speed_m_per_s, _LEAST)
+    return Walker(noise_m, speed_m_per_s, options.drift, options.drift_share)

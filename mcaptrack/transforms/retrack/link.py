@@ -76,7 +76,7 @@ def candidates(
     begins, ends = paths.step[first], paths.step[last]
     order = np.argsort(begins, kind="stable")
     low = np.searchsorted(begins[order], ends + 1)
-    high = np.searchsorted(begins[order], ends + round(max_hole_s / step_s) + 1, "right")
+    high = np.searchsorted(begins[order], ends + round(max_hole_s / step_s), "right")
     many = high - low
     i = np.repeat(np.arange(len(first)), many)
     j = order[np.arange(len(i)) - np.repeat(np.cumsum(many) - many, many) + low[i]]

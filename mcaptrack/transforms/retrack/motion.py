@@ -64,19 +64,17 @@ class Walker:
         cov[:, 2] = v + t * drift
         return State(out, cov)
 
-    def update(self, state: State, xy_m: Floats, noise_m: Floats | None = None) -> tuple[State, Floats]:
-        """Seen at (K, 2); also the log evidence (K,) of that. ``noise_m`` (K,) replaces the usual noise."""
+    def update(self, state: State, xy_m: Floats, noise_m: Floats) -> State:
+        """Seen at (K, 2) with noise (K,)."""
         mean, cov = state
-        r = self.noise_m**2 if noise_m is None else noise_m**2
-        s = cov[:, 0] + r
+        s = cov[:, 0] + noise_m**2
         off = xy_m - mean[:, :2]
         gain = cov[:, :2] / s[:, None]
         new = mean + np.concatenate([gain[:, :1] * off, gain[:, 1:] * off], axis=1)
         p = cov[:, 0] * (1 - gain[:, 0])
         c = cov[:, 1] * (1 - gain[:, 0])
         v = cov[:, 2] - gain[:, 1] * cov[:, 1]
-        evidence = -0.5 * (off**2).sum(axis=1) / s - np.log(2 * np.pi * s)
-        return State(new, np.stack([p, c, v], axis=1)), evidence
+        return State(new, np.stack([p, c, v], axis=1))
 
 
 class Paths(NamedTuple):
@@ -91,13 +89,13 @@ class Paths(NamedTuple):
     noise_m: Floats
 
 
-def _by_length(first: Ints) -> tuple[Ints, Ints, Ints]:
+def _by_length(first: Ints) -> tuple[Ints, Ints]:
     """Tracks from the longest to the shortest, and how many have a row k for each k."""
     length = np.diff(first)
     order = np.argsort(-length, kind="stable")
     longest = int(length.max(initial=0))
     alive = np.searchsorted(-length[order], -np.arange(longest), "left")
-    return order, length[order], alive
+    return order, alive
 
 
 def smooth(walker: Walker, paths: Paths, step_s: float) -> tuple[State, State, State]:
@@ -109,7 +107,7 @@ def smooth(walker: Walker, paths: Paths, step_s: float) -> tuple[State, State, S
     backward = _filter(walker, _turned(paths), step_s)
     backward = State(*(part[::-1] for part in backward))
     backward.mean[:, 2:] *= -1
-    order, _, alive = _by_length(paths.first)
+    order, alive = _by_length(paths.first)
     mean, cov = forward.mean.copy(), forward.cov.copy()
     last = paths.first[1:][order] - 1
     for back in range(1, len(alive)):
@@ -140,7 +138,7 @@ def _turned(paths: Paths) -> Paths:
 
 
 def _filter(walker: Walker, paths: Paths, step_s: float) -> State:
-    order, _, alive = _by_length(paths.first)
+    order, alive = _by_length(paths.first)
     start = paths.first[:-1][order]
     out = State(np.empty((len(paths.step), 4)), np.empty((len(paths.step), 3)))
     state = walker.born(paths.xy_m[start])
@@ -150,7 +148,7 @@ def _filter(walker: Walker, paths: Paths, step_s: float) -> State:
         if row:
             state = walker.predict(state.take(slice(alive[row])), step_s)
             seen = np.isfinite(paths.xy_m[at, 0])
-            new, _ = walker.update(state.take(seen), paths.xy_m[at[seen]], paths.noise_m[at[seen]])
+            new = walker.update(state.take(seen), paths.xy_m[at[seen]], paths.noise_m[at[seen]])
             state.mean[seen], state.cov[seen] = new
         out.mean[at], out.cov[at] = state
     return out

@@ -97,7 +97,7 @@ def _encounters(paths: Paths, track: Ints, count: int) -> tuple[Ints, Ints, Ints
     new[1:] = (pair[1:] != pair[:-1]) | (np.diff(when) > 2 * _MARGIN)
     begin = np.flatnonzero(new)
     end = np.append(begin[1:], len(pair))[: len(begin)] - 1
-    i, j = pair[begin] // max(count, 1), pair[begin] % max(count, 1)
+    i, j = np.divmod(pair[begin], count)
     starts, ends = paths.step[paths.first[:-1]], paths.step[paths.first[1:] - 1]
     low = np.maximum(when[begin] - _MARGIN, np.maximum(starts[i], starts[j]))
     high = np.minimum(when[end] + _MARGIN, np.minimum(ends[i], ends[j]))

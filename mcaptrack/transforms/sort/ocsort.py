@@ -43,7 +43,7 @@ class OcSort(Sort):
     """
 
     inertia: float = option(0.2, "what going on in one direction counts, beside overlap", least=0.0, search=(0.0, 0.6))
-    direction_frames: int = option(3, "a direction is that of so many frames", least=1, most=100, search=(1, 10))
+    direction_frames: int = option(3, "a direction is that of so many frames", least=2, most=100, search=(2, 10))
     recover: bool = option(True, "look for lost tracks where they were seen last")
     reupdate: bool = option(True, "run the filter anew once a track is found again")
 
