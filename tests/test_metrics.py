@@ -320,6 +320,20 @@ class TestDisplacement:
                 assert recall[at] == pytest.approx(kept.mean())
                 assert ade[at] == pytest.approx(result.ade_m[kept].mean())
 
+    def test_errors_by_step_are_those_of_pairs_that_agree_on_the_past(self):
+        """Two people; one track is 1 m off and so d_obs is 1 m^2, the other 2 m off, which is 4 m^2."""
+        truth = positions(straight(1, range(10)) | straight(2, range(10), lane=30.0))
+        tracks = positions(straight(5, range(10), lane=1.0) | straight(6, range(10), lane=32.0))
+        made = forecasts(
+            foretold(4, 5, [(5.0, 0.5), (6.0, 1.5), (7.0, 2.5)]), foretold(4, 6, [(5.0, 37), (6.0, 38), (7.0, 39)])
+        )
+        result = displacement(truth, tracks, made)
+        assert sorted(result.d_obs_m2.tolist()) == pytest.approx([1.0, 4.0])
+        assert result.away_by_step().tolist() == [[0.5, 1.5, 2.5]]  # tau is 2 m^2
+        assert sorted(result.away_by_step(5.0).tolist()) == [[0.5, 1.5, 2.5], [7.0, 8.0, 9.0]]
+        assert result.away_by_step(1.0).tolist() == []
+        assert result.summary()["recall"] == 0.5
+
     def test_drift_of_consecutive_forecasts_by_hand(self):
         truth = positions(straight(1, range(10)))
         made = forecasts(foretold(4, 7, [(5.0, 0), (6.0, 0), (7.0, 0)]), foretold(5, 7, [(6.0, 1), (7.0, 2), (8.0, 9)]))

@@ -63,7 +63,7 @@ def test_what_is_changed(wanted):
 
 
 def test_what_is_not_changed():
-    """Docstrings, annotations, imports, arguments that may stand either way, and strict= of zip()."""
+    """Docstrings, annotations, imports, arguments of symmetric functions, and strict= of zip()."""
     found = changes(SOURCE)
     assert not {line for line, _, _ in found} & {1, 2, 7}
     assert (6, "constant", "3") not in found

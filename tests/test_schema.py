@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -95,10 +96,44 @@ def test_a_writer_that_leaves_defaults_out_is_read_between_others():
     assert np.isnan(rows["y_m"][1])
 
 
-def test_a_bool_written_as_another_number_is_still_true():
-    payload = bytearray(TRACKS.codec.encode(TRACKS.rows(track_id=[1], observed=[True], source_id=[0])))
-    payload[TRACKS.dtype.fields["observed"][1]] = 2
-    assert TRACKS.codec.decode(bytes(payload))["observed"].tolist() == [True]
+@pytest.mark.parametrize("schema", SCHEMAS.values(), ids=str)
+def test_a_bool_written_as_another_number_is_read_as_the_byte_1(schema):
+    """NumPy takes every byte but 0 for true, but only 1 is the opposite of false: ~ of a byte 2 is true as well."""
+    flags = [column.name for column in schema.columns if column.kind == "bool"]
+    payload = bytearray(schema.codec.encode(schema.empty(2)))
+    for name in flags:
+        payload[schema.dtype.fields[name][1]] = 2  # in the first of two rows
+    raw = np.frombuffer(bytes(payload), np.uint8)
+    read = [schema.codec.decode(bytes(payload)), schema.codec.decode_all([bytes(payload)])[0]]
+    for name in flags:
+        assert schema.codec.decode_at(raw, np.array([0]), np.array([len(raw)])) is None
+        for rows in read:
+            assert np.ascontiguousarray(rows[name]).view(np.uint8).tolist() == [1, 0]
+            assert (~rows[name]).tolist() == [False, True]
+
+
+def test_some_schema_has_a_bool():
+    assert any(column.kind == "bool" for schema in SCHEMAS.values() for column in schema.columns)
+
+
+@pytest.mark.parametrize("schema", SCHEMAS.values(), ids=str)
+def test_the_gate_lets_whole_numbers_in_up_to_the_ends_of_their_range(schema):
+    for column in schema.columns:
+        if schema.dtype[column.name].kind not in "iu":
+            continue
+        bits, signed = 8 * schema.dtype[column.name].itemsize, schema.dtype[column.name].kind == "i"
+        low, high = (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1) if signed else (0, 2**bits - 1)
+        others = {c.name: np.zeros(1, schema.dtype[c.name]) for c in schema.columns if c is not column}
+        for value in (low, high):
+            assert schema.rows(**others, **{column.name: np.array([value])})[column.name].tolist() == [value]
+        for value in (low - 1, high + 1):
+            words = f"{schema.name}.{column.name} holds {low} to {high}, not {value}"
+            if -(2**63) <= value < 2**64:  # further numbers are no whole numbers to NumPy
+                with pytest.raises(ValueError, match=re.escape(words)):
+                    schema.rows(**others, **{column.name: np.array([value])})
+            else:
+                with pytest.raises(ValueError, match="needs whole numbers"):
+                    schema.rows(**others, **{column.name: np.array([value])})
 
 
 def test_bytes_that_are_no_message_are_refused():

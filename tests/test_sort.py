@@ -236,22 +236,6 @@ def test_ocsort_forgets_what_the_filter_made_up():
     assert abs(dreamt[30].rows["x_px"] - seen[30].rows["x_px"]) > 0.01
 
 
-def test_ocsort_prefers_who_comes_the_way_it_goes():
-    """Two boxes overlap a track alike; one lies ahead, one behind."""
-    frames = detections(lambda n: [(100 + 8 * n, 100)], 12)
-    last = 100 + 8 * 11
-    ahead, behind = (last + 8 + 6, 100), (last + 8 - 6.5, 100)
-    frames += [Frame(ns(1.2), 12, boxes_at([behind, ahead]))]
-    options = {"min_hits_frames": 0, "max_age_frames": 5, "direction_frames": 1}
-
-    def follower(**more):
-        rows = run(frames, kind=OcSort, **options, **more)[-1].rows
-        return float(rows["x_px"][rows["track_id"] == 1][0]) + 10
-
-    assert follower(inertia=0.6) > last + 8
-    assert follower(inertia=3.0) > last + 8
-
-
 def test_with_nothing_that_tells_them_apart_the_trackers_agree():
     """Sure boxes, nobody lost: the three are one."""
     frames = detections(lambda n: [(50 + 3 * n, 50), (300 - 3 * n, 150)], 30)

@@ -463,3 +463,37 @@ def test_a_byte_that_changed_on_the_disk_is_noticed(tmp_path_factory, data):
     else:  # page headers and indexes hold bits that nobody needs to read the rows
         assert rows == table.num_rows
         assert pq.read_table(path).equals(table.replace_schema_metadata(pq.read_schema(path).metadata))
+
+
+@pytest.mark.parametrize("more", [(), ("topic",), ("observed",), ("topic", "observed")])
+def test_tracks_of_others_are_read_as_frames(tmp_path, more):
+    """Rows in any order; those without a place are left out; what a file doesn't say is unknown, or was observed."""
+    table = {
+        "t_ns": [5, 7, 5, 7, 7],
+        "track_id": [2, 1, 1, 2, 9],
+        "x_m": [0.5, 1.5, 2.5, 3.5, None],
+        "y_m": [0.0, 1.0, 2.0, 3.0, 4.0],
+        "topic": ["/b", "/a", "/a", "/b", "/a"],
+        "observed": [True, False, True, True, True],
+    }
+    chosen = {name: values for name, values in table.items() if name not in ("topic", "observed") or name in more}
+    path = tmp_path / "tracks.parquet"
+    pq.write_table(pa.table(chosen), path)
+    assert tables.holds_tracks(path)
+    found = tables.read_tracks(path)
+    if "topic" in more:
+        assert {name: [f.t_ns for f in frames] for name, frames in found.items()} == {"/a": [5, 7], "/b": [5, 7]}
+        rows = [row for topic in ("/a", "/b") for frame in found[topic] for row in frame.rows]
+        wanted = [(1, 2.5), (1, 1.5), (2, 0.5), (2, 3.5)]
+    else:
+        (frames,) = found.values()
+        assert list(found) == [""]
+        assert [(frame.t_ns, frame.index) for frame in frames] == [(5, 0), (7, 1)]
+        rows = [row for frame in frames for row in frame.rows]
+        wanted = [(1, 2.5), (2, 0.5), (1, 1.5), (2, 3.5)]
+    assert [(row["track_id"], row["x_m"]) for row in rows] == wanted
+    for row in rows:
+        TRACKS.check(np.array([row], TRACKS.dtype))
+        assert row["source_id"] == -1
+        assert row["observed"] == ("observed" not in more or row["x_m"] != 1.5)
+        assert all(np.isnan(row[name]) for name in ("x_px", "y_px", "w_px", "h_px", "score"))

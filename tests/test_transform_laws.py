@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import fields, replace
+from typing import get_type_hints
 
 import numpy as np
 import pytest
@@ -15,7 +16,8 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.plane import GroundPlane
 from mcaptrack.schema import TRACKS, VIDEO, Frame
 from mcaptrack.transforms import PROFILES, TRACKERS, TRANSFORMS, Retrack, Transform
-from tests.worlds import boxes_at, ns
+from mcaptrack.transforms.protocol import bare_type
+from tests.worlds import boxes_at, ids, ns, walk
 
 PLANE = GroundPlane((0.05, 0, 0, 0, 0.05, 0, 0, 0, 1), 640, 480)
 SEEDS = st.integers(0, 2**32 - 1)
@@ -204,6 +206,43 @@ def test_frames_in_the_middle_may_be_silent(name, transform):
 
 
 KINDS = dict(TRANSFORMS) | dict(TRACKERS)
+INPUT_OF = {name: name for name in TRANSFORMS} | dict.fromkeys(TRACKERS, "track")
+
+
+def ends_of_ranges(kind) -> dict[str, list]:
+    """The least and the greatest value of every option that has one."""
+    hints = get_type_hints(kind)
+    out = {}
+    for option in fields(kind):
+        limits = [option.metadata[end] for end in ("least", "most") if np.isfinite(option.metadata.get(end, np.inf))]
+        out[option.name] = [bare_type(hints[option.name])(limit) for limit in limits]
+    return {name: values for name, values in out.items() if values}
+
+
+@pytest.mark.parametrize("name", KINDS)
+@given(data=st.data(), seed=SEEDS)
+@settings(max_examples=25)
+def test_options_at_the_ends_of_their_ranges_run_without_warnings(name, data, seed):
+    """Any options at the least or greatest value that they accept: rows conform to the schema, and no warnings."""
+    kind = KINDS[name]
+    base = data.draw(st.sampled_from(list(PROFILES.values()))) if name == "retrack" else kind()
+    ends = ends_of_ranges(kind)
+    chosen = data.draw(st.lists(st.sampled_from(sorted(ends)), unique=True))
+    transform = replace(base, **{option: data.draw(st.sampled_from(ends[option])) for option in chosen})
+    outputs = zip(*transform(INPUTS[INPUT_OF[name]](np.random.default_rng(seed))), strict=True)
+    for schema, output in zip(transform.writes.values(), outputs, strict=True):
+        for frame in output:
+            schema.check(frame.rows)
+
+
+@pytest.mark.parametrize("distance", ["likelihood", "now"])
+def test_zero_noise_and_zero_speeds_drop_no_track(distance):
+    """Taken literally, a noise of 0 m or speeds of 0 m/s would make covariances singular."""
+    frames = walk(lambda n: {1: (0.5 * n, 0.0), 2: (10.0 - 0.5 * n, 0.5)}, 30)
+    for options in ({}, {"speed_m_per_s": 0.0, "drift": 0.0, "drift_share": 0.0}):
+        still = walk(lambda n: {1: (0.0, 0.0), 2: (10.0, 0.5)}, 30) if options else frames
+        outputs = [offline for offline, _, _ in Retrack(distance=distance, noise_m=0.0, link_s=4.0, **options)(still)]
+        assert [ids(frame) for frame in outputs] == [[1, 2]] * 30
 
 
 @pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS)

@@ -108,3 +108,85 @@ def write_clip(
         for packet in stream.encode(None):
             container.mux(packet)
     return images
+
+
+def tracked(rng: np.random.Generator, names: np.ndarray, seen: np.ndarray):
+    """Rows of tracks at places (N, 2) in metres, with boxes on a picture of 20 px a metre; some are interpolated."""
+    count = len(names)
+    return TRACKS.rows(
+        track_id=names.astype(np.int64),
+        x_px=seen[:, 0] * 20 + 300,
+        y_px=seen[:, 1] * 20 + 200,
+        w_px=rng.uniform(8, 12, count),
+        h_px=rng.uniform(25, 35, count),
+        x_m=seen[:, 0],
+        y_m=seen[:, 1],
+        score=rng.random(count),
+        observed=rng.random(count) > 0.1,
+        source_id=np.full(count, -1),
+    )
+
+
+def noisy_tracks(
+    rng: np.random.Generator, people: int = 4, ticks: int = 30, rate_hz: float = 2.5, hidden: float = 0.0
+) -> list[Frame]:
+    """Tracks of random walkers: noise, misses, interpolated rows, new and exchanged ids, gaps of the log.
+
+    Two people near each other may be merged into one detection.
+    ``hidden`` is the probability at each tick that a person is hidden for a while, up to eight seconds.
+    """
+    place, speed = rng.uniform(-4, 4, (people, 2)), rng.normal(0, 0.5, (people, 2)) * rng.integers(0, 2, (people, 1))
+    names = rng.permutation(50)[:people]
+    noise_m = rng.choice([0.02, 0.1, 0.3])
+    frames, now, free = [], 0.0, 50
+    back = np.zeros(people)
+    for tick in range(ticks):
+        steps = int(rng.choice([1, 1, 1, 1, 1, 1, 1, 1, 1, 3]))
+        now += steps / rate_hz + rng.uniform(-0.02, 0.02)
+        speed += rng.normal(0, 0.05, speed.shape)
+        place = place + steps * speed
+        for who in range(people):
+            if rng.random() < 0.06:
+                names[who], free = free, free + 1
+        if people > 1 and rng.random() < 0.06:
+            a, b = rng.permutation(people)[:2]
+            names[[a, b]] = names[[b, a]]
+        back = np.where((back <= tick) & (rng.random(people) < hidden), tick + rng.integers(3, 20, people), back)
+        there = rng.permutation(np.flatnonzero((rng.random(people) > 0.15) & (back <= tick)))
+        seen = place[there] + rng.normal(0, noise_m, (len(there), 2))
+        for one in range(len(there)):
+            apart = np.hypot(*(seen - seen[one]).T)
+            other = int(np.argsort(apart, kind="stable")[1]) if len(there) > 1 else one
+            if other != one and apart[other] < 0.8 and rng.random() < 0.7:
+                seen[one] = (seen[one] + seen[other]) / 2
+                there, seen = np.delete(there, other), np.delete(seen, other, axis=0)
+                break
+        frames.append(Frame(ns(max(now, 0.0)), tick, tracked(rng, names[there], seen)))
+    return frames
+
+
+def crossing_tracks(rng: np.random.Generator, ticks: int = 50, rate_hz: float = 2.5) -> list[Frame]:
+    """Two pairs of people cross: when near, they are hidden, merged or seen; afterwards ids may be exchanged."""
+    way = rng.uniform(0.15, 0.4, 2)
+    beside = rng.uniform(0.1, 0.9, 2)
+    middle = rng.integers(20, 30, 2)
+    how, swaps = rng.integers(0, 3, 2), rng.random(2) < 0.6
+    noise_m = rng.choice([0.02, 0.1, 0.2])
+    names = rng.permutation(20)[:4].reshape(2, 2)
+    frames = []
+    for tick in range(ticks):
+        who, seen = [], []
+        for pair in range(2):
+            if tick == middle[pair] and swaps[pair]:
+                names[pair] = names[pair][::-1] if rng.random() < 0.7 else [names[pair][0], 90 + pair]
+            ahead = way[pair] * (tick - middle[pair])
+            both = np.array([[ahead, 0], [-ahead, beside[pair]]]) + [0, 3.0 * pair] + rng.normal(0, noise_m, (2, 2))
+            near = abs(tick - middle[pair]) <= 2
+            if near and how[pair] == 1:
+                who, seen = [*who, names[pair][0]], [*seen, both.mean(axis=0)]
+            elif not near or how[pair] == 2:
+                kept = rng.random(2) > 0.05
+                who, seen = [*who, *names[pair][kept]], [*seen, *both[kept]]
+        rows = tracked(rng, np.array(who, int), np.array(seen).reshape(-1, 2))
+        frames.append(Frame(ns(tick / rate_hz), tick, rows))
+    return frames

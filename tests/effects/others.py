@@ -1,0 +1,147 @@
+"""What each option of detection, sampling and prediction does."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from mcaptrack.schema import Frame
+from mcaptrack.transforms import Detect, Predict, Sample
+from tests.effects import Case, Outputs, change_of_forecasts, forecast_steps, line, rows, shaky
+from tests.worlds import ns, tracks_at
+
+CASES: dict[tuple[str, str], Case] = {}
+
+
+def case(kind: str, option: str, *args: Any) -> None:
+    CASES[kind, option] = Case(*args)
+
+
+def first_forecast(outputs: Outputs) -> int:
+    return next(tick for tick, frame in enumerate(outputs[0]) if len(frame.rows))
+
+
+case(
+    "predict",
+    "predictor",
+    "a person walks on, seen with noise",
+    Predict(),
+    shaky(),
+    change_of_forecasts,
+    {"cv": "more", "kalman": "least"},
+)
+case(
+    "predict",
+    "horizon_s",
+    "2.5 steps a second",
+    Predict(predictor="cv"),
+    line(0.5, 9, 9),
+    forecast_steps,
+    {0.4: 1, 2.0: 5, 4.8: 12},
+)
+case(
+    "predict",
+    "min_history",
+    "a person is seen from tick 0 on",
+    Predict(predictor="cv"),
+    line(0.5, 9, 9),
+    first_forecast,
+    {1: 0, 2: 1, 4: 3},
+)
+
+
+def tenths(seen: list[int]) -> list[Frame]:
+    """Frames of ten a second; a person is there in some of them."""
+    return [Frame(ns(n / 10), n, tracks_at({7: (0.1 * n, 0.0)} if n in seen else {})) for n in range(31)]
+
+
+case(
+    "sample",
+    "rate_hz",
+    "three seconds, both ends included",
+    Sample(),
+    tenths(list(range(31))),
+    rows,
+    {1.0: 4, 2.5: 8, 5.0: 16},
+)
+case(
+    "sample",
+    "max_hole_s",
+    "a person is seen until 0.5 s and from 2 s on: ticks at 0.8, 1.2 and 1.6 s are in the hole of 1.5 s",
+    Sample(),
+    tenths([n for n in range(31) if n <= 5 or n >= 20]),
+    rows,
+    {0.0: 5, 1.4: 5, 1.5: 8, 3.0: 8},
+)
+
+
+def film(draw, count: int = 30) -> list[Frame]:
+    """A grey floor on which something is drawn, ten pictures a second."""
+    frames = []
+    for number in range(count):
+        image = np.full((120, 160), 90, np.uint8)
+        draw(image, number)
+        frames.append(Frame(ns(number / 10), number, image))
+    return frames
+
+
+def stops(image: np.ndarray, number: int) -> None:
+    """A person comes in and stops in picture 40, for good."""
+    if number >= 30:
+        left = 11 + 4 * min(number - 30, 10)
+        image[41:81, left : left + 12] = 200
+
+
+def pale(image: np.ndarray, number: int) -> None:
+    """A person hardly brighter than the floor walks over it."""
+    image[41:81, 11 + 4 * number : 23 + 4 * number] = 104
+
+
+def last_boxes(outputs: Outputs) -> int:
+    return len(outputs[0][-1].rows)
+
+
+def all_boxes(outputs: Outputs) -> int:
+    return sum(len(frame.rows) for frame in outputs[0][5:])
+
+
+def shaken() -> list[Frame]:
+    """A patterned floor and no people on it, filmed by a shaking camera."""
+    rng = np.random.default_rng(1)
+    floor = np.kron(rng.integers(40, 200, (16, 20)), np.ones((8, 8))).astype(np.uint8)
+    shifts = rng.integers(-3, 4, (25, 2))
+    return [Frame(ns(n / 10), n, np.roll(floor, tuple(s), axis=(0, 1))) for n, s in enumerate(shifts)]
+
+
+STEADY = Detect(stabilise=False)
+STOPS = film(stops, 60)
+case(
+    "detect",
+    "method",
+    stops.__doc__,
+    STEADY,
+    STOPS,
+    all_boxes,
+    {"frame-difference": "least", "mog2": "more", "knn": "most"},
+)
+case(
+    "detect",
+    "threshold",
+    pale.__doc__,
+    Detect(stabilise=False, method="frame-difference"),
+    film(pale),
+    last_boxes,
+    {10.0: 1, 20.0: 0},
+)
+case("detect", "history_s", stops.__doc__, STEADY, STOPS, all_boxes, {0.5: "least", 2.0: "more", 60.0: "most"})
+case(
+    "detect",
+    "max_pixels",
+    stops.__doc__,
+    STEADY,
+    STOPS,
+    lambda o: float(o[0][-1].rows["x_px"][0]),
+    {1_000_000: 51.0, 10_000: 50.0},
+)
+case("detect", "stabilise", shaken.__doc__, Detect(), shaken(), all_boxes, {False: "more", True: "least"})

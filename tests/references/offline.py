@@ -1,0 +1,296 @@
+"""What re-tracking does once the whole log is known, once more, to compare with: slow, and nothing of the package.
+
+A path is a dictionary of positions by step. The numbers of the models stand here a second time: whoever changes them in
+the package says so here, too. Weights and biases are those that tools/choose_retrack.py printed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from itertools import combinations
+from math import exp, hypot, inf, log
+
+import numpy as np
+
+Point = tuple[float, float]
+Path = dict[int, Point]
+
+REACH_M_PER_S, NEAR_M, SPEED_M_PER_S = 2.5, 0.3, 0.15
+LINK_WEIGHTS = (-0.996, -0.798, -0.205, -0.304, 0.247, 0.482, -0.324)
+LINK_BIAS, LINK_USUAL, LINK_LEAST = 3.702, 0.666, -2.52
+PERSON_WEIGHTS = (1.58, -0.58, 1.736, -1.126, -0.559, 0.59, -1.993)
+PERSON_BIAS, BESIDE_M = -3.342, 1.2
+MEET_M, MARGIN, EXCHANGE_COST, SAME_ID, LEAST_GAIN = 2.0, 10, 5.0, 2.0, 3.0
+DRIFTS = (0.05, 0.15, 0.4)
+
+
+@dataclass(frozen=True)
+class Motion:
+    """How people move: noise of positions, spread of velocities, drift of velocities; and the seconds of a step."""
+
+    noise_m: float
+    speed_m_per_s: float
+    drift: float
+    drift_share: float
+    step_s: float
+
+    def start(self, at: Point) -> State:
+        mean = np.stack([at, np.zeros(2)], axis=1)
+        return State(mean, np.diag([self.noise_m**2, self.speed_m_per_s**2]))
+
+    def ahead(self, state: State) -> tuple[State, np.ndarray]:
+        """A step on; also the matrix that takes states there."""
+        t = self.step_s
+        move = np.array([[1, t], [0, 1]])
+        power = (self.drift + self.drift_share * hypot(*state.mean[:, 1])) ** 2
+        noise = power * np.array([[t**3 / 3, t**2 / 2], [t**2 / 2, t]])
+        return State(state.mean @ move.T, move @ state.cov @ move.T + noise), move
+
+    def filtered(self, path: Path) -> dict[int, State]:
+        """The state at every step from the positions up to it."""
+        out: dict[int, State] = {}
+        for step in range(min(path), max(path) + 1):
+            if not out:
+                out[step] = self.start(path[step])
+                continue
+            state, _ = self.ahead(out[step - 1])
+            if step in path:
+                gain = state.cov[:, 0] / (state.cov[0, 0] + self.noise_m**2)
+                off = np.array(path[step]) - state.mean[:, 0]
+                state = State(state.mean + np.outer(off, gain), state.cov - np.outer(gain, state.cov[0]))
+            out[step] = state
+        return out
+
+    def backwards(self, path: Path) -> dict[int, State]:
+        """The state at every step from the positions from it on."""
+        turned = self.filtered({-step: at for step, at in path.items()})
+        return {-step: State(state.mean * [1, -1], state.cov) for step, state in turned.items()}
+
+    def smoothed(self, path: Path) -> dict[int, State]:
+        """The state at every step from all positions (Rauch, Tung, Striebel 1965)."""
+        out = self.filtered(path)
+        for step in range(max(path) - 1, min(path) - 1, -1):
+            now, later = out[step], out[step + 1]
+            ahead, move = self.ahead(now)
+            gain = now.cov @ move.T @ np.linalg.inv(ahead.cov)
+            mean = now.mean + (later.mean - ahead.mean) @ gain.T
+            out[step] = State(mean, now.cov + gain @ (later.cov - ahead.cov) @ gain.T)
+        return out
+
+
+@dataclass(frozen=True)
+class State:
+    """``mean`` (2, 2): position and velocity, along x and along y; ``cov`` (2, 2), the same along both."""
+
+    mean: np.ndarray
+    cov: np.ndarray
+
+
+def sigmoid(odds: float) -> float:
+    return 1 / (1 + exp(-odds))
+
+
+# Links over gaps.
+
+
+def link_features(motion: Motion, before: State, after: State, gap_s: float) -> list[float]:
+    way = after.mean[:, 0] - before.mean[:, 0]
+    left, came = before.mean[:, 1], after.mean[:, 1]
+    miss = min(hypot(*(way - left * gap_s)), hypot(*(way - came * gap_s)))
+    misfit, stay = hypot(*(way - (left + came) / 2 * gap_s)), hypot(*way)
+    speed = max(hypot(*left), hypot(*came))
+    variance = before.cov[0, 0] + after.cov[0, 0] + (before.cov[1, 1] + after.cov[1, 1]) * (gap_s / 2) ** 2
+    variance += (motion.drift + motion.drift_share * speed) ** 2 * gap_s**3 / 12
+    return [
+        log(miss + NEAR_M),
+        log(1 + misfit**2 / (2 * variance)),
+        gap_s,
+        log(min(misfit, stay) + NEAR_M) * log(gap_s + 0.4),
+        log(hypot(*(came - left)) + SPEED_M_PER_S),
+        log(stay + NEAR_M) * log(speed + SPEED_M_PER_S),
+        log(misfit + NEAR_M) * log(speed + SPEED_M_PER_S),
+    ]
+
+
+def links(motion: Motion, paths: dict[int, Path], max_gap_s: float, least: float) -> dict[int, int]:
+    """For a track the one that goes on from it."""
+    from scipy.optimize import linear_sum_assignment
+
+    names = sorted(paths)
+    ends = {name: motion.filtered(paths[name])[max(paths[name])] for name in names}
+    begins = {name: motion.backwards(paths[name])[min(paths[name])] for name in names}
+    gains = np.zeros((len(names), len(names)))
+    for a, b in ((a, b) for a in names for b in names):
+        gap = min(paths[b]) - max(paths[a])
+        gap_s = gap * motion.step_s
+        apart = hypot(*(ends[a].mean[:, 0] - begins[b].mean[:, 0]))
+        if 0 < gap <= round(max_gap_s / motion.step_s) and apart <= 1 + REACH_M_PER_S * gap_s:
+            odds = np.dot(LINK_WEIGHTS, link_features(motion, ends[a], begins[b], gap_s)) + LINK_BIAS
+            gains[names.index(a), names.index(b)] = max(odds - LINK_LEAST, 0)
+    made = {
+        (i, j): gains[i, j] + LINK_LEAST for i, j in zip(*linear_sum_assignment(-gains), strict=True) if gains[i, j]
+    }
+    shift = 0.0
+    for _ in range(1000):  # how many links are right in this log
+        share = (sum(sigmoid(odds + shift) for odds in made.values()) + 0.3) / (len(made) + 3)
+        shift = log(share / (1 - share)) - log(LINK_USUAL / (1 - LINK_USUAL))
+    return {names[i]: names[j] for (i, j), odds in made.items() if sigmoid(odds + shift) > least}
+
+
+def linked(motion: Motion, paths: dict[int, Path], max_gap_s: float, least: float) -> dict[int, int]:
+    """The name of each track after the links: that of the first one."""
+    name = {track: track for track in paths}
+    follows = links(motion, paths, max_gap_s, least)
+    for track in sorted(follows, key=lambda t: min(paths[t])):
+        name[follows[track]] = name[track]
+    return name
+
+
+# Encounters: two people come near each other; were their labels exchanged?
+
+
+@dataclass
+class Survivor:
+    """One course of exchanges: a filter of the position of one from the other, as it would be without exchanges."""
+
+    mean: np.ndarray
+    cov: np.ndarray
+    score: float
+    course: list[bool] = field(default_factory=list)
+
+    def likelihood(self, at: np.ndarray, noise: float) -> float:
+        variance = self.cov[0, 0] + noise
+        return -0.5 * ((at - self.mean[:, 0]) ** 2).sum() / variance - log(variance)
+
+    def after(self, at: np.ndarray | None, noise: float, score: float, exchanged: bool) -> Survivor:
+        mean, cov = self.mean, self.cov
+        if at is not None:
+            gain = cov[:, 0] / (cov[0, 0] + noise)
+            mean, cov = mean + np.outer(at - mean[:, 0], gain), cov - np.outer(gain, cov[0])
+        return Survivor(mean, cov, score, [*self.course, exchanged])
+
+
+def course_of(
+    apart: list[np.ndarray | None], cost: list[float], motion: Motion, drift: float
+) -> tuple[list[bool], float, float]:
+    """The likeliest course of exchanges (Viterbi), how much likelier than none it is, and its log likelihood."""
+    t, noise = motion.step_s, 2 * motion.noise_m**2
+    move = np.array([[1, t], [0, 1]])
+    wander = drift**2 * np.array([[t**3 / 3, t**2 / 2], [t**2 / 2, t]])
+    cov = np.diag([noise, 2 * motion.speed_m_per_s**2])
+    kept, crossed, never = (Survivor(np.zeros((2, 2)), cov, score) for score in (0.0, -inf, 0.0))
+    started = False
+    for step, at in enumerate(apart):
+        for one in (kept, crossed, never):
+            if step:
+                one.mean, one.cov = one.mean @ move.T, move @ one.cov @ move.T + wander
+            if at is not None and not started:
+                side = -1 if one is crossed else 1
+                one.mean = np.stack([side * at, np.zeros(2)], axis=1)
+        if at is None or not started:
+            new = [(one, None, one.score, one is crossed) for one in (kept, crossed, never)]
+        else:
+            new = [
+                max(
+                    (
+                        (one, at, one.score + one.likelihood(at, noise) - fee, False)
+                        for one, fee in ((kept, 0.0), (crossed, cost[step]))
+                    ),
+                    key=lambda each: each[2],
+                ),
+                max(
+                    (
+                        (one, -at, one.score + one.likelihood(-at, noise) - fee, True)
+                        for one, fee in ((crossed, 0.0), (kept, cost[step]))
+                    ),
+                    key=lambda each: each[2],
+                ),
+                (never, at, never.score + never.likelihood(at, noise), False),
+            ]
+        kept, crossed, never = (one.after(where, noise, score, side) for one, where, score, side in new)
+        started |= at is not None
+    best = crossed if crossed.score > kept.score else kept
+    return best.course, best.score - never.score, best.score
+
+
+def encounters(paths: dict[int, Path]) -> list[tuple[int, int, int, int]]:
+    """Two tracks that come near each other, and the steps from and to which they are looked at."""
+    out = []
+    for a, b in combinations(sorted(paths), 2):
+        one, other = paths[a], paths[b]
+        near = [
+            s for s in sorted(one) if s in other and hypot(one[s][0] - other[s][0], one[s][1] - other[s][1]) < MEET_M
+        ]
+        groups: list[list[int]] = []
+        for step in near:
+            if groups and step - groups[-1][-1] <= 2 * MARGIN:
+                groups[-1].append(step)
+            else:
+                groups.append([step])
+        first, last = max(min(one), min(other)), min(max(one), max(other))
+        out += [(a, b, max(group[0] - MARGIN, first), min(group[-1] + MARGIN, last)) for group in groups]
+    return out
+
+
+def exchange_costs(a: dict[int, int], b: dict[int, int], low: int, high: int) -> list[float]:
+    """What an exchange costs at each step, by the ids that the input gives the two."""
+    costs, last_a, last_b = [], None, None
+    for step in range(low, high + 1):
+        now_a, now_b = a.get(step), b.get(step)
+        same = (now_a is not None and now_a == last_a) + (now_b is not None and now_b == last_b)
+        crossed = (now_a is not None and now_a == last_b) + (now_b is not None and now_b == last_a)
+        costs.append(EXCHANGE_COST + SAME_ID * (same - crossed))
+        last_a, last_b = last_a if now_a is None else now_a, last_b if now_b is None else now_b
+    return costs
+
+
+def exchanged(motion: Motion, paths: dict[int, Path], ids: dict[int, dict[int, int]]) -> dict[int, dict[int, int]]:
+    """For tracks of encounters that were decided anew: the track that each step belongs to. {} if there is none."""
+    decided = []
+    for a, b, low, high in encounters(paths):
+        steps = range(low, high + 1)
+        apart = [np.subtract(paths[a][s], paths[b][s]) if s in paths[a] and s in paths[b] else None for s in steps]
+        costs = exchange_costs(ids[a], ids[b], low, high)
+        course, gain, _ = max((course_of(apart, costs, motion, d) for d in DRIFTS), key=lambda each: each[2])
+        decided.append((gain, a, b, low, course))
+    owner: dict[int, dict[int, int]] = {}
+    for gain, a, b, low, course in sorted(decided, key=lambda each: -each[0]):
+        if gain >= LEAST_GAIN and a not in owner and b not in owner:
+            for mine, other in ((a, b), (b, a)):
+                at = {step: min(step - low, len(course) - 1) for step in paths[mine]}
+                owner[mine] = {s: other if k >= 0 and course[k] else mine for s, k in at.items()}
+    return owner
+
+
+# False tracks.
+
+
+def person_log_odds(motion: Motion, paths: dict[int, Path]) -> dict[int, float]:
+    """For each track the log odds that it is a person."""
+    where = {name: motion.smoothed(path) for name, path in paths.items()}
+    out = {}
+    for name, path in paths.items():
+        states = where[name]
+        length, count = len(states), len(path)
+        places = np.array([state.mean[:, 0] for state in states.values()])
+        off = sum(((np.array(at) - states[step].mean[:, 0]) ** 2).sum() for step, at in path.items())
+        speed = sum(hypot(*state.mean[:, 1]) for state in states.values()) / length
+        features = [
+            log(length * motion.step_s),
+            log(count),
+            log(hypot(*(places.max(axis=0) - places.min(axis=0))) + 0.3),
+            log(speed + 0.1),
+            log(off / count / (2 * motion.noise_m**2) + 0.1),
+            count / length,
+            max((beside(states, other) for who, other in where.items() if who != name), default=0.0),
+        ]
+        out[name] = float(np.dot(PERSON_WEIGHTS, features) + PERSON_BIAS)
+    return out
+
+
+def beside(mine: dict[int, State], theirs: dict[int, State]) -> float:
+    """The share of a track's steps near another that began well before it and ended well after it."""
+    if not (min(theirs) + 3 < min(mine) and max(theirs) - 3 > max(mine)):
+        return 0.0
+    near = [s for s in mine if s in theirs and hypot(*(mine[s].mean[:, 0] - theirs[s].mean[:, 0])) < BESIDE_M]
+    return len(near) / len(mine)

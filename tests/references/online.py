@@ -1,0 +1,180 @@
+"""The likelihood method online: slow, one object a track with matrices, to compare with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import exp, hypot, log
+
+import numpy as np
+
+from tests.references.retracking import (
+    LEAST,
+    Claims,
+    Point,
+    Predict,
+    Row,
+    best_assignment,
+    move_to,
+    offline,
+    place,
+    steps_of,
+)
+
+
+@dataclass
+class Person:
+    """A Kalman filter along both axes, which share their covariance, and what is known of the identity."""
+
+    name: int
+    mean: np.ndarray  # (2, 2): position and velocity along x, along y
+    cov: np.ndarray  # (2, 2)
+    source: int
+    hits: int = 1
+    missed: int = 0
+    merged: int = 0
+    row: Row | None = None
+
+    @property
+    def here(self) -> np.ndarray:
+        return self.mean[:, 0]
+
+    def predict(self, seconds: float, drift: float, drift_share: float) -> None:
+        power = (drift + drift_share * hypot(*self.mean[:, 1])) ** 2
+        move = np.array([[1, seconds], [0, 1]])
+        noise = power * np.array([[seconds**3 / 3, seconds**2 / 2], [seconds**2 / 2, seconds]])
+        self.mean, self.cov = self.mean @ move.T, move @ self.cov @ move.T + noise
+
+    def correct(self, at: np.ndarray, noise_m: float) -> None:
+        gain = self.cov[:, 0] / (self.cov[0, 0] + noise_m**2)
+        self.mean = self.mean + np.outer(at - self.here, gain)
+        self.cov = self.cov - np.outer(gain, self.cov[0])
+
+
+class OnlineTracker:
+    CAP, GATE, CROWD_M, FRESH, FLOOR_M = 26.0, 40.0, 1.7, 4.0, 0.1
+    WIDE = 0.1
+
+    def __init__(self, options, predict: Predict, past: int) -> None:
+        o = self.options = options
+        self.predict, self.past = predict, past
+        self.noise_m = 0.2 if o.noise_m is None else max(o.noise_m, LEAST)
+        self.confirm = max(1, round(o.sure_s * o.rate_hz) + 1)
+        self.max_age = max(1, round(o.max_age_s * o.rate_hz))
+        self.people: list[Person] = []
+        self.claims = Claims()
+        self.known: set[int] = set()
+        self.born = self.judged = 0
+
+    def run(self, samples: list[list[Row]], times_ns: list[int]):
+        o = self.options
+        steps = steps_of(times_ns, o.rate_hz)
+        online, predictions = [], []
+        places: dict[tuple[int, int], Point] = {}
+        for at, (step, rows) in enumerate(zip(steps, samples, strict=True)):
+            passed = step - steps[at - 1] if at else 1
+            seen = sorted((r for r in rows if r["observed"] or o.filled), key=lambda row: row["track_id"])
+            has = self.step(seen, passed)
+            shown = []
+            for person in self.people:
+                row = has.get(person.name)
+                if row is not None:
+                    self.claims.made.append((step, person.name, row["track_id"]))
+                    places[step, person.name] = (row["x_m"], row["y_m"])
+                    person.row = row
+                    if person.hits >= self.confirm:
+                        shown.append(row | {"source_id": row["track_id"], "track_id": person.name})
+                elif person.hits >= 1.5 * self.confirm and person.missed <= round(o.coast_s * o.rate_hz):
+                    lost = person.row | {"source_id": -1, "track_id": person.name, "observed": False}
+                    move_to(lost, person.here, o.ground_planes)
+                    shown.append(lost)
+            shown.sort(key=lambda row: row["track_id"])
+            online.append(shown)
+            predictions.append([(row["track_id"], *self.forecast(row, step, places)) for row in shown])
+        return offline(self.claims, samples, steps, o, self.noise_m), online, predictions
+
+    def forecast(self, row: Row, step: int, places: dict[tuple[int, int], Point]):
+        past = [places.get((step - back, row["track_id"])) for back in range(self.past - 1, 0, -1)]
+        return self.predict([*past, (row["x_m"], row["y_m"])])
+
+    def step(self, rows: list[Row], passed: int) -> dict[int, Row]:
+        """Go on; returns the row that each person has."""
+        o = self.options
+        young = min(self.confirm, self.max_age)
+        for person in self.people:
+            person.missed += passed
+        self.people = [p for p in self.people if p.missed <= (self.max_age if p.hits >= self.confirm else young)]
+        for person in self.people:
+            person.predict(passed / o.rate_hz, o.drift, o.drift_share)
+        value = [[self.gain(person, row, rows) for row in rows] for person in self.people]
+        pairs = best_assignment(value, most_pairs=False)
+        has = {self.people[a].name: rows[b] for a, b in pairs}
+        hosts = self.merge(has, passed)
+        self.learn(has, hosts, self.noise_m)
+        for person in self.people:
+            if person.name in has:
+                row = has[person.name]
+                host = person.name in hosts
+                person.correct(place(row), o.share_m / 2 if host else self._noise_before)
+                person.hits, person.missed, person.merged = person.hits + 1, 0, 0
+                person.source = -1 if host else row["track_id"]
+        for row in rows:
+            if not any(row is other for other in has.values()):
+                self.born += 1
+                mean = np.stack([place(row), np.zeros(2)], axis=1)
+                new = Person(
+                    self.born, mean, np.diag([self.noise_m**2, max(o.speed_m_per_s, LEAST) ** 2]), row["track_id"]
+                )
+                self.people.append(new)
+                has[new.name] = row
+        self.known |= {row["track_id"] for row in rows}
+        return has
+
+    def gain(self, person: Person, row: Row, rows: list[Row]) -> float | None:
+        """Twice the log likelihood of a pair against none."""
+        o = self.options
+        variance = person.cov[0, 0] + self.noise_m**2 + self.FLOOR_M**2
+        squared = ((place(row) - person.here) ** 2).sum() / variance
+        if squared > self.GATE:
+            return None
+        gain = self.CAP - squared - 2 * log(variance)
+        if person.source == row["track_id"]:
+            others = [hypot(*(place(other) - place(row))) for other in rows if other is not row]
+            gain += o.same_source / 3 if any(apart < self.CROWD_M for apart in others) else o.same_source
+        if row["track_id"] not in self.known and person.missed == 1:
+            gain -= self.FRESH
+        gain = round(gain, 6)
+        return gain if gain > 0 else None
+
+    def merge(self, has: dict[int, Row], passed: int) -> set[int]:
+        """Lost tracks merged into one detection with another track are updated by it; returns those other tracks."""
+        o, hosts = self.options, set()
+        sure = [p for p in self.people if p.name in has and p.hits >= self.confirm]
+        for person in self.people:
+            if person.name in has or person.hits < self.confirm or person.merged / o.rate_hz >= o.share_s or not sure:
+                continue
+            host = min(sure, key=lambda p: hypot(*(place(has[p.name]) - person.here)))
+            at = place(has[host.name])
+            middle = (host.here + person.here) / 2
+            if hypot(*(at - person.here)) < o.share_m and hypot(*(at - middle)) < hypot(*(at - host.here)):
+                hosts.add((host.name, person.name))
+        for host, guest in hosts:
+            person = next(p for p in self.people if p.name == guest)
+            person.correct(place(has[host]), o.share_m / 2)
+            person.missed, person.merged = max(person.missed - passed, 1), person.merged + passed
+        return {host for host, _ in hosts}
+
+    def learn(self, has: dict[int, Row], hosts: set[int], noise_m: float) -> None:
+        """The noise of positions grows where more than a tenth of them lie outside the 90 % circle, and shrinks."""
+        self._noise_before = noise_m
+        if self.options.noise_m is not None:
+            return
+        outside = []
+        for person in self.people:
+            if person.name in has and person.name not in hosts and person.hits >= self.confirm:
+                squared = ((place(has[person.name]) - person.here) ** 2).sum()
+                outside.append(squared > -2 * log(self.WIDE) * (person.cov[0, 0] + noise_m**2))
+        if outside:
+            self.judged += len(outside)
+            rate = max(0.01, 5 / (self.judged + 50))
+            change = rate * sum(out - self.WIDE for out in outside)
+            self.noise_m = min(max(exp(log(noise_m) + change), 0.03), 0.8)

@@ -1,0 +1,67 @@
+"""Every option of every transform has a scene in which it matters, with the expected effect."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from itertools import pairwise
+from typing import get_type_hints
+
+import numpy as np
+import pytest
+
+from mcaptrack.transforms import TRACKERS, TRANSFORMS
+from mcaptrack.transforms.protocol import bare_type
+from tests.effects import Case, others, retrack, sort
+
+CASES = retrack.CASES | sort.CASES | others.CASES
+KINDS = dict(TRANSFORMS) | dict(TRACKERS)
+ORDER = ("least", "more", "most")
+
+
+@pytest.mark.parametrize(
+    ("option", "case"), [(name, case) for (_, name), case in CASES.items()], ids=map("-".join, CASES)
+)
+def test_an_option_has_the_effect_that_its_scene_says(option: str, case: Case):
+    found = {}
+    for value in case.wanted:
+        transform = replace(case.transform, **{option: value})
+        found[value] = case.number([list(output) for output in zip(*transform(case.frames), strict=True)])
+    if set(case.wanted.values()) <= set(ORDER):
+        ordered = sorted(found, key=lambda value: ORDER.index(case.wanted[value]))
+        numbers = [found[value] for value in ordered]
+        assert all(more > 1.02 * less for less, more in pairwise(numbers)), found
+    else:
+        assert found == pytest.approx(case.wanted), case.scene
+
+
+def test_every_option_has_a_scene():
+    options = {(kind, o.name) for kind, made in KINDS.items() for o in fields(made) if not o.metadata.get("context")}
+    assert set(CASES) == options
+
+
+#: Ranges that don't follow from what an option is.
+RANGES = {
+    "direction_frames": (2, 100),
+    "history_s": (0.1, np.inf),
+    "horizon_s": (0.1, 60.0),
+    "link_certainty": (0.01, 0.99),
+    "max_pixels": (1000, np.inf),
+    "min_history": (1, np.inf),
+    "rate_hz": (0.1, 1000.0),
+    "sigma_m": (1e-6, np.inf),
+}
+SHARES = {"alpha", "beta", "min_iou", "low_min_iou", "min_certainty"}
+ANY = {"min_score", "high_score", "new_score"}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_ranges_quantities_are_not_negative_and_shares_are_within_0_and_1(kind):
+    for option in fields(KINDS[kind]):
+        name, hint = option.name, get_type_hints(KINDS[kind])[option.name]
+        if option.metadata.get("context") or bare_type(hint) not in (int, float):
+            continue
+        usual = (0.0, 1.0) if name in SHARES else (-np.inf, np.inf) if name in ANY else (0.0, np.inf)
+        assert (option.metadata["least"], option.metadata["most"]) == RANGES.get(name, usual), name
+        low, high = option.metadata["search"] or (option.metadata["least"], option.metadata["most"])
+        assert option.metadata["least"] <= low < high <= option.metadata["most"]
+        assert option.default is None or low <= option.default <= high

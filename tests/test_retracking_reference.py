@@ -1,0 +1,194 @@
+"""Re-tracking against a second, slow implementation, row by row, on random walkers."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from itertools import chain
+
+import numpy as np
+from hypothesis import Phase, assume, given, settings
+from hypothesis import strategies as st
+
+from mcaptrack.plane import GroundPlane
+from mcaptrack.predictors import make
+from mcaptrack.schema import Frame
+from mcaptrack.transforms import PROFILES, Retrack
+from tests.references.algorithm1 import Algorithm1
+from tests.references.online import OnlineTracker
+from tests.references.retracking import Undecided, constant_velocity
+from tests.worlds import crossing_tracks, noisy_tracks
+
+SEEDS = st.integers(0, 2**32 - 1)
+#: Nothing done afterwards but what both methods share: gaps are filled in, and what is short is left out.
+PLAIN = {"link_s": 0.0, "part": False, "smooth": False, "min_certainty": 0.0}
+
+
+#: A plane that is a plain scale, so that what a box moves by is known: 20 px a metre.
+PLANE = ((0, GroundPlane((0.05, 0, 0, 0, 0.05, 0, 0, 0, 1), 640, 480)),)
+#: What fails is not made simpler: that takes minutes, and a seed says enough.
+QUICK = [Phase.explicit, Phase.generate]
+
+
+def rows_of(frame: Frame) -> list[dict[str, float]]:
+    names = frame.rows.dtype.names
+    return [dict(zip(names, row, strict=True)) for row in zip(*(frame.rows[n].tolist() for n in names), strict=True)]
+
+
+def black_box(name: str, steps: int, step_s: float):
+    """A predictor of the package for one track; where a position is not known stands None."""
+    predictor = make(name, steps, step_s)
+
+    def predict(points):
+        known = np.array([[point is not None for point in points]])
+        xy = np.array([[(np.nan, np.nan) if point is None else point for point in points]])
+        mean, cov = predictor.predict(xy, known)
+        return mean[0], cov[0]
+
+    return predict, predictor.past
+
+
+def compare(transform: Retrack, frames: list[Frame], reference, covariances: bool = True) -> None:
+    """Compare all three outputs, row by row."""
+    samples, times = [rows_of(frame) for frame in frames], [frame.t_ns for frame in frames]
+    try:
+        wanted = reference.run(samples, times)
+    except Undecided:
+        assume(False)
+    found = [list(part) for part in zip(*transform(frames), strict=True)]
+    for ours, theirs in zip(found[:2], wanted[:2], strict=True):
+        assert [len(frame.rows) for frame in ours] == [len(rows) for rows in theirs]
+        mine, yours = np.concatenate([frame.rows for frame in ours]), list(chain(*theirs))
+        for name in mine.dtype.names:
+            np.testing.assert_allclose(mine[name], [row[name] for row in yours], rtol=1e-6, atol=1e-9, err_msg=name)
+    for frame, forecasts in zip(found[2], wanted[2], strict=True):
+        horizon = len(frame.rows) // max(len(forecasts), 1)
+        assert frame.rows["track_id"].tolist() == [name for name, _, _ in forecasts for _ in range(horizon)]
+        for at, (_, mean, cov) in enumerate(forecasts):
+            rows = frame.rows[at * horizon : (at + 1) * horizon]
+            assert rows["step"].tolist() == list(range(1, len(mean) + 1))
+            np.testing.assert_allclose(rows["ahead_s"], np.arange(1, len(mean) + 1) / transform.rate_hz)
+            np.testing.assert_allclose(np.stack([rows["x_m"], rows["y_m"]], axis=-1), mean, atol=1e-9)
+            if covariances:
+                found_cov = np.stack([rows["cov_xx_m2"], rows["cov_xy_m2"], rows["cov_yy_m2"]], axis=-1)
+                np.testing.assert_allclose(found_cov, cov[:, [0, 0, 1], [0, 1, 1]], atol=1e-9)
+
+
+def algorithm_1(transform: Retrack) -> Algorithm1:
+    predict, past = black_box(
+        transform.predictor, round(transform.horizon_s * transform.rate_hz), 1 / transform.rate_hz
+    )
+    return Algorithm1(transform, predict, past)
+
+
+@given(seed=SEEDS)
+@settings(max_examples=15, phases=QUICK)
+def test_profile_paper_equals_algorithm_1(seed):
+    paper = replace(PROFILES["paper"], min_track_s=1.2)
+    reference = Algorithm1(paper, constant_velocity(12), 4)
+    compare(paper, noisy_tracks(np.random.default_rng(seed)), reference, covariances=False)
+
+
+#: What Algorithm 1 is asked for, beside the choices between names; of each a few values that change its course.
+NUMBERS = {
+    "horizon_s": [0.8, 2.0, 4.8],
+    "sigma_m": [0.3, 1.0],
+    "noise_m": [None, 0.0, 0.5],
+    "max_distance": [0.5, 1.5, 3.0],
+    "certain_distance": [0.0, 0.4],
+    "max_jump_m": [None, 0.5, 1.5],
+    "same_source": [0.0, 1.0, 12.0],
+    "max_age_s": [0.4, 1.2, 3.2],
+    "alpha": [0.5, 0.8, 1.0],
+    "beta": [0.0, 0.5],
+    "min_history": [1, 2, 4, 5],
+    "min_hits": [0, 1, 2],
+    "min_track_s": [0.0, 0.8, 2.0],
+    "rate_hz": [2.5, 4.0],
+}
+CHOICES = {
+    "distance": ["mean", "max", "first", "now"],
+    "covariance": ["paper", "predictor"],
+    "birth": ["raw", "smoothed"],
+    "backfill": ["none", "unclaimed", "all"],
+    "confirm": [False, True],
+    "filled": [False, True],
+    "predictor": ["cv", "holt-cv"],
+}
+
+
+@given(seed=SEEDS, chosen=st.fixed_dictionaries({name: st.sampled_from(v) for name, v in (NUMBERS | CHOICES).items()}))
+@settings(max_examples=60, phases=QUICK)
+def test_algorithm_1_with_random_options_equals_the_reference(seed, chosen):
+    transform = Retrack(**PLAIN, **chosen)
+    frames = noisy_tracks(np.random.default_rng(seed), rate_hz=transform.rate_hz)
+    compare(transform, frames, algorithm_1(transform))
+
+
+#: What the likelihood method is asked for.
+LIKELIHOOD = {
+    "horizon_s": [0.8, 4.8],
+    "noise_m": [None, None, 0.1, 0.3],
+    "speed_m_per_s": [0.5, 1.75],
+    "drift": [0.0, 0.12, 0.5],
+    "drift_share": [0.0, 0.08, 0.3],
+    "same_source": [0.0, 4.0, 12.0],
+    "max_age_s": [0.4, 1.2, 2.0],
+    "share_m": [0.0, 1.0, 2.0],
+    "share_s": [0.0, 0.8, 3.0],
+    "sure_s": [0.0, 0.4, 1.2],
+    "coast_s": [0.0, 0.4, 1.2],
+    "min_track_s": [0.0, 0.8, 2.0],
+    "filled": [False, True],
+    "backfill": ["unclaimed", "all"],
+    "rate_hz": [2.5, 4.0],
+    "predictor": ["kalman", "cv"],
+}
+
+
+@given(seed=SEEDS, chosen=st.fixed_dictionaries({name: st.sampled_from(v) for name, v in LIKELIHOOD.items()}))
+@settings(max_examples=60, phases=QUICK)
+def test_the_likelihood_method_equals_the_reference(seed, chosen):
+    transform = Retrack(**PLAIN, **chosen)
+    predict, past = black_box(
+        transform.predictor, round(transform.horizon_s * transform.rate_hz), 1 / transform.rate_hz
+    )
+    reference = OnlineTracker(transform, predict, past)
+    rng = np.random.default_rng(seed)
+    make_frames = crossing_tracks if rng.random() < 0.3 else noisy_tracks
+    compare(transform, make_frames(rng, rate_hz=transform.rate_hz), reference)
+
+
+#: What is done once the whole log is known.
+OFFLINE = {
+    "distance": ["likelihood", "likelihood", "mean"],
+    "noise_m": [None, 0.1, 0.3],
+    "speed_m_per_s": [0.8, 1.75],
+    "drift": [0.05, 0.12],
+    "drift_share": [0.0, 0.08],
+    "same_source": [0.0, 12.0, 25.0],
+    "link_s": [0.0, 4.0, 20.0],
+    "link_certainty": [0.2, 0.5, 0.9],
+    "part": [False, True],
+    "smooth": [False, True],
+    "min_certainty": [0.0, 0.2, 0.5],
+    "min_track_s": [0.0, 2.0],
+    "backfill": ["unclaimed", "all"],
+    "ground_planes": [(), PLANE],
+}
+
+
+@given(seed=SEEDS, chosen=st.fixed_dictionaries({name: st.sampled_from(v) for name, v in OFFLINE.items()}))
+@settings(max_examples=30, phases=QUICK)
+def test_the_offline_part_equals_the_reference(seed, chosen):
+    transform = Retrack(predictor="cv", horizon_s=2.0, **chosen)
+    rng = np.random.default_rng(seed)
+    frames = crossing_tracks(rng) if rng.random() < 0.5 else noisy_tracks(rng, ticks=70, hidden=0.02)
+    if chosen["distance"] == "mean":
+        reference = algorithm_1(transform)
+    else:
+        reference = OnlineTracker(transform, *black_box("cv", 5, 0.4))
+    compare(transform, frames, reference)
+
+
+def test_every_option_is_varied():
+    assert {option.name for option in fields(Retrack)} == {*NUMBERS, *CHOICES, *LIKELIHOOD, *OFFLINE}

@@ -1,0 +1,125 @@
+"""Sampling and prediction against second, slow implementations, row by row, on random walkers."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mcaptrack.predictors import make
+from mcaptrack.schema import Frame
+from mcaptrack.transforms import Predict, Sample
+from tests.worlds import noisy_tracks, ns
+
+LINEAR = ("x_px", "y_px", "w_px", "h_px", "x_m", "y_m", "score")
+SEEDS = st.integers(0, 2**32 - 1)
+
+
+def as_rows(frames: list[Frame]) -> list[tuple[int, dict[str, float]]]:
+    """All rows with their times."""
+    return [(f.t_ns, {name: row[name].item() for name in row.dtype.names}) for f in frames for row in f.rows]
+
+
+def ticks_of(frames: list[Frame], start_ns: int, rate_hz: float, max_gap_s: float) -> list[int]:
+    """The ticks at a frame, or between two frames that are no further apart than a gap may be, or than two ticks."""
+    times = [frame.t_ns for frame in frames]
+    limit = max(round(max_gap_s * 1e9), round(2e9 / rate_hz))
+    out, number = [], 0
+    while (t := start_ns + round(number * 1e9 / rate_hz)) <= times[-1]:
+        spans = [(a, b) for a, b in zip(times, [*times[1:], times[-1]], strict=True) if a <= t <= b]
+        if t in times or any(b - a <= limit for a, b in spans):
+            out.append(t)
+        number += 1
+    return out
+
+
+def slow_sample(frames: list[Frame], options: Sample) -> list[tuple[int, int, list[dict[str, float]]]]:
+    times = [frame.t_ns for frame in frames]
+    usual = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
+    paths: dict[int, list] = {}
+    for t, row in as_rows(frames):
+        paths.setdefault(row["track_id"], []).append((t, row))
+    out = []
+    for tick in ticks_of(frames, options.start_ns or times[0], options.rate_hz, options.max_hole_s):
+        rows = []
+        for who in sorted(paths):
+            before = [(t, row) for t, row in paths[who] if t <= tick]
+            after = [(t, row) for t, row in paths[who] if t > tick]
+            if not before:
+                continue
+            (low, one), made = before[-1], dict(before[-1][1])
+            if low != tick:
+                if not after or after[0][0] - low > round(options.max_hole_s * 1e9):
+                    continue
+                high, other = after[0]
+                for name in LINEAR:
+                    made[name] += (tick - low) / (high - low) * (other[name] - one[name])
+                made["observed"] = one["observed"] and other["observed"] and high - low <= 1.5 * usual
+            rows.append(made | {"source_id": who})
+        out.append((tick, max(frame.index for frame in frames if frame.t_ns <= tick), rows))
+    return out
+
+
+@given(
+    seed=SEEDS,
+    rate_hz=st.sampled_from([1.0, 2.5, 3.0, 10.0]),
+    gap_s=st.sampled_from([0.0, 0.3, 0.4, 1.0, 2.0]),
+    late=st.sampled_from([None, -3.0, 0.7]),
+)
+@settings(max_examples=60)
+def test_samples_equal_the_reference(seed, rate_hz, gap_s, late):
+    rng = np.random.default_rng(seed)
+    frames = noisy_tracks(rng, ticks=25, rate_hz=7.0, hidden=0.05)
+    if rng.random() < 0.5:  # some frames are exactly on ticks
+        frames = [frame._replace(t_ns=ns(round(frame.t_ns / 1e9 * 10) / 10)) for frame in frames]
+        frames = [a for a, b in zip(frames, [*frames[1:], None], strict=True) if b is None or a.t_ns < b.t_ns]
+    start_ns = None if late is None else max(frames[0].t_ns + ns(late), 1)
+    sample = Sample(rate_hz=rate_hz, max_hole_s=gap_s, start_ns=start_ns)
+    wanted = slow_sample(frames, sample)
+    found = [frame for (frame,) in sample(frames)]
+    assert [(frame.t_ns, frame.index) for frame in found] == [(t, index) for t, index, _ in wanted]
+    for frame, (_, _, rows) in zip(found, wanted, strict=True):
+        mine = [row for _, row in as_rows([frame])]
+        assert [row["track_id"] for row in mine] == [row["track_id"] for row in rows]
+        for a, b in zip(mine, rows, strict=True):
+            assert a == pytest.approx(b, rel=1e-6)
+
+
+def test_gaps_of_up_to_two_ticks_have_ticks_and_longer_ones_have_none():
+    """No row is interpolated there (the gap limit is 0), but the ticks exist, as frames without rows."""
+    for apart_s, ticks in ((0.8, [0.0, 0.4, 0.8]), (0.81, [0.0])):
+        frames = [Frame(ns(k * apart_s), k, noisy_tracks(np.random.default_rng(0), ticks=1)[0].rows) for k in range(2)]
+        found = [frame for (frame,) in Sample(max_hole_s=0.0)(frames)]
+        assert [frame.t_ns for frame in found] == [ns(t) for t in ticks]
+
+
+@given(seed=SEEDS, least=st.sampled_from([1, 2, 4, 9]), name=st.sampled_from(["cv", "holt-cv", "kalman"]))
+@settings(max_examples=25)
+def test_forecasts_equal_those_made_one_by_one(seed, least, name):
+    rate_hz = 2.5
+    frames = noisy_tracks(np.random.default_rng(seed), ticks=25, rate_hz=rate_hz)
+    predictor = make(name, 5, 1 / rate_hz)
+    length = max(predictor.past, least)
+    places: dict[tuple[int, int], tuple[float, float]] = {}
+    step = 0
+    found = [frame for (frame,) in Predict(predictor=name, min_history=least, horizon_s=2.0, rate_hz=rate_hz)(frames)]
+    for at, (frame, made) in enumerate(zip(frames, found, strict=True)):
+        if at:
+            step += max(1, round((frame.t_ns - frames[at - 1].t_ns) / 1e9 * rate_hz))
+        for row in frame.rows:
+            places[step, int(row["track_id"])] = (float(row["x_m"]), float(row["y_m"]))
+        wanted = []
+        for row in frame.rows:
+            past = [places.get((step - back, int(row["track_id"]))) for back in range(length - 1, -1, -1)]
+            if None in past[-least:] or not row["observed"]:
+                continue
+            known = np.array([[place is not None for place in past]])
+            mean, cov = predictor.predict(np.array([[place or (np.nan, np.nan) for place in past]]), known)
+            for ahead in range(5):
+                xx, xy, yy = cov[0, ahead, [0, 0, 1], [0, 1, 1]]
+                ahead_s = (ahead + 1) / rate_hz
+                wanted.append((row["track_id"], ahead + 1, ahead_s, *mean[0, ahead], xx, xy, yy))
+        assert (made.t_ns, made.index) == (frame.t_ns, frame.index)
+        mine = np.array([tuple(row) for row in made.rows.tolist()]).reshape(-1, 8)
+        np.testing.assert_allclose(mine, np.array(wanted).reshape(-1, 8), atol=1e-9)
