@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 
 from mcaptrack.boxes import columns_to_boxes, iou
+from mcaptrack.clock import FrameClock
 from mcaptrack.match import assign
 from mcaptrack.scene import Scene
 from mcaptrack.schema import Frame
 from mcaptrack.transforms.detect import Detect
+from mcaptrack.transforms.detect.foreground import FrameDifference
 from mcaptrack.transforms.detect.motion import CameraMotion
 from tests.worlds import ns, small_scene
 
@@ -110,3 +112,125 @@ def test_frame_difference_sees_what_moves_and_not_what_stands():
         boxes = columns_to_boxes(frame.rows)
         assert len(boxes) > 0
         assert (boxes[:, 1] + boxes[:, 3] < 66).all()
+
+
+def blocks(*boxes: tuple[int, int, int, int], height: int = 120, width: int = 160) -> np.ndarray:
+    """Bright blocks (left, top, width, height) on a grey floor."""
+    image = np.full((height, width), 90, np.uint8)
+    for left, top, wide, high in boxes:
+        image[top : top + high, left : left + wide] = 220
+    return image
+
+
+def boxes_of(pictures: list[np.ndarray], **options) -> list[list[list[float]]]:
+    """The boxes in each picture, ten pictures a second."""
+    frames = [Frame(ns(n / 10), n, picture) for n, picture in enumerate(pictures)]
+    return [columns_to_boxes(frame.rows).tolist() for (frame,) in Detect(stabilise=False, **options)(frames)]
+
+
+EMPTY = [blocks()] * 5
+
+
+@pytest.mark.parametrize("method", ["knn", "mog2"])
+def test_boxes_are_those_that_were_drawn_in_reading_order(method):
+    """Two people walk past each other, each a step further than they are wide; a third appears in the end."""
+    drawn = [[(2 + 13 * n, 75, 12, 34), (146 - 11 * n, 20, 10, 30)] for n in range(10)]
+    drawn[-1].append((75, 70, 11, 32))
+    found = boxes_of([*[blocks()] * 30, *(blocks(*each) for each in drawn)], method=method)
+    assert all(boxes == [] for boxes in found[:30])
+    for boxes, each in zip(found[30:], drawn, strict=True):
+        assert boxes == [list(map(float, box)) for box in sorted(each, key=lambda box: (box[1], box[0]))]
+
+
+@pytest.mark.parametrize(("gap", "parts"), [(0, 1), (6, 1), (12, 2)])
+def test_parts_of_a_body_that_lie_above_each_other_are_one_person(gap, parts):
+    """People are 40 px tall here; parts up to a fifth of that apart are joined, above each other but not side by side."""
+    people = [[(20 + 3 * n, 60, 12, 40)] for n in range(12)]
+    broken = [(60, 20, 12, 20), (60, 40 + gap, 12, 20)]
+    beside = [(60, 20, 12, 40), (72 + max(gap, 1), 20, 12, 40)]
+    *_, above = boxes_of([*EMPTY, *(blocks(*each) for each in people), blocks(*broken)])
+    *_, across = boxes_of([*EMPTY, *(blocks(*each) for each in people), blocks(*beside)])
+    assert len(above) == parts
+    assert len(across) == 2
+
+
+def test_what_is_too_small_to_be_a_person_is_left_out():
+    """The height of people is that of most of what moved so far: least is 3 % of its square, or 20 px."""
+    people = [[(20 + 3 * n, 60, 12, 40)] for n in range(12)]
+    for size, seen in (((6, 8), False), ((7, 8), False), ((8, 9), True)):  # areas of outlines: 35, 42, 56; 48 is least
+        *_, boxes = boxes_of([*EMPTY, *(blocks(*each) for each in people), blocks((100, 30, *size))])
+        assert len(boxes) == seen
+    *_, first = boxes_of([*EMPTY, blocks((100, 30, 5, 6), (20, 30, 6, 6))])  # 20 and 25; nothing is known of people yet
+    assert len(first) == 2
+    *_, first = boxes_of([*EMPTY, blocks((100, 30, 5, 5), (20, 30, 6, 6))])
+    assert first == [[20.0, 30.0, 6.0, 6.0]]
+
+
+def test_a_picture_of_which_more_than_half_differs_shows_no_people():
+    for share, seen in ((0.45, 1), (0.55, 0)):
+        *_, boxes = boxes_of([*EMPTY, blocks((0, 0, round(160 * share), 120))])
+        assert len(boxes) == seen
+
+
+@pytest.mark.parametrize(("fps", "span"), [(30, 5), (12, 2), (5, 1)])
+def test_frame_difference_is_the_largest_of_three_differences_a_sixth_of_a_second_apart(fps, span):
+    import cv2
+
+    rng = np.random.default_rng(fps)
+    pictures = [rng.integers(60, 90, (40, 50)).astype(np.uint8) for _ in range(20)]
+    clock, model = FrameClock(), FrameDifference(9.0)
+    blurred = [cv2.GaussianBlur(picture, (5, 5), 0).astype(int) for picture in pictures]
+    for n, picture in enumerate(pictures):
+        clock.tick(ns(n / fps))
+        mask = model.mask(picture, clock)
+        if n < span + 2:
+            assert not mask.any()
+            continue
+        pairs = [(n - span - 2 + k, n - 2 + k) for k in range(3)]
+        largest = np.max([np.abs(blurred[a] - blurred[b]) for a, b in pairs], axis=0)
+        np.testing.assert_array_equal(mask, np.where(largest > 9, 255, 0))
+
+
+class TestCameraMotion:
+    def textured(self, seed: int = 3) -> np.ndarray:
+        rng = np.random.default_rng(seed)
+        return np.kron(rng.integers(40, 200, (20, 30)), np.ones((8, 8))).astype(np.uint8)
+
+    @pytest.mark.parametrize(
+        ("degrees", "scale", "shift"), [(2.0, 1.0, (0, 0)), (0.0, 1.03, (0, 0)), (1.0, 0.98, (3, -2))]
+    )
+    def test_turns_scales_and_shifts_are_measured(self, degrees, scale, shift):
+        import cv2
+
+        still = self.textured()
+        centre = (still.shape[1] / 2, still.shape[0] / 2)
+        matrix = cv2.getRotationMatrix2D(centre, degrees, scale)
+        matrix[:, 2] += shift
+        image = cv2.warpAffine(still, matrix, still.shape[::-1], borderMode=cv2.BORDER_REPLICATE)
+        camera = CameraMotion()
+        camera.follow(still)
+        found, is_new = camera.follow(image)
+        assert not is_new
+        corners = np.array([[0, 0, 1], [still.shape[1], 0, 1], [0, still.shape[0], 1], [*still.shape[::-1], 1]])
+        back = np.column_stack([corners @ matrix.T, np.ones(4)]) @ found.T
+        np.testing.assert_allclose(back, corners[:, :2], atol=0.5)
+
+    def test_a_new_view_is_taken_after_15_pictures_that_do_not_fit(self):
+        camera = CameraMotion()
+        camera.follow(self.textured())
+        other = np.random.default_rng(0).integers(0, 255, (160, 240)).astype(np.uint8)
+        fresh = [camera.follow(other)[1] for _ in range(20)]
+        assert [n for n, is_new in enumerate(fresh, start=1) if is_new] == [16]
+
+    def test_a_fit_in_between_forgets_the_pictures_that_did_not(self):
+        camera, still = CameraMotion(), self.textured()
+        other = np.random.default_rng(0).integers(0, 255, (160, 240)).astype(np.uint8)
+        camera.follow(still)
+        for picture in [other] * 10 + [still] + [other] * 15:
+            assert not camera.follow(picture)[1]
+
+    def test_pictures_without_corners_are_still(self):
+        camera = CameraMotion()
+        for _ in range(30):
+            found, _ = camera.follow(np.full((60, 80), 90, np.uint8))
+            np.testing.assert_array_equal(found, [[1, 0, 0], [0, 1, 0]])

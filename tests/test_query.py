@@ -250,7 +250,6 @@ def test_two_runs_beside_each_other(tmp_path):
 
 @pytest.mark.parametrize("library", ["polars", "pandas"])
 def test_the_same_in_other_libraries(square, monkeypatch, library):
-    pytest.importorskip(library)
     (block,) = re.findall(rf"```python {library}\n(.*?)```", PAGE, re.S)
     monkeypatch.chdir(square)
     names = {}

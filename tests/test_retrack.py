@@ -10,7 +10,7 @@ import pytest
 
 from mcaptrack.history import Holt
 from mcaptrack.predictors import Forecast
-from mcaptrack.transforms import PROFILES, Retrack
+from mcaptrack.transforms import PROFILES
 from mcaptrack.transforms.retrack.distance import jumps, mahalanobis, paper_covariance, to_forecasts, to_positions
 from mcaptrack.transforms.retrack.state import Motion
 from tests.worlds import ids, places, tracks_at, walk
@@ -385,16 +385,6 @@ def test_authors_keep_what_two_matches_in_a_row_confirm():
     assert ticks(AUTHORS, 23) == list(range(10))
     assert ticks(replace(AUTHORS, confirm=False), 23) == list(range(24))
     assert ticks(AUTHORS, 24) == list(range(25))
-
-
-def test_profiles_differ_by_named_parameters():
-    assert Retrack() == DEFAULT
-    assert PAPER.distance == "mean"
-    assert AUTHORS.distance == "max"
-    assert (
-        replace(AUTHORS, distance="mean", certain_distance=0.0, birth="raw", backfill="unclaimed", confirm=False)
-        == PAPER
-    )
 
 
 def test_the_log_without_people_gives_frames_without_rows():

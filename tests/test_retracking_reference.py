@@ -81,7 +81,7 @@ def algorithm_1(transform: Retrack) -> Algorithm1:
 
 
 @given(seed=SEEDS)
-@settings(max_examples=15, phases=QUICK)
+@settings(max_examples=10, phases=QUICK)
 def test_profile_paper_equals_algorithm_1(seed):
     paper = replace(PROFILES["paper"], min_track_s=1.2)
     reference = Algorithm1(paper, constant_velocity(12), 4)
@@ -117,7 +117,7 @@ CHOICES = {
 
 
 @given(seed=SEEDS, chosen=st.fixed_dictionaries({name: st.sampled_from(v) for name, v in (NUMBERS | CHOICES).items()}))
-@settings(max_examples=60, phases=QUICK)
+@settings(max_examples=45, phases=QUICK)
 def test_algorithm_1_with_random_options_equals_the_reference(seed, chosen):
     transform = Retrack(**PLAIN, **chosen)
     frames = noisy_tracks(np.random.default_rng(seed), rate_hz=transform.rate_hz)
@@ -146,7 +146,7 @@ LIKELIHOOD = {
 
 
 @given(seed=SEEDS, chosen=st.fixed_dictionaries({name: st.sampled_from(v) for name, v in LIKELIHOOD.items()}))
-@settings(max_examples=60, phases=QUICK)
+@settings(max_examples=45, phases=QUICK)
 def test_the_likelihood_method_equals_the_reference(seed, chosen):
     transform = Retrack(**PLAIN, **chosen)
     predict, past = black_box(
@@ -178,7 +178,7 @@ OFFLINE = {
 
 
 @given(seed=SEEDS, chosen=st.fixed_dictionaries({name: st.sampled_from(v) for name, v in OFFLINE.items()}))
-@settings(max_examples=30, phases=QUICK)
+@settings(max_examples=22, phases=QUICK)
 def test_the_offline_part_equals_the_reference(seed, chosen):
     transform = Retrack(predictor="cv", horizon_s=2.0, **chosen)
     rng = np.random.default_rng(seed)

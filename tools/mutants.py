@@ -34,6 +34,7 @@ from typing import Any
 
 from tools.mutations import ROOT, Mutant, find, sample
 
+RETRACK = "retrack whole offline_reference retracking_reference retracking_laws retracking_thresholds"
 #: The test files that cover a folder or a file, beside those of the folders around it; all tests where none are named.
 COVERS = {
     "mcaptrack/evaluation": "evaluation events forecast_errors metrics_oracles compared",
@@ -41,10 +42,10 @@ COVERS = {
     "mcaptrack/predictors": "prediction networks",
     "mcaptrack/schema": "schema",
     "mcaptrack/tables": "tables",
-    "mcaptrack/transforms": "transform_laws option_effects",
+    "mcaptrack/transforms": "transform_laws option_effects defaults",
     "mcaptrack/transforms/detect": "detect",
     "mcaptrack/transforms/predict.py": "prediction sample_reference",
-    "mcaptrack/transforms/retrack": "retrack whole retracking_reference offline_reference",
+    "mcaptrack/transforms/retrack": RETRACK,
     "mcaptrack/transforms/sample.py": "prediction sample_reference",
     "mcaptrack/transforms/sort": "sort sort_reference",
 }
@@ -171,12 +172,17 @@ class Bench:
         return (self._folder / "out.txt").read_text(errors="replace")
 
     def tests_of(self, mutant: Mutant, record: dict[str, Any]) -> list[str]:
-        """The tests that call the function that is changed; if none does, those that call any in the file, or all."""
-        calls, place = record["calls"], f"{mutant.path}:{mutant.scope}"
+        """The tests that call the function that is changed; all where none does, those that use the file first.
+
+        Constants and defaults of a module or a class may matter to tests that call nothing in it.
+        """
+        calls, took_s = record["calls"], record["took_s"]
+        place = f"{mutant.path}:{mutant.scope}"
         chosen = [test for test, called in calls.items() if place in called] if mutant.scope else []
-        if not chosen:
-            chosen = [test for test, called in calls.items() if any(c.startswith(f"{mutant.path}:") for c in called)]
-        return sorted(chosen or calls, key=lambda test: record["took_s"][test])
+        if chosen:
+            return sorted(chosen, key=lambda test: took_s[test])
+        uses = {test: any(call.startswith(f"{mutant.path}:") for call in called) for test, called in calls.items()}
+        return sorted(calls, key=lambda test: (not uses[test], took_s[test]))
 
     def survives(self, mutant: Mutant, files: Sequence[str]) -> tuple[bool, str]:
         """Whether all tests pass on the mutant; and if not, what caught it."""

@@ -29,7 +29,7 @@ _WIDE = 0.1
 _SLOWEST = 0.01
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Evidence:
     """What speaks for a pair of track and row, in units of squared standard deviations (twice a log likelihood).
 
@@ -39,14 +39,14 @@ class Evidence:
     the noise of positions. Two tracks are one sample for at most ``share_s`` where it is within ``share_m`` of both.
     """
 
+    alone: float
+    crowded: float
+    share_m: float
+    share_s: float
     cap: float = 26.0
     gate: float = 40.0
-    alone: float = 12.0
-    crowded: float = 4.0
     crowd_m: float = 1.7
     fresh: float = 4.0
-    share_m: float = 1.0
-    share_s: float = 3.0
     floor_m: float = 0.1
 
 

@@ -125,10 +125,9 @@ def exchanges(
     ``apart_m`` (C, T, 2) is the position of one from the other, NaN where not both were seen. ``hint`` (C, T) is what
     an exchange between a step and the one before costs, as a log likelihood. The labels of the first step stand.
     """
-    best_gain, best = np.zeros(len(apart_m)), np.zeros(apart_m.shape[:2], bool)
-    evidence = np.full(len(apart_m), -np.inf)
-    for drift in DRIFTS:
-        path, gain, total = _viterbi(apart_m, hint, step_s, noise_m, speed_m_per_s, drift**2)
+    models = (_viterbi(apart_m, hint, step_s, noise_m, speed_m_per_s, drift**2) for drift in DRIFTS)
+    best, best_gain, evidence = next(models)
+    for path, gain, total in models:
         better = total > evidence
         evidence = np.where(better, total, evidence)
         best = np.where(better[:, None], path, best)

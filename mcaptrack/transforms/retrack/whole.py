@@ -50,13 +50,12 @@ class Claims:
     def on(self, samples: Rows, steps: Sequence[int], counts: Sequence[int]) -> tuple[Ints, Ints, Ints, Ints]:
         """Steps, tracks, sources and samples (rows of ``samples``, ``counts`` of them at each of ``steps``) of claims.
 
-        In the order in which they were made; a track has one sample a step, the first that it claimed.
+        In the order in which they were made. A track claims one sample a step.
         """
         nothing = [np.empty(0, np.int64)]
         step, track, source = (np.concatenate(p or nothing) for p in (self._steps, self._tracks, self._sources))
         key = _lookup(samples["track_id"], np.repeat(np.array(steps, np.int64), counts), source, step)
-        there = np.flatnonzero((key >= 0) & self._stands(step, track))
-        kept = there[_first_of(track[there], step[there])]
+        kept = np.flatnonzero((key >= 0) & self._stands(step, track))
         return step[kept], track[kept], source[kept], key[kept]
 
     def _stands(self, step: Ints, track: Ints) -> NDArray[np.bool_]:
@@ -85,7 +84,7 @@ def whole_tracks(
     samples = TRACKS.joined(sample_rows)
     step, track, source, key = claims.on(samples, steps, [len(rows) for rows in sample_rows])
     if options.backfill != "all":
-        kept = _first_of(key, np.zeros_like(key))
+        _, kept = np.unique(key, return_index=True)
         step, track, source, key = step[kept], track[kept], source[kept], key[kept]
     xy_m = np.stack([samples["x_m"][key], samples["y_m"][key]], axis=-1)
     step_s = 1 / options.rate_hz
@@ -185,14 +184,6 @@ def moved(rows: Rows, xy_m: Floats, planes: Planes, t_ns: Ints) -> Rows:
         out["y_px"][here] += shift[:, 1]
     out["x_m"], out["y_m"] = xy_m.T
     return out
-
-
-def _first_of(a: Ints, b: Ints) -> Ints:
-    """Positions of the first occurrence of each pair, in their order."""
-    order = np.lexsort((b, a))
-    first = np.ones(len(order), bool)
-    first[1:] = (a[order][1:] != a[order][:-1]) | (b[order][1:] != b[order][:-1])
-    return np.sort(order[first])
 
 
 def _lookup(ids: Ints, steps: Ints, wanted_ids: Ints, wanted_steps: Ints) -> Ints:

@@ -75,10 +75,11 @@ class OcSort(Sort):
         Weighted by the score of the box, as in the paper's program.
         """
         table, seen = moment.tracks.table, moment.seen
-        last = (table[_LAST][:2] + table[_LAST][2:]) / 2
-        path = table[_PATH:].reshape(-1, 2, table.shape[1])
-        since = np.isfinite(path[:, 0]).argmax(axis=0)  # the oldest that is remembered, or nothing at all
-        before = path[since, :, np.arange(table.shape[1])].T
+        path, tracks = table[_PATH:].reshape(-1, 2, table.shape[1]), np.arange(table.shape[1])
+        there = np.isfinite(path[:, 0])
+        # The oldest and the newest place that is remembered: the same one has no direction, and neither has NaN.
+        before = path[there.argmax(axis=0), :, tracks].T
+        last = path[-1 - there[::-1].argmax(axis=0), :, tracks].T
         was, now = (last - before)[:, pairs.track], seen.measured[:2, pairs.box] - before[:, pairs.track]
         length = np.hypot(was[0], was[1]) * np.hypot(now[0], now[1])
         known = length > 0  # False for NaN

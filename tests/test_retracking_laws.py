@@ -1,0 +1,147 @@
+"""Symmetries of re-tracking: where and when people walk, what ids are called, and who else is far away don't matter."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mcaptrack.schema import Frame, Rows
+from mcaptrack.transforms import PROFILES, Retrack
+from tests.worlds import noisy_tracks, ns, places, walk
+
+SEEDS = st.integers(0, 2**32 - 1)
+#: "now" looks at the forecast of the present, which the other readings of Algorithm 1 don't.
+METHODS = dict(PROFILES) | {"now": replace(PROFILES["default"], distance="now", noise_m=0.3)}
+every_method = pytest.mark.parametrize("method", METHODS.values(), ids=METHODS)
+
+
+def outputs(method: Retrack, frames: list[Frame]) -> list[Rows]:
+    """The rows of offline and online tracks and of forecasts."""
+    return [np.concatenate([frame.rows for frame in part]) for part in zip(*method(frames), strict=True)]
+
+
+def same(found: Rows, wanted: Rows, **changed: np.ndarray) -> None:
+    """Equal rows, but for columns that are ``changed``; places to a micrometre."""
+    for name in found.dtype.names:
+        values = changed.get(name, wanted[name])
+        np.testing.assert_allclose(found[name], values, rtol=1e-6, atol=1e-6, err_msg=name)
+
+
+def moved(frames: list[Frame], turn: np.ndarray, shift: np.ndarray) -> list[Frame]:
+    out = []
+    for frame in frames:
+        rows = frame.rows.copy()
+        xy = np.stack([rows["x_m"], rows["y_m"]], axis=-1) @ turn.T + shift
+        rows["x_m"], rows["y_m"] = xy.T
+        out.append(frame._replace(rows=rows))
+    return out
+
+
+@every_method
+@given(seed=SEEDS, angle=st.floats(0, 7))
+@settings(max_examples=2)
+def test_a_moved_and_turned_world_has_moved_and_turned_tracks(method, seed, angle):
+    rng = np.random.default_rng(seed)
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    shift = rng.uniform(-100, 100, 2)
+    method = replace(method, min_certainty=0.0)  # the extent of a path is measured along the axes
+    frames = noisy_tracks(rng, ticks=40, hidden=0.03)
+    for found, wanted in zip(outputs(method, moved(frames, turn, shift)), outputs(method, frames), strict=True):
+        x_m, y_m = (np.stack([wanted["x_m"], wanted["y_m"]], axis=-1) @ turn.T + shift).T
+        changed = {"x_m": x_m, "y_m": y_m}
+        if "cov_xx_m2" in wanted.dtype.names:  # linear predictors have round ellipses
+            np.testing.assert_array_equal(wanted["cov_xy_m2"], 0)
+        same(found, wanted, **changed)
+
+
+@every_method
+@given(seed=SEEDS)
+@settings(max_examples=2)
+def test_a_later_log_with_larger_ids_has_the_same_tracks(method, seed):
+    frames = noisy_tracks(np.random.default_rng(seed), ticks=40, hidden=0.03)
+    later = []
+    for frame in frames:
+        rows = frame.rows.copy()
+        rows["track_id"] += 1000
+        later.append(Frame(frame.t_ns + ns(86400.0), frame.index + 7, rows))
+    for found, wanted in zip(outputs(method, later), outputs(method, frames), strict=True):
+        changed = {}
+        if "source_id" in wanted.dtype.names:
+            changed["source_id"] = np.where(wanted["source_id"] >= 0, wanted["source_id"] + 1000, -1)
+        same(found, wanted, **changed)
+
+
+def by_place(rows: Rows) -> Rows:
+    """The rows of a frame in an order that ids don't decide."""
+    return rows[np.lexsort((rows["y_m"], rows["x_m"]))]
+
+
+@every_method
+@given(seed=SEEDS)
+@settings(max_examples=2)
+def test_crowds_that_are_far_apart_are_tracked_as_if_alone(method, seed):
+    """With a given noise; how many links are right is learned from the whole log, so nothing is linked here."""
+    rng = np.random.default_rng(seed)
+    method = replace(method, noise_m=0.15, link_s=0.0)
+    one, two = noisy_tracks(rng, ticks=40), noisy_tracks(rng, ticks=40)
+    two = [b._replace(t_ns=a.t_ns) for a, b in zip(one, moved(two, np.eye(2), np.array([5e3, 0.0])), strict=True)]
+    for frame in two:
+        frame.rows["track_id"] += 1000
+    both = [a._replace(rows=np.concatenate([a.rows, b.rows])) for a, b in zip(one, two, strict=True)]
+    for crowd, here in ((one, False), (two, True)):
+        renamed: dict[int, int] = {}
+        for result, alone in zip(method(both), method(crowd), strict=True):
+            for together, wanted in zip(result, alone, strict=True):
+                a, b = by_place(together.rows[(together.rows["x_m"] > 2500) == here]), by_place(wanted.rows)
+                assert len(a) == len(b)
+                assert all(
+                    renamed.setdefault(k, m) == m
+                    for k, m in zip(b["track_id"].tolist(), a["track_id"].tolist(), strict=True)
+                )
+                same(a, b, track_id=a["track_id"])
+        assert len(set(renamed.values())) == len(renamed)
+
+
+def standing(first: list[tuple[float, float]], then: list[tuple[float, float]], gap: range, ticks: int) -> list[Frame]:
+    """People stand, are not seen for a while, and then stand elsewhere under new ids."""
+
+    def path(tick: int):
+        if tick in gap:
+            return {}
+        here = first if tick < gap.start else then
+        return {k + (10 if tick >= gap.stop else 0): place for k, place in enumerate(here)}
+
+    return walk(path, ticks)
+
+
+TIES = {
+    # The corners of a square: who went to the left and who to the right can't be said.
+    "online": (standing([(1.3, 2.4), (1.3, 1.0)], [(2.0, 1.7), (0.6, 1.7)], range(12, 13), 30), {"max_jump_m": None}),
+    "link": (
+        standing([(1.3, 2.1), (1.3, 1.3)], [(1.7, 1.7), (0.9, 1.7)], range(20, 28), 60),
+        {"max_age_s": 0.8, "link_s": 20.0},
+    ),
+}
+
+
+@every_method
+@pytest.mark.parametrize("tie", TIES)
+def test_last_digits_decide_nothing(method, tie):
+    """Forecasts and sums differ in the last digits from machine to machine, and with how many are computed at once."""
+    frames, options = TIES[tie]
+    method = replace(method, min_certainty=0.0, **options)
+    wanted = [sorted(places(frame).items()) for frame, _, _ in method(frames)]
+    assert len({who for frame in wanted for who, _ in frame}) == 2  # the old ones went on
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        shaken = []
+        for frame in frames:
+            rows = frame.rows.copy()
+            rows["x_m"] += rng.uniform(-1e-12, 1e-12, len(rows))
+            rows["y_m"] += rng.uniform(-1e-12, 1e-12, len(rows))
+            shaken.append(frame._replace(rows=rows))
+        assert [sorted(places(frame).items()) for frame, _, _ in method(shaken)] == wanted

@@ -1,0 +1,199 @@
+"""Decisions of re-tracking flip where they flip in the slow reference: at the same distance.
+
+Random tracks seldom come near a threshold; here a scene is changed by halves until it is at one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mcaptrack.schema import Frame
+from mcaptrack.transforms import PROFILES
+from mcaptrack.transforms.retrack.link import link
+from mcaptrack.transforms.retrack.motion import Walker, smooth
+from mcaptrack.transforms.retrack.part import _encounters, part
+from mcaptrack.transforms.retrack.whole import laid
+from tests.references.offline import Motion, Path, encounters, exchanged, links
+from tests.references.online import OnlineTracker
+from tests.worlds import walk
+
+NUMBERS = (0.2, 1.75, 0.12, 0.08)
+WALKER, MOTION = Walker(*NUMBERS), Motion(*NUMBERS, 0.4)
+FEW = replace(
+    PROFILES["default"],
+    predictor="cv",
+    noise_m=0.2,
+    link_s=0.0,
+    part=False,
+    smooth=False,
+    min_certainty=0.0,
+    min_track_s=0.0,
+)
+
+
+def edge(decides: Callable[[float], bool], low: float, high: float) -> float:
+    """Where a decision that holds at ``low`` and not at ``high`` flips."""
+    assert decides(low)
+    assert not decides(high)
+    for _ in range(16):
+        middle = (low + high) / 2
+        low, high = (middle, high) if decides(middle) else (low, middle)
+    return (low + high) / 2
+
+
+def compare(ours: Callable[[float], bool], reference: Callable[[float], bool], low: float, high: float) -> None:
+    assert edge(ours, low, high) == pytest.approx(edge(reference, low, high), abs=(high - low) / 2**15)
+
+
+def jump(to_m: float, name: int, gap: int, beside_m: float | None) -> list[Frame]:
+    """Person 7 stands at 0 m and, after a gap, at ``to_m`` under the id ``name``; 9 was there before, far away.
+
+    ``beside_m`` is where another person appears, from where 7 is then.
+    """
+
+    def path(tick: int):
+        if tick < 12:
+            return {7: (0.0, 0.0)} | ({9: (90.0, 0.0)} if tick < 4 else {})
+        if tick < 12 + gap:
+            return {}
+        return {name: (to_m, 0.0)} | ({8: (to_m, beside_m)} if beside_m is not None else {})
+
+    return walk(path, 15 + gap)
+
+
+@pytest.mark.parametrize(
+    ("name", "gap", "beside_m"),
+    [(7, 0, None), (9, 0, None), (99, 0, None), (99, 1, None), (7, 2, None), (7, 0, 1.65), (7, 0, 1.75), (9, 2, 1.0)],
+    ids=[
+        "same id",
+        "known id",
+        "new id",
+        "new id after a gap",
+        "same id after a gap",
+        "in a crowd",
+        "beside a crowd",
+        "known id in a crowd",
+    ],
+)
+def test_how_far_a_track_follows_a_jump(name, gap, beside_m):
+    def sources(rows) -> list[tuple[int, int]]:
+        return [(int(row["track_id"]), int(row["source_id"])) for row in rows]
+
+    def ours(to_m: float) -> bool:
+        *_, (offline, _, _) = FEW(jump(to_m, name, gap, beside_m))
+        return (1, name) in sources(offline.rows)
+
+    def reference(to_m: float) -> bool:
+        frames = jump(to_m, name, gap, beside_m)
+        samples = [[dict(zip(row.dtype.names, row.tolist(), strict=True)) for row in frame.rows] for frame in frames]
+        offline, _, _ = OnlineTracker(FEW, lambda points: (np.zeros((1, 2)), np.zeros((1, 2, 2))), 1).run(
+            samples, [frame.t_ns for frame in frames]
+        )
+        return (1, name) in sources(offline[-1])
+
+    compare(ours, reference, 0.0, 20.0)
+
+
+def laid_out(paths: dict[int, Path]):
+    step, name, x, y = (
+        np.array(column)
+        for column in zip(*((s, n, *at) for n, path in paths.items() for s, at in path.items()), strict=True)
+    )
+    _, at, out = laid(step, name, np.stack([x, y], axis=-1), WALKER.noise_m)
+    return out, at
+
+
+def line(first: int, steps: int, start: tuple[float, float], speed: tuple[float, float]) -> Path:
+    return {first + k: (start[0] + speed[0] * k * 0.4, start[1] + speed[1] * k * 0.4) for k in range(steps)}
+
+
+@pytest.mark.parametrize(("others", "least"), [(0, 0.5), (4, 0.1), (4, 0.9)])
+@pytest.mark.parametrize(("speed", "gap"), [(0.0, 3), (0.0, 30), (1.2, 3), (1.2, 20)])
+def test_how_far_aside_a_track_is_linked(speed, gap, others, least):
+    def paths(aside_m: float) -> dict[int, Path]:
+        out = {
+            k: line(20 * (k % 2), 12, (300.0 * (k // 2) + 14.4 * (k % 2), 40.0), (1.8, 0.0)) for k in range(2 * others)
+        }
+        out[90] = line(0, 15, (0.0, 0.0), (speed, 0.0))
+        out[91] = line(14 + gap, 15, (speed * 0.4 * (14 + gap), aside_m), (speed, 0.0))
+        return out
+
+    def ours(aside_m: float) -> bool:
+        out, _ = laid_out(paths(aside_m))
+        forward, backward, _ = smooth(WALKER, out, 0.4)
+        return link(WALKER, out, forward, backward, 0.4, 20.0, least)[-2] == 2 * others + 1
+
+    def reference(aside_m: float) -> bool:
+        return links(MOTION, paths(aside_m), 20.0, least).get(90) == 91
+
+    if reference(0.0):
+        compare(ours, reference, 0.0, 20.0)
+    else:
+        assert not ours(0.0)
+
+
+def crossing(beside_m: float, gap: int, shift: int, named: str) -> tuple[dict[int, Path], dict[int, dict[int, int]]]:
+    """Two people cross, and their labels are exchanged ``shift`` steps after they met, in a gap of the tracks.
+
+    The ids of the input are exchanged with the labels, are the same all the time, or are new afterwards.
+    """
+    one, two = line(0, 51, (-10.0, 0.0), (1.0, 0.0)), line(0, 51, (10.0, beside_m), (-1.0, 0.0))
+    when = 25 + shift
+    unseen = range(when - gap, when)
+    paths = {
+        3: {s: (one if s < when else two)[s] for s in one if s not in unseen},
+        5: {s: (two if s < when else one)[s] for s in one if s not in unseen},
+    }
+    names = {"follow the people": {3: 5, 5: 3}, "follow the labels": {3: 3, 5: 5}, "are new": {3: 13, 5: 15}}[named]
+    ids = {track: {s: track if s < when else names[track] for s in path} for track, path in paths.items()}
+    return paths, ids
+
+
+def ours_exchanged(paths: dict[int, Path], ids: dict[int, dict[int, int]]) -> bool:
+    out, at = laid_out(paths)
+    source = np.array([ids[track][step] for track, path in paths.items() for step in path])
+    return part(WALKER, out, at, source, 0.4)[1] > 0
+
+
+@pytest.mark.parametrize("named", ["follow the people", "follow the labels", "are new"])
+@pytest.mark.parametrize("gap", [0, 4])
+def test_how_near_people_cross_until_exchanged_labels_are_not_noticed(named, gap):
+    """They pass each other at this distance: the nearer, the less the two courses differ."""
+
+    def ours(near: float) -> bool:
+        return ours_exchanged(*crossing(1.9 - near, gap, 0, named))
+
+    def reference(near: float) -> bool:
+        return bool(exchanged(MOTION, *crossing(1.9 - near, gap, 0, named)))
+
+    if reference(1.9):
+        assert ours(1.9)
+    else:
+        compare(ours, reference, 0.0, 1.9)
+
+
+def test_people_who_stay_further_apart_than_2_m_do_not_meet():
+    for beside_m, met in ((1.99, True), (2.01, False)):
+        paths, ids = crossing(beside_m, 0, 0, "are new")
+        assert bool(exchanged(MOTION, paths, ids)) == met
+        assert ours_exchanged(paths, ids) == met
+
+
+def test_encounters_begin_and_end_as_in_the_reference():
+    """Two walk abreast and come near each other twice, with any number of steps between."""
+    for between in range(15, 26):
+        one = {s: (0.4 * s, 0.0) for s in range(5, 90)}
+        two = {
+            s: (0.4 * s, 1.0 if s in range(20, 24) or s in range(23 + between, 26 + between) else 3.0)
+            for s in range(80)
+        }
+        paths = {4: one, 9: two, 12: {s: (0.4 * s, -1.0) for s in range(28, 33)}}
+        out, _ = laid_out(paths)
+        track = np.repeat(np.arange(3), np.diff(out.first))
+        found = zip(*(column.tolist() for column in _encounters(out, track, 3)), strict=True)
+        names = sorted(paths)
+        assert [(names[i], names[j], low, high) for i, j, low, high in found] == encounters(paths)
