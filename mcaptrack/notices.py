@@ -15,7 +15,16 @@ from contextvars import ContextVar
 from typing import Final, Literal, NamedTuple
 
 #: What kind of thing a warning is about, for programs. docs/warnings.md says what each means.
-Code = Literal["assumed-ground-plane", "left-out", "lost", "not-compared", "other", "other-settings", "out-of-date"]
+Code = Literal[
+    "assumed-ground-plane",
+    "left-out",
+    "lost",
+    "not-compared",
+    "option-not-used",
+    "other",
+    "other-settings",
+    "out-of-date",
+]
 
 
 class McaptrackWarning(UserWarning):

@@ -304,3 +304,45 @@ def test_an_option_is_seen(command, option, see):
     before, after = KNOWN[case.base], see(f"{case.base} {case.words}")
     assert after.code != 2, after.err
     assert before != after
+
+
+#: Options that need data of their own to be seen: rules that differ in rare frames, a table that isn't asked for.
+BY_DATA = ("rules", "seed", "with")
+#: Other things that commands are used for: an option that does nothing there has to be refused, or a line says so.
+ALSO = {
+    "evaluate": [
+        "evaluate a.mcap",
+        "evaluate a.mcap --similarity iou",
+        "evaluate a.mcap --similarity metres",
+        "evaluate tall.txt --truth truth.txt --ground-plane plane.txt",
+    ],
+    "events": ["events a.mcap --similarity iou", "events a.mcap --similarity metres"],
+    "query": ["query a.mcap 'from events'", "query a.mcap 'from events' --format csv", "query a.mcap --tables"],
+    "tune": [
+        "tune a.mcap --trials 1",
+        "tune tall.txt --truth truth.txt --trials 1 --fps 10",
+    ],
+    "render": ["render a.mcap -o b.mp4"],
+    "ingest": [
+        "ingest truth.txt --fps 10 --as truth",
+        "ingest truth.txt --fps 10 --as truth --ground-plane plane.txt",
+        "ingest a.mcap -o b.mcap",
+        "ingest clip.mp4",
+        "ingest clip.mp4 --image-format jpeg",
+    ],
+}
+
+
+@pytest.mark.parametrize(("command", "base"), [(name, base) for name, bases in ALSO.items() for base in bases])
+def test_an_option_that_does_nothing_is_said(command, base, see):
+    before, silent = see(base), []
+    assert before.code == 0, before.err
+    for option, case in CASES[command].items():
+        is_there = f"--{option}" in base or case.words in base
+        if (
+            option not in ("force", "config", "quiet", *BY_DATA)
+            and not is_there
+            and see(f"{base} {case.words}") == before
+        ):
+            silent.append(case.words)
+    assert silent == []

@@ -13,6 +13,7 @@ from typer.core import TyperCommand
 
 from mcaptrack.cli.settings import Given, Setting, declared_settings, found_of, gather
 from mcaptrack.cli.text import refuse_usage, say
+from mcaptrack.notices import warn
 
 COMMON: Final = "Options of all commands"
 _RUNNING: Final[ContextVar[typer.Context]] = ContextVar("running")
@@ -162,3 +163,11 @@ def is_on_command_line(parameter: str) -> bool:
     """Whether an option of the running command was given on its command line."""
     source = _RUNNING.get().get_parameter_source(parameter)
     return source is not None and source.name == "COMMANDLINE"
+
+
+def warn_unused(reason: str, *parameters: str) -> None:
+    """Warn of options on the command line that change nothing here, and say why."""
+    command: Any = _RUNNING.get().command
+    for setting in command.settings.values():
+        if setting.parameter in parameters and is_on_command_line(setting.parameter):
+            warn(f"--{setting.name} changes nothing here: {reason}", "option-not-used")

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 import typer
 
 from mcaptrack.cli import common
+from mcaptrack.cli.command import warn_unused
 from mcaptrack.cli.text import console, printable, say
 from mcaptrack.errors import McaptrackError
 
@@ -17,7 +18,8 @@ if TYPE_CHECKING:
     from mcaptrack.evaluation import Outcome, Sequenced
 
 _COLUMNS: Final = ("MOTA", "IDF1", "HOTA", "IDSW", "FP", "FN", "Frag")
-_FILES: Final = (".txt", ".csv", ".parquet", ".pq")
+_TABLES: Final = (".parquet", ".pq")
+_FILES: Final = (".txt", ".csv", *_TABLES)
 _FORECAST_COLUMNS: Final = {
     "ADE_m": "ADE m",
     "FDE_m": "FDE m",
@@ -102,12 +104,23 @@ def evaluate(
         if truth:
             plane_options = {"ground_plane": ground_plane, "point": point, "fps": fps, "topics": options.topics}
             sequences = _from_files(paths, common.expand(truth), plane_options, talk)
+            warn_unused("files of tracks are of no camera", "camera")
+            if ground_plane is None:
+                warn_unused("there is no ground plane", "point")
+            if not any(path.suffix.lower() in _TABLES for path in paths):
+                warn_unused("only tables hold several channels", "topic")
         else:
             for path in paths:
                 if path.suffix.lower() in _FILES:
                     raise McaptrackError(f"{path} is no log; to score a file of tracks give the truth with --truth")
             sequences = _from_logs(paths, camera, options.topics)
+            warn_unused("it is about label files; logs have theirs inside", "ground_plane", "point", "fps")
         outcome = score(sequences, options, talk.detail)
+        compared = {result.similarity for result in outcome.results}
+        if "metres" not in compared:
+            warn_unused("nothing is compared by distance on the ground", "gate_m")
+        if "iou" not in compared:
+            warn_unused("nothing is compared by overlap", "min_iou")
         for words in outcome.notes:
             talk.warn(words, "not-compared")
     with common.printed_to(output, force):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Annotated
 
 from mcaptrack.cli import common
+from mcaptrack.cli.command import warn_unused
 from mcaptrack.cli.stages import run_on_logs, watched
 
 
@@ -40,6 +41,8 @@ def events(
 
     Example: mcaptrack events log.mcap --similarity metres --gate-m 1
     """
+    if similarity is not None:
+        warn_unused(f"people and tracks are compared by {similarity}", "gate_m" if similarity == "iou" else "min_iou")
     watch = watched(similarity, gate_m, min_iou, topics=tuple(topic or ()), again=True)
     given = {"logs": logs, "camera": camera, "output": output, "sidecar": sidecar, "topic": None, "force": force}
     run_on_logs(given | {"json": json, "quiet": quiet, "verbose": verbose}, lambda _: [], watch=watch)

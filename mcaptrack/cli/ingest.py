@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from fractions import Fraction
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 import typer
 
 from mcaptrack.cli import common
+from mcaptrack.cli.command import warn_unused
 from mcaptrack.errors import McaptrackError
+
+if TYPE_CHECKING:
+    from mcaptrack.ingest import IngestOptions
 
 Inputs = Annotated[
     list[Path],
@@ -23,6 +28,10 @@ Inputs = Annotated[
 
 def _label_file(words: str) -> Any:
     return common.option(panel=common.FILES, help=f"Label file of the pictures: {words}.")
+
+
+#: The channels that label files become.
+_OF_LABELS: Final = frozenset({"detections", "tracks", "truth", "ground_plane"})
 
 
 @common.one_line
@@ -144,6 +153,7 @@ def ingest(
                 with log.read(into) as opened:
                     opened.lock()
                     report = make_log(source, target, options, into=opened, force=force, progress=talk.progress)
+            _warn_unused(report.messages, options)
             for words in report.said:
                 talk.say(words)
             for words in report.notes:
@@ -164,6 +174,18 @@ def ingest(
         common.print_json({"results": results})
     if lost:
         raise typer.Exit(common.LOST)
+
+
+def _warn_unused(topics: Mapping[str, int], options: IngestOptions) -> None:
+    """Say which options are about what wasn't there, as the topics that were written tell."""
+    prefix = f"/{options.camera.strip('/')}/"
+    ours = {topic.removeprefix(prefix) for topic in topics if topic.startswith(prefix)}
+    if not options.labels and set(topics) != {prefix + name for name in ours & _OF_LABELS}:
+        warn_unused("there is no label file", "label_format")
+    if options.ground_plane is None:
+        warn_unused("there is no ground plane", "point")
+    if not ours:
+        warn_unused("the channels of a recording keep their names", "camera")
 
 
 def _fps(text: str | None) -> Fraction | None:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 import typer
 
 from mcaptrack.cli import common
+from mcaptrack.cli.command import warn_unused
 from mcaptrack.cli.text import console, printable, show
 from mcaptrack.errors import McaptrackError
 
@@ -79,8 +80,11 @@ def query(
     Example: mcaptrack query 'runs/*.mcap' -f speed.sql -o speed.csv
     """
     paths, sql = _asked(words or [], file, tables)
+    if tables:
+        warn_unused("--tables lists what could be asked", "form", "rows")
     if tables and not paths:
-        _print_tables(None, json)
+        with common.printed_to(output, force):
+            _print_tables(None, json)
         return
     paths = common.expand(paths)
     chosen = _form(form, output, json)
@@ -94,7 +98,8 @@ def query(
 
     with common.Talk(quiet, verbose).open() as talk, Database(paths, _named(beside or [])) as database:
         if tables:
-            _print_tables(database, json)
+            with common.printed_to(output, force):
+                _print_tables(database, json)
             return
         answer = database.ask(sql)
         for note in database.notes:
@@ -105,6 +110,7 @@ def query(
                 words_after = _print_answer(answer, limit)
             talk.say(words_after) if words_after else None
         else:
+            warn_unused(f"{chosen} has all rows", "rows")
             _write(answer, chosen, output, json)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Annotated
 
 from mcaptrack.cli import common
+from mcaptrack.cli.command import warn_unused
 from mcaptrack.errors import McaptrackError
 
 
@@ -51,6 +52,8 @@ def render(
     _in_bounds("--start-s", start_s, 0, 1e9)
     _in_bounds("--end-s", end_s, 0, 1e9)
     options = rendering.RenderOptions(width_px=width, max_fps=max_fps, start_s=start_s, end_s=end_s)
+    if output is not None:
+        warn_unused("the name that -o gives says what is written", "gif")
     results = []
     with common.Talk(quiet, verbose).open() as talk:
         for path in paths:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 import typer
 
 from mcaptrack.cli import common
+from mcaptrack.cli.command import warn_unused
 from mcaptrack.cli.config import NAME
 from mcaptrack.cli.text import console, show
 from mcaptrack.errors import McaptrackError
@@ -102,8 +103,15 @@ def tune(
         if truth:
             given = {"fps": fps, "ground_plane": ground_plane, "point": point}
             tasks = _tasks_of_files(common.expand(inputs), common.expand(truth), stage, given, talk)
+            warn_unused("files of detections are of no camera", "camera", "topic")
+            if ground_plane is None:
+                warn_unused("there is no ground plane", "point")
         else:
             tasks = _tasks_of_logs(common.expand(inputs), camera, topic, stage, kind)
+            warn_unused("it is about label files; logs have theirs inside", "ground_plane", "point", "fps")
+        if stage not in ALTERNATIVES:
+            warn_unused(f"{stage} has no trackers", "tracker")
+        warn_unused(*(("overlap is compared", "gate_m") if chosen == "iou" else ("distance is compared", "min_iou")))
         if force:
             trials_file.unlink(missing_ok=True)
         if kind is TRACKERS["sort"] and trials * sum(len(task.frames) for task in tasks) > _WORTH_COMPILING:

@@ -93,6 +93,8 @@ def compare_files(
             raise McaptrackError(f"{tracks} and {truth} share no clock: one counts frames, the other does not")
         frames = ingest.label_frames({"tracks": tracks, "truth": truth}, fps, ground_plane, point)
         return Compared(frames["truth"], frames["tracks"], notes)
+    if fps is not None:
+        notes.append("frames are compared by their numbers, whatever the frames per second")
     return _by_number(both, ground_plane, point, notes)
 
 
