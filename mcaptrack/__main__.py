@@ -43,6 +43,9 @@ def main() -> None:
     sys.unraisablehook = _once_more
     try:
         from mcaptrack.cli import app
+        from mcaptrack.environment import hush_libraries
+
+        hush_libraries()
 
         app()
     except BrokenPipeError:  # whoever read our output has had enough

@@ -5,6 +5,7 @@ from __future__ import annotations
 import glob
 import os
 import secrets
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -85,6 +86,18 @@ def sync_folder(folder: Path) -> None:
 def is_same_file(one: Path, other: Path) -> bool:
     """Whether two paths lead to one file that is there."""
     return one.exists() and other.exists() and one.samefile(other)
+
+
+def refuse_special(path: Path) -> None:
+    """Raise McaptrackError for a pipe, a device or a socket: reading one may never end."""
+    try:
+        mode = path.stat().st_mode
+    except OSError:
+        return  # whoever opens it says why
+    kinds = {stat.S_ISFIFO: "a pipe", stat.S_ISCHR: "a device", stat.S_ISBLK: "a device", stat.S_ISSOCK: "a socket"}
+    for is_kind, what in kinds.items():
+        if is_kind(mode):
+            raise McaptrackError(f"{path} is {what}, not a file; write what it gives to a file first")
 
 
 def refuse_overwrite(path: Path, force: bool) -> None:

@@ -2,16 +2,44 @@
 
 from __future__ import annotations
 
+import re
 from bisect import bisect_left, insort
 from collections import deque
+from fractions import Fraction
 from typing import Final
 
 NS_PER_S: Final = 1_000_000_000
+#: The last time that nanoseconds since 1970 can be kept for, in 2262.
+LAST_NS: Final = 2**63 - 1
+#: Frame rates: a picture a day, for plants that grow, to ten thousand a second.
+FPS_RANGE: Final = (Fraction(1, 86_400), Fraction(10_000))
+#: Numbers that people write: no exponent that takes a lifetime to work out.
+_RATIO: Final = re.compile(r"\+?(\d+\.?\d*|\.\d+)(e[+-]?\d{1,2})?(/\d+)?", re.ASCII | re.IGNORECASE)
+_MAX_DIGITS: Final = 40
 #: How many intervals the usual one is taken from.
 _MEMORY: Final = 25
 #: From how many intervals on the usual one is sure enough to notice that it has changed, and by what factor then.
 _SURE: Final = 8
 _CHANGED: Final = 1.5
+
+
+def parse_ratio(text: str) -> Fraction:
+    """A number of 0 or more from "25", "29.97" or "30000/1001". Raises ValueError for anything else."""
+    text = text.strip()
+    if len(text) > _MAX_DIGITS or not _RATIO.fullmatch(text):
+        raise ValueError(f"{text[:_MAX_DIGITS]!r} is no number")
+    number, _, below = text.partition("/")
+    if below and not int(below):
+        raise ValueError(f"{text!r} divides by 0")
+    return Fraction(number) / int(below or 1)
+
+
+def parse_fps(text: str) -> Fraction:
+    """Frames per second, as ``parse_ratio``. Raises ValueError for what is out of ``FPS_RANGE``, too."""
+    fps = parse_ratio(text)
+    if not FPS_RANGE[0] <= fps <= FPS_RANGE[1]:
+        raise ValueError(f"{text} frames a second: there can be one a day to {FPS_RANGE[1]} a second")
+    return fps
 
 
 def seconds_to_ns(seconds: float) -> int:

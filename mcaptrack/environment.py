@@ -14,6 +14,7 @@ PREFIX: Final = "MCAPTRACK_"
 VARIABLES: Final[Mapping[str, str]] = MappingProxyType(
     {
         "MCAPTRACK_MAX_CHUNK_MIB": "chunks of a log that say they are larger than this are refused, in MiB",
+        "MCAPTRACK_MAX_MEGAPIXELS": "pictures that say they are larger than this are refused, in millions of pixels",
         "MCAPTRACK_DATA": "a folder with reference recordings, for the tests",
     }
 )
@@ -36,3 +37,8 @@ def whole_number(name: str, otherwise: int) -> int:
     if not (text.isascii() and text.isdecimal() and len(text) <= 9 and int(text) > 0):
         raise McaptrackError(f"{name} needs a whole number from 1 to 999999999, not {text[:20]!r}")
     return int(text)
+
+
+def hush_libraries() -> None:
+    """Keep OpenCV from printing what it finds wrong with pictures: the command says it, in one line."""
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")

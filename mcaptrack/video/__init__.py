@@ -5,13 +5,16 @@ FFmpeg does the work, through PyAV; its wheels bring it along.
 
 from mcaptrack.video.decode import Encoded, brightness, colours
 from mcaptrack.video.encode import H264Encoder, Image, ImageFormat, Keep, encode_image, write_clip, write_mp4
+from mcaptrack.video.folder import IMAGE_SUFFIXES
 from mcaptrack.video.raw import RAW_ENCODINGS, Layout
-from mcaptrack.video.source import IMAGE_SUFFIXES, EncodedPicture, Video, open_video, seqinfo_fps
-from mcaptrack.video.streams import entry
+from mcaptrack.video.seqinfo import SEQINFO, SeqInfo, find_seqinfo
+from mcaptrack.video.source import EncodedPicture, Video, open_video
+from mcaptrack.video.streams import entry, is_video
 
 __all__ = [
     "IMAGE_SUFFIXES",
     "RAW_ENCODINGS",
+    "SEQINFO",
     "Encoded",
     "EncodedPicture",
     "H264Encoder",
@@ -19,13 +22,15 @@ __all__ = [
     "ImageFormat",
     "Keep",
     "Layout",
+    "SeqInfo",
     "Video",
     "brightness",
     "colours",
     "encode_image",
     "entry",
+    "find_seqinfo",
+    "is_video",
     "open_video",
-    "seqinfo_fps",
     "write_clip",
     "write_mp4",
 ]

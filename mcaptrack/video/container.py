@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Iterator
 from contextlib import contextmanager
 from fractions import Fraction
@@ -9,6 +10,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from mcaptrack.errors import McaptrackError
+from mcaptrack.video.limits import max_pixels, too_large
 
 _COVER: Final = 0x400  # AV_DISPOSITION_ATTACHED_PIC
 _NO_TIMESTAMPS: Final = 0x80  # AVFMT_NOTIMESTAMPS
@@ -24,19 +26,29 @@ def reading(path: Path) -> Iterator[Any]:
     import av
 
     major = int(av.__version__.partition(".")[0])
-    options: dict[str, Any] = {}
+    options: dict[str, Any] = {"options": {"max_pixels": str(max_pixels())}}
     if major <= _LAST_WITH_METADATA_ERRORS:
         options["metadata_errors"] = "surrogateescape"
     try:
         with av.open(_url(path), **options) as opened:
+            for stream in opened.streams.video:
+                if stream.codec_context is not None:
+                    stream.codec_context.options = options["options"]
             yield opened
     except av.error.EOFError:
         raise McaptrackError(f"{path} is a video without frames") from None
     except av.error.FFmpegError as error:
+        why = error.strerror or error
+        if is_size_error(error):
+            why = f"{why}: it is damaged, or its pictures are too large, {too_large()}"
         raise McaptrackError(
-            f"{path} can't be read as a video ({error.strerror or error}); "
-            "give an mp4, mov, mkv, avi or webm file that is whole"
+            f"{path} can't be read as a video ({why}); give an mp4, mov, mkv, avi or webm file that is whole"
         ) from error
+
+
+def is_size_error(error: Any) -> bool:
+    """Whether an error of FFmpeg's is one of those that its decoders give for pictures that are too large."""
+    return error.errno in (errno.EINVAL, errno.ENOMEM, errno.ERANGE)
 
 
 @contextmanager
@@ -80,6 +92,16 @@ def has_times(opened: Any) -> bool:
 
 def indexed(opened: Any) -> int:
     """How many pictures the parts of a fragmented MP4 list that were read so far; 0 if it is none."""
+    return len(_mp4_entries(opened))
+
+
+def empty(opened: Any) -> int:
+    """How many pictures an MP4 lists that have no bytes: nothing was recorded there."""
+    return sum(entry.size == 0 for entry in _mp4_entries(opened))
+
+
+def _mp4_entries(opened: Any) -> Any:
+    """The list of pictures of an MP4; older versions of PyAV don't tell."""
     stream = videos(opened)[0]
     is_mp4 = "mp4" in opened.format.name.split(",")
-    return len(stream.index_entries) if is_mp4 and hasattr(stream, "index_entries") else 0
+    return stream.index_entries if is_mp4 and hasattr(stream, "index_entries") else ()

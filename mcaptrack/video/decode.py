@@ -12,6 +12,9 @@ from numpy.typing import NDArray
 from mcaptrack.clock import NS_PER_S
 from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import Frame
+from mcaptrack.video import h264
+from mcaptrack.video.container import is_size_error
+from mcaptrack.video.limits import check_size, check_still, max_pixels, still_size, too_large
 from mcaptrack.video.raw import Layout, raw_brightness, raw_colours
 from mcaptrack.video.streams import CODECS
 
@@ -76,6 +79,9 @@ def _decoded(
         elif wanted is not None and picture.index not in wanted:
             continue
         elif picture.layout:
+            width, height, *_ = picture.layout
+            if width * height <= len(picture.data):
+                check_size(width, height, picture.name)
             try:
                 pixels = of_pixels(picture.format, picture.data, picture.layout)
             except McaptrackError as error:
@@ -90,11 +96,14 @@ def _decoded(
 def _still(picture: Encoded, is_grey: bool) -> Pixels:
     import cv2
 
-    try:
-        how = cv2.IMREAD_GRAYSCALE if is_grey else cv2.IMREAD_COLOR
-        image = cv2.imdecode(np.frombuffer(picture.data, np.uint8), how)
-    except cv2.error:  # of no bytes, or of a header that promises more pixels than there can be
-        image = None
+    size, image = still_size(picture.data), None
+    if size is not None:
+        check_still(size, picture.name)
+        try:
+            how = cv2.IMREAD_GRAYSCALE if is_grey else cv2.IMREAD_COLOR
+            image = cv2.imdecode(np.frombuffer(picture.data, np.uint8), how)
+        except cv2.error:  # of a header that promises what can't be
+            image = None
     if image is None:
         raise McaptrackError(f"{picture.name} can't be decoded as {picture.format or 'an image'}")
     return np.asarray(image, np.uint8)
@@ -108,6 +117,7 @@ class _VideoDecoder:
 
         self._codec: Any = av.CodecContext.create(CODECS[name].decoder, "r")
         self._codec.thread_type = "AUTO"
+        self._codec.options = {"max_pixels": str(max_pixels())}
         self._base = Fraction(1, NS_PER_S)
         self._count, self._sets, self._begun, self._last = 0, b"", False, "the video"
         self._waiting: dict[int, tuple[int, int]] = {}
@@ -124,6 +134,8 @@ class _VideoDecoder:
             return  # a recording may begin anywhere; nothing can be made of what is before the first parameter sets
         # A copy in FFmpeg's own memory: its threads can't let go of Python's while Python waits for them to end.
         data = self._sets + picture.data
+        if picture.format == "h264" and (self._sets or head.has_sets):  # FFmpeg says no more than that these are bad
+            check_size(*h264.largest(data), picture.name)
         packet = av.Packet(len(data))
         packet.update(data)
         packet.pts = packet.dts = self._count  # not its time: messages of others may share one
@@ -142,7 +154,10 @@ class _VideoDecoder:
         try:
             decoded = self._codec.decode(packet)
         except av.error.FFmpegError as error:
-            raise McaptrackError(f"{where} can't be decoded: {error.strerror or error}") from error
+            why = error.strerror or error
+            if is_size_error(error):
+                why = f"{why}; it is damaged, or too large: {too_large()}"
+            raise McaptrackError(f"{where} can't be decoded: {why}") from error
         for frame in decoded:
             t_ns, index = self._waiting.pop(frame.pts)
             if self._wanted is None or index in self._wanted:

@@ -51,11 +51,17 @@ def with_sets(data: bytes, sets: tuple[bytes, ...]) -> bytes:
 
 def is_interlaced(sets: tuple[bytes, ...]) -> bool:
     """Whether pictures may be made of two fields."""
-    return any(not _frames_only(nal) for nal in sets if nal[0] & 0x1F == _SPS)
+    return any(not _geometry(nal)[2] for nal in sets if nal[0] & 0x1F == _SPS)
 
 
-def _frames_only(sps: bytes) -> bool:
-    """frame_mbs_only_flag of a sequence parameter set (7.3.2.1.1)."""
+def largest(data: bytes) -> tuple[int, int]:
+    """The width and height, in whole blocks, of the largest pictures that sequence parameter sets announce."""
+    sizes = [_geometry(nal)[:2] for kind, nal in nal_units(data, _SETS, 0, 0x1F) if kind == _SPS]
+    return max(sizes, key=lambda size: size[0] * size[1], default=(0, 0))
+
+
+def _geometry(sps: bytes) -> tuple[int, int, bool]:
+    """Width and height in whole blocks, and frame_mbs_only_flag, of a sequence parameter set (7.3.2.1.1)."""
     bits = Bits.of_nal(sps[1:])
     profile = bits.take(8)
     bits.take(16)  # constraints, level
@@ -78,8 +84,10 @@ def _frames_only(sps: bytes) -> bool:
         bits.golomb(), bits.golomb()
         for _ in range(min(bits.golomb(), 255)):
             bits.golomb()
-    bits.golomb(), bits.take(1), bits.golomb(), bits.golomb()  # references, gaps, width, height
-    return bool(bits.take(1))
+    bits.golomb(), bits.take(1)  # references, gaps
+    blocks, units = bits.golomb() + 1, bits.golomb() + 1  # of a height of one block, or of two in pairs of fields
+    frames_only = bool(bits.take(1))
+    return 16 * blocks, 16 * units * (1 if frames_only else 2), frames_only
 
 
 def _pass_scaling_list(bits: Bits, size: int) -> None:

@@ -17,17 +17,20 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaptrack.clock import NS_PER_S
+from mcaptrack.clock import LAST_NS, NS_PER_S
 from mcaptrack.errors import McaptrackError
-from mcaptrack.video.container import fraction, has_slots, has_times, indexed, reading, videos
+from mcaptrack.notices import warn
+from mcaptrack.video.container import empty, fraction, has_slots, has_times, indexed, reading, videos
 from mcaptrack.video.encode import H264Encoder, Keep, StillFormat, encode_image
+from mcaptrack.video.folder import Images, find_images, read_image
+from mcaptrack.video.limits import check_h264, check_size
 from mcaptrack.video.passing import look, packets
+from mcaptrack.video.seqinfo import find_seqinfo
+from mcaptrack.video.slots import count_slots
 from mcaptrack.video.streams import CODECS
 
 Image = NDArray[np.uint8]
 
-IMAGE_SUFFIXES: Final = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
-_MAX_PIXELS: Final = 2**27
 #: As many on every machine, so that what is made of damaged streams is the same everywhere.
 _THREADS: Final = 4
 _FULL_RANGE, _LIMITED_RANGE = 2, 1  # AVCOL_RANGE_JPEG, AVCOL_RANGE_MPEG
@@ -42,8 +45,12 @@ class EncodedPicture(NamedTuple):
 
 
 class Shown(NamedTuple):
-    """One picture as it is shown: its time in seconds, if it has one, and FFmpeg's frame or BGR (height, width, 3)."""
+    """One picture as it is shown: its number, its time in seconds, if it has one, and FFmpeg's frame or BGR (H, W, 3).
 
+    Pictures that can't be decoded have numbers, too.
+    """
+
+    index: int  # type: ignore[assignment]  # hides tuple.index, which nobody wants here
     seconds: Fraction | None
     picture: Any
 
@@ -54,6 +61,7 @@ class Video:
 
     ``format`` is what its messages are: "h264", "vp9", "jpeg" and so on. ``width_px`` and ``height_px`` are of these.
     ``frames`` is what the container claims, 0 if nothing. ``start_ns`` is when the recording began, if it says.
+    ``images`` are those of a folder, of which every so many are there by the numbers in their names (``every``).
     ``why_transcode`` is empty where the stream is passed on, or where stills are asked for. ``lost`` and ``notes``
     collect, while pictures are read, what could not be, and what is worth saying.
     """
@@ -68,11 +76,17 @@ class Video:
     start_ns: int | None
     why_transcode: str
     sets: tuple[bytes, ...] = ()
-    images: list[Path] = field(default_factory=list)
+    images: Images | None = None
+    stream: int = 0
     lost: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     has_slots: bool = False
     length_s: Fraction | None = None
+
+    @property
+    def every(self) -> int:
+        """How far apart the numbers of pictures are: 12 for images of which every twelfth has kept its number."""
+        return self.images.every if self.images else 1
 
     def pictures(self, start_ns: int = 0) -> Iterator[EncodedPicture]:
         """All pictures in order, the first of them at ``start_ns``."""
@@ -85,10 +99,13 @@ class Video:
             yield from _pass_on(self, clock)
 
     def note_missing(self, read: int, hidden: int = 0, last_s: Fraction | None = None) -> None:
-        """Compare what was read with what the container claims; ``hidden`` is what it says not to show."""
+        """Compare what was read with what the container claims; ``hidden`` is what it says not to show, or is empty."""
         if self.has_slots and self.fps and last_s is not None:
             hidden += round(last_s * self.fps) + 1 - read  # slots that are empty
         if self.frames and read + hidden < self.frames:
+            slots = None if self.images else count_slots(self.path, self.stream)
+            if slots is not None and slots >= self.frames:
+                return  # the file is whole: what was not read is empty, or was said to be lost
             self.lost.append(f"{self.path} claims {self.frames} frames; {read} could be read")
         elif not self.frames and self.length_s and last_s is not None and self.fps:
             gap = self.length_s - last_s
@@ -118,6 +135,10 @@ class _Clock:
             self._first = seconds if self._first is None else self._first
             seconds -= self._first
         t_ns = self._start_ns + round(seconds * NS_PER_S)
+        if not 0 <= t_ns < LAST_NS:
+            raise McaptrackError(
+                f"{self._where}: picture {index} is {float(seconds):g} s after the first; times reach to the year 2262"
+            )
         self._last = max(t_ns, self._last + 1)  # two pictures never share a time
         return self._last
 
@@ -135,10 +156,7 @@ def open_video(path: Path, keep: Keep = Keep()) -> Video:  # noqa: B008  # froze
         context = stream.codec_context
         if context is None:
             raise McaptrackError(f"{path} holds video in a codec that is not known here; convert it to H.264 first")
-        if context.width * context.height > _MAX_PIXELS:
-            raise McaptrackError(
-                f"{path} has pictures of {context.width} x {context.height}; at most {_MAX_PIXELS} pixels"
-            )
+        check_size(context.width, context.height, path)
         first = next(opened.decode(stream), None)
         if first is None:
             raise McaptrackError(f"{path} is a video without frames")
@@ -155,6 +173,7 @@ def open_video(path: Path, keep: Keep = Keep()) -> Video:  # noqa: B008  # froze
             stream.frames,
             _creation_ns(opened.metadata.get("creation_time") or stream.metadata.get("creation_time")),
             f"it is turned by {first.rotation} degrees" if first.rotation else "",
+            stream=stream.index,
             has_slots=has_slots(opened),
             length_s=_length_s(opened, stream),
         )
@@ -175,6 +194,7 @@ def open_video(path: Path, keep: Keep = Keep()) -> Video:  # noqa: B008  # froze
 def _make_even(video: Video) -> None:
     """Pictures that are encoded as H.264 have an even number of rows and columns."""
     if video.why_transcode:
+        check_h264(video.width_px, video.height_px, video.path)
         video.width_px += video.width_px % 2
         video.height_px += video.height_px % 2
 
@@ -188,36 +208,22 @@ def _length_s(opened: Any, stream: Any) -> Fraction | None:
 
 
 def _open_folder(path: Path, keep: Keep) -> Video:
-    import cv2
-
-    images = sorted((p for p in path.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES), key=_natural)
-    if not images:
-        raise McaptrackError(f"{path} holds no images ({', '.join(IMAGE_SUFFIXES)})")
-    first = cv2.imread(str(images[0]), cv2.IMREAD_COLOR)
+    images = find_images(path)
+    first = read_image(images.paths[0])
     if first is None:
-        raise McaptrackError(f"{images[0]} can't be read as an image")
+        raise McaptrackError(f"{images.paths[0]} can't be read as an image")
     height, width = first.shape[:2]
     name = keep.image_format if keep.is_still else "h264"
-    why = "" if keep.is_still else "it is a folder of images"
-    video = Video(path, keep, name, width, height, seqinfo_fps(path), len(images), None, why, images=images)
+    why, info = "" if keep.is_still else "it is a folder of images", find_seqinfo(path)
+    video = Video(
+        path, keep, name, width, height, info.fps if info else None, len(images.paths), None, why, images=images
+    )
+    if images.missing:
+        warn(f"{path}: {images.missing} are missing; their times stay empty", "clock")
+    if info and info.frames and info.frames != images.place[-1] + 1:
+        warn(f"{info.path} counts {info.frames} frames, and {path} has images of {images.place[-1] + 1}", "clock")
     _make_even(video)
     return video
-
-
-def _natural(path: Path) -> list[tuple[int, str]]:
-    """Sort key by which 2.jpg comes before 10.jpg."""
-    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", path.name) if part]
-
-
-def seqinfo_fps(folder: Path) -> Fraction | None:
-    """The frame rate that a MOTChallenge sequence states in the seqinfo.ini in ``folder`` or above it."""
-    for info in (folder / "seqinfo.ini", folder.parent / "seqinfo.ini"):
-        found = (
-            re.search(r"^frameRate\s*=\s*([\d.]+)", info.read_text(encoding="utf-8"), re.M) if info.is_file() else None
-        )
-        if found:
-            return Fraction(found.group(1))
-    return None
 
 
 def _creation_ns(text: str | None) -> int | None:
@@ -230,7 +236,7 @@ def _creation_ns(text: str | None) -> int | None:
         return None
     moment = moment if moment.tzinfo else moment.replace(tzinfo=UTC)
     t_ns = round(moment.timestamp() * 1e6) * 1000
-    return t_ns if t_ns >= 0 else None
+    return t_ns if 0 <= t_ns < LAST_NS else None
 
 
 def _pass_on(video: Video, clock: _Clock) -> Iterator[EncodedPicture]:
@@ -249,60 +255,55 @@ def _pass_on(video: Video, clock: _Clock) -> Iterator[EncodedPicture]:
             yield EncodedPicture(clock.time(index, seconds), index, data)
             index += 1
         video.frames = video.frames or indexed(opened)
-    video.note_missing(index, last_s=seconds)
+        hidden = empty(opened)
+    video.note_missing(index, hidden, seconds)
 
 
 def _transcode(video: Video, clock: _Clock) -> Iterator[EncodedPicture]:
     keep, encoder = video.keep, None
-    for index, (seconds, picture) in enumerate(_shown(video)):
+    for index, seconds, picture in _shown(video):
         t_ns = clock.time(index, seconds)
         fitted = _fit(video, picture)
         if encoder is None:
             fps = clock.fps or video.fps or Fraction(30)
             encoder = H264Encoder(video.width_px, video.height_px, fps, keep.crf, keep.key_every_s, like=fitted)
-        yield EncodedPicture(t_ns, index, encoder.encode(fitted, t_ns))
+        data = encoder.encode(fitted, t_ns)
+        del picture, fitted  # not kept while the next one is read: pictures may be large
+        yield EncodedPicture(t_ns, index, data)
 
 
 def _stills(video: Video, clock: _Clock) -> Iterator[EncodedPicture]:
     name: StillFormat = "jpeg" if video.format == "jpeg" else "png"
-    for index, (seconds, picture) in enumerate(_shown(video)):
-        image = _upright(picture)
-        yield EncodedPicture(clock.time(index, seconds), index, encode_image(image, name, video.keep.jpeg_quality))
+    for index, seconds, picture in _shown(video):
+        data = encode_image(_upright(picture), name, video.keep.jpeg_quality)
+        del picture
+        yield EncodedPicture(clock.time(index, seconds), index, data)
 
 
 def images(video: Video) -> Iterator[tuple[Fraction | None, Image]]:
     """Decoded pictures, BGR (height, width, 3), upright, with their times in seconds."""
-    for seconds, picture in _shown(video):
+    for _, seconds, picture in _shown(video):
         yield seconds, _upright(picture)
 
 
 def _shown(video: Video) -> Iterator[Shown]:
     """All pictures as they are shown; what could not be read is noted."""
-    if video.images:
-        read = 0
-        for shown in _folder_images(video):
-            yield shown
-            read += 1
-        video.note_missing(read)
-    else:
+    if video.images is None:
         yield from _decoded(video)
-
-
-def _folder_images(video: Video) -> Iterator[Shown]:
-    import cv2
-
-    for path in video.images:
-        image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+        return
+    for path, place in zip(video.images.paths, video.images.place, strict=True):
+        image = read_image(path)
         if image is None:
             video.lost.append(f"{path} can't be read as an image; it is left out")
-            continue
-        yield Shown(None, np.asarray(image, np.uint8))
+        else:
+            yield Shown(place, None, image)
+            del image
 
 
 def _decoded(video: Video) -> Iterator[Shown]:
     import av
 
-    read, damaged, hidden, cut_off, seconds = 0, 0, 0, 0, None
+    read, failed, damaged, hidden, cut_off, seconds = 0, 0, 0, 0, 0, None
     slots: list[int] = []
     with reading(video.path) as opened:
         stream = videos(opened)[0]
@@ -322,14 +323,16 @@ def _decoded(video: Video) -> Iterator[Shown]:
                 frames = packet.decode()
             except av.error.FFmpegError as error:
                 video.lost.append(f"{video.path}: a packet can't be decoded ({error.strerror or error})")
+                failed += 1
                 continue
             for frame in frames:
-                ticks = slots[min(read, len(slots) - 1)] if slots else frame.pts
+                ticks = slots[min(read + failed, len(slots) - 1)] if slots else frame.pts
                 seconds = None if ticks is None else ticks * base
                 damaged += frame.is_corrupt
+                yield Shown(read + failed, seconds, frame)
                 read += 1
-                yield Shown(seconds, frame)
         video.frames = video.frames or indexed(opened)
+        hidden += empty(opened)
     if cut_off:
         video.lost.append(f"{video.path}: {cut_off} packets are cut off or damaged")
     if damaged:

@@ -37,3 +37,8 @@ def entry(image_format: str, data: bytes) -> Entry:
     """What a message of this format begins with; decoding can begin at every still."""
     codec = CODECS.get(image_format)
     return codec.entry(data) if codec else Entry(True, True, True)
+
+
+def is_video(image_format: str) -> bool:
+    """Whether pictures of this format may need pictures before them."""
+    return image_format in CODECS

@@ -1,0 +1,383 @@
+"""Pictures: how large they may be, which number each has, and what is lost of them and what isn't."""
+
+from __future__ import annotations
+
+import os
+import socket
+import struct
+import subprocess
+import sys
+import zlib
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mcaptrack import log
+from mcaptrack.atomic import refuse_special
+from mcaptrack.errors import McaptrackError
+from mcaptrack.foreign import PICTURES_READ, is_compressed
+from mcaptrack.ingest import IngestOptions, ingest
+from mcaptrack.schema import TRACKS
+from mcaptrack.video import Encoded, Keep, Layout, brightness, colours, open_video
+from mcaptrack.video.limits import ENVIRONMENT, still_size
+from mcaptrack.video.streams import CODECS
+from tests.test_cli import start
+from tests.worlds import ids, ns, write_clip
+
+SUFFIXES = ("png", "jpg", "bmp", "webp", "tif", "avif")
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+@pytest.mark.parametrize("shape", [(31, 17, 3), (48, 64), (5, 300, 4), (1, 1, 3)])
+def test_the_size_of_a_still_is_that_of_its_pixels(suffix, shape):
+    image = np.random.default_rng(1).integers(0, 255, shape, np.uint8)
+    for options in ([], [cv2.IMWRITE_WEBP_QUALITY, 40], [cv2.IMWRITE_JPEG_PROGRESSIVE, 1]):
+        ok, data = cv2.imencode(f".{suffix}", image, options)
+        assert ok
+        decoded = cv2.imdecode(data, cv2.IMREAD_COLOR)
+        assert still_size(data.tobytes())[:2] == (decoded.shape[1], decoded.shape[0]) == (shape[1], shape[0])
+
+
+def test_pixels_of_many_bytes_are_counted():
+    _, data = cv2.imencode(".tif", np.zeros((4, 6, 3), np.uint16))
+    assert still_size(data.tobytes()) == (6, 4, 6)
+
+
+HEADS = [
+    b"\x89PNG\r\n\x1a\n",
+    b"\xff\xd8\xff\xe0",
+    b"BM",
+    b"RIFF0000WEBPVP8 ",
+    b"II*\0\x08\0\0\0",
+    b"0000ftypavif",
+    b"",
+]
+
+
+@given(st.sampled_from(HEADS), st.binary(max_size=60))
+def test_bytes_of_strangers_have_a_size_or_none(head, rest):
+    size = still_size(head + rest)
+    assert size is None or min(size) >= 0
+
+
+def png(width: int, height: int) -> bytes:
+    """A black picture of one bit a pixel, written by hand: a few bytes, however large it is."""
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    pack = zlib.compressobj(9)
+    rows = b"".join(pack.compress(bytes(1 + (width + 7) // 8)) for _ in range(height)) + pack.flush()
+    head = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 1, 0, 0, 0, 0))
+    return b"\x89PNG\r\n\x1a\n" + head + chunk(b"IDAT", rows) + chunk(b"IEND", b"")
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="what a process needed stands there")
+def test_a_picture_that_says_that_it_is_huge_costs_nothing(tmp_path):
+    (tmp_path / "images").mkdir()
+    bomb = png(16_000, 16_000)
+    (tmp_path / "images" / "0.png").write_bytes(bomb)
+    assert len(bomb) < 100_000
+    code = (
+        "import sys\n"
+        "from mcaptrack.cli import app\n"
+        "try: app(sys.argv[1:])\n"
+        "except SystemExit as end: print(end.code, *(line for line in open('/proc/self/status') if 'VmHWM' in line))\n"
+    )
+    words = ["ingest", "images", "--fps", "1"]
+    done = subprocess.run(
+        [sys.executable, "-c", code, *words], cwd=tmp_path, capture_output=True, text=True, check=True
+    )
+    assert done.stderr == (
+        "mcaptrack: images/0.png has 16000 x 16000 pixels; at most 100 megapixels are read "
+        f"({ENVIRONMENT} sets another limit)\n"
+    )
+    exit_code, _, kibibytes, _ = done.stdout.split()
+    assert exit_code == "1"
+    assert int(kibibytes) < 200 * 1024
+    with pytest.raises(McaptrackError, match="16000 x 16000 pixels; at most 100 megapixels"):
+        list(brightness([Encoded(0, 7, "png", bomb)]))
+
+
+SIZE = (1100, 1000)
+CODEC_OF = {"h264": "libx264", "h265": "libx265", "vp9": "libvpx-vp9", "av1": "libsvtav1"}
+
+
+def encoded(codec: str) -> bytes:
+    """The first picture of a stream."""
+    context = av.CodecContext.create(codec, "w")
+    context.width, context.height = SIZE
+    context.pix_fmt, context.time_base, context.framerate = "yuv420p", Fraction(1, 10), 10
+    options = {"libx265": {"x265-params": "log-level=none:pools=1"}, "libx264": {"tune": "zerolatency"}}
+    context.options = options.get(codec, {}) | {"g": "1"}
+    frame = av.VideoFrame.from_ndarray(np.full((SIZE[1], SIZE[0], 3), 50, np.uint8), format="bgr24")
+    return bytes(next(iter([*context.encode(frame), *context.encode(None)])))
+
+
+def stills() -> dict[str, bytes]:
+    image = np.full((SIZE[1], SIZE[0]), 50, np.uint8)
+    return {suffix: cv2.imencode(f".{suffix}", image)[1].tobytes() for suffix in SUFFIXES}
+
+
+@pytest.mark.parametrize("pixels", [brightness, colours])
+@pytest.mark.parametrize("name", [*CODECS, *SUFFIXES, "raw"])
+def test_pictures_of_messages_are_bounded(monkeypatch, name, pixels):
+    if name == "raw":
+        picture = Encoded(0, 0, "mono8", bytes(SIZE[0] * SIZE[1]), Layout(*SIZE))
+    else:
+        picture = Encoded(0, 0, name, encoded(CODEC_OF[name]) if name in CODECS else stills()[name])
+    monkeypatch.setenv(ENVIRONMENT, "2")
+    assert [frame.rows.shape[:2] for frame in pixels([picture])] == [SIZE[::-1]]
+    monkeypatch.setenv(ENVIRONMENT, "1")
+    with pytest.raises(McaptrackError, match=r"^frame 0[^\n]*at most 1 megapixels are read \(MCAPTRACK_MAX_MEGAPIXELS"):
+        list(pixels([picture]))
+
+
+def test_every_kind_of_message_with_pictures_is_among_them():
+    """Compressed ones hold stills or a video, the others pixels: see above."""
+    assert {is_compressed(name) for name in PICTURES_READ} == {True, False}
+
+
+@pytest.mark.parametrize("name", ["a.mp4", "a.avi", "a.mkv", "a.webm", "folder"])
+def test_pictures_of_files_are_bounded(tmp_path, monkeypatch, name):
+    path = tmp_path / name
+    if name == "folder":
+        path.mkdir()
+        (path / "1.png").write_bytes(stills()["png"])
+    else:
+        codec = {"a.avi": "mpeg4", "a.webm": "libvpx-vp9"}.get(name, "libx264")
+        write_clip(path, frames=2, size=SIZE, codec=codec)
+    options = IngestOptions(fps=Fraction(10))
+    monkeypatch.setenv(ENVIRONMENT, "1")
+    with pytest.raises(McaptrackError, match=r"at most 1 megapixels are read \(MCAPTRACK_MAX_MEGAPIXELS"):
+        ingest(path, tmp_path / "a.mcap", options)
+    monkeypatch.setenv(ENVIRONMENT, "2")
+    assert ingest(path, tmp_path / "a.mcap", options).lost == []
+
+
+@pytest.mark.parametrize("given", ["x", "0", "-1", "1e3", "9" * 20])
+def test_a_limit_that_is_no_number_is_refused(monkeypatch, given):
+    monkeypatch.setenv(ENVIRONMENT, given)
+    with pytest.raises(McaptrackError, match=f"{ENVIRONMENT} needs a whole number"):
+        list(brightness([Encoded(0, 0, "png", png(8, 8))]))
+
+
+def test_pictures_that_no_h264_stream_holds_are_refused_with_what_helps(tmp_path):
+    folder = tmp_path / "images"
+    folder.mkdir()
+    (folder / "0.png").write_bytes(png(8000, 4500))
+    with pytest.raises(McaptrackError, match=r"8000 x 4500 pixels, .* at most 35.7 megapixels; --image-format jpeg"):
+        open_video(folder, Keep(fps=Fraction(1)))
+    assert open_video(folder, Keep(fps=Fraction(1), image_format="jpeg")).width_px == 8000
+
+
+# What is no file
+
+
+def special(path: Path, kind: str) -> Path:
+    if kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "socket":
+        with socket.socket(socket.AF_UNIX) as made:
+            made.bind(str(path))
+    else:
+        path.symlink_to("/dev/zero")
+    return path
+
+
+@pytest.mark.parametrize("kind", ["pipe", "socket", "device"])
+def test_pipes_devices_and_sockets_are_no_files(tmp_path, monkeypatch, kind):
+    monkeypatch.chdir(tmp_path)  # names of sockets are short
+    with pytest.raises(McaptrackError, match=f"x is a {kind}, not a file"):
+        refuse_special(special(Path("x"), kind))
+    refuse_special(Path("none"))
+    refuse_special(tmp_path)
+    Path("link").symlink_to(__file__)
+    refuse_special(Path("link"))
+
+
+def test_an_image_that_is_a_pipe_is_refused(tmp_path):
+    (tmp_path / "0.png").write_bytes(png(8, 8))
+    (tmp_path / "seqinfo.ini").write_text("frameRate=5")
+    os.mkfifo(tmp_path / "1.png")
+    code = f"from pathlib import Path; from mcaptrack.video import *; list(open_video(Path({str(tmp_path)!r}), Keep(image_format='png')).pictures())"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
+    assert "1.png is a pipe, not a file" in done.stderr
+
+
+# Which number a picture has
+
+
+def images(folder: Path, *names: str) -> Path:
+    folder.mkdir(exist_ok=True)
+    for name in names:
+        cv2.imwrite(str(folder / name), np.full((48, 64, 3), 50, np.uint8))
+    return folder
+
+
+NUMBERED = {
+    "without a gap": (["8.png", "9.png", "10.png"], [0, 1, 2], ""),
+    "with a gap": ([f"{n:04}.jpg" for n in (3, 4, 6, 8)], [0, 1, 3, 5], r"2 of 6 numbered images (5, 7) are missing"),
+    "with many": (["a1.png", "a3.png", "a4.png", "a8.png"], [0, 2, 3, 7], "4 of 8 numbered images (2, 5, 6, ...)"),
+    "every twelfth": (["0.png", "12.png", "24.png", "48.png"], [0, 1, 2, 4], "1 of 5 numbered images (36)"),
+    "times rather than counts": (["1.png", "90.png", "91.png"], [0, 1, 2], ""),
+    "without numbers": (["a.png", "b.png"], [0, 1], ""),
+    "of two series": (["a1.png", "a3.png", "b4.png"], [0, 1, 2], ""),
+    "of two kinds": (["1.png", "3.jpg", "4.png"], [0, 1, 2], ""),
+}
+
+
+@pytest.mark.parametrize(("names", "places", "words"), NUMBERED.values(), ids=NUMBERED)
+def test_images_that_are_missing_leave_their_time_empty(tmp_path, names, places, words):
+    found = images(tmp_path / "images", *names)
+    report = ingest(found, tmp_path / "a.mcap", IngestOptions(fps=Fraction(10)))
+    with log.read(tmp_path / "a.mcap") as opened:
+        there = [(message.t_ns, message.sequence) for message in opened.messages("/camera/video")]
+    assert there == [(ns(place / 10), place) for place in places]
+    assert [words in notice.message for notice in report.warnings] == ([True] if words else [])
+    assert report.lost == []
+
+
+def labelled(path: Path, *frames: int) -> Path:
+    path.write_text("".join(f"{n},{n + 1},1,1,2,2\n" for n in frames))
+    return path
+
+
+def tracks(path: Path) -> dict[int, list[int]]:
+    with log.read(path) as opened:
+        return {f.t_ns: ids(f) for f in opened.frames("/camera/truth", TRACKS)}
+
+
+@pytest.mark.parametrize("how", ["beside", "into"])
+def test_labels_of_images_that_are_missing_or_damaged_are_lost_and_the_others_stay(tmp_path, how):
+    """Image 3 is not there, image 5 is no image: the labels of 4 and 6 are those of 4 and 6."""
+    found, out = images(tmp_path / "images", "1.png", "2.png", "4.png", "5.png", "6.png"), tmp_path / "a.mcap"
+    (found / "5.png").write_bytes(b"no image")
+    truth = labelled(tmp_path / "gt.txt", 1, 2, 3, 4, 5, 6)
+    if how == "beside":
+        report = ingest(found, out, IngestOptions(fps=Fraction(10), labels={"truth": truth}))
+        assert "5.png can't be read as an image" in report.lost[0]
+    else:
+        ingest(found, out, IngestOptions(fps=Fraction(10)))
+        with log.read(out) as opened:
+            report = ingest(truth, out, IngestOptions(role="truth"), into=opened)
+    assert report.lost[-1] == f"{truth}: 2 labels are of frames whose pictures are missing"
+    assert tracks(out) == {0: [2], ns(0.1): [3], ns(0.3): [5], ns(0.5): [7]}
+
+
+@pytest.mark.parametrize("how", ["beside", "into"])
+def test_labels_may_count_as_the_names_of_images_do(tmp_path, how):
+    found, out = images(tmp_path / "images", *(f"{12 * n}.png" for n in range(5))), tmp_path / "a.mcap"
+    truth = tmp_path / "gt.txt"
+    truth.write_text("".join(f"{n} {n + 1} 1.0 2.0\n" for n in (0, 12, 36)))
+    if how == "beside":
+        report = ingest(found, out, IngestOptions(fps=Fraction(10), labels={"truth": truth}))
+    else:
+        ingest(found, out, IngestOptions(fps=Fraction(10)))
+        with log.read(out) as opened:
+            report = ingest(truth, out, IngestOptions(role="truth"), into=opened)
+    assert tracks(out) == {0: [1], ns(0.1): [13], ns(0.2): [], ns(0.3): [37], ns(0.4): []}
+    assert "counts frames as the names of the pictures of" in report.warnings[-1].message
+    by_place = labelled(tmp_path / "gt2.txt", 1, 2, 4)
+    ingest(found, out, IngestOptions(fps=Fraction(10), labels={"truth": by_place}))
+    assert {t: who for t, who in tracks(out).items() if who} == {0: [2], ns(0.1): [3], ns(0.3): [5]}
+
+
+def test_a_picture_that_can_not_be_decoded_keeps_its_number_and_its_time(tmp_path):
+    """Motion JPEG, every picture alone: number 4 is overwritten."""
+    path = tmp_path / "a.avi"
+    write_clip(path, frames=8, codec="mjpeg", pixels="yuvj420p")
+    with av.open(str(path)) as container:
+        packets = [bytes(packet) for packet in container.demux(video=0) if packet.size]
+    path.write_bytes(path.read_bytes().replace(packets[4], bytes(len(packets[4]))))
+    for keep, options in (({}, {}), ({"fps": Fraction(10)}, {"fps": Fraction(10)})):
+        video = open_video(path, Keep(**keep))
+        there = [(picture.index, picture.t_ns) for picture in video.pictures()]
+        assert there == [(n, ns(n / 10)) for n in range(8) if n != 4]
+        assert len(video.lost) == 1
+        truth = labelled(tmp_path / "gt.txt", *range(1, 9))
+        report = ingest(path, tmp_path / "a.mcap", IngestOptions(labels={"truth": truth}, **options))
+        assert tracks(tmp_path / "a.mcap") == {ns(n / 10): [n + 2] for n in range(8) if n != 4}
+        assert report.lost[-1] == f"{truth}: 1 labels are of frames whose pictures are missing"
+
+
+# What is lost, and what is only empty
+
+
+def ivf(path: Path, packets: list[bytes]) -> None:
+    head = struct.pack("<4sHH4sHHIIII", b"DKIF", 0, 32, b"VP90", 64, 48, 10, 1, len(packets), 0)
+    path.write_bytes(head + b"".join(struct.pack("<IQ", len(data), n) + data for n, data in enumerate(packets)))
+
+
+def every_second(path: Path) -> int:
+    """A clip in which every second place for a picture is empty, the last too; returns how many pictures it has."""
+    count = 12
+    write_clip(path.with_suffix(".webm"), frames=count, codec="libvpx-vp9", options={"g": "10"})
+    with av.open(str(path.with_suffix(".webm"))) as container:
+        vp9 = [bytes(packet) for packet in container.demux(video=0) if packet.size]
+    if path.suffix == ".ivf":
+        ivf(path, [data for packet in vp9 for data in (packet, b"")])
+    elif path.suffix == ".avi":
+        with av.open(str(path), "w") as container:
+            stream = container.add_stream("mpeg4", rate=10)
+            stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+            for n in [*range(count), None]:
+                frame = None
+                if n is not None:
+                    frame = av.VideoFrame.from_ndarray(np.full((48, 64, 3), 10 * n, np.uint8), format="bgr24")
+                    frame.pts, frame.time_base = 2 * n, Fraction(1, 10)
+                for packet in stream.encode(frame):
+                    container.mux(packet)
+        raw = bytearray(path.read_bytes())  # one place more at the end: in the header, in the list, and in its length
+        at = raw.index(b"idx1")
+        length = raw.index(b"LIST", raw.index(b"movi") - 8) + 4
+        raw[at:at] = b"00dc\0\0\0\0"
+        for where in (4, length):
+            raw[where : where + 4] = struct.pack("<I", struct.unpack_from("<I", raw, where)[0] + 8)
+        frames = raw.index(b"strh") + 8 + 32
+        for where in (frames, raw.index(b"avih") + 8 + 16):
+            raw[where : where + 4] = struct.pack("<I", 2 * count)
+        path.write_bytes(raw)
+    else:  # the list of an MP4 says that the last pictures have no bytes
+        write_clip(path, frames=2 * count, options={"bf": "0", "g": "4"})
+        raw = bytearray(path.read_bytes())
+        sizes = raw.index(b"stsz") + 16
+        raw[sizes + 4 * count : sizes + 8 * count] = bytes(4 * count)
+        path.write_bytes(raw)
+    return count
+
+
+@pytest.mark.parametrize("keep", [{}, {"image_format": "jpeg"}], ids=["auto", "jpeg"])
+@pytest.mark.parametrize("suffix", [".avi", ".ivf", ".mp4"])
+def test_places_that_are_empty_are_no_loss(tmp_path, suffix, keep):
+    path = tmp_path / f"a{suffix}"
+    count = every_second(path)
+    with av.open(str(path)) as container:
+        assert container.streams.video[0].frames == 2 * count
+    video = open_video(path, Keep(**keep))
+    made = list(video.pictures())
+    assert (len(made), video.lost) == (count, [])
+    assert [picture.index for picture in made] == list(range(count))
+    process = start("ingest", path, "-o", tmp_path / "a.mcap")
+    assert (process.communicate(timeout=60)[1].count("lost"), process.returncode) == (0, 0)
+
+
+@pytest.mark.parametrize("suffix", [".avi", ".ivf"])
+def test_places_that_were_cut_off_are_lost(tmp_path, suffix):
+    """Of the second half of the file, the list of an AVI too, nothing is there."""
+    path = tmp_path / f"a{suffix}"
+    count = every_second(path)
+    raw = path.read_bytes()
+    end = raw.index(b"idx1") if suffix == ".avi" else len(raw)
+    first = raw.index(b"movi") if suffix == ".avi" else 32
+    path.write_bytes(raw[: (first + end) // 2])
+    video = open_video(path)
+    read = len(list(video.pictures()))
+    assert 0 < read < count
+    assert any(f"claims {2 * count} frames; {read} could be read" in words for words in video.lost), video.lost
