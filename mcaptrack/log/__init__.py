@@ -7,7 +7,7 @@ check(path)                             is it sound
 recover(path, output)                   what is whole in it, as a new one
 """
 
-from mcaptrack.log.change import extend
+from mcaptrack.log.change import extend, refuse_recorded
 from mcaptrack.log.check import Checked, check
 from mcaptrack.log.check_summary import Finding
 from mcaptrack.log.messages import Columns, Message, Places
@@ -33,6 +33,7 @@ __all__ = [
     "profile",
     "read",
     "recover",
+    "refuse_recorded",
     "stream",
     "topics_with_schema",
 ]

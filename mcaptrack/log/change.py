@@ -24,6 +24,7 @@ from mcaptrack.log.reader import Log
 from mcaptrack.log.records import BLOCK, MAGIC, Bytes, ChunkIndexRecord, Damaged, Record, crc_of, walk
 from mcaptrack.log.source import Source
 from mcaptrack.log.writer import LogWriter, Sink, refuse_earlier_results, verify
+from mcaptrack.provenance import Provenance
 
 
 @contextmanager
@@ -52,6 +53,22 @@ def extend(
         opened = _in_place(log, change) if output is None and change.is_small else _as_copy(log, change, output)
         with opened as writer:
             yield writer
+
+
+def refuse_recorded(log: Log, topics: Collection[str], instead: str) -> None:
+    """Raise McaptrackError if others recorded a channel of these topics: results never take its place.
+
+    Of several channels that share a topic every one counts, in the log and in its results. ``instead`` says what to do.
+    """
+    for part in log.parts:
+        for channel in part.index.channels.values():
+            if channel.topic in topics and not Provenance.from_metadata(channel.metadata):
+                schema = part.index.schemas.get(channel.schema_id)
+                name = schema.name if schema else "no schema"
+                raise McaptrackError(
+                    f"{part.path} has {channel.topic}, which others recorded ({name}) and which is never replaced; "
+                    f"{instead}"
+                )
 
 
 @contextmanager

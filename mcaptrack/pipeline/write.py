@@ -91,6 +91,8 @@ def write(
     new = {attachment_of(name): content for name, content in layout_files.items()}
     standing = {name for name, content in new.items() if opened.attachment(name) == content}
     replaced = [name for name in ATTACHMENTS if name not in standing]
+    new_topics = {*made, *outdated, *(view.topic for view in (*drawn_first, *drawn_last))}
+    log.refuse_recorded(opened, new_topics, f"`mcaptrack drop {opened.path} TOPIC -o FILE` makes a log without it")
     with log.extend(opened, output, drop={*made, *outdated}, drop_attachments=replaced) as writer:
         streams: list[Iterator[Numbered]] = []
 
