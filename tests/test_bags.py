@@ -517,7 +517,7 @@ class TestBesideLabels:
 
     def test_of_several_cameras_one_is_chosen(self, tmp_path, files):
         camera_bag(tmp_path / "a.bag", "/left/image", "/right/image")
-        with pytest.raises(McaptrackError, match=r"the log has /left/image, /right/image. Choose one with --camera"):
+        with pytest.raises(McaptrackError, match=r"/left/image, /right/image; .* choose with --camera left"):
             make(tmp_path / "a.bag", tmp_path / "a.mcap", **files)
         assert not (tmp_path / "a.mcap").exists()
         assert make(tmp_path / "a.bag", tmp_path / "a.mcap", camera="right", **files).messages["/right/truth"] == 30
@@ -529,17 +529,19 @@ class TestBesideLabels:
 
 
 class TestInto:
-    def test_a_bag_is_added_to_a_log_and_to_no_log_twice(self, tmp_path):
+    def test_a_bag_is_added_to_a_log_and_replaces_no_channel_of_it(self, tmp_path):
         said = bag1(tmp_path / "a.bag", 10, 100)
-        other = bag2(tmp_path / "bag")
-        make(tmp_path / "bag", tmp_path / "a.mcap")
-        words = ["ingest", str(tmp_path / "a.bag"), "--into", str(tmp_path / "a.mcap")]
-        result = CliRunner().invoke(app, words)
-        assert result.exit_code == 1
-        assert "has /silent, /talk already; --force replaces them" in result.stderr
-        assert CliRunner().invoke(app, [*words, "--force"]).exit_code == 0
-        kept = [message for message in other if message[0] == "/image"]
-        assert recorded(tmp_path / "a.mcap") == sorted(said + kept)
+        camera_bag(tmp_path / "b.bag", "/robot/image", frames=3)
+        make(tmp_path / "b.bag", tmp_path / "b.mcap")
+        other = recorded(tmp_path / "b.mcap")
+        words = ["ingest", str(tmp_path / "a.bag"), "--into", str(tmp_path / "b.mcap")]
+        assert CliRunner().invoke(app, words).exit_code == 0
+        assert recorded(tmp_path / "b.mcap") == sorted(said + other)
+        for force in ([], ["--force"]):
+            result = CliRunner().invoke(app, [*words, *force])
+            assert result.exit_code == 1
+            assert "which others recorded (std_msgs/String) and which is never replaced; make" in result.stderr
+            assert recorded(tmp_path / "b.mcap") == sorted(said + other)
 
     @pytest.mark.parametrize("chunks", [True, False])
     def test_an_mcap_file_is_added_with_all_that_is_in_it(self, tmp_path, chunks):

@@ -91,7 +91,7 @@ def test_kitti_counts_pedestrians_and_forgives_what_it_says(tmp_path):
     row, _ = scores(a, b)
     assert (row["GT"], row["FN"], row["FP"]) == (1, 0, 5)  # false: who stands where the car is
     b.write_text("\n".join(kitti(0, 1, "Car", 1.0) for _ in range(2)))
-    with pytest.raises(McaptrackError, match="holds no pedestrians, only car"):
+    with pytest.raises(McaptrackError, match="holds no pedestrians, only 2 Car"):
         compare_files(a, b)
 
 

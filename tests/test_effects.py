@@ -84,6 +84,8 @@ CASES: dict[str, dict[str, Case]] = {
         tracks="--tracks truth.txt",
         truth="--truth truth.txt",
         format=("ingest truth.txt --fps 10", "--format kitti"),
+        first_frame=("ingest truth.txt --fps 10", "--first-frame 0"),
+        frames=("ingest truth.txt --fps 10", "--frames 500"),
         **{"as": ("ingest truth.txt --fps 10", "--as truth")},
         into=("ingest truth.txt --fps 10 --as tracks", "--into a.mcap"),
         force=("ingest clip.mp4 -o a.mcap", "--force"),

@@ -53,7 +53,7 @@ class TestLabels:
         labels = read_labels(write(tmp_path / "a.txt", SDD))
         assert (labels.format, labels.first_frame) == ("sdd", 0)
         assert labels.boxes_px.tolist() == [[10, 20, 4, 8], [11, 20, 4, 8]]
-        assert labels.left_out == "1 boxes of others than pedestrians and 1 boxes out of sight (lost)"
+        assert labels.left_out == "1 Biker and 1 boxes out of sight (lost)"
 
     @pytest.mark.parametrize("text", [TRAJNET, TRAJNET.replace(" ", ","), TRAJNET.replace(" ", "\t")])
     def test_trajnet_by_hand(self, tmp_path, text):
@@ -78,13 +78,13 @@ class TestLabels:
         "half a frame": (
             "1.5,1,1,1,2,2\n",
             "auto",
-            r"a\.txt:1: the frame has to be a whole number from 0 on, not 1\.5",
+            r"a\.txt:1: the frame \(a count of pictures, no time\) has to be a whole number from 0 on, not 1\.5",
         ),
         "negative width": ("1,1,1,1,-2,2\n", "auto", r"a\.txt:1: a box can't be -2 wide"),
         "not a number": ("1,1,nan,1,2,2\n", "auto", r"a\.txt:1: a number is not finite"),
         "twice in one frame": ("1,4,1,1,2,2\n1,4,5,5,2,2\n", "auto", r"id 4 appears twice in frame 1"),
         "nothing": ("\n\n", "auto", "holds no labels"),
-        "sdd without people": (SDD.replace("Pedestrian", "Cart"), "sdd", "holds no pedestrians, only Biker, Cart"),
+        "sdd without people": (SDD.replace("Pedestrian", "Cart"), "sdd", "holds no pedestrians, only 3 Cart, 1 Biker"),
         "words in a score": ("1,1,1,1,2,2,high\n", "auto", "not all are numbers"),
     }
 
@@ -95,7 +95,7 @@ class TestLabels:
 
     def test_what_is_no_text_is_said(self, tmp_path):
         (tmp_path / "a.txt").write_bytes(b"\xff\xfe\x00\x00" * 10)
-        with pytest.raises(McaptrackError, match="it is not text"):
+        with pytest.raises(McaptrackError, match="is not text"):
             read_labels(tmp_path / "a.txt")
         with pytest.raises(McaptrackError, match="can't be read"):
             read_labels(tmp_path / "none.txt")
@@ -146,11 +146,11 @@ class TestIngest:
             assert (made.transform, made.parameters) == ("ingest", {"file": "gt.txt", "format": "mot"})
 
     def test_labels_of_every_twelfth_frame_leave_the_others_unsaid(self, tmp_path, clip):
-        truth = write(tmp_path / "gt.txt", TRAJNET.replace("24 7", "36 7"))
+        truth = write(tmp_path / "gt.txt", TRAJNET.replace("24 7 1.7 2.5\n", ""))
         out = tmp_path / "a.mcap"
         report = ingest(clip, out, options(labels={"truth": truth}))
         assert report.messages["/camera/truth"] == 2  # frames 0 and 12 of 20
-        assert "1 labels are of frames after the last picture" in report.lost[0]
+        assert report.said == [f"{truth} has labels every 12 frames, from 0 on; the frames in between are left out"]
 
     def test_labels_alone_keep_their_own_clock(self, tmp_path):
         out = tmp_path / "a.mcap"
@@ -164,29 +164,66 @@ class TestIngest:
             ]
 
     def test_label_files_of_one_log_share_a_clock(self, tmp_path):
-        """Boxes at every frame that begin at frame 8, truth at every twelfth: both count from the same frame 0."""
+        """Boxes at every frame that begin at frame 8, truth at every twelfth: frame 1 of these is frame 0 of those."""
         found = write(tmp_path / "det.txt", "".join(f"{n},-1,10,20,4,8,1,-1,-1,-1\n" for n in range(8, 30)))
         truth = write(tmp_path / "gt.txt", TRAJNET)
         out = tmp_path / "a.mcap"
         ingest(found, out, options(fps=Fraction(30), labels={"truth": truth}))
         with log.read(out) as opened:
-            assert opened.frames("/camera/detections", DETECTIONS)[0].t_ns == ns(8 / 30)
+            frames = opened.frames("/camera/detections", DETECTIONS)
+            assert [(f.t_ns, len(f.rows)) for f in frames] == [(ns(k / 30), int(k > 6)) for k in range(29)]
             assert [f.t_ns for f in opened.frames("/camera/truth", TRACKS)] == [0, ns(0.4), ns(0.8)]
             assert opened.metadata(CLOCK) == {"start_ns": "0"}
 
-    def test_empty_frames_between_labels_say_nobody(self, tmp_path):
+    def test_empty_frames_before_between_and_after_labels_are_data(self, tmp_path):
         out = tmp_path / "a.mcap"
-        ingest(write(tmp_path / "t.txt", "1,4,1,1,2,2\n2,4,1,1,2,2\n5,4,1,1,2,2\n"), out, options(fps=Fraction(10)))
+        found = write(tmp_path / "t.txt", "3,4,1,1,2,2\n4,4,1,1,2,2\n7,4,1,1,2,2\n")
+        report = ingest(found, out, options(fps=Fraction(10), frames=9))
+        assert report.said == [f"{found}: 9 frames (by --frames) from 1 on, 10 a second (by --fps)"]
         with log.read(out) as opened:
-            assert [len(f.rows) for f in opened.frames("/camera/tracks", TRACKS)] == [1, 1, 0, 0, 1]
+            assert [len(f.rows) for f in opened.frames("/camera/tracks", TRACKS)] == [0, 0, 1, 1, 0, 0, 1, 0, 0]
+        report = ingest(found, out, options(fps=Fraction(10)))
+        assert report.said == [f"{found}: 7 frames (by the last label) from 1 on, 10 a second (by --fps)"]
+        with log.read(out) as opened:
+            assert [len(f.rows) for f in opened.frames("/camera/tracks", TRACKS)] == [0, 0, 1, 1, 0, 0, 1]
 
-    def test_the_frame_rate_of_a_sequence_is_read_beside_it(self, tmp_path):
-        (tmp_path / "gt").mkdir()
-        write(tmp_path / "seqinfo.ini", "[Sequence]\nname=x\nframeRate=14\n")
+    def test_what_is_left_out_of_labels_was_still_looked_at(self, tmp_path):
+        """A frame with nothing but a distractor is a frame; so is one with nothing but a car."""
+        rows = [(1, 1), (2, 7), (4, 1), (5, 3)]
+        found = write(tmp_path / "gt.txt", "".join(f"{n},{n},1,1,2,2,1,{kind},1\n" for n, kind in rows))
         out = tmp_path / "a.mcap"
-        ingest(write(tmp_path / "gt" / "gt.txt", MOT15), out, options(role="truth"))
+        ingest(found, out, options(role="truth", fps=Fraction(10)))
         with log.read(out) as opened:
-            assert [f.t_ns for f in opened.frames("/camera/truth", TRACKS)] == [ns(1 / 14), ns(2 / 14)]
+            assert [ids(f) for f in opened.frames("/camera/truth", TRACKS)] == [[1], [], [], [4], []]
+
+    def test_rate_and_length_of_a_sequence_are_read_beside_it(self, tmp_path):
+        (tmp_path / "gt").mkdir()
+        write(tmp_path / "seqinfo.ini", "[Sequence]\nname=x\nframeRate=14\nseqLength=4\n")
+        out = tmp_path / "a.mcap"
+        found = write(tmp_path / "gt" / "gt.txt", MOT15)
+        report = ingest(found, out, options(role="truth"))
+        assert report.said == [f"{found}: 4 frames (by seqinfo.ini) from 1 on, 14 a second (by seqinfo.ini)"]
+        with log.read(out) as opened:
+            frames = opened.frames("/camera/truth", TRACKS)
+            assert [(f.t_ns, ids(f)) for f in frames] == [
+                (0, [3, 5]),
+                (ns(1 / 14), [3]),
+                (ns(2 / 14), []),
+                (ns(3 / 14), []),
+            ]
+        report = ingest(found, out, options(role="truth", fps=Fraction(7), frames=3))
+        assert [(notice.message, notice.code) for notice in report.warnings] == [
+            (f"{found}: 14 frames a second by seqinfo.ini, and 7 by --fps, which is taken", "clock")
+        ]
+        write(tmp_path / "seqinfo.ini", "frameRate=14\nseqLength=1\n")
+        with pytest.raises(
+            McaptrackError, match=r"the frames that seqinfo\.ini counts end with frame 1, the labels with"
+        ):
+            ingest(found, out, options(role="truth"))
+        for rate in ("1.2.3", "9" * 5000, "0", "1e-30"):
+            write(tmp_path / "seqinfo.ini", f"frameRate={rate}\n")
+            with pytest.raises(McaptrackError, match=r"seqinfo\.ini: frameRate is no number of frames a second"):
+                ingest(found, out, options(role="truth"))
 
     def test_labels_are_added_to_a_log_that_stands(self, tmp_path, clip):
         out = tmp_path / "a.mcap"

@@ -9,6 +9,7 @@ import re
 import shlex
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import duckdb
@@ -80,10 +81,10 @@ def square(tmp_path_factory) -> Path:
     options = IngestOptions(fps=demo_scene().fps, ground_plane=footage.ground_plane, role="truth")
     ingest(footage.truth, folder / "labels.mcap", options)
     with log.read(folder / "labels.mcap") as opened:
-        # Labels alone begin with frame 1; beside a video the first is that of the first picture.
-        step = opened.start_ns
-        frames = [Frame(f.t_ns - step, f.index - 1, f.rows) for f in opened.frames("/camera/truth", TRACKS)]
+        frames = opened.frames("/camera/truth", TRACKS)
         made = Provenance.from_metadata(opened.channel("/camera/truth").metadata)
+    # Labels alone say their frame rate; those of the demonstration stand beside a video.
+    made = replace(made, parameters={key: value for key, value in made.parameters.items() if key != "fps"})
     write_log(folder / "demo.mcap", {"/camera/truth": (TRACKS, made, frames)})
     with log.read(folder / "demo.mcap") as opened:
         export(opened, folder / "demo.tables")

@@ -183,7 +183,7 @@ def _from_logs(paths: Sequence[Path], camera: str | None, topics: tuple[str, ...
 def _from_files(
     tracks: Sequence[Path], truths: Sequence[Path], given: dict[str, Any], talk: common.Talk
 ) -> list[Sequenced]:
-    from mcaptrack.cli.ingest import _fps
+    from mcaptrack.cli.ingest import parse_fps
     from mcaptrack.evaluation import sequence_of_files
     from mcaptrack.ingest.compared import compare_files, pair_files
 
@@ -192,7 +192,9 @@ def _from_files(
         talk.say(words)
     sequences = []
     for name, path, truth in pairs:
-        both = compare_files(path, truth, _fps(given["fps"]), given["ground_plane"], given["point"], given["topics"])
+        both = compare_files(
+            path, truth, parse_fps(given["fps"]), given["ground_plane"], given["point"], given["topics"]
+        )
         for note in both.notes:
             talk.say(note)
         sequences.append(sequence_of_files(name, path, both.truth, both.tracks, len(pairs)))

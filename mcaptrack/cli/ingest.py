@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -14,7 +13,7 @@ from mcaptrack.cli.command import warn_unused
 from mcaptrack.errors import McaptrackError
 
 if TYPE_CHECKING:
-    from mcaptrack.ingest import IngestOptions
+    from mcaptrack.ingest import IngestOptions, Report
 
 Inputs = Annotated[
     list[Path],
@@ -28,10 +27,6 @@ Inputs = Annotated[
 
 def _label_file(words: str) -> Any:
     return common.option(panel=common.FILES, help=f"Label file of the pictures: {words}.")
-
-
-#: The channels that label files become.
-_OF_LABELS: Final = frozenset({"detections", "tracks", "truth", "ground_plane"})
 
 
 @common.one_line
@@ -94,6 +89,22 @@ def ingest(
         Literal["auto", "mot", "kitti", "sdd", "trajnet", "obsmat"],
         common.option("--format", tuning=True, help="Format of the label files."),
     ] = "auto",
+    first_frame: Annotated[
+        int | None,
+        common.option(
+            "--first-frame",
+            help="Number that label files give the first picture.",
+            show_default="1 in MOTChallenge, otherwise 0",
+        ),
+    ] = None,
+    frames: Annotated[
+        int | None,
+        common.option(
+            "--frames",
+            help="How many frames there are, where labels have no pictures.",
+            show_default="as seqinfo.ini says, otherwise up to the last label",
+        ),
+    ] = None,
     role: Annotated[
         Literal["detections", "tracks", "truth"] | None,
         common.option("--as", help="What INPUT holds, if it is a label file.", show_default="as its ids tell"),
@@ -131,7 +142,7 @@ def ingest(
     given = {"detections": detections, "tracks": tracks, "truth": truth}
     options = IngestOptions(
         camera=camera,
-        fps=_fps(fps),
+        fps=parse_fps(fps),
         start_ns=_start_ns(start_time),
         image_format=image_format,
         quality=quality,
@@ -140,6 +151,8 @@ def ingest(
         point=point,
         labels={name: path for name, path in given.items() if path is not None},  # type: ignore[misc]
         label_format=label_format,
+        first_frame=first_frame,
+        frames=frames,
         role=role,
     )
     results, lost = [], False
@@ -153,7 +166,7 @@ def ingest(
                 with log.read(into) as opened:
                     opened.lock()
                     report = make_log(source, target, options, into=opened, force=force, progress=talk.progress)
-            _warn_unused(report.messages, options)
+            _warn_unused(report, options)
             for words in report.said:
                 talk.say(words)
             for words in report.notes:
@@ -176,29 +189,26 @@ def ingest(
         raise typer.Exit(common.LOST)
 
 
-def _warn_unused(topics: Mapping[str, int], options: IngestOptions) -> None:
-    """Say which options are about what wasn't there, as the topics that were written tell."""
-    prefix = f"/{options.camera.strip('/')}/"
-    ours = {topic.removeprefix(prefix) for topic in topics if topic.startswith(prefix)}
-    if not options.labels and set(topics) != {prefix + name for name in ours & _OF_LABELS}:
+def _warn_unused(report: Report, options: IngestOptions) -> None:
+    """Say which options are about what wasn't there."""
+    if not report.has_labels:
         warn_unused("there is no label file", "label_format")
     if options.ground_plane is None:
         warn_unused("there is no ground plane", "point")
-    if not ours:
+    if not report.uses_camera:
         warn_unused("the channels of a recording keep their names", "camera")
 
 
-def _fps(text: str | None) -> Fraction | None:
+def parse_fps(text: str | None) -> Fraction | None:
     """Frames per second from "25", "29.97" or "30000/1001"."""
-    if text is None:
-        return None
+    from mcaptrack import clock
+
     try:
-        fps = Fraction(text)
-    except (ValueError, ZeroDivisionError):
-        fps = Fraction(0)
-    if not 0 < fps <= 10_000:
-        raise McaptrackError(f"--fps needs a number like 25, 29.97 or 30000/1001, not {text!r}")
-    return fps
+        return None if text is None else clock.parse_fps(text)
+    except ValueError:
+        raise McaptrackError(
+            f"--fps needs a number like 25, 29.97 or 30000/1001, from one frame a day to 10000 a second, not {text!r}"
+        ) from None
 
 
 def _start_ns(text: str | None) -> int | None:
@@ -207,9 +217,11 @@ def _start_ns(text: str | None) -> int | None:
         return None
     from datetime import UTC, datetime
 
+    from mcaptrack.clock import LAST_NS, NS_PER_S, parse_ratio
+
     try:
-        seconds = Fraction(text)
-    except (ValueError, ZeroDivisionError):
+        seconds = parse_ratio(text)
+    except ValueError:
         try:
             moment = datetime.fromisoformat(text)
         except ValueError:
@@ -219,6 +231,6 @@ def _start_ns(text: str | None) -> int | None:
         moment = moment if moment.tzinfo else moment.replace(tzinfo=UTC)
         passed = moment - datetime(1970, 1, 1, tzinfo=UTC)
         seconds = Fraction(passed.days * 86400 + passed.seconds) + Fraction(passed.microseconds, 1_000_000)
-    if not 0 <= seconds < 2**63 // 10**9:
+    if not 0 <= seconds < LAST_NS // NS_PER_S:
         raise McaptrackError(f"--start-time has to lie between 1970 and 2262, not {text!r}")
-    return round(seconds * 10**9)
+    return round(seconds * NS_PER_S)

@@ -155,10 +155,10 @@ def train(
 
 
 def _options(fps: str | None, ground_plane: Path | None, point: Literal["center", "foot"], topic: str | None) -> Any:
-    from mcaptrack.cli.ingest import _fps
+    from mcaptrack.cli.ingest import parse_fps
     from mcaptrack.training.sources import SourceOptions
 
-    return SourceOptions(fps=_fps(fps), ground_plane=ground_plane, point=point, topic=topic)
+    return SourceOptions(fps=parse_fps(fps), ground_plane=ground_plane, point=point, topic=topic)
 
 
 def _windows(

@@ -171,7 +171,7 @@ def _ranges(kind: type[Transform], wanted: Sequence[str]) -> dict[str, Range]:
 def _tasks_of_files(
     paths: Sequence[Path], truths: Sequence[Path], stage: str, given: dict[str, Any], talk: common.Talk
 ) -> list[Task]:
-    from mcaptrack.cli.ingest import _fps
+    from mcaptrack.cli.ingest import parse_fps
     from mcaptrack.ingest.compared import detections_and_truth, pair_files
     from mcaptrack.tuning import Task
 
@@ -182,7 +182,7 @@ def _tasks_of_files(
         talk.say(words)
     tasks = []
     for name, path, truth in pairs:
-        found = detections_and_truth(path, truth, _fps(given["fps"]), given["ground_plane"], given["point"])
+        found = detections_and_truth(path, truth, parse_fps(given["fps"]), given["ground_plane"], given["point"])
         tasks.append(Task(name, found.detections, found.truth, {"ground_planes": found.planes}))
     return tasks
 

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from array import array
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Final
 
+import numpy as np
+
 from mcaptrack import foreign, log
 from mcaptrack.errors import McaptrackError
-from mcaptrack.ingest.job import IngestOptions, PictureJob, Progress
+from mcaptrack.ingest.cameras import choose, picture_test, timeline_of
+from mcaptrack.ingest.job import IngestOptions, Job, Progress
 from mcaptrack.ingest.source import Connection, Found, Source
+from mcaptrack.ingest.timeline import Timeline
 from mcaptrack.plane import GroundPlane
 from mcaptrack.video import Encoded, brightness
 
@@ -20,10 +25,12 @@ _MAX_MESSAGE_BYTES: Final = 2**28 - 2**24
 _PROGRESS_EVERY: Final = 256
 
 
-class LogJob(PictureJob):
+class LogJob(Job):
     """A recording, with labels beside its pictures."""
 
-    def __init__(self, source: Path, options: IngestOptions, recorded: Source, progress: Progress) -> None:
+    def __init__(
+        self, source: Path, options: IngestOptions, recorded: Source, progress: Progress, there: log.Log | None = None
+    ) -> None:
         self._recorded, self._progress = recorded, progress
         try:
             for given, name in (
@@ -31,42 +38,41 @@ class LogJob(PictureJob):
                 (options.start_ns is not None, "--start-time"),
                 (options.for_videos(), options.for_videos()),
                 (options.role, "--as"),
+                (options.frames is not None, "--frames"),
             ):
                 if given:
                     raise McaptrackError(
                         f"{source} is a log: its messages stay as they are, and so do their times; leave {name} out"
                     )
-            super().__init__(source, options)
+            super().__init__(source, options, there)
             #: What is passed on as a whole, if anything is.
             self._passed_on: log.Log | None = None
             #: The connections with the pictures that labels belong to.
-            self._pictures: list[Connection] = []
+            self._connections: list[Connection] = []
             self._channels: dict[Connection, int] = {}
             self._written: dict[int, int] = {}
             if self.labels or self.homography:
-                self.prefix, self._pictures = self._find_pictures()
+                self._find_pictures()
         except BaseException:
             recorded.close()
             raise
         self._close.callback(recorded.close)
 
-    def _find_pictures(self) -> tuple[str, list[Connection]]:
-        """The camera that labels belong to: the only one with pictures, or the one that --camera names."""
+    def _find_pictures(self) -> None:
+        """Find the camera that labels belong to: the only one with pictures, or the one that --camera names."""
         by_topic: dict[str, list[Connection]] = {}
         for connection in self._recorded.connections:
             is_empty = self._recorded.claims is not None and not self._recorded.claims[connection]
             if foreign.is_picture(connection.schema[0]) and not is_empty:
                 by_topic.setdefault(connection.topic, []).append(connection)
-        there = ", ".join(sorted(by_topic)) or "none"
-        chosen = [topic for topic in by_topic if _prefix(topic) == self.prefix]
-        if not chosen and self.options.camera == "camera":
-            chosen = list(by_topic)
-        if len(chosen) != 1:
+        self.prefix, self.pictures = choose(self.source, self.options.camera, by_topic)
+        if not self.pictures:
             raise McaptrackError(
-                f"{self.source}: labels and ground planes belong to the pictures of one camera; the log has {there}. "
-                "Choose one with --camera, the part of its topic before the last /"
+                f"{self.source}: labels and ground planes belong to the pictures of one camera; the log has "
+                f"{', '.join(sorted(by_topic)) or 'none'}. Choose one with --camera, the part of its topic before the "
+                "last /"
             )
-        return _prefix(chosen[0]), by_topic[chosen[0]]
+        self._connections = by_topic[self.pictures]
 
     def topics(self) -> Iterator[str]:
         """The topics that are new in the log: of a recording that is passed on, those of labels."""
@@ -84,22 +90,26 @@ class LogJob(PictureJob):
         self._passed_on = self._recorded.as_it_is
         if self._passed_on is not None:
             return log.extend(self._passed_on, output, drop=self.taken(self._passed_on, force))
-        doubled = {c.topic for c in self._recorded.connections} & set(super().topics())
+        recorded = {connection.topic for connection in self._recorded.connections}
+        doubled = recorded & set(super().topics())
         if doubled:
-            raise McaptrackError(f"{self.source} has {', '.join(sorted(doubled))} already; leave those labels out")
+            raise McaptrackError(f"{self.source} has {', '.join(sorted(doubled))} already; {super().instead(recorded)}")
         return log.create(output, self._recorded.profile)
 
     def write(self, writer: log.LogWriter, has_clock: bool) -> None:
         """Write all that the recording holds, then labels."""
-        times = self._pass_on(writer) if self._passed_on else self._write_messages(writer)
+        timeline = self._pass_on(writer) if self._passed_on else self._write_messages(writer)
         self._recorded.extras(writer, has_clock, passed_on=self._passed_on is not None)
-        if self._pictures:
-            if not times:
-                raise McaptrackError(
-                    f"{self.source}: {self._pictures[0].topic} has no pictures that labels could be of"
-                )
-            self.write_plane(writer, self._plane(), times[0])
-            self.write_labels(writer, self._plane(), {role: self.label_times(role, times) for role in self.labels})
+        if self._connections:
+            if not len(timeline.t_ns):
+                raise McaptrackError(f"{self.source}: {self.pictures} has no pictures that labels could be of")
+            plane = self._plane()
+            self.write_plane(writer, plane, int(timeline.t_ns[0]))
+            self.write_labels(writer, plane, timeline)
+
+    def instead(self, topics: Collection[str]) -> str:
+        """Words on where to put a recording, or labels beside one, where topics are taken."""
+        return super().instead(topics) if self._passed_on else "make a log of its own of it with -o"
 
     def check(self, output: Path) -> None:
         """Every channel has the messages that were given to it."""
@@ -115,8 +125,8 @@ class LogJob(PictureJob):
 
     # Messages
 
-    def _pass_on(self, writer: log.LogWriter) -> list[int]:
-        """Count what is in the log that is passed on as it is; returns the times of the pictures."""
+    def _pass_on(self, writer: log.LogWriter) -> Timeline:
+        """Count what is in the log that is passed on as it is; returns the pictures that labels belong to."""
         opened = self._passed_on
         assert opened is not None
         for number in writer.channels:
@@ -124,16 +134,23 @@ class LogJob(PictureJob):
             if not self._written[number]:  # some writers describe channels without messages in the summary alone
                 writer.put_description(number)
         self._report({number: channel.topic for number, channel in writer.channels.items()})
-        found = Found()
-        if not self._pictures:
-            return []
-        if len(self._pictures) == 1:
-            return list(map(int, opened.times(self._pictures[0].topic)))
-        return sorted(m.t_ns for c, m in self._recorded.messages(found) if c in self._pictures)
+        if len(self._connections) == 1:
+            return timeline_of(opened, self.pictures)
+        holds_picture = self._holds_picture()
+        return self._timeline(m.t_ns for c, m in self._recorded.messages(Found()) if holds_picture(c, m.payload))
 
-    def _write_messages(self, writer: log.LogWriter) -> list[int]:
-        """Write all channels and messages; returns the times of the pictures."""
-        found, done, times = Found(), 0, list[int]()
+    def _timeline(self, t_ns: Iterable[int]) -> Timeline:
+        times = np.array(sorted(t_ns), np.int64)
+        return Timeline(np.arange(len(times)), times, f"the pictures of {self.pictures}", not self.report.lost)
+
+    def _holds_picture(self) -> Callable[[Connection, bytes], bool]:
+        """Whether a message is one of the pictures that labels belong to."""
+        kinds = {one: picture_test(foreign.Kind(*one.schema, one.encoding)) for one in self._connections}
+        return lambda connection, payload: connection in kinds and kinds[connection](payload)
+
+    def _write_messages(self, writer: log.LogWriter) -> Timeline:
+        """Write all channels and messages; returns the pictures that labels belong to."""
+        found, done, times, holds_picture = Found(), 0, array("q"), self._holds_picture()
         for connection in self._recorded.connections:
             self._channel(writer, connection)
         total = sum((self._recorded.claims or {}).values())
@@ -146,7 +163,7 @@ class LogJob(PictureJob):
                 )
             writer.add_message(number, message.t_ns, message.sequence, message.payload, message.publish_ns)
             self._written[number] += 1
-            if connection in self._pictures:
+            if holds_picture(connection, message.payload):
                 times.append(message.t_ns)
             done += 1
             if done % _PROGRESS_EVERY == 0:
@@ -156,7 +173,7 @@ class LogJob(PictureJob):
         self.report.lost += found.lost
         self._compare()
         self._report({number: connection.topic for connection, number in self._channels.items()})
-        return sorted(times)
+        return self._timeline(times)
 
     def _channel(self, writer: log.LogWriter, connection: Connection) -> None:
         number = writer.add_channel(
@@ -195,25 +212,18 @@ class LogJob(PictureJob):
             return None
         first = next(brightness(self._encoded()), None)
         if first is None:
-            raise McaptrackError(f"{self.source}: {self._pictures[0].topic} has no picture that can be decoded")
+            raise McaptrackError(f"{self.source}: {self.pictures} has no picture that can be decoded")
         height, width = first.rows.shape
         return self.plane(width, height)
 
     def _encoded(self) -> Iterator[Encoded]:
         """The pictures that labels belong to, as far as anybody asks."""
-        topic = self._pictures[0].topic
         decoders = {
             connection: foreign.picture_decoder(foreign.Kind(*connection.schema, connection.encoding))
-            for connection in self._pictures
+            for connection in self._connections
         }
         for index, (connection, message) in enumerate(self._recorded.messages(Found())):
             if connection in decoders:
                 picture = decoders[connection](message.payload)
-                where = f"{self.source}: {topic} at {message.t_ns} ns"
+                where = f"{self.source}: {self.pictures} at {message.t_ns} ns"
                 yield Encoded(message.t_ns, index, picture.format, picture.data, picture.layout, where)
-
-
-def _prefix(topic: str) -> str:
-    """What everything of a camera lies under."""
-    folder, slash, _ = topic.strip("/").rpartition("/")
-    return f"/{folder}" if slash else "/camera"

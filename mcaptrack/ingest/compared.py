@@ -20,12 +20,13 @@ from mcaptrack import ingest, tables
 from mcaptrack.boxes import iou
 from mcaptrack.clock import NS_PER_S
 from mcaptrack.errors import McaptrackError
-from mcaptrack.ingest.job import label_rows
-from mcaptrack.ingest.labels import KITTI_HEIGHT_PX, Aside, Labels, Role, read_homography, read_labels
+from mcaptrack.ingest.formats import KITTI_HEIGHT_PX, PERSON, Aside, Labels, Role
+from mcaptrack.ingest.job import IngestOptions, label_rows
+from mcaptrack.ingest.label_job import LabelJob
+from mcaptrack.ingest.labels import read_homography, read_labels
 from mcaptrack.match import solve
 from mcaptrack.plane import GroundPlane, Point
 from mcaptrack.schema import Frame
-from mcaptrack.video import seqinfo_fps
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -33,6 +34,8 @@ Bools = NDArray[np.bool_]
 #: Formats whose rows say in which frame of the video they are.
 _COUNTING: Final = ("mot", "kitti", "parquet")
 _ALIKE: Final = 0.5
+#: A file of nothing but blanks is no larger than this.
+_BLANK_BYTES: Final = 4096
 _EPS: Final = float(np.finfo(float).eps)
 
 
@@ -87,12 +90,12 @@ def compare_files(
         "tracks": (tracks, _read(tracks, "tracks", topics)),
     }
     formats = [labels.format for _, labels in both.values()]
-    notes = [f"{path} also holds {labels.left_out}" for path, labels in both.values() if labels.left_out]
     if not all(name in _COUNTING for name in formats) and len(set(formats)) > 1:
         if "parquet" in formats:
             raise McaptrackError(f"{tracks} and {truth} share no clock: one counts frames, the other does not")
         frames = ingest.label_frames({"tracks": tracks, "truth": truth}, fps, ground_plane, point)
-        return Compared(frames["truth"], frames["tracks"], notes)
+        return Compared(frames["truth"], frames["tracks"])
+    notes = [f"{path} also holds {labels.left_out}" for path, labels in both.values() if labels.left_out]
     if fps is not None:
         notes.append("frames are compared by their numbers, whatever the frames per second")
     return _by_number(both, ground_plane, point, notes)
@@ -114,27 +117,25 @@ def detections_and_truth(
 
     Raises McaptrackError if they can't be read, or if nothing says how many frames a second there are.
     """
-    found, true = read_labels(detections, role="detections"), _read(truth, "truth", ())
-    if found.boxes_px is None or true.boxes_px is None:
-        raise McaptrackError(f"{detections} and {truth} have to hold boxes in pixels, both")
-    fps = fps or seqinfo_fps(detections.parent) or seqinfo_fps(truth.parent)
-    if fps is None:
-        raise McaptrackError(f"{detections} has no clock of its own; give the frames per second with --fps")
-    plane = _plane(ground_plane, point, true, found)
-    out: list[list[Frame]] = []
-    parts: tuple[tuple[Role, Labels], ...] = (("detections", found), ("truth", true))
-    for role, labels in parts:
-        there = labels.frame - labels.first_frame
-        numbers = np.arange(int(there.min()), int(there.max()) + 1)
-        frames = _frames(labels, numbers, there, plane, role)
-        out.append([frame._replace(t_ns=round(frame.index / fps * NS_PER_S)) for frame in frames])
-    return Detected(out[0], out[1], ((0, plane),) if plane else ())
+    options = IngestOptions(fps=fps, ground_plane=ground_plane, point=point)
+    with _PairJob([("detections", detections), ("truth", truth)], options) as job:
+        if any(labels.boxes_px is None for _, labels in job.labels.values()):
+            raise McaptrackError(f"{detections} and {truth} have to hold boxes in pixels, both")
+        planes = ((0, job.ground),) if job.ground else ()
+        return Detected(job.all_frames("detections"), job.all_frames("truth"), planes)
+
+
+class _PairJob(LabelJob):
+    """Detections and the truth, which may be a table."""
+
+    def read(self, path: Path, role: Role) -> Labels:
+        return _read(path, role, ()) if role == "truth" else super().read(path, role)
 
 
 def _read(path: Path, role: Role, topics: Sequence[str]) -> Labels:
     if path.suffix.lower() in (".parquet", ".pq"):
         return _read_parquet(path, role, topics)
-    if role == "tracks" and path.is_file() and not path.read_bytes().strip():
+    if role == "tracks" and path.is_file() and _is_blank(path):
         return _nobody("mot")
     labels = read_labels(path, role=role)
     if not labels.identified:
@@ -142,10 +143,14 @@ def _read(path: Path, role: Role, topics: Sequence[str]) -> Labels:
     return labels
 
 
+def _is_blank(path: Path) -> bool:
+    return path.stat().st_size < _BLANK_BYTES and not path.read_bytes().strip()
+
+
 def _nobody(name: Any) -> Labels:
     """A file of tracks without any: a tracker that found nobody."""
     none = np.empty(0, np.int64)
-    return Labels(name, 1, none, none, np.empty((0, 4)), None, np.empty(0))
+    return Labels(name, 1, none, none, np.empty((0, 4)), None, np.empty(0), none, np.empty(0, np.uint32))
 
 
 def _read_parquet(path: Path, role: Role, topics: Sequence[str]) -> Labels:
@@ -176,13 +181,15 @@ def _read_parquet(path: Path, role: Role, topics: Sequence[str]) -> Labels:
         boxes[order],
         xy_m[order],
         table["score"][mine][order],
+        np.unique(frame),
+        np.full(len(frame), PERSON, np.uint32),
     )
 
 
 def _by_number(
     both: dict[Role, tuple[Path, Labels]], ground_plane: Path | None, point: Point, notes: list[str]
 ) -> Compared:
-    """Frames by their numbers, from the first to the last of either file, both counted from 0."""
+    """The frames that either file has rows of, by their numbers, both counted from 0."""
     truth, tracks = both["truth"][1], both["tracks"][1]
     plane = _plane(ground_plane, point, truth, tracks)
     there = {role: labels.frame - labels.first_frame for role, (_, labels) in both.items()}
@@ -196,12 +203,10 @@ def _by_number(
             words = [f"{both[role][0]} ({low} to {high})" for role, (low, high) in spans.items()]
             raise McaptrackError(f"the frames of {' and '.join(words)} never overlap, counted from 0")
     step = max(truth.step, tracks.step) if len(tracks.frame) else truth.step
-    low, high = (
-        int(edge) for edge in (np.min(np.concatenate([*there.values()])), np.max(np.concatenate([*there.values()])))
-    )
     sparse = truth if truth.step >= tracks.step or not len(tracks.frame) else tracks
-    start = int(sparse.frame[0] - sparse.first_frame) % step if step > 1 else low
-    numbers = np.arange(start + (max(low - start, 0) // step) * step, high + 1, step)
+    start = int(sparse.labelled[0] - sparse.first_frame) % step
+    numbers = np.unique(np.concatenate([*there.values()]))  # a frame without rows of either counts for nothing
+    numbers = numbers[numbers % step == start]
     frames = {role: _frames(labels, numbers, there[role], plane, role) for role, (_, labels) in both.items()}
     if truth.aside is not None and truth.boxes_px is not None:
         frames["tracks"], gone = _without_forgiven(frames["truth"], frames["tracks"], truth)

@@ -5,7 +5,8 @@ Letters: N rows.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+import json
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field
 from fractions import Fraction
@@ -17,7 +18,10 @@ from numpy.typing import NDArray
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
-from mcaptrack.ingest.labels import Format, Labels, Role, read_homography, read_labels
+from mcaptrack.ingest.formats import Format, Labels, Role
+from mcaptrack.ingest.labels import read_homography, read_labels
+from mcaptrack.ingest.timeline import Placed, Timeline
+from mcaptrack.notices import Notice, warn
 from mcaptrack.plane import GroundPlane, Point
 from mcaptrack.provenance import CLOCK, Provenance, digest
 from mcaptrack.schema import DETECTIONS, GROUND_PLANE, TRACKS, Frame, Rows, Schema
@@ -26,15 +30,22 @@ from mcaptrack.video import ImageFormat, Keep
 
 Ints = NDArray[np.int64]
 Progress = Callable[[str, int, int], None]
+#: Frames, from the beginning whenever it is called.
+Frames = Callable[[], Iterator[Frame]]
 
 _SCHEMA_OF: Final[Mapping[Role, Schema]] = {"detections": DETECTIONS, "tracks": TRACKS, "truth": TRACKS}
+#: The names of classes, by their numbers, in the metadata of a channel.
+_CLASSES: Final = "mcaptrack.classes"
+_BLOCK: Final = 4096
 
 
 @dataclass(frozen=True, kw_only=True)
 class IngestOptions:
     """How to make a log. ``labels`` maps what a label file says to the file; ``role`` is for an input that is one.
 
-    ``fps``, ``image_format``, ``quality`` and ``keyframe_interval_s`` are as in ``video.Keep``.
+    ``fps``, ``image_format``, ``quality`` and ``keyframe_interval_s`` are as in ``video.Keep``. ``first_frame`` is the
+    number that label files give the first picture, if it isn't that of their format; ``frames`` how many pictures there
+    are, where there are none.
     """
 
     camera: str = "camera"
@@ -47,6 +58,8 @@ class IngestOptions:
     point: Point = "foot"
     labels: Mapping[Role, Path] = field(default_factory=dict)
     label_format: Format = "auto"
+    first_frame: int | None = None
+    frames: int | None = None
     role: Role | None = None
 
     @property
@@ -71,29 +84,47 @@ class IngestOptions:
 
 @dataclass
 class Report:
-    """What became of an input: messages by topic, what to say of it (``notes``: to some), what was lost."""
+    """What became of an input: messages by topic, what to say of it (``notes``: to some), what was lost.
+
+    ``warnings`` are what was assumed, left out or looks odd. ``has_labels`` says whether there were label files, and
+    ``uses_camera`` whether anything was put below the camera's name.
+    """
 
     messages: dict[str, int] = field(default_factory=dict)
     said: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     lost: list[str] = field(default_factory=list)
+    warnings: list[Notice] = field(default_factory=list)
+    has_labels: bool = False
+    uses_camera: bool = False
 
 
 class Job:
-    """What videos and labels have in common: the topics of a camera, its ground plane, rows to messages."""
+    """What videos and labels have in common: the topics of a camera, its ground plane, rows to messages.
+
+    ``there`` is the log that a job adds to, if it doesn't make one.
+    """
 
     #: Whether a clock that a log has is replaced by the job's own.
     drops_clock = False
+    #: What a camera is called that stands beside one whose topics are taken.
+    beside = "{camera}/labels"
 
-    def __init__(self, source: Path, options: IngestOptions) -> None:
+    def __init__(self, source: Path, options: IngestOptions, there: log.Log | None = None) -> None:
         self._close = ExitStack()
-        self.source, self.options, self.report = source, options, Report()
+        self.source, self.options, self.there, self.report = source, options, there, Report()
         self.prefix = "/" + options.camera.strip("/")
+        #: The topic of the pictures that labels belong to, if there is one.
+        self.pictures = ""
         self.homography = read_homography(options.ground_plane) if options.ground_plane else None
         self.labels: dict[Role, tuple[Path, Labels]] = {
-            role: (path, read_labels(path, options.label_format, role)) for role, path in options.labels.items()
+            role: (path, self.read(path, role)) for role, path in options.labels.items()
         }
         self.check_labels()
+
+    def read(self, path: Path, role: Role) -> Labels:
+        """A label file, as the options have it."""
+        return read_labels(path, self.options.label_format, role, self.options.first_frame)
 
     def check_labels(self) -> None:
         """Refuse labels that can't be what they are given as."""
@@ -102,8 +133,24 @@ class Job:
                 raise McaptrackError(f"{path} holds positions, not boxes; detections are boxes")
             if role != "detections" and not labels.identified:
                 raise McaptrackError(f"{path} says of nobody who it is (all ids are -1); {role} need ids")
+
+    def tell(self) -> None:
+        """Say what of the labels is left out or taken for something."""
+        firsts = {labels.first_frame: f"frame {labels.first_frame} of {path}" for path, labels in self.labels.values()}
+        if len(firsts) > 1:
+            warn(f"{' and '.join(firsts.values())} are taken as one picture; --first-frame says otherwise", "clock")
+        for role, (path, labels) in self.labels.items():
             if labels.left_out:
-                self.report.notes.append(f"{path} also holds {labels.left_out}; they are left out")
+                warn(f"{path} also holds {labels.left_out}; left out of {role}", "left-out")
+            if labels.step > 1:
+                words = f"{path} has labels every {labels.step} frames, from {labels.labelled[0]} on"
+                self.report.said.append(f"{words}; the frames in between are left out")
+            if role == "detections" and len(set(labels.class_id.tolist())) > 1:
+                ids, counts = np.unique(labels.class_id, return_counts=True)
+                names = [f" {labels.classes[number]}" if number in labels.classes else "" for number in ids.tolist()]
+                found = zip(ids.tolist(), names, counts.tolist(), strict=True)
+                words = ", ".join(f"{number}{name} ({count})" for number, name, count in found)
+                self.report.said.append(f"{path} has several classes; class_id is {words}")
 
     def __enter__(self) -> Self:
         return self
@@ -122,11 +169,26 @@ class Job:
         return log.extend(into, drop=taken, drop_metadata=[CLOCK] if self.drops_clock else [])
 
     def taken(self, there: log.Log | None, force: bool) -> set[str]:
-        """The topics of a log that this job replaces."""
+        """The topics of a log that this job replaces.
+
+        Raises McaptrackError if others recorded one of them, whatever ``force`` is, and without it if there is any.
+        """
         taken = set(self.topics()) & set(there.channels) if there else set()
-        if taken and there and not force:
+        if there and taken:
+            log.refuse_recorded(there, taken, self.instead(there.channels))
+        if there and taken and not force:
             raise McaptrackError(f"{there.path} has {', '.join(sorted(taken))} already; --force replaces them")
         return taken
+
+    def instead(self, topics: Collection[str]) -> str:
+        """Words on where to write where topics are taken."""
+        ends = [topic.removeprefix(self.prefix) for topic in self.topics() if topic.startswith(self.prefix)]
+        name = free = self.beside.format(camera=self.prefix.strip("/"))
+        number = 1
+        while any(f"/{free}{end}" in topics for end in ends):
+            number += 1
+            free = f"{name}{number}"
+        return f"--camera {free} puts these beside them"
 
     def write(self, writer: log.LogWriter, has_clock: bool) -> None:
         """Write all channels; ``has_clock`` says that the log has a clock already."""
@@ -155,77 +217,69 @@ class Job:
         if plane is not None and self.options.ground_plane:
             rows = plane_to_rows(plane)
             words = {"file": self.options.ground_plane.name, "point": self.options.point}
-            self.write_rows(writer, "ground_plane", GROUND_PLANE, [Frame(t_ns, 0, rows)], words)
+            self.write_rows(writer, "ground_plane", GROUND_PLANE, lambda: iter([Frame(t_ns, 0, rows)]), words)
 
-    def write_labels(
-        self, writer: log.LogWriter, plane: GroundPlane | None, times: dict[Role, tuple[Ints, Ints]]
-    ) -> None:
-        """``times`` gives for each label file its frames (in the file's numbers) and their times."""
+    def write_labels(self, writer: log.LogWriter, plane: GroundPlane | None, timeline: Timeline) -> None:
+        """Write the labels, each frame at the time of its picture."""
         for role, (path, labels) in self.labels.items():
-            numbers, t_ns = times[role]
-            frames = self.frames(role, plane, numbers, t_ns)
-            words = {"file": path.name, "format": labels.format}
-            self.write_rows(writer, role, _SCHEMA_OF[role], frames, words)
+            placed = timeline.place(path, labels, self.report.lost)
+            words: dict[str, Any] = {"file": path.name, "format": labels.format} | self.label_words(labels)
+            classes = {str(number): name for number, name in labels.classes.items()} if role == "detections" else {}
+            frames = self.frames(role, plane, placed)
+            self.write_rows(writer, role, _SCHEMA_OF[role], frames, words, classes)
 
-    def frames(self, role: Role, plane: GroundPlane | None, numbers: Ints, t_ns: Ints) -> list[Frame]:
-        """The labels of the frames with these ``numbers`` in the file, at these times; empty ones too."""
+    def label_words(self, labels: Labels) -> dict[str, Any]:
+        """What else the provenance of labels says."""
+        return {} if self.options.first_frame is None else {"first_frame": labels.first_frame}
+
+    def frames(self, role: Role, plane: GroundPlane | None, placed: Placed) -> Frames:
+        """The labels of these frames; empty ones too."""
         labels = self.labels[role][1]
         rows = label_rows(labels, role, plane)
-        first, last = (np.searchsorted(labels.frame, numbers, side) for side in ("left", "right"))
-        columns = (t_ns, self.frame_index(labels, numbers), first, last)
-        spans = zip(*(column.tolist() for column in columns), strict=True)
-        return [Frame(time, index, rows[low:high]) for time, index, low, high in spans]
+        first, last = (np.searchsorted(labels.frame, placed.number, side) for side in ("left", "right"))
 
-    def frame_index(self, labels: Labels, numbers: Ints) -> Ints:
-        """The frames, counted from 0, of a label file's numbers."""
-        return numbers
+        def frames() -> Iterator[Frame]:
+            for low in range(0, len(first), _BLOCK):
+                columns = (column[low : low + _BLOCK] for column in (placed.t_ns, placed.index, first, last))
+                for t_ns, index, start, end in zip(*(column.tolist() for column in columns), strict=True):
+                    yield Frame(t_ns, index, rows[start:end])
+
+        return frames
 
     def write_rows(
-        self, writer: log.LogWriter, suffix: str, schema: Schema, frames: list[Frame], words: Mapping[str, Any]
+        self,
+        writer: log.LogWriter,
+        suffix: str,
+        schema: Schema,
+        frames: Frames,
+        words: Mapping[str, Any],
+        classes: Mapping[str, str] = {},
     ) -> None:
-        """Write a channel below the camera's; ``words`` say what it was made of."""
-        messages = [(frame.t_ns, frame.index, schema.codec.encode(schema.check(frame.rows))) for frame in frames]
-        provenance = Provenance("ingest", words, digest=digest(messages))
+        """Write a channel below the camera's; ``words`` say what it was made of, ``classes`` what its classes are.
+
+        Frames are made twice, for the digest and for the channel, and never stand in memory all together.
+        """
+
+        def messages() -> Iterator[tuple[int, int, bytes]]:
+            return ((frame.t_ns, frame.index, schema.codec.encode(frame.rows)) for frame in frames())
+
+        made = Provenance("ingest", words, self.pictures, digest=digest(messages())).to_metadata()
+        if classes:
+            made[_CLASSES] = json.dumps(classes, sort_keys=True, separators=(",", ":"))
         topic = f"{self.prefix}/{suffix}"
-        channel = writer.add_channel(
-            topic, (schema.name, "protobuf", schema.descriptor), "protobuf", provenance.to_metadata()
-        )
-        for message in messages:
+        channel = writer.add_channel(topic, (schema.name, "protobuf", schema.descriptor), "protobuf", made)
+        count = 0
+        for message in messages():
             writer.add_message(channel, *message)
-        self.report.messages[topic] = len(messages)
-
-
-class PictureJob(Job):
-    """Pictures with labels beside them, whose frames are the pictures in their order."""
-
-    def frame_index(self, labels: Labels, numbers: Ints) -> Ints:
-        """The pictures, counted from 0, of a label file's numbers."""
-        return numbers - labels.first_frame
-
-    def label_times(self, role: Role, times: list[int]) -> tuple[Ints, Ints]:
-        """The labelled frames among the pictures, and their times."""
-        path, labels = self.labels[role]
-        index = labels.frame - labels.first_frame
-        beyond = int((index >= len(times)).sum())
-        if beyond == len(index):
-            raise McaptrackError(f"{path}: all labels are of frames after the last picture, {len(times) - 1}")
-        if beyond:
-            self.report.lost.append(
-                f"{path}: {beyond} labels are of frames after the last picture; "
-                f"the last labelled frame is {labels.frame.max()}"
-            )
-        first = int(index[0] % labels.step) if labels.step > 1 else 0
-        known = np.arange(first, len(times), labels.step)
-        return known + labels.first_frame, np.array(times, np.int64)[known]
+            count += 1
+        self.report.messages[topic] = count
 
 
 def label_rows(labels: Labels, role: Role, plane: GroundPlane | None) -> Rows:
     """The N rows of labels as rows of detections or tracks; in metres too, given a plane."""
     if role == "detections" and labels.boxes_px is not None:
         x, y, w, h = labels.boxes_px.T
-        return DETECTIONS.rows(
-            x_px=x, y_px=y, w_px=w, h_px=h, score=labels.score, class_id=np.ones(len(labels.frame), np.uint32)
-        )
+        return DETECTIONS.rows(x_px=x, y_px=y, w_px=w, h_px=h, score=labels.score, class_id=labels.class_id)
     nowhere = np.full((len(labels.frame), 4), np.nan)
     boxes = nowhere if labels.boxes_px is None else labels.boxes_px
     xy_m = labels.xy_m

@@ -96,7 +96,8 @@ def _from_labels(path: Path, options: SourceOptions, step_s: float) -> list[Scen
     if labels.xy_m is None and plane is None:
         raise McaptrackError(f"{path} is in pixels; give its homography with --ground-plane")
     frames = label_frames({"truth": path}, fps, plane, options.point)["truth"]
-    return [_scene(path.stem, frames, step_s, ())]
+    first = next((number for number, frame in enumerate(frames) if len(frame.rows)), 0)
+    return [_scene(path.stem, frames[first:], step_s, ())]  # windows begin where labels do
 
 
 def _from_log(path: Path, options: SourceOptions, step_s: float) -> list[Scene]:
