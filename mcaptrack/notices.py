@@ -18,6 +18,7 @@ from typing import Final, Literal, NamedTuple
 Code = Literal[
     "assumed-ground-plane",
     "clock",
+    "journal",
     "left-out",
     "lost",
     "not-compared",

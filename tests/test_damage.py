@@ -18,7 +18,7 @@ from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.log import records
 from mcaptrack.log.records import MAGIC
-from tests.test_log import MESSAGES, SCHEMA, SOME, STOCK_OPTIONS, our_messages, stock_messages, write_log, write_stock
+from tests.test_log import MESSAGES, SCHEMA, STOCK_OPTIONS, our_messages, stock_messages, write_log, write_stock
 
 #: Forty messages of three channels, each of which could be told from all others.
 FORTY = [("abc"[n % 3], n * 10, n, bytes([n]) * 40) for n in range(40)]
@@ -346,12 +346,3 @@ def test_what_nobody_can_save_is_said(tmp_path):
         with pytest.raises(McaptrackError, match="can't be opened: No such file"):
             verb(tmp_path / "none.mcap")
     assert not (tmp_path / "saved.mcap").exists()
-
-
-def test_a_journal_that_is_damaged_itself_does_not_keep_what_is_whole(tmp_path):
-    path = tmp_path / "a.mcap"
-    write_log(path, SOME)
-    (tmp_path / "a.mcap.journal").write_bytes(b"mcaptrack journal 1\nand then nothing")
-    with pytest.raises(McaptrackError, match=r"`mcaptrack recover .*a\.mcap` saves what is whole"):
-        log.read(path)
-    assert log.recover(path, tmp_path / "saved.mcap").messages == len(SOME)

@@ -139,7 +139,7 @@ def test_a_log_that_is_open_is_read_on_when_something_is_added_to_it(tmp_path):
         before = opened.fingerprint("a")
         with log.read(path) as other, log.extend(other) as writer:
             writer.add_message(writer.add_channel("new", ("", "", b""), "json", {}), 5, 1, b"x" * 1000)
-        assert path.stat().st_ino == os.fstat(opened.source.pieces[0].file.handle).st_ino
+        assert path.stat().st_ino == os.fstat(opened.snapshot.source.pieces[0].file.handle).st_ino
         assert len(list(opened.messages("a"))) == len(opened.times("a")) == 200
         assert opened.fingerprint("a") == before
         assert "new" not in opened.channels

@@ -160,7 +160,7 @@ def drop(
             dropped = _chosen(opened, topics)
             gone = [channel.id for channel in opened.index.channels.values() if channel.topic in dropped]
             messages = sum(opened.index.counts.get(number, 0) for number in gone)
-            before = path.stat().st_size
+            before = opened.size
             with log.extend(opened, output, drop=dropped):
                 pass
         after = (output or path).stat().st_size

@@ -73,7 +73,7 @@ def _as_data(opened: Log) -> dict[str, Any]:
         )
     return {
         "log": str(opened.path),
-        "bytes": opened.path.stat().st_size,
+        "bytes": opened.size,
         "start_ns": opened.start_ns,
         "end_ns": opened.end_ns,
         "results": str(opened.results.path) if opened.results else None,

@@ -50,6 +50,11 @@ def view(
     if not lichtblick.startswith(("http://", "https://")):
         raise McaptrackError(f"--lichtblick needs an address such as http://localhost:8080, not {lichtblick!r}")
     with log.read(path) as opened:
+        if not opened.is_on_disk:
+            raise McaptrackError(
+                f"viewers can't open {path}: a change of it goes on or was interrupted. The next command that writes "
+                f"to it mends it; `mcaptrack recover {path}` saves it to another file"
+            )
         files: dict[str, Path | bytes] = {part.path.name: part.real_path for part in opened.parts}
         layouts, notes = _layouts(path, opened)
     if layout is not None and layout not in layouts:

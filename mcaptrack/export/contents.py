@@ -178,7 +178,7 @@ class Contents:
             "end_t_ns": span[1],
             "duration_s": (opened.end_ns - opened.start_ns) / 1e9 if messages else 0.0,
             "messages": messages,
-            "size_bytes": sum(part.path.stat().st_size for part in opened.parts),
+            "size_bytes": sum(part.size for part in opened.parts),
             "digest": opened.fingerprint(),
             "results_file": opened.results.path.name if opened.results else None,
             "ground_plane": None if not planes else _OF_PLANES[len({*planes}), planes[0]],

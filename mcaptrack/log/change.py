@@ -19,7 +19,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.log import records
 from mcaptrack.log.chunks import chunk_record, message_head, open_chunk
 from mcaptrack.log.index import Index
-from mcaptrack.log.journal import new_end
+from mcaptrack.log.new_end import new_end
 from mcaptrack.log.reader import Log
 from mcaptrack.log.records import BLOCK, MAGIC, Bytes, ChunkIndexRecord, Damaged, Record, crc_of, walk
 from mcaptrack.log.source import Source
@@ -48,11 +48,12 @@ def extend(
         log = log.results
     if output is None:
         log.lock()
-    with log.mending():
+    with log.snapshot.mending():
         change = _Change.plan(log, drop, drop_metadata, drop_attachments)
         opened = _in_place(log, change) if output is None and change.is_small else _as_copy(log, change, output)
         with opened as writer:
             yield writer
+    log.is_spent = output is None
 
 
 def refuse_recorded(log: Log, topics: Collection[str], instead: str) -> None:
@@ -76,9 +77,10 @@ def _in_place(log: Log, change: _Change) -> Iterator[LogWriter]:
     index = log.index
     crc = change.crc_before()
     try:
-        with new_end(log.real_path, log.lock(), change.cut) as end:
+        with new_end(log.real_path, log.lock(), change.cut, log.snapshot.file) as end:
+            log.snapshot.source.pieces = end.journal.pieces()  # whoever goes on reading it reads what it was
             writer = LogWriter(end, change.cut, crc, change.before())
-            change.replay(writer, end.old.part(0, index.data_end - change.cut), change.cut)
+            change.replay(writer, end.journal.old_end().part(0, index.data_end - change.cut), change.cut)
             yield writer
             messages = writer.finish()
             end.close()
@@ -96,18 +98,18 @@ def _as_copy(log: Log, change: _Change, output: Path | None) -> Iterator[LogWrit
         start, crc = 0, change.crc_before()
         if change.cut > len(MAGIC):
             start = change.cut
-            _pass_on(log.source, start, stream)
+            _pass_on(log.snapshot.source, start, stream)
             writer = LogWriter(stream, start, crc, change.before())
         else:
             crc = 0
             writer = LogWriter(stream, 0, 0, change.before())
             writer.write(MAGIC)
-        change.replay(writer, log.source.part(0, log.index.data_end), 0)
+        change.replay(writer, log.snapshot.source.part(0, log.index.data_end), 0)
         yield writer
         messages = writer.finish()
         stream.flush()
         copy = Path(stream.name)
-        _compare(log.source, copy, start)
+        _compare(log.snapshot.source, copy, start)
         verify(copy, writer, messages, start, crc or 0)
 
 
@@ -145,7 +147,7 @@ class _Change:
     def plan(cls, log: Log, drop: Collection[str], metadata: Collection[str], attachments: Collection[str]) -> _Change:
         index = log.index
         dropped = {channel.id for channel in index.channels.values() if channel.topic in drop}
-        change = cls(index, log.source, dropped, metadata, attachments)
+        change = cls(index, log.snapshot.source, dropped, metadata, attachments)
         if not index.regular:
             change.open_all = True
             return change
@@ -155,9 +157,9 @@ class _Change:
         places += [listed.offset for listed in index.attachments if listed.name in attachments]
         undescribed = {channel for channel in dropped if not change._is_described_where_it_begins(channel)}
         if undescribed:
-            for record in walk(log.source.front_to_back(), len(MAGIC), index.data_end):
+            for record in walk(log.snapshot.source.front_to_back(), len(MAGIC), index.data_end):
                 if record.opcode == Opcode.CHANNEL:
-                    channel = records.read_channel(log.source, record).id
+                    channel = records.read_channel(log.snapshot.source, record).id
                     places += [record.start] if channel in dropped else []
                     undescribed.discard(channel)
         change.open_all = bool(undescribed)

@@ -13,8 +13,10 @@ from pathlib import Path
 import numpy as np
 from mcap.opcode import Opcode
 
+from mcaptrack import notices
 from mcaptrack.errors import McaptrackError
-from mcaptrack.log import journal, records
+from mcaptrack.log import records
+from mcaptrack.log.beside import changed, find_journal
 from mcaptrack.log.check_summary import Finding, Findings, check_summary, record_name
 from mcaptrack.log.chunks import (
     HEAD,
@@ -26,7 +28,7 @@ from mcaptrack.log.chunks import (
     open_chunk,
 )
 from mcaptrack.log.index import Index, begins_as_log, ends_as_log, list_attachment, list_metadata
-from mcaptrack.log.opening import changed
+from mcaptrack.log.journal import find_content, journal_of
 from mcaptrack.log.records import MAGIC, Bytes, ChunkIndexRecord, Damaged, Reader, Record, walk
 from mcaptrack.log.source import OpenFile, RunningChecksum, Signature, Source
 
@@ -54,10 +56,17 @@ def check(path: Path, progress: Progress = lambda *_: None) -> Checked:
     Checksums, sizes and times of chunks, message indexes, the order of each channel's messages, attachments, and
     everything that the summary and the footer say. What is found is grouped by kind.
     """
-    journal.settle(path.resolve())
     with open_bytes(path) as (source, file):
         signature = Signature.of(file.handle)
-        look = _Look(source.front_to_back(), progress)
+        found = find_journal(path, file)
+        if found and found.is_busy:
+            raise McaptrackError(f"{path} is being written to by another process; try again when it is done")
+        half = found.journal if found else None
+        if found and not half:
+            notices.warn(found.words, "journal")
+        look = _Look((half.overlay() if half else source).front_to_back(), progress)
+        if found and half:
+            look.findings.add("half-written", half.start, found.words)
         try:
             look.at_everything()
         except Damaged as error:  # damage to the content is a finding
@@ -68,10 +77,40 @@ def check(path: Path, progress: Progress = lambda *_: None) -> Checked:
     return Checked(path, sum(look.found.counts.values()), len(look.found.chunks), findings)
 
 
+def is_sound(source: Source) -> bool:
+    """Whether a look at every byte finds no error."""
+    look = _Look(source.front_to_back(), lambda *_: None)
+    try:
+        look.at_everything()
+    except Damaged:
+        return False
+    return all(finding.level != "error" for finding in look.findings)
+
+
+def best_content(path: Path, source: Source, file: OpenFile) -> Source:
+    """What to save of a log that a journal lies beside: the log as the journal has it where the file itself is damaged.
+
+    Since the log itself stays as it is, a journal will do that doesn't prove that it is of this very file.
+    """
+    found = find_journal(path, file)
+    if found is None:
+        return source
+    before = found.journal.overlay() if found.journal else find_content(path.resolve(), file)
+    if before is None or (not found.journal and is_sound(source)) or not is_sound(before):
+        notices.warn(found.words, "journal")
+        return source
+    notices.warn(
+        f"{path} was left half written by a change that was interrupted; it is saved as it was before, by what "
+        f"{journal_of(path.resolve()).name} holds",
+        "journal",
+    )
+    return before
+
+
 @contextmanager
 def open_bytes(path: Path) -> Iterator[tuple[Source, OpenFile]]:
     """The bytes of a file. Raises McaptrackError if it is none or empty."""
-    file = OpenFile(path)
+    file = OpenFile.at(path)
     try:
         source = Source.of(file)
         if not len(source):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import zlib
 from array import array
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
@@ -144,6 +145,29 @@ def read_summary(buffer: Bytes) -> Index | None:
     index.chunks.sort(key=lambda chunk: chunk.offset)
     index.regular = statistics is not None and _adds_up(index, Reader(summary, statistics.body, statistics.end))
     return index if index.regular else None
+
+
+def summary_start(buffer: Bytes) -> int:
+    """Where the summary is said to start; 0 if nobody says."""
+    footer = read_footer(buffer) if ends_as_log(buffer) else None
+    return footer[1] if footer and len(MAGIC) < footer[1] <= footer[0] else 0
+
+
+def whole_summary(buffer: Bytes, start: int) -> Index | None:
+    """What the summary of a damaged log says, if it stands at ``start`` and a checksum shows that it is whole."""
+    footer = read_footer(buffer)
+    if footer is None or not len(MAGIC) < start <= footer[0]:
+        return None
+    at, _, _, crc = footer
+    summary = buffer[start : len(buffer) - len(MAGIC) - 4]
+    if not crc or zlib.crc32(summary) != crc:
+        return None
+    index = Index(start - DATA_END_SIZE)
+    with suppress(Damaged):
+        for record in walk(summary, 0, at - start):
+            take(index, summary, record)
+        return index
+    return None
 
 
 def _adds_up(index: Index, statistics: Reader) -> bool:

@@ -5,22 +5,19 @@ from __future__ import annotations
 import hashlib
 import heapq
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaptrack.errors import DamagedError, McaptrackError
-from mcaptrack.log import journal, records
+from mcaptrack.errors import McaptrackError
+from mcaptrack.log import new_end, records
 from mcaptrack.log.fingerprint import fingerprint
-from mcaptrack.log.index import read_index
-from mcaptrack.log.messages import Columns, Late, Message, Messages, Places
-from mcaptrack.log.opening import changed, open_log, recover_words
+from mcaptrack.log.messages import Columns, Message, Places
 from mcaptrack.log.records import ChannelRecord, Damaged
-from mcaptrack.log.source import Signature, Source
+from mcaptrack.log.snapshot import take_snapshot
 from mcaptrack.log.writer import RESULTS, create, results_of
 from mcaptrack.schema import Frame, Schema
 
@@ -51,15 +48,11 @@ class Log:
         self.path = path
         self.real_path = path.resolve()
         self._lock: int | None = None
-        journal.settle(self.real_path)
-        opened = open_log(path)
-        self._file, self._signature, self._is_certain = opened.file, opened.signature, opened.is_certain
-        self.source, self.index = opened.source, opened.index
-        self._messages = Messages(self.source, self.index)
-        self._fresh: Messages | None = None  # the log as it was found when it had this signature
-        self._fresh_at: Signature | None = None
+        self.snapshot = take_snapshot(path)
+        self.index, self._messages = self.snapshot.index, self.snapshot.messages
         self.results = results
         self.is_new = False  # made a moment ago, and to be removed if nothing comes into it
+        self.is_spent = False  # extended: the file is another now, and this still shows what it was
         #: Every channel of this file, also those that share a topic, and those that the results replace.
         self.recorded: tuple[Channel, ...] = tuple(map(self._channel, self.index.channels.values()))
         self._by_topic: dict[str, list[Channel]] = {}
@@ -79,7 +72,7 @@ class Log:
         if self._lock is not None:
             os.close(self._lock)
             self._lock = None
-        self._file.close()
+        self.snapshot.file.close()
         if self.results is not None:
             self.results.__exit__()
             if self.results.is_new:
@@ -95,6 +88,8 @@ class Log:
         """
         if self.results is not None:
             return self.results.lock()
+        if self.is_spent:
+            raise McaptrackError(f"{self.path} was changed since it was opened; open it again")
         if self._lock is None:
             try:
                 handle = os.open(self.real_path, os.O_RDWR)
@@ -104,8 +99,9 @@ class Log:
                     "write to another file with -o, or beside it with --sidecar"
                 ) from None
             try:
-                journal.lock(self.real_path, handle)
-                if not os.path.samestat(os.fstat(handle), os.fstat(self._file.handle)) or not self._is_as_opened():
+                new_end.lock(self.real_path, handle)
+                new_end.settle(self.real_path, handle, self.snapshot.file)
+                if not self.snapshot.is_on_disk(os.fstat(handle)):
                     raise McaptrackError(f"{self.path} was replaced while it was being read; try again")
             except BaseException:
                 os.close(handle)
@@ -117,6 +113,16 @@ class Log:
     def parts(self) -> tuple[Log, ...]:
         """The log, and its results if they stand in another."""
         return (self,) if self.results is None else (self, self.results)
+
+    @property
+    def size(self) -> int:
+        """How many bytes this log has, results aside."""
+        return len(self.snapshot.source)
+
+    @property
+    def is_on_disk(self) -> bool:
+        """Whether other programs that open the file see the same: no change of it goes on or was interrupted."""
+        return not any(part.snapshot.is_through_journal for part in self.parts)
 
     def part(self, topic: str) -> Log:
         """The part that holds the channel of that topic."""
@@ -182,8 +188,8 @@ class Log:
         found = [listed.offset for listed in self.index.metadata if listed.name == name]
         if not found:
             return None
-        with self.mending():
-            whole = self.record(found[-1])
+        with self.snapshot.mending():
+            whole = self.snapshot.record(found[-1])
             return records.read_metadata(whole, records.record_at(whole, 0))[1]
 
     def attachment(self, name: str) -> bytes | None:
@@ -193,8 +199,8 @@ class Log:
         found = [listed.offset for listed in self.index.attachments if listed.name == name]
         if not found:
             return None
-        with self.mending():
-            whole = self.record(found[-1])
+        with self.snapshot.mending():
+            whole = self.snapshot.record(found[-1])
             attachment = records.read_attachment(whole, records.record_at(whole, 0))
             return bytes(whole[attachment.start : attachment.end])
 
@@ -207,9 +213,9 @@ class Log:
             yield from part.messages(topic, start_ns, end_ns)
             return
         channels = self._ids(topic)
-        with self.mending():
+        with self.snapshot.mending():
             yield from self._messages.by_time(channels, (start_ns, end_ns))
-            self._confirm(channels)
+            self.snapshot.confirm(channels)
 
     def merged(
         self, topics: Iterable[str], start_ns: int | None = None, end_ns: int | None = None
@@ -229,9 +235,9 @@ class Log:
         if channel.schema_name != schema.name or channel.message_encoding != "protobuf":
             raise McaptrackError(f"{self.path}: {topic} holds {channel.schema_name or 'no schema'}, not {schema.name}")
         channels = self._ids(topic)
-        with self._computing(topic):
+        with self.snapshot.computing(topic):
             found = self._messages.columns(channels, schema)
-            self._confirm(channels)
+            self.snapshot.confirm(channels)
             if found is not None:
                 return found
             messages = list(self.messages(topic))
@@ -255,27 +261,27 @@ class Log:
         if (part := self.part(topic)) is not self:
             return part.times(topic)
         channels = self._ids(topic)
-        with self._computing(topic):
-            return self._still(lambda messages: messages.times(channels), np.array_equal)
+        with self.snapshot.computing(topic):
+            return self.snapshot.still(lambda messages: messages.times(channels), np.array_equal)
 
     def places(self, topic: str) -> Places:
         """Where the messages of a channel stand in the file of its part, by time, without reading them."""
         if (part := self.part(topic)) is not self:
             return part.places(topic)
         channels = self._ids(topic)
-        with self._computing(topic):
-            return self._still(lambda messages: messages.places(channels), _are_equal)
+        with self.snapshot.computing(topic):
+            return self.snapshot.still(lambda messages: messages.places(channels), _are_equal)
 
     def message_at(self, chunk_offset: int | None, offset: int) -> tuple[str, Message]:
         """The message at a place in this file, results aside, and its topic; one chunk is opened.
 
         Raises McaptrackError if none stands there.
         """
-        with self.mending():
+        with self.snapshot.mending():
             channel, message = self._messages.at(chunk_offset, offset)
             if channel not in self.index.channels:
                 raise Damaged(f"a message of channel {channel}, which is not described anywhere")
-            self._confirm([channel])
+            self.snapshot.confirm([channel])
             return self.index.channels[channel].topic, message
 
     def fingerprint(self, topic: str | None = None) -> str:
@@ -285,7 +291,7 @@ class Log:
         """
         if topic is not None and (part := self.part(topic)) is not self:
             return part.fingerprint(topic)
-        with self.mending():
+        with self.snapshot.mending():
             if topic is not None:
                 self.channel(topic)
                 those = [self._fingerprint(one.id) for one in self._by_topic[topic]]
@@ -294,94 +300,9 @@ class Log:
             return whole[0] if len(whole) == 1 else hashlib.sha256("".join(whole).encode()).hexdigest()
 
     def _fingerprint(self, channel_id: int | None = None) -> str:
-        return self._still(lambda messages: fingerprint(messages.source, messages.index, channel_id), str.__eq__)
-
-    def record(self, offset: int) -> memoryview:
-        """The record that stands at an offset of the file; for this package alone."""
-
-        def whole(messages: Messages) -> memoryview:
-            found = records.record_at(messages.source, offset)
-            return messages.source[found.start : found.end]
-
-        return self._still(whole, memoryview.__eq__)
-
-    @contextmanager
-    def mending(self, topic: str = "") -> Iterator[None]:
-        """What is found damaged in the block is said of this log, with what can be done; for this package alone."""
-        try:
-            yield
-        except Damaged as error:
-            if not self._is_as_opened():
-                raise changed(self.path) from None
-            where = f"{self.path}: {topic}" if topic else str(self.path)
-            raise DamagedError(f"{where} is damaged: {error}; {recover_words(self.path)}") from None
-
-    @contextmanager
-    def _computing(self, topic: str) -> Iterator[None]:
-        """The same for whoever takes times as signed numbers."""
-        try:
-            with self.mending(topic):
-                yield
-        except Late as late:
-            raise McaptrackError(
-                f"{self.path}: {topic} has {late.count} messages later than the year 2262, the first at {late.t_ns} "
-                "ns; they are kept as they are, but nothing is computed with such times "
-                f"(`mcaptrack drop {self.path} {topic}` leaves the channel out)"
-            ) from None
-
-    # While others write
-
-    def confirm(self) -> None:
-        """Raises McaptrackError if the file was changed since it was opened; for this package alone."""
-        if Signature.of(self._file.handle) != self._signature:
-            raise changed(self.path)
-
-    def _is_as_opened(self) -> bool:
-        """Whether the file still says what it said when it was opened."""
-        try:
-            now = self._now()
-        except (Damaged, McaptrackError):
-            return False
-        return now is None or self.index.agrees_in_all(now.index)
-
-    def _now(self) -> Messages | None:
-        """The log as it is now; None if nobody changed it.
-
-        Raises Damaged if it is no log any more, and McaptrackError if it is being changed.
-        """
-        now = Signature.of(self._file.handle)
-        is_certain = now.is_certain
-        if now == self._signature and self._is_certain:
-            return None
-        if now != self._fresh_at:
-            source = Source.of(self._file)
-            self._fresh, self._fresh_at = Messages(source, read_index(source)), None
-            if self.index.agrees_in_all(self._fresh.index) and self._messages.are_in(self._fresh.source):
-                self._signature, self._is_certain = now, is_certain
-            elif is_certain:
-                self._fresh_at = now
-            if Signature.of(self._file.handle) != now:
-                raise changed(self.path)
-        return self._fresh
-
-    def _confirm(self, channels: Sequence[int]) -> None:
-        """Raises McaptrackError if what was read may be half of what was there, and half of what is there now."""
-        try:
-            fresh = self._now()
-            if fresh is None:
-                return
-            if all(self.index.agrees(fresh.index, one) for one in channels) and self._messages.are_in(fresh.source):
-                return
-        except Damaged:
-            pass
-        raise changed(self.path)
-
-    def _still(self, look: Callable[[Messages], T], are_equal: Callable[[T, T], bool]) -> T:
-        """What is found in the log, and found once more if the file was changed meanwhile."""
-        found, fresh = look(self._messages), self._now()
-        if fresh is not None and not are_equal(found, look(fresh)):
-            raise changed(self.path)
-        return found
+        return self.snapshot.still(
+            lambda messages: fingerprint(messages.source, messages.index, channel_id), str.__eq__
+        )
 
 
 def _are_equal(one: Places, other: Places) -> bool:

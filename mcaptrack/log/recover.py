@@ -9,11 +9,10 @@ Nothing is taken out of a chunk that is not whole: nobody can say which of its m
 from __future__ import annotations
 
 import re
-import zlib
 from bisect import bisect_right
 from collections import Counter
 from collections.abc import Callable, Mapping
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, TypeVar
@@ -22,11 +21,11 @@ import numpy as np
 from mcap.opcode import Opcode
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.log import journal, records
-from mcaptrack.log.check import open_bytes
+from mcaptrack.log import records
+from mcaptrack.log.check import best_content, open_bytes
 from mcaptrack.log.check_summary import record_name
 from mcaptrack.log.chunks import Entries, chunk_entries, message_head, open_chunk
-from mcaptrack.log.index import DATA_END_SIZE, Index, begins_as_log, ends_as_log, read_footer, take
+from mcaptrack.log.index import Index, begins_as_log, summary_start, whole_summary
 from mcaptrack.log.records import (
     BLOCK,
     MAGIC,
@@ -88,10 +87,10 @@ def recover(path: Path, output: Path, progress: Progress = lambda *_: None) -> R
 
     Raises McaptrackError, and writes nothing, if there is no message to be saved.
     """
-    with suppress(McaptrackError):  # what can't be put back is damage like any other
-        journal.settle(path.resolve())
     report = Recovered(path, output)
-    with open_bytes(path) as (source, _), create(output, header=_header(source)) as writer:
+    with open_bytes(path) as (there, file), ExitStack() as stack:
+        source = best_content(path, there, file)
+        writer = stack.enter_context(create(output, header=_header(source)))
         try:
             report.messages = _Rescue(source.front_to_back(), writer, report, progress).all()
         except Damaged as error:  # damage that can be passed over was passed over
@@ -119,7 +118,7 @@ class _Rescue:
 
     def __init__(self, buffer: Source, writer: LogWriter, report: Recovered, progress: Progress) -> None:
         self._buffer, self._writer, self._report, self._progress = buffer, writer, report, progress
-        self._said = _summary(buffer, _summary_start(buffer)) or Index()
+        self._said = whole_summary(buffer, summary_start(buffer)) or Index()
         places = {chunk.offset for chunk in self._said.chunks} | {self._said.data_end}
         places |= {listed.offset for listed in (*self._said.attachments, *self._said.metadata)}
         self._places = sorted(places - {0})  # where records stand, if anybody says so
@@ -229,7 +228,8 @@ class _Rescue:
         if self._places:
             self._ended = record.start >= self._places[-1]
         else:
-            self._said = _summary(buffer, record.end) or self._said  # its offsets may be wrong, its numbers are not
+            # Its offsets may be wrong, its numbers are not.
+            self._said = whole_summary(buffer, record.end) or self._said
             self._ended = record.end == len(buffer) or buffer[record.end] not in _NOT_BEHIND
         said = Reader(buffer, record.body, record.end).number(4)
         if self._ended and said and not self._report.lost and said != self._checksum.upto(record.start):
@@ -382,26 +382,3 @@ def _agree(known: dict[int, Described], record: Described) -> None:
     """Raises Damaged if a schema or channel of that number is known as another."""
     if known.setdefault(record.id, record) != record:
         raise Damaged(f"schema or channel {record.id} is described otherwise than elsewhere")
-
-
-def _summary_start(buffer: Bytes) -> int:
-    """Where the summary is said to start; 0 if nobody says."""
-    footer = read_footer(buffer) if ends_as_log(buffer) else None
-    return footer[1] if footer and len(MAGIC) < footer[1] <= footer[0] else 0
-
-
-def _summary(buffer: Bytes, start: int) -> Index | None:
-    """What the summary of a damaged log says, if it stands at ``start`` and a checksum shows that it is whole."""
-    footer = read_footer(buffer)
-    if footer is None or not len(MAGIC) < start <= footer[0]:
-        return None
-    at, _, _, crc = footer
-    summary = buffer[start : len(buffer) - len(MAGIC) - 4]
-    if not crc or zlib.crc32(summary) != crc:
-        return None
-    index = Index(start - DATA_END_SIZE)
-    with suppress(Damaged):
-        for record in walk(summary, 0, at - start):
-            take(index, summary, record)
-        return index
-    return None

@@ -62,34 +62,43 @@ class Signature(NamedTuple):
 class OpenFile:
     """A regular file, open for reading; closed with ``close``, or when nothing refers to it any more."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, handle: int) -> None:
+        self.handle = handle
+        self.close = weakref.finalize(self, os.close, handle)
+
+    @classmethod
+    def at(cls, path: Path) -> OpenFile:
         """Raises McaptrackError for what isn't there, may not be read, or is no file; never waits for a pipe."""
         try:
             kind = kind_of_file(path.stat().st_mode)
             if not kind:
-                self.handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+                file = cls(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC))
         except OSError as error:
             raise McaptrackError(f"{path} can't be opened: {error.strerror}") from None
-        if not kind:
-            self.close = weakref.finalize(self, os.close, self.handle)
-            kind = kind_of_file(os.fstat(self.handle).st_mode)  # it may have been replaced meanwhile
+        kind = kind or kind_of_file(os.fstat(file.handle).st_mode)  # it may have been replaced meanwhile
         if kind:
             raise McaptrackError(f"{path} is {kind}, not an MCAP file")
+        return file
 
     def read(self, at: int, size: int) -> bytes:
         """Bytes of the file. Raises Damaged where it has become shorter or can't be read."""
         if not self.close.alive:
             raise ValueError("the file is closed")
-        try:
-            data = os.pread(self.handle, size, at)
-            while len(data) < size:
-                more = os.pread(self.handle, size - len(data), at + len(data))
-                if not more:
-                    raise Damaged(f"the file ends before byte {at + size}; it was longer when it was opened")
-                data += more
-        except OSError as error:
-            raise Damaged(f"it can't be read: {error.strerror}", at) from None
-        return data
+        return read_exactly(self.handle, at, size)
+
+
+def read_exactly(handle: int, at: int, size: int) -> bytes:
+    """Bytes of an open file. Raises Damaged where it is shorter or can't be read."""
+    try:
+        data = os.pread(handle, size, at)
+        while len(data) < size:
+            more = os.pread(handle, size - len(data), at + len(data))
+            if not more:
+                raise Damaged(f"the file ends before byte {at + size}; it was longer when it was opened")
+            data += more
+    except OSError as error:
+        raise Damaged(f"it can't be read: {error.strerror}", at) from None
+    return data
 
 
 class Piece(NamedTuple):
@@ -109,7 +118,7 @@ class Source:
     """
 
     def __init__(self, pieces: Sequence[Piece], ahead: int = 0) -> None:
-        self.pieces = tuple(pieces)
+        self.pieces: tuple[Piece, ...] = tuple(pieces)
         self._size = sum(piece.size for piece in pieces)
         self._ahead = ahead
         self._next_ahead = ahead or _LEAST_AHEAD

@@ -19,8 +19,8 @@ def stream(log: Log) -> Iterator[tuple[int, Message]]:
 
     Raises McaptrackError where the log is damaged, and at the end if it was changed meanwhile.
     """
-    source = log.source.front_to_back()
-    with log.mending():
+    source = log.snapshot.source.front_to_back()
+    with log.snapshot.mending():
         for record in walk(source, len(MAGIC), log.index.data_end):
             if record.opcode == Opcode.MESSAGE:
                 yield _message(source, record)
@@ -29,7 +29,7 @@ def stream(log: Log) -> Iterator[tuple[int, Message]]:
                 for inner in walk(content, 0, len(content)):
                     if inner.opcode == Opcode.MESSAGE:
                         yield _message(content, inner)
-        log.confirm()
+        log.snapshot.confirm_all()
 
 
 def _message(buffer: Bytes, record: Record) -> tuple[int, Message]:
@@ -40,16 +40,16 @@ def _message(buffer: Bytes, record: Record) -> tuple[int, Message]:
 
 def profile(log: Log) -> str:
     """The profile that the log's header names."""
-    with log.mending():
-        whole = log.record(len(MAGIC))
+    with log.snapshot.mending():
+        whole = log.snapshot.record(len(MAGIC))
         return records.read_header(whole, records.record_at(whole, 0))[0]
 
 
 def pass_on_extras(log: Log, writer: LogWriter, *, without: Collection[str] = ()) -> None:
     """Write the log's attachments, and its metadata records of all names but these, as they are."""
-    with log.mending():
+    with log.snapshot.mending():
         for listed in log.index.metadata:
             if listed.name not in without:
-                writer.put_metadata(bytes(log.record(listed.offset)))
+                writer.put_metadata(bytes(log.snapshot.record(listed.offset)))
         for listed in log.index.attachments:
-            writer.put_attachment(bytes(log.record(listed.offset)))
+            writer.put_attachment(bytes(log.snapshot.record(listed.offset)))

@@ -22,7 +22,7 @@ from mcap.opcode import Opcode
 from mcaptrack import __version__
 from mcaptrack.atomic import publish_stream
 from mcaptrack.errors import McaptrackError
-from mcaptrack.log import records
+from mcaptrack.log import journal, records
 from mcaptrack.log.chunks import LOG_MAX_NS
 from mcaptrack.log.index import Index, Listed, list_attachment, list_metadata, read_index
 from mcaptrack.log.records import MAGIC, ChannelRecord, ChunkIndexRecord, Damaged, SchemaRecord, crc_of
@@ -330,6 +330,7 @@ def refuse_earlier_results(path: Path) -> None:
 def create(path: Path, profile: str = "", *, header: bytes | None = None) -> Iterator[LogWriter]:
     """A new log at ``path``, there once the block has ended well. ``header`` is the header record of another."""
     refuse_earlier_results(path)
+    is_half_written = journal.is_left(path)
     with publish_stream(path) as stream:
         writer = LogWriter(stream)
         writer.header(profile, header)
@@ -337,6 +338,8 @@ def create(path: Path, profile: str = "", *, header: bytes | None = None) -> Ite
         messages = writer.finish()
         stream.flush()
         verify(Path(stream.name), writer, messages)
+    if is_half_written:  # the log that it belonged to is gone
+        journal.remove(path)
 
 
 def verify(path: Path, writer: LogWriter, messages: int, start: int = 0, crc: int = 0) -> None:
@@ -344,7 +347,7 @@ def verify(path: Path, writer: LogWriter, messages: int, start: int = 0, crc: in
 
     Raises McaptrackError if it is not what was written, or does not add up: then it must not stay.
     """
-    file = OpenFile(path)
+    file = OpenFile.at(path)
     try:
         source = Source.of(file)
         index = read_index(source)

@@ -236,7 +236,7 @@ def _recording(opened: log.Log) -> dict[str, Any]:
     return {
         "log": opened.path.name,
         "results_file": opened.results.path.name if opened.results else None,
-        "bytes": sum(part.path.stat().st_size for part in opened.parts),
+        "bytes": sum(part.size for part in opened.parts),
         "messages": messages,
         "start_ns": opened.start_ns if messages else None,
         "end_ns": opened.end_ns if messages else None,

@@ -1,0 +1,313 @@
+"""What may lie at LOG.journal: it is used only where it is proof, said in a line otherwise, and stays as it is."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import socket
+import struct
+import subprocess
+import zlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from mcaptrack import log, notices
+from mcaptrack.errors import McaptrackError
+from mcaptrack.log import journal, new_end
+from mcaptrack.log.journal import journal_of
+from mcaptrack.log.source import OpenFile
+from tests.test_log import SCHEMA, write_log
+from tests.test_log_interrupted import add_results, killed
+
+SOME = [("abc"[n % 3], n, n, bytes([n]) * 3000) for n in range(100)]
+AS_ROOT = os.geteuid() == 0
+
+
+def first_journal(start: int, size: int, before: bytes, old: bytes) -> bytes:
+    """A journal as version 0.1.0 wrote them."""
+    head = struct.pack("<QQII", start, size, zlib.crc32(before[-65536:]), zlib.crc32(old))
+    return b"mcaptrack journal 1\n" + head + zlib.crc32(head).to_bytes(4, "little") + old
+
+
+@pytest.fixture
+def path(tmp_path) -> Path:
+    """A log that was left half written, with its journal."""
+    path = tmp_path / "a b.mcap"  # a name that a shell takes apart
+    write_log(path, SOME, "media")
+    interrupt(path)
+    return path
+
+
+def interrupt(path: Path) -> None:
+    """Leave a log half written: killed in the middle of the second of several pieces."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(new_end, "_PIECE", 20_000)
+        assert killed(lambda: add_results(path, 2, 200), 2, ["pwrite"])
+    with notices.collected() as said, notices.listening(said.append), log.read(path):
+        assert "was left half written" in said[0].message
+
+
+def everything(folder: Path) -> dict[str, tuple[object, ...]]:
+    """All that is in a folder, without following links or waiting for pipes."""
+    found: dict[str, tuple[object, ...]] = {}
+    for at, folders, files in os.walk(folder):
+        for name in [*folders, *files]:
+            entry = Path(at, name)
+            there = entry.lstat()
+            content = entry.read_bytes() if entry.is_file() and not entry.is_symlink() else None
+            found[str(entry)] = (there.st_mode, there.st_ino, there.st_mtime_ns, there.st_size, content)
+    return found
+
+
+@pytest.fixture(autouse=True)
+def never_waits() -> Iterator[None]:
+    def late(*_: object) -> None:
+        raise TimeoutError("it waits")
+
+    signal.signal(signal.SIGALRM, late)
+    signal.alarm(60)
+    yield
+    signal.alarm(0)
+
+
+def a_socket(at: Path) -> None:
+    here = os.getcwd()
+    os.chdir(at.parent)  # names of sockets are short
+    with socket.socket(socket.AF_UNIX) as made:
+        made.bind(at.name)
+    os.chdir(here)
+
+
+def linked(at: Path) -> None:
+    at.rename(at.with_name("elsewhere"))
+    at.symlink_to("elsewhere")
+
+
+def flipped(at: Path, place: int) -> None:
+    raw = bytearray(at.read_bytes())
+    raw[place] ^= 1
+    at.write_bytes(raw)
+
+
+def of_another(at: Path) -> None:
+    other = at.with_name("other.mcap")
+    write_log(other, [(t, ns + 1, n, data) for t, ns, n, data in SOME], "media")
+    interrupt(other)
+    os.replace(journal_of(other), at)
+
+
+def of_a_copy(at: Path) -> None:
+    other = at.with_name("other.mcap")
+    write_log(other, SOME, "media")
+    interrupt(other)
+    os.replace(journal_of(other), at)
+
+
+def anew(make: Callable[[Path], object]) -> Callable[[Path], object]:
+    def put(at: Path) -> None:
+        at.unlink()
+        make(at)
+
+    return put
+
+
+#: What lies beside the log, and what is said of it.
+THINGS: dict[str, tuple[Callable[[Path], object], str]] = {
+    "words": (lambda at: at.write_bytes(b"dear diary"), "is no journal of mcaptrack"),
+    "nothing in it": (lambda at: at.write_bytes(b""), "is no journal of mcaptrack"),
+    "48 bytes that fit all": (lambda at: at.write_bytes(first_journal(0, 0, b"", b"")), "version 0.1.0"),
+    "the first bytes": (lambda at: at.write_bytes(at.read_bytes()[:90]), "is an incomplete or damaged journal"),
+    "a head": (lambda at: at.write_bytes(at.read_bytes()[:240]), "is an incomplete or damaged journal"),
+    "a flipped head": (lambda at: flipped(at, 40), "is an incomplete or damaged journal"),
+    "a flipped end": (lambda at: flipped(at, 400), "is an incomplete or damaged journal"),
+    "a folder": (anew(Path.mkdir), "is a folder"),
+    "a pipe": (anew(os.mkfifo), "is a named pipe"),
+    "a socket": (anew(a_socket), "is a socket"),
+    "a link to itself, elsewhere": (linked, "is a symbolic link"),
+    "a link to nothing": (anew(lambda at: at.symlink_to("nothing")), "is a symbolic link"),
+    "one of another log": (of_another, "is of a log that began differently"),
+    "one of a copy": (of_a_copy, "is of another file than"),
+}
+if AS_ROOT:
+    THINGS["a device"] = (anew(lambda at: os.mknod(at, 0o020644, os.makedev(1, 5))), "is a device")
+
+
+def look(path: Path) -> None:
+    with log.read(path) as opened:
+        for topic in opened.channels:
+            list(opened.messages(topic))
+
+
+@pytest.mark.parametrize("thing", THINGS)
+def test_what_is_no_proof_is_said_in_a_line_and_never_used(path, tmp_path, thing):
+    make, words = THINGS[thing]
+    make(journal_of(path))
+    before = everything(tmp_path)
+    out = tmp_path.parent / f"{tmp_path.name}.recovered.mcap"
+    for verb in (look, log.check, lambda there: log.recover(there, out)):
+        with notices.collected() as said, notices.listening(said.append):
+            try:
+                verb(path)
+            except McaptrackError as error:  # it is left half written, after all
+                assert "\n" not in str(error)
+        assert everything(tmp_path) == before
+        assert len(said) == 1
+        assert "\n" not in said[0].message
+        if "saved as it was" not in said[0].message:
+            assert said[0].message.startswith(f"{journal_of(path)} ")
+            assert words in said[0].message
+            assert "is not used" in said[0].message
+    assert out.exists()
+
+
+@pytest.mark.parametrize("thing", THINGS)
+def test_what_lies_in_the_way_is_refused_and_the_command_that_is_proposed_removes_it(tmp_path, thing):
+    path = tmp_path / "a b.mcap"
+    write_log(path, SOME, "media")
+    whole = path.read_bytes()
+    interrupt(path)
+    THINGS[thing][0](journal_of(path))
+    with path.open("rb+") as stream:  # a whole log again
+        stream.write(whole)
+        stream.truncate(len(whole))
+    before = everything(tmp_path)
+    with (
+        notices.collected(),
+        notices.listening(lambda _: None),
+        log.read(path) as opened,
+        pytest.raises(McaptrackError, match="lies where the journal goes") as refused,
+        log.extend(opened),
+    ):
+        pass
+    assert everything(tmp_path) == before
+    command = str(refused.value).rpartition("remove it with `")[2].rstrip("`")
+    subprocess.run(command, shell=True, check=True)
+    assert not os.path.lexists(journal_of(path))
+    add_results(path, 3, 5)
+    assert log.check(path).is_sound
+
+
+@pytest.mark.skipif(not AS_ROOT, reason="only root gives files away")
+@pytest.mark.parametrize(("owner", "is_used"), [(0, True), (1001, True), (1002, False)])
+def test_a_journal_of_another_user_is_not_used(tmp_path, monkeypatch, owner, is_used):
+    path = tmp_path / "a.mcap"
+    write_log(path, SOME, "media")
+    os.chown(path, 1001, 1001)
+    interrupt(path)
+    assert journal_of(path).stat().st_uid == 1001  # whoever owns the log owns its journal
+    os.chown(journal_of(path), owner, owner)
+    monkeypatch.setattr(os, "geteuid", lambda: 1001)
+    with notices.collected() as said, notices.listening(said.append):
+        try:
+            look(path)
+        except McaptrackError:
+            assert not is_used
+    assert ("belongs to another user" in said[0].message) == (not is_used)
+
+
+def test_a_file_that_is_no_log_is_never_written_to(path, tmp_path):
+    text = tmp_path / "thesis.txt"
+    for content in (b"", b"chapter one\n" * 1000, b"x" + path.read_bytes()[1:]):
+        for beside in (
+            first_journal(0, 0, b"", b""),
+            first_journal(0, 0, content, b""),
+            journal_of(path).read_bytes(),
+        ):
+            text.write_bytes(content)
+            journal_of(text).write_bytes(beside)
+            before = everything(tmp_path)
+            for verb in (look, log.check, lambda there: log.recover(there, tmp_path.parent / "no.mcap")):
+                with notices.collected(), notices.listening(lambda _: None):
+                    try:
+                        verb(text)
+                    except McaptrackError as error:
+                        assert "\n" not in str(error)
+                assert everything(tmp_path) == before
+            (tmp_path.parent / "no.mcap").unlink(missing_ok=True)
+
+
+def test_a_journal_that_fits_a_file_that_is_no_log_changes_nothing(tmp_path):
+    text = tmp_path / "thesis.txt"
+    text.write_bytes(b"chapter one\n" * 1000)
+    with text.open("rb+") as stream:
+        journal_of(text).write_bytes(journal.pack_head(stream.fileno(), 100) + text.read_bytes()[100:])
+        before = everything(tmp_path)
+        with pytest.raises(McaptrackError, match="which is no MCAP file"):
+            new_end.settle(text, stream.fileno(), OpenFile.at(text))
+    assert everything(tmp_path) == before
+
+
+def test_what_somebody_else_wrote_into_a_half_written_log_is_not_undone(path):
+    """Be it a few rows only: nobody can say what they are."""
+    with log.read(path) as opened:
+        first = opened.index.data_end  # where new results begin
+    with path.open("rb+") as stream:
+        for row in range(4):
+            stream.seek((first // 512 + 2 * row + 1) * 512)
+            stream.write(b"by somebody else")
+    before = everything(path.parent)
+    with notices.collected() as said, notices.listening(said.append), pytest.raises(McaptrackError):
+        look(path)
+    assert "has been changed since" in said[0].message
+    assert everything(path.parent) == before
+
+
+def test_the_first_versions_journal_saves_a_log_to_another_file_and_is_not_put_back(tmp_path):
+    path, saved = tmp_path / "a.mcap", tmp_path / "saved.mcap"
+    write_log(path, SOME, "media")
+    whole = path.read_bytes()
+    with log.read(path) as opened:
+        start = opened.index.data_end
+    path.write_bytes(whole[:start] + b"half of something")
+    journal_of(path).write_bytes(first_journal(start, len(whole), whole[:start], whole[start:]))
+    before = everything(tmp_path)
+    with notices.collected() as said, notices.listening(said.append):
+        with pytest.raises(McaptrackError, match="can't be read as an MCAP file"):
+            log.read(path)
+        assert everything(tmp_path) == before
+        assert "If it was left half written, `mcaptrack recover" in said[0].message
+        assert log.recover(path, saved).lost == []
+    with log.read(saved) as one:
+        assert sum(channel.messages for channel in one.channels.values()) == len(SOME)
+    saved.unlink()
+    assert everything(tmp_path) == before
+    # A log that is whole is taken as it is, whatever the journal says.
+    path.write_bytes(whole)
+    journal_of(path).write_bytes(first_journal(8, 8, whole[:8], b""))
+    with notices.collected(), notices.listening(lambda _: None):
+        assert log.recover(path, saved).messages == len(SOME)
+
+
+def test_a_log_that_replaces_another_is_not_held_up_by_its_journal(path):
+    """What `ingest --force` does: the half-written log is gone, and so is what was left of its change."""
+    with log.create(path) as writer:
+        writer.add_message(writer.add_channel("a", SCHEMA, "json", {}), 1, 1, b"new")
+    assert [entry.name for entry in path.parent.iterdir()] == [path.name]
+    add_results(path, 3, 5)
+
+
+def test_a_journal_that_comes_while_results_are_computed_is_not_overwritten(tmp_path):
+    path = tmp_path / "a.mcap"
+    write_log(path, SOME, "media")
+    whole = path.read_bytes()
+    with log.read(path) as opened:
+        opened.lock()
+        journal_of(path).write_bytes(b"somebody's own")
+        with pytest.raises(McaptrackError, match="something lies there already"), log.extend(opened):
+            pass
+    assert journal_of(path).read_bytes() == b"somebody's own"
+    assert path.read_bytes() == whole
+
+
+def test_a_log_may_be_moved_with_its_journal_and_is_then_saved_to_another_file(path, tmp_path):
+    moved = tmp_path / "moved"
+    moved.mkdir()
+    for name in (path, journal_of(path)):
+        shutil.copyfile(name, moved / name.name)
+    with notices.collected() as said, notices.listening(said.append), pytest.raises(McaptrackError):
+        look(moved / path.name)
+    assert "is of another file than" in said[0].message
+    assert "If it was left half written, `mcaptrack recover" in said[0].message

@@ -1,0 +1,349 @@
+"""Changes of a log that are interrupted, at any call: the old log or the new one, and reading changes nothing."""
+
+from __future__ import annotations
+
+import errno
+import os
+import random
+import shutil
+import signal
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+from mcaptrack import log, notices
+from mcaptrack.errors import McaptrackError
+from mcaptrack.log import new_end
+from mcaptrack.log.journal import journal_of
+from tests.test_log_in_place import SCHEMA, contents
+
+#: Results of so many messages are replaced by so many others.
+CHANGES = {"grows": (30, 1500), "shrinks": (1500, 30), "stays as long": (400, 400)}
+
+
+def add_results(path: Path, seed: int, count: int) -> None:
+    """Replace the results of a log by random ones."""
+    noise = random.Random(seed)
+    with log.read(path) as opened:
+        there = [topic for topic in opened.channels if topic.startswith("/result")]
+        with log.extend(opened, drop=there, drop_attachments=["layout"]) as writer:
+            number = writer.add_channel("/result", SCHEMA, "json", {}, "media")  # not compressed: as long as it is
+            for n in range(count):
+                writer.add_message(number, n * 10, n, noise.randbytes(400))
+            writer.add_attachment("layout", "application/json", noise.randbytes(100))
+
+
+def seen(path: Path) -> dict[str, list[bytes]]:
+    """What our reader finds."""
+    with log.read(path) as opened:
+        found = {topic: [m.payload for m in opened.messages(topic)] for topic in opened.channels}
+        return found | {"layout": [opened.attachment("layout") or b""]}
+
+
+def photo(folder: Path) -> dict[str, tuple[bytes, int]]:
+    """Everything in a folder: names, content, times."""
+    return {entry.name: (entry.read_bytes(), entry.stat().st_mtime_ns) for entry in sorted(folder.iterdir())}
+
+
+class Change(NamedTuple):
+    old: bytes
+    new: bytes
+    make: Callable[[Path], None]
+
+
+@pytest.fixture(scope="module", params=CHANGES)
+def change(request, tmp_path_factory) -> Change:
+    """A log before and after a change that is made in place, in several pieces."""
+    before, after = CHANGES[request.param]
+    path = tmp_path_factory.mktemp("whole") / "a.mcap"
+    noise = random.Random(1)
+    with log.create(path) as writer:
+        number = writer.add_channel("/video", SCHEMA, "json", {}, "media")
+        for n in range(60):
+            writer.add_message(number, n * 10, n, noise.randbytes(20_000))
+    add_results(path, 1, before)
+    assert len(contents(path)["/result"]) == before
+    old, node = path.read_bytes(), path.stat().st_ino
+    add_results(path, 2, after)
+    assert len(contents(path)["/result"]) == after
+    new = path.read_bytes()
+    assert path.stat().st_ino == node
+    assert (len(new) > len(old), len(new) < len(old)) == (after > before, after < before)
+    return Change(old, new, lambda there: add_results(there, 2, after))
+
+
+@pytest.fixture
+def path(tmp_path, monkeypatch, change) -> Path:
+    monkeypatch.setattr(new_end, "_PIECE", 100_000)
+    monkeypatch.setattr(new_end, "_BLOCK", 200_000)
+    path = tmp_path / "a.mcap"
+    path.write_bytes(change.old)
+    return path
+
+
+CALLS = ("pwrite", "write", "fsync", "replace", "unlink", "ftruncate", "chmod", "fchown")
+
+
+def sabotage(at: int, fault: Callable[[], object], calls: Sequence[str] = CALLS) -> list[str]:
+    """The ``at``-th call that changes something on the disk does half of its work, if it writes, and then ``fault``."""
+    done: list[str] = []
+
+    def patched(name, real):
+        def call(*args, **kwargs):
+            done.append(name)
+            if len(done) == at:
+                if name in ("pwrite", "write"):
+                    real(args[0], bytes(args[1])[: len(args[1]) // 2], *args[2:])
+                fault()
+            return real(*args, **kwargs)
+
+        return call
+
+    for name in calls:
+        setattr(os, name, patched(name, getattr(os, name)))
+    return done
+
+
+def killed(work: Callable[[], object], at: int, calls: Sequence[str] = CALLS) -> bool:
+    """Whether a process that does this work is killed at its ``at``-th call that changes something on the disk."""
+    child = os.fork()
+    if child == 0:  # in the child: nothing of pytest is to run again
+        try:
+            sabotage(at, lambda: os.kill(os.getpid(), signal.SIGKILL), calls)
+            with notices.collected(), notices.listening(lambda _: None):
+                work()
+            os._exit(0)
+        finally:
+            os._exit(1)
+    _, status = os.waitpid(child, 0)
+    assert status in (0, signal.SIGKILL), status
+    return status != 0
+
+
+def left_behind(path: Path, change: Change, work: Callable[[], object]) -> Iterator[int]:
+    """Kill at each call, one after another; restores nothing."""
+    for at in range(1, 300):
+        reset(path, change.old)
+        if not killed(work, at):
+            return
+        yield at
+    raise AssertionError("it goes on and on")
+
+
+def reset(path: Path, content: bytes) -> None:
+    for entry in path.parent.iterdir():
+        if entry != path:
+            entry.unlink()
+    with path.open("rb+") as stream:  # the file stays the same one
+        stream.write(content)
+        stream.truncate(len(content))
+
+
+def mend(path: Path) -> None:
+    with log.read(path) as opened:
+        opened.lock()
+
+
+def look(path: Path, change: Change) -> str:
+    """What is seen of a log after a kill, and left of it: "old" or "new"; and that looking changes nothing."""
+    before = photo(path.parent)
+    is_beside = journal_of(path).exists()
+    with notices.collected() as said, notices.listening(said.append):
+        found = seen(path)
+    assert photo(path.parent) == before
+    assert [(notice.code, "\n" in notice.message) for notice in said] == [("journal", False)] * is_beside
+    half = is_beside and "left half written" in said[0].message
+    with notices.collected() as again, notices.listening(again.append):
+        checked = log.check(path)
+    assert [f.kind for f in checked.findings if f.level == "error"] == ["half-written"] * half
+    assert photo(path.parent) == before
+    with notices.collected() as mended, notices.listening(mended.append):
+        mend(path)
+    assert sum("has been put back as it was" in notice.message for notice in mended) == half
+    assert not journal_of(path).exists()
+    left = path.read_bytes()
+    assert left in (change.old, change.new)
+    assert seen(path) == found
+    return "old" if left == change.old else "new"
+
+
+def test_killed_at_any_call_it_is_the_old_log_or_the_new_one(path, change):
+    outcomes = [look(path, change) for _ in left_behind(path, change, lambda: change.make(path))]
+    assert len(outcomes) > 10
+    assert outcomes == sorted(outcomes, reverse=True)  # new from some call on
+    assert set(outcomes) == {"old", "new"}
+    assert path.read_bytes() == change.new
+    assert [entry.name for entry in path.parent.iterdir()] == ["a.mcap"]
+
+
+def test_killed_while_it_is_put_back_it_can_be_put_back_still(path, change):
+    middles = {}
+    for at in left_behind(path, change, lambda: change.make(path)):
+        if journal_of(path).exists():
+            middles.setdefault((path.read_bytes(), journal_of(path).read_bytes()), at)
+    for at in list(middles.values())[::3]:
+        for second in range(1, 100):
+            reset(path, change.old)
+            assert killed(lambda: change.make(path), at)
+            if not killed(lambda: mend(path), second):
+                break
+            look(path, change)
+        assert second > 2
+        assert not journal_of(path).exists()
+
+
+@pytest.mark.parametrize("error", [OSError(errno.ENOSPC, "No space left on device"), KeyboardInterrupt()])
+def test_when_the_disk_is_full_or_somebody_interrupts_it_is_the_old_log_or_the_new_one(
+    path, change, monkeypatch, error
+):
+    def fail() -> None:
+        raise error
+
+    outcomes = []
+    for at in range(1, 300):
+        reset(path, change.old)
+        raised = None
+        with monkeypatch.context() as patch, notices.collected() as said, notices.listening(said.append):
+            for name in CALLS:
+                patch.setattr(os, name, getattr(os, name))  # put back at the end
+            done = sabotage(at, fail)
+            try:
+                change.make(path)
+            except (McaptrackError, KeyboardInterrupt) as found:
+                assert "\n" not in str(found)
+                raised = found
+        if len(done) < at:
+            break
+        left = path.read_bytes()
+        outcomes.append("old" if left == change.old else "new")
+        assert left == change.old or (left == change.new and (said or raised is error))
+        assert outcomes[-1] == "new" or raised is not None
+        with notices.collected() as said, notices.listening(said.append):
+            mend(path)
+        assert path.read_bytes() == left
+        assert not journal_of(path).exists()
+    assert len(done) < at
+    assert len(outcomes) > 10
+    assert {"old", "new"} == set(outcomes)
+    assert path.read_bytes() == change.new
+
+
+def test_what_can_t_be_put_back_at_once_is_put_back_later(path, change, monkeypatch):
+    real, count = os.pwrite, [0]
+
+    def full(*args):
+        count[0] += 1
+        if count[0] > 1:
+            raise OSError(errno.EIO, "Input/output error")
+        return real(*args)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "pwrite", full)
+        patch.setattr(os, "ftruncate", full)
+        with pytest.raises(McaptrackError) as said:
+            change.make(path)
+    if count[0] > 2:
+        assert "nor put back as it was" in str(said.value)
+        assert "\n" not in str(said.value)
+    assert look(path, change) == "old"
+
+
+def test_a_newer_log_that_takes_the_place_of_a_half_written_one_is_never_rolled_back(path, change, tmp_path_factory):
+    """Also where it is what the interrupted change would have become, which another machine may have finished."""
+    newer = path.parent / "newer"
+    newer.write_bytes(change.old)
+    add_results(newer, 3, 700)
+    other = newer.read_bytes()
+    for at in left_behind(path, change, lambda: change.make(path)):
+        for content in (change.new, other):
+            reset(path, change.old)
+            assert killed(lambda: change.make(path), at)
+            with path.open("rb+") as stream:  # as cp does: the file stays the same one
+                stream.write(content)
+                stream.truncate(len(content))
+            before, wanted = photo(path.parent), contents(path)
+            with notices.collected() as said, notices.listening(said.append):
+                found = seen(path)
+                assert log.check(path).is_sound
+            assert {topic: len(of) for topic, of in found.items()} == {topic: len(of) for topic, of in wanted.items()}
+            assert photo(path.parent) == before
+            with notices.collected() as said, notices.listening(said.append):
+                try:
+                    mend(path)
+                except McaptrackError as error:
+                    assert "has been changed since" in str(error)
+                    assert f"`rm {journal_of(path)}`" in str(error)
+            assert path.read_bytes() == content
+
+
+def test_a_writer_that_is_at_work_is_seen_beside(path, change):
+    """Whoever reads meanwhile sees the log as it was, at every step, and waits for nobody."""
+    said: list[notices.Notice] = []
+    steps = []
+
+    def watch(name, real):
+        def call(*args, **kwargs):
+            out = real(*args, **kwargs)
+            if journal_of(path).exists() and name in ("pwrite", "replace", "ftruncate"):
+                steps.append(name)
+                with notices.collected() as heard, notices.listening(heard.append):
+                    assert seen(path) == old
+                    with pytest.raises(McaptrackError, match="is being written to by another process"):
+                        log.check(path)
+                    with pytest.raises(McaptrackError, match="is being written to by another process"):
+                        mend(path)
+                said.extend(heard)
+            return out
+
+        return call
+
+    old = seen(path)
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("pwrite", "replace", "ftruncate"):
+            patch.setattr(os, name, watch(name, getattr(os, name)))
+        change.make(path)
+    assert path.read_bytes() == change.new
+    assert len(steps) > 1
+    assert {notice.message for notice in said} == {
+        f"{path} is being written to by another process; it is seen as it was before"
+    }
+
+
+def test_who_extends_a_log_goes_on_seeing_what_it_was(path, change):
+    with log.read(path) as opened:
+        before = {topic: [m.payload for m in opened.messages(topic)] for topic in opened.channels}
+        with log.extend(opened, drop=["/result"]) as writer:
+            number = writer.add_channel("/more", SCHEMA, "json", {})
+            for n in range(300):
+                writer.add_message(number, n, n, bytes(1000))
+                if n % 100 == 0:
+                    assert [m.payload for m in opened.messages("/result")] == before["/result"]
+        assert {topic: [m.payload for m in opened.messages(topic)] for topic in opened.channels} == before
+        with pytest.raises(McaptrackError, match="was changed since it was opened; open it again"):
+            opened.lock()
+    assert sorted(seen(path)) == ["/more", "/video", "layout"]
+
+
+def test_a_log_that_was_moved_away_with_its_journal_can_be_saved(path, change, tmp_path):
+    """Its journal fits by what it holds, but can't prove whose it is: it is used for another file only."""
+    saved = set()
+    for _ in left_behind(path, change, lambda: change.make(path)):
+        if not journal_of(path).exists():
+            continue
+        folder = tmp_path / "moved"
+        folder.mkdir()
+        moved = folder / "a.mcap"
+        shutil.copyfile(path, moved)
+        shutil.copyfile(journal_of(path), journal_of(moved))
+        before = photo(folder)
+        with notices.collected() as said, notices.listening(said.append):
+            report = log.recover(moved, tmp_path / "saved.mcap")
+        assert photo(folder) == before
+        assert report.lost == []
+        assert len(said) == 1
+        kept = contents(tmp_path / "saved.mcap")
+        saved.add(len(kept["/result"]))
+        shutil.rmtree(folder)
+    assert saved <= {30, 1500, 400}

@@ -1,0 +1,149 @@
+"""Commands that read change nothing: no byte, no time, no name, whatever lies beside the log."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Callable
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+from mcaptrack.log.journal import journal_of
+from tests.commands import GROUP, called, done, made_log
+from tests.test_journal import everything, first_journal, interrupt, never_waits  # noqa: F401
+
+#: How each command is run so that it only reads the log; nothing comes into the log's folder.
+READING: dict[str, Callable[[Path, Path], list[object]]] = {
+    "check": lambda log, out: [log],
+    "drop": lambda log, out: [log, "/camera/truth", "-o", out / "dropped.mcap"],
+    "evaluate": lambda log, out: [log],
+    "export": lambda log, out: [log, "-o", out / "tables"],
+    "info": lambda log, out: [log],
+    "ingest": lambda log, out: [log, "-o", out / "ingested.mcap"],
+    "query": lambda log, out: [log, "select count(*) from tracks"],
+    "recover": lambda log, out: [log, "-o", out / "recovered.mcap"],
+    "render": lambda log, out: [log, "-o", out / "rendered.gif", "--width", "64", "--end-s", "0.2"],
+    "report": lambda log, out: [log, "-o", out / "report.html"],
+    "tune": lambda log, out: [log, "--trials", "1", "-o", out / "tuned.json"],
+    "view": lambda log, out: [log, "--layout", "no such layout"],
+    **{
+        name: lambda log, out: [log, "-o", out / "other.mcap"]
+        for name in ("detect", "track", "sample", "predict", "retrack", "run", "events")
+    },
+}
+#: Those that read no log.
+OTHERS = {"demo"}
+if find_spec("torch"):  # without it `train` reads nothing
+    READING["train"] = lambda log, out: [log, "-o", out / "trained", "--epochs", "1", "--device", "cpu"]
+else:
+    OTHERS |= {"train"}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory) -> Path:
+    return made_log(tmp_path_factory.mktemp("whole"), 16)
+
+
+@pytest.fixture(scope="module")
+def half(whole, tmp_path_factory) -> Path:
+    """A log that was left half written. Nothing here changes it, or every test after that fails."""
+    path = tmp_path_factory.mktemp("half") / "a.mcap"
+    shutil.copy(whole, path)
+    interrupt(path)
+    return path
+
+
+@pytest.fixture
+def out(tmp_path, monkeypatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_every_command_is_tried():
+    assert READING.keys() | OTHERS == set(GROUP.commands)
+
+
+@pytest.mark.parametrize("command", sorted(READING))
+def test_a_half_written_log_stays_as_it_is_and_is_read_as_it_was(command, half, whole, out):
+    before = everything(half.parent)
+    words = READING[command](half, out)
+    outcome = called(command, *words)
+    assert everything(half.parent) == before
+    said = [line for line in outcome.err.splitlines() if "left half written" in line]
+    if command == "view":
+        assert outcome.code == 1
+        assert "viewers can't open" in outcome.err
+    elif command == "check":
+        assert outcome.code == 1
+        assert "half-written" in outcome.out
+    else:
+        assert [line.startswith("warning: ") for line in said] == [True]
+    shutil.rmtree(out)
+    out.mkdir()
+    other = called(command, *READING[command](whole, out))
+    if command not in ("view", "check"):
+        assert outcome.code == other.code
+        assert outcome.out.replace(str(half), str(whole)) == other.out
+
+
+@pytest.mark.parametrize("command", ["info", "evaluate", "query"])
+def test_it_stands_in_the_warnings_for_programs(command, half, out):
+    outcome = done(command, *READING[command](half, out), "--json", "-q")
+    warnings = json.loads(outcome.out)["warnings"]
+    assert [warning["code"] for warning in warnings if "left half written" in warning["message"]] == ["journal"]
+
+
+def test_the_next_command_that_writes_puts_it_back_and_says_so(half, whole, tmp_path):
+    path = tmp_path / "a.mcap"
+    shutil.copy(whole, path)
+    interrupt(path)
+    outcome = done("drop", path, "/camera/truth", "-q")
+    assert "has been put back as it was before" in outcome.err
+    assert not journal_of(path).exists()
+    other = tmp_path / "b.mcap"
+    shutil.copy(whole, other)
+    done("drop", other, "/camera/truth")
+    assert path.read_bytes() == other.read_bytes()
+
+
+BESIDE: dict[str, Callable[[Path], object]] = {
+    "48 bytes": lambda at: at.write_bytes(first_journal(0, 0, b"", b"")),
+    "a pipe": os.mkfifo,
+    "a folder": Path.mkdir,
+}
+
+
+@pytest.mark.parametrize("thing", BESIDE)
+@pytest.mark.parametrize("command", sorted(READING))
+def test_what_lies_where_the_journal_goes_harms_and_stops_nothing(command, thing, whole, out):
+    folder = out / "logs"
+    folder.mkdir()
+    path = folder / "a.mcap"
+    shutil.copy(whole, path)
+    BESIDE[thing](journal_of(path))
+    before = everything(folder)
+    outcome = called(command, *READING[command](path, out))
+    assert everything(folder) == before
+    said = [line for line in outcome.err.splitlines() if str(journal_of(path)) in line]
+    assert [line.startswith("warning: ") for line in said] == [True]
+
+
+@pytest.mark.parametrize("command", sorted(READING.keys() - {"ingest"}))
+def test_what_is_no_file_is_refused_in_a_line(command, out):
+    """As the log, and as the results beside one."""
+    folder = out / "logs"
+    folder.mkdir()
+    os.mkfifo(folder / "pipe.mcap")
+    (folder / "folder.mcap").mkdir()
+    os.mkfifo(folder / "beside.results.mcap")
+    shutil.copy(os.devnull, folder / "beside.mcap")
+    for name, words in {"pipe.mcap": "a named pipe", "folder.mcap": "a folder", "beside.mcap": "a named pipe"}.items():
+        before = everything(folder)
+        outcome = called(command, *READING[command](folder / name, out))
+        assert outcome.code in (1, 2)
+        assert "Traceback" not in outcome.err
+        assert len([line for line in outcome.err.splitlines() if words in line]) == 1 or name == "beside.mcap"
+        assert everything(folder) == before
