@@ -265,3 +265,20 @@ def test_kitti_is_scored_as_by_trackeval(seed, tmp_path, capsys):
     theirs = datasets.Kitti2DBox(folders)
     data = theirs.get_preprocessed_seq_data(theirs.get_raw_seq_data("us", "0000"), "pedestrian")
     same_as_trackeval(scores(tracks, truth)[0], by_trackeval(data))
+
+
+def test_files_of_several_sequences_are_combined_and_one_file_stands_alone(tmp_path):
+    """Their names differ, so what they have in common is that they were given together."""
+    made = []
+    for name in ("north", "south"):
+        tracks, truth = write(tmp_path / f"{name}.txt", *FOUND), write(tmp_path / f"{name}-gt.txt", *WALK)
+        both = compare_files(tracks, truth)
+        made.append((name, tracks, both.truth, both.tracks))
+    together = evaluate([sequence_of_files(*one, 2) for one in made], EvaluateOptions(("iou",)))
+    assert [(r.sequence, r.tracks) for r in together.results] == [
+        ("north", "north.txt"),
+        ("south", "south.txt"),
+        ("COMBINED", "2 files"),
+    ]
+    (alone,) = evaluate([sequence_of_files(*made[0], 1)], EvaluateOptions(("iou",))).results
+    assert (alone.tracks, alone.group) == ("north.txt", "")

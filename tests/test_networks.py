@@ -276,6 +276,24 @@ class TestOnnx:
         cov = predictor.predict(np.zeros((2, 4, 2)), known).cov
         np.testing.assert_allclose(cov[:, 0], [2 * np.eye(2), 4 * np.eye(2)])
 
+    def with_step(self, folder, said: str) -> str:
+        """A network whose metadata say how long a step is (field 14 of the model: key and value)."""
+        entry = b"\x0a\x06step_s\x12" + bytes([len(said)]) + said.encode()
+        path = folder / "net.onnx"
+        path.write_bytes(base64.b64decode(LINE) + b"\x72" + bytes([len(entry)]) + entry)
+        return f"onnx:{path}"
+
+    def test_metadata_say_how_long_a_step_is(self, tmp_path):
+        past = np.array([[[5.0, 5.0], [6.0, 5.25], [7.0, 5.5]]])
+        forecast = make(self.with_step(tmp_path, "0.8"), 3, 0.8).predict(past, np.ones((1, 3), bool))
+        np.testing.assert_allclose(forecast.mean[0], [[8, 5.75], [9, 6.0], [10, 6.25]], atol=1e-5)
+        assert make(self.with_step(tmp_path, "0.8"), 6, 0.4).step_s == 0.4  # read between the steps of the network
+
+    @pytest.mark.parametrize("said", ["0", "-0.4", "inf", "nan", "half"])
+    def test_a_step_that_is_no_number_of_seconds_is_refused(self, tmp_path, said):
+        with pytest.raises(McaptrackError, match=f"its metadata say step_s = '{said}', which is no number of seconds"):
+            make(self.with_step(tmp_path, said), 3, 0.4)
+
     def test_what_can_not_be_used_is_refused_in_one_line(self, tmp_path):
         name = self.file(tmp_path, WRONG)
         with pytest.raises(McaptrackError, match=r"net\.onnx has to give \(B, T, 2\)"):
@@ -304,6 +322,21 @@ class TestCalibration:
         assert scores["NLL"] == pytest.approx(1.25 + np.log(36) / 2 + np.log(2 * np.pi))
         # chi^2 with two degrees of freedom has its quantiles at 1.386, 4.605 and 5.991
         assert [scores[f"coverage_{level}"] for level in (50, 90, 95)] == [0.5, 0.5, 1.0]
+
+    def test_log_likelihood_and_distance_equal_those_of_scipy(self):
+        from scipy.stats import multivariate_normal
+
+        rng = np.random.default_rng(3)
+        root = rng.normal(size=(5, 4, 2, 2))
+        cov = root @ root.transpose(0, 1, 3, 2) + 0.1 * np.eye(2)
+        off, future = rng.normal(size=(5, 4, 2)), rng.normal(size=(5, 4, 2))
+        wanted = [
+            -multivariate_normal([0, 0], c).logpdf(o)
+            for c, o in zip(cov.reshape(-1, 2, 2), off.reshape(-1, 2), strict=True)
+        ]
+        assert forecast_scores(future + off, cov, future)["NLL"] == pytest.approx(np.mean(wanted))
+        squared = [o @ np.linalg.inv(c) @ o for c, o in zip(cov.reshape(-1, 2, 2), off.reshape(-1, 2), strict=True)]
+        np.testing.assert_allclose(mahalanobis_squared(off, cov).ravel(), squared)
 
     def test_ellipses_of_gaussian_errors_hold_what_they_say(self):
         from scipy.stats import multivariate_normal

@@ -14,6 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mcaptrack.schema import DETECTIONS, EVENTS, PREDICTIONS, SCHEMAS, TRACKS
+from mcaptrack.schema.codec import RowCodec
 from mcaptrack.schema.proto import parse
 from tests.strategies import columns
 
@@ -134,6 +135,28 @@ def test_the_gate_lets_whole_numbers_in_up_to_the_ends_of_their_range(schema):
             else:
                 with pytest.raises(ValueError, match="needs whole numbers"):
                     schema.rows(**others, **{column.name: np.array([value])})
+
+
+@given(st.integers(1, 40), st.data())
+def test_wide_rows_and_high_field_numbers_are_written_as_by_the_protobuf_runtime(count, data):
+    """Lengths and tags above 127 take two bytes."""
+    numbers = sorted(data.draw(st.sets(st.integers(1, 5000), min_size=count, max_size=count)))
+    kinds = data.draw(
+        st.lists(st.sampled_from(["double", "float", "bool", "sfixed64"]), min_size=count, max_size=count)
+    )
+    text = "".join(f"{kind} c{number} = {number};\n" for kind, number in zip(kinds, numbers, strict=True))
+    codec = RowCodec(
+        parse(f"package p;\nmessage A {{\nmessage Row {{\n{text}}}\nrepeated Row rows = 1;\n}}", "a.proto")
+    )
+    rows = np.zeros(2, codec.dtype)
+    for number in numbers:
+        rows[f"c{number}"] = [1, number % 2]
+    message = codec.message_class()
+    message.ParseFromString(codec.encode(rows))
+    for number in numbers:
+        assert [getattr(row, f"c{number}") for row in message.rows] == [1, number % 2]
+    read = codec.decode(codec.encode(rows))
+    assert all(read[name].tolist() == rows[name].tolist() for name in read.dtype.names)
 
 
 def test_bytes_that_are_no_message_are_refused():

@@ -37,8 +37,8 @@ from tools.mutations import ROOT, Mutant, find, sample
 RETRACK = "retrack whole offline_reference retracking_reference retracking_laws retracking_thresholds"
 #: The test files that cover a folder or a file, beside those of the folders around it; all tests where none are named.
 COVERS = {
-    "mcaptrack/evaluation": "evaluation events forecast_errors metrics_oracles compared",
-    "mcaptrack/metrics": "metrics metrics_oracles forecast_errors evaluation",
+    "mcaptrack/evaluation": "evaluation events events_reference forecast_errors metrics_oracles compared",
+    "mcaptrack/metrics": "metrics metrics_oracles networks forecast_errors evaluation",
     "mcaptrack/predictors": "prediction networks",
     "mcaptrack/schema": "schema",
     "mcaptrack/tables": "tables",
