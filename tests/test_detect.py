@@ -10,7 +10,7 @@ from mcaptrack.clock import FrameClock
 from mcaptrack.match import assign
 from mcaptrack.scene import Scene
 from mcaptrack.schema import Frame
-from mcaptrack.transforms.detect import Detect
+from mcaptrack.transforms.detect import Detect, _PersonSize
 from mcaptrack.transforms.detect.foreground import FrameDifference
 from mcaptrack.transforms.detect.motion import CameraMotion
 from tests.worlds import ns, small_scene
@@ -164,6 +164,19 @@ def test_what_is_too_small_to_be_a_person_is_left_out():
     assert len(first) == 2
     *_, first = boxes_of([*EMPTY, blocks((100, 30, 5, 5), (20, 30, 6, 6))])
     assert first == [[20.0, 30.0, 6.0, 6.0]]
+
+
+def test_the_height_of_people_is_the_median_height_weighted_by_area():
+    """Of blobs of at least 20 px of area that are less than half as high as the picture; 20 px until ten were seen."""
+    size = _PersonSize()
+    small, tall = blocks((10, 10, 10, 10), (40, 10, 10, 10)), blocks((10, 10, 12, 40))
+    high, speck = blocks((100, 10, 20, 70)), blocks((100, 10, 5, 5))
+    masks = [np.where(picture > 90, np.uint8(255), np.uint8(0)) for picture in (small, tall, high, speck)]
+    assert [size.measure(masks[k]) for k in (0, 0, 2, 3, 0, 0)] == [20.0] * 6
+    assert size.measure(masks[0]) == 10.0  # ten blobs of 100 px^2
+    assert size.measure(masks[1]) == 10.0  # 480 against 1000 px^2
+    assert size.measure(masks[1]) == 10.0  # 960
+    assert size.measure(masks[1]) == 40.0  # 1440
 
 
 def test_a_picture_of_which_more_than_half_differs_shows_no_people():

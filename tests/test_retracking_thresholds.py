@@ -13,11 +13,12 @@ import pytest
 
 from mcaptrack.schema import Frame
 from mcaptrack.transforms import PROFILES
+from mcaptrack.transforms.retrack.doubt import log_odds
 from mcaptrack.transforms.retrack.link import link
 from mcaptrack.transforms.retrack.motion import Walker, smooth
 from mcaptrack.transforms.retrack.part import _encounters, part
 from mcaptrack.transforms.retrack.whole import laid
-from tests.references.offline import Motion, Path, encounters, exchanged, links
+from tests.references.offline import Motion, Path, encounters, exchanged, links, person_log_odds
 from tests.references.online import OnlineTracker
 from tests.worlds import walk
 
@@ -134,6 +135,38 @@ def test_how_far_aside_a_track_is_linked(speed, gap, others, least):
         compare(ours, reference, 0.0, 20.0)
     else:
         assert not ours(0.0)
+
+
+@pytest.mark.parametrize("gap", [2, 6])
+def test_how_fast_a_runner_is_linked(gap):
+    """No link is longer than 1 m and 2.5 m a second of the gap, however well it fits."""
+
+    def paths(speed: float) -> dict[int, Path]:
+        later = 20 + gap
+        return {1: line(0, 21, (0.0, 0.0), (speed, 0.0)), 2: line(later, 20, (speed * 0.4 * later, 0.0), (speed, 0.0))}
+
+    def ours(speed: float) -> bool:
+        out, _ = laid_out(paths(speed))
+        forward, backward, _ = smooth(WALKER, out, 0.4)
+        return link(WALKER, out, forward, backward, 0.4, 20.0, 0.05)[0] == 1
+
+    compare(ours, lambda speed: links(MOTION, paths(speed), 20.0, 0.05).get(1) == 2, 1.0, 9.0)
+
+
+def test_how_near_a_double_walks_beside_a_person():
+    """A short track beside a long one counts as its double up to 1.2 m."""
+
+    def odds(beside_m: float) -> tuple[float, float]:
+        paths = {1: line(0, 40, (0.0, 0.0), (1.0, 0.0)), 2: line(12, 10, (4.8, beside_m), (1.0, 0.0))}
+        out, _ = laid_out(paths)
+        _, _, smoothed = smooth(WALKER, out, 0.4)
+        return float(log_odds(WALKER, out, smoothed, 0.4)[1]), person_log_odds(MOTION, paths)[2]
+
+    near, far = odds(1.1), odds(1.3)
+    assert far[0] - near[0] == pytest.approx(1.993)  # what walking beside a person counts for
+    assert near == pytest.approx(near[::-1])
+    for side in (0, 1):
+        compare(lambda more, s=side: odds(1.0 + more)[s] < sum(near + far) / 4, lambda more: more < 0.2, 0.0, 1.0)
 
 
 def crossing(beside_m: float, gap: int, shift: int, named: str) -> tuple[dict[int, Path], dict[int, dict[int, int]]]:

@@ -248,17 +248,16 @@ def test_with_nothing_that_tells_them_apart_the_trackers_agree():
 @given(st.integers(0, 2**32 - 1))
 @settings(max_examples=25)
 def test_compiled_it_is_the_same_to_the_bit(seed):
-    """Crowds in which all boxes overlap, frames that are missing, classes, and all the ways to say an age."""
+    """Crowds in which all boxes overlap, boxes that shrink until the next would be none, missing frames, and classes."""
     assert compile_sort()
     rng = np.random.default_rng(seed)
     now, frames = 0.0, []
     for number in range(90):
         now += rng.choice([0.1, 0.1, 0.1, 0.1, 0.4, 3.0]) if number < 40 else 0.033
         rows = boxes_at(rng.uniform(0, 120, (rng.integers(0, 12), 2)), (30, 40))
-        size = rng.choice([1.0, 0.1], len(rows), p=[0.9, 0.1])  # some are expected to vanish in the next frame
-        rows["w_px"], rows["h_px"] = rows["w_px"] * size, rows["h_px"] * size
         rows["class_id"] = rng.integers(1, 3, len(rows))
-        frames.append(Frame(ns(now), number, rows))
+        vanishing = boxes_at([(200, 60), (260, 60)], (30 * 0.65 ** (number % 9), 40 * 0.65 ** (number % 7)))
+        frames.append(Frame(ns(now), number, np.concatenate([rows, vanishing])))
     ages = {"max_age_s": 0.5, "min_hits_s": 0.1} if rng.random() < 0.5 else {"max_age_frames": 3, "min_hits_frames": 1}
     sort = Sort(**ages, min_iou=0.1, mix_classes=bool(rng.random() < 0.5))
     fast = [frame for (frame,) in sort(frames)]

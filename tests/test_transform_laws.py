@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import fields, replace
 from typing import get_type_hints
@@ -253,9 +254,14 @@ def test_every_parameter_says_what_it_is_and_refuses_what_it_can_not_be(kind):
         assert parameter.metadata["help"]
         with pytest.raises(McaptrackError, match=parameter.name):
             kind(**{parameter.name: object()})
-        if parameter.metadata["least"] > -np.inf and isinstance(parameter.default, (int, float)):
-            with pytest.raises(McaptrackError, match=f"{parameter.name} has to be"):
-                kind(**{parameter.name: type(parameter.default)(parameter.metadata["least"] - 1)})
+        least, most = parameter.metadata["least"], parameter.metadata["most"]
+        words = f"at least {least:g}" if most == np.inf else f"from {least:g} to {most:g}"
+        number = bare_type(get_type_hints(kind)[parameter.name])
+        for value in (least - 1, most + 1):
+            if np.isfinite(value):
+                refused = f"{parameter.name} has to be {words}, not {number(value)}"
+                with pytest.raises(McaptrackError, match=re.escape(refused)):
+                    kind(**{parameter.name: number(value)})
     with pytest.raises(AttributeError):
         kind().reads = None
     assert replace(kind()) == kind()

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from mcaptrack.transforms import PROFILES
 from mcaptrack.transforms.retrack.follow import pairs
+from mcaptrack.transforms.retrack.following import Following
 from mcaptrack.transforms.retrack.link import link
 from mcaptrack.transforms.retrack.motion import Paths, State, Walker, smooth
 from mcaptrack.transforms.retrack.part import exchanges
@@ -222,8 +223,6 @@ class TestOfTheWholeLog:
         assert np.sqrt((off**2).sum(axis=1).mean()) < 0.7 * raw
 
     def test_the_noise_is_found_out(self):
-        from mcaptrack.transforms.retrack.following import Following
-
         for noise_m in (0.05, 0.35):
             rng = np.random.default_rng(2)
             frames = walk(
@@ -236,6 +235,35 @@ class TestOfTheWholeLog:
             for frame in frames:
                 run.tick(frame)
             assert run.noise_m == pytest.approx(noise_m, rel=0.25)
+
+    @pytest.mark.parametrize(("spread_m", "found_m"), [(0.0, 0.03), (4.0, 0.8)])
+    def test_the_noise_that_is_found_out_has_limits(self, spread_m, found_m):
+        rng = np.random.default_rng(2)
+        run = Following(replace(DEFAULT, max_jump_m=None))
+        for frame in walk(lambda n: {k: tuple([0.0, 900.0 * k] + rng.normal(0, spread_m, 2)) for k in range(9)}, 250):
+            run.tick(frame)
+        assert run.noise_m == pytest.approx(found_m)
+
+    def test_exchanges_with_three_others_one_after_another_are_all_undone(self):
+        """Person 1 crosses three others, unseen for a moment each time, and each time the input exchanges the ids."""
+        crossings = [(20, 2), (45, 3), (70, 4)]
+
+        def crowd(tick: int):
+            place = {1: (0.4 * tick, 0.0)}
+            place |= {who: (0.4 * when - 0.4 * (tick - when), 0.5) for when, who in crossings}
+            name = {who: who for who in place}
+            for when, who in crossings:
+                if abs(tick - when) <= 1:
+                    del place[1], place[who]
+                    break
+                if tick > when:
+                    name[1], name[who] = name[who], name[1]
+            return {name[who]: at for who, at in place.items()}
+
+        frames = self.offline(crowd, 95, replace(DEFAULT, same_source=60.0, link_s=0.0))
+        first, last = places(frames[5]), places(frames[90])
+        one = next(who for who, (_, y) in first.items() if abs(y) < 0.2)
+        assert last[one] == pytest.approx((36.0, 0.0), abs=0.2)
 
     @given(seed=st.integers(0, 2**32 - 1), cut=st.integers(5, 55))
     @settings(max_examples=15)
