@@ -280,5 +280,6 @@ def test_files_of_several_sequences_are_combined_and_one_file_stands_alone(tmp_p
         ("south", "south.txt"),
         ("COMBINED", "2 files"),
     ]
+    assert {(r.similarity, r.gate, r.rules) for r in together.results} == {("iou", 0.5, "trackeval")}
     (alone,) = evaluate([sequence_of_files(*made[0], 1)], EvaluateOptions(("iou",))).results
     assert (alone.tracks, alone.group) == ("north.txt", "")

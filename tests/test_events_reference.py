@@ -20,8 +20,9 @@ def random_world(rng: np.random.Generator) -> tuple[list[Frame], list[Frame]]:
     start, speed = rng.uniform(-5, 5, (4, 2)), rng.normal(0, 0.1, (4, 2))
     since, until = rng.integers(0, 15, 4), rng.integers(25, 60, 4)
     names, lost, truth, tracks, now = [10, 20, 30, 40], np.zeros(4), [], [], 0.0
+    slower = rng.choice([1.0, 9.0])  # ten frames a second, or about one
     for number in range(50):
-        now += rng.choice([0.1, 0.1, 0.1, 0.1, 0.2, 0.7])
+        now += slower * rng.choice([0.1, 0.1, 0.1, 0.1, 0.2, 0.7])
         people, found = {}, {}
         for who in range(4):
             here = start[who] + number * speed[who]

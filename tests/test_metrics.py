@@ -294,6 +294,14 @@ class TestDisplacement:
         made = forecasts(*(foretold(4, who, [(5.0, 0), (6.0, 0), (7.0, 0)]) for who in (7, 8)))
         assert displacement(truth, tracks, made).summary()["false_forecasts_per_frame"] == 1.0
 
+    def test_forecasts_of_tracks_without_positions_are_not_judged(self):
+        """Neither of an id that is not in the tracks, nor at a time at which the track is not there."""
+        truth, tracks = positions(straight(1, range(10))), positions(straight(7, range(10)))
+        for step, who in ((4, 6), (4, 8), (-1, 7), (12, 7)):
+            found = displacement(truth, tracks, forecasts(foretold(step, who, [(5.0, 0), (6.0, 0), (7.0, 0)])))
+            assert found.false_forecasts == 0
+            assert found.ade_m.tolist() == []
+
     def test_holes_of_a_track_are_filled_and_young_tracks_are_not_asked(self):
         truth = positions(straight(1, range(10)))
         holed = positions({7: {step: (step, 0.0) for step in (0, 1, 4, 5)}})

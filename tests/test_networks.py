@@ -255,6 +255,14 @@ class _Forecasts:
         return Forecast(*self._inner.predict(xy_m, valid))
 
 
+def test_tensors_of_a_saved_file_are_aligned_whatever_the_card_says(tmp_path):
+    """The format wants the tensors to begin at a multiple of 8 bytes."""
+    for length in range(9):
+        save(tmp_path / "w.safetensors", STORED["red"], CARDS["red"] | {"note": "x" * length})
+        assert int.from_bytes((tmp_path / "w.safetensors").read_bytes()[:8], "little") % 8 == 0
+        assert load(tmp_path / "w.safetensors").card["note"] == "x" * length
+
+
 class TestOnnx:
     def file(self, folder, text):
         path = folder / "net.onnx"
@@ -269,6 +277,8 @@ class TestOnnx:
         kalman = make("kalman", 3, 0.4).predict(past, np.array([[True, False, True]]))
         np.testing.assert_allclose(forecast.cov, kalman.cov)
         assert len(predictor.weights_sha256) == 64
+        nothing = predictor.predict(np.empty((0, 3, 2)), np.empty((0, 3), bool))
+        assert (nothing.mean.shape, nothing.cov.shape) == ((0, 3, 2), (0, 3, 2, 2))
 
     def test_a_covariance_of_its_own_and_what_it_knows_of_holes(self, tmp_path):
         predictor = make(self.file(tmp_path, WITH_COV), 3, 0.4)

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from mcaptrack.schema import DETECTIONS, EVENTS, PREDICTIONS, SCHEMAS, TRACKS
 from mcaptrack.schema.codec import RowCodec
-from mcaptrack.schema.proto import parse
+from mcaptrack.schema.proto import KINDS, parse
 from tests.strategies import columns
 
 ALL = st.sampled_from(sorted(SCHEMAS.values(), key=lambda schema: schema.name))
@@ -95,6 +95,9 @@ def test_a_writer_that_leaves_defaults_out_is_read_between_others():
     assert rows["x_m"].tolist() == [1.5, 3.0]
     assert rows["track_id"].tolist() == [5, 0]
     assert np.isnan(rows["y_m"][1])
+    for payload in (TRACKS.codec.encode(ours), message.SerializeToString()):
+        with pytest.raises(ValueError, match="read-only"):
+            TRACKS.codec.decode(payload)["x_m"] = 1.0
 
 
 @pytest.mark.parametrize("schema", SCHEMAS.values(), ids=str)
@@ -132,6 +135,10 @@ def test_the_gate_lets_whole_numbers_in_up_to_the_ends_of_their_range(schema):
             if -(2**63) <= value < 2**64:  # further numbers are no whole numbers to NumPy
                 with pytest.raises(ValueError, match=re.escape(words)):
                     schema.rows(**others, **{column.name: np.array([value])})
+                two = {name: np.repeat(values, 2) for name, values in others.items()}
+                for among in ([value, 1], [1, value]):
+                    with pytest.raises(ValueError, match=re.escape(words)):
+                        schema.rows(**two, **{column.name: np.array(among, np.array([value]).dtype)})
             else:
                 with pytest.raises(ValueError, match="needs whole numbers"):
                     schema.rows(**others, **{column.name: np.array([value])})
@@ -141,9 +148,7 @@ def test_the_gate_lets_whole_numbers_in_up_to_the_ends_of_their_range(schema):
 def test_wide_rows_and_high_field_numbers_are_written_as_by_the_protobuf_runtime(count, data):
     """Lengths and tags above 127 take two bytes."""
     numbers = sorted(data.draw(st.sets(st.integers(1, 5000), min_size=count, max_size=count)))
-    kinds = data.draw(
-        st.lists(st.sampled_from(["double", "float", "bool", "sfixed64"]), min_size=count, max_size=count)
-    )
+    kinds = data.draw(st.lists(st.sampled_from(sorted(KINDS)), min_size=count, max_size=count))
     text = "".join(f"{kind} c{number} = {number};\n" for kind, number in zip(kinds, numbers, strict=True))
     codec = RowCodec(
         parse(f"package p;\nmessage A {{\nmessage Row {{\n{text}}}\nrepeated Row rows = 1;\n}}", "a.proto")

@@ -40,7 +40,7 @@ COVERS = {
     "mcaptrack/evaluation": "evaluation events events_reference forecast_errors metrics_oracles compared",
     "mcaptrack/metrics": "metrics metrics_oracles networks forecast_errors evaluation",
     "mcaptrack/predictors": "prediction networks",
-    "mcaptrack/schema": "schema",
+    "mcaptrack/schema": "schema events tables",
     "mcaptrack/tables": "tables",
     "mcaptrack/transforms": "transform_laws option_effects defaults",
     "mcaptrack/transforms/detect": "detect",

@@ -269,7 +269,6 @@ class _Life:
         self._class_id: float | None = None
         self.one_class = True
         self._count = 0
-        self._first_ns = self._last_ns = 0
 
     def notice_classes(self, class_id: Floats) -> None:
         """Take the classes of the boxes to come."""
