@@ -61,6 +61,18 @@ def straight_on(tick: int):
 # Scenes
 
 
+@pytest.mark.parametrize(("aside_m", "truth_id"), [((1.0, 1.0), -1), ((1.0, 0.99), 1)])
+def test_a_track_belongs_to_a_person_within_less_than_tau(aside_m, truth_id):
+    """The mean squared distance of the pasts is 2 m^2, which is tau, and a little less."""
+    truth = walk(straight_on, 12)
+    tracks = walk(lambda n: {7: tuple(np.add(straight_on(n)[1], aside_m))}, 12)
+    made = predictions(lambda n: {7: [(2.5, 1.0), (3.0, 1.0), (3.5, 1.0)]} if n == 4 else {}, 12)
+    row, score = only(find_forecast_errors(made, tracks, truth, tracks))
+    assert row["truth_id"] == truth_id
+    assert score["false_forecasts"] == (truth_id == -1)
+    assert score["scored"] == (truth_id == 1)
+
+
 def test_a_forecast_that_veers_off():
     """1 m off to the side at the first step, 2 m at the second, 4 m at the third: by hand."""
     truth = walk(straight_on, 12)

@@ -89,6 +89,19 @@ def test_cases_by_hand(truth, tracks, wanted):
     assert {name: found[name] for name in wanted} == pytest.approx(wanted)
 
 
+@pytest.mark.parametrize("rules", ["trackeval", "motmetrics"])
+@pytest.mark.parametrize("others", [0, 1, 2])
+def test_a_pair_exactly_at_the_gate_counts(rules, others):
+    """Alone, beside another track at the gate, and beside a second person who competes for both."""
+    tracks = [{5: 1.0} | ({6: -1.0} if others else {})] * 3
+    truth = [{1: 0.0} | ({2: 2.0} if others == 2 else {})] * 3
+    found = summary(score(matchup(truth, tracks), rules))
+    assert found["FN"] == 0
+    assert found["FP"] == (3 if others == 1 else 0)
+    beyond = summary(score(matchup([{1: 0.0}] * 3, [{5: 1.0 + 1e-9, 6: -1.0 - 1e-9}] * 3), rules))
+    assert beyond["FN"] == 3
+
+
 def test_the_two_evaluators_differ_where_they_are_known_to():
     """After a miss py-motmetrics keeps the old pair though another track stands nearer; TrackEval takes the nearer."""
     truth = [{1: 0.0}] * 3
@@ -339,7 +352,7 @@ class TestDisplacement:
         assert sorted(result.d_obs_m2.tolist()) == pytest.approx([1.0, 4.0])
         assert result.away_by_step().tolist() == [[0.5, 1.5, 2.5]]  # tau is 2 m^2
         assert sorted(result.away_by_step(5.0).tolist()) == [[0.5, 1.5, 2.5], [7.0, 8.0, 9.0]]
-        assert result.away_by_step(1.0).tolist() == []
+        assert result.away_by_step(1.0).tolist() == []  # less than the threshold, not equal to it
         assert result.summary()["recall"] == 0.5
 
     def test_drift_of_consecutive_forecasts_by_hand(self):

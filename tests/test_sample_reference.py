@@ -94,7 +94,7 @@ def test_gaps_of_up_to_two_ticks_have_ticks_and_longer_ones_have_none():
         assert [frame.t_ns for frame in found] == [ns(t) for t in ticks]
 
 
-@given(seed=SEEDS, least=st.sampled_from([1, 2, 4, 9]), name=st.sampled_from(["cv", "holt-cv", "kalman"]))
+@given(seed=SEEDS, least=st.sampled_from([1, 2, 4, 9]), name=st.sampled_from(["cv", "holt-cv", "red"]))
 @settings(max_examples=25)
 def test_forecasts_equal_those_made_one_by_one(seed, least, name):
     rate_hz = 2.5
