@@ -19,6 +19,7 @@ import typer
 from mcaptrack import SCHEMA_VERSION, notices
 from mcaptrack.atomic import publish_bytes, refuse_overwrite
 from mcaptrack.cli.command import COMMON, Command, read_config
+from mcaptrack.cli.inputs import check_paths, refuse_url
 from mcaptrack.cli.settings import Declared
 from mcaptrack.cli.text import say
 from mcaptrack.errors import McaptrackError
@@ -199,6 +200,7 @@ def one_line(command: Callable[P, None]) -> Callable[P, None]:
     def guarded(*args: P.args, **kwargs: P.kwargs) -> None:
         _WARNED.set([])
         try:
+            check_paths(kwargs.values())
             with notices.listening(_show_warning):
                 command(*args, **kwargs)
         except McaptrackError as error:
@@ -240,6 +242,7 @@ def expand(paths: Sequence[Path]) -> list[Path]:
     """Paths and patterns as paths. Raises McaptrackError for a pattern that matches nothing."""
     out: list[Path] = []
     for path in paths:
+        refuse_url(path)
         if path.exists() or not glob.has_magic(str(path)):
             out.append(path)
             continue

@@ -11,6 +11,7 @@ import typer
 
 from mcaptrack.cli import common
 from mcaptrack.cli.command import warn_unused
+from mcaptrack.cli.inputs import refuse_url
 from mcaptrack.cli.text import console, printable, show
 from mcaptrack.errors import McaptrackError
 
@@ -118,6 +119,8 @@ def _asked(words: Sequence[str], file: Path | None, tables: bool) -> tuple[list[
     """The logs and the query among the words of the command."""
     from_file = file is not None or tables
     names = list(words) if from_file else list(words[:-1])
+    for word in words:
+        refuse_url(word)
     stray = next((name for name in names if name.lower() in _KEYWORDS and not Path(name).exists()), None)
     if stray is not None:
         raise McaptrackError(f'{stray} is no log; the query is one word, in quotes: "{stray} ..."')

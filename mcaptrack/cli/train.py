@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 import typer
 
 from mcaptrack.cli import common
+from mcaptrack.cli.inputs import refuse_url
 from mcaptrack.cli.text import console, show
 from mcaptrack.errors import McaptrackError
 
@@ -126,6 +127,8 @@ def train(
     """
     from mcaptrack.training.recipe import RECIPES
 
+    for source in sources:
+        refuse_url(source)
     given = {"epochs": epochs, "batch": batch, "rate": rate, "patience": patience, "seed": seed}
     given |= {"consistency_weight": consistency_weight}
     corrupted = {"noise_m": noise_m, "gaps": gaps, "scale": scale}

@@ -1,0 +1,109 @@
+"""What no file can be is refused by name, by every command and every option that takes a path."""
+
+from __future__ import annotations
+
+import inspect
+import os
+from pathlib import Path
+from typing import Any, get_type_hints
+
+import pytest
+from typer.main import get_command
+from typer.testing import CliRunner
+
+from mcaptrack.cli import app
+from mcaptrack.cli.inputs import refuse_url
+from mcaptrack.errors import McaptrackError
+from mcaptrack.transforms import TRANSFORMS
+from tests.test_cli import start
+
+COMMANDS = get_command(app).commands
+#: Arguments that are words, some of which are paths.
+WORDS = {("query", "words"), ("train", "sources")}
+STAGES = TRANSFORMS
+
+
+def takes_paths(command: str) -> list[Any]:
+    """The parameters of a command whose values are paths, by the types that it declares; config is read before."""
+    callback = inspect.unwrap(next(c.callback for c in app.registered_commands if c.name == command))
+    hints = getattr(callback, "__annotations__", {}) if command in STAGES else get_type_hints(callback)
+    paths = {name for name, hint in hints.items() if "Path" in str(hint)} - {"config"}
+    return [p for p in COMMANDS[command].params if p.name in paths or (command, p.name) in WORDS]
+
+
+PATHS = [(name, parameter) for name in COMMANDS for parameter in takes_paths(name)]
+
+
+def words_with(name: str, parameter: Any, value: str) -> list[str]:
+    """A command with a value for one parameter, and others for all that it needs."""
+    words = [name]
+    for other in COMMANDS[name].params:
+        if other.param_type_name == "argument":
+            words.append(value if other.name == parameter.name else "a.txt")
+            words += ["select 1"] if (name, other.name) == ("query", "words") else []
+    return [*words, parameter.opts[0], value] if parameter.param_type_name == "option" else words
+
+
+@pytest.mark.parametrize(("name", "parameter"), PATHS, ids=[f"{name} {p.name}" for name, p in PATHS])
+@pytest.mark.parametrize("url", ["s3://bucket/a.mcap", "https://example.org/a/b?c=d", "gs://b/*.mcap"])
+def test_a_url_is_named_as_one(tmp_path, monkeypatch, name, parameter, url):
+    monkeypatch.chdir(tmp_path)
+    Path("a.txt").write_text("1,1,1,1,2,2\n")
+    result = CliRunner().invoke(app, words_with(name, parameter, url))
+    said = [line for line in result.stderr.splitlines() if line]
+    assert (result.exit_code, said) == (
+        1,
+        [f"mcaptrack: {url} is a URL; only files are read and written: copy it here first"],
+    )
+    assert os.listdir() == ["a.txt"]
+
+
+def test_the_paths_of_all_commands_are_tried():
+    assert {name for name, _ in PATHS} == set(COMMANDS)
+
+
+@pytest.mark.parametrize("name", ["a.mcap", "C:/a", "12:30.mp4", "a b://c", "://x", "/s3:/x"])
+def test_a_path_is_no_url(name):
+    refuse_url(name)
+
+
+def test_a_folder_that_looks_like_a_url_is_a_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("s3:").mkdir()
+    Path("s3:/a").write_text("x")
+    refuse_url(Path("s3:/a"))
+    with pytest.raises(McaptrackError, match="s3://b is a URL"):
+        refuse_url(Path("s3:/b"))
+
+
+#: Of each kind of option one process: a pipe that is opened waits for ever.
+PIPES = [
+    ("ingest", "inputs"),
+    ("ingest", "truth"),
+    ("ingest", "ground_plane"),
+    ("ingest", "into"),
+    ("evaluate", "inputs"),
+    ("evaluate", "truth"),
+    ("run", "logs"),
+    ("check", "logs"),
+]
+
+
+def test_a_pipe_is_no_file(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "a.txt").write_text("1,1,1,1,2,2\n")
+    known = {(name, parameter.name): parameter for name, parameter in PATHS}
+    running = [
+        start(
+            *words_with(name, known[name, option], "pipe"),
+            *(["--truth", "a.txt"] * (name == "evaluate")),
+            folder=tmp_path,
+        )
+        for name, option in PIPES
+    ]
+    for process in running:
+        _, err = process.communicate(timeout=60)
+        assert (process.returncode, err.splitlines()) == (
+            1,
+            ["mcaptrack: pipe is a pipe, not a file; write what it gives to a file first"],
+        )
