@@ -17,6 +17,7 @@ from typing import Final, Literal, NamedTuple
 #: What kind of thing a warning is about, for programs. docs/warnings.md says what each means.
 Code = Literal[
     "assumed-ground-plane",
+    "classes",
     "clock",
     "journal",
     "left-out",

@@ -18,7 +18,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from mcaptrack import foxglove
 from mcaptrack.errors import McaptrackError
-from mcaptrack.foreign import Kind, boxes_decoder, picture_decoder
+from mcaptrack.foreign import Classes, Kind, boxes_decoder, picture_decoder
 from mcaptrack.video import RAW_ENCODINGS, Encoded, Layout, brightness
 
 STAMP_NS = 1_700_000_000_123_456_789
@@ -407,7 +407,7 @@ class TestBoxes:
             (10.0, 10.0, 4.0, 8.0, 0.0, []),
             (10.0, 10.0, 4.0, 8.0, np.pi / 2, [(2, 0.5)]),
         ]
-        rows = boxes_decoder(vision(layout, boxes)[0])(vision(layout, boxes)[1])
+        rows = boxes_decoder(vision(layout, boxes)[0], Classes())(vision(layout, boxes)[1])
         np.testing.assert_allclose(rows["x_px"], [90, 8, 6])
         np.testing.assert_allclose(rows["y_px"], [30, 6, 8])
         np.testing.assert_allclose(rows["w_px"], [20, 4, 8])
@@ -416,24 +416,40 @@ class TestBoxes:
         assert rows["class_id"].tolist() == [7, 0, 2]
 
     @pytest.mark.parametrize("layout", ["v3", "v4"])
-    def test_names_of_people_are_1_and_of_others_0(self, layout):
-        names = ["person", "Pedestrian", "5", "car", "-3", "99999999999"]
+    def test_names_of_classes_get_numbers_after_those_that_have_one(self, layout):
+        """People are 1 by any name; other names follow in the order of the alphabet; what is neither is unknown."""
+        names = ["person", "Pedestrian", "5", "car", "-3", "99999999999", "4294967295", "bicycle", "car"]
         kind, payload = vision(layout, [(0.0, 0.0, 1.0, 1.0, 0.0, [(name, 0.5)]) for name in names])
-        assert boxes_decoder(kind)(payload)["class_id"].tolist() == [1, 1, 5, 0, 0, 0]
+        classes = Classes()
+        rows = boxes_decoder(kind, classes)(payload)
+        numbers = classes.numbers()
+        assert [numbers.get(n, n) for n in rows["class_id"].tolist()] == [1, 1, 5, 7, 0, 0, 0, 6, 7]
+        assert classes.named() == [("bicycle", 6), ("car", 7)]
+
+    def test_there_are_only_so_many_names(self):
+        classes = Classes()
+        assert all(classes.class_id(f"name {n:05}") for n in range(1024))
+        assert classes.class_id("name 99999") == 0
+        assert classes.class_id("name 00000") == 2**32 - 1024
+        assert sorted(classes.numbers().values()) == list(range(2, 1026))
 
     def test_nobody_is_seen_too(self):
         kind, payload = vision("v4", [])
-        assert len(boxes_decoder(kind)(payload)) == 0
+        assert len(boxes_decoder(kind, Classes())(payload)) == 0
 
     @pytest.mark.parametrize("box", [(np.nan, 0.0, 1.0, 1.0), (0.0, np.inf, 1.0, 1.0), (0.0, 0.0, -1.0, 1.0)])
     def test_boxes_that_can_not_be_are_said(self, box):
         kind, payload = vision("v4", [(*box, 0.0, [])])
         with pytest.raises(McaptrackError, match="a box can't be"):
-            boxes_decoder(kind)(payload)
+            boxes_decoder(kind, Classes())(payload)
 
     def test_other_channels_are_refused(self):
         with pytest.raises(McaptrackError, match="it holds x, not detections; vision_msgs/Detection2DArray is read"):
-            boxes_decoder(Kind("x", "", b"", "json"))
+            boxes_decoder(Kind("x", "", b"", "json"), Classes())
+
+
+def boxes(kind: Kind):
+    return boxes_decoder(kind, Classes())
 
 
 def kinds() -> dict[str, tuple]:
@@ -447,8 +463,8 @@ def kinds() -> dict[str, tuple]:
     made["raw ros1"] = (picture_decoder, *ros_raw(gradient(2, 2), "bgr8", True))
     made["raw ros2"] = (picture_decoder, *ros_raw(gradient(2, 2), "bgr8", False))
     for layout in VISION:
-        made[f"boxes {layout}"] = (boxes_decoder, *vision(layout, [(1.0, 1.0, 1.0, 1.0, 0.0, [(1, 0.5)])]))
-    made["boxes json"] = (boxes_decoder, *as_json("vision_msgs/msg/Detection2DArray", detections=[]))
+        made[f"boxes {layout}"] = (boxes, *vision(layout, [(1.0, 1.0, 1.0, 1.0, 0.0, [(1, 0.5)])]))
+    made["boxes json"] = (boxes, *as_json("vision_msgs/msg/Detection2DArray", detections=[]))
     return {name: (make(kind), payload) for name, (make, kind, payload) in made.items()}
 
 

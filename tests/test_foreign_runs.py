@@ -12,10 +12,12 @@ import pytest
 from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
 from mcap.reader import make_reader
 from mcap.writer import Writer
+from typer.testing import CliRunner
 
-from mcaptrack import log, pipeline
+from mcaptrack import api, log, pipeline
 from mcaptrack.cli import app
 from mcaptrack.errors import McaptrackError
+from mcaptrack.notices import McaptrackWarning
 from mcaptrack.provenance import Provenance
 from mcaptrack.schema import DETECTIONS, TRACKS
 from mcaptrack.transforms import Detect, Sort
@@ -271,3 +273,59 @@ def test_a_real_log_of_images_is_processed_in_place(data, tmp_path):
         assert (t_ns, message.timestamp.ToNanoseconds()) == (row[3], said["sec"] * 10**9 + said["nsec"])
     with log.read(path) as opened:
         assert "/image/retracks" in opened.channels
+
+
+def boxes_log(path: Path, *names: str, damaged: bool = False) -> list[int]:
+    """Messages with one more box each, of these classes in turn; returns how many boxes each has."""
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start(profile="ros2", library="theirs")
+        kind = vision("v4", [])[0]
+        channel = writer.register_channel(
+            "/lidar/boxes", "cdr", writer.register_schema(kind.name, "ros2msg", kind.schema)
+        )
+        for number in range(4):
+            seen = [(10.0 * n, 20.0, 4.0, 8.0, 0.0, [(names[n % len(names)], 0.5)]) for n in range(number)]
+            payload = b"\0\1\0\0damaged" if damaged and number == 2 else vision("v4", seen)[1]
+            writer.add_message(channel, START_NS + ns(number / 10), payload, START_NS)
+        writer.finish()
+    return [0, 1, 2, 3]
+
+
+def test_boxes_of_others_are_in_the_table_of_detections(tmp_path):
+    """With the numbers that names got, and joined with the messages they stand in."""
+    path = tmp_path / "a.mcap"
+    counts = boxes_log(path, "person", "car", "7")
+    with api.open(path) as opened, pytest.warns(McaptrackWarning, match="1 is a person, 8 is 'car'"):
+        rows, frames = opened.array("detections"), opened.array("frames")
+    assert frames[["topic", "t_ns", "rows"]].tolist() == [
+        ("/lidar/boxes", START_NS + ns(n / 10), count) for n, count in enumerate(counts)
+    ]
+    expected = [(n, 10.0 * k - 2, 16.0, 4.0, 8.0, (1, 8, 7)[k]) for n in counts for k in range(n)]
+    assert rows[["frame", "x_px", "y_px", "w_px", "h_px", "class_id"]].tolist() == expected
+    outcome = CliRunner().invoke(app, ["export", str(path), "-o", str(tmp_path / "t"), "--json"])
+    data = json.loads(outcome.stdout)
+    assert (data["results"][0]["rows"]["detections"], [w["code"] for w in data["warnings"]]) == (6, ["classes"])
+
+
+def test_boxes_of_others_that_can_not_be_read_leave_the_other_tables_as_they_are(tmp_path):
+    path = tmp_path / "a.mcap"
+    boxes_log(path, "person", damaged=True)
+    outcome = CliRunner().invoke(app, ["export", str(path), "-o", str(tmp_path / "t"), "--json"])
+    data = json.loads(outcome.stdout)
+    assert (outcome.exit_code, data["results"][0]["rows"]["detections"], data["results"][0]["rows"]["frames"]) == (
+        0,
+        0,
+        4,
+    )
+    (warning,) = data["warnings"]
+    assert (warning["code"], "no vision_msgs" in warning["message"]) == ("left-out", True)
+    assert "export --topic /lidar/boxes" in warning["message"]
+
+
+def test_tracking_boxes_of_named_classes_says_their_numbers(tmp_path, capsys):
+    path = tmp_path / "a.mcap"
+    boxes_log(path, "person", "car", "bicycle")
+    mcaptrack("track", path, "--topic", "/lidar/boxes")
+    assert "warning: " in (err := capsys.readouterr().err)
+    assert "classes of /lidar/boxes are names; in class_id 1 is a person, 2 is 'bicycle', 3 is 'car'" in err

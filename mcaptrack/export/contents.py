@@ -14,6 +14,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.export.names import recording_name
 from mcaptrack.foreign.flat import flattener, kind_of
 from mcaptrack.provenance import Provenance
+from mcaptrack.schema import DETECTIONS
 from mcaptrack.tables import TABLES, Part, Pointers
 
 _TRUTH: Final = "/truth"
@@ -64,8 +65,11 @@ class Contents:
         schema = TABLES[name].rows_of
         if schema is None:
             raise KeyError(name)
-        found = log.topics_with_schema(self.opened, [schema.name])
-        return sorted(channel.topic for channel in found if channel.message_encoding == "protobuf")
+        ours = log.topics_with_schema(self.opened, [schema.name])
+        found = [channel.topic for channel in ours if channel.message_encoding == "protobuf"]
+        if schema is DETECTIONS:
+            found += [channel.topic for channel in self.opened.channels.values() if foreign.holds_detections(channel)]
+        return sorted(found)
 
     def source(self, name: str) -> str:
         """What a table is made from: another digest when the table may be another. Reads no messages."""
@@ -121,6 +125,9 @@ class Contents:
 
     def _part(self, topic: str) -> Part:
         if topic not in self._parts:
+            if foreign.holds_detections(self.opened.channel(topic)):
+                self._parts[topic] = self._boxes(topic)
+                return self._parts[topic]
             schema = next(
                 table.rows_of
                 for table in TABLES.values()
@@ -128,6 +135,19 @@ class Contents:
             )
             self._parts[topic] = Part(*self.opened.rows(topic, schema))
         return self._parts[topic]
+
+    def _boxes(self, topic: str) -> Part:
+        """Boxes of others; none, and a note, if they can't be read: the other tables don't depend on them."""
+        try:
+            frames = foreign.detections(self.opened, topic)
+        except McaptrackError as error:
+            self._note("detections", f"{error}; `mcaptrack export --topic {topic}` keeps what its messages say")
+            t_ns = self.opened.times(topic)
+            return Part(DETECTIONS.empty(), t_ns, np.arange(len(t_ns)), np.zeros(len(t_ns), np.int64))
+        return tables.frames_to_part(DETECTIONS, frames)
+
+    def _note(self, name: str, words: str) -> None:
+        self.notes[name] = "; ".join([*filter(None, [self.notes.get(name)]), words])
 
     def _pointers(self, topic: str, of_rows: bool = True) -> Pointers:
         places = self.opened.places(topic)
@@ -153,7 +173,7 @@ class Contents:
                 sequence = evaluation.sequence_of_log(self.opened, prefix, ())
                 outcome = evaluation.evaluate([sequence], evaluation.EvaluateOptions())
             except McaptrackError as error:  # there is nothing that could be compared
-                self.notes["metrics"] = "; ".join([*self.notes.get("metrics", "").split("; "), str(error)]).strip("; ")
+                self._note("metrics", str(error))
                 continue
             for result in outcome.results:
                 row = result.to_json()

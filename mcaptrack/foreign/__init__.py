@@ -2,8 +2,6 @@
 
 A message has two times: when it was logged, which orders everything, and the stamp that its maker gave it, by which
 viewers match what is drawn to a picture.
-
-Letters: N boxes.
 """
 
 from __future__ import annotations
@@ -12,7 +10,6 @@ import base64
 import re
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
-from math import cos, isfinite, nan, sin
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -21,13 +18,16 @@ from numpy.typing import NDArray
 from mcaptrack import foxglove, log
 from mcaptrack.clock import NS_PER_S
 from mcaptrack.errors import McaptrackError
-from mcaptrack.foreign.messages import Kind, plain_name, unpacker
-from mcaptrack.schema import DETECTIONS, Frame, Rows
+from mcaptrack.foreign.boxes import DETECTIONS_READ, Classes, boxes_decoder
+from mcaptrack.foreign.messages import Kind, guarded, plain_name
+from mcaptrack.notices import warn
+from mcaptrack.schema import Frame
 from mcaptrack.video import Layout
 
 __all__ = [
     "DETECTIONS_READ",
     "PICTURES_READ",
+    "Classes",
     "Kind",
     "Picture",
     "boxes_decoder",
@@ -48,16 +48,11 @@ _COMPRESSED: Final = (foxglove.VIDEO, foxglove.IMAGE, "sensor_msgs/CompressedIma
 _RAW: Final = ("foxglove.RawImage", "sensor_msgs/Image")
 #: Schemas whose messages are pictures, as ROS 1 and Foxglove name them; ROS 2 has "/msg/" between.
 PICTURES_READ: Final = (*_COMPRESSED, *_RAW)
-#: Schemas whose messages are boxes, but our own.
-DETECTIONS_READ: Final = ("vision_msgs/Detection2DArray",)
-
 #: Words in the format of a compressed picture that name a video codec; all others are still images.
 _VIDEO_WORDS: Final = {"h264": "h264", "avc": "h264", "h265": "h265", "hevc": "h265", "vp9": "vp9", "av1": "av1"}
 _RFC3339: Final = re.compile(r"(\d{4}-\d\d-\d\d)[Tt ](\d\d:\d\d:\d\d)(?:\.(\d{1,9})\d*)?(Z|z|[+-]\d\d:\d\d)", re.ASCII)
 _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
 _LIMIT_NS: Final = 2**63
-_MAX_CLASS: Final = 2**32
-_PERSON: Final = ("person", "pedestrian", "human")
 
 
 class Picture(NamedTuple):
@@ -114,9 +109,20 @@ def stamps(opened: log.Log, topic: str) -> Ints:
 
 
 def detections(opened: log.Log, topic: str) -> list[Frame]:
-    """What others detected, a frame a message. Raises McaptrackError, with topic and time, as ``pictures`` does."""
-    found = enumerate(_decoded(opened, topic, boxes_decoder))
-    return [Frame(message.t_ns, index, rows) for index, (message, rows) in found]
+    """What others detected, a frame a message. Raises McaptrackError, with topic and time, as ``pictures`` does.
+
+    Classes that have names get numbers (see ``boxes.Classes``); a warning says which.
+    """
+    classes = Classes()
+    found = _decoded(opened, topic, lambda kind: boxes_decoder(kind, classes))
+    frames = [Frame(message.t_ns, index, rows) for index, (message, rows) in enumerate(found)]
+    numbers = classes.numbers()
+    for frame in frames:
+        frame.rows["class_id"] = [numbers.get(number, number) for number in frame.rows["class_id"].tolist()]
+    if numbers:
+        names = ", ".join(f"{number} is {name!r}" for name, number in classes.named())
+        warn(f"{opened.path}: classes of {topic} are names; in class_id 1 is a person, {names}", "classes")
+    return frames
 
 
 def _decoded(opened: log.Log, topic: str, make: Callable[[Kind], Callable[[bytes], Any]]) -> Iterator[tuple[Any, Any]]:
@@ -145,22 +151,6 @@ def _reader(
     return read
 
 
-def _guarded(kind: Kind, convert: Callable[[Any], Any]) -> Callable[[bytes], Any]:
-    """Payload -> what ``convert`` makes of the message. Whatever goes wrong is the payload's fault: McaptrackError."""
-    unpack = unpacker(kind)
-
-    def decode(payload: bytes) -> Any:
-        try:
-            return convert(unpack(payload))
-        except McaptrackError:
-            raise
-        except Exception as error:  # bytes of strangers through parsers of others: no list of exceptions is complete
-            why = " ".join(str(error).split())[:120] or type(error).__name__
-            raise McaptrackError(f"{len(payload)} bytes are no {kind.name} message ({why})") from None
-
-    return decode
-
-
 # Pictures
 
 
@@ -172,9 +162,9 @@ def picture_decoder(kind: Kind) -> Callable[[bytes], Picture]:
     """
     name = plain_name(kind.name)
     if name in _COMPRESSED:
-        return _guarded(kind, _compressed)
+        return guarded(kind, _compressed)
     if name in _RAW:
-        return _guarded(kind, _raw)
+        return guarded(kind, _raw)
     raise McaptrackError(f"it holds {kind.name or 'no schema'}, not pictures; {', '.join(PICTURES_READ)} are read")
 
 
@@ -253,56 +243,3 @@ def _bytes(value: Any) -> bytes:
     if isinstance(value, bytes | list):
         return bytes(value)
     raise ValueError(f"a {type(value).__name__} where bytes belong")
-
-
-# Boxes
-
-
-def boxes_decoder(kind: Kind) -> Callable[[bytes], Rows]:
-    """What makes rows of detections (N,) of the payloads of a channel; raises as ``picture_decoder`` does."""
-    if plain_name(kind.name) not in DETECTIONS_READ:
-        raise McaptrackError(
-            f"it holds {kind.name or 'no schema'}, not detections; {', '.join(DETECTIONS_READ)} is read"
-        )
-    return _guarded(kind, _boxes)
-
-
-def _boxes(message: Any) -> Rows:
-    rows = [_box(detection) for detection in message.detections]
-    x, y, w, h, score, class_id = (list(column) for column in zip(*rows, strict=True)) if rows else [[]] * 6
-    return DETECTIONS.rows(
-        x_px=np.array(x, float),
-        y_px=np.array(y, float),
-        w_px=np.array(w, float),
-        h_px=np.array(h, float),
-        score=np.array(score, float),
-        class_id=np.array(class_id, np.uint32),
-    )
-
-
-def _box(detection: Any) -> tuple[float, float, float, float, float, int]:
-    """Left, top, width and height of the upright box around a detection, its best score and what that says it is."""
-    centre = detection.bbox.center
-    place = getattr(centre, "position", centre)  # vision_msgs 4 put a point where 3 had a pose
-    x, y, theta, w, h = (
-        float(value)
-        for value in (place.x, place.y, getattr(centre, "theta", 0.0), detection.bbox.size_x, detection.bbox.size_y)
-    )
-    if not all(isfinite(value) for value in (x, y, theta, w, h)) or w < 0 or h < 0:
-        raise ValueError(f"a box can't be {w:g} x {h:g} at ({x:g}, {y:g})")
-    if theta:
-        w, h = (abs(w * cos(theta)) + abs(h * sin(theta)), abs(w * sin(theta)) + abs(h * cos(theta)))
-    guesses = [getattr(result, "hypothesis", result) for result in detection.results]
-    scored = [(float(guess.score), guess) for guess in guesses]
-    known = [(score, guess) for score, guess in scored if isfinite(score)]
-    score, best = max(known or scored, key=lambda pair: pair[0], default=(nan, None))
-    return x - w / 2, y - h / 2, w, h, score if known else nan, _class_id(best)
-
-
-def _class_id(guess: Any) -> int:
-    if guess is None:
-        return 0
-    said = str(guess.class_id if hasattr(guess, "class_id") else guess.id).strip()
-    if said.lower() in _PERSON:
-        return 1
-    return int(said) if re.fullmatch(r"[0-9]{1,10}", said) and int(said) < _MAX_CLASS else 0

@@ -46,6 +46,25 @@ def plain_name(schema_name: str) -> str:
     return f"foxglove.{name}" if package == "foxglove_msgs" else f"{package}/{name}"
 
 
+def guarded(kind: Kind, convert: Callable[[Any], Any]) -> Callable[[bytes], Any]:
+    """Payload -> what ``convert`` makes of the message. Whatever goes wrong is the payload's fault: McaptrackError.
+
+    Raises McaptrackError as ``unpacker`` does.
+    """
+    unpack = unpacker(kind)
+
+    def decode(payload: bytes) -> Any:
+        try:
+            return convert(unpack(payload))
+        except McaptrackError:
+            raise
+        except Exception as error:  # bytes of strangers through parsers of others: no list of exceptions is complete
+            why = " ".join(str(error).split())[:120] or type(error).__name__
+            raise McaptrackError(f"{len(payload)} bytes are no {kind.name} message ({why})") from None
+
+    return decode
+
+
 def unpacker(kind: Kind) -> Unpack:
     """What reads the messages of a channel. Raises McaptrackError for what can't be read, whatever the messages are."""
     if kind.encoding == "protobuf" and kind.name.startswith("foxglove."):
