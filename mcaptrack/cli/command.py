@@ -6,7 +6,7 @@ import copy
 from collections.abc import Callable, Mapping
 from contextvars import ContextVar
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 import typer
 from typer.core import TyperCommand
@@ -15,12 +15,18 @@ from mcaptrack.cli.settings import Given, Setting, declared_settings, found_of, 
 from mcaptrack.cli.text import refuse_usage, say
 from mcaptrack.notices import warn
 
-COMMON: Final = "Options of all commands"
+#: Headings of options that stand last in the help: what is read and written, and what every command has.
+LAST_PANELS: Final = ("Input and output", "Options of all commands")
 _RUNNING: Final[ContextVar[typer.Context]] = ContextVar("running")
 
 
 class Command(TyperCommand):
-    """See the module. ``settings`` are its options by name, also under the names that they had before."""
+    """See the module. ``settings`` are its options by name, also under the names that they had before.
+
+    A command that ``reads`` changes no file, but the one that -o names.
+    """
+
+    reads: ClassVar = False
 
     def __init__(self, name: str, **given: Any) -> None:
         super().__init__(name, **given)
@@ -36,6 +42,7 @@ class Command(TyperCommand):
             self.params.append(hidden)
             first = targets[0]
             self.settings[old] = Setting(name, old, hidden.name, first.kind, first.many, first.declared)
+        self.params.sort(key=_place)
         config = parameters["config"]
         config.envvar = now["config"].variable  # the others are read with the files, once this is known
 
@@ -43,7 +50,7 @@ class Command(TyperCommand):
         """``--help`` stands with the options that all commands have."""
         option = super().get_help_option(ctx)
         if option is not None:
-            option.rich_help_panel = COMMON
+            option.rich_help_panel = LAST_PANELS[-1]
         return option
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
@@ -91,6 +98,12 @@ class Command(TyperCommand):
         return f"options: {', '.join(parts)}"
 
 
+class Reading(Command):
+    """A command that changes nothing."""
+
+    reads: ClassVar = True
+
+
 _DEFAULT: Final = 3
 
 
@@ -106,6 +119,12 @@ def _rank(ctx: Any, parameter: str, found: Mapping[str, tuple[Setting, Given]]) 
 
 def _python_name(name: str) -> str:
     return "old_" + name.replace("-", "_")
+
+
+def _place(parameter: Any) -> int:
+    """Where a parameter stands in the help, among others in the order in which they are declared."""
+    panel = getattr(parameter, "rich_help_panel", None)
+    return 1 + LAST_PANELS.index(panel) if panel in LAST_PANELS else 0
 
 
 def _hidden(parameter: Any, old: str) -> Any:

@@ -18,7 +18,7 @@ import typer
 
 from mcaptrack import SCHEMA_VERSION, notices
 from mcaptrack.atomic import publish_bytes, refuse_overwrite
-from mcaptrack.cli.command import COMMON, Command, read_config
+from mcaptrack.cli.command import LAST_PANELS, Command, Reading, read_config
 from mcaptrack.cli.inputs import check_paths, refuse_url
 from mcaptrack.cli.settings import Declared
 from mcaptrack.cli.text import say
@@ -28,8 +28,11 @@ from mcaptrack.notices import Code, Notice
 P = ParamSpec("P")
 #: What the running command has warned of.
 _WARNED: Final[ContextVar[list[Notice]]] = ContextVar("warned")
-#: The heading of options that say what is read and written.
-FILES: Final = "Input and output"
+#: Headings of options in the help: what is read and written, what every command has, label files, and how tracks are
+#: compared with the truth.
+FILES, COMMON = LAST_PANELS
+LABELS: Final = "Label files"
+SCORES: Final = "Scores"
 
 DONE, REFUSED, LOST, GATE_MISSED = 0, 1, 3, 4
 
@@ -62,10 +65,12 @@ Printed = Annotated[Path | None, option("--output", "-o", panel=FILES, help="Pri
 Sidecar = Annotated[
     bool, option("--sidecar", panel=FILES, help="Write results to LOG.results.mcap, from now on; LOG stays as it is.")
 ]
-Force = Annotated[bool, option("--force", panel=FILES, help="Replace what is there.")]
+Force = Annotated[bool, option("--force", panel=FILES, help="Replace the file that is there.")]
 Json = Annotated[bool, option("--json", panel=COMMON, help="Print data for programs.")]
 Quiet = Annotated[bool, option("--quiet", "-q", panel=COMMON, help="Say nothing but errors and warnings.")]
-Verbose = Annotated[bool, option("--verbose", "-v", panel=COMMON, help="Say more.")]
+Verbose = Annotated[
+    bool, option("--verbose", "-v", panel=COMMON, help="Print more, such as where each option was set.")
+]
 Config = Annotated[
     Path | None,
     option(
@@ -82,19 +87,23 @@ GroundPlane = Annotated[
     Path | None,
     option(
         "--ground-plane",
-        panel=FILES,
+        panel=LABELS,
         help="File with a 3x3 homography from pixels to metres.",
     ),
 ]
 Point = Annotated[
     Literal["center", "foot"],
-    option("--point", tuning=True, help="Which point of a box touches the ground."),
+    option("--point", panel=LABELS, tuning=True, help="Which point of a box touches the ground."),
 ]
 FPS_PATTERN: Final = r"[0-9]+([.][0-9]+)?(/[0-9]+)?"
 LabelFps = Annotated[
     str | None,
     option(
-        "--fps", tuning=FPS_PATTERN, help="Frames per second of label files.", show_default="as seqinfo.ini beside them"
+        "--fps",
+        panel=LABELS,
+        tuning=FPS_PATTERN,
+        help="Frames per second of label files.",
+        show_default="as seqinfo.ini beside them says",
     ),
 ]
 
@@ -102,30 +111,37 @@ LabelFps = Annotated[
 def similarity(shown: str) -> Any:
     """What makes a person and a track alike; ``shown`` says what happens unless it is given."""
     words = "How a person and a track are compared: overlap of boxes (iou), or distance on the ground (metres)."
-    return option("--similarity", tuning=True, help=words, show_default=shown)
+    return option("--similarity", panel=SCORES, tuning=True, help=words, show_default=shown)
 
 
 def gate_m(shown: str | bool = True, tuning: str | bool = True, was: str = "") -> Any:
     """The largest distance of a match."""
     words = "Largest distance in metres at which a person and a track match."
-    return option("--gate-m", tuning=tuning, was=was, help=words, show_default=shown)
+    return option("--gate-m", panel=SCORES, tuning=tuning, was=was, help=words, show_default=shown)
 
 
 def min_iou(was: str = "", was_if: tuple[str, str] | None = None) -> Any:
     """The least overlap of a match."""
     words = "Least overlap (IoU) at which a person and a track match."
-    return option("--min-iou", tuning=True, was=was, was_if=was_if, help=words, show_default="0.5")
+    return option("--min-iou", panel=SCORES, tuning=True, was=was, was_if=was_if, help=words, show_default="0.5")
 
 
 Logs = Annotated[
-    list[Path], typer.Argument(metavar="LOG...", help="One or several logs, or a pattern.", show_default=False)
+    list[Path], typer.Argument(metavar="LOG", help="One or several logs, or a pattern.", show_default=False)
 ]
 
 
-def register(app: typer.Typer, name: str, command: Callable[..., None], words: str | None = None) -> None:
-    """Add a command whose options can also come from MCAPTRACK_NAME_OPTION and from files."""
+def register(
+    app: typer.Typer, panel: str, name: str, command: Callable[..., None], words: str | None = None, reads: bool = False
+) -> None:
+    """Add a command, below a heading of the help, whose options can also come from MCAPTRACK_NAME_OPTION and files.
+
+    One that ``reads`` changes no file, but the one that -o names.
+    """
     settings = {"help_option_names": ["--help", "-h"]}
-    app.command(name, cls=Command, help=words, context_settings=settings)(command)
+    app.command(name, cls=Reading if reads else Command, help=words, context_settings=settings, rich_help_panel=panel)(
+        command
+    )
 
 
 class Talk:

@@ -15,7 +15,9 @@ _GATE_M: Final = 1.0
 
 @common.one_line
 def demo(
-    output: Annotated[Path, common.option("--output", "-o", help="Folder for what it makes.")] = Path("mcaptrack-demo"),
+    output: Annotated[
+        Path, common.option("--output", "-o", panel=common.FILES, help="Folder for what it makes.")
+    ] = Path("mcaptrack-demo"),
     force: common.Force = False,
     json: common.Json = False,
     quiet: common.Quiet = False,

@@ -37,13 +37,14 @@ _FORECAST_COLUMNS: Final = {
 def evaluate(
     inputs: Annotated[
         list[Path],
-        typer.Argument(metavar="LOG|TRACKS...", help="Logs, or files of tracks.", show_default=False),
+        typer.Argument(metavar="LOG|TRACKS", help="Logs, or files of tracks.", show_default=False),
     ],
     truth: Annotated[
         list[Path] | None,
         common.option(
             "--truth",
-            help="True tracks for files of tracks: one for each, matched by name or in order.",
+            panel=common.LABELS,
+            help="True tracks for files of tracks: one file for each, matched by name or in order.",
             show_default=False,
         ),
     ] = None,
@@ -54,12 +55,15 @@ def evaluate(
     min_iou: Annotated[float, common.min_iou()] = 0.5,
     rules: Annotated[
         Literal["trackeval", "motmetrics"],
-        common.option("--rules", tuning=True, help="Rules for counting switches and fragments."),
+        common.option("--rules", panel=common.SCORES, tuning=True, help="Rules for counting switches and fragments."),
     ] = "trackeval",
     topic: Annotated[
         list[str] | None,
         common.option(
-            "--topic", help="Score these channels.", show_default="tracks, samples, retracks, retracks/online"
+            "--topic",
+            panel=common.SCORES,
+            help="Score these channels.",
+            show_default="tracks, samples, retracks, retracks/online",
         ),
     ] = None,
     camera: common.Camera = None,
@@ -68,9 +72,11 @@ def evaluate(
     fps: common.LabelFps = None,
     fail_under: Annotated[
         list[str] | None,
-        common.option("--fail-under", help="Exit 4 if a score is lower, as in idf1=0.7.", show_default=False),
+        common.option(
+            "--fail-under", panel=common.SCORES, help="Exit 4 if a score is lower, as in idf1=0.7.", show_default=False
+        ),
     ] = None,
-    csv: Annotated[bool, common.option("--csv", help="Print rows for a spreadsheet.")] = False,
+    csv: Annotated[bool, common.option("--csv", panel=common.FILES, help="Print rows for a spreadsheet.")] = False,
     output: common.Printed = None,
     force: common.Force = False,
     json: common.Json = False,

@@ -14,7 +14,12 @@ def events(
     logs: common.Logs,
     topic: Annotated[
         list[str] | None,
-        common.option("--topic", help="Look at these channels of tracks.", show_default="tracks, retracks"),
+        common.option(
+            "--topic",
+            panel=common.FILES,
+            help="Write events of these channels of tracks.",
+            show_default="tracks, retracks",
+        ),
     ] = None,
     similarity: Annotated[
         common.SimilarityName | None, common.similarity("iou at the video's rate, otherwise metres")
@@ -30,14 +35,14 @@ def events(
     verbose: common.Verbose = False,
     config: common.Config = None,
 ) -> None:
-    """Write down what happened to identities, and how far off forecasts were: to jump to, to query, to plot.
+    """Write events of tracks (begin, end, identity switches) and errors of predictions into the log.
 
-    Where tracks begin and end, and which of them re-tracking joined or parted; where the log has /camera/truth also
-    who was missed, which tracks are nobody, and each identity switch, matched as `mcaptrack evaluate` does. To
-    /camera/tracks/events (rows), .../events/view/log (words) and /camera/tracks/counts (how it stands, frame by frame),
-    and the same for /camera/retracks. Unless --topic names channels, also how far off each forecast was, from the truth
-    and from what re-tracking made of the tracks: to /camera/predictions/errors and, frame by frame, .../scores; and the
-    same for /camera/retracks/predictions. `mcaptrack run` does all this too.
+    Events are where tracks begin and end, and which of them re-tracking joined or split; where the log has
+    /camera/truth also missed people, false tracks and identity switches, matched as `mcaptrack evaluate` does. They go
+    to /camera/tracks/events (rows), .../events/view/log (text) and /camera/tracks/counts (totals frame by frame), and
+    the same for /camera/retracks. Unless --topic names channels, errors of predictions against the truth and against
+    re-tracked tracks go to /camera/predictions/errors and, frame by frame, .../scores; and the same for
+    /camera/retracks/predictions. `mcaptrack run` does all this too.
 
     Example: mcaptrack events log.mcap --similarity metres --gate-m 1
     """

@@ -132,7 +132,7 @@ def drop(
     path: Annotated[Path, typer.Argument(metavar="LOG", help="The log.", show_default=False)],
     topics: Annotated[
         list[str],
-        typer.Argument(metavar="TOPIC...", help="Channels to leave out; patterns such as '/camera/*' are several."),
+        typer.Argument(metavar="TOPIC", help="Channels to leave out; patterns such as '/camera/*' are several."),
     ],
     output: common.Output = None,
     force: common.Force = False,

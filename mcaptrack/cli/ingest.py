@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 Inputs = Annotated[
     list[Path],
     typer.Argument(
-        metavar="INPUT...",
+        metavar="INPUT",
         help="Videos, folders of images, ROS bags, MCAP files, or label files; each becomes a log.",
         show_default=False,
     ),
@@ -26,7 +26,10 @@ Inputs = Annotated[
 
 
 def _label_file(words: str) -> Any:
-    return common.option(panel=common.FILES, help=f"Label file of the pictures: {words}.")
+    return common.option(panel=common.LABELS, help=f"Label file of the pictures: {words}.")
+
+
+_PICTURES: Final = "Pictures"
 
 
 @common.one_line
@@ -34,12 +37,13 @@ def ingest(
     inputs: Inputs,
     output: common.Output = None,
     camera: Annotated[
-        str, common.option("--camera", help="Name of the camera: its channels lie below /NAME.")
+        str, common.option("--camera", panel=common.FILES, help="Name of the camera: its channels lie below /NAME.")
     ] = "camera",
     fps: Annotated[
         str | None,
         common.option(
             "--fps",
+            panel=_PICTURES,
             tuning=common.FPS_PATTERN,
             help="Frames per second, instead of the file's own times.",
             show_default=False,
@@ -49,6 +53,7 @@ def ingest(
         str | None,
         common.option(
             "--start-time",
+            panel=_PICTURES,
             help="When the recording began (2026-05-01T12:00:00Z, or seconds since 1970).",
             show_default="as the file says, otherwise 0",
         ),
@@ -57,6 +62,7 @@ def ingest(
         Literal["auto", "h264", "h265", "jpeg", "png"],
         common.option(
             "--image-format",
+            panel=_PICTURES,
             tuning=True,
             help="How pictures are kept. auto: H.264, VP9 and AV1 as they are where viewers play them, else as H.264; "
             "h264: nothing but H.264; h265: as auto, and H.265 as it is; jpeg, png: every picture alone.",
@@ -66,6 +72,7 @@ def ingest(
         int | None,
         common.option(
             "--quality",
+            panel=_PICTURES,
             tuning=True,
             help="Of what is encoded: H.264's constant rate factor, 1 (best) to 51; JPEG's quality, 1 to 100 (best).",
             show_default="23; JPEG 90",
@@ -75,6 +82,7 @@ def ingest(
         float | None,
         common.option(
             "--keyframe-interval-s",
+            panel=_PICTURES,
             tuning=True,
             help="Key pictures are at most so far apart, in seconds; a stream that has fewer is encoded again.",
             show_default="2 in what is kept as it is, 1 in what is encoded",
@@ -87,12 +95,14 @@ def ingest(
     truth: Annotated[Path | None, _label_file("boxes or positions with the true ids")] = None,
     label_format: Annotated[
         Literal["auto", "mot", "kitti", "sdd", "trajnet", "obsmat"],
-        common.option("--format", tuning=True, help="Format of the label files."),
+        common.option("--format", panel=common.LABELS, tuning=True, help="Format of the label files."),
     ] = "auto",
     first_frame: Annotated[
         int | None,
         common.option(
             "--first-frame",
+            panel=common.LABELS,
+            tuning=True,
             help="Number that label files give the first picture.",
             show_default="1 in MOTChallenge, otherwise 0",
         ),
@@ -101,17 +111,23 @@ def ingest(
         int | None,
         common.option(
             "--frames",
-            help="How many frames there are, where labels have no pictures.",
+            panel=common.LABELS,
+            tuning=True,
+            help="Number of frames, where labels have no pictures.",
             show_default="as seqinfo.ini says, otherwise up to the last label",
         ),
     ] = None,
     role: Annotated[
         Literal["detections", "tracks", "truth"] | None,
-        common.option("--as", help="What INPUT holds, if it is a label file.", show_default="as its ids tell"),
+        common.option(
+            "--as", panel=common.LABELS, help="What INPUT holds, if it is a label file.", show_default="as its ids tell"
+        ),
     ] = None,
     into: Annotated[
         Path | None,
-        common.option("--into", help="Add it to this log, instead of making one.", show_default=False),
+        common.option(
+            "--into", panel=common.FILES, help="Add it to this log, instead of making one.", show_default=False
+        ),
     ] = None,
     force: common.Force = False,
     json: common.Json = False,

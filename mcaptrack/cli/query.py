@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from mcaptrack.sql import Database
 
 Form = Literal["table", "csv", "json", "jsonl", "parquet", "arrow"]
+_QUERY: Final = "Query and answer"
 #: Rows that a terminal is shown unless more are asked for.
 _SHOWN: Final = 60
 #: Characters of a cell in a table, on a terminal and elsewhere.
@@ -41,26 +42,41 @@ def query(
     ] = None,
     file: Annotated[
         Path | None,
-        common.option("--file", "-f", help="Take the query from this file; all words are logs.", show_default=False),
+        common.option(
+            "--file", "-f", panel=_QUERY, help="Take the query from this file; all words are logs.", show_default=False
+        ),
     ] = None,
     form: Annotated[
         Form | None,
-        common.option("--format", help="What the answer is written as.", show_default="table, or what -o ends with"),
+        common.option(
+            "--format", panel=_QUERY, help="Format of the answer.", show_default="table, or what -o ends with"
+        ),
     ] = None,
     beside: Annotated[
         list[str] | None,
         common.option(
-            "--with", metavar="NAME=FILE", help="A CSV, JSON or Parquet file as one more table.", show_default=False
+            "--with",
+            panel=_QUERY,
+            metavar="NAME=FILE",
+            help="A CSV, JSON or Parquet file as one more table.",
+            show_default=False,
         ),
     ] = None,
     rows: Annotated[
         int | None,
         common.option(
-            "--rows", min=0, help="As a table: show so many rows; 0 is all.", show_default="60 on a terminal"
+            "--rows",
+            panel=_QUERY,
+            min=0,
+            help="Number of rows that a table shows; 0 is all.",
+            show_default="60 on a terminal",
         ),
     ] = None,
     tables: Annotated[
-        bool, common.option("--tables", help="List the tables with their columns, units and meanings; no query.")
+        bool,
+        common.option(
+            "--tables", panel=_QUERY, help="List the tables with their columns, units and meanings; no query."
+        ),
     ] = False,
     output: common.Printed = None,
     force: common.Force = False,

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Final
 
 from mcaptrack.cli import common
 from mcaptrack.cli.command import warn_unused
 from mcaptrack.errors import McaptrackError
+
+_PICTURE: Final = "Pictures"
 
 
 @common.one_line
@@ -14,20 +16,39 @@ def render(
     logs: common.Logs,
     topic: Annotated[
         list[str] | None,
-        common.option("--topic", help="Draw this view; several with several --topic.", show_default="as in the layout"),
+        common.option(
+            "--topic",
+            panel=_PICTURE,
+            help="Draw these views.",
+            show_default="as in the layout",
+        ),
     ] = None,
     width: Annotated[
-        int | None, common.option("--width", tuning=True, help="Pixels across.", show_default="as the video")
+        int | None,
+        common.option("--width", panel=_PICTURE, tuning=True, help="Width in pixels.", show_default="as the video"),
     ] = None,
     max_fps: Annotated[
         float | None,
-        common.option("--max-fps", tuning=True, help="At most so many pictures a second.", show_default="all; GIF 10"),
+        common.option(
+            "--max-fps",
+            panel=_PICTURE,
+            tuning=True,
+            help="Largest number of pictures a second.",
+            show_default="all; GIF 10",
+        ),
     ] = None,
-    start_s: Annotated[float, common.option("--start-s", tuning=True, help="From this second on.")] = 0.0,
+    start_s: Annotated[
+        float, common.option("--start-s", panel=_PICTURE, tuning=True, help="Begin at this second of the log.")
+    ] = 0.0,
     end_s: Annotated[
-        float | None, common.option("--end-s", tuning=True, help="To this second.", show_default="the end")
+        float | None,
+        common.option(
+            "--end-s", panel=_PICTURE, tuning=True, help="End at this second of the log.", show_default="the end"
+        ),
     ] = None,
-    gif: Annotated[bool, common.option("--gif", help="A GIF, if -o doesn't say.")] = False,
+    gif: Annotated[
+        bool, common.option("--gif", panel=_PICTURE, help="Write a GIF, where no -o says what to write.")
+    ] = False,
     camera: common.Camera = None,
     output: common.Output = None,
     force: common.Force = False,

@@ -13,7 +13,10 @@ from mcaptrack.errors import McaptrackError
 def report(
     logs: common.Logs,
     output: Annotated[
-        Path | None, common.option("--output", "-o", help="The page.", show_default="LOG.report.html beside the log")
+        Path | None,
+        common.option(
+            "--output", "-o", panel=common.FILES, help="The page.", show_default="LOG.report.html beside the log"
+        ),
     ] = None,
     camera: common.Camera = None,
     force: common.Force = False,

@@ -136,17 +136,32 @@ def export(
     logs: common.Logs,
     output: Annotated[
         Path | None,
-        common.option("--output", "-o", help="Folder for the tables.", show_default="LOG.tables beside the log"),
+        common.option(
+            "--output",
+            "-o",
+            panel=common.FILES,
+            help="Folder for the tables.",
+            show_default="LOG.tables beside the log",
+        ),
     ] = None,
     form: Annotated[
-        Literal["parquet", "arrow", "csv", "jsonl"], common.option("--format", help="What kind of files.")
+        Literal["parquet", "arrow", "csv", "jsonl"],
+        common.option("--format", panel=common.FILES, help="Format of the files."),
     ] = "parquet",
     topic: Annotated[
         list[str] | None,
-        common.option("--topic", help="A table of this channel's messages too, whatever they are.", show_default=False),
+        common.option(
+            "--topic",
+            panel=common.FILES,
+            help="Write a table of all messages of this channel, too.",
+            show_default=False,
+        ),
     ] = None,
     blobs: Annotated[
-        bool, common.option("--blobs", help="With --topic: keep fields of bytes, as pictures and point clouds are.")
+        bool,
+        common.option(
+            "--blobs", panel=common.FILES, help="With --topic: keep fields of bytes, such as pictures and point clouds."
+        ),
     ] = False,
     force: Annotated[
         bool,

@@ -39,11 +39,14 @@ _OUTPUTS_OF: Final[Mapping[str, tuple[str, ...]]] = {
 }
 
 
-def add_stages(app: typer.Typer) -> None:
-    """A command for every transform, and one for all of them."""
+_AFTER: Final = "After the stages"
+
+
+def add_stages(app: typer.Typer, panel: str) -> None:
+    """A command for all transforms, and one for each, below a heading of the help."""
+    common.register(app, panel, "run", common.one_line(run_all))
     for name, kind in TRANSFORMS.items():
-        common.register(app, name, common.one_line(_stage_command(name, kind)), _help(name, kind))
-    common.register(app, "run", common.one_line(run_all))
+        common.register(app, panel, name, common.one_line(_stage_command(name, kind)), _help(name, kind))
 
 
 def _help(name: str, kind: type[Transform]) -> str:
@@ -93,12 +96,14 @@ def _stage_command(name: str, kind: type[Transform]) -> Callable[..., None]:
     own = {one: _options_of(made) for one, made in kinds.items()}
     parameters = [_parameter("logs", common.Logs, inspect.Parameter.empty)]
     if several:
-        words = common.option("--" + several.option, tuning=True, help=f"Which {several.option}.")
+        words = common.option("--" + several.option, tuning=True, help=f"The {several.option} to use.")
         default = next(one for one, made in kinds.items() if made is kind)
         parameters.append(_parameter(several.option, Annotated[Literal[tuple(kinds)], words], default))
     if name == "retrack":
         words = common.option(
-            "--profile", tuning=True, help="Parameters: ours, the paper's, or those of its authors' program."
+            "--profile",
+            tuning=True,
+            help="Values of all parameters: the defaults, the paper's, or those of its authors' program.",
         )
         parameters.append(_parameter("profile", Annotated[Literal[tuple(PROFILES)], words], "default"))
         words = common.option(
@@ -153,8 +158,17 @@ def run_all(
     camera: common.Camera = None,
     output: common.Output = None,
     sidecar: common.Sidecar = False,
-    events: Annotated[bool, common.option("--events/--no-events", help="Tell what happened to identities.")] = True,
-    tables: Annotated[bool, common.option("--tables/--no-tables", help="Write Parquet tables beside the log.")] = True,
+    events: Annotated[
+        bool,
+        common.option(
+            "--events/--no-events",
+            panel=_AFTER,
+            help="Write events and scores of identities, as `mcaptrack events` does.",
+        ),
+    ] = True,
+    tables: Annotated[
+        bool, common.option("--tables/--no-tables", panel=_AFTER, help="Write Parquet tables beside the log.")
+    ] = True,
     force: Annotated[
         bool,
         common.option("--force", panel=common.FILES, help="Run everything again, and replace the file that -o names."),

@@ -26,6 +26,8 @@ _COLUMNS: Final = {
     "coverage_90": "in 90 %",
     "coverage_95": "in 95 %",
 }
+_TRAINING: Final = "Training"
+_WINDOWS: Final = "What is trained on"
 _LICENCE: Final = "that of the data it was trained on"
 
 
@@ -34,79 +36,129 @@ def train(
     sources: Annotated[
         list[str],
         typer.Argument(
-            metavar="SOURCE...",
+            metavar="SOURCE",
             help="Label files (TrajNet, Stanford Drone, ETH, MOTChallenge), Parquet tables, logs, folders of these, or "
             "`synthetic`.",
             show_default=False,
         ),
     ],
     output: Annotated[
-        Path, common.option("--output", "-o", help="Folder for the weights, the log of epochs and the state.")
+        Path,
+        common.option(
+            "--output", "-o", panel=common.FILES, help="Folder for the weights, the log of epochs and the state."
+        ),
     ] = Path("trained"),
     recipe: Annotated[
         Literal["red", "paper"],
-        common.option("--recipe", tuning=True, help="Our network and training, or the paper's."),
+        common.option(
+            "--recipe",
+            panel=_TRAINING,
+            tuning=True,
+            help="Network and training: mcaptrack's own (red), or the paper's.",
+        ),
     ] = "red",
     validate: Annotated[
         list[Path] | None,
         common.option(
-            "--validate", help="Sources to validate on.", show_default="a tenth of the windows, whole scenes apart"
+            "--validate",
+            panel=common.FILES,
+            help="Sources to validate on.",
+            show_default="a tenth of the windows, whole scenes apart",
         ),
     ] = None,
     epochs: Annotated[
         int | None,
-        common.option("--epochs", tuning=True, help="Passes over the windows.", show_default="20; paper: 50"),
+        common.option(
+            "--epochs", panel=_TRAINING, tuning=True, help="Passes over the windows.", show_default="20; paper: 50"
+        ),
     ] = None,
     batch: Annotated[
-        int | None, common.option("--batch", tuning=True, help="Windows a step.", show_default="256; paper: 60")
+        int | None,
+        common.option("--batch", panel=_TRAINING, tuning=True, help="Windows a step.", show_default="256; paper: 60"),
     ] = None,
     rate: Annotated[
-        float | None, common.option("--rate", tuning=True, help="Learning rate.", show_default="0.003; paper: 0.0001")
+        float | None,
+        common.option(
+            "--rate", panel=_TRAINING, tuning=True, help="Learning rate.", show_default="0.003; paper: 0.0001"
+        ),
     ] = None,
     noise_m: Annotated[
         float | None,
         common.option(
-            "--noise-m", tuning=True, help="Most noise added to past positions.", show_default="0.4; paper: 0"
+            "--noise-m",
+            panel=_WINDOWS,
+            tuning=True,
+            help="Largest noise added to past positions.",
+            show_default="0.4; paper: 0",
         ),
     ] = None,
     gaps: Annotated[
         float | None,
-        common.option("--gaps", tuning=True, help="Share of past positions taken away.", show_default="0.3; paper: 0"),
+        common.option(
+            "--gaps",
+            panel=_WINDOWS,
+            tuning=True,
+            help="Share of past positions taken away.",
+            show_default="0.3; paper: 0",
+        ),
     ] = None,
     scale: Annotated[
         float | None,
         common.option(
             "--scale",
+            panel=_WINDOWS,
             tuning=True,
-            help="Most that people are scaled by, as a logarithm.",
+            help="Largest scaling of positions, as a logarithm.",
             show_default="0.15; paper: 0",
         ),
     ] = None,
     consistency_weight: Annotated[
         float,
         common.option(
-            "--consistency-weight", tuning=True, help="How much forecasts may not differ from one step to the next."
+            "--consistency-weight",
+            panel=_TRAINING,
+            tuning=True,
+            help="Weight of the difference between predictions of successive steps in the loss.",
         ),
     ] = 0.0,
     patience: Annotated[
         int,
-        common.option("--patience", tuning=True, help="End after so many epochs without a better one; 0 for never."),
+        common.option(
+            "--patience",
+            panel=_TRAINING,
+            tuning=True,
+            help="End after so many epochs without a better one; 0 for never.",
+        ),
     ] = 0,
-    walks: Annotated[int, common.option("--walks", tuning=True, help="How many walks `synthetic` makes up.")] = 60_000,
-    seed: Annotated[int, common.option("--seed", tuning=True, help="The same seed gives the same weights.")] = 1,
+    walks: Annotated[
+        int, common.option("--walks", panel=_WINDOWS, tuning=True, help="Number of walks that `synthetic` makes.")
+    ] = 60_000,
+    seed: Annotated[int, common.option("--seed", panel=_TRAINING, tuning=True, help="Random seed.")] = 1,
     device: Annotated[
-        Literal["auto", "cpu", "cuda", "mps"], common.option("--device", tuning=True, help="What to compute on.")
+        Literal["auto", "cpu", "cuda", "mps"],
+        common.option("--device", panel=_TRAINING, tuning=True, help="Device to compute on."),
     ] = "auto",
     threads: Annotated[
         int,
         common.option(
-            "--threads", tuning=True, help="Threads of the processor to use; more than one rarely helps.", min=1
+            "--threads",
+            panel=_TRAINING,
+            tuning=True,
+            help="Threads of the processor to use; more than one rarely helps.",
+            min=1,
         ),
     ] = 1,
-    resume: Annotated[bool, common.option("--resume", help="Go on with the training in the folder.")] = False,
+    resume: Annotated[
+        bool, common.option("--resume", panel=common.FILES, help="Continue the training in the folder.")
+    ] = False,
     topic: Annotated[
         str | None,
-        common.option("--topic", help="The channel of logs and tables.", show_default="truth, or the best tracks"),
+        common.option(
+            "--topic",
+            panel=common.FILES,
+            help="Read this channel of logs and tables.",
+            show_default="truth, or the best tracks",
+        ),
     ] = None,
     fps: common.LabelFps = None,
     ground_plane: common.GroundPlane = None,
@@ -117,7 +169,7 @@ def train(
     verbose: common.Verbose = False,
     config: common.Config = None,
 ) -> None:
-    """Train a predictor on people's tracks, or on walks that are made up.
+    """Train a predictor on tracks of people, or on synthetic walks.
 
     Leaves the weights (safetensors, with a model card in the header), a log of the epochs and a state to go on from in
     a folder, and compares what was learned with constant velocity on the same windows. Use it with `mcaptrack predict

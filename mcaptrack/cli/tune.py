@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 #: From so many frames on, over all trials, it pays to have SORT compiled first.
 _WORTH_COMPILING: Final = 100_000
+_SEARCH: Final = "Search"
 _SHOWN: Final = ("IDF1", "MOTA", "HOTA", "IDSW", "FP", "FN")
 
 
@@ -28,38 +29,54 @@ _SHOWN: Final = ("IDF1", "MOTA", "HOTA", "IDSW", "FP", "FN")
 def tune(
     inputs: Annotated[
         list[Path],
-        typer.Argument(metavar="LOG|DETECTIONS...", help="Logs, or files of detections.", show_default=False),
+        typer.Argument(metavar="LOG|DETECTIONS", help="Logs, or files of detections.", show_default=False),
     ],
     truth: Annotated[
         list[Path] | None,
-        common.option("--truth", help="True tracks for files of detections: by name or in order.", show_default=False),
+        common.option(
+            "--truth",
+            panel=common.LABELS,
+            help="True tracks for files of detections: one file for each, matched by name or in order.",
+            show_default=False,
+        ),
     ] = None,
     stage: Annotated[
-        Literal["track", "sample", "retrack"], common.option("--stage", tuning=True, help="What to tune.")
+        Literal["track", "sample", "retrack"],
+        common.option("--stage", panel=_SEARCH, tuning=True, help="The stage to tune."),
     ] = "track",
     tracker: Annotated[
-        Literal["sort", "bytetrack", "ocsort"], common.option("--tracker", tuning=True, help="Which tracker.")
+        Literal["sort", "bytetrack", "ocsort"],
+        common.option("--tracker", panel=_SEARCH, tuning=True, help="The tracker to tune."),
     ] = "sort",
     metric: Annotated[
         Literal["IDF1", "MOTA", "HOTA", "IDP", "IDR", "DetA", "AssA"],
-        common.option("--metric", tuning=True, help="What to make as large as can be.", case_sensitive=False),
+        common.option("--metric", panel=common.SCORES, tuning=True, help="Score to maximise.", case_sensitive=False),
     ] = "IDF1",
     trials: Annotated[
-        int, common.option("--trials", tuning=True, help="How many settings to try, the defaults first.", min=1)
+        int,
+        common.option(
+            "--trials", panel=_SEARCH, tuning=True, help="Number of settings to try, the defaults first.", min=1
+        ),
     ] = 100,
     search: Annotated[
         list[str] | None,
         common.option(
             "--search",
+            panel=_SEARCH,
             tuning=r"[A-Za-z0-9_-]+(=[0-9.eE+-]+:[0-9.eE+-]+)?",
-            help="Search these parameters, in these ranges, as in min-iou=0.1:0.5; or only in name.",
+            help="Parameters to search, with a range as in min-iou=0.1:0.5, or without.",
             show_default="all that the stage declares",
         ),
     ] = None,
-    seed: Annotated[int, common.option("--seed", tuning=True, help="Which chance.", min=0)] = 0,
+    seed: Annotated[int, common.option("--seed", panel=_SEARCH, tuning=True, help="Random seed.", min=0)] = 0,
     study: Annotated[
         Path | None,
-        common.option("--study", help="Keep trials in this file; go on with those in it.", show_default="beside -o"),
+        common.option(
+            "--study",
+            panel=common.FILES,
+            help="Keep trials in this file; go on with those in it.",
+            show_default="beside -o",
+        ),
     ] = None,
     similarity: Annotated[common.SimilarityName | None, common.similarity("iou; metres after track")] = None,
     gate_m: Annotated[float, common.gate_m()] = 1.0,

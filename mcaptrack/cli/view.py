@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
@@ -15,19 +15,32 @@ from mcaptrack.links import LICHTBLICK, viewer_links
 if TYPE_CHECKING:
     from mcaptrack.log import Log
 
+_VIEWER: Final = "Server and viewer"
+
 
 @common.one_line
 def view(
     path: Annotated[Path, typer.Argument(metavar="LOG", help="The log.", show_default=False)],
-    port: Annotated[int, common.option("--port", help="Port to serve it at.", show_default="any that is free")] = 0,
+    port: Annotated[
+        int, common.option("--port", panel=_VIEWER, help="Port to serve it at.", show_default="any that is free")
+    ] = 0,
     lichtblick: Annotated[
-        str, common.option("--lichtblick", help="Where Lichtblick is, if you have it installed yourself.")
+        str,
+        common.option("--lichtblick", panel=_VIEWER, help="Where Lichtblick is, if you have it installed yourself."),
     ] = LICHTBLICK,
     layout: Annotated[
         str | None,
-        common.option("--layout", help="The layout to print a link for.", metavar="NAME", show_default="all there are"),
+        common.option(
+            "--layout",
+            panel=_VIEWER,
+            help="The layout to print a link for.",
+            metavar="NAME",
+            show_default="all there are",
+        ),
     ] = None,
-    browser: Annotated[bool, common.option("--open/--no-open", help="Open Lichtblick in the browser.")] = False,
+    browser: Annotated[
+        bool, common.option("--open/--no-open", panel=_VIEWER, help="Open Lichtblick in the browser.")
+    ] = False,
     json: common.Json = False,
     quiet: common.Quiet = False,
     verbose: common.Verbose = False,

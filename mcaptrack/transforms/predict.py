@@ -32,8 +32,8 @@ class Predict:
         "what predicts: cv, holt-cv, kalman, lstm, red; or with weights of your own, red:FILE, lstm:FILE, onnx:FILE",
         names=NAMES,
     )
-    horizon_s: float = option(4.8, "how far ahead", least=0.1, most=60.0)
-    min_history: int = option(4, "past positions (with the present one) that a forecast needs", least=1)
+    horizon_s: float = option(4.8, "how far ahead to predict", least=0.1, most=60.0)
+    min_history: int = option(4, "past positions, with the present one, that a prediction needs", least=1)
     rate_hz: float = context(lambda: 2.5)
 
     reads: ClassVar[Schema] = TRACKS

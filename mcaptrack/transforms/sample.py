@@ -27,13 +27,13 @@ Ints = NDArray[np.int64]
 
 @dataclass(frozen=True, kw_only=True)
 class Sample:
-    """Put tracks on the regular clock of prediction, in metres.
+    """Resample tracks to a fixed rate, in metres on the ground.
 
-    Reads tracks, writes tracks: a row for everybody who is there at a tick; ``observed`` is false inside holes.
+    Reads tracks, writes tracks: a row for every person at each tick; ``observed`` is false inside gaps.
     """
 
     rate_hz: float = option(2.5, "ticks per second", least=0.1, most=1000.0)
-    max_hole_s: float = option(2.0, "a hole in a track that is longer than this stays a hole", least=0.0)
+    max_hole_s: float = option(2.0, "a longer gap in a track stays a gap; shorter ones are interpolated", least=0.0)
     start_ns: int | None = context(lambda: None)
     ground_planes: Planes = context(tuple)
 

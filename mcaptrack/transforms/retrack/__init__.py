@@ -25,77 +25,127 @@ from mcaptrack.transforms.retrack.distance import Covariance, Distance
 from mcaptrack.transforms.retrack.following import Following, walker
 from mcaptrack.transforms.retrack.whole import whole_tracks
 
+# Headings of the options in the help.
+_ASSOCIATION: Final = "Association"
+_MOTION: Final = "Motion model"
+_PREDICTIONS: Final = "Predictions"
+_LIFE: Final = "Begin and end of tracks"
+_OFFLINE: Final = "With the whole log known (offline)"
+
 
 @dataclass(frozen=True, kw_only=True)
 class Retrack:
-    """Repair tracks by what is foretold of them (re-tracking by prediction).
+    """Repair tracks: re-tracking by prediction.
 
-    Reads samples; writes the repaired tracks of the whole log, the same as they were known at the time (online), and
-    the forecasts of these.
+    Reads samples; writes the repaired tracks with the whole log known (offline), as they were known at the time
+    (online), and predictions from the latter.
     """
 
     predictor: PredictorName = option(
-        "kalman", "what predicts: cv, holt-cv, kalman, lstm, red; or red:FILE, lstm:FILE, onnx:FILE", names=NAMES
+        "kalman",
+        "what predicts: cv, holt-cv, kalman, lstm, red; or red:FILE, lstm:FILE, onnx:FILE",
+        names=NAMES,
+        theme=_PREDICTIONS,
     )
-    horizon_s: float = option(4.8, "how far ahead", least=0.1, most=60.0)
+    horizon_s: float = option(4.8, "how far ahead to predict", least=0.1, most=60.0, theme=_PREDICTIONS)
     distance: Distance = option(
         "likelihood",
-        "what is compared: the mean, max or first of the foretold steps, the expected and the seen position now, or "
-        "how likely a track makes a sample, with what the input says of identity",
+        "what a track and an observation are compared by: the mean, max or first distance between predicted steps, the "
+        "distance now, or the likelihood of the observation",
+        theme=_ASSOCIATION,
     )
-    covariance: Covariance = option("predictor", "whose uncertainty: the predictor's, or the paper's (u - t) sigma^2")
-    sigma_m: float = option(1.0, "the paper's sigma", least=1e-6)
+    covariance: Covariance = option(
+        "predictor", "uncertainty of predictions: the predictor's, or the paper's (u - t) sigma^2", theme=_PREDICTIONS
+    )
+    sigma_m: float = option(1.0, "sigma of the paper's covariance", least=1e-6, theme=_PREDICTIONS)
     noise_m: float | None = option(
         None,
-        "noise of a seen position (now, likelihood); found out on the way unless it is given",
+        "noise of observed positions (distance now or likelihood); estimated from the input unless it is given",
         least=0.0,
+        theme=_MOTION,
     )
-    speed_m_per_s: float = option(1.75, "how fast people may be when nothing is known of them (likelihood)", least=0.0)
-    drift: float = option(0.12, "how much velocities change in a second, m/s (likelihood)", least=0.0)
-    drift_share: float = option(0.08, "the same, as a share of the speed", least=0.0)
+    speed_m_per_s: float = option(
+        1.75, "speed to expect of people of whom nothing is known yet (likelihood)", least=0.0, theme=_MOTION
+    )
+    drift: float = option(0.12, "how much velocities change in a second, in m/s (likelihood)", least=0.0, theme=_MOTION)
+    drift_share: float = option(
+        0.08, "how much velocities change in a second, as a share of the speed (likelihood)", least=0.0, theme=_MOTION
+    )
     max_distance: float = option(
-        3.0, "a track and an observation further apart than this (d_min) are not matched", least=0.0
+        3.0,
+        "gate: a track and an observation that are further apart (d_min in the paper) are not matched",
+        least=0.0,
+        theme=_ASSOCIATION,
     )
     certain_distance: float = option(
-        0.0, "a pair nearer than this is matched before all others; 0 for never", least=0.0
+        0.0, "pairs nearer than this are matched before all others; 0 for never", least=0.0, theme=_ASSOCIATION
     )
     max_jump_m: float | None = option(
-        3.0, "a track is not matched further than this from where it is expected now", least=0.0
+        3.0,
+        "gate: a track is not matched further than this from its predicted position now",
+        least=0.0,
+        theme=_ASSOCIATION,
     )
     same_source: float = option(
         12.0,
-        "how much nearer a pair counts if the input gives it the id that the track had last; the paper drops ids",
+        "how much nearer a pair counts if the input gives the observation the id that the track had last; the paper "
+        "drops ids",
         least=0.0,
+        theme=_ASSOCIATION,
     )
-    max_age_s: float = option(2.0, "a track is dropped after so long without an observation (t_max)", least=0.0)
+    max_age_s: float = option(
+        2.0, "a track ends after so long without an observation (t_max in the paper)", least=0.0, theme=_LIFE
+    )
     share_m: float = option(
-        1.0, "two tracks may be one sample (one box) that is so near to both, and between them; 0 for never", least=0.0
+        1.0,
+        "two tracks may be merged into one detection that lies so near to both, and between them; 0 for never",
+        least=0.0,
+        theme=_ASSOCIATION,
     )
-    share_s: float = option(3.0, "for so long at most", least=0.0)
-    sure_s: float = option(1.2, "a track is shown online once it was seen for so long (likelihood)", least=0.0)
-    coast_s: float = option(1.2, "a track is shown online for so long where it is not seen (likelihood)", least=0.0)
-    alpha: float = option(1.0, "smoothing of displacements, Eq. 3; 1 for none", least=0.0, most=1.0)
-    beta: float = option(0.0, "smoothing of their trend, Eq. 3", least=0.0, most=1.0)
-    birth: Literal["raw", "smoothed"] = option("raw", "what a new track foretells from: its past as seen, or smoothed")
-    min_history: int = option(2, "past positions (with the present one) that an observation needs", least=1)
-    min_hits: int = option(1, "a track is shown online from so many matches in a row", least=0)
+    share_s: float = option(
+        3.0, "tracks stay merged into one detection for so long at most", least=0.0, theme=_ASSOCIATION
+    )
+    sure_s: float = option(
+        1.2, "online, a track is shown once it was observed for so long (likelihood)", least=0.0, theme=_LIFE
+    )
+    coast_s: float = option(
+        1.2, "online, a track is shown for so long where it is not observed (likelihood)", least=0.0, theme=_LIFE
+    )
+    alpha: float = option(1.0, "smoothing of displacements, Eq. 3; 1 for none", least=0.0, most=1.0, theme=_PREDICTIONS)
+    beta: float = option(0.0, "smoothing of the trend of displacements, Eq. 3", least=0.0, most=1.0, theme=_PREDICTIONS)
+    birth: Literal["raw", "smoothed"] = option(
+        "raw", "what a new track predicts from: its past as observed, or smoothed", theme=_PREDICTIONS
+    )
+    min_history: int = option(
+        2, "past positions, with the present one, that an observation needs", least=1, theme=_PREDICTIONS
+    )
+    min_hits: int = option(1, "online, a track is shown from so many matches in a row", least=0, theme=_LIFE)
     confirm: bool = option(
-        False, "offline, leave out what a track matched after it was last matched min_hits times in a row"
+        False, "offline, leave out what a track matched after it was last matched min_hits times in a row", theme=_LIFE
     )
-    min_track_s: float = option(2.0, "a track that lasts less than this is left out (probation)", least=0.0)
-    link_s: float = option(20.0, "offline, ends and beginnings so far apart are put together; 0 for never", least=0.0)
+    min_track_s: float = option(
+        2.0, "a track that lasts less than this is left out (probation)", least=0.0, theme=_LIFE
+    )
+    link_s: float = option(
+        20.0,
+        "link the end of a track with the beginning of another that is so much later; 0 for never",
+        least=0.0,
+        theme=_OFFLINE,
+    )
     link_certainty: float = option(
-        0.5, "offline, what is put together is one person with at least this probability", least=0.01, most=0.99
+        0.5, "link tracks that are one person with at least this probability", least=0.01, most=0.99, theme=_OFFLINE
     )
-    part: bool = option(True, "offline, decide anew who is who after two came near each other, from before and after")
+    part: bool = option(True, "decide identities anew where two people met, from before and after", theme=_OFFLINE)
     min_certainty: float = option(
-        0.5, "offline, a track that is a person with less than this probability is left out", least=0.0, most=1.0
+        0.5, "leave out tracks that are a person with less than this probability", least=0.0, most=1.0, theme=_OFFLINE
     )
-    smooth: bool = option(True, "offline, smooth positions, from past and future")
+    smooth: bool = option(True, "smooth positions, from past and future", theme=_OFFLINE)
     backfill: Literal["none", "unclaimed", "all"] = option(
-        "unclaimed", "whether a new track gets the past of its first observation, and also what other tracks hold"
+        "unclaimed",
+        "whether a new track gets the past of its first observation, and also what other tracks hold",
+        theme=_OFFLINE,
     )
-    filled: bool = option(False, "take samples inside holes of the input for observations too")
+    filled: bool = option(False, "take samples inside gaps of the input for observations, too", theme=_ASSOCIATION)
     rate_hz: float = context(lambda: 2.5)
     ground_planes: Planes = context(tuple)
 

@@ -24,10 +24,12 @@ class ByteTrack(Sort):
     were seen in the frame before: whoever is half hidden scores low, but is where he is expected.
     """
 
-    high_score: float = option(0.5, "boxes from this score on are paired first; without a score too", search=(0.2, 0.9))
-    new_score: float = option(0.6, "boxes from this score on may begin a track", search=(0.2, 0.9))
+    high_score: float = option(
+        0.5, "boxes of this score or more, and without a score, are paired first", search=(0.2, 0.9)
+    )
+    new_score: float = option(0.6, "boxes of this score or more may begin a track", search=(0.2, 0.9))
     low_min_iou: float = option(
-        0.5, "the least overlap for boxes with a lower score, paired second", least=0.0, most=1.0, search=(0.2, 0.8)
+        0.5, "least overlap for boxes of a lower score, which are paired second", least=0.0, most=1.0, search=(0.2, 0.8)
     )
 
     def _pair(self, moment: Moment) -> tuple[Ints, Ints]:

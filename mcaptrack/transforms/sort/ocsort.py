@@ -42,10 +42,14 @@ class OcSort(Sort):
     a track that comes back forgets what its filter made up in between.
     """
 
-    inertia: float = option(0.2, "what going on in one direction counts, beside overlap", least=0.0, search=(0.0, 0.6))
-    direction_frames: int = option(3, "a direction is that of so many frames", least=2, most=100, search=(2, 10))
-    recover: bool = option(True, "look for lost tracks where they were seen last")
-    reupdate: bool = option(True, "run the filter anew once a track is found again")
+    inertia: float = option(
+        0.2, "weight of keeping the direction of motion, beside overlap", least=0.0, search=(0.0, 0.6)
+    )
+    direction_frames: int = option(
+        3, "number of frames over which the direction of motion is taken", least=2, most=100, search=(2, 10)
+    )
+    recover: bool = option(True, "pair lost tracks once more by where they were seen last")
+    reupdate: bool = option(True, "recompute the filter over the gap when a track is found again")
 
     def _no_tracks(self) -> Tracks:
         return Tracks(_PATH - SHARED_ROWS + 2 * (self.direction_frames + 1))

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice, pairwise
 from types import MappingProxyType
-from typing import ClassVar, NamedTuple
+from typing import ClassVar, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -73,6 +73,12 @@ class Moment(NamedTuple):
     one_class: bool
 
 
+# Headings of the options in the help.
+_ASSOCIATION: Final = "Association"
+_DETECTIONS: Final = "Detections"
+_LIFE: Final = "Begin and end of tracks"
+
+
 @dataclass(frozen=True, kw_only=True)
 class Sort:
     """Track boxes over time.
@@ -81,19 +87,46 @@ class Sort:
     where a Kalman filter expects tracks.
     """
 
-    max_age_s: float = option(1.4, "a track is dropped after so long without a box", least=0.0, search=(0.2, 4.0))
-    max_age_frames: int | None = option(None, "the same in frames, instead of seconds", least=0)
-    min_hits_s: float = option(0.3, "a track is shown after so long of unbroken boxes", least=0.0, search=(0.0, 1.0))
-    min_hits_frames: int | None = option(None, "the same in frames, instead of seconds", least=0)
-    cost: Cost = option("iou", "what boxes and tracks are paired by: overlap, or distance in pixels or on the ground")
-    min_iou: float = option(
-        0.2, "the least overlap of a box with a track's expected one", least=0.0, most=1.0, search=(0.05, 0.6)
+    max_age_s: float = option(
+        1.4, "a track ends after so long without a box", least=0.0, search=(0.2, 4.0), theme=_LIFE
     )
-    max_distance_px: float = option(60.0, "the same for --cost pixels: how far centres may be apart", least=0.0)
-    max_distance_m: float = option(1.0, "the same for --cost metres: how far feet may be apart", least=0.0)
-    min_score: float | None = option(None, "boxes with a lower score are passed over")
-    class_id: int | None = option(None, "boxes of other classes than this are passed over", least=0)
-    mix_classes: bool = option(False, "a track may go on with a box of another class")
+    max_age_frames: int | None = option(
+        None, "a track ends after so many frames without a box, instead of --max-age-s", least=0, theme=_LIFE
+    )
+    min_hits_s: float = option(
+        0.3, "a track is shown after so long of unbroken boxes", least=0.0, search=(0.0, 1.0), theme=_LIFE
+    )
+    min_hits_frames: int | None = option(
+        None, "a track is shown after so many frames of unbroken boxes, instead of --min-hits-s", least=0, theme=_LIFE
+    )
+    cost: Cost = option(
+        "iou",
+        "what boxes and tracks are paired by: overlap, or distance in pixels or on the ground",
+        theme=_ASSOCIATION,
+    )
+    min_iou: float = option(
+        0.2,
+        "least overlap of a box with a track's predicted box",
+        least=0.0,
+        most=1.0,
+        search=(0.05, 0.6),
+        theme=_ASSOCIATION,
+    )
+    max_distance_px: float = option(
+        60.0,
+        "with --cost pixels: largest distance of a box's centre from the predicted one",
+        least=0.0,
+        theme=_ASSOCIATION,
+    )
+    max_distance_m: float = option(
+        1.0,
+        "with --cost metres: largest distance of a box's foot from the predicted one",
+        least=0.0,
+        theme=_ASSOCIATION,
+    )
+    min_score: float | None = option(None, "ignore boxes with a lower score", theme=_DETECTIONS)
+    class_id: int | None = option(None, "ignore boxes of other classes", least=0, theme=_DETECTIONS)
+    mix_classes: bool = option(False, "a track may continue with a box of another class", theme=_ASSOCIATION)
     ground_planes: Planes = context(tuple)
 
     reads: ClassVar[Schema] = DETECTIONS

@@ -1,0 +1,156 @@
+"""The help and docs/options.md say what there is, in an order that people find their way in, and it is so."""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+import re
+from collections import Counter, defaultdict
+from pathlib import Path
+from types import ModuleType
+from typing import Any, NamedTuple
+
+import pytest
+
+from mcaptrack import environment
+from mcaptrack.cli.command import LAST_PANELS
+from tests.commands import GROUP, called
+
+ROOT = Path(__file__).parent.parent
+PAGE = (ROOT / "docs" / "options.md").read_text()
+COMMANDS = GROUP.commands
+EVERY_COMMAND = pytest.mark.parametrize("command", sorted(COMMANDS))
+
+
+def shown(command: str) -> list[Any]:
+    """The options that the help of a command lists, but ``--help``."""
+    return [one for one in COMMANDS[command].params if one.param_type_name == "option" and not one.hidden]
+
+
+class TestHelp:
+    def test_commands_stand_under_a_few_headings(self):
+        panels = Counter(command.rich_help_panel for command in COMMANDS.values())
+        assert 3 <= len(panels) <= 6
+        assert None not in panels
+        assert max(panels.values()) <= 8
+
+    @EVERY_COMMAND
+    def test_options_stand_under_headings_that_can_be_taken_in(self, command):
+        panels = [option.rich_help_panel for option in shown(command)]
+        assert max(Counter(panels).values()) <= 9
+        order = [LAST_PANELS.index(panel) + 1 if panel in LAST_PANELS else 0 for panel in panels]
+        assert order == sorted(order)
+
+    def test_what_every_command_has_is_the_same_everywhere(self):
+        def common(command: str) -> list[tuple[list[str], str]]:
+            return [(one.opts, one.help) for one in shown(command) if one.rich_help_panel == LAST_PANELS[-1]]
+
+        for command in COMMANDS:
+            assert common(command) == common("run")
+        assert [names for names, _ in common("run")] == [
+            ["--json"],
+            ["--quiet", "-q"],
+            ["--verbose", "-v"],
+            ["--config"],
+        ]
+
+    def test_short_names_mean_one_thing(self):
+        for command in COMMANDS:
+            short = {name: one.name for one in shown(command) for name in one.opts if re.fullmatch("-[a-z]", name)}
+            usual = {"-o": "output", "-q": "quiet", "-v": "verbose", "-f": "file"}
+            assert short.items() <= usual.items()
+            assert ("-o" in short) == any(one.name == "output" for one in shown(command))
+
+    @EVERY_COMMAND
+    def test_every_option_is_told_in_a_sentence_of_its_own(self, command):
+        sentences = Counter(option.help for option in shown(command))
+        assert sentences.most_common(1)[0][1] == 1
+        for option in shown(command):
+            assert option.help[0].isupper(), option.name
+            assert option.help.endswith("."), option.name
+            assert not option.help.startswith(("The same", "For so long")), (
+                option.name
+            )  # understood where it stands alone
+        assert len(COMMANDS[command].help) > 40
+
+    def test_what_means_the_same_has_the_same_name_everywhere(self):
+        names = defaultdict(set)
+        for command in COMMANDS:
+            for option in shown(command):
+                names[option.help].add(max(option.opts, key=len))
+        assert {words: found for words, found in names.items() if len(found) > 1} == {}
+
+
+class Bounded(NamedTuple):
+    """An option with a bound, as the page lists it."""
+
+    command: str
+    chosen: tuple[str, ...]
+    name: str
+    least: float
+    most: float
+    whole: bool
+
+
+def documented() -> list[Bounded]:
+    """The options that the page gives a range."""
+    out, chosen = [], ("", ())
+    for line in PAGE.splitlines():
+        if head := re.fullmatch(r"### (\w+)(?:, with `--(\w+) (\w+)` alone)?", line):
+            chosen = head[1], (f"--{head[2]}", head[3]) if head[2] else ()
+        elif row := re.match(r"\| `--([a-z-]+)` \| (whole )?number(?: at least (\S+)| from (\S+) to (\S+))? \|", line):
+            least, most = row[3] or row[4], row[5]
+            bounds = float(least) if least else -math.inf, float(most) if most else math.inf
+            out.append(Bounded(*chosen, row[1], *bounds, bool(row[2])))
+    return [one for one in out if one.least > -math.inf or one.most < math.inf]
+
+
+BOUNDED = documented()
+
+
+@pytest.fixture(scope="module")
+def tool() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("options_doc", ROOT / "tools" / "options_doc.py")
+    assert spec is not None
+    assert spec.loader is not None
+    tool = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(tool)
+    return tool
+
+
+class TestPage:
+    def test_the_page_lists_all_parameters_of_stages(self, tool):
+        assert tool.with_options(PAGE) == PAGE, "run tools/options_doc.py"
+
+    def test_the_page_lists_the_variables_that_are_no_options(self):
+        listed = re.findall(r"^\| `(MCAPTRACK_\w+)` \| (.+) \|$", PAGE, re.MULTILINE)
+        assert dict(listed) == dict(environment.VARIABLES)
+
+    @pytest.mark.parametrize("way", ["command line", "environment", "file"])
+    @pytest.mark.parametrize("case", BOUNDED, ids=lambda case: "-".join([case.command, *case.chosen[1:], case.name]))
+    def test_a_bound_is_taken_and_what_lies_beyond_is_not(self, case, way, tmp_path, monkeypatch):
+        monkeypatch.chdir(tmp_path)
+        beyond = [(case.least, -1), (case.most, 1)]
+        for bound, sign in beyond:
+            if math.isinf(bound):
+                continue
+            after = bound + sign if case.whole else math.nextafter(bound, sign * math.inf)
+            for value, is_taken in ((bound, True), (after, False)):
+                text = str(int(value)) if case.whole else repr(value)
+                words = [case.command, "none.mcap", *case.chosen]
+                with monkeypatch.context() as patch:
+                    if way == "command line":
+                        words += [f"--{case.name}", text]
+                    elif way == "environment":
+                        patch.setenv(f"MCAPTRACK_{case.command}_{case.name}".upper().replace("-", "_"), text)
+                    else:
+                        Path("mcaptrack.toml").write_text(f"[{case.command}]\n{case.name} = {text}\n")
+                    code, out, err = called(*words)
+                assert (code, out) == (1, "")
+                parameter = case.name.replace("-", "_")
+                expected = "none.mcap" if is_taken else f"{parameter} has to be"
+                assert expected in err, (case, text, err)
+
+    def test_there_are_bounds_of_every_stage(self):
+        assert {case.command for case in BOUNDED} == {"detect", "track", "sample", "predict", "retrack"}
+        assert len(BOUNDED) > 35

@@ -1,0 +1,138 @@
+"""Commands that read change nothing, whatever lies beside the log: no byte, no time, no name in its folder.
+
+Which commands read, they declare themselves; all others leave everything as it is where ``-o`` names another place.
+"""
+
+from __future__ import annotations
+
+import os
+import shlex
+import shutil
+import signal
+import stat
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from mcaptrack.serving import Server
+from tests.commands import GROUP, called, done, made_log
+from tests.test_effects import CASES
+
+#: What a command is given, where the case without options of the other tests isn't what reads most.
+LINES = {
+    "query": "query a.mcap 'select count(*) as n from tracks'",
+    "evaluate": "evaluate a.mcap",
+    "tune": "tune a.mcap --trials 1 --search min-iou --study {elsewhere}/b.jsonl",
+    "train": "train a.mcap",
+}
+_HANGS_S = 60
+
+
+def line_of(command: str) -> str:
+    """A command line that changes nothing in the folder, if it does as it says."""
+    base = LINES.get(command) or CASES[command]["json"].base
+    name = {"train": "b", "export": "b", "report": "b.html", "render": "b.mp4", "tune": "b.toml"}
+    output = f" -o {{elsewhere}}/{name.get(command, 'b.mcap')}"
+    return base if GROUP.commands[command].reads else base + output
+
+
+class Seen(tuple[object, ...]):
+    """All that there is to see of a file, but when it was read last."""
+
+    __slots__ = ()
+
+    @classmethod
+    def of(cls, path: Path) -> Seen:
+        about = path.lstat()
+        content: object = None
+        if stat.S_ISREG(about.st_mode):
+            content = path.read_bytes()
+        elif stat.S_ISLNK(about.st_mode):
+            content = os.readlink(path)
+        kind = (about.st_mode, about.st_ino, about.st_nlink, about.st_uid, about.st_gid, about.st_size)
+        return cls((*kind, about.st_mtime_ns, about.st_ctime_ns, content))
+
+
+def seen(folder: Path) -> dict[str, Seen]:
+    """Everything in a folder, and the folder."""
+    return {str(path.relative_to(folder)): Seen.of(path) for path in (folder, *sorted(folder.rglob("*")))}
+
+
+@pytest.fixture(scope="module")
+def template(tmp_path_factory) -> Path:
+    """A folder with what commands read. Not to be changed."""
+    folder = tmp_path_factory.mktemp("reading")
+    made_log(folder)
+    done("ingest", folder / "clip.mp4", "--truth", folder / "truth.txt", "-o", folder / "fresh.mcap")
+    return folder
+
+
+#: Names of what belongs to a log or could pass for it.
+BESIDE = (
+    "a.mcap.journal",
+    "a.results.mcap",
+    "a.results.mcap.journal",
+    "a.layout.json",
+    "a.tables",
+    ".a.mcap.1.ab.part",
+)
+
+
+def nothing(folder: Path) -> None:
+    (folder / "notes.txt").write_text("mine")
+
+
+def noise(folder: Path) -> None:
+    for name in BESIDE:
+        (folder / name).write_bytes(os.urandom(4096))
+
+
+def emptiness(folder: Path) -> None:
+    for name in BESIDE:
+        (folder / name).write_bytes(b"")
+
+
+SURROUNDINGS = [nothing, noise, emptiness]
+
+
+@pytest.fixture
+def no_hanging() -> Iterator[None]:
+    """A command that waits for what never comes fails, instead of the whole run."""
+
+    def hangs(*_: object) -> None:
+        raise TimeoutError(f"it takes longer than {_HANGS_S} s")
+
+    before = signal.signal(signal.SIGALRM, hangs)
+    signal.alarm(_HANGS_S)
+    yield
+    signal.alarm(0)
+    signal.signal(signal.SIGALRM, before)
+
+
+def _interrupted(*_: object, **__: object) -> None:
+    raise KeyboardInterrupt
+
+
+@pytest.mark.usefixtures("no_hanging")
+@pytest.mark.parametrize("beside", SURROUNDINGS, ids=lambda one: one.__name__)
+@pytest.mark.parametrize("command", sorted(set(GROUP.commands) - {"demo", "train"}))  # train needs torch
+def test_what_is_read_stays_as_it_is(
+    command: str, beside: Callable[[Path], None], template: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(Server, "serve_forever", _interrupted)
+    folder = tmp_path / "work"
+    shutil.copytree(template, folder)
+    shutil.rmtree(folder / "a.tables", ignore_errors=True) if beside is not nothing else None
+    for path in folder.glob("*.layout.json"):
+        path.unlink()
+    beside(folder)
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(folder)
+    before = seen(folder)
+    outcome = called(*shlex.split(line_of(command).format(elsewhere=tmp_path / "elsewhere")))
+    assert outcome.code in (0, 1), outcome.err
+    assert outcome.code == 0 or beside is not nothing, outcome.err
+    after = seen(folder)
+    assert after.keys() == before.keys()
+    assert [name for name in after if after[name] != before[name]] == []
