@@ -9,6 +9,7 @@ import re
 import shlex
 import subprocess
 import sys
+from contextlib import redirect_stdout
 from dataclasses import replace
 from pathlib import Path
 
@@ -669,3 +670,36 @@ def test_the_tables_are_listed_with_columns_units_and_meanings(known):
     column = next(column for column in tracks["columns"] if column["name"] == "x_m")
     assert "timestamp[ns, tz=UTC]" in words
     assert (column["unit"], column["meaning"]) == ("m", "position on the ground plane, first axis")
+
+
+class Terminal(io.StringIO):
+    """A stdout of 80 columns."""
+
+    def isatty(self) -> bool:
+        return True
+
+
+LONG = "select range(5000) as many, repeat('x', 5000) as words, {'a': range(5000)} as nested, 1 as one"
+
+
+def test_long_values_are_cut_in_tables_and_nowhere_else(known):
+    shown = run(known, LONG)
+    assert max(map(len, shown.stdout.splitlines())) < 4000
+    assert "3 long values are cut; --format json or csv has all of it" in shown.stderr
+    assert "1 long value is cut" in run(known, "select repeat('x', 5000) as words").stderr
+    assert "cut" not in run(known, "select repeat('x', 1000) as words").stderr
+    for form in ("json", "jsonl", "csv"):
+        assert len(run(known, LONG, "--format", form).stdout) > 3 * 5000
+    (row,) = json.loads(run(known, LONG, "--json").stdout)["results"]
+    assert (row["many"], row["nested"]["a"], len(row["words"])) == ([*range(5000)], [*range(5000)], 5000)
+
+
+def test_a_table_is_no_wider_than_the_terminal(known, monkeypatch):
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "80")
+    for rows in ([], ["--rows", "0"]):
+        with redirect_stdout(Terminal()) as screen, pytest.raises(SystemExit):
+            app(["query", str(known), LONG, *rows])
+        text = re.sub(r"\x1b\[[0-9;]*m", "", screen.getvalue())
+        assert "…" in text
+        assert max(map(len, text.splitlines())) <= 80

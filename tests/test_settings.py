@@ -308,6 +308,10 @@ class TestFiles:
         path.symlink_to(path)
         assert "can't be read" in refused(*words)
 
+    def test_a_mark_of_byte_order_does_no_harm(self, folder):
+        (folder / "mcaptrack.toml").write_bytes(b"\xef\xbb\xbf[track]\nmax-age-s = 2")
+        assert parsed("track")["max_age_s"] == 2
+
     def test_a_file_that_is_named_has_to_be_there(self):
         assert "there is no such file" in refused("track", "x.mcap", "--config", "none.toml")
 

@@ -239,7 +239,11 @@ def _print_answer(answer: Any, limit: int) -> str:
     for row in rows:
         table.add_row(*(Text("null", "dim") if word is None else word for word in row[:fitting]))
     out.print(table)
-    said = [f"{were_cut} long values are cut; --format json or csv has them in full"] if were_cut else []
+    said = (
+        [f"{were_cut} long value{'s are' if were_cut > 1 else ' is'} cut; --format json or csv has all of it"]
+        if were_cut
+        else []
+    )
     if shown < answer.num_rows:
         said.append(f"the first {shown} of {answer.num_rows} rows; --rows 0 shows all")
     elif answer.num_rows == 0:
