@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import math
 import re
+import shlex
 from collections import Counter, defaultdict
 from pathlib import Path
 from types import ModuleType
@@ -33,6 +34,38 @@ class TestHelp:
         assert 3 <= len(panels) <= 6
         assert None not in panels
         assert max(panels.values()) <= 8
+
+    def test_the_first_page_names_every_command(self):
+        words = called("--help").out
+        assert [name for name in COMMANDS if not re.search(rf"│ {name} ", words)] == []
+
+    @EVERY_COMMAND
+    @pytest.mark.parametrize("width", ["80", "120"])
+    def test_names_of_options_are_whole_at_every_width(self, command, width, monkeypatch):
+        monkeypatch.setenv("COLUMNS", width)
+        words = set(called(command, "--help").out.split())
+        assert {name for option in shown(command) for name in (*option.opts, *option.secondary_opts)} <= words
+
+    @EVERY_COMMAND
+    def test_examples_are_commands_that_can_be_given(self, command):
+        examples = re.findall(r"^Example: mcaptrack (.+)$", COMMANDS[command].help, re.MULTILINE)
+        assert examples
+        for example in examples:
+            name, *words = shlex.split(example)
+            assert name == command
+            COMMANDS[name].make_parser(COMMANDS[name].context_class(COMMANDS[name])).parse_args(words)
+
+    @EVERY_COMMAND
+    def test_what_can_be_written_over_has_to_be_forced(self, command):
+        names = {name for option in shown(command) for name in option.opts}
+        assert "--force" in names or "--output" not in names
+
+    def test_parameters_of_transforms_are_shown_with_their_defaults(self, monkeypatch):
+        monkeypatch.setenv("COLUMNS", "160")
+        words = called("track", "--help").out
+        for option, default in (("--max-age-s", "1.4"), ("--min-iou", "0.2"), ("--min-hits-frames", "none")):
+            assert option in words
+            assert f"[default: ({default})]" in words
 
     @EVERY_COMMAND
     def test_options_stand_under_headings_that_can_be_taken_in(self, command):
