@@ -11,6 +11,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO
 
+from mcaptrack import notices
 from mcaptrack.errors import McaptrackError
 
 
@@ -22,14 +23,15 @@ def publish(path: Path) -> Iterator[Path]:
     new one. If the block fails or is interrupted what it wrote is removed.
     """
     _sweep(path)
-    part = path.with_name(f".{path.name}.{os.getpid()}.{secrets.token_hex(4)}.part")
+    part = _part_of(path)
     try:
         yield part
         with part.open("rb+") as written:
             os.fsync(written.fileno())
-        if path.exists():  # whoever could read the old file can read the new one
-            part.chmod(path.stat().st_mode)
+        lost = keep_attributes(path, part) if path.exists() else []
         os.replace(part, path)
+        if lost:
+            notices.warn(f"{path} is a new file now, which could not be given the {' and '.join(lost)} of the old one")
     finally:
         with suppress(FileNotFoundError):
             part.unlink()
@@ -52,6 +54,69 @@ def publish_bytes(path: Path, data: bytes) -> None:
     """The same for a small file. Raises McaptrackError if it can't be written."""
     with publish_stream(path) as stream:
         stream.write(data)
+
+
+def keep_attributes(path: Path, new: Path) -> list[str]:
+    """Give a new file the owner, group, permissions and extended attributes (access control lists, too) of another.
+
+    Returns which of these it could not be given, in words.
+    """
+    there, here = path.stat(), new.stat()
+    lost: list[str] = []
+    for name, wanted, given, owner in (
+        ("owner", there.st_uid, here.st_uid, (there.st_uid, -1)),
+        ("group", there.st_gid, here.st_gid, (-1, there.st_gid)),
+    ):
+        if wanted != given:
+            with _noting(name, lost):
+                os.chown(new, *owner)
+    with _noting("permissions", lost):
+        new.chmod(there.st_mode & (0o777 if lost else 0o7777))  # no set-user-id for another user
+    with _noting("extended attributes", lost):
+        _keep_extended(path, new)
+    return lost
+
+
+@contextmanager
+def _noting(name: str, lost: list[str]) -> Iterator[None]:
+    try:
+        yield
+    except OSError:
+        lost.append(name)
+
+
+def _keep_extended(path: Path, new: Path) -> None:
+    if not hasattr(os, "listxattr"):
+        return
+    ours, theirs = ({name: os.getxattr(of, name) for name in os.listxattr(of)} for of in (new, path))
+    for name in ours.keys() - theirs.keys():
+        os.removexattr(new, name)
+    for name, value in theirs.items():
+        if ours.get(name) != value:
+            os.setxattr(new, name, value)
+
+
+def can_replace(path: Path) -> bool:
+    """Whether a new file can take the place of a file, and be like it in all but its content.
+
+    It can't where the file has other names (hard links), which would go on leading to the old content, or where owner
+    and attributes can't be kept.
+    """
+    if path.stat().st_nlink > 1:
+        return False
+    probe = _part_of(path)
+    try:
+        probe.touch(0o600, exist_ok=False)
+        return not keep_attributes(path, probe)
+    except OSError:
+        return True  # nothing can be made beside it: whoever tries says so
+    finally:
+        with suppress(OSError):
+            probe.unlink()
+
+
+def _part_of(path: Path) -> Path:
+    return path.with_name(f".{path.name}.{os.getpid()}.{secrets.token_hex(4)}.part")
 
 
 def _sweep(path: Path) -> None:

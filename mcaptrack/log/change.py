@@ -2,11 +2,13 @@
 
 What comes before the first record that goes is not touched: the end from there on is written anew, kept chunks as they
 are, new ones behind them, then a new summary. That is done in place where it is less work than a copy, so adding to a
-log costs what is added. A log without a usable summary, or with messages outside of chunks, is copied and put in order.
+log costs what is added, and where a copy could not keep what belongs to the file beside its content: other names (hard
+links), owner, rights, attributes. A log without a usable summary, or with messages outside of chunks, is put in order.
 """
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -14,7 +16,7 @@ from pathlib import Path
 
 from mcap.opcode import Opcode
 
-from mcaptrack.atomic import publish_stream
+from mcaptrack.atomic import can_replace, publish_stream
 from mcaptrack.errors import McaptrackError
 from mcaptrack.log import records
 from mcaptrack.log.chunks import chunk_record, message_head, open_chunk
@@ -50,7 +52,8 @@ def extend(
         log.lock()
     with log.snapshot.mending():
         change = _Change.plan(log, drop, drop_metadata, drop_attachments)
-        opened = _in_place(log, change) if output is None and change.is_small else _as_copy(log, change, output)
+        is_in_place = output is None and (change.is_small or not can_replace(log.real_path))
+        opened = _in_place(log, change) if is_in_place else _as_copy(log, change, output)
         with opened as writer:
             yield writer
     log.is_spent = output is None
@@ -95,22 +98,16 @@ def _as_copy(log: Log, change: _Change, output: Path | None) -> Iterator[LogWrit
     if output is not None:
         refuse_earlier_results(output)
     with publish_stream(output or log.real_path) as stream:
-        start, crc = 0, change.crc_before()
-        if change.cut > len(MAGIC):
-            start = change.cut
-            _pass_on(log.snapshot.source, start, stream)
-            writer = LogWriter(stream, start, crc, change.before())
-        else:
-            crc = 0
-            writer = LogWriter(stream, 0, 0, change.before())
-            writer.write(MAGIC)
+        crc = change.crc_before()
+        _pass_on(log.snapshot.source, change.cut, stream)
+        writer = LogWriter(stream, change.cut, crc, change.before())
         change.replay(writer, log.snapshot.source.part(0, log.index.data_end), 0)
         yield writer
         messages = writer.finish()
         stream.flush()
         copy = Path(stream.name)
-        _compare(log.snapshot.source, copy, start)
-        verify(copy, writer, messages, start, crc or 0)
+        _compare(log.snapshot.source, copy, change.cut)
+        verify(copy, writer, messages, change.cut, crc or 0)
 
 
 def _pass_on(source: Source, end: int, stream: Sink) -> None:
@@ -181,6 +178,8 @@ class _Change:
     def crc_before(self) -> int | None:
         """The checksum of everything before the cut; None if the log has none."""
         index = self.index
+        if self.cut == len(MAGIC):
+            return zlib.crc32(MAGIC)
         if not index.data_crc:
             return None
         tail = crc_of(self.source, self.cut, index.data_end)

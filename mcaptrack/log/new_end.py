@@ -9,12 +9,12 @@ from __future__ import annotations
 import fcntl
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
 from mcaptrack import notices
-from mcaptrack.atomic import publish
+from mcaptrack.atomic import keep_attributes, publish
 from mcaptrack.errors import McaptrackError
 from mcaptrack.log import journal
 from mcaptrack.log.journal import Journal, Unfit, journal_of
@@ -160,9 +160,8 @@ def _begin(path: Path, handle: int, start: int, log: OpenFile) -> tuple[Journal,
     with publish(journal_of(path)) as part:
         file = OpenFile(os.open(part, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_APPEND | os.O_CLOEXEC, 0o600))
         fcntl.flock(file.handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        with suppress(PermissionError):
-            os.fchown(file.handle, there.st_uid, there.st_gid)
-        part.chmod(there.st_mode & 0o777)  # whoever may not read the log may not read its end either
+        if keep_attributes(path, part):  # whoever may not read the log may not read its end either
+            part.chmod(there.st_mode & 0o700)
         _append(file.handle, head)
         for at in range(start, there.st_size, _BLOCK):
             _append(file.handle, os.pread(handle, min(_BLOCK, there.st_size - at), at))
