@@ -399,9 +399,7 @@ def several(path, cover=False):
             stream.width, stream.height, stream.pix_fmt = 64, 48, "yuvj420p" if is_cover else "yuv420p"
             streams.append(stream)
         if cover:
-            from av.stream import Disposition  # not in the oldest versions that do
-
-            streams[0].disposition = Disposition.attached_pic
+            streams[0].disposition = av.stream.Disposition.attached_pic.value  # PyAV 17 takes nothing but a number
         for stream, count in zip(streams, counts, strict=True):
             for number in range(count):
                 frame = av.VideoFrame.from_ndarray(np.full((48, 64, 3), 9 * number, np.uint8), format="bgr24")

@@ -57,16 +57,13 @@ def test_the_search_finds_the_age_that_keeps_an_identity(chance):
 
 
 def test_optuna_finds_it_too():
-    pytest.importorskip("optuna")
     _, best = tune(Sort(), [scene()], {"max_age_s": Range(0.1, 6.0, False)}, IOU, trials=25)
     assert best.parameters["max_age_s"] > 2.4
 
 
 @pytest.mark.parametrize("with_optuna", [False, True])
 def test_a_search_that_was_ended_goes_on_where_it_was(with_optuna, tmp_path, monkeypatch):
-    if with_optuna:
-        pytest.importorskip("optuna")
-    else:
+    if not with_optuna:
         monkeypatch.setitem(sys.modules, "optuna", None)
     path, ranges, task = tmp_path / "study.jsonl", {"max_age_s": Range(0.1, 6.0, False)}, scene()
     told = []

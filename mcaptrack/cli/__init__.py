@@ -12,6 +12,7 @@ import typer
 from mcaptrack import __version__
 from mcaptrack.cli.common import register
 from mcaptrack.cli.demo import demo
+from mcaptrack.cli.docs import docs
 from mcaptrack.cli.evaluate import evaluate
 from mcaptrack.cli.events import events
 from mcaptrack.cli.files import check, drop, recover
@@ -65,6 +66,7 @@ register(app, _LOOK, "render", render)
 register(app, _LOOK, "report", report)
 register(app, _LOOK, "query", query, reads=True)
 register(app, _LOOK, "export", export)
+register(app, _LOOK, "docs", docs, reads=True)
 register(app, _MEASURE, "evaluate", evaluate, reads=True)
 register(app, _MEASURE, "tune", tune)
 register(app, _MEASURE, "train", train)

@@ -87,10 +87,10 @@ def query(
 ) -> None:
     """Ask a log in SQL: who was where, how fast, how long, how well.
 
-    The tables are those of `mcaptrack export` (docs/tables.md); `recording` tells several logs apart. They are read
-    from the files beside the log where those are up to date, otherwise from the log. Any other channel is a table under
-    its name in double quotes. Queries read nothing else and change nothing. Needs DuckDB (`pip install duckdb`).
-    docs/sql.md answers what people ask.
+    The tables are those of `mcaptrack export` (`mcaptrack docs tables`); `recording` tells several logs apart. They are
+    read from the files beside the log where those are up to date, otherwise from the log. Any other channel is a table
+    under its name in double quotes. Queries read nothing else and change nothing. Needs DuckDB (`pip install duckdb`).
+    `mcaptrack docs sql` answers what people ask.
 
     Example: mcaptrack query log.mcap "select topic, count(distinct track_id) from tracks group by topic"
 

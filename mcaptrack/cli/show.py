@@ -178,7 +178,7 @@ def export(
 
     One folder a table (frames, detections, tracks, track_summary, predictions, events, metrics, channels, recordings
     and others), one file a log in it; several logs can share a folder. Exporting again replaces what has changed.
-    docs/tables.md lists all columns.
+    `mcaptrack docs tables` lists all columns.
 
     Example: mcaptrack export log.mcap -o tables/
 

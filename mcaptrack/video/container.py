@@ -67,12 +67,7 @@ def _url(path: Path) -> str:
 
 def videos(opened: Any) -> list[Any]:
     """The streams of pictures in a container, without cover pictures."""
-    return [stream for stream in opened.streams.video if not _bits(getattr(stream, "disposition", 0)) & _COVER]
-
-
-def _bits(flags: Any) -> int:
-    """Flags of FFmpeg's, which PyAV gives as a number or not, by its version."""
-    return int(getattr(flags, "value", flags))
+    return [stream for stream in opened.streams.video if not stream.disposition.value & _COVER]
 
 
 def fraction(ratio: Any) -> Fraction | None:
@@ -87,7 +82,7 @@ def has_slots(opened: Any) -> bool:
 
 def has_times(opened: Any) -> bool:
     """Whether pictures have times at all; what FFmpeg gives for raw streams it makes up."""
-    return not _bits(opened.format.flags) & _NO_TIMESTAMPS
+    return not opened.format.flags & _NO_TIMESTAMPS
 
 
 def indexed(opened: Any) -> int:
@@ -101,7 +96,6 @@ def empty(opened: Any) -> int:
 
 
 def _mp4_entries(opened: Any) -> Any:
-    """The list of pictures of an MP4; older versions of PyAV don't tell."""
+    """The list of pictures of an MP4; of other formats nothing."""
     stream = videos(opened)[0]
-    is_mp4 = "mp4" in opened.format.name.split(",")
-    return stream.index_entries if is_mp4 and hasattr(stream, "index_entries") else ()
+    return stream.index_entries if "mp4" in opened.format.name.split(",") else ()

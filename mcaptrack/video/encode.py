@@ -23,7 +23,7 @@ Image = NDArray[np.uint8]
 _MP4_BASE: Final = Fraction(1, 90_000)
 _GIF_BASE: Final = Fraction(1, 100)
 
-_BT601, _UNKNOWN = 6, 2  # AVCOL_SPC_SMPTE170M, and what all of these enumerations call unspecified
+_BT601: Final = 6  # AVCOL_SPC_SMPTE170M
 _STILLS: Final = ("jpeg", "png")
 _JPEG_QUALITY: Final = 90
 _CRF: Final = 23
@@ -130,8 +130,7 @@ class H264Encoder:
         codec.time_base, codec.framerate = 1 / fps, fps
         if isinstance(like, av.VideoFrame):
             codec.colorspace = like.colorspace
-            codec.color_primaries = getattr(like, "color_primaries", _UNKNOWN)  # older versions of PyAV don't tell
-            codec.color_trc = getattr(like, "color_trc", _UNKNOWN)
+            codec.color_primaries, codec.color_trc = like.color_primaries, like.color_trc
         else:
             codec.colorspace = _BT601
         group = max(1, round(fps * Fraction(key_every_s)))

@@ -68,17 +68,12 @@ def packets(opened: Any, image_format: str) -> Iterator[Passed]:
             continue
         ticks = packet.dts if slots else packet.pts
         seconds = None if ticks is None else ticks * base
-        flags = (packet.is_keyframe, packet.is_discard, packet.is_corrupt, _has_new_sets(packet))
+        flags = (packet.is_keyframe, packet.is_discard, packet.is_corrupt, packet.has_sidedata("new_extradata"))
         try:
             units = to_annex_b.filter(packet) if to_annex_b else [packet]  # takes the packet's contents with it
         except av.error.FFmpegError:
             units, flags = [], (*flags[:2], True, flags[3])
         yield Passed(seconds, b"".join(bytes(unit) for unit in units), *flags)
-
-
-def _has_new_sets(packet: Any) -> bool:
-    """Whether the container changes its description of the stream here; older versions of PyAV don't tell."""
-    return bool(packet.has_sidedata("new_extradata")) if hasattr(packet, "has_sidedata") else False
 
 
 def look(path: Path, keep: Keep) -> Stream:

@@ -1,0 +1,195 @@
+"""What is built and installed: the wheel, the source distribution, and what both say of themselves."""
+
+from __future__ import annotations
+
+import ast
+import json
+import re
+import subprocess
+import tarfile
+import tomllib
+import zipfile
+from collections.abc import Iterator
+from email import message_from_bytes
+from email.message import Message
+from pathlib import Path
+
+import pytest
+from hatchling.builders.sdist import SdistBuilder
+from hatchling.builders.wheel import WheelBuilder
+from typer.main import get_command
+
+from mcaptrack import __version__
+from mcaptrack.cli import app
+from tests.test_cli import call
+
+ROOT = Path(__file__).parent.parent
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+HOME = "https://github.com/mcaptrack/mcaptrack"
+
+
+@pytest.fixture(scope="module")
+def sdist(tmp_path_factory) -> Path:
+    """The source distribution, unpacked."""
+    folder = tmp_path_factory.mktemp("sdist")
+    (artifact,) = SdistBuilder(str(ROOT)).build(directory=str(folder), versions=["standard"])
+    with tarfile.open(artifact) as archive:
+        archive.extractall(folder, filter="data")
+    return folder / f"mcaptrack-{__version__}"
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory) -> Path:
+    (artifact,) = WheelBuilder(str(ROOT)).build(directory=str(tmp_path_factory.mktemp("wheel")), versions=["standard"])
+    return Path(artifact)
+
+
+@pytest.fixture(scope="module")
+def shipped(wheel) -> set[str]:
+    """The names in the wheel."""
+    return set(zipfile.ZipFile(wheel).namelist())
+
+
+@pytest.fixture(scope="module")
+def metadata(wheel, shipped) -> Message:
+    (name,) = (name for name in shipped if name.endswith(".dist-info/METADATA"))
+    return message_from_bytes(zipfile.ZipFile(wheel).read(name))
+
+
+def test_the_source_distribution_has_every_file_of_the_repository(sdist):
+    if not (ROOT / ".git").exists():
+        pytest.skip("this is no clone")
+    words = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
+    listed = subprocess.run(words, cwd=ROOT, capture_output=True, check=True, text=True).stdout
+    kept = {name for name in listed.split("\0") if name and (ROOT / name).exists()}
+    built = {path.relative_to(sdist).as_posix() for path in sdist.rglob("*") if path.is_file()}
+    assert kept - built == set()
+    assert built - kept == {"PKG-INFO"}
+
+
+def test_the_source_distribution_builds_the_same_wheel(sdist, wheel, tmp_path):
+    (again,) = WheelBuilder(str(sdist)).build(directory=str(tmp_path), versions=["standard"])
+    assert Path(again).read_bytes() == wheel.read_bytes()
+
+
+def test_the_wheel_has_all_that_is_needed_and_nothing_else(shipped):
+    package = {
+        path.relative_to(ROOT).as_posix()
+        for path in (ROOT / "mcaptrack").rglob("*")
+        if path.is_file() and "__pycache__" not in path.parts
+    }
+    schemas = {f"mcaptrack/schemas/{path.name}" for path in (ROOT / "schemas").glob("*.proto")}
+    pages = {
+        f"mcaptrack/docs/{path.name}"
+        for path in [*(ROOT / "docs").glob("*.md"), *map(Path, ("README.md", "CHANGELOG.md"))]
+    }
+    about = {name for name in shipped if name.startswith(f"mcaptrack-{__version__}.dist-info/")}
+    assert shipped == package | schemas | pages | about
+    assert {"mcaptrack/py.typed", "mcaptrack/__init__.pyi"} <= package
+    assert {"mcaptrack/predictors/trained/red.safetensors", "mcaptrack/predictors/trained/lstm.safetensors"} <= package
+    assert f"mcaptrack-{__version__}.dist-info/licenses/LICENSE" in about
+
+
+def test_the_wheel_says_where_the_project_is_and_whose(metadata):
+    urls = dict(line.split(", ") for line in metadata.get_all("Project-URL"))
+    assert set(urls) == {"Homepage", "Repository", "Documentation", "Changelog", "Issues"}
+    for address in urls.values():
+        assert address == HOME or address.startswith(f"{HOME}/")
+        named = re.fullmatch(rf"{HOME}/(?:tree|blob)/main/(.+)", address)
+        assert named is None or (ROOT / named[1]).exists()
+    assert metadata["Author"] == "The mcaptrack authors"
+    assert metadata["License-Expression"] == "Apache-2.0"
+    assert metadata["Requires-Python"] == ">=3.11"
+    assert "Typing :: Typed" in metadata.get_all("Classifier")
+
+
+def test_dependencies_have_a_lower_bound_that_is_tried_and_the_same_one_everywhere():
+    extras = PROJECT["optional-dependencies"]
+    bounds: dict[str, set[str]] = {}
+    for wanted in [*PROJECT["dependencies"], *(each for extra in extras.values() for each in extra)]:
+        name, bound = re.fullmatch(r"([\w.-]+)(.*)", wanted).groups()
+        bounds.setdefault(name.lower(), set()).add(bound)
+    assert all(len(found) == 1 and ">=" in next(iter(found)) for found in bounds.values()), bounds
+
+
+# What people read: help, and the strings that errors and notes are made of.
+
+
+def help_texts() -> Iterator[tuple[str, str]]:
+    for name, command in get_command(app).commands.items():
+        yield name, command.help or ""
+        yield from (
+            (f"{name} {parameter.name}", getattr(parameter, "help", None) or "") for parameter in command.params
+        )
+
+
+def strings() -> Iterator[tuple[str, str]]:
+    """Every string in the package but its docstrings; those of commands are their help."""
+    for path in sorted((ROOT / "mcaptrack").rglob("*.py")):
+        tree = ast.parse(path.read_text())
+        kinds = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
+        documented = [
+            node.body[0].value
+            for node in ast.walk(tree)
+            if isinstance(node, kinds) and isinstance(node.body[0], ast.Expr)
+        ]
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Constant) and isinstance(node.value, str) and node not in documented:
+                yield f"{path.relative_to(ROOT)}:{node.lineno}", node.value
+
+
+SAID = [*help_texts(), *strings()]
+
+
+def test_pages_that_help_and_errors_name_exist_for_whoever_installed_a_wheel(shipped):
+    named = [(where, page) for where, text in SAID for page in re.findall(r"`mcaptrack docs (\w+)`", text)]
+    assert {page for _, page in named} >= {"tables", "sql"}
+    for where, page in named:
+        assert {f"mcaptrack/docs/{page}.md", f"mcaptrack/docs/{page.upper()}.md"} & shipped, where
+
+
+def test_help_and_errors_name_no_file_of_the_repository():
+    """Whoever installed a wheel has none of them, or has them elsewhere."""
+    ours = {path.relative_to(ROOT).parts[0] for path in ROOT.iterdir()} - {"mcaptrack", ".git"}
+    folders = "|".join(re.escape(name) for name in sorted(ours) if (ROOT / name).is_dir() and not name.startswith("."))
+    files = "|".join(re.escape(name) for name in sorted(ours) if (ROOT / name).is_file())
+    named = re.compile(rf"(?<![\w/.-])(?:(?:{folders})/[\w./-]*\w|{files})|[\w/-]+\.md\b")
+    found = {(where, match) for where, text in SAID for match in named.findall(text)}
+    assert found == set()
+
+
+# The command
+
+
+def test_the_pages_are_listed_and_printed_as_they_were_written(tmp_path):
+    code, out, _ = call("docs")
+    listed = dict(line.split(maxsplit=1) for line in out.splitlines())
+    assert (code, next(iter(listed))) == (0, "readme")
+    assert set(listed) == {path.stem for path in (ROOT / "docs").glob("*.md")} | {"readme", "changelog"}
+    assert listed["sql"] == "SQL"
+    said = json.loads(call("docs", "--json")[1])
+    assert {page["name"]: page["title"] for page in said["pages"]} == listed
+    text = (ROOT / "docs" / "sql.md").read_text()
+    for name in ("sql", "SQL.md", "docs/sql.md"):
+        assert call("docs", name)[1] == text
+    assert json.loads(call("docs", "sql", "--json")[1])["text"] == text
+    assert call("docs", "sql", "-o", tmp_path / "page.md")[0] == 0
+    assert (tmp_path / "page.md").read_text() == text
+
+
+def test_a_page_that_is_not_there_is_said_with_those_that_are():
+    code, _, err = call("docs", "tabels")
+    assert code == 1
+    assert err.startswith("mcaptrack: there is no page tabels; did you mean tables? There are readme, ")
+
+
+@pytest.mark.parametrize("path", [*(ROOT / "docs").glob("*.md"), ROOT / "README.md"], ids=lambda path: path.name)
+def test_links_of_the_pages_lead_somewhere(path):
+    for target in re.findall(r"\]\(([^)#][^)]*)\)", path.read_text()):
+        assert target.startswith("https://") or (path.parent / target.partition("#")[0]).exists(), target
+    headings = {
+        re.sub(r"[^\w -]", "", line.lstrip("# ")).lower().replace(" ", "-")
+        for line in path.read_text().splitlines()
+        if line.startswith("#")
+    }
+    assert set(re.findall(r"\]\(#([^)]+)\)", path.read_text())) <= headings
