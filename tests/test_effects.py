@@ -204,6 +204,7 @@ CASES: dict[str, dict[str, Case]] = {
         force=("drop a.mcap /camera/retracks -o clip.mp4", "--force"),
     ),
     "demo": common("demo", output="-o b", force=("demo -o taken", "--force")),
+    "docs": common("docs", output="-o pages.txt", force=("docs -o clip.mp4", "--force")),
 }
 
 

@@ -35,7 +35,7 @@ READING: dict[str, Callable[[Path, Path], list[object]]] = {
     },
 }
 #: Those that read no log.
-OTHERS = {"demo"}
+OTHERS = {"demo", "docs"}
 if find_spec("torch"):  # without it `train` reads nothing
     READING["train"] = lambda log, out: [log, "-o", out / "trained", "--epochs", "1", "--device", "cpu"]
 else:

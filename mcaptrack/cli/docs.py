@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 from mcaptrack.cli import common
+from mcaptrack.cli.text import console, show
 from mcaptrack.errors import McaptrackError
 
 
@@ -41,7 +42,7 @@ def docs(
                 common.print_json({"pages": [{"name": name, "title": title} for name, title in titles.items()]})
             else:
                 width = max(map(len, titles)) + 2
-                print("\n".join(f"{name:<{width}}{title}" for name, title in titles.items()))
+                show(*(f"{name:<{width}}{title}" for name, title in titles.items()))
         return
     name = Path(page).name.lower().removesuffix(".md")
     if name not in pages:
@@ -54,12 +55,11 @@ def docs(
         if json:
             common.print_json({"name": name, "title": _title(pages[name]), "text": text})
         elif output is None and sys.stdout.isatty():
-            from rich.console import Console
             from rich.markdown import Markdown
 
-            Console().print(Markdown(text))
+            console().print(Markdown(text))
         else:
-            print(text, end="")
+            show(*text.splitlines())
 
 
 def documentation() -> dict[str, Path]:
