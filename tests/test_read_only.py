@@ -140,7 +140,7 @@ def test_what_is_no_file_is_refused_in_a_line(command, out):
     (folder / "folder.mcap").mkdir()
     os.mkfifo(folder / "beside.results.mcap")
     shutil.copy(os.devnull, folder / "beside.mcap")
-    for name, words in {"pipe.mcap": "a pipe", "folder.mcap": "a folder", "beside.mcap": "a named pipe"}.items():
+    for name, words in {"pipe.mcap": "pipe", "folder.mcap": "a folder", "beside.mcap": "a named pipe"}.items():
         before = everything(folder)
         outcome = called(command, *READING[command](folder / name, out))
         assert outcome.code in (1, 2)
