@@ -16,6 +16,7 @@ FPS_RANGE: Final = (Fraction(1, 86_400), Fraction(10_000))
 #: Numbers that people write: no exponent that takes a lifetime to work out.
 _RATIO: Final = re.compile(r"\+?(\d+\.?\d*|\.\d+)(e[+-]?\d{1,2})?(/\d+)?", re.ASCII | re.IGNORECASE)
 _MAX_DIGITS: Final = 40
+_WHOLE: Final = re.compile(r"-?\d{1,19}", re.ASCII)
 #: How many intervals the usual one is taken from.
 _MEMORY: Final = 25
 #: From how many intervals on the usual one is sure enough to notice that it has changed, and by what factor then.
@@ -40,6 +41,13 @@ def parse_fps(text: str) -> Fraction:
     if not FPS_RANGE[0] <= fps <= FPS_RANGE[1]:
         raise ValueError(f"{text} frames a second: there can be one a day to {FPS_RANGE[1]} a second")
     return fps
+
+
+def parse_ns(text: str) -> int | None:
+    """A time in nanoseconds, written by ``str``; None for anything else, and for times that can't be computed with."""
+    if not _WHOLE.fullmatch(text) or abs(int(text)) > LAST_NS:
+        return None
+    return int(text)
 
 
 def seconds_to_ns(seconds: float) -> int:

@@ -10,6 +10,7 @@ from typing import Any, Final
 import numpy as np
 
 from mcaptrack import __version__, evaluation, foreign, log, tables
+from mcaptrack.clock import LAST_NS
 from mcaptrack.errors import McaptrackError
 from mcaptrack.export.names import recording_name
 from mcaptrack.foreign.flat import flattener, kind_of
@@ -189,7 +190,10 @@ class Contents:
             for channel in opened.channels.values()
             if (made := Provenance.from_metadata(channel.metadata)) and made.transform == "ingest"
         }
-        span = (opened.start_ns, opened.end_ns) if messages else (None, None)
+        span: tuple[int | None, int | None] = (opened.start_ns, opened.end_ns) if messages else (None, None)
+        if messages and opened.end_ns > LAST_NS:
+            self._note("recordings", "messages are later than the year 2262, which tables can't hold")
+            span = (opened.start_ns if opened.start_ns <= LAST_NS else None, None)
         return {
             "file": opened.path.name,
             "start_t": span[0],

@@ -127,7 +127,7 @@ def detections(opened: log.Log, topic: str) -> list[Frame]:
 
 def _decoded(opened: log.Log, topic: str, make: Callable[[Kind], Callable[[bytes], Any]]) -> Iterator[tuple[Any, Any]]:
     read = _reader(opened, topic, make)
-    return ((message, read(message)) for message in opened.messages(topic))
+    return ((message, read(message)) for message in opened.timed(topic))
 
 
 def _reader(

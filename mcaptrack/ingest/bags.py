@@ -12,6 +12,7 @@ from typing import Final
 import numpy as np
 
 from mcaptrack import foreign, log
+from mcaptrack.clock import LAST_NS
 from mcaptrack.errors import McaptrackError
 from mcaptrack.ingest.cameras import choose, picture_test, timeline_of
 from mcaptrack.ingest.job import IngestOptions, Job, Progress
@@ -140,7 +141,13 @@ class LogJob(Job):
         return self._timeline(m.t_ns for c, m in self._recorded.messages(Found()) if holds_picture(c, m.payload))
 
     def _timeline(self, t_ns: Iterable[int]) -> Timeline:
-        times = np.array(sorted(t_ns), np.int64)
+        in_order = sorted(t_ns)
+        if in_order and in_order[-1] > LAST_NS:
+            raise McaptrackError(
+                f"{self.source}: {self.pictures} has pictures later than the year 2262, the last at {in_order[-1]} ns; "
+                "labels can't be placed on such times"
+            )
+        times = np.array(in_order, np.int64)
         return Timeline(np.arange(len(times)), times, f"the pictures of {self.pictures}", not self.report.lost)
 
     def _holds_picture(self) -> Callable[[Connection, bytes], bool]:
@@ -150,7 +157,7 @@ class LogJob(Job):
 
     def _write_messages(self, writer: log.LogWriter) -> Timeline:
         """Write all channels and messages; returns the pictures that labels belong to."""
-        found, done, times, holds_picture = Found(), 0, array("q"), self._holds_picture()
+        found, done, times, holds_picture = Found(), 0, array("Q"), self._holds_picture()
         for connection in self._recorded.connections:
             self._channel(writer, connection)
         total = sum((self._recorded.claims or {}).values())

@@ -13,7 +13,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from mcaptrack import log
-from mcaptrack.clock import NS_PER_S
+from mcaptrack.clock import NS_PER_S, parse_ns
 from mcaptrack.errors import McaptrackError
 from mcaptrack.foreign import holds_pictures
 from mcaptrack.ingest.cameras import Standing, camera_of, labels_of, seen_by, size_of, timeline_of
@@ -137,8 +137,8 @@ class LabelJob(Job):
         if self.there:
             self._check_standing(self.there, standing, fps)
             if self.options.start_ns is None:
-                said = (self.there.metadata(CLOCK) or {}).get("start_ns", "")
-                self._start_ns = int(said) if said.isdecimal() else 0
+                said = self.there.metadata(CLOCK) or {}
+                self._start_ns = parse_ns(said.get("start_ns", "")) or 0
         count, counted_by = self._count(known, standing)
         timeline = Timeline.spaced(count, fps, self._start_ns, f"the frames that {counted_by} counts")
         if self.there and any(part.index.counts for part in self.there.parts):

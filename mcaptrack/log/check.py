@@ -20,6 +20,7 @@ from mcaptrack.log.beside import changed, find_journal
 from mcaptrack.log.check_summary import Finding, Findings, check_summary, record_name
 from mcaptrack.log.chunks import (
     HEAD,
+    MAX_NS,
     Entries,
     chunk_entries,
     heads_at,
@@ -300,12 +301,16 @@ class _Look:
                 self._find("no-channel", where, f"messages of channel {channel}, which was not described before")
             t_ns = listed[:, 0]
             latest = self._latest.get(channel, 0)
-            late = int((t_ns < np.maximum(np.maximum.accumulate(t_ns), np.uint64(latest))).sum())
-            if late:
-                known = self.found.channels.get(channel)
-                topic = known.topic if known else f"channel {channel}"
+            known = self.found.channels.get(channel)
+            topic = known.topic if known else f"channel {channel}"
+            behind = t_ns < np.maximum(np.maximum.accumulate(t_ns), np.uint64(latest))
+            if behind.any():
                 words = f"messages of {topic} that stand behind later ones"
-                self._find("order", where, words, "warning", late)
+                self._find("order", where, words, "warning", int(behind.sum()))
+            late = t_ns > np.uint64(MAX_NS)
+            if late.any():
+                words = f"messages of {topic} later than the year 2262, which are kept, but nothing is computed with"
+                self._find("late", where, words, "warning", int(late.sum()))
             self._latest[channel] = max(latest, int(t_ns.max()))
             if not self.found.counts:
                 self.found.start_ns = int(t_ns.min())

@@ -330,7 +330,7 @@ def _pieces(channel_id: int, chunk: ChunkIndexRecord | None, entries: Entries, s
 
 def signed(t_ns: Times) -> Ints:
     """Times as signed numbers, as all arithmetic has them. Raises Late where one is too late for that."""
-    if len(t_ns) and t_ns.max() > MAX_NS:
-        late = t_ns[t_ns > MAX_NS]
+    late = t_ns[t_ns > np.uint64(MAX_NS)]
+    if len(late):
         raise Late(len(late), int(late.min()))
     return t_ns.astype(np.int64)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.log import new_end, records
+from mcaptrack.log.chunks import MAX_NS
 from mcaptrack.log.fingerprint import fingerprint
 from mcaptrack.log.messages import Columns, Message, Places
 from mcaptrack.log.records import ChannelRecord, Damaged
@@ -216,6 +217,16 @@ class Log:
         with self.snapshot.mending():
             yield from self._messages.by_time(channels, (start_ns, end_ns))
             self.snapshot.confirm(channels)
+
+    def timed(self, topic: str) -> Iterator[Message]:
+        """The messages of a channel by time, for code that computes with their times.
+
+        Raises McaptrackError at the first message whose time is too late for that, and as ``messages`` does.
+        """
+        for message in self.messages(topic):
+            if message.t_ns > MAX_NS:
+                self.times(topic)  # which says so
+            yield message
 
     def merged(
         self, topics: Iterable[str], start_ns: int | None = None, end_ns: int | None = None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -96,7 +97,7 @@ class Snapshot:
             raise McaptrackError(
                 f"{self.path}: {topic} has {late.count} messages later than the year 2262, the first at {late.t_ns} "
                 "ns; they are kept as they are, but nothing is computed with such times "
-                f"(`mcaptrack drop {self.path} {topic}` leaves the channel out)"
+                f"(`mcaptrack drop {shlex.quote(str(self.path))} {shlex.quote(topic)} -o OTHER.mcap` leaves them out)"
             ) from None
 
     # The file

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from mcaptrack import foreign, log
 from mcaptrack.carry import carry
-from mcaptrack.clock import NS_PER_S
+from mcaptrack.clock import NS_PER_S, parse_ns
 from mcaptrack.notices import Notice, collected, warn
 from mcaptrack.pipeline.events import STAGE as EVENTS_STAGE
 from mcaptrack.pipeline.events import Watch, make_events, tally
@@ -159,8 +159,8 @@ def _in_context(opened: log.Log, prefix: str, job: Job, made: Mapping[str, Made]
 def _clock_start(opened: log.Log, prefix: str) -> int | None:
     """When the clock of prediction begins: as ingest said, or with the first picture of the camera."""
     said = opened.metadata(CLOCK)
-    if said and said.get("start_ns", "").lstrip("-").isdigit():
-        return int(said["start_ns"])
+    if said and (start := parse_ns(said.get("start_ns", ""))) is not None:
+        return start
     pictures = picture_topic(opened, prefix)
     return min(opened.times(pictures).tolist(), default=None) if pictures else None
 

@@ -1,0 +1,145 @@
+"""Times from 2^63 ns on, which MCAP allows: kept as they are by what passes messages on, refused by what computes."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+from mcaptrack import log
+from mcaptrack.clock import parse_ns
+from mcaptrack.log.chunks import LOG_MAX_NS, MAX_NS
+from tests.commands import called, done, made_log
+from tests.test_journal import everything
+from tests.test_log import SCHEMA, SOME, STOCK_OPTIONS, our_messages, stock_messages, write_stock
+from tests.test_read_only import READING
+
+LATE = [
+    ("a", MAX_NS, 6, b"the last that is computed with"),
+    ("b", MAX_NS + 1, 7, b"late"),
+    ("a", LOG_MAX_NS, 8, b"the last of all"),
+    ("c", LOG_MAX_NS - 1, 9, b""),
+]
+
+
+@pytest.fixture(params=STOCK_OPTIONS)
+def theirs(request, tmp_path) -> Path:
+    path = tmp_path / "theirs.mcap"
+    write_stock(path, [*SOME, *LATE], **STOCK_OPTIONS[request.param])
+    return path
+
+
+def test_they_are_kept_by_every_way_to_pass_messages_on(theirs, tmp_path):
+    wanted = Counter([*SOME, *LATE])
+    done("recover", theirs, "-o", tmp_path / "recovered.mcap")
+    done("ingest", theirs, "-o", tmp_path / "ingested.mcap")
+    done("drop", theirs, "b", "-o", tmp_path / "dropped.mcap")
+    assert Counter(stock_messages(tmp_path / "recovered.mcap")) == wanted
+    assert Counter(stock_messages(tmp_path / "ingested.mcap")) == wanted
+    assert Counter(stock_messages(tmp_path / "dropped.mcap")) == Counter(m for m in wanted if m[0] != "b")
+    with log.read(theirs) as opened, log.extend(opened) as writer:
+        writer.add_message(writer.add_channel("new", SCHEMA, "json", {}), MAX_NS + 5, 1, b"added")
+    assert Counter(stock_messages(theirs)) == wanted + Counter([("new", MAX_NS + 5, 1, b"added")])
+    found = our_messages(theirs)
+    assert found["a"] == sorted(m[1:] for m in [*SOME, *LATE] if m[0] == "a")
+    with log.read(theirs) as opened:
+        assert [m.sequence for m in opened.messages("a", MAX_NS, LOG_MAX_NS)] == [6]
+        assert [m.sequence for m in opened.messages("b", 41)] == [7]
+        assert (opened.start_ns, opened.end_ns) == (5, LOG_MAX_NS)
+    assert log.check(theirs).is_sound
+
+
+def test_check_names_the_channels_and_counts_the_messages(theirs):
+    outcome = done("check", theirs, "--json")
+    late = [finding for finding in json.loads(outcome.out)["results"][0]["findings"] if finding["kind"] == "late"]
+    assert [(finding["level"], finding["times"]) for finding in late] == [("warning", 3)]
+    assert "later than the year 2262" in late[0]["words"]
+    write_stock(theirs, [*SOME, LATE[0]])
+    assert "late" not in [f["kind"] for f in json.loads(done("check", theirs, "--json").out)["results"][0]["findings"]]
+
+
+def test_tables_leave_out_what_they_can_t_hold_and_say_so(tmp_path):
+    theirs = tmp_path / "theirs.mcap"
+    write_stock(theirs, [*SOME, *LATE])
+    outcome = done("export", theirs, "-o", tmp_path / "tables")
+    assert "recordings: messages are later than the year 2262, which tables can't hold" in outcome.err
+    answer = done("query", theirs, "select start_t_ns, end_t_ns, messages from recordings", "--json")
+    assert json.loads(answer.out)["results"] == [{"start_t_ns": 5, "end_t_ns": None, "messages": 9}]
+    refused = called("export", theirs, "--topic", "a", "-o", tmp_path / "tables")
+    assert refused.code == 1
+    assert f"a has 1 messages later than the year 2262, the first at {LOG_MAX_NS} ns" in refused.err
+    proposed = refused.err.split("`mcaptrack ")[1].split("`")[0].replace("OTHER.mcap", str(tmp_path / "other.mcap"))
+    done(*proposed.split())
+    assert Counter(stock_messages(tmp_path / "other.mcap")) == Counter(m for m in [*SOME, *LATE] if m[0] != "a")
+
+
+@pytest.fixture(scope="module")
+def early(tmp_path_factory) -> Path:
+    return made_log(tmp_path_factory.mktemp("early"), 12)
+
+
+@pytest.fixture(scope="module", params=["all of them", "some of them"])
+def ours(request, early, tmp_path_factory) -> Path:
+    """A log with everything in it, whose messages are later than they were."""
+    path = tmp_path_factory.mktemp("late") / "late.mcap"
+    with log.read(early) as opened, log.create(path, log.profile(opened)) as writer:
+        middle = (opened.start_ns + opened.end_ns) // 2
+        later = MAX_NS + 1 - (0 if request.param == "all of them" else middle)
+        numbers = {}
+        for number, channel in opened.index.channels.items():
+            schema = opened.index.schemas.get(channel.schema_id)
+            layout = (schema.name, schema.encoding, schema.data) if schema else ("", "", b"")
+            numbers[number] = writer.add_channel(channel.topic, layout, channel.message_encoding, channel.metadata)
+        for number, message in log.stream(opened):
+            writer.add_message(numbers[number], message.t_ns + later, message.sequence, message.payload)
+        log.pass_on_extras(opened, writer)
+    return path
+
+
+@pytest.mark.parametrize("command", sorted(READING.keys() - {"train"}))
+def test_every_command_keeps_them_or_refuses_in_a_line(command, ours, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    before = everything(ours.parent)
+    outcome = called(command, *READING[command](ours, tmp_path))
+    assert everything(ours.parent) == before
+    assert outcome.code in (0, 1), outcome.err
+    if outcome.code:
+        last = outcome.err.splitlines()[-1]
+        assert last.startswith("mcaptrack: ")
+        if command not in ("render", "view", "tune"):
+            assert "later than the year 2262" in last
+        assert not [made for made in tmp_path.iterdir() if made.suffix == ".mcap"]
+
+
+@pytest.mark.parametrize(
+    ("text", "number"),
+    [
+        ("0", 0),
+        ("-5", -5),
+        (str(MAX_NS), MAX_NS),
+        (str(MAX_NS + 1), None),
+        ("9" * 5000, None),
+        ("", None),
+        ("1.5", None),
+        ("٣", None),
+        (" 1", None),
+    ],
+)
+def test_a_clock_start_that_can_t_be_computed_with_is_none(text, number):
+    assert parse_ns(text) == number
+
+
+def test_boxes_of_others_at_such_times_are_not_tracked(tmp_path):
+    path = tmp_path / "robot.mcap"
+    boxes = {"header": {"stamp": {"sec": 1, "nanosec": 0}, "frame_id": ""}, "detections": []}
+    with log.create(path) as writer:
+        number = writer.add_channel("/boxes", ("vision_msgs/Detection2DArray", "jsonschema", b"{}"), "json", {})
+        for t_ns in (MAX_NS, MAX_NS + 1):
+            writer.add_message(number, t_ns, 0, json.dumps(boxes).encode())
+    before = everything(tmp_path)
+    outcome = called("track", path, "--topic", "/boxes")
+    assert outcome.code == 1
+    assert "/boxes has 1 messages later than the year 2262, the first at 9223372036854775808 ns" in outcome.err
+    assert everything(tmp_path) == before
