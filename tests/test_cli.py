@@ -350,7 +350,7 @@ class TestMistakes:
         ),
         "no truth": (["evaluate", "a.mcap"], "has no channel /camera/truth; add one with"),
         "no pattern": (["run", "*.nothing"], "no file matches *.nothing"),
-        "a number out of range": (["track", "a.mcap", "--min-iou", "3"], "min_iou has to be from 0 to 1, not 3"),
+        "a number out of range": (["track", "a.mcap", "--min-iou", "3"], "--min-iou has to be from 0 to 1, not 3"),
         "no frame rate": (["ingest", "clip.mp4", "--fps", "fast", "-o", "x.mcap"], "--fps needs a number"),
         "no time": (["ingest", "clip.mp4", "--start-time", "noon", "-o", "x.mcap"], "--start-time needs"),
         "no gates": (["evaluate", "a.mcap", "--gate-m", "near"], "--gate-m needs distances in metres"),

@@ -139,6 +139,8 @@ def documented() -> list[Bounded]:
 
 
 BOUNDED = documented()
+#: What a command needs beside its input.
+WORDS = {"query": ("select 1",)}
 
 
 @pytest.fixture(scope="module")
@@ -152,7 +154,7 @@ def tool() -> ModuleType:
 
 
 class TestPage:
-    def test_the_page_lists_all_parameters_of_stages(self, tool):
+    def test_the_page_lists_all_parameters_of_stages_and_all_numbers(self, tool):
         assert tool.with_options(PAGE) == PAGE, "run tools/options_doc.py"
 
     def test_the_page_lists_the_variables_that_are_no_options(self):
@@ -163,27 +165,46 @@ class TestPage:
     @pytest.mark.parametrize("case", BOUNDED, ids=lambda case: "-".join([case.command, *case.chosen[1:], case.name]))
     def test_a_bound_is_taken_and_what_lies_beyond_is_not(self, case, way, tmp_path, monkeypatch):
         monkeypatch.chdir(tmp_path)
-        beyond = [(case.least, -1), (case.most, 1)]
-        for bound, sign in beyond:
+        for bound, sign in ((case.least, -1), (case.most, 1)):
             if math.isinf(bound):
                 continue
             after = bound + sign if case.whole else math.nextafter(bound, sign * math.inf)
             for value, is_taken in ((bound, True), (after, False)):
                 text = str(int(value)) if case.whole else repr(value)
-                words = [case.command, "none.mcap", *case.chosen]
+                words = [case.command, "none.mcap", *WORDS.get(case.command, ()), *case.chosen]
+                where = f"--{case.name}"
                 with monkeypatch.context() as patch:
                     if way == "command line":
                         words += [f"--{case.name}", text]
                     elif way == "environment":
-                        patch.setenv(f"MCAPTRACK_{case.command}_{case.name}".upper().replace("-", "_"), text)
+                        where = f"MCAPTRACK_{case.command}_{case.name}".upper().replace("-", "_")
+                        patch.setenv(where, text)
                     else:
-                        Path("mcaptrack.toml").write_text(f"[{case.command}]\n{case.name} = {text}\n")
+                        where = f"set.toml: [{case.command}] {case.name}"
+                        Path("set.toml").write_text(f"[{case.command}]\n{case.name} = {text}\n")
+                        words += ["--config", "set.toml"]
                     code, out, err = called(*words)
                 assert (code, out) == (1, "")
-                parameter = case.name.replace("-", "_")
-                expected = "none.mcap" if is_taken else f"{parameter} has to be"
-                assert expected in err, (case, text, err)
+                assert err.startswith(f"mcaptrack: {where} has to be ") is not is_taken, (case, text, err)
+                assert err.count("\n") == 1
 
-    def test_there_are_bounds_of_every_stage(self):
-        assert {case.command for case in BOUNDED} == {"detect", "track", "sample", "predict", "retrack"}
-        assert len(BOUNDED) > 35
+    @EVERY_COMMAND
+    def test_what_is_no_number_is_taken_for_none(self, command):
+        for setting in COMMANDS[command].settings.values():
+            if setting.kind is float and not setting.parameter.startswith("old_"):
+                chosen = next((case.chosen for case in BOUNDED if case[::2][:2] == (command, setting.name)), ())
+                words = [command, "none.mcap", *WORDS.get(command, ()), *chosen, f"--{setting.name}=nan"]
+                _, _, err = called(*words)
+                assert err.startswith(f"mcaptrack: --{setting.name} has to be "), err
+
+    def test_numbers_of_all_commands_have_ends(self):
+        bounded = {(case.command, case.name) for case in BOUNDED}
+        numbers = {
+            (command, setting.name)
+            for command in COMMANDS
+            for setting in COMMANDS[command].settings.values()
+            if setting.kind in (int, float) and not setting.parameter.startswith("old_")
+        }
+        assert bounded < numbers
+        scores = {("track", name) for name in ("min-score", "high-score", "new-score")}  # each detector has its own
+        assert numbers - bounded == scores

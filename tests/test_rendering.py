@@ -170,7 +170,7 @@ MISTAKES = {
     "another suffix": (["-o", "a.avi"], "a video is rendered to .mp4 or .gif, not to .avi"),
     "no such view": (["--topic", "/camera/none"], "has no channel /camera/none/view/image"),
     "no such second": (["--start-s", "5000"], "no picture lies in the seconds that were asked for; there are "),
-    "a width of nothing": (["--width", "0"], "--width is a number from 16 to 16384, not 0"),
+    "a width of nothing": (["--width", "0"], "--width has to be from 16 to 16384, not 0"),
 }
 
 

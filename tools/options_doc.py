@@ -9,16 +9,24 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any, get_type_hints
 
+from typer.main import get_command
+
+from mcaptrack.cli import app
+from mcaptrack.cli.settings import Setting
 from mcaptrack.transforms import ALTERNATIVES, PROFILES, TRANSFORMS
-from mcaptrack.transforms.protocol import bare_type, choices, range_words
+from mcaptrack.transforms.protocol import bare_type, choices, limits
 
 DOCUMENT = Path(__file__).parent.parent / "docs" / "options.md"
 BEGIN, END = "<!-- options: begin, written by tools/options_doc.py -->", "<!-- options: end -->"
+_HEAD = "| option | values | default | meaning |\n|---|---|---|---|"
+_OTHERS = """## Numbers that other commands take
+
+`mcaptrack COMMAND --help` lists all options of a command; here are those that are numbers."""
 _KINDS = {bool: "yes or no", int: "whole number", float: "number", str: "text"}
 
 
 def described() -> str:
-    """All options of stages with what they take, as Markdown."""
+    """All options of stages, and the numbers that other commands take, as Markdown."""
     parts = []
     for command in TRANSFORMS:
         kinds = dict(ALTERNATIVES[command].kinds) if command in ALTERNATIVES else {"": TRANSFORMS[command]}
@@ -30,8 +38,22 @@ def described() -> str:
             known |= {row.split("`")[1] for row in rows}
             several = f", with `--{ALTERNATIVES[command].option} {name}` alone" if _stands(parts, command) else ""
             head = f"### {command}{several}"
-            parts.append("\n".join([head, "", "| option | values | default | meaning |", "|---|---|---|---|", *new]))
+            parts.append("\n".join([head, "", _HEAD, *new]))
+    parts.append(_OTHERS)
+    for name, command in get_command(app).commands.items():  # type: ignore[attr-defined]
+        shown = {one.name: one for one in command.params if one.param_type_name == "option" and not one.hidden}
+        numbers = [one for one in command.settings.values() if one.kind in (int, float) and one.parameter in shown]
+        if numbers and name not in TRANSFORMS:
+            rows = [_number_row(one, shown[one.parameter]) for one in numbers]
+            parts.append("\n".join([f"### {name}", "", _HEAD, *rows]))
     return "\n\n".join(parts)
+
+
+def _number_row(setting: Setting, option: Any) -> str:
+    range_ = limits(setting.declared.least, setting.declared.most)
+    default = option.show_default if isinstance(option.show_default, str) else option.default
+    words = option.help.removesuffix(".").removesuffix(f"{range_[:1].upper()}{range_[1:]}").strip().removesuffix(".")
+    return f"| `--{setting.name}` | {_KINDS[setting.kind]} {range_} | {default} | {words} |"
 
 
 def _stands(parts: list[str], command: str) -> bool:
@@ -44,7 +66,8 @@ def _row(made: Any, field: Any) -> str:
     default = getattr(made, field.name)
     shown = "none" if default is None else str(default).lower() if kind is bool else f"{default}"
     values = (
-        " ".join(f"`{name}`" for name in choices(kind)) or f"{_KINDS[kind]} {range_words(field).lower().rstrip('.')}"
+        " ".join(f"`{name}`" for name in choices(kind))
+        or f"{_KINDS[kind]} {limits(field.metadata['least'], field.metadata['most'])}"
     )
     words = field.metadata["help"]
     return f"| `--{field.name.replace('_', '-')}` | {values.strip()} | {shown} | {words[:1].upper()}{words[1:]} |"

@@ -174,8 +174,19 @@ def settings_of(command: str) -> dict[str, Any]:
     context: Any = _RUNNING.get()
     values, found = converted(context, command), found_of(command)
     other: Command = context.parent.command.commands[command]
-    other.rename(values, lambda name: (found[name][1].rank, found[name][1].where) if name in found else (_DEFAULT, ""))
+    places = {name: (given.rank, given.where) for name, (_, given) in found.items()}
+    other.rename(values, lambda name: places.get(name, (_DEFAULT, "")))
+    for setting in other.settings.values():
+        setting.check(values.get(setting.parameter), places.get(setting.parameter, (0, ""))[1])
     return values
+
+
+def check_ranges(values: Mapping[str, Any]) -> None:
+    """Raise McaptrackError for a number out of range among the values of the running command's options."""
+    context: Any = _RUNNING.get()
+    found = found_of(context.info_name)
+    for setting in context.command.settings.values():
+        setting.check(values.get(setting.parameter), _rank(context, setting.parameter, found)[1])
 
 
 def is_on_command_line(parameter: str) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import glob
 import io
 import json
+import math
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout
@@ -18,12 +19,13 @@ import typer
 
 from mcaptrack import SCHEMA_VERSION, notices
 from mcaptrack.atomic import publish_bytes, refuse_overwrite
-from mcaptrack.cli.command import LAST_PANELS, Command, Reading, read_config
+from mcaptrack.cli.command import LAST_PANELS, Command, Reading, check_ranges, read_config
 from mcaptrack.cli.inputs import check_paths, refuse_url
 from mcaptrack.cli.settings import Declared
 from mcaptrack.cli.text import say
 from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import Code, Notice
+from mcaptrack.transforms.protocol import limits
 
 P = ParamSpec("P")
 #: What the running command has warned of.
@@ -43,18 +45,22 @@ def option(
     tuning: bool | str = False,
     was: str = "",
     was_if: tuple[str, str] | None = None,
+    least: float = -math.inf,
+    most: float = math.inf,
     **given: Any,
 ) -> Any:
-    """A Typer option, below the heading ``panel`` of the help; for the others see ``Declared``.
+    """A Typer option, below the heading ``panel`` of the help, which names the range; for the others see ``Declared``.
 
     The options of ``COMMON`` and of ``FILES`` show no defaults; that all can come from the environment goes unsaid.
     """
+    if words := limits(least, most):
+        given["help"] += f" {words[0].upper()}{words[1:]}."
     if panel:
         given["rich_help_panel"] = panel
     if panel in (COMMON, FILES):
         given.setdefault("show_default", False)
     made: Any = typer.Option(*names, show_envvar=False, **given)
-    made.declared = Declared(tuning, was.lstrip("-"), was_if)
+    made.declared = Declared(tuning, was.lstrip("-"), was_if, least, most)
     return made
 
 
@@ -117,13 +123,15 @@ def similarity(shown: str) -> Any:
 def gate_m(shown: str | bool = True, tuning: str | bool = True, was: str = "") -> Any:
     """The largest distance of a match."""
     words = "Largest distance in metres at which a person and a track match."
-    return option("--gate-m", panel=SCORES, tuning=tuning, was=was, help=words, show_default=shown)
+    ends: dict[str, Any] = {} if isinstance(tuning, str) else {"least": 0.001, "most": 1e6}  # text is several numbers
+    return option("--gate-m", panel=SCORES, tuning=tuning, was=was, help=words, show_default=shown, **ends)
 
 
 def min_iou(was: str = "", was_if: tuple[str, str] | None = None) -> Any:
     """The least overlap of a match."""
     words = "Least overlap (IoU) at which a person and a track match."
-    return option("--min-iou", panel=SCORES, tuning=True, was=was, was_if=was_if, help=words, show_default="0.5")
+    about: dict[str, Any] = {"was": was, "was_if": was_if, "least": 0.001, "most": 1}
+    return option("--min-iou", panel=SCORES, tuning=True, help=words, show_default="0.5", **about)
 
 
 Logs = Annotated[
@@ -217,6 +225,7 @@ def one_line(command: Callable[P, None]) -> Callable[P, None]:
         _WARNED.set([])
         try:
             check_paths(kwargs.values())
+            check_ranges(kwargs)
             with notices.listening(_show_warning):
                 command(*args, **kwargs)
         except McaptrackError as error:

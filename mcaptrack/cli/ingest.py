@@ -73,6 +73,8 @@ def ingest(
         common.option(
             "--quality",
             panel=_PICTURES,
+            least=1,
+            most=100,
             tuning=True,
             help="Of what is encoded: H.264's constant rate factor, 1 (best) to 51; JPEG's quality, 1 to 100 (best).",
             show_default="23; JPEG 90",
@@ -83,6 +85,8 @@ def ingest(
         common.option(
             "--keyframe-interval-s",
             panel=_PICTURES,
+            least=0.01,
+            most=60,
             tuning=True,
             help="Key pictures are at most so far apart, in seconds; a stream that has fewer is encoded again.",
             show_default="2 in what is kept as it is, 1 in what is encoded",
@@ -102,6 +106,8 @@ def ingest(
         common.option(
             "--first-frame",
             panel=common.LABELS,
+            least=0,
+            most=10**12,
             tuning=True,
             help="Number that label files give the first picture.",
             show_default="1 in MOTChallenge, otherwise 0",
@@ -112,6 +118,8 @@ def ingest(
         common.option(
             "--frames",
             panel=common.LABELS,
+            least=1,
+            most=10_000_000,
             tuning=True,
             help="Number of frames, where labels have no pictures.",
             show_default="as seqinfo.ini says, otherwise up to the last label",

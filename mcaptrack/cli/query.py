@@ -67,7 +67,7 @@ def query(
         common.option(
             "--rows",
             panel=_QUERY,
-            min=0,
+            least=0,
             help="Number of rows that a table shows; 0 is all.",
             show_default="60 on a terminal",
         ),

@@ -25,25 +25,44 @@ def render(
     ] = None,
     width: Annotated[
         int | None,
-        common.option("--width", panel=_PICTURE, tuning=True, help="Width in pixels.", show_default="as the video"),
+        common.option(
+            "--width",
+            panel=_PICTURE,
+            least=16,
+            most=16384,
+            tuning=True,
+            help="Width in pixels.",
+            show_default="as the video",
+        ),
     ] = None,
     max_fps: Annotated[
         float | None,
         common.option(
             "--max-fps",
             panel=_PICTURE,
+            least=0.01,
+            most=1000,
             tuning=True,
             help="Largest number of pictures a second.",
             show_default="all; GIF 10",
         ),
     ] = None,
     start_s: Annotated[
-        float, common.option("--start-s", panel=_PICTURE, tuning=True, help="Begin at this second of the log.")
+        float,
+        common.option(
+            "--start-s", panel=_PICTURE, least=0, most=1e9, tuning=True, help="Begin at this second of the log."
+        ),
     ] = 0.0,
     end_s: Annotated[
         float | None,
         common.option(
-            "--end-s", panel=_PICTURE, tuning=True, help="End at this second of the log.", show_default="the end"
+            "--end-s",
+            panel=_PICTURE,
+            least=0,
+            most=1e9,
+            tuning=True,
+            help="End at this second of the log.",
+            show_default="the end",
         ),
     ] = None,
     gif: Annotated[
@@ -68,10 +87,6 @@ def render(
 
     paths = common.expand(logs)
     common.only_one_output(paths, output)
-    _in_bounds("--width", width, 16, 16384)
-    _in_bounds("--max-fps", max_fps, 0.01, 1000)
-    _in_bounds("--start-s", start_s, 0, 1e9)
-    _in_bounds("--end-s", end_s, 0, 1e9)
     options = rendering.RenderOptions(width_px=width, max_fps=max_fps, start_s=start_s, end_s=end_s)
     if output is not None:
         warn_unused("the name that -o gives says what is written", "gif")
@@ -91,8 +106,3 @@ def render(
             results.append({"log": str(path), "output": str(target), "pictures": count, "views": views})
     if json:
         common.print_json({"results": results})
-
-
-def _in_bounds(name: str, value: float | None, low: float, high: float) -> None:
-    if value is not None and not low <= value <= high:
-        raise McaptrackError(f"{name} is a number from {low:g} to {high:g}, not {value:g}")

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import difflib
 import inspect
+import math
 import os
 import re
 import reprlib
@@ -21,6 +22,8 @@ from typing import Any, Final, Literal, NamedTuple, get_args, get_origin, get_ty
 from mcaptrack.cli.config import NAME, ConfigFile, read_files, user_file
 from mcaptrack.cli.text import refuse_usage
 from mcaptrack.environment import PREFIX, VARIABLES
+from mcaptrack.errors import McaptrackError
+from mcaptrack.transforms.protocol import limits
 
 #: Options that belong to one call, not to a file or to another command.
 CALL_ONLY: Final = ("config", "help")
@@ -36,12 +39,14 @@ class Declared:
     ``tuning`` says that a file in the working folder may set it: numbers, choices and switches that change how results
     are computed. For text it is a pattern that the whole value has to match, because text could name a file. ``was`` is
     the name it had before, without dashes; where several options had it, ``was_if`` are another option and its value
-    that make it this one.
+    that make it this one. Numbers are refused below ``least`` and above ``most``.
     """
 
     tuning: bool | str = False
     was: str = ""
     was_if: tuple[str, str] | None = None
+    least: float = -math.inf
+    most: float = math.inf
 
 
 class Given(NamedTuple):
@@ -102,6 +107,13 @@ class Setting:
         if not fits:
             raise ValueError(f"needs {wanted}, not {reprlib.repr(value)}")
         return value
+
+    def check(self, value: Any, where: str) -> None:
+        """Raise McaptrackError for a number out of range. ``where`` it was set, if not on the command line."""
+        least, most = self.declared.least, self.declared.most
+        if self.kind in (int, float) and value is not None and not least <= value <= most:
+            words = limits(least, most) or "a number"
+            raise McaptrackError(f"{where or f'--{self.name}'} has to be {words}, not {value}")
 
     def may_tune(self, value: Any) -> bool:
         """Whether a file in the working folder may give this value."""

@@ -15,7 +15,7 @@ from mcaptrack.cli import common
 from mcaptrack.cli.command import is_on_command_line, settings_of
 from mcaptrack.errors import McaptrackError
 from mcaptrack.transforms import ALTERNATIVES, PROFILES, TRANSFORMS, Transform
-from mcaptrack.transforms.protocol import bare_type, range_words
+from mcaptrack.transforms.protocol import bare_type
 
 if TYPE_CHECKING:
     from mcaptrack.pipeline import Watch
@@ -68,12 +68,13 @@ def _option(field: Field[Any], annotation: Any, default: Any, whose: str = "") -
     flag = "--" + field.name.replace("_", "-")
     names = f"{flag}/--no-{flag[2:]}" if kind is bool else flag
     shown = "none" if default is None else str(default).lower() if isinstance(default, bool) else f"{default}"
-    words = f"{about['help'][:1].upper()}{about['help'][1:]}. {range_words(field)}".rstrip()
     info = common.option(
         names,
         panel=f"Options of {whose} alone" if whose else about["theme"],
         tuning="|".join(map(re.escape, about["names"])) or False if kind is str else True,
-        help=words,
+        help=f"{about['help'][:1].upper()}{about['help'][1:]}.",
+        least=about["least"],
+        most=about["most"],
         show_default=shown,
     )
     return _parameter(field.name, Annotated[kind | None, info], None)
@@ -203,14 +204,10 @@ def run_all(
 def watched(
     similarity: common.SimilarityName | None, gate_m: float | None, min_iou: float | None, **chosen: Any
 ) -> Watch:
-    """What `mcaptrack events` and `run` are to look for. Raises McaptrackError for what can't be a gate."""
+    """What `mcaptrack events` and `run` are to look for."""
     from mcaptrack.evaluation.events import EventOptions
     from mcaptrack.pipeline import Watch
 
-    if gate_m is not None and not 0 < gate_m <= 1e6:
-        raise McaptrackError(f"--gate-m is a distance in metres, more than 0, not {gate_m:g}")
-    if min_iou is not None and not 0 < min_iou <= 1:
-        raise McaptrackError(f"--min-iou is an overlap, more than 0 and at most 1, not {min_iou:g}")
     return Watch(EventOptions(similarity, gate_m, min_iou), **chosen)
 
 

@@ -69,17 +69,37 @@ def train(
     epochs: Annotated[
         int | None,
         common.option(
-            "--epochs", panel=_TRAINING, tuning=True, help="Passes over the windows.", show_default="20; paper: 50"
+            "--epochs",
+            panel=_TRAINING,
+            least=1,
+            most=1_000_000,
+            tuning=True,
+            help="Passes over the windows.",
+            show_default="20; paper: 50",
         ),
     ] = None,
     batch: Annotated[
         int | None,
-        common.option("--batch", panel=_TRAINING, tuning=True, help="Windows a step.", show_default="256; paper: 60"),
+        common.option(
+            "--batch",
+            panel=_TRAINING,
+            least=1,
+            most=1_000_000,
+            tuning=True,
+            help="Windows a step.",
+            show_default="256; paper: 60",
+        ),
     ] = None,
     rate: Annotated[
         float | None,
         common.option(
-            "--rate", panel=_TRAINING, tuning=True, help="Learning rate.", show_default="0.003; paper: 0.0001"
+            "--rate",
+            panel=_TRAINING,
+            least=1e-9,
+            most=1,
+            tuning=True,
+            help="Learning rate.",
+            show_default="0.003; paper: 0.0001",
         ),
     ] = None,
     noise_m: Annotated[
@@ -87,6 +107,8 @@ def train(
         common.option(
             "--noise-m",
             panel=_WINDOWS,
+            least=0,
+            most=10,
             tuning=True,
             help="Largest noise added to past positions.",
             show_default="0.4; paper: 0",
@@ -97,6 +119,8 @@ def train(
         common.option(
             "--gaps",
             panel=_WINDOWS,
+            least=0,
+            most=0.9,
             tuning=True,
             help="Share of past positions taken away.",
             show_default="0.3; paper: 0",
@@ -107,6 +131,8 @@ def train(
         common.option(
             "--scale",
             panel=_WINDOWS,
+            least=0,
+            most=1,
             tuning=True,
             help="Largest scaling of positions, as a logarithm.",
             show_default="0.15; paper: 0",
@@ -117,6 +143,8 @@ def train(
         common.option(
             "--consistency-weight",
             panel=_TRAINING,
+            least=0,
+            most=1e6,
             tuning=True,
             help="Weight of the difference between predictions of successive steps in the loss.",
         ),
@@ -126,14 +154,25 @@ def train(
         common.option(
             "--patience",
             panel=_TRAINING,
+            least=0,
             tuning=True,
             help="End after so many epochs without a better one; 0 for never.",
         ),
     ] = 0,
     walks: Annotated[
-        int, common.option("--walks", panel=_WINDOWS, tuning=True, help="Number of walks that `synthetic` makes.")
+        int,
+        common.option(
+            "--walks",
+            panel=_WINDOWS,
+            least=1000,
+            most=100_000_000,
+            tuning=True,
+            help="Number of walks that `synthetic` makes.",
+        ),
     ] = 60_000,
-    seed: Annotated[int, common.option("--seed", panel=_TRAINING, tuning=True, help="Random seed.")] = 1,
+    seed: Annotated[
+        int, common.option("--seed", panel=_TRAINING, least=0, most=2**31 - 1, tuning=True, help="Random seed.")
+    ] = 1,
     device: Annotated[
         Literal["auto", "cpu", "cuda", "mps"],
         common.option("--device", panel=_TRAINING, tuning=True, help="Device to compute on."),
@@ -143,9 +182,10 @@ def train(
         common.option(
             "--threads",
             panel=_TRAINING,
+            least=1,
+            most=1024,
             tuning=True,
             help="Threads of the processor to use; more than one rarely helps.",
-            min=1,
         ),
     ] = 1,
     resume: Annotated[
@@ -226,8 +266,6 @@ def _windows(
 
     parts, words = [], []
     if SYNTHETIC in sources:
-        if walks < 1000:
-            raise McaptrackError(f"--walks has to be at least 1000, not {walks}")
         talk.say(f"making up {walks} walks ...")
         parts.append(synthetic(recipe, walks, recipe.seed))
         words.append(f"{walks} synthetic walks of mcaptrack {__version__}, seed {recipe.seed}")

@@ -55,7 +55,12 @@ def tune(
     trials: Annotated[
         int,
         common.option(
-            "--trials", panel=_SEARCH, tuning=True, help="Number of settings to try, the defaults first.", min=1
+            "--trials",
+            panel=_SEARCH,
+            least=1,
+            most=1_000_000,
+            tuning=True,
+            help="Number of settings to try, the defaults first.",
         ),
     ] = 100,
     search: Annotated[
@@ -68,7 +73,9 @@ def tune(
             show_default="all that the stage declares",
         ),
     ] = None,
-    seed: Annotated[int, common.option("--seed", panel=_SEARCH, tuning=True, help="Random seed.", min=0)] = 0,
+    seed: Annotated[
+        int, common.option("--seed", panel=_SEARCH, least=0, most=2**31 - 1, tuning=True, help="Random seed.")
+    ] = 0,
     study: Annotated[
         Path | None,
         common.option(

@@ -22,7 +22,10 @@ _VIEWER: Final = "Server and viewer"
 def view(
     path: Annotated[Path, typer.Argument(metavar="LOG", help="The log.", show_default=False)],
     port: Annotated[
-        int, common.option("--port", panel=_VIEWER, help="Port to serve it at.", show_default="any that is free")
+        int,
+        common.option(
+            "--port", panel=_VIEWER, least=0, most=65535, help="Port to serve it at.", show_default="any that is free"
+        ),
     ] = 0,
     lichtblick: Annotated[
         str,

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import Field, field, fields
+from dataclasses import field, fields
 from types import UnionType
 from typing import Any, ClassVar, Literal, Protocol, get_args, get_origin, get_type_hints
 
@@ -100,17 +100,15 @@ def check_options(transform: Transform) -> None:
             raise McaptrackError(f"{name} needs {kind.__name__}, not {value!r}")
         least, most = parameter.metadata["least"], parameter.metadata["most"]
         if kind in (int, float) and not least <= value <= most:
-            raise McaptrackError(f"{name} has to be {_limits(least, most)}, not {value}")
+            raise McaptrackError(f"{name} has to be {limits(least, most) or 'a number'}, not {value}")
 
 
-def range_words(parameter: Field[Any]) -> str:
-    """The range of a parameter in words, as in "From 0 to 1."; "" if it has none."""
-    least, most = parameter.metadata["least"], parameter.metadata["most"]
-    words = _limits(least, most)
-    return f"{words[0].upper()}{words[1:]}." if words else ""
-
-
-def _limits(least: float, most: float) -> str:
+def limits(least: float, most: float) -> str:
+    """A range in words, as in "from 0 to 1"; "" if it has no ends."""
     if most == math.inf:
-        return "" if least == -math.inf else f"at least {least:g}"
-    return f"at most {most:g}" if least == -math.inf else f"from {least:g} to {most:g}"
+        return "" if least == -math.inf else f"at least {_number(least)}"
+    return f"at most {_number(most)}" if least == -math.inf else f"from {_number(least)} to {_number(most)}"
+
+
+def _number(value: float) -> str:
+    return str(int(value)) if value == int(value) else f"{value:g}"
