@@ -108,7 +108,7 @@ def test_its_scores_are_those_of_evaluate_and_json_prints_what_the_page_holds(fi
     assert without_curves(printed["results"]) == without_curves(scored)
     inside = numbers_in(Reader(target.read_text()))
     inside["results"] = without_curves(inside["results"])
-    assert inside == {key: value for key, value in printed.items() if key != "warnings"}
+    assert inside == {key: value for key, value in printed.items() if key not in ("failed", "warnings")}
 
 
 def test_several_logs_are_combined_as_evaluate_combines_them(finished, tmp_path):  # noqa: F811

@@ -10,10 +10,11 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout
 from contextvars import ContextVar
+from dataclasses import dataclass, field
 from functools import wraps
 from pathlib import Path
 from time import monotonic
-from typing import Annotated, Any, Final, Literal, ParamSpec
+from typing import Annotated, Any, Final, Literal, NamedTuple, ParamSpec
 
 import typer
 
@@ -28,8 +29,26 @@ from mcaptrack.notices import Code, Notice
 from mcaptrack.transforms.protocol import limits
 
 P = ParamSpec("P")
-#: What the running command has warned of.
+
+
+class Failed(NamedTuple):
+    """An input that could not be processed, and why."""
+
+    input: str
+    error: str
+
+
+@dataclass
+class _Batch:
+    """How many inputs the running command has tried, and which of them could not be processed."""
+
+    tried: int = 0
+    failed: list[Failed] = field(default_factory=list)
+
+
+#: What the running command has warned of, and its inputs.
 _WARNED: Final[ContextVar[list[Notice]]] = ContextVar("warned")
+_BATCH: Final[ContextVar[_Batch]] = ContextVar("batch")
 #: Headings of options in the help: what is read and written, what every command has, label files, and how tracks are
 #: compared with the truth.
 FILES, COMMON = LAST_PANELS
@@ -176,6 +195,25 @@ class Talk:
         """A line that is never hidden and stands in the command's JSON; see ``mcaptrack.notices``."""
         notices.warn(words, code)
 
+    @contextmanager
+    def attempt(self, path: Path, paths: Sequence[Path]) -> Iterator[None]:
+        """Process one of several inputs: an error in it is printed and does not stop the others.
+
+        The command ends with exit code 1 then, and its JSON lists the inputs that failed.
+        """
+        batch = _BATCH.get()
+        batch.tried += 1
+        try:
+            yield
+        except McaptrackError as error:
+            if len(paths) == 1:
+                raise
+            words = str(error).strip()
+            words = words if str(path) in words else f"{path}: {words}"
+            self._stop()
+            say(f"mcaptrack: {words}")
+            batch.failed.append(Failed(str(path), words))
+
     def _hear(self, notice: Notice) -> None:
         self._stop()
         _show_warning(notice)
@@ -218,11 +256,13 @@ class Talk:
 
 
 def one_line(command: Callable[P, None]) -> Callable[P, None]:
-    """A fault that a user can mend becomes one line and exit code 1; warnings become lines and stand in the JSON."""
+    """An error that a user can mend becomes one line and exit code 1; warnings become lines and stand in the JSON."""
 
     @wraps(command)
     def guarded(*args: P.args, **kwargs: P.kwargs) -> None:
         _WARNED.set([])
+        batch = _Batch()
+        _BATCH.set(batch)
         try:
             check_paths(kwargs.values())
             check_ranges(kwargs)
@@ -231,6 +271,13 @@ def one_line(command: Callable[P, None]) -> Callable[P, None]:
         except McaptrackError as error:
             say(f"mcaptrack: {str(error).strip()}")
             raise typer.Exit(REFUSED) from None
+        except typer.Exit:
+            if not batch.failed:
+                raise
+        if batch.failed:
+            names = ", ".join(one.input for one in batch.failed)
+            say(f"mcaptrack: {len(batch.failed)} of {batch.tried} failed: {names}")
+            raise typer.Exit(REFUSED)
 
     return guarded
 
@@ -256,10 +303,14 @@ def printed_to(output: Path | None, force: bool) -> Iterator[None]:
 
 
 def print_json(data: dict[str, Any]) -> None:
-    """One object on stdout, with the version of its shape and all warnings; there at once, also for a program that goes
-    on.
+    """One object on stdout, with the version of its shape, the inputs that failed and all warnings; there at once, also
+    for a program that goes on.
     """
-    whole = {"schema_version": SCHEMA_VERSION} | data | {"warnings": [notice._asdict() for notice in _WARNED.get()]}
+    said = {
+        "failed": [one._asdict() for one in _BATCH.get().failed],
+        "warnings": [one._asdict() for one in _WARNED.get()],
+    }
+    whole = {"schema_version": SCHEMA_VERSION} | data | said
     print(json.dumps(whole, indent=2, allow_nan=False), flush=True)
 
 

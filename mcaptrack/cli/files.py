@@ -35,8 +35,12 @@ def check(
     """
     from mcaptrack import log
 
+    paths = common.expand(logs)
+    checked: list[Checked] = []
     with common.Talk(quiet, verbose).open() as talk:
-        checked = [log.check(path, talk.progress) for path in common.expand(logs)]
+        for path in paths:
+            with talk.attempt(path, paths):
+                checked.append(log.check(path, talk.progress))
     with common.printed_to(output, force):
         if json:
             common.print_json({"results": [_checked_as_data(one) for one in checked]})
@@ -104,19 +108,20 @@ def recover(
     reports = []
     with common.Talk(quiet, verbose).open() as talk:
         for path in paths:
-            target = output or path.with_suffix(".recovered.mcap")
-            if is_same_file(target, path):
-                raise McaptrackError(f"{path} is both input and output; give another name with -o")
-            refuse_overwrite(target, force)
-            report = log.recover(path, target, talk.progress)
-            reports.append(report)
-            talk.say(f"{target}: {report.messages} messages in {report.chunks} chunks are saved")
-            for words in report.lost if verbose else report.lost[:_SHOWN]:
-                talk.say(f"lost: {words}")
-            if len(report.lost) > _SHOWN and not verbose:
-                talk.say(f"lost: {len(report.lost) - _SHOWN} more; -v shows them")
-            if not report.lost:
-                talk.say("nothing was lost")
+            with talk.attempt(path, paths):
+                target = output or path.with_suffix(".recovered.mcap")
+                if is_same_file(target, path):
+                    raise McaptrackError(f"{path} is both input and output; give another name with -o")
+                refuse_overwrite(target, force)
+                report = log.recover(path, target, talk.progress)
+                reports.append(report)
+                talk.say(f"{target}: {report.messages} messages in {report.chunks} chunks are saved")
+                for words in report.lost if verbose else report.lost[:_SHOWN]:
+                    talk.say(f"lost: {words}")
+                if len(report.lost) > _SHOWN and not verbose:
+                    talk.say(f"lost: {len(report.lost) - _SHOWN} more; -v shows them")
+                if not report.lost:
+                    talk.say("nothing was lost")
     if json:
         results = [
             {"log": str(r.path), "output": str(r.output), "messages": r.messages, "chunks": r.chunks, "lost": r.lost}

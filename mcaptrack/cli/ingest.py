@@ -182,31 +182,32 @@ def ingest(
     results, lost = [], False
     with common.Talk(quiet, verbose).open() as talk:
         for source in sources:
-            target = into or output or Path((source.name if source.is_dir() else source.stem) + ".mcap")
-            if into is None:
-                refuse_overwrite(target, force or is_same_file(target, source))
-                report = make_log(source, target, options, progress=talk.progress)
-            else:
-                with log.read(into) as opened:
-                    opened.lock()
-                    report = make_log(source, target, options, into=opened, force=force, progress=talk.progress)
-            _warn_unused(report, options)
-            for words in report.said:
-                talk.say(words)
-            for words in report.notes:
-                talk.detail(words)
-            for words in report.lost:
-                talk.warn(f"lost: {words}", "lost")
-            lost |= bool(report.lost)
-            talk.say(f"{target}: " + ", ".join(f"{topic} {count}" for topic, count in report.messages.items()))
-            results.append(
-                {
-                    "log": str(target),
-                    "messages": report.messages,
-                    "notes": report.said + report.notes,
-                    "lost": report.lost,
-                }
-            )
+            with talk.attempt(source, sources):
+                target = into or output or Path((source.name if source.is_dir() else source.stem) + ".mcap")
+                if into is None:
+                    refuse_overwrite(target, force or is_same_file(target, source))
+                    report = make_log(source, target, options, progress=talk.progress)
+                else:
+                    with log.read(into) as opened:
+                        opened.lock()
+                        report = make_log(source, target, options, into=opened, force=force, progress=talk.progress)
+                _warn_unused(report, options)
+                for words in report.said:
+                    talk.say(words)
+                for words in report.notes:
+                    talk.detail(words)
+                for words in report.lost:
+                    talk.warn(f"lost: {words}", "lost")
+                lost |= bool(report.lost)
+                talk.say(f"{target}: " + ", ".join(f"{topic} {count}" for topic, count in report.messages.items()))
+                results.append(
+                    {
+                        "log": str(target),
+                        "messages": report.messages,
+                        "notes": report.said + report.notes,
+                        "lost": report.lost,
+                    }
+                )
     if json:
         common.print_json({"results": results})
     if lost:

@@ -93,16 +93,17 @@ def render(
     results = []
     with common.Talk(quiet, verbose).open() as talk:
         for path in paths:
-            target = output or path.with_suffix(".gif" if gif else ".mp4")
-            refuse_overwrite(target, force)
-            with log.read(path) as opened:
-                prefix = pipeline.find_camera(opened, camera)
-                pictures = pipeline.picture_topic(opened, prefix)
-                if pictures is None:
-                    raise McaptrackError(f"{path} has no pictures of {prefix} to draw on; `mcaptrack info {path}`")
-                views = pipeline.find_views(opened, prefix, topic or ())
-                count = rendering.render(opened, pictures, views, target, options, talk.progress)
-            talk.say(f"{target}: {count} pictures with {', '.join(views) or 'nothing drawn'}")
-            results.append({"log": str(path), "output": str(target), "pictures": count, "views": views})
+            with talk.attempt(path, paths):
+                target = output or path.with_suffix(".gif" if gif else ".mp4")
+                refuse_overwrite(target, force)
+                with log.read(path) as opened:
+                    prefix = pipeline.find_camera(opened, camera)
+                    pictures = pipeline.picture_topic(opened, prefix)
+                    if pictures is None:
+                        raise McaptrackError(f"{path} has no pictures of {prefix} to draw on; `mcaptrack info {path}`")
+                    views = pipeline.find_views(opened, prefix, topic or ())
+                    count = rendering.render(opened, pictures, views, target, options, talk.progress)
+                talk.say(f"{target}: {count} pictures with {', '.join(views) or 'nothing drawn'}")
+                results.append({"log": str(path), "output": str(target), "pictures": count, "views": views})
     if json:
         common.print_json({"results": results})

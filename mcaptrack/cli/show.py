@@ -34,9 +34,10 @@ def info(
     from mcaptrack import log
 
     results = []
-    with common.printed_to(output, force):
-        for path in common.expand(logs):
-            with log.read(path) as opened:
+    paths = common.expand(logs)
+    with common.Talk(quiet, verbose).open() as talk, common.printed_to(output, force):
+        for path in paths:
+            with talk.attempt(path, paths), log.read(path) as opened:
                 if json:
                     results.append(_as_data(opened))
                 else:
@@ -204,14 +205,15 @@ def export(
     with common.Talk(quiet, verbose).open() as talk:
         for path in paths:
             folder = output or default_folder(path)
-            with log.read(path) as opened:
-                done = write_tables(
-                    opened, folder, talk.progress, form=form, topics=topic or (), blobs=blobs, force=force
-                )
-            for words in done.notes:
-                talk.warn(words, "left-out")
-            talk.say(f"{folder}: " + ", ".join(f"{name} {rows}" for name, rows in done.rows.items()))
-            talk.detail(f"{folder}: written {', '.join(done.written) or 'nothing, all tables are up to date'}")
-            results.append({"log": str(path), "folder": str(folder), "rows": done.rows, "written": done.written})
+            with talk.attempt(path, paths):
+                with log.read(path) as opened:
+                    done = write_tables(
+                        opened, folder, talk.progress, form=form, topics=topic or (), blobs=blobs, force=force
+                    )
+                for words in done.notes:
+                    talk.warn(words, "left-out")
+                talk.say(f"{folder}: " + ", ".join(f"{name} {rows}" for name, rows in done.rows.items()))
+                talk.detail(f"{folder}: written {', '.join(done.written) or 'nothing, all tables are up to date'}")
+                results.append({"log": str(path), "folder": str(folder), "rows": done.rows, "written": done.written})
     if json:
         common.print_json({"results": results})

@@ -259,7 +259,7 @@ def run_on_logs(
     results = []
     with common.Talk(given["quiet"], given["verbose"]).open() as talk:
         for path in paths:
-            with notices.about(given["output"] or path):
+            with talk.attempt(path, paths), notices.about(given["output"] or path):
                 results.append(_run_on_log(path, given, make_plan, tables, watch, talk))
     if given["json"]:
         common.print_json({"results": results})

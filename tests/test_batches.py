@@ -1,0 +1,88 @@
+"""Several inputs on one command line: one that can't be processed is said, counted and listed, and the others are done."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+
+from tests.commands import GROUP, called, made_log
+
+#: Commands that make one thing of all their inputs: without one of them it would be another thing, so they refuse.
+COMBINING = {"report", "query", "evaluate", "tune", "train"}
+SEVERAL = {name for name, command in GROUP.commands.items() if any(one.nargs == -1 for one in command.params)} - {
+    "drop"
+}
+WORDS = {"query": ["select 1"]}
+
+
+@pytest.fixture(scope="module")
+def template(tmp_path_factory) -> Path:
+    """A folder with a log that has everything in it. Not to be changed."""
+    folder = tmp_path_factory.mktemp("batches")
+    made_log(folder, frames=12)
+    return folder
+
+
+@pytest.fixture
+def folder(template, tmp_path, monkeypatch) -> Path:
+    """Two logs, a file that is no log, and the folder as the working folder."""
+    for name in ("a.mcap", "z.mcap"):
+        shutil.copy(template / "a.mcap", tmp_path / name)
+    (tmp_path / "broken.mcap").write_bytes(b"no log at all")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def inputs(command: str, *names: str) -> list[str]:
+    """What a command is given so that it processes these; ingest would write over its own input otherwise."""
+    if command == "ingest":
+        Path("in").mkdir(exist_ok=True)
+        for name in names:
+            if Path(name).exists():
+                os.replace(name, f"in/{name}")
+        return [f"in/{name}" for name in names]
+    return list(names)
+
+
+@pytest.mark.parametrize("command", sorted(SEVERAL - COMBINING))
+def test_a_broken_input_stops_no_other(command, folder):
+    bad = ["missing.mcap"] if command == "check" else ["broken.mcap", "missing.mcap"]  # check tells what is broken
+    *bad, good = inputs(command, *bad, "a.mcap")
+    outcome = called(command, *bad, good, "--json")
+    assert outcome.code == 1, outcome.err
+    data = json.loads(outcome.out)
+    assert [Path(one["log"]).name for one in data["results"]] == ["a.mcap"]
+    assert [one["input"] for one in data["failed"]] == bad
+    lines = outcome.err.splitlines()
+    for one in data["failed"]:
+        assert one["input"] in one["error"]
+        assert f"mcaptrack: {one['error']}" in lines
+    assert lines[-1] == f"mcaptrack: {len(bad)} of {len(bad) + 1} failed: {', '.join(bad)}"
+
+
+@pytest.mark.parametrize("command", sorted(SEVERAL - COMBINING))
+def test_a_single_input_that_is_missing_is_one_line(command, folder):
+    outcome = called(command, "missing.mcap", "--json")
+    assert (outcome.code, outcome.out) == (1, "")
+    assert outcome.err.count("\n") == 1
+    assert outcome.err.startswith("mcaptrack: ")
+
+
+@pytest.mark.parametrize("command", sorted(COMBINING - {"train"}))  # which needs torch
+def test_what_is_made_of_all_inputs_is_not_made_of_some(command, folder):
+    more = [] if command == "tune" else ["--json"]
+    before = sorted(folder.rglob("*"))
+    outcome = called(command, "a.mcap", "broken.mcap", *WORDS.get(command, []), "-o", "out.html", *more)
+    assert (outcome.code, outcome.out) == (1, "")
+    assert "broken.mcap" in outcome.err
+    assert sorted(folder.rglob("*")) == before
+
+
+def test_what_all_can_not_be_written_to_is_refused_before_anything_is_done(folder):
+    before = {path: path.read_bytes() for path in folder.iterdir()}
+    assert called("run", "a.mcap", "z.mcap", "-o", "b.mcap").code == 1
+    assert {path: path.read_bytes() for path in folder.iterdir()} == before
