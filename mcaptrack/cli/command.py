@@ -182,8 +182,10 @@ def settings_of(command: str) -> dict[str, Any]:
 
 
 def check_ranges(values: Mapping[str, Any]) -> None:
-    """Raise McaptrackError for a number out of range among the values of the running command's options."""
-    context: Any = _RUNNING.get()
+    """Raise McaptrackError for a number out of range among the values of the running command's options, if one runs."""
+    context: Any = _RUNNING.get(None)
+    if context is None:  # its function was called, without a command line
+        return
     found = found_of(context.info_name)
     for setting in context.command.settings.values():
         setting.check(values.get(setting.parameter), _rank(context, setting.parameter, found)[1])
