@@ -21,7 +21,7 @@ from typing import Any, Final, Protocol, Self
 from mcaptrack import log, tables
 from mcaptrack.errors import McaptrackError
 from mcaptrack.export import TOPICS, Contents, default_folder, standing, topic_folder
-from mcaptrack.log.writer import results_of
+from mcaptrack.log.names import results_of
 from mcaptrack.tables import TABLES
 
 __all__ = ["Database"]
@@ -236,6 +236,7 @@ class Database:
         readers = [_OfFolder(path, name) for name in sorted(found)]
         there = [reader for reader in readers if any(reader.part(table) for table in TABLES)]
         if not there:
+            log.refuse_other_kinds(path)
             other = " (those in other formats are not read)" if found else ""
             raise McaptrackError(
                 f"{path} is a folder without tables in Parquet{other}; give a log, or a folder as `mcaptrack export` "

@@ -24,6 +24,7 @@ from mcaptrack import log, scene
 from mcaptrack.serving import Server
 from mcaptrack.transforms import ALTERNATIVES, TRANSFORMS
 from tests.commands import GROUP, called, done, made_log
+from tests.test_ros_recordings import plain
 from tests.worlds import small_scene
 
 
@@ -88,6 +89,7 @@ CASES: dict[str, dict[str, Case]] = {
         frames=("ingest truth.txt --fps 10", "--frames 500"),
         **{"as": ("ingest truth.txt --fps 10", "--as truth")},
         into=("ingest truth.txt --fps 10 --as tracks", "--into a.mcap"),
+        sidecar=("ingest truth.txt --fps 10 --as truth --camera left --into a.mcap", "--sidecar"),
         force=("ingest clip.mp4 -o a.mcap", "--force"),
     ),
     "detect": stage("detect"),
@@ -201,6 +203,7 @@ CASES: dict[str, dict[str, Case]] = {
     "drop": common(
         "drop a.mcap /camera/retracks",
         output="-o b.mcap",
+        in_place=("drop robot.mcap /a", "--in-place"),
         force=("drop a.mcap /camera/retracks -o clip.mp4", "--force"),
     ),
     "demo": common("demo", output="-o b", force=("demo -o taken", "--force")),
@@ -249,6 +252,7 @@ def template(tmp_path_factory) -> Path:
     (folder / "more.csv").write_text("a\n1\n")
     (folder / "verbose.toml").write_text("\n".join(f"[{name}]\nverbose = true" for name in GROUP.commands))
     _add_channels_of_others(folder / "a.mcap")
+    plain(folder / "robot.mcap", "ros2")
     done("export", folder / "fresh.mcap", "-o", folder / "taken")
     for path in [*(folder / "taken").glob("*/recording=fresh")]:
         path.rename(path.with_name("recording=a"))

@@ -88,7 +88,13 @@ Output = Annotated[
 ]
 Printed = Annotated[Path | None, option("--output", "-o", panel=FILES, help="Print to this file.")]
 Sidecar = Annotated[
-    bool, option("--sidecar", panel=FILES, help="Write results to LOG.results.mcap, from now on; LOG stays as it is.")
+    bool | None,
+    option(
+        "--sidecar/--in-place",
+        panel=FILES,
+        help="Write results to LOG.results.mcap, from now on, so that LOG stays as it is, or into LOG. "
+        "Recordings that ROS tools read stay as they are unless --in-place is given.",
+    ),
 ]
 Force = Annotated[bool, option("--force", panel=FILES, help="Replace the file that is there.")]
 Json = Annotated[bool, option("--json", panel=COMMON, help="Print data for programs.")]
@@ -314,8 +320,13 @@ def print_json(data: dict[str, Any]) -> None:
     print(json.dumps(whole, indent=2, allow_nan=False), flush=True)
 
 
-def expand(paths: Sequence[Path]) -> list[Path]:
-    """Paths and patterns as paths. Raises McaptrackError for a pattern that matches nothing."""
+def expand(paths: Sequence[Path], *, each: bool = False) -> list[Path]:
+    """Paths and patterns as paths; the results of a log that is among them are part of it unless ``each`` is a file.
+
+    Raises McaptrackError for a pattern that matches nothing.
+    """
+    from mcaptrack.log import results_of
+
     out: list[Path] = []
     for path in paths:
         refuse_url(path)
@@ -326,7 +337,8 @@ def expand(paths: Sequence[Path]) -> list[Path]:
         if not found:
             raise McaptrackError(f"no file matches {path}")
         out += found
-    return out
+    results = {results_of(path.resolve()) for path in out}
+    return [path for path in out if each or path.resolve() not in results]
 
 
 def only_one_output(paths: Sequence[Path], output: Path | None) -> None:

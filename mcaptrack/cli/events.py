@@ -28,7 +28,7 @@ def events(
     min_iou: Annotated[float | None, common.min_iou(was="--gate", was_if=("similarity", "iou"))] = None,
     camera: common.Camera = None,
     output: common.Output = None,
-    sidecar: common.Sidecar = False,
+    sidecar: common.Sidecar = None,
     force: common.Force = False,
     json: common.Json = False,
     quiet: common.Quiet = False,

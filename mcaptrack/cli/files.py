@@ -35,7 +35,7 @@ def check(
     """
     from mcaptrack import log
 
-    paths = common.expand(logs)
+    paths = [part for path in common.expand(logs) for part in _parts(path)]
     checked: list[Checked] = []
     with common.Talk(quiet, verbose).open() as talk:
         for path in paths:
@@ -49,6 +49,14 @@ def check(
                 _print_checked(one, quiet)
     if not all(one.is_sound for one in checked):
         raise typer.Exit(common.REFUSED)
+
+
+def _parts(path: Path) -> list[Path]:
+    """A log, and its results if they stand beside it."""
+    from mcaptrack import log
+
+    beside = log.results_of(path)
+    return [path, beside] if beside != path and beside.exists() else [path]
 
 
 def _checked_as_data(checked: Checked) -> dict[str, object]:
@@ -103,7 +111,7 @@ def recover(
     from mcaptrack import log
     from mcaptrack.atomic import is_same_file, refuse_overwrite
 
-    paths = common.expand(logs)
+    paths = common.expand(logs, each=True)
     common.only_one_output(paths, output)
     reports = []
     with common.Talk(quiet, verbose).open() as talk:
@@ -140,6 +148,9 @@ def drop(
         typer.Argument(metavar="TOPIC", help="Channels to leave out; patterns such as '/camera/*' are several."),
     ],
     output: common.Output = None,
+    in_place: Annotated[
+        bool, common.option("--in-place", help="Leave them out of a recording that ROS tools read, too.")
+    ] = False,
     force: common.Force = False,
     json: common.Json = False,
     quiet: common.Quiet = False,
@@ -149,26 +160,41 @@ def drop(
     """Leave channels out of a log, in place or in a copy; all others stay as they are, to the byte.
 
     With a channel goes what was made only to show it and to tell of it: its `/view/`, `/events`, `/counts`, `/errors`
-    and `/scores`.
+    and `/scores`. Results that stand beside the log are part of it, and of a copy.
 
     Example: mcaptrack drop log.mcap /camera/video -o small.mcap
     """
     from mcaptrack import log
     from mcaptrack.atomic import is_same_file, refuse_overwrite
+    from mcaptrack.ingest.place import recording_of
+    from mcaptrack.provenance import Provenance
 
     if output is not None:
         refuse_overwrite(output, force)
         if is_same_file(output, path):
             raise McaptrackError(f"{path} is both input and output; leave -o out to change it in place")
+    beside = log.results_of(path)
     with common.Talk(quiet, verbose).open() as talk:
-        with log.read(path, sidecar=False) as opened:
+        with log.read(path) as opened:
             dropped = _chosen(opened, topics)
-            gone = [channel.id for channel in opened.index.channels.values() if channel.topic in dropped]
-            messages = sum(opened.index.counts.get(number, 0) for number in gone)
-            before = opened.size
-            with log.extend(opened, output, drop=dropped):
-                pass
-        after = (output or path).stat().st_size
+            holds = {part.path: [c for c in part.recorded if c.topic in dropped] for part in opened.parts}
+            messages = sum(channel.messages for gone in holds.values() for channel in gone)
+            before = sum(part.size for part in opened.parts)
+            recorded = {c.topic for c in holds[path] if Provenance.from_metadata(c.metadata) is None}
+            if recorded and output is None and not in_place and (recording := recording_of(opened)):
+                raise McaptrackError(
+                    f"{path} is {recording}, which ROS tools read; -o writes a copy without "
+                    f"{', '.join(sorted(recorded))}, --in-place changes it all the same"
+                )
+        targets = {path: output or path, beside: log.results_of(output) if output else beside}
+        if output is not None and beside in holds:
+            refuse_overwrite(targets[beside], force)
+        for part, gone in holds.items():
+            if gone or output is not None:
+                target = targets[part] if output else None
+                with log.read(part, sidecar=False) as opened, log.extend(opened, target, drop={c.topic for c in gone}):
+                    pass
+        after = sum(targets[part].stat().st_size for part in holds)
         talk.say(
             f"{output or path}: {', '.join(sorted(dropped))} with {messages} messages left out; "
             f"{before} bytes became {after}"

@@ -137,6 +137,7 @@ def ingest(
             "--into", panel=common.FILES, help="Add it to this log, instead of making one.", show_default=False
         ),
     ] = None,
+    sidecar: common.Sidecar = None,
     force: common.Force = False,
     json: common.Json = False,
     quiet: common.Quiet = False,
@@ -158,10 +159,13 @@ def ingest(
     from mcaptrack.atomic import is_same_file, refuse_overwrite
     from mcaptrack.ingest import IngestOptions
     from mcaptrack.ingest import ingest as make_log
+    from mcaptrack.ingest.place import Place
 
     if into is not None and output is not None:
         raise McaptrackError("--into adds to a log in place; it does not go with -o")
-    sources = common.expand(inputs)
+    if into is None and sidecar is not None:
+        raise McaptrackError("--sidecar and --in-place are about a log that is added to; name it with --into")
+    sources = common.expand(inputs, each=True)
     common.only_one_output(sources, output or into)
     given = {"detections": detections, "tracks": tracks, "truth": truth}
     options = IngestOptions(
@@ -188,9 +192,13 @@ def ingest(
                     refuse_overwrite(target, force or is_same_file(target, source))
                     report = make_log(source, target, options, progress=talk.progress)
                 else:
-                    with log.read(into) as opened:
+                    place = Place(sidecar)
+                    with log.read(into, sidecar=place) as opened:
                         opened.lock()
                         report = make_log(source, target, options, into=opened, force=force, progress=talk.progress)
+                        written_to = opened.parts[-1].path
+                    if place.why:
+                        report.said.append(place.words(written_to))
                 _warn_unused(report, options)
                 for words in report.said:
                     talk.say(words)

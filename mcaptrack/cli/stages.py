@@ -125,7 +125,7 @@ def _stage_command(name: str, kind: type[Transform]) -> Callable[..., None]:
         _parameter("to", Annotated[str | None, to], None),
         _parameter("camera", common.Camera, None),
         _parameter("output", common.Output, None),
-        _parameter("sidecar", common.Sidecar, False),
+        _parameter("sidecar", common.Sidecar, None),
         _parameter("force", common.Force, False),
         _parameter("json", common.Json, False),
         _parameter("quiet", common.Quiet, False),
@@ -158,7 +158,7 @@ def run_all(
     topic: Topic = None,
     camera: common.Camera = None,
     output: common.Output = None,
-    sidecar: common.Sidecar = False,
+    sidecar: common.Sidecar = None,
     events: Annotated[
         bool,
         common.option(
@@ -254,8 +254,9 @@ def run_on_logs(
 
     paths = common.expand(given["logs"])
     common.only_one_output(paths, given["output"])
-    if given["output"] and given["sidecar"]:
-        raise McaptrackError("--sidecar and -o are two places for the same results; give one of them")
+    if given["output"] and given["sidecar"] is not None:
+        flag = "--sidecar" if given["sidecar"] else "--in-place"
+        raise McaptrackError(f"{flag} and -o are two places for the same results; give one of them")
     results = []
     with common.Talk(given["quiet"], given["verbose"]).open() as talk:
         for path in paths:
@@ -277,6 +278,7 @@ def _run_on_log(
     from mcaptrack import log, pipeline
     from mcaptrack.atomic import is_same_file, publish_bytes, refuse_overwrite
     from mcaptrack.export import default_folder, export
+    from mcaptrack.ingest.place import Place
 
     output: Path | None = given["output"]
     target = output or path
@@ -284,13 +286,15 @@ def _run_on_log(
         if is_same_file(output, path):
             raise McaptrackError(f"{path} is both input and output; leave -o out to add to it in place")
         refuse_overwrite(output, given["force"])
-    with log.read(path, sidecar=given["sidecar"] or None) as opened:
+    place = Place(given["sidecar"])
+    with log.read(path, sidecar=None if output else place) as opened:
         if output is None:
             opened.lock()  # a second writer is turned away before it computes anything
         camera = given["camera"] or (pipeline.camera_of(opened, watch.topics) if watch else None)
         prefix = pipeline.find_camera(opened, camera, given["topic"])
         jobs = make_plan(_Plan(opened, prefix, talk.say))
         report = pipeline.run(opened, prefix, jobs, output, talk.progress, watch)
+        written_to = output or opened.parts[-1].path
     for name, content in report.layouts.items():
         publish_bytes(pipeline.layout_path(target, name), content)
     for topic, count in report.frames.items():
@@ -314,5 +318,11 @@ def _run_on_log(
         talk.detail(f"{folder}: {', '.join(f'{name} {rows}' for name, rows in written.items())}")
     done = ", ".join(report.stages) or "nothing to do, everything is up to date"
     talk.say(f"{target}: {done}")
+    if place.why and report.stages:
+        talk.say(place.words(written_to))
     data = {"stages": report.stages, "frames": report.frames, "events": report.events, "tables": written}
-    return {"log": str(target)} | data
+    where = {
+        "written_to": str(written_to) if report.stages else None,
+        "written_there_because": place.why or None,
+    }
+    return {"log": str(target)} | data | where

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, Final
 
 from mcaptrack.errors import McaptrackError
+from mcaptrack.ingest import plain_yaml
+from mcaptrack.ingest.plain_yaml import Fields, NotPlainError
 
 METADATA: Final = "metadata.yaml"
+_ROOT: Final = "rosbag2_bagfile_information"
 
 
 @dataclass
@@ -24,44 +28,53 @@ class Bag:
     topics: Sequence[tuple[str, str, str, str, str, int]] = ()
 
 
-def read_metadata(path: Path) -> tuple[Bag, list[str]]:
-    """A metadata.yaml, and the files that it names. Raises McaptrackError if it is none."""
-    from ruamel.yaml import YAML
-    from ruamel.yaml.error import YAMLError
+def holds_metadata(path: Path) -> bool:
+    """Whether a file is there and looks like the metadata of a bag."""
+    return path.is_file() and _ROOT.encode() in _start(path)
 
+
+def _start(path: Path) -> bytes:
+    """All that is read of it, and a byte more if there is more."""
     try:
-        text = path.read_bytes()
-        said = YAML(typ="safe", pure=True).load(text.decode("utf-8"))["rosbag2_bagfile_information"]
-        mode, compression = str(said.get("compression_mode") or ""), str(said.get("compression_format") or "")
-        topics = []
-        for entry in said.get("topics_with_message_count") or []:
-            topic = entry["topic_metadata"]
-            encoding, qos = (
-                str(topic.get("serialization_format", "cdr")),
-                _yaml(topic.get("offered_qos_profiles") or ""),
-            )
-            digest = str(topic.get("type_description_hash") or "")
-            topics.append((str(topic["name"]), str(topic["type"]), encoding, qos, digest, int(entry["message_count"])))
-        names = [str(name) for name in said["relative_file_paths"]]
-        bag = Bag(text, str(said.get("ros_distro") or ""), mode.lower() == "message", topics)
+        with path.open("rb") as stream:
+            return stream.read(plain_yaml.MAX_BYTES + 1)
     except OSError as error:
         raise McaptrackError(f"{path} can't be read: {error.strerror}") from None
-    except (YAMLError, UnicodeDecodeError, KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
-        why = " ".join(str(error).split())[:120]
-        raise McaptrackError(f"{path} is no metadata of a rosbag2 bag ({why})") from None
+
+
+def read_metadata(path: Path) -> tuple[Bag, list[str]]:
+    """A metadata.yaml, and the files that it names. Raises McaptrackError if it is none."""
+    text = _start(path)
+    try:
+        said = Fields(plain_yaml.load(text), "it").map(_ROOT)
+        mode, compression = said.text("compression_mode", ""), said.text("compression_format", "")
+        topics = [_topic(Fields(entry, "a topic")) for entry in said.values("topics_with_message_count")]
+        names = [_name(entry) for entry in said.values("relative_file_paths")]
+        bag = Bag(text, said.text("ros_distro", ""), mode.lower() == "message", topics)
+    except NotPlainError as error:
+        raise McaptrackError(f"{path} is no metadata of a rosbag2 bag ({str(error)[:200]})") from None
+    twice = next((name for name, times in Counter(names).items() if times > 1), "")
+    if twice:
+        raise McaptrackError(f"{path} names {twice} twice; its messages would be there twice")
     if mode.lower() not in ("", "none") and compression.lower() != "zstd":
         raise McaptrackError(f"{path}: the bag is compressed with {compression!r}; zstd is read")
     return bag, names
 
 
-def _yaml(value: Any) -> str:
-    """Words as they are; anything else, as it is since ROS 2 Jazzy, as YAML."""
-    if isinstance(value, str):
-        return value
-    from io import StringIO
+def _topic(entry: Fields) -> tuple[str, str, str, str, str, int]:
+    topic = entry.map("topic_metadata")
+    name, kind, encoding = topic.text("name"), topic.text("type"), topic.text("serialization_format", "cdr")
+    qos = topic.any("offered_qos_profiles")
+    # Text before ROS 2 Jazzy; since then, YAML inside of YAML.
+    words = "" if qos is None else str(qos) if isinstance(qos, str) else plain_yaml.dump(qos)
+    return name, kind, encoding, words, topic.text("type_description_hash", ""), entry.whole("message_count")
 
-    from ruamel.yaml import YAML
 
-    out = StringIO()
-    YAML(typ="safe", pure=True).dump(value, out)
-    return out.getvalue()
+def _name(entry: Any) -> str:
+    """The name of a file in the bag's folder. Before ROS 2 Galactic the folder's name stood before it."""
+    if not isinstance(entry, str) or not PurePosixPath(entry).name:
+        raise NotPlainError(f"relative_file_paths names {entry!r}, which is no file"[:120])
+    path = PurePosixPath(entry)
+    if path.is_absolute() or ".." in path.parts or "\0" in entry:
+        raise NotPlainError(f"relative_file_paths names {entry!r}, which lies outside of the bag's folder"[:200])
+    return path.name

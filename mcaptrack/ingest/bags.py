@@ -99,6 +99,8 @@ class LogJob(Job):
 
     def write(self, writer: log.LogWriter, has_clock: bool) -> None:
         """Write all that the recording holds, then labels."""
+        self.report.notes += self._recorded.words.notes
+        self.report.lost += self._recorded.words.lost
         timeline = self._pass_on(writer) if self._passed_on else self._write_messages(writer)
         self._recorded.extras(writer, has_clock, passed_on=self._passed_on is not None)
         if self._connections:

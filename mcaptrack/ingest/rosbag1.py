@@ -14,6 +14,7 @@ from typing import BinaryIO, Final, NamedTuple
 from mcaptrack import log
 from mcaptrack.clock import NS_PER_S
 from mcaptrack.errors import McaptrackError
+from mcaptrack.ingest import unpack
 from mcaptrack.ingest.source import Connection, Found
 
 _MESSAGE, _BAG, _CHUNK, _CHUNK_INFO, _CONNECTION = 2, 3, 5, 6, 7
@@ -21,8 +22,8 @@ _MAGIC: Final = b"#ROSBAG V2.0\n"
 _U32: Final = struct.Struct("<I")
 _U32_PAIR: Final = struct.Struct("<II")
 _MAX_HEADER_BYTES: Final = 2**20
-#: A chunk that says it is larger than this is not decompressed.
-_MAX_CHUNK_BYTES: Final = 2**30
+#: A record whose data are longer is not read.
+_MAX_DATA_BYTES: Final = 2**28
 
 Fields = Mapping[bytes, bytes]
 
@@ -50,6 +51,7 @@ class Bag1:
         self._size = path.stat().st_size
         self._known: dict[int, Connection] = {}
         self.claims: Mapping[Connection, int] | None = None
+        self.words = Found()
         try:
             self._end, self._why_unindexed = self._read_index()
             if self._why_unindexed:
@@ -140,6 +142,8 @@ class Bag1:
         self.claims = {connection: counts.get(number, 0) for number, connection in self._known.items()}
 
     def _at(self, start: int, end: int) -> bytes:
+        if end - start > _MAX_DATA_BYTES:
+            raise _Broken(f"a record has {end - start} bytes; at most {_MAX_DATA_BYTES} are read")
         self._file.seek(start)
         data = self._file.read(end - start)
         if len(data) != end - start:
@@ -172,8 +176,8 @@ class Bag1:
     def _loose(self, record: _Record, found: Found) -> Iterator[tuple[int, int, bytes]]:
         """A record outside of chunks: messages stand there if a chunk was never finished."""
         if record.op in (_MESSAGE, _CONNECTION):
-            whole = self._at(record.data, record.end)
             try:
+                whole = self._at(record.data, record.end)
                 yield from self._take(record.op, record.fields, whole)
             except _Broken as error:
                 found.lost.append(f"{self.path}: byte {record.data}: {error}")
@@ -181,9 +185,9 @@ class Bag1:
     def _chunk(self, record: _Record, found: Found) -> Iterator[tuple[int, int, bytes]]:
         """The messages of a chunk, or of what is there of it."""
         where = f"{self.path}: the chunk at byte {record.data}"
-        size = self._number(record.fields, b"size")
-        data = self._at(record.data, min(record.end, self._end))
         try:
+            size = self._number(record.fields, b"size")
+            data = self._at(record.data, min(record.end, self._end))
             content = _decompress(data, record.fields.get(b"compression", b"none"), size)
         except _Broken as error:
             found.lost.append(f"{where}: {error}")
@@ -275,20 +279,20 @@ def _text(data: bytes) -> str:
 
 def _decompress(data: bytes, compression: bytes, size: int) -> bytes:
     """At most one byte more than ``size``; less if ``data`` is cut off."""
-    if size > _MAX_CHUNK_BYTES:
-        raise _Broken(f"it says that it has {size} bytes; at most {_MAX_CHUNK_BYTES} are read")
+    most = unpack.limit_of(len(data))
+    if size > most:
+        raise _Broken(str(unpack.too_large(size, most)))
     try:
         if compression == b"none":
             return data
         if compression == b"bz2":
             import bz2
 
-            return bz2.BZ2Decompressor().decompress(data, size + 1)
+            return unpack.in_steps(bz2.BZ2Decompressor(), data, size + 1)
         if compression == b"lz4":
             import lz4.frame
 
-            out: bytes = lz4.frame.LZ4FrameDecompressor().decompress(data, size + 1)
-            return out
+            return unpack.in_steps(lz4.frame.LZ4FrameDecompressor(), data, size + 1)
     except (OSError, ValueError, RuntimeError, EOFError) as error:
         raise _Broken(f"it can't be decompressed ({error})") from None
     raise _Broken(f"it is compressed with {compression.decode('utf-8', 'replace')!r}; bz2 and lz4 are read")

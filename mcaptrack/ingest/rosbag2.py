@@ -7,40 +7,63 @@ were recorded before definitions were kept in them.
 
 from __future__ import annotations
 
-import sqlite3
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
-from functools import cache
-from pathlib import Path, PurePath
-from tempfile import TemporaryDirectory
+from pathlib import Path
 from typing import Any, Final
 
 from mcaptrack import log
+from mcaptrack.atomic import refuse_special
 from mcaptrack.errors import McaptrackError
-from mcaptrack.ingest.bag_metadata import METADATA, Bag, read_metadata
+from mcaptrack.ingest import unpack
+from mcaptrack.ingest.bag_metadata import METADATA, Bag, holds_metadata, read_metadata
+from mcaptrack.ingest.database import Database
+from mcaptrack.ingest.definitions import known_definition
 from mcaptrack.ingest.source import Connection, Found, Source
+from mcaptrack.notices import warn
 from mcaptrack.provenance import CLOCK
 
 _MCAP_MAGIC, _SQLITE_MAGIC, _ZSTD_MAGIC = b"\x89MCAP0\r\n", b"SQLite format 3\0", b"\x28\xb5\x2f\xfd"
 #: A message that is larger decompressed is not read.
 _MAX_MESSAGE_BYTES: Final = 2**28
+#: So many numbers of topics that are not described are named.
+_MAX_STRANGE: Final = 10
+_NEEDED: Final = {
+    "topics": {"id", "name", "type", "serialization_format"},
+    "messages": {"topic_id", "timestamp", "data"},
+}
+_TABLES: Final = ("topics", "messages", "metadata", "schema", "message_definitions")
 
 
 def open_bag(folder: Path) -> Source:
     """The bag in a folder with a metadata.yaml. Raises McaptrackError if it can't be read or is incomplete."""
     bag, names = read_metadata(folder / METADATA)
-    paths = [folder / PurePath(name).name for name in names]
+    paths = [folder / name for name in names]
     paths = [path if path.exists() else path.with_name(path.name + ".zstd") for path in paths]
     missing = [str(path).removesuffix(".zstd") for path in paths if not path.exists()]
     if missing:
         raise McaptrackError(
             f"{folder / METADATA} names {missing[0]}, which does not exist; a part of the bag is missing"
         )
+    places: dict[tuple[int, int], Path] = {}
+    for path in paths:
+        found = path.stat()
+        other = places.setdefault((found.st_dev, found.st_ino), path)
+        if other is not path:
+            raise McaptrackError(f"{folder / METADATA} names {other.name} and {path.name}, which are one file")
     source = open_files(paths, folder, bag) if paths else _Files([], folder, bag)
-    ours = {path.name for path in paths}
-    beside = [entry.name for entry in folder.iterdir() if entry.suffix in (".db3", ".mcap") and entry.name not in ours]
-    if beside and isinstance(source, _Files):
-        source.words.notes += [f"{folder / name} is not named in {METADATA}; it is left out" for name in sorted(beside)]
+    ours, results = {path.name for path in paths}, {log.results_of(path).name for path in paths}
+    beside = [
+        entry.name
+        for entry in folder.iterdir()
+        if entry.suffix in (".db3", ".mcap") and entry.name not in ours | results
+    ]
+    for name in sorted(beside):
+        warn(f"{folder / name} is not named in {METADATA}; it is left out", "left-out")
+    for path in paths:
+        if not path.resolve().is_relative_to(folder.resolve()):
+            warn(f"{path} is a link out of the folder, to {path.resolve()}, which is read")
     return source
 
 
@@ -51,54 +74,45 @@ def open_files(paths: Sequence[Path], whole: Path, bag: Bag | None = None) -> So
     with ExitStack() as opened:
         parts = [_unpacked(path, opened) for path in paths]
         heads = [_head(path) for path in parts]
+        source: _Files
         if all(head.startswith(_SQLITE_MAGIC) for head in heads):
-            source: _Files = Databases(parts, whole, bag)
+            source = Databases(parts, whole, bag)
         elif all(head.startswith(_MCAP_MAGIC) for head in heads):
             source = Logs(parts, whole, bag)
         else:
-            wrong = next(
-                (
-                    path
-                    for path, head in zip(paths, heads, strict=True)
-                    if not head.startswith((_MCAP_MAGIC, _SQLITE_MAGIC))
-                ),
-                None,
-            )
-            if wrong is None:
+            known = (_MCAP_MAGIC, _SQLITE_MAGIC)
+            wrong = [path for path, head in zip(paths, heads, strict=True) if not head.startswith(known)]
+            if not wrong:
                 raise McaptrackError(f"{whole} holds both MCAP files and databases; one bag is made of either")
-            raise McaptrackError(f"{wrong} is neither an MCAP file nor a rosbag2 database; it may be damaged")
+            raise McaptrackError(f"{wrong[0]} is neither an MCAP file nor a rosbag2 database; it may be damaged")
         source.closing.push(opened.pop_all())
         return source
 
 
 def _head(path: Path) -> bytes:
-    with path.open("rb") as stream:
-        return stream.read(16)
+    refuse_special(path)
+    try:
+        with path.open("rb") as stream:
+            return stream.read(16)
+    except OSError as error:
+        raise McaptrackError(f"{path} can't be read: {error.strerror}") from None
 
 
 def _unpacked(path: Path, opened: ExitStack) -> Path:
     """The file, or what it holds if it is compressed as a whole."""
     if not _head(path).startswith(_ZSTD_MAGIC):
         return path
-    import zstandard
-
-    out = Path(opened.enter_context(TemporaryDirectory())) / path.name.removesuffix(".zstd")
-    try:
-        with path.open("rb") as packed, out.open("wb") as stream:
-            zstandard.ZstdDecompressor(max_window_size=2**27).copy_stream(packed, stream)
-    except zstandard.ZstdError as error:
-        raise McaptrackError(f"{path} can't be decompressed: {error}") from None
-    except OSError as error:
-        raise McaptrackError(f"{path} can't be decompressed to {out.parent}: {error.strerror}") from None
+    out = opened.enter_context(unpack.temporary_folder()) / path.name.removesuffix(".zstd")
+    unpack.unzstd_file(path, out)
     return out
 
 
 def _bag_around(paths: Sequence[Path]) -> Bag:
     """What the metadata.yaml beside a single file says of it, if there is one that names it: not how much there is."""
     beside = paths[0].with_name(METADATA)
-    if len(paths) == 1 and beside.is_file() and b"rosbag2_bagfile_information" in beside.read_bytes():
+    if len(paths) == 1 and holds_metadata(beside):
         bag, names = read_metadata(beside)
-        if paths[0].name.removesuffix(".zstd") in [PurePath(name).name.removesuffix(".zstd") for name in names]:
+        if paths[0].name.removesuffix(".zstd") in [name.removesuffix(".zstd") for name in names]:
             return Bag(distro=bag.distro, packed=bag.packed)
     return Bag()
 
@@ -135,8 +149,6 @@ class _Files:
 
     def messages(self, found: Found) -> Iterator[tuple[Connection, log.Message]]:
         """All messages, file after file, as they stand there."""
-        found.notes += self.words.notes
-        found.lost += self.words.lost
         self._passed = {}
         for number in range(len(self.paths)):
             yield from self._messages(number, found)
@@ -165,16 +177,17 @@ class _Files:
 
     def _compare(self) -> None:
         """What the metadata has and the files have not."""
+        holds: Counter[str] = Counter()
+        for connection, count in self.claims.items():
+            holds[connection.topic] += count
         for topic, kind, encoding, qos, digest, messages in self.bag.topics:
-            there = [connection for connection in self.claims if connection.topic == topic]
-            if not there:
+            if topic not in holds:
                 metadata = {"offered_qos_profiles": qos, "topic_type_hash": digest}
-                self.claims[Connection(topic, (kind, "", b""), encoding, metadata)] = 0
+                self.claims[Connection(topic, (kind, "", b""), encoding, metadata)] = holds[topic] = 0
                 self.words.notes.append(f"{topic} ({kind}) is in {METADATA} alone; its channel has no schema")
-            holds = sum(self.claims[connection] for connection in there)
-            if holds < messages:
+            if holds[topic] < messages:
                 self.words.lost.append(
-                    f"{self.whole}: {METADATA} counts {messages} messages of {topic}, and {holds} are there"
+                    f"{self.whole}: {METADATA} counts {messages} messages of {topic}, and {holds[topic]} are there"
                 )
 
 
@@ -182,7 +195,7 @@ class Databases(_Files):
     """SQLite databases."""
 
     def __init__(self, paths: Sequence[Path], whole: Path, bag: Bag) -> None:
-        self._databases: list[sqlite3.Connection] = []
+        self._databases: list[Database] = []
         self._topics: list[dict[int, Connection]] = []
         self._distro = bag.distro
         self._undefined: dict[str, str] = {}
@@ -198,92 +211,96 @@ class Databases(_Files):
         super().extras(writer, has_clock, passed_on)
         if self._distro:
             writer.add_metadata("mcaptrack.bag", {"file": self.whole.name, "ros_distro": self._distro})
-        for number in range(len(self.paths)):
-            if self._columns(number, "metadata") >= {"metadata"}:
-                for (text,) in self._ask(number, "SELECT metadata FROM metadata ORDER BY rowid"):
+        for database in self._databases:
+            if "metadata" in database.columns("metadata"):
+                for (text,) in database.rows("metadata", ["metadata"]):
                     writer.add_metadata("rosbag2", {"serialized_metadata": _text(text)})
 
     def _open(self, number: int) -> None:
         path = self.paths[number]
-        # What a recorder that was killed left beside it belongs to it; otherwise nothing is written beside it.
-        left = any(path.with_name(path.name + end).exists() for end in ("-wal", "-journal"))
-        try:
-            name = f"{path.resolve().as_uri()}?{'mode=ro' if left else 'immutable=1'}"
-            database = sqlite3.connect(name, uri=True)
-        except sqlite3.Error as error:
-            raise McaptrackError(f"{path} can't be opened: {error}") from None
+        database = Database(path, _TABLES)
         self.closing.callback(database.close)
-        database.text_factory = bytes
         self._databases.append(database)
-        topics, messages = (self._columns(number, table) for table in ("topics", "messages"))
-        wanted = {"id", "name", "type", "serialization_format"}
-        if not topics >= wanted or not messages >= {"topic_id", "timestamp", "data"}:
+        wanted = {
+            "topics": {"id", "name", "type", "serialization_format"},
+            "messages": {"topic_id", "timestamp", "data"},
+        }
+        if not all(columns <= set(database.columns(table)) for table, columns in wanted.items()):
             raise McaptrackError(f"{path} is a database, but none of rosbag2: it has no topics and messages")
-        counts = dict(self._ask(number, "SELECT topic_id, count(*) FROM messages GROUP BY topic_id"))
-        ((total,),) = self._ask(number, "SELECT count(*) FROM messages")  # by the index of times, if there is one
-        if total != sum(counts.values()):
-            raise McaptrackError(
-                f"{path} does not add up: its index counts {total} messages, and {sum(counts.values())} are there"
-            )
-        definitions = self._definitions(number)
-        columns = [name if name in topics else "''" for name in ("offered_qos_profiles", "type_description_hash")]
-        known: dict[int, Connection] = {}
-        twins: dict[object, int] = {}
-        query = f"SELECT id, name, type, serialization_format, {', '.join(columns)} FROM topics ORDER BY id"  # noqa: S608
-        for key, *words in self._ask(number, query):
-            topic, kind, encoding, qos, digest = map(_text, words)
+        definitions = self._definitions(database)
+        has = database.columns("topics")
+        optional = [name for name in ("offered_qos_profiles", "type_description_hash") if name in has]
+        described: dict[int, Connection] = {}
+        for key, *words in database.rows("topics", ["id", "name", "type", "serialization_format", *optional]):
+            topic, kind, encoding, *more = map(_text, words)
+            said = dict(zip(optional, more, strict=True))
+            digest = said.get("type_description_hash", "")
             schema, defined_digest = definitions.get(kind) or (self._schema(kind, digest), "")
+            qos = said.get("offered_qos_profiles", "")
             metadata = {"offered_qos_profiles": qos, "topic_type_hash": digest or defined_digest}
-            described = Connection(topic, schema, encoding, metadata)
-            known[key] = self._connection(twins, described, counts.pop(key, 0))
-        self._topics.append(known)
-        for key, count in counts.items():
-            self.words.lost.append(f"{path}: {count} messages of topic {key}, which is not described")
+            described[key] = Connection(topic, schema, encoding, metadata)
+        counts = self._count(database, described)
+        twins: dict[object, int] = {}
+        self._topics.append(
+            {key: self._connection(twins, described[key], counts[key]) for key in sorted(described, key=_in_order)}
+        )
 
-    def _definitions(self, number: int) -> dict[str, tuple[tuple[str, str, bytes], str]]:
+    def _count(self, database: Database, described: dict[int, Connection]) -> Counter[int]:
+        """The messages of each topic. Those of topics that are not described are lost."""
+        counts: Counter[int] = Counter()
+        strange: Counter[object] = Counter()
+        for (key,) in database.rows("messages", ["topic_id"]):
+            if key in described:
+                counts[key] += 1
+            else:
+                strange[key if key in strange or len(strange) < _MAX_STRANGE else "other numbers"] += 1
+        total, there = database.count("messages"), counts.total() + strange.total()
+        if total != there:
+            raise McaptrackError(
+                f"{database.path} does not add up: its index counts {total} messages, and {there} are there"
+            )
+        self.words.lost += [
+            f"{database.path}: {count} messages of topic {_text(key)[:80]}, which is not described"
+            for key, count in strange.items()
+        ]
+        return counts
+
+    def _definitions(self, database: Database) -> dict[str, tuple[tuple[str, str, bytes], str]]:
         """The schema record and the hash of each type that a database defines."""
-        if not self._distro and self._columns(number, "schema") >= {"ros_distro"}:
-            self._distro = next((_text(row[0]) for row in self._ask(number, "SELECT ros_distro FROM schema")), "")
-        columns = self._columns(number, "message_definitions")
-        if not columns >= {"topic_type", "encoding", "encoded_message_definition"}:
+        if not self._distro and "ros_distro" in database.columns("schema"):
+            self._distro = next((_text(row[0]) for row in database.rows("schema", ["ros_distro"])), "")
+        has = database.columns("message_definitions")
+        if not {"topic_type", "encoding", "encoded_message_definition"} <= set(has):
             return {}
-        digest = "type_description_hash" if "type_description_hash" in columns else "''"
-        query = f"SELECT topic_type, encoding, encoded_message_definition, {digest} FROM message_definitions"  # noqa: S608
-        rows = [tuple(map(_text, row)) for row in self._ask(number, query)]
+        wanted = ["topic_type", "encoding", "encoded_message_definition"]
+        wanted += ["type_description_hash"] * ("type_description_hash" in has)
+        rows = [[*map(_text, row), ""] for row in database.rows("message_definitions", wanted)]
         return {
             kind: ((kind, encoding, text.encode()), said)
-            for kind, encoding, text, said in rows
+            for kind, encoding, text, said, *_ in rows
             if encoding in ("ros2msg", "ros2idl") and (text or kind.endswith("/Empty"))
         }
 
     def _schema(self, kind: str, digest: str) -> tuple[str, str, bytes]:
         """The schema record of a type that the database does not define."""
-        text, self._undefined[kind] = _known_definition(kind, self._distro.lower(), digest)
+        text, self._undefined[kind] = known_definition(kind, self._distro.lower(), digest)
         return (kind, "ros2msg", text.encode()) if self._undefined[kind] else (kind, "", b"")
 
     def _messages(self, number: int, found: Found) -> Iterator[tuple[Connection, log.Message]]:
-        known = self._topics[number]
-        for key, t_ns, data in self._ask(number, "SELECT topic_id, timestamp, data FROM messages ORDER BY rowid"):
+        known, path = self._topics[number], self.paths[number]
+        left = unpack.limit_of(path.stat().st_size)
+        for key, t_ns, data in self._databases[number].rows("messages", ["topic_id", "timestamp", "data"]):
             connection = known.get(key)
             if connection is None:
                 continue
             if not isinstance(t_ns, int) or not isinstance(data, bytes):
-                raise McaptrackError(f"{self.paths[number]} is damaged: a message without time or data")
+                raise McaptrackError(f"{path} is damaged: a message without time or data")
             if self.bag.packed or (data.startswith(_ZSTD_MAGIC) and connection.encoding == "cdr"):  # CDR begins with 0
-                data = _unpack_message(data, self.paths[number], t_ns)  # noqa: PLW2901
+                data = _unpack_message(data, path, t_ns, left)  # noqa: PLW2901
+                left -= len(data)
             count = self._passed.get(connection, 0)
             self._passed[connection] = count + 1
             yield connection, log.Message(t_ns, count % 2**32, t_ns, data)
-
-    def _ask(self, number: int, query: str) -> Iterator[tuple[Any, ...]]:
-        try:
-            yield from self._databases[number].execute(query)
-        except (sqlite3.Error, UnicodeDecodeError) as error:  # SQLite quotes what is damaged
-            why = "it can't be understood" if isinstance(error, UnicodeDecodeError) else str(error)
-            raise McaptrackError(f"{self.paths[number]} is damaged: {why}") from None
-
-    def _columns(self, number: int, table: str) -> set[str]:
-        return {_text(row[1]) for row in self._ask(number, f"PRAGMA table_info({table})")}
 
 
 class Logs(_Files):
@@ -293,7 +310,7 @@ class Logs(_Files):
         self.logs: list[log.Log] = []
         self._channels: list[dict[int, Connection]] = []
         super().__init__(paths, whole, bag)
-        profiles = {log.profile(opened) for opened in self.logs}
+        profiles = {log.header(opened)[0] for opened in self.logs}
         self.profile = profiles.pop() if len(profiles) == 1 else ""
         self.as_it_is = self.logs[0] if len(self.logs) == 1 and not bag.packed else None
 
@@ -304,7 +321,10 @@ class Logs(_Files):
             log.pass_on_extras(opened, writer, without=[CLOCK] if has_clock else [])
 
     def _open(self, number: int) -> None:
-        opened = self.closing.enter_context(log.read(self.paths[number], sidecar=False))
+        path = self.paths[number]
+        opened = self.closing.enter_context(log.read(path, sidecar=False))
+        if log.results_of(path).exists():
+            warn(f"{log.results_of(path)} holds results of {path.name}; they are left out", "left-out")
         self.logs.append(opened)
         known: dict[int, Connection] = {}
         twins: dict[object, int] = {}
@@ -316,10 +336,12 @@ class Logs(_Files):
         self._channels.append(known)
 
     def _messages(self, number: int, found: Found) -> Iterator[tuple[Connection, log.Message]]:
-        known = self._channels[number]
+        known, path = self._channels[number], self.paths[number]
+        left = unpack.limit_of(path.stat().st_size)
         for channel, message in log.stream(self.logs[number]):
             if self.bag.packed:
-                payload = _unpack_message(message.payload, self.paths[number], message.t_ns)
+                payload = _unpack_message(message.payload, path, message.t_ns, left)
+                left -= len(payload)
                 yield known[channel], message._replace(payload=payload)
             else:
                 yield known[channel], message
@@ -330,32 +352,14 @@ def _text(value: Any) -> str:
     return value.decode("utf-8", "replace") if isinstance(value, bytes) else "" if value is None else str(value)
 
 
-def _unpack_message(data: bytes, path: Path, t_ns: int) -> bytes:
-    import zstandard
+def _in_order(key: Any) -> tuple[int, Any]:
+    """Numbers of topics by size; what else SQLite lets stand there behind them."""
+    return (0, key) if isinstance(key, int) else (1, str(key))
 
+
+def _unpack_message(data: bytes, path: Path, t_ns: int, left: int) -> bytes:
+    """A message that is compressed by itself; ``left`` is how much all that are to come may have, together."""
     try:
-        with zstandard.ZstdDecompressor(max_window_size=2**27).stream_reader(data) as stream:
-            out: bytes = stream.read(_MAX_MESSAGE_BYTES + 1)
-    except zstandard.ZstdError as error:
+        return unpack.unzstd(data, min(left, _MAX_MESSAGE_BYTES))
+    except unpack.NotUnpackedError as error:
         raise McaptrackError(f"{path}: the message at {t_ns} ns can't be decompressed: {error}") from None
-    if len(out) > _MAX_MESSAGE_BYTES:
-        raise McaptrackError(f"{path}: the message at {t_ns} ns has more than {_MAX_MESSAGE_BYTES} bytes, decompressed")
-    return out
-
-
-@cache
-def _known_definition(kind: str, distro: str, digest: str) -> tuple[str, str]:
-    """The definition of a type and whose it is: of the distribution, or else of the newest whose hash is the same."""
-    from rosbags.typesys import Stores, get_typestore
-
-    all_stores = {store.value.removeprefix("ros2_"): store for store in Stores if store.value.startswith("ros2_")}
-    named = {distro: all_stores[distro]} if distro in all_stores else {}
-    for name, store in (named or dict(reversed(all_stores.items()))).items():
-        types = get_typestore(store)
-        try:
-            if digest.startswith("RIHS01_") and types.hash_rihs01(kind) != digest:
-                continue
-            return types.generate_msgdef(kind, ros_version=2)[0], f"ROS 2 {name.capitalize()}"
-        except Exception:  # noqa: BLE001, PERF203, S112, RUF100  # it fails in many ways for types it has not
-            continue
-    return "", ""

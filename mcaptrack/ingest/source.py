@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, Protocol
 
 from mcaptrack import log
+from mcaptrack.atomic import refuse_special
 from mcaptrack.errors import McaptrackError
 from mcaptrack.video import IMAGE_SUFFIXES
 
 _MCAP, _ROS1, _SQLITE, _ZSTD = b"\x89MCAP0\r\n", b"#ROSBAG V", b"SQLite format 3\0", b"\x28\xb5\x2f\xfd"
 _SUFFIXES: Final = {".mcap": "an MCAP file", ".bag": "a ROS bag", ".db3": "a rosbag2 database"}
-_SPLIT: Final = re.compile(r"(.+?)_(\d+)(\.(?:mcap|db3)(?:\.zstd)?)")
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +40,10 @@ class Source(Protocol):
     @property
     def profile(self) -> str:
         """As in the MCAP registry: ros1, ros2."""
+
+    @property
+    def words(self) -> Found:
+        """What there is to say before any message is read."""
 
     @property
     def connections(self) -> list[Connection]:
@@ -71,8 +74,12 @@ def open_source(path: Path) -> Source | None:
     """
     if path.is_dir():
         return _open_folder(path)
-    with path.open("rb") as stream:
-        head = stream.read(16)
+    refuse_special(path)
+    try:
+        with path.open("rb") as stream:
+            head = stream.read(16)
+    except OSError as error:
+        raise McaptrackError(f"{path} can't be read: {error.strerror}") from None
     if head.startswith(_ROS1):
         from mcaptrack.ingest.rosbag1 import Bag1
 
@@ -88,19 +95,16 @@ def open_source(path: Path) -> Source | None:
 
 
 def _open_folder(path: Path) -> Source | None:
-    from mcaptrack.ingest.bag_metadata import METADATA
+    from mcaptrack.ingest.bag_metadata import METADATA, holds_metadata
     from mcaptrack.ingest.rosbag2 import open_bag, open_files
 
-    metadata = path / METADATA
-    if metadata.is_file() and b"rosbag2_bagfile_information" in metadata.read_bytes():
+    if holds_metadata(path / METADATA):
         return open_bag(path)
     names = sorted(entry.name for entry in path.iterdir())
     if any(Path(name).suffix.lower() in IMAGE_SUFFIXES for name in names):
         return None
-    parts = [found for found in map(_SPLIT.fullmatch, names) if found]
-    if len({(found[1], found[3]) for found in parts}) == 1:
-        in_order = sorted(parts, key=lambda found: int(found[2]))
-        return open_files([path / found[0] for found in in_order], path)
+    if parts := log.parts_in(path):
+        return open_files(parts, path) if len(parts) > 1 else open_source(parts[0])
     logs = [name for name in names if Path(name).suffix.lower() in _SUFFIXES]
     if logs:
         raise McaptrackError(

@@ -11,12 +11,15 @@ from mcaptrack.log.change import extend, refuse_recorded
 from mcaptrack.log.check import Checked, check
 from mcaptrack.log.check_summary import Finding
 from mcaptrack.log.messages import Columns, Message, Places
+from mcaptrack.log.names import results_of
+from mcaptrack.log.other_kinds import parts_in, refuse_other_kinds
 from mcaptrack.log.reader import Channel, Log, read, topics_with_schema
 from mcaptrack.log.recover import Recovered, recover
-from mcaptrack.log.stream import pass_on_extras, profile, stream
-from mcaptrack.log.writer import LogWriter, create
+from mcaptrack.log.stream import header, pass_on_extras, stream
+from mcaptrack.log.writer import LIBRARY, LogWriter, create
 
 __all__ = [
+    "LIBRARY",
     "Channel",
     "Checked",
     "Columns",
@@ -29,11 +32,14 @@ __all__ = [
     "check",
     "create",
     "extend",
+    "header",
+    "parts_in",
     "pass_on_extras",
-    "profile",
     "read",
     "recover",
+    "refuse_other_kinds",
     "refuse_recorded",
+    "results_of",
     "stream",
     "topics_with_schema",
 ]

@@ -176,9 +176,8 @@ def _adds_up(index: Index, statistics: Reader) -> bool:
     said = [statistics.number(size) for size in (2, 4, 4, 4, 4)]
     found = [len(part) for part in (index.schemas, index.channels, index.attachments, index.metadata, index.chunks)]
     known = {channel for chunk in index.chunks for channel in chunk.message_index_offsets}
-    described = known <= set(index.channels) and all(
-        c.schema_id in {0, *index.schemas} for c in index.channels.values()
-    )
+    schemas = {0, *index.schemas}
+    described = known <= set(index.channels) and all(c.schema_id in schemas for c in index.channels.values())
     # The length of the message indexes says how many messages they list; fewer than there are means that some stand
     # outside of chunks or were never indexed.
     listed = sum(c.message_index_length - 15 * len(c.message_index_offsets) for c in index.chunks)

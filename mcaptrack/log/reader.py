@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import heapq
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple, Self, TypeVar
 
@@ -17,9 +17,10 @@ from mcaptrack.log import new_end, records
 from mcaptrack.log.chunks import MAX_NS
 from mcaptrack.log.fingerprint import fingerprint
 from mcaptrack.log.messages import Columns, Message, Places
+from mcaptrack.log.names import RESULTS, results_of
 from mcaptrack.log.records import ChannelRecord, Damaged
 from mcaptrack.log.snapshot import take_snapshot
-from mcaptrack.log.writer import RESULTS, create, results_of
+from mcaptrack.log.writer import create
 from mcaptrack.schema import Frame, Schema
 
 Ints = NDArray[np.int64]
@@ -45,13 +46,13 @@ class Log:
     the results.
     """
 
-    def __init__(self, path: Path, results: Log | None = None) -> None:
+    def __init__(self, path: Path) -> None:
         self.path = path
         self.real_path = path.resolve()
         self._lock: int | None = None
         self.snapshot = take_snapshot(path)
         self.index, self._messages = self.snapshot.index, self.snapshot.messages
-        self.results = results
+        self.results: Log | None = None
         self.is_new = False  # made a moment ago, and to be removed if nothing comes into it
         self.is_spent = False  # extended: the file is another now, and this still shows what it was
         #: Every channel of this file, also those that share a topic, and those that the results replace.
@@ -63,8 +64,12 @@ class Log:
         for topic, those in self._by_topic.items():
             first = next((channel for channel in those if channel.messages), those[0])
             self.channels[topic] = first._replace(messages=sum(channel.messages for channel in those))
-        if results is not None:
-            self.channels |= results.channels
+
+    def add_results(self, results: Log, is_new: bool) -> None:
+        """From now on the channels of both are there, and what is added goes to the results."""
+        results.is_new = is_new
+        self.results = results
+        self.channels |= results.channels
 
     def __enter__(self) -> Self:
         return self
@@ -320,23 +325,26 @@ def _are_equal(one: Places, other: Places) -> bool:
     return all(map(np.array_equal, one, other))
 
 
-def read(path: Path, *, sidecar: bool | None = None) -> Log:
+def read(path: Path, *, sidecar: bool | Callable[[Log], bool] | None = None) -> Log:
     """Open a log, with its results if they stand beside it; with ``sidecar`` they do from now on, without it never.
 
-    Raises McaptrackError, in one line, if it is none or is damaged.
+    ``sidecar`` may also be what decides, given the log alone. Raises McaptrackError, in one line, if it is none or is
+    damaged.
     """
-    beside = results_of(path)
-    if path.name.endswith(RESULTS) or sidecar is False or not (sidecar or beside.exists()):
-        return Log(path)
-    if not path.exists():
-        return Log(path)  # which says so
-    is_new = not beside.exists()
-    if is_new:
-        with create(beside):
-            pass
-    results = Log(beside)
-    results.is_new = is_new
-    return Log(path, results)
+    log, beside = Log(path), results_of(path)
+    try:
+        if not path.name.endswith(RESULTS) and (
+            sidecar(log) if callable(sidecar) else sidecar or (sidecar is None and beside.exists())
+        ):
+            is_new = not beside.exists()
+            if is_new:
+                with create(beside):
+                    pass
+            log.add_results(Log(beside), is_new)
+    except BaseException:
+        log.__exit__()
+        raise
+    return log
 
 
 def topics_with_schema(log: Log, names: Sequence[str]) -> list[Channel]:

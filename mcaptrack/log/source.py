@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Final, NamedTuple, overload
 
 from mcaptrack.errors import McaptrackError
+from mcaptrack.log.other_kinds import refuse_other_kinds
 from mcaptrack.log.records import BLOCK, Damaged, crc_of
 
 #: Small reads fetch at least so much, and while they go on one after another twice as much each time, up to the most.
@@ -69,6 +70,7 @@ class OpenFile:
     @classmethod
     def at(cls, path: Path) -> OpenFile:
         """Raises McaptrackError for what isn't there, may not be read, or is no file; never waits for a pipe."""
+        refuse_other_kinds(path)
         try:
             kind = kind_of_file(path.stat().st_mode)
             if not kind:

@@ -38,11 +38,11 @@ def _message(buffer: Bytes, record: Record) -> tuple[int, Message]:
     return channel, Message(t_ns, sequence, publish_ns, payload)
 
 
-def profile(log: Log) -> str:
-    """The profile that the log's header names."""
+def header(log: Log) -> tuple[str, str]:
+    """The profile that the log's header names, and the library that wrote it."""
     with log.snapshot.mending():
         whole = log.snapshot.record(len(MAGIC))
-        return records.read_header(whole, records.record_at(whole, 0))[0]
+        return records.read_header(whole, records.record_at(whole, 0))
 
 
 def pass_on_extras(log: Log, writer: LogWriter, *, without: Collection[str] = ()) -> None:

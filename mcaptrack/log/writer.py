@@ -13,6 +13,7 @@ from array import array
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
 from typing import Final, Literal, Protocol
 
@@ -25,11 +26,12 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.log import journal, records
 from mcaptrack.log.chunks import LOG_MAX_NS
 from mcaptrack.log.index import Index, Listed, list_attachment, list_metadata, read_index
+from mcaptrack.log.names import RESULTS, results_of
 from mcaptrack.log.records import MAGIC, ChannelRecord, ChunkIndexRecord, Damaged, SchemaRecord, crc_of
 from mcaptrack.log.source import OpenFile, Source
 
-#: How the name of a log ends that holds the results of another.
-RESULTS: Final = ".results.mcap"
+#: What the headers of our logs name as their writer, before the version.
+LIBRARY: Final = "mcaptrack"
 
 Kind = Literal["media", "rows", "views"]
 
@@ -80,6 +82,8 @@ class LogWriter:
         self._groups: dict[int, tuple[Kind, str]] = {}
         self._open: dict[tuple[Kind, str], _OpenChunk] = {}
         self._topics = {channel.topic for channel in self.channels.values()}
+        self._schema_ids = {(s.name, s.encoding, bytes(s.data)): s.id for s in reversed(self.schemas.values())}
+        self._last = max(self.schemas, default=0), max(self.channels, default=0)
 
     # Adding
 
@@ -87,7 +91,7 @@ class LogWriter:
         """The first bytes; ``profile`` as in the MCAP registry, "" for none; ``record`` the header of another log."""
         self.write(MAGIC)
         self.write(
-            record or records.pack(Opcode.HEADER, records.text(profile), records.text(f"mcaptrack {__version__}"))
+            record or records.pack(Opcode.HEADER, records.text(profile), records.text(f"{LIBRARY} {__version__}"))
         )
 
     def add_channel(
@@ -110,10 +114,11 @@ class LogWriter:
             raise McaptrackError(f"there is a channel {topic} already")
         schema_id = 0
         if schema != ("", "", b""):
-            schema_id = next((s.id for s in self.schemas.values() if (s.name, s.encoding, s.data) == schema), 0)
-            schema_id = schema_id or _free_id(self.schemas, 1, "schemas")
+            schema_id = self._schema_ids.get(schema, 0) or _free_id(self.schemas, self._last[0], "schemas")
+            self._schema_ids[schema] = schema_id
             self.schemas[schema_id] = SchemaRecord(schema_id, *schema)
-        channel_id = _free_id(self.channels, 1, "channels")
+        channel_id = _free_id(self.channels, self._last[1], "channels")
+        self._last = max(schema_id, self._last[0]), max(channel_id, self._last[1])
         self.channels[channel_id] = ChannelRecord(channel_id, schema_id, topic, message_encoding, dict(metadata))
         self._topics.add(topic)
         self._groups[channel_id] = (kind, group)
@@ -300,20 +305,13 @@ def _append(chunk: _OpenChunk, channel_id: int, t_ns: int, record: memoryview) -
     chunk.size += len(record)
 
 
-def _free_id(taken: Mapping[int, object], first: int, what: str) -> int:
-    """The number after the highest that is taken, or else the lowest that is not."""
-    following = max(taken, default=first - 1) + 1
-    if following <= _MAX_ID:
-        return following
-    free = next((number for number in range(first, _MAX_ID + 1) if number not in taken), None)
-    if free is None:
+def _free_id(taken: Mapping[int, object], last: int, what: str) -> int:
+    """The first number after ``last`` that is not taken, or else the lowest."""
+    free = (number for number in chain(range(last + 1, _MAX_ID + 1), range(1, last + 1)) if number not in taken)
+    found = next(free, None)
+    if found is None:
         raise McaptrackError(f"there are {len(taken)} {what} already; a log holds no more")
-    return free
-
-
-def results_of(path: Path) -> Path:
-    """Where the results of a log stand if they are not in it."""
-    return path.with_name(path.name.removesuffix(".mcap") + RESULTS)
+    return found
 
 
 def refuse_earlier_results(path: Path) -> None:

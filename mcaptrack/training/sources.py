@@ -69,6 +69,7 @@ def read_scenes(paths: Sequence[Path], options: SourceOptions, step_s: float) ->
 def _files(path: Path) -> list[Path]:
     """The files of a folder that can be sources, or the file itself."""
     if not path.is_dir():
+        log.refuse_other_kinds(path)
         return [path]
     kinds = (".txt", ".parquet", ".mcap")
     found = sorted(file for file in path.rglob("*") if file.suffix.lower() in kinds and file.is_file())
@@ -77,6 +78,7 @@ def _files(path: Path) -> list[Path]:
     found = [file for file in found if not logs & set(file.parents)]
     found = [file for file in found if file.suffix.lower() != ".parquet" or tables.holds_tracks(file)]
     if not found:
+        log.refuse_other_kinds(path)
         raise McaptrackError(f"{path} has no {', '.join(kinds)} to train on")
     return found
 

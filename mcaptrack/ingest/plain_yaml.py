@@ -1,0 +1,192 @@
+"""YAML of strangers as plain data: scalars, lists and maps, within bounds.
+
+A small file must not become a large one, so there are no aliases, no tags and no directives, and scalars stay text:
+what a field is, its reader says.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from typing import Any, Final, Self
+
+#: The metadata of a recording with thousands of topics and files is smaller.
+MAX_BYTES: Final = 8 * 2**20
+_MAX_VALUES: Final = 500_000
+_MAX_DEPTH: Final = 32
+_NULL: Final = ("", "~", "null", "Null", "NULL")
+_WHOLE: Final = re.compile(r"\d{1,19}", re.ASCII)
+_DIRECTIVE: Final = re.compile(rb"^%", re.MULTILINE)
+
+
+class Scalar(str):
+    """A scalar as it was written, without its quotes."""
+
+    __slots__ = ("is_plain",)
+    is_plain: bool
+
+    @classmethod
+    def of(cls, text: str, is_plain: bool) -> Self:
+        """The text, and whether it had no quotes around it."""
+        scalar = cls(text)
+        scalar.is_plain = is_plain
+        return scalar
+
+
+class NotPlainError(ValueError):
+    """Text that is no YAML, or none that is read here; the message says where and why."""
+
+
+def load(data: bytes) -> Any:
+    """The only document of ``data``: a Scalar, a list, or a dict with text as its keys. Raises NotPlainError."""
+    import yaml
+
+    if len(data) > MAX_BYTES:
+        raise NotPlainError(f"it has {len(data)} bytes; at most {MAX_BYTES} are read")
+    if _DIRECTIVE.search(data):
+        raise NotPlainError("it has a line that begins with %; directives are not read")
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise NotPlainError(f"byte {error.start} is no UTF-8") from None
+    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+    try:
+        return _build(yaml, yaml.parse(text, Loader=loader))
+    except yaml.YAMLError as error:
+        raise NotPlainError(" ".join(str(error).split())) from None
+
+
+def _build(yaml: Any, events: Iterator[Any]) -> Any:
+    """The value that parser events describe. One loop, because nesting must not use the stack."""
+    documents: list[Any] = []
+    open_values: list[tuple[Any, list[str]]] = [(documents, [])]  # each with the key that waits for its value
+    for number, event in enumerate(events):
+        where = f"line {event.start_mark.line + 1}"
+        if number > _MAX_VALUES:
+            raise NotPlainError(f"{where}: it has more than {_MAX_VALUES} values")
+        if getattr(event, "anchor", None) is not None:
+            raise NotPlainError(f"{where}: anchors and aliases are not read")
+        if getattr(event, "tag", None) not in (None, "!"):
+            raise NotPlainError(f"{where}: tags are not read")
+        value: Any
+        if isinstance(event, yaml.ScalarEvent):
+            value = Scalar.of(event.value, event.implicit[0])
+        elif isinstance(event, yaml.SequenceStartEvent):
+            value = []
+        elif isinstance(event, yaml.MappingStartEvent):
+            value = {}
+        else:
+            if isinstance(event, yaml.CollectionEndEvent):
+                open_values.pop()
+            continue
+        parent, keys = open_values[-1]
+        if isinstance(parent, list):
+            parent.append(value)
+        elif keys:
+            parent[keys.pop()] = value
+        elif not isinstance(value, str):
+            raise NotPlainError(f"{where}: a list or a map is a key")
+        elif value in parent:
+            raise NotPlainError(f"{where}: {value[:40]!r} is there twice")
+        else:
+            keys.append(value)
+        if not isinstance(value, str):
+            open_values.append((value, []))
+            if len(open_values) > _MAX_DEPTH:
+                raise NotPlainError(f"{where}: it is nested more than {_MAX_DEPTH} deep")
+    if len(documents) != 1:
+        raise NotPlainError(f"it holds {len(documents)} documents, not one")
+    return documents[0]
+
+
+def dump(value: Any) -> str:
+    """What was loaded as YAML again, a line for each value."""
+    import yaml
+
+    dumper = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
+    framed = [yaml.StreamStartEvent(), yaml.DocumentStartEvent(), *_events(yaml, value)]
+    text: str = yaml.emit([*framed, yaml.DocumentEndEvent(), yaml.StreamEndEvent()], Dumper=dumper, width=10_000)
+    return text
+
+
+def _events(yaml: Any, value: Any) -> Iterator[Any]:
+    if isinstance(value, list):
+        yield yaml.SequenceStartEvent(None, None, True, flow_style=False)
+        for one in value:
+            yield from _events(yaml, one)
+        yield yaml.SequenceEndEvent()
+    elif isinstance(value, dict):
+        yield yaml.MappingStartEvent(None, None, True, flow_style=False)
+        for key, one in value.items():
+            yield from _events(yaml, key)
+            yield from _events(yaml, one)
+        yield yaml.MappingEndEvent()
+    else:
+        yield yaml.ScalarEvent(None, None, (value.is_plain, not value.is_plain), str(value), style=_style(value))
+
+
+def _style(value: Scalar) -> str | None:
+    return None if value.is_plain else '"'
+
+
+class Fields:
+    """The fields of a map, each of the kind that its reader asks for.
+
+    ``where`` says which map it is. Every method raises NotPlainError, with the field and what it is, for another kind.
+    """
+
+    def __init__(self, value: Any, where: str) -> None:
+        if not isinstance(value, dict):
+            raise NotPlainError(f"{where} is {_kind(value)}, not a map")
+        self._fields: Mapping[str, Any] = value
+        self._where = where
+
+    def text(self, name: str, default: str | None = None) -> str:
+        """Text; an empty field, or none at all, is the ``default`` if there is one."""
+        value = self._fields.get(name)
+        if default is not None and (value is None or _is_null(value)):
+            return default
+        if not isinstance(value, str):
+            raise self._wrong(name, value, "text")
+        return str(value)
+
+    def whole(self, name: str) -> int:
+        """A whole number from 0 to 2^63 - 1."""
+        value = self._fields.get(name)
+        number = int(value) if isinstance(value, Scalar) and value.is_plain and _WHOLE.fullmatch(value) else -1
+        if not 0 <= number < 2**63:
+            raise self._wrong(name, value, "a whole number")
+        return number
+
+    def values(self, name: str) -> list[Any]:
+        """A list; an empty field, or none at all, is an empty one."""
+        value = self._fields.get(name)
+        if value is None or _is_null(value):
+            return []
+        if not isinstance(value, list):
+            raise self._wrong(name, value, "a list")
+        return value
+
+    def map(self, name: str) -> Fields:
+        """A map."""
+        return Fields(self._fields.get(name), f"{self._where}: {name}")
+
+    def any(self, name: str) -> Any:
+        """Whatever it is; None if it is empty or not there."""
+        value = self._fields.get(name)
+        return None if value is None or _is_null(value) else value
+
+    def _wrong(self, name: str, value: Any, wanted: str) -> NotPlainError:
+        return NotPlainError(f"{self._where}: {name} is {_kind(value)}, not {wanted}")
+
+
+def _is_null(value: Any) -> bool:
+    return isinstance(value, Scalar) and value.is_plain and value in _NULL
+
+
+def _kind(value: Any) -> str:
+    if value is None:
+        return "missing"
+    if isinstance(value, str):
+        return repr(value[:40])
+    return "a list" if isinstance(value, list) else "a map"

@@ -1,0 +1,58 @@
+"""Recordings that are no MCAP files, told by their first bytes: `mcaptrack ingest` makes logs of them."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+from typing import Final
+
+from mcaptrack.errors import McaptrackError
+from mcaptrack.log.names import RESULTS
+
+_BEGIN: Final = {b"#ROSBAG V": "a ROS 1 bag", b"SQLite format 3\0": "a database, as rosbag2 writes them"}
+_ZSTD: Final = b"\x28\xb5\x2f\xfd"
+_PARTS: Final = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd", ".bag")
+_SPLIT: Final = re.compile(r"(.+?)_(\d{1,9})(\.(?:mcap|db3)(?:\.zstd)?)")
+
+
+def refuse_other_kinds(path: Path) -> None:
+    """Raise McaptrackError for a recording of another kind, with the command that makes a log of it.
+
+    Everything else is for whoever opens it to judge.
+    """
+    try:
+        what = _folder(path) if path.is_dir() else _file(path) if path.is_file() else ""
+    except OSError:
+        return
+    if what:
+        words = str(path)
+        quoted = shlex.quote(f"./{words}" if words.startswith("-") else words)
+        raise McaptrackError(f"{path} is {what}, not an MCAP file; `mcaptrack ingest {quoted}` makes a log of it")
+
+
+def _folder(path: Path) -> str:
+    if (path / "metadata.yaml").is_file():
+        return "a rosbag2 folder"
+    return "a folder with a recording" if parts_in(path) else ""
+
+
+def parts_in(folder: Path) -> list[Path]:
+    """The files of the only recording in a folder without a metadata.yaml, in order; none if there is none, or several.
+
+    One file, or several whose names count as rosbag2 does: drive_0.mcap, drive_1.mcap.
+    """
+    names = [entry.name for entry in folder.iterdir() if entry.name.endswith(_PARTS)]
+    names = [name for name in names if not name.endswith(RESULTS)]
+    found = [match for match in map(_SPLIT.fullmatch, names) if match]
+    if len(found) == len(names) and len({(match[1], match[3]) for match in found}) == 1:
+        return [folder / match[0] for match in sorted(found, key=lambda match: int(match[2]))]
+    return [folder / names[0]] if len(names) == 1 else []
+
+
+def _file(path: Path) -> str:
+    with path.open("rb") as stream:
+        head = stream.read(16)
+    if head.startswith(_ZSTD) and path.name.endswith(_PARTS):
+        return "a compressed file of rosbag2"
+    return next((what for begin, what in _BEGIN.items() if head.startswith(begin)), "")

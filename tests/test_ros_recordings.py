@@ -1,0 +1,305 @@
+"""Recordings that ROS tools read: they stay as they are, and are read together with their results."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import Writer as McapWriter
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
+from rosbags.rosbag2 import Writer as Writer2
+
+from mcaptrack import log
+from mcaptrack.provenance import Provenance
+from mcaptrack.schema import TRACKS
+from tests.commands import GROUP, called, done
+from tests.test_bags import MOT, ROS2, T0, bag1, bag2, picture
+
+COMMANDS = GROUP.commands
+FRAMES = 24
+
+
+def record(folder: Path) -> Path:
+    """A rosbag2 folder whose only file is an MCAP file with pictures; returns that file."""
+    kind, header, time = (
+        ROS2.types[name]
+        for name in ("sensor_msgs/msg/CompressedImage", "std_msgs/msg/Header", "builtin_interfaces/msg/Time")
+    )
+    with Writer2(folder, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        connection = writer.add_connection("/robot/front/image", kind.__msgtype__, typestore=ROS2)
+        for number in range(FRAMES):
+            stamp = time(sec=1000 + number // 10, nanosec=number % 10 * 100_000_000)
+            data = np.frombuffer(picture(number), np.uint8)
+            message = kind(header=header(stamp=stamp, frame_id="cam"), format="jpeg", data=data)
+            payload = bytes(ROS2.serialize_cdr(message, kind.__msgtype__))
+            writer.write(connection, T0 + number * 100_000_000, payload)
+    return folder / f"{folder.name}.mcap"
+
+
+def by_rosbags(folder: Path) -> list[tuple[str, int, bytes]]:
+    """All messages of a folder by rosbags, decoded."""
+    with AnyReader([folder]) as reader:
+        return [(c.topic, t, reader.deserialize(raw, c.msgtype).data.tobytes()) for c, t, raw in reader.messages()]
+
+
+def by_mcap_ros2(path: Path) -> list[tuple[str, int, bytes]]:
+    """All messages of a file by mcap_ros2, decoded."""
+    factory = pytest.importorskip("mcap_ros2.decoder").DecoderFactory()
+    with path.open("rb") as stream:
+        decoded = make_reader(stream, decoder_factories=[factory]).iter_decoded_messages()
+        return [(channel.topic, m.log_time, bytes(ros.data)) for _, channel, m, ros in decoded]
+
+
+def on_disk(folder: Path) -> dict[str, tuple[int, bytes]]:
+    return {entry.name: (entry.stat().st_mtime_ns, entry.read_bytes()) for entry in folder.iterdir() if entry.is_file()}
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory) -> Path:
+    """Not to be changed."""
+    return record(tmp_path_factory.mktemp("recorded") / "drive")
+
+
+@pytest.fixture
+def path(recorded, tmp_path) -> Path:
+    shutil.copytree(recorded.parent, tmp_path / "drive")
+    return tmp_path / "drive" / "drive.mcap"
+
+
+def person(number: int) -> dict[str, float]:
+    """Who is seen in a picture."""
+    known = {"track_id": 1, "x_px": 2 + number, "y_px": 20, "w_px": 10, "h_px": 16, "score": 1.0}
+    return known | {"x_m": np.nan, "y_m": np.nan, "observed": True, "source_id": -1}
+
+
+def on_recording(path: Path, elsewhere: Path) -> dict[str, list[object]]:
+    """A way to give a recording to each command, so that a command finds what those before it wrote."""
+    truth = elsewhere / "truth.mcap"
+    with log.create(truth) as writer:
+        record = (TRACKS.name, "protobuf", TRACKS.descriptor)
+        channel = writer.add_channel("/robot/front/truth", record, "protobuf", {})
+        for number in range(FRAMES):
+            rows = TRACKS.rows(**{name: [value] for name, value in person(number).items()})
+            writer.add_message(channel, T0 + number * 100_000_000, number, TRACKS.codec.encode(rows))
+    return {
+        "ingest": [truth, "--into", path],
+        "run": [path],
+        "detect": [path, "--method", "frame-difference"],
+        "track": [path],
+        "sample": [path],
+        "predict": [path, "--predictor", "cv"],
+        "retrack": [path],
+        "events": [path],
+        "evaluate": [path],
+        "export": [path, "-o", elsewhere / "tables"],
+        "query": [path, "select count(*) from tracks"],
+        "info": [path],
+        "check": [path],
+        "render": [path, "-o", elsewhere / "a.mp4"],
+        "report": [path, "-o", elsewhere / "a.html"],
+        "recover": [path, "-o", elsewhere / "recovered.mcap"],
+        "tune": [path, "--trials", "1", "--output", elsewhere / "tuned.toml"],
+        "drop": [path, "/robot/front/retracks*"],
+        "view": [],  # serves until it is interrupted, and opens the log like all others
+        "train": [],  # needs torch, and opens logs like all others
+        "demo": [],  # takes no log
+    }
+
+
+def test_no_command_changes_a_recording_that_ros_tools_read(path, tmp_path):
+    """Neither its bytes nor what others read of it; what is written stands beside it, and all commands see it."""
+    before, theirs = on_disk(path.parent), by_rosbags(path.parent)
+    assert len(theirs) == FRAMES
+    ways = on_recording(path, tmp_path)
+    assert ways.keys() == COMMANDS.keys()
+    results = path.with_name("drive.results.mcap")
+    for name, words in ways.items():
+        if not words:
+            continue
+        was = results.read_bytes() if results.exists() else b""
+        result = done(name, *words)
+        now = on_disk(path.parent)
+        assert {part: now[part] for part in before} == before, name
+        if "sidecar" in {parameter.name for parameter in COMMANDS[name].params}:
+            assert results.read_bytes() != was, name
+            lines = [line for line in result.err.splitlines() if str(results) in line]
+            assert len(lines) == 1, (name, result.err)
+            assert ("earlier results are there" in lines[0]) == bool(was)
+            assert was or "drive.mcap is named in" in lines[0]
+            assert was or "--in-place writes into it all the same" in lines[0]
+    assert by_rosbags(path.parent) == theirs
+    with log.read(path) as opened:
+        assert "/robot/front/truth" in opened.channels
+        assert "/robot/front/detections" in opened.channels
+        assert "/robot/front/retracks" not in opened.channels
+    assert not list(path.parent.glob("*.retracks*"))
+
+
+def test_mcap_ros2_reads_a_recording_that_has_results(path):
+    before = by_mcap_ros2(path)
+    assert before == by_rosbags(path.parent)
+    done("detect", path, "--method", "frame-difference")
+    assert by_mcap_ros2(path) == before
+
+
+def test_what_was_written_where_and_why_stands_in_the_data(path):
+    for why in ("--in-place writes into it all the same", "earlier results are there"):
+        method = "mog2" if "there" in why else "frame-difference"
+        (result,) = json.loads(done("detect", path, "--method", method, "--json").out)["results"]
+        assert result["written_to"] == str(path.with_name("drive.results.mcap"))
+        assert why in result["written_there_because"]
+    (result,) = json.loads(done("detect", path, "--sidecar", "--json").out)["results"]
+    assert result["written_there_because"] == "--sidecar was given"
+
+
+def test_results_that_a_pattern_matches_too_are_part_of_their_log(path):
+    done("detect", path, "--method", "frame-difference")
+    pattern = path.parent / "*.mcap"
+    assert len(list(path.parent.glob("*.mcap"))) == 2
+    (result,) = json.loads(done("track", pattern, "--json").out)["results"]
+    assert result["log"] == str(path)
+    checked = json.loads(done("check", pattern, "--json").out)["results"]
+    assert [result["log"] for result in checked] == [str(path), str(path.with_name("drive.results.mcap"))]
+
+
+def test_in_place_insists_and_what_is_in_place_goes_on_there(path):
+    result = done("detect", path, "--in-place", "--method", "frame-difference")
+    assert "drive.results.mcap" not in result.err
+    with path.open("rb") as stream:
+        assert "/robot/front/detections" in {c.topic for c in make_reader(stream).get_summary().channels.values()}
+    result = done("track", path)
+    (line,) = [line for line in result.err.splitlines() if "results are in" in line]
+    assert f"results are in {path}: earlier results are in it; ROS tools may stumble over them" in line
+    assert [entry.name for entry in path.parent.glob("*.mcap")] == ["drive.mcap"]
+    done("drop", path, "/robot/front/*detections*", "/robot/front/tracks*")  # ours
+    result = called("drop", path, "/robot/front/image")
+    assert result.code == 1
+    assert "-o writes a copy without /robot/front/image, --in-place changes it all the same" in result.err
+    done("drop", path, "/robot/front/image", "--in-place")
+
+
+def test_in_place_is_refused_where_results_stand_beside(path):
+    done("detect", path, "--method", "frame-difference")
+    before = on_disk(path.parent)
+    result = called("track", path, "--in-place")
+    assert result.code == 1
+    assert "--in-place would leave them there and make others: remove drive.results.mcap first" in result.err
+    assert on_disk(path.parent) == before
+
+
+def test_a_copy_without_channels_has_its_results_beside_it(path, tmp_path):
+    done("detect", path, "--method", "frame-difference")
+    before = on_disk(path.parent)
+    out = tmp_path / "small.mcap"
+    done("drop", path, "/robot/front/image", "/robot/front/detections/*", "-o", out)
+    assert on_disk(path.parent) == before
+    with log.read(out) as opened:
+        assert "/robot/front/image" not in opened.channels
+        assert opened.channel("/robot/front/detections").messages == FRAMES
+        assert opened.results is not None
+    result = called("track", path, "--in-place", "-o", tmp_path / "b.mcap")
+    assert (result.code, "--in-place and -o are two places" in result.err) == (1, True)
+
+
+def plain(path: Path, profile: str, library: str = "robot") -> Path:
+    """A log with one channel of JSON."""
+    with path.open("wb") as stream:
+        writer = McapWriter(stream)
+        writer.start(profile, library)
+        writer.add_message(writer.register_channel("/a", "json", 0), 1, b"{}", 1)
+        writer.finish()
+    return path
+
+
+METADATA = "rosbag2_bagfile_information:\n  relative_file_paths: [{}]\n"
+
+
+@pytest.mark.parametrize(
+    ("profile", "library", "metadata", "is_beside"),
+    [
+        ("ros1", "robot", "", True),
+        ("ros2", "robot", "", True),
+        ("", "robot", "", False),
+        ("ros2", "mcaptrack 0.1.0", "", False),
+        ("", "robot", METADATA.format("a.mcap"), True),
+        ("", "robot", METADATA.format("b.mcap"), False),
+        ("ros2", "mcaptrack 0.1.0", METADATA.format("a.mcap"), True),
+        ("", "robot", METADATA.format("[a"), True),
+        ("", "robot", "other: 1\n", False),
+    ],
+)
+def test_recordings_are_told_by_profile_and_by_the_metadata_beside_them(
+    tmp_path, profile, library, metadata, is_beside
+):
+    path = plain(tmp_path / "a.mcap", profile, library)
+    before = path.read_bytes()
+    if metadata:
+        (tmp_path / "metadata.yaml").write_text(metadata)
+    bag1(tmp_path / "a.bag", 3, 50)
+    result = done("ingest", tmp_path / "a.bag", "--into", path)
+    assert path.with_name("a.results.mcap").exists() == is_beside
+    assert (path.read_bytes() == before) == is_beside
+    assert ("results are in" in result.err) == is_beside
+    link = tmp_path / "elsewhere" / "link.mcap"
+    link.parent.mkdir()
+    link.symlink_to(path)
+    with log.read(link, sidecar=False) as opened:
+        from mcaptrack.ingest.place import recording_of
+
+        assert bool(recording_of(opened)) == is_beside
+
+
+def test_a_log_that_was_made_of_a_bag_takes_results_itself(path, tmp_path):
+    """It is a log of ours, whatever ROS tools can read of it; the bag stays as it is."""
+    out = tmp_path / "out.mcap"
+    (tmp_path / "gt.txt").write_text(MOT)
+    done("ingest", path.parent, "--truth", tmp_path / "gt.txt", "-o", out)
+    done("run", out, "-q")
+    assert not out.with_name("out.results.mcap").exists()
+    with log.read(out) as opened:
+        assert Provenance.from_metadata(opened.channel("/robot/front/tracks").metadata)
+
+
+def others(folder: Path) -> list[Path]:
+    """Recordings that are no logs yet, of every kind."""
+    bag1(folder / "a.bag", 3, 50)
+    bag2(folder / "files")
+    bag2(folder / "logs", "MCAP")
+    shutil.copytree(folder / "files", folder / "no metadata; 'x' $y")
+    (folder / "no metadata; 'x' $y" / "metadata.yaml").unlink()
+    writer = Writer2(folder / "packed", version=9)
+    writer.set_compression(CompressionMode.FILE, CompressionFormat.ZSTD)
+    with writer:
+        connection = writer.add_connection("/a", "std_msgs/msg/String", typestore=ROS2)
+        writer.write(connection, 1, b"\0\1\0\0\0\0\0\0")
+    files = [folder / "files" / "files.db3", folder / "packed" / "packed.db3.zstd"]
+    return [folder / "a.bag", *(folder / name for name in ("files", "logs", "no metadata; 'x' $y")), *files]
+
+
+def test_whatever_is_given_a_recording_that_is_no_log_says_how_to_make_one(tmp_path, monkeypatch):
+    """And what it says works."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "there").mkdir()
+    for number, recording in enumerate(others(tmp_path / "there")):
+        said = set()
+        for name, words in on_recording(Path("RECORDING"), tmp_path).items():
+            if not words or name == "ingest" or (number > 1 and name != "info"):
+                continue  # the kinds are told apart in one place
+            result = called(name, *(recording if word == Path("RECORDING") else word for word in words))
+            assert result.code == 1, (name, recording, result.err)
+            assert result.err.count("\n") == 1, (name, recording, result.err)
+            said.add(result.err.split("`")[1])
+        (command,) = said
+        program, *words = shlex.split(command)
+        assert (program, words[0]) == ("mcaptrack", "ingest")
+        (tmp_path / str(number)).mkdir()
+        monkeypatch.chdir(tmp_path / str(number))
+        done(*words)
+        (made,) = Path.cwd().iterdir()
+        done("info", made)
