@@ -73,7 +73,8 @@ def content(path: Path) -> dict[str, list]:
 
 
 def mcaptrack(*words: object) -> None:
-    assert not app([str(word) for word in words], standalone_mode=False), words
+    """Run a stage on a recording, and write into it."""
+    assert not app([*map(str, words), "--in-place"], standalone_mode=False), words
 
 
 @pytest.fixture(scope="module")

@@ -23,6 +23,7 @@ from mcaptrack.ingest import IngestOptions, ingest, plain_yaml
 from mcaptrack.ingest import database as bag_database
 from tests import bounded
 from tests.test_bags import ROS2, STRING1, database
+from tests.test_cli import start
 
 TOPICS = [(1, "/a", STRING1, "cdr", "")]
 
@@ -497,3 +498,40 @@ def test_a_message_of_a_bag_is_not_larger_than_one_of_a_log(commands, folder):
     outcome = commands.run("ingest", folder / "a.bag", "-o", folder.parent / "out.mcap")
     assert (outcome.code, outcome.err.count("lost: ")) == (3, 1), outcome
     assert "4294967295 bytes" in outcome.err
+
+
+def endless_database(path: Path) -> None:
+    """Not quite: more than a million messages."""
+    database(path, 3, [], TOPICS)
+    with sqlite3.connect(path) as db:
+        counted = "WITH RECURSIVE r(n) AS (SELECT 1 UNION ALL SELECT n + 1 FROM r LIMIT 1500000)"
+        db.execute(f"{counted} INSERT INTO messages(topic_id, timestamp, data) SELECT 1, n, x'00010000' FROM r")
+    db.close()
+
+
+def endless_bag(path: Path) -> None:
+    unfinished_bag(path, b"none", b"", 0)
+    said = b"".join(
+        struct.pack("<I", len(word)) + word for word in (b"topic=/a", b"type=a/B", b"message_definition=int8 a")
+    )
+    connection = record(said, op=b"\7", conn=bytes(4), topic=b"/a")
+    message = record(b"a", op=b"\2", conn=bytes(4), time=struct.pack("<II", 5, 5))
+    with path.open("ab") as stream:
+        stream.write(connection + message * 500_000)
+
+
+@pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM], ids=["Ctrl-C", "kill"])
+@pytest.mark.parametrize("make", [endless_database, endless_bag])
+def test_a_signal_ends_ingesting_and_leaves_nothing(folder, tmp_path, make, sent):
+    name = "a.db3" if make is endless_database else "a.bag"
+    make(folder / name)
+    before = (folder / name).stat()
+    process = start("ingest", folder / name, "-o", tmp_path / "out.mcap")
+    while not list(tmp_path.glob(".out.mcap.*.part")):  # it is at the messages
+        assert process.poll() is None, process.communicate()
+    process.send_signal(sent)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode in (128 + sent, -sent)
+    assert err == ""
+    assert list(tmp_path.iterdir()) == [folder]
+    assert (folder / name).stat() == before

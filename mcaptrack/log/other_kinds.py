@@ -34,7 +34,9 @@ def refuse_other_kinds(path: Path) -> None:
 def _folder(path: Path) -> str:
     if (path / "metadata.yaml").is_file():
         return "a rosbag2 folder"
-    return "a folder with a recording" if parts_in(path) else ""
+    parts = parts_in(path)
+    is_log = len(parts) == 1 and parts[0].suffix == ".mcap"  # which needs no folder
+    return "a folder with a recording" if parts and not is_log else ""
 
 
 def parts_in(folder: Path) -> list[Path]:
