@@ -11,9 +11,14 @@ if TYPE_CHECKING:
 _SOON_S: Final = 0.01
 
 
-def _terminated(number: int, _: object) -> NoReturn:
-    """A polite kill leaves like Ctrl-C does: what is half written is removed."""
-    raise SystemExit(128 + number)
+#: The signals that ended this command.
+_RECEIVED: Final[list[int]] = []
+
+
+def _end(number: int, _: object) -> NoReturn:
+    """Unwind, so that what is half written is removed: on Ctrl-C, and on a polite kill as well."""
+    _RECEIVED.append(number)
+    raise KeyboardInterrupt if number == signal.SIGINT else SystemExit(128 + number)
 
 
 def _once_more(unraisable: "UnraisableHookArgs") -> None:
@@ -32,7 +37,9 @@ def _once_more(unraisable: "UnraisableHookArgs") -> None:
 
 def main() -> None:
     """Run the command line. Ctrl-C is exit 130 from the first moment on, also while modules are still being loaded."""
-    signal.signal(signal.SIGTERM, _terminated)
+    signal.signal(signal.SIGTERM, _end)
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not where the caller ignores it, as nohup does
+        signal.signal(signal.SIGINT, _end)
     sys.unraisablehook = _once_more
     try:
         from mcaptrack.cli import app
@@ -41,11 +48,14 @@ def main() -> None:
         hush_libraries()
 
         app()
-    except KeyboardInterrupt:
-        sys.exit(130)
     except BrokenPipeError:  # whoever read our output has had enough
         sys.stderr.close()
         sys.exit(0)
+    except BaseException as error:
+        # Libraries turn a signal into errors of their own: one in the middle of an import becomes an ImportError.
+        if _RECEIVED and not (isinstance(error, SystemExit) and error.code in (0, None)):
+            sys.exit(128 + _RECEIVED[0])
+        raise
     finally:
         # All is done: a signal during Python's own goodbye ends the process without a word.
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGALRM):
