@@ -148,6 +148,11 @@ def sync_folder(folder: Path) -> None:
         os.close(handle)
 
 
+def follow_links(path: Path) -> Path:
+    """Where a path leads, links followed; links that lead in a circle are left for the one who opens the file."""
+    return Path(os.path.realpath(path))  # Path.resolve raises RuntimeError for these up to Python 3.12
+
+
 def is_same_file(one: Path, other: Path) -> bool:
     """Whether two paths lead to one file that is there."""
     return one.exists() and other.exists() and one.samefile(other)

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any, Final, Protocol, Self
 
 from mcaptrack import log, tables
+from mcaptrack.atomic import follow_links
 from mcaptrack.errors import McaptrackError
 from mcaptrack.export import TOPICS, Contents, default_folder, standing, topic_folder
 from mcaptrack.log.names import results_of
@@ -70,7 +71,7 @@ class _OfLog:
         self.opened = log.read(path)
         self.contents = Contents(self.opened)
         self.recording = self.contents.recording
-        self.where = path.resolve().parent
+        self.where = follow_links(path).parent
 
     def part(self, name: str) -> Any:
         return standing(self.contents, default_folder(self.opened.path), name) or self.contents.table(name)
@@ -85,7 +86,7 @@ class _OfLog:
 class _OfFolder:
     def __init__(self, folder: Path, recording: str) -> None:
         self.folder, self.recording = folder, recording
-        self.where = folder.resolve()
+        self.where = follow_links(folder)
         self._member = Path(f"recording={recording}", "part-0.parquet")
 
     def part(self, name: str) -> Any:
@@ -299,7 +300,7 @@ def _different(paths: Sequence[Path]) -> list[Path]:
     """Paths, each once; the results of a log that is among them are part of it."""
     by_place: dict[Path, Path] = {}
     for path in paths:
-        by_place.setdefault(path.resolve(), path)
+        by_place.setdefault(follow_links(path), path)
     results = {results_of(place) for place in by_place}
     return [path for place, path in by_place.items() if place not in results]
 

@@ -525,7 +525,7 @@ def endless_bag(path: Path) -> None:
 def test_a_signal_ends_ingesting_and_leaves_nothing(folder, tmp_path, make, sent):
     name = "a.db3" if make is endless_database else "a.bag"
     make(folder / name)
-    before = (folder / name).stat()
+    before = bounded.on_disk(folder)
     process = start("ingest", folder / name, "-o", tmp_path / "out.mcap")
     while not list(tmp_path.glob(".out.mcap.*.part")):  # it is at the messages
         assert process.poll() is None, process.communicate()
@@ -534,4 +534,4 @@ def test_a_signal_ends_ingesting_and_leaves_nothing(folder, tmp_path, make, sent
     assert process.returncode in (128 + sent, -sent)
     assert err == ""
     assert list(tmp_path.iterdir()) == [folder]
-    assert (folder / name).stat() == before
+    assert bounded.on_disk(folder) == before

@@ -325,6 +325,7 @@ def expand(paths: Sequence[Path], *, each: bool = False) -> list[Path]:
 
     Raises McaptrackError for a pattern that matches nothing.
     """
+    from mcaptrack.atomic import follow_links
     from mcaptrack.log import results_of
 
     out: list[Path] = []
@@ -337,8 +338,8 @@ def expand(paths: Sequence[Path], *, each: bool = False) -> list[Path]:
         if not found:
             raise McaptrackError(f"no file matches {path}")
         out += found
-    results = {results_of(path.resolve()) for path in out}
-    return [path for path in out if each or path.resolve() not in results]
+    results = {results_of(follow_links(path)) for path in out}
+    return [path for path in out if each or follow_links(path) not in results]
 
 
 def only_one_output(paths: Sequence[Path], output: Path | None) -> None:

@@ -186,6 +186,7 @@ def export(
     Example: mcaptrack export robot.mcap --topic /imu --format csv
     """
     from mcaptrack import log
+    from mcaptrack.atomic import follow_links
     from mcaptrack.export import default_folder, recording_name
     from mcaptrack.export import export as write_tables
 
@@ -198,7 +199,7 @@ def export(
     folders: dict[tuple[Path, str], Path] = {}
     for path in paths:
         other = folders.setdefault((output or default_folder(path), recording_name(path)), path)
-        if other.resolve() != path.resolve():
+        if follow_links(other) != follow_links(path):
             raise McaptrackError(
                 f"{other} and {path} would both be {recording_name(path)} in the tables; export them to two folders"
             )

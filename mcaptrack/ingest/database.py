@@ -13,7 +13,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Final
 
-from mcaptrack.atomic import refuse_special
+from mcaptrack.atomic import follow_links, refuse_special
 from mcaptrack.errors import McaptrackError
 from mcaptrack.ingest import unpack
 
@@ -78,7 +78,7 @@ class Database:
         return count or 0
 
     def _opened(self) -> sqlite3.Connection:
-        path, is_copy = self.path.resolve(), False
+        path, is_copy = follow_links(self.path), False
         # What a recorder that was killed left beside it belongs to it. It is read in a copy, since reading it writes.
         beside = [path.with_name(path.name + end) for end in ("-wal", "-journal")]
         left = [other for other in beside if other.is_file() and other.stat().st_size]

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from mcaptrack import log
-from mcaptrack.atomic import refuse_special
+from mcaptrack.atomic import follow_links, refuse_special
 from mcaptrack.errors import McaptrackError
 from mcaptrack.ingest import unpack
 from mcaptrack.ingest.bag_metadata import METADATA, Bag, holds_metadata, read_metadata
@@ -62,8 +62,8 @@ def open_bag(folder: Path) -> Source:
     for name in sorted(beside):
         warn(f"{folder / name} is not named in {METADATA}; it is left out", "left-out")
     for path in paths:
-        if not path.resolve().is_relative_to(folder.resolve()):
-            warn(f"{path} is a link out of the folder, to {path.resolve()}, which is read")
+        if not follow_links(path).is_relative_to(follow_links(folder)):
+            warn(f"{path} is a link out of the folder, to {follow_links(path)}, which is read")
     return source
 
 

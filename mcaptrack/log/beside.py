@@ -6,6 +6,7 @@ import shlex
 from pathlib import Path
 from typing import NamedTuple
 
+from mcaptrack.atomic import follow_links
 from mcaptrack.errors import McaptrackError
 from mcaptrack.log.journal import Journal, Unfit, find, find_content, journal_of, remove_words
 from mcaptrack.log.source import OpenFile
@@ -21,7 +22,7 @@ class Found(NamedTuple):
 
 def find_journal(path: Path, file: OpenFile) -> Found | None:
     """What lies beside an open log, for whoever only reads; None if nothing does."""
-    real_path = path.resolve()
+    real_path = follow_links(path)
     try:
         journal = find(real_path, file)
         state = journal.state() if journal else None

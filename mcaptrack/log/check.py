@@ -14,6 +14,7 @@ import numpy as np
 from mcap.opcode import Opcode
 
 from mcaptrack import notices
+from mcaptrack.atomic import follow_links
 from mcaptrack.errors import McaptrackError
 from mcaptrack.log import records
 from mcaptrack.log.beside import changed, find_journal
@@ -96,13 +97,13 @@ def best_content(path: Path, source: Source, file: OpenFile) -> Source:
     found = find_journal(path, file)
     if found is None:
         return source
-    before = found.journal.overlay() if found.journal else find_content(path.resolve(), file)
+    before = found.journal.overlay() if found.journal else find_content(follow_links(path), file)
     if before is None or (not found.journal and is_sound(source)) or not is_sound(before):
         notices.warn(found.words, "journal")
         return source
     notices.warn(
         f"{path} was left half written by a change that was interrupted; it is saved as it was before, by what "
-        f"{journal_of(path.resolve()).name} holds",
+        f"{journal_of(follow_links(path)).name} holds",
         "journal",
     )
     return before

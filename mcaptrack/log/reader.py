@@ -12,6 +12,7 @@ from typing import NamedTuple, Self, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from mcaptrack.atomic import follow_links
 from mcaptrack.errors import McaptrackError
 from mcaptrack.log import new_end, records
 from mcaptrack.log.chunks import MAX_NS
@@ -48,7 +49,7 @@ class Log:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.real_path = path.resolve()
+        self.real_path = follow_links(path)
         self._lock: int | None = None
         self.snapshot = take_snapshot(path)
         self.index, self._messages = self.snapshot.index, self.snapshot.messages
