@@ -17,7 +17,7 @@ from mcap.reader import make_reader
 from tests import bounded
 from tests.bag_mutants import KINDS, mutant
 
-MUTANTS = int(os.environ.get("MUTANTS", "99"))
+MUTANTS = int(os.environ.get("MUTANTS", "27"))
 FIRST = int(os.environ.get("FIRST_MUTANT", "0"))
 
 
