@@ -109,6 +109,7 @@ def on_recording(path: Path, elsewhere: Path) -> dict[str, list[object]]:
         "view": [],  # serves until it is interrupted, and opens the log like all others
         "train": [],  # needs torch, and opens logs like all others
         "demo": [],  # takes no log
+        "docs": [],
     }
 
 
