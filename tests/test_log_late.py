@@ -84,7 +84,7 @@ def early(tmp_path_factory) -> Path:
 def ours(request, early, tmp_path_factory) -> Path:
     """A log with everything in it, whose messages are later than they were."""
     path = tmp_path_factory.mktemp("late") / "late.mcap"
-    with log.read(early) as opened, log.create(path, log.profile(opened)) as writer:
+    with log.read(early) as opened, log.create(path, log.header(opened)[0]) as writer:
         middle = (opened.start_ns + opened.end_ns) // 2
         later = MAX_NS + 1 - (0 if request.param == "all of them" else middle)
         numbers = {}

@@ -490,10 +490,10 @@ MISTAKES = {
         ["--quality", "60"],
         "--quality is H.264's constant rate factor, a number from 1 to 51 (1",
     ),
-    "a JPEG quality of nothing": (["--image-format", "jpeg", "--quality", "0"], "a number from 1 to 100 (100 is best)"),
+    "a JPEG quality of nothing": (["--image-format", "jpeg", "--quality", "0"], "from 1 to 100, not 0"),
     "a quality of PNG": (["--image-format", "png", "--quality", "9"], "PNG keeps pictures exactly as they are"),
     "key pictures of JPEG": (["--image-format", "jpeg", "--keyframe-interval-s", "1"], "as jpeg, every picture stands"),
-    "no time between key pictures": (["--keyframe-interval-s", "0"], "a number from 0.01 to 60, not 0"),
+    "no time between key pictures": (["--keyframe-interval-s", "0"], "from 0.01 to 60, not 0"),
     "labels": (["--quality", "20"], "labels.txt is a label file; --quality is for videos"),
 }
 
