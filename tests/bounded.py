@@ -1,4 +1,4 @@
-"""Commands on hostile input, each in a process of its own with bounds on its time and memory.
+"""Commands on hostile input, each in a process of its own with bounds on its time and memory, and commands that are ended.
 
 ``python -m tests.bounded`` loads the command line once, then forks for each line of JSON on its stdin.
 """
@@ -12,6 +12,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -22,12 +23,27 @@ CPU_S, MEMORY_BYTES = 5, 10**9
 
 
 class Outcome(NamedTuple):
-    """How a command ended: ``code`` is negative if a signal ended it."""
+    """How a command ended: ``code`` is negative if a signal ended it.
+
+    ``signal_cpu_s`` is the processor time that it had taken when it got the signal that it was to get.
+    """
 
     code: int
     err: str
     cpu_s: float
     peak_bytes: int
+    signal_cpu_s: float | None = None
+
+
+class Moment(NamedTuple):
+    """When a command gets which signal: as soon as it is about to do that with a file in this folder.
+
+    ``deed`` is read, write or publish (put a file in the place of another), or serve, wherever that is.
+    """
+
+    deed: str
+    folder: Path
+    signal: int
 
 
 @contextmanager
@@ -57,7 +73,14 @@ class Commands:
 
     def run(self, *words: object) -> Outcome:
         """Run a command of mcaptrack within the bounds."""
-        print(json.dumps([str(word) for word in words]), file=self._process.stdin, flush=True)
+        return self._ask([str(word) for word in words], None)
+
+    def end(self, moment: Moment, *words: object) -> Outcome:
+        """Run a command in the folder of that moment until then, without bounds on its memory."""
+        return self._ask([str(word) for word in words], moment._replace(folder=str(moment.folder)))
+
+    def _ask(self, words: list[str], moment: Moment | None) -> Outcome:
+        print(json.dumps([words, moment]), file=self._process.stdin, flush=True)
         return Outcome(*json.loads(self._process.stdout.readline()))
 
 
@@ -68,31 +91,59 @@ def on_disk(*folders: Path) -> dict[str, tuple[int, bytes]]:
 
 
 def _serve(lines: Iterable[str]) -> None:
+    from mcaptrack import export, pipeline  # noqa: F401
     from mcaptrack.__main__ import main
     from mcaptrack.cli import app  # noqa: F401
     from mcaptrack.ingest import database, ingest, plain_yaml, rosbag1, rosbag2  # noqa: F401
 
     for line in lines:
-        with tempfile.TemporaryFile() as err:
+        words, moment = json.loads(line)
+        with tempfile.TemporaryFile() as err, tempfile.TemporaryFile() as noted:
             child = os.fork()
             if child == 0:
-                _run(main, json.loads(line), err.fileno())
+                _run(main, words, err.fileno(), (Moment(*moment), noted.fileno()) if moment else None)
             _, status, used = os.wait4(child, 0)
             err.seek(0)
-            words = err.read().decode("utf-8", "replace")
-        outcome = Outcome(
-            os.waitstatus_to_exitcode(status), words, used.ru_utime + used.ru_stime, used.ru_maxrss * 1024
-        )
-        print(json.dumps(outcome), flush=True)
+            said = err.read().decode("utf-8", "replace")
+            noted.seek(0)
+            signal_cpu_s = float(noted.read() or "nan")
+        code, cpu_s = os.waitstatus_to_exitcode(status), used.ru_utime + used.ru_stime
+        print(json.dumps(Outcome(code, said, cpu_s, used.ru_maxrss * 1024, signal_cpu_s)), flush=True)
 
 
-def _run(main: object, words: list[str], err: int) -> None:
+def _get_signal(moment: Moment, noted: int) -> None:
+    """Send this process a signal at that moment."""
+    left, folder = [moment], str(moment.folder)
+
+    def watch(event: str, given: tuple[object, ...]) -> None:
+        deed = {"open": "read", "os.mkdir": "write", "os.rename": "publish", "socket.bind": "serve"}.get(event)
+        if deed is None or not left:
+            return
+        if event == "open":
+            path, _, flags = given
+            if not isinstance(path, str | os.PathLike):
+                return
+            deed = "write" if flags & (os.O_CREAT | os.O_WRONLY | os.O_RDWR) else "read"
+        is_there = deed == "serve" or os.path.abspath(os.fspath(given[0])).startswith(folder)
+        if is_there and deed == moment.deed:
+            left.clear()
+            os.write(noted, str(time.process_time()).encode())
+            os.kill(os.getpid(), moment.signal)
+
+    sys.addaudithook(watch)
+
+
+def _run(main: object, words: list[str], err: int, moment: tuple[Moment, int] | None) -> None:
     """In the child: run the command and be gone."""
     code = 99
     try:
-        with Path("/proc/self/statm").open() as stream:
-            now = int(stream.read().split()[0]) * resource.getpagesize()
-        resource.setrlimit(resource.RLIMIT_AS, (now + MEMORY_BYTES,) * 2)
+        if moment is None:
+            with Path("/proc/self/statm").open() as stream:
+                now = int(stream.read().split()[0]) * resource.getpagesize()
+            resource.setrlimit(resource.RLIMIT_AS, (now + MEMORY_BYTES,) * 2)
+        else:
+            os.chdir(moment[0].folder)
+            _get_signal(*moment)
         resource.setrlimit(resource.RLIMIT_CPU, (CPU_S, CPU_S + 1))
         signal.alarm(60)  # for what waits without computing
         os.dup2(err, 2)

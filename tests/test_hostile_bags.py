@@ -520,8 +520,7 @@ def endless_bag(path: Path) -> None:
         stream.write(connection + message * 500_000)
 
 
-@pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM], ids=["Ctrl-C", "kill"])
-@pytest.mark.parametrize("make", [endless_database, endless_bag])
+@pytest.mark.parametrize(("make", "sent"), [(endless_database, signal.SIGINT), (endless_bag, signal.SIGTERM)])
 def test_a_signal_ends_ingesting_and_leaves_nothing(folder, tmp_path, make, sent):
     name = "a.db3" if make is endless_database else "a.bag"
     make(folder / name)

@@ -1,0 +1,75 @@
+"""Ctrl-C and SIGTERM end every command soon, as such, and leave the files as they were."""
+
+from __future__ import annotations
+
+import shlex
+import shutil
+import signal
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+from tests import bounded
+from tests.commands import GROUP, done, made_log
+from tests.test_effects import CASES
+
+#: Seconds of processor time that a command may still take: the time on a clock depends on what else the machine does.
+SOON_S = 2
+SIGNALS = {"Ctrl-C": signal.SIGINT, "kill": signal.SIGTERM}
+#: Where the case without options of the other tests isn't what takes longest, or doesn't do all that a command does.
+LINES = {
+    "tune": "tune a.mcap --trials 1 --search min-iou -o b.toml",
+    "docs": "docs tables",
+    "run": "run fresh.mcap",
+    "train": "train a.mcap -o b --epochs 1 --device cpu",
+}
+#: What is looked at of a command, where it is not the reading, and the writing and publishing of those that write.
+DEEDS = {"demo": ["write"], "tune": ["read", "write"], "view": ["read", "serve"]}
+MOMENTS = [
+    (command, deed)
+    for command, known in GROUP.commands.items()
+    for deed in DEEDS.get(command, ["read"] if known.reads else ["read", "write", "publish"])
+]
+DOCS = Path(__file__).parent.parent / "docs"
+
+
+def line_of(command: str) -> str:
+    return LINES.get(command) or CASES[command]["json"].base
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(entry): entry.read_bytes() for entry in folder.rglob("*") if entry.is_file()}
+
+
+@pytest.fixture(scope="module")
+def commands():
+    with bounded.commands() as running:
+        yield running
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    """A folder with what commands are ended on. None of them changes it, or all tests after that fail."""
+    folder = tmp_path_factory.mktemp("ended")
+    made_log(folder)
+    done("ingest", folder / "clip.mp4", "--truth", folder / "truth.txt", "-o", folder / "fresh.mcap")
+    shutil.rmtree(folder / "a.tables")
+    for path in folder.glob("*.layout.json"):
+        path.unlink()
+    return folder
+
+
+@pytest.mark.parametrize("number", range(len(MOMENTS)), ids=[" ".join(moment) for moment in MOMENTS])
+def test_a_signal_ends_a_command_and_leaves_what_was_there(number, commands, folder):
+    command, deed = MOMENTS[number]
+    if command == "train" and not find_spec("torch"):
+        pytest.skip("train needs torch")
+    where = DOCS if command == "docs" else folder
+    name = list(SIGNALS)[number % 2]
+    before = contents(folder)
+    outcome = commands.end(bounded.Moment(deed, where, SIGNALS[name]), *shlex.split(line_of(command)))
+    assert outcome.code == 128 + SIGNALS[name], outcome
+    assert "Traceback" not in outcome.err
+    assert outcome.cpu_s - outcome.signal_cpu_s < SOON_S
+    assert contents(folder) == before
