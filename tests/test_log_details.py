@@ -1,0 +1,212 @@
+"""Where findings point to, what exactly is lost, what a fingerprint covers, and how large chunks grow."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from mcap.reader import make_reader
+from mcap.stream_reader import StreamReader
+from mcap.writer import IndexType, Writer
+
+from mcaptrack import log
+from tests.test_damage import FORTY
+from tests.test_log import SCHEMA, write_stock
+
+MIB = 2**20
+
+
+def summary_of(path: Path):
+    """The summary as the stock reader has it."""
+    with path.open("rb") as stream:
+        return make_reader(stream).get_summary()
+
+
+@pytest.mark.parametrize(
+    ("counts", "first"), [((2, 2), 0), ((0, 2), 1), ((2, 0), 0), ((0, 0), 0), ((0, 1, 1), 1)], ids=str
+)
+def test_the_channel_of_a_topic_is_the_first_that_has_messages(tmp_path, counts, first):
+    path = tmp_path / "a.mcap"
+    with log.create(path) as writer:
+        for number, count in enumerate(counts):
+            channel = writer.add_channel("t", SCHEMA, "json", {"number": str(number)}, another=True)
+            for t_ns in range(count):
+                writer.add_message(channel, t_ns, 0, b"{}")
+    with log.read(path) as opened:
+        assert opened.channel("t").metadata == {"number": str(first)}
+        assert opened.channel("t").messages == sum(counts)
+
+
+@pytest.mark.parametrize("options", [{}, {"use_chunking": False}, {"index_types": IndexType.NONE}], ids=str)
+def test_a_schema_goes_with_the_last_channel_that_has_it(tmp_path, options):
+    """One that no channel ever had stays."""
+    path = tmp_path / "a.mcap"
+
+    def write() -> None:
+        with path.open("wb") as stream:
+            writer = Writer(stream, **options)
+            writer.start()
+            schemas = {name: writer.register_schema(name, "jsonschema", b"{}") for name in ("own", "shared", "unused")}
+            numbers = {
+                topic: writer.register_channel(topic, "json", schemas[schema])
+                for topic, schema in (("a", "own"), ("b", "shared"), ("c", "shared"))
+            }
+            for topic, number in numbers.items():
+                writer.add_message(number, 1, topic.encode(), 1)
+            writer.finish()
+
+    for dropped, left in (
+        (["a"], {"shared", "unused"}),
+        (["b"], {"own", "shared", "unused"}),
+        (["b", "c"], {"own", "unused"}),
+        (["a", "b", "c"], {"unused"}),
+    ):
+        write()
+        with log.read(path) as opened, log.extend(opened, drop=dropped):
+            pass
+        with path.open("rb") as stream:
+            described = {record.name for record in StreamReader(stream).records if hasattr(record, "encoding")}
+        assert described == left, dropped
+        assert {schema.name for schema in summary_of(path).schemas.values()} == left, dropped
+
+
+def prints(path: Path) -> tuple[str, str]:
+    with log.read(path) as opened:
+        return opened.fingerprint(), opened.fingerprint("a")
+
+
+def test_a_fingerprint_is_another_when_anything_has_changed(tmp_path):
+    """The one of a channel only when something of the channel has."""
+    path = tmp_path / "a.mcap"
+
+    def write(channel="x", other="x", metadata="x", attachment=b"x", payload=b"x", **options) -> tuple[str, str]:
+        with path.open("wb") as stream:
+            writer = Writer(stream, **options)
+            writer.start()
+            schema = writer.register_schema(*SCHEMA)
+            numbers = [writer.register_channel(t, "json", schema, {"m": m}) for t, m in (("a", channel), ("b", other))]
+            for number in numbers:
+                writer.add_message(number, 1, payload if number == numbers[0] else b"x", 1)
+            writer.add_metadata("about", {"what": metadata})
+            writer.add_attachment(1, 2, "notes", "text/plain", attachment)
+            writer.finish()
+        return prints(path)
+
+    for options in ({"chunk_size": 1}, {"chunk_size": 1, "enable_crcs": False}, {"use_chunking": False}):
+        whole, of_channel = write(**options)
+        assert write(**options) == (whole, of_channel)
+        seen = {whole}
+        for change in ({"metadata": "y"}, {"attachment": b"y"}, {"channel": "y"}, {"payload": b"y"}, {"other": "y"}):
+            other, own = write(**change, **options)
+            seen.add(other)
+            if change.keys() != {"other"}:  # the stock writer describes both channels in one chunk
+                assert (own != of_channel) == bool(change.keys() & {"channel", "payload"}), (change, options)
+        assert len(seen) == 6, options
+
+
+@pytest.mark.parametrize(("kind", "limit"), [("rows", MIB), ("views", MIB), ("media", 4 * MIB)])
+def test_a_chunk_is_closed_when_it_is_full(tmp_path, kind, limit):
+    path = tmp_path / "a.mcap"
+    size = limit // 4
+    with log.create(path) as writer:
+        number = writer.add_channel("a", SCHEMA, "json", {}, kind)
+        for t_ns in range(13):
+            writer.add_message(number, t_ns, t_ns, bytes(size))
+    sizes = [chunk.uncompressed_size for chunk in summary_of(path).chunk_indexes]
+    assert all(limit <= found < limit + size + 1000 for found in sizes[:-1])
+    assert len(sizes) == 4
+
+
+def test_messages_outside_of_chunks_come_into_chunks_that_are_closed_when_full(tmp_path):
+    path = tmp_path / "a.mcap"
+    write_stock(path, [("a", t_ns, t_ns, bytes(MIB // 4)) for t_ns in range(13)], use_chunking=False)
+    with log.read(path) as opened, log.extend(opened):
+        pass
+    assert len(summary_of(path).chunk_indexes) == 4
+    assert max(chunk.uncompressed_size for chunk in summary_of(path).chunk_indexes) < 1.3 * MIB
+
+
+@pytest.fixture
+def chunked(tmp_path) -> Path:
+    path = tmp_path / "a.mcap"
+    write_stock(path, FORTY, chunk_size=600, enable_data_crcs=True)
+    return path
+
+
+def flip(path: Path, at: int) -> None:
+    raw = bytearray(path.read_bytes())
+    raw[at] ^= 0xFF
+    path.write_bytes(raw)
+
+
+def places(path: Path) -> dict[str, tuple[int, int]]:
+    """A byte to damage, as the stock reader's summary has the places, and the byte that a finding has to name."""
+    summary, size = summary_of(path), len(path.read_bytes())
+    chunk = summary.chunk_indexes[1]
+    index_at = min(chunk.message_index_offsets.values())
+    attachment, metadata = summary.attachment_indexes[0], summary.metadata_indexes[0]
+    with path.open("rb") as stream:
+        start = next(r.summary_start for r in StreamReader(stream).records if type(r).__name__ == "Footer")
+    return {
+        "bad-chunk": (chunk.chunk_start_offset + chunk.chunk_length - 5, chunk.chunk_start_offset),
+        "wrong-index": (index_at + 9 + 2 + 4 + 8, index_at),
+        "attachment-checksum": (attachment.offset + attachment.length - 6, attachment.offset),
+        "bad-metadata": (metadata.offset + 9 + 3, metadata.offset),
+        "summary-checksum": (start + 15, start),
+        "data-checksum": (start - 13 + 9, start - 13),
+        "cut-off": (size - 1, size),
+        "magic": (0, 0),
+    }
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        "bad-chunk",
+        "wrong-index",
+        "attachment-checksum",
+        "bad-metadata",
+        "summary-checksum",
+        "data-checksum",
+        "cut-off",
+        "magic",
+    ],
+)
+def test_a_finding_names_the_byte_where_the_record_begins(chunked, kind):
+    at, where = places(chunked)[kind]
+    flip(chunked, at)
+    found = {finding.kind: finding for finding in log.check(chunked).findings}
+    assert found[kind].where == where
+    assert found[kind].times == 1
+
+
+def test_what_is_lost_is_listed_once_and_nothing_else(chunked, tmp_path):
+    saved = tmp_path / "saved.mcap"
+    whole = chunked.read_bytes()
+    chunk = summary_of(chunked).chunk_indexes[1]
+    start, end = chunk.chunk_start_offset, chunk.chunk_start_offset + chunk.chunk_length
+    held = [n for n in range(40) if chunk.message_start_time <= 10 * n <= chunk.message_end_time]
+    flip(chunked, end - 5)
+    lost = log.recover(chunked, saved).lost
+    assert len(lost) == 1 + len({"abc"[n % 3] for n in held})
+    assert lost[0].startswith(f"byte {start} to ")
+    assert "it held messages of a, b, c" in lost[0]
+    for topic, words in zip("abc", lost[1:], strict=True):
+        count = sum("abc"[n % 3] == topic for n in range(40))
+        gone = sum("abc"[n % 3] == topic for n in held)
+        assert words == f"{topic}: {count - gone} of {count} messages are saved"
+    chunked.write_bytes(whole[:end])
+    lost = log.recover(chunked, saved).lost
+    assert lost == [f"byte {end}: the file is cut off; if anything stood behind, it is lost"]
+    attachment = summary_of_bytes(tmp_path, whole).attachment_indexes[0]
+    chunked.write_bytes(whole)
+    flip(chunked, attachment.offset + attachment.length - 6)
+    lost = log.recover(chunked, saved).lost
+    assert len(lost) == 1
+    assert lost[0].startswith(f"byte {attachment.offset} to {attachment.offset + attachment.length}: ")
+
+
+def summary_of_bytes(folder: Path, whole: bytes):
+    path = folder / "whole.mcap"
+    path.write_bytes(whole)
+    return summary_of(path)
