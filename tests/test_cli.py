@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 
 from mcaptrack import __version__, demo, log
+from mcaptrack.cli.demo import _next_commands
 from mcaptrack.schema import COUNTS, EVENTS, EventKind
 from tests.worlds import small_scene, write_clip
 
@@ -475,6 +476,10 @@ def test_the_demonstration(tmp_path, monkeypatch):
     for words in ("SORT", "re-tracked", "identity switches", "demo.mcap", "Lichtblick"):
         assert words in shown.stdout
     names = sorted(path.name for path in (tmp_path / "d").iterdir())
+    proposed = shown.stdout.partition("See more:\n")[2].splitlines()
+    assert len(proposed) == 4
+    for line in proposed:  # works as it stands, where the demonstration was called
+        subprocess.run(line, shell=True, capture_output=True, check=True, env=os.environ | {"PATH": "/usr/bin:/bin"})
     assert names == [
         *(f"demo{end}" for end in (*LAYOUTS, ".mcap", ".mp4", ".predictions.layout.json", ".tables")),
         "ground_plane.txt",
@@ -483,6 +488,25 @@ def test_the_demonstration(tmp_path, monkeypatch):
     again = subprocess.run(run, capture_output=True, text=True, check=False)
     assert again.returncode == 1
     assert "exists; give another folder with -o, or --force" in again.stderr
+
+
+def test_the_demonstration_proposes_commands_as_the_shell_finds_them(tmp_path, monkeypatch):
+    for folder in (".venv", "other"):
+        program = tmp_path / folder / "bin" / "mcaptrack"
+        program.parent.mkdir(parents=True)
+        program.write_text("#!/bin/sh\n")
+        program.chmod(0o755)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", [str(tmp_path / ".venv" / "bin" / "mcaptrack"), "demo"])
+    for path, called in {
+        ".venv/bin": "mcaptrack",
+        "other/bin": ".venv/bin/mcaptrack",
+        "": ".venv/bin/mcaptrack",
+    }.items():
+        monkeypatch.setenv("PATH", str(tmp_path / path) if path else "/nowhere")
+        assert _next_commands(Path("a b.mcap"))[0] == f"{called} info 'a b.mcap'"
+    monkeypatch.chdir(tmp_path / "other")
+    assert _next_commands(Path("a.mcap"))[0] == f"{tmp_path}/.venv/bin/mcaptrack info a.mcap"
 
 
 def test_a_log_is_checked_and_what_is_wrong_stands_in_a_table(finished, tmp_path):

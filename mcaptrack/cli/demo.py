@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import sys
+from importlib.util import find_spec
 from pathlib import Path
+from shlex import quote
+from shutil import which
 from typing import Annotated, Final
 
 from mcaptrack.cli import common
@@ -77,9 +81,33 @@ def demo(
         f"tables   {default_folder(target)}",
         "",
         f"Open the log in Foxglove, or in Lichtblick (https://{_LICHTBLICK}): open local file, then import a layout.",
-        f"Ask the tables:  duckdb -c \"from '{default_folder(target)}/tracks/*/*.parquet' limit 5\"",
-        f"See more:        mcaptrack info {target}    mcaptrack evaluate {target}",
+        "See more:",
+        *(f"  {line}" for line in _next_commands(target)),
     )
+
+
+def _next_commands(target: Path) -> list[str]:
+    """Command lines that can be given where this one was."""
+    command, log = _how_called(), quote(str(target))
+    lines = [f"{command} {name} {log}" for name in ("info", "evaluate", "report")]
+    if find_spec("duckdb") is None:
+        lines.append(f"{_from_here(Path(sys.executable))} -m pip install duckdb")
+    return [*lines, f'{command} query {log} "from tracks limit 5"']
+
+
+def _how_called() -> str:
+    """What a shell finds the running program by: its name, otherwise its path."""
+    program = Path(sys.argv[0])
+    found = which(program.name)
+    if program.name.endswith(".py") or not program.is_file():  # python -m mcaptrack
+        return f"{_from_here(Path(sys.executable))} -m mcaptrack"
+    return program.name if found and Path(found).samefile(program) else _from_here(program)
+
+
+def _from_here(path: Path) -> str:
+    """A path as it is written in the working folder."""
+    path = Path.cwd() / path
+    return quote(str(path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path))
 
 
 def _side_by_side(sort: dict[str, float], retracked: dict[str, float]) -> list[str]:
