@@ -39,10 +39,15 @@ class Place:
                 f"{beside} holds results of {opened.path}; --in-place would leave them there and make others: remove "
                 f"{beside.name} first, or leave --in-place out"
             )
-        if self.wanted is not None:
-            self.why = "--sidecar was given" if self.wanted else ""
-            return self.wanted
+        if self.wanted:
+            self.why = "--sidecar was given"
+            return True
         recording = recording_of(opened)
+        if self.wanted is False:
+            self.why = (
+                f"--in-place was given; ROS tools may stumble over them, for it is {recording}" if recording else ""
+            )
+            return False
         if beside.exists():
             self.why = "earlier results are there"
             return True
