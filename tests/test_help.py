@@ -20,6 +20,7 @@ from tests.commands import GROUP, called
 ROOT = Path(__file__).parent.parent
 PAGE = (ROOT / "docs" / "options.md").read_text()
 COMMANDS = GROUP.commands
+UNITS = {"s": "second", "m": "metre", "px": "pixel", "hz": "per second", "fps": "per second"}
 EVERY_COMMAND = pytest.mark.parametrize("command", sorted(COMMANDS))
 
 
@@ -105,6 +106,12 @@ class TestHelp:
                 option.name
             )  # understood where it stands alone
         assert len(COMMANDS[command].help) > 40
+
+    @EVERY_COMMAND
+    def test_units_in_names_are_said_in_words(self, command):
+        for option in shown(command):
+            unit = max(option.opts, key=len).rpartition("-")[2]
+            assert UNITS.get(unit, "") in option.help.lower(), option.name
 
     def test_what_means_the_same_has_the_same_name_everywhere(self):
         names = defaultdict(set)

@@ -48,14 +48,15 @@ def _main(
         bool, typer.Option("--version", help="Print the version.", is_eager=True, callback=_version, show_default=False)
     ] = False,
 ) -> None:
-    """Find people in a video or a log, track them, repair the tracks, predict where they go, and write it all back.
+    """Detect and track people in a video or a log, repair the tracks, predict where people go, and write the results
+    into the log.
 
     Start with `mcaptrack demo`, or with `mcaptrack ingest video.mp4` and `mcaptrack run video.mcap`.
     """
 
 
-_MAKE, _RUN, _LOOK = "Make a log", "Detect, track, predict", "Look at what was found"
-_MEASURE, _KEEP = "Measure and improve", "Check and mend logs"
+_MAKE, _RUN, _LOOK = "Make a log", "Detect, track, predict", "Look at results"
+_MEASURE, _KEEP = "Measure and improve", "Check and repair logs"
 register(app, _MAKE, "ingest", ingest)
 register(app, _MAKE, "demo", demo)
 add_stages(app, _RUN)

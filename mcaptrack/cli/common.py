@@ -83,10 +83,14 @@ def option(
     return made
 
 
-Output = Annotated[
-    Path | None, option("--output", "-o", panel=FILES, help="Write to this instead; the input stays as it is.")
-]
-Printed = Annotated[Path | None, option("--output", "-o", panel=FILES, help="Print to this file.")]
+def output(shown: str | bool = False) -> Any:
+    """Where to write; ``shown`` says where it goes unless this is given."""
+    words = "Write to this file; the input stays unchanged."
+    return option("--output", "-o", panel=FILES, help=words, show_default=shown)
+
+
+Output = Annotated[Path | None, output()]
+Printed = Annotated[Path | None, option("--output", "-o", panel=FILES, help="Write to this file instead of stdout.")]
 Sidecar = Annotated[
     bool | None,
     option(
@@ -96,8 +100,8 @@ Sidecar = Annotated[
         "Recordings that ROS tools read stay as they are unless --in-place is given.",
     ),
 ]
-Force = Annotated[bool, option("--force", panel=FILES, help="Replace the file that is there.")]
-Json = Annotated[bool, option("--json", panel=COMMON, help="Print data for programs.")]
+Force = Annotated[bool, option("--force", panel=FILES, help="Overwrite the output file if it exists.")]
+Json = Annotated[bool, option("--json", panel=COMMON, help="Print JSON for programs.")]
 Quiet = Annotated[bool, option("--quiet", "-q", panel=COMMON, help="Say nothing but errors and warnings.")]
 Verbose = Annotated[
     bool, option("--verbose", "-v", panel=COMMON, help="Print more, such as where each option was set.")
@@ -107,7 +111,8 @@ Config = Annotated[
     option(
         "--config",
         panel=COMMON,
-        help="Read options from this file, instead of mcaptrack.toml here (tuning only) and in your config folder.",
+        help="Read options from this file, instead of mcaptrack.toml in the working folder (tuning only) and in your "
+        "config folder.",
         is_eager=True,
         callback=read_config,
     ),
@@ -119,7 +124,7 @@ GroundPlane = Annotated[
     option(
         "--ground-plane",
         panel=LABELS,
-        help="File with a 3x3 homography from pixels to metres.",
+        help="File with a 3x3 homography from pixels to metres on the ground.",
     ),
 ]
 Point = Annotated[

@@ -20,7 +20,7 @@ _GATE_M: Final = 1.0
 @common.one_line
 def demo(
     output: Annotated[
-        Path, common.option("--output", "-o", panel=common.FILES, help="Folder for what it makes.")
+        Path, common.option("--output", "-o", panel=common.FILES, help="Folder for what it makes.", show_default=True)
     ] = Path("mcaptrack-demo"),
     force: common.Force = False,
     json: common.Json = False,
@@ -28,10 +28,10 @@ def demo(
     verbose: common.Verbose = False,
     config: common.Config = None,
 ) -> None:
-    """Draw a scene with known truth, run everything on it, and show what re-tracking mends.
+    """Draw a scene with known ground truth, run everything on it, and compare SORT with re-tracking.
 
-    People cross, meet and part, one is hidden for a second, a tree sways and the camera shakes a little: the ways in
-    which tracking fails. Makes a video, a log, tables and layouts.
+    The scene has what makes tracking fail: people who cross, who meet and part, who are hidden for a second, a tree
+    that sways, a camera that shakes a little. Writes a video, a log, tables and layouts.
 
     Example: mcaptrack demo -o demo
     """

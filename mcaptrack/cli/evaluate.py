@@ -44,7 +44,7 @@ def evaluate(
         common.option(
             "--truth",
             panel=common.LABELS,
-            help="True tracks for files of tracks: one file for each, matched by name or in order.",
+            help="Ground truth for files of tracks: one file for each, matched by name or in order.",
             show_default=False,
         ),
     ] = None,
@@ -84,7 +84,7 @@ def evaluate(
     verbose: common.Verbose = False,
     config: common.Config = None,
 ) -> None:
-    """Score tracks and forecasts against the truth.
+    """Score tracks and predictions against ground truth.
 
     Reads /camera/truth and the tracks of a log; or files of tracks, with --truth: MOTChallenge (by the rules of MOT15,
     or of MOT16 and later where the truth names classes), KITTI tracking, Parquet as `mcaptrack export` writes it, and

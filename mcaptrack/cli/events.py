@@ -37,12 +37,14 @@ def events(
 ) -> None:
     """Write events of tracks (begin, end, identity switches) and errors of predictions into the log.
 
-    Events are where tracks begin and end, and which of them re-tracking joined or split; where the log has
-    /camera/truth also missed people, false tracks and identity switches, matched as `mcaptrack evaluate` does. They go
-    to /camera/tracks/events (rows), .../events/view/log (text) and /camera/tracks/counts (totals frame by frame), and
-    the same for /camera/retracks. Unless --topic names channels, errors of predictions against the truth and against
-    re-tracked tracks go to /camera/predictions/errors and, frame by frame, .../scores; and the same for
-    /camera/retracks/predictions. `mcaptrack run` does all this too.
+    Events are the begin and end of tracks, and which tracks re-tracking joined or split; if the log has /camera/truth
+    also missed people, false tracks and identity switches, matched as in `mcaptrack evaluate`. They go to
+    /camera/tracks/events (rows), .../events/view/log (text) and /camera/tracks/counts (totals frame by frame); for
+    /camera/retracks likewise.
+
+    Errors of predictions, against ground truth and against re-tracked tracks, go to /camera/predictions/errors and,
+    frame by frame, to .../scores; for /camera/retracks/predictions likewise. With --topic they are left out. `mcaptrack
+    run` writes all this, too.
 
     Example: mcaptrack events log.mcap --similarity metres --gate-m 1
     """

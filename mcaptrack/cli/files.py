@@ -27,9 +27,10 @@ def check(
     verbose: common.Verbose = False,
     config: common.Config = None,
 ) -> None:
-    """Look at every byte of a log: structure, checksums, indexes, statistics, the order of messages.
+    """Check every byte of a log: structure, checksums, indexes, statistics, order of messages.
 
-    Errors make the exit code 1; warnings say what could be better. `mcaptrack recover` saves what is whole.
+    The exit code is 1 if there are errors; warnings are about what could be better. `mcaptrack recover` saves what is
+    intact.
 
     Example: mcaptrack check log.mcap
     """
@@ -94,17 +95,17 @@ def _print_checked(checked: Checked, quiet: bool) -> None:
 @common.one_line
 def recover(
     logs: common.Logs,
-    output: common.Output = None,
+    output: Annotated[Path | None, common.output("LOG.recovered.mcap beside the log")] = None,
     force: common.Force = False,
     json: common.Json = False,
     quiet: common.Quiet = False,
     verbose: common.Verbose = False,
     config: common.Config = None,
 ) -> None:
-    """Save what is whole in a damaged log to LOG.recovered.mcap; the damaged log stays as it is.
+    """Save what is intact in a damaged log to LOG.recovered.mcap; the damaged log stays unchanged.
 
-    Every chunk that can be opened and whose checksum is right is kept as it stands, with new indexes. What is lost is
-    named, and the exit code is 3 then.
+    Every chunk that can be read and has the right checksum is copied, with new indexes. What is lost is printed, and
+    the exit code is then 3.
 
     Example: mcaptrack recover broken.mcap -o saved.mcap
     """
@@ -145,11 +146,13 @@ def drop(
     path: Annotated[Path, typer.Argument(metavar="LOG", help="The log.", show_default=False)],
     topics: Annotated[
         list[str],
-        typer.Argument(metavar="TOPIC", help="Channels to leave out; patterns such as '/camera/*' are several."),
+        typer.Argument(metavar="TOPIC", help="Channels to remove, or patterns such as '/camera/*'."),
     ],
     output: common.Output = None,
     in_place: Annotated[
-        bool, common.option("--in-place", help="Leave them out of a recording that ROS tools read, too.")
+        bool, common.option(
+            "--in-place", panel=common.FILES, help="Also change a recording in place that ROS tools may have to read."
+        ),
     ] = False,
     force: common.Force = False,
     json: common.Json = False,
@@ -157,10 +160,10 @@ def drop(
     verbose: common.Verbose = False,
     config: common.Config = None,
 ) -> None:
-    """Leave channels out of a log, in place or in a copy; all others stay as they are, to the byte.
+    """Remove channels from a log, in place or in a copy; all others stay unchanged, to the byte.
 
-    With a channel goes what was made only to show it and to tell of it: its `/view/`, `/events`, `/counts`, `/errors`
-    and `/scores`. Results that stand beside the log are part of it, and of a copy.
+    Channels that only describe a removed one are removed with it: its `/view/`, `/events`, `/counts`, `/errors` and
+    `/scores`. Results that stand beside the log are part of it, and of a copy.
 
     Example: mcaptrack drop log.mcap /camera/video -o small.mcap
     """

@@ -26,7 +26,7 @@ Inputs = Annotated[
 
 
 def _label_file(words: str) -> Any:
-    return common.option(panel=common.LABELS, help=f"Label file of the pictures: {words}.")
+    return common.option(panel=common.LABELS, help=f"Label file with {words}.")
 
 
 _PICTURES: Final = "Pictures"
@@ -35,9 +35,9 @@ _PICTURES: Final = "Pictures"
 @common.one_line
 def ingest(
     inputs: Inputs,
-    output: common.Output = None,
+    output: Annotated[Path | None, common.output("INPUT.mcap in the working folder")] = None,
     camera: Annotated[
-        str, common.option("--camera", panel=common.FILES, help="Name of the camera: its channels lie below /NAME.")
+        str, common.option("--camera", panel=common.FILES, help="Name of the camera; its channels begin with /NAME.")
     ] = "camera",
     fps: Annotated[
         str | None,
@@ -64,8 +64,8 @@ def ingest(
             "--image-format",
             panel=_PICTURES,
             tuning=True,
-            help="How pictures are kept. auto: H.264, VP9 and AV1 as they are where viewers play them, else as H.264; "
-            "h264: nothing but H.264; h265: as auto, and H.265 as it is; jpeg, png: every picture alone.",
+            help="How pictures are stored. auto: H.264, VP9 and AV1 as they are where viewers play them, otherwise "
+            "H.264; h264: H.264 alone; h265: like auto, and H.265 as it is; jpeg, png: one image per picture.",
         ),
     ] = "auto",
     quality: Annotated[
@@ -76,7 +76,7 @@ def ingest(
             least=1,
             most=100,
             tuning=True,
-            help="Of what is encoded: H.264's constant rate factor, 1 (best) to 51; JPEG's quality, 1 to 100 (best).",
+            help="Quality of encoding: for H.264 the constant rate factor, 1 (best) to 51; for JPEG 1 to 100 (best).",
             show_default="23; JPEG 90",
         ),
     ] = None,
@@ -88,15 +88,15 @@ def ingest(
             least=0.01,
             most=60,
             tuning=True,
-            help="Key pictures are at most so far apart, in seconds; a stream that has fewer is encoded again.",
-            show_default="2 in what is kept as it is, 1 in what is encoded",
+            help="Longest time between keyframes, in seconds; streams with longer gaps are re-encoded.",
+            show_default="2 if copied, 1 if encoded",
         ),
     ] = None,
     ground_plane: common.GroundPlane = None,
     point: common.Point = "foot",
-    detections: Annotated[Path | None, _label_file("boxes without ids")] = None,
-    tracks: Annotated[Path | None, _label_file("boxes or positions with the ids of a tracker")] = None,
-    truth: Annotated[Path | None, _label_file("boxes or positions with the true ids")] = None,
+    detections: Annotated[Path | None, _label_file("detections: boxes without ids")] = None,
+    tracks: Annotated[Path | None, _label_file("tracks: boxes or positions with ids")] = None,
+    truth: Annotated[Path | None, _label_file("ground truth: boxes or positions with true ids")] = None,
     label_format: Annotated[
         Literal["auto", "mot", "kitti", "sdd", "trajnet", "obsmat"],
         common.option("--format", panel=common.LABELS, tuning=True, help="Format of the label files."),
@@ -109,7 +109,7 @@ def ingest(
             least=0,
             most=10**12,
             tuning=True,
-            help="Number that label files give the first picture.",
+            help="Number of the first picture in label files.",
             show_default="1 in MOTChallenge, otherwise 0",
         ),
     ] = None,
@@ -121,7 +121,7 @@ def ingest(
             least=1,
             most=10_000_000,
             tuning=True,
-            help="Number of frames, where labels have no pictures.",
+            help="Number of frames, if there are labels but no pictures.",
             show_default="as seqinfo.ini says, otherwise up to the last label",
         ),
     ] = None,
@@ -134,11 +134,16 @@ def ingest(
     into: Annotated[
         Path | None,
         common.option(
-            "--into", panel=common.FILES, help="Add it to this log, instead of making one.", show_default=False
+            "--into", panel=common.FILES, help="Add to this log, instead of making a new one.", show_default=False
         ),
     ] = None,
     sidecar: common.Sidecar = None,
-    force: common.Force = False,
+    force: Annotated[
+        bool,
+        common.option(
+            "--force", panel=common.FILES, help="Overwrite the log; with --into, replace the channels it has already."
+        ),
+    ] = False,
     json: common.Json = False,
     quiet: common.Quiet = False,
     verbose: common.Verbose = False,
@@ -147,11 +152,11 @@ def ingest(
     """Make a log of a video, a folder of images, a ROS bag, an MCAP file, or a label file.
 
     Writes /camera/video, /camera/ground_plane, /camera/detections, /camera/tracks and /camera/truth, as far as they are
-    given. A stream that viewers can play (H.264, VP9, AV1) is passed on as it is; others are encoded again, as H.264,
-    and the reason is said. Times are those of the file, to the nanosecond.
+    given. Streams that viewers can play (H.264, VP9, AV1) are copied without re-encoding; others are re-encoded as
+    H.264, and the reason is printed. Timestamps are those of the file, exact to the nanosecond.
 
-    Of a ROS 1 bag, a rosbag2 folder or database, or an MCAP file every message stays as it is, with its times; labels
-    stand beside the pictures of its only camera, or of the one that --camera names.
+    From a ROS 1 bag, a rosbag2 folder or database, or an MCAP file every message is copied unchanged, with its
+    timestamps; labels belong to its only camera, or to the one that --camera names.
 
     Example: mcaptrack ingest video.mp4 --ground-plane homography.txt --truth gt.txt -o log.mcap
     """

@@ -68,7 +68,7 @@ def query(
             "--rows",
             panel=_QUERY,
             least=0,
-            help="Number of rows that a table shows; 0 is all.",
+            help="Number of rows that a table shows; 0 for all.",
             show_default="60 on a terminal",
         ),
     ] = None,
@@ -85,7 +85,7 @@ def query(
     verbose: common.Verbose = False,
     config: common.Config = None,
 ) -> None:
-    """Ask a log in SQL: who was where, how fast, how long, how well.
+    """Query a log in SQL: where people were, how fast, how long, and how well they were tracked.
 
     The tables are those of `mcaptrack export` (`mcaptrack docs tables`); `recording` tells several logs apart. They are
     read from the files beside the log where those are up to date, otherwise from the log. Any other channel is a table

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated, Final
 
 from mcaptrack.cli import common
@@ -43,14 +44,19 @@ def render(
             least=0.01,
             most=1000,
             tuning=True,
-            help="Largest number of pictures a second.",
+            help="Largest number of pictures per second.",
             show_default="all; GIF 10",
         ),
     ] = None,
     start_s: Annotated[
         float,
         common.option(
-            "--start-s", panel=_PICTURE, least=0, most=1e9, tuning=True, help="Begin at this second of the log."
+            "--start-s",
+            panel=_PICTURE,
+            least=0,
+            most=1e9,
+            tuning=True,
+            help="Begin at this time of the log, in seconds.",
         ),
     ] = 0.0,
     end_s: Annotated[
@@ -61,24 +67,24 @@ def render(
             least=0,
             most=1e9,
             tuning=True,
-            help="End at this second of the log.",
+            help="End at this time of the log, in seconds.",
             show_default="the end",
         ),
     ] = None,
     gif: Annotated[
-        bool, common.option("--gif", panel=_PICTURE, help="Write a GIF, where no -o says what to write.")
+        bool, common.option("--gif", panel=_PICTURE, help="Write LOG.gif instead of LOG.mp4, if -o names no file.")
     ] = False,
     camera: common.Camera = None,
-    output: common.Output = None,
+    output: Annotated[Path | None, common.output("LOG.mp4 or LOG.gif beside the log")] = None,
     force: common.Force = False,
     json: common.Json = False,
     quiet: common.Quiet = False,
     verbose: common.Verbose = False,
     config: common.Config = None,
 ) -> None:
-    """Draw what was found on the video of a log, for people without a viewer: LOG.mp4, or a GIF.
+    """Draw boxes, trails and predictions on the video of a log: LOG.mp4, or a GIF.
 
-    Boxes, trails and forecasts are those of the views in the log, in the same colours.
+    They are those of the views that Foxglove and Lichtblick show, in the same colours.
 
     Example: mcaptrack render log.mcap -o walk.gif --width 480 --start-s 2 --end-s 8
     """

@@ -28,8 +28,8 @@ def report(
     """Write one page about a log, or several: scores, forecasts, tracks over the scene, identity switches, lineage.
 
     The page needs no network and runs nothing; its numbers are inside it as JSON, and --json prints them too. Scores
-    are those of `mcaptrack evaluate`; without a truth in the log the page says what can be said without. Reads logs
-    only: what is missing in one, `mcaptrack run` makes.
+    are those of `mcaptrack evaluate`; without ground truth in the log the page has none. Reads logs only: stages that
+    are missing in one, `mcaptrack run` makes.
 
     Example: mcaptrack report log.mcap -o report.html
 

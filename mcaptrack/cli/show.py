@@ -25,7 +25,7 @@ def info(
     verbose: common.Verbose = False,
     config: common.Config = None,
 ) -> None:
-    """Show the channels of a log, how many messages they hold, and what was made from what.
+    """Show the channels of a log, their number of messages, and what was made from what.
 
     Reads the summary only. With -v also the parameters that channels were made with.
 
@@ -154,14 +154,16 @@ def export(
         common.option(
             "--topic",
             panel=common.FILES,
-            help="Write a table of all messages of this channel, too.",
+            help="Also write a table of all messages of this channel.",
             show_default=False,
         ),
     ] = None,
     blobs: Annotated[
         bool,
         common.option(
-            "--blobs", panel=common.FILES, help="With --topic: keep fields of bytes, such as pictures and point clouds."
+            "--blobs",
+            panel=common.FILES,
+            help="With --topic: include binary fields, such as pictures and point clouds.",
         ),
     ] = False,
     force: Annotated[
@@ -175,7 +177,7 @@ def export(
     verbose: common.Verbose = False,
     config: common.Config = None,
 ) -> None:
-    """Write what is in a log as tables (Parquet), one row an object a frame.
+    """Write a log as tables (Parquet), one row per object and frame.
 
     One folder a table (frames, detections, tracks, track_summary, predictions, events, metrics, channels, recordings
     and others), one file a log in it; several logs can share a folder. Exporting again replaces what has changed.

@@ -29,7 +29,7 @@ _WORDS: Final = {
     "retrack": ("Example: mcaptrack retrack log.mcap --profile authors", "{camera}/samples", "{camera}/retracks"),
 }
 Topic = Annotated[
-    str | None, common.option("--topic", panel=common.FILES, help="Read this channel instead of the usual one.")
+    str | None, common.option("--topic", panel=common.FILES, help="Read this channel instead of the default one.")
 ]
 Mode = Literal["both", "offline", "online"]
 _OUTPUTS_OF: Final[Mapping[str, tuple[str, ...]]] = {
@@ -51,9 +51,8 @@ def add_stages(app: typer.Typer, panel: str) -> None:
 
 def _help(name: str, kind: type[Transform]) -> str:
     example, source, target = _WORDS[name]
-    where = (
-        f"From {source.format(camera='/camera')} to {target.format(camera='/camera')}. A missing input is made first."
-    )
+    first, last = source.format(camera="/camera"), target.format(camera="/camera")
+    where = f"From {first} to {last}. Inputs that are missing are made first."
     others = [] if name not in ALTERNATIVES else [k for k in ALTERNATIVES[name].kinds.values() if k is not kind]
     words = [inspect.cleandoc(one.__doc__ or "") for one in (kind, *others)]
     return "\n\n".join([*words, where, example])
@@ -104,11 +103,13 @@ def _stage_command(name: str, kind: type[Transform]) -> Callable[..., None]:
         words = common.option(
             "--profile",
             tuning=True,
-            help="Values of all parameters: the defaults, the paper's, or those of its authors' program.",
+            help="Values of all parameters: mcaptrack's own (default), the paper's, or those of its authors' program.",
         )
         parameters.append(_parameter("profile", Annotated[Literal[tuple(PROFILES)], words], "default"))
         words = common.option(
-            "--mode", tuning=True, help="With the whole log known (offline), from the past alone (online), or both."
+            "--mode",
+            tuning=True,
+            help="Write tracks that use the whole log (offline), the past alone (online), or both.",
         )
         parameters.append(_parameter("mode", Annotated[Mode, words], "both"))
     there: dict[str, list[str]] = {}
@@ -119,7 +120,7 @@ def _stage_command(name: str, kind: type[Transform]) -> Callable[..., None]:
         one = those[0]
         hint, shown = get_type_hints(kinds[one])[option], getattr(defaults[one], option)
         parameters.append(_option(own[one][option], hint, shown, one if len(those) < len(kinds) else ""))
-    to = common.option("--to", panel=common.FILES, help="Write this channel instead of the usual one.")
+    to = common.option("--to", panel=common.FILES, help="Write to this channel instead of the default one.")
     parameters += [
         _parameter("topic", Topic, None),
         _parameter("to", Annotated[str | None, to], None),
@@ -181,10 +182,11 @@ def run_all(
 ) -> None:
     """Run all stages that are missing or out of date, then events, views and tables.
 
-    From /camera/video (or whatever of detections, tracks and samples there is) to /camera/predictions and
-    /camera/retracks, what happened to identities (see `mcaptrack events`), and Parquet tables beside the log. With
-    --topic from the pictures, or the boxes, of that channel. What stands keeps the parameters it was made with; with
-    --force everything is made again, by what environment and files say now, otherwise with the parameters it had.
+    From /camera/video (or the detections, tracks or samples that the log has) to /camera/predictions and
+    /camera/retracks; then events (see `mcaptrack events`), views, and Parquet tables beside the log. --topic begins
+    with the pictures, or the boxes, of that channel. Stages that are up to date are left alone, those that are out of
+    date are made again with the parameters they had. --force makes all again, with the parameters that environment and
+    config files set now, and otherwise those they had.
 
     Example: mcaptrack run log.mcap
     """

@@ -27,7 +27,7 @@ _COLUMNS: Final = {
     "coverage_95": "in 95 %",
 }
 _TRAINING: Final = "Training"
-_WINDOWS: Final = "What is trained on"
+_WINDOWS: Final = "Training data"
 _LICENCE: Final = "that of the data it was trained on"
 
 
@@ -45,7 +45,11 @@ def train(
     output: Annotated[
         Path,
         common.option(
-            "--output", "-o", panel=common.FILES, help="Folder for the weights, the log of epochs and the state."
+            "--output",
+            "-o",
+            panel=common.FILES,
+            help="Folder for the weights, the log of epochs and the state.",
+            show_default=True,
         ),
     ] = Path("trained"),
     recipe: Annotated[
@@ -74,7 +78,7 @@ def train(
             least=1,
             most=1_000_000,
             tuning=True,
-            help="Passes over the windows.",
+            help="Number of passes over the training windows.",
             show_default="20; paper: 50",
         ),
     ] = None,
@@ -86,7 +90,7 @@ def train(
             least=1,
             most=1_000_000,
             tuning=True,
-            help="Windows a step.",
+            help="Number of windows per step.",
             show_default="256; paper: 60",
         ),
     ] = None,
@@ -110,7 +114,7 @@ def train(
             least=0,
             most=10,
             tuning=True,
-            help="Largest noise added to past positions.",
+            help="Largest noise added to past positions, in metres.",
             show_default="0.4; paper: 0",
         ),
     ] = None,
@@ -122,7 +126,7 @@ def train(
             least=0,
             most=0.9,
             tuning=True,
-            help="Share of past positions taken away.",
+            help="Share of past positions that are removed.",
             show_default="0.3; paper: 0",
         ),
     ] = None,
@@ -134,7 +138,7 @@ def train(
             least=0,
             most=1,
             tuning=True,
-            help="Largest scaling of positions, as a logarithm.",
+            help="Largest scaling of positions, as a natural logarithm.",
             show_default="0.15; paper: 0",
         ),
     ] = None,
@@ -156,7 +160,7 @@ def train(
             panel=_TRAINING,
             least=0,
             tuning=True,
-            help="End after so many epochs without a better one; 0 for never.",
+            help="Stop after this many epochs without improvement; 0 for never.",
         ),
     ] = 0,
     walks: Annotated[
@@ -211,9 +215,9 @@ def train(
 ) -> None:
     """Train a predictor on tracks of people, or on synthetic walks.
 
-    Leaves the weights (safetensors, with a model card in the header), a log of the epochs and a state to go on from in
-    a folder, and compares what was learned with constant velocity on the same windows. Use it with `mcaptrack predict
-    --predictor red:FOLDER/red.safetensors`. Needs torch: `pip install 'mcaptrack[train]'`.
+    Writes the weights (safetensors, with a model card in the header), a log of the epochs and a state to resume from
+    into a folder, and compares the predictor with constant velocity on the same windows. Use the weights with
+    `mcaptrack predict --predictor red:FOLDER/red.safetensors`. Needs torch: `pip install 'mcaptrack[train]'`.
 
     Example: mcaptrack train synthetic -o trained
     """

@@ -36,7 +36,7 @@ def tune(
         common.option(
             "--truth",
             panel=common.LABELS,
-            help="True tracks for files of detections: one file for each, matched by name or in order.",
+            help="Ground truth for files of detections: one file for each, matched by name or in order.",
             show_default=False,
         ),
     ] = None,
@@ -92,11 +92,12 @@ def tune(
     ground_plane: common.GroundPlane = None,
     point: common.Point = "foot",
     topic: Annotated[
-        str | None, common.option("--topic", panel=common.FILES, help="Read this channel instead of the usual one.")
+        str | None, common.option("--topic", panel=common.FILES, help="Read this channel instead of the default one.")
     ] = None,
     camera: common.Camera = None,
     output: Annotated[
-        Path, common.option("--output", "-o", panel=common.FILES, help="Write the settings to this file.")
+        Path,
+        common.option("--output", "-o", panel=common.FILES, help="Write the settings to this file.", show_default=True),
     ] = Path(NAME),
     force: Annotated[bool, common.option("--force", panel=common.FILES, help="Forget earlier trials.")] = False,
     json: common.Json = False,
@@ -104,12 +105,12 @@ def tune(
     verbose: common.Verbose = False,
     config: common.Config = None,
 ) -> None:
-    """Find the settings of a stage that score best against the truth.
+    """Find the settings of a stage that score best against ground truth.
 
-    Reads detections and truth: of logs, or files with --truth. Writes the best settings to mcaptrack.toml, which every
-    command reads; what else stands there stays. Ended and begun again, it goes on where it was. With Optuna installed
-    trials learn from each other, otherwise they are random. Score the settings on other recordings before you trust
-    them.
+    Reads detections and ground truth from logs, or from files with --truth. Writes the best settings to mcaptrack.toml,
+    which every command reads; other settings in it stay. A search that was interrupted continues where it stopped. With
+    Optuna installed trials learn from each other, otherwise they are random. Score the settings on other recordings
+    before you trust them.
 
     Example: mcaptrack tune log.mcap --tracker ocsort --metric hota --trials 200
     """

@@ -24,16 +24,16 @@ from mcaptrack.transforms.protocol import check_options, context, option
 class Predict:
     """Predict where tracked people go.
 
-    Reads tracks on the clock of prediction, writes predictions: for everybody seen often enough, one row a future step.
+    Reads samples, writes predictions: one row per track and future step, for tracks with enough past positions.
     """
 
     predictor: PredictorName = option(
         "red",
-        "what predicts: cv, holt-cv, kalman, lstm, red; or with weights of your own, red:FILE, lstm:FILE, onnx:FILE",
+        "predictor: cv, holt-cv, kalman, lstm, red; or with weights of your own, red:FILE, lstm:FILE, onnx:FILE",
         names=NAMES,
     )
-    horizon_s: float = option(4.8, "how far ahead to predict", least=0.1, most=60.0)
-    min_history: int = option(4, "past positions, with the present one, that a prediction needs", least=1)
+    horizon_s: float = option(4.8, "how far ahead to predict, in seconds", least=0.1, most=60.0)
+    min_history: int = option(4, "number of positions, the current one included, that a prediction needs", least=1)
     rate_hz: float = context(lambda: 2.5)
 
     reads: ClassVar[Schema] = TRACKS

@@ -29,11 +29,11 @@ Ints = NDArray[np.int64]
 class Sample:
     """Resample tracks to a fixed rate, in metres on the ground.
 
-    Reads tracks, writes tracks: a row for every person at each tick; ``observed`` is false inside gaps.
+    Reads tracks, writes tracks: one row per person and sample time; ``observed`` is false where a gap was interpolated.
     """
 
-    rate_hz: float = option(2.5, "ticks per second", least=0.1, most=1000.0)
-    max_hole_s: float = option(2.0, "a longer gap in a track stays a gap; shorter ones are interpolated", least=0.0)
+    rate_hz: float = option(2.5, "samples per second", least=0.1, most=1000.0)
+    max_hole_s: float = option(2.0, "gaps in a track of up to this many seconds are interpolated", least=0.0)
     start_ns: int | None = context(lambda: None)
     ground_planes: Planes = context(tuple)
 

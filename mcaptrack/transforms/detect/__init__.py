@@ -39,16 +39,16 @@ _PERSON: Final = 1
 
 @dataclass(frozen=True, kw_only=True)
 class Detect:
-    """Detect what moves in front of the background.
+    """Detect what moves, by background subtraction.
 
     Reads video, writes detections: one box for each connected region that differs from the background.
     """
 
-    method: Method = option("knn", "background model (knn, mog2) or difference of frames, as in the paper")
+    method: Method = option("knn", "background model (knn, mog2), or difference of frames, as in the paper")
     threshold: float | None = option(
         None, "difference from the background that counts as motion; each method has its own default", least=0.0
     )
-    history_s: float = option(60.0, "memory of the background model", least=0.1)
+    history_s: float = option(60.0, "memory of the background model, in seconds", least=0.1)
     max_pixels: int = option(1_000_000, "pictures are halved until they have no more pixels than this", least=1_000)
     stabilise: bool = option(True, "compensate the motion of a shaking camera")
 

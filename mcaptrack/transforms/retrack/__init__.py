@@ -37,39 +37,47 @@ _OFFLINE: Final = "With the whole log known (offline)"
 class Retrack:
     """Repair tracks: re-tracking by prediction.
 
-    Reads samples; writes the repaired tracks with the whole log known (offline), as they were known at the time
+    Reads samples; writes repaired tracks that use the whole log (offline), repaired tracks that use the past alone
     (online), and predictions from the latter.
     """
 
     predictor: PredictorName = option(
         "kalman",
-        "what predicts: cv, holt-cv, kalman, lstm, red; or red:FILE, lstm:FILE, onnx:FILE",
+        "predictor: cv, holt-cv, kalman, lstm, red; or red:FILE, lstm:FILE, onnx:FILE",
         names=NAMES,
         theme=_PREDICTIONS,
     )
-    horizon_s: float = option(4.8, "how far ahead to predict", least=0.1, most=60.0, theme=_PREDICTIONS)
+    horizon_s: float = option(4.8, "how far ahead to predict, in seconds", least=0.1, most=60.0, theme=_PREDICTIONS)
     distance: Distance = option(
         "likelihood",
-        "what a track and an observation are compared by: the mean, max or first distance between predicted steps, the "
-        "distance now, or the likelihood of the observation",
+        "how a track and an observation are compared: mean, max or first distance between their predicted steps, the "
+        "current distance (now), or the likelihood of the observation",
         theme=_ASSOCIATION,
     )
     covariance: Covariance = option(
         "predictor", "uncertainty of predictions: the predictor's, or the paper's (u - t) sigma^2", theme=_PREDICTIONS
     )
-    sigma_m: float = option(1.0, "sigma of the paper's covariance", least=1e-6, theme=_PREDICTIONS)
+    sigma_m: float = option(1.0, "sigma of the paper's covariance, in metres", least=1e-6, theme=_PREDICTIONS)
     noise_m: float | None = option(
         None,
-        "noise of observed positions (distance now or likelihood); estimated from the input unless it is given",
+        "noise of observed positions in metres (--distance now or likelihood); estimated from the input if not given",
         least=0.0,
         theme=_MOTION,
     )
     speed_m_per_s: float = option(
-        1.75, "speed to expect of people of whom nothing is known yet (likelihood)", least=0.0, theme=_MOTION
+        1.75,
+        "expected speed of people without a history, in metres per second (--distance likelihood)",
+        least=0.0,
+        theme=_MOTION,
     )
-    drift: float = option(0.12, "how much velocities change in a second, in m/s (likelihood)", least=0.0, theme=_MOTION)
+    drift: float = option(
+        0.12, "how much velocities change within a second, in m/s (--distance likelihood)", least=0.0, theme=_MOTION
+    )
     drift_share: float = option(
-        0.08, "how much velocities change in a second, as a share of the speed (likelihood)", least=0.0, theme=_MOTION
+        0.08,
+        "how much velocities change within a second, as a share of the speed (--distance likelihood)",
+        least=0.0,
+        theme=_MOTION,
     )
     max_distance: float = option(
         3.0,
@@ -82,70 +90,90 @@ class Retrack:
     )
     max_jump_m: float | None = option(
         3.0,
-        "gate: a track is not matched further than this from its predicted position now",
+        "gate: a track is not matched further than this from its predicted current position, in metres",
         least=0.0,
         theme=_ASSOCIATION,
     )
     same_source: float = option(
         12.0,
-        "how much nearer a pair counts if the input gives the observation the id that the track had last; the paper "
-        "drops ids",
+        "how much nearer a pair counts if the observation has the input id that the track had last; the paper ignores "
+        "input ids",
         least=0.0,
         theme=_ASSOCIATION,
     )
     max_age_s: float = option(
-        2.0, "a track ends after so long without an observation (t_max in the paper)", least=0.0, theme=_LIFE
+        2.0, "a track ends after this many seconds without an observation (t_max in the paper)", least=0.0, theme=_LIFE
     )
     share_m: float = option(
         1.0,
-        "two tracks may be merged into one detection that lies so near to both, and between them; 0 for never",
+        "two tracks may be merged into one detection that lies between them, this many metres from both; 0 for never",
         least=0.0,
         theme=_ASSOCIATION,
     )
     share_s: float = option(
-        3.0, "tracks stay merged into one detection for so long at most", least=0.0, theme=_ASSOCIATION
+        3.0, "longest time that tracks stay merged into one detection, in seconds", least=0.0, theme=_ASSOCIATION
     )
     sure_s: float = option(
-        1.2, "online, a track is shown once it was observed for so long (likelihood)", least=0.0, theme=_LIFE
+        1.2,
+        "online, a track is written once it was observed for this many seconds (--distance likelihood)",
+        least=0.0,
+        theme=_LIFE,
     )
     coast_s: float = option(
-        1.2, "online, a track is shown for so long where it is not observed (likelihood)", least=0.0, theme=_LIFE
+        1.2,
+        "online, a track is written for this many seconds without an observation (--distance likelihood)",
+        least=0.0,
+        theme=_LIFE,
     )
-    alpha: float = option(1.0, "smoothing of displacements, Eq. 3; 1 for none", least=0.0, most=1.0, theme=_PREDICTIONS)
-    beta: float = option(0.0, "smoothing of the trend of displacements, Eq. 3", least=0.0, most=1.0, theme=_PREDICTIONS)
+    alpha: float = option(
+        1.0, "smoothing of displacements (Eq. 3 of the paper); 1 for none", least=0.0, most=1.0, theme=_PREDICTIONS
+    )
+    beta: float = option(
+        0.0, "smoothing of the trend of displacements (Eq. 3 of the paper)", least=0.0, most=1.0, theme=_PREDICTIONS
+    )
     birth: Literal["raw", "smoothed"] = option(
         "raw", "what a new track predicts from: its past as observed, or smoothed", theme=_PREDICTIONS
     )
     min_history: int = option(
-        2, "past positions, with the present one, that an observation needs", least=1, theme=_PREDICTIONS
+        2, "number of positions, the current one included, that an observation needs", least=1, theme=_PREDICTIONS
     )
-    min_hits: int = option(1, "online, a track is shown from so many matches in a row", least=0, theme=_LIFE)
+    min_hits: int = option(1, "online, a track is written from this many matches in a row", least=0, theme=_LIFE)
     confirm: bool = option(
-        False, "offline, leave out what a track matched after it was last matched min_hits times in a row", theme=_LIFE
+        False, "offline, leave out what a track matched after its last --min-hits matches in a row", theme=_LIFE
     )
     min_track_s: float = option(
-        2.0, "a track that lasts less than this is left out (probation)", least=0.0, theme=_LIFE
+        2.0, "leave out tracks that last less than this many seconds (probation)", least=0.0, theme=_LIFE
     )
     link_s: float = option(
         20.0,
-        "link the end of a track with the beginning of another that is so much later; 0 for never",
+        "link the end of a track with the beginning of another up to this many seconds later; 0 for never",
         least=0.0,
         theme=_OFFLINE,
     )
     link_certainty: float = option(
-        0.5, "link tracks that are one person with at least this probability", least=0.01, most=0.99, theme=_OFFLINE
-    )
-    part: bool = option(True, "decide identities anew where two people met, from before and after", theme=_OFFLINE)
-    min_certainty: float = option(
-        0.5, "leave out tracks that are a person with less than this probability", least=0.0, most=1.0, theme=_OFFLINE
-    )
-    smooth: bool = option(True, "smooth positions, from past and future", theme=_OFFLINE)
-    backfill: Literal["none", "unclaimed", "all"] = option(
-        "unclaimed",
-        "whether a new track gets the past of its first observation, and also what other tracks hold",
+        0.5,
+        "link two tracks if they are one person with at least this probability",
+        least=0.01,
+        most=0.99,
         theme=_OFFLINE,
     )
-    filled: bool = option(False, "take samples inside gaps of the input for observations, too", theme=_ASSOCIATION)
+    part: bool = option(
+        True, "assign identities again where two people met, by what was before and after", theme=_OFFLINE
+    )
+    min_certainty: float = option(
+        0.5,
+        "leave out tracks that are a person with less than this probability (false tracks)",
+        least=0.0,
+        most=1.0,
+        theme=_OFFLINE,
+    )
+    smooth: bool = option(True, "smooth positions by past and future", theme=_OFFLINE)
+    backfill: Literal["none", "unclaimed", "all"] = option(
+        "unclaimed",
+        "whether a new track gets the past of its first observation: not at all, what no other track has, or all",
+        theme=_OFFLINE,
+    )
+    filled: bool = option(False, "use interpolated samples as observations, too", theme=_ASSOCIATION)
     rate_hz: float = context(lambda: 2.5)
     ground_planes: Planes = context(tuple)
 

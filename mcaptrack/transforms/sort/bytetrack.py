@@ -18,18 +18,22 @@ Ints = NDArray[np.intp]
 
 @dataclass(frozen=True, kw_only=True)
 class ByteTrack(Sort):
-    """ByteTrack pairs in two stages.
+    """ByteTrack: association in two steps.
 
-    Boxes with a high score are paired with all tracks first; then the doubtful ones with the tracks that are left and
-    were seen in the frame before: whoever is half hidden scores low, but is where he is expected.
+    Detections with a high score are matched with all tracks first, then those with a low score with the remaining
+    tracks that were detected in the previous frame: people who are partly hidden score low, but stand where predicted.
     """
 
     high_score: float = option(
-        0.5, "boxes of this score or more, and without a score, are paired first", search=(0.2, 0.9)
+        0.5, "detections with at least this score, or without a score, are matched first", search=(0.2, 0.9)
     )
-    new_score: float = option(0.6, "boxes of this score or more may begin a track", search=(0.2, 0.9))
+    new_score: float = option(0.6, "detections with at least this score may begin a track", search=(0.2, 0.9))
     low_min_iou: float = option(
-        0.5, "least overlap for boxes of a lower score, which are paired second", least=0.0, most=1.0, search=(0.2, 0.8)
+        0.5,
+        "least overlap (IoU) for detections with a low score, which are matched second",
+        least=0.0,
+        most=1.0,
+        search=(0.2, 0.8),
     )
 
     def _pair(self, moment: Moment) -> tuple[Ints, Ints]:

@@ -36,19 +36,17 @@ _PATH: Final = _AGO + 1
 
 @dataclass(frozen=True, kw_only=True)
 class OcSort(Sort):
-    """OC-SORT trusts observations more than the filter.
+    """OC-SORT: observations count for more than the filter.
 
-    Pairs in the direction of a track count for more, tracks that are lost are looked for where they were seen last, and
-    a track that comes back forgets what its filter made up in between.
+    Matches that keep a track's direction of motion are preferred, lost tracks are matched once more by their last
+    detection, and a track that is found again has its filter recomputed over the gap.
     """
 
-    inertia: float = option(
-        0.2, "weight of keeping the direction of motion, beside overlap", least=0.0, search=(0.0, 0.6)
-    )
+    inertia: float = option(0.2, "weight of the direction of motion, beside overlap", least=0.0, search=(0.0, 0.6))
     direction_frames: int = option(
-        3, "number of frames over which the direction of motion is taken", least=2, most=100, search=(2, 10)
+        3, "number of frames over which the direction of motion is measured", least=2, most=100, search=(2, 10)
     )
-    recover: bool = option(True, "pair lost tracks once more by where they were seen last")
+    recover: bool = option(True, "match lost tracks once more by their last detection")
     reupdate: bool = option(True, "recompute the filter over the gap when a track is found again")
 
     def _no_tracks(self) -> Tracks:

@@ -81,32 +81,39 @@ _LIFE: Final = "Begin and end of tracks"
 
 @dataclass(frozen=True, kw_only=True)
 class Sort:
-    """Track boxes over time.
+    """Track detections over time.
 
-    Reads detections, writes tracks: one row for each person who is tracked and seen in a frame. SORT pairs boxes with
-    where a Kalman filter expects tracks.
+    Reads detections, writes tracks: one row per frame for each person who is tracked and detected in it. SORT matches
+    detections with the positions that Kalman filters predict for the tracks.
     """
 
     max_age_s: float = option(
-        1.4, "a track ends after so long without a box", least=0.0, search=(0.2, 4.0), theme=_LIFE
+        1.4, "a track ends after this many seconds without a detection", least=0.0, search=(0.2, 4.0), theme=_LIFE
     )
     max_age_frames: int | None = option(
-        None, "a track ends after so many frames without a box, instead of --max-age-s", least=0, theme=_LIFE
+        None, "a track ends after this many frames without a detection, instead of --max-age-s", least=0, theme=_LIFE
     )
     min_hits_s: float = option(
-        0.3, "a track is shown after so long of unbroken boxes", least=0.0, search=(0.0, 1.0), theme=_LIFE
+        0.3,
+        "a track is written once it was detected without a break for this many seconds",
+        least=0.0,
+        search=(0.0, 1.0),
+        theme=_LIFE,
     )
     min_hits_frames: int | None = option(
-        None, "a track is shown after so many frames of unbroken boxes, instead of --min-hits-s", least=0, theme=_LIFE
+        None,
+        "a track is written once it was detected in this many frames in a row, instead of --min-hits-s",
+        least=0,
+        theme=_LIFE,
     )
     cost: Cost = option(
         "iou",
-        "what boxes and tracks are paired by: overlap, or distance in pixels or on the ground",
+        "how detections and tracks are compared: overlap of boxes (iou), or distance in pixels or in metres",
         theme=_ASSOCIATION,
     )
     min_iou: float = option(
         0.2,
-        "least overlap of a box with a track's predicted box",
+        "least overlap (IoU) of a detection with a track's predicted box",
         least=0.0,
         most=1.0,
         search=(0.05, 0.6),
@@ -114,19 +121,19 @@ class Sort:
     )
     max_distance_px: float = option(
         60.0,
-        "with --cost pixels: largest distance of a box's centre from the predicted one",
+        "with --cost pixels: largest distance of a box's centre from the predicted one, in pixels",
         least=0.0,
         theme=_ASSOCIATION,
     )
     max_distance_m: float = option(
         1.0,
-        "with --cost metres: largest distance of a box's foot from the predicted one",
+        "with --cost metres: largest distance on the ground from the predicted position, in metres",
         least=0.0,
         theme=_ASSOCIATION,
     )
-    min_score: float | None = option(None, "ignore boxes with a lower score", theme=_DETECTIONS)
-    class_id: int | None = option(None, "ignore boxes of other classes", least=0, theme=_DETECTIONS)
-    mix_classes: bool = option(False, "a track may continue with a box of another class", theme=_ASSOCIATION)
+    min_score: float | None = option(None, "ignore detections with a lower score", theme=_DETECTIONS)
+    class_id: int | None = option(None, "ignore detections of other classes", least=0, theme=_DETECTIONS)
+    mix_classes: bool = option(False, "a track may continue with a detection of another class", theme=_ASSOCIATION)
     ground_planes: Planes = context(tuple)
 
     reads: ClassVar[Schema] = DETECTIONS
