@@ -121,6 +121,41 @@ class TestHelp:
         assert {words: found for words, found in names.items() if len(found) > 1} == {}
 
 
+class TestWrongUsage:
+    """A command line that can't be understood is refused in one line, which names what it might be."""
+
+    @staticmethod
+    def refused(*words: str) -> str:
+        code, out, err = called(*words)
+        assert (code, out, err.count("\n")) == (2, "", 1)
+        assert err.startswith("mcaptrack: ")
+        return err
+
+    @EVERY_COMMAND
+    def test_an_option_that_is_not_there(self, command):
+        words = self.refused(command, "a", "--verbos")
+        assert "--verbose" in words
+        assert f"`mcaptrack {command} --help`" in words
+
+    @EVERY_COMMAND
+    def test_a_value_of_another_kind_and_a_value_that_is_missing(self, command):
+        for setting in COMMANDS[command].settings.values():
+            if setting.kind in (int, float):
+                assert f"--{setting.name}" in self.refused(command, "a", f"--{setting.name}", "two")
+            if setting.kind is not bool:
+                assert f"--{setting.name}" in self.refused(command, "a", f"--{setting.name}")
+
+    @EVERY_COMMAND
+    def test_an_argument_that_is_missing(self, command):
+        needed = [one for one in COMMANDS[command].params if one.param_type_name == "argument" and one.required]
+        if needed:
+            assert needed[0].human_readable_name.strip(".") in self.refused(command)
+
+    def test_a_command_or_an_option_before_it_that_is_not_there(self):
+        assert "'evaluate'? `mcaptrack --help` lists" in self.refused("evaluat", "a.mcap")
+        assert "--versio" in self.refused("--versio")
+
+
 class Bounded(NamedTuple):
     """An option with a bound, as the page lists it."""
 

@@ -170,7 +170,7 @@ class TestUnknownNames:
             assert nearest, name
             outcome = called(command, f"--{wrong}", "x")
             assert outcome.code == 2
-            assert "No such option" in outcome.err
+            assert "no such option" in outcome.err
             assert f"--{nearest[0]}" in outcome.err
             put(folder / "mcaptrack.toml", f"[{command}]\n{wrong} = 1\n")
             words = f"mcaptrack.toml: {command} has no option {wrong}; did you mean {nearest[0]}?"

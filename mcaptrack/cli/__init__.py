@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 from mcaptrack import __version__
+from mcaptrack.cli.command import Group
 from mcaptrack.cli.common import register
 from mcaptrack.cli.demo import demo
 from mcaptrack.cli.docs import docs
@@ -29,6 +30,7 @@ from mcaptrack.cli.view import view
 
 app = typer.Typer(
     name="mcaptrack",
+    cls=Group,
     no_args_is_help=True,
     rich_markup_mode="markdown",
     pretty_exceptions_enable=False,

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path
 from typing import Any, ClassVar, Final
 
 import typer
-from typer.core import TyperCommand
+from typer.core import TyperCommand, TyperGroup
 
 from mcaptrack.cli.settings import Given, Setting, declared_settings, found_of, gather
 from mcaptrack.cli.text import refuse_usage, say
@@ -18,6 +19,38 @@ from mcaptrack.notices import warn
 #: Headings of options that stand last in the help: what is read and written, and what every command has.
 LAST_PANELS: Final = ("Input and output", "Options of all commands")
 _RUNNING: Final[ContextVar[typer.Context]] = ContextVar("running")
+
+
+#: What Typer raises for a command line that it does not understand.
+_UsageError: Final[Any] = typer.BadParameter.__bases__[0]
+
+
+@contextmanager
+def _usage_in_one_line(command: str = "") -> Iterator[None]:
+    """Refuse a wrong command line in one line, without Typer's box."""
+    try:
+        yield
+    except _UsageError as error:
+        words = " ".join(error.format_message().replace("Value error, ", "").rstrip(".").split())
+        page = " ".join(filter(None, ["mcaptrack", command, "--help"]))
+        end = "" if words.endswith("?") else ";"
+        refuse_usage(f"{words[:1].lower()}{words[1:]}{end} `{page}` lists the {'options' if command else 'commands'}")
+
+
+class Group(TyperGroup):
+    """The command of commands."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Take what stands before the command; an unknown option is refused in one line."""
+        if not args:
+            return super().parse_args(ctx, args)  # which prints the help
+        with _usage_in_one_line():
+            return super().parse_args(ctx, args)
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """Find the command; one that isn't there is refused in one line."""
+        with _usage_in_one_line():
+            return super().resolve_command(ctx, args)
 
 
 class Command(TyperCommand):
@@ -55,7 +88,8 @@ class Command(TyperCommand):
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Take what was given under an old name for the new one."""
-        left = super().parse_args(ctx, args)
+        with _usage_in_one_line(self.name or ""):
+            left = super().parse_args(ctx, args)
         if not ctx.resilient_parsing:
             found = found_of(self.name or "")
             self.rename(ctx.params, lambda parameter: _rank(ctx, parameter, found), ctx.params.get("quiet"))
