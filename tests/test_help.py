@@ -149,7 +149,7 @@ class TestWrongUsage:
     def test_an_argument_that_is_missing(self, command):
         needed = [one for one in COMMANDS[command].params if one.param_type_name == "argument" and one.required]
         if needed:
-            assert needed[0].human_readable_name.strip(".") in self.refused(command)
+            assert str(needed[0].metavar) in self.refused(command)
 
     def test_a_command_or_an_option_before_it_that_is_not_there(self):
         assert "'evaluate'? `mcaptrack --help` lists" in self.refused("evaluat", "a.mcap")

@@ -96,8 +96,9 @@ Sidecar = Annotated[
     option(
         "--sidecar/--in-place",
         panel=FILES,
-        help="Write results to LOG.results.mcap, from now on, so that LOG stays as it is, or into LOG. "
-        "Recordings that ROS tools read stay as they are unless --in-place is given.",
+        help="Write results to LOG.results.mcap from now on, so that LOG stays unchanged (--sidecar), or into LOG "
+        "(--in-place).",
+        show_default="sidecar for recordings that ROS tools read, otherwise in place",
     ),
 ]
 Force = Annotated[bool, option("--force", panel=FILES, help="Overwrite the output file if it exists.")]

@@ -150,7 +150,8 @@ def drop(
     ],
     output: common.Output = None,
     in_place: Annotated[
-        bool, common.option(
+        bool,
+        common.option(
             "--in-place", panel=common.FILES, help="Also change a recording in place that ROS tools may have to read."
         ),
     ] = False,
