@@ -44,8 +44,10 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 @pytest.fixture(scope="module")
 def commands():
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # what a shell runs in the background ignores it
     with bounded.commands() as running:
         yield running
+    signal.signal(signal.SIGINT, before)
 
 
 @pytest.fixture(scope="module")
