@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,9 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import IndexType, Writer
 
 from mcaptrack import log
+from mcaptrack.log import records
+from mcaptrack.provenance import Provenance
+from tests.commands import done
 from tests.test_damage import FORTY
 from tests.test_log import SCHEMA, write_stock
 
@@ -210,3 +214,38 @@ def summary_of_bytes(folder: Path, whole: bytes):
     path = folder / "whole.mcap"
     path.write_bytes(whole)
     return summary_of(path)
+
+
+@pytest.mark.parametrize("compression", ["", "zstd", "lz4", "zst4", "another", "ü"])
+def test_chunks_and_their_indexes_are_read_as_they_were_written_or_not_at_all(compression):
+    index = records.ChunkIndexRecord(1, 2**64 - 1, 3, 4, {5: 6, 2**16 - 1: 7}, 8, compression, 9, 10)
+    whole = memoryview(records.pack_chunk_index(index))
+    assert records.read_chunk_index(whole, records.record_at(whole, 0)) == index
+    chunk = memoryview(records.pack_chunk((1, 2**64 - 1, 3, 4), compression, b"data"))
+    start = len(chunk) - 4
+    head = records.ChunkHead(1, 2**64 - 1, 3, 4, compression, start, start + 4)
+    assert records.read_chunk(chunk, records.record_at(chunk, 0)) == head
+    for data, read in ((whole, records.read_chunk_index), (chunk, records.read_chunk)):
+        for end in range(9, len(data)):
+            with pytest.raises(records.Damaged):
+                read(data, records.Record(data[0], 0, 9, end))
+
+
+def test_channels_that_were_made_from_each_other_may_be_many(tmp_path):
+    """A line of them, in the order in which they were made, and those that lead in a circle."""
+    path = tmp_path / "a.mcap"
+    count = 1100
+    inputs = {f"/c{n:04}": f"/c{n - 1:04}" for n in range(count)} | {"/round/a": "/round/b", "/round/b": "/round/a"}
+    with log.create(path) as writer:
+        for topic, source in reversed(inputs.items()):
+            made = Provenance("sample", {}, source)
+            writer.add_channel(topic, SCHEMA, "json", made.to_metadata())
+    done("report", path, "-o", tmp_path / "a.html")
+    page = (tmp_path / "a.html").read_text()
+    shown = re.findall(r"(?<=>)/[a-z/0-9]+(?=<)", page)
+    assert [topic for topic in dict.fromkeys(shown) if topic != "/round/b"] == [
+        *(f"/c{n:04}" for n in range(count)),
+        "/round/a",
+    ]
+    shown = done("info", path).out
+    assert "/c1099" in shown

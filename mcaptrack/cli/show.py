@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 from mcaptrack.cli import common
 from mcaptrack.cli.text import console, printable
@@ -106,15 +106,24 @@ def _print(opened: Log, verbose: bool) -> None:
     out.print(_lineage([*reversed(shown.values())], verbose))
 
 
+#: The lineage is drawn no deeper: what comes after that stands beside what it was made from.
+_DEEPEST: Final = 30
+
+
 def _lineage(channels: list[dict[str, Any]], verbose: bool) -> Tree:
     """What was made from what, as a tree whose roots are the channels that were recorded or ingested."""
     from rich.text import Text
     from rich.tree import Tree
 
     topics = {channel["topic"] for channel in channels}
+    made_from: dict[str | None, list[dict[str, Any]]] = {}
+    for channel in channels:
+        if channel["transform"] != "view":
+            made_from.setdefault(channel["input"] if channel["input"] in topics else None, []).append(channel)
     root = Tree("lineage")
-
-    def add(parent: Tree, channel: dict[str, Any], above: frozenset[str]) -> None:
+    waiting = [(root, channel, 1) for channel in reversed(made_from.get(None, []))]
+    while waiting:
+        parent, channel, depth = waiting.pop()
         label = Text(printable(channel["topic"]))
         label.append(f"  {printable(channel['transform'])}" if channel["transform"] else "", "dim")
         label.append("  out of date" if channel["stale"] else "", "red")
@@ -122,13 +131,8 @@ def _lineage(channels: list[dict[str, Any]], verbose: bool) -> Tree:
         if verbose and channel["parameters"]:
             words = ", ".join(f"{key}={value}" for key, value in sorted(channel["parameters"].items()))
             node.add(Text(printable(words), "dim"))
-        for other in channels:
-            if other["input"] == channel["topic"] and other["topic"] not in above and other["transform"] != "view":
-                add(node, other, above | {other["topic"]})
-
-    for channel in channels:
-        if channel["input"] not in topics and channel["transform"] != "view":
-            add(root, channel, frozenset({channel["topic"]}))
+        below = node if depth < _DEEPEST else parent
+        waiting += [(below, other, depth + 1) for other in reversed(made_from.get(channel["topic"], []))]
     return root
 
 

@@ -25,6 +25,8 @@ MAX_CHUNK_MIB: Final = 256
 ENVIRONMENT: Final = "MCAPTRACK_MAX_CHUNK_MIB"
 #: A chunk that is not compressed and larger than this is not read into memory as a whole.
 _MOST_PLAIN_BYTES: Final = 64 * 2**20
+#: So many heads of messages are read one by one.
+_FEW: Final = 16
 #: The last time that is worked with, in nanoseconds: a signed number of 64 bits, in the year 2262.
 MAX_NS: Final = 2**63 - 1
 #: The last time that a log can hold.
@@ -170,7 +172,7 @@ def listed_entries(buffer: Bytes, at: int, channel_id: int) -> Entries:
     entries = np.frombuffer(listed, "<u8").reshape(-1, 2)
     if len(entries) and entries[:, 1].max() > MAX_NS:
         raise Damaged("a message index that points beyond any chunk", at)
-    if len(np.unique(entries[:, 1])) != len(entries):
+    if len(entries) > 1 and len(np.unique(entries[:, 1])) != len(entries):
         raise Damaged("a message index that lists a message twice", at)
     return entries
 
@@ -193,7 +195,7 @@ def heads_at(content: Bytes, channel_id: int, t_ns: Times, offset: Ints) -> Head
         raise Damaged(f"a message is said to stand at byte {outside[0]} of a chunk of {len(content)}")
     if not len(offset):
         head = np.empty(0, HEAD)
-    elif isinstance(content, memoryview):
+    elif isinstance(content, memoryview) and len(offset) > _FEW:
         raw = np.frombuffer(content, np.uint8)
         head = np.lib.stride_tricks.sliding_window_view(raw, HEAD.itemsize)[offset].view(HEAD)[:, 0]
     else:

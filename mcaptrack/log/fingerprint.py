@@ -10,11 +10,15 @@ from mcaptrack.log.index import Index
 from mcaptrack.log.records import BLOCK, Bytes, ChunkIndexRecord, record_at
 
 
-def fingerprint(buffer: Bytes, index: Index, channel_id: int | None = None) -> str:
+def fingerprint(
+    buffer: Bytes, index: Index, channel_id: int | None = None, checksums: dict[int, int | str] | None = None
+) -> str:
     """SHA-256 of a channel, or of everything: descriptions, and of each chunk its times and checksum.
 
-    Where a chunk or attachment has no checksum, and outside of chunks, the bytes themselves count.
+    Where a chunk or attachment has no checksum, and outside of chunks, the bytes themselves count. ``checksums`` keeps
+    those of chunks, by offset, for the next call with the same ``buffer``.
     """
+    checksums = {} if checksums is None else checksums
     total = hashlib.sha256()
 
     def say(*words: object) -> None:
@@ -30,7 +34,9 @@ def fingerprint(buffer: Bytes, index: Index, channel_id: int | None = None) -> s
         if channel_id is None or channel_id in chunk.message_index_offsets:
             # Where a chunk stands matters to those who look for messages, not to those who read a channel's rows.
             place = (chunk.offset, *sorted(chunk.message_index_offsets)) if channel_id is None else ()
-            say(place, chunk.start_ns, chunk.end_ns, chunk.uncompressed_size, _checksum(buffer, chunk))
+            if chunk.offset not in checksums:
+                checksums[chunk.offset] = _checksum(buffer, chunk)
+            say(place, chunk.start_ns, chunk.end_ns, chunk.uncompressed_size, checksums[chunk.offset])
     for number in sorted(index.loose) if channel_id is None else [channel_id]:
         for offset in index.loose[number][:, 1].tolist() if number in index.loose else []:
             record = record_at(buffer, offset)

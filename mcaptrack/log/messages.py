@@ -26,6 +26,7 @@ from mcaptrack.log.chunks import (
     message_head,
     open_and_mark,
 )
+from mcaptrack.log.fingerprint import fingerprint
 from mcaptrack.log.index import Index
 from mcaptrack.log.records import (
     BLOCK,
@@ -123,6 +124,8 @@ class Messages:
         # What was read, to tell whether it still stands there: checksums of chunks, ends and checksums of pieces.
         self._chunks: dict[int, int] = {}
         self._pieces: dict[int, tuple[int, int]] = {}
+        self._fingerprints: dict[int | None, str] = {}
+        self._checksums: dict[int, int | str] = {}
 
     def times(self, channels: Sequence[int], span: Span = (None, None)) -> Ints:
         """The times of messages, rising, (M,)."""
@@ -216,6 +219,12 @@ class Messages:
             rows = rows[np.repeat(first - (np.cumsum(kept) - kept), kept) + np.arange(len(rows))]
         rows.flags.writeable = False
         return Columns(rows, t_ns[order], sequence[order], counts[order])
+
+    def fingerprint(self, channel_id: int | None = None) -> str:
+        """The fingerprint of a channel, or of everything; worked out once."""
+        if channel_id not in self._fingerprints:
+            self._fingerprints[channel_id] = fingerprint(self.source, self.index, channel_id, self._checksums)
+        return self._fingerprints[channel_id]
 
     def are_in(self, source: Source) -> bool:
         """Whether what was read so far stands in ``source`` as it did when it was read."""

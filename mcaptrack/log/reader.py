@@ -16,7 +16,6 @@ from mcaptrack.atomic import follow_links
 from mcaptrack.errors import McaptrackError
 from mcaptrack.log import new_end, records
 from mcaptrack.log.chunks import MAX_NS
-from mcaptrack.log.fingerprint import fingerprint
 from mcaptrack.log.messages import Columns, Message, Places
 from mcaptrack.log.names import RESULTS, results_of
 from mcaptrack.log.records import ChannelRecord, Damaged
@@ -317,9 +316,7 @@ class Log:
             return whole[0] if len(whole) == 1 else hashlib.sha256("".join(whole).encode()).hexdigest()
 
     def _fingerprint(self, channel_id: int | None = None) -> str:
-        return self.snapshot.still(
-            lambda messages: fingerprint(messages.source, messages.index, channel_id), str.__eq__
-        )
+        return self.snapshot.still(lambda messages: messages.fingerprint(channel_id), str.__eq__)
 
 
 def _are_equal(one: Places, other: Places) -> bool:

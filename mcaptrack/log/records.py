@@ -8,6 +8,7 @@ from __future__ import annotations
 import struct
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from typing import Final, NamedTuple, Protocol, overload
 
 from mcap.opcode import Opcode
@@ -22,6 +23,15 @@ _HEAD: Final = struct.Struct("<BQ")
 MESSAGE_HEAD: Final = struct.Struct("<HIQQ")
 RECORD_MESSAGE_HEAD: Final = struct.Struct("<BQHIQQ")
 FOOTER_BODY: Final = struct.Struct("<QQI")
+#: A chunk up to its records, by its compression: times, size, checksum, length of the name, the name, size of the data.
+_CHUNK_HEADS: Final = {name: struct.Struct(f"<QQQII{len(name)}xQ") for name in (b"zstd", b"", b"lz4")}
+_CHUNK_NAME_AT: Final = struct.calcsize("<QQQII")
+_CHUNK_HEAD_SIZE: Final = max(layout.size for layout in _CHUNK_HEADS.values())
+_INDEX_HEAD: Final = struct.Struct("<HI")
+_CHUNK_INDEX_HEAD: Final = struct.Struct("<QQQQI")
+_CHUNK_INDEX_OFFSET: Final = struct.Struct("<HQ")
+_CHUNK_INDEX_NAME: Final = struct.Struct("<QI")
+_CHUNK_INDEX_SIZES: Final = struct.Struct("<QQ")
 _CRC_POLYNOMIAL: Final = 0xEDB88320
 #: So much of a record is looked at together, so many records in a row, and so much is summed at once.
 _NEAR: Final = 1024
@@ -237,6 +247,14 @@ def read_channel(buffer: Bytes, record: Record) -> ChannelRecord:
 
 
 def read_chunk(buffer: Bytes, record: Record) -> ChunkHead:
+    near = buffer[record.body : min(record.body + _CHUNK_HEAD_SIZE, record.end)]
+    for name, layout in _CHUNK_HEADS.items():  # those that nearly all chunks have
+        if len(near) >= layout.size:
+            first, last, size, crc, length, data_size = layout.unpack_from(near)
+            start = record.body + layout.size
+            is_known = length == len(name) and near[_CHUNK_NAME_AT : _CHUNK_NAME_AT + length] == name
+            if is_known and data_size <= record.end - start:
+                return ChunkHead(first, last, size, crc, name.decode(), start, start + data_size)
     r = Reader(buffer, record.body, record.end)
     head = (r.number(8), r.number(8), r.number(8), r.number(4), r.text())
     size = r.number(8)
@@ -255,8 +273,13 @@ def read_message_entries(buffer: Bytes, record: Record) -> tuple[int, memoryview
     """The channel of a message index and its entries, log time and offset of 8 bytes each."""
     if record.opcode != Opcode.MESSAGE_INDEX:
         raise Damaged("no message index where one belongs", record.start)
-    r = Reader(buffer, record.body, record.end)
-    return r.number(2), r.raw()
+    whole = buffer[record.body : record.end]
+    if len(whole) < _INDEX_HEAD.size:
+        raise Damaged(f"a message index of {len(whole)} bytes", record.start)
+    channel, size = _INDEX_HEAD.unpack_from(whole)
+    if size > len(whole) - _INDEX_HEAD.size:
+        raise Damaged(f"a message index of {size} bytes in a record with {len(whole) - _INDEX_HEAD.size}", record.start)
+    return channel, whole[_INDEX_HEAD.size : _INDEX_HEAD.size + size]
 
 
 def read_metadata(buffer: Bytes, record: Record) -> tuple[str, dict[str, str]]:
@@ -359,6 +382,16 @@ def pack_chunk_index(index: ChunkIndexRecord) -> bytes:
 
 
 def read_chunk_index(buffer: Bytes, record: Record) -> ChunkIndexRecord:
+    whole = buffer[record.body : record.end]
+    with suppress(struct.error, UnicodeDecodeError):  # then what is wrong with it is found out below
+        first, last, offset, length, size = _CHUNK_INDEX_HEAD.unpack_from(whole)
+        at = _CHUNK_INDEX_HEAD.size + size
+        offsets = dict(_CHUNK_INDEX_OFFSET.iter_unpack(whole[_CHUNK_INDEX_HEAD.size : at]))
+        index_length, size = _CHUNK_INDEX_NAME.unpack_from(whole, at)
+        at += _CHUNK_INDEX_NAME.size + size
+        stored, opened = _CHUNK_INDEX_SIZES.unpack_from(whole, at)
+        name = bytes(whole[at - size : at]).decode()
+        return ChunkIndexRecord(first, last, offset, length, offsets, index_length, name, stored, opened)
     r = Reader(buffer, record.body, record.end)
     head = (r.number(8), r.number(8), r.number(8), r.number(8))
     return ChunkIndexRecord(*head, r.number_map(2, 8), r.number(8), r.text(), r.number(8), r.number(8))

@@ -39,22 +39,19 @@ def provenance(report: LogReport) -> Markup:
 def _by_lineage(channels: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """Channels after what they were made from, with how deep they stand."""
     topics = {channel["topic"] for channel in channels}
-    out: list[dict[str, Any]] = []
-
-    def add(channel: dict[str, Any], depth: int) -> None:
-        if any(done["topic"] == channel["topic"] for done in out):
-            return
-        out.append(channel | {"depth": depth})
-        for other in channels:
-            if other["input"] == channel["topic"]:
-                add(other, depth + 1)
-
+    made_from: dict[str | None, list[dict[str, Any]]] = {}
     for channel in channels:
-        if channel["input"] not in topics:
-            add(channel, 0)
-    for channel in channels:  # those that say they were made from each other
-        add(channel, 0)
-    return out
+        made_from.setdefault(channel["input"], []).append(channel)
+    out: dict[str, dict[str, Any]] = {}
+    roots = [channel for channel in channels if channel["input"] not in topics]
+    for root in (*roots, *channels):  # after the roots those that say they were made from each other
+        waiting = [(root, 0)]
+        while waiting:
+            channel, depth = waiting.pop()
+            if channel["topic"] not in out:
+                out[channel["topic"]] = channel | {"depth": depth}
+                waiting += [(other, depth + 1) for other in reversed(made_from.get(channel["topic"], []))]
+    return list(out.values())
 
 
 def _made(channel: dict[str, Any]) -> tuple[object, ...]:
