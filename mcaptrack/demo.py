@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from importlib import resources
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -19,6 +21,25 @@ from mcaptrack.video import Image, write_mp4
 VIDEO: Final = "demo.mp4"
 TRUTH: Final = "truth.txt"
 PLANE: Final = "ground_plane.txt"
+
+
+#: Scores of every scene and seed, written by tools/bench/demo.py.
+SCORES: Final = "demo_scores.json"
+
+
+def read_scores() -> dict[str, Any]:
+    """Scores of SORT and of re-tracking for each scene, a value a seed, within 1 m on the clock of prediction.
+
+    ``{"version": ..., "seeds": [...], "scenes": {scene: {"SORT" | "re-tracked": {score: [a value a seed]}}}}``
+    """
+    scores: dict[str, Any] = json.loads(resources.files("mcaptrack").joinpath(SCORES).read_text("utf-8"))
+    return scores
+
+
+def mean_and_range(values: Sequence[float], scale: float = 1.0, digits: int = 1) -> str:
+    """The mean of values times ``scale``, and the lowest and highest in brackets."""
+    low, mean, high = (scale * value for value in (min(values), sum(values) / len(values), max(values)))
+    return f"{mean:.{digits}f} ({low:.{digits}f} to {high:.{digits}f})"
 
 
 @dataclass(frozen=True)

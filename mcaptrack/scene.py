@@ -8,7 +8,7 @@ Letters: N people in a picture. Ground: x to the right, y away from the camera, 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Final, NamedTuple
@@ -232,11 +232,16 @@ def _point(xy: Floats) -> Sequence[int]:
     return [round(float(xy[0])), round(float(xy[1]))]
 
 
-def demo_scene() -> Scene:
+#: What stands on the square.
+_KIOSK: Final = (Block(1.6, 14.9, 1.7, 2.3),)
+_TREE_AT_M: Final = (-6.8, 16.0)
+
+
+def demo_scene(seed: int = 2) -> Scene:
     """The scene of the demonstration: the four ways in which tracking fails in the paper, within 40 seconds.
 
     Two people cross; two meet, go side by side and part; one passes behind a kiosk for a second; a tree sways; the
-    camera shakes a little; others just walk.
+    camera shakes a little; others just walk. ``seed`` draws the pixels and the shaking; the routes stay.
     """
     people = (
         # two who cross
@@ -256,4 +261,82 @@ def demo_scene() -> Scene:
         Walker(10, ((0, 3.0, 20.0), (9, 2.5, 12.5), (17, 8.0, 8.0)), (225, 240, 235)),
         Walker(11, ((28, 8.5, 14.5), (40, -5.0, 10.0)), (35, 20, 60)),
     )
-    return Scene(people, 40.0, blocks=(Block(1.6, 14.9, 1.7, 2.3),), tree_at_m=(-6.8, 16.0), shake_px=0.8)
+    return Scene(people, 40.0, blocks=_KIOSK, tree_at_m=_TREE_AT_M, shake_px=0.8, seed=seed)
+
+
+def walkers_scene(seed: int = 1) -> Scene:
+    """Ten people cross the same square on random routes."""
+    rng = np.random.default_rng([seed, 1])
+    return _square(tuple(_random_walker(rng, number) for number in range(1, 11)), seed)
+
+
+def crowd_scene(seed: int = 1) -> Scene:
+    """Twenty people cross the same square on random routes, most of them at the same time."""
+    rng = np.random.default_rng([seed, 2])
+    return _square(tuple(_random_walker(rng, number, latest_s=20.0) for number in range(1, 21)), seed)
+
+
+def pairs_scene(seed: int = 1) -> Scene:
+    """Three pairs of people walk side by side the whole way, 0.7 m apart."""
+    rng = np.random.default_rng([seed, 3])
+    people: list[Walker] = []
+    for pair in range(3):
+        first = _random_walker(rng, 2 * pair + 1)
+        # Beside the first one: across the picture, or in depth where they walk across it.
+        (_, x0, y0), (_, x1, y1) = first.route
+        along = np.array([x1 - x0, y1 - y0]) / np.hypot(x1 - x0, y1 - y0)
+        x, y = 0.7 * np.array([-along[1], along[0]])
+        beside = tuple((seconds, float(px + x), float(py + y)) for seconds, px, py in first.route)
+        people += [first, Walker(2 * pair + 2, beside, _random_colour(rng))]
+    return _square(tuple(people), seed)
+
+
+def standing_scene(seed: int = 1) -> Scene:
+    """Six people come, stand still for 8 to 15 seconds, two of them together, and go on."""
+    rng = np.random.default_rng([seed, 4])
+    people: list[Walker] = []
+    for number in range(1, 7):
+        walker = _random_walker(rng, number, latest_s=8.0)
+        (start, x0, y0), (end, x1, y1) = walker.route
+        share, stay = float(rng.uniform(0.3, 0.7)), float(rng.uniform(8.0, 15.0))
+        x, y = x0 + share * (x1 - x0), y0 + share * (y1 - y0)
+        if number == 2:  # joins the first one
+            _, x, y = people[0].route[1]
+            x, y = x + 0.9, y + 0.2
+        arrival = start + share * (end - start)
+        route = ((start, x0, y0), (arrival, x, y), (arrival + stay, x, y), (end + stay, x1, y1))
+        people.append(Walker(number, route, walker.colour))
+    return _square(tuple(people), seed)
+
+
+def _square(people: tuple[Walker, ...], seed: int) -> Scene:
+    """These people on the square of the demonstration."""
+    return Scene(people, 40.0, blocks=_KIOSK, tree_at_m=_TREE_AT_M, shake_px=0.8, seed=seed)
+
+
+def _random_walker(rng: np.random.Generator, number: int, latest_s: float = 26.0) -> Walker:
+    """Somebody who crosses the square on a straight line at 0.9 to 1.6 m/s, from one side to the other."""
+    side = float(rng.choice([-1.0, 1.0]))
+    start = np.array([side * 8.5, rng.uniform(8.0, 17.0)])
+    end = np.array([-side * 8.5, rng.uniform(8.0, 17.0)])
+    seconds = float(np.hypot(*(end - start)) / rng.uniform(0.9, 1.6))
+    begin = float(rng.uniform(0.0, latest_s))
+    route = ((begin, float(start[0]), float(start[1])), (begin + seconds, float(end[0]), float(end[1])))
+    return Walker(number, route, _random_colour(rng))
+
+
+def _random_colour(rng: np.random.Generator) -> tuple[int, int, int]:
+    """Clothes: dark, or bright; not that of the paving."""
+    low, high = (15, 100) if rng.random() < 0.75 else (200, 245)
+    b, g, r = rng.integers(low, high, 3).tolist()
+    return b, g, r
+
+
+#: The scenes of the demonstration by name: the one it shows, and others, most of them harder. Each takes a seed.
+SCENES: Final[Mapping[str, Callable[[int], Scene]]] = {
+    "square": demo_scene,
+    "walkers": walkers_scene,
+    "crowd": crowd_scene,
+    "side-by-side": pairs_scene,
+    "standing": standing_scene,
+}

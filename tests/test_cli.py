@@ -468,7 +468,7 @@ def test_the_demonstration(tmp_path, monkeypatch):
     """Everything on a scene that it draws itself; a short one here."""
     code = (
         "import sys; from mcaptrack import scene; from tests.worlds import small_scene\n"
-        "scene.demo_scene = small_scene; sys.argv = ['mcaptrack', 'demo', '-o', sys.argv[1]]\n"
+        "scene.SCENES['square'] = lambda seed: small_scene(seed=seed); sys.argv = ['mcaptrack', 'demo', '-o', sys.argv[1]]\n"
         "from mcaptrack.__main__ import main; main()\n"
     )
     run = [sys.executable, "-c", code, str(tmp_path / "d")]

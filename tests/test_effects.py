@@ -206,7 +206,7 @@ CASES: dict[str, dict[str, Case]] = {
         in_place=("drop robot.mcap /a", "--in-place"),
         force=("drop a.mcap /camera/retracks -o clip.mp4", "--force"),
     ),
-    "demo": common("demo", output="-o b", force=("demo -o taken", "--force")),
+    "demo": common("demo", output="-o b", force=("demo -o taken", "--force"), scene="--scene crowd", seed="--seed 3"),
     "docs": common("docs", output="-o pages.txt", force=("docs -o clip.mp4", "--force")),
 }
 
@@ -271,7 +271,8 @@ def _add_channels_of_others(path: Path) -> None:
 @pytest.fixture
 def see(template, tmp_path, monkeypatch) -> Callable[[str], Seen]:
     """Run a command line in a fresh copy of the template."""
-    monkeypatch.setattr(scene, "demo_scene", lambda: small_scene(2.0))
+    monkeypatch.setitem(scene.SCENES, "square", lambda seed: small_scene(2.0, seed=seed))
+    monkeypatch.setitem(scene.SCENES, "crowd", lambda seed: small_scene(1.0, seed=seed))
     monkeypatch.setattr(Server, "serve_forever", _interrupted)
     monkeypatch.setattr(secrets, "token_urlsafe", lambda _: "secret")
     monkeypatch.setattr(webbrowser, "open", lambda address: print(f"opened {address}"))

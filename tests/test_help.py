@@ -181,8 +181,11 @@ def documented() -> list[Bounded]:
 
 
 BOUNDED = documented()
-#: What a command needs beside its input.
-WORDS = {"query": ("select 1",)}
+#: What commands are given, in which none finds anything to do, so that each ends at once with 1.
+WORDS = dict.fromkeys(COMMANDS, ("none.mcap",)) | {
+    "query": ("none.mcap", "select 1"),
+    "demo": ("-o", str(ROOT / "README.md")),
+}
 
 
 @pytest.fixture(scope="module")
@@ -213,7 +216,7 @@ class TestPage:
             after = bound + sign if case.whole else math.nextafter(bound, sign * math.inf)
             for value, is_taken in ((bound, True), (after, False)):
                 text = str(int(value)) if case.whole else repr(value)
-                words = [case.command, "none.mcap", *WORDS.get(case.command, ()), *case.chosen]
+                words = [case.command, *WORDS[case.command], *case.chosen]
                 where = f"--{case.name}"
                 with monkeypatch.context() as patch:
                     if way == "command line":
@@ -235,7 +238,7 @@ class TestPage:
         for setting in COMMANDS[command].settings.values():
             if setting.kind is float and not setting.parameter.startswith("old_"):
                 chosen = next((case.chosen for case in BOUNDED if case[::2][:2] == (command, setting.name)), ())
-                words = [command, "none.mcap", *WORDS.get(command, ()), *chosen, f"--{setting.name}=nan"]
+                words = [command, *WORDS[command], *chosen, f"--{setting.name}=nan"]
                 _, _, err = called(*words)
                 assert err.startswith(f"mcaptrack: --{setting.name} has to be "), err
 

@@ -88,7 +88,7 @@ def _replaced(text: str) -> str:
 @pytest.fixture
 def run(template, tmp_path, monkeypatch):
     """Run a command line in a fresh copy of the template, with evil names for its files and channels."""
-    monkeypatch.setattr(scene, "demo_scene", lambda: small_scene(2.0))
+    monkeypatch.setitem(scene.SCENES, "square", lambda seed: small_scene(2.0, seed=seed))
     monkeypatch.setattr(Server, "serve_forever", _interrupted)
     folders = (tmp_path / str(number) for number in itertools.count())
 

@@ -383,7 +383,7 @@ def test_old_tables_have_new_columns_as_null(square, tmp_path):
         found = database.ask(
             "select recording, count(*) as n, count(source_id) as known from tracks group by all order by all"
         )
-        assert rows_of(found)[1] == [["demo", 3168, 3168], ["old", 3168, 0]]
+        assert rows_of(found)[1] == [["demo", 3171, 3171], ["old", 3171, 0]]
         assert rows_of(database.ask("select count(*) from events"))[1] == [[0]]
 
 
