@@ -125,6 +125,23 @@ def options(**given) -> IngestOptions:
 
 
 class TestIngest:
+    @pytest.mark.parametrize("role", ["truth", "tracks"])
+    def test_labels_get_metres_by_the_ground_plane_that_the_log_has(self, tmp_path, clip, role):
+        labels = write(tmp_path / "gt.txt", MOT15)
+        plane = write(tmp_path / "h.txt", "0.1,0,0\n0,0.2,0\n0,0,1\n")
+        ingest(clip, tmp_path / "whole.mcap", options(ground_plane=plane, labels={role: labels}))
+        ingest(clip, tmp_path / "added.mcap", options(ground_plane=plane))
+        with log.read(tmp_path / "added.mcap") as opened:
+            ingest(labels, tmp_path / "added.mcap", options(role=role), into=opened)
+        seen = []
+        for name in ("whole", "added"):
+            with log.read(tmp_path / f"{name}.mcap") as opened:
+                seen.append([message.payload for message in opened.messages(f"/camera/{role}")])
+                first = next(frame.rows for frame in opened.frames(f"/camera/{role}", TRACKS) if len(frame.rows))
+        assert seen[0] == seen[1]
+        foot = [(first["x_px"] + first["w_px"] / 2) * 0.1, (first["y_px"] + first["h_px"]) * 0.2]
+        assert np.allclose([first["x_m"], first["y_m"]], foot)
+
     def test_a_video_with_everything_beside_it(self, tmp_path, clip):
         truth = write(tmp_path / "gt.txt", MOT15)
         plane = write(tmp_path / "h.txt", "0.1,0,0\n0,0.1,0\n0,0,1\n")

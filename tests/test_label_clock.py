@@ -513,5 +513,5 @@ def test_the_commands_of_the_readme_work_as_written(tmp_path, monkeypatch):
         assert len(times) > 1
         assert len({tuple(t) for t in times.values()}) == 1 or name == "boxes.mcap"
         assert all(t == [round(Fraction(k, 7) * 10**9) for k in range(len(t))] for t in times.values())
-    result = CliRunner().invoke(app, ["evaluate", "log.mcap", "--json"])
+    result = CliRunner().invoke(app, ["evaluate", "video.mcap", "--json"])
     assert {row["MOTA"] for row in json.loads(result.stdout)["results"] if row["similarity"] == "iou"} == {1.0}

@@ -18,6 +18,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 from time import monotonic
 
@@ -65,8 +66,9 @@ def main() -> int:
         if why:
             print(f"not run: {line} ({why})", flush=True)
             continue
-        for word in shlex.split(line):
-            if word in FILES and not any(work.glob(word.rstrip("/"))):
+        words = shlex.split(line)
+        for before, word in pairwise(words):
+            if before != "-o" and word in FILES and not any(work.glob(word.rstrip("/"))):
                 run([folder / "env" / "bin" / "python", Path(__file__).resolve(), "--make", word], work, folder)
         also = next((codes for name, codes in ALSO_GOOD.items() if line.startswith(f"mcaptrack {name} ")), set())
         run(["sh", "-c", line], work, folder, also)
@@ -171,11 +173,15 @@ def labels(path: Path) -> None:
 
 
 def sequences(pattern: str) -> Callable[[Path], None]:
-    """Label files for each name that a pattern may match."""
+    """Label files for each name that a pattern may match, in folders as MOTChallenge has them."""
 
     def make(path: Path) -> None:
         for name in ("east", "west"):
-            labels(Path(str(path).replace("*", name)))
+            made = Path(str(path).replace("*", name))
+            labels(made)
+            if made.parent.name in ("gt", "det"):
+                words = f"name={name}\nframeRate={FPS}\nseqLength={FPS * SECONDS}\nimWidth=320\nimHeight=180\n"
+                (made.parent.parent / "seqinfo.ini").write_text(f"[Sequence]\n{words}")
 
     return make
 
@@ -295,7 +301,7 @@ FILES: dict[str, Callable[[Path], None]] = {
     **dict.fromkeys(("video.mp4", "walk.mp4", "video.avi"), video),
     "frames/": images,
     "homography.txt": homography,
-    **dict.fromkeys(("gt.txt", "tracks.txt"), labels),
+    **dict.fromkeys(("gt.txt", "det.txt", "tracks.txt"), labels),
     **{pattern: sequences(pattern) for pattern in ("train/*/gt/gt.txt", "train/*/det/det.txt", "tracks/*.txt")},
     **dict.fromkeys(("drive.bag", "rosbag2_2026_05_01/"), bag),
     **dict.fromkeys(("robot.mcap", "other.mcap"), robot),
@@ -303,7 +309,7 @@ FILES: dict[str, Callable[[Path], None]] = {
     "broken.mcap": broken,
     "red:trained/red.safetensors": lambda path: trained(Path("trained/red.safetensors")),
     "speed.sql": lambda path: (
-        path.write_text("select recording, avg(speed_m_per_s) from track_summary group by 1\n") and None
+        path.write_text("select recording, avg(mean_speed_m_s) from track_summary group by 1\n") and None
     ),
 }
 

@@ -21,9 +21,10 @@ from mcaptrack.ingest.formats import Format, Labels, Role
 from mcaptrack.ingest.job import IngestOptions, Job
 from mcaptrack.ingest.timeline import MAX_FRAMES, Timeline, count_frames
 from mcaptrack.notices import warn
-from mcaptrack.plane import Point
+from mcaptrack.plane import GroundPlane, Point
 from mcaptrack.provenance import CLOCK
-from mcaptrack.schema import Frame
+from mcaptrack.schema import GROUND_PLANE, Frame
+from mcaptrack.schema.ground import rows_to_plane
 from mcaptrack.video import SEQINFO, find_seqinfo
 
 _SDD_FPS: Final = Fraction(30)
@@ -50,7 +51,7 @@ class LabelJob(Job):
     """Label files without pictures, or for pictures that a log has. The first of ``inputs`` is the input itself.
 
     A role that is None follows from whether there are ids. ``default_fps`` is for files that say nothing. ``ground`` is
-    the ground plane, if one is given.
+    the ground plane, if one is given or the log has one.
     """
 
     def __init__(
@@ -81,7 +82,7 @@ class LabelJob(Job):
             size = size_of(there, self.pictures) if self.homography and self.pictures else size
         else:
             self.timeline = self._of_rate(default_fps)
-        self.ground = self.plane(*size)
+        self.ground = self.plane(*size) or self._measured_plane()
 
     def _add(self, role: Role | None, path: Path) -> None:
         labels = self.read(path, role or "tracks")
@@ -99,6 +100,14 @@ class LabelJob(Job):
             return 0, 0
         corner = np.concatenate([part[:, :2] + part[:, 2:] for part in boxes]).max(axis=0)
         return max(0, int(np.ceil(corner[0]))), max(0, int(np.ceil(corner[1])))
+
+    def _measured_plane(self) -> GroundPlane | None:
+        """The ground plane that the log has for the camera, if it was measured and holds throughout."""
+        topic = f"{self.prefix}/ground_plane"
+        if self.there is None or topic not in self.there.channels:
+            return None
+        planes = [rows_to_plane(frame.rows) for frame in self.there.frames(topic, GROUND_PLANE)]
+        return planes[0] if len(planes) == 1 and not planes[0].assumed else None
 
     def _of_pictures(self, there: log.Log, topic: str) -> Timeline:
         """The pictures that stand in the log. Raises McaptrackError if options say that they are others."""
