@@ -6,8 +6,9 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-# Every package, those that build included, comes in the version that constraints.txt names.
-export PIP_CONSTRAINT := $(CURDIR)/constraints.txt
+# Every package, those that build included, comes in the version that constraints.txt names. pip would take an absolute
+# path with a blank in it for two.
+export PIP_CONSTRAINT := constraints.txt
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .PHONY: demo test mutants clean
