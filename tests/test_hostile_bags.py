@@ -433,8 +433,7 @@ def test_the_limit_of_unpacking_can_be_set(folder, monkeypatch):
     assert ingest(folder / "a.db3.zstd", folder.parent / "out.mcap", IngestOptions()).messages == {"/a": 1}
 
 
-@pytest.mark.parametrize("pack", [zeros, undeclared])
-@pytest.mark.parametrize("storage", ["SQLITE3", "MCAP"])
+@pytest.mark.parametrize(("pack", "storage"), [(zeros, "SQLITE3"), (undeclared, "MCAP")])
 def test_messages_that_become_huge_together_are_refused(commands, folder, pack, storage):
     from rosbags.rosbag2 import StoragePlugin
     from rosbags.rosbag2 import Writer as Writer2
