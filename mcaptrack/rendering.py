@@ -16,7 +16,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaptrack import foxglove, log
+from mcaptrack import foxglove, log, notices
 from mcaptrack.clock import NS_PER_S, seconds_to_ns
 from mcaptrack.errors import McaptrackError
 from mcaptrack.pictures import Pictures
@@ -65,6 +65,10 @@ def render(
     first = int(times[0]) + seconds_to_ns(options.start_s)
     last = int(times[-1]) if options.end_s is None else int(times[0]) + seconds_to_ns(options.end_s)
     numbers = np.flatnonzero((times >= first) & (times <= last))
+    _, first_of = np.unique(times[numbers], return_index=True)
+    if len(first_of) < len(numbers):
+        notices.warn(f"{len(numbers) - len(first_of)} pictures have the time of another and are left out", "left-out")
+        numbers = numbers[first_of]
     max_fps = options.max_fps or (_GIF_FPS if output.suffix.lower() == ".gif" else None)
     if max_fps is not None and len(numbers):
         ticks = np.floor((times[numbers] - times[numbers[0]]) / NS_PER_S * max_fps + 1e-6)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -75,6 +76,19 @@ def test_tables_leave_out_what_they_can_t_hold_and_say_so(tmp_path):
     assert Counter(stock_messages(tmp_path / "other.mcap")) == Counter(m for m in [*SOME, *LATE] if m[0] != "a")
 
 
+def retime(path: Path, output: Path, when: Callable[[int], int]) -> None:
+    """Write a log once more, with other times of messages."""
+    with log.read(path) as opened, log.create(output) as writer:
+        numbers = {}
+        for number, channel in opened.index.channels.items():
+            schema = opened.index.schemas.get(channel.schema_id)
+            layout = (schema.name, schema.encoding, schema.data) if schema else ("", "", b"")
+            numbers[number] = writer.add_channel(channel.topic, layout, channel.message_encoding, channel.metadata)
+        for number, message in log.stream(opened):
+            writer.add_message(numbers[number], when(message.t_ns), message.sequence, message.payload)
+        log.pass_on_extras(opened, writer)
+
+
 @pytest.fixture(scope="module")
 def early(tmp_path_factory) -> Path:
     return made_log(tmp_path_factory.mktemp("early"), 12)
@@ -84,17 +98,10 @@ def early(tmp_path_factory) -> Path:
 def ours(request, early, tmp_path_factory) -> Path:
     """A log with everything in it, whose messages are later than they were."""
     path = tmp_path_factory.mktemp("late") / "late.mcap"
-    with log.read(early) as opened, log.create(path, log.header(opened)[0]) as writer:
+    with log.read(early) as opened:
         middle = (opened.start_ns + opened.end_ns) // 2
-        later = MAX_NS + 1 - (0 if request.param == "all of them" else middle)
-        numbers = {}
-        for number, channel in opened.index.channels.items():
-            schema = opened.index.schemas.get(channel.schema_id)
-            layout = (schema.name, schema.encoding, schema.data) if schema else ("", "", b"")
-            numbers[number] = writer.add_channel(channel.topic, layout, channel.message_encoding, channel.metadata)
-        for number, message in log.stream(opened):
-            writer.add_message(numbers[number], message.t_ns + later, message.sequence, message.payload)
-        log.pass_on_extras(opened, writer)
+    later = MAX_NS + 1 - (0 if request.param == "all of them" else middle)
+    retime(early, path, lambda t_ns: t_ns + later)
     return path
 
 
@@ -143,3 +150,15 @@ def test_boxes_of_others_at_such_times_are_not_tracked(tmp_path):
     assert outcome.code == 1
     assert "/boxes has 1 messages later than the year 2262, the first at 9223372036854775808 ns" in outcome.err
     assert everything(tmp_path) == before
+
+
+@pytest.mark.parametrize("shared", [3, 1000], ids=["some share a time", "all share a time"])
+def test_messages_may_share_a_time(early, tmp_path, monkeypatch, shared):
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / "same" / "a.mcap"
+    path.parent.mkdir()
+    retime(early, path, lambda t_ns: t_ns // (shared * 10**8) * shared * 10**8)
+    for command in ("predict", "retrack", "render", "report", "evaluate"):
+        done(command, *READING[command](path, tmp_path))
+        (tmp_path / "other.mcap").unlink(missing_ok=True)
+    done("render", path, "-o", tmp_path / "a.mp4")

@@ -151,8 +151,9 @@ def _in_context(opened: log.Log, prefix: str, job: Job, made: Mapping[str, Made]
         known["start_ns"] = _clock_start(opened, prefix)
     if "rate_hz" in names:
         times = [f.t_ns for f in made[job.source].frames] if job.source in made else opened.times(job.source).tolist()
-        if len(times) > 1:
-            known["rate_hz"] = round(NS_PER_S / float(np.median(np.diff(times))), 6)
+        steps = np.diff(times)
+        if (steps > 0).any():  # frames may share a time
+            known["rate_hz"] = round(NS_PER_S / float(np.median(steps[steps > 0])), 6)
     return replace(job.transform, **known)
 
 
