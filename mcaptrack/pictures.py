@@ -8,6 +8,7 @@ Letters: M messages.
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Container, Iterable, Iterator
 from typing import Final, Protocol
 
@@ -15,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack import foreign, log
-from mcaptrack.errors import McaptrackError
+from mcaptrack.errors import DamagedError, McaptrackError
 from mcaptrack.schema import Frame
 from mcaptrack.video import Encoded, colours, entry
 
@@ -141,8 +142,15 @@ class Pictures:
             # Messages may share a time: then some that are not meant come along.
             before = int(np.searchsorted(self.t_ns, self.t_ns[first]))
             span = int(self.t_ns[first]), int(self.t_ns[until - 1]) + 1
+            read = first
             for number, message in enumerate(self._opened.messages(self._topic, *span), before):
                 if first <= number < until:
+                    read = number + 1
                     picture = self._picture(message)
                     where = f"{self._opened.path}: {self._topic} at {message.t_ns} ns"
                     yield number, Encoded(message.t_ns, number, picture.format, picture.data, picture.layout, where)
+            if read < until:
+                raise DamagedError(
+                    f"{self._opened.path} is damaged: messages of {self._topic} lie outside of the times that their "
+                    f"chunk names; `mcaptrack recover {shlex.quote(str(self._opened.path))}` mends that"
+                )

@@ -38,7 +38,8 @@ def resample(frames: Sequence[Frame], at_ns: Ints, max_hole_ns: int) -> tuple[Ro
     step_ns = np.append(np.diff(row_ns), 0)[: len(rows)]
     goes_on = same & (step_ns > 0) & (step_ns <= max_hole_ns)
     low = np.searchsorted(at_ns, row_ns, "left")
-    high = np.searchsorted(at_ns, np.where(goes_on, row_ns + step_ns, row_ns + 1), "left")
+    until = np.searchsorted(at_ns, np.where(goes_on, row_ns + step_ns, row_ns), "left")
+    high = np.where(goes_on, until, np.searchsorted(at_ns, row_ns, "right"))
     count = high - low
 
     before = np.repeat(np.arange(len(rows)), count)

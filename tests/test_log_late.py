@@ -7,15 +7,22 @@ from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from mcaptrack import log
 from mcaptrack.clock import parse_ns
+from mcaptrack.errors import McaptrackError
 from mcaptrack.log.chunks import LOG_MAX_NS, MAX_NS
+from mcaptrack.pictures import Pictures
+from mcaptrack.resample import resample
+from mcaptrack.schema import Frame
 from tests.commands import called, done, made_log
+from tests.log_mutants import CHUNK, parts, without_summary
 from tests.test_journal import everything
 from tests.test_log import SCHEMA, SOME, STOCK_OPTIONS, our_messages, stock_messages, write_stock
 from tests.test_read_only import READING
+from tests.worlds import tracks_at
 
 LATE = [
     ("a", MAX_NS, 6, b"the last that is computed with"),
@@ -162,3 +169,28 @@ def test_messages_may_share_a_time(early, tmp_path, monkeypatch, shared):
         done(command, *READING[command](path, tmp_path))
         (tmp_path / "other.mcap").unlink(missing_ok=True)
     done("render", path, "-o", tmp_path / "a.mp4")
+
+
+def test_pictures_outside_of_the_times_that_their_chunk_names_are_refused(early):
+    with log.read(early) as opened:
+        opened.index.chunks[:] = [chunk._replace(start_ns=0, end_ns=0) for chunk in opened.index.chunks]
+        with pytest.raises(McaptrackError, match="lie outside of the times that their chunk names"):
+            list(Pictures(opened, "/camera/video").frames([3]))
+
+
+def test_chunks_without_an_index_are_found_by_the_times_of_their_messages(tmp_path):
+    path = tmp_path / "a.mcap"
+    write_stock(path, SOME)
+    records, _ = parts(path.read_bytes())
+    records = [(opcode, bytes(16) + body[16:] if opcode == CHUNK else body) for opcode, body in records]
+    path.write_bytes(without_summary(records))
+    with log.read(path) as opened:
+        assert [message.sequence for message in opened.messages("b", 35, 50)] == [5]
+
+
+def test_the_last_time_of_all_is_computed_with():
+    rows = tracks_at({1: (1.0, 2.0)})
+    at_ns = np.array([MAX_NS - 1, MAX_NS])
+    found, at = resample([Frame(MAX_NS - 1, 0, rows), Frame(MAX_NS, 1, rows)], at_ns, 5)
+    assert at.tolist() == [0, 1]
+    assert found["track_id"].tolist() == [1, 1]

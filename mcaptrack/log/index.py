@@ -266,10 +266,11 @@ def _scan_chunk(index: Index, buffer: Bytes, record: Record) -> None:
     entries = chunk_entries(content)
     _count(index, entries)
     index.entries[record.start] = entries
+    edges = [int(edge) for listed in entries.values() for edge in (listed[:, 0].min(), listed[:, 0].max())]
     index.chunks.append(
         ChunkIndexRecord(
-            head.start_ns,
-            head.end_ns,
+            min(edges, default=head.start_ns),  # the chunk may say otherwise
+            max(edges, default=head.end_ns),
             record.start,
             record.end - record.start,
             dict.fromkeys(entries, 0),  # there may be no message index; 0 says so
