@@ -255,7 +255,7 @@ def test_every_parameter_says_what_it_is_and_refuses_what_it_can_not_be(kind):
         with pytest.raises(McaptrackError, match=parameter.name):
             kind(**{parameter.name: object()})
         least, most = parameter.metadata["least"], parameter.metadata["most"]
-        words = f"at least {least:g}" if most == np.inf else f"from {least:g} to {most:g}"
+        words = f"from {least:.15g} to {most:.15g}"
         number = bare_type(get_type_hints(kind)[parameter.name])
         for value in (least - 1, most + 1):
             if np.isfinite(value):

@@ -68,6 +68,7 @@ def query(
             "--rows",
             panel=_QUERY,
             least=0,
+            most=1_000_000_000,
             help="Number of rows that a table shows; 0 for all.",
             show_default="60 on a terminal",
         ),

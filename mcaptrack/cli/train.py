@@ -159,6 +159,7 @@ def train(
             "--patience",
             panel=_TRAINING,
             least=0,
+            most=1_000_000,
             tuning=True,
             help="Stop after this many epochs without improvement; 0 for never.",
         ),

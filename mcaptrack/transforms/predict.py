@@ -33,7 +33,9 @@ class Predict:
         names=NAMES,
     )
     horizon_s: float = option(4.8, "how far ahead to predict, in seconds", least=0.1, most=60.0)
-    min_history: int = option(4, "number of positions, the current one included, that a prediction needs", least=1)
+    min_history: int = option(
+        4, "number of positions, the current one included, that a prediction needs", least=1, most=100
+    )
     rate_hz: float = context(lambda: 2.5)
 
     reads: ClassVar[Schema] = TRACKS

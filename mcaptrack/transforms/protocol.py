@@ -20,7 +20,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import field, fields
 from types import UnionType
-from typing import Any, ClassVar, Literal, Protocol, get_args, get_origin, get_type_hints
+from typing import Any, ClassVar, Final, Literal, Protocol, get_args, get_origin, get_type_hints
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import Frame, Schema
@@ -41,22 +41,31 @@ class Transform(Protocol):
         ...
 
 
+#: The upper end of parameters that name no other: days as seconds, hundreds of kilometres as metres.
+LARGEST: Final = 1e6
+
+
 def option(
     default: Any,
     help: str,  # noqa: A002
     *,
     least: float = -math.inf,
-    most: float = math.inf,
+    most: float | None = None,
     search: tuple[float, float] | None = None,
     names: tuple[str, ...] = (),
     theme: str = "",
 ) -> Any:
     """A parameter of a transform: its default, what it means, and its range.
 
+    What has a lower end has an upper one, too, ``LARGEST`` unless ``most`` says another: times in nanoseconds and
+    counts of steps stay in 64 bits then.
+
     ``search`` is the part of the range that is worth a search (``mcaptrack tune``); None for what isn't tuned.
     ``names`` are the built-in values of a text that may also name a file. ``theme`` is a heading that parameters share
     in the help of a command that has many.
     """
+    if most is None:
+        most = math.inf if least == -math.inf else LARGEST
     about = {"help": help, "least": least, "most": most, "search": search, "names": names, "theme": theme}
     return field(default=default, metadata=about)
 
@@ -111,4 +120,4 @@ def limits(least: float, most: float) -> str:
 
 
 def _number(value: float) -> str:
-    return str(int(value)) if value == int(value) else f"{value:g}"
+    return f"{value:.15g}"

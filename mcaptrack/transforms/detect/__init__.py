@@ -49,7 +49,9 @@ class Detect:
         None, "difference from the background that counts as motion; each method has its own default", least=0.0
     )
     history_s: float = option(60.0, "memory of the background model, in seconds", least=0.1)
-    max_pixels: int = option(1_000_000, "pictures are halved until they have no more pixels than this", least=1_000)
+    max_pixels: int = option(
+        1_000_000, "pictures are halved until they have no more pixels than this", least=1_000, most=1_000_000_000
+    )
     stabilise: bool = option(True, "compensate the motion of a shaking camera")
 
     reads: ClassVar[Schema] = VIDEO

@@ -135,9 +135,15 @@ class Retrack:
         "raw", "what a new track predicts from: its past as observed, or smoothed", theme=_PREDICTIONS
     )
     min_history: int = option(
-        2, "number of positions, the current one included, that an observation needs", least=1, theme=_PREDICTIONS
+        2,
+        "number of positions, the current one included, that an observation needs",
+        least=1,
+        most=100,
+        theme=_PREDICTIONS,
     )
-    min_hits: int = option(1, "online, a track is written from this many matches in a row", least=0, theme=_LIFE)
+    min_hits: int = option(
+        1, "online, a track is written from this many matches in a row", least=0, most=1000, theme=_LIFE
+    )
     confirm: bool = option(
         False, "offline, leave out what a track matched after its last --min-hits matches in a row", theme=_LIFE
     )

@@ -132,7 +132,9 @@ class Sort:
         theme=_ASSOCIATION,
     )
     min_score: float | None = option(None, "ignore detections with a lower score", theme=_DETECTIONS)
-    class_id: int | None = option(None, "ignore detections of other classes", least=0, theme=_DETECTIONS)
+    class_id: int | None = option(
+        None, "ignore detections of other classes", least=0, most=2**31 - 1, theme=_DETECTIONS
+    )
     mix_classes: bool = option(False, "a track may continue with a detection of another class", theme=_ASSOCIATION)
     ground_planes: Planes = context(tuple)
 
