@@ -69,6 +69,17 @@ def carry(tracks: Sequence[Frame], retracks: Sequence[Frame], planes: Planes) ->
     return [Frame(frame.t_ns, frame.index, rows[low:high]) for frame, low, high in spans]
 
 
+def keep(tracks: Sequence[Frame], planes: Planes) -> list[Frame]:
+    """The frames of ``tracks`` under the names that they have, as ``carry`` gives them."""
+    out = []
+    for frame in tracks:
+        rows = frame.rows.copy()
+        rows["source_id"] = rows["track_id"]
+        _to_metres(rows, np.full(len(rows), frame.t_ns), planes)
+        out.append(frame._replace(rows=rows))
+    return out
+
+
 def _owner(track: Ints, t_ns: Ints, retracks: Sequence[Frame], tick_ns: Ints) -> tuple[Ints, Ints]:
     """Whom rows of ``track`` (N,) at ``t_ns`` belong to by the tick that is nearest of those which say it, and how far
     that is in ns; -1 where none says it.

@@ -12,22 +12,35 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from typing import Final, Literal, NamedTuple
+from typing import Final, Literal, NamedTuple, get_args
 
 #: What kind of thing a warning is about, for programs. docs/warnings.md says what each means.
 Code = Literal[
     "assumed-ground-plane",
+    "camera-moves",
+    "chosen-camera",
     "classes",
     "clock",
+    "extrapolated",
+    "held-back",
     "journal",
     "left-out",
     "lost",
+    "memory",
     "not-compared",
+    "nothing-found",
     "option-not-used",
     "other",
     "other-settings",
     "out-of-date",
+    "view-lost",
+    "worse",
 ]
+
+
+def known_code(text: str) -> Code:
+    """A code that was read; "other" for one that this version doesn't know."""
+    return next((code for code in get_args(Code) if code == text), "other")
 
 
 class McaptrackWarning(UserWarning):
@@ -55,7 +68,7 @@ _LOG: Final[ContextVar[str | None]] = ContextVar("log", default=None)
 
 def warn(message: str, code: Code = "other") -> None:
     """Say something that changes results or casts doubt on them: what, where, and what to do."""
-    _pass_on(Notice(" ".join(message.split()), code, _LOG.get()), _LISTENER.get())
+    _pass_on(Notice(" ".join(message.splitlines()), code, _LOG.get()), _LISTENER.get())
 
 
 def _pass_on(notice: Notice, listener: Listener | None) -> None:

@@ -8,7 +8,6 @@ Letters: M messages.
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Container, Iterable, Iterator
 from typing import Final, Protocol
 
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 
 from mcaptrack import foreign, log
 from mcaptrack.errors import DamagedError, McaptrackError
+from mcaptrack.log.beside import recover_command
 from mcaptrack.schema import Frame
 from mcaptrack.video import Encoded, colours, entry
 
@@ -152,5 +152,5 @@ class Pictures:
             if read < until:
                 raise DamagedError(
                     f"{self._opened.path} is damaged: messages of {self._topic} lie outside of the times that their "
-                    f"chunk names; `mcaptrack recover {shlex.quote(str(self._opened.path))}` mends that"
+                    f"chunk names; {recover_command(self._opened.path)} mends that"
                 )

@@ -104,6 +104,28 @@ def plane_at(planes: Planes, t_ns: int) -> GroundPlane | None:
     return held
 
 
+def is_assumed(planes: Planes | None) -> bool:
+    """Whether there are planes, and all were guessed."""
+    return planes is not None and len(planes) > 0 and all(plane.assumed for _, plane in planes)
+
+
+#: Where the ground is less deep in the picture than this, one scale for all of it can't hold (see ``ground_depth``).
+LEAST_DEPTH = 1.8
+
+
+def ground_depth(xywh: Floats) -> float:
+    """How deep the ground on which boxes (N, 4) stand is in the picture, in heights of a tall person; NaN for none.
+
+    Both without the outermost twentieths. It is small for a camera that looks along the ground: then people near and
+    far stand at the same place of the picture, and differ in size. In drawn scenes with cameras of all heights and
+    tilts re-tracking on a guessed scale made IDF1 worse in most with less than 1.8, and better in nearly all with more.
+    """
+    if len(xywh) == 0:
+        return float("nan")
+    low, high = np.quantile(xywh[:, 1] + xywh[:, 3], [0.05, 0.95])
+    return float((high - low) / np.quantile(xywh[:, 3], 0.95))
+
+
 def assumed_plane(heights_px: Floats, width_px: int, height_px: int) -> GroundPlane:
     """The plane for a scene that nobody measured: the image itself, scaled so that the median box is a person high.
 
@@ -112,7 +134,7 @@ def assumed_plane(heights_px: Floats, width_px: int, height_px: int) -> GroundPl
     """
     heights = heights_px[np.isfinite(heights_px) & (heights_px > 0)]
     if len(heights) == 0:
-        raise McaptrackError("no boxes to guess a scale from; give the plane with `mcaptrack ingest --ground-plane`")
+        raise McaptrackError("no boxes to guess a scale from; a ground plane has to be given")
     scale = PERSON_HEIGHT_M / float(np.median(heights))
     homography = (scale, 0.0, -scale * width_px / 2, 0.0, -scale, scale * height_px / 2, 0.0, 0.0, 1.0)
     return GroundPlane(homography, width_px, height_px, assumed=True)

@@ -7,13 +7,16 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final, Self
+from typing import Any, Final, Self, TypeVar
 
 from mcaptrack import __version__
 
+T = TypeVar("T", dict[str, Any], list[Any])
 _PREFIX: Final = "mcaptrack."
+#: The transforms of channels that no stage made: what came in, and what shows others.
+INGEST, VIEW = "ingest", "view"
 #: The metadata record that says when the clock of a log's cameras begins, as ``start_ns``.
 CLOCK: Final = "mcaptrack.clock"
 
@@ -23,7 +26,9 @@ class Provenance:
     """What made a channel, from what, and how. ``digest`` is of its own messages, ``input_digest`` of its input's.
 
     ``references`` are the topics that the input was compared with, and the digest of each: empty where there was
-    nothing of that name.
+    nothing of that name. ``implementation`` is where the transform is defined ("package.module:Class") if it is not
+    built in, and ``distribution`` what it was installed with ("name 1.2"). ``warnings`` are what was odd about it when
+    it was made: code and message of each.
     """
 
     transform: str
@@ -33,6 +38,9 @@ class Provenance:
     digest: str = ""
     weights_sha256: str = ""
     references: Mapping[str, str] = field(default_factory=dict)
+    implementation: str = ""
+    distribution: str = ""
+    warnings: Sequence[Sequence[str]] = ()
     version: str = __version__
 
     def made_from(self) -> dict[str, str]:
@@ -50,7 +58,12 @@ class Provenance:
             "digest": self.digest,
             "weights_sha256": self.weights_sha256,
             "references": json.dumps(dict(self.references), sort_keys=True, separators=(",", ":")),
+            "implementation": self.implementation,
+            "distribution": self.distribution,
+            "warnings": json.dumps(self.warnings, separators=(",", ":")),
         }
+        if not self.warnings:
+            del values["warnings"]
         if not self.references:
             del values["references"]
         return {_PREFIX + key: value for key, value in values.items() if value}
@@ -61,18 +74,31 @@ class Provenance:
         values = {key.removeprefix(_PREFIX): value for key, value in metadata.items() if key.startswith(_PREFIX)}
         if "transform" not in values:
             return None
-        parameters, references = (_object(values.pop(key, "{}")) for key in ("parameters", "references"))
+        parameters, references = (_read(values.pop(key, ""), dict) for key in ("parameters", "references"))
+        warnings = [one for one in _read(values.pop("warnings", ""), list) if _is_warning(one)]
         known = {key: value for key, value in values.items() if key in cls.__dataclass_fields__}
-        return cls(parameters=parameters, references=references, **known)
+        return cls(parameters=parameters, references=references, warnings=warnings, **known)
 
 
-def _object(text: str) -> dict[str, Any]:
-    """A JSON object; an empty one for anything else."""
+def _read(text: str, kind: type[T]) -> T:
+    """A JSON object or array; an empty one for anything else."""
     try:
         value = json.loads(text)
-    except ValueError:
-        return {}
-    return value if isinstance(value, dict) else {}
+    except (ValueError, RecursionError):
+        return kind()
+    return value if isinstance(value, kind) else kind()
+
+
+def _is_warning(value: object) -> bool:
+    return isinstance(value, list) and len(value) == 2 and all(isinstance(part, str) for part in value)
+
+
+def distribution_of(module: str) -> str:
+    """Name and version of what a module was installed with, as in "name 1.2"; "" if that isn't known."""
+    from importlib.metadata import packages_distributions, version
+
+    names = packages_distributions().get(module.partition(".")[0], [])
+    return f"{names[0]} {version(names[0])}" if names else ""
 
 
 def digest(messages: Iterable[tuple[int, int, bytes]]) -> str:

@@ -20,7 +20,7 @@ from typing import Any, Final, Protocol, Self
 
 from mcaptrack import log, tables
 from mcaptrack.atomic import follow_links
-from mcaptrack.errors import McaptrackError
+from mcaptrack.errors import McaptrackError, command
 from mcaptrack.export import TOPICS, Contents, default_folder, standing, topic_folder
 from mcaptrack.log.names import results_of
 from mcaptrack.tables import TABLES
@@ -165,7 +165,9 @@ class Database:
     def _answer(self, query: str) -> Any:
         """The answer of the last statement that gives one, Arrow or None."""
         if re.match(r"\s*show\s+(all\s+)?tables\b", query, re.IGNORECASE):
-            raise McaptrackError("tables come in when a query names them; `mcaptrack query LOG --tables` lists them")
+            raise McaptrackError(
+                f"tables come in when a query names them; {command('query', 'LOG', '--tables')} lists them"
+            )
         statements = self._connection.extract_statements(query)
         _refuse_writing([statement.type.name for statement in statements])
         answer = None
@@ -240,8 +242,7 @@ class Database:
             log.refuse_other_kinds(path)
             other = " (those in other formats are not read)" if found else ""
             raise McaptrackError(
-                f"{path} is a folder without tables in Parquet{other}; give a log, or a folder as `mcaptrack export` "
-                "writes it"
+                f"{path} is a folder without tables in Parquet{other}; give a log, or a folder that one was exported to"
             )
         return [*there]
 

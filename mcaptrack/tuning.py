@@ -171,7 +171,7 @@ class _Study:
             head, *lines = (json.loads(line) for line in whole.decode("utf-8").splitlines())
             self.trials = [Trial(line["number"], line["parameters"], line["scores"]) for line in lines]
         except (ValueError, KeyError, TypeError):
-            raise McaptrackError(f"{path} is no study of `mcaptrack tune`") from None
+            raise McaptrackError(f"{path} is no study: a file of trials that tune wrote") from None
         differs = sorted(name for name in about if head.get(name) != about[name]) if isinstance(head, dict) else ["all"]
         if differs:
             raise McaptrackError(

@@ -67,6 +67,7 @@ DEFAULTS: dict[str, dict[str, Any]] = {
         "smooth": True,
         "backfill": "unclaimed",
         "filled": False,
+        "side_view": False,
     },
 }
 #: Algorithm 1 as in the paper; numbers that the paper doesn't give are those of the authors' program.

@@ -284,6 +284,7 @@ def see(template, tmp_path, monkeypatch) -> Callable[[str], Seen]:
         monkeypatch.chdir(folder)
         code, out, err = called(*shlex.split(line))
         out = re.sub(r"(?<=127\.0\.0\.1)(:|%3A)\d{5}\b", ":any", out)  # a port that was free
+        out, err = re.sub(r'"seconds": [\d.]+', "", out), re.sub(r" in [\d.]+ s\b", "", err)  # how long it took
         files = {str(path.relative_to(folder)): _digest(path) for path in folder.rglob("*") if path.is_file()}
         monkeypatch.chdir(tmp_path)
         return Seen(code, out, err, files)

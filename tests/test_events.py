@@ -510,8 +510,10 @@ def test_tracks_that_others_wrote_are_watched_and_their_channels_are_never_repla
     path = written(tmp_path / "b.mcap", made_by="", tracks=SWAPPED, tracks_events=TRUTH)
     report, notes = watched(path)
     assert report.stages == []
-    assert notes == ["no events of /camera/tracks: /camera/tracks/events was recorded by others"]
-    with pytest.raises(McaptrackError, match="would replace /camera/tracks/events, which others recorded"):
+    assert notes == [
+        "no events of /camera/tracks: they would replace /camera/tracks/events, which was recorded by others (mcaptrack.Tracks)"
+    ]
+    with pytest.raises(McaptrackError, match="would replace /camera/tracks/events, which was recorded by others"):
         watched(path, "/camera/tracks", again=True)
 
 
@@ -520,8 +522,7 @@ def test_channels_that_are_named_are_watched_from_then_on(tmp_path):
     with pytest.raises(McaptrackError, match="has no tracks of /camera"):
         watched(path, again=True)
     with log.read(path) as opened:
-        assert pipeline.camera_of(opened, ["/camera/retracks/online"]) == "camera"
-        assert pipeline.camera_of(opened, ["/elsewhere/tracks"]) is None
+        assert pipeline.find_camera(opened, None, "/camera/retracks/online") == "/camera"
     assert watched(path)[0].stages == []
     watched(path, "/camera/retracks/online", again=True)
     replaced(path, "/camera/retracks/online", TRUTH)

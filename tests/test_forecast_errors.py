@@ -429,7 +429,7 @@ def test_a_channel_that_others_recorded_is_never_replaced(tmp_path):
     with log.read(path) as opened, notices.collected() as heard:
         pipeline.run(opened, "/camera", [], watch=pipeline.Watch(again=True))
     assert [notice.message for notice in heard] == [
-        f"no errors of /camera/predictions: {SCORES} was recorded by others"
+        f"no errors of /camera/predictions: they would replace {SCORES}, which was recorded by others (no schema)"
     ]
     with log.read(path) as opened:
         assert [message.payload for message in opened.messages(SCORES)] == [b"{}"]

@@ -169,7 +169,7 @@ def test_of_several_cameras_one_has_to_be_chosen(tmp_path):
     mcaptrack("detect", path, "-q", "--topic", "/right/image")
     mcaptrack("track", path, "-q", "--camera", "right")
     with log.read(path) as opened:
-        assert pipeline.picture_topic(opened, "/right") == "/right/image"
+        assert pipeline.camera_at(opened, "/right").pictures == "/right/image"
         assert {"/left/retracks", "/right/tracks", "/right/tracks" + SUFFIX} <= set(opened.channels)
         assert "/right/retracks" not in opened.channels
 
@@ -199,10 +199,12 @@ def test_what_others_recorded_is_never_replaced(tmp_path):
     before = path.read_bytes()
     with log.read(path) as opened:
         with pytest.raises(
-            McaptrackError, match=r"detect would replace /eye/detections, which others recorded \(vision"
+            McaptrackError, match=r"detect would replace /eye/detections, which was recorded by others \(vision"
         ):
             pipeline.plan_stage(opened, "/eye", "detect", Detect(), "/eye/image")
-        with pytest.raises(McaptrackError, match="/eye/detections is there and was not made by detect; leave --topic"):
+        with pytest.raises(
+            McaptrackError, match=r"/eye/detections is there and was recorded by others .*; leave --topic out"
+        ):
             pipeline.plan_all(opened, "/eye", source="/eye/image")
     mcaptrack("detect", path, "-q", "--topic", "/eye/image", "--to", "/eye/found")
     assert content(path)["/eye/detections"] == content_of(before, tmp_path)["/eye/detections"]
@@ -321,7 +323,7 @@ def test_boxes_of_others_that_can_not_be_read_leave_the_other_tables_as_they_are
     )
     (warning,) = data["warnings"]
     assert (warning["code"], "no vision_msgs" in warning["message"]) == ("left-out", True)
-    assert "export --topic /lidar/boxes" in warning["message"]
+    assert "no boxes of /lidar/boxes are in the table" in warning["message"]
 
 
 def test_tracking_boxes_of_named_classes_says_their_numbers(tmp_path, capsys):

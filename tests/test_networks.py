@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import base64
 import json
+import sys
 from fractions import Fraction
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from mcaptrack import log, pipeline
+from mcaptrack import log, notices, pipeline
 from mcaptrack.errors import McaptrackError
 from mcaptrack.ingest import IngestOptions, ingest
 from mcaptrack.metrics.calibration import coverage, forecast_scores, mahalanobis_squared
 from mcaptrack.predictors import make
 from mcaptrack.predictors.linear import LinearPredictor
 from mcaptrack.predictors.lstm import Lstm
+from mcaptrack.predictors.onnx import are_covariances
 from mcaptrack.predictors.own_clock import OnClock
 from mcaptrack.predictors.red import Red
 from mcaptrack.predictors.weights import SHIPPED, Weights, load, save
@@ -289,6 +292,50 @@ class TestOnnx:
     def test_a_step_that_is_no_number_of_seconds_is_refused(self, tmp_path, said):
         with pytest.raises(McaptrackError, match=f"its metadata say step_s = '{said}', which is no number of seconds"):
             make(self.with_step(tmp_path, said), 3, 0.4)
+
+    @pytest.mark.parametrize(("declared", "given"), [(12, (8, 8)), ("T", (8, 12)), (8, (8, 12))])
+    def test_one_that_gives_other_steps_than_it_declares_is_refused(self, tmp_path, monkeypatch, declared, given):
+        """ONNX Runtime corrects what it can work out for itself; here is one where it can't."""
+
+        class Session:
+            def __init__(self, *_, **__):
+                pass
+
+            def get_inputs(self):
+                return [SimpleNamespace(name="obs", shape=["B", 4, 2])]
+
+            def get_outputs(self):
+                return [SimpleNamespace(name="mean", shape=["B", declared, 2])]
+
+            def get_modelmeta(self):
+                return SimpleNamespace(custom_metadata_map={})
+
+            def run(self, _, inputs):
+                batch = len(inputs["obs"])
+                return [np.zeros((batch, given[batch > 1], 2), np.float32)]
+
+        (tmp_path / "net.onnx").write_bytes(b"net")
+        monkeypatch.setitem(
+            sys.modules, "onnxruntime", SimpleNamespace(SessionOptions=SimpleNamespace, InferenceSession=Session)
+        )
+        with pytest.raises(McaptrackError, match=r"declares .* as its output, and gives \[8, 12\] steps"):
+            make(f"onnx:{tmp_path / 'net.onnx'}", 12, 0.4)
+
+    def test_asked_for_more_steps_than_it_has_it_goes_on_straight_and_that_is_said(self, tmp_path):
+        name = self.file(tmp_path, LINE)
+        with notices.collected() as said:
+            make(name, 3, 0.4)
+        assert said == []
+        with notices.collected() as said:
+            make(name, 6, 0.4)
+        assert [notice.code for notice in said] == ["extrapolated"]
+        assert "predicts 1.2 s ahead; what is asked for beyond, up to 2.4 s, is a straight line" in said[0].message
+
+    @pytest.mark.parametrize(
+        "cov", [[[1, 2], [2, 1]], [[0, 0], [0, 1]], [[-1, 0], [0, 1]], [[1, 0.5], [0.2, 1]], [[1, 0], [0, np.nan]]]
+    )
+    def test_covariances_that_are_none_are_told(self, cov):
+        assert not are_covariances(np.full((1, 3, 2, 2), cov))
 
     def test_what_can_not_be_used_is_refused_in_one_line(self, tmp_path):
         name = self.file(tmp_path, WRONG)

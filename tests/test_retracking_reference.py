@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from mcaptrack.plane import GroundPlane
 from mcaptrack.predictors import make
 from mcaptrack.schema import Frame
-from mcaptrack.transforms import PROFILES, Retrack
+from mcaptrack.transforms import PROFILES, Predict, Retrack
 from tests.references.algorithm1 import Algorithm1
 from tests.references.online import OnlineTracker
 from tests.references.retracking import Undecided, constant_velocity
@@ -190,5 +190,28 @@ def test_the_offline_part_equals_the_reference(seed, chosen):
     compare(transform, frames, reference)
 
 
+#: Whether anything is re-tracked at all.
+WHETHER = {"side_view", "poor_scale"}
+
+
 def test_every_option_is_varied():
-    assert {option.name for option in fields(Retrack)} == {*NUMBERS, *CHOICES, *LIKELIHOOD, *OFFLINE}
+    assert {option.name for option in fields(Retrack)} == {*NUMBERS, *CHOICES, *LIKELIHOOD, *OFFLINE} | WHETHER
+
+
+@given(seed=SEEDS)
+@settings(max_examples=10, phases=QUICK)
+def test_tracks_that_are_passed_on_are_the_input_and_their_forecasts_those_of_predict(seed):
+    frames = noisy_tracks(np.random.default_rng(seed))
+    options = {"predictor": "cv", "horizon_s": 2.0, "min_history": 3}
+    passed_on, insisted, usual = (
+        list(Retrack(**options, **PLAIN, poor_scale=is_poor, side_view=is_asked)(frames))
+        for is_poor, is_asked in ((True, False), (True, True), (False, False))
+    )
+    seen = [(frame.rows, frame.rows[frame.rows["observed"]]) for frame in frames]
+    predicted = [frame.rows for (frame,) in Predict(**options)(frames)]
+    for outputs, wanted, forecasts in zip(passed_on, seen, predicted, strict=True):
+        for frame, rows in zip(outputs, (*wanted, forecasts), strict=True):
+            np.testing.assert_array_equal(frame.rows, rows)
+    for ours, theirs in zip(insisted, usual, strict=True):
+        for frame, same in zip(ours, theirs, strict=True):
+            np.testing.assert_array_equal(frame.rows, same.rows)

@@ -6,7 +6,8 @@ from typing import Annotated
 
 from mcaptrack.cli import common
 from mcaptrack.cli.command import warn_unused
-from mcaptrack.cli.stages import run_on_logs, watched
+from mcaptrack.cli.running import run_on_logs
+from mcaptrack.cli.stages import watched
 
 
 @common.one_line
@@ -52,4 +53,4 @@ def events(
         warn_unused(f"people and tracks are compared by {similarity}", "gate_m" if similarity == "iou" else "min_iou")
     watch = watched(similarity, gate_m, min_iou, topics=tuple(topic or ()), again=True)
     given = {"logs": logs, "camera": camera, "output": output, "sidecar": sidecar, "topic": None, "force": force}
-    run_on_logs(given | {"json": json, "quiet": quiet, "verbose": verbose}, lambda _: [], watch=watch)
+    run_on_logs(given | {"json": json, "quiet": quiet, "verbose": verbose}, lambda *_: [], watch)

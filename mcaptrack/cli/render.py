@@ -7,7 +7,7 @@ from typing import Annotated, Final
 
 from mcaptrack.cli import common
 from mcaptrack.cli.command import warn_unused
-from mcaptrack.errors import McaptrackError
+from mcaptrack.errors import McaptrackError, command
 
 _PICTURE: Final = "Pictures"
 
@@ -104,9 +104,10 @@ def render(
                 refuse_overwrite(target, force)
                 with log.read(path) as opened:
                     prefix = pipeline.find_camera(opened, camera)
-                    pictures = pipeline.picture_topic(opened, prefix)
+                    pictures = pipeline.camera_at(opened, prefix).pictures
                     if pictures is None:
-                        raise McaptrackError(f"{path} has no pictures of {prefix} to draw on; `mcaptrack info {path}`")
+                        more = command("info", path)
+                        raise McaptrackError(f"{path} has no pictures of {prefix} to draw on; {more} shows what it has")
                     views = pipeline.find_views(opened, prefix, topic or ())
                     count = rendering.render(opened, pictures, views, target, options, talk.progress)
                 talk.say(f"{target}: {count} pictures with {', '.join(views) or 'nothing drawn'}")

@@ -6,19 +6,20 @@ import inspect
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import Field, fields, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, get_type_hints
 
 import typer
 
 from mcaptrack.cli import common
 from mcaptrack.cli.command import is_on_command_line, settings_of
+from mcaptrack.cli.running import run_on_logs
 from mcaptrack.errors import McaptrackError
 from mcaptrack.transforms import ALTERNATIVES, PROFILES, TRANSFORMS, Transform
 from mcaptrack.transforms.protocol import bare_type
 
 if TYPE_CHECKING:
-    from mcaptrack.pipeline import Watch
+    from mcaptrack.log import Log
+    from mcaptrack.pipeline import Job, Watch
 
 #: What a command says of itself, beyond its transform.
 _WORDS: Final = {
@@ -146,7 +147,13 @@ def _stage_command(name: str, kind: type[Transform]) -> Callable[..., None]:
                 del wanted[option]  # set in a file or in the environment, for when another one is chosen
         transform = replace(base, **wanted)
         keep = _OUTPUTS_OF[given["mode"]] if name == "retrack" else None
-        run_on_logs(given, lambda plan: plan.stage(name, transform, given["topic"], given["to"], keep))
+
+        def plan(opened: Log, prefix: str, say: Callable[[str], None]) -> list[Job]:
+            from mcaptrack.pipeline import plan_stage
+
+            return plan_stage(opened, prefix, name, transform, given["topic"], given["to"], keep, say, _configured())
+
+        run_on_logs(given, plan)
 
     command.__name__ = name
     command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
@@ -192,15 +199,15 @@ def run_all(
     """
     given = {"logs": logs, "camera": camera, "output": output, "sidecar": sidecar, "topic": topic, "force": force}
     settings = settings_of("events")
-    given |= {"json": json, "quiet": quiet, "verbose": verbose}
-    run_on_logs(
-        given,
-        lambda plan: plan.all(topic, force),
-        tables,
-        watched(settings.get("similarity"), settings.get("gate_m"), settings.get("min_iou"), anew=force)
-        if events
-        else None,
-    )
+    given |= {"json": json, "quiet": quiet, "verbose": verbose, "tables": tables}
+    gates = (settings.get("similarity"), settings.get("gate_m"), settings.get("min_iou"))
+
+    def plan(opened: Log, prefix: str, say: Callable[[str], None]) -> list[Job]:
+        from mcaptrack.pipeline import plan_all
+
+        return plan_all(opened, prefix, say, topic, _configured(), force)
+
+    run_on_logs(given, plan, watched(*gates, anew=force) if events else None, is_run=True)
 
 
 def watched(
@@ -225,106 +232,3 @@ def _configured() -> dict[str, Transform]:
         if chosen or settings.keys() & {"tracker", "profile"}:
             out[name] = replace(base, **chosen)
     return out
-
-
-class _Plan:
-    """What to do on one log, once it is open."""
-
-    def __init__(self, opened: Any, prefix: str, say: Callable[[str], None]) -> None:
-        self._opened, self._prefix, self._say = opened, prefix, say
-
-    def stage(
-        self, name: str, transform: Transform, topic: str | None, to: str | None, keep: tuple[str, ...] | None
-    ) -> Any:
-        from mcaptrack import pipeline
-
-        return pipeline.plan_stage(
-            self._opened, self._prefix, name, transform, topic, to, keep, self._say, _configured()
-        )
-
-    def all(self, topic: str | None, anew: bool) -> Any:
-        from mcaptrack import pipeline
-
-        return pipeline.plan_all(self._opened, self._prefix, self._say, topic, _configured(), anew)
-
-
-def run_on_logs(
-    given: Mapping[str, Any], make_plan: Callable[[_Plan], Any], tables: bool = False, watch: Watch | None = None
-) -> None:
-    """Plan and run on every log, and say and print what came of it."""
-    from mcaptrack import notices
-
-    paths = common.expand(given["logs"])
-    common.only_one_output(paths, given["output"])
-    if given["output"] and given["sidecar"] is not None:
-        flag = "--sidecar" if given["sidecar"] else "--in-place"
-        raise McaptrackError(f"{flag} and -o are two places for the same results; give one of them")
-    results = []
-    with common.Talk(given["quiet"], given["verbose"]).open() as talk:
-        for path in paths:
-            with talk.attempt(path, paths), notices.about(given["output"] or path):
-                results.append(_run_on_log(path, given, make_plan, tables, watch, talk))
-    if given["json"]:
-        common.print_json({"results": results})
-
-
-def _run_on_log(
-    path: Path,
-    given: Mapping[str, Any],
-    make_plan: Callable[[_Plan], Any],
-    tables: bool,
-    watch: Watch | None,
-    talk: common.Talk,
-) -> dict[str, Any]:
-    """Plan and run on one log; what came of it, for programs."""
-    from mcaptrack import log, pipeline
-    from mcaptrack.atomic import is_same_file, publish_bytes, refuse_overwrite
-    from mcaptrack.export import default_folder, export
-    from mcaptrack.ingest.place import Place
-
-    output: Path | None = given["output"]
-    target = output or path
-    if output is not None:
-        if is_same_file(output, path):
-            raise McaptrackError(f"{path} is both input and output; leave -o out to add to it in place")
-        refuse_overwrite(output, given["force"])
-    place = Place(given["sidecar"])
-    with log.read(path, sidecar=None if output else place) as opened:
-        if output is None:
-            opened.lock()  # a second writer is turned away before it computes anything
-        camera = given["camera"] or (pipeline.camera_of(opened, watch.topics) if watch else None)
-        prefix = pipeline.find_camera(opened, camera, given["topic"])
-        jobs = make_plan(_Plan(opened, prefix, talk.say))
-        report = pipeline.run(opened, prefix, jobs, output, talk.progress, watch)
-        written_to = output or opened.parts[-1].path
-    for name, content in report.layouts.items():
-        publish_bytes(pipeline.layout_path(target, name), content)
-    for topic, count in report.frames.items():
-        talk.detail(f"{target}: {topic} {count} frames")
-    for topic, kinds in report.events.items():
-        words = ", ".join(f"{kind} {count}" for kind, count in kinds.items() if count) or "nothing happened"
-        (talk.say if watch and watch.again else talk.detail)(f"{topic}: {words}")
-    for topic in report.stale:
-        talk.warn(
-            f"{topic} was made from what has just been replaced; `mcaptrack run {target}` brings it up to date",
-            "out-of-date",
-        )
-    written = {}
-    if tables:
-        with log.read(target) as opened:
-            folder = default_folder(target)
-            exported = export(opened, folder, talk.progress, force=given["force"])
-        written = exported.rows
-        for words in exported.notes:
-            talk.warn(words, "left-out")
-        talk.detail(f"{folder}: {', '.join(f'{name} {rows}' for name, rows in written.items())}")
-    done = ", ".join(report.stages) or "nothing to do, everything is up to date"
-    talk.say(f"{target}: {done}")
-    if place.why and report.stages:
-        talk.say(place.words(written_to))
-    data = {"stages": report.stages, "frames": report.frames, "events": report.events, "tables": written}
-    where = {
-        "written_to": str(written_to) if report.stages else None,
-        "written_there_because": place.why or None,
-    }
-    return {"log": str(target)} | data | where

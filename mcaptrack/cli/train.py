@@ -10,7 +10,7 @@ import typer
 from mcaptrack.cli import common
 from mcaptrack.cli.inputs import refuse_url
 from mcaptrack.cli.text import console, show
-from mcaptrack.errors import McaptrackError
+from mcaptrack.errors import McaptrackError, command
 
 if TYPE_CHECKING:
     from mcaptrack.training.loop import Trained
@@ -319,4 +319,5 @@ def _print(trained: Trained, recipe: Recipe) -> None:
     console().print(table)
     minutes, seconds = divmod(round(trained.seconds), 60)
     show("", f"{trained.weights}: epoch {trained.kept_epoch} of {trained.epochs}, {minutes} min {seconds} s")
-    show(f"Use it:  mcaptrack predict log.mcap --predictor {recipe.network}:{trained.weights}")
+    use = command("predict", "LOG", "--predictor", f"{recipe.network}:{trained.weights}")
+    show(f"Use it:  {use.strip('`')}")

@@ -9,7 +9,7 @@ import typer
 
 from mcaptrack.cli import common
 from mcaptrack.cli.text import show
-from mcaptrack.errors import McaptrackError
+from mcaptrack.errors import McaptrackError, command
 from mcaptrack.links import LICHTBLICK, viewer_links
 
 if TYPE_CHECKING:
@@ -69,7 +69,7 @@ def view(
         if not opened.is_on_disk:
             raise McaptrackError(
                 f"viewers can't open {path}: a change of it goes on or was interrupted. The next command that writes "
-                f"to it mends it; `mcaptrack recover {path}` saves it to another file"
+                f"to it mends it; {command('recover', path)} saves it to another file"
             )
         files: dict[str, Path | bytes] = {part.path.name: part.real_path for part in opened.parts}
         layouts, notes = _layouts(path, opened)
@@ -102,7 +102,7 @@ def view(
             lines = [(f"Lichtblick, {name}", links["Lichtblick"]) for name, links in ways.items()]
             lines = [*(lines or [("Lichtblick", first["Lichtblick"])]), ("Foxglove", first["Foxglove"])]
             lines += [("log", "  ".join(logs))] + [(f"layout, {name}", address) for name, address in addresses.items()]
-            lines += [] if addresses else [("layout", "none yet: `mcaptrack run` makes one")]
+            lines += [] if addresses else [("layout", f"none yet: {command('run', path)} makes one")]
             width = max(len(name) for name, _ in lines) + 2
             show(*(f"{name:<{width}}{what}" for name, what in lines))
         talk.say("serving until Ctrl-C ...")

@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack import log, metrics
-from mcaptrack.errors import McaptrackError
+from mcaptrack.cameras import camera_at
+from mcaptrack.errors import McaptrackError, command
 from mcaptrack.evaluation.aligned import (
     IOU_THRESHOLD,
     Similarity,
@@ -111,12 +112,10 @@ class Outcome:
 
 def truth_of_log(opened: log.Log, prefix: str) -> list[Frame]:
     """The true tracks in a log. Raises McaptrackError if there are none."""
-    topic = f"{prefix}/truth"
+    topic = camera_at(opened, prefix).truth
     if topic not in opened.channels:
-        raise McaptrackError(
-            f"{opened.path} has no channel {topic}; "
-            f"add one with `mcaptrack ingest FILE --as truth --into {opened.path}`"
-        )
+        add = command("ingest", "LABELS", "--as", "truth", "--into", opened.path)
+        raise McaptrackError(f"{opened.path} has no channel {topic}; add one with {add}")
     return opened.frames(topic, TRACKS)
 
 
@@ -126,7 +125,7 @@ def sequence_of_log(opened: log.Log, prefix: str, topics: Sequence[str]) -> Sequ
     usual = [f"{prefix}/{name}" for name in SCORED]
     chosen = list(topics) or [topic for topic in usual if topic in opened.channels]
     if not chosen:
-        raise McaptrackError(f"{opened.path} has no tracks to score; run `mcaptrack run {opened.path}`")
+        raise McaptrackError(f"{opened.path} has no tracks to score; {command('run', opened.path)} makes them")
     forecasts_of = {f"{prefix}/{tracks}": f"{prefix}/{name}" for name, tracks in MADE_FROM.items()}
     candidates = []
     for topic in chosen:

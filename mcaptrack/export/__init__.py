@@ -18,7 +18,7 @@ from typing import Final
 from mcaptrack import __version__, log, tables
 from mcaptrack.errors import McaptrackError
 from mcaptrack.export.contents import Contents
-from mcaptrack.export.names import recording_name, topic_folder
+from mcaptrack.export.names import file_name, recording_name, topic_folder
 from mcaptrack.tables import TABLES, Format
 
 __all__ = ["TOPICS", "Contents", "Exported", "default_folder", "export", "recording_name", "standing", "topic_folder"]
@@ -47,7 +47,7 @@ def standing(contents: Contents, folder: Path, name: str) -> Path | None:
     path = folder.joinpath(name, f"recording={contents.recording}", "part-0.parquet")
     known = tables.described(path, "parquet") or {}
     said = (known.get("recording"), known.get("table_version"), known.get("source"))
-    now = (contents.opened.path.name, tables.TABLE_VERSION)
+    now = (file_name(contents.opened.path), tables.TABLE_VERSION)
     return path if said[:2] == now and said[2] == contents.source(name) else None
 
 
@@ -128,7 +128,7 @@ class _Job:
         if self.force:
             return False
         known = tables.described(path, self.form) or {}
-        file = self.contents.opened.path.name
+        file = file_name(self.contents.opened.path)
         if known.get("recording", file) != file:
             raise McaptrackError(
                 f"{path.parent} holds the tables of {known['recording']}, not of {file}; give another folder with -o"
@@ -140,7 +140,7 @@ class _Job:
 
     def _write(self, name: str, path: Path, made: object, words: dict[str, str], order: Sequence[str]) -> None:
         rows = made.num_rows  # type: ignore[attr-defined]  # an Arrow table, which only tables knows
-        words |= {"version": __version__, "recording": self.contents.opened.path.name, "rows": str(rows)}
+        words |= {"version": __version__, "recording": file_name(self.contents.opened.path), "rows": str(rows)}
         if tables.write(path, made, words, order, self.form, self.force):
             self.done.written.append(name)
         self.done.rows[name] = rows
@@ -150,7 +150,7 @@ class _Job:
         out = {}
         for path in self._topic_files():
             known = tables.described(path, self.form) or {}
-            if known.get("recording") == self.contents.opened.path.name and "topic" in known:
+            if known.get("recording") == file_name(self.contents.opened.path) and "topic" in known:
                 out[known["topic"]] = known.get("blobs") == "true"
         return out
 

@@ -10,15 +10,15 @@ from typing import Any, Final
 import numpy as np
 
 from mcaptrack import __version__, evaluation, foreign, log, tables
+from mcaptrack.cameras import Camera, cameras
 from mcaptrack.clock import LAST_NS
 from mcaptrack.errors import McaptrackError
-from mcaptrack.export.names import recording_name
+from mcaptrack.export.names import file_name, recording_name
 from mcaptrack.foreign.flat import flattener, kind_of
 from mcaptrack.provenance import Provenance
 from mcaptrack.schema import DETECTIONS
 from mcaptrack.tables import TABLES, Part, Pointers
 
-_TRUTH: Final = "/truth"
 #: Tables that say where messages stand, or what the whole log is.
 _OF_THE_WHOLE: Final = ("frames", "channels", "recordings")
 
@@ -62,7 +62,7 @@ class Contents:
         if name == "track_summary":
             return self.topics("tracks")
         if name == "metrics":
-            return sorted({topic for prefix in self._prefixes() for topic in self._scored(prefix)})
+            return sorted({topic for camera in self._labelled() for topic in self._scored(camera)})
         schema = TABLES[name].rows_of
         if schema is None:
             raise KeyError(name)
@@ -76,7 +76,7 @@ class Contents:
         """What a table is made from: another digest when the table may be another. Reads no messages."""
         whole = name in _OF_THE_WHOLE
         of = [self.opened.fingerprint()] if whole else [self.opened.fingerprint(topic) for topic in self.topics(name)]
-        files = [part.path.name for part in self.opened.parts]
+        files = [file_name(part.path) for part in self.opened.parts]
         return _digest([name, __version__, self.recording, files, of])
 
     def lineage(self, name: str) -> str:
@@ -142,7 +142,7 @@ class Contents:
         try:
             frames = foreign.detections(self.opened, topic)
         except McaptrackError as error:
-            self._note("detections", f"{error}; `mcaptrack export --topic {topic}` keeps what its messages say")
+            self._note("detections", f"{error}; no boxes of {topic} are in the table")
             t_ns = self.opened.times(topic)
             return Part(DETECTIONS.empty(), t_ns, np.arange(len(t_ns)), np.zeros(len(t_ns), np.int64))
         return tables.frames_to_part(DETECTIONS, frames)
@@ -152,7 +152,7 @@ class Contents:
 
     def _pointers(self, topic: str, of_rows: bool = True) -> Pointers:
         places = self.opened.places(topic)
-        file = self.opened.part(topic).path.name
+        file = file_name(self.opened.part(topic).path)
         count = len(places.t_ns)
         frame, rows = np.arange(count), np.full(count, -1)
         if of_rows and not foreign.holds_pictures(self.opened.channel(topic)):
@@ -160,18 +160,20 @@ class Contents:
             frame, rows = part.frame, part.counts
         return Pointers(file, places.t_ns, frame, rows, places.chunk_offset, places.offset)
 
-    def _prefixes(self) -> list[str]:
-        """The cameras that have a truth."""
-        return [topic.removesuffix(_TRUTH) for topic in self.topics("tracks") if topic.endswith(_TRUTH)]
+    def _labelled(self) -> list[Camera]:
+        """The cameras that have a ground truth."""
+        tracks = self.topics("tracks")
+        return [camera for camera in cameras(self.opened) if camera.truth in tracks]
 
-    def _scored(self, prefix: str) -> list[str]:
-        known = [f"{prefix}/{name}" for name in ("truth", *evaluation.SCORED, *evaluation.FORECASTS)]
+    def _scored(self, camera: Camera) -> list[str]:
+        names = (*evaluation.SCORED, *evaluation.FORECASTS)
+        known = [camera.truth, *(f"{camera.prefix}/{name}" for name in names)]
         return [topic for topic in known if topic in self.opened.channels]
 
     def _scores(self) -> Iterator[dict[str, Any]]:
-        for prefix in self._prefixes():
+        for camera in self._labelled():
             try:
-                sequence = evaluation.sequence_of_log(self.opened, prefix, ())
+                sequence = evaluation.sequence_of_log(self.opened, camera.prefix, ())
                 outcome = evaluation.evaluate([sequence], evaluation.EvaluateOptions())
             except McaptrackError as error:  # there is nothing that could be compared
                 self._note("metrics", str(error))
@@ -179,7 +181,7 @@ class Contents:
             for result in outcome.results:
                 row = result.to_json()
                 forecasts = row.pop("displacement", {})
-                yield row | forecasts | {"topic": result.tracks, "truth": prefix + _TRUTH}
+                yield row | forecasts | {"topic": result.tracks, "truth": camera.truth}
 
     def _recording(self) -> dict[str, Any]:
         opened = self.opened
@@ -195,7 +197,7 @@ class Contents:
             self._note("recordings", "messages are later than the year 2262, which tables can't hold")
             span = (opened.start_ns if opened.start_ns <= LAST_NS else None, None)
         return {
-            "file": opened.path.name,
+            "file": file_name(opened.path),
             "start_t": span[0],
             "end_t": span[1],
             "start_t_ns": span[0],
@@ -204,7 +206,7 @@ class Contents:
             "messages": messages,
             "size_bytes": sum(part.size for part in opened.parts),
             "digest": opened.fingerprint(),
-            "results_file": opened.results.path.name if opened.results else None,
+            "results_file": file_name(opened.results.path) if opened.results else None,
             "ground_plane": None if not planes else _OF_PLANES[len({*planes}), planes[0]],
             "source": json.dumps(sources, sort_keys=True, separators=(",", ":")) if sources else None,
             "mcaptrack_version": __version__,

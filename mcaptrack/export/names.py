@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import re
 from pathlib import Path
 from typing import Final
@@ -23,6 +24,11 @@ def recording_name(path: Path) -> str:
     name = _cut(re.sub(r"[^\w.\-]+", "_", path.stem).lstrip(".") or "log")
     is_text = re.search(r"[^\W\d_]", name) and not re.fullmatch(r"[-\d._]*e[-\d]+", name, re.IGNORECASE)
     return name if is_text and name.lower().lstrip("-") not in _NO_TEXT else f"log-{name}"
+
+
+def file_name(path: Path) -> str:
+    """The name of a file as text; of bytes that are no UTF-8 the numbers, since tables hold nothing but text."""
+    return os.fsencode(path.name).decode("utf-8", "backslashreplace")
 
 
 def topic_folder(topic: str) -> str:

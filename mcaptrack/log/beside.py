@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import shlex
 from pathlib import Path
 from typing import NamedTuple
 
 from mcaptrack.atomic import follow_links
-from mcaptrack.errors import McaptrackError
+from mcaptrack.errors import McaptrackError, command
 from mcaptrack.log.journal import Journal, Unfit, find, find_content, journal_of, remove_words
 from mcaptrack.log.source import OpenFile
 
@@ -54,4 +53,4 @@ def recover_words(path: Path) -> str:
 
 def recover_command(path: Path) -> str:
     """The command that saves a damaged log."""
-    return f"`mcaptrack recover {shlex.quote(str(path))}`"
+    return command("recover", path)

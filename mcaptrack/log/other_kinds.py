@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import re
-import shlex
 from pathlib import Path
 from typing import Final
 
-from mcaptrack.errors import McaptrackError
+from mcaptrack.errors import McaptrackError, command
 from mcaptrack.log.names import RESULTS
 
 _BEGIN: Final = {b"#ROSBAG V": "a ROS 1 bag", b"SQLite format 3\0": "a database, as rosbag2 writes them"}
@@ -26,9 +25,9 @@ def refuse_other_kinds(path: Path) -> None:
     except OSError:
         return
     if what:
-        words = str(path)
-        quoted = shlex.quote(f"./{words}" if words.startswith("-") else words)
-        raise McaptrackError(f"{path} is {what}, not an MCAP file; `mcaptrack ingest {quoted}` makes a log of it")
+        other_name = ("-o", "OTHER.mcap") if path.suffix == ".mcap" else ()  # a log would have the same name
+        make = command("ingest", path, *other_name)
+        raise McaptrackError(f"{path} is {what}, not an MCAP file; {make} makes a log of it")
 
 
 def _folder(path: Path) -> str:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack.atomic import follow_links
-from mcaptrack.errors import McaptrackError
+from mcaptrack.errors import McaptrackError, command
 from mcaptrack.log import new_end, records
 from mcaptrack.log.chunks import MAX_NS
 from mcaptrack.log.messages import Columns, Message, Places
@@ -148,9 +148,9 @@ class Log:
         """The channel of that topic. Raises McaptrackError, with what there is, if there is none."""
         if topic not in self.channels:
             there = [name for name in sorted(self.channels) if "/view/" not in name]
+            more = command("info", self.path)
             raise McaptrackError(
-                f"{self.path} has no channel {topic}; it has {', '.join(there) or 'none'}. "
-                f"`mcaptrack info {self.path}` shows more"
+                f"{self.path} has no channel {topic}; it has {', '.join(there) or 'none'}. {more} shows more"
             )
         return self.channels[topic]
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shlex
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -11,7 +10,7 @@ from pathlib import Path
 from typing import Final, TypeVar
 
 from mcaptrack import notices
-from mcaptrack.errors import DamagedError, McaptrackError
+from mcaptrack.errors import DamagedError, McaptrackError, command
 from mcaptrack.log import records
 from mcaptrack.log.beside import changed, find_journal, recover_words
 from mcaptrack.log.index import Index, read_index
@@ -97,7 +96,7 @@ class Snapshot:
             raise McaptrackError(
                 f"{self.path}: {topic} has {late.count} messages later than the year 2262, the first at {late.t_ns} "
                 "ns; they are kept as they are, but nothing is computed with such times "
-                f"(`mcaptrack drop {shlex.quote(str(self.path))} {shlex.quote(topic)} -o OTHER.mcap` leaves them out)"
+                f"({command('drop', self.path, topic, '-o', 'OTHER.mcap')} leaves them out)"
             ) from None
 
     # The file

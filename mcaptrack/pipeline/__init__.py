@@ -3,39 +3,33 @@
 A stage runs on a log that stands and adds its channels to it, with what they were made from and how.
 """
 
-from mcaptrack.pipeline.events import Watch, camera_of
-from mcaptrack.pipeline.plan import (
-    DEFAULT_CAMERA,
-    ROUTES,
-    Job,
-    Route,
-    find_camera,
-    is_stale,
-    picture_topic,
-    plan_all,
-    plan_stage,
-)
-from mcaptrack.pipeline.run import Report, input_of, read_planes, run
+from mcaptrack.cameras import ROUTES, Camera, camera_at, find_camera
+from mcaptrack.pipeline.checks import Job
+from mcaptrack.pipeline.events import Watch
+from mcaptrack.pipeline.plan import is_stale, plan_all, plan_stage
+from mcaptrack.pipeline.planes import read_planes
+from mcaptrack.pipeline.run import Report, input_of, run
+from mcaptrack.pipeline.summary import Summary, summarise
 from mcaptrack.pipeline.write import LAYOUTS, attachment_of, find_views, layout_path
 
 __all__ = [
-    "DEFAULT_CAMERA",
     "LAYOUTS",
     "ROUTES",
+    "Camera",
     "Job",
     "Report",
-    "Route",
+    "Summary",
     "Watch",
     "attachment_of",
-    "camera_of",
+    "camera_at",
     "find_camera",
     "find_views",
     "input_of",
     "is_stale",
     "layout_path",
-    "picture_topic",
     "plan_all",
     "plan_stage",
     "read_planes",
     "run",
+    "summarise",
 ]

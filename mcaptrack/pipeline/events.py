@@ -17,14 +17,16 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from mcaptrack import foxglove, log
-from mcaptrack.errors import McaptrackError
+from mcaptrack.cameras import camera_at
+from mcaptrack.errors import McaptrackError, command
 from mcaptrack.evaluation.events import EventOptions, find_events
 from mcaptrack.evaluation.forecasts import MADE_FROM, find_forecast_errors
 from mcaptrack.evaluation.words import SUFFIX, log_messages
 from mcaptrack.notices import warn
+from mcaptrack.pipeline.checks import how_it_came, may_replace
 from mcaptrack.pipeline.plan import is_stale
 from mcaptrack.pipeline.write import Made, digest_of
-from mcaptrack.provenance import Provenance
+from mcaptrack.provenance import VIEW, Provenance
 from mcaptrack.schema import (
     COUNTS,
     EVENT_KINDS,
@@ -74,22 +76,22 @@ def make_events(opened: log.Log, prefix: str, made: Mapping[str, Made], watch: W
     out: dict[str, Made] = {}
     topics = watch.topics or _watched(opened, prefix, made)
     if watch.again and not topics:
-        raise McaptrackError(f"{opened.path} has no tracks of {prefix}; run `mcaptrack run {opened.path}`")
+        raise McaptrackError(f"{opened.path} has no tracks of {prefix}; {command('run', opened.path)} makes them")
 
     @cache
     def truth() -> _Truth:
-        return _read_truth(opened, f"{prefix}/truth")
+        return _read_truth(opened, camera_at(opened, prefix).truth)
 
     for topic in topics:
         options = watch.options if watch.again else _asked(opened, topic, watch.options)
         stands = _asked(opened, topic, EventOptions()) == options and not _is_due(opened, outputs(topic), made)
         if stands and not (watch.again or watch.anew):
             continue
-        taken = [name for name in outputs(topic) if not _is_ours(opened, name)]
+        taken = _taken(opened, outputs(topic))
         if taken:
             if watch.topics:
-                raise McaptrackError(f"{opened.path}: events would replace {taken[0]}, which others recorded")
-            warn(f"no events of {topic}: {taken[0]} was recorded by others", "left-out")
+                raise McaptrackError(f"{opened.path}: events would replace {taken}")
+            warn(f"no events of {topic}: they would replace {taken}", "left-out")
             continue
         frames, tracks_digest = _rows(opened, topic, made)
         found = find_events(frames, truth().frames, options, opened.path.stem, topic)
@@ -99,7 +101,7 @@ def make_events(opened: log.Log, prefix: str, made: Mapping[str, Made], watch: W
         provenance = Provenance(STAGE, parameters, topic, tracks_digest, references=truth().digests)
         out[topic + _EVENTS] = events = Made.of(EVENTS, found.events, provenance)
         words_of = list(log_messages(found.events, topic, opened.start_ns, found.usual_s))
-        view = Provenance("view", {}, topic + _EVENTS, events.provenance.digest)
+        view = Provenance(VIEW, {}, topic + _EVENTS, events.provenance.digest)
         out[topic + _EVENTS + SUFFIX] = Made(EVENTS, [], view, words_of, foxglove.schema_record(foxglove.LOG))
         out[topic + _COUNTS] = Made.of(COUNTS, found.counts, provenance)
     if not watch.topics:
@@ -124,9 +126,9 @@ def _forecast_errors(
     topics = (topic + _ERRORS, topic + _SCORES)
     if not again and not _is_due(opened, topics, made) and later in _made_from(opened, topics[0]):
         return {}
-    taken = [one for one in topics if not _is_ours(opened, one)]
+    taken = _taken(opened, topics)
     if taken:
-        warn(f"no errors of {topic}: {taken[0]} was recorded by others", "left-out")
+        warn(f"no errors of {topic}: they would replace {taken}", "left-out")
         return {}
     forecasts, digest_of_forecasts = _rows(opened, topic, made, PREDICTIONS)
     (from_tracks, of_tracks), (became, of_later) = (_rows(opened, one, made) for one in (tracks, later))
@@ -152,14 +154,6 @@ def tally(happened: Mapping[str, Made]) -> dict[str, dict[str, int]]:
             counts = np.bincount(kinds, minlength=max(EVENT_KINDS) + 1).tolist()
             out[topic.removesuffix(_EVENTS)] = {words: counts[kind] for kind, words in EVENT_KINDS.items()}
     return out
-
-
-def camera_of(opened: log.Log, topics: Sequence[str]) -> str | None:
-    """The camera that these channels belong to: the shortest prefix of the first under which there are tracks."""
-    parts = topics[0].strip("/").split("/")[:-1] if topics else []
-    prefixes = ["/".join(parts[: count + 1]) for count in range(len(parts))]
-    names = ("truth", "tracks", "samples", "detections", "video")
-    return next((one for one in prefixes if any(f"/{one}/{name}" in opened.channels for name in names)), None)
 
 
 class _Truth(NamedTuple):
@@ -188,8 +182,8 @@ def _watched(opened: log.Log, prefix: str, made: Mapping[str, Made]) -> list[str
     topics = [f"{prefix}/{name}" for name in WATCHED]
     topics += [
         topic.removesuffix(_EVENTS)
-        for topic in sorted(opened.channels)
-        if topic.startswith(prefix + "/") and topic.endswith(_EVENTS) and _is_ours(opened, topic)
+        for topic in sorted(camera_at(opened, prefix).topics)
+        if topic.endswith(_EVENTS) and may_replace(opened, topic, STAGE)
     ]
     return [topic for topic in dict.fromkeys(topics) if _holds(opened, topic, made)]
 
@@ -229,10 +223,11 @@ def _made_from(opened: log.Log, topic: str) -> dict[str, str]:
     return known.made_from() if known else {}
 
 
-def _is_ours(opened: log.Log, topic: str) -> bool:
-    """Whether a topic is free, or holds what may be replaced."""
-    channel = opened.channels.get(topic)
-    return channel is None or Provenance.from_metadata(channel.metadata) is not None
+def _taken(opened: log.Log, topics: Sequence[str]) -> str:
+    """The first of these topics that holds what events may not replace, and how that came; "" if there is none."""
+    made_by = {topic: VIEW if topic.endswith(SUFFIX) else STAGE for topic in topics}
+    taken = [topic for topic, transform in made_by.items() if not may_replace(opened, topic, transform)]
+    return f"{taken[0]}, which {how_it_came(opened, taken[0])}" if taken else ""
 
 
 def _holds(opened: log.Log, topic: str, made: Mapping[str, Made] = {}, schema: Schema = TRACKS) -> bool:

@@ -1,102 +1,30 @@
 """Which channel feeds which transform, and what has to run, and before what.
 
-What is missing is made first; what was made from a channel that has changed since is made again, with the parameters it
-had.
+What is missing is made first; what was made from a channel that has changed since is made again, by the same transform
+with the parameters that it had, or left as it is where that can't be done.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import fields
-from typing import Final, NamedTuple
+from typing import Final
 
-from mcaptrack import foreign, log, views
-from mcaptrack.errors import McaptrackError
+from mcaptrack import foreign, log
+from mcaptrack.cameras import ROUTES, USUAL, camera_at, chain_of, name_above, outputs_of
+from mcaptrack.errors import McaptrackError, command
 from mcaptrack.notices import warn
+from mcaptrack.pipeline.checks import Job, check_inputs, fits, how_it_came
+from mcaptrack.pipeline.planes import planes_to_json, read_planes
+from mcaptrack.predictors import weights_sha256
 from mcaptrack.provenance import Provenance
-from mcaptrack.schema import DETECTIONS, VIDEO, Schema
-from mcaptrack.transforms import TRANSFORMS, Transform, chosen
+from mcaptrack.schema import DETECTIONS, VIDEO
+from mcaptrack.transforms import TRANSFORMS, Transform, chosen, implementation_of
 
 Say = Callable[[str], None]
 
-DEFAULT_CAMERA: Final = "camera"
-#: Below the re-tracked tracks: the same at the video's rate.
-FULL: Final = "/full"
-
-
-class Route(NamedTuple):
-    """Where a transform reads and writes, below the camera's prefix."""
-
-    reads: str
-    writes: str
-
-
-#: The channels between the stages, in the order in which they run.
-ROUTES: Final[Mapping[str, Route]] = {
-    "detect": Route("video", "detections"),
-    "track": Route("detections", "tracks"),
-    "sample": Route("tracks", "samples"),
-    "predict": Route("samples", "predictions"),
-    "retrack": Route("samples", "retracks"),
-}
 #: So many parameters that differ are named.
 _NAMED: Final = 3
-_MAKER: Final = {route.writes: name for name, route in ROUTES.items()}
-
-
-class Job(NamedTuple):
-    """A transform to run from one topic to another; ``keep`` are the outputs that go into the log, None for all."""
-
-    stage: str
-    transform: Transform
-    source: str
-    target: str
-    keep: tuple[str, ...] | None = None
-
-    def outputs(self) -> dict[str, Schema]:
-        """Topic and schema of each output, in the transform's order."""
-        return {f"{self.target}/{suffix}".rstrip("/"): schema for suffix, schema in self.transform.writes.items()}
-
-    def kept(self) -> set[str]:
-        """The topics that go into the log."""
-        kept = {f"{self.target}/{suffix}".rstrip("/") for suffix in self.keep or self.transform.writes}
-        return kept | {self.target + FULL} if self.stage == "retrack" and self.target in kept else kept
-
-
-def find_camera(opened: log.Log, camera: str | None, topic: str | None = None) -> str:
-    """The prefix that everything of one camera lives under: of the topic, of the name, or the only one of the log."""
-    if topic:
-        return "/" + topic.strip("/").rpartition("/")[0] if "/" in topic.strip("/") else "/" + DEFAULT_CAMERA
-    if camera:
-        return "/" + camera.strip("/")
-    ours = [channel for channel in opened.channels.values() if Provenance.from_metadata(channel.metadata)]
-    names = [*(route.writes for route in ROUTES.values()), "video", "truth", "ground_plane"]
-    found = {c.topic.removesuffix("/" + name) for c in ours for name in names if c.topic.endswith("/" + name)}
-    found = {prefix for prefix in found if prefix + "/retracks" not in found and not prefix.endswith("/retracks")}
-    if len(found) > 1 and "/" + DEFAULT_CAMERA not in found:
-        raise McaptrackError(f"{opened.path} has several cameras, {', '.join(sorted(found))}; choose one with --camera")
-    if not found:
-        return find_camera(opened, None, _only_pictures(opened) or DEFAULT_CAMERA)
-    return found.pop() if len(found) == 1 else "/" + DEFAULT_CAMERA
-
-
-def picture_topic(opened: log.Log, prefix: str) -> str | None:
-    """Where the pictures of a camera are: its video, what its detections were made from, or all that others recorded.
-
-    None if there are no pictures, or several channels of them and nothing to tell whose they are.
-    """
-    if f"{prefix}/video" in opened.channels:
-        return f"{prefix}/video"
-    detections = opened.channels.get(f"{prefix}/detections")
-    made = Provenance.from_metadata(detections.metadata) if detections else None
-    source = opened.channels.get(made.input) if made else None
-    return source.topic if source and foreign.holds_pictures(source) else _only_pictures(opened)
-
-
-def _only_pictures(opened: log.Log) -> str | None:
-    channels = opened.channels.values()
-    theirs = [c.topic for c in channels if foreign.holds_pictures(c) and not Provenance.from_metadata(c.metadata)]
-    return theirs[0] if len(theirs) == 1 else None
 
 
 def plan_stage(
@@ -114,15 +42,14 @@ def plan_stage(
 
     ``source`` and ``target`` are topics other than the usual ones; ``defaults`` are transforms for stages that are
     missing, where they are not to be the usual ones. Raises McaptrackError if there is nothing to start
-    from.
+    from, or if the stage would replace what it did not make.
     """
-    route = ROUTES[stage]
-    planner = _Planner(opened, prefix, say, defaults=defaults)
+    planner = _Planner(opened, prefix, defaults=defaults)
+    usual = f"{prefix}/{ROUTES[stage].writes}"
     source = source or planner.source_of(stage)
     planner.ensure(source)
-    planner.jobs.append(Job(stage, transform, source, target or f"{prefix}/{route.writes}", keep))
-    check_inputs(opened, prefix, planner.jobs)
-    return planner.jobs
+    planner.jobs.append(Job(stage, transform, source, target or usual, keep))
+    return planner.checked(say)
 
 
 def plan_all(
@@ -139,17 +66,24 @@ def plan_all(
     ``plan_stage``. With ``anew`` what is up to date is made again, too, as ``defaults`` say or else as before. Raises
     McaptrackError as ``plan_stage`` does.
     """
-    planner = _Planner(opened, prefix, say, {_stage_from(opened, source): source} if source else {}, defaults, anew)
+    planner = _Planner(opened, prefix, {_stage_from(opened, source): source} if source else {}, defaults, anew)
     for target in ("predictions", "retracks"):
         planner.ensure(f"{prefix}/{target}")
-    check_inputs(opened, prefix, planner.jobs)
-    return planner.jobs
+    for topic in sorted(camera_at(opened, prefix).topics):  # also what was written elsewhere
+        planner.ensure(topic)
+    return planner.checked(say)
 
 
 def _stage_from(opened: log.Log, source: str) -> str:
-    """The first stage of a run that begins with this topic."""
+    """The first stage of a run that begins with this topic. Raises McaptrackError if none reads it."""
     channel = opened.channel(source)
-    return "track" if channel.schema_name == DETECTIONS.name or foreign.holds_detections(channel) else "detect"
+    for stage, reads in (("detect", VIDEO), ("track", DETECTIONS)):
+        if fits(channel, reads)[1]:
+            return stage
+    wanted = ", ".join((*foreign.PICTURES_READ, DETECTIONS.name, *foreign.DETECTIONS_READ))
+    raise McaptrackError(
+        f"{opened.path}: {source} holds {channel.schema_name or 'no schema'}; run begins with one of {wanted}"
+    )
 
 
 class _Planner:
@@ -163,70 +97,133 @@ class _Planner:
         self,
         opened: log.Log,
         prefix: str,
-        say: Say,
         sources: Mapping[str, str] = {},
         defaults: Mapping[str, Transform] = {},
         anew: bool = False,
     ) -> None:
         self.jobs: list[Job] = []
-        self._defaults, self._anew = defaults, anew
-        self._opened, self._prefix, self._say = opened, prefix, say
-        self._sources = sources
+        self._opened, self._prefix = opened, prefix
+        self._sources, self._defaults, self._anew = sources, defaults, anew
         self._changes: dict[str, bool] = {}
+        self._said: list[str] = []
+        self._differing: set[str] = set()
+
+    def checked(self, say: Say) -> list[Job]:
+        """The jobs, once it is known that they can run; only then it is said what runs and why."""
+        check_inputs(self._opened, self._prefix, self.jobs)
+        for words in self._said:
+            say(words)
+        return self.jobs
 
     def source_of(self, stage: str) -> str:
         """The topic that a stage reads, unless it was made from another one before."""
         usual = f"{self._prefix}/{ROUTES[stage].reads}"
-        if stage != "detect" or stage in self._sources or usual in self._opened.channels:
+        if stage in self._sources or usual in self._opened.channels:
             return self._sources.get(stage, usual)
-        found = picture_topic(self._opened, self._prefix)
-        if found:
-            self._say(f"{usual} is missing: taking the pictures of {found}")
-        return found or usual
+        camera = camera_at(self._opened, self._prefix)
+        if stage == "detect" and camera.pictures:
+            self._said.append(f"{usual} is missing: taking the pictures of {camera.pictures}")
+            if camera.boxes:
+                self._said.append(f"boxes that others detected are in {camera.boxes}; --topic takes them instead")
+            return camera.pictures
+        if stage == "track" and camera.boxes and not camera.pictures:
+            self._said.append(f"{usual} is missing: taking the boxes of {camera.boxes}")
+            return camera.boxes
+        return usual
 
     def ensure(self, topic: str) -> bool:
         """Plan what makes ``topic``; returns whether it will change."""
         if topic not in self._changes:
+            self._changes[topic] = False  # a channel that says it was made from itself ends the search
             self._changes[topic] = self._plan(topic)
         return self._changes[topic]
 
     def _plan(self, topic: str) -> bool:
-        stage = _MAKER.get(topic.removeprefix(self._prefix + "/")) if topic.startswith(self._prefix + "/") else None
         channel = self._opened.channels.get(topic)
-        if stage is None or (channel and not _made_by_stage(channel)):
-            if stage in self._sources:
-                raise McaptrackError(
-                    f"{self._opened.path}: {topic} is there and was not made by {stage}; leave --topic out to go on "
-                    f"from it, or run {stage} with --topic and --to"
-                )
-            return False  # recorded or ingested: nothing makes it but its recording
+        usual = USUAL.get(topic.removeprefix(self._prefix + "/"), "") if topic.startswith(self._prefix + "/") else ""
+        made = Provenance.from_metadata(channel.metadata) if channel else None
         if channel is None:
-            source = self.source_of(stage)
-            self.ensure(source)
-            self._say(f"{topic} is missing: running {stage}")
-            self.jobs.append(Job(stage, self._defaults.get(stage) or TRANSFORMS[stage](), source, topic))
-            return True
-        made = Provenance.from_metadata(channel.metadata)
-        had = made.input if made else self.source_of(stage)
-        source = self._sources.get(stage, had)
-        stands = not self.ensure(source) and not is_stale(self._opened, topic) and source == had
-        before = _transform_of(stage, channel)
-        wanted = self._defaults.get(stage, before)
-        if self._anew:
-            before = wanted
-        elif differing := _differing(before, wanted):
-            warn(
-                f"{topic} was made with other settings than now ({differing}); `mcaptrack run --force` takes these",
-                "other-settings",
-            )
-        if stands and not self._anew:
-            return False
-        if source != had:
-            self._say(f"{topic} was made from {had}: running {stage} again, from {source}")
-        elif not stands and not self._anew:
-            self._say(f"{topic} was made from an earlier {source}: running {stage} again, as before")
-        self.jobs.append(Job(stage, before, source, topic))
+            sibling = self._sibling(usual, topic)
+            return self._make_again(sibling, usual, topic) if sibling else bool(usual) and self._make(usual, topic)
+        if made is None or made.transform not in TRANSFORMS:
+            if usual in self._sources and topic != self._sources[usual]:
+                raise McaptrackError(self._not_made(usual, topic))
+            return False  # recorded or ingested: nothing makes it but its recording
+        return self._make_again(made, made.transform, topic)
+
+    def _sibling(self, stage: str, topic: str) -> Provenance | None:
+        """How the other outputs of a stage were made whose output at ``topic`` is missing."""
+        topics = outputs_of(stage, _main(self._opened, stage, topic)) if stage else ()
+        found = (
+            Provenance.from_metadata(self._opened.channels[one].metadata)
+            for one in topics
+            if one in self._opened.channels
+        )
+        return next((made for made in found if made and made.transform == stage), None)
+
+    def _make(self, stage: str, topic: str) -> bool:
+        """Plan a channel that is missing."""
+        source = self.source_of(stage)
+        self.ensure(source)
+        self._said.append(f"{topic} is missing: running {stage}")
+        transform = self._defaults.get(stage) or TRANSFORMS[stage]()
+        self._add(Job(stage, transform, source, _main(self._opened, stage, topic)))
         return True
+
+    def _make_again(self, made: Provenance, stage: str, topic: str) -> bool:
+        """Plan a channel that a stage made, or of whose outputs it is, if it is missing, out of date, or to come from
+        elsewhere now.
+        """
+        is_missing = topic not in self._opened.channels
+        had = made.input or self.source_of(stage)
+        source = self._sources.get(stage, had)
+        is_due = self.ensure(source) or is_missing or is_stale(self._opened, topic) or source != had
+        before, why_not = _transform_of(stage, made, self._defaults)
+        main = _main(self._opened, stage, topic)
+        is_usual = main == f"{self._prefix}/{ROUTES[stage].writes}"  # what stands elsewhere was asked for as it is
+        wanted = self._defaults.get(stage, before) if is_usual else before
+        if wanted and not self._anew and (differing := _differing(before, wanted) if before else why_not):
+            self._warn_of_settings(main, differing)
+        if not is_due and not self._anew:
+            return False
+        transform = wanted if self._anew else before
+        if transform is None:
+            if is_missing or source != had:
+                raise McaptrackError(f"{self._opened.path}: {topic} can't be made from {source}: {why_not}")
+            why = "is out of date and" if is_due else "is not made again, it"
+            warn(f"{topic} {why} stays as it is: {why_not}", "out-of-date" if is_due else "left-out")
+            return False
+        if is_missing:
+            self._said.append(f"{topic} is missing: running {stage}, as for what it made beside it")
+        elif source != had:
+            self._said.append(f"{topic} was made from {had}: running {stage} again, from {source}")
+        elif is_due and not self._anew:
+            self._said.append(f"{topic} was made from an earlier {source}: running {stage} again, as before")
+        there = [f"{main}/{suffix}".rstrip("/") for suffix in transform.writes]
+        kept = [one == topic or one in self._opened.channels for one in there]
+        keep = tuple(suffix for suffix, is_kept in zip(transform.writes, kept, strict=True) if is_kept)
+        self._add(Job(stage, transform, source, main, None if all(kept) else keep))
+        return True
+
+    def _warn_of_settings(self, main: str, differing: str) -> None:
+        """Say once for all outputs of a stage that they were made with other settings."""
+        if main in self._differing:
+            return
+        self._differing.add(main)
+        force = command("run", self._opened.path, "--force")
+        warn(f"{main} was made with other settings than now ({differing}); {force} takes these", "other-settings")
+
+    def _add(self, job: Job) -> None:
+        self.jobs.append(job)
+        self._changes |= dict.fromkeys(job.kept(), True)
+
+    def _not_made(self, stage: str, topic: str) -> str:
+        source = self._sources[stage]
+        other = command(stage, self._opened.path, "--topic", source, "--to", f"{topic}_again")
+        return (
+            f"{self._opened.path}: {topic} is there and {how_it_came(self._opened, topic)}; leave --topic out to go on "
+            f"from it, or run {other}"
+        )
 
 
 def _differing(before: Transform, wanted: Transform) -> str:
@@ -239,16 +236,24 @@ def _differing(before: Transform, wanted: Transform) -> str:
     return "; ".join(words[:_NAMED]) + (f"; and {len(words) - _NAMED} more" if len(words) > _NAMED else "")
 
 
-def _made_by_stage(channel: log.Channel) -> bool:
-    made = Provenance.from_metadata(channel.metadata)
-    return made is not None and made.transform in TRANSFORMS
+def _main(opened: log.Log, stage: str, topic: str) -> str:
+    """The topic that a stage writes to so that ``topic`` comes of it: itself, or what its last part stands below."""
+    for suffix in TRANSFORMS[stage].writes:
+        if suffix and topic.endswith("/" + suffix):
+            below = [one for one in outputs_of(stage, topic)[1:] if one in opened.channels]
+            return topic if below else topic.removesuffix("/" + suffix)
+    return topic
 
 
 def is_stale(opened: log.Log, topic: str) -> bool:
-    """Whether the channel that ``topic`` was made from, or compared with, has been replaced since."""
+    """Whether what ``topic`` was made from or compared with, or the ground plane, is another than it was then."""
     made = Provenance.from_metadata(opened.channel(topic).metadata)
     if made is None:
         return False
+    if "ground_planes" in made.parameters:
+        planes = read_planes(opened, name_above(chain_of(opened, topic)[-1]))
+        if planes_to_json(planes or ()) != made.parameters["ground_planes"]:
+            return True
     if any((name in opened.channels) != bool(then) for name, then in made.references.items()):
         return True
     for name, then in made.made_from().items():
@@ -259,48 +264,34 @@ def is_stale(opened: log.Log, topic: str) -> bool:
     return False
 
 
-def _transform_of(stage: str, channel: log.Channel) -> Transform:
-    """The transform that made a channel, with the parameters it had as far as they are known today."""
-    made = Provenance.from_metadata(channel.metadata)
-    had = made.parameters if made else {}
-    kind = chosen(stage, had)
-    names = {f.name for f in fields(kind) if not f.metadata.get("context")}
-    return kind(**{key: value for key, value in had.items() if key in names})
+def _transform_of(stage: str, made: Provenance, known: Mapping[str, Transform]) -> tuple[Transform | None, str]:
+    """The transform that made a channel, with the parameters it had; None, and why, where it can't be had today.
 
-
-def check_inputs(opened: log.Log, prefix: str, jobs: Sequence[Job]) -> None:
-    """Every job's input is in the log or made by a job before it, and is of the right kind."""
-    coming: dict[str, Schema] = {}
-    for job in jobs:
-        reads = job.transform.reads
-        channel = opened.channels.get(job.source)
-        if job.source in coming:
-            name, fits = coming[job.source].name, coming[job.source] is reads
-        elif channel:
-            theirs = foreign.holds_detections(channel) if reads is DETECTIONS else False
-            name = channel.schema_name
-            fits = foreign.holds_pictures(channel) if reads is VIDEO else theirs or name == reads.name
-        else:
-            there = [topic for topic in sorted(opened.channels) if "/view/" not in topic]
-            hint = f"`mcaptrack info {opened.path}` shows more"
-            if job.source == f"{prefix}/video":
-                hint = f"add pictures with `mcaptrack ingest VIDEO --into {opened.path}`, or name theirs with --topic"
-            has = f"it has {', '.join(there) or 'none'}"
-            pictures = [topic for topic in there if foreign.holds_pictures(opened.channels[topic])]
-            if job.source == f"{prefix}/video" and pictures:
-                has, hint = f"it has pictures in {', '.join(pictures)}", "choose one with --topic"
-            raise McaptrackError(f"{opened.path} has no channel {job.source} for {job.stage}; {has}. {hint}")
-        if not fits:
-            theirs_too = foreign.DETECTIONS_READ if reads is DETECTIONS else ()
-            wanted = " or ".join(foreign.PICTURES_READ if reads is VIDEO else (reads.name, *theirs_too))
-            raise McaptrackError(f"{opened.path}: {job.source} holds {name or 'no schema'}; {job.stage} reads {wanted}")
-        for topic in sorted(
-            name for kept in job.kept() for name in (kept, *(kept + suffix for suffix in views.SUFFIXES))
-        ):
-            known = opened.channels.get(topic)
-            if known and not Provenance.from_metadata(known.metadata):
-                raise McaptrackError(
-                    f"{opened.path}: {job.stage} would replace {topic}, which others recorded "
-                    f"({known.schema_name or 'no schema'}); write to another channel with --to"
-                )
-        coming |= job.outputs()
+    ``known`` are transforms by stage whose kinds may be used, beside the built-in ones. Nothing is ever imported
+    because a log names it.
+    """
+    had = dict(made.parameters)
+    kind: type[Transform] | None
+    if made.implementation:
+        given = known.get(stage)
+        kind = type(given) if given and implementation_of(stage, type(given)) == made.implementation else None
+        if kind is None:
+            where = f" ({made.distribution})" if made.distribution else ""
+            return None, f"{made.implementation}{where} made it, which is not at hand"
+    else:
+        option, name, kind = chosen(stage, had)
+        if kind is None:
+            return None, f"{option} {name} made it, which this version does not have"
+        had.pop(option, None)
+    options = {f.name: f for f in fields(kind)}
+    strange = sorted(set(had) - set(options))
+    if strange:
+        return None, f"it was made with {', '.join(strange)}, which {kind.__name__} does not have"
+    try:
+        transform = kind(**{name: value for name, value in had.items() if not options[name].metadata.get("context")})
+    except McaptrackError as error:
+        return None, str(error)
+    predictor = getattr(transform, "predictor", "")
+    if made.weights_sha256 and ":" in predictor and weights_sha256(predictor) != made.weights_sha256:
+        return None, f"{predictor} holds other weights than those it was made with"
+    return transform, ""

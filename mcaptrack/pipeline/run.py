@@ -6,36 +6,38 @@ import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack import foreign, log
-from mcaptrack.carry import carry
+from mcaptrack.cameras import FULL, ROUTES, camera_at
+from mcaptrack.carry import carry, keep
 from mcaptrack.clock import NS_PER_S, parse_ns
+from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import Notice, collected, warn
+from mcaptrack.pipeline.checks import Job, check_inputs
 from mcaptrack.pipeline.events import STAGE as EVENTS_STAGE
 from mcaptrack.pipeline.events import Watch, make_events, tally
-from mcaptrack.pipeline.plan import FULL, ROUTES, Job, check_inputs, picture_topic
+from mcaptrack.pipeline.findings import warn_of_memory, warn_of_nothing, warn_of_what_stands
+from mcaptrack.pipeline.planes import guess_plane, is_poor, read_planes
 from mcaptrack.pipeline.write import Made, digest_of, write
-from mcaptrack.plane import GroundPlane, Planes, assumed_plane
+from mcaptrack.plane import Planes, is_assumed
 from mcaptrack.predictors import weights_sha256
-from mcaptrack.provenance import CLOCK, Provenance
-from mcaptrack.schema import DETECTIONS, GROUND_PLANE, SCHEMAS, TRACKS, VIDEO, Frame, Schema
-from mcaptrack.schema.ground import plane_to_rows, rows_to_plane
-from mcaptrack.transforms import TRANSFORMS, Transform, choice
+from mcaptrack.provenance import CLOCK, Provenance, distribution_of
+from mcaptrack.schema import GROUND_PLANE, TRACKS, VIDEO, Frame, Schema
+from mcaptrack.transforms import TRANSFORMS, Transform, choice, implementation_of
 from mcaptrack.video import Encoded, brightness
 
 Ints = NDArray[np.int64]
 Progress = Callable[[str, int, int], None]
 
-_ASSUME: Final = "assume-ground-plane"
-
 
 @dataclass
 class Report:
-    """What a run did: the stages that ran, the frames of each topic they made, and the layouts for their views.
+    """What a run did: the stages that ran, the frames, rows and tracks of each topic they made, and the layouts for
+    their views.
 
     ``stale`` are the channels that were made from something that has now been replaced. ``events`` says for each
     channel of tracks how many events of each kind were found. ``warnings`` are what was assumed, left out or looks odd.
@@ -43,10 +45,19 @@ class Report:
 
     stages: list[str] = field(default_factory=list)
     frames: dict[str, int] = field(default_factory=dict)
+    rows: dict[str, int] = field(default_factory=dict)
+    tracks: dict[str, int] = field(default_factory=dict)
     layouts: dict[str, bytes] = field(default_factory=dict)
     stale: list[str] = field(default_factory=list)
     events: dict[str, dict[str, int]] = field(default_factory=dict)
     warnings: list[Notice] = field(default_factory=list)
+
+    def count(self, topic: str, made: Made) -> None:
+        """Count what was made."""
+        rows = made.schema.joined([frame.rows for frame in made.frames])
+        self.frames[topic], self.rows[topic] = len(made.frames), len(rows)
+        if made.schema is TRACKS:
+            self.tracks[topic] = len(np.unique(rows["track_id"]))
 
 
 def run(
@@ -65,7 +76,7 @@ def run(
     """
     with collected() as warnings:
         report = _run(opened, prefix, jobs, output, progress, watch)
-    report.warnings = warnings
+    report.warnings = list(dict.fromkeys(warnings))
     return report
 
 
@@ -77,41 +88,29 @@ def _run(
     report = Report()
     planes = read_planes(opened, prefix)
     for job in jobs:
+        given = _input(opened, job, made, stamps, progress)
         # A guessed scale is guessed anew from new detections; a given one stands.
-        if (planes is None and job.stage in ("track", "sample")) or (job.stage == "track" and _is_assumed(planes)):
-            planes = _assume_plane(opened, prefix, made, job.source)
-        transform = _in_context(opened, prefix, job, made, planes or ())
-        input_digest, frames = _input(opened, job, made, stamps, progress)
-        outputs: list[list[Frame]] = [[] for _ in job.transform.writes]
-        for result in transform(frames):
-            for frame, channel in zip(result, outputs, strict=True):
-                channel.append(frame)
-        seen = len(stamps.get(job.source, ())) if job.source not in made else 0
-        if job.transform.reads is VIDEO and seen > len(outputs[0]):
-            warn(
-                f"{job.source}: {seen - len(outputs[0])} of {seen} messages were left out: a video has to begin with a "
-                "key picture that has its parameter sets",
-                "left-out",
-            )
-        weights = weights_sha256(transform.predictor) if hasattr(transform, "predictor") else ""
-        for (topic, schema), channel in zip(job.outputs().items(), outputs, strict=True):
-            if topic not in job.kept():
-                continue
-            parameters = json.loads(json.dumps(choice(job.stage, transform) | asdict(transform)))
-            provenance = Provenance(job.stage, parameters, job.source, input_digest(), weights_sha256=weights)
-            made[topic] = Made.of(schema, channel, provenance)
-            report.frames[topic] = len(channel)
-        if job.target + FULL in job.kept():
-            made |= _carried(opened, job, made, planes or ())
+        is_usual = job.target == f"{prefix}/{ROUTES[job.stage].writes}"
+        is_due = job.stage == "track" and is_usual and is_assumed(planes)
+        if is_due or (planes is None and job.stage in ("track", "sample")):
+            planes, channel = guess_plane(given.frames, job.source, given.digest())
+            made |= {camera_at(opened, prefix).ground_plane: Made.of(GROUND_PLANE, *channel)} if channel else {}
+        if job.stage == "track":
+            warn_of_memory(len(given.frames), sum(len(frame.rows) for frame in given.frames))
+        made |= _run_job(opened, prefix, job, given, made, planes or ())
+        for topic in (topic for topic in job.outputs() if topic in made):
+            report.count(topic, made[topic])
         report.stages.append(job.stage)
     if watch is not None:
         happened = make_events(opened, prefix, made, watch)
         made |= happened
-        report.frames |= {topic: len(channel.messages) for topic, channel in happened.items()}
+        report.frames |= {topic: channel.size() for topic, channel in happened.items()}
         report.events = tally(happened)
         report.stages += [EVENTS_STAGE] if happened else []
     if made or output is not None:
         report.layouts = write(opened, prefix, made, planes or (), stamps, output)
+    how = {topic: channel.provenance for topic, channel in made.items()}
+    warn_of_what_stands(opened, prefix, how, planes or (), is_all=watch is not None or not jobs)
     digests = {topic: channel.provenance.digest for topic, channel in made.items()}
     for topic, there in sorted(opened.channels.items()):
         known = Provenance.from_metadata(there.metadata)
@@ -121,7 +120,74 @@ def _run(
     return report
 
 
-def _carried(opened: log.Log, job: Job, made: Mapping[str, Made], planes: Planes) -> dict[str, Made]:
+class _Input(NamedTuple):
+    """What a job reads: the frames as they come, all of them if they are rows, their digest, once they were read, and
+    how many messages they were read from.
+    """
+
+    stream: Iterable[Frame]
+    frames: list[Frame]
+    digest: Callable[[], str]
+    messages: Callable[[], int]
+
+
+def _run_job(
+    opened: log.Log, prefix: str, job: Job, given: _Input, made: Mapping[str, Made], planes: Planes
+) -> dict[str, Made]:
+    """The channels that a job makes. ``made`` are those of jobs before it."""
+    transform = _in_context(opened, prefix, job, given.frames, planes)
+    outputs: list[list[Frame]] = [[] for _ in transform.writes]
+    try:
+        with collected() as warnings:
+            for result in transform(given.stream):
+                for frame, channel in zip(result, outputs, strict=True):
+                    channel.append(frame)
+            if not warnings:  # otherwise it is known why
+                warn_of_nothing(job.source, transform, given.frames, outputs[0])
+    except McaptrackError as error:
+        where = "" if str(opened.path) in str(error) else f"{opened.path}: {job.source}: "
+        raise type(error)(f"{where}{error}") from None
+    left_out = given.messages() - len(outputs[0])
+    if transform.reads is VIDEO and left_out > 0:
+        warn(
+            f"{job.source}: {left_out} of {given.messages()} messages were left out: a video has to begin with a key "
+            "picture that has its parameter sets",
+            "left-out",
+        )
+    provenance = _provenance_of(job, transform, given.digest(), warnings)
+    out = {
+        topic: Made.of(schema, channel, provenance)
+        for (topic, schema), channel in zip(job.outputs().items(), outputs, strict=True)
+        if topic in job.kept()
+    }
+    if job.target + FULL in job.kept():
+        out |= _carried(opened, job, {**made, **out}, planes, getattr(transform, "holds_back", False))
+    return out
+
+
+def _provenance_of(job: Job, transform: Transform, input_digest: str, warnings: Sequence[Notice]) -> Provenance:
+    """How a job makes its channels. Raises McaptrackError for parameters that can't be kept in a log."""
+    kind = type(transform)
+    implementation = implementation_of(job.stage, kind)
+    try:
+        parameters = json.loads(json.dumps(choice(job.stage, transform) | asdict(transform)))
+    except TypeError as error:
+        name = implementation or kind.__name__
+        raise McaptrackError(f"the parameters of {name} can't be kept in a log: {error}") from None
+    predictor = getattr(transform, "predictor", None)
+    return Provenance(
+        job.stage,
+        parameters,
+        job.source,
+        input_digest,
+        weights_sha256=weights_sha256(predictor) if isinstance(predictor, str) else "",
+        implementation=implementation,
+        distribution=distribution_of(kind.__module__) if implementation else "",
+        warnings=[(notice.code, notice.message) for notice in warnings],
+    )
+
+
+def _carried(opened: log.Log, job: Job, made: Mapping[str, Made], planes: Planes, holds_back: bool) -> dict[str, Made]:
     """The re-tracked people at the rate of the tracks that their samples were made from; nothing if there are none."""
     samples = (
         made[job.source].provenance
@@ -137,11 +203,11 @@ def _carried(opened: log.Log, job: Job, made: Mapping[str, Made], planes: Planes
     if not tracks:
         return {}
     retracked = made[job.target]
-    frames = carry(tracks, retracked.frames, planes)
+    frames = keep(tracks, planes) if holds_back else carry(tracks, retracked.frames, planes)
     return {job.target + FULL: Made.of(TRACKS, frames, retracked.provenance)}
 
 
-def _in_context(opened: log.Log, prefix: str, job: Job, made: Mapping[str, Made], planes: Planes) -> Transform:
+def _in_context(opened: log.Log, prefix: str, job: Job, frames: Sequence[Frame], planes: Planes) -> Transform:
     """The transform with what the log knows: ground planes, the start of the clock, its rate."""
     names = {f.name for f in fields(job.transform) if f.metadata.get("context")}
     known: dict[str, Any] = {}
@@ -150,10 +216,11 @@ def _in_context(opened: log.Log, prefix: str, job: Job, made: Mapping[str, Made]
     if "start_ns" in names:
         known["start_ns"] = _clock_start(opened, prefix)
     if "rate_hz" in names:
-        times = [f.t_ns for f in made[job.source].frames] if job.source in made else opened.times(job.source).tolist()
-        steps = np.diff(times)
+        steps = np.diff([frame.t_ns for frame in frames])
         if (steps > 0).any():  # frames may share a time
             known["rate_hz"] = round(NS_PER_S / float(np.median(steps[steps > 0])), 6)
+    if "poor_scale" in names and is_assumed(planes):
+        known["poor_scale"] = is_poor(frames)
     return replace(job.transform, **known)
 
 
@@ -162,23 +229,23 @@ def _clock_start(opened: log.Log, prefix: str) -> int | None:
     said = opened.metadata(CLOCK)
     if said and (start := parse_ns(said.get("start_ns", ""))) is not None:
         return start
-    pictures = picture_topic(opened, prefix)
+    pictures = camera_at(opened, prefix).pictures
     return min(opened.times(pictures).tolist(), default=None) if pictures else None
 
 
 def _input(
     opened: log.Log, job: Job, made: Mapping[str, Made], stamps: dict[str, list[int]], progress: Progress
-) -> tuple[Callable[[], str], Iterable[Frame]]:
-    """The frames that a job reads, and their digest, to be asked for when they have been read."""
+) -> _Input:
+    """What a job reads; ``stamps`` gets those of pictures."""
+    if job.source not in made and job.transform.reads is VIDEO:
+        seen = stamps.setdefault(job.source, [])
+        digest, pictures = _pictures(opened, opened.channel(job.source), seen, job.stage, progress)
+        return _Input(pictures, [], digest, lambda: len(seen))
     if job.source in made:
-        source = made[job.source]
-        return (lambda: source.provenance.digest), _counted(source.frames, job.stage, progress)
-    channel = opened.channel(job.source)
-    if job.transform.reads is VIDEO:
-        return _pictures(opened, channel, stamps.setdefault(channel.topic, []), job.stage, progress)
-    said = digest_of(opened, job.source)
-    frames = _frames(opened, job.source, job.transform.reads)
-    return (lambda: said), _counted(frames, job.stage, progress)
+        frames, said = made[job.source].frames, made[job.source].provenance.digest
+    else:
+        frames, said = _frames(opened, job.source, job.transform.reads), digest_of(opened, job.source)
+    return _Input(_counted(frames, job.stage, progress), frames, lambda: said, lambda: len(frames))
 
 
 def _frames(opened: log.Log, topic: str, schema: Schema) -> list[Frame]:
@@ -223,44 +290,6 @@ def input_of(
     topic = source or f"{prefix}/{ROUTES[stage].reads}"
     job = Job(stage, transform, topic, f"{prefix}/{ROUTES[stage].writes}")
     check_inputs(opened, prefix, [job])
-    known = _in_context(opened, prefix, job, {}, read_planes(opened, prefix) or ())
-    context = {f.name: getattr(known, f.name) for f in fields(known) if f.metadata.get("context")}
-    return _frames(opened, topic, transform.reads), context
-
-
-def read_planes(opened: log.Log, prefix: str) -> Planes | None:
-    """The ground planes of a camera with the times from which they hold; None if there are none."""
-    topic = f"{prefix}/ground_plane"
-    if topic not in opened.channels:
-        return None
-    frames = opened.frames(topic, GROUND_PLANE)
-    return [(frame.t_ns, rows_to_plane(frame.rows)) for frame in frames] or None
-
-
-def _is_assumed(planes: Planes | None) -> bool:
-    return planes is not None and all(plane.assumed for _, plane in planes)
-
-
-def _assume_plane(opened: log.Log, prefix: str, made: dict[str, Made], source: str) -> Planes | None:
-    """Guess a scale from the boxes where nobody gave a ground plane; it becomes a channel that says so."""
-    if source in made:
-        frames, known = made[source].frames, made[source].provenance
-    else:
-        channel = opened.channel(source)
-        frames = _frames(opened, source, SCHEMAS.get(channel.schema_name, DETECTIONS))
-        known = Provenance.from_metadata(channel.metadata) or Provenance("", {})
-    rows = np.concatenate([frame.rows[["x_px", "y_px", "w_px", "h_px"]] for frame in frames]) if frames else None
-    if rows is None or not np.isfinite(rows["h_px"]).any():
-        return None  # nothing in pixels: nothing to bring to metres
-    width, height = (int(np.nanmax(rows[a] + rows[b]).round()) for a, b in (("x_px", "w_px"), ("y_px", "h_px")))
-    plane: GroundPlane = assumed_plane(rows["h_px"], width, height)
-    metres = 1 / plane.homography[0]
-    warn(
-        f"no ground plane is known: taking {metres:.3g} px for a metre, since people are 1.7 m high; "
-        "give one with `mcaptrack ingest --ground-plane`",
-        "assumed-ground-plane",
-    )
-    start = frames[0].t_ns
-    provenance = Provenance(_ASSUME, {}, source, known.digest)
-    made[f"{prefix}/ground_plane"] = Made.of(GROUND_PLANE, [Frame(start, 0, plane_to_rows(plane))], provenance)
-    return [(start, plane)]
+    frames = _frames(opened, topic, transform.reads)
+    known = _in_context(opened, prefix, job, frames, read_planes(opened, prefix) or ())
+    return frames, {f.name: getattr(known, f.name) for f in fields(known) if f.metadata.get("context")}

@@ -12,12 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack import foreign, foxglove, log, views
-from mcaptrack.errors import McaptrackError
+from mcaptrack.cameras import FULL, VIDEO, Camera, camera_at
+from mcaptrack.errors import McaptrackError, command
 from mcaptrack.foxglove.layouts import Eye
-from mcaptrack.pipeline.plan import FULL
-from mcaptrack.pipeline.plan import picture_topic as find_pictures
+from mcaptrack.notices import warn
+from mcaptrack.pipeline.checks import how_it_came, may_replace
 from mcaptrack.plane import Planes
-from mcaptrack.provenance import Provenance, digest
+from mcaptrack.provenance import INGEST, VIEW, Provenance, digest
 from mcaptrack.schema import DETECTIONS, FORECAST_SCORES, GROUND_PLANE, PREDICTIONS, SCHEMAS, TRACKS, Frame, Schema
 from mcaptrack.views import layouts
 
@@ -27,19 +28,32 @@ Numbered = tuple[int, int, int, bytes]
 
 
 class Made(NamedTuple):
-    """A channel that was just made; ``record`` is its schema record, if that is not the schema's own."""
+    """A channel that was just made, of frames; or of ``words``, messages of another kind, with their schema record."""
 
     schema: Schema
     frames: list[Frame]
     provenance: Provenance
-    messages: list[tuple[int, int, bytes]]
+    words: list[tuple[int, int, bytes]] | None = None
     record: tuple[str, str, bytes] | None = None
 
     @classmethod
     def of(cls, schema: Schema, frames: list[Frame], provenance: Provenance) -> Made:
-        """Frames through the gate and as messages, whose digest goes into the provenance."""
-        messages = [(frame.t_ns, frame.index, schema.codec.encode(schema.check(frame.rows))) for frame in frames]
-        return cls(schema, frames, replace(provenance, digest=digest(messages)), messages)
+        """Frames through the gate; the digest of their messages goes into the provenance."""
+        for frame in frames:
+            schema.check(frame.rows)
+        made = cls(schema, frames, provenance)
+        return made._replace(provenance=replace(provenance, digest=digest(made.messages())))
+
+    def messages(self) -> Iterator[tuple[int, int, bytes]]:
+        """Time, frame and payload of each message; made one by one, since all of them take much memory."""
+        if self.words is not None:
+            return iter(self.words)
+        encode = self.schema.codec.encode
+        return ((frame.t_ns, frame.index, encode(frame.rows)) for frame in self.frames)
+
+    def size(self) -> int:
+        """How many messages there are."""
+        return len(self.frames if self.words is None else self.words)
 
 
 def digest_of(opened: log.Log, topic: str) -> str:
@@ -69,30 +83,36 @@ def write(
 
     ``stamps`` are those of pictures that were read on the way.
     """
-    usual = f"{prefix}/video"
-    video = usual if usual in opened.channels else next(iter(stamps), None) or find_pictures(opened, prefix)
+    camera = camera_at(opened, prefix)
+    usual = f"{prefix}/{VIDEO}"
+    video = usual if usual in opened.channels else next(iter(stamps), None) or camera.pictures
     picture_ns = opened.times(video) if video else np.empty(0, np.int64)
     video = video if len(picture_ns) else None
     stamp_ns = _stamps(opened, video, stamps.get(video, ())) if video else picture_ns
-    shown = _shown(opened, prefix, made)
+    shown = _shown(opened, camera, made)
     outdated = {topic + suffix for topic in shown for suffix in views.SUFFIXES}
     drawn = _Drawn(prefix, picture_ns, stamp_ns, planes)
     if any(channel.schema in _ON_GROUND for channel in shown.values()):
         outdated.add(drawn.frame_topic)
+    taken = {topic for topic in outdated if not may_replace(opened, topic, VIEW)}
+    outdated -= taken
+    for topic in sorted(taken):
+        warn(f"no view at {topic}, which {how_it_came(opened, topic)}", "left-out")
     # All that is read, before anything is written: the log is changed in place.
-    start_ns = _start_ns(opened, prefix, shown, picture_ns)
+    start_ns = _start_ns(opened, camera, shown, picture_ns)
     eye = layouts.eye_on(_places(opened, prefix, shown), planes, start_ns)
     last_step, is_truth_known = _last_step(opened, prefix, shown), _is_truth_known(opened, prefix, shown)
     # What stays comes first: then what is made again finds the place that it had, and the bytes are the same.
-    drawn_first = list(drawn.views({topic: channel for topic, channel in shown.items() if topic not in made}, start_ns))
-    drawn_last = list(drawn.views({topic: channel for topic, channel in shown.items() if topic in made}, start_ns))
+    first, last = ({t: c for t, c in shown.items() if (t in made) is is_made} for is_made in (False, True))
+    drawn_first = [view for view in drawn.views(first, start_ns) if view.topic not in taken]
+    drawn_last = [view for view in drawn.views(last, start_ns) if view.topic not in taken]
     there = {*opened.channels} - outdated | {*made} | {view.topic for view in (*drawn_first, *drawn_last)}
     layout_files = layouts.make(drawn.there(there, video, eye, last_step, is_truth_known))
     new = {attachment_of(name): content for name, content in layout_files.items()}
     standing = {name for name, content in new.items() if opened.attachment(name) == content}
     replaced = [name for name in ATTACHMENTS if name not in standing]
     new_topics = {*made, *outdated, *(view.topic for view in (*drawn_first, *drawn_last))}
-    log.refuse_recorded(opened, new_topics, f"`mcaptrack drop {opened.path} TOPIC -o FILE` makes a log without it")
+    log.refuse_recorded(opened, new_topics, "write to another channel")
     with log.extend(opened, output, drop={*made, *outdated}, drop_attachments=replaced) as writer:
         streams: list[Iterator[Numbered]] = []
 
@@ -108,7 +128,7 @@ def write(
             record = channel.record or (channel.schema.name, "protobuf", channel.schema.descriptor)
             made_by = channel.provenance.transform  # results of one stage share chunks, so that they can go together
             number = writer.add_channel(topic, record, "protobuf", channel.provenance.to_metadata(), group=made_by)
-            streams.append(_with_number(number, channel.messages))
+            streams.append(_with_number(number, channel.messages()))
         draw(drawn_last)
         _write_by_time(writer, streams)
         for name, content in new.items():
@@ -126,7 +146,7 @@ class Shown(NamedTuple):
     made_by: str
 
 
-def _shown(opened: log.Log, prefix: str, made: Mapping[str, Made]) -> dict[str, Shown]:
+def _shown(opened: log.Log, camera: Camera, made: Mapping[str, Made]) -> dict[str, Shown]:
     """The channels whose views are to be made: what was made, and what was ingested since, or has none yet."""
     shown = {
         topic: Shown(channel.schema, channel.frames, channel.provenance.digest, channel.provenance.transform)
@@ -135,7 +155,7 @@ def _shown(opened: log.Log, prefix: str, made: Mapping[str, Made]) -> dict[str, 
     for topic, channel in sorted(opened.channels.items()):
         schema = SCHEMAS.get(channel.schema_name)
         known = Provenance.from_metadata(channel.metadata)
-        if topic in shown or not topic.startswith(prefix + "/") or not known or known.transform != _INGESTED:
+        if topic in shown or topic not in camera.topics or not known or known.transform != INGEST:
             continue
         drawn = opened.channels.get(topic + (views.SUFFIX if schema is DETECTIONS else views.SCENE_SUFFIX))
         drawn_from = Provenance.from_metadata(drawn.metadata) if drawn else None
@@ -168,7 +188,7 @@ class _Drawn:
     def views(self, shown: Mapping[str, Shown], start_ns: int) -> Iterator[View]:
         """All views of these channels, and the frame in which scenes lie, which is there from the start."""
         for topic, channel in shown.items():
-            made_from = Provenance("view", {}, topic, channel.digest)
+            made_from = Provenance(VIEW, {}, topic, channel.digest)
             group = channel.made_by
             if topic == f"{self._prefix}/ground_plane":
                 outline = views.ground.outlines(self._planes, start_ns, self._frame_id)
@@ -189,7 +209,7 @@ class _Drawn:
             self._is_framed = True
             frame = foxglove.pack_transform(start_ns, views.ground.world_of(self._prefix), self._frame_id)
             topic, channel = next(iter(on_ground.items()))
-            made_from = Provenance("view", {}, topic, channel.digest)
+            made_from = Provenance(VIEW, {}, topic, channel.digest)
             yield View(self.frame_topic, foxglove.TRANSFORM, made_from, "", iter([(start_ns, 0, frame)]))
 
     def there(
@@ -201,10 +221,10 @@ class _Drawn:
         return layouts.There(self._prefix, names, video, self._frame_id, eye, last_step, is_truth_known)
 
 
-def _start_ns(opened: log.Log, prefix: str, shown: Mapping[str, Shown], picture_ns: Ints) -> int:
+def _start_ns(opened: log.Log, camera: Camera, shown: Mapping[str, Shown], picture_ns: Ints) -> int:
     """When a camera's first picture or row is."""
     known = [channel.topic for channel in opened.channels.values() if channel.schema_name in SCHEMAS]
-    times = [picture_ns, *(opened.times(topic) for topic in known if topic.startswith(prefix + "/"))]
+    times = [picture_ns, *(opened.times(topic) for topic in known if topic in camera.topics)]
     times += [np.array([channel.frames[0].t_ns], np.int64) for channel in shown.values() if channel.frames]
     return min((int(some[0]) for some in times if len(some)), default=0)
 
@@ -261,8 +281,6 @@ def _write_by_time(writer: log.LogWriter, streams: Iterable[Iterator[Numbered]])
 _NOT_SHOWN: Final = ("/samples", "/online")
 #: What has a view in metres.
 _ON_GROUND: Final = (TRACKS, PREDICTIONS, GROUND_PLANE)
-#: What made the channels that came into the log with labels.
-_INGESTED: Final = "ingest"
 
 
 def layout_path(path: Path, name: str) -> Path:
@@ -294,7 +312,7 @@ def find_views(opened: log.Log, prefix: str, topics: Sequence[str] = ()) -> list
     }
     found = [f"{prefix}/{name}{views.SUFFIX}" for name in layouts.best(there)]
     if not found:
-        raise McaptrackError(f"{opened.path} has no views of {prefix} yet; `mcaptrack run {opened.path}` makes them")
+        raise McaptrackError(f"{opened.path} has no views of {prefix} yet; {command('run', opened.path)} makes them")
     return found
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Final
 
 from mcaptrack.errors import McaptrackError
+from mcaptrack.notices import warn
 from mcaptrack.predictors.forecast import Forecast, Predictor
 from mcaptrack.predictors.linear import LinearPredictor
 from mcaptrack.predictors.own_clock import OnClock
@@ -24,12 +25,19 @@ _WITH_FILE: Final = ("lstm", "red", "onnx")
 def make(name: PredictorName, steps: int, step_s: float) -> Predictor:
     """The predictor of that name for ``steps`` steps of ``step_s`` seconds.
 
-    Raises McaptrackError if there is none, or if its file can't be read.
+    A network that predicts less far than that is continued in a straight line, with a warning. Raises McaptrackError if
+    there is none of that name, or if its file can't be read.
     """
     kind, file = check(name)
     if kind not in _WITH_FILE:
         return LinearPredictor(kind, steps, step_s)
     inner = _network(kind, file)
+    ahead_s, own_s = steps * step_s, inner.steps * inner.step_s
+    if ahead_s > own_s + inner.step_s / 2:
+        warn(
+            f"{name} predicts {own_s:.3g} s ahead; what is asked for beyond, up to {ahead_s:.3g} s, is a straight line",
+            "extrapolated",
+        )
     same = inner.steps == steps and abs(inner.step_s / step_s - 1) < 1e-6
     return inner if same else OnClock(inner, steps, step_s)
 

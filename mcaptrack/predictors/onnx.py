@@ -75,8 +75,13 @@ class Onnx:
         if not 0 < step_s < float("inf"):
             raise McaptrackError(f"{path}: its metadata say step_s = {said!r}, which is no number of seconds")
         tried = cls(path, session, shape[1], 0, step_s, sha256)
-        steps = [tried._run(np.zeros((batch, shape[1], 2)), np.ones((batch, shape[1]), bool)) for batch in (1, 7)]
-        return cls(path, session, shape[1], steps[0][0].shape[1], step_s, sha256)
+        given = [tried._run(np.zeros((batch, shape[1], 2)), np.ones((batch, shape[1]), bool)) for batch in (1, 7)]
+        steps = {outputs[0].shape[1] for outputs in given}
+        declared = session.get_outputs()[0].shape or []  # some say nothing
+        steps |= {size for size in declared[1:2] if isinstance(size, int)}
+        if len(steps) > 1:
+            raise McaptrackError(f"{path} declares {declared} as its output, and gives {sorted(steps)} steps, by batch")
+        return cls(path, session, shape[1], steps.pop(), step_s, sha256)
 
     @cached_property
     def _uncertain(self) -> LinearPredictor:
@@ -98,6 +103,10 @@ class Onnx:
             raise McaptrackError(f"{self.path} has to give (B, T, 2), and may give (B, T, 2, 2); it gives {shapes}")
         if not all(np.isfinite(output).all() for output in outputs):
             raise McaptrackError(f"{self.path} gives numbers that are not finite")
+        if len(outputs) > 1 and not are_covariances(outputs[1]):
+            raise McaptrackError(
+                f"{self.path} gives covariances that are none: variances of 0 or less, or not symmetric"
+            )
         return outputs
 
     def predict(self, xy_m: Floats, valid: Bools) -> Forecast:
@@ -110,6 +119,14 @@ class Onnx:
         outputs = self._run(filled - now, known)
         cov = outputs[1] if len(outputs) > 1 else self._uncertain.predict(xy_m, valid).cov
         return Forecast(now + outputs[0], cov)
+
+
+def are_covariances(cov: Floats) -> bool:
+    """Whether matrices (B, T, 2, 2) are symmetric and positive definite, as far as 32 bits tell."""
+    xx, xy, yx, yy = cov[..., 0, 0], cov[..., 0, 1], cov[..., 1, 0], cov[..., 1, 1]
+    scale = np.sqrt(np.maximum(xx, 0) * np.maximum(yy, 0))
+    is_symmetric = np.abs(xy - yx) <= 1e-4 * scale
+    return bool((is_symmetric & (xx > 0) & (yy > 0) & (np.abs(xy + yx) / 2 <= scale)).all())
 
 
 def _first_line(error: Exception) -> str:

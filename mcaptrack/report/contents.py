@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
 from mcaptrack import log, pipeline
 from mcaptrack.clock import NS_PER_S
-from mcaptrack.errors import DamagedError, McaptrackError
+from mcaptrack.errors import DamagedError, McaptrackError, command
 from mcaptrack.evaluation import EvaluateOptions, Result, Sequenced, evaluate, sequence_of_log
 from mcaptrack.evaluation.aligned import frame_times, has, resampled
 from mcaptrack.evaluation.events import EventOptions, Rule, find_events
@@ -111,6 +112,7 @@ def _said(error: McaptrackError, opened: log.Log) -> str:
 
 def _read(opened: log.Log, out: LogReport) -> None:
     """The tracks, and the ground."""
+    camera = pipeline.camera_at(opened, out.prefix)
     channel = opened.channels.get(f"{out.prefix}/tracks")
     made = Provenance.from_metadata(channel.metadata) if channel else None
     by = _TRACKERS.get(str(made.parameters.get("tracker", "sort")), "tracker") if made else "tracker"
@@ -123,7 +125,7 @@ def _read(opened: log.Log, out: LogReport) -> None:
         "truth": "truth",
     }
     for below, role in ROLES.items():
-        topic = f"{out.prefix}/{below}"
+        topic = camera.truth if role == "truth" else f"{out.prefix}/{below}"
         there = opened.channels.get(topic)
         if there is None:
             continue
@@ -143,8 +145,8 @@ def _score(opened: log.Log, out: LogReport) -> None:
     path = opened.path.name
     if "truth" not in out.sets:
         out.lacks["scores"] = (
-            "How right the tracks are can't be said: the log has no truth. "
-            f"Add labels with `mcaptrack ingest LABELS --as truth --into {path}`."
+            "How right the tracks are can't be said: the log has no truth. Add labels with "
+            f"{command('ingest', 'LABELS', '--as', 'truth', '--into', Path(path))}."
         )
         return
     try:
@@ -189,7 +191,7 @@ def _recorded(opened: log.Log, topic: str) -> tuple[list[Frame], Rule | None] | 
 
 
 def _look(opened: log.Log, out: LogReport) -> None:
-    topic = pipeline.picture_topic(opened, out.prefix)
+    topic = pipeline.camera_at(opened, out.prefix).pictures
     if topic is None:
         out.lacks["pictures"] = "The log has no pictures of the scene"
         return

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import NamedTuple
 
+from mcaptrack.errors import command
 from mcaptrack.evaluation import Result, combined
 from mcaptrack.metrics import summary
 from mcaptrack.report.contents import LogReport, result_of
@@ -106,7 +108,8 @@ def _without_truth(reports: Sequence[LogReport]) -> str:
     if not any(report.data["messages"] for report in reports):
         return "There is nothing in here yet: no messages at all."
     if not seen:
-        return "Nobody has been tracked in here yet; `mcaptrack run` does that."
+        run = command("run", *(Path(report.file) for report in reports))
+        return f"Nobody has been tracked in here yet; {run} does that."
     said = f"Tracking found {counted(tracked, 'track')}."
     if any("offline" in report.sets for report in reports):
         was = "was" if joined == 1 else "were"

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
+from mcaptrack.errors import command
 from mcaptrack.evaluation import Result
 from mcaptrack.metrics import summary
 from mcaptrack.report.charts import Axis, Bars, Line, beside, figure, histogram_chart, line_chart, round_most
@@ -62,14 +64,15 @@ def score_table(results: Sequence[Result], report: LogReport) -> Markup:
             body.append(tag("tr", *cells))
     head = [tag("th", "tracks", scope="col"), tag("th", "channel", scope="col")]
     head += [tag("th", key, scope="col", class_="n") for key in _SCORES]
-    caption = tag("caption", "Scores against the truth, as ", tag("code", "mcaptrack evaluate"), " gives them")
+    caption = tag("caption", "Scores against the truth, as ", tag("code", "evaluate"), " gives them")
     whole = tag("table", caption, tag("thead", tag("tr", *head)), tag("tbody", *body))
     return tag("div", whole, class_="wide", tabindex="0", role="region", aria_label="scores")
 
 
 def _track_table(report: LogReport) -> Markup:
     if not report.sets:
-        return lack(f"Nobody has been tracked here; `mcaptrack run {report.file}` finds, tracks and re-tracks people.")
+        run = command("run", Path(report.file))
+        return lack(f"Nobody has been tracked here; {run} finds, tracks and re-tracks people.")
     repairs = {story.topic: story.counts["joined"] + story.counts["parted"] for story in report.stories}
     rows = [
         (
@@ -95,7 +98,7 @@ def forecasts(report: LogReport) -> Markup:
         why = "There are no forecasts that could be scored"
         reason = "the log has no truth" if "truth" not in report.sets else "none have a known future"
         if not any(c["schema"] == "mcaptrack.Predictions" for c in report.data["channels"]):
-            reason = f"the log holds none; `mcaptrack predict {report.file}` makes them"
+            reason = f"the log holds none; {command('predict', Path(report.file))} makes them"
         return lack(f"{why}: {reason}.")
     roles = {one.topic: one for one in report.sets.values()}
 
@@ -190,7 +193,7 @@ def motion(report: LogReport) -> Markup:
         figures.append(_histogram(report, speeds, "Speed. ", "speed, m/s", note, "m/s", "step", 2))
     elif report.sets:
         words = "Speeds can't be said: nobody knows where on the ground people are"
-        figures.append(lack(words + "; `mcaptrack ingest --ground-plane` gives a ground plane."))
+        figures.append(lack(words + "; a ground plane says it."))
     if dwell:
         note = "From the first row of a track to its last."
         figures.append(_histogram(report, dwell, "Dwell. ", "time there, s", note, "s", "track", 1))

@@ -49,9 +49,9 @@ def scene(report: LogReport, number_of: int) -> Markup:
     on_ground = [(one, ground_paths(one.frames)) for one in sets]
     on_ground = [(one, paths) for one, paths in on_ground if paths]
     if not on_ground:
-        where = "`mcaptrack ingest --ground-plane` gives a ground plane"
         return lack(
-            f"Tracks can't be drawn: there is no picture, and nobody knows where on the ground they are; {where}."
+            "Tracks can't be drawn: there is no picture, and nothing says where on the ground they are; a ground plane "
+            "does."
         )
     span = ground_span([points for _, paths in on_ground for _, points, _ in paths])
     panels = [

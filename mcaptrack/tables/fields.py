@@ -151,7 +151,7 @@ _SUMMARY: Final = Table(
 _METRICS: Final = Table(
     "metrics",
     "One row a channel of tracks, similarity and gate: its scores against the truth of its camera, the numbers of "
-    "`mcaptrack evaluate --json`. No rows where the log has no truth.",
+    "evaluate --json. No rows where the log has no truth.",
     ("topic", "similarity", "gate"),
     ("topic", "similarity", "gate"),
     (

@@ -133,13 +133,11 @@ def described(path: Path, form: Format) -> dict[str, str] | None:
     import pyarrow.parquet as pq
 
     try:
-        if form == "parquet":
-            found = pq.read_metadata(path).metadata or {}
-        elif form == "arrow":
-            with pa.OSFile(str(path)) as file:
-                found = pa.ipc.open_file(file).schema.metadata or {}
-        else:
+        if form not in ("parquet", "arrow"):
             return None
+        with path.open("rb") as stream:  # Arrow opens no file whose name is no text
+            described = pq.read_metadata(stream) if form == "parquet" else pa.ipc.open_file(stream).schema
+            found = described.metadata or {}
     except (OSError, pa.ArrowException):
         return None
     pairs = ((key.decode("utf-8", "replace"), value.decode("utf-8", "replace")) for key, value in found.items())
@@ -156,7 +154,7 @@ def verify(path: Path, form: Format = "parquet") -> int:
 
     said = (described(path, form) or {}).get("digest")
     if said is None:
-        raise McaptrackError(f"{path} is no table with a digest as `mcaptrack export` writes it")
+        raise McaptrackError(f"{path} is no exported table: it has no digest")
     rows = [0]
 
     def counted(pieces: Iterable[Any]) -> Iterator[Any]:
@@ -166,11 +164,11 @@ def verify(path: Path, form: Format = "parquet") -> int:
 
     try:
         if form == "parquet":
-            with pq.ParquetFile(path, page_checksum_verification=True) as file:
+            with path.open("rb") as stream, pq.ParquetFile(stream, page_checksum_verification=True) as file:
                 groups = (file.read_row_group(number) for number in range(file.num_row_groups))
                 found = digest(file.schema_arrow, counted(groups))
         else:
-            with pa.OSFile(str(path)) as stream:
+            with path.open("rb") as stream:
                 table = pa.ipc.open_file(stream).read_all()
             found = digest(table.schema, counted(_pieces(table)))
     except (OSError, pa.ArrowException) as error:

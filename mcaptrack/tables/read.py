@@ -30,9 +30,7 @@ def read_columns(path: Path, names: Sequence[str]) -> dict[str, NDArray[Any]]:
         raise McaptrackError(f"{path} is no Parquet file that can be read: {str(error).splitlines()[0]}") from None
     missing = [name for name in names if name not in table.column_names]
     if missing:
-        raise McaptrackError(
-            f"{path} has no column {', '.join(missing)}; a table of tracks as `mcaptrack export` writes it has"
-        )
+        raise McaptrackError(f"{path} has no column {', '.join(missing)}; an exported table of tracks has")
     out = {}
     for name in names:
         column = table.column(name)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from mcaptrack import log, pipeline, tables
 from mcaptrack.clock import NS_PER_S
-from mcaptrack.errors import McaptrackError
+from mcaptrack.errors import McaptrackError, command
 from mcaptrack.ingest import label_frames
 from mcaptrack.ingest.labels import read_labels
 from mcaptrack.plane import Planes
@@ -108,7 +108,7 @@ def _from_log(path: Path, options: SourceOptions, step_s: float) -> list[Scene]:
         topics = [options.topic] if options.topic else [f"{prefix}/{name}" for name in _BEST]
         found = [topic for topic in topics if topic in opened.channels and opened.channels[topic].messages]
         if not found:
-            raise McaptrackError(f"{path} has none of {', '.join(topics)}; `mcaptrack run {path}` makes tracks")
+            raise McaptrackError(f"{path} has none of {', '.join(topics)}; {command('run', path)} makes tracks")
         if opened.channels[found[0]].schema_name != TRACKS.name:
             raise McaptrackError(f"{path}: {found[0]} holds {opened.channels[found[0]].schema_name}, not {TRACKS.name}")
         planes = pipeline.read_planes(opened, prefix) or ()

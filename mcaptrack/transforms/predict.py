@@ -10,13 +10,9 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import ClassVar
 
-import numpy as np
-
-from mcaptrack.clock import NS_PER_S
-from mcaptrack.history import Histories
-from mcaptrack.predictors import NAMES, PredictorName, check, make
+from mcaptrack.predictors import NAMES, PredictorName, check
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame, Schema
-from mcaptrack.schema.predictions import forecast_to_rows
+from mcaptrack.transforms.forecasts import Forecaster
 from mcaptrack.transforms.protocol import check_options, context, option
 
 
@@ -47,15 +43,6 @@ class Predict:
         check(self.predictor)
 
     def __call__(self, frames: Iterable[Frame]) -> Iterator[tuple[Frame, ...]]:
-        predictor = make(self.predictor, max(1, round(self.horizon_s * self.rate_hz)), 1 / self.rate_hz)
-        histories = Histories(max(predictor.past, self.min_history))
-        last_ns = None
+        forecaster = Forecaster(self.predictor, self.horizon_s, self.min_history, self.rate_hz)
         for frame in frames:
-            steps = 1 if last_ns is None else max(1, round((frame.t_ns - last_ns) * self.rate_hz / NS_PER_S))
-            last_ns = frame.t_ns
-            ids = frame.rows["track_id"]
-            past, known = histories.push(ids, np.stack([frame.rows["x_m"], frame.rows["y_m"]], axis=-1), steps)
-            # A row inside a hole was filled in with what came after it; nothing may be foretold from there.
-            ready = known[:, -self.min_history :].all(axis=1) & frame.rows["observed"]
-            forecast = predictor.predict(past[ready], known[ready])
-            yield (Frame(frame.t_ns, frame.index, forecast_to_rows(ids[ready], forecast, predictor.step_s)),)
+            yield (frame._replace(rows=forecaster.predict(frame)),)

@@ -17,6 +17,7 @@ Laws that hold for every transform, tested for all in ``TRANSFORMS``:
 from __future__ import annotations
 
 import math
+import typing
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import field, fields
 from types import UnionType
@@ -80,17 +81,20 @@ def choices(annotation: Any) -> tuple[str, ...]:
     return tuple(str(name) for name in get_args(annotation)) if get_origin(annotation) is Literal else ()
 
 
+#: What a parameter can be, and the values that it takes.
+_KINDS: Final[Mapping[type, tuple[type, ...]]] = {float: (int, float), int: (int,), bool: (bool,), str: (str,)}
+
+
 def bare_type(annotation: Any) -> Any:
     """The type of a parameter without the "or None"."""
-    if isinstance(annotation, UnionType):
-        return next(part for part in get_args(annotation) if part is not type(None))
-    return annotation
+    parts = [part for part in get_args(annotation) if part is not type(None)]
+    return parts[0] if get_origin(annotation) in (UnionType, typing.Union) and len(parts) == 1 else annotation
 
 
 def check_options(transform: Transform) -> None:
     """Refuse parameters that are out of range or of the wrong kind, by name and number. For ``__post_init__``.
 
-    Raises McaptrackError.
+    Raises McaptrackError; also for a class whose parameters are of types that no command line and no log can hold.
     """
     hints = get_type_hints(type(transform))
     for parameter in fields(transform):
@@ -100,14 +104,18 @@ def check_options(transform: Transform) -> None:
         if value is None and kind is not hints[name]:
             continue
         names = choices(kind)
+        if not (kind in _KINDS or (names and all(isinstance(one, str) for one in get_args(kind)))):
+            raise McaptrackError(
+                f"{type(transform).__name__}.{name} is a {hints[name]}; a parameter is a float, an int, a bool, a str "
+                "or a Literal of names, or one of these or None"
+            )
         if names:
             if value not in names:
                 raise McaptrackError(f"{name} is one of {', '.join(names)}, not {value}")
             continue
-        wanted = {float: (int, float), int: (int,), bool: (bool,), str: (str,)}[kind]
-        if not isinstance(value, wanted) or (isinstance(value, bool) and kind is not bool):
+        if not isinstance(value, _KINDS[kind]) or (isinstance(value, bool) and kind is not bool):
             raise McaptrackError(f"{name} needs {kind.__name__}, not {value!r}")
-        least, most = parameter.metadata["least"], parameter.metadata["most"]
+        least, most = parameter.metadata.get("least", -math.inf), parameter.metadata.get("most", math.inf)
         if kind in (int, float) and not least <= value <= most:
             raise McaptrackError(f"{name} has to be {limits(least, most) or 'a number'}, not {value}")
 

@@ -297,6 +297,14 @@ case(
     {0.0: 2, 6.0: 2, 6.4: 1},
 )
 case(
+    "side_view",
+    "the same seen from the side, on a scale that was guessed: tracks are passed on as they are, unless that is asked for",
+    replace(LIKELY, min_track_s=0.4, link_s=20.0, poor_scale=True),
+    hidden(range(20, 35), 60),
+    people,
+    {False: 2, True: 1},
+)
+case(
     "link_certainty",
     "a person walks on behind a wall, 1 m aside",
     replace(LIKELY, link_s=20.0),

@@ -21,6 +21,7 @@ from mcaptrack.clock import FrameClock
 from mcaptrack.schema import DETECTIONS, VIDEO, Frame, Schema
 from mcaptrack.transforms.detect.foreground import Method, model
 from mcaptrack.transforms.detect.motion import IDENTITY, CameraMotion
+from mcaptrack.transforms.detect.steadiness import Steadiness
 from mcaptrack.transforms.protocol import check_options, option
 
 Image = NDArray[np.uint8]
@@ -62,12 +63,13 @@ class Detect:
         check_options(self)
 
     def __call__(self, frames: Iterable[Frame]) -> Iterator[tuple[Frame, ...]]:
-        clock, camera, size = FrameClock(), CameraMotion(), _PersonSize()
+        clock, camera, size, steadiness = FrameClock(), CameraMotion(), _PersonSize(), Steadiness()
         foreground = model(self.method, self.threshold, self.history_s)
         for frame in frames:
             clock.tick(frame.t_ns)
             image, halvings = _halve(frame.rows, self.max_pixels)
             to_reference, is_new = camera.follow(image) if self.stabilise else (IDENTITY, False)
+            steadiness.see(frame.t_ns, camera.view, is_new)
             if is_new:  # another view has another background
                 foreground = model(self.method, self.threshold, self.history_s)
             mask = _steady_mask(foreground.mask(_move(image, to_reference), clock), to_reference)
@@ -75,6 +77,7 @@ class Detect:
                 mask = np.zeros_like(mask)
             boxes = _boxes(mask, size.measure(mask))
             yield (Frame(frame.t_ns, frame.index, _rows(_back(boxes, to_reference) * 2**halvings)),)
+        steadiness.judge()
 
 
 def _halve(image: Image, max_pixels: int) -> tuple[Image, int]:

@@ -2,7 +2,8 @@
 
 An observation is a sample with the forecast from its own past; its identity is dropped. A track is a forecast and an
 age. Observations go to the tracks whose forecasts agree with theirs; a matched track is smoothed and foretells again;
-an unmatched one ages. Three readings are offered by name, see ``PROFILES``.
+an unmatched one ages. Three readings are offered by name, see ``PROFILES``. All of this is about metres: where they
+were guessed and can't be right (``poor_scale``), tracks are passed on as they are.
 
 Letters: K tracks, N observations, L past positions, T future steps.
 """
@@ -19,6 +20,7 @@ import numpy as np
 from mcaptrack.plane import Planes
 from mcaptrack.predictors import NAMES, PredictorName
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame, Schema
+from mcaptrack.transforms.forecasts import Forecaster
 from mcaptrack.transforms.protocol import check_options, context, option
 from mcaptrack.transforms.retrack.algorithm import Forecasting
 from mcaptrack.transforms.retrack.distance import Covariance, Distance
@@ -180,8 +182,14 @@ class Retrack:
         theme=_OFFLINE,
     )
     filled: bool = option(False, "use interpolated samples as observations, too", theme=_ASSOCIATION)
+    side_view: bool = option(
+        False,
+        "re-track also where no ground plane is known and the camera looks along the ground",
+        theme=_ASSOCIATION,
+    )
     rate_hz: float = context(lambda: 2.5)
     ground_planes: Planes = context(tuple)
+    poor_scale: bool = context(lambda: False)
 
     reads: ClassVar[Schema] = TRACKS
     writes: ClassVar[Mapping[str, Schema]] = MappingProxyType(
@@ -192,7 +200,18 @@ class Retrack:
     def __post_init__(self) -> None:
         check_options(self)
 
+    @property
+    def holds_back(self) -> bool:
+        """Whether tracks stay as they are, because where people are isn't known well enough to repair them."""
+        return self.poor_scale and not self.side_view
+
     def __call__(self, frames: Iterable[Frame]) -> Iterator[tuple[Frame, ...]]:
+        if self.holds_back:
+            forecaster = Forecaster(self.predictor, self.horizon_s, self.min_history, self.rate_hz)
+            for frame in frames:
+                online = frame._replace(rows=frame.rows[frame.rows["observed"]])
+                yield frame, online, frame._replace(rows=forecaster.predict(frame))
+            return
         run = Following(self) if self.distance == "likelihood" else Forecasting(self)
         times_ns = []
         for frame in frames:

@@ -234,7 +234,7 @@ class Sort:
         elif self.cost == "pixels":
             pairs, least = by_distance(seen.corners, moment.expected, self.max_distance_px, None), 0.0
         elif moment.plane is None:
-            raise McaptrackError("cost metres needs a ground plane; give one with `mcaptrack ingest --ground-plane`")
+            raise McaptrackError("cost metres needs a ground plane, and none is known")
         else:
             pairs, least = by_distance(seen.corners, moment.expected, self.max_distance_m, moment.plane), 0.0
         return self._of_one_class(moment, pairs), least

@@ -1,0 +1,129 @@
+"""What a stage may read and write: checked before anything runs.
+
+A stage replaces what it made itself, and nothing else: not what was recorded or ingested, and not what another made.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import is_dataclass
+from typing import NamedTuple
+
+from mcaptrack import foreign, log, views
+from mcaptrack.cameras import FULL, ROUTES, USUAL, chain_of
+from mcaptrack.errors import McaptrackError, command
+from mcaptrack.provenance import INGEST, VIEW, Provenance
+from mcaptrack.schema import DETECTIONS, VIDEO, Schema
+from mcaptrack.transforms import Transform
+from mcaptrack.transforms.protocol import check_options
+
+
+class Job(NamedTuple):
+    """A transform to run from one topic to another; ``keep`` are the outputs that go into the log, None for all."""
+
+    stage: str
+    transform: Transform
+    source: str
+    target: str
+    keep: tuple[str, ...] | None = None
+
+    def outputs(self) -> dict[str, Schema]:
+        """Topic and schema of each output, in the transform's order."""
+        return {f"{self.target}/{suffix}".rstrip("/"): schema for suffix, schema in self.transform.writes.items()}
+
+    def kept(self) -> set[str]:
+        """The topics that go into the log."""
+        kept = {f"{self.target}/{suffix}".rstrip("/") for suffix in self.keep or self.transform.writes}
+        return kept | {self.target + FULL} if self.stage == "retrack" and self.target in kept else kept
+
+
+def check_inputs(opened: log.Log, prefix: str, jobs: Sequence[Job]) -> None:
+    """Every job's input is in the log or made by a job before it, and of the right kind; nothing else is replaced."""
+    coming: dict[str, Schema] = {}
+    for job in jobs:
+        if not is_dataclass(job.transform):
+            raise McaptrackError(
+                f"{type(job.transform).__qualname__} is no dataclass; the fields of a transform are its parameters"
+            )
+        check_options(job.transform)  # those of others, too
+        if job.source in coming:
+            name, is_read = coming[job.source].name, coming[job.source] is job.transform.reads
+        elif job.source in opened.channels:
+            name, is_read = fits(opened.channels[job.source], job.transform.reads)
+        else:
+            raise McaptrackError(_lacks(opened, prefix, job))
+        if not is_read:
+            reads = job.transform.reads
+            theirs_too = foreign.DETECTIONS_READ if reads is DETECTIONS else ()
+            wanted = " or ".join(foreign.PICTURES_READ if reads is VIDEO else (reads.name, *theirs_too))
+            raise McaptrackError(f"{opened.path}: {job.source} holds {name or 'no schema'}; {job.stage} reads {wanted}")
+        _check_outputs(opened, prefix, job)
+        coming |= job.outputs()
+
+
+def fits(channel: log.Channel, reads: Schema) -> tuple[str, bool]:
+    """What a channel holds, and whether a stage that reads this schema can read it."""
+    if reads is VIDEO:
+        return channel.schema_name, foreign.holds_pictures(channel)
+    theirs = reads is DETECTIONS and foreign.holds_detections(channel)
+    return channel.schema_name, theirs or channel.schema_name == reads.name
+
+
+def _lacks(opened: log.Log, prefix: str, job: Job) -> str:
+    """What is missing for a job, what there is, and what to do."""
+    there = [topic for topic in sorted(opened.channels) if "/view/" not in topic]
+    has, hint = f"it has {', '.join(there) or 'none'}", f"{command('info', opened.path)} shows more"
+    if job.source == f"{prefix}/{ROUTES['detect'].reads}":
+        pictures = [topic for topic in there if foreign.holds_pictures(opened.channels[topic])]
+        if pictures:
+            has, hint = f"it has pictures in {', '.join(pictures)}", "choose one with --topic"
+        else:
+            add = command("ingest", "VIDEO", "--into", opened.path)
+            hint = f"add pictures with {add}, or name what to begin with by --topic"
+    return f"{opened.path} has no channel {job.source} for {job.stage}; {has}. {hint}"
+
+
+def _check_outputs(opened: log.Log, prefix: str, job: Job) -> None:
+    """A stage replaces what it made itself, and nothing else; names of a camera stand for what they usually hold."""
+    usual = USUAL.get(job.target.removeprefix(prefix + "/")) if job.target.startswith(prefix + "/") else None
+    if usual not in (None, job.stage):
+        by = f"what {usual} makes" if usual else "what is ingested"
+        raise McaptrackError(f"{opened.path}: {job.target} is the name of {by}; give {job.stage} another --to")
+    for above in chain_of(opened, job.source):
+        if above in job.kept():
+            raise McaptrackError(
+                f"{opened.path}: {job.source} was itself made from {above}, which {job.stage} would replace; write to "
+                "another channel with --to"
+            )
+    for topic in sorted(job.kept()):
+        maker = {topic: job.stage} | {topic + suffix: VIEW for suffix in views.SUFFIXES}
+        for name, transform in maker.items():
+            if not may_replace(opened, name, transform):
+                raise McaptrackError(
+                    f"{opened.path}: {job.stage} would replace {name}, which {how_it_came(opened, name)}; "
+                    "write to another channel with --to"
+                )
+
+
+def may_replace(opened: log.Log, topic: str, transform: str) -> bool:
+    """Whether a topic is free, or holds what the same transform made and nothing else."""
+    return all(made is not None and made.transform == transform for made, _ in _making(opened, topic))
+
+
+def how_it_came(opened: log.Log, topic: str) -> str:
+    """Where a channel is from, in words; of several that share the topic, what others recorded before all else."""
+    made, schema_name = min(_making(opened, topic), key=lambda found: found[0] is not None)
+    if made is None:
+        return f"was recorded by others ({schema_name or 'no schema'})"
+    return "was ingested" if made.transform == INGEST else f"was made by {made.transform}"
+
+
+def _making(opened: log.Log, topic: str) -> list[tuple[Provenance | None, str]]:
+    """How each of the channels that share a topic was made, and the name of its schema."""
+    return [
+        (Provenance.from_metadata(channel.metadata), schema.name if schema else "")
+        for part in opened.parts
+        for channel in part.index.channels.values()
+        if channel.topic == topic
+        for schema in [part.index.schemas.get(channel.schema_id)]
+    ]

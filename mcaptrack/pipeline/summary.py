@@ -1,0 +1,140 @@
+"""What a log holds of a camera once stages ran: in numbers, for people and programs."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from mcaptrack import foreign, log
+from mcaptrack.cameras import ROUTES, camera_at
+from mcaptrack.errors import McaptrackError
+from mcaptrack.evaluation import Candidate, EvaluateOptions, Sequenced, evaluate
+from mcaptrack.notices import warn
+from mcaptrack.provenance import Provenance
+from mcaptrack.schema import DETECTIONS, GROUND_PLANE, PREDICTIONS, TRACKS, Rows, Schema
+
+#: Tracks within this distance of the truth are right, as in the demonstration.
+_GATE_M = 1.0
+_MIN_IOU = 0.5
+
+
+@dataclass(frozen=True)
+class Repair:
+    """What re-tracking made of tracks: gaps between them that it closed, tracks that it took apart and left out."""
+
+    tracks: int
+    joined: int
+    parted: int
+    left_out: int
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Identity scores (IDF1, 0 to 1) and switches of samples and of re-tracked tracks, and how they were matched."""
+
+    idf1: tuple[float, float]
+    switches: tuple[int, int]
+    by: str
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What is there of a camera; None for what isn't there. ``ground_plane`` is "given" or "assumed"."""
+
+    pictures: int | None = None
+    boxes: int | None = None
+    tracks: int | None = None
+    repair: Repair | None = None
+    forecasts: int | None = None
+    horizon_s: float | None = None
+    scores: Scores | None = None
+    ground_plane: str | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        """As JSON."""
+        return asdict(self)
+
+
+def summarise(opened: log.Log, prefix: str) -> Summary:
+    """Count what a log holds of a camera, and score it against the truth if it has one.
+
+    Warns where re-tracking lost more than it mended.
+    """
+    camera = camera_at(opened, prefix)
+    boxes, tracks, samples, predictions, retracks = (f"{prefix}/{route.writes}" for route in ROUTES.values())
+    tracked, repaired = _rows(opened, tracks, TRACKS), _rows(opened, retracks, TRACKS)
+    forecasts = _rows(opened, f"{retracks}/predictions", PREDICTIONS)
+    forecasts = _rows(opened, predictions, PREDICTIONS) if forecasts is None else forecasts
+    planes = _rows(opened, camera.ground_plane, GROUND_PLANE)
+    scores = _scores(opened, camera.truth, (samples, retracks))
+    if scores is not None and scores.idf1[1] < scores.idf1[0]:
+        was, now = scores.idf1
+        warn(
+            f"re-tracking made it worse: IDF1 {was:.1%} before, {now:.1%} after, against {camera.truth}, {scores.by}",
+            "worse",
+        )
+    return Summary(
+        pictures=opened.channels[camera.pictures].messages if camera.pictures else None,
+        boxes=_count_boxes(opened, tracks, boxes),
+        tracks=None if tracked is None else len(np.unique(tracked["track_id"])),
+        repair=None if tracked is None or repaired is None else _repair(tracked, repaired),
+        forecasts=None if forecasts is None else int((forecasts["step"] == 1).sum()),
+        horizon_s=None if forecasts is None or not len(forecasts) else round(float(forecasts["ahead_s"].max()), 3),
+        scores=scores,
+        ground_plane=None if planes is None or not len(planes) else "assumed" if planes["assumed"].all() else "given",
+    )
+
+
+def _rows(opened: log.Log, topic: str, schema: Schema) -> Rows | None:
+    """All rows of a channel; None if it isn't there or holds something else."""
+    channel = opened.channels.get(topic)
+    return opened.rows(topic, schema).rows if channel and channel.schema_name == schema.name else None
+
+
+def _count_boxes(opened: log.Log, tracks: str, usual: str) -> int | None:
+    """How many boxes tracks were made from."""
+    channel = opened.channels.get(tracks)
+    made = Provenance.from_metadata(channel.metadata) if channel else None
+    source = opened.channels.get(made.input if made else usual) or opened.channels.get(usual)
+    if source is None:
+        return None
+    if foreign.holds_detections(source):
+        return sum(len(frame.rows) for frame in foreign.detections(opened, source.topic))
+    rows = _rows(opened, source.topic, DETECTIONS)
+    return None if rows is None else len(rows)
+
+
+def _repair(tracked: Rows, repaired: Rows) -> Repair:
+    """What became of which track, by the sources that re-tracked rows name."""
+    named = repaired[repaired["source_id"] >= 0]
+    pairs = np.unique(np.stack([named["track_id"], named["source_id"]]), axis=1)
+    ids, sources = np.unique(pairs[0]), np.unique(pairs[1])
+    return Repair(
+        tracks=len(np.unique(repaired["track_id"])),
+        joined=pairs.shape[1] - len(ids),
+        parted=pairs.shape[1] - len(sources),
+        left_out=int((~np.isin(np.unique(tracked["track_id"]), sources)).sum()),
+    )
+
+
+def _scores(opened: log.Log, truth: str, topics: tuple[str, str]) -> Scores | None:
+    """Scores before and after re-tracking, on the clock that both share; None if they can't be compared."""
+    there = [opened.channels.get(topic) for topic in (truth, *topics)]
+    if not all(channel and channel.schema_name == TRACKS.name for channel in there):
+        return None
+    candidates = [Candidate(topic, None, opened.frames(topic, TRACKS)) for topic in topics]
+    sequence = Sequenced(opened.path.stem, opened.frames(truth, TRACKS), candidates)
+    ways = {
+        f"within {_GATE_M:g} m": EvaluateOptions(similarities=("metres",), gates_m=(_GATE_M,)),
+        f"by an overlap of {_MIN_IOU:g}": EvaluateOptions(similarities=("iou",), min_iou=_MIN_IOU),
+    }
+    for by, options in ways.items():
+        try:
+            rows = [result.to_json() for result in evaluate([sequence], options).results]
+        except McaptrackError:
+            continue  # one of them has no places in these units
+        idf1, switches = (tuple(row[name] for row in rows) for name in ("IDF1", "IDSW"))
+        return Scores((idf1[0], idf1[1]), (switches[0], switches[1]), by)
+    return None

@@ -1,0 +1,37 @@
+"""Forecasts of people from their own past, frame by frame; what transforms that predict have in common."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mcaptrack.clock import NS_PER_S
+from mcaptrack.history import Histories
+from mcaptrack.predictors import make
+from mcaptrack.schema import Frame, Rows
+from mcaptrack.schema.predictions import forecast_to_rows
+
+
+class Forecaster:
+    """Remembers where people were, and predicts where those go who were seen often enough.
+
+    ``rate_hz`` is the clock of the frames; ``min_history`` past positions, with the present one, are needed.
+    """
+
+    def __init__(self, predictor: str, horizon_s: float, min_history: int, rate_hz: float) -> None:
+        self._rate_hz, self._min_history = rate_hz, min_history
+        self._predictor = make(predictor, max(1, round(horizon_s * rate_hz)), 1 / rate_hz)
+        self._histories = Histories(max(self._predictor.past, min_history))
+        self._last_ns: int | None = None
+
+    def predict(self, frame: Frame) -> Rows:
+        """Rows of Predictions for the tracks of a frame."""
+        passed = 1
+        if self._last_ns is not None:
+            passed = max(1, round((frame.t_ns - self._last_ns) * self._rate_hz / NS_PER_S))
+        self._last_ns = frame.t_ns
+        ids = frame.rows["track_id"]
+        past, known = self._histories.push(ids, np.stack([frame.rows["x_m"], frame.rows["y_m"]], axis=-1), passed)
+        # A row inside a hole was filled in with what came after it; nothing may be predicted from there.
+        ready = known[:, -self._min_history :].all(axis=1) & frame.rows["observed"]
+        forecast = self._predictor.predict(past[ready], known[ready])
+        return forecast_to_rows(ids[ready], forecast, self._predictor.step_s)

@@ -1,0 +1,287 @@
+"""Which channels are of which camera: by what they were made from, wherever they were written and however they came in."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mcaptrack import log, pipeline
+from mcaptrack.cameras import ROUTES, camera_at, cameras, find_camera, name_above
+from mcaptrack.errors import McaptrackError
+from mcaptrack.provenance import Provenance, digest
+from mcaptrack.schema import TRACKS, Frame
+from mcaptrack.transforms import TRANSFORMS
+from tests.commands import GROUP, called, done, made_log
+from tests.test_foreign_runs import write_log
+from tests.worlds import tracks_at
+
+#: Where a stage may be told to write: beside its usual channel, below it, elsewhere, and under names that mean something
+#: below another camera.
+TARGETS = [
+    "/camera/other",
+    "/camera/retracks/mine",
+    "/elsewhere",
+    "/x/y/predictions",
+    "/x/retracks",
+    "/other/truth",
+    "bare",
+]
+#: Every stage somewhere, and something everywhere.
+PLACES = [*zip([*ROUTES, *ROUTES], TARGETS, strict=False)]
+#: How each command that can be told a camera is called on a log, and what of its JSON has to stay.
+READING = {
+    "evaluate": (),
+    "report": ("-o", "page.html", "--force"),
+    "events": (),
+    "render": ("-o", "walk.gif", "--force", "--width", "64"),
+    "run": ("--no-tables",),
+    "tune": ("--trials", "1", "-o", "tuned.toml"),
+} | dict.fromkeys(TRANSFORMS, ())
+
+
+@pytest.fixture(scope="module")
+def template(tmp_path_factory) -> Path:
+    """A small log with everything in it. Not to be changed."""
+    return made_log(tmp_path_factory.mktemp("made"))
+
+
+@pytest.fixture
+def path(template, tmp_path, monkeypatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return Path(shutil.copy(template, tmp_path / "a.mcap"))
+
+
+def answer(command: str, path: Path) -> Any:
+    """What a command says of a log, without what is about the file or the time that it took."""
+    copied = Path(shutil.copy(path, path.with_name("asked.mcap")))
+    given = json.loads(done(command, copied, *READING[command], "--json", "-q").out)
+    for result in given.get("results", []):
+        for name in ("seconds", "scores", "study"):
+            result.pop(name, None) if command in ("run", "events", *TRANSFORMS) else None
+    for name in ("channels", "bytes", "messages", "digest"):
+        [one.pop(name, None) for one in given.get("logs", [])]
+    return given
+
+
+def test_every_command_with_a_camera_is_asked():
+    having = {name for name, command in GROUP.commands.items() if any("--camera" in p.opts for p in command.params)}
+    assert having - {"ingest"} == set(READING)
+
+
+def test_wherever_stages_wrote_every_command_works_as_before(path):
+    before = {command: answer(command, path) for command in READING}
+    for stage, target in PLACES:
+        done(stage, path, "--to", f"{target}/{stage}", "-q")
+    after = {command: answer(command, path) for command in READING}
+    for command in READING:
+        assert after[command] == before[command], command
+
+
+@pytest.mark.parametrize(("stage", "target"), PLACES)
+def test_what_a_stage_writes_belongs_to_the_camera_that_it_comes_from(path, stage, target):
+    done(stage, path, "--to", target, "-q")
+    with log.read(path) as opened:
+        assert [camera.prefix for camera in cameras(opened)] == ["/camera"]
+        assert find_camera(opened) == find_camera(opened, "camera") == find_camera(opened, None, target) == "/camera"
+        assert target in camera_at(opened, "/camera").topics
+    done("run", path, "-q")
+    for again in list(ROUTES)[list(ROUTES).index(stage) + 1 :]:  # and what is made from it stands with all the rest
+        if TRANSFORMS[again].reads is TRANSFORMS[stage].writes[""] and stage != "retrack":
+            done(again, path, "--topic", target, "-q")
+            with log.read(path) as opened:
+                made = Provenance.from_metadata(opened.channel(f"/camera/{ROUTES[again].writes}").metadata)
+                assert made is not None
+                assert made.input == target
+
+
+def test_a_channel_elsewhere_is_made_again_when_its_input_is(path):
+    done("track", path, "--to", "/elsewhere", "--max-age-s", 3, "-q")
+    done("sample", path, "--topic", "/elsewhere", "-q")
+    done("detect", path, "--method", "mog2", "-q")
+    said = done("run", path, "--no-tables").err
+    assert "/elsewhere was made from an earlier /camera/detections: running track again, as before" in said
+    with log.read(path) as opened:
+        made = Provenance.from_metadata(opened.channel("/elsewhere").metadata)
+        assert made is not None
+        assert made.parameters["max_age_s"] == 3
+        assert not [topic for topic in opened.channels if pipeline.is_stale(opened, topic)]
+
+
+def outputs(path: Path, topic: str) -> dict[str, Any]:
+    """The outputs of re-tracking that stand below a topic, and the parameters of each."""
+    with log.read(path) as opened:
+        known = {name: Provenance.from_metadata(channel.metadata) for name, channel in opened.channels.items()}
+    return {
+        name.removeprefix(topic): made.parameters["max_age_s"]
+        for name, made in known.items()
+        if made and made.transform == "retrack" and name.startswith(topic)
+    }
+
+
+@pytest.mark.parametrize(("mode", "made"), [("online", ["/online", "/predictions"]), ("offline", ["", "/full"])])
+def test_what_is_made_again_is_what_stood_there(path, mode, made):
+    done("retrack", path, "--to", "/again", "--mode", mode, "--max-age-s", 1, "-q")
+    done("sample", path, "--rate-hz", 5, "-q")
+    done("run", path, "--no-tables", "-q")
+    assert outputs(path, "/again") == dict.fromkeys(made, 1)
+
+
+def test_outputs_that_are_missing_are_made_as_those_beside_them_were(path):
+    done("drop", path, "/camera/retracks*", "-o", "dropped.mcap", "-q")
+    done("retrack", "dropped.mcap", "--mode", "online", "--max-age-s", 1, "-q")
+    said = done("run", "dropped.mcap", "--no-tables").err
+    assert "/camera/retracks is missing: running retrack, as for what it made beside it" in said
+    assert outputs(Path("dropped.mcap"), "/camera/retracks") == dict.fromkeys(
+        ["", "/full", "/online", "/predictions"], 1
+    )
+
+
+def test_a_stage_does_not_replace_what_its_input_was_made_from(path):
+    before = path.read_bytes()
+    outcome = called("sample", path, "--topic", "/camera/retracks")
+    assert (outcome.code, path.read_bytes()) == (1, before)
+    assert "/camera/retracks was itself made from /camera/samples, which sample would replace" in outcome.err
+    done("sample", path, "--topic", "/camera/retracks", "--to", "/camera/sampled", "-q")
+
+
+@pytest.mark.parametrize("stage", ROUTES)
+def test_no_stage_replaces_what_it_did_not_make(path, stage):
+    before = path.read_bytes()
+    for name in {"video", "truth", "ground_plane", *(route.writes for route in ROUTES.values())} - {
+        ROUTES[stage].writes
+    }:
+        outcome = called(stage, path, "--to", f"/camera/{name}")
+        assert (outcome.code, "another --to" in outcome.err) == (1, True), outcome.err
+    assert path.read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("stage", "below"),
+    [*((stage, "") for stage in ROUTES), ("track", "/view/image"), ("retrack", "/view/scene")]
+    + [("retrack", f"/{suffix}") for suffix in ("online", "predictions", "full")],
+)
+def test_no_stage_replaces_what_others_recorded(path, stage, below):
+    """Not where it writes, nor beside that: neither outputs nor views."""
+    with log.read(path) as opened, log.extend(opened) as writer:
+        channel = writer.add_channel(f"/theirs{below}", ("", "", b""), "json", {})
+        writer.add_message(channel, 1, 0, b'{"mine": 1}')
+    outcome = called(stage, path, "--to", "/theirs")
+    with log.read(path) as opened:
+        assert [message.payload for message in opened.messages(f"/theirs{below}")] == [b'{"mine": 1}']
+    takes = {"", *(f"/{suffix}" for suffix in TRANSFORMS[stage].writes)} | ({"/full"} if stage == "retrack" else set())
+    if below in takes:
+        assert (outcome.code, "was recorded by others" in outcome.err) == (1, True), outcome.err
+
+
+def test_boxes_that_were_ingested_are_not_replaced(template, tmp_path):
+    rows = "".join(f"{n},-1,{10 + 2 * n},20,10,34,1,-1,-1,-1\n" for n in range(1, 30))
+    (tmp_path / "det.txt").write_text(rows)
+    path = tmp_path / "boxes.mcap"
+    done("ingest", template.with_name("clip.mp4"), "--detections", tmp_path / "det.txt", "-o", path, "-q")
+    before = path.read_bytes()
+    outcome = called("detect", path)
+    assert (outcome.code, path.read_bytes()) == (1, before)
+    assert "detect would replace /camera/detections, which was ingested; write to another channel" in outcome.err
+
+
+LAYOUTS = [
+    ("/front/image_raw", "/front/detections"),
+    ("/front/image_raw", "/front/boxes"),
+    ("/front/camera/image", "/front/yolo/boxes"),
+    ("/cam0/image", "/detector/out"),
+    ("/image", "/boxes"),
+]
+
+
+def label(path: Path, topic: str) -> None:
+    """Put a true track into a log, as ingest does."""
+    with log.read(path) as opened:
+        times = opened.times(next(name for name in opened.channels))
+    frames = [Frame(t_ns, n, tracks_at({1: (n / 10, 1.0)})) for n, t_ns in enumerate(times.tolist())]
+    messages = [(frame.t_ns, frame.index, TRACKS.codec.encode(frame.rows)) for frame in frames]
+    how = Provenance("ingest", {}, digest=digest(messages)).to_metadata()
+    with log.read(path) as opened, log.extend(opened) as writer:
+        number = writer.add_channel(topic, (TRACKS.name, "protobuf", TRACKS.descriptor), "protobuf", how)
+        for message in messages:
+            writer.add_message(number, *message)
+
+
+@pytest.mark.parametrize(
+    ("pictures", "boxes", "truth"),
+    [
+        (*layout, truth)
+        for layout, truth in zip(LAYOUTS, ["beside", "/camera/truth", "beside", "beside", None], strict=True)
+    ],
+)
+def test_own_boxes_and_pictures_are_one_camera_with_one_set_of_results(tmp_path, pictures, boxes, truth):
+    path = tmp_path / "boxes.mcap"
+    write_log(path, pictures, boxes=boxes)
+    if truth:
+        label(path, f"{name_above(pictures)}/truth" if truth == "beside" else truth)
+    done("run", path, "--topic", boxes, "--no-tables", "-q")
+    with log.read(path) as opened:
+        (camera,) = cameras(opened)
+        assert (camera.pictures, camera.boxes) == (pictures, boxes)
+        assert camera.truth in opened.channels or not truth
+        assert [topic for topic in opened.channels if topic.endswith("/tracks")] == [f"{camera.prefix}/tracks"]
+    again = json.loads(done("run", path, "--no-tables", "--json", "-q").out)["results"][0]
+    assert (again["stages"], again["summary"]["tracks"] > 0) == ([], True)
+    again = json.loads(done("run", path, "--topic", boxes, "--no-tables", "--json", "-q").out)["results"][0]
+    assert again["stages"] == []
+    if truth:
+        assert json.loads(done("evaluate", path, "--json", "-q").out)["results"]
+    if truth == "beside":
+        return  # the rest is slow
+    assert "finds, tracks and re-tracks" not in done("report", path, "-o", tmp_path / "r.html", "-q").out
+    page = (tmp_path / "r.html").read_text()
+    assert "Nobody has been tracked" not in page
+    done("render", path, "-o", tmp_path / "walk.gif", "--width", "64", "--end-s", "0.3", "-q")
+    done("events", path, "-q")
+
+
+def test_each_of_two_cameras_has_its_boxes_and_its_results(tmp_path):
+    path = tmp_path / "two.mcap"
+    write_log(path, "/front/image", boxes="/front/yolo/boxes")
+    write_log(tmp_path / "other.mcap", "/rear/image", boxes="/rear/yolo/boxes")
+    with log.read(tmp_path / "other.mcap") as other, log.read(path) as opened, log.extend(opened) as writer:
+        for topic in ("/rear/image", "/rear/yolo/boxes"):
+            channel = other.channel(topic)
+            schema = other.index.schemas[other.index.channels[channel.id].schema_id]
+            number = writer.add_channel(topic, (schema.name, schema.encoding, bytes(schema.data)), "cdr", {})
+            for message in other.messages(topic):
+                writer.add_message(number, message.t_ns, message.sequence, message.payload)
+    for side in ("front", "rear"):
+        done("run", path, "--topic", f"/{side}/yolo/boxes", "--no-tables", "-q")
+    with log.read(path) as opened:
+        assert [camera.pictures for camera in cameras(opened)] == ["/front/image", "/rear/image"]
+        with pytest.raises(
+            McaptrackError, match="has several cameras, /front/yolo, /rear/yolo; choose one with --camera"
+        ):
+            find_camera(opened)
+        assert find_camera(opened, "front") == find_camera(opened, "front/yolo") == "/front/yolo"
+    outcome = called("run", path, "--topic", "/front/yolo/boxes", "--camera", "rear")
+    assert (outcome.code, "belongs to the camera front/yolo, not to rear" in outcome.err) == (1, True)
+
+
+def test_boxes_without_pictures_are_taken(tmp_path):
+    path = tmp_path / "boxes.mcap"
+    write_log(path, boxes="/lidar/boxes")
+    said = done("run", path, "--no-tables").err
+    assert "/lidar/detections is missing: taking the boxes of /lidar/boxes" in said
+    with log.read(path) as opened:
+        assert "/lidar/retracks" in opened.channels
+
+
+def test_a_chain_of_inputs_that_goes_round_ends(tmp_path):
+    path = tmp_path / "round.mcap"
+    with log.create(path) as writer:
+        for name, source in (("a", "/x/b"), ("b", "/x/a"), ("c", "/x/c")):
+            how = Provenance("track", {}, f"{source}").to_metadata()
+            writer.add_channel(f"/x/{name}", (TRACKS.name, "protobuf", TRACKS.descriptor), "protobuf", how)
+    with log.read(path) as opened:
+        assert [camera.prefix for camera in cameras(opened)] == ["/x"]
+    assert called("run", path).code == 1

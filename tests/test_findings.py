@@ -1,0 +1,353 @@
+"""What runs say of what they found: numbers, what was assumed, what is odd, and what they can't do."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import ClassVar
+
+import numpy as np
+import pytest
+
+from mcaptrack import log, notices, pipeline
+from mcaptrack.errors import McaptrackError
+from mcaptrack.pipeline import findings
+from mcaptrack.provenance import Provenance
+from mcaptrack.schema import DETECTIONS, TRACKS, VIDEO, Frame, Schema
+from mcaptrack.transforms import Detect
+from mcaptrack.transforms.protocol import option
+from tests.commands import called, done, made_log
+from tests.worlds import boxes_at, ns, tracks_at, walk
+
+
+@pytest.fixture(scope="module")
+def template(tmp_path_factory) -> Path:
+    """A small log with everything in it. Not to be changed."""
+    return made_log(tmp_path_factory.mktemp("made"))
+
+
+@pytest.fixture
+def path(template, tmp_path, monkeypatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return Path(shutil.copy(template, tmp_path / "a.mcap"))
+
+
+def made_by(path: Path, topic: str) -> Provenance:
+    with log.read(path) as opened:
+        made = Provenance.from_metadata(opened.channel(topic).metadata)
+    assert made is not None
+    return made
+
+
+def written(path: Path, **tracks: list[Frame]) -> Path:
+    """A log of nothing but tracks of a camera, by name."""
+    with log.create(path) as writer:
+        for name, frames in tracks.items():
+            how = Provenance("retrack" if name == "retracks" else "track", {}).to_metadata()
+            number = writer.add_channel(
+                f"/camera/{name}", (TRACKS.name, "protobuf", TRACKS.descriptor), "protobuf", how
+            )
+            for frame in frames:
+                writer.add_message(number, frame.t_ns, frame.index, TRACKS.codec.encode(frame.rows))
+    return path
+
+
+# The summary
+
+
+def of_sources(*parts: tuple[int, int]) -> list[Frame]:
+    """Tracks that were re-tracked, each for a second: their ids and those they come from, one part after another."""
+    frames = []
+    for number, (track, source) in enumerate(parts):
+        rows = tracks_at({track: (float(number), 1.0)})
+        rows["source_id"] = source
+        frames.append(Frame(ns(float(number)), number, rows))
+    return frames
+
+
+def test_repairs_are_counted_by_what_became_of_which_track(tmp_path):
+    """Tracks 1 and 2 are one person, 3 was two people, 4 is left out; 12 takes up what was left of 3."""
+    tracks = [Frame(ns(float(n)), n, tracks_at({n + 1: (float(n), 1.0)})) for n in range(4)]
+    path = written(tmp_path / "a.mcap", tracks=tracks, retracks=of_sources((10, 1), (10, 2), (11, 3), (12, 3)))
+    with log.read(path) as opened:
+        summary = pipeline.summarise(opened, "/camera")
+    assert summary.tracks == 4
+    assert summary.repair is not None
+    assert asdict(summary.repair) == {"tracks": 3, "joined": 1, "parted": 1, "left_out": 1}
+    assert (summary.pictures, summary.boxes, summary.forecasts, summary.scores) == (None, None, None, None)
+
+
+@pytest.mark.parametrize("is_worse", [False, True])
+def test_scores_before_and_after_are_those_of_samples_and_retracked_and_a_loss_is_said(tmp_path, is_worse):
+    truth = walk(lambda n: {1: (n * 0.4, 0.0), 2: (n * 0.4, 5.0)}, 10)
+    swapped = walk(lambda n: {1 + n // 5: (n * 0.4, 0.0), 2 - n // 5: (n * 0.4, 5.0)}, 10)
+    samples, retracks = (truth, swapped) if is_worse else (swapped, truth)
+    path = written(tmp_path / "a.mcap", truth=truth, samples=samples, retracks=retracks)
+    with log.read(path) as opened, notices.collected() as said:
+        scores = pipeline.summarise(opened, "/camera").scores
+    assert scores is not None
+    assert (scores.idf1, scores.switches) == (((1.0, 0.5), (0, 2)) if is_worse else ((0.5, 1.0), (2, 0)))
+    assert [notice.code for notice in said] == ["worse"] * is_worse
+
+
+def test_run_ends_with_what_the_log_holds_in_words_and_in_json(path):
+    said = done("run", path, "--force", "--no-tables").err
+    data = json.loads(done("run", path, "--no-tables", "--json", "-q").out)["results"][0]
+    lines = dict(line.strip().split("  ", 1) for line in said.splitlines() if line.startswith("  "))
+    summary = data["summary"]
+    with log.read(path) as opened:
+        boxes = opened.rows("/camera/detections", DETECTIONS).rows
+        retracked = opened.rows("/camera/retracks", TRACKS).rows
+    assert (summary["boxes"], summary["pictures"]) == (len(boxes), 30)
+    assert summary["repair"]["tracks"] == len(np.unique(retracked["track_id"]))
+    assert lines["boxes"].split() == [f"{summary['boxes']}", "in", "30", "pictures"]
+    assert lines["tracks"].strip() == str(summary["tracks"])
+    assert lines["re-tracked"].split()[0] == str(summary["repair"]["tracks"])
+    was, now = summary["scores"]["idf1"]
+    assert f"IDF1 {was:.1%} before re-tracking, {now:.1%} after" in lines["ground truth"]
+    assert lines["forecasts"].split(",")[0].strip() == str(summary["forecasts"])
+    assert (
+        lines["next"].strip().split("    ") == data["next"] == [f"mcaptrack {w} {path}" for w in ("view", "evaluate")]
+    )
+    assert "detect, track, sample, predict, retrack, events in " in said
+    assert data["seconds"] > 0
+
+
+def test_what_was_odd_is_said_again_by_every_run_and_by_quiet_ones(path):
+    """Also where nothing is left to do, and with what it was made from."""
+    done("ingest", path.with_name("a.mcap"), "-o", "b.mcap", "-q")
+    done("drop", "b.mcap", "/camera/ground_plane", "/camera/[!v]*", "-q")
+    first = json.loads(done("run", "b.mcap", "--no-tables", "--json", "-q").out)
+    again = done("run", "b.mcap", "--no-tables", "--json", "-q")
+    assert json.loads(again.out)["results"][0]["stages"] == []
+    assert json.loads(again.out)["warnings"] == first["warnings"]
+    codes = [one["code"] for one in first["warnings"]]
+    assert "assumed-ground-plane" in codes
+    assert len(codes) == len(set(codes))
+    assert again.err.count("warning: ") == len(codes)
+    lines = done("run", "b.mcap", "--no-tables").err
+    assert f"{len(codes)}, see above: {', '.join(codes)}" in lines
+    assert "the scale of the ground, from the heights of boxes" in lines
+    assert made_by(Path("b.mcap"), "/camera/tracks").warnings == []
+
+
+def test_what_is_missing_is_said_once(path):
+    done("drop", path, "/camera/[!t]*", "/camera/tracks", "-q")
+    outcome = called("run", path)
+    (line,) = outcome.err.splitlines()
+    assert (outcome.code, "/camera/video" in line, "mcaptrack ingest VIDEO --into" in line) == (1, True, True)
+
+
+def test_little_memory_is_said(path, monkeypatch):
+    monkeypatch.setattr(findings, "free_memory", lambda: 1_000_000)
+    said = json.loads(done("track", path, "--json", "-q").out)["warnings"]
+    assert [one["code"] for one in said] == ["memory"]
+
+
+# Without a ground plane
+
+
+def ingested(path: Path, rows: Iterable[str], *words: object) -> Path:
+    path.with_suffix(".txt").write_text("\n".join(rows) + "\n")
+    done("ingest", path.with_suffix(".txt"), "--as", "detections", "--fps", "10", *words, "-o", path, "-q")
+    return path
+
+
+def side_by_side(frames: int = 60) -> list[str]:
+    """People who walk past each other in front of a camera that stands at their height."""
+    return [f"{n},-1,{x},20,20,60,1,-1,-1,-1" for n in range(1, frames) for x in (n * 3, 200 - n * 3)]
+
+
+def downwards(frames: int = 60) -> list[str]:
+    """The same seen from above: they walk all over the picture."""
+    return [f"{n},-1,{x},{n * 4},20,40,1,-1,-1,-1" for n in range(1, frames) for x in (100, 300)]
+
+
+def test_a_camera_that_looks_along_the_ground_has_its_tracks_passed_on_and_that_is_said(tmp_path):
+    path = ingested(tmp_path / "a.mcap", side_by_side())
+    data = json.loads(done("run", path, "--no-tables", "--json", "-q").out)
+    assert {"held-back", "assumed-ground-plane"} <= {one["code"] for one in data["warnings"]}
+    with log.read(path) as opened:
+        samples, retracks = (opened.rows(f"/camera/{name}", TRACKS).rows for name in ("samples", "retracks"))
+    np.testing.assert_array_equal(retracks, samples)
+    insisted = json.loads(done("retrack", path, "--side-view", "--json", "-q").out)
+    assert "held-back" not in {one["code"] for one in insisted["warnings"]}
+    assert made_by(path, "/camera/retracks").parameters["side_view"] is True
+
+
+def test_a_camera_that_looks_down_has_its_tracks_re_tracked(tmp_path):
+    path = ingested(tmp_path / "a.mcap", downwards())
+    data = json.loads(done("run", path, "--no-tables", "--json", "-q").out)
+    assert [one["code"] for one in data["warnings"]] == ["assumed-ground-plane"]
+
+
+def test_a_plane_that_was_given_is_trusted(tmp_path):
+    (tmp_path / "plane.txt").write_text("0.05,0,0\n0,0.05,0\n0,0,1\n")
+    path = ingested(tmp_path / "a.mcap", side_by_side(), "--ground-plane", tmp_path / "plane.txt")
+    assert json.loads(done("run", path, "--no-tables", "--json", "-q").out)["warnings"] == []
+
+
+def test_a_sequence_that_is_too_short_says_so(tmp_path):
+    (tmp_path / "plane.txt").write_text("0.05,0,0\n0,0.05,0\n0,0,1\n")
+    path = ingested(tmp_path / "a.mcap", downwards(15), "--ground-plane", tmp_path / "plane.txt")
+    (said,) = json.loads(done("run", path, "--no-tables", "--json", "-q").out)["warnings"]
+    assert said["code"] == "nothing-found"
+    assert "the longest track lasts 1.2 s; those under 2 s are left out (min_track_s)" in said["message"]
+
+
+# Cameras that move
+
+_TEXTURE = np.random.default_rng(0).integers(0, 256, (30, 60), dtype=np.uint8).repeat(8, 0).repeat(8, 1)
+
+
+def view(x: float, y: float = 40.0, walker: int | None = None) -> np.ndarray:
+    """A part of a large picture, with somebody in it."""
+    image = _TEXTURE[round(y) : round(y) + 96, round(x) : round(x) + 128].copy()
+    if walker is not None:
+        image[30:60, walker : walker + 12] = 255
+    return image
+
+
+def looks(kind: str, n: int) -> np.ndarray:
+    """Picture ``n`` of 60, of a camera of this kind."""
+    walker = (n * 2) % 110
+    shake = (3 * np.sin(n * 1.7), 2 * np.cos(n * 2.3))
+    return {
+        "stands": lambda: view(100, walker=walker),
+        "shakes": lambda: view(100 + shake[0], 40 + shake[1], walker),
+        "is empty": lambda: np.full((96, 128), 90, np.uint8),
+        "is dim and noisy": lambda: (view(100, walker=walker) // 4 + np.random.default_rng(n).integers(0, 6, (96, 128))).astype(np.uint8),
+        "pans for a while": lambda: view(100 + 4 * max(0, n - 48), walker=walker),
+        "pans": lambda: view(20 + 5 * n, walker=walker),
+        "pans over a still scene": lambda: view(20 + 5 * n),
+        "is cut": lambda: view(100 if n < 30 else 300, walker=walker),
+    }[kind]()  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("kind", "codes"),
+    [
+        ("stands", []),
+        ("shakes", []),
+        ("is empty", []),
+        ("is dim and noisy", []),
+        ("pans for a while", ["camera-moves"]),
+        ("is cut", ["view-lost"]),
+    ],
+)
+def test_a_camera_that_moves_is_noticed_and_one_that_stands_or_shakes_is_none(kind, codes):
+    frames = [Frame(ns(n / 10), n, looks(kind, n)) for n in range(60)]
+    with notices.collected() as said:
+        list(Detect()(frames))
+    assert [notice.code for notice in said] == codes
+
+
+@pytest.mark.parametrize("kind", ["pans", "pans over a still scene"])
+def test_a_camera_that_moves_all_the_time_is_refused(kind):
+    frames = [Frame(ns(n / 10), n, looks(kind, n)) for n in range(60)]
+    with pytest.raises(McaptrackError, match=r"the camera moves in \d+% of the pictures"):
+        list(Detect()(frames))
+
+
+def test_a_camera_that_moved_is_said_by_all_that_is_made_from_what_it_saw(tmp_path):
+    import cv2
+
+    (tmp_path / "pictures").mkdir()
+    for n in range(60):
+        cv2.imwrite(str(tmp_path / "pictures" / f"{n:03}.png"), looks("pans for a while", n))
+    path = tmp_path / "a.mcap"
+    done("ingest", tmp_path / "pictures", "--fps", "10", "--image-format", "png", "-o", path, "-q")
+    for command in ("detect", "track"):
+        outcome = done(command, path, "--json", "-q")
+        assert "camera-moves" in [one["code"] for one in json.loads(outcome.out)["warnings"]]
+        assert f"warning: {path}: the camera moves in" in outcome.err
+
+
+# Transforms of others
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fixed:
+    """A detector of somebody else's: one box in every picture."""
+
+    size_px: float = option(8.0, "how large the box is")
+
+    reads: ClassVar[Schema] = VIDEO
+    writes: ClassVar[Mapping[str, Schema]] = MappingProxyType({"": DETECTIONS})
+    latency_s: ClassVar[float] = 0.0
+
+    def __call__(self, frames: Iterable[Frame]) -> Iterator[tuple[Frame, ...]]:
+        for frame in frames:
+            yield (frame._replace(rows=boxes_at([(20.0, 20.0)], (self.size_px, self.size_px))),)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Single:
+    """A tracker of somebody else's: all boxes are the same one person's."""
+
+    reads: ClassVar[Schema] = DETECTIONS
+    writes: ClassVar[Mapping[str, Schema]] = MappingProxyType({"": TRACKS})
+    latency_s: ClassVar[float] = 0.0
+
+    def __call__(self, frames: Iterable[Frame]) -> Iterator[tuple[Frame, ...]]:
+        for frame in frames:
+            yield (frame._replace(rows=tracks_at({7: (1.0, frame.index / 10)})),)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sized(Fixed):
+    """One with a parameter that no log can hold."""
+
+    sizes_px: tuple[float, ...] = option((8.0, 9.0), "how large boxes are")
+
+
+def run_stage(path: Path, stage: str, transform: object) -> None:
+    with log.read(path) as opened:
+        pipeline.run(opened, "/camera", pipeline.plan_stage(opened, "/camera", stage, transform))
+
+
+@pytest.mark.parametrize(
+    ("stage", "transform", "topic", "why"),
+    [
+        ("detect", Fixed(size_px=9.0), "detections", "is not made again, it"),
+        ("track", Single(), "tracks", "is out of date and"),
+    ],
+)
+def test_what_others_made_is_never_made_again_by_something_else(path, stage, transform, topic, why):
+    topic = f"/camera/{topic}"
+    run_stage(path, stage, transform)
+    first = made_by(path, topic)
+    assert (first.implementation, first.parameters) == (f"{__name__}:{type(transform).__name__}", asdict(transform))
+    done("run", path, "--no-tables", "-q")  # what was made from it follows
+    said = json.loads(done("run", path, "--no-tables", "--force", "--json", "-q").out)["warnings"]
+    assert [one["message"] for one in said if topic in one["message"]] == [
+        f"{topic} {why} stays as it is: {first.implementation} made it, which is not at hand"
+    ]
+    assert made_by(path, topic) == first
+    with log.read(path) as opened:
+        jobs = pipeline.plan_all(opened, "/camera", defaults={stage: type(transform)()}, anew=True)
+        assert [type(job.transform) for job in jobs if job.stage == stage] == [type(transform)]
+        pipeline.run(opened, "/camera", jobs)
+    assert made_by(path, topic).implementation == first.implementation
+    done("drop", path, topic, "-o", "left.mcap", "-q")
+    assert "running " + stage in done("run", "left.mcap", "--no-tables").err
+
+
+def test_what_others_made_and_is_out_of_date_stays_and_is_said(path):
+    run_stage(path, "track", Single())
+    first = made_by(path, "/camera/tracks")
+    done("detect", path, "--method", "mog2", "-q")
+    said = json.loads(done("run", path, "--no-tables", "--json", "-q").out)["warnings"]
+    assert [one["code"] for one in said if "which is not at hand" in one["message"]] == ["out-of-date"]
+    assert made_by(path, "/camera/tracks") == first
+
+
+def test_parameters_that_no_log_can_hold_are_refused(path):
+    before = path.read_bytes()
+    with pytest.raises(McaptrackError, match=r"Sized\.sizes_px is a tuple\[float, \.\.\.\]; a parameter is a float"):
+        run_stage(path, "detect", Sized())
+    assert path.read_bytes() == before

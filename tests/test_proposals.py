@@ -1,0 +1,263 @@
+"""Every message that proposes a command proposes one that works, whatever the file is called."""
+
+from __future__ import annotations
+
+import ast
+import html
+import re
+import shutil
+import subprocess
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+import mcaptrack
+from mcaptrack import log, serving
+from mcaptrack.errors import McaptrackError, command
+from mcaptrack.schema import TRACKS
+from mcaptrack.training.sources import SourceOptions, read_scenes
+from tests.commands import GROUP, called, done, made_log
+from tests.test_bags import bag1
+from tests.test_foreign_runs import write_log
+from tests.test_journal import interrupt
+
+PACKAGE = Path(mcaptrack.__file__).parent
+#: A name that a shell, an option parser and a reader of messages can all stumble over.
+NAME = "-a  b'c$(x)`.mcap".replace("`", "")
+VERBS = "|".join(GROUP.commands)
+
+
+@pytest.fixture(scope="module")
+def template(tmp_path_factory) -> Path:
+    """A small log with everything in it, beside what it was made from. Not to be changed."""
+    return made_log(tmp_path_factory.mktemp("made"))
+
+
+class Scene:
+    """A folder with a log of an odd name, and what it was made from."""
+
+    def __init__(self, template: Path, folder: Path) -> None:
+        for name in ("clip.mp4", "truth.txt", "plane.txt"):
+            shutil.copy(template.with_name(name), folder / name)
+        (folder / "boxes.txt").write_text("".join(f"{n},-1,{n},24,8,8,1,-1,-1,-1\n" for n in range(1, 31)))
+        shutil.copy(template, folder / NAME)
+        self.path = Path(NAME)
+
+    def says(self, *words: str) -> str:
+        """What a command on the log prints, its name in the place of LOG."""
+        given = [f"./{NAME}" if word == "LOG" else word for word in words]
+        outcome = called(*given)
+        return outcome.err + outcome.out
+
+    def without(self, *topics: str) -> Scene:
+        """The log without some channels."""
+        done("drop", f"./{NAME}", *topics, "-o", "left.mcap")
+        Path("left.mcap").replace(NAME)
+        return self
+
+    def ingested(self, *words: str) -> Scene:
+        """The log made anew."""
+        done("ingest", *words, "-o", f"./{NAME}", "--force")
+        return self
+
+    def page(self) -> str:
+        """What a report says."""
+        done("report", f"./{NAME}", "-o", "page.html")
+        return html.unescape(re.sub(r"<[^>]*>", "", re.sub(r"</?code>", "`", Path("page.html").read_text())))
+
+    def damaged(self) -> str:
+        """A byte of each chunk but the last is another."""
+        data = bytearray(self.path.read_bytes())
+        with log.read(self.path) as opened:
+            places = [chunk.offset + 200 for chunk in opened.index.chunks[:-1]]
+        for place in places:
+            data[place] ^= 0xFF
+        self.path.write_bytes(data)
+        return self.says("export", "LOG", "-o", "tables")
+
+    def half_written(self) -> Scene:
+        """A change of the log was cut off."""
+        interrupt(self.path.resolve())
+        return self
+
+    def late(self) -> str:
+        """Messages at times that nothing computes with."""
+        channel = (TRACKS.name, "protobuf", TRACKS.descriptor)
+        with log.read(self.path) as opened, log.extend(opened) as writer:
+            number = writer.add_channel("/camera/late", channel, "protobuf", {})
+            writer.add_message(number, 2**63 + 5, 0, TRACKS.codec.encode(TRACKS.empty()))
+        return self.says("sample", "LOG", "--topic", "/camera/late", "--to", "/camera/later")
+
+    def elsewhere(self) -> str:
+        """Boxes of others at the place where a stage would write."""
+        write_log(self.path, "/eye/image", boxes="/eye/detections")
+        return self.says("run", "LOG", "--topic", "/eye/image")
+
+    def side_view(self) -> str:
+        """People at one distance, seen from their height, without a ground plane."""
+        rows = [f"{n},-1,{n * 2},{20 + k % 2},20,60,1,-1,-1,-1" for n in range(1, 60) for k in (0, 1)]
+        Path("boxes.txt").write_text("\n".join(rows))
+        return self.ingested("boxes.txt", "--as", "detections", "--fps", "10").says("run", "LOG", "--no-tables")
+
+    def of_a_later_version(self) -> str:
+        Path("mcaptrack.toml").write_text("[track]\nmax-age-s = 7.0\n")
+        return self.says("run", "LOG", "--no-tables")
+
+    def bag(self) -> str:
+        """The name is that of a recording of another kind."""
+        self.path.unlink()
+        bag1(self.path, 3, 10)
+        return self.says("info", "LOG")
+
+    def to_train_on(self) -> str:
+        with pytest.raises(McaptrackError) as refused:
+            read_scenes([self.path], SourceOptions(), 0.4)
+        return str(refused.value)
+
+    def untracked(self) -> Scene:
+        return self.ingested("clip.mp4", "--truth", "truth.txt", "--ground-plane", "plane.txt")
+
+
+#: By module, function and verb: a scene in which the message comes.
+SCENES: dict[str, Callable[[Scene], str]] = {
+    "cli/render.py:render:info": lambda s: s.without("/camera/video").says("render", "LOG"),
+    "cli/running.py:_run_on_log:*": lambda s: s.says("run", "LOG", "--no-tables"),
+    "cli/running.py:_run_on_log:run": lambda s: s.says("detect", "LOG", "--method", "mog2"),
+    "cli/train.py:_print:predict": lambda s: s.says(
+        "train", "synthetic", "--walks", "1000", "--epochs", "1", "-o", "my net"
+    ),
+    "cli/view.py:view:run": lambda s: s.untracked().says("view", "LOG"),
+    "evaluation/__init__.py:sequence_of_log:run": lambda s: s.untracked().says("evaluate", "LOG"),
+    "evaluation/__init__.py:truth_of_log:ingest": lambda s: s.without("/camera/truth*").says("evaluate", "LOG"),
+    "cli/view.py:view:recover": lambda s: s.half_written().says("view", "LOG"),
+    "log/beside.py:recover_command:recover": Scene.damaged,
+    "log/snapshot.py:computing:drop": Scene.late,
+    "log/other_kinds.py:refuse_other_kinds:ingest": Scene.bag,
+    "log/reader.py:channel:info": lambda s: s.says("export", "LOG", "--topic", "/nothing"),
+    "pipeline/checks.py:_lacks:info": lambda s: s.says("sample", "LOG", "--topic", "/nothing"),
+    "pipeline/checks.py:_lacks:ingest": lambda s: s.ingested("truth.txt", "--as", "truth", "--fps", "10").says(
+        "run", "LOG"
+    ),
+    "pipeline/events.py:make_events:run": lambda s: s.untracked().says("events", "LOG"),
+    "pipeline/findings.py:warn_of_what_stands:ingest": Scene.side_view,
+    "pipeline/findings.py:warn_of_what_stands:retrack": Scene.side_view,
+    "pipeline/plan.py:_warn_of_settings:run": Scene.of_a_later_version,
+    "pipeline/plan.py:_not_made:*": Scene.elsewhere,
+    "pipeline/write.py:find_views:run": lambda s: s.untracked().says("render", "LOG"),
+    "report/contents.py:_score:ingest": lambda s: s.without("/camera/truth*").page(),
+    "report/headline.py:_without_truth:run": lambda s: s.ingested("clip.mp4").page(),
+    "report/sections.py:_track_table:run": lambda s: s.ingested("clip.mp4").page(),
+    "report/sections.py:forecasts:predict": lambda s: s.without("*predictions*").page(),
+    "sql.py:_answer:query": lambda s: s.says("query", "LOG", "show tables"),
+    "training/sources.py:_from_log:run": lambda s: s.ingested("clip.mp4").to_train_on(),
+}
+
+
+def functions(tree: ast.AST) -> Iterator[tuple[str, ast.AST]]:
+    """Every node of a module with the name of the innermost function around it."""
+
+    def within(node: ast.AST, name: str) -> Iterator[tuple[str, ast.AST]]:
+        name = node.name if isinstance(node, ast.FunctionDef) else name
+        yield name, node
+        for child in ast.iter_child_nodes(node):
+            yield from within(child, name)
+
+    return within(tree, "")
+
+
+def names_of(node: ast.ImportFrom) -> set[str]:
+    return {alias.name for alias in node.names}
+
+
+def proposals() -> set[str]:
+    """Where the package proposes commands: module, function and verb."""
+    out = set()
+    for path in PACKAGE.rglob("*.py"):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        if not any(
+            isinstance(node, ast.ImportFrom) and node.module == "mcaptrack.errors" and "command" in names_of(node)
+            for node in ast.walk(tree)
+        ):
+            continue
+        for name, node in functions(tree):
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "command":
+                first = node.args[0]
+                verb = first.value if isinstance(first, ast.Constant) else "*"
+                out.add(f"{path.relative_to(PACKAGE).as_posix()}:{name}:{verb}")
+    return out
+
+
+def test_every_proposal_has_a_scene():
+    assert proposals() == set(SCENES)
+
+
+def test_commands_are_proposed_in_one_way():
+    """Texts that are no documentation name no command but through ``errors.command``."""
+    found = []
+    for path in PACKAGE.rglob("*.py"):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        documents = {
+            id(node.body[0].value)
+            for node in ast.walk(tree)
+            if isinstance(node, ast.FunctionDef | ast.ClassDef | ast.Module)
+            and node.body
+            and isinstance(node.body[0], ast.Expr)
+        }
+        documents |= {
+            id(part)
+            for node in ast.walk(tree)
+            if isinstance(node, ast.keyword) and node.arg == "help"
+            for part in ast.walk(node)
+        }
+        texts = [node for node in ast.walk(tree) if isinstance(node, ast.Constant) and isinstance(node.value, str)]
+        texts = [node for node in texts if id(node) not in documents and not node.value.startswith("Example: ")]
+        found += [f"{path}:{node.lineno}" for node in texts if re.search(rf"\bmcaptrack ({VERBS})\b", node.value)]
+    assert found == []
+
+
+def words_of(line: str) -> list[str]:
+    """The words of a command as a shell sees them."""
+    shown = subprocess.run(["bash", "-c", f"printf '%s\\0' {line}"], capture_output=True, check=True).stdout
+    return shown.decode().split("\0")[:-1]
+
+
+@pytest.mark.parametrize("where", SCENES)
+def test_what_is_proposed_works(where, template, tmp_path, monkeypatch):
+    if where.startswith("cli/train"):
+        pytest.importorskip("torch", reason="training needs torch")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(serving.Server, "serve_forever", lambda *_, **__: (_ for _ in ()).throw(KeyboardInterrupt))
+    verb = where.rpartition(":")[2]
+    said = SCENES[where](Scene(template, tmp_path))
+    lines = re.findall(r"mcaptrack ((?:" + VERBS + r")\b[^`\n]*?)(?=`|\n|$|    )", said)
+    lines = [line for line in lines if verb in ("*", line.split()[0])]
+    assert lines, said
+    given = {
+        "LABELS": "truth.txt",
+        "VIDEO": "clip.mp4",
+        "INPUT": "boxes.txt",
+        "HOMOGRAPHY": "plane.txt",
+        "LOG": f"./{NAME}",
+    }
+    for line in dict.fromkeys(lines):
+        words = [given.get(word, word) for word in words_of(line)]
+        if "boxes.txt" in words:
+            words += ["--as", "detections", "--fps", "10"]
+        outcome = called(*words)
+        assert outcome.code in (0, 3), f"{line}: {outcome.err}"
+
+
+@pytest.mark.parametrize(
+    "name", ["a.mcap", "a b.mcap", "it's.mcap", "-o.mcap", "$(rm -r).mcap", 'say "a".mcap', "line\nend\t.mcap", "naïve.mcap", "a*?[b].mcap", "back\\slash.mcap", "~.mcap", "#.mcap", "--help"]
+)  # fmt: skip
+def test_a_shell_reads_what_was_meant(name):
+    line = command("run", Path(name), "--topic", "/a b")
+    assert (line[0], line[-1], "\n" in line) == ("`", "`", False)
+    assert words_of(line.strip("`")) == [
+        "mcaptrack",
+        "run",
+        f"./{name}" if name.startswith("-") else name,
+        "--topic",
+        "/a b",
+    ]
