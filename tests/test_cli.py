@@ -345,6 +345,11 @@ class TestMistakes:
         "a log as its own copy": (["run", "a.mcap", "-o", "a.mcap", "--force"], "a.mcap is both input and output"),
         "no log": (["run", "text.mp4"], "text.mp4 can't be read as an MCAP file"),
         "a folder as a log": (["info", "folder"], "folder is a folder, not an MCAP file"),
+        "a video as a log": (["run", "clip.mp4"], "clip.mp4 is a video, not an MCAP file; `mcaptrack ingest clip.mp4`"),
+        "truth beside a log": (
+            ["evaluate", "a.mcap", "--truth", "good.txt"],
+            "add it with `mcaptrack ingest good.txt --as truth --into a.mcap`",
+        ),
         "no such channel": (
             ["track", "a.mcap", "--topic", "/none"],
             "has no channel /none for track; it has /camera/video",
@@ -388,6 +393,29 @@ class TestMistakes:
             code, _, err = call(*words, folder=place)
             assert code == 2
             assert "Traceback" not in err
+
+    @pytest.mark.parametrize(
+        ("words", "said"),
+        [
+            (["--predictor", "red"], "no such option: --predictor (predict, retrack have it); `"),
+            (["--min_iou", "0.5"], "no such option: --min_iou; did you mean --min-iou? `"),
+            (["--max-age", "2"], "no such option: --max-age; did you mean --max-age-s or --max-age-frames? `"),
+            (["--max-age-s", "2s"], "invalid value for '--max-age-s': '2s' is not a number; `"),
+            (["--max-age-frames", "2.5"], "invalid value for '--max-age-frames': '2.5' is not a whole number; `"),
+        ],
+    )
+    def test_wrong_options_are_said_with_what_is_meant(self, place, words, said):
+        code, out, err = call("track", "a.mcap", *words, folder=place)
+        assert (code, out) == (2, "")
+        assert err == f"mcaptrack: {said}mcaptrack track --help` lists the options\n"
+
+    def test_stages_that_cannot_run_are_not_announced(self, place):
+        done("ingest", "good.txt", "--as", "truth", "--fps", "10", "-o", place / "labels.mcap", folder=place)
+        code, _, err = call("run", "labels.mcap", folder=place)
+        (place / "labels.mcap").unlink()
+        assert code == 1
+        assert err.count("\n") == 1
+        assert "add pictures with `mcaptrack ingest VIDEO --into labels.mcap`" in err
 
     def test_names_that_would_steer_the_terminal_are_made_harmless(self, place):
         code, _, err = call("info", "\x1b[2Jevil.mcap", folder=place)

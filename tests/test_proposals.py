@@ -131,6 +131,9 @@ SCENES: dict[str, Callable[[Scene], str]] = {
     "evaluation/__init__.py:sequence_of_log:run": lambda s: s.untracked().says("evaluate", "LOG"),
     "evaluation/__init__.py:truth_of_log:ingest": lambda s: s.without("/camera/truth*").says("evaluate", "LOG"),
     "cli/view.py:view:recover": lambda s: s.half_written().says("view", "LOG"),
+    "ingest/compared.py:pair_files:ingest": lambda s: s.without("/camera/truth*").says(
+        "evaluate", "LOG", "--truth", "truth.txt"
+    ),
     "log/beside.py:recover_command:recover": Scene.damaged,
     "log/snapshot.py:computing:drop": Scene.late,
     "log/other_kinds.py:refuse_other_kinds:ingest": Scene.bag,

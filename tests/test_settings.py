@@ -178,7 +178,7 @@ class TestUnknownNames:
             (folder / "mcaptrack.toml").unlink()
             variable = f"MCAPTRACK_{command}_{wrong}".upper().replace("-", "_")
             monkeypatch.setenv(variable, "1")
-            assert f"the environment variable {variable} is of no option; did you mean " in refused("info", "x.mcap")
+            assert f"the environment variable {variable} names no option; did you mean " in refused("info", "x.mcap")
             monkeypatch.delenv(variable)
 
     def test_a_variable_that_lacks_its_unit(self, monkeypatch):

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import copy
+import difflib
+import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -25,16 +27,56 @@ _RUNNING: Final[ContextVar[typer.Context]] = ContextVar("running")
 _UsageError: Final[Any] = typer.BadParameter.__bases__[0]
 
 
+#: What a value is not, by pydantic's name of the fault.
+_NOT: Final = {
+    "float_parsing": "a number",
+    "int_parsing": "a whole number",
+    "int_from_float": "a whole number",
+    "bool_parsing": "true or false",
+}
+
+
 @contextmanager
 def _usage_in_one_line(command: str = "") -> Iterator[None]:
     """Refuse a wrong command line in one line, without Typer's box."""
     try:
         yield
     except _UsageError as error:
+        error.message = _message(error)
         words = " ".join(error.format_message().replace("Value error, ", "").rstrip(".").split())
+        if hasattr(error, "possibilities"):
+            words = _unknown_option(error)
         page = " ".join(filter(None, ["mcaptrack", command, "--help"]))
         end = "" if words.endswith("?") else ";"
         refuse_usage(f"{words[:1].lower()}{words[1:]}{end} `{page}` lists the {'options' if command else 'commands'}")
+
+
+def _message(error: Any) -> str:
+    """What Typer says of a value, or what was given and what it should be where that is left to pydantic."""
+    for found in error.__cause__.errors() if hasattr(error.__cause__, "errors") else ():
+        if found["type"] in _NOT:
+            return f"{found['input']!r} is not {_NOT[found['type']]}"
+    return re.sub(r"Got unexpected extra argument(?:s|\(s\))? \((.*)\)", r"too many arguments: \1", str(error.message))
+
+
+def _unknown_option(error: Any) -> str:
+    """An option that the command doesn't have: the commands that have it, and those of this command that are alike."""
+    name, context = error.option_name, error.ctx
+    words = f"no such option: {name}"
+    if context is None or context.parent is None:
+        return words
+    theirs = {command: _options_of(found) for command, found in context.parent.command.commands.items()}
+    if having := [command for command, options in theirs.items() if name in options]:
+        words += f" ({', '.join(having)} {'has' if len(having) == 1 else 'have'} it)"
+    known = theirs.get(context.info_name, [])
+    stem = name.replace("_", "-")
+    alike = [option for option in known if option == stem or option.startswith(f"{stem}-")]
+    alike = alike or difflib.get_close_matches(name, known, 1, 0.75)
+    return f"{words}; did you mean {' or '.join(alike)}?" if alike else words
+
+
+def _options_of(command: Any) -> list[str]:
+    return [name for option in command.params if not getattr(option, "hidden", False) for name in option.opts]
 
 
 class Group(TyperGroup):
@@ -199,7 +241,7 @@ def converted(context: Any, command: str) -> dict[str, Any]:
         try:
             out[name] = parameters[name].process_value(context, given.value)
         except typer.BadParameter as error:
-            refuse_usage(f"{given.where}: {error.message}")
+            refuse_usage(f"{given.where}: {_message(error)}")
     return out
 
 

@@ -351,4 +351,6 @@ def expand(paths: Sequence[Path], *, each: bool = False) -> list[Path]:
 def only_one_output(paths: Sequence[Path], output: Path | None) -> None:
     """Raises McaptrackError if several inputs would go to one output."""
     if output is not None and len(paths) > 1:
-        raise McaptrackError(f"{len(paths)} inputs can't all be written to {output}; leave -o out or give one input")
+        raise McaptrackError(
+            f"{len(paths)} inputs can't all be written to {output}; give one input, or no name for the output"
+        )

@@ -169,7 +169,7 @@ def _from_environment(settings: Settings) -> Iterable[tuple[str, Setting, Given]
             continue
         setting = by_variable.get(name)
         if setting is None:
-            refuse_usage(f"the environment variable {name} is of no option{_nearest(name, [*by_variable, *VARIABLES])}")
+            refuse_usage(f"the environment variable {name} names no option{_nearest(name, [*by_variable, *VARIABLES])}")
         if not text or setting.name in CALL_ONLY:
             continue
         try:

@@ -19,11 +19,12 @@ from numpy.typing import NDArray
 from mcaptrack import ingest, tables
 from mcaptrack.boxes import iou
 from mcaptrack.clock import NS_PER_S
-from mcaptrack.errors import McaptrackError
+from mcaptrack.errors import McaptrackError, command
 from mcaptrack.ingest.formats import KITTI_HEIGHT_PX, PERSON, Aside, Labels, Role
 from mcaptrack.ingest.job import IngestOptions, label_rows
 from mcaptrack.ingest.label_job import LabelJob
 from mcaptrack.ingest.labels import read_homography, read_labels
+from mcaptrack.ingest.source import is_mcap
 from mcaptrack.match import solve
 from mcaptrack.plane import GroundPlane, Point
 from mcaptrack.schema import Frame
@@ -52,8 +53,12 @@ def pair_files(tracks: Sequence[Path], truths: Sequence[Path]) -> tuple[list[tup
     """Which truth belongs to which tracks, with a name for each pair, and in words how that was found.
 
     By their names where these are the same (the file's, or a folder's above it: ``SEQ/gt/gt.txt``), otherwise in order.
-    Raises McaptrackError if there are not as many of one as of the other.
+    Raises McaptrackError if there are not as many of one as of the other, and for a log, which holds its truth.
     """
+    for path in tracks:
+        if is_mcap(path):
+            add = command("ingest", truths[0] if len(truths) == 1 else "LABELS", "--as", "truth", "--into", path)
+            raise McaptrackError(f"{path} is a log, not a file of labels; logs hold their own truth: add it with {add}")
     if len(tracks) != len(truths):
         raise McaptrackError(f"{len(tracks)} files of tracks and {len(truths)} of truth; give one truth for each")
     track_names, truth_names = _names(tracks), _names(truths)

@@ -94,6 +94,16 @@ def open_source(path: Path) -> Source | None:
     return None
 
 
+def is_mcap(path: Path) -> bool:
+    """Whether a file begins as an MCAP file does; False for what can't be read."""
+    refuse_special(path)
+    try:
+        with path.open("rb") as stream:
+            return stream.read(len(_MCAP)) == _MCAP
+    except OSError:
+        return False
+
+
 def _open_folder(path: Path) -> Source | None:
     from mcaptrack.ingest.bag_metadata import METADATA, holds_metadata
     from mcaptrack.ingest.rosbag2 import open_bag, open_files

@@ -1,4 +1,4 @@
-"""Recordings that are no MCAP files, told by their first bytes: `mcaptrack ingest` makes logs of them."""
+"""Recordings that are not MCAP files, detected by their first bytes: `mcaptrack ingest` makes logs of them."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from mcaptrack.errors import McaptrackError, command
 from mcaptrack.log.names import RESULTS
 
 _BEGIN: Final = {b"#ROSBAG V": "a ROS 1 bag", b"SQLite format 3\0": "a database, as rosbag2 writes them"}
+_MATROSKA: Final = b"\x1a\x45\xdf\xa3"  # and WebM
 _ZSTD: Final = b"\x28\xb5\x2f\xfd"
 _PARTS: Final = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd", ".bag")
 _SPLIT: Final = re.compile(r"(.+?)_(\d{1,9})(\.(?:mcap|db3)(?:\.zstd)?)")
@@ -56,4 +57,6 @@ def _file(path: Path) -> str:
         head = stream.read(16)
     if head.startswith(_ZSTD) and path.name.endswith(_PARTS):
         return "a compressed file of rosbag2"
+    if head[4:8] == b"ftyp" or head.startswith(_MATROSKA) or (head[:4], head[8:12]) == (b"RIFF", b"AVI "):
+        return "a video"
     return next((what for begin, what in _BEGIN.items() if head.startswith(begin)), "")

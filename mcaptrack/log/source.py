@@ -79,7 +79,8 @@ class OpenFile:
             raise McaptrackError(f"{path} can't be opened: {error.strerror}") from None
         kind = kind or kind_of_file(os.fstat(file.handle).st_mode)  # it may have been replaced meanwhile
         if kind:
-            raise McaptrackError(f"{path} is {kind}, not an MCAP file")
+            hint = "; give the logs in it, as in 'FOLDER/*.mcap'" if path.is_dir() else ""
+            raise McaptrackError(f"{path} is {kind}, not an MCAP file{hint}")
         return file
 
     def read(self, at: int, size: int) -> bytes:
