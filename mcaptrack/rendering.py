@@ -75,8 +75,9 @@ def render(
         numbers = numbers[np.flatnonzero(np.diff(ticks, prepend=-1))]
     chosen = times[numbers]
     if not len(chosen):
-        span = f"{(int(times[-1]) - int(times[0])) / NS_PER_S:.3f} s"
-        raise McaptrackError(f"{opened.path}: no picture lies in the seconds that were asked for; there are {span}")
+        end = "the end" if options.end_s is None else f"{options.end_s:g} s"
+        there = f"the pictures are from 0 to {(int(times[-1]) - int(times[0])) / NS_PER_S:.3f} s"
+        raise McaptrackError(f"{opened.path} has no picture between {options.start_s:g} s and {end}; {there}")
     rest = np.diff(chosen)
     fps = Fraction(NS_PER_S, int(np.median(rest))).limit_denominator(1001) if len(rest) else Fraction(1)
 

@@ -326,7 +326,7 @@ class TestMistakes:
         "a folder without images": (["ingest", "folder"], "folder holds no images"),
         "a plane that is none": (
             ["ingest", "clip.mp4", "--ground-plane", "text.mp4", "-o", "x.mcap"],
-            "is no homography",
+            "is not a homography",
         ),
         "a truth in the wrong format": (
             ["ingest", "clip.mp4", "--truth", "bad.txt", "-o", "x.mcap"],

@@ -74,7 +74,7 @@ class TestLabels:
         "letters": ("1,1,1,1,2,2\n2,1,x,1,2,2\n", "auto", r"a\.txt:2: not MOTChallenge .*not all are numbers: 2,1,x"),
         "columns": ("1,1,1,1,2,2\n2,1,3\n", "auto", r"a\.txt:2: not MOTChallenge .*3 columns"),
         "another format": (MOT15, "trajnet", r"a\.txt:1: not TrajNet \(frame id x y\), 10 columns"),
-        "no format": ("hello world\n", "auto", r"a\.txt:1: 2 columns are of no label format"),
+        "no format": ("hello world\n", "auto", r"a\.txt:1: a row of 2 columns fits no label format"),
         "half a frame": (
             "1.5,1,1,1,2,2\n",
             "auto",
@@ -95,7 +95,7 @@ class TestLabels:
 
     def test_what_is_no_text_is_said(self, tmp_path):
         (tmp_path / "a.txt").write_bytes(b"\xff\xfe\x00\x00" * 10)
-        with pytest.raises(McaptrackError, match="is not text"):
+        with pytest.raises(McaptrackError, match="is not a text file"):
             read_labels(tmp_path / "a.txt")
         with pytest.raises(McaptrackError, match="can't be read"):
             read_labels(tmp_path / "none.txt")
@@ -106,7 +106,7 @@ class TestLabels:
 
     @pytest.mark.parametrize("text", ["", "1 2 3\n4 5\n", "1 2 3\n4 5 6\n7 8 9\n1 2 3\n", "a b c\n1 2 3\n1 2 3\n"])
     def test_what_is_no_homography_is_refused(self, tmp_path, text):
-        with pytest.raises(McaptrackError, match="is no homography: 3 rows of 3 numbers"):
+        with pytest.raises(McaptrackError, match="is not a homography: it needs 3 rows of 3 numbers"):
             read_homography(write(tmp_path / "h.txt", text))
 
     def test_planes_come_back_from_their_channel(self):
@@ -270,7 +270,7 @@ class TestIngest:
         "labels of boxes that know nobody": ({"labels": {"truth": "0,-1,1,1,2,2\n"}}, "says of nobody who it is"),
         "detections in metres": ({"labels": {"detections": TRAJNET}}, "holds positions, not boxes"),
         "a singular plane": ({"ground_plane": "1 0 0\n2 0 0\n0 0 1\n"}, "the homography is singular"),
-        "no plane at all": ({"ground_plane": "1 0\n"}, "is no homography"),
+        "no plane at all": ({"ground_plane": "1 0\n"}, "is not a homography"),
         "labels after the end": ({"labels": {"truth": "900,1,1,1,2,2\n"}}, "all labels are of frames after"),
         "a role for a video": ({"role": "truth"}, "is no label file; --as is for those"),
     }

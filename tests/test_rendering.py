@@ -169,7 +169,7 @@ def test_a_log_becomes_a_video_of_its_pictures(finished, tmp_path):  # noqa: F81
 MISTAKES = {
     "another suffix": (["-o", "a.avi"], "a video is rendered to .mp4 or .gif, not to .avi"),
     "no such view": (["--topic", "/camera/none"], "has no channel /camera/none/view/image"),
-    "no such second": (["--start-s", "5000"], "no picture lies in the seconds that were asked for; there are "),
+    "no such second": (["--start-s", "5000"], "has no picture between 5000 s and the end; the pictures are from 0 to "),
     "a width of nothing": (["--width", "0"], "--width has to be from 16 to 16384, not 0"),
 }
 

@@ -82,7 +82,7 @@ def _guess(path: Path, number: int, line: str) -> Format:
     if len(columns) == 8 and "," not in line:
         return "obsmat"
     raise McaptrackError(
-        f"{path}:{number}: {len(columns)} columns are of no label format that is known here ({', '.join(FORMATS)}): "
+        f"{path}:{number}: a row of {len(columns)} columns fits no label format ({', '.join(FORMATS)}): "
         f"{line.strip()[:60]}"
     )
 
@@ -99,13 +99,13 @@ def _refuse_twins(path: Path, labels: Labels) -> None:
 
 def read_homography(path: Path) -> tuple[float, ...]:
     """A 3x3 homography, comma or blank separated, as 9 numbers row by row. Raises McaptrackError if it is none."""
-    words = f"{path} is no homography: 3 rows of 3 numbers"
+    words = f"{path} is not a homography: it needs 3 rows of 3 numbers"
     rows: list[list[float]] = []
     for _, line in lines_of(path):
         try:
             rows.append([float(part) for part in split(line)])
         except ValueError:
-            raise McaptrackError(f"{words}, comma or blank separated") from None
+            raise McaptrackError(f"{words}, separated by commas or blanks") from None
         if len(rows) > 3:
             break
     if len(rows) != 3 or any(len(row) != 3 for row in rows):

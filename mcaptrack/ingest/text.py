@@ -42,7 +42,7 @@ def lines_of(path: Path) -> Lines:
                 if line.strip() and not line.lstrip().startswith("#"):
                     yield number, line
     except UnicodeDecodeError:
-        raise McaptrackError(f"{path} is not text") from None
+        raise McaptrackError(f"{path} is not a text file, as labels and homographies are") from None
     except OSError as error:
         raise McaptrackError(f"{path} can't be read: {error.strerror}") from None
 
