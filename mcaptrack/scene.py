@@ -315,7 +315,7 @@ def _square(people: tuple[Walker, ...], seed: int) -> Scene:
 
 
 def _random_walker(rng: np.random.Generator, number: int, latest_s: float = 26.0) -> Walker:
-    """Somebody who crosses the square on a straight line at 0.9 to 1.6 m/s, from one side to the other."""
+    """A person who crosses the square on a straight line at 0.9 to 1.6 m/s, from one side to the other."""
     side = float(rng.choice([-1.0, 1.0]))
     start = np.array([side * 8.5, rng.uniform(8.0, 17.0)])
     end = np.array([-side * 8.5, rng.uniform(8.0, 17.0)])

@@ -238,7 +238,7 @@ def test_own_boxes_and_pictures_are_one_camera_with_one_set_of_results(tmp_path,
         return  # the rest is slow
     assert "finds, tracks and re-tracks" not in done("report", path, "-o", tmp_path / "r.html", "-q").out
     page = (tmp_path / "r.html").read_text()
-    assert "Nobody has been tracked" not in page
+    assert "There are no tracks here" not in page
     done("render", path, "-o", tmp_path / "walk.gif", "--width", "64", "--end-s", "0.3", "-q")
     done("events", path, "-q")
 

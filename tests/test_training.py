@@ -198,7 +198,7 @@ class TestSources:
     def test_nothing_to_train_on(self, tmp_path):
         with pytest.raises(McaptrackError, match=r"has no \.txt"):
             self.read(tmp_path)
-        with pytest.raises(McaptrackError, match=r"nobody is seen for 5\.6 s without a break in short"):
+        with pytest.raises(McaptrackError, match=r"no track lasts 5\.6 s without a gap in short"):
             windows_of([Scene("short", np.zeros((2, 9, 2)))], RED)
 
 

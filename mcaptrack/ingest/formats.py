@@ -74,10 +74,10 @@ _MAX_NAMES: Final = 256
 
 @dataclass(frozen=True)
 class Aside:
-    """Labelled boxes that nobody has to find: frames (N,) as in the file, boxes (N, 4).
+    """Labelled boxes that need not be found: frames (N,) as in the file, boxes (N, 4).
 
-    ``forgiven`` (N,): a track that is matched with the box counts neither for nor against; otherwise it counts as found
-    nobody. ``region`` (N,): so do tracks that match nobody and lie in the box.
+    ``forgiven`` (N,): a track that is matched with the box counts neither for nor against; otherwise it counts as
+    false. ``region`` (N,): so do tracks that match no person and lie in the box.
     """
 
     frame: Ints

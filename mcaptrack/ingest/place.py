@@ -1,7 +1,7 @@
 """Where results of a log are written: into the log itself, or into LOG.results.mcap beside it.
 
 ROS tools expect that all channels of a recording hold ROS messages, and that its metadata.yaml counts all of them. So a
-recording that ROS tools read stays as it is, unless somebody insists.
+recording that ROS tools read stays as it is, unless --in-place is given.
 """
 
 from __future__ import annotations

@@ -37,7 +37,7 @@ class Placed(NamedTuple):
     """The labelled frames of a file (F,): their numbers in the file, as pictures counted from 0, and their times."""
 
     number: Ints
-    index: Ints  # type: ignore[assignment]  # hides tuple.index, which nobody wants here
+    index: Ints  # type: ignore[assignment]  # hides tuple.index, which is not needed here
     t_ns: Ints
 
 

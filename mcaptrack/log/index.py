@@ -148,7 +148,7 @@ def read_summary(buffer: Bytes) -> Index | None:
 
 
 def summary_start(buffer: Bytes) -> int:
-    """Where the summary is said to start; 0 if nobody says."""
+    """Where the summary is said to start; 0 if it is not said."""
     footer = read_footer(buffer) if ends_as_log(buffer) else None
     return footer[1] if footer and len(MAGIC) < footer[1] <= footer[0] else 0
 

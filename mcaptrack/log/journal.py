@@ -111,7 +111,7 @@ class Journal:
             fcntl.flock(self.file.handle, fcntl.LOCK_UN)
         except BlockingIOError:
             return "busy"
-        except OSError:  # without locks nobody can be at work
+        except OSError:  # without locks no other process can be at work
             pass
         return _Comparison(self).state()
 
@@ -175,7 +175,7 @@ class _Comparison:
         return bool((there[:low] == before[:low]).all() and not there[low:].any())
 
     def _is_sound(self) -> bool:
-        """Whether the file is a log whose end can be read: then somebody finished it, and it is not to be undone."""
+        """Whether the file is a log whose end can be read: then it was finished, and is not to be undone."""
         try:
             index = read_index(self._now)
             for chunk in index.chunks:
@@ -258,7 +258,7 @@ def find(path: Path, log: OpenFile) -> Journal | None:
 
 
 def is_left(path: Path) -> bool:
-    """Whether the file at ``path`` has a journal of its own that a change left which nobody goes on with."""
+    """Whether the file at ``path`` has a journal of its own that an interrupted change left."""
     try:
         found = None if path.is_symlink() or not path.is_file() else find(path, OpenFile.at(path))
         return found is not None and found.state() != "busy"
@@ -283,7 +283,7 @@ def find_content(path: Path, log: OpenFile) -> Source | None:
 
 
 def _open(path: Path, log: OpenFile) -> OpenFile | None:
-    """What lies at LOG.journal, if it is a file of somebody who may be trusted with the log."""
+    """What lies at LOG.journal, if it is a file of a user who may be trusted with the log."""
     try:
         kind = kind_of_file(os.lstat(path).st_mode)
         if kind:

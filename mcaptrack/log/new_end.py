@@ -27,7 +27,7 @@ _BLOCK: Final = 2**20
 
 
 def lock(path: Path, handle: int) -> None:
-    """Be the only one to write to an open file until the handle is closed. Raises McaptrackError if somebody is."""
+    """Be the only one to write to an open file until the handle is closed. Raises McaptrackError if another is."""
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError:

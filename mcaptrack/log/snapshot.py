@@ -122,7 +122,7 @@ class Snapshot:
         return True
 
     def _now(self) -> Messages | None:
-        """The log as it is now; None if nobody changed it.
+        """The log as it is now; None if it has not changed.
 
         Raises Damaged if it is no log any more, and McaptrackError if it is being changed.
         """
@@ -161,7 +161,7 @@ def take_snapshot(path: Path) -> Snapshot:
 
 
 def _look(path: Path, file: OpenFile) -> Snapshot | McaptrackError:
-    """What an open file holds; an error if that can't be told while somebody changes it. Raises what won't pass."""
+    """What an open file holds; an error if that can't be told while it is being changed. Raises what won't pass."""
     signature = Signature.of(file.handle)
     is_certain = signature.is_certain
     try:
@@ -185,7 +185,7 @@ def _look(path: Path, file: OpenFile) -> Snapshot | McaptrackError:
 
 
 def _is_as_it_was(path: Path, file: OpenFile, signature: Signature) -> bool:
-    """Whether the path still leads to the file, and nobody changed it since."""
+    """Whether the path still leads to the file, which has not changed since."""
     try:
         return os.path.samestat(path.stat(), os.fstat(file.handle)) and Signature.of(file.handle) == signature
     except OSError:

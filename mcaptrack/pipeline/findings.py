@@ -46,7 +46,7 @@ def _reason(transform: Transform, given: Sequence[Frame], made: Sequence[Frame])
         return "no track is there at two ticks, or none stands on the ground plane"
     if isinstance(transform, Predict):
         needed_s = (transform.min_history - 1) / transform.rate_hz
-        return f"nobody is seen without a gap for the {needed_s:.3g} s that a forecast needs (min_history)"
+        return f"no track is without a gap for the {needed_s:.3g} s that a forecast needs (min_history)"
     if isinstance(transform, Retrack):
         longest_s = longest_track_s(given)
         if longest_s < transform.min_track_s:

@@ -38,7 +38,7 @@ def planes_to_json(planes: Planes) -> list[Any]:
 def guess_plane(
     frames: Sequence[Frame], source: str, digest: str
 ) -> tuple[Planes | None, tuple[list[Frame], Provenance] | None]:
-    """A scale from boxes where nobody gave a ground plane: planes, and the frames and making of the channel for them.
+    """A scale from boxes where no ground plane is given: planes, and the frames and making of the channel for them.
 
     ``source`` is where the boxes are from, and ``digest`` what that holds. None and None if there are no boxes.
     """

@@ -109,7 +109,7 @@ def _without_truth(reports: Sequence[LogReport]) -> str:
         return "There is nothing in here yet: no messages at all."
     if not seen:
         run = command("run", *(Path(report.file) for report in reports))
-        return f"Nobody has been tracked in here yet; {run} does that."
+        return f"This log has no tracks yet; {run} makes them."
     said = f"Tracking found {counted(tracked, 'track')}."
     if any("offline" in report.sets for report in reports):
         was = "was" if joined == 1 else "were"

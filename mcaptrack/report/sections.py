@@ -72,7 +72,7 @@ def score_table(results: Sequence[Result], report: LogReport) -> Markup:
 def _track_table(report: LogReport) -> Markup:
     if not report.sets:
         run = command("run", Path(report.file))
-        return lack(f"Nobody has been tracked here; {run} finds, tracks and re-tracks people.")
+        return lack(f"There are no tracks here; {run} finds, tracks and re-tracks people.")
     repairs = {story.topic: story.counts["joined"] + story.counts["parted"] for story in report.stories}
     rows = [
         (

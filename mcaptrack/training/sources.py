@@ -165,7 +165,7 @@ def windows_of(scenes: Sequence[Scene], recipe: Recipe) -> Windows:
     windows = Windows.join([scene.cut(recipe, number) for number, scene in enumerate(scenes)])
     if len(windows) == 0:
         seconds = (recipe.least + recipe.steps) * recipe.step_s
-        raise McaptrackError(f"nobody is seen for {seconds:g} s without a break in {', '.join(s.name for s in scenes)}")
+        raise McaptrackError(f"no track lasts {seconds:g} s without a gap in {', '.join(s.name for s in scenes)}")
     return windows
 
 

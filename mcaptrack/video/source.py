@@ -40,7 +40,7 @@ class EncodedPicture(NamedTuple):
     """One picture as a message carries it."""
 
     t_ns: int
-    index: int  # type: ignore[assignment]  # hides tuple.index, which nobody wants here
+    index: int  # type: ignore[assignment]  # hides tuple.index, which is not needed here
     data: bytes
 
 
@@ -50,7 +50,7 @@ class Shown(NamedTuple):
     Pictures that can't be decoded have numbers, too.
     """
 
-    index: int  # type: ignore[assignment]  # hides tuple.index, which nobody wants here
+    index: int  # type: ignore[assignment]  # hides tuple.index, which is not needed here
     seconds: Fraction | None
     picture: Any
 
