@@ -18,6 +18,7 @@ from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.log import records
 from mcaptrack.log.records import MAGIC
+from tests.commands import called, made_log
 from tests.test_log import MESSAGES, SCHEMA, STOCK_OPTIONS, our_messages, stock_messages, write_log, write_stock
 
 #: Forty messages of three channels, each of which could be told from all others.
@@ -346,3 +347,24 @@ def test_what_nobody_can_save_is_said(tmp_path):
         with pytest.raises(McaptrackError, match="can't be opened: No such file"):
             verb(tmp_path / "none.mcap")
     assert not (tmp_path / "saved.mcap").exists()
+
+
+@pytest.mark.parametrize("what", ["text", "nothing", "a JPEG file", "no beginning", "no end", "neither"])
+def test_recovering_is_proposed_where_something_shows_that_it_is_a_log(what, tmp_path):
+    """And then it saves something."""
+    path = made_log(tmp_path)
+    whole = path.read_bytes()
+    content = {
+        "text": b"frame,x,y\n1,2,3\n",
+        "nothing": b"",
+        "a JPEG file": b"\xff\xd8\xff\xe0" + bytes(2000),
+        "no beginning": b"\0" * 8 + whole[8:],
+        "no end": whole[: len(whole) * 2 // 3],
+        "neither": b"\0" * 8 + whole[8 : len(whole) * 2 // 3],
+    }[what]
+    path.write_bytes(content)
+    refused = called("info", path)
+    assert refused.code == 1
+    is_proposed = f"`mcaptrack recover {path}`" in refused.err
+    assert is_proposed == (what in ("no beginning", "no end"))
+    assert not is_proposed or called("recover", path, "-o", tmp_path / "saved.mcap").code == 3

@@ -171,7 +171,8 @@ def _look(path: Path, file: OpenFile) -> Snapshot | McaptrackError:
             raise Damaged("it is empty")
         index = read_index(source)
     except Damaged as error:
-        words = McaptrackError(f"{path} can't be read as an MCAP file: {error}; {recover_words(path)}")
+        hint = f"; {recover_words(path)}" if _may_be_log(file, signature.size) else ""
+        words = McaptrackError(f"{path} can't be read as an MCAP file: {error}{hint}")
         if not _is_as_it_was(path, file, signature):
             return words
         if found:
@@ -182,6 +183,12 @@ def _look(path: Path, file: OpenFile) -> Snapshot | McaptrackError:
     if found:
         notices.warn(found.words, "journal")
     return Snapshot(path, file, source, index, signature, is_certain)
+
+
+def _may_be_log(file: OpenFile, size: int) -> bool:
+    """Whether a file begins or ends as logs do, so that something can be saved of it."""
+    ends = (os.pread(file.handle, len(records.MAGIC), at) for at in (0, max(size - len(records.MAGIC), 0)))
+    return records.MAGIC in ends
 
 
 def _is_as_it_was(path: Path, file: OpenFile, signature: Signature) -> bool:
