@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
@@ -92,6 +93,25 @@ def test_scores_before_and_after_are_those_of_samples_and_retracked_and_a_loss_i
     assert scores is not None
     assert (scores.idf1, scores.switches) == (((1.0, 0.5), (0, 2)) if is_worse else ((0.5, 1.0), (2, 0)))
     assert [notice.code for notice in said] == ["worse"] * is_worse
+
+
+def test_what_is_odd_about_the_whole_is_counted_with_the_rest(path, monkeypatch):
+    """It is found after the stages have run."""
+    summarise = pipeline.summarise
+
+    def odd(*given):
+        notices.warn("re-tracking made it worse", "worse")
+        return summarise(*given)
+
+    before = done("run", path, "--no-tables", "--force").err
+    monkeypatch.setattr(pipeline, "summarise", odd)
+    after = done("run", path, "--no-tables", "--force").err
+
+    def counted(said):
+        (words,) = re.findall(r"^  warnings +(\d+), see above: (.*)$", said, re.MULTILINE) or [("0", "")]
+        return int(words[0]), {*words[1].split(", ")} - {""}
+
+    assert counted(after) == (counted(before)[0] + 1, counted(before)[1] | {"worse"})
 
 
 def test_run_ends_with_what_the_log_holds_in_words_and_in_json(path):

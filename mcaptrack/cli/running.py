@@ -7,6 +7,7 @@ from pathlib import Path
 from time import monotonic
 from typing import TYPE_CHECKING, Any
 
+from mcaptrack import notices
 from mcaptrack.cli import common
 from mcaptrack.errors import McaptrackError, command
 
@@ -25,8 +26,6 @@ def run_on_logs(
 
     With ``is_run`` tables are written if ``given`` says so, and the summary is of all that the log holds.
     """
-    from mcaptrack import notices
-
     paths = common.expand(given["logs"])
     common.only_one_output(paths, given["output"])
     if given["output"] and given["sidecar"] is not None:
@@ -85,8 +84,9 @@ def _run_on_log(
     }
     if is_run:
         data["tables"] = _export(target, given, talk) if given["tables"] else {}
-        with log.read(target) as opened:
+        with notices.collected() as warnings, log.read(target) as opened:
             summary = pipeline.summarise(opened, prefix)
+        report.warnings += warnings
         data["summary"] = summary.to_json()
         lines = [*_lines_of_run(summary), *_lines_of_warnings(report)]
         steps = ["view"] + (["evaluate"] if summary.scores else []) if summary.tracks else ["info"]
