@@ -1,6 +1,6 @@
 # make demo   install into .venv and run everything on a scene that is drawn for it
 # make test   install into .venv and run all checks and tests
-# make mutants [ARGS="mcaptrack/metrics --count 20 --seed 2"]   change the code at random; print what no test notices
+# make mutants [ARGS="mcaptrack/evaluation/metrics --count 20 --seed 2"]   change the code at random; print what no test notices
 
 PYTHON ?= python3
 VENV ?= .venv

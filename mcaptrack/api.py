@@ -20,12 +20,14 @@ from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaptrack import export, foreign, tables
 from mcaptrack import log as logs
+from mcaptrack import tables
 from mcaptrack.errors import McaptrackError
-from mcaptrack.pictures import Pictures
 from mcaptrack.schema import Frame
-from mcaptrack.video import brightness, colours
+from mcaptrack.sources import foreign
+from mcaptrack.sources.pictures import Pictures
+from mcaptrack.sources.video import brightness, colours
+from mcaptrack.tables import export
 
 if TYPE_CHECKING:
     import pyarrow as pa

@@ -91,10 +91,11 @@ def on_disk(*folders: Path) -> dict[str, tuple[int, bytes]]:
 
 
 def _serve(lines: Iterable[str]) -> None:
-    from mcaptrack import export, pipeline  # noqa: F401
+    from mcaptrack import pipeline  # noqa: F401
     from mcaptrack.__main__ import main
     from mcaptrack.cli import app  # noqa: F401
-    from mcaptrack.ingest import database, ingest, plain_yaml, rosbag1, rosbag2  # noqa: F401
+    from mcaptrack.sources.ingest import database, ingest, plain_yaml, rosbag1, rosbag2  # noqa: F401
+    from mcaptrack.tables import export  # noqa: F401
 
     for line in lines:
         words, moment = json.loads(line)

@@ -14,10 +14,11 @@ import pytest
 from typer.testing import CliRunner
 
 import mcaptrack
-from mcaptrack import ingest, log, pipeline, tables
+from mcaptrack import log, pipeline, tables
 from mcaptrack.cli import app
-from mcaptrack.demo import draw
 from mcaptrack.errors import McaptrackError
+from mcaptrack.sources import ingest
+from mcaptrack.sources.demo import draw
 from tests.test_export import some_log
 from tests.worlds import small_scene, write_clip
 

@@ -10,16 +10,16 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from mcaptrack import kalman
-from mcaptrack.boxes import iou, overlapping
-from mcaptrack.clock import FrameClock, seconds_to_ns
 from mcaptrack.errors import McaptrackError
-from mcaptrack.history import Histories, Holt, fill_holes, rebuild
-from mcaptrack.match import assign, heaviest, solve
-from mcaptrack.plane import GroundPlane, assumed_plane, plane_at
-from mcaptrack.resample import looked_at, resample
-from mcaptrack.scene import demo_scene
+from mcaptrack.geometry import kalman
+from mcaptrack.geometry.assignment import assign, heaviest, solve
+from mcaptrack.geometry.boxes import iou, overlapping
+from mcaptrack.geometry.clocks import FrameClock, seconds_to_ns
+from mcaptrack.geometry.histories import Histories, Holt, fill_holes, rebuild
+from mcaptrack.geometry.plane import GroundPlane, assumed_plane, plane_at
 from mcaptrack.schema import TRACKS, Frame
+from mcaptrack.schema.resampling import looked_at, resample
+from mcaptrack.sources.scene import demo_scene
 from tests.worlds import tracks_at
 
 BOXES = hnp.arrays(float, st.tuples(st.integers(0, 5), st.just(4)), elements=st.floats(0.5, 100))

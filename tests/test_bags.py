@@ -25,9 +25,9 @@ from typer.testing import CliRunner
 from mcaptrack import log
 from mcaptrack.cli import app
 from mcaptrack.errors import McaptrackError
-from mcaptrack.ingest import IngestOptions, ingest
 from mcaptrack.schema import GROUND_PLANE, TRACKS
 from mcaptrack.schema.ground import rows_to_plane
+from mcaptrack.sources.ingest import IngestOptions, ingest
 
 T0 = 1_700_000_000_123_456_789
 ROS1, ROS2 = get_typestore(Stores.ROS1_NOETIC), get_typestore(Stores.ROS2_HUMBLE)

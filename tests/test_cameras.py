@@ -10,10 +10,10 @@ from typing import Any
 import pytest
 
 from mcaptrack import log, pipeline
-from mcaptrack.cameras import ROUTES, camera_at, cameras, find_camera, name_above
 from mcaptrack.errors import McaptrackError
-from mcaptrack.provenance import Provenance, digest
 from mcaptrack.schema import TRACKS, Frame
+from mcaptrack.schema.provenance import Provenance, digest
+from mcaptrack.sources.cameras import ROUTES, camera_at, cameras, find_camera, name_above
 from mcaptrack.transforms import TRANSFORMS
 from tests.commands import GROUP, called, done, made_log
 from tests.test_foreign_runs import write_log

@@ -8,8 +8,8 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mcaptrack.carry import carry
 from mcaptrack.schema import TRACKS, Frame
+from mcaptrack.transforms.to_video_rate import carry
 from tests.test_cli import done
 from tests.worlds import ns
 

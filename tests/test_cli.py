@@ -14,9 +14,10 @@ from pathlib import Path
 
 import pytest
 
-from mcaptrack import __version__, demo, log
+from mcaptrack import __version__, log
 from mcaptrack.cli.demo import _next_commands
 from mcaptrack.schema import COUNTS, EVENTS, EventKind
+from mcaptrack.sources import demo
 from tests.worlds import small_scene, write_clip
 
 LAYOUTS = [".comparing.layout.json", ".layout.json"]
@@ -495,7 +496,7 @@ def test_an_interruption_that_a_library_turns_into_its_own_error_is_still_one(se
 def test_the_demonstration(tmp_path, monkeypatch):
     """Everything on a scene that it draws itself; a short one here."""
     code = (
-        "import sys; from mcaptrack import scene; from tests.worlds import small_scene\n"
+        "import sys; from mcaptrack.sources import scene; from tests.worlds import small_scene\n"
         "scene.SCENES['square'] = lambda seed: small_scene(seed=seed); sys.argv = ['mcaptrack', 'demo', '-o', sys.argv[1]]\n"
         "from mcaptrack.__main__ import main; main()\n"
     )

@@ -11,8 +11,8 @@ import pytest
 from mcaptrack import tables
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation import EvaluateOptions, evaluate, sequence_of_files
-from mcaptrack.ingest.compared import compare_files, pair_files
 from mcaptrack.schema import TRACKS, Frame
+from mcaptrack.tables.compared import compare_files, pair_files
 from tests.test_cli import call, done
 from tests.test_evaluation import boxed
 from tests.worlds import ns

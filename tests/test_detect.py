@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mcaptrack.boxes import columns_to_boxes, iou
-from mcaptrack.clock import FrameClock
-from mcaptrack.match import assign
-from mcaptrack.scene import Scene
+from mcaptrack.geometry.assignment import assign
+from mcaptrack.geometry.boxes import columns_to_boxes, iou
+from mcaptrack.geometry.clocks import FrameClock
 from mcaptrack.schema import Frame
+from mcaptrack.sources.scene import Scene
 from mcaptrack.transforms.detect import Detect, _PersonSize
 from mcaptrack.transforms.detect.foreground import FrameDifference
 from mcaptrack.transforms.detect.motion import CameraMotion

@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mcaptrack import demo
-from mcaptrack.scene import SCENES
+from mcaptrack.sources import demo
+from mcaptrack.sources.scene import SCENES
 from tools.bench.demo import page
 
 ROOT = Path(__file__).parent.parent

@@ -20,9 +20,10 @@ from typing import NamedTuple
 
 import pytest
 
-from mcaptrack import log, scene
-from mcaptrack.serving import Server
+from mcaptrack import log
+from mcaptrack.sources import scene
 from mcaptrack.transforms import ALTERNATIVES, TRANSFORMS
+from mcaptrack.viewing.serving import Server
 from tests.commands import GROUP, called, done, made_log
 from tests.test_ros_recordings import plain
 from tests.worlds import small_scene

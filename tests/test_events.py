@@ -21,9 +21,9 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation import Candidate, EvaluateOptions, Sequenced, evaluate, sequence_of_log
 from mcaptrack.evaluation.events import EventOptions, Rule, find_events
 from mcaptrack.evaluation.words import log_messages
-from mcaptrack.provenance import Provenance, digest
 from mcaptrack.schema import COUNTS, EVENT_KINDS, EVENTS, TRACKS, EventKind, Frame
 from mcaptrack.schema.proto import parse
+from mcaptrack.schema.provenance import Provenance, digest
 from mcaptrack.transforms import PROFILES
 from tests.test_evaluation import boxed
 from tests.worlds import ns, tracks_at, walk

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from mcaptrack.evaluation.aligned import matchup
 from mcaptrack.evaluation.events import find_events
-from mcaptrack.metrics.clear import matches
+from mcaptrack.evaluation.metrics.clear import matches
 from mcaptrack.schema import EventKind, Frame
 from tests.worlds import ns, tracks_at
 

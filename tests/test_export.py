@@ -17,11 +17,11 @@ from typer.testing import CliRunner
 from mcaptrack import log, tables
 from mcaptrack.cli import app
 from mcaptrack.errors import McaptrackError
-from mcaptrack.export import Contents, export, recording_name, topic_folder
-from mcaptrack.plane import GroundPlane
-from mcaptrack.provenance import Provenance
+from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import DETECTIONS, GROUND_PLANE, TRACKS, Frame
 from mcaptrack.schema.ground import plane_to_rows
+from mcaptrack.schema.provenance import Provenance
+from mcaptrack.tables.export import Contents, export, recording_name, topic_folder
 from tests.worlds import boxes_at, ns, tracks_at
 
 IMU = {

@@ -17,8 +17,8 @@ import pytest
 from mcaptrack import log, notices, pipeline
 from mcaptrack.errors import McaptrackError
 from mcaptrack.pipeline import findings
-from mcaptrack.provenance import Provenance
 from mcaptrack.schema import DETECTIONS, TRACKS, VIDEO, Frame, Schema
+from mcaptrack.schema.provenance import Provenance
 from mcaptrack.transforms import Detect
 from mcaptrack.transforms.protocol import option
 from tests.commands import called, done, made_log

@@ -16,8 +16,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 import mcaptrack
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
-from mcaptrack.foreign import Kind
-from mcaptrack.foreign.flat import flattener
+from mcaptrack.sources.foreign import Kind
+from mcaptrack.sources.foreign.flat import flattener
 
 PROTO = """
 syntax = "proto3";
@@ -140,7 +140,7 @@ def test_bytes_are_kept_where_they_are_asked_for(tmp_path, state):
         writer.add_message(number, 0, 0, make(picture=b"\x00\xff").SerializeToString())
         other = writer.add_channel("/y", ("robot.State", "protobuf", schema), "protobuf", {})
         writer.add_message(other, 0, 0, make(picture=b"\x01").SerializeToString())
-    from mcaptrack.export import export
+    from mcaptrack.tables.export import export
 
     with log.read(tmp_path / "a.mcap") as opened:
         done = export(opened, tmp_path / "t", topics=["/x"])

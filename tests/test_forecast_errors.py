@@ -17,11 +17,11 @@ from mcaptrack.cli import app
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation import Candidate, EvaluateOptions, Sequenced, evaluate
 from mcaptrack.evaluation.forecasts import find_forecast_errors
-from mcaptrack.metrics.displacement import pair
+from mcaptrack.evaluation.metrics.displacement import pair
 from mcaptrack.predictors import Forecast
-from mcaptrack.provenance import Provenance, digest
 from mcaptrack.schema import FORECAST_ERRORS, FORECAST_SCORES, PREDICTIONS, TRACKS, Frame
 from mcaptrack.schema.predictions import forecast_to_rows
+from mcaptrack.schema.provenance import Provenance, digest
 from tests.test_metrics import forecasts, foretold, positions
 from tests.worlds import ns, walk
 
@@ -290,7 +290,7 @@ def test_many_times_are_paired_as_few_are(monkeypatch):
     truth = {who: {n: tuple(rng.normal(0, 3, 2)) for n in range(30)} for who in range(5)}
     made = forecasts(*(foretold(n, who, [(0.0, 0.0)]) for n in range(4, 29) for who in truth))
     once = pair(positions(truth), positions(truth), made)
-    monkeypatch.setattr("mcaptrack.metrics.displacement._PAIRS_AT_ONCE", 60)
+    monkeypatch.setattr("mcaptrack.evaluation.metrics.displacement._PAIRS_AT_ONCE", 60)
     again = pair(positions(truth), positions(truth), made)
     assert len(once.forecast) == 25 * 5
     assert all(np.array_equal(a, b) for a, b in zip(once, again, strict=True))

@@ -18,8 +18,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from mcaptrack import foxglove
 from mcaptrack.errors import McaptrackError
-from mcaptrack.foreign import Classes, Kind, boxes_decoder, picture_decoder
-from mcaptrack.video import RAW_ENCODINGS, Encoded, Layout, brightness
+from mcaptrack.sources.foreign import Classes, Kind, boxes_decoder, picture_decoder
+from mcaptrack.sources.video import RAW_ENCODINGS, Encoded, Layout, brightness
 
 STAMP_NS = 1_700_000_000_123_456_789
 SEC, NSEC = divmod(STAMP_NS, 10**9)
@@ -527,7 +527,8 @@ class TestStrangers:
 
 
 def test_the_pictures_of_a_real_log_are_read(data):
-    from mcaptrack import foreign, log
+    from mcaptrack import log
+    from mcaptrack.sources import foreign
 
     with log.read(Path(data) / "mcap/images/custom-camera-model.mcap") as opened:
         found = list(foreign.pictures(opened, "/image/compressed"))

@@ -17,11 +17,11 @@ from typer.testing import CliRunner
 from mcaptrack import api, log, pipeline
 from mcaptrack.cli import app
 from mcaptrack.errors import McaptrackError
+from mcaptrack.foxglove.views import SUFFIX
 from mcaptrack.notices import McaptrackWarning
-from mcaptrack.provenance import Provenance
 from mcaptrack.schema import DETECTIONS, TRACKS
+from mcaptrack.schema.provenance import Provenance
 from mcaptrack.transforms import Detect, Sort
-from mcaptrack.views import SUFFIX
 from tests.test_foreign import Ros, pixels, vision
 from tests.worlds import ns, small_scene
 

@@ -15,9 +15,9 @@ import pytest
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
-from mcaptrack import scene
 from mcaptrack.cli.text import printable
-from mcaptrack.serving import Server
+from mcaptrack.sources import scene
+from mcaptrack.viewing.serving import Server
 from tests.commands import GROUP, Outcome, called, done, made_log
 from tests.test_effects import CASES
 from tests.worlds import small_scene

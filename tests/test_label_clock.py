@@ -26,17 +26,17 @@ from typer.testing import CliRunner
 
 from mcaptrack import foxglove, log
 from mcaptrack.cli import app
-from mcaptrack.clock import FPS_RANGE
 from mcaptrack.errors import McaptrackError
-from mcaptrack.ingest import IngestOptions, ingest, label_frames
-from mcaptrack.ingest.compared import compare_files, detections_and_truth
-from mcaptrack.ingest.formats import READERS, Format, Role
-from mcaptrack.ingest.labels import read_labels
-from mcaptrack.ingest.timeline import Timeline
-from mcaptrack.provenance import Provenance
+from mcaptrack.geometry.clocks import FPS_RANGE
 from mcaptrack.schema import DETECTIONS, TRACKS
-from mcaptrack.video import H264Encoder
-from mcaptrack.video.h264 import inspect
+from mcaptrack.schema.provenance import Provenance
+from mcaptrack.sources.ingest import IngestOptions, ingest, label_frames
+from mcaptrack.sources.ingest.formats import READERS, Format, Role
+from mcaptrack.sources.ingest.labels import read_labels
+from mcaptrack.sources.ingest.timeline import Timeline
+from mcaptrack.sources.video import H264Encoder
+from mcaptrack.sources.video.h264 import inspect
+from mcaptrack.tables.compared import compare_files, detections_and_truth
 from tests.test_bags import camera_bag
 from tests.test_foreign import Ros, pixels
 from tests.worlds import ns, write_clip

@@ -12,7 +12,7 @@ from mcap.writer import IndexType, Writer
 
 from mcaptrack import log
 from mcaptrack.log import records
-from mcaptrack.provenance import Provenance
+from mcaptrack.schema.provenance import Provenance
 from tests.commands import done
 from tests.test_damage import FORTY
 from tests.test_log import SCHEMA, write_stock

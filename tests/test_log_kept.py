@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from mcaptrack import log, notices
-from mcaptrack.atomic import can_replace, publish_bytes
+from mcaptrack.files import can_replace, publish_bytes
 from mcaptrack.log import new_end
 from mcaptrack.log.journal import journal_of
 from tests.test_log import SCHEMA, SOME, STOCK_OPTIONS, our_messages, write_log, write_stock
@@ -172,7 +172,7 @@ def test_what_a_new_file_can_t_be_given_is_said(tmp_path, monkeypatch, refused):
         raise PermissionError(1, "Operation not permitted")
 
     monkeypatch.setattr(Path, "stat", stat)
-    call = {"permissions": (Path, "chmod"), "extended attributes": ("mcaptrack.atomic", "_keep_extended")}
+    call = {"permissions": (Path, "chmod"), "extended attributes": ("mcaptrack.files", "_keep_extended")}
     at = call.get(refused, (os, "chown"))
     monkeypatch.setattr(*at, fail) if not isinstance(at[0], str) else monkeypatch.setattr(".".join(at), fail)
     with notices.listening(lambda _: None), notices.collected() as said:

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from mcaptrack import log
-from mcaptrack.clock import parse_ns
 from mcaptrack.errors import McaptrackError
+from mcaptrack.geometry.clocks import parse_ns
 from mcaptrack.log.chunks import LOG_MAX_NS, MAX_NS
-from mcaptrack.pictures import Pictures
-from mcaptrack.resample import resample
 from mcaptrack.schema import Frame
+from mcaptrack.schema.resampling import resample
+from mcaptrack.sources.pictures import Pictures
 from tests.commands import called, done, made_log
 from tests.log_mutants import CHUNK, parts, without_summary
 from tests.test_journal import everything

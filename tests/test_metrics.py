@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mcaptrack.boxes import iou
-from mcaptrack.metrics import Matchup, combine, distances, metres_to_similarity, score, summary
-from mcaptrack.metrics.displacement import Forecasts, Path, displacement
-from mcaptrack.metrics.displacement import combine as combine_displacements
+from mcaptrack.evaluation.metrics import Matchup, combine, distances, metres_to_similarity, score, summary
+from mcaptrack.evaluation.metrics.displacement import Forecasts, Path, displacement
+from mcaptrack.evaluation.metrics.displacement import combine as combine_displacements
+from mcaptrack.geometry.boxes import iou
 
 
 def matchup(truth, tracks, gate: float = 1.0) -> Matchup:

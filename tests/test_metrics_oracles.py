@@ -7,8 +7,8 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from mcaptrack.boxes import iou
-from mcaptrack.metrics import Matchup, combine, score, summary
+from mcaptrack.evaluation.metrics import Matchup, combine, score, summary
+from mcaptrack.geometry.boxes import iou
 
 Sequence = tuple[list[dict[int, np.ndarray]], list[dict[int, np.ndarray]]]
 

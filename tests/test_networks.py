@@ -14,8 +14,7 @@ import pytest
 
 from mcaptrack import log, notices, pipeline
 from mcaptrack.errors import McaptrackError
-from mcaptrack.ingest import IngestOptions, ingest
-from mcaptrack.metrics.calibration import coverage, forecast_scores, mahalanobis_squared
+from mcaptrack.evaluation.metrics.calibration import coverage, forecast_scores, mahalanobis_squared
 from mcaptrack.predictors import make
 from mcaptrack.predictors.linear import LinearPredictor
 from mcaptrack.predictors.lstm import Lstm
@@ -23,7 +22,8 @@ from mcaptrack.predictors.onnx import are_covariances
 from mcaptrack.predictors.own_clock import OnClock
 from mcaptrack.predictors.red import Red
 from mcaptrack.predictors.weights import SHIPPED, Weights, load, save
-from mcaptrack.provenance import Provenance
+from mcaptrack.schema.provenance import Provenance
+from mcaptrack.sources.ingest import IngestOptions, ingest
 from mcaptrack.training.walks import walks
 from mcaptrack.training.windows import Windows, ar1
 from mcaptrack.transforms import Predict

@@ -17,8 +17,8 @@ from typer.testing import CliRunner
 import mcaptrack
 from mcaptrack import log, notices, pipeline
 from mcaptrack.cli import app, common
-from mcaptrack.ingest import IngestOptions, ingest
 from mcaptrack.notices import Code, McaptrackWarning, Notice
+from mcaptrack.sources.ingest import IngestOptions, ingest
 from mcaptrack.transforms import Sort
 
 PACKAGE = Path(mcaptrack.__file__).parent

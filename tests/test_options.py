@@ -16,7 +16,7 @@ import pytest
 
 from mcaptrack import log
 from mcaptrack.predictors import NAMES
-from mcaptrack.provenance import Provenance
+from mcaptrack.schema.provenance import Provenance
 from mcaptrack.transforms import PROFILES, TRACKERS, TRANSFORMS
 from mcaptrack.transforms.protocol import bare_type, choices
 from tests.commands import called, done, made_log, toml_value

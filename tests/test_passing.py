@@ -20,9 +20,9 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.ingest import IngestOptions, ingest
-from mcaptrack.video import Keep, open_video
-from mcaptrack.video.streams import CODECS
+from mcaptrack.sources.ingest import IngestOptions, ingest
+from mcaptrack.sources.video import Keep, open_video
+from mcaptrack.sources.video.streams import CODECS
 from tests.test_cli import call
 from tests.worlds import write_clip
 
@@ -341,7 +341,7 @@ def test_one_core_or_all_the_bytes_are_the_same(tmp_path):
     code = (
         "import os, sys, hashlib\nfrom pathlib import Path\n"
         "if sys.argv[2] == 'one': os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})\n"
-        "from mcaptrack.video import open_video\n"
+        "from mcaptrack.sources.video import open_video\n"
         "total = hashlib.sha256()\n"
         "for picture in open_video(Path(sys.argv[1])).pictures(): total.update(picture.data)\n"
         "print(total.hexdigest())\n"

@@ -19,14 +19,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mcaptrack import log
-from mcaptrack.atomic import refuse_special
 from mcaptrack.errors import McaptrackError
-from mcaptrack.foreign import PICTURES_READ, is_compressed
-from mcaptrack.ingest import IngestOptions, ingest
+from mcaptrack.files import refuse_special
 from mcaptrack.schema import TRACKS
-from mcaptrack.video import Encoded, Keep, Layout, brightness, colours, open_video
-from mcaptrack.video.limits import ENVIRONMENT, still_size
-from mcaptrack.video.streams import CODECS
+from mcaptrack.sources.foreign import PICTURES_READ, is_compressed
+from mcaptrack.sources.ingest import IngestOptions, ingest
+from mcaptrack.sources.video import Encoded, Keep, Layout, brightness, colours, open_video
+from mcaptrack.sources.video.limits import ENVIRONMENT, still_size
+from mcaptrack.sources.video.streams import CODECS
 from tests.test_cli import start
 from tests.worlds import ids, ns, write_clip
 
@@ -206,7 +206,7 @@ def test_an_image_that_is_a_pipe_is_refused(tmp_path):
     (tmp_path / "0.png").write_bytes(png(8, 8))
     (tmp_path / "seqinfo.ini").write_text("frameRate=5")
     os.mkfifo(tmp_path / "1.png")
-    code = f"from pathlib import Path; from mcaptrack.video import *; list(open_video(Path({str(tmp_path)!r}), Keep(image_format='png')).pictures())"
+    code = f"from pathlib import Path; from mcaptrack.sources.video import *; list(open_video(Path({str(tmp_path)!r}), Keep(image_format='png')).pictures())"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
     assert "1.png is a pipe, not a file" in done.stderr
 

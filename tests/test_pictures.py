@@ -11,11 +11,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mcaptrack import foxglove, log, rendering
+from mcaptrack import foxglove, log
 from mcaptrack.errors import McaptrackError
-from mcaptrack.ingest import IngestOptions, ingest
-from mcaptrack.pictures import Pictures
-from mcaptrack.video import Encoded, H264Encoder, Keep, brightness, open_video
+from mcaptrack.sources.ingest import IngestOptions, ingest
+from mcaptrack.sources.pictures import Pictures
+from mcaptrack.sources.video import Encoded, H264Encoder, Keep, brightness, open_video
+from mcaptrack.viewing import rendering
 from tests.test_cli import done
 from tests.test_passing import SVT, X265
 from tests.worlds import write_clip

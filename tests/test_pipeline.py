@@ -11,13 +11,14 @@ import pytest
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
-from mcaptrack import demo, log, pipeline
+from mcaptrack import log, pipeline
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation import EvaluateOptions, evaluate, sequence_of_log
-from mcaptrack.ingest import IngestOptions, ingest
-from mcaptrack.provenance import Provenance
 from mcaptrack.schema import DETECTIONS, GROUND_PLANE, PREDICTIONS, TRACKS
 from mcaptrack.schema.ground import rows_to_plane
+from mcaptrack.schema.provenance import Provenance
+from mcaptrack.sources import demo
+from mcaptrack.sources.ingest import IngestOptions, ingest
 from mcaptrack.transforms import PROFILES, ByteTrack, Detect, OcSort, Predict, Retrack, Sample, Sort
 from tests.worlds import small_scene
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.plane import GroundPlane
+from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.predictors import make
 from mcaptrack.predictors.linear import (
     DRIFT_M2_PER_S3,

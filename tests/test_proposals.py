@@ -13,10 +13,11 @@ from pathlib import Path
 import pytest
 
 import mcaptrack
-from mcaptrack import log, serving
+from mcaptrack import log
 from mcaptrack.errors import McaptrackError, command
 from mcaptrack.schema import TRACKS
 from mcaptrack.training.sources import SourceOptions, read_scenes
+from mcaptrack.viewing import serving
 from tests.commands import GROUP, called, done, made_log
 from tests.test_bags import bag1
 from tests.test_foreign_runs import write_log
@@ -131,7 +132,7 @@ SCENES: dict[str, Callable[[Scene], str]] = {
     "evaluation/__init__.py:sequence_of_log:run": lambda s: s.untracked().says("evaluate", "LOG"),
     "evaluation/__init__.py:truth_of_log:ingest": lambda s: s.without("/camera/truth*").says("evaluate", "LOG"),
     "cli/view.py:view:recover": lambda s: s.half_written().says("view", "LOG"),
-    "ingest/compared.py:pair_files:ingest": lambda s: s.without("/camera/truth*").says(
+    "tables/compared.py:pair_files:ingest": lambda s: s.without("/camera/truth*").says(
         "evaluate", "LOG", "--truth", "truth.txt"
     ),
     "log/beside.py:recover_command:recover": Scene.damaged,
@@ -148,11 +149,11 @@ SCENES: dict[str, Callable[[Scene], str]] = {
     "pipeline/plan.py:_warn_of_settings:run": Scene.of_a_later_version,
     "pipeline/plan.py:_not_made:*": Scene.elsewhere,
     "pipeline/write.py:find_views:run": lambda s: s.untracked().says("render", "LOG"),
-    "report/contents.py:_score:ingest": lambda s: s.without("/camera/truth*").page(),
-    "report/headline.py:_without_truth:run": lambda s: s.ingested("clip.mp4").page(),
-    "report/sections.py:_track_table:run": lambda s: s.ingested("clip.mp4").page(),
-    "report/sections.py:forecasts:predict": lambda s: s.without("*predictions*").page(),
-    "sql.py:_answer:query": lambda s: s.says("query", "LOG", "show tables"),
+    "viewing/report/contents.py:_score:ingest": lambda s: s.without("/camera/truth*").page(),
+    "viewing/report/headline.py:_without_truth:run": lambda s: s.ingested("clip.mp4").page(),
+    "viewing/report/sections.py:_track_table:run": lambda s: s.ingested("clip.mp4").page(),
+    "viewing/report/sections.py:forecasts:predict": lambda s: s.without("*predictions*").page(),
+    "tables/sql.py:_answer:query": lambda s: s.says("query", "LOG", "show tables"),
     "training/sources.py:_from_log:run": lambda s: s.ingested("clip.mp4").to_train_on(),
 }
 

@@ -21,15 +21,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from mcaptrack import demo, log, tables
+from mcaptrack import log, tables
 from mcaptrack.cli import app
 from mcaptrack.errors import McaptrackError
-from mcaptrack.export import default_folder, export
-from mcaptrack.ingest import IngestOptions, ingest
-from mcaptrack.provenance import Provenance
-from mcaptrack.scene import demo_scene
 from mcaptrack.schema import EVENTS, PREDICTIONS, TRACKS, Frame
-from mcaptrack.sql import Database
+from mcaptrack.schema.provenance import Provenance
+from mcaptrack.sources import demo
+from mcaptrack.sources.ingest import IngestOptions, ingest
+from mcaptrack.sources.scene import demo_scene
+from mcaptrack.tables.export import default_folder, export
+from mcaptrack.tables.sql import Database
 from tests.worlds import ns, tracks_at
 
 PAGE = (Path(__file__).parent.parent / "docs" / "sql.md").read_text()
@@ -474,7 +475,7 @@ def test_ctrl_c_ends_a_query_and_leaves_the_database(known):
     program = (
         "import os, signal, sys, threading\n"
         "from pathlib import Path\n"
-        "from mcaptrack.sql import Database\n"
+        "from mcaptrack.tables.sql import Database\n"
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "with Database([Path(sys.argv[1])]) as database:\n"
         "    threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT)).start()\n"

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from mcaptrack.serving import Server
+from mcaptrack.viewing.serving import Server
 from tests.commands import GROUP, called, done, made_log
 from tests.test_effects import CASES
 

@@ -15,9 +15,9 @@ from typer.testing import CliRunner
 
 from mcaptrack import log
 from mcaptrack.cli import app
-from mcaptrack.ingest import IngestOptions, ingest
-from mcaptrack.ingest.formats import Role
-from mcaptrack.provenance import Provenance
+from mcaptrack.schema.provenance import Provenance
+from mcaptrack.sources.ingest import IngestOptions, ingest
+from mcaptrack.sources.ingest.formats import Role
 from mcaptrack.transforms import TRANSFORMS
 from tests.test_bags import camera_bag
 from tests.test_label_clock import lines, robot_log

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from mcaptrack import log
+from mcaptrack.evaluation.metrics.calibration import forecast_scores
 from mcaptrack.log import records
-from mcaptrack.metrics.calibration import forecast_scores
 from mcaptrack.predictors import make
 from mcaptrack.training.recipe import RECIPES
 from mcaptrack.training.sources import SourceOptions, read_scenes, windows_of

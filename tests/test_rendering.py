@@ -14,11 +14,11 @@ from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
 from mcaptrack import foxglove, log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.pipeline import find_views
-from mcaptrack.rendering import draw
-from mcaptrack.video import write_clip
-from mcaptrack.video.decode import Encoded, colours
-from mcaptrack.video.encode import encode_image
-from mcaptrack.video.raw import Layout
+from mcaptrack.sources.video import write_clip
+from mcaptrack.sources.video.decode import Encoded, colours
+from mcaptrack.sources.video.encode import encode_image
+from mcaptrack.sources.video.raw import Layout
+from mcaptrack.viewing.rendering import draw
 from tests.test_cli import call, done, finished, footage  # noqa: F401
 
 GREY = np.full((100, 200, 3), 100, np.uint8)

@@ -18,16 +18,16 @@ from hypothesis import strategies as st
 from mcaptrack import foxglove, log
 from mcaptrack.evaluation import Candidate, EvaluateOptions, Sequenced, evaluate
 from mcaptrack.evaluation.events import Rule, find_events
+from mcaptrack.evaluation.metrics.displacement import Forecasts, combine, displacement
+from mcaptrack.evaluation.metrics.displacement import Path as Positions
 from mcaptrack.foxglove.colours import COUNT as COLOURS
-from mcaptrack.metrics.displacement import Forecasts, combine, displacement
-from mcaptrack.metrics.displacement import Path as Positions
-from mcaptrack.provenance import Provenance
-from mcaptrack.report import ELEMENT, charts, data, gather, measures, page
-from mcaptrack.report.markup import Markup, escape, plain, script_json, tag
-from mcaptrack.report.moments import SIDE_PX, most_important, photograph, tell
-from mcaptrack.report.scenery import simplified
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame
+from mcaptrack.schema.provenance import Provenance
 from mcaptrack.transforms import Predict
+from mcaptrack.viewing.report import ELEMENT, charts, data, gather, measures, page
+from mcaptrack.viewing.report.markup import Markup, escape, plain, script_json, tag
+from mcaptrack.viewing.report.moments import SIDE_PX, most_important, photograph, tell
+from mcaptrack.viewing.report.scenery import simplified
 from tests.test_cli import call, done, finished, footage  # noqa: F401
 from tests.worlds import ns, tracks_at, walk
 

@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from mcaptrack.history import Holt
+from mcaptrack.geometry.histories import Holt
 from mcaptrack.predictors import Forecast
 from mcaptrack.transforms import PROFILES
 from mcaptrack.transforms.retrack.distance import jumps, mahalanobis, paper_covariance, to_forecasts, to_positions

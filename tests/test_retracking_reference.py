@@ -9,7 +9,7 @@ import numpy as np
 from hypothesis import Phase, assume, given, settings
 from hypothesis import strategies as st
 
-from mcaptrack.plane import GroundPlane
+from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.predictors import make
 from mcaptrack.schema import Frame
 from mcaptrack.transforms import PROFILES, Predict, Retrack

@@ -16,8 +16,8 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 
 from mcaptrack import log
-from mcaptrack.provenance import Provenance
 from mcaptrack.schema import TRACKS
+from mcaptrack.schema.provenance import Provenance
 from tests.commands import GROUP, called, done
 from tests.test_bags import MOT, ROS2, T0, bag1, bag2, picture
 
@@ -251,7 +251,7 @@ def test_recordings_are_told_by_profile_and_by_the_metadata_beside_them(
     link.parent.mkdir()
     link.symlink_to(path)
     with log.read(link, sidecar=False) as opened:
-        from mcaptrack.ingest.place import recording_of
+        from mcaptrack.sources.ingest.place import recording_of
 
         assert bool(recording_of(opened)) == is_beside
 

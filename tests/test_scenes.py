@@ -10,10 +10,10 @@ from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
 from mcaptrack import foxglove, log
-from mcaptrack.plane import GroundPlane
+from mcaptrack.foxglove.views import Drawing, ground, layouts
+from mcaptrack.foxglove.views.layouts import There, make
+from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame
-from mcaptrack.views import Drawing, ground, layouts
-from mcaptrack.views.layouts import There, make
 from tests.test_cli import done, finished, footage  # noqa: F401
 from tests.test_views import FORECAST, PICTURES, PLANE
 from tests.worlds import ns, tracks_at

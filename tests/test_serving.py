@@ -29,7 +29,7 @@ from mcap.reader import make_reader
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
-from mcaptrack.serving import Limits, Server, requested_range
+from mcaptrack.viewing.serving import Limits, Server, requested_range
 from tests.test_cli import call
 from tests.test_log import SOME, stock_messages, write_log
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from mcaptrack import notices
 from mcaptrack.errors import McaptrackError
-from mcaptrack.plane import GroundPlane
+from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import DETECTIONS, Frame
 from mcaptrack.transforms.sort import TRACKERS, ByteTrack, OcSort, Sort, compile_sort, tracker
 from tests.worlds import boxes_at, detections, ids, ns

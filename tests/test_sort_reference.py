@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mcaptrack.plane import GroundPlane
+from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import DETECTIONS, Frame
 from mcaptrack.transforms.sort import TRACKERS
 from tests.references.sort import Box, ReferenceByteTrack, ReferenceOcSort, ReferenceSort

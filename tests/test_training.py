@@ -15,9 +15,9 @@ from typer.testing import CliRunner
 from mcaptrack import log, tables
 from mcaptrack.cli import app
 from mcaptrack.errors import McaptrackError
-from mcaptrack.export import export
-from mcaptrack.ingest import IngestOptions, ingest
 from mcaptrack.predictors.weights import load
+from mcaptrack.sources.ingest import IngestOptions, ingest
+from mcaptrack.tables.export import export
 from mcaptrack.training.recipe import RECIPES, Recipe
 from mcaptrack.training.sources import Scene, SourceOptions, read_scenes, split, synthetic, windows_of
 from mcaptrack.training.walks import walks

@@ -12,9 +12,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mcaptrack.clock import NS_PER_S
 from mcaptrack.errors import McaptrackError
-from mcaptrack.plane import GroundPlane
+from mcaptrack.geometry.clocks import NS_PER_S
+from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import TRACKS, VIDEO, Frame
 from mcaptrack.transforms import PROFILES, TRACKERS, TRANSFORMS, Retrack, Transform
 from mcaptrack.transforms.protocol import bare_type

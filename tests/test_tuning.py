@@ -12,9 +12,9 @@ import pytest
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation import EvaluateOptions
+from mcaptrack.evaluation.tuning import Range, Task, declared_ranges, settings_to_toml, tune
 from mcaptrack.schema import Frame
 from mcaptrack.transforms import TRACKERS, TRANSFORMS, Sort
-from mcaptrack.tuning import Range, Task, declared_ranges, settings_to_toml, tune
 from tests.test_cli import call, done
 from tests.test_evaluation import boxed
 from tests.worlds import boxes_at, detections, ns

@@ -15,9 +15,9 @@ import pytest
 
 import mcaptrack
 from mcaptrack.errors import McaptrackError
-from mcaptrack.video import Encoded, H264Encoder, Keep, brightness, encode_image, open_video, write_mp4
-from mcaptrack.video.h264 import inspect
-from mcaptrack.video.source import images as upright_images
+from mcaptrack.sources.video import Encoded, H264Encoder, Keep, brightness, encode_image, open_video, write_mp4
+from mcaptrack.sources.video.h264 import inspect
+from mcaptrack.sources.video.source import images as upright_images
 from tests.worlds import write_clip
 
 NO_B = {"bf": "0", "g": "10"}
@@ -238,7 +238,7 @@ def test_pictures_that_are_too_large_for_h264_are_refused_with_their_size(tmp_pa
 def test_files_are_opened_with_pyav_in_one_place():
     root = Path(mcaptrack.__file__).parent
     opening = {path.relative_to(root).as_posix() for path in root.rglob("*.py") if "av.open(" in path.read_text()}
-    assert opening == {"video/container.py"}
+    assert opening == {"sources/video/container.py"}
 
 
 def test_a_video_without_frames_is_refused(tmp_path):
@@ -291,7 +291,7 @@ def test_a_decoder_that_is_let_go_while_its_threads_work_does_not_wait_for_ever(
     code = (
         "import sys, numpy as np\n"
         "from fractions import Fraction\n"
-        "from mcaptrack.video import Encoded, H264Encoder, brightness\n"
+        "from mcaptrack.sources.video import Encoded, H264Encoder, brightness\n"
         "encoder = H264Encoder(640, 480, Fraction(10))\n"
         "noise = np.random.default_rng(1).integers(0, 255, (480, 640, 3), np.uint8)\n"
         "pictures = [Encoded(n, n, 'h264', encoder.encode(np.roll(noise, n, axis=1))) for n in range(12)]\n"

@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 from mcap_protobuf.schema import build_file_descriptor_set
 
 from mcaptrack import foxglove
-from mcaptrack.plane import GroundPlane
+from mcaptrack.foxglove.views import Drawing
+from mcaptrack.foxglove.views.people import around, ellipses
+from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import DETECTIONS, PREDICTIONS, TRACKS, Frame
-from mcaptrack.views import Drawing
-from mcaptrack.views.people import around, ellipses
 from tests.worlds import boxes_at, ns, tracks_at
 
 PLANE = [(0, GroundPlane((0.1, 0, 0, 0, 0.1, 0, 0, 0, 1), 640, 480))]

@@ -9,9 +9,9 @@ from pathlib import Path
 import av
 import numpy as np
 
-from mcaptrack.clock import NS_PER_S
-from mcaptrack.scene import Block, Scene, Walker
+from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame
+from mcaptrack.sources.scene import Block, Scene, Walker
 
 Positions = Mapping[int, tuple[float, float]]
 

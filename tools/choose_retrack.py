@@ -24,8 +24,8 @@ from corruptions import CORRUPTIONS, STEP_S, corrupt, whole_people
 from reproduce import on_clock
 
 from mcaptrack.evaluation.aligned import matchup
-from mcaptrack.match import assign, solve
-from mcaptrack.metrics import combine, score, summary
+from mcaptrack.evaluation.metrics import combine, score, summary
+from mcaptrack.geometry.assignment import assign, solve
 from mcaptrack.schema import Frame
 from mcaptrack.transforms import PROFILES, Retrack, Sample
 from mcaptrack.transforms.retrack import doubt, link

@@ -23,7 +23,7 @@ import av
 import numpy as np
 
 import mcaptrack
-from mcaptrack.scene import Scene, Walker
+from mcaptrack.sources.scene import Scene, Walker
 
 ROOT = Path(__file__).resolve().parent.parent
 FPS, SECONDS = 10, 12.0

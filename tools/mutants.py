@@ -38,8 +38,8 @@ RETRACK = "retrack whole offline_reference retracking_reference retracking_laws 
 #: The test files that cover a folder or a file, beside those of the folders around it; all tests where none are named.
 COVERS = {
     "mcaptrack/evaluation": "evaluation events events_reference forecast_errors metrics_oracles compared",
-    "mcaptrack/ingest": "ingest label_clock compared recorded_kept",
-    "mcaptrack/metrics": "metrics metrics_oracles networks forecast_errors evaluation",
+    "mcaptrack/sources/ingest": "ingest label_clock compared recorded_kept",
+    "mcaptrack/evaluation/metrics": "metrics metrics_oracles networks forecast_errors evaluation",
     "mcaptrack/predictors": "prediction networks",
     "mcaptrack/schema": "schema events tables",
     "mcaptrack/tables": "tables",
@@ -49,7 +49,7 @@ COVERS = {
     "mcaptrack/transforms/retrack": RETRACK,
     "mcaptrack/transforms/sample.py": "prediction sample_reference",
     "mcaptrack/transforms/sort": "sort sort_reference",
-    "mcaptrack/video": "picture_limits video passing",
+    "mcaptrack/sources/video": "picture_limits video passing",
 }
 #: Time that tests get at most, beside five times what they take unchanged.
 SLACK_S = 60.0

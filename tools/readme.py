@@ -121,7 +121,7 @@ def run(words: list[object], work: Path, folder: Path, also_good: set[int] = fro
 
 def shots():
     """A scene of three people who walk, picture by picture."""
-    from mcaptrack.scene import Scene, Walker
+    from mcaptrack.sources.scene import Scene, Walker
 
     people = (
         Walker(1, ((0.0, -6.0, 9.0), (SECONDS, 6.0, 11.0)), (30, 30, 30)),

@@ -22,9 +22,9 @@ from pathlib import Path
 import numpy as np
 
 from mcaptrack.evaluation import Candidate, EvaluateOptions, Outcome, Sequenced, evaluate
-from mcaptrack.metrics import summary
-from mcaptrack.metrics.displacement import TAU_M2, Displacement
-from mcaptrack.plane import GroundPlane
+from mcaptrack.evaluation.metrics import summary
+from mcaptrack.evaluation.metrics.displacement import TAU_M2, Displacement
+from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame
 from mcaptrack.transforms import PROFILES, TRANSFORMS, Predict, Retrack, Sample
 

@@ -19,12 +19,12 @@ from typing import Annotated, Any, Final, Literal, NamedTuple, ParamSpec
 import typer
 
 from mcaptrack import SCHEMA_VERSION, notices
-from mcaptrack.atomic import publish_bytes, refuse_overwrite
 from mcaptrack.cli.command import LAST_PANELS, Command, Reading, check_ranges, read_config
 from mcaptrack.cli.inputs import check_paths, refuse_url
 from mcaptrack.cli.settings import Declared
 from mcaptrack.cli.text import say
 from mcaptrack.errors import McaptrackError
+from mcaptrack.files import publish_bytes, refuse_overwrite
 from mcaptrack.notices import Code, Notice
 from mcaptrack.transforms.protocol import limits
 
@@ -331,7 +331,7 @@ def expand(paths: Sequence[Path], *, each: bool = False) -> list[Path]:
 
     Raises McaptrackError for a pattern that matches nothing.
     """
-    from mcaptrack.atomic import follow_links
+    from mcaptrack.files import follow_links
     from mcaptrack.log import results_of
 
     out: list[Path] = []

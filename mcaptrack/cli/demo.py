@@ -48,13 +48,13 @@ def demo(
 
     Example: mcaptrack demo --scene crowd --seed 7 -o crowd
     """
-    from mcaptrack import demo as drawing
     from mcaptrack import log, pipeline
-    from mcaptrack.atomic import publish_bytes
     from mcaptrack.evaluation import EvaluateOptions, evaluate, sequence_of_log
-    from mcaptrack.export import default_folder, export
-    from mcaptrack.ingest import IngestOptions, ingest
-    from mcaptrack.scene import SCENES
+    from mcaptrack.files import publish_bytes
+    from mcaptrack.sources import demo as drawing
+    from mcaptrack.sources.ingest import IngestOptions, ingest
+    from mcaptrack.sources.scene import SCENES
+    from mcaptrack.tables.export import default_folder, export
 
     if output.exists() and not output.is_dir():
         raise McaptrackError(f"{output} is a file; the demonstration needs a folder")
@@ -146,7 +146,7 @@ def _side_by_side(sort: dict[str, float], retracked: dict[str, float]) -> list[s
 
 def _over_seeds(scene: str, seed: int) -> list[str]:
     """Mean and range over all seeds of all scenes."""
-    from mcaptrack.demo import mean_and_range, read_scores
+    from mcaptrack.sources.demo import mean_and_range, read_scores
 
     scores = read_scores()
     lines = [f"This is scene {scene}, seed {seed}: one draw. IDF1 over {len(scores['seeds'])} seeds, mean and range:"]

@@ -191,7 +191,7 @@ def _from_files(
 ) -> list[Sequenced]:
     from mcaptrack.cli.ingest import parse_fps
     from mcaptrack.evaluation import sequence_of_files
-    from mcaptrack.ingest.compared import compare_files, pair_files
+    from mcaptrack.tables.compared import compare_files, pair_files
 
     pairs, words = pair_files(tracks, truths)
     if words:

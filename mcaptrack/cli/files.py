@@ -110,7 +110,7 @@ def recover(
     Example: mcaptrack recover broken.mcap -o saved.mcap
     """
     from mcaptrack import log
-    from mcaptrack.atomic import is_same_file, refuse_overwrite
+    from mcaptrack.files import is_same_file, refuse_overwrite
 
     paths = common.expand(logs, each=True)
     common.only_one_output(paths, output)
@@ -169,9 +169,9 @@ def drop(
     Example: mcaptrack drop log.mcap /camera/video -o small.mcap
     """
     from mcaptrack import log
-    from mcaptrack.atomic import is_same_file, refuse_overwrite
-    from mcaptrack.ingest.place import recording_of
-    from mcaptrack.provenance import Provenance
+    from mcaptrack.files import is_same_file, refuse_overwrite
+    from mcaptrack.schema.provenance import Provenance
+    from mcaptrack.sources.ingest.place import recording_of
 
     if output is not None:
         refuse_overwrite(output, force)
@@ -215,7 +215,7 @@ def _chosen(opened: Log, patterns: list[str]) -> set[str]:
     """
     from fnmatch import fnmatchcase
 
-    from mcaptrack.provenance import Provenance
+    from mcaptrack.schema.provenance import Provenance
 
     chosen: set[str] = set()
     for pattern in patterns:

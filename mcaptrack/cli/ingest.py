@@ -13,7 +13,7 @@ from mcaptrack.cli.command import warn_unused
 from mcaptrack.errors import McaptrackError
 
 if TYPE_CHECKING:
-    from mcaptrack.ingest import IngestOptions, Report
+    from mcaptrack.sources.ingest import IngestOptions, Report
 
 Inputs = Annotated[
     list[Path],
@@ -161,10 +161,10 @@ def ingest(
     Example: mcaptrack ingest video.mp4 --ground-plane homography.txt --truth gt.txt -o log.mcap
     """
     from mcaptrack import log
-    from mcaptrack.atomic import is_same_file, refuse_overwrite
-    from mcaptrack.ingest import IngestOptions
-    from mcaptrack.ingest import ingest as make_log
-    from mcaptrack.ingest.place import Place
+    from mcaptrack.files import is_same_file, refuse_overwrite
+    from mcaptrack.sources.ingest import IngestOptions
+    from mcaptrack.sources.ingest import ingest as make_log
+    from mcaptrack.sources.ingest.place import Place
 
     if into is not None and output is not None:
         raise McaptrackError("--into adds to a log in place; it does not go with -o")
@@ -239,10 +239,10 @@ def _warn_unused(report: Report, options: IngestOptions) -> None:
 
 def parse_fps(text: str | None) -> Fraction | None:
     """Frames per second from "25", "29.97" or "30000/1001"."""
-    from mcaptrack import clock
+    from mcaptrack.geometry import clocks
 
     try:
-        return None if text is None else clock.parse_fps(text)
+        return None if text is None else clocks.parse_fps(text)
     except ValueError:
         raise McaptrackError(
             f"--fps needs a number like 25, 29.97 or 30000/1001, from one frame a day to 10000 a second, not {text!r}"
@@ -255,7 +255,7 @@ def _start_ns(text: str | None) -> int | None:
         return None
     from datetime import UTC, datetime
 
-    from mcaptrack.clock import LAST_NS, NS_PER_S, parse_ratio
+    from mcaptrack.geometry.clocks import LAST_NS, NS_PER_S, parse_ratio
 
     try:
         seconds = parse_ratio(text)

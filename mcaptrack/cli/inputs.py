@@ -7,8 +7,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Final
 
-from mcaptrack.atomic import refuse_special
 from mcaptrack.errors import McaptrackError
+from mcaptrack.files import refuse_special
 
 #: A URL, also one that has become a path: "s3://bucket/a" is "s3:/bucket/a" then.
 _URL: Final = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):/+([^\s]+)")

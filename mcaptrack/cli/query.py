@@ -16,7 +16,7 @@ from mcaptrack.cli.text import console, printable, show
 from mcaptrack.errors import McaptrackError
 
 if TYPE_CHECKING:
-    from mcaptrack.sql import Database
+    from mcaptrack.tables.sql import Database
 
 Form = Literal["table", "csv", "json", "jsonl", "parquet", "arrow"]
 _QUERY: Final = "Query and answer"
@@ -107,12 +107,12 @@ def query(
     paths = common.expand(paths)
     chosen = _form(form, output, json)
     if output is not None:
-        from mcaptrack.atomic import is_same_file, refuse_overwrite
+        from mcaptrack.files import is_same_file, refuse_overwrite
 
         refuse_overwrite(output, force)
         if any(is_same_file(output, path) for path in paths):
             raise McaptrackError(f"{output} is both input and output; give another name with -o")
-    from mcaptrack.sql import Database
+    from mcaptrack.tables.sql import Database
 
     with common.Talk(quiet, verbose).open() as talk, Database(paths, _named(beside or [])) as database:
         if tables:

@@ -88,8 +88,9 @@ def render(
 
     Example: mcaptrack render log.mcap -o walk.gif --width 480 --start-s 2 --end-s 8
     """
-    from mcaptrack import log, pipeline, rendering
-    from mcaptrack.atomic import refuse_overwrite
+    from mcaptrack import log, pipeline
+    from mcaptrack.files import refuse_overwrite
+    from mcaptrack.viewing import rendering
 
     paths = common.expand(logs)
     common.only_one_output(paths, output)

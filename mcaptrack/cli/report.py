@@ -36,8 +36,8 @@ def report(
     Example: mcaptrack report 'logs/*.mcap' -o report.html
     """
     from mcaptrack import log
-    from mcaptrack.atomic import is_same_file, publish_bytes, refuse_overwrite
-    from mcaptrack.report import data, draw, gather, page
+    from mcaptrack.files import is_same_file, publish_bytes, refuse_overwrite
+    from mcaptrack.viewing.report import data, draw, gather, page
 
     paths = common.expand(logs)
     if output is None and len(paths) > 1:

@@ -45,8 +45,8 @@ def _run_on_log(
 ) -> dict[str, Any]:
     """Plan and run on one log; what came of it, for programs."""
     from mcaptrack import log, pipeline
-    from mcaptrack.atomic import is_same_file, publish_bytes, refuse_overwrite
-    from mcaptrack.ingest.place import Place
+    from mcaptrack.files import is_same_file, publish_bytes, refuse_overwrite
+    from mcaptrack.sources.ingest.place import Place
 
     began = monotonic()
     output: Path | None = given["output"]
@@ -109,7 +109,7 @@ def _run_on_log(
 def _export(target: Path, given: Mapping[str, Any], talk: common.Talk) -> dict[str, int]:
     """Write the tables beside a log; how many rows each has."""
     from mcaptrack import log
-    from mcaptrack.export import default_folder, export
+    from mcaptrack.tables.export import default_folder, export
 
     folder = default_folder(target)
     with log.read(target) as opened:

@@ -48,7 +48,7 @@ def info(
 
 def _as_data(opened: Log) -> dict[str, Any]:
     from mcaptrack.pipeline import is_stale
-    from mcaptrack.provenance import Provenance
+    from mcaptrack.schema.provenance import Provenance
 
     channels = []
     every = [(channel, part) for part in opened.parts for channel in part.recorded]
@@ -192,9 +192,9 @@ def export(
     Example: mcaptrack export robot.mcap --topic /imu --format csv
     """
     from mcaptrack import log
-    from mcaptrack.atomic import follow_links
-    from mcaptrack.export import default_folder, recording_name
-    from mcaptrack.export import export as write_tables
+    from mcaptrack.files import follow_links
+    from mcaptrack.tables.export import default_folder, recording_name
+    from mcaptrack.tables.export import export as write_tables
 
     results = []
     paths = common.expand(logs)

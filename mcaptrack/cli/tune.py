@@ -17,7 +17,7 @@ from mcaptrack.transforms import ALTERNATIVES, TRACKERS, TRANSFORMS, Transform
 from mcaptrack.transforms.sort import compile_sort
 
 if TYPE_CHECKING:
-    from mcaptrack.tuning import Range, Task, Trial
+    from mcaptrack.evaluation.tuning import Range, Task, Trial
 
 #: From so many frames on, over all trials, it pays to have SORT compiled first.
 _WORTH_COMPILING: Final = 100_000
@@ -115,8 +115,8 @@ def tune(
     Example: mcaptrack tune log.mcap --tracker ocsort --metric hota --trials 200
     """
     from mcaptrack.evaluation import EvaluateOptions
-    from mcaptrack.tuning import tune as run
-    from mcaptrack.tuning import uses_optuna
+    from mcaptrack.evaluation.tuning import tune as run
+    from mcaptrack.evaluation.tuning import uses_optuna
 
     kind = ALTERNATIVES[stage].kinds[tracker] if stage in ALTERNATIVES else TRANSFORMS[stage]
     chosen = similarity or ("iou" if stage == "track" else "metres")
@@ -167,7 +167,7 @@ def tune(
 
 def _ranges(kind: type[Transform], wanted: Sequence[str]) -> dict[str, Range]:
     """The ranges to search in: those that are asked for, or all that are declared."""
-    from mcaptrack.tuning import Range, declared_ranges
+    from mcaptrack.evaluation.tuning import Range, declared_ranges
 
     declared = declared_ranges(kind)
     if not wanted:
@@ -197,8 +197,8 @@ def _tasks_of_files(
     paths: Sequence[Path], truths: Sequence[Path], stage: str, given: dict[str, Any], talk: common.Talk
 ) -> list[Task]:
     from mcaptrack.cli.ingest import parse_fps
-    from mcaptrack.ingest.compared import detections_and_truth, pair_files
-    from mcaptrack.tuning import Task
+    from mcaptrack.evaluation.tuning import Task
+    from mcaptrack.tables.compared import detections_and_truth, pair_files
 
     if stage != "track":
         raise McaptrackError(f"files of detections are for --stage track; to tune {stage} give logs")
@@ -217,7 +217,7 @@ def _tasks_of_logs(
 ) -> list[Task]:
     from mcaptrack import log, pipeline
     from mcaptrack.evaluation import truth_of_log
-    from mcaptrack.tuning import Task
+    from mcaptrack.evaluation.tuning import Task
 
     tasks = []
     for path in paths:
@@ -232,8 +232,8 @@ def _tasks_of_logs(
 def _write(path: Path, command: str, settings: dict[str, Any]) -> None:
     import tomllib
 
-    from mcaptrack.atomic import publish_bytes
-    from mcaptrack.tuning import settings_to_toml
+    from mcaptrack.evaluation.tuning import settings_to_toml
+    from mcaptrack.files import publish_bytes
 
     try:
         text = path.read_text(encoding="utf-8") if path.exists() else ""

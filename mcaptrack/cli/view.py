@@ -10,7 +10,7 @@ import typer
 from mcaptrack.cli import common
 from mcaptrack.cli.text import show
 from mcaptrack.errors import McaptrackError, command
-from mcaptrack.links import LICHTBLICK, viewer_links
+from mcaptrack.viewing.links import LICHTBLICK, viewer_links
 
 if TYPE_CHECKING:
     from mcaptrack.log import Log
@@ -61,7 +61,7 @@ def view(
 
     from mcaptrack import log
     from mcaptrack.pipeline import layout_path
-    from mcaptrack.serving import Server
+    from mcaptrack.viewing.serving import Server
 
     if not lichtblick.startswith(("http://", "https://")):
         raise McaptrackError(f"--lichtblick needs an address such as http://localhost:8080, not {lichtblick!r}")

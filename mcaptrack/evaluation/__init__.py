@@ -16,9 +16,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaptrack import log, metrics
-from mcaptrack.cameras import camera_at
+from mcaptrack import log
 from mcaptrack.errors import McaptrackError, command
+from mcaptrack.evaluation import metrics
 from mcaptrack.evaluation.aligned import (
     IOU_THRESHOLD,
     Similarity,
@@ -28,11 +28,12 @@ from mcaptrack.evaluation.aligned import (
     without,
 )
 from mcaptrack.evaluation.forecasts import MADE_FROM, score_forecasts
-from mcaptrack.metrics import Rules, Score
-from mcaptrack.metrics.displacement import Displacement
-from mcaptrack.metrics.displacement import combine as combine_displacements
-from mcaptrack.provenance import Provenance
+from mcaptrack.evaluation.metrics import Rules, Score
+from mcaptrack.evaluation.metrics.displacement import Displacement
+from mcaptrack.evaluation.metrics.displacement import combine as combine_displacements
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame
+from mcaptrack.schema.provenance import Provenance
+from mcaptrack.sources.cameras import camera_at
 
 Ints = NDArray[np.int64]
 

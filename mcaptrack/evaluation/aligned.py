@@ -11,13 +11,13 @@ from typing import Final, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaptrack import metrics
-from mcaptrack.boxes import columns_to_boxes, iou_of_pairs
-from mcaptrack.clock import NS_PER_S, seconds_to_ns
 from mcaptrack.errors import McaptrackError
-from mcaptrack.metrics import Matchup
-from mcaptrack.resample import looked_at, resample
+from mcaptrack.evaluation import metrics
+from mcaptrack.evaluation.metrics import Matchup
+from mcaptrack.geometry.boxes import columns_to_boxes, iou_of_pairs
+from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
 from mcaptrack.schema import TRACKS, Frame, Rows
+from mcaptrack.schema.resampling import looked_at, resample
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

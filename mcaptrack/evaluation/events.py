@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaptrack.clock import NS_PER_S, seconds_to_ns
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation.aligned import (
     GATE_M,
@@ -33,8 +32,9 @@ from mcaptrack.evaluation.aligned import (
     without,
 )
 from mcaptrack.evaluation.lives import NOBODY, SAME_S, Lives, between_s, event_rows, usual_ns
-from mcaptrack.metrics.clear import matches, switched
-from mcaptrack.metrics.matchup import Pairs
+from mcaptrack.evaluation.metrics.clear import matches, switched
+from mcaptrack.evaluation.metrics.matchup import Pairs
+from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
 from mcaptrack.schema import COUNTS, EVENTS, EventKind, Frame, Rows
 
 Bools = NDArray[np.bool_]

@@ -14,13 +14,22 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaptrack.clock import NS_PER_S, seconds_to_ns
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation.aligned import MAX_HOLE_S, frame_times, on_ground, resampled
-from mcaptrack.metrics.calibration import LEVELS
-from mcaptrack.metrics.displacement import TAU_M2, Displacement, Forecasts, Paired, Path, displacement, errors, pair
-from mcaptrack.resample import looked_at
+from mcaptrack.evaluation.metrics.calibration import LEVELS
+from mcaptrack.evaluation.metrics.displacement import (
+    TAU_M2,
+    Displacement,
+    Forecasts,
+    Paired,
+    Path,
+    displacement,
+    errors,
+    pair,
+)
+from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
 from mcaptrack.schema import FORECAST_ERRORS, FORECAST_SCORES, PREDICTIONS, TRACKS, Frame, Rows, Schema
+from mcaptrack.schema.resampling import looked_at
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaptrack.clock import NS_PER_S, seconds_to_ns
+from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
 from mcaptrack.schema import EVENTS, EventKind, Rows
 
 Floats = NDArray[np.float64]

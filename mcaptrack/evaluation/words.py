@@ -11,7 +11,7 @@ from math import isnan
 from typing import Any, Final, Literal
 
 from mcaptrack import foxglove
-from mcaptrack.clock import NS_PER_S
+from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.schema import EventKind, Frame
 
 Level = Literal["DEBUG", "INFO", "WARNING", "ERROR"]

@@ -5,8 +5,8 @@ from __future__ import annotations
 from functools import cache
 from typing import Any, Final
 
-from mcaptrack.clock import NS_PER_S
 from mcaptrack.errors import McaptrackError
+from mcaptrack.geometry.clocks import NS_PER_S
 
 VIDEO: Final = "foxglove.CompressedVideo"
 IMAGE: Final = "foxglove.CompressedImage"

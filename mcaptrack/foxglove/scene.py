@@ -16,10 +16,10 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaptrack.clock import NS_PER_S
 from mcaptrack.foxglove.messages import SCENE, message_class
 from mcaptrack.foxglove.template import STAMP, Each, Group, Slot, Template, Word, group, joined, stamps
 from mcaptrack.foxglove.words import by_length
+from mcaptrack.geometry.clocks import NS_PER_S
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

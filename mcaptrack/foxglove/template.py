@@ -17,7 +17,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from mcaptrack.clock import NS_PER_S
+from mcaptrack.geometry.clocks import NS_PER_S
 
 Ints = NDArray[np.int64]
 Bytes = NDArray[np.uint8]

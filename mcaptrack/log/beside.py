@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import NamedTuple
 
-from mcaptrack.atomic import follow_links
 from mcaptrack.errors import McaptrackError, command
+from mcaptrack.files import follow_links
 from mcaptrack.log.journal import Journal, Unfit, find, find_content, journal_of, remove_words
 from mcaptrack.log.source import OpenFile
 

@@ -16,8 +16,8 @@ from pathlib import Path
 
 from mcap.opcode import Opcode
 
-from mcaptrack.atomic import can_replace, publish_stream
 from mcaptrack.errors import McaptrackError
+from mcaptrack.files import can_replace, publish_stream
 from mcaptrack.log import records
 from mcaptrack.log.chunks import chunk_record, message_head, open_chunk
 from mcaptrack.log.index import Index
@@ -26,7 +26,7 @@ from mcaptrack.log.reader import Log
 from mcaptrack.log.records import BLOCK, MAGIC, Bytes, ChunkIndexRecord, Damaged, Record, crc_of, walk
 from mcaptrack.log.source import Source
 from mcaptrack.log.writer import LogWriter, Sink, refuse_earlier_results, verify
-from mcaptrack.provenance import Provenance
+from mcaptrack.schema.provenance import Provenance
 
 
 @contextmanager

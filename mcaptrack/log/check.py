@@ -14,8 +14,8 @@ import numpy as np
 from mcap.opcode import Opcode
 
 from mcaptrack import notices
-from mcaptrack.atomic import follow_links
 from mcaptrack.errors import McaptrackError
+from mcaptrack.files import follow_links
 from mcaptrack.log import records
 from mcaptrack.log.beside import changed, find_journal
 from mcaptrack.log.check_summary import Finding, Findings, check_summary, record_name

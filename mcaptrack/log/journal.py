@@ -28,8 +28,8 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaptrack.atomic import sync_folder
 from mcaptrack.errors import McaptrackError
+from mcaptrack.files import sync_folder
 from mcaptrack.log.chunks import chunk_record, open_chunk
 from mcaptrack.log.index import begins_as_log, read_index
 from mcaptrack.log.records import MAGIC, Damaged

@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Final
 
 from mcaptrack import notices
-from mcaptrack.atomic import keep_attributes, publish
 from mcaptrack.errors import McaptrackError
+from mcaptrack.files import keep_attributes, publish
 from mcaptrack.log import journal
 from mcaptrack.log.journal import Journal, Unfit, journal_of
 from mcaptrack.log.records import Damaged

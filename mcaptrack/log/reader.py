@@ -12,8 +12,8 @@ from typing import NamedTuple, Self, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaptrack.atomic import follow_links
 from mcaptrack.errors import McaptrackError, command
+from mcaptrack.files import follow_links
 from mcaptrack.log import new_end, records
 from mcaptrack.log.chunks import MAX_NS
 from mcaptrack.log.messages import Columns, Message, Places

@@ -21,8 +21,8 @@ import numpy as np
 from mcap.opcode import Opcode
 
 from mcaptrack import __version__
-from mcaptrack.atomic import publish_stream
 from mcaptrack.errors import McaptrackError
+from mcaptrack.files import publish_stream
 from mcaptrack.log import journal, records
 from mcaptrack.log.chunks import LOG_MAX_NS
 from mcaptrack.log.index import Index, Listed, list_attachment, list_metadata, read_index

@@ -3,7 +3,6 @@
 A stage runs on a log that stands and adds its channels to it, with what they were made from and how.
 """
 
-from mcaptrack.cameras import ROUTES, Camera, camera_at, find_camera
 from mcaptrack.pipeline.checks import Job
 from mcaptrack.pipeline.events import Watch
 from mcaptrack.pipeline.plan import is_stale, plan_all, plan_stage
@@ -11,6 +10,7 @@ from mcaptrack.pipeline.planes import read_planes
 from mcaptrack.pipeline.run import Report, input_of, run
 from mcaptrack.pipeline.summary import Summary, summarise
 from mcaptrack.pipeline.write import LAYOUTS, attachment_of, find_views, layout_path
+from mcaptrack.sources.cameras import ROUTES, Camera, camera_at, find_camera
 
 __all__ = [
     "LAYOUTS",

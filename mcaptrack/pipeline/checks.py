@@ -9,11 +9,13 @@ from collections.abc import Sequence
 from dataclasses import is_dataclass
 from typing import NamedTuple
 
-from mcaptrack import foreign, log, views
-from mcaptrack.cameras import FULL, ROUTES, USUAL, chain_of
+from mcaptrack import log
 from mcaptrack.errors import McaptrackError, command
-from mcaptrack.provenance import INGEST, VIEW, Provenance
+from mcaptrack.foxglove import views
 from mcaptrack.schema import DETECTIONS, VIDEO, Schema
+from mcaptrack.schema.provenance import INGEST, VIEW, Provenance
+from mcaptrack.sources import foreign
+from mcaptrack.sources.cameras import FULL, ROUTES, USUAL, chain_of
 from mcaptrack.transforms import Transform
 from mcaptrack.transforms.protocol import check_options
 

@@ -17,7 +17,6 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from mcaptrack import foxglove, log
-from mcaptrack.cameras import camera_at
 from mcaptrack.errors import McaptrackError, command
 from mcaptrack.evaluation.events import EventOptions, find_events
 from mcaptrack.evaluation.forecasts import MADE_FROM, find_forecast_errors
@@ -26,7 +25,6 @@ from mcaptrack.notices import warn
 from mcaptrack.pipeline.checks import how_it_came, may_replace
 from mcaptrack.pipeline.plan import is_stale
 from mcaptrack.pipeline.write import Made, digest_of
-from mcaptrack.provenance import VIEW, Provenance
 from mcaptrack.schema import (
     COUNTS,
     EVENT_KINDS,
@@ -38,6 +36,8 @@ from mcaptrack.schema import (
     Frame,
     Schema,
 )
+from mcaptrack.schema.provenance import VIEW, Provenance
+from mcaptrack.sources.cameras import camera_at
 
 #: The name of the stage, in reports and in the provenance.
 STAGE: Final = "events"

@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 
 from mcaptrack import log
-from mcaptrack.cameras import camera_at
-from mcaptrack.clock import NS_PER_S
 from mcaptrack.errors import command
+from mcaptrack.geometry.clocks import NS_PER_S
+from mcaptrack.geometry.plane import Planes, is_assumed
 from mcaptrack.notices import known_code, warn
-from mcaptrack.plane import Planes, is_assumed
-from mcaptrack.provenance import Provenance
 from mcaptrack.schema import TRACKS, VIDEO, Frame
+from mcaptrack.schema.provenance import Provenance
+from mcaptrack.sources.cameras import camera_at
 from mcaptrack.transforms import Detect, Predict, Retrack, Sample, Sort, Transform
 
 #: What stages take, measured with 2 to 20 people at 15 pictures a second, in bytes.

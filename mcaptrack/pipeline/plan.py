@@ -10,15 +10,16 @@ from collections.abc import Callable, Mapping
 from dataclasses import fields
 from typing import Final
 
-from mcaptrack import foreign, log
-from mcaptrack.cameras import ROUTES, USUAL, camera_at, chain_of, name_above, outputs_of
+from mcaptrack import log
 from mcaptrack.errors import McaptrackError, command
 from mcaptrack.notices import warn
 from mcaptrack.pipeline.checks import Job, check_inputs, fits, how_it_came
 from mcaptrack.pipeline.planes import planes_to_json, read_planes
 from mcaptrack.predictors import weights_sha256
-from mcaptrack.provenance import Provenance
 from mcaptrack.schema import DETECTIONS, VIDEO
+from mcaptrack.schema.provenance import Provenance
+from mcaptrack.sources import foreign
+from mcaptrack.sources.cameras import ROUTES, USUAL, camera_at, chain_of, name_above, outputs_of
 from mcaptrack.transforms import TRANSFORMS, Transform, chosen, implementation_of
 
 Say = Callable[[str], None]

@@ -10,12 +10,12 @@ from typing import Any, Final
 import numpy as np
 
 from mcaptrack import log
-from mcaptrack.boxes import columns_to_boxes
-from mcaptrack.cameras import camera_at
-from mcaptrack.plane import LEAST_DEPTH, GroundPlane, Planes, assumed_plane, ground_depth
-from mcaptrack.provenance import Provenance
+from mcaptrack.geometry.boxes import columns_to_boxes
+from mcaptrack.geometry.plane import LEAST_DEPTH, GroundPlane, Planes, assumed_plane, ground_depth
 from mcaptrack.schema import GROUND_PLANE, TRACKS, Frame
 from mcaptrack.schema.ground import plane_to_rows, rows_to_plane
+from mcaptrack.schema.provenance import Provenance
+from mcaptrack.sources.cameras import camera_at
 
 _ASSUME: Final = "assume-ground-plane"
 

@@ -11,11 +11,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaptrack import foreign, log
-from mcaptrack.cameras import FULL, ROUTES, camera_at
-from mcaptrack.carry import carry, keep
-from mcaptrack.clock import NS_PER_S, parse_ns
+from mcaptrack import log
 from mcaptrack.errors import McaptrackError
+from mcaptrack.geometry.clocks import NS_PER_S, parse_ns
+from mcaptrack.geometry.plane import Planes, is_assumed
 from mcaptrack.notices import Notice, collected, warn
 from mcaptrack.pipeline.checks import Job, check_inputs
 from mcaptrack.pipeline.events import STAGE as EVENTS_STAGE
@@ -23,12 +22,14 @@ from mcaptrack.pipeline.events import Watch, make_events, tally
 from mcaptrack.pipeline.findings import warn_of_memory, warn_of_nothing, warn_of_what_stands
 from mcaptrack.pipeline.planes import guess_plane, is_poor, read_planes
 from mcaptrack.pipeline.write import Made, digest_of, write
-from mcaptrack.plane import Planes, is_assumed
 from mcaptrack.predictors import weights_sha256
-from mcaptrack.provenance import CLOCK, Provenance, distribution_of
 from mcaptrack.schema import GROUND_PLANE, TRACKS, VIDEO, Frame, Schema
+from mcaptrack.schema.provenance import CLOCK, Provenance, distribution_of
+from mcaptrack.sources import foreign
+from mcaptrack.sources.cameras import FULL, ROUTES, camera_at
+from mcaptrack.sources.video import Encoded, brightness
 from mcaptrack.transforms import TRANSFORMS, Transform, choice, implementation_of
-from mcaptrack.video import Encoded, brightness
+from mcaptrack.transforms.to_video_rate import carry, keep
 
 Ints = NDArray[np.int64]
 Progress = Callable[[str, int, int], None]

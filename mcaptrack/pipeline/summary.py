@@ -7,13 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from mcaptrack import foreign, log
-from mcaptrack.cameras import ROUTES, camera_at
+from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation import Candidate, EvaluateOptions, Sequenced, evaluate
 from mcaptrack.notices import warn
-from mcaptrack.provenance import Provenance
 from mcaptrack.schema import DETECTIONS, GROUND_PLANE, PREDICTIONS, TRACKS, Rows, Schema
+from mcaptrack.schema.provenance import Provenance
+from mcaptrack.sources import foreign
+from mcaptrack.sources.cameras import ROUTES, camera_at
 
 #: Tracks within this distance of the truth are right, as in the demonstration.
 _GATE_M = 1.0

@@ -11,16 +11,18 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaptrack import foreign, foxglove, log, views
-from mcaptrack.cameras import FULL, VIDEO, Camera, camera_at
+from mcaptrack import foxglove, log
 from mcaptrack.errors import McaptrackError, command
+from mcaptrack.foxglove import views
 from mcaptrack.foxglove.layouts import Eye
+from mcaptrack.foxglove.views import layouts
+from mcaptrack.geometry.plane import Planes
 from mcaptrack.notices import warn
 from mcaptrack.pipeline.checks import how_it_came, may_replace
-from mcaptrack.plane import Planes
-from mcaptrack.provenance import INGEST, VIEW, Provenance, digest
 from mcaptrack.schema import DETECTIONS, FORECAST_SCORES, GROUND_PLANE, PREDICTIONS, SCHEMAS, TRACKS, Frame, Schema
-from mcaptrack.views import layouts
+from mcaptrack.schema.provenance import INGEST, VIEW, Provenance, digest
+from mcaptrack.sources import foreign
+from mcaptrack.sources.cameras import FULL, VIDEO, Camera, camera_at
 
 Ints = NDArray[np.int64]
 #: Log time, number of the channel, sequence and payload of a message.

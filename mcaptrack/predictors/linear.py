@@ -17,7 +17,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaptrack.history import Holt, fill_holes
+from mcaptrack.geometry.histories import Holt, fill_holes
 from mcaptrack.predictors.forecast import Forecast
 
 Floats = NDArray[np.float64]

@@ -16,7 +16,7 @@ from typing import ClassVar, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaptrack.history import fill_holes, last_positions
+from mcaptrack.geometry.histories import fill_holes, last_positions
 from mcaptrack.predictors.forecast import Forecast
 from mcaptrack.predictors.linear import LinearPredictor
 from mcaptrack.predictors.weights import Network

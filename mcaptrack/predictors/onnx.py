@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.history import fill_holes, last_positions
+from mcaptrack.geometry.histories import fill_holes, last_positions
 from mcaptrack.predictors.forecast import Forecast
 from mcaptrack.predictors.linear import LinearPredictor
 

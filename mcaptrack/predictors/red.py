@@ -17,7 +17,7 @@ from typing import ClassVar, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaptrack.history import fill_holes, last_positions
+from mcaptrack.geometry.histories import fill_holes, last_positions
 from mcaptrack.predictors.forecast import Forecast
 from mcaptrack.predictors.weights import Network
 

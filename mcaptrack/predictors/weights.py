@@ -116,7 +116,7 @@ def save(path: Path, tensors: Mapping[str, NDArray[np.floating]], card: Mapping[
     """Write weights as 32-bit floats, with their card in the header; the same weights give the same bytes."""
     import safetensors.numpy
 
-    from mcaptrack.atomic import publish_bytes
+    from mcaptrack.files import publish_bytes
 
     flat = {name: np.ascontiguousarray(value, np.float32) for name, value in sorted(tensors.items())}
     data = safetensors.numpy.save(flat, dict(card))

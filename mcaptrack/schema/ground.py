@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.plane import GroundPlane
+from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import GROUND_PLANE, Rows
 
 

@@ -15,8 +15,8 @@ from typing import Any, Final, Literal, get_args
 
 import numpy as np
 
-from mcaptrack.atomic import publish
 from mcaptrack.errors import McaptrackError
+from mcaptrack.files import publish
 from mcaptrack.tables.fields import TABLE_VERSION
 
 Format = Literal["parquet", "arrow", "csv", "jsonl"]

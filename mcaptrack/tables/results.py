@@ -11,8 +11,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final, Literal
 
-from mcaptrack.atomic import publish
 from mcaptrack.errors import McaptrackError
+from mcaptrack.files import publish
 from mcaptrack.tables import text
 
 #: How an answer can be written.

@@ -14,9 +14,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaptrack.atomic import publish_bytes
 from mcaptrack.errors import McaptrackError
-from mcaptrack.metrics.calibration import forecast_scores, mahalanobis_squared
+from mcaptrack.evaluation.metrics.calibration import forecast_scores, mahalanobis_squared
+from mcaptrack.files import publish_bytes
 from mcaptrack.predictors import make, red
 from mcaptrack.predictors.forecast import Predictor
 from mcaptrack.predictors.lstm import Lstm

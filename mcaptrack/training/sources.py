@@ -15,12 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack import log, pipeline, tables
-from mcaptrack.clock import NS_PER_S
 from mcaptrack.errors import McaptrackError, command
-from mcaptrack.ingest import label_frames
-from mcaptrack.ingest.labels import read_labels
-from mcaptrack.plane import Planes
+from mcaptrack.geometry.clocks import NS_PER_S
+from mcaptrack.geometry.plane import Planes
 from mcaptrack.schema import TRACKS, Frame
+from mcaptrack.sources.ingest import label_frames
+from mcaptrack.sources.ingest.labels import read_labels
 from mcaptrack.training.recipe import Recipe
 from mcaptrack.training.walks import walks
 from mcaptrack.training.windows import Windows

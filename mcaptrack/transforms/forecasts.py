@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from mcaptrack.clock import NS_PER_S
-from mcaptrack.history import Histories
+from mcaptrack.geometry.clocks import NS_PER_S
+from mcaptrack.geometry.histories import Histories
 from mcaptrack.predictors import make
 from mcaptrack.schema import Frame, Rows
 from mcaptrack.schema.predictions import forecast_to_rows

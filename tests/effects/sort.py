@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from mcaptrack.plane import GroundPlane
+from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import Frame
 from mcaptrack.transforms import ByteTrack, OcSort, Sort
 from tests.effects import Case, Outputs, people, rows

@@ -12,7 +12,7 @@ from math import acos, hypot, isnan, nan, pi, sqrt
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from mcaptrack.clock import FrameClock
+from mcaptrack.geometry.clocks import FrameClock
 
 MOVE = np.eye(7) + np.eye(7, k=4)
 SEE = np.eye(4, 7)

@@ -1,6 +1,6 @@
 """What the demonstration scores on every scene, over ten seeds: the mean and the range that it prints.
 
-    .venv/bin/python tools/bench/demo.py            # measures all, writes mcaptrack/demo_scores.json and docs/demo.md
+    .venv/bin/python tools/bench/demo.py  # measures all, writes mcaptrack/sources/demo_scores.json and docs/demo.md
     .venv/bin/python tools/bench/demo.py --check 3  # three of them at random, against what is written
 
 Runs `mcaptrack demo` itself, in a process of its own, and reads its JSON. Half a minute of one core a run.
@@ -17,8 +17,9 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from mcaptrack import __version__, demo
-from mcaptrack.scene import SCENES
+from mcaptrack import __version__
+from mcaptrack.sources import demo
+from mcaptrack.sources.scene import SCENES
 
 ROOT = Path(__file__).parent.parent.parent
 PAGE = ROOT / "docs" / "demo.md"
@@ -101,7 +102,7 @@ def main() -> None:
             print(scene, seed, *(f"{mode} IDF1 {100 * runs[-1][mode]['IDF1']:.1f}" for mode in MODES), flush=True)
         scenes[scene] = {part: {name: [run[part][name] for run in runs] for name in runs[0][part]} for part in runs[0]}
     scores = {"version": __version__, "seeds": [*SEEDS], "scenes": scenes}
-    (ROOT / "mcaptrack" / demo.SCORES).write_text(json.dumps(scores, indent=1) + "\n")
+    (ROOT / "mcaptrack" / "sources" / demo.SCORES).write_text(json.dumps(scores, indent=1) + "\n")
     PAGE.write_text(page(scores))
 
 

@@ -18,8 +18,8 @@ from pathlib import Path
 
 import numpy as np
 
-from mcaptrack.boxes import iou
-from mcaptrack.metrics import Matchup, score, summary
+from mcaptrack.evaluation.metrics import Matchup, score, summary
+from mcaptrack.geometry.boxes import iou
 
 # This file's folder is where Python looks first, and a file in it is named like a peer.
 sys.path.pop(0)

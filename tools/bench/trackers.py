@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from mcaptrack.clock import NS_PER_S
+from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.schema import DETECTIONS, Frame
 from mcaptrack.transforms import ByteTrack, OcSort, Sort
 from mcaptrack.transforms.sort import compile_sort

@@ -15,10 +15,10 @@ import time
 from pathlib import Path
 
 from mcaptrack.evaluation import EvaluateOptions
-from mcaptrack.ingest.compared import detections_and_truth
+from mcaptrack.evaluation.tuning import Task, trial_scores
+from mcaptrack.tables.compared import detections_and_truth
 from mcaptrack.transforms import Sort
 from mcaptrack.transforms.sort import compile_sort
-from mcaptrack.tuning import Task, trial_scores
 
 # This file's folder is where Python looks first, and a file in it is named like the peer.
 sys.path.pop(0)

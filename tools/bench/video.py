@@ -18,8 +18,8 @@ import cv2
 import numpy as np
 
 from mcaptrack import log
-from mcaptrack.ingest import IngestOptions, ingest
-from mcaptrack.pictures import Pictures
+from mcaptrack.sources.ingest import IngestOptions, ingest
+from mcaptrack.sources.pictures import Pictures
 
 TOPIC, FPS, ROUNDS = "/camera/video", 30, 3
 

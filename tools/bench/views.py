@@ -20,8 +20,9 @@ import numpy as np
 from mcap.records import Channel, Chunk, Message
 from mcap.stream_reader import StreamReader, breakup_chunk
 
-from mcaptrack import foxglove, log, views
-from mcaptrack.plane import GroundPlane
+from mcaptrack import foxglove, log
+from mcaptrack.foxglove import views
+from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import DETECTIONS, PREDICTIONS, TRACKS, Frame
 
 PEOPLE, PICTURES, FPS, STEPS = 20, 600, 30, 12

@@ -17,7 +17,7 @@ from typing import ClassVar, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaptrack.clock import FrameClock
+from mcaptrack.geometry.clocks import FrameClock
 from mcaptrack.schema import DETECTIONS, VIDEO, Frame, Schema
 from mcaptrack.transforms.detect.foreground import Method, model
 from mcaptrack.transforms.detect.motion import IDENTITY, CameraMotion

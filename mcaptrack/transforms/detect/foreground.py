@@ -8,7 +8,7 @@ from typing import Any, Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaptrack.clock import FrameClock
+from mcaptrack.geometry.clocks import FrameClock
 
 Method = Literal["knn", "mog2", "frame-difference"]
 Image = NDArray[np.uint8]

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections import Counter
 from typing import Final
 
-from mcaptrack.clock import NS_PER_S
 from mcaptrack.errors import McaptrackError
+from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.notices import warn
 from mcaptrack.transforms.detect.motion import View
 

@@ -17,7 +17,7 @@ from typing import ClassVar, Final, Literal
 
 import numpy as np
 
-from mcaptrack.plane import Planes
+from mcaptrack.geometry.plane import Planes
 from mcaptrack.predictors import NAMES, PredictorName
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame, Schema
 from mcaptrack.transforms.forecasts import Forecaster

@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaptrack.clock import NS_PER_S
-from mcaptrack.history import Histories, Holt
-from mcaptrack.match import assign
+from mcaptrack.geometry.assignment import assign
+from mcaptrack.geometry.clocks import NS_PER_S
+from mcaptrack.geometry.histories import Histories, Holt
 from mcaptrack.predictors import Forecast, Predictor, make
 from mcaptrack.schema import Frame, Rows
 from mcaptrack.schema.predictions import forecast_to_rows

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaptrack.match import solve
+from mcaptrack.geometry.assignment import solve
 from mcaptrack.transforms.retrack.motion import State, Walker
 
 Floats = NDArray[np.float64]

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaptrack.clock import NS_PER_S
+from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.predictors import Forecast, Predictor, make
 from mcaptrack.schema import PREDICTIONS, Frame, Rows
 from mcaptrack.schema.predictions import forecast_to_rows

@@ -10,7 +10,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaptrack.history import Holt, rebuild
+from mcaptrack.geometry.histories import Holt, rebuild
 from mcaptrack.predictors import Forecast
 
 Floats = NDArray[np.float64]

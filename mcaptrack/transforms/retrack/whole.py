@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaptrack.boxes import columns_to_boxes
-from mcaptrack.plane import Planes, plane_at
-from mcaptrack.resample import LINEAR
+from mcaptrack.geometry.boxes import columns_to_boxes
+from mcaptrack.geometry.plane import Planes, plane_at
 from mcaptrack.schema import TRACKS, Rows
+from mcaptrack.schema.resampling import LINEAR
 from mcaptrack.transforms.retrack.doubt import log_odds
 from mcaptrack.transforms.retrack.link import link
 from mcaptrack.transforms.retrack.motion import Paths, Walker, smooth

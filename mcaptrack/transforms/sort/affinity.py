@@ -7,9 +7,9 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaptrack.boxes import overlapping
-from mcaptrack.match import heaviest, one_to_one
-from mcaptrack.plane import GroundPlane
+from mcaptrack.geometry.assignment import heaviest, one_to_one
+from mcaptrack.geometry.boxes import overlapping
+from mcaptrack.geometry.plane import GroundPlane
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]

@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from mcaptrack import kalman
+from mcaptrack.geometry import kalman
 from mcaptrack.transforms.sort.tracks import CLASS, ID, MISSED, SCORE, SHARED_ROWS, STREAK
 
 Floats = NDArray[np.float64]

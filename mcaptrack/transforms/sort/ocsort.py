@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaptrack import kalman
+from mcaptrack.geometry import kalman
 from mcaptrack.transforms.protocol import option
 from mcaptrack.transforms.sort.affinity import Pairs, by_overlap, pair
 from mcaptrack.transforms.sort.tracker import Moment, Sort

@@ -17,11 +17,11 @@ from typing import ClassVar, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaptrack import kalman
-from mcaptrack.clock import NS_PER_S, FrameClock
 from mcaptrack.errors import McaptrackError
+from mcaptrack.geometry import kalman
+from mcaptrack.geometry.clocks import NS_PER_S, FrameClock
+from mcaptrack.geometry.plane import GroundPlane, Planes, plane_at
 from mcaptrack.notices import warn
-from mcaptrack.plane import GroundPlane, Planes, plane_at
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame, Schema
 from mcaptrack.transforms.protocol import check_options, context, option
 from mcaptrack.transforms.sort.affinity import Cost, Pairs, by_distance, by_overlap, pair

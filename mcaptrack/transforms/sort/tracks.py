@@ -15,9 +15,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaptrack import kalman
-from mcaptrack.boxes import columns_to_boxes
-from mcaptrack.plane import Planes, plane_at
+from mcaptrack.geometry import kalman
+from mcaptrack.geometry.boxes import columns_to_boxes
+from mcaptrack.geometry.plane import Planes, plane_at
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame
 
 Floats = NDArray[np.float64]

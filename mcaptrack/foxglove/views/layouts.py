@@ -1,0 +1,222 @@
+"""The layouts of a camera, filled in from what its log has: how tracking goes, tracks side by side, and forecasts."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from math import atan2, degrees, hypot, isfinite
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaptrack.foxglove import layouts
+from mcaptrack.foxglove.layouts import Eye, Tree, beside
+from mcaptrack.geometry.plane import Planes, plane_at
+
+Floats = NDArray[np.float64]
+
+#: The layouts that there are, and how the file of each ends.
+TRACKING, COMPARING, PREDICTIONS = "tracking", "comparing", "predictions"
+FILES: Final[Mapping[str, str]] = {
+    TRACKING: ".layout.json",
+    COMPARING: ".comparing.layout.json",
+    PREDICTIONS: ".predictions.layout.json",
+}
+#: The best tracks that a layout switches on, below the prefix; the others can be switched on by hand.
+_BEST: Final = ("retracks/full", "retracks", "tracks", "detections")
+#: Kinds of tracks that are compared: what they are called, and where they are.
+_KINDS: Final = (
+    ("SORT", ("tracks",)),
+    ("Re-tracked", ("retracks/full", "retracks")),
+    ("Truth", ("truth",)),
+)
+_TILT_DEG: Final = 45.0
+#: Below a channel of tracks: what happened to them, in words.
+_EVENTS: Final = "/events/view/log"
+
+
+class There(NamedTuple):
+    """What a log has of a camera: its topics below the prefix, where the pictures are, how the ground is seen, how many
+    steps forecasts go ahead, and whether it is known how far off the truth they were.
+    """
+
+    prefix: str
+    names: frozenset[str]
+    pictures: str | None
+    frame_id: str
+    eye: Eye
+    last_step: int
+    is_truth_known: bool = False
+
+    def topics(self, suffix: str, on: Collection[str]) -> dict[str, bool]:
+        """The topics of all views of one kind, with which are on."""
+        found = sorted(name.removesuffix(suffix) for name in self.names if name.endswith(suffix))
+        return {f"{self.prefix}/{name}{suffix}": name in on for name in found}
+
+    def drawn(self, name: str) -> bool:
+        """Whether there is a view of a channel."""
+        return bool({name + "/view/image", name + "/view/scene"} & self.names)
+
+    def is_seen(self) -> bool:
+        """Whether there is any view."""
+        return any(name.endswith(("/view/image", "/view/scene")) for name in self.names)
+
+
+def best(names: Collection[str]) -> list[str]:
+    """The channels to look at first, of those below the prefix: the best tracks, and their forecasts."""
+    found = [name for name in _BEST if name in names][:1]
+    of_these = "retracks/predictions"
+    return found + [of_these for name in found if name.startswith("retracks") and of_these in names]
+
+
+def eye_on(places_m: Floats, planes: Planes, t_ns: int) -> Eye:
+    """A view of where people are (N, 2), from the side that the camera looks from."""
+    known = places_m[np.isfinite(places_m).all(axis=1)]
+    low, high = np.quantile(known, [0.02, 0.98], axis=0) if len(known) else (np.full(2, -5.0), np.full(2, 5.0))
+    middle, radius = (low + high) / 2, max(2.5, float(np.hypot(*(high - low))) / 2)
+    bearing, plane = 0.0, plane_at(planes, t_ns)
+    if plane is not None:
+        width, height = plane.width_px, plane.height_px
+        sight = plane.pixels_to_metres(np.array([[width / 2, height], [width / 2, height * 0.9]]))
+        ahead_x, ahead_y = (sight[1] - sight[0]).tolist()
+        bearing = degrees(atan2(ahead_x, ahead_y)) if isfinite(ahead_x) and hypot(ahead_x, ahead_y) else 0.0
+    return Eye(
+        round(float(middle[0]), 1), round(float(middle[1]), 1), round(2.4 * radius, 1), _TILT_DEG, round(bearing, 1)
+    )
+
+
+def make(there: There) -> dict[str, bytes]:
+    """The layout files that make sense for a log, by their names; none if there is nothing to see."""
+    if not there.is_seen():
+        return {}
+    made = {TRACKING: _tracking(there)}
+    if sum(any(there.drawn(name) for name in names) for _, names in _KINDS) > 1:
+        made[COMPARING] = _comparing(there)
+    if there.drawn("predictions") or there.drawn("retracks/predictions"):
+        made[PREDICTIONS] = _predictions(there)
+    return made
+
+
+def _tracking(there: There) -> bytes:
+    channels = {name.removesuffix("/view/image").removesuffix("/view/scene") for name in there.names}
+    on = best([name for name in channels if there.drawn(name)])
+    panels: dict[str, Any] = {}
+    left = [*_image(there, panels, "picture", "Video", on), *_plots(there, panels)]
+    right = [*_ground(there, panels, "ground", "Ground", on), *_words(there, panels)]
+    return _file(panels, _columns(left, right, 55.0))
+
+
+def _comparing(there: There) -> bytes:
+    panels: dict[str, Any] = {}
+    upper: list[Tree] = []
+    shown = []
+    for number, (title, names) in enumerate(_KINDS):
+        found = [name for name in names if there.drawn(name)][:1]
+        if found:
+            shown += found
+            upper += _image(there, panels, f"picture{number}", title, found) or _ground(
+                there, panels, f"ground{number}", title, found
+            )
+    lower = [*_ground(there, panels, "ground", "All", shown), *_plots(there, panels)]
+    told = [part for title, names in _KINDS for part in _events(there, panels, title, names)]
+    lower += [beside(told, "column")] if told else []
+    return _file(panels, ("column", beside(upper), beside(lower), 50.0) if lower else beside(upper))
+
+
+def _predictions(there: There) -> bytes:
+    future = next(name for name in ("retracks/predictions", "predictions") if there.drawn(name))
+    past = "retracks/full" if future.startswith("retracks") else "tracks"
+    on = [future, past, "truth"]
+    panels: dict[str, Any] = {}
+    source = f"{there.prefix}/{future}"
+    last = f"{source}.rows[:]{{step=={there.last_step}}}"
+    spread = {f"{last}.cov_{axis}_m2": f"variance at the end, {axis[0]} (m2)" for axis in ("xx", "yy")}
+    panels["Plot!spread"] = layouts.plot_panel("How sure forecasts are", spread)
+    told = "retracks" if future.startswith("retracks") else "tracks"
+    left = [*_image(there, panels, "picture", "Forecasts", on), *_errors(there, panels)]
+    right = [*_ground(there, panels, "ground", "Forecasts on the ground", on)]
+    right.append(beside(["Plot!spread", *_events(there, panels, "Tracking", (told,))]))
+    return _file(panels, _columns(left, right, 50.0))
+
+
+def _errors(there: There, panels: dict[str, Any]) -> list[Tree]:
+    """How far off forecasts were: the truth, or if that is not known the tracks as they became."""
+    front = "" if there.is_truth_known else "later_"
+    labels = {"retracks/predictions": "re-tracked", "predictions": "SORT"}
+    paths = {
+        f"{there.prefix}/{name}/scores.rows[:].{front}{measure.lower()}_m": f"{label}: {measure} (m)"
+        for measure in ("ADE", "FDE")
+        for name, label in labels.items()
+        if f"{name}/scores" in there.names
+    }
+    if not paths:
+        return []
+    words = "the truth" if there.is_truth_known else "where tracks went"
+    panels["Plot!errors"] = layouts.plot_panel(f"Prediction errors, against {words}", paths)
+    return ["Plot!errors"]
+
+
+def _image(there: There, panels: dict[str, Any], name: str, title: str, on: Collection[str]) -> list[Tree]:
+    if there.pictures is None:
+        return []
+    panels[f"Image!{name}"] = layouts.image_panel(title, there.pictures, there.topics("/view/image", on))
+    return [f"Image!{name}"]
+
+
+def _ground(there: There, panels: dict[str, Any], name: str, title: str, on: Collection[str]) -> list[Tree]:
+    topics = there.topics("/view/scene", [*on, "ground_plane"])
+    if not topics:
+        return []
+    panels[f"3D!{name}"] = layouts.scene_panel(title, there.frame_id, topics, there.eye)
+    return [f"3D!{name}"]
+
+
+def _plots(there: There, panels: dict[str, Any]) -> list[Tree]:
+    """How many people there are, where it is counted; otherwise where they are."""
+    labels = {"tracks": "SORT", "retracks": "re-tracked", "retracks/full": "re-tracked", "truth": "truth"}
+    counted = {
+        f"{there.prefix}/{name}/counts.rows[:].tracked": label
+        for name, label in labels.items()
+        if f"{name}/counts" in there.names
+    }
+    places = {
+        f"{there.prefix}/{name}.rows[:].x_m": f"{label}, x (m)"
+        for name, label in labels.items()
+        if name in there.names and name != "retracks/full"
+    }
+    if counted and "truth" in there.names:
+        counted[next(iter(counted)).replace(".tracked", ".people")] = "truth"
+    if not counted and not places:
+        return []
+    title = "People" if counted else "Places"
+    panels["Plot!people"] = layouts.plot_panel(title, counted or places)
+    return ["Plot!people"]
+
+
+def _events(there: There, panels: dict[str, Any], title: str, names: Collection[str]) -> list[Tree]:
+    """What happened to the first of these channels of which that is told."""
+    found = [f"{name}{_EVENTS}" for name in names if f"{name}{_EVENTS}" in there.names][:1]
+    for topic in found:
+        panels[f"RosOut!{title}"] = layouts.log_panel(f"{title}: events", f"{there.prefix}/{topic}")
+    return [f"RosOut!{title}" for _ in found]
+
+
+def _words(there: There, panels: dict[str, Any]) -> list[Tree]:
+    """What happened, where it is told; otherwise what is in the log."""
+    found = _events(there, panels, "Tracking", ("retracks/full", "retracks", "tracks"))
+    if not found:
+        panels["SourceInfo!log"] = layouts.panel("Log", {})
+    return found or ["SourceInfo!log"]
+
+
+def _columns(left: Sequence[Tree], right: Sequence[Tree], share: float) -> Tree:
+    columns = [_column(parts) for parts in (left, right) if parts]
+    return ("row", columns[0], columns[1], share) if len(columns) == 2 else columns[0]
+
+
+def _column(parts: Sequence[Tree]) -> Tree:
+    return ("column", parts[0], beside(parts[1:], "column"), 65.0) if len(parts) > 1 else parts[0]
+
+
+def _file(panels: Mapping[str, Any], tree: Tree) -> bytes:
+    return layouts.layout(panels, tree)

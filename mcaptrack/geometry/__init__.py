@@ -1,0 +1,1 @@
+"""Arithmetic of boxes, the ground plane, clocks, filters and assignment: arrays in, arrays out."""

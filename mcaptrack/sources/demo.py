@@ -1,0 +1,92 @@
+"""The demonstration: a scene with known truth, drawn to a real video file, and everything run on it."""
+
+from __future__ import annotations
+
+import json
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from mcaptrack.errors import McaptrackError
+from mcaptrack.files import publish
+from mcaptrack.sources.scene import Scene
+from mcaptrack.sources.video import Image, write_mp4
+
+#: What the demonstration writes, by name.
+VIDEO: Final = "demo.mp4"
+TRUTH: Final = "truth.txt"
+PLANE: Final = "ground_plane.txt"
+
+
+#: Scores of every scene and seed, written by tools/bench/demo.py.
+SCORES: Final = "demo_scores.json"
+
+
+def read_scores() -> dict[str, Any]:
+    """Scores of SORT and of re-tracking for each scene, a value a seed, within 1 m on the clock of prediction.
+
+    ``{"version": ..., "seeds": [...], "scenes": {scene: {"SORT" | "re-tracked": {score: [a value a seed]}}}}``
+    """
+    scores: dict[str, Any] = json.loads(resources.files("mcaptrack.sources").joinpath(SCORES).read_text("utf-8"))
+    return scores
+
+
+def mean_and_range(values: Sequence[float], scale: float = 1.0, digits: int = 1) -> str:
+    """The mean of values times ``scale``, and the lowest and highest in brackets."""
+    low, mean, high = (scale * value for value in (min(values), sum(values) / len(values), max(values)))
+    return f"{mean:.{digits}f} ({low:.{digits}f} to {high:.{digits}f})"
+
+
+@dataclass(frozen=True)
+class Footage:
+    """A drawn scene on disk: the video, its true boxes (MOTChallenge) and its ground plane (3x3)."""
+
+    video: Path
+    truth: Path
+    ground_plane: Path
+
+
+def draw(
+    scene: Scene,
+    folder: Path,
+    progress: Callable[[str, int, int], None] = lambda *_: None,
+    *,
+    video: bool = True,
+) -> Footage:
+    """Draw a scene into a folder: what a person with a camera and much patience would have.
+
+    Without ``video`` only the truth and the ground plane are written, the same ones.
+    """
+    footage = Footage(folder / VIDEO, folder / TRUTH, folder / PLANE)
+    lines: list[str] = []
+    total = round(scene.seconds * scene.fps)
+
+    def images() -> Iterator[Image]:
+        for number, shot in enumerate(scene.shots(video), start=1):
+            for who, box in zip(shot.ids, shot.boxes.tolist(), strict=True):
+                lines.append(",".join([str(number), str(who), *(f"{value:.2f}" for value in box), "1,1,1"]))
+            progress("draw", number, total)
+            yield shot.image
+
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if video:
+            write_mp4(footage.video, images(), scene.fps)
+        else:
+            deque(images(), maxlen=0)
+        _write_text(footage.truth, "\n".join(lines) + "\n")
+        rows = np.array(scene.ground_plane().homography).reshape(3, 3).tolist()
+        _write_text(footage.ground_plane, "\n".join(",".join(f"{value:.17g}" for value in row) for row in rows) + "\n")
+    except OSError as error:
+        raise McaptrackError(f"{folder} can't be written to: {error.strerror or error}") from error
+    return footage
+
+
+def _write_text(path: Path, text: str) -> None:
+    with publish(path) as part:
+        part.write_text(text, encoding="utf-8")

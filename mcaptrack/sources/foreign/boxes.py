@@ -1,0 +1,113 @@
+"""Boxes that others detected -> rows of detections, and numbers for the classes that they name.
+
+Letters: N boxes.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from itertools import islice
+from math import cos, isfinite, nan, sin
+from typing import Any, Final
+
+import numpy as np
+
+from mcaptrack.errors import McaptrackError
+from mcaptrack.schema import DETECTIONS, Rows
+from mcaptrack.sources.foreign.messages import Kind, guarded, plain_name
+
+#: Schemas whose messages are boxes, but our own.
+DETECTIONS_READ: Final = ("vision_msgs/Detection2DArray",)
+
+_UNKNOWN, _PERSON = 0, 1
+_PEOPLE: Final = ("person", "pedestrian", "human")
+_NUMBER: Final = re.compile(r"[0-9]{1,10}")
+_NAME: Final = re.compile(r"[^\W\d_]")
+#: A channel has no more named classes than this; class ids from here on stand for names until all names are known.
+_MAX_NAMES: Final = 1024
+_FIRST_NAME: Final = 2**32 - _MAX_NAMES
+_SHOWN: Final = 12
+
+
+class Classes:
+    """The classes of one channel: numbers stay what they are, people are 1, and other names get numbers.
+
+    These follow the largest number of the channel, in the order of the alphabet, so that they don't depend on what was
+    seen first.
+    """
+
+    def __init__(self) -> None:
+        self._names: dict[str, int] = {}
+        self._largest = _PERSON
+
+    def class_id(self, said: str) -> int:
+        """The number of a class; for one that has a name, what ``numbers`` knows it by."""
+        if said.lower() in _PEOPLE:
+            return _PERSON
+        if _NUMBER.fullmatch(said):
+            number = int(said) if int(said) < _FIRST_NAME else _UNKNOWN
+            self._largest = max(self._largest, number)
+            return number
+        if not _NAME.search(said) or (said not in self._names and len(self._names) == _MAX_NAMES):
+            return _UNKNOWN
+        return self._names.setdefault(said, _FIRST_NAME + len(self._names))
+
+    def numbers(self) -> dict[int, int]:
+        """The final number of each class that has a name, by what ``class_id`` gave."""
+        order = enumerate(sorted(self._names), start=self._largest + 1)
+        return {self._names[name]: number for number, name in order}
+
+    def named(self) -> list[tuple[str, int]]:
+        """The first names in the order of the alphabet, with their numbers."""
+        return list(islice(zip(sorted(self._names), range(self._largest + 1, 2**32), strict=False), _SHOWN))
+
+
+def boxes_decoder(kind: Kind, classes: Classes) -> Callable[[bytes], Rows]:
+    """What makes rows of detections (N,) of the payloads of a channel; raises as ``picture_decoder`` does.
+
+    ``classes`` collects the names of classes.
+    """
+    if plain_name(kind.name) not in DETECTIONS_READ:
+        raise McaptrackError(
+            f"it holds {kind.name or 'no schema'}, not detections; {', '.join(DETECTIONS_READ)} is read"
+        )
+    return guarded(kind, lambda message: _boxes(message, classes))
+
+
+def _boxes(message: Any, classes: Classes) -> Rows:
+    rows = [_box(detection, classes) for detection in message.detections]
+    x, y, w, h, score, class_id = (list(column) for column in zip(*rows, strict=True)) if rows else [[]] * 6
+    return DETECTIONS.rows(
+        x_px=np.array(x, float),
+        y_px=np.array(y, float),
+        w_px=np.array(w, float),
+        h_px=np.array(h, float),
+        score=np.array(score, float),
+        class_id=np.array(class_id, np.uint32),
+    )
+
+
+def _box(detection: Any, classes: Classes) -> tuple[float, float, float, float, float, int]:
+    """Left, top, width and height of the upright box around a detection, its best score and what that says it is."""
+    centre = detection.bbox.center
+    place = getattr(centre, "position", centre)  # vision_msgs 4 put a point where 3 had a pose
+    x, y, theta, w, h = (
+        float(value)
+        for value in (place.x, place.y, getattr(centre, "theta", 0.0), detection.bbox.size_x, detection.bbox.size_y)
+    )
+    if not all(isfinite(value) for value in (x, y, theta, w, h)) or w < 0 or h < 0:
+        raise ValueError(f"a box can't be {w:g} x {h:g} at ({x:g}, {y:g})")
+    if theta:
+        w, h = (abs(w * cos(theta)) + abs(h * sin(theta)), abs(w * sin(theta)) + abs(h * cos(theta)))
+    guesses = [getattr(result, "hypothesis", result) for result in detection.results]
+    scored = [(float(guess.score), guess) for guess in guesses]
+    known = [(score, guess) for score, guess in scored if isfinite(score)]
+    score, best = max(known or scored, key=lambda pair: pair[0], default=(nan, None))
+    return x - w / 2, y - h / 2, w, h, score if known else nan, _class_id(best, classes)
+
+
+def _class_id(guess: Any, classes: Classes) -> int:
+    if guess is None:
+        return _UNKNOWN
+    return classes.class_id(str(guess.class_id if hasattr(guess, "class_id") else guess.id).strip())

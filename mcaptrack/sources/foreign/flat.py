@@ -1,0 +1,191 @@
+"""Messages of any schema as flat rows: each field that holds one value, or a list of such, by its path.
+
+Times and durations (seconds and nanoseconds) become one whole number of nanoseconds; lists of messages become JSON;
+bytes are told apart, since pictures and point clouds are no columns.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, Final
+
+import numpy as np
+
+from mcaptrack import log
+from mcaptrack.errors import McaptrackError
+from mcaptrack.geometry.clocks import NS_PER_S
+from mcaptrack.sources.foreign.messages import Kind, unpacker
+
+Path = tuple[str, ...]
+Value = bool | int | float | str | bytes | list[Any] | None
+
+_MAX_DEPTH: Final = 32
+_MAX_DESCRIPTOR: Final = 4 * 2**20
+#: How the parts of a time are called: in ROS 1, ROS 2, JSON of bridges, protobuf.
+_TIMES: Final = (("secs", "nsecs"), ("sec", "nsec"), ("sec", "nanosec"), ("seconds", "nanos"))
+
+
+class _Messages(tuple[Any, ...]):
+    """A list of messages: JSON even where it is empty, so that a column keeps its type."""
+
+
+def kind_of(opened: log.Log, topic: str) -> Kind:
+    """What a channel of a log says of its messages."""
+    channel = opened.channel(topic)
+    index = opened.part(topic).index
+    schema = index.schemas.get(index.channels[channel.id].schema_id)
+    words = (schema.name, schema.encoding, bytes(schema.data)) if schema else ("", "", b"")
+    return Kind(*words, channel.message_encoding)
+
+
+def flattener(kind: Kind) -> Callable[[bytes], dict[Path, Value]]:
+    """What makes a row of the payload of a message: path of each field -> value.
+
+    Raises McaptrackError if messages of this kind are not read; what it returns raises McaptrackError for payloads that
+    are malformed.
+    """
+    unpack = _unpacker(kind)
+
+    def flatten(payload: bytes) -> dict[Path, Value]:
+        try:
+            message = unpack(payload)
+            found = dict(_walk(message, ()))
+        except McaptrackError:
+            raise
+        except Exception as error:  # bytes of strangers through parsers of others: no list of exceptions is complete
+            why = " ".join(str(error).split())[:120] or type(error).__name__
+            raise McaptrackError(f"{len(payload)} bytes are no {kind.name or kind.encoding} message ({why})") from None
+        return found
+
+    return flatten
+
+
+def _unpacker(kind: Kind) -> Callable[[bytes], Any]:
+    if kind.encoding == "json":
+        return json.loads
+    if kind.encoding == "protobuf":
+        return _protobuf(kind)
+    return unpacker(kind)
+
+
+def _protobuf(kind: Kind) -> Callable[[bytes], Any]:
+    """Protobuf by the definition that the log carries."""
+    from google.protobuf.descriptor_pb2 import FileDescriptorSet
+    from google.protobuf.descriptor_pool import DescriptorPool
+    from google.protobuf.message_factory import GetMessageClass
+
+    try:
+        if len(kind.schema) > _MAX_DESCRIPTOR:
+            raise ValueError(f"it has {len(kind.schema)} bytes")
+        pool = DescriptorPool()
+        for file in FileDescriptorSet.FromString(kind.schema).file:
+            pool.Add(file)
+        made: Any = GetMessageClass(pool.FindMessageTypeByName(kind.name))
+    except Exception as error:  # of a parser that fails in its own many ways
+        why = " ".join(str(error).split())[:120] or type(error).__name__
+        raise McaptrackError(
+            f"{kind.name} can't be read: the log's definition of it can't be understood ({why})"
+        ) from None
+    return made.FromString  # type: ignore[no-any-return]
+
+
+def _walk(value: Any, path: Path) -> Iterator[tuple[Path, Value]]:
+    if len(path) > _MAX_DEPTH:
+        raise ValueError(f"it is more than {_MAX_DEPTH} messages deep")
+    fields = _fields(value)
+    if fields is None:
+        yield path or ("value",), _value(value)
+        return
+    t_ns = _nanoseconds(fields)
+    if t_ns is not None and path:
+        yield (*path[:-1], path[-1] + "_ns"), t_ns
+        return
+    for name, member in fields.items():
+        yield from _walk(member, (*path, name))
+
+
+def _fields(value: Any) -> Mapping[str, Any] | None:
+    """The fields of a message, of any encoding; None of what is no message."""
+    if isinstance(value, dict):
+        return value
+    if hasattr(value, "DESCRIPTOR"):
+        return {field.name: _member(value, field) for field in value.DESCRIPTOR.fields}
+    fields = getattr(value, "__dataclass_fields__", None)
+    if fields is not None:  # constants of the definition stand among the fields, and say so
+        kinds = {name: str(field.type) for name, field in fields.items()}
+        return {name: _ros(getattr(value, name), kind) for name, kind in kinds.items() if "ClassVar" not in kind}
+    return None
+
+
+def _ros(value: Any, kind: str) -> Any:
+    """A field of a ROS message."""
+    return _Messages(value) if isinstance(value, list) and "__" in kind else value
+
+
+def _member(message: Any, field: Any) -> Any:
+    """A field of a protobuf message: None where it is not set, enumerations by name."""
+    if field.has_presence and not message.HasField(field.name):
+        return None
+    value = getattr(message, field.name)
+    if field.message_type is not None and isinstance(value, Sequence):
+        return _Messages(value)
+    if field.enum_type is None:
+        return value
+    names = field.enum_type.values_by_number
+
+    def named(number: int) -> str:
+        return str(names[number].name) if number in names else str(number)
+
+    return named(value) if isinstance(value, int) else [named(number) for number in value]
+
+
+def _nanoseconds(fields: Mapping[str, Any]) -> int | None:
+    for seconds, nanoseconds in _TIMES:
+        if set(fields) == {seconds, nanoseconds}:
+            parts = [fields[seconds], fields[nanoseconds]]
+            if all(isinstance(part, int | np.integer) and not isinstance(part, bool) for part in parts):
+                return int(parts[0]) * NS_PER_S + int(parts[1])
+    return None
+
+
+def _value(value: Any) -> Value:
+    if value is None or isinstance(value, bool | str | bytes | int | float):
+        return value
+    if isinstance(value, np.generic):
+        return value.item()  # type: ignore[no-any-return]
+    if isinstance(value, np.ndarray):
+        return value.tobytes() if value.dtype.itemsize == 1 and value.dtype.kind in "ui" else value.tolist()
+    if hasattr(value, "items"):  # a map of protobuf
+        return _json({str(key): member for key, member in value.items()})
+    members = list(value)
+    if not isinstance(value, _Messages) and all(
+        isinstance(member, bool | int | float | str | np.generic) for member in members
+    ):
+        return [member.item() if isinstance(member, np.generic) else member for member in members]
+    return _json(members)
+
+
+def _json(value: Any) -> str:
+    return json.dumps(_plain(value, 0), ensure_ascii=False, separators=(",", ":"), allow_nan=False)
+
+
+def _plain(value: Any, depth: int) -> Any:
+    """A message as JSON has it; numbers that JSON doesn't know as text, bytes by their number."""
+    if depth > _MAX_DEPTH:
+        raise ValueError(f"it is more than {_MAX_DEPTH} messages deep")
+    fields = _fields(value)
+    if fields is not None:
+        return {name: _plain(member, depth + 1) for name, member in fields.items()}
+    if isinstance(value, float | np.floating) and not math.isfinite(value):
+        return "NaN" if math.isnan(value) else "Infinity" if value > 0 else "-Infinity"
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, bytes):
+        return f"{len(value)} bytes"
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    if hasattr(value, "items"):
+        return {str(key): _plain(member, depth + 1) for key, member in value.items()}
+    return [_plain(member, depth + 1) for member in value]

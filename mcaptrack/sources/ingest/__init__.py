@@ -1,0 +1,89 @@
+"""Whatever exists becomes a log: a video, a folder of images, a recording, label files beside them or alone."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Final
+
+from mcaptrack import log, notices
+from mcaptrack.errors import McaptrackError
+from mcaptrack.files import is_same_file, refuse_special
+from mcaptrack.schema.provenance import CLOCK
+from mcaptrack.sources.ingest.bags import LogJob
+from mcaptrack.sources.ingest.formats import Format, Role
+from mcaptrack.sources.ingest.job import IngestOptions, Job, Progress, Report
+from mcaptrack.sources.ingest.label_job import LabelJob, label_frames
+from mcaptrack.sources.ingest.source import open_source
+from mcaptrack.sources.ingest.video_job import VideoJob
+from mcaptrack.sources.video import IMAGE_SUFFIXES, ImageFormat
+
+__all__ = ["Format", "ImageFormat", "IngestOptions", "Report", "Role", "ingest", "label_frames"]
+
+VIDEO_SUFFIXES: Final = (
+    ".mp4",
+    ".mov",
+    ".mkv",
+    ".avi",
+    ".webm",
+    ".m4v",
+    ".ts",
+    ".h264",
+    ".264",
+    ".mpg",
+    ".mpeg",
+    ".h265",
+    ".265",
+    ".hevc",
+    ".ivf",
+    ".obu",
+)
+
+
+def ingest(
+    source: Path,
+    output: Path,
+    options: IngestOptions,
+    *,
+    into: log.Log | None = None,
+    force: bool = False,
+    progress: Progress = lambda *_: None,
+) -> Report:
+    """Make the log ``output`` from ``source``, or add its channels to the log ``into``, which then is the output.
+
+    Raises McaptrackError, and writes nothing, if anything of the input can't be understood.
+    """
+    if not re.fullmatch(r"[A-Za-z0-9_\-/]+", options.camera) or options.camera.strip("/") == "":
+        raise McaptrackError(f"a camera's name is made of letters, digits, _, - and /, not {options.camera!r}")
+    if not source.exists():
+        raise McaptrackError(f"{source} does not exist")
+    refuse_special(source)
+    if into is None and is_same_file(output, source):
+        raise McaptrackError(f"{source} is both input and output; give another name with -o")
+    with notices.collected() as warned, _job(source, options, progress, into) as job:
+        if options.first_frame is not None and not job.labels:
+            raise McaptrackError(f"{source}: --first-frame is about label files, and none is given")
+        job.tell()
+        with job.opened(output, into, force) as writer:
+            job.write(writer, has_clock=bool(into and into.metadata(CLOCK)))
+        job.check(output)
+        job.report.warnings, job.report.has_labels = warned, bool(job.labels)
+        job.report.uses_camera = bool(job.labels or job.homography) or isinstance(job, VideoJob)
+    return job.report
+
+
+def _job(source: Path, options: IngestOptions, progress: Progress, there: log.Log | None) -> Job:
+    recorded = open_source(source)
+    if recorded is not None:
+        return LogJob(source, options, recorded, progress, there)
+    is_video = source.is_dir() or source.suffix.lower() in VIDEO_SUFFIXES or _is_binary(source)
+    if is_video:
+        return VideoJob(source, options, progress, there)
+    return LabelJob([(options.role, source)], options, there)
+
+
+def _is_binary(source: Path) -> bool:
+    if source.suffix.lower() in IMAGE_SUFFIXES:
+        raise McaptrackError(f"{source} is a single image; give the folder that the images lie in")
+    with source.open("rb") as stream:
+        return b"\0" in stream.read(4096)

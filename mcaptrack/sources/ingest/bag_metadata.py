@@ -1,0 +1,80 @@
+"""The metadata.yaml of a rosbag2 folder."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any, Final
+
+from mcaptrack.errors import McaptrackError
+from mcaptrack.sources.ingest import plain_yaml
+from mcaptrack.sources.ingest.plain_yaml import Fields, NotPlainError
+
+METADATA: Final = "metadata.yaml"
+_ROOT: Final = "rosbag2_bagfile_information"
+
+
+@dataclass
+class Bag:
+    """What a metadata.yaml says of a bag."""
+
+    text: bytes = b""
+    distro: str = ""
+    #: Whether each message is compressed by itself.
+    packed: bool = False
+    #: Topic, type, serialization, quality of service, type hash, and how many messages the bag holds.
+    topics: Sequence[tuple[str, str, str, str, str, int]] = ()
+
+
+def holds_metadata(path: Path) -> bool:
+    """Whether a file is there and looks like the metadata of a bag."""
+    return path.is_file() and _ROOT.encode() in _start(path)
+
+
+def _start(path: Path) -> bytes:
+    """All that is read of it, and a byte more if there is more."""
+    try:
+        with path.open("rb") as stream:
+            return stream.read(plain_yaml.MAX_BYTES + 1)
+    except OSError as error:
+        raise McaptrackError(f"{path} can't be read: {error.strerror}") from None
+
+
+def read_metadata(path: Path) -> tuple[Bag, list[str]]:
+    """A metadata.yaml, and the files that it names. Raises McaptrackError if it is none."""
+    text = _start(path)
+    try:
+        said = Fields(plain_yaml.load(text), "it").map(_ROOT)
+        mode, compression = said.text("compression_mode", ""), said.text("compression_format", "")
+        topics = [_topic(Fields(entry, "a topic")) for entry in said.values("topics_with_message_count")]
+        names = [_name(entry) for entry in said.values("relative_file_paths")]
+        bag = Bag(text, said.text("ros_distro", ""), mode.lower() == "message", topics)
+    except NotPlainError as error:
+        raise McaptrackError(f"{path} is no metadata of a rosbag2 bag ({str(error)[:200]})") from None
+    twice = next((name for name, times in Counter(names).items() if times > 1), "")
+    if twice:
+        raise McaptrackError(f"{path} names {twice} twice; its messages would be there twice")
+    if mode.lower() not in ("", "none") and compression.lower() != "zstd":
+        raise McaptrackError(f"{path}: the bag is compressed with {compression!r}; zstd is read")
+    return bag, names
+
+
+def _topic(entry: Fields) -> tuple[str, str, str, str, str, int]:
+    topic = entry.map("topic_metadata")
+    name, kind, encoding = topic.text("name"), topic.text("type"), topic.text("serialization_format", "cdr")
+    qos = topic.any("offered_qos_profiles")
+    # Text before ROS 2 Jazzy; since then, YAML inside of YAML.
+    words = "" if qos is None else str(qos) if isinstance(qos, str) else plain_yaml.dump(qos)
+    return name, kind, encoding, words, topic.text("type_description_hash", ""), entry.whole("message_count")
+
+
+def _name(entry: Any) -> str:
+    """The name of a file in the bag's folder. Before ROS 2 Galactic the folder's name stood before it."""
+    if not isinstance(entry, str) or not PurePosixPath(entry).name:
+        raise NotPlainError(f"relative_file_paths names {entry!r}, which is no file"[:120])
+    path = PurePosixPath(entry)
+    if path.is_absolute() or ".." in path.parts or "\0" in entry:
+        raise NotPlainError(f"relative_file_paths names {entry!r}, which lies outside of the bag's folder"[:200])
+    return path.name

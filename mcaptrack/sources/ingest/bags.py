@@ -1,0 +1,239 @@
+"""Recordings of others -> a log with everything that is in them: messages, schemas and times as they are."""
+
+from __future__ import annotations
+
+from array import array
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Iterator
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from mcaptrack import log
+from mcaptrack.errors import McaptrackError
+from mcaptrack.geometry.clocks import LAST_NS
+from mcaptrack.geometry.plane import GroundPlane
+from mcaptrack.sources import foreign
+from mcaptrack.sources.ingest.cameras import choose, picture_test, timeline_of
+from mcaptrack.sources.ingest.job import IngestOptions, Job, Progress
+from mcaptrack.sources.ingest.source import Connection, Found, Source
+from mcaptrack.sources.ingest.timeline import Timeline
+from mcaptrack.sources.video import Encoded, brightness
+
+#: A larger message would make a chunk that no careful reader opens.
+_MAX_MESSAGE_BYTES: Final = 2**28 - 2**24
+_PROGRESS_EVERY: Final = 256
+
+
+class LogJob(Job):
+    """A recording, with labels beside its pictures."""
+
+    def __init__(
+        self, source: Path, options: IngestOptions, recorded: Source, progress: Progress, there: log.Log | None = None
+    ) -> None:
+        self._recorded, self._progress = recorded, progress
+        try:
+            for given, name in (
+                (options.fps, "--fps"),
+                (options.start_ns is not None, "--start-time"),
+                (options.for_videos(), options.for_videos()),
+                (options.role, "--as"),
+                (options.frames is not None, "--frames"),
+            ):
+                if given:
+                    raise McaptrackError(
+                        f"{source} is a log: its messages stay as they are, and so do their times; leave {name} out"
+                    )
+            super().__init__(source, options, there)
+            #: What is passed on as a whole, if anything is.
+            self._passed_on: log.Log | None = None
+            #: The connections with the pictures that labels belong to.
+            self._connections: list[Connection] = []
+            self._channels: dict[Connection, int] = {}
+            self._written: dict[int, int] = {}
+            if self.labels or self.homography:
+                self._find_pictures()
+        except BaseException:
+            recorded.close()
+            raise
+        self._close.callback(recorded.close)
+
+    def _find_pictures(self) -> None:
+        """Find the camera that labels belong to: the only one with pictures, or the one that --camera names."""
+        by_topic: dict[str, list[Connection]] = {}
+        for connection in self._recorded.connections:
+            is_empty = self._recorded.claims is not None and not self._recorded.claims[connection]
+            if foreign.is_picture(connection.schema[0]) and not is_empty:
+                by_topic.setdefault(connection.topic, []).append(connection)
+        self.prefix, self.pictures = choose(self.source, self.options.camera, by_topic)
+        if not self.pictures:
+            raise McaptrackError(
+                f"{self.source}: labels and ground planes belong to the pictures of one camera; the log has "
+                f"{', '.join(sorted(by_topic)) or 'none'}. Choose one with --camera, the part of its topic before the "
+                "last /"
+            )
+        self._connections = by_topic[self.pictures]
+
+    def topics(self) -> Iterator[str]:
+        """The topics that are new in the log: of a recording that is passed on, those of labels."""
+        if not self._passed_on:
+            yield from {connection.topic: None for connection in self._recorded.connections}
+        yield from super().topics()
+
+    def opened(self, output: Path, into: log.Log | None, force: bool) -> AbstractContextManager[log.LogWriter]:
+        """As for all jobs; an MCAP file that becomes a new log is copied as it is."""
+        if into is not None:
+            itself = self._recorded.as_it_is
+            if itself is not None and itself.real_path == into.real_path:
+                raise McaptrackError(f"{self.source} can't be added to itself")
+            return log.extend(into, drop=self.taken(into, force))
+        self._passed_on = self._recorded.as_it_is
+        if self._passed_on is not None:
+            return log.extend(self._passed_on, output, drop=self.taken(self._passed_on, force))
+        recorded = {connection.topic for connection in self._recorded.connections}
+        doubled = recorded & set(super().topics())
+        if doubled:
+            raise McaptrackError(f"{self.source} has {', '.join(sorted(doubled))} already; {super().instead(recorded)}")
+        return log.create(output, self._recorded.profile)
+
+    def write(self, writer: log.LogWriter, has_clock: bool) -> None:
+        """Write all that the recording holds, then labels."""
+        self.report.notes += self._recorded.words.notes
+        self.report.lost += self._recorded.words.lost
+        timeline = self._pass_on(writer) if self._passed_on else self._write_messages(writer)
+        self._recorded.extras(writer, has_clock, passed_on=self._passed_on is not None)
+        if self._connections:
+            if not len(timeline.t_ns):
+                raise McaptrackError(f"{self.source}: {self.pictures} has no pictures that labels could be of")
+            plane = self._plane()
+            self.write_plane(writer, plane, int(timeline.t_ns[0]))
+            self.write_labels(writer, plane, timeline)
+
+    def instead(self, topics: Collection[str]) -> str:
+        """Words on where to put a recording, or labels beside one, where topics are taken."""
+        return super().instead(topics) if self._passed_on else "make a log of its own of it with -o"
+
+    def check(self, output: Path) -> None:
+        """Every channel has the messages that were given to it."""
+        with log.read(output) as done:
+            index = done.parts[-1].index
+            for number, count in self._written.items():
+                there = index.counts.get(number, 0)
+                if there != count:
+                    topic = index.channels[number].topic if number in index.channels else "a channel"
+                    raise McaptrackError(
+                        f"{output} is not complete: {there} messages of {topic} where {self.source} has {count}"
+                    )
+
+    # Messages
+
+    def _pass_on(self, writer: log.LogWriter) -> Timeline:
+        """Count what is in the log that is passed on as it is; returns the pictures that labels belong to."""
+        opened = self._passed_on
+        assert opened is not None
+        for number in writer.channels:
+            self._written[number] = opened.index.counts.get(number, 0)
+            if not self._written[number]:  # some writers describe channels without messages in the summary alone
+                writer.put_description(number)
+        self._report({number: channel.topic for number, channel in writer.channels.items()})
+        if len(self._connections) == 1:
+            return timeline_of(opened, self.pictures)
+        holds_picture = self._holds_picture()
+        return self._timeline(m.t_ns for c, m in self._recorded.messages(Found()) if holds_picture(c, m.payload))
+
+    def _timeline(self, t_ns: Iterable[int]) -> Timeline:
+        in_order = sorted(t_ns)
+        if in_order and in_order[-1] > LAST_NS:
+            raise McaptrackError(
+                f"{self.source}: {self.pictures} has pictures later than the year 2262, the last at {in_order[-1]} ns; "
+                "labels can't be placed on such times"
+            )
+        times = np.array(in_order, np.int64)
+        return Timeline(np.arange(len(times)), times, f"the pictures of {self.pictures}", not self.report.lost)
+
+    def _holds_picture(self) -> Callable[[Connection, bytes], bool]:
+        """Whether a message is one of the pictures that labels belong to."""
+        kinds = {one: picture_test(foreign.Kind(*one.schema, one.encoding)) for one in self._connections}
+        return lambda connection, payload: connection in kinds and kinds[connection](payload)
+
+    def _write_messages(self, writer: log.LogWriter) -> Timeline:
+        """Write all channels and messages; returns the pictures that labels belong to."""
+        found, done, times, holds_picture = Found(), 0, array("Q"), self._holds_picture()
+        for connection in self._recorded.connections:
+            self._channel(writer, connection)
+        total = sum((self._recorded.claims or {}).values())
+        for connection, message in self._recorded.messages(found):
+            number = self._channels[connection]
+            if len(message.payload) > _MAX_MESSAGE_BYTES:
+                raise McaptrackError(
+                    f"{self.source}: {connection.topic} at {message.t_ns} ns: "
+                    f"a message of {len(message.payload)} bytes; at most {_MAX_MESSAGE_BYTES} go into a log"
+                )
+            writer.add_message(number, message.t_ns, message.sequence, message.payload, message.publish_ns)
+            self._written[number] += 1
+            if holds_picture(connection, message.payload):
+                times.append(message.t_ns)
+            done += 1
+            if done % _PROGRESS_EVERY == 0:
+                self._progress("ingest", done, max(total, done))
+        self._progress("ingest", done, max(total, done))
+        self.report.notes += found.notes
+        self.report.lost += found.lost
+        self._compare()
+        self._report({number: connection.topic for connection, number in self._channels.items()})
+        return self._timeline(times)
+
+    def _channel(self, writer: log.LogWriter, connection: Connection) -> None:
+        number = writer.add_channel(
+            connection.topic,
+            connection.schema,
+            connection.encoding,
+            connection.metadata,
+            kind="media" if foreign.is_compressed(connection.schema[0]) else "rows",
+            another=True,
+        )
+        self._channels[connection] = number
+        self._written[number] = 0
+
+    def _compare(self) -> None:
+        """What was read with what the recording says that it holds."""
+        for connection, said in (self._recorded.claims or {}).items():
+            count = self._written[self._channels[connection]]
+            if count < said and self.report.lost:
+                self.report.lost.append(f"{connection.topic}: {said - count} of {said} messages")
+            elif count != said:
+                raise McaptrackError(
+                    f"{self.source} does not add up: its index counts {said} messages of {connection.topic}, "
+                    f"and {count} are there"
+                )
+
+    def _report(self, topics: dict[int, str]) -> None:
+        counts: Counter[str] = Counter()
+        for number, topic in topics.items():
+            counts[topic] += self._written.get(number, 0)
+        self.report.messages |= counts
+
+    # Pictures
+
+    def _plane(self) -> GroundPlane | None:
+        if self.homography is None:
+            return None
+        first = next(brightness(self._encoded()), None)
+        if first is None:
+            raise McaptrackError(f"{self.source}: {self.pictures} has no picture that can be decoded")
+        height, width = first.rows.shape
+        return self.plane(width, height)
+
+    def _encoded(self) -> Iterator[Encoded]:
+        """The pictures that labels belong to, as far as anybody asks."""
+        decoders = {
+            connection: foreign.picture_decoder(foreign.Kind(*connection.schema, connection.encoding))
+            for connection in self._connections
+        }
+        for index, (connection, message) in enumerate(self._recorded.messages(Found())):
+            if connection in decoders:
+                picture = decoders[connection](message.payload)
+                where = f"{self.source}: {self.pictures} at {message.t_ns} ns"
+                yield Encoded(message.t_ns, index, picture.format, picture.data, picture.layout, where)

@@ -1,0 +1,169 @@
+"""Which pictures labels belong to: a camera is the part of a topic before its last "/"."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator
+from fractions import Fraction
+from itertools import islice
+from typing import Final, NamedTuple, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaptrack import log
+from mcaptrack.errors import McaptrackError
+from mcaptrack.geometry.clocks import parse_fps
+from mcaptrack.schema.provenance import Provenance
+from mcaptrack.sources import foreign
+from mcaptrack.sources.foreign.flat import kind_of
+from mcaptrack.sources.ingest.formats import Role
+from mcaptrack.sources.ingest.timeline import Timeline
+from mcaptrack.sources.video import Encoded, brightness, entry, is_video
+
+#: The camera where no one names another.
+DEFAULT: Final = "camera"
+
+
+class Camera(NamedTuple):
+    """What everything of a camera lies under, and the topic of its pictures, "" if there are none."""
+
+    prefix: str
+    pictures: str
+
+
+def choose(where: object, camera: str, topics: Collection[str]) -> Camera:
+    """The camera of this name, among topics of pictures.
+
+    The name may also be a topic of pictures itself, or lie below a camera: labels that can't stand beside the pictures
+    of ``front`` go to ``front/labels``. Unless another camera is named, it is the only one with pictures. Raises
+    McaptrackError, with the names, if a camera has several topics of pictures or if none of several is named.
+    """
+    prefix = "/" + camera.strip("/")
+    for at in (prefix, *_above(prefix)):
+        if at in topics:
+            return Camera(folder_of(at) if at == prefix else prefix, at)
+        found = sorted(topic for topic in topics if folder_of(topic) == at)
+        if len(found) == 1 or f"{at}/video" in found:
+            return Camera(prefix, f"{at}/video" if len(found) > 1 else found[0])
+        if found:
+            raise McaptrackError(
+                f"{where}: {at} has several topics of pictures, {', '.join(found)}; name one with "
+                f"--camera {found[0].strip('/')}"
+            )
+    if camera != DEFAULT or not topics:
+        return Camera(prefix, "")
+    if len(topics) > 1:
+        names = sorted({folder_of(topic).strip("/") for topic in topics})
+        names = names if len(names) == len(topics) else sorted(topic.strip("/") for topic in topics)
+        raise McaptrackError(
+            f"{where} has pictures of several cameras, {', '.join(sorted(topics))}; labels and ground planes belong to "
+            f"those of one: choose with --camera {names[0]}"
+        )
+    (topic,) = topics
+    return Camera(folder_of(topic), topic)
+
+
+def _above(prefix: str) -> Iterator[str]:
+    while "/" in prefix[1:]:
+        prefix = prefix.rpartition("/")[0]
+        yield prefix
+
+
+def folder_of(topic: str) -> str:
+    """What everything beside a topic lies under."""
+    folder, slash, _ = topic.strip("/").rpartition("/")
+    return f"/{folder}" if slash else f"/{DEFAULT}"
+
+
+def camera_of(opened: log.Log, camera: str) -> Camera:
+    """The camera of this name in a log. Raises McaptrackError as ``choose`` does."""
+    topics = [c.topic for c in opened.channels.values() if foreign.holds_pictures(c) and c.messages]
+    return choose(opened.path, camera, topics)
+
+
+def picture_test(kind: foreign.Kind) -> Callable[[bytes], bool]:
+    """What tells whether a message of a channel is a picture: of a video, parameter sets may stand alone in one."""
+    if not foreign.is_compressed(kind.name):
+        return lambda _: True
+    decode = foreign.picture_decoder(kind)
+
+    def test(payload: bytes) -> bool:
+        try:
+            picture = decode(payload)
+        except McaptrackError:
+            return True  # a damaged picture is one; whoever decodes it says what is wrong
+        return entry(picture.format, picture.data).has_picture
+
+    return test
+
+
+def timeline_of(opened: log.Log, topic: str) -> Timeline:
+    """The pictures of a channel with messages. Raises McaptrackError if it is damaged, or none of them is a picture."""
+    t_ns: NDArray[np.int64] = opened.times(topic)
+    index, every, of = np.arange(len(t_ns)), 1, f"the pictures of {topic}"
+    made = Provenance.from_metadata(opened.channel(topic).metadata)
+    if made:
+        said = made.parameters.get("every")
+        every = said if isinstance(said, int) and said > 0 else 1
+        last = max(message.sequence for message in opened.messages(topic, int(t_ns[-1])))
+        if last + 1 != len(t_ns):  # pictures were lost on the way: the others keep their numbers
+            index = np.array([message.sequence for message in opened.messages(topic)], np.int64)
+    elif _may_be_video(opened, topic):
+        is_picture = picture_test(kind_of(opened, topic))
+        t_ns = np.array([m.t_ns for m in opened.messages(topic) if is_picture(m.payload)], np.int64)
+        index = np.arange(len(t_ns))
+    if not len(t_ns):
+        raise McaptrackError(f"{opened.path}: {topic} has no pictures that labels could be of")
+    return Timeline(index, t_ns, of, len(index) == index[-1] + 1, every)
+
+
+def seen_by(opened: log.Log, prefix: str) -> str:
+    """The detections of a camera whose pictures are gone: they have a frame for each; "" if there are none."""
+    channel = opened.channels.get(f"{prefix}/detections")
+    made = Provenance.from_metadata(channel.metadata) if channel else None
+    return channel.topic if channel and channel.messages and made and made.transform == "detect" else ""
+
+
+def _may_be_video(opened: log.Log, topic: str) -> bool:
+    """Whether the first picture of a channel is of a video, or can't be read."""
+    if not foreign.is_compressed(opened.channel(topic).schema_name):
+        return False
+    decode = foreign.picture_decoder(kind_of(opened, topic))
+    try:
+        return any(is_video(decode(message.payload).format) for message in islice(opened.messages(topic), 1))
+    except McaptrackError:
+        return True
+
+
+class Standing(NamedTuple):
+    """Labels that stand in a log: their times, rising, how many frames they count, at which rate if they say it."""
+
+    t_ns: NDArray[np.int64]
+    frames: int
+    fps: Fraction | None
+
+
+def labels_of(opened: log.Log, prefix: str) -> dict[str, Standing]:
+    """The labels of a camera that were put into a log, by topic."""
+    out = {}
+    for role in get_args(Role):
+        channel = opened.channels.get(f"{prefix}/{role}")
+        made = Provenance.from_metadata(channel.metadata) if channel else None
+        if channel and channel.messages and made and made.transform == "ingest":
+            t_ns = opened.times(channel.topic)
+            said = made.parameters.get("fps")
+            fps = parse_fps(said) if isinstance(said, str) else None
+            frames = 1 + max(message.sequence for message in opened.messages(channel.topic, int(t_ns[-1])))
+            out[channel.topic] = Standing(t_ns, frames, fps)
+    return out
+
+
+def size_of(opened: log.Log, topic: str) -> tuple[int, int]:
+    """Width and height of the pictures of a channel. Raises McaptrackError if none of them can be decoded."""
+    found = foreign.pictures(opened, topic)
+    for frame in brightness(
+        Encoded(m.t_ns, number, picture.format, picture.data, picture.layout, f"{opened.path}: {topic} at {m.t_ns} ns")
+        for number, (m, picture) in enumerate(found)
+    ):
+        return frame.rows.shape[1], frame.rows.shape[0]
+    raise McaptrackError(f"{opened.path}: {topic} has no picture that can be decoded")

@@ -1,0 +1,351 @@
+"""The formats of label files, and what all of them become: ``Labels``.
+
+| format  | columns                                                                        | frames | unit |
+|---------|--------------------------------------------------------------------------------|--------|------|
+| mot     | frame, id, left, top, width, height[, score[, ...]]; 6 to 10, comma separated  | from 1 | px   |
+| kitti   | frame id type truncated occluded alpha left top right bottom ...; 17 or 18     | from 0 | px   |
+| sdd     | id xmin ymin xmax ymax frame lost occluded generated "label"; blank separated  | from 0 | px   |
+| trajnet | frame id x y; comma or blank separated                                         | from 0 | m    |
+| obsmat  | frame id x z y vx vz vy; blank separated                                       | from 0 | m    |
+
+MOTChallenge's truth names the class of a box in column 8 since MOT16; in MOT15, which has 10 columns, a position stands
+there. Truth also holds boxes of what isn't scored: see ``Aside``. Tracks and truth are of people, since their rows have
+no class; detections keep all classes.
+
+Letters: N rows, F frames.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaptrack.errors import McaptrackError
+from mcaptrack.sources.ingest.text import Lines, Table
+
+Format = Literal["auto", "mot", "kitti", "sdd", "trajnet", "obsmat"]
+Role = Literal["detections", "tracks", "truth"]
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+Classes = NDArray[np.uint32]
+
+NO_ID: Final = -1
+PERSON: Final = 1
+#: Coordinates, in pixels or metres, and scores can't be larger.
+_MAX_PLACE: Final = 1e8
+_MAX_SCORE: Final = 1e9
+_MAX_FRAME: Final = 2**31 - 1
+#: Formats that are labelled every so many frames by custom.
+_POSITIONS: Final = ("trajnet", "obsmat")
+#: Boxes are labelled every so many frames, rather than seldom seen, if there are at least so many labelled frames.
+_SPARSE_FRAMES: Final = 3
+
+#: Classes of MOT16, 17 and 20 that are people but none to be found: on a vehicle, standing still (a statue),
+#: distractors, reflections.
+_DISTRACTORS: Final = (2, 7, 8, 12)
+#: Occluded more than this, or truncated at all, KITTI's people don't count; boxes up to this height don't count against
+#: anybody.
+_KITTI_OCCLUDED: Final = 2
+KITTI_HEIGHT_PX: Final = 25.0
+#: The classes that formats name, as they are numbered in detections; others get numbers after these. KITTI's tracking
+#: labels call Person what its detection labels call Person_sitting.
+_KITTI_CLASSES: Final = {
+    "pedestrian": PERSON,
+    "cyclist": 2,
+    "car": 3,
+    "van": 4,
+    "truck": 5,
+    "tram": 6,
+    "person_sitting": 7,
+    "person": 7,
+    "misc": 8,
+}
+_SDD_CLASSES: Final = {"pedestrian": PERSON, "biker": 2, "skater": 3, "cart": 4, "car": 5, "bus": 6}
+_KITTI_REGION: Final = "dontcare"
+_MAX_NAMES: Final = 256
+
+
+@dataclass(frozen=True)
+class Aside:
+    """Labelled boxes that need not be found: frames (N,) as in the file, boxes (N, 4).
+
+    ``forgiven`` (N,): a track that is matched with the box counts neither for nor against; otherwise it counts as
+    false. ``region`` (N,): so do tracks that match no person and lie in the box.
+    """
+
+    frame: Ints
+    boxes_px: Floats
+    forgiven: Bools
+    region: Bools
+
+
+@dataclass(frozen=True)
+class Labels:
+    """The rows of a label file, ordered by frame and id.
+
+    ``frame`` (N,) is the number in the file, which is ``first_frame`` for the video's first frame. ``id`` (N,) is -1 in
+    detections. ``boxes_px`` (N, 4) or ``xy_m`` (N, 2) is None where the format has none. ``score`` (N,) is NaN where
+    there is none. ``labelled`` (F,) are the frames that the file has rows of, rising; also of rows that aren't kept.
+    ``class_id`` (N,) is as in the schema of detections; ``classes`` are the names of those that have one. ``left_out``
+    says what the file holds that isn't kept; of truth, ``aside`` holds it.
+    """
+
+    format: Format
+    first_frame: int
+    frame: Ints
+    id: Ints
+    boxes_px: Floats | None
+    xy_m: Floats | None
+    score: Floats
+    labelled: Ints
+    class_id: Classes
+    classes: Mapping[int, str] = field(default_factory=dict)
+    left_out: str = ""
+    aside: Aside | None = None
+
+    @property
+    def step(self) -> int:
+        """Every how many frames there are labels: 1, or 12 where every twelfth frame was labelled."""
+        least = 2 if self.format in _POSITIONS else _SPARSE_FRAMES
+        return int(np.gcd.reduce(np.diff(self.labelled))) if len(self.labelled) >= least else 1
+
+    @property
+    def identified(self) -> bool:
+        """Whether the rows say who it is."""
+        return bool((self.id != NO_ID).any())
+
+
+class _Names:
+    """The names in a column of classes, numbered from 0 as they come."""
+
+    def __init__(self) -> None:
+        self._numbers: dict[str, int] = {}
+
+    def number(self, name: str) -> int:
+        """The number of a name. Raises ValueError for more names than there are classes."""
+        if name not in self._numbers and len(self._numbers) == _MAX_NAMES:
+            raise ValueError(f"the column of classes has more than {_MAX_NAMES} names")
+        return self._numbers.setdefault(name, len(self._numbers))
+
+    def are(self, numbers: Floats, name: str) -> Bools:
+        """Which of a column's names are this one, which is in lower case."""
+        same = np.array([other.lower() == name for other in self._numbers], bool)
+        return np.asarray(same[numbers.astype(int)], bool)
+
+    def count(self, numbers: Floats) -> str:
+        """How often each name comes in a column, in words."""
+        names = list(self._numbers)
+        counts = Counter(numbers.astype(int).tolist())
+        return ", ".join(f"{count} {names[number]}" for number, count in counts.most_common())
+
+    def ids(self, numbers: Floats, known: Mapping[str, int]) -> tuple[Classes, dict[int, str]]:
+        """A column as class ids, and the names of these."""
+        others = sorted({name.lower() for name in self._numbers} - known.keys())
+        places = {**known, **{name: number for number, name in enumerate(others, start=max(known.values()) + 1)}}
+        ids = np.array([places[name.lower()] for name in self._numbers], np.uint32)
+        names = dict(zip(ids.tolist(), self._numbers, strict=True))
+        column = ids[numbers.astype(int)]
+        return column, {number: names[number] for number in np.unique(column).tolist()}
+
+
+def _all_people(count: int) -> Classes:
+    return np.full(count, PERSON, np.uint32)
+
+
+def _boxes(table: Table, columns: slice, corners: bool = False) -> Floats:
+    """Left, top, width and height (N, 4) from columns that hold them, or that hold left, top, right and bottom."""
+    boxes = table.within(columns, "a coordinate", _MAX_PLACE)
+    if corners:
+        boxes = np.concatenate([boxes[:, :2], boxes[:, 2:] - boxes[:, :2]], axis=1)
+    table.refuse(
+        (boxes[:, 2] < 0) | (boxes[:, 3] < 0),
+        lambda row: f"a box can't be {boxes[row, 2]:g} wide and {boxes[row, 3]:g} high",
+    )
+    return boxes
+
+
+def _frame(table: Table, column: int) -> Ints:
+    return table.whole(column, "the frame (a count of pictures, no time)", 0, _MAX_FRAME)
+
+
+def _score(table: Table, column: int) -> Floats:
+    """A column of scores, NaN where there is none."""
+    score = table.values[:, column]
+    table.refuse(np.abs(score) > _MAX_SCORE, lambda row: f"a score can't be {score[row]:g}")
+    return score
+
+
+def _columns(parts: Sequence[str], least: int, most: int) -> None:
+    if not least <= len(parts) <= most:
+        raise ValueError(f"{len(parts)} column{'s' * (len(parts) != 1)}")
+
+
+def read_mot(path: Path, lines: Lines, role: Role) -> Labels:
+    """MOTChallenge."""
+
+    def parse(parts: list[str]) -> list[float]:
+        _columns(parts, 6, 10)
+        # Of 10 columns, which are MOT15's, the eighth is no class.
+        more = parts[6:8] if len(parts) < 10 else parts[6:7]
+        return [*map(float, parts[:6]), *map(float, more), *[np.nan] * (2 - len(more))]
+
+    table = Table(path, lines, "MOTChallenge (frame, id, left, top, width, height, score, ...)", 8, parse)
+    frame, who = _frame(table, 0), table.whole(1, "the id", NO_ID)
+    boxes, score, kind = _boxes(table, slice(2, 6)), _score(table, 6), table.values[:, 7]
+    named = np.isfinite(kind)
+    kept = np.ones(len(frame), bool)
+    if role == "truth":
+        if (kind == 0).all():
+            raise McaptrackError(
+                f"{path}: the class of all {len(kind)} boxes (column 8) is 0; pedestrians are 1 there since MOT16, and "
+                "-1 or no column 8 says that there are no classes"
+            )
+        # A score of 0 marks boxes that don't count.
+        kept = (score != 0) & ((kind == PERSON) | (kind == NO_ID) | np.isnan(kind))
+        if not kept.any():
+            raise McaptrackError(f"{path}: all {len(kept)} boxes are marked as not counting (score 0 or a class but 1)")
+    class_id = _all_people(len(frame))
+    if role == "detections":
+        table.refuse(
+            named & ~((kind == np.rint(kind)) & (kind >= NO_ID) & (kind < 2**32)),
+            lambda row: f"a class (column 8) is a whole number from -1 (none) on, not {kind[row]:g}",
+        )
+        class_id = np.where(named & (kind != NO_ID), kind, PERSON).astype(np.uint32)
+    gone = ~kept
+    others = f"{int(gone.sum())} boxes that don't count (score 0 or a class but 1)" if gone.any() else ""
+    if role == "tracks" and ((kind > 0) & (kind != PERSON)).any():
+        others = f"the classes of {int(((kind > 0) & (kind != PERSON)).sum())} boxes that aren't people (column 8)"
+    aside = Aside(frame[gone], boxes[gone], np.isin(kind[gone], _DISTRACTORS), np.zeros(int(gone.sum()), bool))
+    return Labels(
+        "mot",
+        0 if (frame == 0).any() else 1,  # some programs count from 0 in this format too, and show it by a frame 0
+        frame[kept],
+        who[kept],
+        boxes[kept],
+        None,
+        score[kept] if role != "truth" else np.full(int(kept.sum()), np.nan),
+        np.unique(frame),
+        class_id[kept],
+        left_out=others,
+        aside=aside if (kind > 0).any() else None,
+    )
+
+
+def read_kitti(path: Path, lines: Lines, role: Role) -> Labels:
+    """KITTI tracking. Scores (column 18) are those of a tracker's."""
+    names = _Names()
+
+    def parse(parts: list[str]) -> list[float]:
+        _columns(parts, 17, 18)
+        score = float(parts[17]) if len(parts) == 18 else np.nan
+        return [*(float(parts[at]) for at in (0, 1, 3, 4, 6, 7, 8, 9)), score, names.number(parts[2])]
+
+    columns = "frame id type truncated occluded alpha left top right bottom height width length x y z rotation score"
+    table = Table(path, lines, f"KITTI tracking ({columns})", 10, parse)
+    frame, who = _frame(table, 0), table.whole(1, "the id", NO_ID)
+    boxes, score, kind = _boxes(table, slice(4, 8), corners=True), _score(table, 8), table.values[:, 9]
+    truncated, occluded = table.values[:, 2], table.values[:, 3]
+    people, region = names.are(kind, "pedestrian"), names.are(kind, _KITTI_REGION)
+    if role == "detections":
+        kept = ~region
+        if not kept.any():
+            raise McaptrackError(f"{path} holds no boxes, only {names.count(kind)}")
+    else:
+        kept = people.copy()
+        if not people.any():
+            raise McaptrackError(f"{path} holds no pedestrians, only {names.count(kind)}")
+    if role == "truth":
+        kept &= (truncated <= 0) & (occluded <= _KITTI_OCCLUDED)
+    hidden = int((people & ~kept).sum())
+    left = [names.count(kind[~people & ~kept])] if (~people & ~kept).any() else []
+    left += [f"{hidden} Pedestrian, hidden or cut off"] if hidden else []
+    sitting = names.are(kind, "person_sitting") | names.are(kind, "person")
+    beside = ~kept & (people | sitting | region)
+    class_id, classes = names.ids(kind[kept], _KITTI_CLASSES)
+    return Labels(
+        "kitti",
+        0,
+        frame[kept],
+        who[kept],
+        boxes[kept],
+        None,
+        score[kept],
+        np.unique(frame),
+        class_id,
+        classes,
+        " and ".join(left),
+        Aside(frame[beside], boxes[beside], ~region[beside], region[beside]) if role == "truth" else None,
+    )
+
+
+def read_sdd(path: Path, lines: Lines, role: Role) -> Labels:
+    """Stanford Drone annotations."""
+    names = _Names()
+
+    def parse(parts: list[str]) -> list[float]:
+        _columns(parts, 10, 10)
+        return [*map(float, parts[:9]), names.number(parts[9].strip('"'))]
+
+    columns = 'id xmin ymin xmax ymax frame lost occluded generated "label"'
+    table = Table(path, lines, f"Stanford Drone annotations ({columns})", 10, parse)
+    frame, who = _frame(table, 5), table.whole(0, "the id", 0)
+    boxes, kind = _boxes(table, slice(1, 5), corners=True), table.values[:, 9]
+    lost = table.values[:, 6] != 0
+    other = ~names.are(kind, "pedestrian") & (role != "detections")
+    kept = ~lost & ~other
+    if not kept.any():
+        what = "pedestrians" if other.any() else "boxes in sight"
+        raise McaptrackError(f"{path} holds no {what}, only {names.count(kind)}")
+    left = [names.count(kind[other & ~lost])] if (other & ~lost).any() else []
+    left += [f"{int(lost.sum())} boxes out of sight (lost)"] if lost.any() else []
+    class_id, classes = names.ids(kind[kept], _SDD_CLASSES)
+    return Labels(
+        "sdd",
+        0,
+        frame[kept],
+        who[kept],
+        boxes[kept],
+        None,
+        np.full(int(kept.sum()), np.nan),
+        np.unique(frame),
+        class_id,
+        classes,
+        " and ".join(left),
+    )
+
+
+def read_trajnet(path: Path, lines: Lines, role: Role) -> Labels:
+    """TrajNet text."""
+    return _positions(path, lines, "trajnet", "TrajNet (frame id x y)", 4, slice(2, 4))
+
+
+def read_obsmat(path: Path, lines: Lines, role: Role) -> Labels:
+    """ETH's obsmat."""
+    return _positions(path, lines, "obsmat", "an ETH obsmat (frame id x z y vx vz vy)", 8, slice(2, 5, 2))
+
+
+def _positions(path: Path, lines: Lines, name: Format, what: str, columns: int, place: slice) -> Labels:
+    def parse(parts: list[str]) -> list[float]:
+        _columns(parts, columns, columns)
+        return [float(part) for part in parts]
+
+    table = Table(path, lines, what, columns, parse)
+    frame, who = _frame(table, 0), table.whole(1, "the id", 0)
+    xy_m, none = table.within(place, "a position", _MAX_PLACE), np.full(len(frame), np.nan)
+    return Labels(name, 0, frame, who, None, xy_m, none, np.unique(frame), _all_people(len(frame)))
+
+
+READERS: Final[Mapping[str, Callable[[Path, Lines, Role], Labels]]] = {
+    "mot": read_mot,
+    "kitti": read_kitti,
+    "sdd": read_sdd,
+    "trajnet": read_trajnet,
+    "obsmat": read_obsmat,
+}

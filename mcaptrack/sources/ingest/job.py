@@ -1,0 +1,299 @@
+"""What all inputs have in common: options, what is reported, labels and the ground plane of a camera.
+
+Letters: N rows.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import AbstractContextManager, ExitStack
+from dataclasses import dataclass, field
+from fractions import Fraction
+from pathlib import Path
+from typing import Any, Final, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaptrack import log
+from mcaptrack.errors import McaptrackError
+from mcaptrack.geometry.plane import GroundPlane, Point
+from mcaptrack.notices import Notice, warn
+from mcaptrack.schema import DETECTIONS, GROUND_PLANE, TRACKS, Frame, Rows, Schema
+from mcaptrack.schema.ground import plane_to_rows
+from mcaptrack.schema.provenance import CLOCK, Provenance, digest
+from mcaptrack.sources.ingest.formats import Format, Labels, Role
+from mcaptrack.sources.ingest.labels import read_homography, read_labels
+from mcaptrack.sources.ingest.timeline import Placed, Timeline
+from mcaptrack.sources.video import ImageFormat, Keep
+
+Ints = NDArray[np.int64]
+Progress = Callable[[str, int, int], None]
+#: Frames, from the beginning whenever it is called.
+Frames = Callable[[], Iterator[Frame]]
+
+_SCHEMA_OF: Final[Mapping[Role, Schema]] = {"detections": DETECTIONS, "tracks": TRACKS, "truth": TRACKS}
+#: The names of classes, by their numbers, in the metadata of a channel.
+_CLASSES: Final = "mcaptrack.classes"
+_BLOCK: Final = 4096
+
+
+@dataclass(frozen=True, kw_only=True)
+class IngestOptions:
+    """How to make a log. ``labels`` maps what a label file says to the file; ``role`` is for an input that is one.
+
+    ``fps``, ``image_format``, ``quality`` and ``keyframe_interval_s`` are as in ``video.Keep``. ``first_frame`` is the
+    number that label files give the first picture, if it isn't that of their format; ``frames`` how many pictures there
+    are, where there are none.
+    """
+
+    camera: str = "camera"
+    fps: Fraction | None = None
+    start_ns: int | None = None
+    image_format: ImageFormat = "auto"
+    quality: int | None = None
+    keyframe_interval_s: float | None = None
+    ground_plane: Path | None = None
+    point: Point = "foot"
+    labels: Mapping[Role, Path] = field(default_factory=dict)
+    label_format: Format = "auto"
+    first_frame: int | None = None
+    frames: int | None = None
+    role: Role | None = None
+
+    @property
+    def keep(self) -> Keep:
+        """How pictures are kept. Raises McaptrackError for what does not go together."""
+        return Keep(
+            image_format=self.image_format,
+            quality=self.quality,
+            keyframe_interval_s=self.keyframe_interval_s,
+            fps=self.fps,
+        )
+
+    def for_videos(self) -> str:
+        """The first option given that is about the pictures of videos; "" if there is none."""
+        given = {
+            "--image-format": self.image_format != "auto",
+            "--quality": self.quality is not None,
+            "--keyframe-interval-s": self.keyframe_interval_s is not None,
+        }
+        return next((name for name, is_given in given.items() if is_given), "")
+
+
+@dataclass
+class Report:
+    """What became of an input: messages by topic, what to say of it (``notes``: to some), what was lost.
+
+    ``warnings`` are what was assumed, left out or looks odd. ``has_labels`` says whether there were label files, and
+    ``uses_camera`` whether anything was put below the camera's name.
+    """
+
+    messages: dict[str, int] = field(default_factory=dict)
+    said: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+    lost: list[str] = field(default_factory=list)
+    warnings: list[Notice] = field(default_factory=list)
+    has_labels: bool = False
+    uses_camera: bool = False
+
+
+class Job:
+    """What videos and labels have in common: the topics of a camera, its ground plane, rows to messages.
+
+    ``there`` is the log that a job adds to, if it doesn't make one.
+    """
+
+    #: Whether a clock that a log has is replaced by the job's own.
+    drops_clock = False
+    #: What a camera is called that stands beside one whose topics are taken.
+    beside = "{camera}/labels"
+
+    def __init__(self, source: Path, options: IngestOptions, there: log.Log | None = None) -> None:
+        self._close = ExitStack()
+        self.source, self.options, self.there, self.report = source, options, there, Report()
+        self.prefix = "/" + options.camera.strip("/")
+        #: The topic of the pictures that labels belong to, if there is one.
+        self.pictures = ""
+        self.homography = read_homography(options.ground_plane) if options.ground_plane else None
+        self.labels: dict[Role, tuple[Path, Labels]] = {
+            role: (path, self.read(path, role)) for role, path in options.labels.items()
+        }
+        self.check_labels()
+
+    def read(self, path: Path, role: Role) -> Labels:
+        """A label file, as the options have it."""
+        return read_labels(path, self.options.label_format, role, self.options.first_frame)
+
+    def check_labels(self) -> None:
+        """Refuse labels that can't be what they are given as."""
+        for role, (path, labels) in self.labels.items():
+            if role == "detections" and labels.boxes_px is None:
+                raise McaptrackError(f"{path} holds positions, not boxes; detections are boxes")
+            if role != "detections" and not labels.identified:
+                raise McaptrackError(f"{path} says of nobody who it is (all ids are -1); {role} need ids")
+
+    def tell(self) -> None:
+        """Say what of the labels is left out or taken for something."""
+        firsts = {labels.first_frame: f"frame {labels.first_frame} of {path}" for path, labels in self.labels.values()}
+        if len(firsts) > 1:
+            warn(f"{' and '.join(firsts.values())} are taken as one picture; --first-frame says otherwise", "clock")
+        for role, (path, labels) in self.labels.items():
+            if labels.left_out:
+                warn(f"{path} also holds {labels.left_out}; left out of {role}", "left-out")
+            if labels.step > 1:
+                words = f"{path} has labels every {labels.step} frames, from {labels.labelled[0]} on"
+                self.report.said.append(f"{words}; the frames in between are left out")
+            if role == "detections" and len(set(labels.class_id.tolist())) > 1:
+                ids, counts = np.unique(labels.class_id, return_counts=True)
+                names = [f" {labels.classes[number]}" if number in labels.classes else "" for number in ids.tolist()]
+                found = zip(ids.tolist(), names, counts.tolist(), strict=True)
+                words = ", ".join(f"{number}{name} ({count})" for number, name, count in found)
+                self.report.said.append(f"{path} has several classes; class_id is {words}")
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._close.close()
+
+    def opened(self, output: Path, into: log.Log | None, force: bool) -> AbstractContextManager[log.LogWriter]:
+        """What writes to ``output``, which is new or is the log ``into``.
+
+        Raises McaptrackError if the log has a channel of this job already and ``force`` is not given.
+        """
+        taken = self.taken(into, force)
+        if into is None:
+            return log.create(output)
+        return log.extend(into, drop=taken, drop_metadata=[CLOCK] if self.drops_clock else [])
+
+    def taken(self, there: log.Log | None, force: bool) -> set[str]:
+        """The topics of a log that this job replaces.
+
+        Raises McaptrackError if others recorded one of them, whatever ``force`` is, and without it if there is any.
+        """
+        taken = set(self.topics()) & set(there.channels) if there else set()
+        if there and taken:
+            log.refuse_recorded(there, taken, self.instead(there.channels))
+        if there and taken and not force:
+            raise McaptrackError(f"{there.path} has {', '.join(sorted(taken))} already; --force replaces them")
+        return taken
+
+    def instead(self, topics: Collection[str]) -> str:
+        """Words on where to write where topics are taken."""
+        ends = [topic.removeprefix(self.prefix) for topic in self.topics() if topic.startswith(self.prefix)]
+        name = free = self.beside.format(camera=self.prefix.strip("/"))
+        number = 1
+        while any(f"/{free}{end}" in topics for end in ends):
+            number += 1
+            free = f"{name}{number}"
+        return f"--camera {free} puts these beside them"
+
+    def write(self, writer: log.LogWriter, has_clock: bool) -> None:
+        """Write all channels; ``has_clock`` says that the log has a clock already."""
+        raise NotImplementedError
+
+    def check(self, output: Path) -> None:
+        """Compare what stands in ``output`` with the input. Raises McaptrackError for a difference."""
+
+    def topics(self) -> Iterator[str]:
+        """The topics that this job writes."""
+        yield from (f"{self.prefix}/{role}" for role in self.labels)
+        if self.homography:
+            yield f"{self.prefix}/ground_plane"
+
+    def plane(self, width_px: int, height_px: int) -> GroundPlane | None:
+        """The ground plane for pictures of this size; None if none was given."""
+        if self.homography is None:
+            return None
+        try:
+            return GroundPlane(self.homography, width_px, height_px, self.options.point)
+        except McaptrackError as error:
+            raise McaptrackError(f"{self.options.ground_plane}: {error}") from None
+
+    def write_plane(self, writer: log.LogWriter, plane: GroundPlane | None, t_ns: int) -> None:
+        """Write the ground plane, if there is one, as it holds from a time on."""
+        if plane is not None and self.options.ground_plane:
+            rows = plane_to_rows(plane)
+            words = {"file": self.options.ground_plane.name, "point": self.options.point}
+            self.write_rows(writer, "ground_plane", GROUND_PLANE, lambda: iter([Frame(t_ns, 0, rows)]), words)
+
+    def write_labels(self, writer: log.LogWriter, plane: GroundPlane | None, timeline: Timeline) -> None:
+        """Write the labels, each frame at the time of its picture."""
+        for role, (path, labels) in self.labels.items():
+            placed = timeline.place(path, labels, self.report.lost)
+            words: dict[str, Any] = {"file": path.name, "format": labels.format} | self.label_words(labels)
+            classes = {str(number): name for number, name in labels.classes.items()} if role == "detections" else {}
+            frames = self.frames(role, plane, placed)
+            self.write_rows(writer, role, _SCHEMA_OF[role], frames, words, classes)
+
+    def label_words(self, labels: Labels) -> dict[str, Any]:
+        """What else the provenance of labels says."""
+        return {} if self.options.first_frame is None else {"first_frame": labels.first_frame}
+
+    def frames(self, role: Role, plane: GroundPlane | None, placed: Placed) -> Frames:
+        """The labels of these frames; empty ones too."""
+        labels = self.labels[role][1]
+        rows = label_rows(labels, role, plane)
+        first, last = (np.searchsorted(labels.frame, placed.number, side) for side in ("left", "right"))
+
+        def frames() -> Iterator[Frame]:
+            for low in range(0, len(first), _BLOCK):
+                columns = (column[low : low + _BLOCK] for column in (placed.t_ns, placed.index, first, last))
+                for t_ns, index, start, end in zip(*(column.tolist() for column in columns), strict=True):
+                    yield Frame(t_ns, index, rows[start:end])
+
+        return frames
+
+    def write_rows(
+        self,
+        writer: log.LogWriter,
+        suffix: str,
+        schema: Schema,
+        frames: Frames,
+        words: Mapping[str, Any],
+        classes: Mapping[str, str] = {},
+    ) -> None:
+        """Write a channel below the camera's; ``words`` say what it was made of, ``classes`` what its classes are.
+
+        Frames are made twice, for the digest and for the channel, and never stand in memory all together.
+        """
+
+        def messages() -> Iterator[tuple[int, int, bytes]]:
+            return ((frame.t_ns, frame.index, schema.codec.encode(frame.rows)) for frame in frames())
+
+        made = Provenance("ingest", words, self.pictures, digest=digest(messages())).to_metadata()
+        if classes:
+            made[_CLASSES] = json.dumps(classes, sort_keys=True, separators=(",", ":"))
+        topic = f"{self.prefix}/{suffix}"
+        channel = writer.add_channel(topic, (schema.name, "protobuf", schema.descriptor), "protobuf", made)
+        count = 0
+        for message in messages():
+            writer.add_message(channel, *message)
+            count += 1
+        self.report.messages[topic] = count
+
+
+def label_rows(labels: Labels, role: Role, plane: GroundPlane | None) -> Rows:
+    """The N rows of labels as rows of detections or tracks; in metres too, given a plane."""
+    if role == "detections" and labels.boxes_px is not None:
+        x, y, w, h = labels.boxes_px.T
+        return DETECTIONS.rows(x_px=x, y_px=y, w_px=w, h_px=h, score=labels.score, class_id=labels.class_id)
+    nowhere = np.full((len(labels.frame), 4), np.nan)
+    boxes = nowhere if labels.boxes_px is None else labels.boxes_px
+    xy_m = labels.xy_m
+    if xy_m is None:
+        xy_m = plane.boxes_to_metres(boxes) if plane else nowhere[:, :2]
+    return TRACKS.rows(
+        track_id=labels.id,
+        x_px=boxes[:, 0],
+        y_px=boxes[:, 1],
+        w_px=boxes[:, 2],
+        h_px=boxes[:, 3],
+        x_m=xy_m[:, 0],
+        y_m=xy_m[:, 1],
+        score=labels.score,
+        observed=np.ones(len(labels.frame), bool),
+        source_id=np.full(len(labels.frame), -1),
+    )

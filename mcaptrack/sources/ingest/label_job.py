@@ -1,0 +1,256 @@
+"""Label files without pictures, or for pictures that a log has already.
+
+Letters: N rows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from fractions import Fraction
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from mcaptrack import log
+from mcaptrack.errors import McaptrackError
+from mcaptrack.geometry.clocks import NS_PER_S, parse_ns
+from mcaptrack.geometry.plane import GroundPlane, Point
+from mcaptrack.notices import warn
+from mcaptrack.schema import GROUND_PLANE, Frame
+from mcaptrack.schema.ground import rows_to_plane
+from mcaptrack.schema.provenance import CLOCK
+from mcaptrack.sources.foreign import holds_pictures
+from mcaptrack.sources.ingest.cameras import Standing, camera_of, labels_of, seen_by, size_of, timeline_of
+from mcaptrack.sources.ingest.formats import Format, Labels, Role
+from mcaptrack.sources.ingest.job import IngestOptions, Job
+from mcaptrack.sources.ingest.timeline import MAX_FRAMES, Timeline, count_frames
+from mcaptrack.sources.video import SEQINFO, find_seqinfo
+
+_SDD_FPS: Final = Fraction(30)
+#: Why a file is taken to have a frame rate that no one gave.
+_BY_FORMAT: Final[Mapping[Format, str]] = {
+    "sdd": "Stanford Drone",
+    "trajnet": "trajnet, a label every 0.4 s",
+    "obsmat": "obsmat, a label every 0.4 s",
+}
+_ASSUMED: Final = "assumption"
+#: The step of labels in formats that are annotated on the clock of prediction.
+_LABEL_STEP_S: Final = Fraction(2, 5)
+
+
+class _Known(NamedTuple):
+    """What is known of the frames of a label file: their rate, their number, and who says so."""
+
+    fps: Fraction | None
+    frames: int | None
+    of: str
+
+
+class LabelJob(Job):
+    """Label files without pictures, or for pictures that a log has. The first of ``inputs`` is the input itself.
+
+    A role that is None follows from whether there are ids. ``default_fps`` is for files that say nothing. ``ground`` is
+    the ground plane, if one is given or the log has one.
+    """
+
+    def __init__(
+        self,
+        inputs: Sequence[tuple[Role | None, Path]],
+        options: IngestOptions,
+        there: log.Log | None = None,
+        default_fps: Fraction | None = None,
+    ) -> None:
+        super().__init__(inputs[0][1], options, there)
+        for role, path in reversed(inputs):
+            self._add(role, path)
+        self.check_labels()
+        if options.for_videos():
+            raise McaptrackError(f"{self.source} is a label file; {options.for_videos()} is for videos")
+        if options.frames is not None and not 0 < options.frames <= MAX_FRAMES:
+            raise McaptrackError(f"--frames is a number from 1 to {MAX_FRAMES}, not {options.frames}")
+        size = self._extent()
+        self._fps: Fraction | None = None
+        self._clock = ("", False)  # what to say of times that don't come from pictures, and whether they are assumed
+        self._other_rates: list[str] = []
+        self._start_ns = options.start_ns or 0
+        if there is not None:
+            self.prefix, self.pictures = camera_of(there, options.camera)
+        seen = seen_by(there, self.prefix) if there is not None and not self.pictures else ""
+        if there is not None and (self.pictures or seen):
+            self.timeline = self._of_pictures(there, self.pictures or seen)
+            size = size_of(there, self.pictures) if self.homography and self.pictures else size
+        else:
+            self.timeline = self._of_rate(default_fps)
+        self.ground = self.plane(*size) or self._measured_plane()
+
+    def _add(self, role: Role | None, path: Path) -> None:
+        labels = self.read(path, role or "tracks")
+        if role is None:
+            role = "tracks" if labels.identified else "detections"
+            labels = labels if role == "tracks" else self.read(path, role)
+        if role in self.labels:
+            raise McaptrackError(f"{path} and {self.labels[role][0]} are both {role}; say with --as what {path} is")
+        self.labels = {role: (path, labels), **self.labels}
+
+    def _extent(self) -> tuple[int, int]:
+        """The size of the image as far as boxes tell."""
+        boxes = [labels.boxes_px for _, labels in self.labels.values() if labels.boxes_px is not None]
+        if not boxes:
+            return 0, 0
+        corner = np.concatenate([part[:, :2] + part[:, 2:] for part in boxes]).max(axis=0)
+        return max(0, int(np.ceil(corner[0]))), max(0, int(np.ceil(corner[1])))
+
+    def _measured_plane(self) -> GroundPlane | None:
+        """The ground plane that the log has for the camera, if it was measured and holds throughout."""
+        topic = f"{self.prefix}/ground_plane"
+        if self.there is None or topic not in self.there.channels:
+            return None
+        planes = [rows_to_plane(frame.rows) for frame in self.there.frames(topic, GROUND_PLANE)]
+        return planes[0] if len(planes) == 1 and not planes[0].assumed else None
+
+    def _of_pictures(self, there: log.Log, topic: str) -> Timeline:
+        """The pictures that stand in the log. Raises McaptrackError if options say that they are others."""
+        options, timeline = self.options, timeline_of(there, topic)
+        if options.fps and not timeline.fits(options.fps):
+            raise McaptrackError(
+                f"{there.path}: {timeline.of} are {timeline.fps:.6g} a second, not {float(options.fps):g}; labels take "
+                "the times of their pictures, so leave --fps out"
+            )
+        for given, name in ((options.start_ns, "--start-time"), (options.frames, "--frames")):
+            if given is not None:
+                raise McaptrackError(f"{there.path}: labels take the times of {timeline.of}; leave {name} out")
+        return timeline
+
+    def _of_rate(self, default: Fraction | None) -> Timeline:
+        """Pictures that aren't there, by the frame rate that is given, or that files or the log know."""
+        standing = labels_of(self.there, self.prefix) if self.there else {}
+        known = [_known(path, labels) for path, labels in self.labels.values()]
+        rates = {one.fps: one.of for one in known if one.fps}
+        if self.options.fps:
+            self._other_rates = [
+                f"{self.source}: {float(rate):g} frames a second by {of}, and {float(self.options.fps):g} by --fps, "
+                "which is taken"
+                for rate, of in rates.items()
+                if rate != self.options.fps
+            ]
+            rates = {self.options.fps: "--fps"}
+        rates = rates or {labels.fps: topic for topic, labels in standing.items() if labels.fps}
+        if len(rates) > 1:
+            words = " and ".join(f"{float(fps):g} by {of}" for fps, of in rates.items())
+            raise McaptrackError(f"{self.source}: {words}: say how many frames a second there are with --fps")
+        if not rates and default is None:
+            raise McaptrackError(self._no_clock())
+        fps, of = next(iter(rates.items()), (default or Fraction(1), _ASSUMED))
+        self._fps = fps
+        if self.there:
+            self._check_standing(self.there, standing, fps)
+            if self.options.start_ns is None:
+                said = self.there.metadata(CLOCK) or {}
+                self._start_ns = parse_ns(said.get("start_ns", "")) or 0
+        count, counted_by = self._count(known, standing)
+        timeline = Timeline.spaced(count, fps, self._start_ns, f"the frames that {counted_by} counts")
+        if self.there and any(part.index.counts for part in self.there.parts):
+            self._check_overlap(self.there, timeline)
+        first = next(iter(self.labels.values()))[1].first_frame
+        self._clock = (
+            f"{self.source}: {count} frames (by {counted_by}) from {first} on, {float(fps):g} a second (by {of})",
+            of in (*_BY_FORMAT.values(), _ASSUMED),
+        )
+        return timeline
+
+    def tell(self) -> None:
+        """Say at what times labels without pictures were put, too."""
+        super().tell()
+        for words in self._other_rates:
+            warn(words, "clock")
+        words, is_assumed = self._clock
+        if is_assumed:
+            warn(f"{words}; --fps says otherwise", "clock")
+        elif words:
+            self.report.said.append(words)
+
+    def _check_standing(self, there: log.Log, standing: Mapping[str, Standing], fps: Fraction) -> None:
+        """Labels of one camera share a clock."""
+        for topic, labels in standing.items():
+            if topic not in self.topics() and labels.fps not in (None, fps):
+                raise McaptrackError(
+                    f"{there.path}: {topic} has {float(labels.fps or 0):g} frames a second, not {float(fps):g}, and "
+                    "labels of one camera are of the same pictures; give the same --fps, or another --camera"
+                )
+
+    def _count(self, known: Sequence[_Known], standing: Mapping[str, Standing]) -> tuple[int, str]:
+        """How many frames there are, and who says so."""
+        if self.options.frames is not None:
+            return self.options.frames, "--frames"
+        said = {one.frames: one.of for one in known if one.frames}
+        if said:
+            return max(said), said[max(said)]
+        counts = [count_frames(path, labels) for path, labels in self.labels.values()]
+        return max(*counts, *(label.frames for label in standing.values()), 1), "the last label"
+
+    def _check_overlap(self, there: log.Log, timeline: Timeline) -> None:
+        """Labels without pictures are at times at which the log has something."""
+        first, last = int(timeline.t_ns[0]), int(timeline.t_ns[-1])
+        if first > there.end_ns or last < there.start_ns:
+            raise McaptrackError(
+                f"{there.path} is from {_seconds(there.start_ns)} to {_seconds(there.end_ns)}, the labels would be "
+                f"from {_seconds(first)} to {_seconds(last)}, and {self.prefix} has no pictures to take times from; "
+                f"say when frame {next(iter(self.labels.values()))[1].first_frame} was with --start-time"
+            )
+
+    def _no_clock(self) -> str:
+        words = f"{self.source} has no clock of its own; give the frames per second with --fps"
+        pictures = sorted(c.topic for c in self.there.channels.values() if holds_pictures(c)) if self.there else []
+        if pictures and self.there:
+            camera = pictures[0].strip("/")
+            words += f", or choose the pictures of {', '.join(pictures)} in {self.there.path} with --camera {camera}"
+        return words
+
+    def write(self, writer: log.LogWriter, has_clock: bool) -> None:
+        """Write the ground plane and the labels."""
+        if not has_clock and not self.pictures:
+            writer.add_metadata(CLOCK, {"start_ns": str(self._start_ns)})
+        self.write_plane(writer, self.ground, int(self.timeline.t_ns[0]))
+        self.write_labels(writer, self.ground, self.timeline)
+
+    def label_words(self, labels: Labels) -> dict[str, Any]:
+        """The rate that frames were counted at, where there were no pictures."""
+        return super().label_words(labels) | ({} if self._fps is None else {"fps": str(self._fps)})
+
+    def all_frames(self, role: Role) -> list[Frame]:
+        """The labels of a role as frames, empty ones too."""
+        path, labels = self.labels[role]
+        return list(self.frames(role, self.ground, self.timeline.place(path, labels, self.report.lost))())
+
+
+def _seconds(t_ns: int) -> str:
+    return f"{t_ns / NS_PER_S:.3f} s"
+
+
+def _known(path: Path, labels: Labels) -> _Known:
+    """What a label file's format, or a file beside it, says of its frames."""
+    if labels.format == "sdd":
+        return _Known(_SDD_FPS, None, _BY_FORMAT[labels.format])
+    if labels.format in ("trajnet", "obsmat"):  # annotated at 2.5 Hz, whatever the video's rate
+        return _Known(labels.step / _LABEL_STEP_S, None, _BY_FORMAT[labels.format])
+    info = find_seqinfo(path.parent)
+    return _Known(info.fps, info.frames, SEQINFO) if info else _Known(None, None, "")
+
+
+def label_frames(
+    files: Mapping[Role, Path],
+    fps: Fraction | None,
+    ground_plane: Path | None,
+    point: Point,
+    label_format: Format = "auto",
+) -> dict[Role, list[Frame]]:
+    """Label files that share a clock as frames, without a log between. Raises McaptrackError as ``ingest`` does.
+
+    Only the order and the distances of times matter to whoever compares such files; without ``fps`` files that have no
+    clock count one frame a second.
+    """
+    options = IngestOptions(fps=fps, ground_plane=ground_plane, point=point, label_format=label_format)
+    job = LabelJob([(role, path) for role, path in files.items()], options, default_fps=Fraction(1))
+    job.tell()
+    return {role: job.all_frames(role) for role in files}

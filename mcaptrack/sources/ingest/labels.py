@@ -1,0 +1,114 @@
+"""Label files and homographies as they are given: which format a file has, and its rows in order."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Final, get_args
+
+import numpy as np
+
+from mcaptrack.errors import McaptrackError
+from mcaptrack.files import refuse_special
+from mcaptrack.sources.ingest.formats import READERS, Format, Labels, Role
+from mcaptrack.sources.ingest.text import lines_of, split
+
+FORMATS: Final = tuple(name for name in get_args(Format) if name != "auto")
+
+#: What files begin with that are no tables, and what they are then.
+_OTHERS: Final = {b"{": "JSON", b"[": "JSON", b"<": "XML"}
+#: How much of such a file is looked at, and words that tell the JSON of COCO.
+_HEAD: Final = 65536
+_COCO: Final = (b'"images"', b'"annotations"', b'"image_id"', b'"categories"')
+
+
+def read_labels(
+    path: Path, label_format: Format = "auto", role: Role = "tracks", first_frame: int | None = None
+) -> Labels:
+    """Read a label file. ``first_frame`` is the number of the first picture, if it isn't that of the format.
+
+    Raises McaptrackError, with the line, if the file is not of that format or not of any.
+    """
+    _refuse_others(path)
+    if label_format == "auto":
+        found = next(lines_of(path), None)
+        if found is None:
+            raise McaptrackError(f"{path} holds no labels")
+        label_format = _guess(path, *found)
+    labels = READERS[label_format](path, lines_of(path), role)
+    if labels.identified and role != "detections":
+        _refuse_twins(path, labels)
+    order = np.lexsort((labels.id, labels.frame)) if labels.identified else np.argsort(labels.frame, kind="stable")
+    boxes, xy = labels.boxes_px, labels.xy_m
+    return replace(
+        labels,
+        first_frame=labels.first_frame if first_frame is None else first_frame,
+        frame=labels.frame[order],
+        id=labels.id[order],
+        boxes_px=None if boxes is None else boxes[order],
+        xy_m=None if xy is None else xy[order],
+        score=labels.score[order],
+        class_id=labels.class_id[order],
+    )
+
+
+def _refuse_others(path: Path) -> None:
+    """Raise McaptrackError for a file of another kind that labels are often in."""
+    refuse_special(path)
+    try:
+        with path.open("rb") as stream:
+            head = stream.read(_HEAD)
+    except OSError as error:
+        raise McaptrackError(f"{path} can't be read: {error.strerror}") from None
+    kind = _OTHERS.get(head.removeprefix(b"\xef\xbb\xbf").lstrip()[:1])
+    if kind == "JSON" and any(word in head for word in _COCO):
+        kind = "COCO JSON"
+    if kind:
+        raise McaptrackError(
+            f"{path} is {kind}, which isn't read; label files are text with a row a box: {', '.join(FORMATS)}"
+        )
+
+
+def _guess(path: Path, number: int, line: str) -> Format:
+    columns = split(line)
+    if "," in line and 6 <= len(columns) <= 10:
+        return "mot"
+    if len(columns) == 10 and columns[-1].startswith('"'):
+        return "sdd"
+    if len(columns) in (17, 18) and columns[2].replace("_", "").isalpha():
+        return "kitti"
+    if len(columns) == 4:
+        return "trajnet"
+    if len(columns) == 8 and "," not in line:
+        return "obsmat"
+    raise McaptrackError(
+        f"{path}:{number}: a row of {len(columns)} columns fits no label format ({', '.join(FORMATS)}): "
+        f"{line.strip()[:60]}"
+    )
+
+
+def _refuse_twins(path: Path, labels: Labels) -> None:
+    """Nobody can be in two places in one frame."""
+    order = np.lexsort((labels.id, labels.frame))
+    frame, who = labels.frame[order], labels.id[order]
+    twins = np.flatnonzero((frame[1:] == frame[:-1]) & (who[1:] == who[:-1]))
+    if len(twins):
+        at = twins[0]
+        raise McaptrackError(f"{path}: id {who[at]} appears twice in frame {frame[at]}")
+
+
+def read_homography(path: Path) -> tuple[float, ...]:
+    """A 3x3 homography, comma or blank separated, as 9 numbers row by row. Raises McaptrackError if it is none."""
+    words = f"{path} is not a homography: it needs 3 rows of 3 numbers"
+    rows: list[list[float]] = []
+    for _, line in lines_of(path):
+        try:
+            rows.append([float(part) for part in split(line)])
+        except ValueError:
+            raise McaptrackError(f"{words}, separated by commas or blanks") from None
+        if len(rows) > 3:
+            break
+    if len(rows) != 3 or any(len(row) != 3 for row in rows):
+        shape = " + ".join(str(len(row)) for row in rows) or "no"
+        raise McaptrackError(f"{words}, not {shape}{' + ...' if len(rows) > 3 else ''} numbers")
+    return tuple(number for row in rows for number in row)

@@ -1,0 +1,365 @@
+"""rosbag2: folders with a metadata.yaml, their SQLite databases and MCAP files, and such files alone.
+
+The databases are read as rosbag2's sqlite3 storage plugin lays them out (schema versions 1 to 4): nothing that they
+hold is made sense of, so nothing is refused. rosbags knows the definitions of ROS's own messages, for databases that
+were recorded before definitions were kept in them.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any, Final
+
+from mcaptrack import log
+from mcaptrack.errors import McaptrackError
+from mcaptrack.files import follow_links, refuse_special
+from mcaptrack.notices import warn
+from mcaptrack.schema.provenance import CLOCK
+from mcaptrack.sources.ingest import unpack
+from mcaptrack.sources.ingest.bag_metadata import METADATA, Bag, holds_metadata, read_metadata
+from mcaptrack.sources.ingest.database import Database
+from mcaptrack.sources.ingest.definitions import known_definition
+from mcaptrack.sources.ingest.source import Connection, Found, Source
+
+_MCAP_MAGIC, _SQLITE_MAGIC, _ZSTD_MAGIC = b"\x89MCAP0\r\n", b"SQLite format 3\0", b"\x28\xb5\x2f\xfd"
+#: A message that is larger decompressed is not read.
+_MAX_MESSAGE_BYTES: Final = 2**28
+#: So many numbers of topics that are not described are named.
+_MAX_STRANGE: Final = 10
+_NEEDED: Final = {
+    "topics": {"id", "name", "type", "serialization_format"},
+    "messages": {"topic_id", "timestamp", "data"},
+}
+_TABLES: Final = ("topics", "messages", "metadata", "schema", "message_definitions")
+
+
+def open_bag(folder: Path) -> Source:
+    """The bag in a folder with a metadata.yaml. Raises McaptrackError if it can't be read or is incomplete."""
+    bag, names = read_metadata(folder / METADATA)
+    paths = [folder / name for name in names]
+    paths = [path if path.exists() else path.with_name(path.name + ".zstd") for path in paths]
+    missing = [str(path).removesuffix(".zstd") for path in paths if not path.exists()]
+    if missing:
+        raise McaptrackError(
+            f"{folder / METADATA} names {missing[0]}, which does not exist; a part of the bag is missing"
+        )
+    places: dict[tuple[int, int], Path] = {}
+    for path in paths:
+        found = path.stat()
+        other = places.setdefault((found.st_dev, found.st_ino), path)
+        if other is not path:
+            raise McaptrackError(f"{folder / METADATA} names {other.name} and {path.name}, which are one file")
+    source = open_files(paths, folder, bag) if paths else _Files([], folder, bag)
+    ours, results = {path.name for path in paths}, {log.results_of(path).name for path in paths}
+    beside = [
+        entry.name
+        for entry in folder.iterdir()
+        if entry.suffix in (".db3", ".mcap") and entry.name not in ours | results
+    ]
+    for name in sorted(beside):
+        warn(f"{folder / name} is not named in {METADATA}; it is left out", "left-out")
+    for path in paths:
+        if not follow_links(path).is_relative_to(follow_links(folder)):
+            warn(f"{path} is a link out of the folder, to {follow_links(path)}, which is read")
+    return source
+
+
+def open_files(paths: Sequence[Path], whole: Path, bag: Bag | None = None) -> Source:
+    """The parts of a recording, which is called ``whole``, one after another."""
+    if bag is None:
+        bag = _bag_around(paths)
+    with ExitStack() as opened:
+        parts = [_unpacked(path, opened) for path in paths]
+        heads = [_head(path) for path in parts]
+        source: _Files
+        if all(head.startswith(_SQLITE_MAGIC) for head in heads):
+            source = Databases(parts, whole, bag)
+        elif all(head.startswith(_MCAP_MAGIC) for head in heads):
+            source = Logs(parts, whole, bag)
+        else:
+            known = (_MCAP_MAGIC, _SQLITE_MAGIC)
+            wrong = [path for path, head in zip(paths, heads, strict=True) if not head.startswith(known)]
+            if not wrong:
+                raise McaptrackError(f"{whole} holds both MCAP files and databases; one bag is made of either")
+            raise McaptrackError(f"{wrong[0]} is neither an MCAP file nor a rosbag2 database; it may be damaged")
+        source.closing.push(opened.pop_all())
+        return source
+
+
+def _head(path: Path) -> bytes:
+    refuse_special(path)
+    try:
+        with path.open("rb") as stream:
+            return stream.read(16)
+    except OSError as error:
+        raise McaptrackError(f"{path} can't be read: {error.strerror}") from None
+
+
+def _unpacked(path: Path, opened: ExitStack) -> Path:
+    """The file, or what it holds if it is compressed as a whole."""
+    if not _head(path).startswith(_ZSTD_MAGIC):
+        return path
+    out = opened.enter_context(unpack.temporary_folder()) / path.name.removesuffix(".zstd")
+    unpack.unzstd_file(path, out)
+    return out
+
+
+def _bag_around(paths: Sequence[Path]) -> Bag:
+    """What the metadata.yaml beside a single file says of it, if there is one that names it: not how much there is."""
+    beside = paths[0].with_name(METADATA)
+    if len(paths) == 1 and holds_metadata(beside):
+        bag, names = read_metadata(beside)
+        if paths[0].name.removesuffix(".zstd") in [name.removesuffix(".zstd") for name in names]:
+            return Bag(distro=bag.distro, packed=bag.packed)
+    return Bag()
+
+
+class _Files:
+    """What databases and MCAP files have in common. ``words`` is known before any message is read."""
+
+    profile = "ros2"
+    as_it_is: log.Log | None = None
+
+    def __init__(self, paths: Sequence[Path], whole: Path, bag: Bag) -> None:
+        self.paths, self.whole, self.bag = paths, whole, bag
+        self.words = Found()
+        self.closing = ExitStack()
+        self.claims: dict[Connection, int] = {}
+        self._same: dict[tuple[object, ...], Connection] = {}
+        self._passed: dict[Connection, int] = {}
+        try:
+            for number in range(len(paths)):
+                self._open(number)
+        except BaseException:
+            self.close()
+            raise
+        self._compare()
+
+    @property
+    def connections(self) -> list[Connection]:
+        """All connections, also those without messages."""
+        return list(self.claims)
+
+    def close(self) -> None:
+        """Let go of the files."""
+        self.closing.close()
+
+    def messages(self, found: Found) -> Iterator[tuple[Connection, log.Message]]:
+        """All messages, file after file, as they stand there."""
+        self._passed = {}
+        for number in range(len(self.paths)):
+            yield from self._messages(number, found)
+
+    def extras(self, writer: log.LogWriter, has_clock: bool, passed_on: bool = False) -> None:
+        """The bag's metadata.yaml, which is no part of what is passed on as it is."""
+        if self.bag.text:
+            writer.add_attachment(METADATA, "application/yaml", self.bag.text)
+
+    def _open(self, number: int) -> None:
+        raise NotImplementedError
+
+    def _messages(self, number: int, found: Found) -> Iterator[tuple[Connection, log.Message]]:
+        yield from ()
+
+    def _connection(self, twins: dict[object, int], known: Connection, messages: int) -> Connection:
+        """The connection that a part of the recording describes: the parts have the same ones.
+
+        ``twins`` counts, in one part, those that are described in the same words.
+        """
+        words = (known.topic, known.schema, known.encoding, *sorted(known.metadata.items()))
+        twins[words] = twins.get(words, 0) + 1
+        connection = self._same.setdefault((*words, twins[words]), known)
+        self.claims[connection] = self.claims.get(connection, 0) + messages
+        return connection
+
+    def _compare(self) -> None:
+        """What the metadata has and the files have not."""
+        holds: Counter[str] = Counter()
+        for connection, count in self.claims.items():
+            holds[connection.topic] += count
+        for topic, kind, encoding, qos, digest, messages in self.bag.topics:
+            if topic not in holds:
+                metadata = {"offered_qos_profiles": qos, "topic_type_hash": digest}
+                self.claims[Connection(topic, (kind, "", b""), encoding, metadata)] = holds[topic] = 0
+                self.words.notes.append(f"{topic} ({kind}) is in {METADATA} alone; its channel has no schema")
+            if holds[topic] < messages:
+                self.words.lost.append(
+                    f"{self.whole}: {METADATA} counts {messages} messages of {topic}, and {holds[topic]} are there"
+                )
+
+
+class Databases(_Files):
+    """SQLite databases."""
+
+    def __init__(self, paths: Sequence[Path], whole: Path, bag: Bag) -> None:
+        self._databases: list[Database] = []
+        self._topics: list[dict[int, Connection]] = []
+        self._distro = bag.distro
+        self._undefined: dict[str, str] = {}
+        super().__init__(paths, whole, bag)
+        for kind, where in sorted(self._undefined.items()):
+            words = (
+                f"its definition is that of {where}" if where else "nobody here knows its definition: it has no schema"
+            )
+            self.words.notes.append(f"{whole} does not say what {kind} is; {words}")
+
+    def extras(self, writer: log.LogWriter, has_clock: bool, passed_on: bool = False) -> None:
+        """The bag's metadata, and those in the databases, as rosbag2 writes them to MCAP files."""
+        super().extras(writer, has_clock, passed_on)
+        if self._distro:
+            writer.add_metadata("mcaptrack.bag", {"file": self.whole.name, "ros_distro": self._distro})
+        for database in self._databases:
+            if "metadata" in database.columns("metadata"):
+                for (text,) in database.rows("metadata", ["metadata"]):
+                    writer.add_metadata("rosbag2", {"serialized_metadata": _text(text)})
+
+    def _open(self, number: int) -> None:
+        path = self.paths[number]
+        database = Database(path, _TABLES)
+        self.closing.callback(database.close)
+        self._databases.append(database)
+        wanted = {
+            "topics": {"id", "name", "type", "serialization_format"},
+            "messages": {"topic_id", "timestamp", "data"},
+        }
+        if not all(columns <= set(database.columns(table)) for table, columns in wanted.items()):
+            raise McaptrackError(f"{path} is a database, but none of rosbag2: it has no topics and messages")
+        definitions = self._definitions(database)
+        has = database.columns("topics")
+        optional = [name for name in ("offered_qos_profiles", "type_description_hash") if name in has]
+        described: dict[int, Connection] = {}
+        for key, *words in database.rows("topics", ["id", "name", "type", "serialization_format", *optional]):
+            topic, kind, encoding, *more = map(_text, words)
+            said = dict(zip(optional, more, strict=True))
+            digest = said.get("type_description_hash", "")
+            schema, defined_digest = definitions.get(kind) or (self._schema(kind, digest), "")
+            qos = said.get("offered_qos_profiles", "")
+            metadata = {"offered_qos_profiles": qos, "topic_type_hash": digest or defined_digest}
+            described[key] = Connection(topic, schema, encoding, metadata)
+        counts = self._count(database, described)
+        twins: dict[object, int] = {}
+        self._topics.append(
+            {key: self._connection(twins, described[key], counts[key]) for key in sorted(described, key=_in_order)}
+        )
+
+    def _count(self, database: Database, described: dict[int, Connection]) -> Counter[int]:
+        """The messages of each topic. Those of topics that are not described are lost."""
+        counts: Counter[int] = Counter()
+        strange: Counter[object] = Counter()
+        for (key,) in database.rows("messages", ["topic_id"]):
+            if key in described:
+                counts[key] += 1
+            else:
+                strange[key if key in strange or len(strange) < _MAX_STRANGE else "other numbers"] += 1
+        total, there = database.count("messages"), counts.total() + strange.total()
+        if total != there:
+            raise McaptrackError(
+                f"{database.path} does not add up: its index counts {total} messages, and {there} are there"
+            )
+        self.words.lost += [
+            f"{database.path}: {count} messages of topic {_text(key)[:80]}, which is not described"
+            for key, count in strange.items()
+        ]
+        return counts
+
+    def _definitions(self, database: Database) -> dict[str, tuple[tuple[str, str, bytes], str]]:
+        """The schema record and the hash of each type that a database defines."""
+        if not self._distro and "ros_distro" in database.columns("schema"):
+            self._distro = next((_text(row[0]) for row in database.rows("schema", ["ros_distro"])), "")
+        has = database.columns("message_definitions")
+        if not {"topic_type", "encoding", "encoded_message_definition"} <= set(has):
+            return {}
+        wanted = ["topic_type", "encoding", "encoded_message_definition"]
+        wanted += ["type_description_hash"] * ("type_description_hash" in has)
+        rows = [[*map(_text, row), ""] for row in database.rows("message_definitions", wanted)]
+        return {
+            kind: ((kind, encoding, text.encode()), said)
+            for kind, encoding, text, said, *_ in rows
+            if encoding in ("ros2msg", "ros2idl") and (text or kind.endswith("/Empty"))
+        }
+
+    def _schema(self, kind: str, digest: str) -> tuple[str, str, bytes]:
+        """The schema record of a type that the database does not define."""
+        text, self._undefined[kind] = known_definition(kind, self._distro.lower(), digest)
+        return (kind, "ros2msg", text.encode()) if self._undefined[kind] else (kind, "", b"")
+
+    def _messages(self, number: int, found: Found) -> Iterator[tuple[Connection, log.Message]]:
+        known, path = self._topics[number], self.paths[number]
+        left = unpack.limit_of(path.stat().st_size)
+        for key, t_ns, data in self._databases[number].rows("messages", ["topic_id", "timestamp", "data"]):
+            connection = known.get(key)
+            if connection is None:
+                continue
+            if not isinstance(t_ns, int) or not isinstance(data, bytes):
+                raise McaptrackError(f"{path} is damaged: a message without time or data")
+            if self.bag.packed or (data.startswith(_ZSTD_MAGIC) and connection.encoding == "cdr"):  # CDR begins with 0
+                data = _unpack_message(data, path, t_ns, left)  # noqa: PLW2901
+                left -= len(data)
+            count = self._passed.get(connection, 0)
+            self._passed[connection] = count + 1
+            yield connection, log.Message(t_ns, count % 2**32, t_ns, data)
+
+
+class Logs(_Files):
+    """MCAP files."""
+
+    def __init__(self, paths: Sequence[Path], whole: Path, bag: Bag) -> None:
+        self.logs: list[log.Log] = []
+        self._channels: list[dict[int, Connection]] = []
+        super().__init__(paths, whole, bag)
+        profiles = {log.header(opened)[0] for opened in self.logs}
+        self.profile = profiles.pop() if len(profiles) == 1 else ""
+        self.as_it_is = self.logs[0] if len(self.logs) == 1 and not bag.packed else None
+
+    def extras(self, writer: log.LogWriter, has_clock: bool, passed_on: bool = False) -> None:
+        """The bag's metadata, and all attachments and metadata of the files."""
+        super().extras(writer, has_clock, passed_on)
+        for opened in [] if passed_on else self.logs:
+            log.pass_on_extras(opened, writer, without=[CLOCK] if has_clock else [])
+
+    def _open(self, number: int) -> None:
+        path = self.paths[number]
+        opened = self.closing.enter_context(log.read(path, sidecar=False))
+        if log.results_of(path).exists():
+            warn(f"{log.results_of(path)} holds results of {path.name}; they are left out", "left-out")
+        self.logs.append(opened)
+        known: dict[int, Connection] = {}
+        twins: dict[object, int] = {}
+        for channel in opened.index.channels.values():
+            found = opened.index.schemas.get(channel.schema_id)
+            schema = (found.name, found.encoding, found.data) if found else ("", "", b"")
+            described = Connection(channel.topic, schema, channel.message_encoding, channel.metadata)
+            known[channel.id] = self._connection(twins, described, opened.index.counts.get(channel.id, 0))
+        self._channels.append(known)
+
+    def _messages(self, number: int, found: Found) -> Iterator[tuple[Connection, log.Message]]:
+        known, path = self._channels[number], self.paths[number]
+        left = unpack.limit_of(path.stat().st_size)
+        for channel, message in log.stream(self.logs[number]):
+            if self.bag.packed:
+                payload = _unpack_message(message.payload, path, message.t_ns, left)
+                left -= len(payload)
+                yield known[channel], message._replace(payload=payload)
+            else:
+                yield known[channel], message
+
+
+def _text(value: Any) -> str:
+    """Text that a database holds, as bytes or as something else."""
+    return value.decode("utf-8", "replace") if isinstance(value, bytes) else "" if value is None else str(value)
+
+
+def _in_order(key: Any) -> tuple[int, Any]:
+    """Numbers of topics by size; what else SQLite lets stand there behind them."""
+    return (0, key) if isinstance(key, int) else (1, str(key))
+
+
+def _unpack_message(data: bytes, path: Path, t_ns: int, left: int) -> bytes:
+    """A message that is compressed by itself; ``left`` is how much all that are to come may have, together."""
+    try:
+        return unpack.unzstd(data, min(left, _MAX_MESSAGE_BYTES))
+    except unpack.NotUnpackedError as error:
+        raise McaptrackError(f"{path}: the message at {t_ns} ns can't be decompressed: {error}") from None

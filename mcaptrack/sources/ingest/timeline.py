@@ -1,0 +1,156 @@
+"""Which picture a labelled frame is, and when that was: one way for all the ways that labels come in.
+
+Label files count pictures, from 0 or 1 by their format. Frame ``first_frame`` of a file is picture 0 of the camera that
+the labels belong to, the next frame is picture 1, and so on, whether the pictures come along, stand in a log already or
+are not there at all and follow from a frame rate.
+
+Letters: P pictures, F labelled frames.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import Final, NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaptrack.errors import McaptrackError
+from mcaptrack.geometry.clocks import LAST_NS, NS_PER_S
+from mcaptrack.notices import warn
+from mcaptrack.sources.ingest.formats import Labels
+
+Ints = NDArray[np.int64]
+
+#: What a frame's number may be at most: more than three days at 30 a second.
+MAX_FRAMES: Final = 10_000_000
+#: Frame numbers of a file without pictures may leave this many frames empty, or this many for each labelled one.
+_EMPTY_FRAMES: Final = 100_000
+_EMPTY_A_LABELLED: Final = 100
+#: Pictures are as far apart as a frame rate says if none is further from its place than this share of a frame.
+_OFF_FRAMES: Final = Fraction(1, 2)
+
+
+class Placed(NamedTuple):
+    """The labelled frames of a file (F,): their numbers in the file, as pictures counted from 0, and their times."""
+
+    number: Ints
+    index: Ints  # type: ignore[assignment]  # hides tuple.index, which is not needed here
+    t_ns: Ints
+
+
+@dataclass(frozen=True)
+class Timeline:
+    """The pictures of a camera: ``index`` (P,), counted from 0, and ``t_ns`` (P,), both rising.
+
+    ``of`` says in words what they are. ``is_complete`` is false where pictures are known to be lost. ``every`` is how
+    far apart their own numbers are: 12 for images of which every twelfth was kept under its number.
+    """
+
+    index: Ints
+    t_ns: Ints
+    of: str
+    is_complete: bool = True
+    every: int = 1
+
+    @classmethod
+    def spaced(cls, count: int, fps: Fraction, start_ns: int, of: str) -> Self:
+        """``count`` pictures at a frame rate, the first at ``start_ns``.
+
+        Raises McaptrackError if they don't end before 2262, when nanoseconds no longer fit.
+        """
+        index = np.arange(count)
+        last_ns = start_ns + round(Fraction(max(count - 1, 0)) / fps * NS_PER_S)
+        if last_ns > LAST_NS:
+            raise McaptrackError(
+                f"{of}: {count} frames at {float(fps):g} a second end {float(count / fps) / 86400:.3g} days after the "
+                "start; times reach to the year 2262"
+            )
+        return cls(index, start_ns + _times(index, fps), of)
+
+    def fits(self, fps: Fraction) -> bool:
+        """Whether the pictures are spaced as a frame rate says, to half a frame."""
+        wanted = self.t_ns[0] + _times(self.index - self.index[0], fps)
+        return bool((np.abs(self.t_ns - wanted) <= float(_OFF_FRAMES / fps * NS_PER_S)).all())
+
+    @property
+    def fps(self) -> float:
+        """Pictures a second, by the usual distance of two; 0 if there are less than two."""
+        gaps = np.diff(self.t_ns) / np.diff(self.index)
+        return NS_PER_S / float(np.median(gaps)) if len(gaps) else 0.0
+
+    def place(self, path: Path, labels: Labels, lost: list[str]) -> Placed:
+        """The labelled frames of a file among the pictures, those without labels in between too.
+
+        Raises McaptrackError if labels are of frames before the first or after the last picture. Where pictures are
+        known to be lost, ``lost`` gets words on the labels that went with them instead.
+        """
+        every = self._every(path, labels)
+        at = (labels.frame - labels.first_frame) // every
+        end = int(self.index[-1]) + 1
+        if at[0] < 0:
+            raise McaptrackError(
+                f"{path}: its first label is of frame {labels.frame[0]}, and frame {labels.first_frame} is said to be "
+                "the first picture; say with --first-frame which one it is"
+            )
+        beyond = int((at >= end).sum())
+        if beyond and (self.is_complete or beyond == len(at)):
+            raise McaptrackError(self._beyond(path, labels, beyond, every * (end - 1) + labels.first_frame))
+        if beyond:
+            lost.append(f"{path}: {beyond} labels are of frames after the last picture that could be read, {end - 1}")
+        missing = ~np.isin(at[at < end], self.index)
+        if missing.any():
+            lost.append(f"{path}: {int(missing.sum())} labels are of frames whose pictures are missing")
+        step = labels.step // every or 1
+        known = self.index % step == (int(labels.labelled[0]) - labels.first_frame) // every % step
+        return Placed(every * self.index[known] + labels.first_frame, self.index[known], self.t_ns[known])
+
+    def _every(self, path: Path, labels: Labels) -> int:
+        """How many numbers of a label file make a picture: those of labels may be those in the names of images."""
+        if self.every == 1 or ((labels.labelled - labels.first_frame) % self.every).any():
+            return 1
+        if int(labels.labelled[-1]) > labels.first_frame:
+            warn(f"{path} counts frames as the names of {self.of} do, every {self.every}", "clock")
+        return self.every
+
+    def _beyond(self, path: Path, labels: Labels, beyond: int, end: int) -> str:
+        """Words on labels after frame ``end`` of the file, which is the last picture."""
+        first, last = int(labels.frame[0]), int(labels.frame[-1])
+        some = "all" if beyond == len(labels.frame) else beyond
+        words = (
+            f"{path}: {some} labels are of frames after the last picture: {self.of} end with frame "
+            f"{end}, the labels with frame {last}"
+        )
+        if last - first <= end - labels.first_frame and first != labels.first_frame:
+            return f"{words}; if frame {first} of the file is the first picture, say so with --first-frame {first}"
+        return f"{words}; give the labels of these pictures, or the part of the file that is of them"
+
+
+def _times(index: Ints, fps: Fraction) -> Ints:
+    """When pictures (P,) are at a frame rate, in nanoseconds, rounded to the nearest, halves to the even one."""
+    most = int(np.abs(index).max(initial=1)) * fps.denominator * NS_PER_S
+    if most >= 2**62 or fps.numerator >= 2**62:
+        return np.array([round(Fraction(int(number)) / fps * NS_PER_S) for number in index], np.int64)
+    whole, rest = np.divmod(index * (fps.denominator * NS_PER_S), fps.numerator)
+    rounded: Ints = whole + ((2 * rest > fps.numerator) | ((2 * rest == fps.numerator) & (whole % 2 == 1)))
+    return rounded
+
+
+def count_frames(path: Path, labels: Labels) -> int:
+    """How many frames there are up to the last one that a file labels.
+
+    Raises McaptrackError if nearly all of them would be empty: then the number is wrong.
+    """
+    last = max(int(labels.labelled[-1]), int(labels.frame[-1]))
+    count = last - labels.first_frame + 1
+    most = max(_EMPTY_FRAMES, _EMPTY_A_LABELLED * len(labels.labelled) * labels.step)
+    if count > min(most, MAX_FRAMES):
+        first = f"give the number of the first picture with --first-frame {labels.labelled[0]}"
+        mend = f"--frames {count} takes it so" if count <= MAX_FRAMES else f"at most {MAX_FRAMES} are read"
+        raise McaptrackError(
+            f"{path}: frame {last} would be the last of {count} frames, of which {len(labels.labelled)} are labelled; "
+            f"{mend}, or {first}"
+        )
+    return count

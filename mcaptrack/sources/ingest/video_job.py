@@ -1,0 +1,115 @@
+"""A video or a folder of images becomes a camera of a log, with labels beside its pictures."""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Iterator
+from fractions import Fraction
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from mcaptrack import foxglove, log
+from mcaptrack.errors import McaptrackError
+from mcaptrack.notices import warn
+from mcaptrack.schema.provenance import CLOCK, Provenance
+from mcaptrack.sources.ingest.cameras import labels_of
+from mcaptrack.sources.ingest.job import IngestOptions, Job, Progress
+from mcaptrack.sources.ingest.timeline import Timeline
+from mcaptrack.sources.video import Video, open_video
+
+_FOXGLOVE_ALONE: Final = {"vp9": "VP9", "av1": "AV1"}
+#: Frame rates that differ by a smaller share than this are the same: 29.97 and 30000/1001.
+_SAME_FPS: Final = Fraction(1, 1000)
+
+
+class VideoJob(Job):
+    """A video or image folder, with labels beside it."""
+
+    drops_clock = True
+    beside = "{camera}2"
+
+    def __init__(self, source: Path, options: IngestOptions, progress: Progress, there: log.Log | None) -> None:
+        super().__init__(source, options, there)
+        self._progress = progress
+        if options.role:
+            raise McaptrackError(f"{source} is no label file; --as is for those")
+        if options.frames is not None:
+            raise McaptrackError(f"{source} is no label file; --frames is for those that stand alone")
+        self.video: Video = open_video(source, options.keep)
+        if self.video.images and not (options.fps or self.video.fps):
+            raise McaptrackError(f"{source}: a folder of images has no clock; give the frames per second with --fps")
+        self._plane = self.plane(self.video.width_px, self.video.height_px)
+        self.pictures = f"{self.prefix}/video"
+        self._standing = {} if there is None else labels_of(there, self.prefix)
+
+    def topics(self) -> Iterator[str]:
+        """The pictures, and what labels there are."""
+        yield self.pictures
+        yield from super().topics()
+
+    def write(self, writer: log.LogWriter, has_clock: bool) -> None:
+        """Write the pictures, then labels at their times."""
+        options, video, keep = self.options, self.video, self.options.keep
+        start_ns = video.start_ns if options.start_ns is None else options.start_ns
+        start_ns = 0 if start_ns is None else start_ns
+        schema_name = foxglove.IMAGE if keep.is_still else foxglove.VIDEO
+        words: dict[str, str | int | float] = {"file": video.path.name, "image_format": video.format}
+        if options.fps is not None:
+            words["fps"] = str(options.fps)
+            self._say_fps(options.fps)
+        if video.every > 1:
+            words["every"] = video.every
+        if video.why_transcode:
+            words |= {"encoded_again_because": video.why_transcode}
+            words |= {"crf": keep.crf, "keyframe_interval_s": keep.key_every_s}
+            self.report.said.append(f"{video.path} is encoded again, as H.264: {video.why_transcode}")
+        elif video.format in _FOXGLOVE_ALONE:
+            kept = f"{video.path} is kept as {_FOXGLOVE_ALONE[video.format]}, which Foxglove plays"
+            self.report.said.append(f"{kept} and Lichtblick does not (--image-format h264 is for both)")
+        elif video.format == "jpeg":
+            words["quality"] = keep.jpeg_quality
+        channel = writer.add_channel(
+            self.pictures,
+            foxglove.schema_record(schema_name),
+            "protobuf",
+            Provenance("ingest", words).to_metadata(),
+            kind="media",
+        )
+        writer.add_metadata(CLOCK, {"start_ns": str(start_ns)})
+        times, numbers = array("q"), array("q")
+        frame_id = self.prefix.lstrip("/")
+        for picture in video.pictures(start_ns):
+            data = foxglove.pack_picture(schema_name, picture.t_ns, frame_id, video.format, picture.data)
+            writer.add_message(channel, picture.t_ns, picture.index, data)
+            times.append(picture.t_ns)
+            numbers.append(picture.index)
+            self._progress("ingest", len(times), max(video.frames, len(times)))
+        if not times:
+            raise McaptrackError(f"{video.path} is a video without frames")
+        self.report.messages[self.pictures] = len(times)
+        self.report.said += video.notes
+        self.report.lost += video.lost
+        of = f"the pictures of {video.path}"
+        timeline = Timeline(np.array(numbers), np.array(times), of, not video.lost, video.every)
+        self._check_standing(timeline)
+        self.write_plane(writer, self._plane, times[0])
+        self.write_labels(writer, self._plane, timeline)
+
+    def _say_fps(self, fps: Fraction) -> None:
+        """Say that pictures are spaced by another rate than their own."""
+        own = self.video.fps
+        if own and abs(fps - own) > _SAME_FPS * own:
+            words = f"{self.video.path} says {float(own):g} frames a second; its pictures are put at {float(fps):g}"
+            warn(f"{words} by --fps", "clock")
+
+    def _check_standing(self, timeline: Timeline) -> None:
+        """Labels that are in the log already are of these pictures: they have their times."""
+        for topic, labels in self._standing.items():
+            if self.there and topic not in self.topics() and not np.isin(labels.t_ns, timeline.t_ns).all():
+                how = f"give --fps {labels.fps}" if labels.fps else "give the --fps and --start-time that they have"
+                raise McaptrackError(
+                    f"{self.there.path}: {topic} has labels at other times than {timeline.of}; {how}, or --camera for "
+                    "another camera"
+                )

@@ -1,0 +1,84 @@
+"""What has to be known about an AV1 stream (its specification, 5.3 to 5.9) before it is passed on or entered."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Final, NamedTuple
+
+from mcaptrack.sources.video.units import Entry, Unit
+
+_SEQUENCE, _DELIMITER, _FRAME_HEADER, _FRAME = 1, 2, 3, 6
+_KEY_FRAME: Final = 0
+
+
+class _Obu(NamedTuple):
+    kind: int
+    start: int
+    body: int
+    end: int
+
+
+def _obus(data: bytes) -> Iterator[_Obu]:
+    """The open bitstream units of a temporal unit in the low-overhead format; none after one that says no length."""
+    at = 0
+    while at < len(data):
+        head, start = data[at], at
+        at += 2 if head & 4 else 1
+        if not head & 2:
+            return
+        size = 0
+        for byte in range(8):
+            if at >= len(data):
+                return
+            size |= (data[at] & 0x7F) << 7 * byte
+            at += 1
+            if not data[at - 1] & 0x80:
+                break
+        yield _Obu(head >> 3 & 15, start, at, at + size)
+        at += size
+
+
+def inspect(data: bytes) -> Unit:
+    """What a temporal unit holds."""
+    pictures, is_key, sets = 0, False, []
+    for obu in _obus(data):
+        if obu.end > len(data):
+            break
+        if obu.kind == _SEQUENCE:
+            sets.append(data[obu.start : obu.end])
+        elif obu.kind in (_FRAME_HEADER, _FRAME) and obu.body < len(data):
+            is_shown, key = _header(data[obu.body])
+            is_key |= key and not pictures
+            pictures += is_shown
+    return Unit(pictures, is_key, tuple(sets), bool(sets))
+
+
+def entry(data: bytes) -> Entry:
+    """What a message begins with; a key picture is one that is shown."""
+    has_sequence = False
+    for obu in _obus(data):
+        has_sequence |= obu.kind == _SEQUENCE
+        if obu.kind in (_FRAME_HEADER, _FRAME) and obu.body < len(data):
+            return Entry(True, _header(data[obu.body])[1], has_sequence)
+    return Entry(False, False, has_sequence)
+
+
+def with_sets(data: bytes, sets: tuple[bytes, ...]) -> bytes:
+    """A temporal unit with sequence headers in it, behind its delimiter."""
+    first = next(_obus(data), None)
+    at = first.end if first and first.kind == _DELIMITER else 0
+    return data[:at] + b"".join(sets) + data[at:]
+
+
+def sequence_headers(configuration: bytes) -> tuple[bytes, ...]:
+    """Those in the configuration record of a container (AV1 in ISO BMFF, 2.3), as far as it has any."""
+    body = configuration[4:]
+    return tuple(body[obu.start : obu.end] for obu in _obus(body) if obu.kind == _SEQUENCE)
+
+
+def _header(byte: int) -> tuple[bool, bool]:
+    """Of an uncompressed header: whether a frame is shown, and whether that is a key frame of its own."""
+    if byte >> 7:
+        return True, False  # a frame from before is shown
+    is_shown = bool(byte >> 4 & 1)
+    return is_shown, is_shown and byte >> 5 & 3 == _KEY_FRAME

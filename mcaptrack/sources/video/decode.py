@@ -1,0 +1,180 @@
+"""Encoded pictures -> brightness, for detectors, and colours, for people."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Container, Iterable, Iterator
+from fractions import Fraction
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaptrack.errors import McaptrackError
+from mcaptrack.geometry.clocks import NS_PER_S
+from mcaptrack.schema import Frame
+from mcaptrack.sources.video import h264
+from mcaptrack.sources.video.container import is_size_error
+from mcaptrack.sources.video.limits import check_size, check_still, max_pixels, still_size, too_large
+from mcaptrack.sources.video.raw import Layout, raw_brightness, raw_colours
+from mcaptrack.sources.video.streams import CODECS
+
+Pixels = NDArray[np.uint8]
+
+_FULL_RANGE: Final = 2  # AVCOL_RANGE_JPEG
+# Video keeps brightness in 16..235; detectors see 0..255 whatever the picture came from.
+_LIMITED_TO_FULL: Final = np.clip(np.rint((np.arange(256) - 16) * (255 / 219)), 0, 255).astype(np.uint8)
+
+
+class Encoded(NamedTuple):
+    """A picture in a log: ``format`` is "h264", "jpeg" and so on; with a ``layout`` it is that of a pixel, "rgb8".
+
+    ``where`` names the picture in errors; without it they say its number.
+    """
+
+    t_ns: int
+    index: int  # type: ignore[assignment]  # hides tuple.index, which nobody wants here
+    format: str
+    data: bytes
+    layout: Layout | None = None
+    where: str = ""
+
+    @property
+    def is_video(self) -> bool:
+        """Whether it may need pictures before it."""
+        return self.format in CODECS and not self.layout
+
+    @property
+    def name(self) -> str:
+        """The picture, as errors say it."""
+        return self.where or f"frame {self.index}"
+
+
+def brightness(pictures: Iterable[Encoded], wanted: Container[int] | None = None) -> Iterator[Frame]:
+    """Frames whose ``rows`` are the brightness of the picture, (height, width) uint8 from 0 to 255.
+
+    Pictures of a video before the first that decoding can begin with are left out, as all viewers leave them out.
+    With ``wanted`` those of other indexes are decoded, where the next ones need them, and left out. Raises
+    McaptrackError for a format that can't be decoded and for pictures that are broken.
+    """
+    return _decoded(pictures, raw_brightness, _luma, wanted, is_grey=True)
+
+
+def colours(pictures: Iterable[Encoded], wanted: Container[int] | None = None) -> Iterator[Frame]:
+    """The same in colour: ``rows`` are (height, width, 3) uint8, blue, green, red."""
+    return _decoded(pictures, raw_colours, _bgr, wanted, is_grey=False)
+
+
+def _decoded(
+    pictures: Iterable[Encoded],
+    of_pixels: Callable[[str, bytes, Layout], Pixels],
+    of_frame: Callable[[Any], Pixels],
+    wanted: Container[int] | None,
+    is_grey: bool,
+) -> Iterator[Frame]:
+    decoder: _VideoDecoder | None = None
+    for picture in pictures:
+        if picture.is_video:
+            decoder = decoder or _VideoDecoder(picture.format, of_frame, wanted)
+            yield from decoder.decode(picture)
+        elif wanted is not None and picture.index not in wanted:
+            continue
+        elif picture.layout:
+            width, height, *_ = picture.layout
+            if width * height <= len(picture.data):
+                check_size(width, height, picture.name)
+            try:
+                pixels = of_pixels(picture.format, picture.data, picture.layout)
+            except McaptrackError as error:
+                raise McaptrackError(f"{picture.name}: {error}") from None
+            yield Frame(picture.t_ns, picture.index, pixels)
+        else:
+            yield Frame(picture.t_ns, picture.index, _still(picture, is_grey))
+    if decoder:
+        yield from decoder.flush()
+
+
+def _still(picture: Encoded, is_grey: bool) -> Pixels:
+    import cv2
+
+    size, image = still_size(picture.data), None
+    if size is not None:
+        check_still(size, picture.name)
+        try:
+            how = cv2.IMREAD_GRAYSCALE if is_grey else cv2.IMREAD_COLOR
+            image = cv2.imdecode(np.frombuffer(picture.data, np.uint8), how)
+        except cv2.error:  # of a header that promises what can't be
+            image = None
+    if image is None:
+        raise McaptrackError(f"{picture.name} can't be decoded as {picture.format or 'an image'}")
+    return np.asarray(image, np.uint8)
+
+
+class _VideoDecoder:
+    def __init__(self, name: str, of_frame: Callable[[Any], Pixels], wanted: Container[int] | None) -> None:
+        import av
+
+        self._of_frame, self._wanted = of_frame, wanted
+
+        self._codec: Any = av.CodecContext.create(CODECS[name].decoder, "r")
+        self._codec.thread_type = "AUTO"
+        self._codec.options = {"max_pixels": str(max_pixels())}
+        self._base = Fraction(1, NS_PER_S)
+        self._count, self._sets, self._begun, self._last = 0, b"", False, "the video"
+        self._waiting: dict[int, tuple[int, int]] = {}
+
+    def decode(self, picture: Encoded) -> Iterator[Frame]:
+        import av
+
+        head = CODECS[picture.format].entry(picture.data)
+        self._begun |= head.has_sets
+        if not head.has_picture:
+            self._sets += picture.data  # some robots send these apart; FFmpeg takes them with a picture
+            return
+        if not self._begun:
+            return  # a recording may begin anywhere; nothing can be made of what is before the first parameter sets
+        # A copy in FFmpeg's own memory: its threads can't let go of Python's while Python waits for them to end.
+        data = self._sets + picture.data
+        if picture.format == "h264" and (self._sets or head.has_sets):  # FFmpeg says no more than that these are bad
+            check_size(*h264.largest(data), picture.name)
+        packet = av.Packet(len(data))
+        packet.update(data)
+        packet.pts = packet.dts = self._count  # not its time: messages of others may share one
+        packet.time_base = self._base
+        self._waiting[self._count], self._sets = (picture.t_ns, picture.index), b""
+        self._count += 1
+        self._last = picture.name
+        yield from self._frames(packet, picture.name)
+
+    def flush(self) -> Iterator[Frame]:
+        yield from self._frames(None, self._last)
+
+    def _frames(self, packet: Any, where: str) -> Iterator[Frame]:
+        import av
+
+        try:
+            decoded = self._codec.decode(packet)
+        except av.error.FFmpegError as error:
+            why = error.strerror or error
+            if is_size_error(error):
+                why = f"{why}; it is damaged, or too large: {too_large()}"
+            raise McaptrackError(f"{where} can't be decoded: {why}") from error
+        for frame in decoded:
+            t_ns, index = self._waiting.pop(frame.pts)
+            if self._wanted is None or index in self._wanted:
+                yield Frame(t_ns, index, self._of_frame(frame))
+
+
+def _bgr(frame: Any) -> Pixels:
+    return np.asarray(frame.to_ndarray(format="bgr24"), np.uint8)
+
+
+def _luma(frame: Any) -> Pixels:
+    """The brightness of a decoded picture; its Y plane where it has one of 8 bits."""
+    import cv2
+
+    if not frame.format.name.startswith(("yuv4", "yuvj4", "nv12", "gray")) or frame.format.components[0].bits != 8:
+        frame = frame.reformat(format="gray")
+    plane = frame.planes[0]
+    rows = np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)[: frame.height, : frame.width]
+    full = frame.color_range == _FULL_RANGE or frame.format.name.startswith(("gray", "yuvj"))
+    return rows.copy() if full else np.asarray(cv2.LUT(rows, _LIMITED_TO_FULL), np.uint8)

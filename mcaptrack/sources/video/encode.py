@@ -1,0 +1,267 @@
+"""Pictures -> H.264, JPEG, PNG; and a video file of pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import Any, Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaptrack.errors import McaptrackError
+from mcaptrack.files import publish
+from mcaptrack.geometry.clocks import NS_PER_S
+from mcaptrack.sources.video.container import writing
+
+ImageFormat = Literal["auto", "h264", "h265", "jpeg", "png"]
+StillFormat = Literal["jpeg", "png"]
+Image = NDArray[np.uint8]
+
+_MP4_BASE: Final = Fraction(1, 90_000)
+_GIF_BASE: Final = Fraction(1, 100)
+
+_BT601: Final = 6  # AVCOL_SPC_SMPTE170M
+_STILLS: Final = ("jpeg", "png")
+_JPEG_QUALITY: Final = 90
+_CRF: Final = 23
+_KEY_EVERY_S: Final = 1.0
+#: Viewers go back to the last key picture; from further away than this it takes long.
+_KEY_WITHIN_S: Final = 2.0
+#: JPEG's scale, and x264's constant rate factor: without 0, which browsers don't play.
+_QUALITIES: Final = {"jpeg": (1, 100), "h264": (1, 51)}
+_INTERVALS_S: Final = (0.01, 60.0)
+# No B-frames, key pictures with their parameter sets, four slices whatever the machine's cores: the same input gives
+# the same bytes everywhere.
+_X264: Final = {
+    "preset": "veryfast",
+    "tune": "zerolatency",
+    "crf": str(_CRF),
+    "bf": "0",
+    "x264-params": "scenecut=0:threads=4:sliced-threads=1",
+}
+_IN_MESSAGES: Final = {"x264-params": _X264["x264-params"] + ":repeat-headers=1:annexb=1", "forced-idr": "1"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Keep:
+    """How the pictures of a video are kept.
+
+    ``image_format`` "auto" passes H.264, VP9 and AV1 on as they are where viewers can play them, "h265" H.265 too,
+    "h264" H.264 alone; all else is encoded as H.264. ``quality`` is from 1 to 100 (best) for JPEG; for H.264 the
+    constant rate factor from 1 (best) to 51, and what has to have one is encoded. ``keyframe_interval_s`` is the
+    longest time between key pictures: of what is passed on (2 unless given) and of what is encoded (1 unless given).
+    ``fps`` spaces pictures evenly instead of by the times of the container.
+    """
+
+    image_format: ImageFormat = "auto"
+    quality: int | None = None
+    keyframe_interval_s: float | None = None
+    fps: Fraction | None = None
+
+    def __post_init__(self) -> None:
+        name = self.image_format
+        low, high = _QUALITIES.get(name, _QUALITIES["h264"])
+        if self.quality is not None and name == "png":
+            raise McaptrackError("--quality is for H.264 and JPEG; PNG keeps pictures exactly as they are")
+        if self.quality is not None and not low <= self.quality <= high:
+            scale = "JPEG's" if name == "jpeg" else "H.264's constant rate factor"
+            best = high if name == "jpeg" else low
+            raise McaptrackError(
+                f"--quality is {scale}, a number from {low} to {high} ({best} is best), not {self.quality}"
+            )
+        if self.keyframe_interval_s is not None:
+            if self.is_still:
+                raise McaptrackError(f"--keyframe-interval-s is for video; as {name}, every picture stands alone")
+            if not _INTERVALS_S[0] <= self.keyframe_interval_s <= _INTERVALS_S[1]:
+                raise McaptrackError(
+                    f"--keyframe-interval-s is a number from {_INTERVALS_S[0]:g} to {_INTERVALS_S[1]:g}, "
+                    f"not {self.keyframe_interval_s:g}"
+                )
+
+    @property
+    def is_still(self) -> bool:
+        """Whether every picture stands alone."""
+        return self.image_format in _STILLS
+
+    @property
+    def jpeg_quality(self) -> int:
+        """From 1 to 100."""
+        return _JPEG_QUALITY if self.quality is None else self.quality
+
+    @property
+    def crf(self) -> int:
+        """x264's constant rate factor."""
+        return _CRF if self.quality is None else self.quality
+
+    @property
+    def key_every_s(self) -> float:
+        """How often what is encoded has a key picture."""
+        return self.keyframe_interval_s or _KEY_EVERY_S
+
+    @property
+    def key_within_s(self) -> float:
+        """How far apart the key pictures may be of what is passed on."""
+        return self.keyframe_interval_s or _KEY_WITHIN_S
+
+
+class H264Encoder:
+    """Pictures -> H.264 in Annex B form, one access unit a picture, without B-frames.
+
+    Key pictures are at most ``key_every_s`` apart, by the times that pictures are given, without these by ``fps``. What
+    colours mean is said as a frame of FFmpeg's, ``like``, says it; images are converted as in ITU-R BT.601.
+    """
+
+    def __init__(
+        self,
+        width_px: int,
+        height_px: int,
+        fps: Fraction,
+        crf: int = _CRF,
+        key_every_s: float = _KEY_EVERY_S,
+        like: Any = None,
+    ) -> None:
+        import av
+
+        codec: Any = av.CodecContext.create("libx264", "w")
+        codec.width, codec.height, codec.pix_fmt = width_px, height_px, "yuv420p"
+        codec.time_base, codec.framerate = 1 / fps, fps
+        if isinstance(like, av.VideoFrame):
+            codec.colorspace = like.colorspace
+            codec.color_primaries, codec.color_trc = like.color_primaries, like.color_trc
+        else:
+            codec.colorspace = _BT601
+        group = max(1, round(fps * Fraction(key_every_s)))
+        codec.options = _X264 | _IN_MESSAGES | {"g": str(group), "crf": str(crf)}
+        self._codec = codec
+        self._index = 0
+        self._key_every_ns, self._key_ns = round(key_every_s * NS_PER_S), 0
+
+    def encode(self, image: Image | Any, t_ns: int | None = None) -> bytes:
+        """One picture, BGR (height, width, 3), or a frame of FFmpeg's of just this size."""
+        import av
+        from av.video.frame import PictureType
+
+        is_image = isinstance(image, np.ndarray)
+        frame: Any = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="bgr24") if is_image else image
+        if t_ns is not None and t_ns - self._key_ns >= self._key_every_ns:
+            frame.pict_type = PictureType.I
+        else:
+            frame.pict_type = PictureType.NONE
+        frame.pts, frame.time_base = self._index, self._codec.time_base
+        self._index += 1
+        try:
+            packets = self._codec.encode(frame)
+        except av.error.FFmpegError as error:
+            raise _refused(frame, error) from error
+        if t_ns is not None and any(packet.is_keyframe for packet in packets):
+            self._key_ns = t_ns
+        return b"".join(bytes(packet) for packet in packets)
+
+
+def _refused(frame: Any, error: Exception) -> McaptrackError:
+    """What to say of a picture that the encoder doesn't take; libx264 wants at most 16384 rows and columns."""
+    why = getattr(error, "strerror", None) or error
+    return McaptrackError(
+        f"pictures of {frame.width} x {frame.height} can't be encoded as H.264 ({why}); jpeg and png can be larger"
+    )
+
+
+def encode_image(image: Image, image_format: StillFormat, quality: int = _JPEG_QUALITY) -> bytes:
+    """One picture, BGR, as JPEG or PNG. ``quality``, from 1 to 100, is JPEG's."""
+    import cv2
+
+    options = [cv2.IMWRITE_JPEG_QUALITY, quality] if image_format == "jpeg" else []
+    ok, data = cv2.imencode(f".{image_format}", image, options)
+    if not ok:
+        raise McaptrackError(f"a picture of {image.shape[1]} x {image.shape[0]} can't be encoded as {image_format}")
+    return data.tobytes()
+
+
+def write_mp4(path: Path, images: Iterable[Image], fps: int) -> int:
+    """Write pictures, BGR of one even size, as an H.264 file, there once it is complete. Returns how many."""
+    step = Fraction(NS_PER_S, fps)
+    return write_clip(path, ((round(number * step), image) for number, image in enumerate(images)), Fraction(fps))
+
+
+def write_clip(path: Path, images: Iterable[tuple[int, Image]], fps: Fraction) -> int:
+    """Write pictures, BGR of one even size, with their times in nanoseconds, as an H.264 file or, by its suffix, a GIF.
+
+    It is there once it is complete. ``fps`` is about how many there are in a second. Returns how many they were.
+    """
+    import av
+
+    is_gif = path.suffix.lower() == ".gif"
+    count, start = 0, 0
+    with publish(path) as part, writing(part, "gif" if is_gif else "mp4") as container:
+        stream: Any = None
+        palette = _Palette() if is_gif else None
+
+        def put(frame: Any) -> None:
+            try:
+                packets = stream.encode(frame)
+            except av.error.FFmpegError as error:
+                raise (_refused(frame, error) if frame else error) from error
+            for packet in packets:
+                container.mux(packet)
+
+        for t_ns, image in images:
+            if stream is None:
+                options = {} if is_gif else _X264 | {"g": str(max(1, round(fps)))}
+                stream = container.add_stream("gif" if is_gif else "libx264", rate=fps, options=options)
+                stream.height, stream.width = image.shape[:2]
+                stream.pix_fmt = "pal8" if is_gif else "yuv420p"
+                stream.codec_context.time_base = _GIF_BASE if is_gif else _MP4_BASE
+                start = t_ns
+            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="bgr24")
+            frame.time_base = stream.codec_context.time_base
+            frame.pts = round(Fraction(t_ns - start, NS_PER_S) / frame.time_base)
+            if palette:
+                palette.push(frame)
+            else:
+                put(frame)
+            count += 1
+        for frame in palette.frames() if palette else ():
+            put(frame)
+        if stream is not None:
+            put(None)
+    return count
+
+
+class _Palette:
+    """Pictures -> the same in the 256 colours that suit all of them best, as a GIF needs them."""
+
+    def __init__(self) -> None:
+        self._graph: Any = None
+
+    def push(self, frame: Any) -> None:
+        import av
+
+        if self._graph is None:
+            graph = self._graph = av.filter.Graph()
+            size, form = {"width": frame.width, "height": frame.height}, av.VideoFormat("bgr24")
+            source: Any = graph.add_buffer(**size, format=form, time_base=_GIF_BASE)
+            split, colours = graph.add("split"), graph.add("palettegen", "stats_mode=full")
+            use = graph.add("paletteuse", "dither=bayer:bayer_scale=4:diff_mode=rectangle")
+            sink = graph.add("buffersink")
+            source.link_to(split)
+            split.link_to(use, 0, 0)
+            split.link_to(colours, 1, 0)
+            colours.link_to(use, 0, 1)
+            use.link_to(sink)
+            graph.configure()
+        self._graph.push(frame)
+
+    def frames(self) -> Iterator[Any]:
+        import av
+
+        if self._graph is None:
+            return
+        self._graph.push(None)
+        while True:
+            try:
+                yield self._graph.pull()
+            except (av.error.EOFError, av.error.BlockingIOError):
+                return

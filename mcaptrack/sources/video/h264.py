@@ -1,0 +1,98 @@
+"""What has to be known about an H.264 stream (ITU-T H.264, 7.3 and Annex B) before it is passed on or entered."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from mcaptrack.sources.video.units import Bits, Entry, Unit, nal_starts, nal_units
+
+_SLICE, _PARTITION, _IDR, _SPS, _PPS, _DELIMITER = 1, 2, 5, 7, 8, 9
+_PICTURES: Final = (_SLICE, _PARTITION, _IDR)
+_SETS: Final = frozenset((_SPS, _PPS))
+_B: Final = 1
+#: Profiles whose parameter sets say how colour is sampled.
+_HIGH: Final = (100, 110, 122, 244, 44, 83, 86, 118, 128, 138, 139, 134, 135)
+
+
+def inspect(data: bytes) -> Unit:
+    """What the access unit ``data`` (Annex B) holds."""
+    pictures, is_key, has_b = 0, False, False
+    sets: dict[bytes, int] = {}
+    for kind, nal in nal_units(data, _SETS, 0, 0x1F):
+        if kind in _SETS:
+            sets[nal] = kind
+        elif kind in _PICTURES:
+            bits = Bits.of_nal(nal[1:])
+            pictures += bits.golomb() == 0  # first_mb_in_slice
+            has_b |= bits.golomb() % 5 == _B  # slice_type
+            is_key |= kind == _IDR
+    return Unit(pictures, is_key, tuple(sets), set(sets.values()) == _SETS, has_b)
+
+
+def entry(data: bytes) -> Entry:
+    """What a message begins with; nothing behind the head of its first slice is looked at."""
+    found: set[int] = set()
+    for start in nal_starts(data):
+        kind = data[start] & 0x1F if start < len(data) else 0
+        if kind in _PICTURES:
+            return Entry(True, kind == _IDR, found >= _SETS)
+        found.add(kind)
+    return Entry(False, False, found >= _SETS)
+
+
+def with_sets(data: bytes, sets: tuple[bytes, ...]) -> bytes:
+    """An access unit with parameter sets before its slices, behind its delimiter."""
+    first = next(nal_starts(data), len(data))
+    at = 0
+    if first < len(data) and data[first] & 0x1F == _DELIMITER:
+        at = first + 2
+    return data[:at] + b"".join(b"\x00\x00\x00\x01" + nal for nal in sets) + data[at:]
+
+
+def is_interlaced(sets: tuple[bytes, ...]) -> bool:
+    """Whether pictures may be made of two fields."""
+    return any(not _geometry(nal)[2] for nal in sets if nal[0] & 0x1F == _SPS)
+
+
+def largest(data: bytes) -> tuple[int, int]:
+    """The width and height, in whole blocks, of the largest pictures that sequence parameter sets announce."""
+    sizes = [_geometry(nal)[:2] for kind, nal in nal_units(data, _SETS, 0, 0x1F) if kind == _SPS]
+    return max(sizes, key=lambda size: size[0] * size[1], default=(0, 0))
+
+
+def _geometry(sps: bytes) -> tuple[int, int, bool]:
+    """Width and height in whole blocks, and frame_mbs_only_flag, of a sequence parameter set (7.3.2.1.1)."""
+    bits = Bits.of_nal(sps[1:])
+    profile = bits.take(8)
+    bits.take(16)  # constraints, level
+    bits.golomb()  # id
+    if profile in _HIGH:
+        chroma = bits.golomb()
+        if chroma == 3:
+            bits.take(1)
+        bits.golomb(), bits.golomb(), bits.take(1)  # bit depths, lossless
+        if bits.take(1):
+            for number in range(8 if chroma != 3 else 12):
+                if bits.take(1):
+                    _pass_scaling_list(bits, 16 if number < 6 else 64)
+    bits.golomb()  # log2_max_frame_num
+    order = bits.golomb()  # pic_order_cnt_type
+    if order == 0:
+        bits.golomb()
+    elif order == 1:
+        bits.take(1)
+        bits.golomb(), bits.golomb()
+        for _ in range(min(bits.golomb(), 255)):
+            bits.golomb()
+    bits.golomb(), bits.take(1)  # references, gaps
+    blocks, units = bits.golomb() + 1, bits.golomb() + 1  # of a height of one block, or of two in pairs of fields
+    frames_only = bool(bits.take(1))
+    return 16 * blocks, 16 * units * (1 if frames_only else 2), frames_only
+
+
+def _pass_scaling_list(bits: Bits, size: int) -> None:
+    last = following = 8
+    for _ in range(size):
+        if following:
+            following = (last + bits.signed_golomb()) % 256
+        last = following or last

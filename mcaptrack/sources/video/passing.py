@@ -1,0 +1,160 @@
+"""Packets of a container -> messages with the same pictures, where every viewer can play them as they stand.
+
+What viewers ask: one picture a message, none shown in another order than they stand in, upright, progressive, 8-bit
+4:2:0, of one size; key pictures that can be decoded on their own, with their parameter sets, close to one another.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+from mcaptrack.sources.video import av1, h264
+from mcaptrack.sources.video.container import fraction, has_slots, reading, videos
+from mcaptrack.sources.video.encode import Keep
+from mcaptrack.sources.video.streams import CODECS
+
+_PIXELS: Final = ("yuv420p", "yuvj420p")
+_WORDS: Final = {"h264": "H.264", "h265": "H.265", "vp9": "VP9", "av1": "AV1"}
+_ONLY_SOME: Final = "it is H.265, which viewers play only where the hardware does (--image-format h265 keeps it)"
+
+
+class Passed(NamedTuple):
+    """A packet as a message: its time in seconds, if it has one, and what its container says of it."""
+
+    seconds: Fraction | None
+    data: bytes
+    is_key: bool
+    is_hidden: bool
+    is_damaged: bool
+    changes_sets: bool
+
+
+@dataclass
+class Stream:
+    """What a look at all packets found.
+
+    ``format`` is as messages name it, "" where they have no name for it. ``why_not`` says why it can't be passed on, ""
+    if it can; then ``sets`` are the parameter sets that key pictures need and that are not with all of them.
+    """
+
+    format: str
+    why_not: str
+    sets: tuple[bytes, ...] = ()
+
+
+def packets(opened: Any, image_format: str) -> Iterator[Passed]:
+    """The packets of the first video stream as messages, as far as they can be read."""
+    import av
+    from av.bitstream import BitStreamFilterContext
+
+    stream = videos(opened)[0]
+    name = CODECS[image_format].annex_b
+    to_annex_b = BitStreamFilterContext(name, stream) if name else None
+    base = fraction(stream.time_base) or Fraction(1)
+    slots, found = has_slots(opened), opened.demux(stream)
+    while True:
+        try:
+            packet = next(found, None)
+        except av.error.FFmpegError:  # FFmpeg reads no further
+            yield Passed(None, b"", False, False, True, False)
+            return
+        if packet is None:
+            return
+        if packet.size == 0:
+            continue
+        ticks = packet.dts if slots else packet.pts
+        seconds = None if ticks is None else ticks * base
+        flags = (packet.is_keyframe, packet.is_discard, packet.is_corrupt, packet.has_sidedata("new_extradata"))
+        try:
+            units = to_annex_b.filter(packet) if to_annex_b else [packet]  # takes the packet's contents with it
+        except av.error.FFmpegError:
+            units, flags = [], (*flags[:2], True, flags[3])
+        yield Passed(seconds, b"".join(bytes(unit) for unit in units), *flags)
+
+
+def look(path: Path, keep: Keep) -> Stream:
+    """Whether and how the first video stream of a file can be passed on, from one pass over its packets."""
+    with reading(path) as opened:
+        stream = videos(opened)[0]
+        context = stream.codec_context
+        name = context.codec.canonical_name
+        image_format = next((key for key, codec in CODECS.items() if codec.name == name), "")
+        why_not = _why_not(image_format, name, keep, context)
+        if why_not:
+            return Stream(image_format, why_not)
+        found = Stream(image_format, "", _outside(image_format, context))
+        found.why_not = _look_at(packets(opened, image_format), found, keep.fps, Fraction(keep.key_within_s))
+        if image_format == "h265" and keep.image_format != "h265" and not found.why_not:
+            found.why_not = _ONLY_SOME
+        return found
+
+
+def _why_not(image_format: str, name: str, keep: Keep, context: Any) -> str:
+    """What speaks against passing a stream on, of all that is known without looking at its packets."""
+    if not image_format:
+        return f"it is {name}, which viewers don't play"
+    if keep.image_format == "h264" and image_format != "h264":
+        return f"it is {_WORDS[image_format]}, not H.264"
+    if keep.quality is not None:
+        return "a quality was asked for"
+    if context.pix_fmt not in _PIXELS:
+        return f"its pixels are {context.pix_fmt}, not 8-bit 4:2:0"
+    return "it has B-frames" if context.has_b_frames else ""
+
+
+def _outside(image_format: str, context: Any) -> tuple[bytes, ...]:
+    """The sequence headers that a container keeps beside its packets; for H.264 and H.265 the filter puts them in."""
+    return av1.sequence_headers(bytes(context.extradata or b"")) if image_format == "av1" else ()
+
+
+def _look_at(found: Iterator[Passed], stream: Stream, fps: Fraction | None, within_s: Fraction) -> str:
+    """Why these packets can't be passed on; notes parameter sets that have to be put beside key pictures."""
+    inspect = CODECS[stream.format].inspect
+    known: tuple[bytes, ...] = stream.sets
+    size: tuple[int, int] | None = None
+    last: Fraction | None = None
+    key_at = Fraction(0)
+    all_have_sets, cut_off = True, False
+    for count, packet in enumerate(found):
+        if cut_off:
+            return "some of its packets are damaged"
+        if packet.is_damaged:
+            cut_off = True  # at the very end it is left out; anywhere else what follows needs it
+            continue
+        if packet.is_hidden:
+            return "an edit list hides some of its frames"
+        if packet.changes_sets and count:
+            return "it changes its parameters on the way"
+        seconds = Fraction(count) / fps if fps else packet.seconds
+        if seconds is None:
+            return "some of its frames have no time"
+        if last is not None and (seconds <= last):
+            return "its frames are not in the order of their times"
+        last = seconds
+        unit = inspect(packet.data)
+        if unit.reorders:
+            return "it has B-frames"
+        if unit.pictures != 1:
+            return "its packets are not one picture each"
+        if count == 0 and not (unit.is_key and (unit.has_sets or known)):
+            return "it does not begin with a key frame"
+        if packet.is_key and not unit.is_key:
+            return "not every key frame can be decoded on its own (open groups of pictures)"
+        if unit.is_key:
+            key_at = seconds
+            all_have_sets &= unit.has_sets
+        elif seconds - key_at > within_s:
+            return f"its key frames are more than {float(within_s):g} s apart"
+        if count == 0:  # what stands in the stream counts; the container's own words may differ
+            known = unit.sets or known
+        if not set(unit.sets) <= set(known) or (size and unit.size and size != unit.size):
+            return "it changes its size or its parameters on the way"
+        size = size or unit.size
+        if count == 0 and stream.format == "h264" and h264.is_interlaced(known):
+            return "it is interlaced"
+    stream.sets = () if all_have_sets else known
+    return ""

@@ -1,0 +1,376 @@
+"""Video files and image folders -> encoded pictures with exact times, one a message.
+
+A stream is passed on without re-encoding where every viewer can play it as it stands (``passing``); otherwise it is
+decoded and encoded again, and the reason is said.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from fractions import Fraction
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaptrack.errors import McaptrackError
+from mcaptrack.geometry.clocks import LAST_NS, NS_PER_S
+from mcaptrack.notices import warn
+from mcaptrack.sources.video.container import empty, fraction, has_slots, has_times, indexed, reading, videos
+from mcaptrack.sources.video.encode import H264Encoder, Keep, StillFormat, encode_image
+from mcaptrack.sources.video.folder import Images, find_images, read_image
+from mcaptrack.sources.video.limits import check_h264, check_size
+from mcaptrack.sources.video.passing import look, packets
+from mcaptrack.sources.video.seqinfo import find_seqinfo
+from mcaptrack.sources.video.slots import count_slots
+from mcaptrack.sources.video.streams import CODECS
+
+Image = NDArray[np.uint8]
+
+#: As many on every machine, so that what is made of damaged streams is the same everywhere.
+_THREADS: Final = 4
+_FULL_RANGE, _LIMITED_RANGE = 2, 1  # AVCOL_RANGE_JPEG, AVCOL_RANGE_MPEG
+
+
+class EncodedPicture(NamedTuple):
+    """One picture as a message carries it."""
+
+    t_ns: int
+    index: int  # type: ignore[assignment]  # hides tuple.index, which is not needed here
+    data: bytes
+
+
+class Shown(NamedTuple):
+    """One picture as it is shown: its number, its time in seconds, if it has one, and FFmpeg's frame or BGR (H, W, 3).
+
+    Pictures that can't be decoded have numbers, too.
+    """
+
+    index: int  # type: ignore[assignment]  # hides tuple.index, which is not needed here
+    seconds: Fraction | None
+    picture: Any
+
+
+@dataclass
+class Video:
+    """A video file or image folder that can be read; made by ``open_video``.
+
+    ``format`` is what its messages are: "h264", "vp9", "jpeg" and so on. ``width_px`` and ``height_px`` are of these.
+    ``frames`` is what the container claims, 0 if nothing. ``start_ns`` is when the recording began, if it says.
+    ``images`` are those of a folder, of which every so many are there by the numbers in their names (``every``).
+    ``why_transcode`` is empty where the stream is passed on, or where stills are asked for. ``lost`` and ``notes``
+    collect, while pictures are read, what could not be, and what is worth saying.
+    """
+
+    path: Path
+    keep: Keep
+    format: str
+    width_px: int
+    height_px: int
+    fps: Fraction | None
+    frames: int
+    start_ns: int | None
+    why_transcode: str
+    sets: tuple[bytes, ...] = ()
+    images: Images | None = None
+    stream: int = 0
+    lost: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+    has_slots: bool = False
+    length_s: Fraction | None = None
+
+    @property
+    def every(self) -> int:
+        """How far apart the numbers of pictures are: 12 for images of which every twelfth has kept its number."""
+        return self.images.every if self.images else 1
+
+    def pictures(self, start_ns: int = 0) -> Iterator[EncodedPicture]:
+        """All pictures in order, the first of them at ``start_ns``."""
+        clock = _Clock(self, start_ns)
+        if self.keep.is_still:
+            yield from _stills(self, clock)
+        elif self.why_transcode:
+            yield from _transcode(self, clock)
+        else:
+            yield from _pass_on(self, clock)
+
+    def note_missing(self, read: int, hidden: int = 0, last_s: Fraction | None = None) -> None:
+        """Compare what was read with what the container claims; ``hidden`` is what it says not to show, or is empty."""
+        if self.has_slots and self.fps and last_s is not None:
+            hidden += round(last_s * self.fps) + 1 - read  # slots that are empty
+        if self.frames and read + hidden < self.frames:
+            slots = None if self.images else count_slots(self.path, self.stream)
+            if slots is not None and slots >= self.frames:
+                return  # the file is whole: what was not read is empty, or was said to be lost
+            self.lost.append(f"{self.path} claims {self.frames} frames; {read} could be read")
+        elif not self.frames and self.length_s and last_s is not None and self.fps:
+            gap = self.length_s - last_s
+            if gap > max(Fraction(1, 2), 3 / self.fps):
+                ends = f"its pictures end at {float(last_s):.2f} s"
+                self.lost.append(f"{self.path} says it is {float(self.length_s):.2f} s long; {ends}")
+
+
+class _Clock:
+    """Times of pictures: from the container, exact in its time base; or evenly spaced."""
+
+    def __init__(self, video: Video, start_ns: int) -> None:
+        self.fps = video.keep.fps or (video.fps if video.images else None)
+        self._where = video.path
+        self._start_ns = start_ns
+        self._first: Fraction | None = None
+        self._last = -1
+
+    def time(self, index: int, seconds: Fraction | None) -> int:
+        if self.fps:
+            seconds = index / self.fps
+        elif seconds is None:
+            raise McaptrackError(
+                f"{self._where}: picture {index} has no time in its container; space them evenly with --fps"
+            )
+        else:
+            self._first = seconds if self._first is None else self._first
+            seconds -= self._first
+        t_ns = self._start_ns + round(seconds * NS_PER_S)
+        if not 0 <= t_ns < LAST_NS:
+            raise McaptrackError(
+                f"{self._where}: picture {index} is {float(seconds):g} s after the first; times reach to the year 2262"
+            )
+        self._last = max(t_ns, self._last + 1)  # two pictures never share a time
+        return self._last
+
+
+def open_video(path: Path, keep: Keep = Keep()) -> Video:  # noqa: B008  # frozen
+    """Look at a video file or image folder. Raises McaptrackError unless it holds pictures that can be decoded."""
+    if path.is_dir():
+        return _open_folder(path, keep)
+    with reading(path) as opened:
+        there = videos(opened)
+        if not there:
+            kinds = ", ".join(sorted({stream.type for stream in opened.streams if stream.type != "video"}))
+            raise McaptrackError(f"{path} holds no video, {f'only {kinds}' if kinds else 'and nothing else'}")
+        stream = there[0]
+        context = stream.codec_context
+        if context is None:
+            raise McaptrackError(f"{path} holds video in a codec that is not known here; convert it to H.264 first")
+        check_size(context.width, context.height, path)
+        first = next(opened.decode(stream), None)
+        if first is None:
+            raise McaptrackError(f"{path} is a video without frames")
+        if not (has_times(opened) or keep.fps):
+            raise McaptrackError(f"{path} has no times of its own; give the frames per second with --fps")
+        sideways = first.rotation % 180 != 0
+        video = Video(
+            path,
+            keep,
+            keep.image_format if keep.is_still else "h264",
+            first.height if sideways else first.width,
+            first.width if sideways else first.height,
+            fraction(stream.average_rate),
+            stream.frames,
+            _creation_ns(opened.metadata.get("creation_time") or stream.metadata.get("creation_time")),
+            f"it is turned by {first.rotation} degrees" if first.rotation else "",
+            stream=stream.index,
+            has_slots=has_slots(opened),
+            length_s=_length_s(opened, stream),
+        )
+        if len(there) > 1:
+            video.notes.append(f"{path} holds {len(there)} videos; the first is taken")
+        if first.interlaced_frame:
+            video.why_transcode = video.why_transcode or "it is interlaced"
+    if keep.is_still:
+        video.why_transcode = ""
+    elif not video.why_transcode:
+        found = look(path, keep)
+        video.why_transcode, video.sets = found.why_not, found.sets
+        video.format = "h264" if found.why_not else found.format
+    _make_even(video)
+    return video
+
+
+def _make_even(video: Video) -> None:
+    """Pictures that are encoded as H.264 have an even number of rows and columns."""
+    if video.why_transcode:
+        check_h264(video.width_px, video.height_px, video.path)
+        video.width_px += video.width_px % 2
+        video.height_px += video.height_px % 2
+
+
+def _length_s(opened: Any, stream: Any) -> Fraction | None:
+    """How long a container says that its pictures are; None if it says it of all streams together."""
+    said = re.fullmatch(r"(\d+):(\d\d):(\d\d(?:\.\d+)?)", stream.metadata.get("DURATION", ""))
+    if said:
+        return int(said[1]) * 3600 + int(said[2]) * 60 + Fraction(said[3])
+    return Fraction(opened.duration, 1_000_000) if opened.duration and len(opened.streams) == 1 else None
+
+
+def _open_folder(path: Path, keep: Keep) -> Video:
+    images = find_images(path)
+    first = read_image(images.paths[0])
+    if first is None:
+        raise McaptrackError(f"{images.paths[0]} can't be read as an image")
+    height, width = first.shape[:2]
+    name = keep.image_format if keep.is_still else "h264"
+    why, info = "" if keep.is_still else "it is a folder of images", find_seqinfo(path)
+    video = Video(
+        path, keep, name, width, height, info.fps if info else None, len(images.paths), None, why, images=images
+    )
+    if images.missing:
+        warn(f"{path}: {images.missing} are missing; their times stay empty", "clock")
+    if info and info.frames and info.frames != images.place[-1] + 1:
+        warn(f"{info.path} counts {info.frames} frames, and {path} has images of {images.place[-1] + 1}", "clock")
+    _make_even(video)
+    return video
+
+
+def _creation_ns(text: str | None) -> int | None:
+    """When a recording began, by its container, whose times are UTC; None if it says nothing or nothing possible."""
+    try:
+        moment = datetime.fromisoformat(text) if text else None
+    except ValueError:
+        return None
+    if moment is None:
+        return None
+    moment = moment if moment.tzinfo else moment.replace(tzinfo=UTC)
+    t_ns = round(moment.timestamp() * 1e6) * 1000
+    return t_ns if 0 <= t_ns < LAST_NS else None
+
+
+def _pass_on(video: Video, clock: _Clock) -> Iterator[EncodedPicture]:
+    codec = CODECS[video.format]
+    index, seconds = 0, None
+    with reading(video.path) as opened:
+        for packet in packets(opened, video.format):
+            if packet.is_damaged:  # the last one
+                video.lost.append(f"{video.path} is cut off or damaged after {index} frames; the rest is left out")
+                continue
+            data = packet.data
+            if video.sets:
+                head = codec.entry(data)
+                data = codec.with_sets(data, video.sets) if head.is_key and not head.has_sets else data
+            seconds = packet.seconds
+            yield EncodedPicture(clock.time(index, seconds), index, data)
+            index += 1
+        video.frames = video.frames or indexed(opened)
+        hidden = empty(opened)
+    video.note_missing(index, hidden, seconds)
+
+
+def _transcode(video: Video, clock: _Clock) -> Iterator[EncodedPicture]:
+    keep, encoder = video.keep, None
+    for index, seconds, picture in _shown(video):
+        t_ns = clock.time(index, seconds)
+        fitted = _fit(video, picture)
+        if encoder is None:
+            fps = clock.fps or video.fps or Fraction(30)
+            encoder = H264Encoder(video.width_px, video.height_px, fps, keep.crf, keep.key_every_s, like=fitted)
+        data = encoder.encode(fitted, t_ns)
+        del picture, fitted  # not kept while the next one is read: pictures may be large
+        yield EncodedPicture(t_ns, index, data)
+
+
+def _stills(video: Video, clock: _Clock) -> Iterator[EncodedPicture]:
+    name: StillFormat = "jpeg" if video.format == "jpeg" else "png"
+    for index, seconds, picture in _shown(video):
+        data = encode_image(_upright(picture), name, video.keep.jpeg_quality)
+        del picture
+        yield EncodedPicture(clock.time(index, seconds), index, data)
+
+
+def images(video: Video) -> Iterator[tuple[Fraction | None, Image]]:
+    """Decoded pictures, BGR (height, width, 3), upright, with their times in seconds."""
+    for _, seconds, picture in _shown(video):
+        yield seconds, _upright(picture)
+
+
+def _shown(video: Video) -> Iterator[Shown]:
+    """All pictures as they are shown; what could not be read is noted."""
+    if video.images is None:
+        yield from _decoded(video)
+        return
+    for path, place in zip(video.images.paths, video.images.place, strict=True):
+        image = read_image(path)
+        if image is None:
+            video.lost.append(f"{path} can't be read as an image; it is left out")
+        else:
+            yield Shown(place, None, image)
+            del image
+
+
+def _decoded(video: Video) -> Iterator[Shown]:
+    import av
+
+    read, failed, damaged, hidden, cut_off, seconds = 0, 0, 0, 0, 0, None
+    slots: list[int] = []
+    with reading(video.path) as opened:
+        stream = videos(opened)[0]
+        stream.thread_type = "AUTO"
+        stream.codec_context.thread_count = _THREADS
+        base = fraction(stream.time_base) or Fraction(1)
+        packets = opened.demux(stream)
+        while True:
+            try:
+                packet = next(packets, None)
+                if packet is None:
+                    break
+                hidden += packet.is_discard
+                cut_off += packet.is_corrupt
+                if video.has_slots and packet.size:
+                    slots.append(len(slots) if packet.dts is None else packet.dts)
+                frames = packet.decode()
+            except av.error.FFmpegError as error:
+                video.lost.append(f"{video.path}: a packet can't be decoded ({error.strerror or error})")
+                failed += 1
+                continue
+            for frame in frames:
+                ticks = slots[min(read + failed, len(slots) - 1)] if slots else frame.pts
+                seconds = None if ticks is None else ticks * base
+                damaged += frame.is_corrupt
+                yield Shown(read + failed, seconds, frame)
+                read += 1
+        video.frames = video.frames or indexed(opened)
+        hidden += empty(opened)
+    if cut_off:
+        video.lost.append(f"{video.path}: {cut_off} packets are cut off or damaged")
+    if damaged:
+        video.lost.append(f"{video.path}: {damaged} of {read} frames are damaged; they are kept as far as they decode")
+    video.note_missing(read, hidden, seconds)
+
+
+def _upright(picture: Any) -> Image:
+    """BGR, as it is to be seen."""
+    if isinstance(picture, np.ndarray):
+        return picture
+    return np.rot90(picture.to_ndarray(format="bgr24"), picture.rotation // 90)
+
+
+def _fit(video: Video, picture: Any) -> Any:
+    """A picture as the encoder takes it, of the (even) size of the video.
+
+    One row or column that is missing is the one before it again. Pictures of other sizes are scaled, and that is noted.
+    """
+    width, height = video.width_px, video.height_px
+    if (
+        not isinstance(picture, np.ndarray)
+        and not picture.rotation
+        and (picture.width, picture.height) == (width, height)
+    ):
+        if picture.format.name == "yuv420p" and picture.color_range != _FULL_RANGE:
+            return picture
+        if picture.format.name.startswith(("yuv4", "yuvj4")):
+            is_full = picture.format.name.startswith("yuvj") or picture.color_range == _FULL_RANGE
+            ranges = {"src_color_range": _FULL_RANGE if is_full else _LIMITED_RANGE, "dst_color_range": _LIMITED_RANGE}
+            return picture.reformat(format="yuv420p", **ranges)
+    image = _upright(picture)
+    right, below = width - image.shape[1], height - image.shape[0]
+    if 0 <= right <= 1 and 0 <= below <= 1:
+        return np.pad(image, ((0, below), (0, right), (0, 0)), mode="edge") if right or below else image
+    import cv2
+
+    words = f"{video.path}: pictures change their size on the way; all are scaled to {width} x {height}"
+    if words not in video.notes:
+        video.notes.append(words)
+    return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)

@@ -1,0 +1,300 @@
+"""Two files that are to be compared, tracks and truth, as frames; and which of several files belong together.
+
+Files that count frames are compared by these; tables and files with clocks of their own, by time.
+
+Letters: N true boxes, K tracks' boxes in one frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from fractions import Fraction
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaptrack import tables
+from mcaptrack.errors import McaptrackError, command
+from mcaptrack.geometry.assignment import solve
+from mcaptrack.geometry.boxes import iou
+from mcaptrack.geometry.clocks import NS_PER_S
+from mcaptrack.geometry.plane import GroundPlane, Point
+from mcaptrack.schema import Frame
+from mcaptrack.sources import ingest
+from mcaptrack.sources.ingest.formats import KITTI_HEIGHT_PX, PERSON, Aside, Labels, Role
+from mcaptrack.sources.ingest.job import IngestOptions, label_rows
+from mcaptrack.sources.ingest.label_job import LabelJob
+from mcaptrack.sources.ingest.labels import read_homography, read_labels
+from mcaptrack.sources.ingest.source import is_mcap
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+#: Formats whose rows say in which frame of the video they are.
+_COUNTING: Final = ("mot", "kitti", "parquet")
+_ALIKE: Final = 0.5
+#: A file of nothing but blanks is no larger than this.
+_BLANK_BYTES: Final = 4096
+_EPS: Final = float(np.finfo(float).eps)
+
+
+@dataclass
+class Compared:
+    """Truth and tracks as frames at the same times, and what is worth saying of them."""
+
+    truth: list[Frame]
+    tracks: list[Frame]
+    notes: list[str] = field(default_factory=list)
+
+
+def pair_files(tracks: Sequence[Path], truths: Sequence[Path]) -> tuple[list[tuple[str, Path, Path]], str]:
+    """Which truth belongs to which tracks, with a name for each pair, and in words how that was found.
+
+    By their names where these are the same (the file's, or a folder's above it: ``SEQ/gt/gt.txt``), otherwise in order.
+    Raises McaptrackError if there are not as many of one as of the other, and for a log, which holds its truth.
+    """
+    for path in tracks:
+        if is_mcap(path):
+            add = command("ingest", truths[0] if len(truths) == 1 else "LABELS", "--as", "truth", "--into", path)
+            raise McaptrackError(f"{path} is a log, not a file of labels; logs hold their own truth: add it with {add}")
+    if len(tracks) != len(truths):
+        raise McaptrackError(f"{len(tracks)} files of tracks and {len(truths)} of truth; give one truth for each")
+    track_names, truth_names = _names(tracks), _names(truths)
+    if len(tracks) == 1:
+        return [(tracks[0].stem, tracks[0], truths[0])], ""
+    if set(track_names) == set(truth_names):
+        found = dict(zip(truth_names, truths, strict=True))
+        return [(name, path, found[name]) for name, path in zip(track_names, tracks, strict=True)], ""
+    pairs = list(zip(track_names, tracks, truths, strict=True))
+    words = ", ".join(f"{path} with {truth}" for _, path, truth in pairs)
+    return pairs, f"names of tracks and truth differ: taken in the order given, {words}"
+
+
+def _names(paths: Sequence[Path]) -> list[str]:
+    """The part of each path that tells them apart: the file's name, or that of a folder above."""
+    parts = [[path.stem, *(folder.name for folder in path.absolute().parents)] for path in paths]
+    for level in zip(*parts, strict=False):
+        if len(set(level)) == len(paths):
+            return list(level)
+    return [path.stem for path in paths]
+
+
+def compare_files(
+    tracks: Path,
+    truth: Path,
+    fps: Fraction | None = None,
+    ground_plane: Path | None = None,
+    point: Point = "foot",
+    topics: Sequence[str] = (),
+) -> Compared:
+    """Tracks and truth as frames. Raises McaptrackError, with what is wrong, if they can't be read or compared."""
+    both: dict[Role, tuple[Path, Labels]] = {
+        "truth": (truth, _read(truth, "truth", topics)),
+        "tracks": (tracks, _read(tracks, "tracks", topics)),
+    }
+    formats = [labels.format for _, labels in both.values()]
+    if not all(name in _COUNTING for name in formats) and len(set(formats)) > 1:
+        if "parquet" in formats:
+            raise McaptrackError(f"{tracks} and {truth} share no clock: one counts frames, the other does not")
+        frames = ingest.label_frames({"tracks": tracks, "truth": truth}, fps, ground_plane, point)
+        return Compared(frames["truth"], frames["tracks"])
+    notes = [f"{path} also holds {labels.left_out}" for path, labels in both.values() if labels.left_out]
+    if fps is not None:
+        notes.append("frames are compared by their numbers, whatever the frames per second")
+    return _by_number(both, ground_plane, point, notes)
+
+
+@dataclass
+class Detected:
+    """Detections and truth as frames on one clock, and the ground plane, if there is one."""
+
+    detections: list[Frame]
+    truth: list[Frame]
+    planes: tuple[tuple[int, GroundPlane], ...]
+
+
+def detections_and_truth(
+    detections: Path, truth: Path, fps: Fraction | None, ground_plane: Path | None, point: Point
+) -> Detected:
+    """A file of detections and the truth as frames, at the times that the frame rate gives them.
+
+    Raises McaptrackError if they can't be read, or if nothing says how many frames a second there are.
+    """
+    options = IngestOptions(fps=fps, ground_plane=ground_plane, point=point)
+    with _PairJob([("detections", detections), ("truth", truth)], options) as job:
+        if any(labels.boxes_px is None for _, labels in job.labels.values()):
+            raise McaptrackError(f"{detections} and {truth} have to hold boxes in pixels, both")
+        planes = ((0, job.ground),) if job.ground else ()
+        return Detected(job.all_frames("detections"), job.all_frames("truth"), planes)
+
+
+class _PairJob(LabelJob):
+    """Detections and the truth, which may be a table."""
+
+    def read(self, path: Path, role: Role) -> Labels:
+        return _read(path, role, ()) if role == "truth" else super().read(path, role)
+
+
+def _read(path: Path, role: Role, topics: Sequence[str]) -> Labels:
+    if path.suffix.lower() in (".parquet", ".pq"):
+        return _read_parquet(path, role, topics)
+    if role == "tracks" and path.is_file() and _is_blank(path):
+        return _nobody("mot")
+    labels = read_labels(path, role=role)
+    if not labels.identified:
+        raise McaptrackError(f"{path} says of nobody who it is (all ids are -1); {role} need ids")
+    return labels
+
+
+def _is_blank(path: Path) -> bool:
+    return path.stat().st_size < _BLANK_BYTES and not path.read_bytes().strip()
+
+
+def _nobody(name: Any) -> Labels:
+    """A file of tracks without any: a tracker that found nobody."""
+    none = np.empty(0, np.int64)
+    return Labels(name, 1, none, none, np.empty((0, 4)), None, np.empty(0), none, np.empty(0, np.uint32))
+
+
+def _read_parquet(path: Path, role: Role, topics: Sequence[str]) -> Labels:
+    """A table of tracks as ``mcaptrack export`` writes it: the rows of one topic."""
+    columns = ("topic", "frame", "track_id", "x_px", "y_px", "w_px", "h_px", "x_m", "y_m", "score")
+    table = tables.read_columns(path, columns)
+    there = sorted(set(table["topic"].tolist()))
+    wanted = [topic for topic in topics if topic in there] or [
+        t for t in there if t.endswith("/truth") == (role == "truth")
+    ]
+    if role == "truth" and not wanted and len(there) == 1:
+        wanted = there
+    if len(wanted) != 1:
+        raise McaptrackError(
+            f"{path} holds {', '.join(there) or 'no rows'}; "
+            + ("choose one with --topic" if wanted else f"none of them is {role}")
+        )
+    mine = table["topic"] == wanted[0]
+    frame, who = table["frame"][mine], table["track_id"][mine]
+    boxes = np.stack([table[name][mine] for name in columns[3:7]], axis=-1)
+    xy_m = np.stack([table["x_m"][mine], table["y_m"][mine]], axis=-1)
+    order = np.lexsort((who, frame))
+    return Labels(
+        "parquet",  # type: ignore[arg-type]
+        0,
+        frame[order],
+        who[order],
+        boxes[order],
+        xy_m[order],
+        table["score"][mine][order],
+        np.unique(frame),
+        np.full(len(frame), PERSON, np.uint32),
+    )
+
+
+def _by_number(
+    both: dict[Role, tuple[Path, Labels]], ground_plane: Path | None, point: Point, notes: list[str]
+) -> Compared:
+    """The frames that either file has rows of, by their numbers, both counted from 0."""
+    truth, tracks = both["truth"][1], both["tracks"][1]
+    plane = _plane(ground_plane, point, truth, tracks)
+    there = {role: labels.frame - labels.first_frame for role, (_, labels) in both.items()}
+    if truth.first_frame != tracks.first_frame and len(tracks.frame):
+        first = {role: f"{path} counts frames from {labels.first_frame}" for role, (path, labels) in both.items()}
+        notes.append(f"{first['tracks']}, {first['truth']}: their first frames are taken as the same")
+    if len(tracks.frame):
+        spans = {role: (int(numbers.min()), int(numbers.max())) for role, numbers in there.items()}
+        (a, b), (c, d) = spans["truth"], spans["tracks"]
+        if b < c or d < a:
+            words = [f"{both[role][0]} ({low} to {high})" for role, (low, high) in spans.items()]
+            raise McaptrackError(f"the frames of {' and '.join(words)} never overlap, counted from 0")
+    step = max(truth.step, tracks.step) if len(tracks.frame) else truth.step
+    sparse = truth if truth.step >= tracks.step or not len(tracks.frame) else tracks
+    start = int(sparse.labelled[0] - sparse.first_frame) % step
+    numbers = np.unique(np.concatenate([*there.values()]))  # a frame without rows of either counts for nothing
+    numbers = numbers[numbers % step == start]
+    frames = {role: _frames(labels, numbers, there[role], plane, role) for role, (_, labels) in both.items()}
+    if truth.aside is not None and truth.boxes_px is not None:
+        frames["tracks"], gone = _without_forgiven(frames["truth"], frames["tracks"], truth)
+        if gone:
+            notes.append(f"{gone} boxes of {both['tracks'][0]} are of what doesn't count; they count neither way")
+    return Compared(frames["truth"], frames["tracks"], notes)
+
+
+def _plane(path: Path | None, point: Point, truth: Labels, tracks: Labels) -> GroundPlane | None:
+    if path is None:
+        return None
+    boxes = np.concatenate(
+        [np.zeros((1, 4)), *(part.boxes_px for part in (truth, tracks) if part.boxes_px is not None)]
+    )
+    width, height = (boxes[:, :2] + boxes[:, 2:]).max(axis=0)
+    try:
+        return GroundPlane(read_homography(path), int(np.ceil(width)), int(np.ceil(height)), point)
+    except McaptrackError as error:
+        raise McaptrackError(f"{path}: {error}") from None
+
+
+def _frames(
+    labels: Labels, numbers: NDArray[np.int64], there: NDArray[np.int64], plane: GroundPlane | None, role: Role
+) -> list[Frame]:
+    """The rows of labels in the frames ``numbers``; ``there`` are the numbers of all rows, rising."""
+    rows = label_rows(labels, role, plane)
+    low, high = (np.searchsorted(there, numbers, side).tolist() for side in ("left", "right"))
+    return [
+        Frame(number * NS_PER_S, number, rows[a:b]) for number, a, b in zip(numbers.tolist(), low, high, strict=True)
+    ]
+
+
+def _without_forgiven(truth: Sequence[Frame], tracks: Sequence[Frame], labels: Labels) -> tuple[list[Frame], int]:
+    """Tracks without the boxes that are matched with labels nobody has to find, as MOTChallenge and KITTI do it.
+
+    Returns how many went, too.
+    """
+    assert labels.aside is not None
+    aside = labels.aside
+    order = np.argsort(aside.frame, kind="stable")
+    aside = _rows(aside, order)
+    at = aside.frame - labels.first_frame
+    out, gone = [], 0
+    for true, found in zip(truth, tracks, strict=True):
+        low, high = np.searchsorted(at, [true.index, true.index + 1])
+        kept = ~_forgiven(_boxes(true), _boxes(found), _rows(aside, slice(low, high)), labels.format == "kitti")
+        gone += int((~kept).sum())
+        out.append(found if kept.all() else found._replace(rows=found.rows[kept]))
+    return out, gone
+
+
+def _rows(aside: Aside, at: slice | NDArray[np.intp]) -> Aside:
+    return Aside(aside.frame[at], aside.boxes_px[at], aside.forgiven[at], aside.region[at])
+
+
+def _boxes(frame: Frame) -> Floats:
+    return np.stack([frame.rows[name] for name in ("x_px", "y_px", "w_px", "h_px")], axis=-1)
+
+
+def _forgiven(true: Floats, found: Floats, aside: Aside, kitti: bool) -> Bools:
+    """Which boxes of tracks (K,) count neither way, among true boxes (N, 4) and boxes aside."""
+    forgiven = np.zeros(len(found), bool)
+    if not len(found):
+        return forgiven
+    other = ~aside.region
+    alike = iou(np.concatenate([true, aside.boxes_px[other]]), found)
+    alike[alike < _ALIKE - _EPS] = 0
+    matched = forgiven.copy()
+    if alike.size:
+        rows, columns = solve(-alike)
+        real = alike[rows, columns] > _EPS
+        rows, columns = rows[real], columns[real]
+        matched[columns] = True
+        of_aside = rows >= len(true)
+        forgiven[columns[of_aside]] = aside.forgiven[other][rows[of_aside] - len(true)]
+    if kitti:
+        forgiven |= ~matched & (found[:, 3] <= KITTI_HEIGHT_PX + _EPS)
+        for region in aside.boxes_px[aside.region]:
+            low, high = (
+                np.maximum(found[:, :2], region[:2]),
+                np.minimum(found[:, :2] + found[:, 2:], region[:2] + region[2:]),
+            )
+            inside = np.clip(high - low, 0, None).prod(axis=1) > _ALIKE * found[:, 2:].prod(axis=1)
+            forgiven |= ~matched & inside
+    return forgiven

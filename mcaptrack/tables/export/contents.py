@@ -1,0 +1,241 @@
+"""What a log holds, as tables: each built when it is asked for, and told apart from what it was before."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, Final
+
+import numpy as np
+
+from mcaptrack import __version__, evaluation, log, tables
+from mcaptrack.errors import McaptrackError
+from mcaptrack.geometry.clocks import LAST_NS
+from mcaptrack.schema import DETECTIONS
+from mcaptrack.schema.provenance import Provenance
+from mcaptrack.sources import foreign
+from mcaptrack.sources.cameras import Camera, cameras
+from mcaptrack.sources.foreign.flat import flattener, kind_of
+from mcaptrack.tables import TABLES, Part, Pointers
+from mcaptrack.tables.export.names import file_name, recording_name
+
+#: Tables that say where messages stand, or what the whole log is.
+_OF_THE_WHOLE: Final = ("frames", "channels", "recordings")
+
+
+class Contents:
+    """The tables of a log. Rows are read once and kept, since several tables are made of the same."""
+
+    def __init__(self, opened: log.Log) -> None:
+        self.opened = opened
+        self.recording = recording_name(opened.path)
+        self._parts: dict[str, Part] = {}
+        #: What tables have to say about themselves, by name.
+        self.notes: dict[str, str] = {}
+
+    def table(self, name: str) -> Any:
+        """One of ``TABLES`` as Arrow, without the column ``recording``."""
+        table = TABLES[name]
+        if table.rows_of is not None:
+            return tables.rows_table(table.rows_of, {topic: self._part(topic) for topic in self.topics(name)})
+        made: Mapping[str, Callable[[], Any]] = {
+            "frames": lambda: tables.frames_table({topic: self._pointers(topic) for topic in self.topics("frames")}),
+            "track_summary": lambda: tables.summary_table(
+                {topic: self._part(topic) for topic in self.topics("tracks")}
+            ),
+            "metrics": lambda: tables.records_table(table, sorted(self._scores(), key=_order_of_scores)),
+            "channels": lambda: tables.records_table(
+                table, [_channel(channel) for _, channel in sorted(self.opened.channels.items())]
+            ),
+            "recordings": lambda: tables.records_table(table, [self._recording()]),
+        }
+        return made[name]()
+
+    def topics(self, name: str) -> list[str]:
+        """The channels that a table is made of, in order."""
+        if name in ("channels", "recordings"):
+            return sorted(self.opened.channels)
+        if name == "frames":
+            pictures = {c.topic for c in self.opened.channels.values() if foreign.holds_pictures(c)}
+            of_rows = (self.topics(table.name) for table in TABLES.values() if table.rows_of is not None)
+            return sorted(pictures.union(*of_rows))
+        if name == "track_summary":
+            return self.topics("tracks")
+        if name == "metrics":
+            return sorted({topic for camera in self._labelled() for topic in self._scored(camera)})
+        schema = TABLES[name].rows_of
+        if schema is None:
+            raise KeyError(name)
+        ours = log.topics_with_schema(self.opened, [schema.name])
+        found = [channel.topic for channel in ours if channel.message_encoding == "protobuf"]
+        if schema is DETECTIONS:
+            found += [channel.topic for channel in self.opened.channels.values() if foreign.holds_detections(channel)]
+        return sorted(found)
+
+    def source(self, name: str) -> str:
+        """What a table is made from: another digest when the table may be another. Reads no messages."""
+        whole = name in _OF_THE_WHOLE
+        of = [self.opened.fingerprint()] if whole else [self.opened.fingerprint(topic) for topic in self.topics(name)]
+        files = [file_name(part.path) for part in self.opened.parts]
+        return _digest([name, __version__, self.recording, files, of])
+
+    def lineage(self, name: str) -> str:
+        """How the channels of a table came about, back to what was recorded, as JSON."""
+        out: dict[str, Any] = {}
+        todo = [] if name in _OF_THE_WHOLE else list(self.topics(name))
+        while todo:
+            topic = todo.pop()
+            channel = self.opened.channels.get(topic)
+            made = Provenance.from_metadata(channel.metadata) if channel and topic not in out else None
+            if made and made.transform != "view":
+                out[topic] = {"transform": made.transform, "input": made.input, "parameters": made.parameters}
+                todo.append(made.input)
+        return json.dumps(out, sort_keys=True, separators=(",", ":"))
+
+    # Channels of others
+
+    def messages_source(self, topic: str, blobs: bool) -> str:
+        """What ``messages`` of a topic are made from."""
+        places = self._pointers(topic, of_rows=False)
+        # The table says where messages stand: that they moved is a change.
+        where = hashlib.sha256(places.chunk_offset.tobytes() + places.message_offset.tobytes()).hexdigest()
+        return _digest([topic, __version__, self.recording, places.file, self.opened.fingerprint(topic), where, blobs])
+
+    def messages(self, topic: str, blobs: bool = False) -> tuple[Any, list[str]]:
+        """The messages of any channel as a table, flat, and the fields that were left out.
+
+        Raises McaptrackError, with topic and time, for messages that can't be read.
+        """
+        places = self._pointers(topic, of_rows=False)
+        kind = kind_of(self.opened, topic)
+        try:
+            flatten = flattener(kind)
+        except McaptrackError as error:
+            raise McaptrackError(f"{self.opened.path}: {topic}: {error}") from None
+
+        def rows() -> Iterator[Mapping[tuple[str, ...], Any]]:
+            for message in self.opened.messages(topic):
+                try:
+                    yield flatten(message.payload)
+                except McaptrackError as error:
+                    raise McaptrackError(f"{self.opened.path}: {topic} at {message.t_ns} ns: {error}") from None
+
+        return tables.messages_table(topic, kind.name, places, rows(), blobs)
+
+    # What tables are made of
+
+    def _part(self, topic: str) -> Part:
+        if topic not in self._parts:
+            if foreign.holds_detections(self.opened.channel(topic)):
+                self._parts[topic] = self._boxes(topic)
+                return self._parts[topic]
+            schema = next(
+                table.rows_of
+                for table in TABLES.values()
+                if table.rows_of is not None and table.rows_of.name == self.opened.channel(topic).schema_name
+            )
+            self._parts[topic] = Part(*self.opened.rows(topic, schema))
+        return self._parts[topic]
+
+    def _boxes(self, topic: str) -> Part:
+        """Boxes of others; none, and a note, if they can't be read: the other tables don't depend on them."""
+        try:
+            frames = foreign.detections(self.opened, topic)
+        except McaptrackError as error:
+            self._note("detections", f"{error}; no boxes of {topic} are in the table")
+            t_ns = self.opened.times(topic)
+            return Part(DETECTIONS.empty(), t_ns, np.arange(len(t_ns)), np.zeros(len(t_ns), np.int64))
+        return tables.frames_to_part(DETECTIONS, frames)
+
+    def _note(self, name: str, words: str) -> None:
+        self.notes[name] = "; ".join([*filter(None, [self.notes.get(name)]), words])
+
+    def _pointers(self, topic: str, of_rows: bool = True) -> Pointers:
+        places = self.opened.places(topic)
+        file = file_name(self.opened.part(topic).path)
+        count = len(places.t_ns)
+        frame, rows = np.arange(count), np.full(count, -1)
+        if of_rows and not foreign.holds_pictures(self.opened.channel(topic)):
+            part = self._part(topic)
+            frame, rows = part.frame, part.counts
+        return Pointers(file, places.t_ns, frame, rows, places.chunk_offset, places.offset)
+
+    def _labelled(self) -> list[Camera]:
+        """The cameras that have a ground truth."""
+        tracks = self.topics("tracks")
+        return [camera for camera in cameras(self.opened) if camera.truth in tracks]
+
+    def _scored(self, camera: Camera) -> list[str]:
+        names = (*evaluation.SCORED, *evaluation.FORECASTS)
+        known = [camera.truth, *(f"{camera.prefix}/{name}" for name in names)]
+        return [topic for topic in known if topic in self.opened.channels]
+
+    def _scores(self) -> Iterator[dict[str, Any]]:
+        for camera in self._labelled():
+            try:
+                sequence = evaluation.sequence_of_log(self.opened, camera.prefix, ())
+                outcome = evaluation.evaluate([sequence], evaluation.EvaluateOptions())
+            except McaptrackError as error:  # there is nothing that could be compared
+                self._note("metrics", str(error))
+                continue
+            for result in outcome.results:
+                row = result.to_json()
+                forecasts = row.pop("displacement", {})
+                yield row | forecasts | {"topic": result.tracks, "truth": camera.truth}
+
+    def _recording(self) -> dict[str, Any]:
+        opened = self.opened
+        messages = sum(sum(part.index.counts.values()) for part in opened.parts)
+        planes = [bool(a) for topic in self.topics("ground_planes") for a in self._part(topic).rows["assumed"]]
+        sources = {
+            channel.topic: dict(made.parameters)
+            for channel in opened.channels.values()
+            if (made := Provenance.from_metadata(channel.metadata)) and made.transform == "ingest"
+        }
+        span: tuple[int | None, int | None] = (opened.start_ns, opened.end_ns) if messages else (None, None)
+        if messages and opened.end_ns > LAST_NS:
+            self._note("recordings", "messages are later than the year 2262, which tables can't hold")
+            span = (opened.start_ns if opened.start_ns <= LAST_NS else None, None)
+        return {
+            "file": file_name(opened.path),
+            "start_t": span[0],
+            "end_t": span[1],
+            "start_t_ns": span[0],
+            "end_t_ns": span[1],
+            "duration_s": (opened.end_ns - opened.start_ns) / 1e9 if messages else 0.0,
+            "messages": messages,
+            "size_bytes": sum(part.size for part in opened.parts),
+            "digest": opened.fingerprint(),
+            "results_file": file_name(opened.results.path) if opened.results else None,
+            "ground_plane": None if not planes else _OF_PLANES[len({*planes}), planes[0]],
+            "source": json.dumps(sources, sort_keys=True, separators=(",", ":")) if sources else None,
+            "mcaptrack_version": __version__,
+        }
+
+
+_OF_PLANES: Final = {(1, False): "given", (1, True): "assumed", (2, False): "mixed", (2, True): "mixed"}
+
+
+def _order_of_scores(row: Mapping[str, Any]) -> tuple[Any, ...]:
+    return tuple(row[name] for name in TABLES["metrics"].order)
+
+
+def _channel(channel: log.Channel) -> dict[str, object]:
+    made = Provenance.from_metadata(channel.metadata)
+    out: dict[str, object] = {
+        "topic": channel.topic,
+        "schema": channel.schema_name or None,
+        "messages": channel.messages,
+        "encoding": channel.message_encoding or None,
+    }
+    if made:
+        names = ("transform", "input", "version", "digest", "input_digest", "weights_sha256")
+        out |= {name: getattr(made, name) or None for name in names}
+        out["parameters"] = json.dumps(made.parameters, sort_keys=True, separators=(",", ":"))
+        out["compared_with"] = json.dumps(dict(made.references), sort_keys=True) if made.references else None
+    return out
+
+
+def _digest(words: list[Any]) -> str:
+    return hashlib.sha256(json.dumps(words).encode()).hexdigest()

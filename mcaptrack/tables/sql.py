@@ -1,0 +1,332 @@
+"""SQL on logs: the tables of logs and of folders of tables in a database that reaches nothing else.
+
+    with Database([Path("log.mcap")]) as database:
+        answer = database.ask("select topic, count(distinct track_id) from tracks group by topic")
+
+A table comes in when a query names it: from the Parquet file beside the log where that is up to date, otherwise from
+the log. Any channel is a table too, under its name in double quotes. DuckDB is known to this module alone.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
+from contextlib import ExitStack, suppress
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any, Final, Protocol, Self
+
+from mcaptrack import log, tables
+from mcaptrack.errors import McaptrackError, command
+from mcaptrack.files import follow_links
+from mcaptrack.log.names import results_of
+from mcaptrack.tables import TABLES
+from mcaptrack.tables.export import TOPICS, Contents, default_folder, standing, topic_folder
+
+__all__ = ["Database"]
+
+#: What the database may do: compute, with what is in memory. The rest of DuckDB's settings are locked as they are.
+_CLOSED: Final = {
+    "autoinstall_known_extensions": "false",
+    "autoload_known_extensions": "false",
+    "allow_persistent_secrets": "false",
+    "python_enable_replacements": "false",
+    "temp_directory": "",
+}
+#: Statements that ask, or that make something which is gone with the database.
+_ASKING: Final = ("SELECT", "EXPLAIN", "CREATE", "SET", "VARIABLE_SET", "RELATION", "MULTI")
+_ANSWERING: Final = ("SELECT", "EXPLAIN", "RELATION", "MULTI")
+#: Files that can be given as tables, by the end of their name, and the method that reads them.
+_READERS: Final = {
+    ".parquet": "read_parquet",
+    ".csv": "read_csv",
+    ".tsv": "read_csv",
+    ".json": "read_json",
+    ".jsonl": "read_json",
+    ".ndjson": "read_json",
+}
+_MISSING: Final = re.compile(r'Table with name "?(.+?)"? does not exist')
+
+
+class _Source(Protocol):
+    """A log, or what a folder of tables holds of one."""
+
+    recording: str
+    where: Path
+
+    def part(self, name: str) -> Any:
+        """One of ``TABLES`` as Arrow or as a Parquet file; None if it isn't there."""
+
+    def channel(self, topic: str) -> Any:
+        """The table of a channel; None if it isn't there."""
+
+    def channels(self) -> list[str]:
+        """The channels that have tables of their own."""
+
+
+class _OfLog:
+    def __init__(self, path: Path) -> None:
+        self.opened = log.read(path)
+        self.contents = Contents(self.opened)
+        self.recording = self.contents.recording
+        self.where = follow_links(path).parent
+
+    def part(self, name: str) -> Any:
+        return standing(self.contents, default_folder(self.opened.path), name) or self.contents.table(name)
+
+    def channel(self, topic: str) -> Any:
+        return self.contents.messages(topic)[0] if topic in self.opened.channels else None
+
+    def channels(self) -> list[str]:
+        return sorted(self.opened.channels)
+
+
+class _OfFolder:
+    def __init__(self, folder: Path, recording: str) -> None:
+        self.folder, self.recording = folder, recording
+        self.where = follow_links(folder)
+        self._member = Path(f"recording={recording}", "part-0.parquet")
+
+    def part(self, name: str) -> Any:
+        path = self.folder / name / self._member
+        return path if path.is_file() else None
+
+    def channel(self, topic: str) -> Any:
+        return self.part(f"{TOPICS}/{topic_folder(topic)}")
+
+    def channels(self) -> list[str]:
+        paths = sorted((self.folder / TOPICS).glob(f"*/{self._member.parent.name}/{self._member.name}"))
+        known = (tables.described(path, "parquet") or {} for path in paths)
+        return [words["topic"] for words in known if "topic" in words]
+
+
+class Database:
+    """The tables of logs, and of folders as ``mcaptrack export`` writes them, to be asked in SQL. A context manager.
+
+    ``recording`` tells logs apart: by name, and by folder and name where two have the same. ``files`` are more tables,
+    by name: CSV, JSON or Parquet. Queries read these and nothing else, and leave nothing behind. Raises McaptrackError
+    if there is nothing to read, and if DuckDB isn't installed.
+    """
+
+    def __init__(self, paths: Sequence[Path], files: Mapping[str, Path] | None = None) -> None:
+        self._stack = ExitStack()
+        with ExitStack() as opening:
+            self._duckdb = _duckdb()
+            #: Where the tables that were asked for came from, in words.
+            self.notes: list[str] = []
+            self._here: set[str] = set()
+            self._sources = [source for path in _different(paths) for source in self._opened(path, opening)]
+            self._names = _told_apart(self._sources)
+            self._connection = opening.enter_context(self._duckdb.connect(":memory:", config=_CLOSED))
+            for name, path in (files or {}).items():
+                self._take(name, path)
+            for setting in ("TimeZone = 'UTC'", "enable_external_access = false", "lock_configuration = true"):
+                self._connection.execute(f"SET {setting}")
+            self._stack = opening.pop_all()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Let go of all files."""
+        self._stack.close()
+
+    @property
+    def recordings(self) -> tuple[str, ...]:
+        """The logs, as the column ``recording`` has them."""
+        return tuple(self._names)
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """The channels that are tables under their own names."""
+        return tuple(sorted({topic for source in self._sources for topic in source.channels()}))
+
+    def ask(self, query: str) -> Any:
+        """What the last question of a query answers, an Arrow table; times are UTC, to the nanosecond (DuckDB 2).
+
+        Raises McaptrackError, in one line, for what DuckDB refuses.
+        """
+        duckdb = self._duckdb
+        try:
+            answer = self._answer(query)
+        except duckdb.OutOfMemoryException as error:
+            raise McaptrackError(f"the query needs more memory than there is: {_first(error)}") from None
+        except (duckdb.Error, RuntimeError) as error:  # the latter is DuckDB's too
+            raise McaptrackError(self._words(str(error), query)) from None
+        if answer is None:
+            raise McaptrackError("the query asks nothing; it needs a SELECT")
+        return tables.tidy(answer)
+
+    def _answer(self, query: str) -> Any:
+        """The answer of the last statement that gives one, Arrow or None."""
+        if re.match(r"\s*show\s+(all\s+)?tables\b", query, re.IGNORECASE):
+            raise McaptrackError(
+                f"tables come in when a query names them; {command('query', 'LOG', '--tables')} lists them"
+            )
+        statements = self._connection.extract_statements(query)
+        _refuse_writing([statement.type.name for statement in statements])
+        answer = None
+        for statement in statements:
+            found = self._run(statement)
+            answer = found if statement.type.name in _ANSWERING else answer
+        return answer
+
+    def _run(self, statement: Any) -> Any:
+        """The answer of a statement, Arrow or None; the tables it names are brought in before, and when it fails."""
+        with suppress(self._duckdb.Error):
+            for name in self._connection.get_table_names(statement.query):
+                self._bring(name)
+        while True:
+            try:
+                return self._computed(statement)
+            except self._duckdb.CatalogException as error:
+                missing = _MISSING.search(str(error))
+                if not missing or not self._bring(missing.group(1)):
+                    raise
+
+    def _computed(self, statement: Any) -> Any:
+        """What a statement answers, Arrow or None. It runs beside, because Ctrl-C only reaches who does not compute."""
+
+        def compute() -> Any:
+            relation = self._connection.sql(statement)
+            return None if relation is None else relation.to_arrow_table()
+
+        with ThreadPoolExecutor(1) as beside:
+            running = beside.submit(compute)
+            try:
+                return running.result()
+            except BaseException:
+                while not running.done():
+                    self._connection.interrupt()
+                    wait([running], 0.05)
+                raise
+
+    def _bring(self, name: str) -> bool:
+        """Make a table known to the database; False if it is known already or there is none."""
+        lower = name.lower()
+        if name in self._here or lower in self._here:
+            return False
+        if lower in TABLES:
+            name, columns = lower, TABLES[lower].arrow
+            parts = [(at, source.part(lower)) for at, source in self._named()]
+        else:
+            columns = None
+            parts = [(at, source.channel(name)) for at, source in self._named()]
+        parts = [(at, part) for at, part in parts if part is not None]
+        if not parts and columns is None:
+            return False
+        for recording, part in parts:
+            words = f"from {part}" if isinstance(part, Path) else "read from the log; exported tables would be quicker"
+            self.notes.append(f"{recording}: {name} {words}")
+        self._connection.register(name, tables.join(parts, columns))
+        self._here.add(name)
+        return True
+
+    def _named(self) -> list[tuple[str, _Source]]:
+        return list(zip(self._names, self._sources, strict=True))
+
+    def _opened(self, path: Path, opening: ExitStack) -> list[_Source]:
+        if not path.is_dir():
+            source = _OfLog(path)
+            opening.enter_context(source.opened)
+            return [source]
+        found = {member.name.partition("=")[2] for name in TABLES for member in (path / name).glob("recording=*")}
+        readers = [_OfFolder(path, name) for name in sorted(found)]
+        there = [reader for reader in readers if any(reader.part(table) for table in TABLES)]
+        if not there:
+            log.refuse_other_kinds(path)
+            other = " (those in other formats are not read)" if found else ""
+            raise McaptrackError(
+                f"{path} is a folder without tables in Parquet{other}; give a log, or a folder that one was exported to"
+            )
+        return [*there]
+
+    def _take(self, name: str, path: Path) -> None:
+        """A file as a table, read now."""
+        reader = _READERS.get(path.suffix.lower())
+        if reader is None:
+            raise McaptrackError(f"{path}: tables are read from files that end with {', '.join(_READERS)}")
+        if name.lower() in TABLES or not re.fullmatch(r"[A-Za-z_]\w*", name):
+            raise McaptrackError(
+                f"{name} can't name a table; take letters and digits, and no name that a log's table has"
+            )
+        if not path.is_file():
+            raise McaptrackError(f"{path} can't be read: no such file")
+        try:
+            getattr(self._connection, reader)(str(path)).create(name)
+        except self._duckdb.Error as error:
+            raise McaptrackError(f"{path} can't be read as a table: {_first(error)}") from None
+        self._here.add(name.lower())
+
+    def _words(self, error: str, query: str) -> str:
+        """A message of DuckDB's in one line, with what there is."""
+        if missing := _MISSING.search(error):
+            name = missing.group(1)
+            known = [*TABLES, *sorted(self._here - set(TABLES))]
+            channels = self.channels if "/" in name else ()
+            close = get_close_matches(name, [*known, *channels], 1) or get_close_matches(name.lower(), known, 1)
+            nearest = f" (did you mean {close[0]}?)" if close else ""
+            more = f"the channels {', '.join(channels)}" if channels else "channels in double quotes"
+            return f"there is no table {name}{nearest}; there are {', '.join(known)}, and {more}"
+        kind, _, words = error.partition(": ")
+        line = re.search(r"^LINE (\d+):", words, re.M)
+        words = " ".join(re.split(r"^LINE \d+:|\n\s*Candidate functions:", words, maxsplit=1, flags=re.M)[0].split())
+        if "file system operations are disabled" in error or "is disabled through configuration" in error:
+            return f"queries only read what they are given ({words}); --with NAME=FILE gives a file"
+        if re.search(r'Referenced column "[^"]*[/ ][^"]*" not found', words):
+            words += " (text stands in 'single quotes', names in \"double\" ones)"
+        if "TIMESTAMPTZ_NS" in words:
+            words += " Such functions take t::timestamptz, which is exact to the microsecond."
+        where = f", in line {line.group(1)}" if line and "\n" in query.strip() else ""
+        return f"SQL{where}: {words}" if kind.endswith("Error") else f"SQL: {error}"
+
+
+def _duckdb() -> Any:
+    """DuckDB, if it is installed."""
+    try:
+        import duckdb
+    except ImportError:
+        raise McaptrackError(
+            'SQL needs DuckDB, which is not installed; install it with: pip install "mcaptrack[sql]"'
+        ) from None
+    return duckdb
+
+
+def _different(paths: Sequence[Path]) -> list[Path]:
+    """Paths, each once; the results of a log that is among them are part of it."""
+    by_place: dict[Path, Path] = {}
+    for path in paths:
+        by_place.setdefault(follow_links(path), path)
+    results = {results_of(place) for place in by_place}
+    return [path for place, path in by_place.items() if place not in results]
+
+
+def _told_apart(sources: Sequence[_Source]) -> list[str]:
+    """The names of logs; those of the same name with as many of the folders they are in as it takes."""
+    names = [source.recording for source in sources]
+    for depth in range(1, 1 + max((len(source.where.parts) for source in sources), default=0)):
+        again = {name for name, count in Counter(names).items() if count > 1}
+        if not again:
+            break
+        names = [
+            "/".join([*source.where.parts[-depth:], source.recording]) if name in again else name
+            for name, source in zip(names, sources, strict=True)
+        ]
+    return names
+
+
+def _refuse_writing(kinds: Sequence[str]) -> None:
+    for kind in kinds:
+        if kind not in _ASKING:
+            raise McaptrackError(
+                f"queries only read: {kind} is refused; -o FILE writes an answer, --with NAME=FILE gives a file"
+            )
+
+
+def _first(error: Exception) -> str:
+    return str(error).partition(": ")[2].splitlines()[0]

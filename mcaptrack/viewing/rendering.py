@@ -1,0 +1,197 @@
+"""The pictures of a log with what its views draw on them, as a video for people without a viewer.
+
+What is drawn are the annotation messages themselves, so colours, ids, trails and forecasts are those of every viewer.
+
+Letters: P points.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaptrack import foxglove, log, notices
+from mcaptrack.errors import McaptrackError
+from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
+from mcaptrack.sources.pictures import Pictures
+from mcaptrack.sources.video import write_clip
+
+Image = NDArray[np.uint8]
+
+_LINE_LOOP, _LINE_STRIP, _LINE_LIST = 2, 3, 4
+#: Coordinates are drawn to this many binary places of a pixel.
+_SHIFT: Final = 4
+_GIF_FPS: Final = 10.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class RenderOptions:
+    """What to draw: so many pixels wide (None: as the pictures are), at most so many pictures a second, which seconds.
+
+    Seconds count from the first picture.
+    """
+
+    width_px: int | None = None
+    max_fps: float | None = None
+    start_s: float = 0.0
+    end_s: float | None = None
+
+
+def render(
+    opened: log.Log,
+    picture_topic: str,
+    view_topics: Sequence[str],
+    output: Path,
+    options: RenderOptions,
+    progress: Callable[[str, int, int], None] = lambda *_: None,
+) -> int:
+    """Draw views on the pictures of a channel, and write the video ``output``; returns how many pictures it has.
+
+    Its suffix says what it becomes: .mp4 or .gif. Raises McaptrackError if there is nothing to draw on, or if pictures
+    can't be decoded.
+    """
+    if output.suffix.lower() not in (".mp4", ".gif"):
+        raise McaptrackError(f"{output}: a video is rendered to .mp4 or .gif, not to {output.suffix or 'no suffix'}")
+    pictures = Pictures(opened, picture_topic)
+    times = pictures.t_ns
+    if not len(times):
+        raise McaptrackError(f"{opened.path}: {picture_topic} has no pictures")
+    first = int(times[0]) + seconds_to_ns(options.start_s)
+    last = int(times[-1]) if options.end_s is None else int(times[0]) + seconds_to_ns(options.end_s)
+    numbers = np.flatnonzero((times >= first) & (times <= last))
+    _, first_of = np.unique(times[numbers], return_index=True)
+    if len(first_of) < len(numbers):
+        notices.warn(f"{len(numbers) - len(first_of)} pictures have the time of another and are left out", "left-out")
+        numbers = numbers[first_of]
+    max_fps = options.max_fps or (_GIF_FPS if output.suffix.lower() == ".gif" else None)
+    if max_fps is not None and len(numbers):
+        ticks = np.floor((times[numbers] - times[numbers[0]]) / NS_PER_S * max_fps + 1e-6)
+        numbers = numbers[np.flatnonzero(np.diff(ticks, prepend=-1))]
+    chosen = times[numbers]
+    if not len(chosen):
+        end = "the end" if options.end_s is None else f"{options.end_s:g} s"
+        there = f"the pictures are from 0 to {(int(times[-1]) - int(times[0])) / NS_PER_S:.3f} s"
+        raise McaptrackError(f"{opened.path} has no picture between {options.start_s:g} s and {end}; {there}")
+    rest = np.diff(chosen)
+    fps = Fraction(NS_PER_S, int(np.median(rest))).limit_denominator(1001) if len(rest) else Fraction(1)
+
+    def drawn() -> Iterator[tuple[int, Image]]:
+        span = int(chosen[0]), int(chosen[-1]) + 1
+        views = [_at_times(opened.messages(topic, *span)) for topic in view_topics]
+        for done, frame in enumerate(pictures.frames(numbers.tolist()), 1):
+            image = _scaled(np.asarray(frame.rows, np.uint8), options.width_px)
+            scale = image.shape[1] / frame.rows.shape[1]
+            for view in views:
+                payload = view(frame.t_ns)
+                if payload is not None:
+                    image = draw(image, foxglove.unpack(foxglove.ANNOTATIONS, payload), scale)
+            yield frame.t_ns, image
+            progress("render", done, len(chosen))
+
+    return write_clip(output, drawn(), fps)
+
+
+def _at_times(messages: Iterator[log.Message]) -> Callable[[int], bytes | None]:
+    """Messages by time, to be asked for at rising times; None where there is none of just that time."""
+    waiting: log.Message | None = next(messages, None)
+
+    def at(t_ns: int) -> bytes | None:
+        nonlocal waiting
+        while waiting is not None and waiting.t_ns < t_ns:
+            waiting = next(messages, None)
+        return waiting.payload if waiting is not None and waiting.t_ns == t_ns else None
+
+    return at
+
+
+def _scaled(image: Image, width_px: int | None) -> Image:
+    """In the width that was asked for, and of even size, as video has it."""
+    import cv2
+
+    height, width = image.shape[:2]
+    wide = width_px or width
+    size = (max(2, wide // 2 * 2), max(2, round(height * wide / width) // 2 * 2))
+    if size == (width, height):
+        return image
+    if width_px is None:
+        return np.ascontiguousarray(image[: size[1], : size[0]])
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def draw(image: Image, annotations: Any, scale: float = 1.0) -> Image:
+    """An ImageAnnotations message drawn on a picture, BGR (height, width, 3), that is ``scale`` times its size."""
+    import cv2
+
+    paint, cover = np.zeros_like(image), np.zeros(image.shape[:2], np.uint8)
+
+    def stroke(line: NDArray[np.int32], rgba: Any, thickness: int, is_closed: bool = False) -> None:
+        if rgba.a <= 0:
+            return
+        bgr = tuple(round(255 * part) for part in (rgba.b, rgba.g, rgba.r))
+        # The colour is laid on a little wider than what shows of it, so that soft edges have it too.
+        cv2.polylines(paint, [line], is_closed, bgr, thickness + 2, cv2.LINE_8, _SHIFT)
+        cv2.polylines(cover, [line], is_closed, round(255 * rgba.a), thickness, cv2.LINE_AA, _SHIFT)
+
+    lines = []
+    for part in annotations.points:
+        points = np.array([(point.x, point.y) for point in part.points], np.float64).reshape(-1, 2) * scale
+        lines.append(np.rint(points * 2**_SHIFT).clip(-(2**24), 2**24).astype(np.int32))
+        if part.type == _LINE_LOOP and part.fill_color.a > 0:
+            image = _filled(image, lines[-1], part.fill_color)
+    for part, line in zip(annotations.points, lines, strict=True):
+        thickness = max(1, round(part.thickness * max(scale, 0.5)))
+        shades = part.outline_colors
+        if part.type == _LINE_LOOP:
+            stroke(line, part.outline_color, thickness, is_closed=True)
+        elif part.type == _LINE_LIST:
+            for pair in range(len(line) // 2):
+                shade = shades[pair] if len(shades) == len(line) // 2 else part.outline_color
+                stroke(line[2 * pair : 2 * pair + 2], shade, thickness)
+        elif part.type == _LINE_STRIP and len(shades) == len(line):
+            for start in range(len(line) - 1):
+                stroke(line[start : start + 2], shades[start + 1], thickness)
+        elif part.type == _LINE_STRIP:
+            stroke(line, part.outline_color, thickness)
+    share = cover[..., None].astype(np.float32) / 255
+    image = np.rint(image * (1 - share) + paint * share).astype(np.uint8)
+    for text in annotations.texts:
+        _write(image, text, scale)
+    return image
+
+
+def _filled(image: Image, line: NDArray[np.int32], rgba: Any) -> Image:
+    """With the inside of a closed line painted; what others painted there before shows through."""
+    import cv2
+
+    cover = np.zeros(image.shape[:2], np.uint8)
+    cv2.fillPoly(cover, [line], round(255 * rgba.a), cv2.LINE_AA, _SHIFT)
+    rows, columns = (np.flatnonzero(cover.any(axis=axis)) for axis in (1, 0))
+    if not len(rows):
+        return image
+    part = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    share = cover[part][..., None].astype(np.float32) / 255
+    bgr = np.array([rgba.b, rgba.g, rgba.r], np.float32) * 255
+    image = image.copy()
+    image[part] = np.rint(image[part] * (1 - share) + bgr * share).astype(np.uint8)
+    return image
+
+
+def _write(image: Image, text: Any, scale: float) -> None:
+    import cv2
+
+    size = text.font_size / 24 * max(scale, 0.75)
+    font = cv2.FONT_HERSHEY_SIMPLEX
+    (width, height), below = cv2.getTextSize(text.text, font, size, 1)
+    x, y = round(text.position.x * scale), round(text.position.y * scale)
+    y = max(y, height + below)
+    back, front = (
+        [round(255 * c) for c in (rgba.b, rgba.g, rgba.r)] for rgba in (text.background_color, text.text_color)
+    )
+    cv2.rectangle(image, (x, y - height - below), (x + width + 2, y), back, cv2.FILLED)
+    cv2.putText(image, text.text, (x + 1, y - below + 1), font, size, front, 1, cv2.LINE_AA)
