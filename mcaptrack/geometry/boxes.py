@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from mcaptrack.geometry.ragged import group_index, ragged_range
+
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
 
@@ -78,7 +80,4 @@ def _side_by_side(a: Floats, b: Floats) -> tuple[Ints, Ints]:
     left = b[0, order]
     low = left.searchsorted(a[0] - (b[2] - b[0]).max(), "left")
     high = left.searchsorted(a[2], "right")
-    count = high - low
-    first = np.arange(len(count)).repeat(count)
-    within = np.arange(len(first)) - (count.cumsum() - count).repeat(count)
-    return first, order[low.repeat(count) + within]
+    return group_index(high - low), order[ragged_range(low, high - low)]

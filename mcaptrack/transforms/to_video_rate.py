@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.plane import Planes, plane_at
+from mcaptrack.geometry.ragged import group_index, run_starts
 from mcaptrack.schema import TRACKS, Frame, Rows
 from mcaptrack.schema.resampling import resample
 
@@ -37,15 +38,13 @@ def carry(tracks: Sequence[Frame], retracks: Sequence[Frame], planes: Planes) ->
     base["observed"], base["source_id"] = False, -1
 
     seen = TRACKS.joined([frame.rows for frame in tracks])
-    at = np.repeat(np.arange(len(tracks)), [len(frame.rows) for frame in tracks])
+    at = group_index([len(frame.rows) for frame in tracks])
     who, far = _owner(seen["track_id"], frame_ns[at], retracks, tick_ns)
     kept = (who >= 0) & (far <= 1.5 * period)
     # where two boxes are one person's, the one whose tick is nearer
     order = np.lexsort((far, who, at))
     order = order[kept[order]]
-    first = np.ones(len(order), bool)
-    first[1:] = (at[order][1:] != at[order][:-1]) | (who[order][1:] != who[order][:-1])
-    order = order[first]
+    order = order[run_starts(at[order], who[order])]
     seen, at, who = seen[order].copy(), at[order], who[order]
 
     names = np.unique(np.concatenate([base["track_id"], who]))

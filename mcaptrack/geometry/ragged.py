@@ -1,0 +1,117 @@
+"""Ragged arrays: groups of different lengths, laid end to end in one flat array. Letters: G groups, N members."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
+
+def group_index(counts: ArrayLike) -> Ints:
+    """For each member the group it belongs to.
+
+    Parameters
+    ----------
+    counts : (G,) of int
+        Number of members of each group, 0 or more.
+
+    Returns
+    -------
+    (N,) of int64
+        0 ``counts[0]`` times, then 1 ``counts[1]`` times, and so on.
+
+    Examples
+    --------
+    >>> group_index([2, 0, 3]).tolist()
+    [0, 0, 2, 2, 2]
+    """
+    sizes = np.asarray(counts, np.int64)
+    return np.repeat(np.arange(len(sizes)), sizes)
+
+
+def ragged_range(starts: ArrayLike, counts: ArrayLike, step: int = 1) -> Ints:
+    """Consecutive numbers for each group, all groups laid end to end.
+
+    Parameters
+    ----------
+    starts : (G,) of int, or one int for all groups
+        First number of each group.
+    counts : (G,) of int
+        How many numbers each group has, 0 or more.
+    step : int
+        Difference between consecutive numbers of a group.
+
+    Returns
+    -------
+    (N,) of int64
+        ``starts[0], starts[0] + step, ...`` (``counts[0]`` numbers), then those of the next group.
+
+    Examples
+    --------
+    >>> ragged_range([10, 20, 30], [2, 0, 3]).tolist()
+    [10, 11, 30, 31, 32]
+    >>> ragged_range(0, [2, 3]).tolist()
+    [0, 1, 0, 1, 2]
+    """
+    sizes = np.asarray(counts, np.int64)
+    before = np.cumsum(sizes) - sizes
+    offset = np.asarray(starts, np.int64) - step * before
+    return np.repeat(np.broadcast_to(offset, sizes.shape), sizes) + step * np.arange(int(sizes.sum()))
+
+
+def run_starts(*keys: NDArray[Any], times: Ints | None = None, max_gap: int = 0) -> Bools:
+    """Where a run of equal keys begins: at the first member, and where a key differs from that of the member before.
+
+    Parameters
+    ----------
+    *keys : (N,) each
+        Keys of the members, equal ones side by side.
+    times : (N,) of int, optional
+        A run also ends where the next member comes more than ``max_gap`` later.
+    max_gap : int
+        In the unit of ``times``.
+
+    Returns
+    -------
+    (N,) of bool
+
+    Examples
+    --------
+    >>> run_starts(np.array([4, 4, 7, 7, 4])).tolist()
+    [True, False, True, False, True]
+    >>> run_starts(np.array([1, 1, 1]), np.array([5, 6, 6])).tolist()
+    [True, True, False]
+    >>> run_starts(np.array([1, 1, 1]), times=np.array([0, 10, 21]), max_gap=10).tolist()
+    [True, False, True]
+    """
+    starts = np.zeros(len(keys[0]), np.bool_)
+    starts[:1] = True
+    for key in keys:
+        starts[1:] |= key[1:] != key[:-1]
+    if times is not None:
+        starts[1:] |= np.diff(times) > max_gap
+    return starts
+
+
+def run_ends(starts: Bools) -> Bools:
+    """Where runs end, given where they begin (see ``run_starts``).
+
+    Parameters
+    ----------
+    starts : (N,) of bool
+
+    Returns
+    -------
+    (N,) of bool
+        Whether each member is the last one of its run.
+
+    Examples
+    --------
+    >>> run_ends(np.array([True, False, True])).tolist()
+    [False, True, True]
+    """
+    return np.append(starts[1:], True)[: len(starts)]
