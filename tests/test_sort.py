@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from mcaptrack import notices
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import DETECTIONS, Frame
-from mcaptrack.transforms.sort import TRACKERS, ByteTrack, OcSort, Sort, compile_sort, tracker
+from mcaptrack.transforms.sort import TRACKERS, ByteTrack, OcSort, Sort
 from tests.worlds import boxes_at, detections, ids, ns
 
 FRAMES = {"max_age_frames": 2, "min_hits_frames": 2, "min_iou": 0.3}
@@ -243,31 +241,6 @@ def test_with_nothing_that_tells_them_apart_the_trackers_agree():
     for out in outs[1:]:
         for a, b in zip(outs[0], out, strict=True):
             np.testing.assert_allclose(a.rows["x_px"], b.rows["x_px"])
-
-
-@given(st.integers(0, 2**32 - 1))
-@settings(max_examples=25)
-def test_compiled_it_is_the_same_to_the_bit(seed):
-    """Crowds in which all boxes overlap, boxes that shrink until the next would be none, missing frames, and classes."""
-    assert compile_sort()
-    rng = np.random.default_rng(seed)
-    now, frames = 0.0, []
-    for number in range(90):
-        now += rng.choice([0.1, 0.1, 0.1, 0.1, 0.4, 3.0]) if number < 40 else 0.033
-        rows = boxes_at(rng.uniform(0, 120, (rng.integers(0, 12), 2)), (30, 40))
-        rows["class_id"] = rng.integers(1, 3, len(rows))
-        vanishing = boxes_at([(200, 60), (260, 60)], (30 * 0.65 ** (number % 9), 40 * 0.65 ** (number % 7)))
-        frames.append(Frame(ns(now), number, np.concatenate([rows, vanishing])))
-    ages = {"max_age_s": 0.5, "min_hits_s": 0.1} if rng.random() < 0.5 else {"max_age_frames": 3, "min_hits_frames": 1}
-    sort = Sort(**ages, min_iou=0.1, mix_classes=bool(rng.random() < 0.5))
-    fast = [frame for (frame,) in sort(frames)]
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(tracker, "_compiled", [])
-        plain = [frame for (frame,) in sort(frames)]
-    for a, b in zip(fast, plain, strict=True):
-        assert [a.rows[name].tobytes() for name in a.rows.dtype.names] == [
-            b.rows[name].tobytes() for name in b.rows.dtype.names
-        ]
 
 
 @pytest.mark.parametrize(

@@ -39,7 +39,7 @@ LEAST = (3, 11)
 EXTRAS = ("onnx", "sql", "tune")
 #: The Pythons that pyproject.toml names: on others a dependency may have no wheels yet.
 NAMED = {line.rpartition(" ")[2] for line in PROJECT["classifiers"] if re.search(r"Python :: 3\.\d", line)}
-#: Where mcaptrack meets what it depends on: video, logs, tables, messages of others, networks, compiled loops.
+#: Where mcaptrack meets what it depends on: video, logs, tables, messages of others, networks.
 EDGES = (
     "bags", "detect", "export", "flat", "foreign", "log", "networks", "passing", "pictures", "query", "rendering",
     "schema", "sort", "tables", "tuning", "video", "views",

@@ -195,11 +195,11 @@ def extras(log: Path) -> None:
         with mcaptrack.open(log.with_name("onnx.mcap")) as opened:
             assert opened.table("predictions").num_rows > 0
         done.append(f"onnx (ONNX Runtime {version('onnxruntime')})")
-    if find_spec("optuna") and find_spec("numba"):
+    if find_spec("optuna"):
         settings = log.with_name("best.toml")
         mcaptrack_command("tune", log, "--trials", 3, "-o", settings, "--force")
         assert "[track]" in settings.read_text()
-        done.append(f"tune (Optuna {version('optuna')}, Numba {version('numba')})")
+        done.append(f"tune (Optuna {version('optuna')})")
     print("extras:", ", ".join(done) or "none is installed")
 
 

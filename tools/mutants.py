@@ -63,7 +63,6 @@ WARM = (
     "hypothesis.extra.numpy",
     "google.protobuf",
     "cv2",
-    "numba",
 )
 
 

@@ -13,14 +13,11 @@ from mcaptrack.cli.command import warn_unused
 from mcaptrack.cli.config import NAME
 from mcaptrack.cli.text import console, show
 from mcaptrack.errors import McaptrackError
-from mcaptrack.transforms import ALTERNATIVES, TRACKERS, TRANSFORMS, Transform
-from mcaptrack.transforms.sort import compile_sort
+from mcaptrack.transforms import ALTERNATIVES, TRANSFORMS, Transform
 
 if TYPE_CHECKING:
     from mcaptrack.evaluation.tuning import Range, Task, Trial
 
-#: From so many frames on, over all trials, it pays to have SORT compiled first.
-_WORTH_COMPILING: Final = 100_000
 _SEARCH: Final = "Search"
 _SHOWN: Final = ("IDF1", "MOTA", "HOTA", "IDSW", "FP", "FN")
 
@@ -139,8 +136,6 @@ def tune(
         warn_unused(*(("overlap is compared", "gate_m") if chosen == "iou" else ("distance is compared", "min_iou")))
         if force:
             trials_file.unlink(missing_ok=True)
-        if kind is TRACKERS["sort"] and trials * sum(len(task.frames) for task in tasks) > _WORTH_COMPILING:
-            compile_sort()
         how = "Optuna" if uses_optuna() else "chance; with `pip install mcaptrack[tune]` they learn from each other"
         talk.say(f"{stage}: {len(ranges)} parameters, {len(tasks)} sequences, trials by {how}")
 

@@ -1,8 +1,8 @@
 """Our trackers against those of Roboflow's `trackers` package, on walkers in crowds of several sizes.
 
-Needs `pip install trackers` (Apache-2.0) in the environment. Both get the same boxes in the form
-each of them reads and give tracks in the form each of them writes, with the same age, hits and overlap ("compiled" is
-our SORT with Numba, if that is installed). Prints frames per second and ratios, the best of several rounds in turn.
+Needs `pip install trackers` (Apache-2.0) in the environment. Both get the same boxes in the form each of them reads and
+give tracks in the form each of them writes, with the same age, hits and overlap. Prints frames per second and ratios,
+the best of several rounds in turn.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ import numpy as np
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.schema import DETECTIONS, Frame
 from mcaptrack.transforms import ByteTrack, OcSort, Sort
-from mcaptrack.transforms.sort import compile_sort
 
 # This file's folder is where Python looks first, and this file is named like the peer.
 sys.path.pop(0)
@@ -92,7 +91,6 @@ def pairs(age: int) -> dict[str, tuple[Callable[[], object], Callable[[], object
         "sort": (lambda: Sort(**mine), lambda: trackers.SORTTracker(**peer)),
         "bytetrack": (lambda: ByteTrack(**mine), lambda: trackers.ByteTrackTracker(**peer)),
         "ocsort": (lambda: OcSort(**mine), lambda: trackers.OCSORTTracker(**ocsort)),
-        "compiled": (lambda: Sort(**mine), lambda: trackers.SORTTracker(**peer)),
     }
 
 
@@ -101,10 +99,10 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--people", type=int, nargs="+", default=[6, 20, 50, 100])
     parser.add_argument("--age", type=int, default=1, help="frames until a track is dropped; SORT's own is 1")
-    parser.add_argument("--trackers", nargs="+", default=["sort", "bytetrack", "ocsort", "compiled"])
+    parser.add_argument("--trackers", nargs="+", default=["sort", "bytetrack", "ocsort"])
     options = parser.parse_args()
     for name, (mine, peer) in pairs(options.age).items():
-        if name not in options.trackers or (name == "compiled" and not compile_sort()):
+        if name not in options.trackers:
             continue
         for people in options.people:
             boxes = crowd(people, max(60, 4000 // people))

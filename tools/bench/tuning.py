@@ -1,9 +1,8 @@
 """One trial of a search, tracking and scoring several sequences, against Roboflow's `trackers`.
 
-Needs `pip install trackers optuna` in the environment, and Numba for ours to be compiled. Reads FOLDER/mot15
-(det/det.txt, gt/gt.txt, seqinfo.ini). Both run SORT on the same boxes and score CLEAR, identity and HOTA; the peer as
-its own tuner does, with files already in memory where it allows that. Prints milliseconds and the ratio, the best of
-several rounds in turn.
+Needs `pip install trackers optuna` in the environment. Reads FOLDER/mot15 (det/det.txt, gt/gt.txt, seqinfo.ini). Both
+run SORT on the same boxes and score CLEAR, identity and HOTA; the peer as its own tuner does, with files already in
+memory where it allows that. Prints milliseconds and the ratio, the best of several rounds in turn.
 """
 
 from __future__ import annotations
@@ -18,7 +17,6 @@ from mcaptrack.evaluation import EvaluateOptions
 from mcaptrack.evaluation.tuning import Task, trial_scores
 from mcaptrack.tables.compared import detections_and_truth
 from mcaptrack.transforms import Sort
-from mcaptrack.transforms.sort import compile_sort
 
 # This file's folder is where Python looks first, and a file in it is named like the peer.
 sys.path.pop(0)
@@ -60,14 +58,11 @@ def main() -> None:
                 trial_scores(Sort(min_iou=0.2 + 0.01 * number), tasks, scoring)
             return time.perf_counter() - start
 
-        plain = min(ours(1) for _ in range(3))
-        compiled = compile_sort()
         ours(1)
         peer(1)
         times = [(ours(3) / 3, peer(3) / 3) for _ in range(options.rounds)]
     a, b = min(t for t, _ in times), min(t for _, t in times)
     frames = sum(len(task.frames) for task in tasks)
-    print(f"without Numba {1e3 * plain:.0f} ms" if compiled else "Numba is not installed")
     print(f"one trial over {len(tasks)} sequences, {frames} frames: {1e3 * a:.0f} ms")
     print(f"trackers: {1e3 * b:.0f} ms, {b / a:.1f} times as fast")
 

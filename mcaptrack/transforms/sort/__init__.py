@@ -11,9 +11,9 @@ from typing import Final
 
 from mcaptrack.transforms.sort.bytetrack import ByteTrack
 from mcaptrack.transforms.sort.ocsort import OcSort
-from mcaptrack.transforms.sort.tracker import Sort, compile_sort
+from mcaptrack.transforms.sort.tracker import Sort
 
-__all__ = ["TRACKERS", "ByteTrack", "OcSort", "Sort", "compile_sort"]
+__all__ = ["TRACKERS", "ByteTrack", "OcSort", "Sort"]
 
 #: The trackers by the name that ``--tracker`` takes.
 TRACKERS: Final[MappingProxyType[str, type[Sort]]] = MappingProxyType(

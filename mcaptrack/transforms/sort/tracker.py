@@ -8,7 +8,7 @@ Letters: N boxes, K tracks.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice, pairwise
 from types import MappingProxyType
@@ -35,25 +35,6 @@ Ints = NDArray[np.intp]
 _BLOCK = 64
 #: So many classes are named.
 _NAMED = 20
-
-
-#: The compiled loop, once somebody has asked for it.
-_compiled: list[Callable[..., tuple[Floats, Floats, NDArray[np.int64], int]]] = []
-
-
-def compile_sort() -> bool:
-    """Have SORT run compiled from now on, where that is possible; returns whether it is: whether Numba is installed.
-
-    It takes a second to load, and ten to compile for the first time, so it pays for whoever tracks again and again.
-    What comes out is the same.
-    """
-    if not _compiled:
-        try:
-            from mcaptrack.transforms.sort.compiled import track
-        except ImportError:
-            return False
-        _compiled.append(track)
-    return True
 
 
 class Moment(NamedTuple):
@@ -152,37 +133,11 @@ class Sort:
             columns, ends = look(block, self.min_score, self.class_id)
             passed.count(block, int(ends[-1]))
             life.notice_classes(columns[9])
-            if _compiled and type(self) is Sort and self.cost == "iou":
-                shown, shown_ends = self._run_compiled(life, block, columns, ends)
-            else:
-                spans = pairwise(ends.tolist())
-                parts = [self._step(life, f, Seen(columns[:, a:b])) for f, (a, b) in zip(block, spans, strict=True)]
-                shown, shown_ends = np.concatenate(parts, axis=1), np.cumsum([0, *(p.shape[1] for p in parts)])
+            spans = pairwise(ends.tolist())
+            parts = [self._step(life, f, Seen(columns[:, a:b])) for f, (a, b) in zip(block, spans, strict=True)]
+            shown, shown_ends = np.concatenate(parts, axis=1), np.cumsum([0, *(p.shape[1] for p in parts)])
             yield from ((frame,) for frame in write(block, shown, shown_ends.tolist(), self.ground_planes))
         passed.warn()
-
-    def _run_compiled(
-        self, life: _Life, frames: list[Frame], columns: Floats, ends: NDArray[np.int64]
-    ) -> tuple[Floats, NDArray[np.int64]]:
-        """As ``_step`` for each of the frames; the columns that are shown, and where those of each begin and end."""
-        moments = np.empty((8, len(frames)))
-        for at, frame in enumerate(frames):
-            steps = life.tick(frame.t_ns)
-            moments[:, at] = (
-                steps,
-                life.clock.stretch,
-                life.age,
-                life.frame_age,
-                life.max_age,
-                life.hit,
-                life.min_hits,
-                life.early,
-            )
-        run = _compiled[0]
-        life.tracks.table, shown, shown_ends, life.next_id = run(
-            life.tracks.table, columns, ends, moments, self.min_iou, self.mix_classes, life.next_id
-        )
-        return shown, shown_ends
 
     def _step(self, life: _Life, frame: Frame, seen: Seen) -> Floats:
         """Take one frame; returns the columns of the tracks that are shown in it."""
