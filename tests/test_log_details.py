@@ -6,18 +6,24 @@ import re
 from pathlib import Path
 
 import pytest
+from mcap.opcode import Opcode as StockOpcode
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 from mcap.writer import IndexType, Writer
 
 from mcaptrack import log
 from mcaptrack.log import records
+from mcaptrack.log.records import Opcode
 from mcaptrack.schema.provenance import Provenance
 from tests.commands import done
 from tests.test_damage import FORTY
 from tests.test_log import SCHEMA, write_stock
 
 MIB = 2**20
+
+
+def test_opcodes_are_those_of_the_stock_library():
+    assert {one.name: one.value for one in Opcode} == {one.name: one.value for one in StockOpcode}
 
 
 def summary_of(path: Path):

@@ -221,8 +221,10 @@ def bag(path: Path) -> None:
 def robot(path: Path) -> None:
     """A log as a robot writes it: pictures, boxes and an IMU, as ROS 2 messages."""
     import numpy as np
-    from mcap.writer import Writer
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    from mcaptrack import log
+    from mcaptrack.log import records
 
     store = get_typestore(Stores.ROS2_HUMBLE)
     for name, text in VISION.items():
@@ -237,20 +239,18 @@ def robot(path: Path) -> None:
     )
     of = {name.rpartition("/")[2]: types[name] for name in VISION}
     found = of["ObjectHypothesisWithPose"](hypothesis=of["ObjectHypothesis"](class_id="person", score=0.9), pose=pose)
-    with path.open("wb") as stream:
-        writer = Writer(stream)
-        writer.start(profile="ros2", library="robot")
+    head = records.pack(records.Opcode.HEADER, records.text("ros2"), records.text("robot"))
+    with log.create(path, header=head) as writer:
         channels = {}
         for topic, name in (("/robot/front/image", IMAGE), ("/robot/front/boxes", BOXES), ("/imu", IMU)):
             definition = store.generate_msgdef(name, ros_version=2)[0]
-            schema = writer.register_schema(name, "ros2msg", definition.encode())
-            channels[name] = writer.register_channel(topic, "cdr", schema)
+            channels[name] = writer.add_channel(topic, (name, "ros2msg", definition.encode()), "cdr", {})
         for number, shot in enumerate(shots()[1]):
             t_ns = T0_NS + number * 10**9 // FPS
-            head = header(types, t_ns)
+            stamp = header(types, t_ns)
             boxes = [
                 of["Detection2D"](
-                    header=head, results=[found], id="",
+                    header=stamp, results=[found], id="",
                     bbox=of["BoundingBox2D"](
                         center=of["Pose2D"](position=of["Point2D"](x=x + w / 2, y=y + h / 2), theta=0.0),
                         size_x=w, size_y=h,
@@ -265,15 +265,14 @@ def robot(path: Path) -> None:
                 "linear_acceleration_covariance": np.zeros(9),
             }
             messages = {
-                IMAGE: types[IMAGE](header=head, format="jpeg", data=jpeg(shot.image)),
-                BOXES: of["Detection2DArray"](header=head, detections=boxes),
+                IMAGE: types[IMAGE](header=stamp, format="jpeg", data=jpeg(shot.image)),
+                BOXES: of["Detection2DArray"](header=stamp, detections=boxes),
                 IMU: types[IMU](
-                    header=head, orientation=turn, angular_velocity=zeros, linear_acceleration=zeros, **imu
+                    header=stamp, orientation=turn, angular_velocity=zeros, linear_acceleration=zeros, **imu
                 ),
             }
             for name, message in messages.items():
-                writer.add_message(channels[name], t_ns, bytes(store.serialize_cdr(message, name)), t_ns)
-        writer.finish()
+                writer.add_message(channels[name], t_ns, number, bytes(store.serialize_cdr(message, name)))
 
 
 def logs(path: Path) -> None:

@@ -13,9 +13,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
-from numpy.typing import NDArray
-
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError, command
 from mcaptrack.evaluation import metrics
@@ -34,8 +31,6 @@ from mcaptrack.evaluation.metrics.displacement import combine as combine_displac
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.cameras import camera_at
-
-Ints = NDArray[np.int64]
 
 COMBINED: Final = "COMBINED"
 DEFAULT_GATES_M: Final = (0.5, 1.0, 2.0)

@@ -9,18 +9,16 @@ from collections.abc import Sequence
 from typing import Final, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation import metrics
 from mcaptrack.evaluation.metrics import Matchup
+from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.boxes import columns_to_boxes, iou_of_pairs
 from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
 from mcaptrack.schema import TRACKS, Frame, Rows
 from mcaptrack.schema.resampling import looked_at, resample
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 Similarity = Literal["iou", "metres"]
 
 #: Boxes that overlap so much are alike, and people so near on the ground, where a command line asks for nothing else.

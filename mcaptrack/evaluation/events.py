@@ -13,7 +13,6 @@ from dataclasses import asdict, dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation.aligned import (
@@ -34,12 +33,9 @@ from mcaptrack.evaluation.aligned import (
 from mcaptrack.evaluation.lives import NOBODY, SAME_S, Lives, between_s, event_rows, usual_ns
 from mcaptrack.evaluation.metrics.clear import matches, switched
 from mcaptrack.evaluation.metrics.matchup import Pairs
+from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
 from mcaptrack.schema import COUNTS, EVENTS, EventKind, Frame, Rows
-
-Bools = NDArray[np.bool_]
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True)

@@ -27,12 +27,10 @@ from mcaptrack.evaluation.metrics.displacement import (
     errors,
     pair,
 )
+from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
 from mcaptrack.schema import FORECAST_ERRORS, FORECAST_SCORES, PREDICTIONS, TRACKS, Frame, Rows, Schema
 from mcaptrack.schema.resampling import looked_at
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 #: The channels of forecasts, below the camera's prefix, and the tracks that each is made from.
 MADE_FROM: Final[Mapping[str, str]] = {"predictions": "samples", "retracks/predictions": "retracks/online"}

@@ -8,13 +8,10 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
 from mcaptrack.schema import EVENTS, EventKind, Rows
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 NOBODY: Final = -1
 #: What is the same again after less than this is one event.

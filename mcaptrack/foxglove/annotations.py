@@ -14,15 +14,12 @@ from functools import cache
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mcaptrack.foxglove.colours import ink
 from mcaptrack.foxglove.messages import ANNOTATIONS, message_class
 from mcaptrack.foxglove.template import STAMP, Each, Group, Slot, Template, Word, group, joined, nested, stamps
 from mcaptrack.foxglove.words import by_length
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
+from mcaptrack.geometry.arrays import Floats, Ints
 
 #: Coordinates are multiples of a quarter of a pixel: numbers with few digits take few bytes of a compressed log.
 PER_PX: Final = 4

@@ -9,7 +9,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from mcaptrack.geometry.arrays import Floats
+
 Rgba = tuple[float, float, float, float]
 
 # Okabe and Ito's colours, which stay apart for colour-blind people, without black; then again, lighter and darker.

@@ -14,15 +14,12 @@ from functools import cache
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mcaptrack.foxglove.messages import SCENE, message_class
 from mcaptrack.foxglove.template import STAMP, Each, Group, Slot, Template, Word, group, joined, stamps
 from mcaptrack.foxglove.words import by_length
+from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.clocks import NS_PER_S
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 #: Coordinates are multiples of 1/64 m.
 PER_M: Final = 64

@@ -17,10 +17,8 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from mcaptrack.geometry.arrays import Bytes, Ints
 from mcaptrack.geometry.clocks import NS_PER_S
-
-Ints = NDArray[np.int64]
-Bytes = NDArray[np.uint8]
 
 #: Bytes of a number in a slot for whole numbers, 7 bits each: enough for nanoseconds, and seconds to the year 3058.
 _VARINT_BYTES: Final = 5

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-Ints = NDArray[np.int64]
+from mcaptrack.geometry.arrays import Ints
 
 
 def by_length(numbers: Ints) -> Iterator[tuple[int, Ints, NDArray[Any]]]:

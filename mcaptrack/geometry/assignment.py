@@ -9,7 +9,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from mcaptrack.geometry.arrays import Floats
+
 Pairs = tuple[NDArray[np.intp], NDArray[np.intp]]
 
 #: Up to so many pairs it costs less to solve the whole than to look for what needs solving.

@@ -5,10 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from mcaptrack.geometry.arrays import Floats, Indices
 from mcaptrack.geometry.ragged import group_index, ragged_range
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.intp]
 
 #: From so many pairs on it pays to look first for those that can overlap.
 _MANY = 1500
@@ -44,7 +42,7 @@ def iou_of_pairs(a: Floats, b: Floats) -> Floats:
     return np.where(either > 0, both / np.where(either > 0, either, 1.0), 0.0)
 
 
-def overlapping(a: Floats, b: Floats, area_a: Floats, area_b: Floats) -> tuple[Ints, Ints, Floats]:
+def overlapping(a: Floats, b: Floats, area_a: Floats, area_b: Floats) -> tuple[Indices, Indices, Floats]:
     """The pairs of boxes that overlap, and their intersection over union.
 
     ``a`` (4, M) and ``b`` (4, N) are left, top, right, bottom, with their areas (M,) and (N,). Returns which of ``a``
@@ -74,7 +72,7 @@ def overlapping(a: Floats, b: Floats, area_a: Floats, area_b: Floats) -> tuple[I
     return first, second, shared
 
 
-def _side_by_side(a: Floats, b: Floats) -> tuple[Ints, Ints]:
+def _side_by_side(a: Floats, b: Floats) -> tuple[Indices, Indices]:
     """Pairs of boxes of which no other pair overlaps: those that a sweep from left to right finds near each other."""
     order = b[0].argsort(kind="stable")
     left = b[0, order]

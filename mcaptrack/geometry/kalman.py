@@ -15,9 +15,8 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from mcaptrack.geometry.arrays import Floats
 
 #: Rows of a state: u, v, s, r and their rates, that of r being 0 for ever; then, for centre, area and ratio each, the
 #: variances, the covariances with the rate, and the variances of the rate. Those of the rate of r are 0 for ever too.

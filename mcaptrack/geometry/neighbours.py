@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
+from mcaptrack.geometry.arrays import Floats, Ints
 
 
 def near_pairs(group: Ints, xy: Floats, distance: float) -> tuple[Ints, Ints]:

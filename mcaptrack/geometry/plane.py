@@ -8,11 +8,10 @@ from functools import cached_property
 from typing import Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mcaptrack.errors import McaptrackError
+from mcaptrack.geometry.arrays import Floats
 
-Floats = NDArray[np.float64]
 Point = Literal["foot", "center"]
 
 #: The height of a person, where the scale of a scene has to be guessed from the boxes.

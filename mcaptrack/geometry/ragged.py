@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-Ints = NDArray[np.int64]
-Bools = NDArray[np.bool_]
+from mcaptrack.geometry.arrays import Bools, Ints
 
 
 def group_index(counts: ArrayLike) -> Ints:

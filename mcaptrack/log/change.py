@@ -14,8 +14,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from mcap.opcode import Opcode
-
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import can_replace, publish_stream
 from mcaptrack.log import records
@@ -23,7 +21,7 @@ from mcaptrack.log.chunks import chunk_record, message_head, open_chunk
 from mcaptrack.log.index import Index
 from mcaptrack.log.new_end import new_end
 from mcaptrack.log.reader import Log
-from mcaptrack.log.records import BLOCK, MAGIC, Bytes, ChunkIndexRecord, Damaged, Record, crc_of, walk
+from mcaptrack.log.records import BLOCK, MAGIC, Bytes, ChunkIndexRecord, Damaged, Opcode, Record, crc_of, walk
 from mcaptrack.log.source import Source
 from mcaptrack.log.writer import LogWriter, Sink, refuse_earlier_results, verify
 from mcaptrack.schema.provenance import Provenance

@@ -11,7 +11,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from mcap.opcode import Opcode
 
 from mcaptrack import notices
 from mcaptrack.errors import McaptrackError
@@ -31,7 +30,7 @@ from mcaptrack.log.chunks import (
 )
 from mcaptrack.log.index import Index, begins_as_log, ends_as_log, list_attachment, list_metadata
 from mcaptrack.log.journal import find_content, journal_of
-from mcaptrack.log.records import MAGIC, Bytes, ChunkIndexRecord, Damaged, Reader, Record, walk
+from mcaptrack.log.records import MAGIC, Bytes, ChunkIndexRecord, Damaged, Opcode, Reader, Record, walk
 from mcaptrack.log.source import OpenFile, RunningChecksum, Signature, Source
 
 Progress = Callable[[str, int, int], None]

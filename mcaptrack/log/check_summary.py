@@ -7,10 +7,8 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from typing import Final, Literal, NamedTuple
 
-from mcap.opcode import Opcode
-
 from mcaptrack.log.index import DATA_END_SIZE, FOOTER_SIZE, Index, read_footer, take
-from mcaptrack.log.records import MAGIC, Bytes, Damaged, Reader, walk
+from mcaptrack.log.records import MAGIC, Bytes, Damaged, Opcode, Reader, walk
 
 Level = Literal["error", "warning"]
 

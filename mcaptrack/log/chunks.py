@@ -8,15 +8,14 @@ from __future__ import annotations
 from typing import Final, NamedTuple
 
 import numpy as np
-from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from mcaptrack import environment
+from mcaptrack.geometry.arrays import Ints
 from mcaptrack.log import records
-from mcaptrack.log.records import Bytes, ChunkHead, ChunkIndexRecord, Damaged, Record, crc_of, walk
+from mcaptrack.log.records import Bytes, ChunkHead, ChunkIndexRecord, Damaged, Opcode, Record, crc_of, walk
 from mcaptrack.log.source import Source
 
-Ints = NDArray[np.int64]
 Times = NDArray[np.uint64]
 Entries = NDArray[np.uint64]
 

@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
 import numpy as np
-from mcap.opcode import Opcode
 
 from mcaptrack.log import records
 from mcaptrack.log.chunks import Entries, chunk_entries, message_head, open_chunk
@@ -20,6 +19,7 @@ from mcaptrack.log.records import (
     ChannelRecord,
     ChunkIndexRecord,
     Damaged,
+    Opcode,
     Reader,
     Record,
     SchemaRecord,

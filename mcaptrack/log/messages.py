@@ -12,9 +12,9 @@ from itertools import islice
 from typing import Final, NamedTuple
 
 import numpy as np
-from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
+from mcaptrack.geometry.arrays import Ints
 from mcaptrack.log.chunks import (
     MAX_NS,
     Entries,
@@ -34,6 +34,7 @@ from mcaptrack.log.records import (
     Bytes,
     ChunkIndexRecord,
     Damaged,
+    Opcode,
     Record,
     crc_of,
     read_chunk,
@@ -42,7 +43,6 @@ from mcaptrack.log.records import (
 from mcaptrack.log.source import Source
 from mcaptrack.schema import Rows, Schema
 
-Ints = NDArray[np.int64]
 Times = NDArray[np.uint64]
 Span = tuple[int | None, int | None]
 

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import NamedTuple, Self, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mcaptrack.errors import McaptrackError, command
 from mcaptrack.files import follow_links
+from mcaptrack.geometry.arrays import Ints
 from mcaptrack.log import new_end, records
 from mcaptrack.log.chunks import MAX_NS
 from mcaptrack.log.messages import Columns, Message, Places
@@ -23,7 +23,6 @@ from mcaptrack.log.snapshot import take_snapshot
 from mcaptrack.log.writer import create
 from mcaptrack.schema import Frame, Schema
 
-Ints = NDArray[np.int64]
 T = TypeVar("T")
 
 

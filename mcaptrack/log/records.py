@@ -9,9 +9,8 @@ import struct
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
+from enum import IntEnum
 from typing import Final, NamedTuple, Protocol, overload
-
-from mcap.opcode import Opcode
 
 from mcaptrack.errors import McaptrackError
 
@@ -37,6 +36,26 @@ _CRC_POLYNOMIAL: Final = 0xEDB88320
 _NEAR: Final = 1024
 _WALKED: Final = 64 * 2**10
 _SUMMED: Final = 2**20
+
+
+class Opcode(IntEnum):
+    """The first byte of a record says what it is. Opcodes from 0x80 on are for private records of applications."""
+
+    HEADER = 0x01
+    FOOTER = 0x02
+    SCHEMA = 0x03
+    CHANNEL = 0x04
+    MESSAGE = 0x05
+    CHUNK = 0x06
+    MESSAGE_INDEX = 0x07
+    CHUNK_INDEX = 0x08
+    ATTACHMENT = 0x09
+    ATTACHMENT_INDEX = 0x0A
+    STATISTICS = 0x0B
+    METADATA = 0x0C
+    METADATA_INDEX = 0x0D
+    SUMMARY_OFFSET = 0x0E
+    DATA_END = 0x0F
 
 
 class Bytes(Protocol):

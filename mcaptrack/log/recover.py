@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Final, TypeVar
 
 import numpy as np
-from mcap.opcode import Opcode
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.log import records
@@ -33,6 +32,7 @@ from mcaptrack.log.records import (
     ChannelRecord,
     ChunkIndexRecord,
     Damaged,
+    Opcode,
     Reader,
     Record,
     SchemaRecord,

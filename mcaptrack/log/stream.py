@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator
 
-from mcap.opcode import Opcode
-
 from mcaptrack.log import records
 from mcaptrack.log.chunks import message_head, open_chunk
 from mcaptrack.log.messages import Message
 from mcaptrack.log.reader import Log
-from mcaptrack.log.records import MAGIC, Bytes, Record, walk
+from mcaptrack.log.records import MAGIC, Bytes, Opcode, Record, walk
 from mcaptrack.log.writer import LogWriter
 
 

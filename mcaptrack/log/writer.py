@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Final, Literal, Protocol
 
 import numpy as np
-from mcap.opcode import Opcode
 
 from mcaptrack import __version__
 from mcaptrack.errors import McaptrackError
@@ -27,7 +26,7 @@ from mcaptrack.log import journal, records
 from mcaptrack.log.chunks import LOG_MAX_NS
 from mcaptrack.log.index import Index, Listed, list_attachment, list_metadata, read_index
 from mcaptrack.log.names import RESULTS, results_of
-from mcaptrack.log.records import MAGIC, ChannelRecord, ChunkIndexRecord, Damaged, SchemaRecord, crc_of
+from mcaptrack.log.records import MAGIC, ChannelRecord, ChunkIndexRecord, Damaged, Opcode, SchemaRecord, crc_of
 from mcaptrack.log.source import OpenFile, Source
 
 #: What the headers of our logs name as their writer, before the version.

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
@@ -31,7 +30,6 @@ from mcaptrack.sources.video import Encoded, brightness
 from mcaptrack.transforms import TRANSFORMS, Transform, choice, implementation_of
 from mcaptrack.transforms.to_video_rate import carry, keep
 
-Ints = NDArray[np.int64]
 Progress = Callable[[str, int, int], None]
 
 

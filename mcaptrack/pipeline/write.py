@@ -16,6 +16,7 @@ from mcaptrack.errors import McaptrackError, command
 from mcaptrack.foxglove import views
 from mcaptrack.foxglove.layouts import Eye
 from mcaptrack.foxglove.views import layouts
+from mcaptrack.geometry.arrays import Ints
 from mcaptrack.geometry.plane import Planes
 from mcaptrack.notices import warn
 from mcaptrack.pipeline.checks import how_it_came, may_replace
@@ -24,7 +25,6 @@ from mcaptrack.schema.provenance import INGEST, VIEW, Provenance, digest
 from mcaptrack.sources import foreign
 from mcaptrack.sources.cameras import FULL, VIDEO, Camera, camera_at
 
-Ints = NDArray[np.int64]
 #: Log time, number of the channel, sequence and payload of a message.
 Numbered = tuple[int, int, int, bytes]
 

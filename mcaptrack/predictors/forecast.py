@@ -7,7 +7,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from mcaptrack.geometry.arrays import Floats
 
 
 class Forecast(NamedTuple):

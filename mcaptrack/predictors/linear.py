@@ -17,10 +17,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from mcaptrack.geometry.arrays import Floats
 from mcaptrack.geometry.histories import Holt, fill_holes
 from mcaptrack.predictors.forecast import Forecast
-
-Floats = NDArray[np.float64]
 
 #: How people walk, for the errors of forecasts: noise of a seen position, spread of velocity when nothing is known of
 #: it, and how fast velocity drifts (the power of its white acceleration). tools/calibrate.py says what they cover.

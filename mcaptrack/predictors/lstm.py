@@ -14,15 +14,12 @@ from functools import cached_property
 from typing import ClassVar, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mcaptrack.geometry.arrays import Bools, Floats
 from mcaptrack.geometry.histories import fill_holes, last_positions
 from mcaptrack.predictors.forecast import Forecast
 from mcaptrack.predictors.linear import LinearPredictor
 from mcaptrack.predictors.weights import Network
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 PAST: Final = 4
 

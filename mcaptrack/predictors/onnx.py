@@ -14,15 +14,12 @@ from pathlib import Path
 from typing import Any, Final, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mcaptrack.errors import McaptrackError
+from mcaptrack.geometry.arrays import Bools, Floats
 from mcaptrack.geometry.histories import fill_holes, last_positions
 from mcaptrack.predictors.forecast import Forecast
 from mcaptrack.predictors.linear import LinearPredictor
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 _STEP_S: Final = 0.4
 

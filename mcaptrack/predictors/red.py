@@ -15,14 +15,11 @@ from functools import cached_property
 from typing import ClassVar, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mcaptrack.geometry.arrays import Bools, Floats
 from mcaptrack.geometry.histories import fill_holes, last_positions
 from mcaptrack.predictors.forecast import Forecast
 from mcaptrack.predictors.weights import Network
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 #: How many past positions the network looks at, and how many at a time.
 PAST: Final = 8

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack.errors import McaptrackError
-
-Floats = NDArray[np.float64]
+from mcaptrack.geometry.arrays import Floats
 
 #: Where the weights are that come with mcaptrack.
 SHIPPED: Final = Path(__file__).parent / "trained"

@@ -11,9 +11,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from mcaptrack.geometry.arrays import Ints
 from mcaptrack.schema import TRACKS, Frame, Rows
-
-Ints = NDArray[np.int64]
 
 #: The columns of a track that change steadily.
 LINEAR: Final = ("x_px", "y_px", "w_px", "h_px", "x_m", "y_m", "score")

@@ -14,8 +14,9 @@ import numpy as np
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import publish
+from mcaptrack.geometry.arrays import Image
 from mcaptrack.sources.scene import Scene
-from mcaptrack.sources.video import Image, write_mp4
+from mcaptrack.sources.video import write_mp4
 
 #: What the demonstration writes, by name.
 VIDEO: Final = "demo.mp4"

@@ -12,16 +12,14 @@ from collections.abc import Container, Iterable, Iterator
 from typing import Final, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mcaptrack import log
 from mcaptrack.errors import DamagedError, McaptrackError
+from mcaptrack.geometry.arrays import Ints
 from mcaptrack.log.beside import recover_command
 from mcaptrack.schema import Frame
 from mcaptrack.sources import foreign
 from mcaptrack.sources.video import Encoded, colours, entry
-
-Ints = NDArray[np.int64]
 
 #: So many messages are looked at in the second step back to a key picture, so many times more in each further one, and
 #: never more than so many at once.

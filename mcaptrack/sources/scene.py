@@ -14,12 +14,9 @@ from functools import partial
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mcaptrack.geometry.arrays import Floats, Image
 from mcaptrack.geometry.plane import GroundPlane
-
-Floats = NDArray[np.float64]
-Image = NDArray[np.uint8]
 
 _PERSON_M: Final = 1.75
 _STRIDE_HZ: Final = 1.8

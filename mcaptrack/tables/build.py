@@ -11,11 +11,9 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.schema import Frame, Rows, Schema
 from mcaptrack.tables.fields import RECORDING, TABLES, Table
-
-Ints = NDArray[np.int64]
-Floats = NDArray[np.float64]
 
 _BITS: Final = 16
 

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from mcaptrack import tables
 from mcaptrack.errors import McaptrackError, command
+from mcaptrack.geometry.arrays import Bools, Floats
 from mcaptrack.geometry.assignment import solve
 from mcaptrack.geometry.boxes import iou
 from mcaptrack.geometry.clocks import NS_PER_S
@@ -29,9 +30,6 @@ from mcaptrack.sources.ingest.job import IngestOptions, label_rows
 from mcaptrack.sources.ingest.label_job import LabelJob
 from mcaptrack.sources.ingest.labels import read_homography, read_labels
 from mcaptrack.sources.ingest.source import is_mcap
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 #: Formats whose rows say in which frame of the video they are.
 _COUNTING: Final = ("mot", "kitti", "parquet")

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation.metrics.calibration import forecast_scores, mahalanobis_squared
@@ -23,8 +22,6 @@ from mcaptrack.predictors.lstm import Lstm
 from mcaptrack.predictors.weights import Weights, load, save
 from mcaptrack.training.recipe import Recipe
 from mcaptrack.training.windows import Windows, ar1
-
-Floats = NDArray[np.float64]
 
 _LOG: Final = "epochs.csv"
 _STATE: Final = "state.safetensors"

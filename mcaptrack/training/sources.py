@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mcaptrack import log, pipeline, tables
 from mcaptrack.errors import McaptrackError, command
+from mcaptrack.geometry.arrays import Floats
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.plane import Planes
 from mcaptrack.schema import TRACKS, Frame
@@ -25,8 +25,6 @@ from mcaptrack.training.recipe import Recipe
 from mcaptrack.training.walks import walks
 from mcaptrack.training.windows import Windows
 from mcaptrack.transforms import Sample
-
-Floats = NDArray[np.float64]
 
 SYNTHETIC: Final = "synthetic"
 #: The channels of a log that are trained on, the best first.

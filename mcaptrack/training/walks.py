@@ -16,8 +16,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
+from mcaptrack.geometry.arrays import Bools, Floats
 
 #: How finely the crowd moves, in seconds, and how long it does before anybody looks.
 _FINE_S: Final = 0.2

@@ -9,11 +9,8 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
-Ints = NDArray[np.int64]
+from mcaptrack.geometry.arrays import Bools, Floats, Ints
 
 #: How fast the noise of a tracker forgets itself, from one step to the next.
 _NOISE_MEMORY: Final = 0.5

@@ -12,17 +12,15 @@ from types import MappingProxyType
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mcaptrack.errors import McaptrackError
+from mcaptrack.geometry.arrays import Ints
 from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
 from mcaptrack.geometry.plane import Planes, plane_at
 from mcaptrack.schema import TRACKS, Frame, Rows, Schema
 from mcaptrack.schema.resampling import resample
 from mcaptrack.transforms.protocol import check_options, context, option
-
-Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True, kw_only=True)

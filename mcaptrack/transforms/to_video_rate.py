@@ -9,15 +9,13 @@ from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mcaptrack.geometry.arrays import Ints
 from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.plane import Planes, plane_at
 from mcaptrack.geometry.ragged import group_index, run_starts
 from mcaptrack.schema import TRACKS, Frame, Rows
 from mcaptrack.schema.resampling import resample
-
-Ints = NDArray[np.int64]
 
 #: What is taken from the tracker where it saw somebody.
 _SEEN: Final = ("x_px", "y_px", "w_px", "h_px", "score", "observed")

@@ -18,11 +18,10 @@ from numpy.typing import NDArray
 
 from mcaptrack import foxglove, log, notices
 from mcaptrack.errors import McaptrackError
+from mcaptrack.geometry.arrays import Image
 from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
 from mcaptrack.sources.pictures import Pictures
 from mcaptrack.sources.video import write_clip
-
-Image = NDArray[np.uint8]
 
 _LINE_LOOP, _LINE_STRIP, _LINE_LIST = 2, 3, 4
 #: Coordinates are drawn to this many binary places of a pixel.

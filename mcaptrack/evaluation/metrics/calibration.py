@@ -8,9 +8,8 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from mcaptrack.geometry.arrays import Floats
 
 #: The shares of true futures that the ellipses are to hold which are reported.
 LEVELS: Final = (0.5, 0.9, 0.95)

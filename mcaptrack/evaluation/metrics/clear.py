@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack.evaluation.metrics.matchup import Matchup, Pairs
+from mcaptrack.geometry.arrays import Indices
 from mcaptrack.geometry.assignment import assign, solve
 
 Rules = Literal["trackeval", "motmetrics"]
 Counts = dict[str, float]
-Ints = NDArray[np.intp]
 
 _EPS: Final = float(np.finfo(float).eps)
 _NOBODY: Final = -1
@@ -100,12 +100,12 @@ class _Memory:
         self._number = _NOBODY
         self._who = self._by = np.empty(0, np.intp)
 
-    def _decided(self, number: int, rows: Ints, columns: Ints) -> tuple[Ints, Ints]:
+    def _decided(self, number: int, rows: Indices, columns: Indices) -> tuple[Indices, Indices]:
         self._number = number
         self._who, self._by = self._matchup.truth[number][rows], self._matchup.tracks[number][columns]
         return rows, columns
 
-    def pairs_trackeval(self, number: int, easy: Pairs, low: int, high: int) -> tuple[Ints, Ints]:
+    def pairs_trackeval(self, number: int, easy: Pairs, low: int, high: int) -> tuple[Indices, Indices]:
         """The pairs of the frame before are kept where they can be, then similarity counts."""
         matchup, last = self._matchup, self._last
         at = int(np.searchsorted(self._looked_at, number))
@@ -123,7 +123,7 @@ class _Memory:
         kept = score[rows, columns] > _EPS
         return self._decided(number, rows[kept], columns[kept])
 
-    def pairs_motmetrics(self, number: int, easy: Pairs, low: int, high: int) -> tuple[Ints, Ints]:
+    def pairs_motmetrics(self, number: int, easy: Pairs, low: int, high: int) -> tuple[Indices, Indices]:
         """Everybody keeps the track it had last, however long ago; then as many and as near pairs as there can be."""
         matchup = self._matchup
         self._last[self._who] = self._by

@@ -16,14 +16,10 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mcaptrack.evaluation.metrics.calibration import LEVELS, mahalanobis_squared
+from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.assignment import solve
-
-Bools = NDArray[np.bool_]
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 #: The threshold of association at which single numbers are given, in m^2 (the paper's tau).
 TAU_M2: Final = 2.0

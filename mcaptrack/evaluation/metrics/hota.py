@@ -11,9 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack.evaluation.metrics.matchup import Matchup
+from mcaptrack.geometry.arrays import Indices
 from mcaptrack.geometry.assignment import solve
-
-Ints = NDArray[np.intp]
 
 ALPHAS: Final = np.arange(0.05, 0.99, 0.05)
 _EPS: Final = float(np.finfo(float).eps)
@@ -30,7 +29,7 @@ def hota(matchup: Matchup) -> dict[str, NDArray[np.float64]]:
     shared = np.bincount(cell, share, minlength=n_truth * n_tracks).reshape(n_truth, n_tracks)
     alignment = shared / np.maximum(truth_count[:, None] + track_count[None, :] - shared, _EPS)
 
-    def solve_frame(number: int, *_: object) -> tuple[Ints, Ints]:
+    def solve_frame(number: int, *_: object) -> tuple[Indices, Indices]:
         who, by = matchup.truth[number], matchup.tracks[number]
         return solve(-(alignment[who[:, None], by] * matchup.similarity[number]))
 

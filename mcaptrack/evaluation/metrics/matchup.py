@@ -13,8 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.intp]
+from mcaptrack.geometry.arrays import Floats, Indices
 
 
 class Pairs(NamedTuple):
@@ -24,14 +23,14 @@ class Pairs(NamedTuple):
     the track of these.
     """
 
-    frame: Ints
-    row: Ints
-    column: Ints
-    who: Ints
-    by: Ints
+    frame: Indices
+    row: Indices
+    column: Indices
+    who: Indices
+    by: Indices
     similarity: Floats
 
-    def where(self, kept: NDArray[np.bool_] | Ints) -> Pairs:
+    def where(self, kept: NDArray[np.bool_] | Indices) -> Pairs:
         """Some of the pairs."""
         frame, row, column, who, by, similarity = self
         return Pairs(frame[kept], row[kept], column[kept], who[kept], by[kept], similarity[kept])
@@ -44,7 +43,7 @@ class Pairs(NamedTuple):
         return contested
 
 
-SolveFrame = Callable[[int, Pairs, int, int], tuple[Ints, Ints]]
+SolveFrame = Callable[[int, Pairs, int, int], tuple[Indices, Indices]]
 
 
 @dataclass(frozen=True)
@@ -56,8 +55,8 @@ class Matchup:
     comparable at ``threshold`` and above. Nobody is twice in a frame.
     """
 
-    truth: tuple[Ints, ...]
-    tracks: tuple[Ints, ...]
+    truth: tuple[Indices, ...]
+    tracks: tuple[Indices, ...]
     similarity: tuple[Floats, ...]
     threshold: float
     n_truth: int
@@ -74,22 +73,22 @@ class Matchup:
         return len(self.all_tracks)
 
     @cached_property
-    def all_truth(self) -> Ints:
+    def all_truth(self) -> Indices:
         """The people of all frames, one after the other (R,)."""
         return _joined(self.truth)
 
     @cached_property
-    def all_tracks(self) -> Ints:
+    def all_tracks(self) -> Indices:
         """The tracks of all frames, one after the other (C,)."""
         return _joined(self.tracks)
 
     @cached_property
-    def truth_counts(self) -> Ints:
+    def truth_counts(self) -> Indices:
         """How many people there are in each frame."""
         return np.array([len(ids) for ids in self.truth], np.intp)
 
     @cached_property
-    def track_counts(self) -> Ints:
+    def track_counts(self) -> Indices:
         """How many tracks there are in each frame."""
         return np.array([len(ids) for ids in self.tracks], np.intp)
 
@@ -119,7 +118,7 @@ class Matchup:
         hard[candidates.frame[candidates.contested()]] = True
         easy, numbers = candidates.where(~hard[candidates.frame]), hard.nonzero()[0]
         ends = np.searchsorted(easy.frame, numbers)
-        found: list[tuple[Ints, Ints]] = []
+        found: list[tuple[Indices, Indices]] = []
         low = 0
         for number, high in zip(numbers.tolist(), ends.tolist(), strict=True):
             found.append(solve_frame(number, easy, low, high))
@@ -141,7 +140,7 @@ class Matchup:
         return np.concatenate([np.empty(0), *(part.ravel() for part in self.similarity)])
 
 
-def _joined(ids: Sequence[Ints]) -> Ints:
+def _joined(ids: Sequence[Indices]) -> Indices:
     return np.concatenate([np.empty(0, np.intp), *ids])
 
 

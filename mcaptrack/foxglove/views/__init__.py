@@ -9,18 +9,17 @@ from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mcaptrack.foxglove.views import ground, image, looks
 from mcaptrack.foxglove.views.image import View
 from mcaptrack.foxglove.views.looks import look_of
 from mcaptrack.foxglove.views.people import People, people_at
+from mcaptrack.geometry.arrays import Ints
 from mcaptrack.geometry.plane import Planes
 from mcaptrack.schema import DETECTIONS, PREDICTIONS, TRACKS, Frame, Schema
 
 __all__ = ["DRAWN", "SCENE_SUFFIX", "SUFFIX", "SUFFIXES", "Drawing", "View", "ground"]
 
-Ints = NDArray[np.int64]
 
 #: Suffixes of the topics of views: on the pictures, and on the ground.
 SUFFIX: Final = "/view/image"

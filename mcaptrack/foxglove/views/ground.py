@@ -9,7 +9,6 @@ from collections.abc import Iterator, Sequence
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mcaptrack.foxglove import Scene, colours
 from mcaptrack.foxglove.views import looks
@@ -25,12 +24,10 @@ from mcaptrack.foxglove.views.people import (
     shown_at,
     trails,
 )
+from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.plane import GroundPlane, Planes
 from mcaptrack.schema import Frame
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 _BATCH: Final = 128
 _WHITE: Final = (1.0, 1.0, 1.0)

@@ -27,12 +27,11 @@ from mcaptrack.foxglove.views.people import (
     shown_at,
     trails,
 )
+from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.plane import Planes
 from mcaptrack.schema import DETECTIONS, Frame
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 View = Iterator[tuple[int, int, bytes]]
 
 #: Messages are made for so many pictures at a time.

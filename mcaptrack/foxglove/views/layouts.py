@@ -7,13 +7,11 @@ from math import atan2, degrees, hypot, isfinite
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mcaptrack.foxglove import layouts
 from mcaptrack.foxglove.layouts import Eye, Tree, beside
+from mcaptrack.geometry.arrays import Floats
 from mcaptrack.geometry.plane import Planes, plane_at
-
-Floats = NDArray[np.float64]
 
 #: The layouts that there are, and how the file of each ends.
 TRACKING, COMPARING, PREDICTIONS = "tracking", "comparing", "predictions"

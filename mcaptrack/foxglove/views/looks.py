@@ -6,13 +6,10 @@ from collections.abc import Sequence
 from typing import Final, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mcaptrack.foxglove import Figure
 from mcaptrack.geometry.plane import Planes
 from mcaptrack.schema import Frame
-
-Floats = NDArray[np.float64]
 
 #: Lines are one of their pixels thick, and words 12 pixels high, on pictures up to so wide; on wider ones more.
 _WIDTH_PX: Final = 800

@@ -11,14 +11,12 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.clocks import seconds_to_ns
 from mcaptrack.geometry.plane import GroundPlane, Planes
 from mcaptrack.schema import PREDICTIONS, Frame
 from mcaptrack.schema.resampling import resample
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 #: How far trails go back, and how many lines they are made of.
 _TRAIL_S: Final = 2.0

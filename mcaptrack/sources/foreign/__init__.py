@@ -13,10 +13,10 @@ from datetime import UTC, datetime
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mcaptrack import foxglove, log
 from mcaptrack.errors import McaptrackError
+from mcaptrack.geometry.arrays import Ints
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.notices import warn
 from mcaptrack.schema import Frame
@@ -41,8 +41,6 @@ __all__ = [
     "pictures",
     "stamps",
 ]
-
-Ints = NDArray[np.int64]
 
 _COMPRESSED: Final = (foxglove.VIDEO, foxglove.IMAGE, "sensor_msgs/CompressedImage")
 _RAW: Final = ("foxglove.RawImage", "sensor_msgs/Image")

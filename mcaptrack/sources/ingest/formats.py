@@ -27,13 +27,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack.errors import McaptrackError
+from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.sources.ingest.text import Lines, Table
 
 Format = Literal["auto", "mot", "kitti", "sdd", "trajnet", "obsmat"]
 Role = Literal["detections", "tracks", "truth"]
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Bools = NDArray[np.bool_]
 Classes = NDArray[np.uint32]
 
 NO_ID: Final = -1

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any, Final, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
@@ -28,7 +27,6 @@ from mcaptrack.sources.ingest.labels import read_homography, read_labels
 from mcaptrack.sources.ingest.timeline import Placed, Timeline
 from mcaptrack.sources.video import ImageFormat, Keep
 
-Ints = NDArray[np.int64]
 Progress = Callable[[str, int, int], None]
 #: Frames, from the beginning whenever it is called.
 Frames = Callable[[], Iterator[Frame]]

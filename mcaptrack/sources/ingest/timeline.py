@@ -15,14 +15,12 @@ from pathlib import Path
 from typing import Final, NamedTuple, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mcaptrack.errors import McaptrackError
+from mcaptrack.geometry.arrays import Ints
 from mcaptrack.geometry.clocks import LAST_NS, NS_PER_S
 from mcaptrack.notices import warn
 from mcaptrack.sources.ingest.formats import Labels
-
-Ints = NDArray[np.int64]
 
 #: What a frame's number may be at most: more than three days at 30 a second.
 MAX_FRAMES: Final = 10_000_000

@@ -4,7 +4,7 @@ FFmpeg does the work, through PyAV; its wheels bring it along.
 """
 
 from mcaptrack.sources.video.decode import Encoded, brightness, colours
-from mcaptrack.sources.video.encode import H264Encoder, Image, ImageFormat, Keep, encode_image, write_clip, write_mp4
+from mcaptrack.sources.video.encode import H264Encoder, ImageFormat, Keep, encode_image, write_clip, write_mp4
 from mcaptrack.sources.video.folder import IMAGE_SUFFIXES
 from mcaptrack.sources.video.raw import RAW_ENCODINGS, Layout
 from mcaptrack.sources.video.seqinfo import SEQINFO, SeqInfo, find_seqinfo
@@ -18,7 +18,6 @@ __all__ = [
     "Encoded",
     "EncodedPicture",
     "H264Encoder",
-    "Image",
     "ImageFormat",
     "Keep",
     "Layout",

@@ -7,9 +7,9 @@ from fractions import Fraction
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mcaptrack.errors import McaptrackError
+from mcaptrack.geometry.arrays import Image
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.schema import Frame
 from mcaptrack.sources.video import h264
@@ -17,8 +17,6 @@ from mcaptrack.sources.video.container import is_size_error
 from mcaptrack.sources.video.limits import check_size, check_still, max_pixels, still_size, too_large
 from mcaptrack.sources.video.raw import Layout, raw_brightness, raw_colours
 from mcaptrack.sources.video.streams import CODECS
-
-Pixels = NDArray[np.uint8]
 
 _FULL_RANGE: Final = 2  # AVCOL_RANGE_JPEG
 # Video keeps brightness in 16..235; detectors see 0..255 whatever the picture came from.
@@ -66,8 +64,8 @@ def colours(pictures: Iterable[Encoded], wanted: Container[int] | None = None) -
 
 def _decoded(
     pictures: Iterable[Encoded],
-    of_pixels: Callable[[str, bytes, Layout], Pixels],
-    of_frame: Callable[[Any], Pixels],
+    of_pixels: Callable[[str, bytes, Layout], Image],
+    of_frame: Callable[[Any], Image],
     wanted: Container[int] | None,
     is_grey: bool,
 ) -> Iterator[Frame]:
@@ -93,7 +91,7 @@ def _decoded(
         yield from decoder.flush()
 
 
-def _still(picture: Encoded, is_grey: bool) -> Pixels:
+def _still(picture: Encoded, is_grey: bool) -> Image:
     import cv2
 
     size, image = still_size(picture.data), None
@@ -110,7 +108,7 @@ def _still(picture: Encoded, is_grey: bool) -> Pixels:
 
 
 class _VideoDecoder:
-    def __init__(self, name: str, of_frame: Callable[[Any], Pixels], wanted: Container[int] | None) -> None:
+    def __init__(self, name: str, of_frame: Callable[[Any], Image], wanted: Container[int] | None) -> None:
         import av
 
         self._of_frame, self._wanted = of_frame, wanted
@@ -164,11 +162,11 @@ class _VideoDecoder:
                 yield Frame(t_ns, index, self._of_frame(frame))
 
 
-def _bgr(frame: Any) -> Pixels:
+def _bgr(frame: Any) -> Image:
     return np.asarray(frame.to_ndarray(format="bgr24"), np.uint8)
 
 
-def _luma(frame: Any) -> Pixels:
+def _luma(frame: Any) -> Image:
     """The brightness of a decoded picture; its Y plane where it has one of 8 bits."""
     import cv2
 

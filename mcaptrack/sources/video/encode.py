@@ -9,16 +9,15 @@ from pathlib import Path
 from typing import Any, Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import publish
+from mcaptrack.geometry.arrays import Image
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.sources.video.container import writing
 
 ImageFormat = Literal["auto", "h264", "h265", "jpeg", "png"]
 StillFormat = Literal["jpeg", "png"]
-Image = NDArray[np.uint8]
 
 _MP4_BASE: Final = Fraction(1, 90_000)
 _GIF_BASE: Final = Fraction(1, 100)

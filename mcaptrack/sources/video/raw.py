@@ -8,11 +8,9 @@ from __future__ import annotations
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mcaptrack.errors import McaptrackError
-
-Bytes = NDArray[np.uint8]
+from mcaptrack.geometry.arrays import Bytes
 
 
 class Layout(NamedTuple):

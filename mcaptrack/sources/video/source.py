@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mcaptrack.errors import McaptrackError
+from mcaptrack.geometry.arrays import Image
 from mcaptrack.geometry.clocks import LAST_NS, NS_PER_S
 from mcaptrack.notices import warn
 from mcaptrack.sources.video.container import empty, fraction, has_slots, has_times, indexed, reading, videos
@@ -28,8 +28,6 @@ from mcaptrack.sources.video.passing import look, packets
 from mcaptrack.sources.video.seqinfo import find_seqinfo
 from mcaptrack.sources.video.slots import count_slots
 from mcaptrack.sources.video.streams import CODECS
-
-Image = NDArray[np.uint8]
 
 #: As many on every machine, so that what is made of damaged streams is the same everywhere.
 _THREADS: Final = 4

@@ -17,15 +17,13 @@ from typing import ClassVar, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from mcaptrack.geometry.arrays import Floats, Image
 from mcaptrack.geometry.clocks import FrameClock
 from mcaptrack.schema import DETECTIONS, VIDEO, Frame, Schema
 from mcaptrack.transforms.detect.foreground import Method, model
 from mcaptrack.transforms.detect.motion import IDENTITY, CameraMotion
 from mcaptrack.transforms.detect.steadiness import Steadiness
 from mcaptrack.transforms.protocol import check_options, option
-
-Image = NDArray[np.uint8]
-Floats = NDArray[np.float64]
 
 # In units of a person's height as measured on the picture: a body falls into pieces above each other, which are joined
 # over this distance, and what is left smaller than this area (height squared) is no person.

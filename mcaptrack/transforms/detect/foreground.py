@@ -6,12 +6,11 @@ from collections import deque
 from typing import Any, Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mcaptrack.geometry.arrays import Image
 from mcaptrack.geometry.clocks import FrameClock
 
 Method = Literal["knn", "mog2", "frame-difference"]
-Image = NDArray[np.uint8]
 
 #: What counts as different, by method: squared distance of brightness; squared deviations; brightness.
 THRESHOLDS: Final[dict[str, float]] = {"knn": 800.0, "mog2": 50.0, "frame-difference": 9.0}

@@ -7,8 +7,8 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-Image = NDArray[np.uint8]
-Floats = NDArray[np.float64]
+from mcaptrack.geometry.arrays import Floats, Image
+
 Points = NDArray[np.float32]
 
 _FEATURES: Final = 200

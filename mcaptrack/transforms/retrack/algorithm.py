@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.assignment import assign
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.histories import Histories, Holt
@@ -28,8 +29,6 @@ from mcaptrack.transforms.retrack.whole import Claims
 if TYPE_CHECKING:
     from mcaptrack.transforms.retrack import Retrack
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 #: What a certain pair costs: less than any number of others could make up for.
 _CERTAIN_COST: Final = -100.0

@@ -8,12 +8,9 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.predictors import Forecast
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 Distance = Literal["mean", "max", "first", "now", "likelihood"]
 Covariance = Literal["paper", "predictor"]

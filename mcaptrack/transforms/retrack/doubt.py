@@ -8,12 +8,9 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.transforms.retrack.motion import Paths, State, Walker
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 #: Somebody's double is nearer than this to them.
 _BESIDE_M: Final = 1.2

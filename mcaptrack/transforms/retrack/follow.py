@@ -12,15 +12,10 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.assignment import solve
 from mcaptrack.transforms.retrack.motion import State, Walker
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Bools = NDArray[np.bool_]
-
 
 #: No noise of seen positions is smaller or larger than this.
 NOISE_M = (0.03, 0.8)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.predictors import Forecast, Predictor, make
 from mcaptrack.schema import PREDICTIONS, Frame, Rows
@@ -21,8 +22,6 @@ from mcaptrack.transforms.retrack.whole import Claims, moved
 if TYPE_CHECKING:
     from mcaptrack.transforms.retrack import Retrack
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 #: Forecasts that are made at once: more take memory, fewer take time.
 _BATCH: Final = 4096

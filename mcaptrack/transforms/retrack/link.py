@@ -12,13 +12,10 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.transforms.retrack.follow import pairs
 from mcaptrack.transforms.retrack.motion import Paths, State, Walker
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 #: How fast people are at most in a hole.
 _REACH_M_PER_S: Final = 2.5

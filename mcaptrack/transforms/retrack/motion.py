@@ -14,9 +14,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-
+from mcaptrack.geometry.arrays import Floats, Ints
 
 #: Noise of a seen position, per axis, where nothing is known of it.
 USUAL_NOISE_M: Final = 0.2

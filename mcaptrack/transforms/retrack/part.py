@@ -13,13 +13,9 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.transforms.retrack.motion import Paths, Walker
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Bools = NDArray[np.bool_]
 
 #: How fast a relative velocity drifts, m/s in a second: the likeliest of these is taken for each encounter.
 DRIFTS: Final = (0.05, 0.15, 0.4)

@@ -8,14 +8,10 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.histories import Holt, rebuild
 from mcaptrack.predictors import Forecast
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Bools = NDArray[np.bool_]
 
 
 @dataclass

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.plane import Planes, plane_at
 from mcaptrack.schema import TRACKS, Rows
@@ -23,9 +24,6 @@ from mcaptrack.transforms.retrack.part import part
 
 if TYPE_CHECKING:
     from mcaptrack.transforms.retrack import Retrack
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 
 @dataclass

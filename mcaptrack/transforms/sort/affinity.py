@@ -5,15 +5,12 @@ from __future__ import annotations
 from typing import Literal, NamedTuple, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mcaptrack.geometry.arrays import Bools, Floats, Indices
 from mcaptrack.geometry.assignment import heaviest, one_to_one
 from mcaptrack.geometry.boxes import overlapping
 from mcaptrack.geometry.plane import GroundPlane
 
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
-Ints = NDArray[np.intp]
 Cost = Literal["iou", "pixels", "metres"]
 COSTS: tuple[Cost, ...] = get_args(Cost)
 
@@ -21,12 +18,12 @@ COSTS: tuple[Cost, ...] = get_args(Cost)
 class Pairs(NamedTuple):
     """Possible pairs: which box (P,), which track (P,), how alike (P,): above 0, at most 1. Of ``shape`` (N, K)."""
 
-    box: Ints
-    track: Ints
+    box: Indices
+    track: Indices
     likeness: Floats
     shape: tuple[int, int]
 
-    def where(self, kept: Bools | Ints) -> Pairs:
+    def where(self, kept: Bools | Indices) -> Pairs:
         """Some of the pairs."""
         return Pairs(self.box[kept], self.track[kept], self.likeness[kept], self.shape)
 
@@ -56,7 +53,7 @@ def _places(corners: Floats, plane: GroundPlane | None) -> Floats:
     return plane.boxes_to_metres(np.concatenate([corners[:2], corners[2:] - corners[:2]]).T).T
 
 
-def pair(pairs: Pairs, least: float) -> tuple[Ints, Ints]:
+def pair(pairs: Pairs, least: float) -> tuple[Indices, Indices]:
     """Which boxes and tracks go together, at least ``least`` alike.
 
     Where no box and no track has a choice there is nothing to weigh. Otherwise the whole is paired for the largest

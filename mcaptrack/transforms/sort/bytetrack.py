@@ -5,15 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mcaptrack.geometry.arrays import Bools, Indices
 from mcaptrack.transforms.protocol import option
 from mcaptrack.transforms.sort.affinity import pair
 from mcaptrack.transforms.sort.tracker import Moment, Sort
 from mcaptrack.transforms.sort.tracks import MISSED, Seen
-
-Bools = NDArray[np.bool_]
-Ints = NDArray[np.intp]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,7 +33,7 @@ class ByteTrack(Sort):
         search=(0.2, 0.8),
     )
 
-    def _pair(self, moment: Moment) -> tuple[Ints, Ints]:
+    def _pair(self, moment: Moment) -> tuple[Indices, Indices]:
         pairs, least = self._likeness(moment, self.min_iou)
         high = ~(moment.seen.score < self.high_score)
         if high.all():

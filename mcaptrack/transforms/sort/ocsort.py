@@ -14,17 +14,13 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mcaptrack.geometry import kalman
+from mcaptrack.geometry.arrays import Floats, Indices
 from mcaptrack.transforms.protocol import option
 from mcaptrack.transforms.sort.affinity import Pairs, by_overlap, pair
 from mcaptrack.transforms.sort.tracker import Moment, Sort
 from mcaptrack.transforms.sort.tracks import SHARED_ROWS, Seen, Tracks
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
-Ints = NDArray[np.intp]
 
 # Rows below the shared ones: the corners of the box seen last; the filter's state then; how many frames ago that was;
 # and the centres seen in the last frames, oldest first, NaN where there was none.
@@ -52,7 +48,7 @@ class OcSort(Sort):
     def _no_tracks(self) -> Tracks:
         return Tracks(_PATH - SHARED_ROWS + 2 * (self.direction_frames + 1))
 
-    def _pair(self, moment: Moment) -> tuple[Ints, Ints]:
+    def _pair(self, moment: Moment) -> tuple[Indices, Indices]:
         table = moment.tracks.table
         path = table[_PATH:]
         for _ in range(min(moment.steps, self.direction_frames + 1)):
@@ -91,7 +87,7 @@ class OcSort(Sort):
         weight: Floats = (0.5 - angle / np.pi) * np.where(np.isnan(score), 1.0, np.clip(score, 0.0, 1.0))
         return weight
 
-    def _where_last_seen(self, moment: Moment, box: Ints, track: Ints) -> Pairs:
+    def _where_last_seen(self, moment: Moment, box: Indices, track: Indices) -> Pairs:
         """The pairs of boxes and tracks that are left over, by the tracks' last boxes."""
         box_left, track_left = np.ones(len(moment.seen), bool), np.ones(len(moment.tracks), bool)
         box_left[box], track_left[track] = False, False
@@ -107,7 +103,7 @@ class OcSort(Sort):
         new = np.arange(len(tracks) - len(seen), len(tracks))
         self._remember(tracks, new, seen)
 
-    def _see(self, tracks: Tracks, at: Ints, seen: Seen, hit: float, steps: int) -> None:
+    def _see(self, tracks: Tracks, at: Indices, seen: Seen, hit: float, steps: int) -> None:
         ago = tracks.table[_AGO, at]
         lost = np.flatnonzero(ago > steps) if self.reupdate else at[:0]
         if len(lost):
@@ -116,7 +112,7 @@ class OcSort(Sort):
         self._remember(tracks, at, seen)
 
     @staticmethod
-    def _remember(tracks: Tracks, at: Ints, seen: Seen) -> None:
+    def _remember(tracks: Tracks, at: Indices, seen: Seen) -> None:
         table = tracks.table
         table[_LAST, at] = seen.corners
         table[_THEN, at] = table[: kalman.STATE_ROWS, at]

@@ -15,10 +15,10 @@ from types import MappingProxyType
 from typing import ClassVar, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry import kalman
+from mcaptrack.geometry.arrays import Bools, Floats, Indices
 from mcaptrack.geometry.clocks import NS_PER_S, FrameClock
 from mcaptrack.geometry.plane import GroundPlane, Planes, plane_at
 from mcaptrack.notices import warn
@@ -26,10 +26,6 @@ from mcaptrack.schema import DETECTIONS, TRACKS, Frame, Schema
 from mcaptrack.transforms.protocol import check_options, context, option
 from mcaptrack.transforms.sort.affinity import Cost, Pairs, by_distance, by_overlap, pair
 from mcaptrack.transforms.sort.tracks import CLASS, MISSED, SHARED_ROWS, STREAK, Seen, Tracks, look, write
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
-Ints = NDArray[np.intp]
 
 #: How many frames are read and written at once.
 _BLOCK = 64
@@ -206,7 +202,7 @@ class Sort:
     def _no_tracks(self) -> Tracks:
         return Tracks()
 
-    def _pair(self, moment: Moment) -> tuple[Ints, Ints]:
+    def _pair(self, moment: Moment) -> tuple[Indices, Indices]:
         """Boxes and tracks that belong together."""
         return pair(*self._likeness(moment, self.min_iou))
 
@@ -217,7 +213,7 @@ class Sort:
     def _begin(self, tracks: Tracks, first_id: int, seen: Seen) -> None:
         tracks.add(first_id, seen)
 
-    def _see(self, tracks: Tracks, at: Ints, seen: Seen, hit: float, steps: int) -> None:
+    def _see(self, tracks: Tracks, at: Indices, seen: Seen, hit: float, steps: int) -> None:
         """Track ``at[i]`` is seen in box i, ``steps`` frames after the frame before."""
         tracks.see(at, seen, hit)
 

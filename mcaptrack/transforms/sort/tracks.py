@@ -16,13 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack.geometry import kalman
+from mcaptrack.geometry.arrays import Bools, Floats, Indices
 from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.plane import Planes, plane_at
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
-Ints = NDArray[np.intp]
 
 #: Rows of a table of tracks, below those of the filter: score and class of the last box; how long the track has been
 #: missed, 0 if it was just seen; how long it has been seen without a break; its name.
@@ -65,7 +62,7 @@ class Seen:
         row: Floats = self.columns[9]
         return row
 
-    def take(self, at: Ints) -> Seen:
+    def take(self, at: Indices) -> Seen:
         """The boxes ``at`` these places, in this order."""
         return Seen(self.columns.take(at, axis=1))
 
@@ -124,7 +121,7 @@ class Tracks:
         new[SHARED_ROWS:] = np.nan
         self.table = np.concatenate([self.table, new], axis=1)
 
-    def see(self, at: Ints, seen: Seen, hit: float) -> None:
+    def see(self, at: Indices, seen: Seen, hit: float) -> None:
         """Track ``at[i]`` is seen in box i (N,); its streak grows by ``hit``."""
         table = self.table.take(at, axis=1)
         kalman.correct(table[: kalman.STATE_ROWS], seen.measured)

@@ -12,11 +12,9 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mcaptrack.geometry.arrays import Floats
 from mcaptrack.viewing.report.markup import Markup, join, number, tag
-
-Floats = NDArray[np.float64]
 
 WIDTH: Final = 460
 HEIGHT: Final = 270

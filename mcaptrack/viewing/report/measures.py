@@ -9,7 +9,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation import Candidate, Result, Sequenced
@@ -17,13 +16,11 @@ from mcaptrack.evaluation.aligned import frame_times, join_rows
 from mcaptrack.evaluation.forecasts import score_forecasts
 from mcaptrack.evaluation.metrics.calibration import LEVELS
 from mcaptrack.evaluation.metrics.displacement import Displacement
+from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.schema import Frame
 from mcaptrack.transforms import Predict
 from mcaptrack.viewing.report.charts import round_step, thinned
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 #: A step longer than so many usual ones is a hole, over which nobody's speed is known.
 _HOLE: Final = 1.5

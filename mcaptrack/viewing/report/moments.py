@@ -14,14 +14,12 @@ from numpy.typing import NDArray
 
 from mcaptrack.evaluation.events import Rule
 from mcaptrack.evaluation.words import describe
+from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
 from mcaptrack.schema import EVENT_KINDS, EventKind, Frame, Rows
 from mcaptrack.sources.pictures import Pictures
 from mcaptrack.sources.video import encode_image
 from mcaptrack.viewing.report.measures import by_track, usual_s
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 #: Thumbnails are squares of so many pixels, and so many times as large as a person.
 SIDE_PX: Final = 168

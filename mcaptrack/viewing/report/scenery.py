@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack.foxglove.colours import COUNT as COLOURS
+from mcaptrack.geometry.arrays import Floats
 from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.plane import GroundPlane
@@ -22,8 +23,6 @@ from mcaptrack.sources.video import encode_image
 from mcaptrack.viewing.report.charts import round_step
 from mcaptrack.viewing.report.markup import Markup, data_uri, number, tag
 from mcaptrack.viewing.report.measures import by_track
-
-Floats = NDArray[np.float64]
 
 #: The picture is made of so many, from the beginning to the end, so that those who walk vanish from it.
 _PICTURES: Final = 9
