@@ -12,10 +12,10 @@ from hypothesis.extra import numpy as hnp
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry import kalman
-from mcaptrack.geometry.assignment import assign, heaviest, solve
+from mcaptrack.geometry.assignment import assign, max_weight_matching, solve
 from mcaptrack.geometry.boxes import iou, overlapping
 from mcaptrack.geometry.clocks import FrameClock, seconds_to_ns
-from mcaptrack.geometry.histories import Histories, Holt, fill_holes, rebuild
+from mcaptrack.geometry.histories import Histories, Holt, fill_gaps, rebuild_positions
 from mcaptrack.geometry.plane import GroundPlane, assumed_plane, plane_at
 from mcaptrack.schema import TRACKS, Frame
 from mcaptrack.schema.resampling import looked_at, resample
@@ -140,11 +140,11 @@ def test_the_solver_finds_the_least_total(cost):
 
 
 @given(hnp.arrays(float, (4, 5), elements=st.integers(0, 6).map(float)), st.integers(0, 5))
-def test_the_heaviest_pairs_are_those_of_every_combination(table, rows):
+def test_the_matching_has_the_largest_weight_of_all_combinations(table, rows):
     """By brute force, in a small table and in the same one as a part of a large one with pairs of its own."""
     table = table[:rows]
     at = np.nonzero(table)
-    (first, second), much = heaviest(at, table[at], table.shape)
+    (first, second), much = max_weight_matching(at, table[at], table.shape)
     least = -min((solve_by_hand(-table),), default=0.0)
     assert table[first, second].tolist() == much.tolist()
     assert much.sum() == pytest.approx(least)
@@ -153,7 +153,7 @@ def test_the_heaviest_pairs_are_those_of_every_combination(table, rows):
     wide[: len(table), :5] = table
     wide[np.arange(10, 40), np.arange(39, 9, -1)] = 1.0
     at = np.nonzero(wide)
-    pairs, much = heaviest(at, wide[at], wide.shape)
+    pairs, much = max_weight_matching(at, wide[at], wide.shape)
     assert wide[pairs].tolist() == much.tolist()
     assert much.sum() == pytest.approx(least + 30)
 
@@ -300,7 +300,7 @@ class TestHistories:
     def test_holes_are_filled_linearly(self):
         nan = np.nan
         xy = np.array([[[nan, nan], [0, 0], [nan, nan], [nan, nan], [3, 6.0]]])
-        filled, known = fill_holes(xy, np.isfinite(xy[..., 0]))
+        filled, known = fill_gaps(xy, np.isfinite(xy[..., 0]))
         np.testing.assert_allclose(filled[0], [[0, 0], [0, 0], [1, 2], [2, 4], [3, 6]])
         assert known.tolist() == [4]
 
@@ -314,7 +314,7 @@ class TestHistories:
         assert (level[0, 0], trend[0, 0]) == (2.875, 0.8125)  # .5 * 4 + .5 * 1.75;  .5 * 1.375 + .5 * .25
 
     def test_the_past_is_rebuilt_backwards_from_now(self):
-        past = rebuild(np.array([[10.0, 0.0]]), np.array([[[1.0, 0], [2, 0], [3, 0]]]))
+        past = rebuild_positions(np.array([[10.0, 0.0]]), np.array([[[1.0, 0], [2, 0], [3, 0]]]))
         assert past[0, :, 0].tolist() == [4, 5, 7, 10]
 
 

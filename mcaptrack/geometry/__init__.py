@@ -1,1 +1,1 @@
-"""Arithmetic of boxes, the ground plane, clocks, filters and assignment: arrays in, arrays out."""
+"""Arithmetic of boxes, the ground plane, clocks, filters, assignment and ragged arrays: arrays in, arrays out."""

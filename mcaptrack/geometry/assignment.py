@@ -1,4 +1,4 @@
-"""Assignment: who goes with whom. Letters: M rows (tracks, truth), N columns (observations, tracks)."""
+"""One-to-one assignment. Letters: M rows (tracks, ground truth), N columns (detections, tracks), P pairs."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from mcaptrack.geometry.arrays import Floats
 
 Pairs = tuple[NDArray[np.intp], NDArray[np.intp]]
 
-#: Up to so many pairs it costs less to solve the whole than to look for what needs solving.
+#: Up to so many pairs, solving the whole is faster than finding the part that needs a solver.
 _SMALL: Final = 600
 
 
 def solve(cost: Floats) -> Pairs:
-    """The assignment of least total cost (M, N); the rows and columns of its min(M, N) pairs, rows rising."""
-    if cost.shape[0] == 1 or cost.shape[1] == 1:  # common, and not worth a solver
+    """The assignment with the lowest total cost (M, N): the rows and columns of its min(M, N) pairs, rows rising."""
+    if cost.shape[0] == 1 or cost.shape[1] == 1:  # common, and faster without the solver
         best = np.unravel_index(np.argmin(cost), cost.shape)
         return np.array([best[0]]), np.array([best[1]])
     rows, columns = _solver()(cost)
@@ -28,17 +28,17 @@ def solve(cost: Floats) -> Pairs:
 
 @cache
 def _solver() -> Callable[[Floats], Pairs]:
-    """SciPy's solver, loaded once it is needed."""
+    """SciPy's solver, imported when it is first needed."""
     from scipy.optimize import linear_sum_assignment
 
     return linear_sum_assignment  # type: ignore[no-any-return]
 
 
 def assign(cost: Floats, gate: float) -> Pairs:
-    """The largest set of pairs with a cost (M, N) of at most ``gate``, and of those sets the one of least total cost.
+    """The largest set of pairs with a cost (M, N) of at most ``gate``, and of those sets the one with the lowest cost.
 
-    Pairs beyond the gate are no pairs: they take no part, so a far pair can't take a place from a near one. NaN is
-    beyond every gate.
+    Pairs beyond the gate are excluded before solving, so a far pair can't take the place of a near one. NaN is beyond
+    every gate.
     """
     allowed = cost <= gate
     rows_with, columns_with = allowed.any(axis=1), allowed.any(axis=0)
@@ -50,23 +50,37 @@ def assign(cost: Floats, gate: float) -> Pairs:
     row_at, column_at = np.flatnonzero(rows_with), np.flatnonzero(columns_with)
     part, ok = cost[np.ix_(row_at, column_at)], allowed[np.ix_(row_at, column_at)]
     lowest = part[ok].min()
-    # One forbidden pair must weigh more than all allowed ones together.
+    # One forbidden pair must cost more than all allowed ones together.
     forbidden = (part[ok].max() - lowest + 1.0) * (min(part.shape) + 1)
     rows, columns = solve(np.where(ok, part - lowest, forbidden))
     kept = ok[rows, columns]
     return row_at[rows[kept]], column_at[columns[kept]]
 
 
+def assign_by_gain(gain: Floats) -> Pairs:
+    """The assignment with the largest total gain (M, N); pairs that gain nothing are left out."""
+    if gain.size == 0:
+        return np.empty(0, np.intp), np.empty(0, np.intp)
+    best = gain.argmax(axis=1)
+    row = np.flatnonzero(gain[np.arange(len(best)), best] > 0)
+    column = best[row]
+    if len(np.unique(column)) == len(column):  # the best column of each row is free
+        return row, column
+    rows, columns = solve(-np.maximum(gain, 0.0))
+    kept = gain[rows, columns] > 0
+    return rows[kept], columns[kept]
+
+
 def one_to_one(rows: NDArray[np.intp], columns: NDArray[np.intp]) -> bool:
-    """Whether no row and no column is in two pairs."""
+    """Whether no row and no column is in more than one pair."""
     return len(set(rows.tolist())) == len(rows) == len(set(columns.tolist()))
 
 
-def heaviest(pairs: Pairs, weight: Floats, shape: tuple[int, int]) -> tuple[Pairs, Floats]:
-    """The pairs (P,) to take so that no row and no column is taken twice, for the largest total weight (P,).
+def max_weight_matching(pairs: Pairs, weight: Floats, shape: tuple[int, int]) -> tuple[Pairs, Floats]:
+    """Choose from sparse candidate pairs (P,) a one-to-one matching with the largest total weight (P,).
 
     Weights are positive; ``shape`` is (M, N). Pairs that compete with no other are taken at once: only the rest needs
-    the solver, however large the whole is. Returns the pairs that are taken, and their weights.
+    the solver, however large the whole is. Returns the chosen pairs and their weights.
     """
     rows, columns = pairs
     if shape[0] * shape[1] <= _SMALL:
@@ -78,25 +92,25 @@ def heaviest(pairs: Pairs, weight: Floats, shape: tuple[int, int]) -> tuple[Pair
     row_names, row_at = _compact(rows[left])
     column_names, column_at = _compact(columns[left])
     (more_rows, more_columns), more = _solved(row_at, column_at, weight[left], (len(row_names), len(column_names)))
-    taken_rows = np.concatenate([rows[free], row_names[more_rows]])
-    taken_columns = np.concatenate([columns[free], column_names[more_columns]])
-    return (taken_rows, taken_columns), np.concatenate([weight[free], more])
+    chosen_rows = np.concatenate([rows[free], row_names[more_rows]])
+    chosen_columns = np.concatenate([columns[free], column_names[more_columns]])
+    return (chosen_rows, chosen_columns), np.concatenate([weight[free], more])
 
 
 def _solved(
     rows: NDArray[np.intp], columns: NDArray[np.intp], weight: Floats, shape: tuple[int, int]
 ) -> tuple[Pairs, Floats]:
-    """The pairs (P,) that the solver takes, and their weights. What it makes of places without a pair is nothing."""
+    """The pairs that the solver chooses among candidates (P,), and their weights."""
     dense = np.zeros(shape)
     dense[rows, columns] = weight
-    taken = solve(-dense)
-    much = dense[taken]
-    real = much > 0
-    return (taken[0][real], taken[1][real]), much[real]
+    chosen = solve(-dense)
+    chosen_weight = dense[chosen]
+    is_candidate = chosen_weight > 0
+    return (chosen[0][is_candidate], chosen[1][is_candidate]), chosen_weight[is_candidate]
 
 
 def _compact(numbers: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """The different ones of whole numbers, rising, and which of these each is."""
+    """The unique values of small non-negative integers, rising, and the index of each among them."""
     there = np.zeros(int(numbers.max()) + 1, np.intp)
     there[numbers] = 1
     return there.nonzero()[0], (np.cumsum(there) - 1)[numbers]

@@ -1,4 +1,4 @@
-"""Boxes in pixels: arrays (N, 4) of left, top, width, height. Letters: M, N boxes."""
+"""Boxes in pixels: arrays (N, 4) of left, top, width, height. Letters: M, N boxes, P pairs."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from mcaptrack.geometry.arrays import Floats, Indices
 from mcaptrack.geometry.ragged import group_index, ragged_range
 
-#: From so many pairs on it pays to look first for those that can overlap.
+#: From so many pairs on, finding those that can overlap first is faster.
 _MANY = 1500
 
 
@@ -23,57 +23,56 @@ def xyxy_to_xywh(corners: Floats) -> Floats:
 
 
 def iou(a: Floats, b: Floats) -> Floats:
-    """Intersection over union (M, N) of every box of ``a`` (M, 4) with every one of ``b`` (N, 4); 0 for empty boxes."""
+    """Intersection over union (M, N) of all boxes of ``a`` (M, 4) with all of ``b`` (N, 4); 0 for empty boxes."""
     low = np.maximum(a[:, None, :2], b[None, :, :2])
     high = np.minimum(a[:, None, :2] + a[:, None, 2:], b[None, :, :2] + b[None, :, 2:])
     extent = np.clip(high - low, 0, None)
-    both = extent[..., 0] * extent[..., 1]
-    either = (a[:, 2] * a[:, 3])[:, None] + (b[:, 2] * b[:, 3])[None, :] - both
-    return np.where(either > 0, both / np.where(either > 0, either, 1.0), 0.0)
+    intersection = extent[..., 0] * extent[..., 1]
+    union = (a[:, 2] * a[:, 3])[:, None] + (b[:, 2] * b[:, 3])[None, :] - intersection
+    return np.where(union > 0, intersection / np.where(union > 0, union, 1.0), 0.0)
 
 
 def iou_of_pairs(a: Floats, b: Floats) -> Floats:
-    """Intersection over union (N,) of each box of ``a`` (N, 4) with the one of ``b`` (N, 4) in its place."""
+    """Intersection over union (N,) of each box of ``a`` (N, 4) with the box of ``b`` (N, 4) at the same index."""
     (ax, ay, aw, ah), (bx, by, bw, bh) = a.T, b.T
-    wide = np.minimum(ax + aw, bx + bw) - np.maximum(ax, bx)
-    high = np.minimum(ay + ah, by + bh) - np.maximum(ay, by)
-    both = np.clip(wide, 0, None) * np.clip(high, 0, None)
-    either = aw * ah + bw * bh - both
-    return np.where(either > 0, both / np.where(either > 0, either, 1.0), 0.0)
+    width = np.minimum(ax + aw, bx + bw) - np.maximum(ax, bx)
+    height = np.minimum(ay + ah, by + bh) - np.maximum(ay, by)
+    intersection = np.clip(width, 0, None) * np.clip(height, 0, None)
+    union = aw * ah + bw * bh - intersection
+    return np.where(union > 0, intersection / np.where(union > 0, union, 1.0), 0.0)
 
 
 def overlapping(a: Floats, b: Floats, area_a: Floats, area_b: Floats) -> tuple[Indices, Indices, Floats]:
     """The pairs of boxes that overlap, and their intersection over union.
 
-    ``a`` (4, M) and ``b`` (4, N) are left, top, right, bottom, with their areas (M,) and (N,). Returns which of ``a``
-    (P,), rising, which of ``b`` (P,), and how much (P,).
+    ``a`` (4, M) and ``b`` (4, N) are left, top, right, bottom, with their areas (M,) and (N,). Returns the indices into
+    ``a`` (P,), rising, those into ``b`` (P,), and the intersection over union (P,).
     """
     if a.shape[1] * b.shape[1] > _MANY:
-        first, second = _side_by_side(a, b)
+        first, second = _sweep(a, b)
         extent = np.minimum(a[2:].take(first, axis=1), b[2:].take(second, axis=1))
         extent -= np.maximum(a[:2].take(first, axis=1), b[:2].take(second, axis=1))
         np.maximum(extent, 0.0, out=extent)
         extent[0] *= extent[1]
         at = extent[0].nonzero()[0]
-        first, second, shared = first.take(at), second.take(at), extent[0].take(at)
+        first, second, intersection = first.take(at), second.take(at), extent[0].take(at)
     else:
         extent = np.minimum(a[2:, :, None], b[2:, None, :])
         extent -= np.maximum(a[:2, :, None], b[:2, None, :])
         np.maximum(extent, 0.0, out=extent)
         extent[0] *= extent[1]
-        both = extent[0].ravel()
-        at = both.nonzero()[0]
-        shared = both.take(at)
+        areas = extent[0].ravel()
+        at = areas.nonzero()[0]
+        intersection = areas.take(at)
         first, second = np.divmod(at, b.shape[1] or 1)
-    either = area_a.take(first)
-    either += area_b.take(second)
-    either -= shared
-    shared /= either
-    return first, second, shared
+    union = area_a.take(first)
+    union += area_b.take(second)
+    union -= intersection
+    return first, second, intersection / union
 
 
-def _side_by_side(a: Floats, b: Floats) -> tuple[Indices, Indices]:
-    """Pairs of boxes of which no other pair overlaps: those that a sweep from left to right finds near each other."""
+def _sweep(a: Floats, b: Floats) -> tuple[Indices, Indices]:
+    """Candidate pairs of a sweep from left to right: all pairs that overlap are among them."""
     order = b[0].argsort(kind="stable")
     left = b[0, order]
     low = left.searchsorted(a[0] - (b[2] - b[0]).max(), "left")

@@ -1,4 +1,4 @@
-"""Time: nanoseconds as whole numbers, and how many frames have passed when frames come when they like."""
+"""Time in integer nanoseconds, and how many frames have passed when frames arrive at irregular times."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from fractions import Fraction
 from typing import Final
 
 NS_PER_S: Final = 1_000_000_000
-#: The last time that nanoseconds since 1970 can be kept for, in 2262.
+#: The last time that 64-bit nanoseconds since 1970 can represent, in 2262.
 LAST_NS: Final = 2**63 - 1
-#: Frame rates: a picture a day, for plants that grow, to ten thousand a second.
+#: Frame rates: from one picture a day (time lapse) to ten thousand a second.
 FPS_RANGE: Final = (Fraction(1, 86_400), Fraction(10_000))
-#: Numbers that people write: no exponent that takes a lifetime to work out.
+#: Numbers in text; exponents are short, because long ones would take too long to compute.
 _RATIO: Final = re.compile(r"\+?(\d+\.?\d*|\.\d+)(e[+-]?\d{1,2})?(/\d+)?", re.ASCII | re.IGNORECASE)
 _MAX_DIGITS: Final = 40
 _WHOLE: Final = re.compile(r"-?\d{1,19}", re.ASCII)
-#: How many intervals the usual one is taken from.
+#: Number of intervals from which the usual one is estimated.
 _MEMORY: Final = 25
-#: From how many intervals on the usual one is sure enough to notice that it has changed, and by what factor then.
-_SURE: Final = 8
+#: Number of intervals after which a change of the usual one is detected, and the factor by which it has to change.
+_MIN_INTERVALS: Final = 8
 _CHANGED: Final = 1.5
 
 
@@ -39,12 +39,12 @@ def parse_fps(text: str) -> Fraction:
     """Frames per second, as ``parse_ratio``. Raises ValueError for what is out of ``FPS_RANGE``, too."""
     fps = parse_ratio(text)
     if not FPS_RANGE[0] <= fps <= FPS_RANGE[1]:
-        raise ValueError(f"{text} frames a second: there can be one a day to {FPS_RANGE[1]} a second")
+        raise ValueError(f"{text} frames per second: it has to be from one per day to {FPS_RANGE[1]} per second")
     return fps
 
 
 def parse_ns(text: str) -> int | None:
-    """A time in nanoseconds, written by ``str``; None for anything else, and for times that can't be computed with."""
+    """A time in nanoseconds, as ``str`` writes it; None for anything else, and for times beyond 64 bits."""
     if not _WHOLE.fullmatch(text) or abs(int(text)) > LAST_NS:
         return None
     return int(text)
@@ -58,12 +58,12 @@ def seconds_to_ns(seconds: float) -> int:
 class FrameClock:
     """Counts frames by their timestamps.
 
-    The usual interval is the mean of the middle half of the last 25, so neither a gap nor stamps that come early and
-    late in turn move it, and it is known from the past alone. A step that is n usual intervals long counts as n frames;
-    stamps that are off by less than a tenth of an interval change no count.
+    The usual interval is the mean of the middle half of the last 25, so neither gaps nor jitter change it, and it needs
+    the past alone. A step of n usual intervals counts as n frames; jitter of less than a tenth of an interval changes
+    no count.
 
-    ``interval_ns`` is the usual interval, 0 while it isn't known. ``stretch`` is how much longer, since the last tick,
-    is what is called a frame: 1 but for the tick at which a new frame rate has set in; jitter never changes it.
+    ``interval_ns`` is the usual interval, 0 while it isn't known. ``stretch`` is the ratio of the new frame interval to
+    the old one at the tick where a new frame rate is detected, and 1 at all others.
     """
 
     def __init__(self) -> None:
@@ -75,7 +75,7 @@ class FrameClock:
         self.stretch = 1.0
 
     def tick(self, t_ns: int) -> int:
-        """Take the time of the next frame; returns how many frames on it is, at least 1."""
+        """Add the time of the next frame; returns by how many frames it advances, at least 1."""
         passed = 0 if self._last_ns is None else t_ns - self._last_ns
         self._last_ns, self.stretch = t_ns, 1.0
         if passed <= 0:
@@ -84,18 +84,18 @@ class FrameClock:
         oldest = intervals.popleft() if len(intervals) == _MEMORY else None
         intervals.append(passed)
         count, usual = len(intervals), self.interval_ns
-        if oldest != passed:  # otherwise they are the same intervals as before
+        if oldest != passed:  # otherwise the intervals are the same as before
             if oldest is not None:
                 del in_order[bisect_left(in_order, oldest)]
             insort(in_order, passed)
             cut = min((count + 3) // 4, (count - 1) // 2)
             middle = in_order[cut : count - cut]
             self.interval_ns = usual = max(sum(middle) // len(middle), 1)
-        if count >= _SURE:
-            self._notice_change(usual, in_order[count // 2])
+        if count >= _MIN_INTERVALS:
+            self._detect_change(usual, in_order[count // 2])
         return max(1, round(passed / usual))
 
-    def _notice_change(self, usual: int, median: int) -> None:
+    def _detect_change(self, usual: int, median: int) -> None:
         anchor = self._anchor_ns
         if anchor and not anchor < usual * _CHANGED < anchor * _CHANGED**2:
             self.stretch, self._anchor_ns = median / anchor, median
@@ -103,5 +103,5 @@ class FrameClock:
             self._anchor_ns = usual
 
     def frames(self, seconds: float) -> int:
-        """How many frames a time span is, at least 1; so far as the usual interval is known, otherwise 1."""
+        """How many frames a time span lasts, at least 1; 1 while the usual interval isn't known."""
         return max(1, round(seconds_to_ns(seconds) / self.interval_ns)) if self.interval_ns else 1

@@ -1,6 +1,6 @@
-"""What is remembered of moving people on a regular clock: recent positions, holes, smoothed displacements.
+"""Recent positions of tracks on a regular clock: histories, gaps, smoothed displacements.
 
-Letters: K people remembered, N people at one time, B batch, L past positions (the last one is now), T steps.
+Letters: K tracks remembered, N tracks at one time, B batch, L past positions (the last one is the current one).
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from mcaptrack.geometry.arrays import Bools, Floats, Ints
 
 @dataclass
 class Histories:
-    """The last L positions of everybody seen within L steps."""
+    """The last L positions of all tracks that were observed within L steps."""
 
     length: int
     ids: Ints = field(default_factory=lambda: np.empty(0, np.int64))
@@ -24,9 +24,9 @@ class Histories:
         self.xy_m = np.empty((0, self.length, 2))
 
     def push(self, ids: Ints, xy_m: Floats, steps: int = 1) -> tuple[Floats, Bools]:
-        """Go ``steps`` on and see ``ids`` (N,) at ``xy_m`` (N, 2).
+        """Advance by ``steps`` and add the positions ``xy_m`` (N, 2) of the tracks ``ids`` (N,).
 
-        Returns the past of these people, (N, L, 2) with NaN where nothing is known, and (N, L) what is known.
+        Returns the histories of these tracks, (N, L, 2) with NaN at unknown positions, and which are known, (N, L).
         """
         steps = min(steps, self.length)
         moved = np.full_like(self.xy_m, np.nan)
@@ -44,19 +44,19 @@ class Histories:
 
 
 def last_positions(xy_m: Floats, valid: Bools, length: int) -> tuple[Floats, Bools]:
-    """The last ``length`` of positions (B, L, 2) and of what is known of them; not known before the first."""
+    """The last ``length`` positions of histories (B, L, 2), padded with unknown ones, and which of them are known."""
     xy_m, valid = xy_m[:, -length:], valid[:, -length:]
     batch, short = len(valid), length - valid.shape[1]
     if short == 0:
         return xy_m, valid
-    nowhere, unknown = np.full((batch, short, 2), np.nan), np.zeros((batch, short), bool)
-    return np.concatenate([nowhere, xy_m], axis=1), np.concatenate([unknown, valid], axis=1)
+    padding, unknown = np.full((batch, short, 2), np.nan), np.zeros((batch, short), bool)
+    return np.concatenate([padding, xy_m], axis=1), np.concatenate([unknown, valid], axis=1)
 
 
-def fill_holes(xy_m: Floats, valid: Bools) -> tuple[Floats, Ints]:
-    """Fill holes between known positions (B, L, 2) linearly; returns them and how many there are up to now (B,).
+def fill_gaps(xy_m: Floats, valid: Bools) -> tuple[Floats, Ints]:
+    """Interpolate gaps between known positions (B, L, 2) linearly; also returns the lengths (B,) from the first known.
 
-    What lies before the first known position is set to it. The last position has to be known.
+    Positions before the first known one are set to it. The last position has to be known.
     """
     batch, length = valid.shape
     if valid.all():
@@ -75,7 +75,7 @@ def fill_holes(xy_m: Floats, valid: Bools) -> tuple[Floats, Ints]:
 
 @dataclass
 class Holt:
-    """Double exponential smoothing of displacements (Eq. 3 of the paper), for K tracks at once.
+    """Double exponential smoothing of displacements (Holt; Eq. 3 of the paper), for K tracks at once.
 
     ``level`` is the smoothed displacement and ``trend`` its change per step, both (K, 2) in metres. The first level is
     the first displacement, the first trend is 0.
@@ -94,7 +94,7 @@ class Holt:
         return new, self.beta * (new - level) + (1 - self.beta) * trend
 
 
-def rebuild(last_m: Floats, displacements: Floats) -> Floats:
-    """Positions (K, L, 2) that end at ``last_m`` (K, 2) and go by ``displacements`` (K, L - 1, 2) before it."""
+def rebuild_positions(last_m: Floats, displacements: Floats) -> Floats:
+    """Positions (K, L, 2) that end at ``last_m`` (K, 2), from the ``displacements`` (K, L - 1, 2) before it."""
     back = np.cumsum(displacements[:, ::-1], axis=1)[:, ::-1]
     return np.concatenate([last_m[:, None] - back, last_m[:, None]], axis=1)

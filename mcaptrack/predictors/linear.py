@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack.geometry.arrays import Floats
-from mcaptrack.geometry.histories import Holt, fill_holes
+from mcaptrack.geometry.histories import Holt, fill_gaps
 from mcaptrack.predictors.forecast import Forecast
 
 #: How people walk, for the errors of forecasts: noise of a seen position, spread of velocity when nothing is known of
@@ -158,7 +158,7 @@ class LinearPredictor:
         Holes are filled linearly; L' may be longer or shorter than ``past``. The mean looks at ``past`` positions, its
         uncertainty at 8.
         """
-        filled, known = fill_holes(xy_m[:, -_MOST:], valid[:, -_MOST:])
+        filled, known = fill_gaps(xy_m[:, -_MOST:], valid[:, -_MOST:])
         now = filled[:, -1:]
         filled = filled - now
         counted = np.minimum(known, self.past)

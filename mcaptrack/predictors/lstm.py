@@ -16,7 +16,7 @@ from typing import ClassVar, Final
 import numpy as np
 
 from mcaptrack.geometry.arrays import Bools, Floats
-from mcaptrack.geometry.histories import fill_holes, last_positions
+from mcaptrack.geometry.histories import fill_gaps, last_positions
 from mcaptrack.predictors.forecast import Forecast
 from mcaptrack.predictors.linear import LinearPredictor
 from mcaptrack.predictors.weights import Network
@@ -70,7 +70,7 @@ class Lstm(Network):
     def predict(self, xy_m: Floats, valid: Bools) -> Forecast:
         """Positions (B, L', 2) of which ``valid`` (B, L') are known, the last one always -> forecasts."""
         into, bias, inside, into_d, bias_d, inside_d, fed, fed_bias, out, out_bias, spread = self._layers
-        filled, _ = fill_holes(*last_positions(xy_m, valid, PAST))
+        filled, _ = fill_gaps(*last_positions(xy_m, valid, PAST))
         moves = np.diff(filled, axis=1, prepend=filled[:, :1])  # the first is 0, as the paper's program has it
         batch, hidden = len(moves), inside.shape[-1]
         state: Floats = np.zeros((batch, hidden))

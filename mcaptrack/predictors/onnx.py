@@ -17,7 +17,7 @@ import numpy as np
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Bools, Floats
-from mcaptrack.geometry.histories import fill_holes, last_positions
+from mcaptrack.geometry.histories import fill_gaps, last_positions
 from mcaptrack.predictors.forecast import Forecast
 from mcaptrack.predictors.linear import LinearPredictor
 
@@ -111,7 +111,7 @@ class Onnx:
         if len(valid) == 0:
             return Forecast(np.empty((0, self.steps, 2)), np.empty((0, self.steps, 2, 2)))
         padded, known = last_positions(xy_m, valid, self.past)
-        filled, _ = fill_holes(padded, known)
+        filled, _ = fill_gaps(padded, known)
         now = filled[:, -1:]
         outputs = self._run(filled - now, known)
         cov = outputs[1] if len(outputs) > 1 else self._uncertain.predict(xy_m, valid).cov

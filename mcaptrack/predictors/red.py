@@ -17,7 +17,7 @@ from typing import ClassVar, Final, NamedTuple
 import numpy as np
 
 from mcaptrack.geometry.arrays import Bools, Floats
-from mcaptrack.geometry.histories import fill_holes, last_positions
+from mcaptrack.geometry.histories import fill_gaps, last_positions
 from mcaptrack.predictors.forecast import Forecast
 from mcaptrack.predictors.weights import Network
 
@@ -60,7 +60,7 @@ def prepare(xy_m: Floats, valid: Bools, base_weights: Floats, base_spread: Float
     """
     xy_m, valid = last_positions(xy_m, valid, PAST)
     batch = len(valid)
-    filled, known = fill_holes(xy_m, valid)
+    filled, known = fill_gaps(xy_m, valid)
     now = filled[:, -1:]
     place = filled - now
     ahead = base_weights[known] @ place

@@ -10,7 +10,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
-from mcaptrack.geometry.histories import Holt, rebuild
+from mcaptrack.geometry.histories import Holt, rebuild_positions
 from mcaptrack.predictors import Forecast
 
 
@@ -65,7 +65,7 @@ class Motion:
         """The past (K, L, 2), rebuilt from smoothed displacements back from now, and what of it is known (K, L)."""
         length = self.smooth.shape[1] + 1
         valid = np.arange(length) >= length - 1 - self.known[:, None]
-        return rebuild(self.last_m, self.smooth), valid
+        return rebuild_positions(self.last_m, self.smooth), valid
 
 
 @dataclass

@@ -7,7 +7,7 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 
 from mcaptrack.geometry.arrays import Bools, Floats, Indices
-from mcaptrack.geometry.assignment import heaviest, one_to_one
+from mcaptrack.geometry.assignment import max_weight_matching, one_to_one
 from mcaptrack.geometry.boxes import overlapping
 from mcaptrack.geometry.plane import GroundPlane
 
@@ -67,7 +67,7 @@ def pair(pairs: Pairs, least: float) -> tuple[Indices, Indices]:
         near = pairs if count == len(close) else pairs.where(close)
         if one_to_one(near.box, near.track):
             return near.box, near.track
-    (box, track), likeness = heaviest((pairs.box, pairs.track), pairs.likeness, pairs.shape)
+    (box, track), likeness = max_weight_matching((pairs.box, pairs.track), pairs.likeness, pairs.shape)
     if count == len(close):
         return box, track
     enough = likeness >= least
