@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
 
@@ -18,6 +20,19 @@ Positions = Mapping[int, tuple[float, float]]
 
 def ns(seconds: float) -> int:
     return round(seconds * NS_PER_S)
+
+
+@contextmanager
+def _own_priority() -> Iterator[None]:
+    """Keep the scheduling of this process: SVT-AV1 makes a superuser's process real-time, for good."""
+    if not hasattr(os, "sched_getscheduler"):
+        yield
+        return
+    policy, priority = os.sched_getscheduler(0), os.sched_getparam(0)
+    try:
+        yield
+    finally:
+        os.sched_setscheduler(0, policy, priority)
 
 
 def boxes_at(centres: Sequence[tuple[float, float]], size: tuple[float, float] = (20.0, 40.0), score: float = 1.0):
@@ -90,7 +105,7 @@ def write_clip(
     """A clip made by FFmpeg: a bright quarter and a spot that wanders one pixel a frame. Returns the pictures."""
     width, height = size
     images = []
-    with av.open(str(path), "w") as container:
+    with _own_priority(), av.open(str(path), "w") as container:
         stream = container.add_stream(codec, rate=fps, options=dict(options or {}))
         stream.width, stream.height, stream.pix_fmt = width, height, pixels
         if times_ms:
