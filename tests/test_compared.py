@@ -164,7 +164,7 @@ def test_tracks_that_meet_nobody_are_scored_and_it_is_said(tmp_path):
         write(tmp_path / "t.txt", *(line(n, 5, 800) for n in range(1, 11))), write(tmp_path / "gt.txt", *WALK)
     )
     assert (row["FP"], row["FN"]) == (10, 10)
-    assert notes == ["x: t.txt and the truth never come near each other"]
+    assert notes == ["x: t.txt and the ground truth never come near each other"]
 
 
 def test_files_are_paired_by_name_or_in_order(tmp_path):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.evaluation import Candidate, EvaluateOptions, Sequenced, evaluate
+from mcaptrack.evaluation import Candidate, EvaluateOptions, EvaluationInput, evaluate
 from mcaptrack.predictors import Forecast
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame
 from mcaptrack.schema.predictions import forecast_to_rows
@@ -30,7 +30,7 @@ def boxed(people):
 
 
 def scored(truth, tracks, options=METRES, forecasts=None):
-    outcome = evaluate([Sequenced("x", truth, [Candidate("t", None, tracks, forecasts, "p")])], options)
+    outcome = evaluate([EvaluationInput("x", truth, [Candidate("t", None, tracks, forecasts, "p")])], options)
     return [result.to_json() for result in outcome.results]
 
 
@@ -74,9 +74,9 @@ def test_boxes_and_metres_are_scored_as_far_as_there_are_both():
     boxes = [Frame(ns(n), n, boxed({1: (5 * n, 0)})) for n in range(5)]
     rows = scored(boxes, boxes, EvaluateOptions())
     assert [(row["similarity"], row["gate"], row["MOTA"]) for row in rows] == [("iou", 0.5, 1.0)]
-    with pytest.raises(McaptrackError, match="the truth and t have no positions in metres"):
+    with pytest.raises(McaptrackError, match="the ground truth and t have no positions in metres"):
         scored(boxes, boxes, METRES)
-    with pytest.raises(McaptrackError, match="t and the truth share neither boxes nor positions"):
+    with pytest.raises(McaptrackError, match="t and the ground truth share neither boxes nor positions"):
         scored(boxes, walk(lambda n: {1: (0.0, 0.0)}, 13), EvaluateOptions())
 
 
@@ -84,17 +84,18 @@ def test_impossible_input_is_said_and_never_scored_as_zeros():
     truth = walk(lambda n: {1: (0.0, 0.0)}, 5)
     later = [frame._replace(t_ns=frame.t_ns + ns(1000)) for frame in truth]
     with pytest.raises(
-        McaptrackError, match=r"the truth \(0\.000 to 1\.600 s\) and t \(1000\.000 to .*never overlap in time"
+        McaptrackError, match=r"the ground truth \(0\.000 to 1\.600 s\) and t \(1000\.000 to .*never overlap in time"
     ):
         scored(truth, later)
-    with pytest.raises(McaptrackError, match="the truth of x holds nobody"):
+    with pytest.raises(McaptrackError, match="the ground truth of x is empty"):
         scored(walk(lambda n: {}, 5), truth)
 
 
 def test_several_sequences_are_combined():
     truth = walk(lambda n: {1: (float(n), 0.0)}, 10)
     sequences = [
-        Sequenced(name, truth, [Candidate("t", None, tracks)]) for name, tracks in (("a", truth), ("b", truth[:5]))
+        EvaluationInput(name, truth, [Candidate("t", None, tracks)])
+        for name, tracks in (("a", truth), ("b", truth[:5]))
     ]
     rows = [result.to_json() for result in evaluate(sequences, METRES).results]
     assert [(row["sequence"], row["FN"]) for row in rows] == [("a", 0), ("b", 5), ("COMBINED", 5)]

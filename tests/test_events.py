@@ -18,9 +18,9 @@ from typer.testing import CliRunner
 from mcaptrack import log, notices, pipeline
 from mcaptrack.cli import app
 from mcaptrack.errors import McaptrackError
-from mcaptrack.evaluation import Candidate, EvaluateOptions, Sequenced, evaluate, sequence_of_log
-from mcaptrack.evaluation.events import EventOptions, Rule, find_events
-from mcaptrack.evaluation.words import log_messages
+from mcaptrack.evaluation import Candidate, EvaluateOptions, EvaluationInput, evaluate, sequence_of_log
+from mcaptrack.evaluation.event_text import log_messages
+from mcaptrack.evaluation.events import EventOptions, MatchRule, find_events
 from mcaptrack.schema import COUNTS, EVENT_KINDS, EVENTS, TRACKS, EventKind, Frame
 from mcaptrack.schema.proto import parse
 from mcaptrack.schema.provenance import Provenance, digest
@@ -63,7 +63,9 @@ def counted(found, name) -> list:
 
 def said(found, start_ns=0) -> list[tuple[str, str]]:
     """Level and words of the messages."""
-    messages = [LogMessage.FromString(data) for *_, data in log_messages(found.events, "/t", start_ns, found.usual_s)]
+    messages = [
+        LogMessage.FromString(data) for *_, data in log_messages(found.events, "/t", start_ns, found.frame_interval_s)
+    ]
     return [
         (LogMessage.DESCRIPTOR.fields_by_name["level"].enum_type.values_by_number[m.level].name, m.message)
         for m in messages
@@ -87,7 +89,7 @@ def test_two_people_swap_their_tracks():
     truth = walk(lambda n: {1: (n / 10, 0.0), 2: (n / 10, 4.0)}, 30, 10)
     tracks = walk(lambda n: {(7 if n < 10 else 8): (n / 10, 0.0), (8 if n < 10 else 7): (n / 10, 4.0)}, 30, 10)
     found = find_events(tracks, truth)
-    assert found.rule == Rule("metres", 1.0)
+    assert found.rule == MatchRule("metres", 1.0)
     assert happened(found) == [
         (0.0, BIRTH, 7, -1, -1),
         (0.0, BIRTH, 8, -1, -1),
@@ -109,7 +111,7 @@ def test_a_person_is_missed_for_three_seconds():
     assert happened(found, *OWN) == [(2.0, MISS, -1, 4, 1)]
     (row,) = rows_of(found, MISS)
     assert (row["duration_s"], row["frames"], row["x_m"], row["y_m"]) == (3.0, 30, 2.0, 2.0)
-    assert said(found)[-1] == ("WARNING", "person 4 is missed for 3.0 s at 2.00 s, (2.0, 2.0) m, track 1 had them")
+    assert said(found)[-1] == ("WARNING", "person 4 is missed for 3.0 s at 2.00 s, (2.0, 2.0) m, last tracked as 1")
     assert counted(found, "misses") == [0] * 20 + [1] * 30 + [0] * 30
 
 
@@ -127,7 +129,7 @@ def test_a_track_is_nobody_for_two_seconds():
         assert (row["duration_s"], row["frames"]) == (2.0, 20)
     assert said(found) == [  # its beginning and its end go without saying
         ("INFO", "track 1 begins at 0.00 s, (0.0, 2.0) m"),
-        ("WARNING", "track 9 is nobody while it lasts, for 2.0 s at 1.00 s, (3.0, 30.0) m"),
+        ("WARNING", "track 9 matches no person while it exists, for 2.0 s at 1.00 s, (3.0, 30.0) m"),
     ]
     assert counted(found, "born") == [1] * 10 + [2] * 40
     assert counted(found, "ended") == [0] * 29 + [1] * 21
@@ -151,8 +153,8 @@ def test_what_is_the_same_again_a_moment_later_is_one_event():
     assert rows_of(found, MISS)["frames"].tolist() == [6, 1]
     assert rows_of(found, MISS)["duration_s"].tolist() == pytest.approx([0.9, 0.1])
     assert said(found)[1:] == [
-        ("DEBUG", "person 4 is missed in 6 of 9 frames over 0.9 s at 2.00 s, (2.0, 2.0) m, track 1 had them"),
-        ("DEBUG", "person 4 is missed for 0.1 s at 5.00 s, (5.0, 2.0) m, track 1 had them"),
+        ("DEBUG", "person 4 is missed in 6 of 9 frames over 0.9 s at 2.00 s, (2.0, 2.0) m, last tracked as 1"),
+        ("DEBUG", "person 4 is missed for 0.1 s at 5.00 s, (5.0, 2.0) m, last tracked as 1"),
     ]
 
 
@@ -216,17 +218,17 @@ def test_a_swap_that_re_tracking_undid_is_two_joins_and_one_message():
 
 def test_boxes_at_the_videos_rate_go_by_overlap_and_other_clocks_by_metres():
     boxes = [Frame(ns(n / 10), n, boxed({1: (n * 1.0, 0.0)})) for n in range(30)]
-    assert find_events(boxes, boxes).rule == Rule("iou", 0.5)
+    assert find_events(boxes, boxes).rule == MatchRule("iou", 0.5)
     metres = walk(lambda n: {1: (n / 10, 0.0)}, 30, 10)
-    assert find_events(metres, metres).rule == Rule("metres", 1.0)
+    assert find_events(metres, metres).rule == MatchRule("metres", 1.0)
     both = [Frame(f.t_ns, f.index, g.rows.copy()) for f, g in zip(boxes, metres, strict=True)]
     for frame, other in zip(both, boxes, strict=True):
         for name in ("x_px", "y_px", "w_px", "h_px"):
             frame.rows[name] = other.rows[name]
-    assert find_events(both, both).rule == Rule("iou", 0.5)
+    assert find_events(both, both).rule == MatchRule("iou", 0.5)
     slow = [Frame(frame.t_ns + 10_000_000, n, frame.rows) for n, frame in enumerate(both[::4])]
-    assert find_events(slow, both).rule == Rule("metres", 1.0)
-    assert find_events(both, both, EventOptions("metres", 0.3)).rule == Rule("metres", 0.3)
+    assert find_events(slow, both).rule == MatchRule("metres", 1.0)
+    assert find_events(both, both, EventOptions("metres", 0.3)).rule == MatchRule("metres", 0.3)
 
 
 def test_truth_at_another_clock_is_brought_to_that_of_the_tracks():
@@ -257,16 +259,16 @@ def test_frames_of_the_truth_that_tracks_lack_are_there_too():
 @pytest.mark.parametrize(
     ("truth", "options", "words"),
     [
-        ([Frame(ns(n), n, tracks_at({})) for n in range(5)], EventOptions(), "the truth holds nobody"),
+        ([Frame(ns(n), n, tracks_at({})) for n in range(5)], EventOptions(), "the ground truth is empty"),
         (
             [Frame(ns(900 + n), n, tracks_at({1: (0.0, 0.0)})) for n in range(5)],
             EventOptions(),
-            "the truth (900.000 to 904.000 s) and /t (0.000 to 3.900 s) never overlap in time",
+            "the ground truth (900.000 to 904.000 s) and /t (0.000 to 3.900 s) never overlap in time",
         ),
         (
             [Frame(ns(n / 10), n, boxed({1: (0.0, 0.0)})) for n in range(40)],
             EventOptions(),
-            "/t and the truth share neither boxes nor positions in metres",
+            "/t and the ground truth share neither boxes nor positions in metres",
         ),
         ([Frame(ns(n / 10), n, tracks_at({1: (0.0, 0.0)})) for n in range(40)], EventOptions("iou"), "have no boxes"),
         (
@@ -333,7 +335,7 @@ def test_events_and_counts_add_up_to_the_scores(similarity, scene):
     gate = 0.5 if similarity == "iou" else 1.0
     found = find_events(tracks, truth, EventOptions(similarity, gate, gate))
     options = EvaluateOptions(similarities=(similarity,), gates_m=(gate,), min_iou=gate)
-    (result,) = evaluate([Sequenced("x", truth, [Candidate("t", None, tracks)])], options).results
+    (result,) = evaluate([EvaluationInput("x", truth, [Candidate("t", None, tracks)])], options).results
     score = result.to_json()
     assert len(rows_of(found, SWITCH)) == counted(found, "switches")[-1] == score["IDSW"]
     assert rows_of(found, MISS)["frames"].sum() == sum(counted(found, "misses")) == score["FN"]

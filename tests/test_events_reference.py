@@ -8,7 +8,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mcaptrack.evaluation.aligned import matchup
+from mcaptrack.evaluation.aligned import make_matchup
 from mcaptrack.evaluation.events import find_events
 from mcaptrack.evaluation.metrics.clear import matches
 from mcaptrack.schema import EventKind, Frame
@@ -69,12 +69,12 @@ def test_misses_false_tracks_and_switches_equal_the_reference(seed):
     truth, tracks = random_world(np.random.default_rng(seed))
     times = [frame.t_ns for frame in truth]
     usual = int(np.median(np.diff(times)))
-    compared = matchup(truth, tracks, "metres", 1.0)
+    compared = make_matchup(truth, tracks, "metres", 1.0)
     pairs = matches(compared)  # compared with other evaluators elsewhere
     people, names = (sorted({w for f in side for w in f.rows["track_id"].tolist()}) for side in (truth, tracks))
     by_person: dict[int, dict[int, int]] = {}
     by_track: dict[int, dict[int, int]] = {}
-    for frame, who, by in zip(pairs.frame.tolist(), pairs.who.tolist(), pairs.by.tolist(), strict=True):
+    for frame, who, by in zip(pairs.frame.tolist(), pairs.person.tolist(), pairs.track.tolist(), strict=True):
         by_person.setdefault(people[who], {})[frame] = names[by]
         by_track.setdefault(names[by], {})[frame] = people[who]
     wanted: list[Event] = []

@@ -15,9 +15,9 @@ from typer.testing import CliRunner
 from mcaptrack import log, notices, pipeline
 from mcaptrack.cli import app
 from mcaptrack.errors import McaptrackError
-from mcaptrack.evaluation import Candidate, EvaluateOptions, Sequenced, evaluate
+from mcaptrack.evaluation import Candidate, EvaluateOptions, EvaluationInput, evaluate
 from mcaptrack.evaluation.forecasts import find_forecast_errors
-from mcaptrack.evaluation.metrics.displacement import pair
+from mcaptrack.evaluation.metrics.displacement import pair_forecasts
 from mcaptrack.predictors import Forecast
 from mcaptrack.schema import FORECAST_ERRORS, FORECAST_SCORES, PREDICTIONS, TRACKS, Frame
 from mcaptrack.schema.predictions import forecast_to_rows
@@ -195,7 +195,7 @@ def scenes(draw):
 
 def evaluated(truth, tracks, made):
     options = EvaluateOptions(similarities=("metres",), gates_m=(1.0,))
-    (result,) = evaluate([Sequenced("x", truth, [Candidate("t", None, tracks, made, "p")])], options).results
+    (result,) = evaluate([EvaluationInput("x", truth, [Candidate("t", None, tracks, made, "p")])], options).results
     return result.displacement and result.displacement.summary()
 
 
@@ -254,7 +254,7 @@ def test_pairs_are_those_of_least_total_distance(seed, people, tracks):
     if not asked:
         return
     made = forecasts(*(foretold(n, who, [(0.0, 0.0), (1.0, 1.0)]) for n, who in asked))
-    found = pair(positions(truth), positions(seen), made)
+    found = pair_forecasts(positions(truth), positions(seen), made)
 
     def filled(path, n):
         known = sorted(path)
@@ -280,7 +280,7 @@ def test_pairs_are_those_of_least_total_distance(seed, people, tracks):
                 wanted.add((list(mine)[column], who, round(cost[row, column], 9), total))
     assert {
         (int(k), int(who), round(d, 9), np.round(off.sum(), 9) if np.isfinite(off).all() else None)
-        for k, who, d, off in zip(found.forecast, found.person, found.d_obs_m2, found.off_m, strict=True)
+        for k, who, d, off in zip(found.forecast, found.person, found.d_obs_m2, found.offset_m, strict=True)
     } == wanted
 
 
@@ -289,9 +289,9 @@ def test_many_times_are_paired_as_few_are(monkeypatch):
     rng = np.random.default_rng(3)
     truth = {who: {n: tuple(rng.normal(0, 3, 2)) for n in range(30)} for who in range(5)}
     made = forecasts(*(foretold(n, who, [(0.0, 0.0)]) for n in range(4, 29) for who in truth))
-    once = pair(positions(truth), positions(truth), made)
+    once = pair_forecasts(positions(truth), positions(truth), made)
     monkeypatch.setattr("mcaptrack.evaluation.metrics.displacement._PAIRS_AT_ONCE", 60)
-    again = pair(positions(truth), positions(truth), made)
+    again = pair_forecasts(positions(truth), positions(truth), made)
     assert len(once.forecast) == 25 * 5
     assert all(np.array_equal(a, b) for a, b in zip(once, again, strict=True))
 

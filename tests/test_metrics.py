@@ -10,8 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mcaptrack.evaluation.metrics import Matchup, combine, distances, metres_to_similarity, score, summary
-from mcaptrack.evaluation.metrics.displacement import Forecasts, Path, displacement
-from mcaptrack.evaluation.metrics.displacement import combine as combine_displacements
+from mcaptrack.evaluation.metrics.displacement import Forecasts, Positions, combine_displacements, displacement
 from mcaptrack.geometry.boxes import iou
 
 
@@ -253,11 +252,11 @@ def test_numbers_of_the_evaluators_on_real_sequences(data, rules, columns):
         )
 
 
-def positions(people: dict[int, dict[int, tuple[float, float]]]) -> Path:
+def positions(people: dict[int, dict[int, tuple[float, float]]]) -> Positions:
     """{id: {step: place}} as arrays."""
     rows = [(step, who, *place) for who, path in people.items() for step, place in path.items()]
     table = np.array(rows, float).reshape(-1, 4)
-    return Path(table[:, 0].astype(int), table[:, 1].astype(int), table[:, 2:])
+    return Positions(table[:, 0].astype(int), table[:, 1].astype(int), table[:, 2:])
 
 
 def straight(who: int, steps: range, offset: float = 0.0, lane: float = 0.0) -> dict:
@@ -350,9 +349,9 @@ class TestDisplacement:
         )
         result = displacement(truth, tracks, made)
         assert sorted(result.d_obs_m2.tolist()) == pytest.approx([1.0, 4.0])
-        assert result.away_by_step().tolist() == [[0.5, 1.5, 2.5]]  # tau is 2 m^2
-        assert sorted(result.away_by_step(5.0).tolist()) == [[0.5, 1.5, 2.5], [7.0, 8.0, 9.0]]
-        assert result.away_by_step(1.0).tolist() == []  # less than the threshold, not equal to it
+        assert result.errors_by_step().tolist() == [[0.5, 1.5, 2.5]]  # tau is 2 m^2
+        assert sorted(result.errors_by_step(5.0).tolist()) == [[0.5, 1.5, 2.5], [7.0, 8.0, 9.0]]
+        assert result.errors_by_step(1.0).tolist() == []  # less than the threshold, not equal to it
         assert result.summary()["recall"] == 0.5
 
     def test_drift_of_consecutive_forecasts_by_hand(self):

@@ -88,11 +88,11 @@ def by_trackeval(part: Matchup) -> list[tuple]:
     metrics = pytest.importorskip("trackeval.metrics")
     data = {
         "num_tracker_dets": part.track_rows,
-        "num_gt_dets": part.truth_rows,
-        "num_gt_ids": part.n_truth,
+        "num_gt_dets": part.ground_truth_rows,
+        "num_gt_ids": part.n_ground_truth,
         "num_tracker_ids": part.n_tracks,
-        "num_timesteps": len(part.truth),
-        "gt_ids": list(part.truth),
+        "num_timesteps": len(part.ground_truth),
+        "gt_ids": list(part.ground_truth),
         "tracker_ids": list(part.tracks),
         "similarity_scores": list(part.similarity),
     }
@@ -129,7 +129,7 @@ def test_all_scores_are_those_of_trackeval(sequence):
 @settings(max_examples=40)
 def test_scores_of_several_sequences_are_those_of_trackeval(sequences, threshold):
     parts = [matchup(*sequence, threshold) for sequence in sequences]
-    if not any(part.truth_rows for part in parts):
+    if not any(part.ground_truth_rows for part in parts):
         return  # with nobody at all TrackEval's sums and its single sequences disagree
     results = [by_trackeval(part) for part in parts]
     theirs = {}

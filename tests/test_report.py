@@ -16,10 +16,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mcaptrack import foxglove, log
-from mcaptrack.evaluation import Candidate, EvaluateOptions, Sequenced, evaluate
-from mcaptrack.evaluation.events import Rule, find_events
-from mcaptrack.evaluation.metrics.displacement import Forecasts, combine, displacement
-from mcaptrack.evaluation.metrics.displacement import Path as Positions
+from mcaptrack.evaluation import Candidate, EvaluateOptions, EvaluationInput, evaluate
+from mcaptrack.evaluation.events import MatchRule, find_events
+from mcaptrack.evaluation.metrics.displacement import Forecasts, Positions, combine_displacements, displacement
 from mcaptrack.foxglove.colours import COUNT as COLOURS
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame
 from mcaptrack.schema.provenance import Provenance
@@ -162,10 +161,10 @@ def test_errors_by_horizon_of_two_scenes_go_as_far_as_the_longer_forecasts():
         path = Positions(np.arange(40), np.ones(40, int), np.stack([np.arange(40.0), np.zeros(40)], axis=1))
         return displacement(path, path, Forecasts(np.array([10]), np.array([1]), zero, cov))
 
-    both = combine([away(3), away(5)])
-    assert both.away_m.tolist()[1] == [11.0, 12.0, 13.0, 14.0, 15.0]
-    assert both.away_m[0, :3].tolist() == [11.0, 12.0, 13.0]
-    assert np.isnan(both.away_m[0, 3:]).all()
+    both = combine_displacements([away(3), away(5)])
+    assert both.error_m.tolist()[1] == [11.0, 12.0, 13.0, 14.0, 15.0]
+    assert both.error_m[0, :3].tolist() == [11.0, 12.0, 13.0]
+    assert np.isnan(both.error_m[0, 3:]).all()
 
 
 def test_walking_on_is_right_about_who_walks_on_and_not_about_who_turns():
@@ -177,7 +176,7 @@ def test_walking_on_is_right_about_who_walks_on_and_not_about_who_turns():
     def error(frames, who):
         members = [Frame(f.t_ns, f.index, f.rows[f.rows["track_id"] == who]) for f in frames]
         wrong = [f for (f,) in Predict(predictor="kalman")(members)]
-        sequence = Sequenced("s", members, [Candidate("t", None, members, wrong, "p")])
+        sequence = EvaluationInput("s", members, [Candidate("t", None, members, wrong, "p")])
         results = evaluate([sequence], EvaluateOptions()).results
         (found,) = measures.describe_forecasts(sequence, results)
         return found["constant_velocity"]
@@ -261,7 +260,7 @@ def story():
     truth = [Frame(ns(t / 10), t, boxes({1: (40 + t, 60)})) for t in range(100)]
     tracks = [Frame(ns(t / 10), t, boxes({switching(t): (40 + t, 60)})) for t in range(100)]
     found = find_events(tracks, truth)
-    assert found.rule == Rule("iou", 0.5)
+    assert found.rule == MatchRule("iou", 0.5)
     return tell("/camera/tracks", found.events, found.rule, tracks, truth, (0, ns(9.9))), tracks
 
 

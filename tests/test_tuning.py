@@ -67,10 +67,10 @@ def test_a_search_that_was_ended_goes_on_where_it_was(with_optuna, tmp_path, mon
         monkeypatch.setitem(sys.modules, "optuna", None)
     path, ranges, task = tmp_path / "study.jsonl", {"max_age_s": Range(0.1, 6.0, False)}, scene()
     told = []
-    tune(Sort(), [task], ranges, IOU, trials=4, study=path, told=lambda trial, *_: told.append(trial.number))
+    tune(Sort(), [task], ranges, IOU, trials=4, study=path, on_trial=lambda trial, *_: told.append(trial.number))
     whole = path.read_bytes()
     path.write_bytes(whole[:-7])  # ended while the fourth was written
-    tune(Sort(), [task], ranges, IOU, trials=6, study=path, told=lambda trial, *_: told.append(trial.number))
+    tune(Sort(), [task], ranges, IOU, trials=6, study=path, on_trial=lambda trial, *_: told.append(trial.number))
     assert told == [0, 1, 2, 3, 3, 4, 5]
     assert [json.loads(line).get("number") for line in path.read_text().splitlines()] == [None, 0, 1, 2, 3, 4, 5]
     if not with_optuna:  # chance draws the same whenever it is asked
@@ -79,10 +79,10 @@ def test_a_search_that_was_ended_goes_on_where_it_was(with_optuna, tmp_path, mon
         assert whole_way.read_bytes() == path.read_bytes()
 
 
-def test_a_study_of_something_else_is_not_gone_on_with(chance, tmp_path):
+def test_a_study_of_another_search_is_refused(chance, tmp_path):
     path, ranges = tmp_path / "study.jsonl", {"max_age_s": Range(0.1, 6.0, False)}
     tune(Sort(), [scene()], ranges, IOU, trials=1, study=path)
-    with pytest.raises(McaptrackError, match=r"study of something else \(parameters differ\)"):
+    with pytest.raises(McaptrackError, match=r"study of another search \(parameters differ\)"):
         tune(Sort(min_iou=0.5), [scene()], ranges, IOU, trials=2, study=path)
     path.write_text("frame,id\n1,2\n")
     with pytest.raises(McaptrackError, match="is no study"):
@@ -131,7 +131,9 @@ def write_files(folder):
         )
     )
     (folder / "gt.txt").write_text(
-        "".join(f"{f.index + 1},1,{r['x_px']},{r['y_px']},10,20,1,-1,-1,-1\n" for f in scene().truth for r in f.rows)
+        "".join(
+            f"{f.index + 1},1,{r['x_px']},{r['y_px']},10,20,1,-1,-1,-1\n" for f in scene().ground_truth for r in f.rows
+        )
     )
 
 
@@ -173,6 +175,6 @@ def test_a_log_can_be_tuned_and_mistakes_are_said(tmp_path):
 def test_empty_tracks_are_a_score_too(chance):
     """A setting with which nobody is tracked is worth nothing, and ends no search."""
     task = scene()
-    empty = Task("x", [f._replace(rows=f.rows[:0]) for f in task.frames], task.truth, {})
+    empty = Task("x", [f._replace(rows=f.rows[:0]) for f in task.frames], task.ground_truth, {})
     first, _ = tune(Sort(), [empty], {"min_iou": Range(0, 1, False)}, IOU, trials=2)
     assert first.scores["IDF1"] == 0.0

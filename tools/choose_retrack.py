@@ -23,7 +23,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 from corruptions import CORRUPTIONS, STEP_S, corrupt, whole_people
 from reproduce import on_clock
 
-from mcaptrack.evaluation.aligned import matchup
+from mcaptrack.evaluation.aligned import make_matchup
 from mcaptrack.evaluation.metrics import combine, score, summary
 from mcaptrack.geometry.assignment import assign, solve
 from mcaptrack.schema import Frame
@@ -79,7 +79,7 @@ def table(everything: dict[str, World], output: int) -> None:
             parts = []
             for true, samples in world.values():
                 found = [result[output] for result in candidate(samples)] if candidate else samples
-                parts.append(score(matchup(true, found, "metres", GATE_M), "motmetrics"))
+                parts.append(score(make_matchup(true, found, "metres", GATE_M), "motmetrics"))
             row = summary(combine(parts))
             means.append((row["IDF1"], row["MOTA"]))
             cells.append(f"{100 * row['IDF1']:.1f} / {100 * row['MOTA']:.1f} / {row['IDSW']}")

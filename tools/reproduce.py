@@ -21,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mcaptrack.evaluation import Candidate, EvaluateOptions, Outcome, Sequenced, evaluate
+from mcaptrack.evaluation import Candidate, EvaluateOptions, EvaluationInput, EvaluationResult, evaluate
 from mcaptrack.evaluation.metrics import summary
 from mcaptrack.evaluation.metrics.displacement import TAU_M2, Displacement
 from mcaptrack.geometry.plane import GroundPlane
@@ -151,12 +151,14 @@ def methods(predictor: str, profile: str) -> dict[str, Callable[[list[Frame]], C
     return out
 
 
-def score(members: list[tuple[str, list[Frame], list[Frame]]], method: Callable[[list[Frame]], Candidate]) -> Outcome:
+def score(
+    members: list[tuple[str, list[Frame], list[Frame]]], method: Callable[[list[Frame]], Candidate]
+) -> EvaluationResult:
     options = EvaluateOptions(similarities=("metres",), gates_m=(0.5, 1.0, 2.0), rules="motmetrics")
-    return evaluate([Sequenced(name, true, [method(samples)]) for name, true, samples in members], options)
+    return evaluate([EvaluationInput(name, true, [method(samples)]) for name, true, samples in members], options)
 
 
-def of_all(outcome: Outcome) -> list:
+def of_all(outcome: EvaluationResult) -> list:
     """The results over all scenes."""
     combined = [result for result in outcome.results if result.sequence == "COMBINED"]
     return combined or outcome.results

@@ -15,7 +15,7 @@ from mcaptrack.cli.text import console, printable, say
 from mcaptrack.errors import McaptrackError
 
 if TYPE_CHECKING:
-    from mcaptrack.evaluation import Outcome, Sequenced
+    from mcaptrack.evaluation import EvaluationInput, EvaluationResult
 
 _COLUMNS: Final = ("MOTA", "IDF1", "HOTA", "IDSW", "FP", "FN", "Frag")
 _TABLES: Final = (".parquet", ".pq")
@@ -164,7 +164,7 @@ def _limit(text: str) -> tuple[str, float]:
         ) from None
 
 
-def _misses(outcome: Outcome, name: str, least: float) -> list[str]:
+def _misses(outcome: EvaluationResult, name: str, least: float) -> list[str]:
     rows = [result.to_json() for result in outcome.results]
     final = [row for row in rows if row["sequence"] == "COMBINED"] or rows
     return [
@@ -175,7 +175,7 @@ def _misses(outcome: Outcome, name: str, least: float) -> list[str]:
     ]
 
 
-def _from_logs(paths: Sequence[Path], camera: str | None, topics: tuple[str, ...]) -> list[Sequenced]:
+def _from_logs(paths: Sequence[Path], camera: str | None, topics: tuple[str, ...]) -> list[EvaluationInput]:
     from mcaptrack import log, pipeline
     from mcaptrack.evaluation import sequence_of_log
 
@@ -188,7 +188,7 @@ def _from_logs(paths: Sequence[Path], camera: str | None, topics: tuple[str, ...
 
 def _from_files(
     tracks: Sequence[Path], truths: Sequence[Path], given: dict[str, Any], talk: common.Talk
-) -> list[Sequenced]:
+) -> list[EvaluationInput]:
     from mcaptrack.cli.ingest import parse_fps
     from mcaptrack.evaluation import sequence_of_files
     from mcaptrack.tables.compared import compare_files, pair_files
@@ -207,7 +207,7 @@ def _from_files(
     return sequences
 
 
-def print_results(outcome: Outcome) -> None:
+def print_results(outcome: EvaluationResult) -> None:
     """The scores as a table on stdout, and the forecasts below it."""
     from rich.table import Table
 
@@ -247,7 +247,7 @@ def print_results(outcome: Outcome) -> None:
         out.print(table)
 
 
-def _print_csv(outcome: Outcome) -> None:
+def _print_csv(outcome: EvaluationResult) -> None:
     import csv
 
     rows = [{k: v for k, v in result.to_json().items() if k != "displacement"} for result in outcome.results]

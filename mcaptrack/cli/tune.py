@@ -145,7 +145,7 @@ def tune(
                 talk.detail(f"trial {trial.number}: {metric} {trial.scores[metric]:.4f} {_words(trial.parameters)}")
 
         first, best = run(
-            kind(), tasks, ranges, scoring, metric=metric, trials=trials, seed=seed, study=trials_file, told=told
+            kind(), tasks, ranges, scoring, metric=metric, trials=trials, seed=seed, study=trials_file, on_trial=told
         )
         settings = ({"tracker": tracker} if stage in ALTERNATIVES else {}) | dict(best.parameters)
         if best is first:
@@ -211,14 +211,14 @@ def _tasks_of_logs(
     paths: Sequence[Path], camera: str | None, topic: str | None, stage: str, kind: type[Transform]
 ) -> list[Task]:
     from mcaptrack import log, pipeline
-    from mcaptrack.evaluation import truth_of_log
+    from mcaptrack.evaluation import ground_truth_of_log
     from mcaptrack.evaluation.tuning import Task
 
     tasks = []
     for path in paths:
         with log.read(path) as opened:
             prefix = pipeline.find_camera(opened, camera, topic)
-            truth = truth_of_log(opened, prefix)
+            truth = ground_truth_of_log(opened, prefix)
             frames, context = pipeline.input_of(opened, prefix, stage, kind(), topic)
             tasks.append(Task(path.stem, frames, truth, context))
     return tasks

@@ -1,9 +1,10 @@
-"""Score the tracks and forecasts of a log, or of label files, against the truth.
+"""Score the tracks and forecasts of a log, or of label files, against ground truth.
 
-Tracks are compared at the truth's times where the tracks have most of these; otherwise (tracks on the clock of
-prediction) the truth is brought to the tracks' times. Impossible comparisons are said, never scored as zeros.
+Tracks are compared at the times of the ground truth if they have most of these; otherwise (tracks at the prediction
+rate) the ground truth is resampled to the times of the tracks. What can't be compared is reported, never scored as
+zero.
 
-Letters: N rows, G true people, H tracks in one frame.
+Letters: N rows, G people of the ground truth, H tracks in one frame.
 """
 
 from __future__ import annotations
@@ -20,28 +21,41 @@ from mcaptrack.evaluation.aligned import (
     IOU_THRESHOLD,
     Similarity,
     align,
-    matchup,
-    strangers,
-    without,
+    explain_no_match,
+    make_matchup,
+    sides_without,
 )
-from mcaptrack.evaluation.forecasts import MADE_FROM, score_forecasts
+from mcaptrack.evaluation.forecasts import FORECAST_INPUTS, score_forecasts
 from mcaptrack.evaluation.metrics import Rules, Score
-from mcaptrack.evaluation.metrics.displacement import Displacement
-from mcaptrack.evaluation.metrics.displacement import combine as combine_displacements
+from mcaptrack.evaluation.metrics.displacement import Displacement, combine_displacements
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.cameras import camera_at
 
 COMBINED: Final = "COMBINED"
 DEFAULT_GATES_M: Final = (0.5, 1.0, 2.0)
-#: The channels of a camera that are scored, and those of the forecasts made from them.
+#: The channels of a camera that are scored, and the channels of forecasts made from them.
 SCORED: Final = ("tracks", "samples", "retracks/online", "retracks")
-FORECASTS: Final = tuple(MADE_FROM)
+FORECASTS: Final = tuple(FORECAST_INPUTS)
 
 
 @dataclass(frozen=True)
 class EvaluateOptions:
-    """What to compare and how. ``similarities`` empty means all that the data allow."""
+    """What to compare and how.
+
+    Parameters
+    ----------
+    similarities : tuple of {"iou", "metres"}
+        By overlap of boxes, by distance on the ground. Empty: all that the data allow.
+    gates_m : tuple of float, m
+        The largest distances of a match, for "metres".
+    min_iou : float
+        The least overlap of a match, for "iou".
+    rules : {"trackeval", "motmetrics"}
+        Rules of CLEAR, see `mcaptrack.evaluation.metrics.clear.clear`.
+    topics : tuple of str
+        The channels to score. Empty: all tracks of the camera.
+    """
 
     similarities: tuple[Similarity, ...] = ()
     gates_m: tuple[float, ...] = DEFAULT_GATES_M
@@ -52,28 +66,28 @@ class EvaluateOptions:
 
 @dataclass
 class Candidate:
-    """Tracks to be scored: where they come from, their frames, and forecasts made from them, if any."""
+    """Tracks to be scored: their name and frames, and the forecasts made from them, if any."""
 
     name: str
     mode: str | None
     frames: Sequence[Frame]
     forecasts: Sequence[Frame] | None = None
     forecasts_name: str = ""
-    group: str = ""  # what tracks of several sequences have in common, if not their name
+    group: str = ""  # a name shared by the tracks of several sequences, if theirs differ
 
 
 @dataclass
-class Sequenced:
-    """One sequence: its truth and what is to be scored against it."""
+class EvaluationInput:
+    """One sequence: its ground truth and the tracks to be scored against it."""
 
     name: str
-    truth: Sequence[Frame]
+    ground_truth: Sequence[Frame]
     candidates: Sequence[Candidate]
 
 
 @dataclass
-class Result:
-    """One row of the outcome."""
+class EvaluationRow:
+    """The scores of one channel of tracks, for one similarity and gate."""
 
     sequence: str
     tracks: str
@@ -86,7 +100,7 @@ class Result:
     group: str = ""
 
     def to_json(self) -> dict[str, Any]:
-        """As ``evaluate --json`` prints it."""
+        """The row as ``evaluate --json`` prints it."""
         names = ("sequence", "tracks", "mode", "similarity", "gate", "rules")
         out = {name: getattr(self, name) for name in names} | metrics.summary(self.score)
         if self.displacement is not None:
@@ -99,15 +113,15 @@ class Result:
 
 
 @dataclass
-class Outcome:
-    """All results, and what could not be compared and why."""
+class EvaluationResult:
+    """All scores, and notes on what could not be compared and why."""
 
-    results: list[Result] = field(default_factory=list)
+    results: list[EvaluationRow] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
 
-def truth_of_log(opened: log.Log, prefix: str) -> list[Frame]:
-    """The true tracks in a log. Raises McaptrackError if there are none."""
+def ground_truth_of_log(opened: log.Log, prefix: str) -> list[Frame]:
+    """The frames of the ground truth of a camera. Raises McaptrackError if there is none."""
     topic = camera_at(opened, prefix).truth
     if topic not in opened.channels:
         add = command("ingest", "LABELS", "--as", "truth", "--into", opened.path)
@@ -115,14 +129,14 @@ def truth_of_log(opened: log.Log, prefix: str) -> list[Frame]:
     return opened.frames(topic, TRACKS)
 
 
-def sequence_of_log(opened: log.Log, prefix: str, topics: Sequence[str]) -> Sequenced:
-    """The truth of a log and its tracks: those of the video's rate, and those of the clock of prediction."""
-    truth = truth_of_log(opened, prefix)
+def sequence_of_log(opened: log.Log, prefix: str, topics: Sequence[str]) -> EvaluationInput:
+    """The ground truth of a camera and its tracks, at the video rate and at the prediction rate."""
+    ground_truth = ground_truth_of_log(opened, prefix)
     usual = [f"{prefix}/{name}" for name in SCORED]
     chosen = list(topics) or [topic for topic in usual if topic in opened.channels]
     if not chosen:
         raise McaptrackError(f"{opened.path} has no tracks to score; {command('run', opened.path)} makes them")
-    forecasts_of = {f"{prefix}/{tracks}": f"{prefix}/{name}" for name, tracks in MADE_FROM.items()}
+    forecasts_of = {f"{prefix}/{tracks}": f"{prefix}/{name}" for name, tracks in FORECAST_INPUTS.items()}
     candidates = []
     for topic in chosen:
         made = Provenance.from_metadata(opened.channel(topic).metadata)
@@ -132,22 +146,36 @@ def sequence_of_log(opened: log.Log, prefix: str, topics: Sequence[str]) -> Sequ
         name = forecasts_of.get(topic, "")
         forecasts = opened.frames(name, PREDICTIONS) if name in opened.channels else None
         candidates.append(Candidate(topic, mode, opened.frames(topic, TRACKS), forecasts, name))
-    return Sequenced(opened.path.stem, truth, candidates)
+    return EvaluationInput(opened.path.stem, ground_truth, candidates)
 
 
 def evaluate(
-    sequences: Iterable[Sequenced], options: EvaluateOptions, progress: Callable[[str], None] = lambda _: None
-) -> Outcome:
-    """Score every candidate of every sequence, and all sequences together where there are several.
+    sequences: Iterable[EvaluationInput], options: EvaluateOptions, progress: Callable[[str], None] = lambda _: None
+) -> EvaluationResult:
+    """Score each candidate of each sequence, and all sequences together if there are several.
 
-    Raises McaptrackError if nothing at all can be compared.
+    Parameters
+    ----------
+    sequences : iterable of EvaluationInput
+    options : EvaluateOptions
+    progress : callable
+        Called with a text before each candidate.
+
+    Returns
+    -------
+    EvaluationResult
+
+    Raises
+    ------
+    McaptrackError
+        If nothing at all can be compared.
     """
-    outcome = Outcome()
+    outcome = EvaluationResult()
     count = 0
     for sequence in sequences:
         count += 1
-        if not any(len(frame.rows) for frame in sequence.truth):
-            raise McaptrackError(f"the truth of {sequence.name} holds nobody; there is nothing to score against")
+        if not any(len(frame.rows) for frame in sequence.ground_truth):
+            raise McaptrackError(f"the ground truth of {sequence.name} is empty; there is nothing to score against")
         for candidate in sequence.candidates:
             progress(f"{sequence.name} {candidate.name}")
             outcome.results += _score(sequence, candidate, options, outcome.notes)
@@ -158,16 +186,16 @@ def evaluate(
     return outcome
 
 
-def combined(results: Sequence[Result]) -> list[Result]:
-    """All sequences together: a result for each kind of tracks, similarity and gate."""
-    groups: dict[tuple[Any, ...], list[Result]] = {}
+def combined(results: Sequence[EvaluationRow]) -> list[EvaluationRow]:
+    """Combine all sequences: a row for each kind of tracks, similarity and gate."""
+    groups: dict[tuple[Any, ...], list[EvaluationRow]] = {}
     for one in results:
         groups.setdefault((one.group or one.tracks, one.mode, one.similarity, one.gate, one.rules), []).append(one)
     out = []
     for (tracks, mode, similarity, gate, rules), members in groups.items():
         forecasts = [member.displacement for member in members if member.displacement is not None]
         out.append(
-            Result(
+            EvaluationRow(
                 COMBINED,
                 tracks,
                 mode,
@@ -181,26 +209,28 @@ def combined(results: Sequence[Result]) -> list[Result]:
     return out
 
 
-def _score(sequence: Sequenced, candidate: Candidate, options: EvaluateOptions, notes: list[str]) -> list[Result]:
-    truth, tracks = align(sequence.name, candidate.name, sequence.truth, candidate.frames)
+def _score(
+    sequence: EvaluationInput, candidate: Candidate, options: EvaluateOptions, notes: list[str]
+) -> list[EvaluationRow]:
+    ground_truth, tracks = align(sequence.name, candidate.name, sequence.ground_truth, candidate.frames)
     wanted = options.similarities or ("iou", "metres")
     results = []
     for similarity in wanted:
-        lacking = without({"the truth": truth, candidate.name: tracks}, similarity)
-        if lacking:
+        missing = sides_without({"the ground truth": ground_truth, candidate.name: tracks}, similarity)
+        if missing:
             unit = "boxes" if similarity == "iou" else "positions in metres"
             if options.similarities:
                 raise McaptrackError(
-                    f"{sequence.name}: {' and '.join(lacking)} {'have' if len(lacking) > 1 else 'has'} no {unit}"
+                    f"{sequence.name}: {' and '.join(missing)} {'have' if len(missing) > 1 else 'has'} no {unit}"
                 )
             continue
         gates = (options.min_iou,) if similarity == "iou" else options.gates_m
         for gate in gates:
-            score = metrics.score(matchup(truth, tracks, similarity, gate), options.rules)
+            score = metrics.score(make_matchup(ground_truth, tracks, similarity, gate), options.rules)
             if gate == gates[-1] and score.hota["HOTA_TP"][0] == 0:
-                notes += strangers(sequence.name, candidate.name, truth, tracks, similarity)
+                notes += explain_no_match(sequence.name, candidate.name, ground_truth, tracks, similarity)
             results.append(
-                Result(
+                EvaluationRow(
                     sequence.name,
                     candidate.name,
                     candidate.mode,
@@ -212,9 +242,11 @@ def _score(sequence: Sequenced, candidate: Candidate, options: EvaluateOptions, 
                 )
             )
     if not results:
-        notes.append(f"{sequence.name}: {candidate.name} and the truth share neither boxes nor positions in metres")
+        notes.append(
+            f"{sequence.name}: {candidate.name} and the ground truth share neither boxes nor positions in metres"
+        )
     if candidate.forecasts is not None and any(result.similarity == "metres" for result in results):
-        errors = score_forecasts(candidate.forecasts, candidate.frames, sequence.truth, candidate.forecasts_name)
+        errors = score_forecasts(candidate.forecasts, candidate.frames, sequence.ground_truth, candidate.forecasts_name)
         for result in results:
             result.displacement = errors if result.similarity == "metres" else None
     return results
@@ -222,7 +254,7 @@ def _score(sequence: Sequenced, candidate: Candidate, options: EvaluateOptions, 
 
 def sequence_of_files(
     name: str, tracks: Path, truth_frames: Sequence[Frame], track_frames: Sequence[Frame], files: int
-) -> Sequenced:
-    """A file of tracks, one of ``files``, and its truth as one sequence."""
+) -> EvaluationInput:
+    """One of ``files`` files of tracks, with its ground truth, as a sequence."""
     group = f"{files} files" if files > 1 else ""
-    return Sequenced(name, truth_frames, [Candidate(tracks.name, None, track_frames, group=group)])
+    return EvaluationInput(name, truth_frames, [Candidate(tracks.name, None, track_frames, group=group)])

@@ -1,9 +1,9 @@
-"""What happened to the identities of tracks, and how tracking stands frame by frame: rows of Events and of Counts.
+"""Events in the life of tracks, and counts for each frame: rows of Events and of Counts.
 
-Births, ends and what re-tracking repaired follow from the tracks alone; misses, false tracks and identity switches from
-the matches with the truth that the scores count, so that they add up to these.
+Births, ends and repairs by re-tracking follow from the tracks alone. Misses, false tracks and identity switches follow
+from the same matches with the ground truth that the scores count; their sums are the counts of CLEAR.
 
-Letters: F frames of the tracks or of what they are compared with, N rows, R events, P matches.
+Letters: F frames of the tracks or of the ground truth, N rows, R events, P matches.
 """
 
 from __future__ import annotations
@@ -18,214 +18,240 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation.aligned import (
     GATE_M,
     IOU_THRESHOLD,
-    Compared,
-    Placed,
+    LocatedRows,
+    RowComparison,
     Similarity,
     align,
-    compare,
-    frame_times,
-    has,
-    join_rows,
-    share_times,
-    strangers,
-    without,
+    compare_rows,
+    explain_no_match,
+    has_positions,
+    have_same_times,
+    sides_without,
 )
-from mcaptrack.evaluation.lives import NOBODY, SAME_S, Lives, between_s, event_rows, usual_ns
-from mcaptrack.evaluation.metrics.clear import matches, switched
-from mcaptrack.evaluation.metrics.matchup import Pairs
+from mcaptrack.evaluation.metrics.clear import is_switch, matches
+from mcaptrack.evaluation.metrics.matchup import RowPairs
+from mcaptrack.evaluation.track_lifecycle import (
+    MAX_PAUSE_S,
+    NO_ID,
+    TrackLifecycle,
+    event_rows,
+    frame_interval_ns,
+    unobserved_s,
+)
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
-from mcaptrack.schema import COUNTS, EVENTS, EventKind, Frame, Rows
+from mcaptrack.geometry.ragged import group_index, run_starts
+from mcaptrack.schema import COUNTS, EVENTS, TRACKS, EventKind, Frame, Rows
+from mcaptrack.schema.framing import frame_times, join_frames, split_rows
 
 
 @dataclass(frozen=True)
 class EventOptions:
-    """What makes a person and a track alike; ``similarity`` None is what suits the tracks (``usual_rule``).
+    """How tracks are matched with people. ``similarity`` None: the default for the tracks (see `default_rule`).
 
-    ``gate_m`` is the largest distance for "metres", ``min_iou`` the least overlap for "iou"; None is what is usual.
+    ``gate_m`` is the largest distance for "metres", ``min_iou`` the least overlap for "iou"; None: the default.
     """
 
     similarity: Similarity | None = None
     gate_m: float | None = None
     min_iou: float | None = None
 
-    def rule(self, similarity: Similarity) -> Rule:
-        """By this similarity, within the gate that was asked for."""
-        gate, usual = (self.min_iou, IOU_THRESHOLD) if similarity == "iou" else (self.gate_m, GATE_M)
-        return Rule(similarity, usual if gate is None else gate)
+    def rule(self, similarity: Similarity) -> MatchRule:
+        """The rule for a similarity, with the gate of these options."""
+        gate, interval = (self.min_iou, IOU_THRESHOLD) if similarity == "iou" else (self.gate_m, GATE_M)
+        return MatchRule(similarity, interval if gate is None else gate)
 
 
-class Rule(NamedTuple):
-    """By what and within what a person and a track are alike."""
+class MatchRule(NamedTuple):
+    """A similarity and its gate."""
 
     similarity: Similarity
     gate: float
 
 
-class Found(NamedTuple):
-    """Events and counts, a frame each for every frame of the tracks and of the truth that they were compared with.
+class TrackEvents(NamedTuple):
+    """Events and counts: one frame of each for every frame of the tracks and of the ground truth.
 
-    ``rule`` is None where they were not compared with any; ``notes`` say why, and what else is odd. ``usual_s`` is what
-    lies between two frames that were compared.
+    ``rule`` is None if there was nothing to compare with; ``notes`` say why, and what else is odd.
+    ``frame_interval_s`` is the usual time between two compared frames.
     """
 
     events: list[Frame]
     counts: list[Frame]
-    rule: Rule | None
+    rule: MatchRule | None
     notes: list[str]
-    usual_s: float
+    frame_interval_s: float
 
     def parameters(self, options: EventOptions) -> dict[str, Any]:
-        """How they were made, as the provenance says it: what was asked for, and what came of it."""
+        """Options and rule, as they stand in the provenance."""
         return {"asked": asdict(options)} | (self.rule._asdict() if self.rule else {"similarity": None, "gate": None})
 
 
-class _Truth(NamedTuple):
-    """Tracks compared with the truth: matches by person and frame, and what of both sides has none."""
+class _Comparison(NamedTuple):
+    """Tracks compared with the ground truth: matches by person and frame, and the times of the frames."""
 
-    compared: Compared
-    found: Pairs
+    compared: RowComparison
+    found: RowPairs
     t_ns: Ints
 
 
 def find_events(
     tracks: Sequence[Frame],
-    truth: Sequence[Frame] | None,
+    ground_truth: Sequence[Frame] | None,
     options: EventOptions = EventOptions(),
     name: str = "the log",
     tracks_name: str = "the tracks",
-) -> Found:
-    """The events and counts of one channel of tracks, with the truth as far as it can be compared."""
+) -> TrackEvents:
+    """Find the events of a channel of tracks and count its rows frame by frame.
+
+    Parameters
+    ----------
+    tracks : sequence of Frame
+        Rows of Tracks.
+    ground_truth : sequence of Frame, optional
+        Rows of Tracks. If it can't be compared, a note says why and there are no misses, false tracks and switches.
+    options : EventOptions
+    name, tracks_name : str
+        Names for messages.
+
+    Returns
+    -------
+    TrackEvents
+    """
     notes: list[str] = []
-    both, rule = None, None
-    if truth is not None:
+    comparison, rule = None, None
+    if ground_truth is not None:
         try:
-            both, rule = _compared(tracks, truth, options, (name, tracks_name), notes)
+            comparison, rule = _compared(tracks, ground_truth, options, (name, tracks_name), notes)
         except McaptrackError as error:
             notes.append(f"no misses, false tracks and switches of {tracks_name}: {error}")
-    index = {frame.t_ns: frame.index for frame in truth or () if both is not None} | {f.t_ns: f.index for f in tracks}
-    seen_ns = both.t_ns if both else np.empty(0, np.int64)
-    t_ns = np.unique(np.concatenate([frame_times(tracks), seen_ns]))
-    rows, bounds = join_rows(tracks)
-    row_ns = np.repeat(frame_times(tracks), np.diff(bounds))
-    order = np.lexsort((rows["track_id"], row_ns))
-    own = Lives(rows[order], row_ns[order], np.unique(frame_times(tracks)))
-    parts = [own.births(), own.ends(), own.repairs()]
-    if both:
-        parts += [_switches(both), _misses(both), _false_tracks(both)]
+    compared = ground_truth or () if comparison else ()
+    index = {frame.t_ns: frame.index for frame in [*compared, *tracks]}
+    compared_ns = comparison.t_ns if comparison else np.empty(0, np.int64)
+    t_ns = np.unique(np.concatenate([frame_times(tracks), compared_ns]))
+    joined = join_frames(TRACKS, tracks)
+    order = np.lexsort((joined.rows["track_id"], joined.row_ns))
+    lifecycle = TrackLifecycle(joined.rows[order], joined.row_ns[order], np.unique(joined.t_ns))
+    parts = [lifecycle.births(), lifecycle.ends(), lifecycle.repairs()]
+    if comparison:
+        parts += [_switches(comparison), _misses(comparison), _false_tracks(comparison)]
     events, events_ns = _in_order(parts)
-    counts = _counts(t_ns, own, events, events_ns, both)
+    counts = _counts(t_ns, lifecycle, events, events_ns, comparison)
     numbers = [index.get(at, 0) for at in t_ns.tolist()]
     ends = np.searchsorted(events_ns, t_ns, "right")
-    return Found(
-        _framed(t_ns, numbers, events, ends),
-        _framed(t_ns, numbers, counts, np.arange(1, len(t_ns) + 1)),
+    return TrackEvents(
+        split_rows(t_ns, numbers, events, ends),
+        split_rows(t_ns, numbers, counts, np.arange(1, len(t_ns) + 1)),
         rule,
         notes,
-        usual_ns(seen_ns) / NS_PER_S,
+        frame_interval_ns(compared_ns) / NS_PER_S,
     )
 
 
-def _framed(t_ns: Ints, index: list[int], rows: Rows, ends: Ints) -> list[Frame]:
-    starts = np.concatenate([[0], ends[:-1]]) if len(ends) else ends
-    spans = zip(t_ns.tolist(), index, starts.tolist(), ends.tolist(), strict=True)
-    return [Frame(at, number, rows[low:high]) for at, number, low, high in spans]
+def default_rule(ground_truth: Sequence[Frame], tracks: Sequence[Frame]) -> MatchRule | None:
+    """The default rule: overlap if tracks have the times of labelled boxes, otherwise distance on the ground.
 
-
-def usual_rule(truth: Sequence[Frame], tracks: Sequence[Frame]) -> Rule | None:
-    """What suits tracks: overlap at the times at which people drew boxes, and otherwise distance on the ground.
-
-    None if truth and tracks share neither boxes nor positions in metres.
+    None if ground truth and tracks share neither boxes nor positions in metres.
     """
-    shared = [one for one in ("iou", "metres") if not without({"truth": truth, "tracks": tracks}, one)]
-    at_video_rate = share_times(frame_times(truth), frame_times(tracks))
-    first: tuple[Similarity, ...] = ("iou", "metres") if at_video_rate and has(truth, "iou") else ("metres", "iou")
+    shared = [one for one in ("iou", "metres") if not sides_without({"truth": ground_truth, "tracks": tracks}, one)]
+    at_video_rate = have_same_times(frame_times(ground_truth), frame_times(tracks))
+    first: tuple[Similarity, ...] = (
+        ("iou", "metres") if at_video_rate and has_positions(ground_truth, "iou") else ("metres", "iou")
+    )
     chosen = next((one for one in first if one in shared), None)
     return EventOptions().rule(chosen) if chosen else None
 
 
 def _compared(
-    tracks: Sequence[Frame], truth: Sequence[Frame], options: EventOptions, names: tuple[str, str], notes: list[str]
-) -> tuple[_Truth, Rule]:
-    """Raises McaptrackError if they can't be compared."""
-    if not any(len(frame.rows) for frame in truth):
-        raise McaptrackError("the truth holds nobody")
-    usual = usual_rule(truth, tracks)
-    similarity = options.similarity or (usual.similarity if usual else None)
+    tracks: Sequence[Frame],
+    ground_truth: Sequence[Frame],
+    options: EventOptions,
+    names: tuple[str, str],
+    notes: list[str],
+) -> tuple[_Comparison, MatchRule]:
+    """Match tracks with the ground truth. Raises McaptrackError if they can't be compared."""
+    if not any(len(frame.rows) for frame in ground_truth):
+        raise McaptrackError("the ground truth is empty")
+    interval = default_rule(ground_truth, tracks)
+    similarity = options.similarity or (interval.similarity if interval else None)
     if similarity is None:
-        raise McaptrackError(f"{names[1]} and the truth share neither boxes nor positions in metres")
+        raise McaptrackError(f"{names[1]} and the ground truth share neither boxes nor positions in metres")
     rule = options.rule(similarity)
-    if lacking := without({"the truth": truth, names[1]: tracks}, similarity):
+    if missing := sides_without({"the ground truth": ground_truth, names[1]: tracks}, similarity):
         unit = "boxes" if similarity == "iou" else "positions in metres"
-        raise McaptrackError(f"{' and '.join(lacking)} {'have' if len(lacking) > 1 else 'has'} no {unit}")
-    at_same = align(*names, truth, tracks)
-    compared = compare(*at_same, *rule)
+        raise McaptrackError(f"{' and '.join(missing)} {'have' if len(missing) > 1 else 'has'} no {unit}")
+    at_same = align(*names, ground_truth, tracks)
+    compared = compare_rows(*at_same, *rule)
     found = matches(compared.matchup)
-    if len(found.who) == 0:
-        notes += strangers(*names, *at_same, rule.similarity)
-    return _Truth(compared, found, frame_times(at_same[0])), rule
+    if len(found.person) == 0:
+        notes += explain_no_match(*names, *at_same, rule.similarity)
+    return _Comparison(compared, found, frame_times(at_same[0])), rule
 
 
 def _in_order(parts: Sequence[tuple[Ints, Rows]]) -> tuple[Rows, Ints]:
-    """Events of all kinds by time, and their times (R,)."""
+    """Events of all kinds ordered by time, and their times (R,)."""
     t_ns = np.concatenate([when for when, _ in parts])
     rows = np.concatenate([part for _, part in parts])
     order = np.lexsort((rows["source_id"], rows["truth_id"], rows["track_id"], rows["kind"], t_ns))
     return EVENTS.check(rows[order]), t_ns[order]
 
 
-def _switches(both: _Truth) -> tuple[Ints, Rows]:
-    """One event for every switch that CLEAR counts."""
-    at = np.flatnonzero(switched(both.found))
-    found, (_, truth, tracks) = both.found, both.compared
-    now_ns, before_ns = both.t_ns[found.frame[at]], both.t_ns[found.frame[at - 1]]
+def _switches(comparison: _Comparison) -> tuple[Ints, Rows]:
+    """One event for each switch that CLEAR counts."""
+    at = np.flatnonzero(is_switch(comparison.found))
+    found, (_, ground_truth, tracks) = comparison.found, comparison.compared
+    now_ns, before_ns = comparison.t_ns[found.frame[at]], comparison.t_ns[found.frame[at - 1]]
     return now_ns, event_rows(
         EventKind.SWITCH,
-        truth.rows[found.row[at]],
-        truth_id=truth.names[found.who[at]],
-        track_id=tracks.names[found.by[at]],
-        previous_id=tracks.names[found.by[at - 1]],
-        duration_s=between_s(both.t_ns, before_ns, now_ns),
+        ground_truth.rows[found.row[at]],
+        truth_id=ground_truth.ids[found.person[at]],
+        track_id=tracks.ids[found.track[at]],
+        previous_id=tracks.ids[found.track[at - 1]],
+        duration_s=unobserved_s(comparison.t_ns, before_ns, now_ns),
     )
 
 
-def _misses(both: _Truth) -> tuple[Ints, Rows]:
-    """Spells in which a true person has no track; ``previous_id`` is the track they had."""
-    found, (_, truth, tracks) = both.found, both.compared
-    t_ns, places, spells = _spells(truth, found.row, both.t_ns)
-    had = _before(found.who, found.frame, found.by, spells.who, spells.frame, tracks.names)
-    return t_ns, event_rows(EventKind.MISS, places, truth_id=places["track_id"], previous_id=had, **spells.columns())
-
-
-def _false_tracks(both: _Truth) -> tuple[Ints, Rows]:
-    """Spells in which a track is nobody; ``previous_id`` is the person that it was."""
-    found, (_, truth, tracks) = both.found, both.compared
-    t_ns, places, spells = _spells(tracks, found.column, both.t_ns)
-    order = np.lexsort((found.frame, found.by))
-    had = _before(found.by[order], found.frame[order], found.who[order], spells.who, spells.frame, truth.names)
+def _misses(comparison: _Comparison) -> tuple[Ints, Rows]:
+    """Periods in which a person has no track; ``previous_id`` is the person's last track."""
+    found, (_, ground_truth, tracks) = comparison.found, comparison.compared
+    t_ns, places, periods = _periods(ground_truth, found.row, comparison.t_ns)
+    previous = _before(found.person, found.frame, found.track, periods.slot, periods.frame, tracks.ids)
     return t_ns, event_rows(
-        EventKind.FALSE_TRACK, places, track_id=places["track_id"], previous_id=had, **spells.columns()
+        EventKind.MISS, places, truth_id=places["track_id"], previous_id=previous, **periods.columns()
     )
 
 
-def _before(mine: Ints, frame: Ints, other: Ints, who: Ints, at: Ints, names: Ints) -> Ints:
-    """The name of whom each of ``who`` (R,) was matched with last before the frame ``at``; -1 for nobody.
+def _false_tracks(comparison: _Comparison) -> tuple[Ints, Rows]:
+    """Periods in which a track matches no person; ``previous_id`` is the person whom it matched last."""
+    found, (_, ground_truth, tracks) = comparison.found, comparison.compared
+    t_ns, places, periods = _periods(tracks, found.column, comparison.t_ns)
+    order = np.lexsort((found.frame, found.track))
+    previous = _before(
+        found.track[order], found.frame[order], found.person[order], periods.slot, periods.frame, ground_truth.ids
+    )
+    return t_ns, event_rows(
+        EventKind.FALSE_TRACK, places, track_id=places["track_id"], previous_id=previous, **periods.columns()
+    )
+
+
+def _before(mine: Ints, frame: Ints, other: Ints, slot: Ints, at: Ints, names: Ints) -> Ints:
+    """The id with which each of ``slot`` (R,) was matched last before the frame ``at``; -1 for none.
 
     Matches are ``mine`` with ``other`` (P,), ordered by ``mine`` and ``frame``.
     """
-    out = np.full(len(who), NOBODY)
+    out = np.full(len(slot), NO_ID)
     if len(mine):
         width = int(max(frame.max(), at.max(initial=0))) + 1
-        place = np.searchsorted(mine * width + frame, who * width + at) - 1
-        known = (place >= 0) & (mine[place] == who)
+        place = np.searchsorted(mine * width + frame, slot * width + at) - 1
+        known = (place >= 0) & (mine[place] == slot)
         out[known] = names[other[place[known]]]
     return out
 
 
-class _Spells(NamedTuple):
-    """Spells of one id without a match: dense number, first frame, frames without a match, seconds (R,)."""
+class _Periods(NamedTuple):
+    """Periods without a match: index of the id, first frame, number of unmatched frames, duration in s (R,)."""
 
-    who: Ints
+    slot: Ints
     frame: Ints
     frames: Ints
     duration_s: Floats
@@ -234,35 +260,36 @@ class _Spells(NamedTuple):
         return {"frames": self.frames, "duration_s": self.duration_s}
 
 
-def _spells(side: Placed, matched: Ints, frame_ns: Ints) -> tuple[Ints, Rows, _Spells]:
-    """Spells in which the same id has no match, with time and row of the beginning.
+def _periods(side: LocatedRows, matched: Ints, frame_ns: Ints) -> tuple[Ints, Rows, _Periods]:
+    """Periods in which an id has no match, with time and row of their beginning.
 
-    Matches that last less than a moment don't end a spell.
+    Matches shorter than ``MAX_PAUSE_S`` do not end a period.
     """
-    alone = np.ones(len(side.rows), bool)
-    alone[matched] = False
-    at = np.repeat(np.arange(len(frame_ns)), np.diff(side.ends))[alone]
-    rows, who = side.rows[alone], side.who[alone]
-    order = np.lexsort((at, who))
-    rows, who, at = rows[order], who[order], at[order]
-    t_ns, usual = frame_ns[at], usual_ns(frame_ns)
-    pause = max(seconds_to_ns(SAME_S), round(1.5 * usual))
-    begins = np.append(True, (who[1:] != who[:-1]) | (np.diff(t_ns) > pause))[: len(who)]
-    start = np.flatnonzero(begins)
-    end = np.append(start[1:], len(who)) if len(start) else start
-    lasts = (t_ns[end - 1] - t_ns[start] + usual) / NS_PER_S
-    return t_ns[start], rows[start], _Spells(who[start], at[start], end - start, lasts)
+    unmatched = np.ones(len(side.rows), bool)
+    unmatched[matched] = False
+    at = group_index(np.diff(side.ends))[unmatched]
+    rows, slot = side.rows[unmatched], side.track[unmatched]
+    order = np.lexsort((at, slot))
+    rows, slot, at = rows[order], slot[order], at[order]
+    t_ns, interval = frame_ns[at], frame_interval_ns(frame_ns)
+    pause = max(seconds_to_ns(MAX_PAUSE_S), round(1.5 * interval))
+    start = np.flatnonzero(run_starts(slot, times=t_ns, max_gap=pause))
+    end = np.append(start[1:], len(slot)) if len(start) else start
+    lasts = (t_ns[end - 1] - t_ns[start] + interval) / NS_PER_S
+    return t_ns[start], rows[start], _Periods(slot[start], at[start], end - start, lasts)
 
 
-def _counts(t_ns: Ints, own: Lives, events: Rows, events_ns: Ints, both: _Truth | None) -> Rows:
-    """A row for each of the times (F,)."""
+def _counts(
+    t_ns: Ints, lifecycle: TrackLifecycle, events: Rows, events_ns: Ints, comparison: _Comparison | None
+) -> Rows:
+    """A row of Counts for each of the times (F,)."""
     total = len(t_ns)
     out = COUNTS.empty(total)
     for name in ("people", "matches", "misses", "false_tracks", "switches", "mota"):
         out[name] = np.nan
-    at = np.searchsorted(t_ns, own.row_ns)
+    at = np.searchsorted(t_ns, lifecycle.row_ns)
     out["tracked"] = np.bincount(at, minlength=total)
-    out["observed"] = np.bincount(at[own.rows["observed"]], minlength=total)
+    out["observed"] = np.bincount(at[lifecycle.rows["observed"]], minlength=total)
 
     def so_far(*kinds: EventKind) -> Ints:
         chosen = np.isin(events["kind"], kinds)
@@ -270,11 +297,11 @@ def _counts(t_ns: Ints, own: Lives, events: Rows, events_ns: Ints, both: _Truth 
 
     out["born"], out["ended"] = so_far(EventKind.BIRTH), so_far(EventKind.END)
     out["repaired"] = so_far(EventKind.JOINED, EventKind.PARTED)
-    if both is None:
+    if comparison is None:
         return out
-    matchup, looked_at = both.compared.matchup, np.searchsorted(t_ns, both.t_ns)
-    hits = np.bincount(both.found.frame, minlength=len(both.t_ns))
-    false, people = matchup.track_counts - hits, matchup.truth_counts
+    matchup, looked_at = comparison.compared.matchup, np.searchsorted(t_ns, comparison.t_ns)
+    hits = np.bincount(comparison.found.frame, minlength=len(comparison.t_ns))
+    false, people = matchup.track_counts - hits, matchup.ground_truth_counts
     switches = so_far(EventKind.SWITCH)[looked_at]
     of_all = np.cumsum(people)
     out["people"][looked_at], out["matches"][looked_at] = people, hits

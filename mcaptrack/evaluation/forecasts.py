@@ -1,7 +1,7 @@
-"""How far off forecasts were: what their scores are made of, each by itself and frame by frame.
+"""Errors of forecasts, for each forecast and frame by frame.
 
-Forecasts are held against the truth, and against what was made of the tracks with all that was known in the end. The
-two are never mixed: the mean over the rows held against the truth is the score that ``evaluate`` gives.
+Forecasts are compared with the ground truth and, in other columns, with the tracks after re-tracking the whole log. The
+two are never mixed: the mean over the rows compared with the ground truth is the score of ``evaluate``.
 
 Letters: N forecasts, P pairs, T future steps, F frames.
 """
@@ -15,34 +15,35 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.evaluation.aligned import MAX_HOLE_S, frame_times, on_ground, resampled
+from mcaptrack.evaluation.aligned import MAX_GAP_S, on_ground, resample_frames
 from mcaptrack.evaluation.metrics.calibration import LEVELS
 from mcaptrack.evaluation.metrics.displacement import (
     TAU_M2,
     Displacement,
     Forecasts,
-    Paired,
-    Path,
+    PairedForecasts,
+    Positions,
     displacement,
-    errors,
-    pair,
+    forecast_errors,
+    pair_forecasts,
 )
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
 from mcaptrack.schema import FORECAST_ERRORS, FORECAST_SCORES, PREDICTIONS, TRACKS, Frame, Rows, Schema
+from mcaptrack.schema.framing import frame_times, join_frames, split_rows
 from mcaptrack.schema.resampling import looked_at
 
-#: The channels of forecasts, below the camera's prefix, and the tracks that each is made from.
-MADE_FROM: Final[Mapping[str, str]] = {"predictions": "samples", "retracks/predictions": "retracks/online"}
-_NOBODY: Final = -1
+#: The channels of forecasts, below the camera's prefix, and the tracks from which each is made.
+FORECAST_INPUTS: Final[Mapping[str, str]] = {"predictions": "samples", "retracks/predictions": "retracks/online"}
+NO_ID: Final = -1
 _WITHIN: Final = LEVELS.index(0.95)
 _AHEAD_S: Final = 1.0
-#: What is said of a forecast that is held against a path.
+#: The columns of a forecast that is compared with a path.
 _MEASURES: Final = ("ade_m", "fde_m", "error_1s_m", "within_95")
 
 
-class _Clock(NamedTuple):
-    """The clock of prediction, which begins with the tracks."""
+class _PredictionClock(NamedTuple):
+    """The regular clock of predictions, which starts with the first frame of the tracks."""
 
     start_ns: int
     last_ns: int
@@ -51,33 +52,34 @@ class _Clock(NamedTuple):
     def to_step(self, t_ns: Ints) -> Ints:
         return np.rint((t_ns - self.start_ns) / (self.step_s * NS_PER_S)).astype(np.int64)
 
-    def positions(self, frames: Sequence[Frame]) -> Path:
-        """The places of tracks whose frames are ticks of this clock."""
-        rows = TRACKS.joined([frame.rows for frame in frames])
-        t_ns = np.repeat(frame_times(frames), [len(frame.rows) for frame in frames])
-        return Path(self.to_step(t_ns), rows["track_id"].astype(np.int64), on_ground(rows))
+    def positions(self, frames: Sequence[Frame]) -> Positions:
+        """The positions of tracks whose frames are ticks of this clock."""
+        joined = join_frames(TRACKS, frames)
+        ids = joined.rows["track_id"].astype(np.int64)
+        return Positions(self.to_step(joined.row_ns), ids, on_ground(joined.rows))
 
-    def brought(self, truth: Sequence[Frame]) -> Path:
-        """The places of tracks of another clock at the ticks of this one, where somebody looked."""
+    def resampled(self, ground_truth: Sequence[Frame]) -> Positions:
+        """The positions of tracks with other times, resampled to the ticks that their frames cover."""
         last = int(self.to_step(np.array([self.last_ns]))[0])
         ticks = self.start_ns + np.rint(np.arange(last + 1) * (self.step_s * NS_PER_S)).astype(np.int64)
-        return self.positions(resampled(truth, ticks[looked_at(frame_times(truth), ticks, seconds_to_ns(MAX_HOLE_S))]))
+        return self.positions(
+            resample_frames(ground_truth, ticks[looked_at(frame_times(ground_truth), ticks, seconds_to_ns(MAX_GAP_S))])
+        )
 
 
-class _Made(NamedTuple):
-    """Forecasts as arrays, ordered by message and id: ``message`` (N,) is the number of the message of each."""
+class _ForecastArrays(NamedTuple):
+    """Forecasts as arrays, ordered by message and id; ``message`` (N,) is the index of each forecast's message."""
 
     message: Ints
     forecasts: Forecasts
-    clock: _Clock
+    clock: _PredictionClock
 
 
-def _arrays(frames: Sequence[Frame], tracks: Sequence[Frame], name: str) -> _Made | None:
-    """None if there are no forecasts at all. Raises McaptrackError if they are not all of the same steps."""
-    rows = PREDICTIONS.joined([frame.rows for frame in frames])
+def _arrays(frames: Sequence[Frame], tracks: Sequence[Frame], name: str) -> _ForecastArrays | None:
+    """Forecasts as arrays; None if there are none. Raises McaptrackError if they differ in their number of steps."""
+    rows, message, _, _ = join_frames(PREDICTIONS, frames)
     if not len(rows) or not len(tracks):
         return None
-    message = np.repeat(np.arange(len(frames)), [len(frame.rows) for frame in frames])
     order = np.lexsort((rows["step"], rows["track_id"], message))
     rows, message = rows[order], message[order]
     horizon = int(rows["step"].max())
@@ -85,7 +87,7 @@ def _arrays(frames: Sequence[Frame], tracks: Sequence[Frame], name: str) -> _Mad
         raise McaptrackError(f"{name}: not all forecasts have {horizon} steps")
     track_ns = frame_times(tracks)
     step_s = float(rows["ahead_s"][0]) / int(rows["step"][0])
-    clock = _Clock(int(track_ns.min()), int(track_ns.max()), step_s)
+    clock = _PredictionClock(int(track_ns.min()), int(track_ns.max()), step_s)
     cov = np.stack([rows["cov_xx_m2"], rows["cov_xy_m2"], rows["cov_xy_m2"], rows["cov_yy_m2"]], axis=-1)
     forecasts = Forecasts(
         clock.to_step(frame_times(frames)[message[::horizon]]),
@@ -93,31 +95,50 @@ def _arrays(frames: Sequence[Frame], tracks: Sequence[Frame], name: str) -> _Mad
         on_ground(rows).reshape(-1, horizon, 2),
         cov.reshape(-1, horizon, 2, 2),
     )
-    return _Made(message[::horizon], forecasts, clock)
+    return _ForecastArrays(message[::horizon], forecasts, clock)
 
 
-_NOTHING: Final = _Made(
+_NOTHING: Final = _ForecastArrays(
     np.empty(0, np.int64),
     Forecasts(np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 1, 2)), np.empty((0, 1, 2, 2))),
-    _Clock(0, 0, 1.0),
+    _PredictionClock(0, 0, 1.0),
 )
 
 
 def score_forecasts(
-    frames: Sequence[Frame], tracks: Sequence[Frame], truth: Sequence[Frame], name: str
+    frames: Sequence[Frame], tracks: Sequence[Frame], ground_truth: Sequence[Frame], name: str
 ) -> Displacement | None:
-    """The scores of forecasts made for tracks; None if there are none at all.
+    """Score the forecasts made for tracks.
 
-    Raises McaptrackError, with ``name``, if they are not all of the same steps.
+    Parameters
+    ----------
+    frames : sequence of Frame
+        Rows of Predictions.
+    tracks : sequence of Frame
+        Rows of Tracks from which the forecasts were made.
+    ground_truth : sequence of Frame
+        Rows of Tracks.
+    name : str
+        The name of the forecasts, for messages.
+
+    Returns
+    -------
+    Displacement or None
+        None if there are no forecasts.
+
+    Raises
+    ------
+    McaptrackError
+        If forecasts differ in their number of steps.
     """
-    made = _arrays(frames, tracks, name)
-    if made is None:
+    arrays = _arrays(frames, tracks, name)
+    if arrays is None:
         return None
-    return displacement(made.clock.brought(truth), made.clock.positions(tracks), made.forecasts)
+    return displacement(arrays.clock.resampled(ground_truth), arrays.clock.positions(tracks), arrays.forecasts)
 
 
-class ForecastsFound(NamedTuple):
-    """Rows of ForecastErrors and of ForecastScores, a frame each for every frame of the forecasts."""
+class ForecastErrorFrames(NamedTuple):
+    """Rows of ForecastErrors and of ForecastScores: one frame of each for every frame of the forecasts."""
 
     errors: list[Frame]
     scores: list[Frame]
@@ -126,37 +147,58 @@ class ForecastsFound(NamedTuple):
 def find_forecast_errors(
     frames: Sequence[Frame],
     tracks: Sequence[Frame],
-    truth: Sequence[Frame] | None,
+    ground_truth: Sequence[Frame] | None,
     later: Sequence[Frame],
     name: str = "the forecasts",
-) -> ForecastsFound:
-    """How far off forecasts were that were made for tracks: from the truth, if any, and from tracks of the same clock.
+) -> ForecastErrorFrames:
+    """Compute the errors of forecasts made for tracks.
 
-    ``later`` are the tracks as they became when more was known. Raises as ``score_forecasts`` does.
+    Parameters
+    ----------
+    frames : sequence of Frame
+        Rows of Predictions.
+    tracks : sequence of Frame
+        Rows of Tracks from which the forecasts were made.
+    ground_truth : sequence of Frame, optional
+        Rows of Tracks at any times.
+    later : sequence of Frame
+        Rows of Tracks at the times of ``tracks``, as they are after the whole log is known.
+    name : str
+        The name of the forecasts, for messages.
+
+    Returns
+    -------
+    ForecastErrorFrames
+
+    Raises
+    ------
+    McaptrackError
+        If forecasts differ in their number of steps.
     """
-    made = _arrays(frames, tracks, name) or _NOTHING
-    rows, scores = _unknown(FORECAST_ERRORS, len(made.message)), _unknown(FORECAST_SCORES, len(frames))
-    rows["track_id"], rows["truth_id"], rows["later_id"] = made.forecasts.id, _NOBODY, _NOBODY
-    scores["forecasts"] = np.bincount(made.message, minlength=len(frames))
-    paths = made.clock.positions(tracks)
-    people = made.clock.brought(truth or ())
+    arrays = _arrays(frames, tracks, name) or _NOTHING
+    rows, scores = _missing_rows(FORECAST_ERRORS, len(arrays.message)), _missing_rows(FORECAST_SCORES, len(frames))
+    rows["track_id"], rows["truth_id"], rows["later_id"] = arrays.forecasts.id, NO_ID, NO_ID
+    scores["forecasts"] = np.bincount(arrays.message, minlength=len(frames))
+    paths = arrays.clock.positions(tracks)
+    people = arrays.clock.resampled(ground_truth or ())
     if np.isfinite(people.xy_m).any():
-        false = _hold(made, pair(people, paths, made.forecasts), rows, "truth_id", "")
-        scores["false_forecasts"] = np.bincount(made.message[false], minlength=len(frames))
-        scores["scored"] = _mean(made.message, rows, scores, "")
+        false = _compare(arrays, pair_forecasts(people, paths, arrays.forecasts), rows, "truth_id", "")
+        scores["false_forecasts"] = np.bincount(arrays.message[false], minlength=len(frames))
+        scores["scored"] = _mean(arrays.message, rows, scores, "")
         for so_far, measure in (("ade_so_far_m", "ade_m"), ("fde_so_far_m", "fde_m")):
             scores[so_far] = _so_far(scores["scored"], scores[measure])
-    _hold(made, pair(made.clock.positions(later), paths, made.forecasts), rows, "later_id", "later_")
-    scores["later_scored"] = _mean(made.message, rows, scores, "later_")
-    ends = np.searchsorted(made.message, np.arange(len(frames)), "right")
-    return ForecastsFound(
-        _framed(frames, FORECAST_ERRORS.check(rows), ends),
-        _framed(frames, FORECAST_SCORES.check(scores), np.arange(1, len(frames) + 1)),
+    _compare(arrays, pair_forecasts(arrays.clock.positions(later), paths, arrays.forecasts), rows, "later_id", "later_")
+    scores["later_scored"] = _mean(arrays.message, rows, scores, "later_")
+    ends = np.searchsorted(arrays.message, np.arange(len(frames)), "right")
+    times, numbers = frame_times(frames), [frame.index for frame in frames]
+    return ForecastErrorFrames(
+        split_rows(times, numbers, FORECAST_ERRORS.check(rows), ends),
+        split_rows(times, numbers, FORECAST_SCORES.check(scores), np.arange(1, len(frames) + 1)),
     )
 
 
-def _unknown(schema: Schema, count: int) -> Rows:
-    """Rows of which nothing is known yet."""
+def _missing_rows(schema: Schema, count: int) -> Rows:
+    """Rows in which every optional column is missing."""
     rows = schema.empty(count)
     for column in schema.columns:
         if column.optional:
@@ -164,27 +206,23 @@ def _unknown(schema: Schema, count: int) -> Rows:
     return rows
 
 
-def _framed(frames: Sequence[Frame], rows: Rows, ends: Ints) -> list[Frame]:
-    starts = [0, *ends.tolist()][:-1]
-    spans = zip(frames, starts, ends.tolist(), strict=True)
-    return [Frame(frame.t_ns, frame.index, rows[low:high]) for frame, low, high in spans]
-
-
-def _hold(made: _Made, found: Paired, rows: Rows, who: str, front: str) -> NDArray[np.bool_]:
-    """Fill in whom forecasts belong to, and how far off they were; returns which (N,) belong to nobody."""
+def _compare(
+    arrays: _ForecastArrays, found: PairedForecasts, rows: Rows, id_column: str, front: str
+) -> NDArray[np.bool_]:
+    """Fill in id and errors of the forecasts that are paired; returns which of the others are false (N,)."""
     near = found.d_obs_m2 < TAU_M2
     at = found.forecast[near]
-    rows[who][at] = found.person[near]
-    off, cov = found.off_m[near], made.forecasts.cov_m2[at]
-    ade_m, fde_m, _, covered, _ = errors(off, cov)
-    soon_m = _at_s(off, made.clock.step_s, _AHEAD_S)
+    rows[id_column][at] = found.person[near]
+    off, cov = found.offset_m[near], arrays.forecasts.cov_m2[at]
+    ade_m, fde_m, _, covered, _ = forecast_errors(off, cov)
+    soon_m = _at_s(off, arrays.clock.step_s, _AHEAD_S)
     for measure, values in zip(_MEASURES, (ade_m, fde_m, soon_m, covered[:, _WITHIN]), strict=True):
         rows[front + measure][at] = values
-    return np.asarray(found.is_judged & (rows[who] == _NOBODY), np.bool_)
+    return np.asarray(found.is_judged & (rows[id_column] == NO_ID), np.bool_)
 
 
 def _at_s(off_m: Floats, step_s: float, ahead_s: float) -> Floats:
-    """How far off (P,) paths are so many seconds ahead, on the straight line between the steps around; NaN outside."""
+    """The distances (P,) at a time ahead, interpolated linearly between steps; NaN outside of them."""
     place = round(ahead_s / step_s - 1, 6)
     if not 0 <= place <= off_m.shape[1] - 1:
         return np.full(len(off_m), np.nan)
@@ -195,7 +233,7 @@ def _at_s(off_m: Floats, step_s: float, ahead_s: float) -> Floats:
 
 
 def _mean(message: Ints, rows: Rows, scores: Rows, front: str) -> Ints:
-    """Fill in the means of each frame over what is known; returns of how many (F,)."""
+    """Fill in the means of each frame over the known values; returns the number of these (F,)."""
     known = np.isfinite(rows[front + "ade_m"])
     count = np.bincount(message[known], minlength=len(scores))
     for measure in ("ade_m", "fde_m", "within_95"):
@@ -205,7 +243,7 @@ def _mean(message: Ints, rows: Rows, scores: Rows, front: str) -> Ints:
 
 
 def _so_far(count: Floats, mean: Floats) -> Floats:
-    """The mean over all up to each frame (F,), of the means of frames over so many."""
+    """The running mean up to each frame (F,), from the means and counts of the frames."""
     of_all = np.cumsum(count)
     total = np.cumsum(np.where(count > 0, count * np.nan_to_num(mean), 0.0))
     return np.where(of_all > 0, total / np.maximum(of_all, 1), np.nan)

@@ -1,8 +1,8 @@
-"""Look for the parameters of a transform that score best against the truth.
+"""Search the parameters of a transform that score best against ground truth.
 
-A search asks for parameters within the ranges that the transform declares, runs the transform on every sequence, scores
-what comes out, and writes each trial to a file as soon as it is known; begun again with the same file it goes on where
-it was. Optuna proposes the trials where it is installed; without it they are drawn at random.
+A search draws parameters within the ranges that the transform declares, runs the transform on each sequence, scores the
+result, and appends each trial to a file at once; started again with the same file, it continues. Optuna proposes the
+trials if it is installed, otherwise they are random.
 """
 
 from __future__ import annotations
@@ -18,28 +18,28 @@ from typing import Any, Final, Literal, Protocol, get_type_hints
 import numpy as np
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.evaluation import Candidate, EvaluateOptions, Sequenced, evaluate
+from mcaptrack.evaluation import Candidate, EvaluateOptions, EvaluationInput, evaluate
 from mcaptrack.schema import Frame
 from mcaptrack.transforms import Transform
 from mcaptrack.transforms.protocol import bare_type
 
 Metric = Literal["IDF1", "MOTA", "HOTA", "IDP", "IDR", "DetA", "AssA"]
 
-#: Parameters are drawn to so many digits, so that what is written is exactly what was tried.
+#: Parameters are rounded to this many digits, so that the file has exactly the values that were tried.
 _DIGITS: Final = 3
 _VERSION: Final = 1
 
 
 @dataclass(frozen=True)
 class Range:
-    """What a parameter may be in a search, both ends included; whole numbers only if ``whole``."""
+    """The range of a parameter, both ends included; only ints if ``whole``."""
 
     low: float
     high: float
     whole: bool
 
     def draw(self, rng: np.random.Generator) -> float | int:
-        """Any of them, all equally likely."""
+        """A value of the range, uniformly distributed."""
         if self.whole:
             return int(rng.integers(round(self.low), round(self.high) + 1))
         return round(float(rng.uniform(self.low, self.high)), _DIGITS)
@@ -47,17 +47,17 @@ class Range:
 
 @dataclass(frozen=True)
 class Task:
-    """One sequence of a search: what the transform reads, its truth, and the transform's context for it."""
+    """One sequence of a search: the input of the transform, the ground truth, and the transform's context."""
 
     name: str
     frames: Sequence[Frame]
-    truth: Sequence[Frame]
+    ground_truth: Sequence[Frame]
     context: Mapping[str, Any]
 
 
 @dataclass(frozen=True)
 class Trial:
-    """Parameters that were tried, and the scores of what came out, over all sequences. Trial 0 is the defaults."""
+    """Parameters and their scores over all sequences. Trial 0 has the default parameters."""
 
     number: int
     parameters: Mapping[str, Any]
@@ -85,12 +85,32 @@ def tune(
     trials: int = 100,
     seed: int = 0,
     study: Path | None = None,
-    told: Callable[[Trial, Trial, int], None] = lambda *_: None,
+    on_trial: Callable[[Trial, Trial, int], None] = lambda *_: None,
 ) -> tuple[Trial, Trial]:
-    """Search, and return the first trial (``base`` as it is) and the best one; of equals the earliest.
+    """Search parameters, and return the first trial (``base`` unchanged) and the best; the earliest of equals.
 
-    ``told`` hears of each new trial: the trial, the best so far, and how many there are to be. Trials in ``study``
-    count as made. Raises McaptrackError if there is nothing to search in, or if ``study`` is of another search.
+    Parameters
+    ----------
+    base : Transform
+    tasks : sequence of Task
+    ranges : mapping of str to Range
+        The parameters to search.
+    scoring : EvaluateOptions
+    metric : str
+        The score to maximise.
+    trials : int
+        The number of trials, including those in ``study``.
+    seed : int
+        Random seed.
+    study : Path, optional
+        A file of earlier trials, to which new ones are appended.
+    on_trial : callable
+        Called with each new trial, the best so far and the number of trials.
+
+    Raises
+    ------
+    McaptrackError
+        If there are no ranges, or if ``study`` belongs to another search.
     """
     if not ranges:
         raise McaptrackError(f"{type(base).__name__.lower()} declares no ranges to search in")
@@ -103,7 +123,7 @@ def tune(
         trial = Trial(number, parameters, trial_scores(replace(base, **parameters), tasks, scoring))
         propose.tell(trial)
         known.add(trial)
-        told(trial, _best(made, metric), trials)
+        on_trial(trial, _best(made, metric), trials)
     return made[0], _best(made, metric)
 
 
@@ -114,10 +134,10 @@ def _best(made: Sequence[Trial], metric: str) -> Trial:
 def trial_scores(transform: Transform, tasks: Sequence[Task], scoring: EvaluateOptions) -> dict[str, float]:
     """The scores of a transform's main output, over all sequences together."""
 
-    def sequences() -> Iterator[Sequenced]:
+    def sequences() -> Iterator[EvaluationInput]:
         for task in tasks:
             out = [result[0] for result in replace(transform, **task.context)(task.frames)]
-            yield Sequenced(task.name, task.truth, [Candidate("tracks", None, out)])
+            yield EvaluationInput(task.name, task.ground_truth, [Candidate("tracks", None, out)])
 
     row = evaluate(sequences(), scoring).results[-1].to_json()
     return {name: value for name, value in row.items() if isinstance(value, int | float) and name != "gate"}
@@ -126,10 +146,10 @@ def trial_scores(transform: Transform, tasks: Sequence[Task], scoring: EvaluateO
 def _about(
     base: Transform, tasks: Sequence[Task], ranges: Mapping[str, Range], scoring: EvaluateOptions
 ) -> dict[str, Any]:
-    """What a study is a study of; trials of another one say nothing here."""
+    """What identifies a study; trials of another study can't be continued."""
     digest = hashlib.sha256()
     for task in tasks:
-        for part in (task.frames, task.truth):
+        for part in (task.frames, task.ground_truth):
             digest.update(task.name.encode())
             for frame in part:
                 digest.update(frame.t_ns.to_bytes(8, "little", signed=True) + frame.rows.tobytes())
@@ -148,7 +168,7 @@ def _about(
 
 
 class _Study:
-    """The trials of a search and the file they are kept in: a line that says what of, then a line a trial."""
+    """The trials of a search and their file: a line that identifies the search, then a line for each trial."""
 
     def __init__(self, path: Path | None, about: Mapping[str, Any]) -> None:
         self.trials: list[Trial] = []
@@ -166,7 +186,7 @@ class _Study:
 
     def _read(self, path: Path, about: Mapping[str, Any]) -> None:
         raw = path.read_bytes()
-        whole = raw[: raw.rfind(b"\n") + 1]  # the last line is cut where a run was ended while it wrote
+        whole = raw[: raw.rfind(b"\n") + 1]  # the last line may be incomplete if a run was ended while it wrote
         try:
             head, *lines = (json.loads(line) for line in whole.decode("utf-8").splitlines())
             self.trials = [Trial(line["number"], line["parameters"], line["scores"]) for line in lines]
@@ -175,7 +195,7 @@ class _Study:
         differs = sorted(name for name in about if head.get(name) != about[name]) if isinstance(head, dict) else ["all"]
         if differs:
             raise McaptrackError(
-                f"{path} is a study of something else ({', '.join(differs)} differ); give another file with --study"
+                f"{path} is a study of another search ({', '.join(differs)} differ); give another file"
             )
         if len(whole) < len(raw):
             path.write_bytes(whole)
@@ -195,7 +215,7 @@ class _Proposer(Protocol):
 
 
 class _Random:
-    """Proposes at random; trial n of a seed is the same whenever it is asked for."""
+    """Proposes random values; trial n of a seed is always the same."""
 
     def __init__(self, ranges: Mapping[str, Range], seed: int) -> None:
         self._ranges, self._seed = ranges, seed
@@ -205,7 +225,7 @@ class _Random:
         return {name: part.draw(rng) for name, part in self._ranges.items()}
 
     def tell(self, trial: Trial) -> None:
-        """Takes no notice."""
+        """Random proposals do not depend on trials."""
 
 
 class _Optuna:
@@ -248,7 +268,7 @@ def _proposer(ranges: Mapping[str, Range], metric: str, seed: int, made: Sequenc
 
 
 def uses_optuna() -> bool:
-    """Whether Optuna is there to propose trials."""
+    """Whether Optuna is installed."""
     from importlib.util import find_spec
 
     return find_spec("optuna") is not None

@@ -114,3 +114,34 @@ def run_ends(starts: Bools) -> Bools:
     [False, True, True]
     """
     return np.append(starts[1:], True)[: len(starts)]
+
+
+def cross_pairs(a_counts: ArrayLike, b_counts: ArrayLike) -> tuple[Ints, Ints, Ints]:
+    """All pairs of a member of one side with a member of the other, within each group.
+
+    Members of each side are numbered through all groups, in the order of groups.
+
+    Parameters
+    ----------
+    a_counts, b_counts : (G,) of int
+        Number of members of each group on either side, 0 or more.
+
+    Returns
+    -------
+    group, a, b : (P,) of int64 each
+        Group and members of each pair, ordered by group, then by ``a``, then by ``b``.
+
+    Examples
+    --------
+    >>> group, a, b = cross_pairs([1, 2], [2, 1])
+    >>> list(zip(group.tolist(), a.tolist(), b.tolist()))
+    [(0, 0, 0), (0, 0, 1), (1, 1, 2), (1, 2, 2)]
+    """
+    a_sizes, b_sizes = np.asarray(a_counts, np.int64), np.asarray(b_counts, np.int64)
+    size = a_sizes * b_sizes
+    group = group_index(size)
+    within = ragged_range(0, size)
+    local = within // b_sizes[group]
+    a = (np.cumsum(a_sizes) - a_sizes)[group] + local
+    b = (np.cumsum(b_sizes) - b_sizes)[group] + within - local * b_sizes[group]
+    return group, a, b

@@ -18,9 +18,9 @@ import numpy as np
 
 from mcaptrack import foxglove, log
 from mcaptrack.errors import McaptrackError, command
+from mcaptrack.evaluation.event_text import SUFFIX, log_messages
 from mcaptrack.evaluation.events import EventOptions, find_events
-from mcaptrack.evaluation.forecasts import MADE_FROM, find_forecast_errors
-from mcaptrack.evaluation.words import SUFFIX, log_messages
+from mcaptrack.evaluation.forecasts import FORECAST_INPUTS, find_forecast_errors
 from mcaptrack.notices import warn
 from mcaptrack.pipeline.checks import how_it_came, may_replace
 from mcaptrack.pipeline.plan import is_stale
@@ -100,12 +100,12 @@ def make_events(opened: log.Log, prefix: str, made: Mapping[str, Made], watch: W
         parameters = found.parameters(options)
         provenance = Provenance(STAGE, parameters, topic, tracks_digest, references=truth().digests)
         out[topic + _EVENTS] = events = Made.of(EVENTS, found.events, provenance)
-        words_of = list(log_messages(found.events, topic, opened.start_ns, found.usual_s))
+        words_of = list(log_messages(found.events, topic, opened.start_ns, found.frame_interval_s))
         view = Provenance(VIEW, {}, topic + _EVENTS, events.provenance.digest)
         out[topic + _EVENTS + SUFFIX] = Made(EVENTS, [], view, words_of, foxglove.schema_record(foxglove.LOG))
         out[topic + _COUNTS] = Made.of(COUNTS, found.counts, provenance)
     if not watch.topics:
-        for name in MADE_FROM:
+        for name in FORECAST_INPUTS:
             out |= _forecast_errors(opened, prefix, name, made, watch.again or watch.anew, truth)
     return out
 
@@ -119,7 +119,7 @@ def _forecast_errors(
     truth: Callable[[], _Truth],
 ) -> dict[str, Made]:
     """How far off the forecasts of one channel were, if they are there and that is missing or out of date."""
-    topic, tracks, later = (f"{prefix}/{one}" for one in (name, MADE_FROM[name], _BECAME))
+    topic, tracks, later = (f"{prefix}/{one}" for one in (name, FORECAST_INPUTS[name], _BECAME))
     if not _holds(opened, topic, made, PREDICTIONS) or not _holds(opened, tracks, made):
         return {}
     later = later if _holds(opened, later, made) else tracks

@@ -9,7 +9,7 @@ import numpy as np
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
-from mcaptrack.evaluation import Candidate, EvaluateOptions, Sequenced, evaluate
+from mcaptrack.evaluation import Candidate, EvaluateOptions, EvaluationInput, evaluate
 from mcaptrack.notices import warn
 from mcaptrack.schema import DETECTIONS, GROUND_PLANE, PREDICTIONS, TRACKS, Rows, Schema
 from mcaptrack.schema.provenance import Provenance
@@ -126,7 +126,7 @@ def _scores(opened: log.Log, truth: str, topics: tuple[str, str]) -> Scores | No
     if not all(channel and channel.schema_name == TRACKS.name for channel in there):
         return None
     candidates = [Candidate(topic, None, opened.frames(topic, TRACKS)) for topic in topics]
-    sequence = Sequenced(opened.path.stem, opened.frames(truth, TRACKS), candidates)
+    sequence = EvaluationInput(opened.path.stem, opened.frames(truth, TRACKS), candidates)
     ways = {
         f"within {_GATE_M:g} m": EvaluateOptions(similarities=("metres",), gates_m=(_GATE_M,)),
         f"by an overlap of {_MIN_IOU:g}": EvaluateOptions(similarities=("iou",), min_iou=_MIN_IOU),

@@ -74,11 +74,11 @@ def by_trackeval(part: Matchup) -> dict:
 
     data = {
         "num_tracker_dets": part.track_rows,
-        "num_gt_dets": part.truth_rows,
-        "num_gt_ids": part.n_truth,
+        "num_gt_dets": part.ground_truth_rows,
+        "num_gt_ids": part.n_ground_truth,
         "num_tracker_ids": part.n_tracks,
-        "num_timesteps": len(part.truth),
-        "gt_ids": list(part.truth),
+        "num_timesteps": len(part.ground_truth),
+        "gt_ids": list(part.ground_truth),
         "tracker_ids": list(part.tracks),
         "similarity_scores": list(part.similarity),
     }
@@ -92,7 +92,7 @@ def by_trackers(part: Matchup) -> dict:
     from trackers.eval.hota import compute_hota_metrics
     from trackers.eval.identity import compute_identity_metrics
 
-    given = (list(part.truth), list(part.tracks), list(part.similarity))
+    given = (list(part.ground_truth), list(part.tracks), list(part.similarity))
     return compute_clear_metrics(*given) | compute_identity_metrics(*given) | compute_hota_metrics(*given)
 
 
@@ -120,7 +120,7 @@ def main() -> None:
                 assert mine not in others or abs(ours[mine] - np.mean(others[mine])) < 1e-9, mine
         calls = by_us, by_trackeval, by_trackers
         times = np.array([[timed(call, parts) for call in calls] for _ in range(options.rounds)]).min(axis=0)
-    frames = sum(len(part.truth) for part in parts)
+    frames = sum(len(part.ground_truth) for part in parts)
     print(f"{len(parts)} sequences, {frames} frames: {1e3 * times[0]:.0f} ms")
     for name, peer in zip(("trackeval", "trackers.eval"), times[1:], strict=True):
         print(f"{name:>14}: {1e3 * peer:5.0f} ms, {peer / times[0]:4.1f} times as fast")

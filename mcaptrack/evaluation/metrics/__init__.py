@@ -1,8 +1,8 @@
-"""Scores: arrays in, numbers out. Nothing here knows a file, a channel or a tracker.
+"""Scores of tracking and prediction: arrays in, numbers out. No module here knows a file, a channel or a tracker.
 
-matchup = ...                          who was there, who was tracked, how alike they are
-summary(score(matchup))                MOTA, IDF1, HOTA and their counts for one sequence
-summary(combine([score(a), score(b)])) the same over several
+matchup = Matchup(...)                 ground truth and tracks of one sequence, and how similar they are
+summary(score(matchup))                MOTA, IDF1, HOTA and their counts
+summary(combine([score(a), score(b)])) the same over several sequences
 """
 
 from __future__ import annotations
@@ -22,19 +22,60 @@ __all__ = ["Matchup", "Rules", "Score", "combine", "distances", "metres_to_simil
 
 
 class Score(NamedTuple):
-    """What can be added up over sequences: counts, and HOTA's parts over its thresholds."""
+    """The scores of a sequence that can be added up: counts, and the parts of HOTA at its 19 thresholds."""
 
     counts: dict[str, float]
     hota: dict[str, NDArray[np.float64]]
 
 
 def score(matchup: Matchup, rules: Rules = "trackeval") -> Score:
-    """CLEAR, identity and HOTA of one sequence."""
+    """Compute CLEAR, identity and HOTA scores of one sequence.
+
+    Parameters
+    ----------
+    matchup : Matchup
+        Ground truth and tracks of the sequence.
+    rules : {"trackeval", "motmetrics"}
+        Rules of CLEAR for keeping pairs from frame to frame, see `clear`.
+
+    Returns
+    -------
+    Score
+        Counts of CLEAR and identity, and the parts of HOTA; input of `combine` and `summary`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> first, second, same = np.array([0]), np.array([1]), np.ones((1, 1))
+    >>> matchup = Matchup((first, first), (first, second), (same, same), 0.5, n_ground_truth=1, n_tracks=2)
+    >>> found = summary(score(matchup))
+    >>> found["IDSW"], found["IDF1"]
+    (1, 0.5)
+    """
     return Score(clear(matchup, rules) | identity(matchup), hota(matchup))
 
 
 def combine(scores: Sequence[Score]) -> Score:
-    """Several sequences as one: counts are added, AssA and LocA weighted by the matches at each threshold."""
+    """Combine the scores of several sequences: counts are added, AssA and LocA weighted by matches at each threshold.
+
+    Parameters
+    ----------
+    scores : sequence of Score
+        At least one.
+
+    Returns
+    -------
+    Score
+        The scores of all sequences together.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> one, same = np.array([0]), np.ones((1, 1))
+    >>> matchup = Matchup((one,), (one,), (same,), 0.5, n_ground_truth=1, n_tracks=1)
+    >>> combine([score(matchup), score(matchup)]).counts["TP"]
+    2
+    """
     counts = {name: sum(part.counts[name] for part in scores) for name in scores[0].counts}
     tp = np.stack([part.hota["HOTA_TP"] for part in scores])
     total = tp.sum(axis=0)
@@ -46,9 +87,25 @@ def combine(scores: Sequence[Score]) -> Score:
 
 
 def summary(part: Score) -> dict[str, Any]:
-    """The numbers that people compare: rates between 0 and 1, counts as whole numbers.
+    """Compute the usual rates (between 0 and 1, MOTA at most 1) and counts of a score.
 
-    Where the truth holds nobody MOTA is 0, as TrackEval has it; it means nothing there.
+    Parameters
+    ----------
+    part : Score
+        Of one sequence or of several.
+
+    Returns
+    -------
+    dict
+        MOTA, IDF1, IDP, IDR, HOTA, DetA, AssA and LocA as floats; IDSW, FP, FN, Frag, MT, PT, ML and GT as ints.
+        Without ground truth MOTA is 0, as in TrackEval; it has no meaning then.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> one, same = np.array([0]), np.ones((1, 1))
+    >>> summary(score(Matchup((one,), (one,), (same,), 0.5, n_ground_truth=1, n_tracks=1)))["MOTA"]
+    1.0
     """
     c, h = part.counts, part.hota
     det_a = h["HOTA_TP"] / np.maximum(1, h["HOTA_TP"] + h["HOTA_FN"] + h["HOTA_FP"])

@@ -1,9 +1,9 @@
-"""CLEAR MOT (Bernardin and Stiefelhagen 2008): misses, false tracks, identity switches, and how whole the tracks are.
+"""CLEAR MOT: missed detections, false positives, identity switches and fragmentation.
 
-Two evaluators are in use and their rules differ; both are here, by name. What was before matters only in frames in
-which pairs compete; everything else is counted for all frames at once.
+Two evaluators are in use, TrackEval and py-motmetrics, and their rules differ; both are implemented. Earlier frames
+matter only in frames in which several pairs compete; all other frames are counted at once.
 
-Letters: G true people, H tracks in a frame; P pairs.
+Letters: G people of the ground truth, H tracks in a frame; P pairs.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaptrack.evaluation.metrics.matchup import Matchup, Pairs
+from mcaptrack.evaluation.metrics.matchup import Matchup, RowPairs
 from mcaptrack.geometry.arrays import Indices
 from mcaptrack.geometry.assignment import assign, solve
 
@@ -21,29 +21,59 @@ Rules = Literal["trackeval", "motmetrics"]
 Counts = dict[str, float]
 
 _EPS: Final = float(np.finfo(float).eps)
-_NOBODY: Final = -1
+_NO_ID: Final = -1
 
 
 def clear(matchup: Matchup, rules: Rules = "trackeval") -> Counts:
-    """The counts of one sequence: TP, FP, FN, IDSW, Frag, MT, PT, ML, GT (people) and the sum of similarities of TP.
+    """Count the errors that CLEAR MOT defines [1]_, in one sequence.
 
-    "trackeval" follows TrackEval and the MATLAB devkit: one assignment a frame that keeps the pairs of the frame
-    before where it can. "motmetrics" follows py-motmetrics: first every person keeps the track it had last, however
-    long ago; then the others are assigned, as many as possible and then as near as possible.
+    Parameters
+    ----------
+    matchup : Matchup
+        Ground truth and tracks of the sequence.
+    rules : {"trackeval", "motmetrics"}
+        "trackeval" follows TrackEval and the MATLAB devkit of MOTChallenge: one assignment for each frame, which keeps
+        the pairs of the previous frame where possible. "motmetrics" follows py-motmetrics: first each person keeps
+        their last track, however long ago that was; the others are then assigned, as many as possible at the least
+        cost.
+
+    Returns
+    -------
+    dict
+        TP, FP, FN: matched rows, rows of tracks without a person, rows of people without a track. IDSW: identity
+        switches. Frag: fragmentations. MT, PT, ML: people who are mostly tracked, partly tracked, mostly lost. GT:
+        people. similarity_sum: sum of the similarities of matched rows.
+
+    References
+    ----------
+    .. [1] K. Bernardin, R. Stiefelhagen: Evaluating Multiple Object Tracking Performance: The CLEAR MOT Metrics.
+    EURASIP
+       Journal on Image and Video Processing, 2008, 246309.
+
+    Examples
+    --------
+    One person in two frames, followed by track 0 and then by track 1:
+
+    >>> import numpy as np
+    >>> from mcaptrack.evaluation.metrics import Matchup
+    >>> first, second, same = np.array([0]), np.array([1]), np.ones((1, 1))
+    >>> found = clear(Matchup((first, first), (first, second), (same, same), 0.5, n_ground_truth=1, n_tracks=2))
+    >>> found["TP"], found["IDSW"], found["MT"]
+    (2, 1, 1)
     """
     by_devkit = rules == "trackeval"
     found = matches(matchup, rules)
-    present = np.bincount(matchup.all_truth, minlength=matchup.n_truth)
-    tracked = np.bincount(found.who, minlength=matchup.n_truth)[present > 0]
+    present = np.bincount(matchup.all_ground_truth, minlength=matchup.n_ground_truth)
+    tracked = np.bincount(found.person, minlength=matchup.n_ground_truth)[present > 0]
     ratio = tracked / present[present > 0]
     mostly = ratio > 0.8 if by_devkit else ratio >= 0.8
     lost = ratio < 0.2
     return {
-        "TP": len(found.who),
-        "FP": matchup.track_rows - len(found.who),
-        "FN": matchup.truth_rows - len(found.who),
-        "IDSW": int(switched(found).sum()),
-        "Frag": _breaks_trackeval(matchup, found) if by_devkit else _breaks_motmetrics(matchup, found),
+        "TP": len(found.person),
+        "FP": matchup.track_rows - len(found.person),
+        "FN": matchup.ground_truth_rows - len(found.person),
+        "IDSW": int(is_switch(found).sum()),
+        "Frag": _fragments_trackeval(matchup, found) if by_devkit else _fragments_motmetrics(matchup, found),
         "MT": int(mostly.sum()),
         "PT": int((~mostly & ~lost).sum()),
         "ML": int(lost.sum()),
@@ -52,83 +82,83 @@ def clear(matchup: Matchup, rules: Rules = "trackeval") -> Counts:
     }
 
 
-def matches(matchup: Matchup, rules: Rules = "trackeval") -> Pairs:
-    """Who is matched with which track in which frame, by person and then by frame."""
+def matches(matchup: Matchup, rules: Rules = "trackeval") -> RowPairs:
+    """The matched pairs of all frames, ordered by person and frame."""
     pairs, by_devkit = matchup.pairs, rules == "trackeval"
     near = pairs.similarity >= matchup.threshold - _EPS if by_devkit else pairs.similarity >= matchup.threshold
-    memory = _Memory(matchup)
-    found = matchup.solved(pairs.where(near), memory.pairs_trackeval if by_devkit else memory.pairs_motmetrics)
-    return found.where(np.lexsort((found.frame, found.who)))
+    memory = _LastTracks(matchup)
+    found = matchup.assigned(pairs.where(near), memory.pairs_trackeval if by_devkit else memory.pairs_motmetrics)
+    return found.where(np.lexsort((found.frame, found.person)))
 
 
-def switched(found: Pairs) -> NDArray[np.bool_]:
-    """Which of these matches (P,), ordered by person and frame, are with another track than the person's last."""
-    out = np.zeros(len(found.who), bool)
-    out[1:] = (found.who[1:] == found.who[:-1]) & (found.by[1:] != found.by[:-1])
+def is_switch(found: RowPairs) -> NDArray[np.bool_]:
+    """Mark the matches (P,) with another track than the person's last; matches are ordered by person and frame."""
+    out = np.zeros(len(found.person), bool)
+    out[1:] = (found.person[1:] == found.person[:-1]) & (found.track[1:] != found.track[:-1])
     return out
 
 
-def _breaks_trackeval(matchup: Matchup, found: Pairs) -> int:
-    """How often people who were tracked began to be tracked again, after a frame without; ``found`` ordered by person.
+def _fragments_trackeval(matchup: Matchup, found: RowPairs) -> int:
+    """Count how often people are tracked again after a frame without a match; ``found`` is ordered by person.
 
-    Frames without people or without tracks are passed over, as the devkit does.
+    Frames without people or without tracks are skipped, as in the devkit.
     """
-    looked_at = np.cumsum((matchup.truth_counts > 0) & (matchup.track_counts > 0))[found.frame]
-    again = found.who[1:] == found.who[:-1]
+    looked_at = np.cumsum((matchup.ground_truth_counts > 0) & (matchup.track_counts > 0))[found.frame]
+    again = found.person[1:] == found.person[:-1]
     return int((again & (np.diff(looked_at) > 1)).sum())
 
 
-def _breaks_motmetrics(matchup: Matchup, found: Pairs) -> int:
-    """How often people change from tracked to missed between the first and the last frame in which they are tracked."""
-    is_tracked = np.zeros(matchup.truth_rows, bool)
+def _fragments_motmetrics(matchup: Matchup, found: RowPairs) -> int:
+    """Count changes from tracked to missed between the first and the last frame in which a person is tracked."""
+    is_tracked = np.zeros(matchup.ground_truth_rows, bool)
     is_tracked[found.row] = True
-    order = np.argsort(matchup.all_truth, kind="stable")
-    who, flag = matchup.all_truth[order], is_tracked[order]
+    order = np.argsort(matchup.all_ground_truth, kind="stable")
+    person, flag = matchup.all_ground_truth[order], is_tracked[order]
     begins = flag.copy()
-    begins[1:] &= ~(flag[:-1] & (who[1:] == who[:-1]))
-    runs = np.bincount(who[begins], minlength=matchup.n_truth)
+    begins[1:] &= ~(flag[:-1] & (person[1:] == person[:-1]))
+    runs = np.bincount(person[begins], minlength=matchup.n_ground_truth)
     return int((runs[runs > 0] - 1).sum())
 
 
-class _Memory:
-    """The track that each person had, for the frames in which that decides."""
+class _LastTracks:
+    """The last track of each person, kept for the frames in which pairs compete."""
 
     def __init__(self, matchup: Matchup) -> None:
         self._matchup = matchup
-        self._last = np.full(matchup.n_truth, _NOBODY)
-        self._looked_at = ((matchup.truth_counts > 0) & (matchup.track_counts > 0)).nonzero()[0]
-        self._number = _NOBODY
-        self._who = self._by = np.empty(0, np.intp)
+        self._last = np.full(matchup.n_ground_truth, _NO_ID)
+        self._looked_at = ((matchup.ground_truth_counts > 0) & (matchup.track_counts > 0)).nonzero()[0]
+        self._number = _NO_ID
+        self._persons = self._tracks = np.empty(0, np.intp)
 
     def _decided(self, number: int, rows: Indices, columns: Indices) -> tuple[Indices, Indices]:
         self._number = number
-        self._who, self._by = self._matchup.truth[number][rows], self._matchup.tracks[number][columns]
+        self._persons, self._tracks = self._matchup.ground_truth[number][rows], self._matchup.tracks[number][columns]
         return rows, columns
 
-    def pairs_trackeval(self, number: int, easy: Pairs, low: int, high: int) -> tuple[Indices, Indices]:
-        """The pairs of the frame before are kept where they can be, then similarity counts."""
+    def pairs_trackeval(self, number: int, easy: RowPairs, low: int, high: int) -> tuple[Indices, Indices]:
+        """Keep the pairs of the previous frame where possible; assign the rest by similarity."""
         matchup, last = self._matchup, self._last
         at = int(np.searchsorted(self._looked_at, number))
-        before = int(self._looked_at[at - 1]) if at else _NOBODY
-        last[:] = _NOBODY
+        before = int(self._looked_at[at - 1]) if at else _NO_ID
+        last[:] = _NO_ID
         if before == self._number:
-            last[self._who] = self._by
+            last[self._persons] = self._tracks
         else:
             start = low + int(np.searchsorted(easy.frame[low:high], before))
-            last[easy.who[start:high]] = easy.by[start:high]
-        people, tracks, similarity = matchup.truth[number], matchup.tracks[number], matchup.similarity[number]
+            last[easy.person[start:high]] = easy.track[start:high]
+        people, tracks, similarity = matchup.ground_truth[number], matchup.tracks[number], matchup.similarity[number]
         score = similarity + 1000.0 * (tracks[None, :] == last[people][:, None])
         score[similarity < matchup.threshold - _EPS] = 0
         rows, columns = solve(-score)
         kept = score[rows, columns] > _EPS
         return self._decided(number, rows[kept], columns[kept])
 
-    def pairs_motmetrics(self, number: int, easy: Pairs, low: int, high: int) -> tuple[Indices, Indices]:
-        """Everybody keeps the track it had last, however long ago; then as many and as near pairs as there can be."""
+    def pairs_motmetrics(self, number: int, easy: RowPairs, low: int, high: int) -> tuple[Indices, Indices]:
+        """Keep each person's last track, however long ago; then assign as many pairs as possible at the least cost."""
         matchup = self._matchup
-        self._last[self._who] = self._by
-        self._last[easy.who[low:high]] = easy.by[low:high]  # of several the last one counts
-        people, tracks, similarity = matchup.truth[number], matchup.tracks[number], matchup.similarity[number]
+        self._last[self._persons] = self._tracks
+        self._last[easy.person[low:high]] = easy.track[low:high]  # the last one of several counts
+        people, tracks, similarity = matchup.ground_truth[number], matchup.tracks[number], matchup.similarity[number]
         ok = similarity >= matchup.threshold
         kept_rows, kept_columns = np.nonzero(ok & (tracks[None, :] == self._last[people][:, None]))
         # Two people may have had the same track last; the first in order keeps it.

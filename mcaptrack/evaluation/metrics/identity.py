@@ -1,4 +1,4 @@
-"""Identity scores (Ristani et al. 2016): one track for one person over the whole sequence."""
+"""Identity scores: one track for each person over the whole sequence."""
 
 from __future__ import annotations
 
@@ -9,18 +9,41 @@ from mcaptrack.geometry.assignment import solve
 
 
 def identity(matchup: Matchup) -> dict[str, float]:
-    """IDTP, IDFN, IDFP of one sequence.
+    """Count identity true and false positives and negatives [1]_ of one sequence.
 
-    IDTP is the weight of the best pairing of people with tracks, where a pair weighs the frames in which it is similar
-    enough. The pairing is solved on the counts themselves: a pair that weighs nothing is the same as no pair.
+    The best one-to-one assignment of people to tracks is found for the whole sequence; a pair weighs the number of
+    frames in which it is at least as similar as the threshold. Pairs of weight zero are the same as no pair.
+
+    Parameters
+    ----------
+    matchup : Matchup
+        Ground truth and tracks of the sequence.
+
+    Returns
+    -------
+    dict
+        IDTP: rows matched under the best assignment. IDFN, IDFP: the other rows of the ground truth and of the tracks.
+
+    References
+    ----------
+    .. [1] E. Ristani, F. Solera, R. Zou, R. Cucchiara, C. Tomasi: Performance Measures and a Data Set for Multi-Target,
+       Multi-Camera Tracking. ECCV Workshops 2016.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from mcaptrack.evaluation.metrics import Matchup
+    >>> first, second, same = np.array([0]), np.array([1]), np.ones((1, 1))
+    >>> identity(Matchup((first, first), (first, second), (same, same), 0.5, n_ground_truth=1, n_tracks=2))
+    {'IDTP': 1.0, 'IDFN': 1.0, 'IDFP': 1.0}
     """
-    shape = (matchup.n_truth, matchup.n_tracks)
+    shape = (matchup.n_ground_truth, matchup.n_tracks)
     pairs = matchup.pairs
     near = pairs.similarity >= matchup.threshold
-    cell = pairs.who[near] * matchup.n_tracks + pairs.by[near]
+    cell = pairs.person[near] * matchup.n_tracks + pairs.track[near]
     together = np.bincount(cell, minlength=shape[0] * shape[1]).reshape(shape).astype(float)
     hits = 0.0
     if together.size:
         rows, columns = solve(-together)
         hits = float(together[rows, columns].sum())
-    return {"IDTP": hits, "IDFN": matchup.truth_rows - hits, "IDFP": matchup.track_rows - hits}
+    return {"IDTP": hits, "IDFN": matchup.ground_truth_rows - hits, "IDFP": matchup.track_rows - hits}

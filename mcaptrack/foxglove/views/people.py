@@ -21,7 +21,7 @@ from mcaptrack.schema.resampling import resample
 #: How far trails go back, and how many lines they are made of.
 _TRAIL_S: Final = 2.0
 _TRAIL_LINES: Final = 4
-_MAX_HOLE_S: Final = 2.0
+_MAX_GAP_S: Final = 2.0
 #: Forecasts are shown until the next ones are due.
 _FORECAST_S: Final = 1.0
 #: Forecasts are lines through at most so many of their points.
@@ -75,7 +75,7 @@ def by_plane(planes: Planes, t_ns: Ints) -> Iterator[tuple[GroundPlane, NDArray[
 
 def people_at(frames: Sequence[Frame], at_ns: Ints, planes: Planes) -> People:
     """The people of a channel of tracks at rising times; what only pixels or metres tell comes by the plane."""
-    rows, frame = resample(frames, at_ns, seconds_to_ns(_MAX_HOLE_S))
+    rows, frame = resample(frames, at_ns, seconds_to_ns(_MAX_GAP_S))
     box = columns_to_boxes(rows)
     at_m = np.stack([rows["x_m"], rows["y_m"]], axis=-1)
     foot = box[:, :2] + box[:, 2:] * [0.5, 1.0]

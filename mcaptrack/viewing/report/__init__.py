@@ -18,7 +18,7 @@ from typing import Any, Final
 import numpy as np
 
 from mcaptrack import SCHEMA_VERSION, __version__, foxglove
-from mcaptrack.evaluation import Result
+from mcaptrack.evaluation import EvaluationRow
 from mcaptrack.evaluation.metrics import summary
 from mcaptrack.foxglove.colours import COUNT as COLOURS
 from mcaptrack.viewing.report import lineage, sections, sights
@@ -45,7 +45,7 @@ def data(reports: Sequence[LogReport]) -> dict[str, Any]:
     }
 
 
-def _without_curve(result: Result) -> dict[str, Any]:
+def _without_curve(result: EvaluationRow) -> dict[str, Any]:
     said = result.to_json()
     if "displacement" in said:
         said["displacement"] = {k: v for k, v in said["displacement"].items() if not k.startswith("curve_")}

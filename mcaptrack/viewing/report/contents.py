@@ -11,12 +11,13 @@ import numpy as np
 
 from mcaptrack import log, pipeline
 from mcaptrack.errors import DamagedError, McaptrackError, command
-from mcaptrack.evaluation import EvaluateOptions, Result, Sequenced, evaluate, sequence_of_log
-from mcaptrack.evaluation.aligned import frame_times, has, resampled
-from mcaptrack.evaluation.events import EventOptions, Rule, find_events
+from mcaptrack.evaluation import EvaluateOptions, EvaluationInput, EvaluationRow, evaluate, sequence_of_log
+from mcaptrack.evaluation.aligned import has_positions, resample_frames
+from mcaptrack.evaluation.events import EventOptions, MatchRule, find_events
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.plane import Planes, plane_at
 from mcaptrack.schema import EVENTS, TRACKS, Frame
+from mcaptrack.schema.framing import frame_times
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.pictures import Pictures
 from mcaptrack.viewing.report import measures
@@ -59,8 +60,8 @@ class LogReport:
     start_ns: int
     end_ns: int
     sets: dict[str, TrackSet] = field(default_factory=dict)
-    sequence: Sequenced | None = None
-    results: list[Result] = field(default_factory=list)
+    sequence: EvaluationInput | None = None
+    results: list[EvaluationRow] = field(default_factory=list)
     stories: list[Story] = field(default_factory=list)
     shown: list[list[Moment]] = field(default_factory=list)
     planes: Planes = ()
@@ -177,7 +178,7 @@ def _tell(opened: log.Log, out: LogReport) -> None:
     out.shown = most_important(out.stories, _THUMBNAILS)
 
 
-def _recorded(opened: log.Log, topic: str) -> tuple[list[Frame], Rule | None] | None:
+def _recorded(opened: log.Log, topic: str) -> tuple[list[Frame], MatchRule | None] | None:
     """Events that stand in the log and by what rule they were matched, unless they are out of date."""
     channel = opened.channels.get(topic)
     made = Provenance.from_metadata(channel.metadata) if channel else None
@@ -186,7 +187,7 @@ def _recorded(opened: log.Log, topic: str) -> tuple[list[Frame], Rule | None] | 
     similarity, gate = made.parameters.get("similarity"), made.parameters.get("gate")
     rule = None
     if similarity in ("iou", "metres") and isinstance(gate, float | int):
-        rule = Rule(similarity, float(gate))
+        rule = MatchRule(similarity, float(gate))
     return opened.frames(topic, EVENTS), rule
 
 
@@ -220,8 +221,8 @@ def _numbers(out: LogReport) -> dict[str, Any]:
     if "truth" in out.sets:
         truth = out.sets["truth"]
         at_ns = np.unique(np.concatenate([np.empty(0, np.int64), *map(frame_times, clocked.values())]))
-        clocked[truth.topic] = resampled(truth.frames, at_ns) if len(at_ns) else truth.frames
-    metric = {topic: frames for topic, frames in clocked.items() if has(frames, "metres")}
+        clocked[truth.topic] = resample_frames(truth.frames, at_ns) if len(at_ns) else truth.frames
+    metric = {topic: frames for topic, frames in clocked.items() if has_positions(frames, "metres")}
     return {
         "tracks": sets,
         "forecasts": measures.describe_forecasts(out.sequence, out.results) if out.sequence else [],
@@ -268,6 +269,6 @@ def plane_of(report: LogReport) -> Any:
     return plane_at(report.planes, report.start_ns)
 
 
-def result_of(results: Sequence[Result], topic: str, similarity: str, gate: float) -> Result | None:
+def result_of(results: Sequence[EvaluationRow], topic: str, similarity: str, gate: float) -> EvaluationRow | None:
     """The score of a channel by one rule."""
     return next((r for r in results if (r.tracks, r.similarity, r.gate) == (topic, similarity, gate)), None)

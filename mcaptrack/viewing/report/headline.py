@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from mcaptrack.errors import command
-from mcaptrack.evaluation import Result, combined
+from mcaptrack.evaluation import EvaluationRow, combined
 from mcaptrack.evaluation.metrics import summary
 from mcaptrack.viewing.report.contents import LogReport, result_of
 from mcaptrack.viewing.report.markup import Markup, counted, number, percent, sentence, tag, times
@@ -20,8 +20,8 @@ class Pair(NamedTuple):
     """Tracking and re-tracking, scored by one rule; either may be missing."""
 
     rule: tuple[str, float]
-    plain: Result | None
-    repaired: Result | None
+    plain: EvaluationRow | None
+    repaired: EvaluationRow | None
 
     def values(self, name: str) -> list[float]:
         """A score of those that there are."""
@@ -33,7 +33,7 @@ def rule_words(similarity: str, gate: float) -> str:
     return f"within {gate:g} m on the ground" if similarity == "metres" else f"by overlap of boxes of at least {gate:g}"
 
 
-def pair_of(report: LogReport, results: Sequence[Result]) -> Pair | None:
+def pair_of(report: LogReport, results: Sequence[EvaluationRow]) -> Pair | None:
     """What the headline compares: tracks on the clock of prediction with those that re-tracking made of them."""
     for similarity, gate in _RULES:
         found = {
@@ -48,7 +48,7 @@ def pair_of(report: LogReport, results: Sequence[Result]) -> Pair | None:
     return None
 
 
-def combined_results(reports: Sequence[LogReport]) -> list[Result]:
+def combined_results(reports: Sequence[LogReport]) -> list[EvaluationRow]:
     """The results of all logs together, where several have any."""
     scored = [report for report in reports if report.results]
     return combined([result for report in scored for result in report.results]) if len(scored) > 1 else []

@@ -11,14 +11,14 @@ from typing import Any, Final
 import numpy as np
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.evaluation import Candidate, Result, Sequenced
-from mcaptrack.evaluation.aligned import frame_times, join_rows
+from mcaptrack.evaluation import Candidate, EvaluationInput, EvaluationRow
 from mcaptrack.evaluation.forecasts import score_forecasts
 from mcaptrack.evaluation.metrics.calibration import LEVELS
 from mcaptrack.evaluation.metrics.displacement import Displacement
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.clocks import NS_PER_S
-from mcaptrack.schema import Frame
+from mcaptrack.schema import TRACKS, Frame
+from mcaptrack.schema.framing import frame_times, join_frames
 from mcaptrack.transforms import Predict
 from mcaptrack.viewing.report.charts import round_step, thinned
 
@@ -36,10 +36,9 @@ def usual_s(frames: Sequence[Frame]) -> float:
 
 def by_track(frames: Sequence[Frame]) -> tuple[Any, Ints]:
     """All rows (N,) by track and time, and their times (N,)."""
-    rows, ends = join_rows(frames)
-    t_ns = np.repeat(frame_times(frames), np.diff(ends))
-    order = np.lexsort((t_ns, rows["track_id"]))
-    return rows[order], t_ns[order]
+    joined = join_frames(TRACKS, frames)
+    order = np.lexsort((joined.row_ns, joined.rows["track_id"]))
+    return joined.rows[order], joined.row_ns[order]
 
 
 def lives_s(frames: Sequence[Frame]) -> Floats:
@@ -63,7 +62,7 @@ def speeds_m_per_s(frames: Sequence[Frame]) -> Floats:
 
 def describe_tracks(frames: Sequence[Frame]) -> dict[str, Any]:
     """What can be said of tracks without knowing the truth."""
-    rows, _ = join_rows(frames)
+    rows = join_frames(TRACKS, frames).rows
     lives = lives_s(frames)
     return {
         "tracks": len(lives),
@@ -99,7 +98,7 @@ def histograms(values: Mapping[str, Floats]) -> dict[str, Any] | None:
     return {"edges": edges.tolist(), "series": series}
 
 
-def describe_forecasts(sequence: Sequenced, results: Sequence[Result]) -> list[dict[str, Any]]:
+def describe_forecasts(sequence: EvaluationInput, results: Sequence[EvaluationRow]) -> list[dict[str, Any]]:
     """How good the forecasts of a sequence are: over recall, and step by step, beside constant velocity."""
     out = []
     for candidate in sequence.candidates:
@@ -119,7 +118,7 @@ def describe_forecasts(sequence: Sequenced, results: Sequence[Result]) -> list[d
             "constant_velocity": None,
             "calibration": [{"nominal": level, "held": summary[f"coverage_{100 * level:g}"]} for level in LEVELS],
         }
-        plain = _constant_velocity(sequence, candidate, step_s, found.away_m.shape[1])
+        plain = _constant_velocity(sequence, candidate, step_s, found.error_m.shape[1])
         if plain is not None:
             said["constant_velocity"] = _by_horizon(plain, step_s)
         out.append(said)
@@ -127,7 +126,7 @@ def describe_forecasts(sequence: Sequenced, results: Sequence[Result]) -> list[d
 
 
 def _by_horizon(found: Displacement, step_s: float) -> dict[str, Any]:
-    away = found.away_by_step()
+    away = found.errors_by_step()
     quartiles = np.percentile(away, [25, 75], axis=0) if len(away) else np.empty((2, 0))
     return {
         "n": len(away),
@@ -138,11 +137,13 @@ def _by_horizon(found: Displacement, step_s: float) -> dict[str, Any]:
     }
 
 
-def _constant_velocity(sequence: Sequenced, candidate: Candidate, step_s: float, steps: int) -> Displacement | None:
+def _constant_velocity(
+    sequence: EvaluationInput, candidate: Candidate, step_s: float, steps: int
+) -> Displacement | None:
     """The errors of walking on as before, from the same tracks at the same times; None if it foretells nothing."""
     try:
         walking_on = Predict(predictor="cv", horizon_s=steps * step_s, rate_hz=1 / step_s)
         frames = [frame for (frame,) in walking_on(candidate.frames)]
-        return score_forecasts(frames, candidate.frames, sequence.truth, "cv")
+        return score_forecasts(frames, candidate.frames, sequence.ground_truth, "cv")
     except McaptrackError:  # a horizon or a rate that no predictor of ours has
         return None

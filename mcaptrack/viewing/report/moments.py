@@ -12,8 +12,8 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaptrack.evaluation.events import Rule
-from mcaptrack.evaluation.words import describe
+from mcaptrack.evaluation.event_text import describe
+from mcaptrack.evaluation.events import MatchRule
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
 from mcaptrack.schema import EVENT_KINDS, EventKind, Frame, Rows
@@ -71,7 +71,7 @@ class Story:
     counts: dict[str, int]
     births: list[int]
     ends: list[int]
-    rule: Rule | None
+    rule: MatchRule | None
     span_s: float
 
     def to_json(self) -> dict[str, Any]:
@@ -99,7 +99,7 @@ class Story:
 def tell(
     topic: str,
     events: Sequence[Frame],
-    rule: Rule | None,
+    rule: MatchRule | None,
     tracks: Sequence[Frame],
     truth: Sequence[Frame] | None,
     span_ns: tuple[int, int],

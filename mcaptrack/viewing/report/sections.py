@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 
 from mcaptrack.errors import command
-from mcaptrack.evaluation import Result
+from mcaptrack.evaluation import EvaluationRow
 from mcaptrack.evaluation.metrics import summary
 from mcaptrack.viewing.report.charts import Axis, Bars, Line, beside, figure, histogram_chart, line_chart, round_most
 from mcaptrack.viewing.report.contents import LogReport
@@ -43,10 +43,10 @@ def scores(report: LogReport) -> Markup:
     return join(parts)
 
 
-def score_table(results: Sequence[Result], report: LogReport) -> Markup:
+def score_table(results: Sequence[EvaluationRow], report: LogReport) -> Markup:
     """Scores, a group of rows for each rule."""
     called = {one.topic: (one.name, one.role) for one in report.sets.values()}
-    groups: dict[tuple[str, float], list[Result]] = {}
+    groups: dict[tuple[str, float], list[EvaluationRow]] = {}
     for result in results:
         groups.setdefault((result.similarity, result.gate), []).append(result)
     body: list[Markup] = []
