@@ -12,7 +12,7 @@ import pytest
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation import EvaluateOptions
-from mcaptrack.evaluation.tuning import Range, Task, declared_ranges, settings_to_toml, tune
+from mcaptrack.evaluation.tuning import Range, Task, declared_ranges, tune
 from mcaptrack.schema import Frame
 from mcaptrack.transforms import TRACKERS, TRANSFORMS, Sort
 from tests.test_cli import call, done
@@ -111,17 +111,6 @@ def test_draws_keep_to_their_ranges():
     assert all(0.2 <= Range(0.2, 0.4, False).draw(rng) <= 0.4 for _ in range(100))
 
 
-def test_settings_go_into_a_file_that_stands_and_leave_the_rest():
-    text = '# mine\n[track]  # tuned once\nmin-iou = 0.5  # old\nmax-age-frames = 3\n\n[retrack]\nprofile = "paper"\n'
-    out = settings_to_toml(text, "track", {"tracker": "sort", "min_iou": 0.25})
-    assert tomllib.loads(out) == {
-        "track": {"tracker": "sort", "min-iou": 0.25, "max-age-frames": 3},
-        "retrack": {"profile": "paper"},
-    }
-    assert "# mine" in out
-    assert tomllib.loads(settings_to_toml("", "track", {"min_iou": 0.1})) == {"track": {"min-iou": 0.1}}
-
-
 def write_files(folder):
     (folder / "det.txt").write_text(
         "".join(
@@ -170,6 +159,27 @@ def test_a_log_can_be_tuned_and_mistakes_are_said(tmp_path):
     code, _, err = call("tune", log, "--search", "min-iou=0.1:7", folder=tmp_path)
     assert code == 1
     assert "min_iou has to be from 0 to 1, not 7" in err
+
+
+def test_settings_go_into_a_file_that_exists_and_a_file_that_cannot_be_edited_is_refused_before_the_search(tmp_path):
+    write_files(tmp_path)
+    words = ("tune", "det.txt", "--truth", "gt.txt", "--fps", 10, "--trials", 12, "--search", "max-age-s=0.1:6", "-q")
+    settings = tmp_path / "mcaptrack.toml"
+    settings.write_bytes(b"# mine\r\n[ track ]  # spaced\r\nmax_age_s = 1.4 # seconds\r\nretrack.profile = 'paper'\r\n")
+    settings.write_bytes(settings.read_bytes().replace(b"retrack.", b"[retrack]\r\n"))
+    done(*words, folder=tmp_path)
+    written = settings.read_bytes()
+    best = tomllib.loads(written.decode())["track"]["max_age_s"]
+    assert best > 2.4
+    assert written == (
+        b"# mine\r\n[ track ]  # spaced\r\nmax_age_s = %a # seconds\r\ntracker = \"sort\"\r\n[retrack]\r\nprofile = 'paper'\r\n"
+        % best
+    )
+    (tmp_path / "other.toml").write_text("[track\n")
+    code, _, err = call(*words, "-o", "other.toml", folder=tmp_path)
+    assert code == 1
+    assert err.startswith("mcaptrack: other.toml is no TOML: ")
+    assert not (tmp_path / "other.sort.trials.jsonl").exists()
 
 
 def test_empty_tracks_are_a_score_too(chance):

@@ -209,6 +209,12 @@ def found_of(command: str) -> dict[str, tuple[Setting, Given]]:
     return {settings[command][name].parameter: (settings[command][name], one) for name, one in found[command].items()}
 
 
+def old_names(command: str) -> dict[str, str]:
+    """The names that options of a command had before, by their names today."""
+    settings, _ = _KNOWN.get()
+    return {one.name: one.declared.was for one in settings[command].values() if one.declared.was not in ("", one.name)}
+
+
 def _nearest(name: str, known: Iterable[str]) -> str:
     close = difflib.get_close_matches(name, list(known), 1)
     return f"; did you mean {close[0]}?" if close else ""

@@ -10,7 +10,8 @@ import typer
 
 from mcaptrack.cli import common
 from mcaptrack.cli.command import warn_unused
-from mcaptrack.cli.config import NAME
+from mcaptrack.cli.config import NAME, read_toml, write_settings
+from mcaptrack.cli.settings import old_names
 from mcaptrack.cli.text import console, show
 from mcaptrack.errors import McaptrackError
 from mcaptrack.transforms import ALTERNATIVES, TRANSFORMS, Transform
@@ -122,6 +123,7 @@ def tune(
     which = tracker if stage in ALTERNATIVES else stage
     trials_file = study or output.with_name(f"{output.stem}.{which}.trials.jsonl")
     with common.Talk(quiet, verbose).open() as talk:
+        read_toml(output)  # a file that can't be edited is refused before the search
         if truth:
             given = {"fps": fps, "ground_plane": ground_plane, "point": point}
             tasks = _tasks_of_files(common.expand(inputs), common.expand(truth), stage, given, talk)
@@ -151,7 +153,8 @@ def tune(
         if best is first:
             talk.say(f"nothing that was tried beats the defaults ({metric} {first.scores[metric]:.4f}); {output} stays")
         else:
-            _write(output, stage, settings)
+            named = {name.replace("_", "-"): value for name, value in settings.items()}
+            write_settings(output, stage, named, old_names(stage))
             talk.say(f"{output}: {metric} {first.scores[metric]:.4f} with the defaults, {best.scores[metric]:.4f} now")
     if json:
         row = {"stage": stage, "metric": metric, "settings": settings, "trials": trials, "best": best.number}
@@ -222,20 +225,6 @@ def _tasks_of_logs(
             frames, context = pipeline.input_of(opened, prefix, stage, kind(), topic)
             tasks.append(Task(path.stem, frames, truth, context))
     return tasks
-
-
-def _write(path: Path, command: str, settings: dict[str, Any]) -> None:
-    import tomllib
-
-    from mcaptrack.evaluation.tuning import settings_to_toml
-    from mcaptrack.files import publish_bytes
-
-    try:
-        text = path.read_text(encoding="utf-8") if path.exists() else ""
-        tomllib.loads(text)
-    except (OSError, ValueError) as error:
-        raise McaptrackError(f"{path} is there and is no TOML: {error}; write to another file with -o") from None
-    publish_bytes(path, settings_to_toml(text, command, settings).encode("utf-8"))
 
 
 def _words(parameters: Any) -> str:

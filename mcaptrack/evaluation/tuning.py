@@ -272,25 +272,3 @@ def uses_optuna() -> bool:
     from importlib.util import find_spec
 
     return find_spec("optuna") is not None
-
-
-def settings_to_toml(text: str, command: str, settings: Mapping[str, Any]) -> str:
-    """The text of a mcaptrack.toml with these settings of a command; all else in it stays as it is."""
-    new = [f"{name.replace('_', '-')} = {json.dumps(value)}" for name, value in settings.items()]
-    names = {name.replace("_", "-") for name in settings}
-    lines, out, inside, written = text.splitlines(), [], False, False
-    for line in lines:
-        bare = line.strip()
-        if bare.startswith("["):
-            inside = bare.split("#")[0].strip() == f"[{command}]"
-            out.append(line)
-            if inside:
-                out += new
-                written = True
-            continue
-        if inside and bare.split("=")[0].strip().strip('"').replace("_", "-") in names and "=" in bare:
-            continue
-        out.append(line)
-    if not written:
-        out += ([""] if out else []) + [f"[{command}]", *new]
-    return "\n".join(out) + "\n"
