@@ -1,4 +1,4 @@
-"""Links, encounters, false tracks and smoothing, each against a second, slow implementation, on made-up paths."""
+"""Links, encounters, false tracks and smoothing, each against a second, slow implementation, on synthetic paths."""
 
 from __future__ import annotations
 
@@ -6,21 +6,20 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mcaptrack.transforms.retrack.doubt import log_odds
-from mcaptrack.transforms.retrack.link import link
-from mcaptrack.transforms.retrack.motion import Walker, smooth
-from mcaptrack.transforms.retrack.part import exchanges, part
-from mcaptrack.transforms.retrack.whole import laid
+from mcaptrack.transforms.retrack.false_tracks import track_log_odds
+from mcaptrack.transforms.retrack.identity_swaps import find_swaps, resolve_swaps
+from mcaptrack.transforms.retrack.linking import link_tracks
+from mcaptrack.transforms.retrack.motion_model import MotionModel, smooth, to_trajectories
 from tests.references.offline import DRIFTS, Motion, course_of, exchanged, links, person_log_odds
 
 SEEDS = st.integers(0, 2**32 - 1)
 Paths = dict[int, dict[int, tuple[float, float]]]
 
 
-def models(rng: np.random.Generator) -> tuple[Walker, Motion]:
+def models(rng: np.random.Generator) -> tuple[MotionModel, Motion]:
     """The same model of motion for both implementations."""
     numbers = (rng.uniform(0.03, 0.4), rng.uniform(0.5, 2.0), rng.uniform(0.05, 0.3), rng.choice([0.0, 0.1]))
-    return Walker(*numbers), Motion(*numbers, 0.4)
+    return MotionModel(*numbers), Motion(*numbers, 0.4)
 
 
 def walk_of(rng: np.random.Generator, start: np.ndarray, speed: np.ndarray, steps: int, noise_m: float) -> np.ndarray:
@@ -34,10 +33,10 @@ def with_gaps(rng: np.random.Generator, first: int, places: np.ndarray, share: f
 
 
 def laid_out(paths: Paths, noise_m: float):
-    """The same paths as the package lays them end to end, and the row of each position."""
-    claims = [(step, name, *place) for name, path in paths.items() for step, place in path.items()]
-    step, name, x, y = (np.array(column) for column in zip(*claims, strict=True))
-    _, at, out = laid(step, name, np.stack([x, y], axis=-1), noise_m)
+    """The same paths as trajectories of the package, and the row of each position."""
+    assigned = [(step, name, *place) for name, path in paths.items() for step, place in path.items()]
+    step, name, x, y = (np.array(column) for column in zip(*assigned, strict=True))
+    _, at, out = to_trajectories(step, name, np.stack([x, y], axis=-1), noise_m)
     return out, at
 
 
@@ -63,10 +62,10 @@ def scattered(rng: np.random.Generator, count: int) -> Paths:
 @settings(max_examples=15)
 def test_filtered_and_smoothed_states_equal_the_reference(seed):
     rng = np.random.default_rng(seed)
-    walker, motion = models(rng)
+    model, motion = models(rng)
     paths = scattered(rng, 4)
-    out, _ = laid_out(paths, walker.noise_m)
-    found = smooth(walker, out, 0.4)
+    out, _ = laid_out(paths, model.noise_m)
+    found = smooth(model, out, 0.4)
     wanted = (motion.filtered, motion.backwards, motion.smoothed)
     for states, other in zip(found, wanted, strict=True):
         theirs = [state for path in paths.values() for state in dict(sorted(other(path).items())).values()]
@@ -78,12 +77,12 @@ def test_filtered_and_smoothed_states_equal_the_reference(seed):
 @settings(max_examples=40)
 def test_links_equal_the_reference(seed):
     rng = np.random.default_rng(seed)
-    walker, motion = models(rng)
+    model, motion = models(rng)
     paths = scattered(rng, int(rng.integers(1, 10)))
     most_s, least = float(rng.choice([1.2, 6.0, 20.0])), float(rng.choice([0.1, 0.5, 0.9]))
-    out, _ = laid_out(paths, walker.noise_m)
-    forward, backward, _ = smooth(walker, out, 0.4)
-    found = link(walker, out, forward, backward, 0.4, most_s, least)
+    out, _ = laid_out(paths, model.noise_m)
+    forward, backward, _ = smooth(model, out, 0.4)
+    found = link_tracks(model, out, forward, backward, 0.4, most_s, least)
     names = sorted(paths)
     assert {names[i]: names[j] for i, j in enumerate(found.tolist()) if j >= 0} == links(motion, paths, most_s, least)
 
@@ -92,19 +91,19 @@ def test_links_equal_the_reference(seed):
 @settings(max_examples=25)
 def test_false_track_odds_equal_the_reference(seed):
     rng = np.random.default_rng(seed)
-    walker, motion = models(rng)
+    model, motion = models(rng)
     paths = scattered(rng, int(rng.integers(1, 8)))
-    out, _ = laid_out(paths, walker.noise_m)
-    _, _, smoothed = smooth(walker, out, 0.4)
-    found = log_odds(walker, out, smoothed, 0.4)
+    out, _ = laid_out(paths, model.noise_m)
+    _, _, smoothed = smooth(model, out, 0.4)
+    found = track_log_odds(model, out, smoothed, 0.4)
     wanted = person_log_odds(motion, paths)
     np.testing.assert_allclose(found, [wanted[name] for name in sorted(paths)], atol=1e-9)
 
 
 @given(seed=SEEDS)
 @settings(max_examples=40)
-def test_the_course_of_exchanges_equals_the_reference(seed):
-    """Positions of one from the other, the labels exchanged now and then, and any cost of an exchange."""
+def test_swaps_equal_the_reference(seed):
+    """Positions of one relative to the other, identities swapped now and then, any cost of a swap."""
     rng = np.random.default_rng(seed)
     _, motion = models(rng)
     count, steps = int(rng.integers(1, 4)), int(rng.integers(1, 40))
@@ -113,7 +112,7 @@ def test_the_course_of_exchanges_equals_the_reference(seed):
         apart[one] = walk_of(rng, rng.normal(0, 1.5, 2), rng.normal(0, 0.5, 2), steps, motion.noise_m)
         apart[one, rng.integers(0, steps) :] *= rng.choice([-1, 1])
         apart[one, rng.random(steps) < 0.2] = np.nan
-    course, gain = exchanges(apart, cost, 0.4, motion.noise_m, motion.speed_m_per_s)
+    course, gain = find_swaps(apart, cost, 0.4, motion.noise_m, motion.speed_m_per_s)
     for one in range(count):
         seen = [None if np.isnan(at[0]) else at for at in apart[one]]
         each = [course_of(seen, cost[one].tolist(), motion, drift) for drift in DRIFTS]
@@ -125,15 +124,15 @@ def test_the_course_of_exchanges_equals_the_reference(seed):
 @given(seed=SEEDS)
 @settings(max_examples=40)
 def test_encounters_are_decided_as_in_the_reference(seed):
-    """Pairs of people that cross, some with exchanged labels, with input ids that follow the exchange or not."""
+    """Pairs of people that cross, some with swapped identities, with input ids that follow the swap or not."""
     rng = np.random.default_rng(seed)
-    walker, motion = models(rng)
+    model, motion = models(rng)
     paths, ids = {}, {}
     for pair in range(int(rng.integers(1, 4))):
         speed, steps = rng.uniform(0.3, 1.0), int(rng.integers(30, 60))
         start = np.array([-speed * 0.4 * steps / 2, 2.0 * pair])
-        one = walk_of(rng, start, np.array([speed, 0]), steps, walker.noise_m)
-        two = walk_of(rng, [-start[0], start[1] + rng.uniform(0.2, 1.5)], np.array([-speed, 0]), steps, walker.noise_m)
+        one = walk_of(rng, start, np.array([speed, 0]), steps, model.noise_m)
+        two = walk_of(rng, [-start[0], start[1] + rng.uniform(0.2, 1.5)], np.array([-speed, 0]), steps, model.noise_m)
         when = steps // 2 + int(rng.integers(-2, 3))
         a, b = 2 * pair + 3, 2 * pair + 4
         if rng.random() < 0.7:
@@ -144,9 +143,9 @@ def test_encounters_are_decided_as_in_the_reference(seed):
         for name, other in ((a, b), (b, a)):
             said = {0: other, 1: 40 + name, 2: name, 3: name}[int(named)]
             ids[name] = {step: name if step < first[0] + when else said for step in paths[name]}
-    out, at = laid_out(paths, walker.noise_m)
+    out, at = laid_out(paths, model.noise_m)
     source = np.array([ids[name][step] for name, path in paths.items() for step in path])
-    owner, decided = part(walker, out, at, source, 0.4)
+    owner, decided = resolve_swaps(model, out, at, source, 0.4)
     wanted = exchanged(motion, paths, ids)
     assert decided == len(wanted) // 2
     names = sorted(paths)

@@ -11,8 +11,14 @@ import pytest
 from mcaptrack.geometry.histories import Holt
 from mcaptrack.predictors import Forecast
 from mcaptrack.transforms import PROFILES
-from mcaptrack.transforms.retrack.distance import jumps, mahalanobis, paper_covariance, to_forecasts, to_positions
-from mcaptrack.transforms.retrack.state import Motion
+from mcaptrack.transforms.retrack.active_tracks import SmoothedHistory
+from mcaptrack.transforms.retrack.distances import (
+    mahalanobis,
+    metric_distances,
+    paper_covariance,
+    position_distances,
+    prediction_distances,
+)
 from tests.worlds import ids, places, tracks_at, walk
 
 PAPER, AUTHORS, DEFAULT = PROFILES["paper"], PROFILES["authors"], PROFILES["default"]
@@ -78,16 +84,16 @@ class TestDistance:
         tracks, seen = forecast(line(0, 1)), forecast(line(1, 1) + [2, 0])
         each = 2 / np.sqrt(2 * np.arange(1, 12) + 1)
         age = np.array([1])
-        assert to_forecasts(tracks, age, seen, "mean", 1.0)[0, 0] == pytest.approx(each.mean())
-        assert to_forecasts(tracks, age, seen, "max", 1.0)[0, 0] == pytest.approx(each.max())
-        assert to_forecasts(tracks, age, seen, "first", 1.0)[0, 0] == pytest.approx(each[0])
-        assert to_forecasts(tracks, age, seen, "mean", 2.0)[0, 0] == pytest.approx(each.mean() / 2)
+        assert prediction_distances(tracks, age, seen, "mean", 1.0)[0, 0] == pytest.approx(each.mean())
+        assert prediction_distances(tracks, age, seen, "max", 1.0)[0, 0] == pytest.approx(each.max())
+        assert prediction_distances(tracks, age, seen, "first", 1.0)[0, 0] == pytest.approx(each[0])
+        assert prediction_distances(tracks, age, seen, "mean", 2.0)[0, 0] == pytest.approx(each.mean() / 2)
 
     def test_older_tracks_overlap_less(self):
         """Ages 1, 9 and 12 leave 11, 3 and no steps, each track by its own."""
         tracks = forecast(line(0, 1), line(0, 1), line(0, 1))
         seen = forecast(line(0, 0))
-        distance = to_forecasts(tracks, np.array([1, 9, 12]), seen, "mean", 1.0)[:, 0]
+        distance = prediction_distances(tracks, np.array([1, 9, 12]), seen, "mean", 1.0)[:, 0]
         steps = np.arange(1, 12)
         assert distance[0] == pytest.approx(((1 + steps) / np.sqrt(2 * steps + 1)).mean())
         steps = np.arange(1, 4)
@@ -96,14 +102,14 @@ class TestDistance:
 
     def test_learned_uncertainty_takes_the_place_of_the_papers(self):
         tracks, seen = forecast(line(0, 0), variance=3.0), forecast(line(0, 0) + [2, 0], variance=1.0)
-        assert to_forecasts(tracks, np.array([1]), seen, "mean", None)[0, 0] == pytest.approx(1.0)
+        assert prediction_distances(tracks, np.array([1]), seen, "mean", None)[0, 0] == pytest.approx(1.0)
 
     def test_expected_and_seen_position_by_hand(self):
         tracks = forecast(line(0, 1), line(0, 1), variance=0.75)
         xy = np.array([[3.0, 1.0]])
-        distance = to_positions(tracks, np.array([3, 13]), xy, 0.5, None)
+        distance = position_distances(tracks, np.array([3, 13]), xy, 0.5, None)
         np.testing.assert_allclose(distance, [[1.0], [np.inf]])
-        np.testing.assert_allclose(jumps(tracks, np.array([2, 13]), xy), [[np.sqrt(2)], [np.nan]])
+        np.testing.assert_allclose(metric_distances(tracks, np.array([2, 13]), xy), [[np.sqrt(2)], [np.nan]])
 
 
 class TestSmoothing:
@@ -111,22 +117,22 @@ class TestSmoothing:
         """Seen at 0 and 1; then a hole; then at 5, three steps on: displacements 1, 4/3, 4/3, 4/3."""
         holt = Holt(0.5, 0.5)
         past = np.array([[[np.nan, np.nan], [0.0, 0], [1, 0]]])
-        motion = Motion.along(holt, past, np.isfinite(past[..., 0]))
-        motion.see(holt, np.array([[5.0, 0.0]]), np.array([3]))
+        history = SmoothedHistory.of_observations(holt, past, np.isfinite(past[..., 0]))
+        history.append(holt, np.array([[5.0, 0.0]]), np.array([3]))
         level, trend = 1.0, 0.0
         smooth = [level]
         for displacement in (4 / 3, 4 / 3, 4 / 3):
             new = 0.5 * displacement + 0.5 * (level + trend)
             level, trend = new, 0.5 * (new - level) + 0.5 * trend
             smooth.append(level)
-        rebuilt, known = motion.past()
+        rebuilt, known = history.positions()
         assert known.tolist() == [[True, True, True]]
         np.testing.assert_allclose(rebuilt[0, :, 0], [5 - smooth[-1] - smooth[-2], 5 - smooth[-1], 5])
 
     def test_without_smoothing_the_past_is_as_it_was_seen(self):
         past = np.array([[[0.0, 1], [1, 1], [3, 0], [2, 5]]])
-        motion = Motion.along(Holt(1.0, 0.0), past, np.ones((1, 4), bool))
-        np.testing.assert_allclose(motion.past()[0], past)
+        history = SmoothedHistory.of_observations(Holt(1.0, 0.0), past, np.ones((1, 4), bool))
+        np.testing.assert_allclose(history.positions()[0], past)
 
 
 class TestBranches:

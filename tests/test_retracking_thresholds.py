@@ -13,17 +13,16 @@ import pytest
 
 from mcaptrack.schema import Frame
 from mcaptrack.transforms import PROFILES
-from mcaptrack.transforms.retrack.doubt import log_odds
-from mcaptrack.transforms.retrack.link import link
-from mcaptrack.transforms.retrack.motion import Walker, smooth
-from mcaptrack.transforms.retrack.part import _encounters, part
-from mcaptrack.transforms.retrack.whole import laid
+from mcaptrack.transforms.retrack.false_tracks import track_log_odds
+from mcaptrack.transforms.retrack.identity_swaps import find_encounters, resolve_swaps
+from mcaptrack.transforms.retrack.linking import link_tracks
+from mcaptrack.transforms.retrack.motion_model import MotionModel, smooth, to_trajectories
 from tests.references.offline import Motion, Path, encounters, exchanged, links, person_log_odds
 from tests.references.online import OnlineTracker
 from tests.worlds import walk
 
 NUMBERS = (0.2, 1.75, 0.12, 0.08)
-WALKER, MOTION = Walker(*NUMBERS), Motion(*NUMBERS, 0.4)
+MODEL, MOTION = MotionModel(*NUMBERS), Motion(*NUMBERS, 0.4)
 FEW = replace(
     PROFILES["default"],
     predictor="cv",
@@ -104,7 +103,7 @@ def laid_out(paths: dict[int, Path]):
         np.array(column)
         for column in zip(*((s, n, *at) for n, path in paths.items() for s, at in path.items()), strict=True)
     )
-    _, at, out = laid(step, name, np.stack([x, y], axis=-1), WALKER.noise_m)
+    _, at, out = to_trajectories(step, name, np.stack([x, y], axis=-1), MODEL.noise_m)
     return out, at
 
 
@@ -125,8 +124,8 @@ def test_how_far_aside_a_track_is_linked(speed, gap, others, least):
 
     def ours(aside_m: float) -> bool:
         out, _ = laid_out(paths(aside_m))
-        forward, backward, _ = smooth(WALKER, out, 0.4)
-        return link(WALKER, out, forward, backward, 0.4, 20.0, least)[-2] == 2 * others + 1
+        forward, backward, _ = smooth(MODEL, out, 0.4)
+        return link_tracks(MODEL, out, forward, backward, 0.4, 20.0, least)[-2] == 2 * others + 1
 
     def reference(aside_m: float) -> bool:
         return links(MOTION, paths(aside_m), 20.0, least).get(90) == 91
@@ -147,8 +146,8 @@ def test_how_fast_a_runner_is_linked(gap):
 
     def ours(speed: float) -> bool:
         out, _ = laid_out(paths(speed))
-        forward, backward, _ = smooth(WALKER, out, 0.4)
-        return link(WALKER, out, forward, backward, 0.4, 20.0, 0.05)[0] == 1
+        forward, backward, _ = smooth(MODEL, out, 0.4)
+        return link_tracks(MODEL, out, forward, backward, 0.4, 20.0, 0.05)[0] == 1
 
     compare(ours, lambda speed: links(MOTION, paths(speed), 20.0, 0.05).get(1) == 2, 1.0, 9.0)
 
@@ -159,8 +158,8 @@ def test_how_near_a_double_walks_beside_a_person():
     def odds(beside_m: float) -> tuple[float, float]:
         paths = {1: line(0, 40, (0.0, 0.0), (1.0, 0.0)), 2: line(12, 10, (4.8, beside_m), (1.0, 0.0))}
         out, _ = laid_out(paths)
-        _, _, smoothed = smooth(WALKER, out, 0.4)
-        return float(log_odds(WALKER, out, smoothed, 0.4)[1]), person_log_odds(MOTION, paths)[2]
+        _, _, smoothed = smooth(MODEL, out, 0.4)
+        return float(track_log_odds(MODEL, out, smoothed, 0.4)[1]), person_log_odds(MOTION, paths)[2]
 
     near, far = odds(1.1), odds(1.3)
     assert far[0] - near[0] == pytest.approx(1.993)  # what walking beside a person counts for
@@ -189,7 +188,7 @@ def crossing(beside_m: float, gap: int, shift: int, named: str) -> tuple[dict[in
 def ours_exchanged(paths: dict[int, Path], ids: dict[int, dict[int, int]]) -> bool:
     out, at = laid_out(paths)
     source = np.array([ids[track][step] for track, path in paths.items() for step in path])
-    return part(WALKER, out, at, source, 0.4)[1] > 0
+    return resolve_swaps(MODEL, out, at, source, 0.4)[1] > 0
 
 
 @pytest.mark.parametrize("named", ["follow the people", "follow the labels", "are new"])
@@ -224,7 +223,6 @@ def test_encounters_begin_and_end_as_in_the_reference():
         }
         paths = {4: one, 9: two, 12: {s: (0.4 * s, -1.0) for s in range(28, 33)}}
         out, _ = laid_out(paths)
-        track = np.repeat(np.arange(3), np.diff(out.first))
-        found = zip(*(column.tolist() for column in _encounters(out, track, 3)), strict=True)
+        found = zip(*(column.tolist() for column in find_encounters(out)), strict=True)
         names = sorted(paths)
         assert [(names[i], names[j], low, high) for i, j, low, high in found] == encounters(paths)

@@ -28,14 +28,13 @@ from mcaptrack.evaluation.metrics import combine, score, summary
 from mcaptrack.geometry.assignment import assign, solve
 from mcaptrack.schema import Frame
 from mcaptrack.transforms import PROFILES, Retrack, Sample
-from mcaptrack.transforms.retrack import doubt, link
-from mcaptrack.transforms.retrack.following import Following, walker
-from mcaptrack.transforms.retrack.motion import Paths, State, Walker, smooth
-from mcaptrack.transforms.retrack.whole import laid
+from mcaptrack.transforms.retrack import false_tracks, linking
+from mcaptrack.transforms.retrack.likelihood import LikelihoodPass, motion_model
+from mcaptrack.transforms.retrack.motion_model import MotionModel, State, Trajectories, smooth, to_trajectories
 
 GATE_M = 1.0
-#: What links are fitted on, and with which of all pairs: elsewhere hardly any are right.
-LINKED, MAX_HOLE_S, LEAST = ("hidden long", "merges"), 30.0, -4.0
+#: What links are fitted on, and with which of all pairs: in other scenes hardly any are right.
+LINKED, MAX_GAP_S, LEAST = ("hidden long", "merges"), 30.0, -4.0
 SCENES = ("coupa_3", "gates_1", "hyang_5", "nexus_2", "bookstore_2", "deathCircle_3")
 LIMIT_STEPS = 900
 
@@ -47,7 +46,7 @@ CANDIDATES: dict[str, Retrack] = {
     **{f"noise {noise:g} m": replace(DEFAULT, noise_m=noise) for noise in (0.1, 0.2, 0.3)},
     **{f"drift {drift:g}": replace(DEFAULT, drift=drift) for drift in (0.1, 0.18)},
     **{f"links within {most:g} s": replace(DEFAULT, link_s=most) for most in (0.0, 8.0, 14.0, 30.0)},
-    "meetings as they are": replace(DEFAULT, part=False),
+    "swaps not resolved": replace(DEFAULT, part=False),
     **{f"certainty {least:g}": replace(DEFAULT, min_certainty=least) for least in (0.0, 0.3, 0.7)},
     "not smoothed": replace(DEFAULT, smooth=False),
 }
@@ -88,16 +87,16 @@ def table(everything: dict[str, World], output: int) -> None:
         print(f"{name:24}" + "".join(f"{cell:>20}" for cell in cells) + f"{mean:>14}", flush=True)
 
 
-def _followed(true: list[Frame], samples: list[Frame]) -> tuple:
-    """The tracks before anything is done to them, laid end to end, and the true person of each row, or -1."""
-    run = Following(DEFAULT)
+def _online_tracks(true: list[Frame], samples: list[Frame]) -> tuple:
+    """The online tracks as trajectories, and the true id of each row, or -1."""
+    run = LikelihoodPass(DEFAULT)
     for frame in samples:
-        run.tick(frame)
+        run.step(frame)
     rows = np.concatenate(run.samples)
-    step, track, _, key = run.claims.on(rows, run.steps, [len(part) for part in run.samples])
+    step, track, _, key = run.assignments.of(rows, run.steps, [len(part) for part in run.samples])
     xy = np.stack([rows["x_m"][key], rows["y_m"][key]], axis=-1)
-    who = walker(DEFAULT, run.noise_m)
-    ids, at, paths = laid(step, track, xy, who.noise_m)
+    model = motion_model(DEFAULT, run.noise_m)
+    ids, at, paths = to_trajectories(step, track, xy, model.noise_m)
     owner = np.full(len(paths.step), -1)
     length = np.diff(paths.first)
     number = np.searchsorted(ids, track)
@@ -105,9 +104,9 @@ def _followed(true: list[Frame], samples: list[Frame]) -> tuple:
         here, people = np.flatnonzero(step == tick), true[run.steps.index(int(tick))].rows
         off = np.hypot(xy[here, 0][:, None] - people["x_m"], xy[here, 1][:, None] - people["y_m"])
         off = np.where(off < GATE_M, off + 1.5 * (1 - length[number[here]] / length.max())[:, None], np.inf)
-        row, column = assign(off, 10.0)  # who is tracked for long is the person, who is beside them is not
+        row, column = assign(off, 10.0)  # the longer track is the person, a duplicate beside it is not
         owner[at[here[row]]] = people["track_id"][column]
-    return who, paths, owner
+    return model, paths, owner
 
 
 def _logistic(
@@ -135,37 +134,41 @@ def _logistic(
 
 
 def fit(everything: dict[str, World]) -> None:
-    """Print the weights of `doubt.py` and `link.py`."""
+    """Print the weights of `false_tracks.py` and `linking.py`."""
     people: list[np.ndarray] = []
     pairs: list[Pairs] = []
     for kind, world in everything.items():
         for true, samples in world.values():
-            who, paths, owner = _followed(true, samples)
-            forward, backward, smoothed = smooth(who, paths, STEP_S)
+            model, paths, owner = _online_tracks(true, samples)
+            forward, backward, smoothed = smooth(model, paths, STEP_S)
             first = paths.first[:-1]
             seen = np.isfinite(paths.xy_m[:, 0])
             count = np.add.reduceat(seen.astype(float), first)
             share = np.add.reduceat((owner >= 0).astype(float), first) / count
-            people.append(np.column_stack([doubt.features(who, paths, smoothed, STEP_S), share, count]))
+            people.append(np.column_stack([false_tracks.features(model, paths, smoothed, STEP_S), share, count]))
             if kind in LINKED:
-                pairs.append(_pairs(LINKED.index(kind), who, paths, forward, backward, owner))
+                pairs.append(_pairs(LINKED.index(kind), model, paths, forward, backward, owner))
     rows = np.concatenate(people)
     weights = _logistic(rows[:, :-2], rows[:, -2], rows[:, -1]).round(3).tolist()
-    print("doubt:", dict(zip((*doubt.NAMES, "1"), weights, strict=True)))
+    print("false tracks:", dict(zip((*false_tracks.FEATURES, "1"), weights, strict=True)))
     right = np.concatenate([one.right for one in pairs])
     group = np.concatenate([np.full(len(one.right), one.kind) for one in pairs])
     weights = _logistic(np.concatenate([one.features for one in pairs]), right, np.ones(len(right)), group)
-    # What is best of all that compete is right more often than it looks alone; that is said in a second step.
+    # The best of several competing links is right more often than its own score says: fit that in a second step.
     best = [_best(one, one.features @ weights[:-1] + weights[-1]) for one in pairs if one.kind == 0]
     gain, right = (np.concatenate(parts) for parts in zip(*best, strict=True))
     scale, shift = _logistic(gain[:, None], right, np.ones(len(right)))
     final = [*(scale * weights[:-1]), scale * weights[-1] + shift]
-    print("link:", dict(zip((*link.NAMES, "1"), np.round(final, 3).tolist(), strict=True)), f"usual {right.mean():.3f}")
+    print(
+        "link:",
+        dict(zip((*linking.FEATURES, "1"), np.round(final, 3).tolist(), strict=True)),
+        f"usual {right.mean():.3f}",
+    )
     print(f"      least {scale * LEAST + shift:.2f}")
 
 
 class Pairs(NamedTuple):
-    """Ends and beginnings (E,) of ``count`` tracks that may be one person's, and which are."""
+    """Candidate links (E,) from ends to beginnings of ``count`` tracks, and which are right."""
 
     kind: int
     count: int
@@ -175,28 +178,28 @@ class Pairs(NamedTuple):
     right: np.ndarray
 
 
-def _pairs(kind: int, who: Walker, paths: Paths, forward: State, backward: State, owner: np.ndarray):
+def _pairs(kind: int, model: MotionModel, paths: Trajectories, forward: State, backward: State, owner: np.ndarray):
     first, last = paths.first[:-1], paths.first[1:] - 1
-    i, j, hole_s = link.candidates(paths, forward, backward, STEP_S, MAX_HOLE_S)
-    found = link.features(who, forward.take(last[i]), backward.take(first[j]), hole_s)
+    i, j, gap_s = linking.candidates(paths, forward, backward, STEP_S, MAX_GAP_S)
+    found = linking.features(model, forward.take(last[i]), backward.take(first[j]), gap_s)
     ends, begins = (np.array([_usual(owner, paths, k, way) for k in range(len(first))]) for way in (-1, 1))
     same = np.flatnonzero((ends[i] >= 0) & (ends[i] == begins[j]))
-    nearest = same[np.lexsort((hole_s[same], i[same]))]
-    _, at = np.unique(i[nearest], return_index=True)  # who comes back after that is another's link
+    nearest = same[np.lexsort((gap_s[same], i[same]))]
+    _, at = np.unique(i[nearest], return_index=True)  # later returns are links of later tracks
     right = np.zeros(len(i))
     right[nearest[at]] = 1
     return Pairs(kind, len(first), i, j, found, right)
 
 
-def _usual(owner: np.ndarray, paths: Paths, track: int, way: int) -> int:
-    """Whose a track is at its beginning (``way`` 1) or end (-1); -1 if nobody's."""
-    whose = owner[paths.first[track] : paths.first[track + 1]][::way]
-    whose = whose[whose >= 0][:8]
-    return int(np.bincount(whose).argmax()) if len(whose) else -1
+def _usual(owner: np.ndarray, paths: Trajectories, track: int, way: int) -> int:
+    """The true id of a track at its beginning (``way`` 1) or end (-1); -1 for none."""
+    ids = owner[paths.first[track] : paths.first[track + 1]][::way]
+    ids = ids[ids >= 0][:8]
+    return int(np.bincount(ids).argmax()) if len(ids) else -1
 
 
 def _best(pairs: Pairs, gain: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The gains of the links that do best together, and which of them are right."""
+    """The gains of the best set of links, and which of them are right."""
     table, right = np.zeros((pairs.count, pairs.count)), np.zeros((pairs.count, pairs.count))
     good = gain > LEAST
     table[pairs.ends[good], pairs.begins[good]] = gain[good] - LEAST
@@ -211,7 +214,7 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--scenes", type=int, default=len(SCENES), help="how many scenes to use")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--online", action="store_true", help="score what was known at the time")
+    parser.add_argument("--online", action="store_true", help="score online tracks")
     parser.add_argument("--fit", action="store_true", help="print weights instead of scores")
     given = parser.parse_args()
     files = sorted(given.folder.glob("*.txt"))

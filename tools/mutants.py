@@ -34,7 +34,7 @@ from typing import Any
 
 from tools.mutations import ROOT, Mutant, find, sample
 
-RETRACK = "retrack whole offline_reference retracking_reference retracking_laws retracking_thresholds"
+RETRACK = "retrack offline offline_reference retracking_reference retracking_laws retracking_thresholds"
 #: The test files that cover a folder or a file, beside those of the folders around it; all tests where none are named.
 COVERS = {
     "mcaptrack/evaluation": "evaluation events events_reference forecast_errors metrics_oracles compared",

@@ -28,7 +28,7 @@ from mcaptrack.sources import foreign
 from mcaptrack.sources.cameras import FULL, ROUTES, camera_at
 from mcaptrack.sources.video import Encoded, brightness
 from mcaptrack.transforms import TRANSFORMS, Transform, choice, implementation_of
-from mcaptrack.transforms.to_video_rate import carry, keep
+from mcaptrack.transforms.to_video_rate import to_video_rate, unchanged_tracks
 
 Progress = Callable[[str, int, int], None]
 
@@ -202,7 +202,7 @@ def _carried(opened: log.Log, job: Job, made: Mapping[str, Made], planes: Planes
     if not tracks:
         return {}
     retracked = made[job.target]
-    frames = keep(tracks, planes) if holds_back else carry(tracks, retracked.frames, planes)
+    frames = unchanged_tracks(tracks, planes) if holds_back else to_video_rate(tracks, retracked.frames, planes)
     return {job.target + FULL: Made.of(TRACKS, frames, retracked.provenance)}
 
 

@@ -1,6 +1,6 @@
-"""Re-tracked identities back at the video's rate: the tracker's boxes under the names that re-tracking gave them.
+"""Re-tracked ids at the video's rate: the boxes of the tracker under the ids that re-tracking assigned.
 
-Letters: F frames of the video, T ticks of the clock of prediction, N rows of the tracker, R rows out.
+Letters: N rows of the tracker.
 """
 
 from __future__ import annotations
@@ -17,15 +17,30 @@ from mcaptrack.geometry.ragged import group_index, run_starts
 from mcaptrack.schema import TRACKS, Frame, Rows
 from mcaptrack.schema.resampling import resample
 
-#: What is taken from the tracker where it saw somebody.
-_SEEN: Final = ("x_px", "y_px", "w_px", "h_px", "score", "observed")
+#: Columns taken from the tracker where it has a box.
+_FROM_TRACKER: Final = ("x_px", "y_px", "w_px", "h_px", "score", "observed")
 
 
-def carry(tracks: Sequence[Frame], retracks: Sequence[Frame], planes: Planes) -> list[Frame]:
-    """The frames of ``tracks`` with the people of ``retracks``, whose rows name tracks of the former as their source.
+def to_video_rate(tracks: Sequence[Frame], retracks: Sequence[Frame], planes: Planes) -> list[Frame]:
+    """The frames of ``tracks`` with the ids of ``retracks``, whose ``source_id`` names the tracks.
 
-    A box of the tracker belongs to whom its track has at the tick that is nearest. Where a re-tracked person has no box
-    their row lies between those of the ticks, not observed. Boxes of tracks that re-tracking left out are left out.
+    Each box of the tracker gets the re-tracked id that its track has at the nearest sample time. Where a re-tracked
+    track has no box, its row is interpolated between the samples and not observed. Boxes of tracks that re-tracking
+    left out are left out.
+
+    Parameters
+    ----------
+    tracks : sequence of Frame
+        Frames of Tracks at the video's rate, as the tracker made them.
+    retracks : sequence of Frame
+        Frames of Tracks at sample times, as re-tracking made them of the samples of ``tracks``.
+    planes : Planes
+        Ground planes, for positions in metres of boxes that have none.
+
+    Returns
+    -------
+    list of Frame
+        One for each of ``tracks``; no id is at two places of a frame, and no box has two ids.
     """
     if not tracks or not retracks:
         return [Frame(frame.t_ns, frame.index, TRACKS.empty()) for frame in tracks]
@@ -35,27 +50,27 @@ def carry(tracks: Sequence[Frame], retracks: Sequence[Frame], planes: Planes) ->
     base, base_at = resample(retracks, frame_ns, round(1.5 * period))
     base["observed"], base["source_id"] = False, -1
 
-    seen = TRACKS.joined([frame.rows for frame in tracks])
+    boxes = TRACKS.joined([frame.rows for frame in tracks])
     at = group_index([len(frame.rows) for frame in tracks])
-    who, far = _owner(seen["track_id"], frame_ns[at], retracks, tick_ns)
-    kept = (who >= 0) & (far <= 1.5 * period)
-    # where two boxes are one person's, the one whose tick is nearer
-    order = np.lexsort((far, who, at))
+    ids, distance_ns = _retracked_ids(boxes["track_id"], frame_ns[at], retracks, tick_ns)
+    kept = (ids >= 0) & (distance_ns <= 1.5 * period)
+    # of two boxes with one id, the one with the nearer sample time
+    order = np.lexsort((distance_ns, ids, at))
     order = order[kept[order]]
-    order = order[run_starts(at[order], who[order])]
-    seen, at, who = seen[order].copy(), at[order], who[order]
+    order = order[run_starts(at[order], ids[order])]
+    boxes, at, ids = boxes[order].copy(), at[order], ids[order]
 
-    names = np.unique(np.concatenate([base["track_id"], who]))
+    names = np.unique(np.concatenate([base["track_id"], ids]))
     width = len(names) + 1
     have = base_at * width + np.searchsorted(names, base["track_id"])
-    want = at * width + np.searchsorted(names, who)
+    want = at * width + np.searchsorted(names, ids)
     place = np.minimum(np.searchsorted(have, want), max(len(have) - 1, 0))  # base is ordered by time and id
     inside = have[place] == want if len(have) else np.zeros(len(want), bool)
-    for name in _SEEN:
-        base[name][place[inside]] = seen[name][inside]
-    base["source_id"][place[inside]] = seen["track_id"][inside]
-    outside = seen[~inside]
-    outside["source_id"], outside["track_id"] = outside["track_id"], who[~inside]
+    for name in _FROM_TRACKER:
+        base[name][place[inside]] = boxes[name][inside]
+    base["source_id"][place[inside]] = boxes["track_id"][inside]
+    outside = boxes[~inside]
+    outside["source_id"], outside["track_id"] = outside["track_id"], ids[~inside]
     _to_metres(outside, frame_ns[at[~inside]], planes)
     rows = np.concatenate([base, outside])
     rows_at = np.concatenate([base_at, at[~inside]])
@@ -66,8 +81,8 @@ def carry(tracks: Sequence[Frame], retracks: Sequence[Frame], planes: Planes) ->
     return [Frame(frame.t_ns, frame.index, rows[low:high]) for frame, low, high in spans]
 
 
-def keep(tracks: Sequence[Frame], planes: Planes) -> list[Frame]:
-    """The frames of ``tracks`` under the names that they have, as ``carry`` gives them."""
+def unchanged_tracks(tracks: Sequence[Frame], planes: Planes) -> list[Frame]:
+    """The frames of ``tracks`` under the ids that they have, in the form of ``to_video_rate``."""
     out = []
     for frame in tracks:
         rows = frame.rows.copy()
@@ -77,33 +92,34 @@ def keep(tracks: Sequence[Frame], planes: Planes) -> list[Frame]:
     return out
 
 
-def _owner(track: Ints, t_ns: Ints, retracks: Sequence[Frame], tick_ns: Ints) -> tuple[Ints, Ints]:
-    """Whom rows of ``track`` (N,) at ``t_ns`` belong to by the tick that is nearest of those which say it, and how far
-    that is in ns; -1 where none says it.
+def _retracked_ids(track: Ints, t_ns: Ints, retracks: Sequence[Frame], tick_ns: Ints) -> tuple[Ints, Ints]:
+    """The re-tracked id of each video-rate row at the nearest sample time of its track, and the distance to it in ns.
+
+    Rows are given by ``track`` (N,) and ``t_ns`` (N,). The id is -1 for tracks without a sample.
     """
     rows = TRACKS.joined([frame.rows for frame in retracks])
     row_ns = np.repeat(tick_ns, [len(frame.rows) for frame in retracks])
-    said = rows["source_id"] >= 0
-    source, owner, row_ns = rows["source_id"][said], rows["track_id"][said], row_ns[said]
+    has_source = rows["source_id"] >= 0
+    source, owner, row_ns = rows["source_id"][has_source], rows["track_id"][has_source], row_ns[has_source]
     order = np.lexsort((row_ns, source))
     source, owner, row_ns = source[order], owner[order], row_ns[order]
-    out, far = np.full(len(track), -1), np.full(len(track), np.iinfo(np.int64).max)
+    ids, distance_ns = np.full(len(track), -1), np.full(len(track), np.iinfo(np.int64).max)
     if len(source) == 0:
-        return out, far
+        return ids, distance_ns
     names, times = np.unique(source), np.unique(np.concatenate([row_ns, t_ns]))
-    mine = np.searchsorted(names, track)  # one rising key for track and time, so that one search finds both
+    own = np.searchsorted(names, track)  # one rising key for track and time, so that one search finds both
     keys = np.searchsorted(names, source) * len(times) + np.searchsorted(times, row_ns)
-    after = np.searchsorted(keys, mine * len(times) + np.searchsorted(times, t_ns))
+    after = np.searchsorted(keys, own * len(times) + np.searchsorted(times, t_ns))
     for side in (after - 1, after):
         place = np.clip(side, 0, len(source) - 1)
         gap = np.abs(row_ns[place] - t_ns)
-        better = (source[place] == track) & (gap < far)
-        out[better], far[better] = owner[place[better]], gap[better]
-    return out, far
+        better = (source[place] == track) & (gap < distance_ns)
+        ids[better], distance_ns[better] = owner[place[better]], gap[better]
+    return ids, distance_ns
 
 
 def _to_metres(rows: Rows, t_ns: Ints, planes: Planes) -> None:
-    """Fill in where rows stand on the ground, as far as a plane says it."""
+    """Fill in missing positions in metres, in place, where there is a ground plane."""
     for when in np.unique(t_ns[np.isnan(rows["x_m"])]).tolist():
         plane, here = plane_at(planes, when), (t_ns == when) & np.isnan(rows["x_m"])
         if plane is not None:

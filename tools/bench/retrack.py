@@ -19,14 +19,14 @@ from reproduce import scenes
 
 from mcaptrack.schema import Frame
 from mcaptrack.transforms import PROFILES, Predict, Retrack
-from mcaptrack.transforms.retrack.following import Following
+from mcaptrack.transforms.retrack.likelihood import LikelihoodPass
 
 
 def online(samples: list[Frame]) -> None:
-    """What is known at the time, with forecasts, and nothing else."""
-    run = Following(Retrack())
+    """Online tracks and their predictions only."""
+    run = LikelihoodPass(Retrack())
     for frame in samples:
-        run.tick(frame)
+        run.step(frame)
     run.outputs()
 
 

@@ -1,11 +1,10 @@
-"""Samples -> re-tracked tracks: re-tracking by prediction (Yu and Zhou, IROS 2021, Algorithm 1).
+"""Samples -> re-tracked tracks: re-tracking by prediction (Yu and Zhou, IROS 2021).
 
-An observation is a sample with the forecast from its own past; its identity is dropped. A track is a forecast and an
-age. Observations go to the tracks whose forecasts agree with theirs; a matched track is smoothed and foretells again;
-an unmatched one ages. Three readings are offered by name, see ``PROFILES``. All of this is about metres: where they
-were guessed and can't be right (``poor_scale``), tracks are passed on as they are.
-
-Letters: K tracks, N observations, L past positions, T future steps.
+Two methods associate observations online: ``consistency`` (Algorithm 1 of the paper) and ``likelihood``. Both leave
+assignments of samples to tracks, from which ``offline`` makes the tracks of the whole log: it links tracks over gaps
+(``linking``), resolves identity swaps (``identity_swaps``), leaves out false tracks (``false_tracks``) and smooths
+(``motion_model``). All of this is in metres: where their scale is guessed and can't be right (``poor_scale``), tracks
+are passed on unchanged.
 """
 
 from __future__ import annotations
@@ -22,10 +21,10 @@ from mcaptrack.predictors import NAMES, PredictorName
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame, Schema
 from mcaptrack.transforms.forecasts import Forecaster
 from mcaptrack.transforms.protocol import check_options, context, option
-from mcaptrack.transforms.retrack.algorithm import Forecasting
-from mcaptrack.transforms.retrack.distance import Covariance, Distance
-from mcaptrack.transforms.retrack.following import Following, walker
-from mcaptrack.transforms.retrack.whole import whole_tracks
+from mcaptrack.transforms.retrack.consistency import ConsistencyPass
+from mcaptrack.transforms.retrack.distances import Covariance, Distance
+from mcaptrack.transforms.retrack.likelihood import LikelihoodPass, motion_model
+from mcaptrack.transforms.retrack.offline import offline_tracks
 
 # Headings of the options in the help.
 _ASSOCIATION: Final = "Association"
@@ -202,7 +201,7 @@ class Retrack:
 
     @property
     def holds_back(self) -> bool:
-        """Whether tracks stay as they are, because where people are isn't known well enough to repair them."""
+        """Whether tracks are passed on unchanged, because positions in metres are too wrong to repair them."""
         return self.poor_scale and not self.side_view
 
     def __call__(self, frames: Iterable[Frame]) -> Iterator[tuple[Frame, ...]]:
@@ -212,12 +211,13 @@ class Retrack:
                 online = frame._replace(rows=frame.rows[frame.rows["observed"]])
                 yield frame, online, frame._replace(rows=forecaster.predict(frame))
             return
-        run = Following(self) if self.distance == "likelihood" else Forecasting(self)
+        run = LikelihoodPass(self) if self.distance == "likelihood" else ConsistencyPass(self)
         times_ns = []
         for frame in frames:
-            run.tick(frame)
+            run.step(frame)
             times_ns.append(frame.t_ns)
-        rows, step = whole_tracks(self, walker(self, run.noise_m), run.claims, run.samples, run.steps, times_ns)
+        model = motion_model(self, run.noise_m)
+        rows, step = offline_tracks(self, model, run.assignments, run.samples, run.steps, times_ns)
         first, last = (np.searchsorted(step, run.steps, side) for side in ("left", "right"))
         for (online, predictions), low, high in zip(run.outputs(), first.tolist(), last.tolist(), strict=True):
             yield Frame(online.t_ns, online.index, rows[low:high]), online, predictions
@@ -243,10 +243,10 @@ _PAPER: Final = Retrack(
     smooth=False,
 )
 
-#: Readings by name. "paper" is Algorithm 1 and Eq. 1 to 3 to the letter; where the paper gives no number (sigma, d_min,
-#: t_max, the probation) the authors' stands. "authors" is what their program does: the largest distance instead of the
-#: mean, certain pairs first, birth from the smoothed past, and what two matches in a row confirm.
-#: "default" is ours.
+#: Values of all parameters by name. "paper" is Algorithm 1 with Eq. 1 to 3 to the letter; where the paper gives no
+#: number (sigma, d_min, t_max, the probation) it is that of the authors' program. "authors" is what their program does:
+#: the largest distance instead of the mean, near pairs first, tracks that start from the smoothed past, and assignments
+#: that two matches in a row confirm. "default" is this project's method.
 PROFILES: Final = MappingProxyType(
     {
         "default": Retrack(),

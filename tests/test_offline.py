@@ -9,34 +9,33 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from mcaptrack.geometry.assignment import assign_by_gain
 from mcaptrack.transforms import PROFILES
-from mcaptrack.transforms.retrack.follow import pairs
-from mcaptrack.transforms.retrack.following import Following
-from mcaptrack.transforms.retrack.link import link
-from mcaptrack.transforms.retrack.motion import Paths, State, Walker, smooth
-from mcaptrack.transforms.retrack.part import exchanges
-from mcaptrack.transforms.retrack.whole import laid
+from mcaptrack.transforms.retrack.identity_swaps import find_swaps
+from mcaptrack.transforms.retrack.likelihood import LikelihoodPass
+from mcaptrack.transforms.retrack.linking import link_tracks
+from mcaptrack.transforms.retrack.motion_model import MotionModel, State, Trajectories, smooth, to_trajectories
 from tests.worlds import places, walk
 
-WALKER = Walker(noise_m=0.1, speed_m_per_s=1.5, drift=0.15, drift_share=0.0)
+MODEL = MotionModel(noise_m=0.1, speed_m_per_s=1.5, drift_m_per_s=0.15, drift_ratio=0.0)
 STEP_S = 0.4
 DEFAULT = PROFILES["default"]
 
 
-def one_path(xy: np.ndarray, start: int = 0) -> Paths:
+def one_path(xy: np.ndarray, start: int = 0) -> Trajectories:
     steps = start + np.arange(len(xy))
-    return Paths(np.array([0, len(xy)]), steps, xy, np.full(len(xy), WALKER.noise_m))
+    return Trajectories(np.array([0, len(xy)]), steps, xy, np.full(len(xy), MODEL.noise_m))
 
 
 def joint(xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Mean (n, 2) and variance (n,) of every true position given all seen ones, from one big Gaussian: no filter."""
     count = len(xy)
     move = np.array([[1, STEP_S], [0, 1]])
-    noise = WALKER.drift**2 * np.array([[STEP_S**3 / 3, STEP_S**2 / 2], [STEP_S**2 / 2, STEP_S]])
+    noise = MODEL.drift_m_per_s**2 * np.array([[STEP_S**3 / 3, STEP_S**2 / 2], [STEP_S**2 / 2, STEP_S]])
     seen = np.flatnonzero(np.isfinite(xy[:, 0]))
     # a flat prior of the first position, as a filter that starts on its measurement has it
     cov = np.zeros((2 * count, 2 * count))
-    cov[:2, :2] = np.diag([1e3, WALKER.speed_m_per_s**2])
+    cov[:2, :2] = np.diag([1e3, MODEL.speed_m_per_s**2])
     for k in range(1, count):
         row = move @ cov[2 * k - 2 : 2 * k, : 2 * k]
         cov[2 * k : 2 * k + 2, : 2 * k] = row
@@ -44,7 +43,7 @@ def joint(xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         cov[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = move @ cov[2 * k - 2 : 2 * k, 2 * k - 2 : 2 * k] @ move.T + noise
     at = 2 * np.arange(count)
     gain = cov[np.ix_(at, at[seen])] @ np.linalg.inv(
-        cov[np.ix_(at[seen], at[seen])] + WALKER.noise_m**2 * np.eye(len(seen))
+        cov[np.ix_(at[seen], at[seen])] + MODEL.noise_m**2 * np.eye(len(seen))
     )
     variance = np.diag(cov[np.ix_(at, at)] - gain @ cov[np.ix_(at[seen], at)])
     return gain @ xy[seen], variance
@@ -55,7 +54,7 @@ class TestMotion:
         rng = np.random.default_rng(3)
         xy = np.cumsum(rng.normal(0.4, 0.1, (14, 2)), axis=0)
         xy[5:8] = np.nan
-        _, _, smoothed = smooth(WALKER, one_path(xy), STEP_S)
+        _, _, smoothed = smooth(MODEL, one_path(xy), STEP_S)
         mean, variance = joint(xy)
         np.testing.assert_allclose(smoothed.mean[:, :2], mean, atol=1e-3)
         np.testing.assert_allclose(smoothed.cov[:, 0], variance, rtol=0.01)
@@ -64,24 +63,24 @@ class TestMotion:
         rng = np.random.default_rng(4)
         parts = [rng.normal(0, 3, (n, 2)) for n in (9, 1, 4)]
         first = np.array([0, 9, 10, 14])
-        together = Paths(
+        together = Trajectories(
             first, np.concatenate([np.arange(n) for n in (9, 1, 4)]), np.concatenate(parts), np.full(14, 0.1)
         )
-        whole = smooth(WALKER, together, STEP_S)
+        whole = smooth(MODEL, together, STEP_S)
         for k, part in enumerate(parts):
-            for a, b in zip(whole, smooth(WALKER, one_path(part), STEP_S), strict=True):
+            for a, b in zip(whole, smooth(MODEL, one_path(part), STEP_S), strict=True):
                 np.testing.assert_allclose(a.mean[first[k] : first[k + 1]], b.mean, atol=1e-9)
 
     def test_backwards_is_forwards_of_the_film_run_backwards(self):
         xy = np.cumsum(np.random.default_rng(5).normal(0.3, 0.2, (10, 2)), axis=0)
-        _, backward, _ = smooth(WALKER, one_path(xy), STEP_S)
-        forward, _, _ = smooth(WALKER, one_path(xy[::-1]), STEP_S)
+        _, backward, _ = smooth(MODEL, one_path(xy), STEP_S)
+        forward, _, _ = smooth(MODEL, one_path(xy[::-1]), STEP_S)
         np.testing.assert_allclose(backward.mean[:, :2], forward.mean[::-1, :2])
         np.testing.assert_allclose(backward.mean[:, 2:], -forward.mean[::-1, 2:])
 
     def test_prediction_in_two_steps_is_prediction_in_one(self):
         state = State(np.array([[1.0, 2, 0.5, -1]]), np.array([[0.1, 0.02, 0.3]]))
-        one, two = WALKER.predict(state, 1.2), WALKER.predict(WALKER.predict(state, 0.4), 0.8)
+        one, two = MODEL.predict(state, 1.2), MODEL.predict(MODEL.predict(state, 0.4), 0.8)
         np.testing.assert_allclose(one.mean, two.mean)
         np.testing.assert_allclose(one.cov, two.cov)
 
@@ -94,7 +93,7 @@ def test_pairs_are_the_best_there_are(seed):
 
     rng = np.random.default_rng(seed)
     gain = rng.normal(0, 1, rng.integers(1, 5, 2))
-    rows, columns = pairs(gain)
+    rows, columns = assign_by_gain(gain)
     assert len(set(columns.tolist())) == len(columns)
     wide = np.maximum(gain if gain.shape[0] <= gain.shape[1] else gain.T, 0)
     best = max(sum(wide[k, c] for k, c in enumerate(order)) for order in permutations(range(wide.shape[1]), len(wide)))
@@ -106,9 +105,9 @@ class TestLinks:
     def follows(self, *people: tuple[int, np.ndarray]) -> list[int]:
         step = np.concatenate([start + np.arange(len(xy)) for start, xy in people])
         track = np.repeat(np.arange(len(people)), [len(xy) for _, xy in people])
-        _, _, paths = laid(step, track, np.concatenate([xy for _, xy in people]), WALKER.noise_m)
-        forward, backward, _ = smooth(WALKER, paths, STEP_S)
-        return link(WALKER, paths, forward, backward, STEP_S, 14.0, 0.5).tolist()
+        _, _, paths = to_trajectories(step, track, np.concatenate([xy for _, xy in people]), MODEL.noise_m)
+        forward, backward, _ = smooth(MODEL, paths, STEP_S)
+        return link_tracks(MODEL, paths, forward, backward, STEP_S, 14.0, 0.5).tolist()
 
     def walking(self, x: float, y: float, steps: int = 12, speed: float = 0.5) -> np.ndarray:
         return np.stack([x + speed * np.arange(steps), np.full(steps, y)], axis=-1)
@@ -148,24 +147,24 @@ class TestMeetings:
 
     @pytest.mark.parametrize("since", [5, 18, 22, 30])
     def test_an_exchange_is_found_to_the_step(self, since):
-        course, gain = exchanges(self.apart(slice(since, None), 0.05), np.full((1, 40), 5.0), STEP_S, 0.05, 1.5)
+        course, gain = find_swaps(self.apart(slice(since, None), 0.05), np.full((1, 40), 5.0), STEP_S, 0.05, 1.5)
         assert np.flatnonzero(course[0]).tolist() == list(range(since, 40))
         assert gain[0] > 3
 
     def test_there_and_back_again(self):
-        course, _ = exchanges(self.apart(slice(8, 15), 0.05), np.full((1, 40), 5.0), STEP_S, 0.05, 1.5)
+        course, _ = find_swaps(self.apart(slice(8, 15), 0.05), np.full((1, 40), 5.0), STEP_S, 0.05, 1.5)
         assert np.flatnonzero(course[0]).tolist() == list(range(8, 15))
 
     def test_where_nothing_was_exchanged_nothing_is(self):
         for seed in range(20):
-            course, gain = exchanges(self.apart(slice(0, 0), 0.1, seed), np.full((1, 40), 5.0), STEP_S, 0.1, 1.5)
+            course, gain = find_swaps(self.apart(slice(0, 0), 0.1, seed), np.full((1, 40), 5.0), STEP_S, 0.1, 1.5)
             assert not course.any()
             assert gain[0] <= 0
 
     def test_encounters_do_not_touch_and_holes_are_bridged(self):
         one, two = self.apart(slice(20, None), 0.05), self.apart(slice(0, 0), 0.05, 1)
         one[0, 17:23] = np.nan
-        course, _ = exchanges(np.concatenate([one, two]), np.full((2, 40), 5.0), STEP_S, 0.05, 1.5)
+        course, _ = find_swaps(np.concatenate([one, two]), np.full((2, 40), 5.0), STEP_S, 0.05, 1.5)
         assert course[0, 23:].all()
         assert not course[0, :17].any()
         assert not course[1].any()
@@ -231,17 +230,17 @@ class TestOfTheWholeLog:
                 },
                 120,
             )
-            run = Following(DEFAULT)
+            run = LikelihoodPass(DEFAULT)
             for frame in frames:
-                run.tick(frame)
+                run.step(frame)
             assert run.noise_m == pytest.approx(noise_m, rel=0.25)
 
     @pytest.mark.parametrize(("spread_m", "found_m"), [(0.0, 0.03), (4.0, 0.8)])
     def test_the_noise_that_is_found_out_has_limits(self, spread_m, found_m):
         rng = np.random.default_rng(2)
-        run = Following(replace(DEFAULT, max_jump_m=None))
+        run = LikelihoodPass(replace(DEFAULT, max_jump_m=None))
         for frame in walk(lambda n: {k: tuple([0.0, 900.0 * k] + rng.normal(0, spread_m, 2)) for k in range(9)}, 250):
-            run.tick(frame)
+            run.step(frame)
         assert run.noise_m == pytest.approx(found_m)
 
     def test_an_id_that_is_handed_on_three_times_is_given_back(self):

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mcaptrack.schema import TRACKS, Frame
-from mcaptrack.transforms.to_video_rate import carry
+from mcaptrack.transforms.to_video_rate import to_video_rate
 from tests.test_cli import done
 from tests.worlds import ns
 
@@ -38,7 +38,7 @@ def named(people: dict[int, tuple[int, float]]):
 
 
 def full(tracks, retracks):
-    frames = carry(
+    frames = to_video_rate(
         [Frame(ns(n / 10), n, boxes(people)) for n, people in enumerate(tracks)],
         [Frame(ns(0.4 * n), 4 * n, named(people)) for n, people in enumerate(retracks)],
         (),
@@ -73,7 +73,7 @@ def test_boxes_of_a_false_track_are_left_out():
 
 def test_nobody_re_tracked_nobody_shown_and_every_frame_there():
     assert full([{7: 0.0}] * 4, [{}]) == [{}] * 4
-    assert carry([], [], ()) == []
+    assert to_video_rate([], [], ()) == []
 
 
 @given(seed=st.integers(0, 2**32 - 1))
@@ -86,7 +86,7 @@ def test_nobody_is_at_two_places_and_no_box_is_two_people(seed):
         sources = rng.permutation(5)[: rng.integers(0, 6)]
         retracks.append({int(10 + rng.permutation(5)[k]) + 10 * k: (int(s), float(s)) for k, s in enumerate(sources)})
     frames = [Frame(ns(n / 10), n, boxes(people)) for n, people in enumerate(tracks)]
-    out = carry(frames, [Frame(ns(0.4 * n), n, named(people)) for n, people in enumerate(retracks)], ())
+    out = to_video_rate(frames, [Frame(ns(0.4 * n), n, named(people)) for n, people in enumerate(retracks)], ())
     for before, after in zip(frames, out, strict=True):
         who, source = after.rows["track_id"].tolist(), after.rows["source_id"]
         assert len(set(who)) == len(who)

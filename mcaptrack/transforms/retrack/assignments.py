@@ -1,0 +1,72 @@
+"""Which sample was assigned to which track, collected while tracks run online. Letters: C assignments."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from mcaptrack.geometry.arrays import Bools, Ints
+from mcaptrack.schema import Rows
+
+
+@dataclass
+class Assignments:
+    """Which sample each track was assigned at which step. Samples are named by step and input id."""
+
+    _steps: list[Ints] = field(default_factory=list)
+    _tracks: list[Ints] = field(default_factory=list)
+    _sources: list[Ints] = field(default_factory=list)
+    _confirmed: list[tuple[int, Ints]] = field(default_factory=list)
+
+    def add(self, step: Ints | int, tracks: Ints, sources: Ints) -> None:
+        """Assign the samples of the input ids ``sources`` (C,) at ``step`` to ``tracks`` (C,)."""
+        self._steps.append(np.broadcast_to(step, tracks.shape))
+        self._tracks.append(tracks)
+        self._sources.append(sources)
+
+    def confirm(self, step: int, tracks: Ints) -> None:
+        """Confirm assignments of ``tracks`` (C,) up to ``step``; once this was called, unconfirmed ones are dropped."""
+        self._confirmed.append((step, tracks))
+
+    def of(self, samples: Rows, steps: Sequence[int], counts: Sequence[int]) -> tuple[Ints, Ints, Ints, Ints]:
+        """Steps, tracks, input ids and samples of the assignments, in the order in which they were made; (C,) each.
+
+        ``samples`` are the rows of all steps, ``counts`` of them at each of ``steps``. A track has one sample a step.
+        """
+        nothing = [np.empty(0, np.int64)]
+        step, track, source = (np.concatenate(p or nothing) for p in (self._steps, self._tracks, self._sources))
+        row = _find(samples["track_id"], np.repeat(np.array(steps, np.int64), counts), source, step)
+        kept = np.flatnonzero((row >= 0) & self._is_confirmed(step, track))
+        return step[kept], track[kept], source[kept], row[kept]
+
+    def _is_confirmed(self, step: Ints, track: Ints) -> Bools:
+        """Which assignments (C,) are not later than the last time that their track was confirmed."""
+        if not self._confirmed:
+            return np.ones(len(step), bool)
+        until = np.full(int(track.max(initial=0)) + 1, np.iinfo(np.int64).min)
+        for when, tracks in self._confirmed:  # rising
+            until[tracks] = when
+        return step <= until[track]
+
+
+def _find(ids: Ints, steps: Ints, wanted_ids: Ints, wanted_steps: Ints) -> Ints:
+    """The row with each wanted id and step; -1 where there is none."""
+    if len(ids) == 0:
+        return np.full(len(wanted_ids), -1)
+    names = np.unique(ids)
+    low = min(int(steps.min()), int(wanted_steps.min(initial=0)))
+    high = int(max(steps.max(), wanted_steps.max(initial=0)))
+    width = high - low + 1
+
+    def key(id_: Ints, step: Ints) -> Ints:
+        return np.searchsorted(names, id_) * width + (step - low)
+
+    have = key(ids, steps)
+    order = np.argsort(have, kind="stable")
+    want = key(wanted_ids, wanted_steps)
+    at = np.minimum(np.searchsorted(have[order], want), len(have) - 1)
+    found = order[at]
+    is_there = np.isin(wanted_ids, names) & (have[found] == want)
+    return np.where(is_there, found, -1)

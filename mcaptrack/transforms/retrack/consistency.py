@@ -1,0 +1,154 @@
+"""Re-tracking by prediction consistency: Algorithm 1 of the paper over one log, step by step.
+
+An observation is a sample with a prediction from its own past; its input id is dropped. A track is a prediction and an
+age. Observations are assigned to the tracks whose predictions agree with theirs; a matched track is smoothed and
+predicts again; an unmatched one ages.
+
+Letters: K tracks, N observations, L past positions, T predicted steps.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from mcaptrack.geometry.arrays import Bools, Floats, Indices, Ints
+from mcaptrack.geometry.assignment import assign
+from mcaptrack.geometry.clocks import NS_PER_S
+from mcaptrack.geometry.histories import Histories, Holt
+from mcaptrack.predictors import Forecast, Predictor, make
+from mcaptrack.schema import Frame, Rows
+from mcaptrack.schema.predictions import forecast_to_rows
+from mcaptrack.transforms.retrack.active_tracks import ActiveTracks, SmoothedHistory
+from mcaptrack.transforms.retrack.assignments import Assignments
+from mcaptrack.transforms.retrack.distances import metric_distances, position_distances, prediction_distances
+from mcaptrack.transforms.retrack.motion_model import DEFAULT_NOISE_M
+
+if TYPE_CHECKING:
+    from mcaptrack.transforms.retrack import Retrack
+
+#: Cost of a pair with priority: lower than any sum of other costs.
+_PRIORITY_COST: Final = -100.0
+
+
+class ConsistencyPass:
+    """Algorithm 1 over one log: ``step`` for each frame, then ``outputs``."""
+
+    def __init__(self, options: Retrack) -> None:
+        horizon = max(1, round(options.horizon_s * options.rate_hz))
+        self._options = options
+        self._predictor: Predictor = make(options.predictor, horizon, 1 / options.rate_hz)
+        self._holt = Holt(options.alpha, options.beta)
+        self._length = max(self._predictor.past, options.min_history, 2)
+        self._histories = Histories(self._length)
+        self._tracks = ActiveTracks.none(self._length, horizon)
+        self.assignments = Assignments()
+        self.samples: list[Rows] = []
+        self.steps: list[int] = []
+        self.noise_m = DEFAULT_NOISE_M if options.noise_m is None else options.noise_m
+        self._outputs: list[tuple[Frame, Frame]] = []
+        self._next_id = 1
+        self._last_ns: int | None = None
+
+    def step(self, frame: Frame) -> None:
+        """One step: associate, update, age, start and terminate tracks."""
+        passed = 1
+        if self._last_ns is not None:
+            passed = max(1, round((frame.t_ns - self._last_ns) * self._options.rate_hz / NS_PER_S))
+        self._last_ns = frame.t_ns
+        step = self.steps[-1] + passed if self.steps else 0
+        self.steps.append(step)
+        self.samples.append(frame.rows)
+
+        sources = frame.rows["track_id"]
+        past, valid = self._histories.push(sources, np.stack([frame.rows["x_m"], frame.rows["y_m"]], axis=-1), passed)
+        usable = valid[:, -self._options.min_history :].all(axis=1)
+        if not self._options.filled:
+            usable &= frame.rows["observed"]
+        row_at = np.flatnonzero(usable)
+        past, valid = past[usable], valid[usable]
+        valid = np.minimum.accumulate(valid[:, ::-1], axis=1)[:, ::-1]  # the unbroken run up to now
+        predictions = self._predictor.predict(past, valid)
+
+        track, observation = self._match(step, past[:, -1], predictions, sources[row_at])
+        self._update(step, track, past[observation, -1], sources[row_at[observation]])
+        self.assignments.add(step, self._tracks.ids[track], sources[row_at[observation]])
+        if self._options.confirm:
+            is_confirmed = self._tracks.hits[track] >= self._options.min_hits
+            self.assignments.confirm(step, self._tracks.ids[track[is_confirmed]])
+        new = np.setdiff1d(np.arange(len(row_at)), observation)
+        raw = Forecast(predictions.mean[new], predictions.cov[new])
+        self._start(step, past[new], valid[new], raw, sources[row_at[new]])
+        online = self._online(frame, np.concatenate([row_at[observation], row_at[new]]), track, len(new))
+        is_over = (step - self._tracks.last_step) / self._options.rate_hz > self._options.max_age_s + 1e-9
+        self._tracks = self._tracks[~is_over]
+        self._outputs.append(online)
+
+    def outputs(self) -> list[tuple[Frame, Frame]]:
+        """For each step the online tracks and their predictions, from the past alone."""
+        return self._outputs
+
+    def _match(self, step: int, xy_m: Floats, predictions: Forecast, sources: Ints) -> tuple[Indices, Indices]:
+        """Pairs of tracks and observations (line 4 of Algorithm 1)."""
+        options, tracks = self._options, self._tracks
+        age = step - tracks.last_step
+        sigma_m = options.sigma_m if options.covariance == "paper" else None
+        kind = options.distance
+        if kind == "now" or kind == "likelihood":  # noqa: PLR1714 - so that mypy knows the others
+            distance = position_distances(tracks.prediction, age, xy_m, self.noise_m, sigma_m)
+        else:
+            distance = prediction_distances(tracks.prediction, age, predictions, kind, sigma_m)
+        # The last digits of predictions depend on the size of the batch; assignments must not.
+        distance = np.round(distance, 6)
+        cost = np.where(distance <= options.max_distance, distance, np.inf)
+        if options.max_jump_m is not None:
+            cost = np.where(metric_distances(tracks.prediction, age, xy_m) <= options.max_jump_m, cost, np.inf)
+        cost = np.where(distance < options.certain_distance, _PRIORITY_COST, cost)
+        cost = cost - options.same_source * (tracks.source[:, None] == sources[None])
+        return assign(cost, np.finfo(float).max)
+
+    def _update(self, step: int, track: Indices, xy_m: Floats, sources: Ints) -> None:
+        """Lines 5 to 12: matched tracks are smoothed and predict again; the others age."""
+        tracks = self._tracks
+        history = tracks[track].history
+        history.append(self._holt, xy_m, step - tracks.last_step[track])
+        prediction = self._predictor.predict(*history.positions())
+        for name, value in vars(history).items():
+            getattr(tracks.history, name)[track] = value
+        tracks.prediction.mean[track], tracks.prediction.cov[track] = prediction
+        is_missed = np.ones(len(tracks.ids), bool)
+        is_missed[track] = False
+        tracks.hits = np.where(is_missed, 0, tracks.hits + 1)
+        tracks.last_step[track], tracks.source[track] = step, sources
+
+    def _start(self, step: int, past: Floats, valid: Bools, raw: Forecast, sources: Ints) -> None:
+        """Lines 13 to 15: unmatched observations start tracks, with their own (``raw``) or smoothed predictions."""
+        count = len(past)
+        ids = np.arange(self._next_id, self._next_id + count)
+        self._next_id += count
+        history = SmoothedHistory.of_observations(self._holt, past, valid)
+        prediction = raw if self._options.birth == "raw" else self._predictor.predict(*history.positions())
+        hits = np.zeros(count, np.int64)
+        self._tracks = self._tracks + ActiveTracks(ids, np.full(count, step), hits, sources.copy(), history, prediction)
+        self.assignments.add(step, ids, sources)
+        if self._options.confirm:
+            self.assignments.confirm(step, ids)
+        if self._options.backfill != "none":
+            track, back = np.nonzero(valid[:, :-1][:, ::-1][:, : max(self._options.min_history, 4) - 1])
+            self.assignments.add(step - 1 - back, ids[track], sources[track])
+
+    def _online(self, frame: Frame, row_at: Indices, track: Indices, started: int) -> tuple[Frame, Frame]:
+        """The tracks of this step with enough matches, where they were observed, and their predictions."""
+        total = len(self._tracks.ids)
+        at = np.concatenate([track, np.arange(total - started, total)])
+        is_shown = self._tracks.hits[at] >= self._options.min_hits
+        at, row_at = at[is_shown], row_at[is_shown]
+        order = np.argsort(self._tracks.ids[at], kind="stable")
+        at, row_at = at[order], row_at[order]
+        rows = frame.rows[row_at].copy()
+        rows["source_id"] = rows["track_id"]
+        rows["track_id"] = self._tracks.ids[at]
+        prediction = Forecast(self._tracks.prediction.mean[at], self._tracks.prediction.cov[at])
+        predictions = forecast_to_rows(rows["track_id"], prediction, self._predictor.step_s)
+        return Frame(frame.t_ns, frame.index, rows), Frame(frame.t_ns, frame.index, predictions)

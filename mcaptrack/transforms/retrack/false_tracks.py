@@ -1,0 +1,79 @@
+"""False tracks: which tracks follow no person, because they flicker, never move, or duplicate another track.
+
+Letters: K tracks, N rows of trajectories, F features.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from mcaptrack.geometry.arrays import Floats
+from mcaptrack.geometry.neighbours import near_pairs
+from mcaptrack.geometry.ragged import group_index
+from mcaptrack.transforms.retrack.motion_model import MotionModel, State, Trajectories
+
+#: A duplicate of a track is nearer to it than this.
+_DUPLICATE_M: Final = 1.2
+#: A track lies inside another if it begins more than so many steps after it and ends as many before it.
+_INSIDE_STEPS: Final = 3
+
+FEATURES: Final = ("log length", "log count", "log extent", "log speed", "log roughness", "observed", "duplicate")
+#: Weight of each feature as a log odds ratio, and the log odds without any (tools/choose_retrack.py).
+_WEIGHTS: Final = (1.58, -0.58, 1.736, -1.126, -0.559, 0.59, -1.993)
+_BIAS: Final = -3.342
+
+
+def track_confidence(model: MotionModel, trajectories: Trajectories, smoothed: State, step_s: float) -> Floats:
+    """The probability that each track is a person, (K,)."""
+    return np.asarray(1 / (1 + np.exp(-track_log_odds(model, trajectories, smoothed, step_s))))
+
+
+def track_log_odds(model: MotionModel, trajectories: Trajectories, smoothed: State, step_s: float) -> Floats:
+    """The log odds that each track is a person, (K,)."""
+    return np.asarray(features(model, trajectories, smoothed, step_s) @ np.array(_WEIGHTS) + _BIAS)
+
+
+def features(model: MotionModel, trajectories: Trajectories, smoothed: State, step_s: float) -> Floats:
+    """What distinguishes people from false tracks, (K, F): see ``FEATURES``."""
+    first, last = trajectories.first[:-1], trajectories.first[1:] - 1
+    length = last - first + 1
+    observed = np.isfinite(trajectories.xy_m[:, 0])
+    count = np.add.reduceat(observed.astype(float), first)
+    xy = smoothed.mean[:, :2]
+    low, high = np.minimum.reduceat(xy, first), np.maximum.reduceat(xy, first)
+    extent = np.hypot(*(high - low).T)
+    residual = np.where(observed[:, None], trajectories.xy_m - xy, 0.0)
+    roughness = np.add.reduceat((residual**2).sum(axis=1), first) / count / (2 * model.noise_m**2)
+    speed = np.hypot(smoothed.mean[:, 2], smoothed.mean[:, 3])
+    mean_speed = np.add.reduceat(speed, first) / length
+    return np.stack(
+        [
+            np.log(length * step_s),
+            np.log(count),
+            np.log(extent + 0.3),
+            np.log(mean_speed + 0.1),
+            np.log(roughness + 0.1),
+            count / length,
+            _duplicate_share(trajectories, xy),
+        ],
+        axis=1,
+    )
+
+
+def _duplicate_share(trajectories: Trajectories, xy: Floats) -> Floats:
+    """The share of each track's rows that are near one other track which began before it and ended after it, (K,)."""
+    begins, ends = trajectories.step[trajectories.first[:-1]], trajectories.step[trajectories.first[1:] - 1]
+    length = np.diff(trajectories.first)
+    track = group_index(length)
+    a, b = (track[side] for side in near_pairs(trajectories.step, xy, _DUPLICATE_M))
+    is_a_short = length[a] <= length[b]
+    short, long = np.where(is_a_short, a, b), np.where(is_a_short, b, a)
+    pair, count = np.unique(short * len(length) + long, return_counts=True)
+    short, long = pair // len(length), pair % len(length)
+    share = count / length[short]
+    is_inside = (begins[long] + _INSIDE_STEPS < begins[short]) & (ends[long] - _INSIDE_STEPS > ends[short])
+    out = np.zeros(len(length))
+    np.maximum.at(out, short, share * is_inside)
+    return out

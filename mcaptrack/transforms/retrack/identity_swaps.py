@@ -1,0 +1,182 @@
+"""Identity swaps at encounters: where two tracks came near each other, decide again which is which.
+
+While two people are near each other their paths are hard to predict, but the position of one relative to the other
+changes little. A Kalman filter of that relative position either goes on smoothly or, where the identities were swapped,
+jumps to its mirror image. The most likely sequence of swaps over an encounter is found by dynamic programming (Viterbi)
+with one filter for each surviving hypothesis, for all encounters at once.
+
+Letters: C encounters, T steps of them, N rows of trajectories.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from mcaptrack.geometry.arrays import Bools, Floats, Ints
+from mcaptrack.geometry.neighbours import near_pairs
+from mcaptrack.geometry.ragged import group_index, run_ends, run_starts
+from mcaptrack.transforms.retrack.motion_model import MotionModel, Trajectories
+
+#: How much a relative velocity drifts within a second, in m/s: the most likely of these is taken for each encounter.
+DRIFTS_M_PER_S: Final = (0.05, 0.15, 0.4)
+#: Two tracks nearer than this meet; an encounter lasts so many steps longer at both ends.
+_NEAR_M: Final = 2.0
+_MARGIN: Final = 10
+#: Cost of a swap as a log likelihood, and how much more it costs for each of the two tracks that keeps its input id
+#: there (and less for each that takes over the input id of the other).
+_SWAP_COST: Final = 5.0
+_SAME_ID_COST: Final = 2.0
+#: How much more likely (as a log likelihood) swaps have to be than none.
+_MIN_GAIN: Final = 3.0
+
+
+def resolve_swaps(
+    model: MotionModel, trajectories: Trajectories, row: Ints, source: Ints, step_s: float
+) -> tuple[Ints, int]:
+    """The track that each row of the trajectories belongs to (N,), and the number of encounters that were changed.
+
+    ``row`` are the rows with an observation, and ``source`` the input id of each. An encounter is left for the next
+    call if one of its tracks was changed in this one.
+    """
+    count = len(trajectories.first) - 1
+    track = group_index(np.diff(trajectories.first))
+    input_id = np.full(len(track), -1)
+    input_id[row] = source
+    i, j, low, high = find_encounters(trajectories)
+    if len(i) == 0:
+        return track, 0
+    steps = low[:, None] + np.arange(int((high - low).max()) + 1)
+    inside = steps <= high[:, None]
+    begin = trajectories.first[:-1] - trajectories.step[trajectories.first[:-1]]
+    row_i = np.where(inside, steps + begin[i][:, None], 0)
+    row_j = np.where(inside, steps + begin[j][:, None], 0)
+    relative = np.where(inside[..., None], trajectories.xy_m[row_i] - trajectories.xy_m[row_j], np.nan)
+    id_i, id_j = np.where(inside, input_id[row_i], -1), np.where(inside, input_id[row_j], -1)
+    cost = _SWAP_COST + _SAME_ID_COST * _continuity(id_i, id_j)
+    swapped, gain = find_swaps(relative, cost, step_s, model.noise_m, model.speed_m_per_s)
+    owner, used, changed = track.copy(), np.zeros(count, bool), 0
+    for encounter in np.argsort(-gain, kind="stable").tolist():
+        if gain[encounter] < _MIN_GAIN:
+            break
+        a, b = int(i[encounter]), int(j[encounter])
+        if used[a] or used[b]:
+            continue
+        used[a] = used[b] = True
+        changed += 1
+        is_swapped = swapped[encounter, : high[encounter] - low[encounter] + 1]
+        for own, other in ((a, b), (b, a)):
+            rows = slice(trajectories.first[own], trajectories.first[own + 1])
+            since = trajectories.step[rows] - low[encounter]
+            goes = (since >= 0) & is_swapped[np.clip(since, 0, len(is_swapped) - 1)]
+            owner[rows] = np.where(goes, other, own)
+    return owner, changed
+
+
+def find_encounters(trajectories: Trajectories) -> tuple[Ints, Ints, Ints, Ints]:
+    """Pairs of tracks that come near each other, and the first and last step of each encounter, (C,) each."""
+    first = trajectories.first
+    count = len(first) - 1
+    track = group_index(np.diff(first))
+    observed = np.flatnonzero(np.isfinite(trajectories.xy_m[:, 0]))
+    one, other = near_pairs(trajectories.step[observed], trajectories.xy_m[observed], _NEAR_M)
+    a, b = observed[one], observed[other]
+    pair = np.minimum(track[a], track[b]) * count + np.maximum(track[a], track[b])
+    when = trajectories.step[a]
+    order = np.lexsort((when, pair))
+    pair, when = pair[order], when[order]
+    starts = run_starts(pair, times=when, max_gap=2 * _MARGIN)
+    begin, end = np.flatnonzero(starts), np.flatnonzero(run_ends(starts))
+    i, j = np.divmod(pair[begin], count)
+    track_begins, track_ends = trajectories.step[first[:-1]], trajectories.step[first[1:] - 1]
+    low = np.maximum(when[begin] - _MARGIN, np.maximum(track_begins[i], track_begins[j]))
+    high = np.minimum(when[end] + _MARGIN, np.minimum(track_ends[i], track_ends[j]))
+    return i, j, low, high
+
+
+def _continuity(id_i: Ints, id_j: Ints) -> Floats:
+    """How many of two tracks (C, T) keep the input id they had before, minus how many take over that of the other."""
+
+    def before(ids: Ints) -> Ints:
+        at = np.maximum.accumulate(np.where(ids >= 0, np.arange(ids.shape[1]), 0), axis=1)
+        return np.concatenate([np.full((len(ids), 1), -1), np.take_along_axis(ids, at, axis=1)[:, :-1]], axis=1)
+
+    last_i, last_j = before(id_i), before(id_j)
+    same = ((id_i == last_i) & (id_i >= 0)).astype(float) + ((id_j == last_j) & (id_j >= 0))
+    crossed = ((id_i == last_j) & (id_i >= 0)).astype(float) + ((id_j == last_i) & (id_j >= 0))
+    return np.asarray(same - crossed)
+
+
+def find_swaps(
+    relative_m: Floats, swap_cost: Floats, step_s: float, noise_m: float, speed_m_per_s: float
+) -> tuple[Bools, Floats]:
+    """At which steps of encounters the identities are swapped, (C, T), and how much more likely that is than no swap.
+
+    ``relative_m`` (C, T, 2) is the position of one track relative to the other, NaN where one of them was not observed.
+    ``swap_cost`` (C, T) is the cost of a swap between a step and the one before, as a log likelihood. The identities of
+    the first step stand. The gain (C,) is a difference of log likelihoods.
+    """
+    models = (_viterbi(relative_m, swap_cost, step_s, noise_m, speed_m_per_s, drift**2) for drift in DRIFTS_M_PER_S)
+    best, best_gain, evidence = next(models)
+    for path, gain, total in models:
+        better = total > evidence
+        evidence = np.where(better, total, evidence)
+        best = np.where(better[:, None], path, best)
+        best_gain = np.where(better, gain, best_gain)
+    return best, best_gain
+
+
+def _viterbi(
+    relative_m: Floats, swap_cost: Floats, step_s: float, noise_m: float, speed_m_per_s: float, power: float
+) -> tuple[Bools, Floats, Floats]:
+    """Swaps (C, T), their gain (C,) and log likelihood (C,) for one drift of the relative velocity."""
+    count, steps = relative_m.shape[:2]
+    r = 2 * noise_m**2
+    mean = np.zeros((count, 3, 4))  # hypotheses: as labelled, swapped, and never swapped at all
+    cov = np.tile([r, 0.0, 2 * speed_m_per_s**2], (count, 3, 1))
+    total = np.tile([0.0, -np.inf, 0.0], (count, 1))
+    came_swapped = np.zeros((steps, count, 2), bool)  # whether the best predecessor has the other labels
+    started = np.zeros(count, bool)
+    sign = np.array([1.0, -1.0, 1.0])
+    for step in range(steps):
+        observed = np.isfinite(relative_m[:, step, 0])
+        z = np.where(observed[:, None], relative_m[:, step], 0.0)
+        p, c, v = cov[..., 0], cov[..., 1], cov[..., 2]
+        if step:
+            p = p + step_s * (2 * c + step_s * (v + step_s * power / 3))
+            c = c + step_s * (v + step_s * power / 2)
+            v = v + step_s * power
+            mean[..., :2] += step_s * mean[..., 2:]
+        new = observed & ~started
+        mean[new, :, :2] = z[new, None] * sign[None, :, None]
+        mean[new, :, 2:] = 0.0
+        s = p + r
+        go = observed & started
+        # from each hypothesis (0, 1, 2) to each labelling (+1, -1)
+        off = z[:, None, None] * np.array([1.0, -1.0])[None, None, :, None] - mean[:, :, None, :2]
+        like = -0.5 * (off**2).sum(-1) / s[..., None] - np.log(s)[..., None]
+        like = np.where(go[:, None, None], like, 0.0)
+        stay = total[:, :2] + np.stack([like[:, 0, 0], like[:, 1, 1]], axis=1)
+        change = total[:, 1::-1] + np.stack([like[:, 1, 0], like[:, 0, 1]], axis=1) - swap_cost[:, step, None]
+        jumped = (change > stay) & go[:, None]
+        came_swapped[step] = jumped
+        total = np.concatenate([np.where(jumped, change, stay), (total[:, 2] + like[:, 2, 0])[:, None]], axis=1)
+        source = np.concatenate([np.where(jumped, [1, 0], [0, 1]), np.full((count, 1), 2)], axis=1)
+        row = np.arange(count)[:, None]
+        mean = mean[row, source]
+        p, c, v = p[row, source], c[row, source], v[row, source]
+        s = s[row, source]
+        gain, gain_rate = np.where(go[:, None], p / s, 0.0), np.where(go[:, None], c / s, 0.0)
+        off = z[:, None] * sign[None, :, None] - mean[..., :2]
+        mean[..., :2] += gain[..., None] * off
+        mean[..., 2:] += gain_rate[..., None] * off
+        cov = np.stack([p * (1 - gain), c * (1 - gain), v - gain_rate * c], axis=-1)
+        started |= observed
+    path = np.zeros((count, steps), bool)
+    now = total[:, 1] > total[:, 0]
+    for step in range(steps - 1, -1, -1):
+        path[:, step] = now
+        now = np.where(came_swapped[step, np.arange(count), now.astype(int)], ~now, now)
+    best = np.maximum(total[:, 0], total[:, 1])
+    return path, best - total[:, 2], best

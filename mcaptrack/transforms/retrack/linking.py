@@ -1,0 +1,142 @@
+"""Tracklet linking: which track continues another one after a gap, decided over the whole log at once.
+
+A link is judged by how well the motion before a gap and the motion after it fit together: people walk on as they
+walked, or stay where they stood. Since links are scored pair by pair, the best set of them is one assignment of ends to
+beginnings.
+
+Letters: K tracks, E candidate links, F features.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from mcaptrack.geometry.arrays import Floats, Ints
+from mcaptrack.geometry.assignment import assign_by_gain
+from mcaptrack.geometry.ragged import group_index, ragged_range, run_starts
+from mcaptrack.transforms.retrack.motion_model import MotionModel, State, Trajectories
+
+#: Nobody moves faster than this on average during a gap.
+_MAX_SPEED_M_PER_S: Final = 2.5
+#: What a link is judged by, see ``features``.
+FEATURES: Final = ("miss", "misfit", "gap", "misfit or stay", "turn", "distance and speed", "misfit and speed")
+#: Weight of each feature as a log odds ratio; and the log odds without any, in logs where a share of
+#: ``_PRIOR`` of the best links is right (tools/choose_retrack.py).
+_WEIGHTS: Final = (-0.996, -0.798, -0.205, -0.304, 0.247, 0.482, -0.324)
+_BIAS, _PRIOR = 3.702, 0.666
+#: Added to distances and speeds before taking logarithms: differences below these mean nothing.
+_NEAR_M, _SPEED_M_PER_S = 0.3, 0.15
+#: Links with lower log odds are not considered.
+_MIN_LOG_ODDS: Final = -2.52
+
+
+def link_tracks(
+    model: MotionModel,
+    trajectories: Trajectories,
+    forward: State,
+    backward: State,
+    step_s: float,
+    max_gap_s: float,
+    min_confidence: float,
+) -> Ints:
+    """For each track the one that continues it, or -1; (K,).
+
+    A link is made if it is right with a probability of at least ``min_confidence``. How many links are right at all
+    differs from log to log: hardly any where gaps are short and people who disappear have left, most where they are
+    occluded for long. That share is estimated from the links themselves (expectation maximisation).
+    """
+    first, last = trajectories.first[:-1], trajectories.first[1:] - 1
+    continued_by = np.full(len(first), -1)
+    i, j, gap_s = candidates(trajectories, forward, backward, step_s, max_gap_s)
+    if len(i) == 0:
+        return continued_by
+    found = features(model, forward.take(last[i]), backward.take(first[j]), gap_s)
+    gain = found @ np.array(_WEIGHTS) + _BIAS - _MIN_LOG_ODDS
+    good = gain > 0
+    i, j, gain = i[good], j[good], gain[good]
+    log_odds = np.full(len(first), -np.inf)
+    for edges in _components(i, j, len(first)):
+        ends, beginnings = np.unique(i[edges]), np.unique(j[edges])
+        table = np.full((len(ends), len(beginnings)), -1.0)
+        table[np.searchsorted(ends, i[edges]), np.searchsorted(beginnings, j[edges])] = np.round(gain[edges], 6)
+        row, column = assign_by_gain(table)
+        continued_by[ends[row]], log_odds[ends[row]] = beginnings[column], table[row, column] + _MIN_LOG_ODDS
+    shift = _prior_shift(log_odds[continued_by >= 0])
+    return np.where(log_odds + shift > np.log(min_confidence / (1 - min_confidence)), continued_by, -1)
+
+
+def candidates(
+    trajectories: Trajectories, forward: State, backward: State, step_s: float, max_gap_s: float
+) -> tuple[Ints, Ints, Floats]:
+    """Pairs (E,) of a track and a later one within reach of its end, and the seconds between them."""
+    first, last = trajectories.first[:-1], trajectories.first[1:] - 1
+    begins, ends = trajectories.step[first], trajectories.step[last]
+    order = np.argsort(begins, kind="stable")
+    low = np.searchsorted(begins[order], ends + 1)
+    high = np.searchsorted(begins[order], ends + round(max_gap_s / step_s), "right")
+    i = group_index(high - low)
+    j: Ints = order[ragged_range(low, high - low)]
+    gap_s = np.asarray((begins[j] - ends[i]) * step_s, np.float64)
+    near = _length(forward.mean[last[i], :2] - backward.mean[first[j], :2]) <= 1.0 + _MAX_SPEED_M_PER_S * gap_s
+    return i[near], j[near], gap_s[near]
+
+
+def _prior_shift(log_odds: Floats) -> float:
+    """What to add to the log odds of links (E,) because another share of them is right in this log than usual."""
+    shift = 0.0
+    for _ in range(100):
+        right = (1 / (1 + np.exp(-(log_odds + shift)))).sum()
+        share = (right + 0.3) / (len(log_odds) + 3)  # in most logs few are
+        before, shift = shift, float(np.log(share / (1 - share)) - np.log(_PRIOR / (1 - _PRIOR)))
+        if abs(shift - before) < 1e-4:
+            break
+    return shift
+
+
+def _components(i: Ints, j: Ints, count: int) -> list[Ints]:
+    """The edges of each connected component of the graph from ends ``i`` to beginnings ``j``."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    graph = coo_array((np.ones(len(i)), (i, count + j)), shape=(2 * count, 2 * count))
+    _, label = connected_components(graph, directed=False)
+    order = np.argsort(label[i], kind="stable")
+    starts = np.flatnonzero(run_starts(label[i][order]))
+    return list(np.split(order, starts[1:])) if len(order) else []
+
+
+def features(model: MotionModel, before: State, after: State, gap_s: Floats) -> Floats:
+    """What distinguishes right links from wrong ones, (E, F): see ``FEATURES``.
+
+    ``before`` are the states at the beginning of each gap, filtered forward; ``after`` those at its end, filtered
+    backward. The miss is the distance from one side to where the other, extrapolated at its own velocity, expects it
+    (the smaller of the two); the misfit is that distance with the mean of both velocities.
+    """
+    span = gap_s[:, None]
+    way = after.mean[:, :2] - before.mean[:, :2]
+    left, came = before.mean[:, 2:], after.mean[:, 2:]
+    miss = np.minimum(_length(way - left * span), _length(way - came * span))
+    misfit, stay = _length(way - (left + came) / 2 * span), _length(way)
+    speed = np.maximum(_length(left), _length(came))
+    power = (model.drift_m_per_s + model.drift_ratio * speed) ** 2
+    spread = before.cov[:, 0] + after.cov[:, 0] + gap_s**2 / 4 * (before.cov[:, 2] + after.cov[:, 2])
+    spread += power * gap_s**3 / 12
+    log_speed = np.log(speed + _SPEED_M_PER_S)
+    return np.stack(
+        [
+            np.log(miss + _NEAR_M),
+            np.log1p(misfit**2 / spread / 2),
+            gap_s,
+            np.log(np.minimum(misfit, stay) + _NEAR_M) * np.log(gap_s + 0.4),
+            np.log(_length(came - left) + _SPEED_M_PER_S),
+            np.log(stay + _NEAR_M) * log_speed,
+            np.log(misfit + _NEAR_M) * log_speed,
+        ],
+        axis=1,
+    )
+
+
+def _length(vector: Floats) -> Floats:
+    return np.asarray(np.hypot(vector[:, 0], vector[:, 1]))
