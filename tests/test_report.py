@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 import itertools
 import json
 import re
@@ -14,6 +13,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from jinja2 import UndefinedError
 
 from mcaptrack import foxglove, log
 from mcaptrack.evaluation import Candidate, EvaluateOptions, EvaluationInput, evaluate
@@ -23,10 +23,11 @@ from mcaptrack.foxglove.colours import COUNT as COLOURS
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.transforms import Predict
-from mcaptrack.viewing.report import ELEMENT, charts, data, gather, measures, page
-from mcaptrack.viewing.report.markup import Markup, escape, plain, script_json, tag
-from mcaptrack.viewing.report.moments import SIDE_PX, most_important, photograph, tell
-from mcaptrack.viewing.report.scenery import simplified
+from mcaptrack.viewing.report import ELEMENT, charts, data, gather, page, statistics
+from mcaptrack.viewing.report.formatting import plain
+from mcaptrack.viewing.report.html import environment
+from mcaptrack.viewing.report.identity_events import SIDE_PX, add_thumbnails, most_important, summarize_events
+from mcaptrack.viewing.report.scene_map import simplified
 from tests.test_cli import call, done, finished, footage  # noqa: F401
 from tests.worlds import ns, tracks_at, walk
 
@@ -178,7 +179,7 @@ def test_walking_on_is_right_about_who_walks_on_and_not_about_who_turns():
         wrong = [f for (f,) in Predict(predictor="kalman")(members)]
         sequence = EvaluationInput("s", members, [Candidate("t", None, members, wrong, "p")])
         results = evaluate([sequence], EvaluateOptions()).results
-        (found,) = measures.describe_forecasts(sequence, results)
+        (found,) = statistics.forecast_statistics(sequence, results)
         return found["constant_velocity"]
 
     straight, turning = error(truth, 1), error(truth, 2)
@@ -192,15 +193,15 @@ def test_speeds_and_stays_by_hand():
     frames = walk(lambda tick: {7: (0.5 * tick, 0.0)} if tick != 3 else {}, 6, rate_hz=2.0)
     frames[0] = Frame(0, 0, tracks_at({7: (0.0, 0.0), 9: (4.0, 4.0)}))
     # 7 is there from 0 to 2.5 s with a hole at 1.5 s, over which its speed is not known; 9 for one frame.
-    assert measures.speeds_m_per_s(frames).tolist() == pytest.approx([1.0, 1.0, 1.0])
-    assert measures.lives_s(frames).tolist() == pytest.approx([3.0, 0.5])
-    said = measures.describe_tracks(frames)
+    assert statistics.speeds_m_per_s(frames).tolist() == pytest.approx([1.0, 1.0, 1.0])
+    assert statistics.durations_s(frames).tolist() == pytest.approx([3.0, 0.5])
+    said = statistics.track_statistics(frames)
     assert (said["tracks"], said["rows"], said["longest_s"], said["observed_share"]) == (2, 6, 3.0, 1.0)
 
 
 @given(st.dictionaries(st.text(max_size=3), st.lists(st.floats(0, 1e6), max_size=60), max_size=3))
 def test_histograms_lose_nobody(values):
-    found = measures.histograms({topic: np.array(part) for topic, part in values.items()})
+    found = statistics.histograms({topic: np.array(part) for topic, part in values.items()})
     if not any(values.values()):
         assert found is None
         return
@@ -212,7 +213,7 @@ def test_histograms_lose_nobody(values):
 
 
 def test_who_all_walk_at_one_speed_are_in_one_bin_of_a_histogram():
-    found = measures.histograms({"t": np.array([1.0, 1.0 + 1e-12, 1.0 - 1e-12] * 50)})
+    found = statistics.histograms({"t": np.array([1.0, 1.0 + 1e-12, 1.0 - 1e-12] * 50)})
     (part,) = found["series"]
     assert part["above"] == 0
     assert sorted(part["counts"])[-2:] in ([0, 150], [50, 100])
@@ -261,15 +262,15 @@ def story():
     tracks = [Frame(ns(t / 10), t, boxes({switching(t): (40 + t, 60)})) for t in range(100)]
     found = find_events(tracks, truth)
     assert found.rule == MatchRule("iou", 0.5)
-    return tell("/camera/tracks", found.events, found.rule, tracks, truth, (0, ns(9.9))), tracks
+    return summarize_events("/camera/tracks", found.events, found.rule, tracks, truth, (0, ns(9.9))), tracks
 
 
 def test_what_lasts_matters_more_than_what_flickers(story):
     told, _ = story
-    assert [moment.t_ns for moment in told.moments] == [ns(2.0), ns(2.2), ns(6.0)]
-    assert [moment.weight_s for moment in told.moments] == pytest.approx([0.2, 0.2, 3.8], abs=0.11)
+    assert [moment.t_ns for moment in told.events] == [ns(2.0), ns(2.2), ns(6.0)]
+    assert [moment.weight_s for moment in told.events] == pytest.approx([0.2, 0.2, 3.8], abs=0.11)
     ((most,),) = most_important([told], 1)
-    assert "track 1 became track 5 at 6.0 s" in most.words
+    assert "track 1 became track 5 at 6.0 s" in most.text
     both = most_important([told, told], 4)
     assert [len(part) for part in both] == [2, 2]
     assert [len(part) for part in most_important([told], 12)] == [3]
@@ -293,12 +294,12 @@ class Film:
 def test_thumbnails_show_who_it_was_before_and_after(story):
     told, tracks = story
     film = Film()
-    photograph(told.moments, tracks, film, 0)
+    add_thumbnails(told.events, tracks, film, 0)
     assert film.decoded == [19, 20, 21, 22, 59, 60]
-    last = told.moments[-1]
+    last = told.events[-1]
     assert (last.before.at_s, last.after.at_s) == pytest.approx((5.9, 6.0))
     assert [(shot.box.identity, shot.box.label) for shot in (last.before, last.after)] == [(1, 1), (5, 5)]
-    for moment in told.moments:
+    for moment in told.events:
         for shot in (moment.before, moment.after):
             seen = cv2.imdecode(np.frombuffer(shot.jpeg, np.uint8), cv2.IMREAD_GRAYSCALE)
             assert seen.shape == (SIDE_PX, SIDE_PX)
@@ -326,7 +327,7 @@ def test_an_empty_log_says_so_in_every_section(tmp_path):
     path = write(tmp_path / "empty.mcap", {})
     _, numbers, reader = report_on(path)
     words = "".join(reader.text)
-    for said in ("no messages at all", "no truth", "no tracks to draw", "no channels", "forecasts", "nobody moves"):
+    for said in ("no messages at all", "no ground truth", "no tracks to draw", "no channels", "forecasts", "no motion"):
         assert said in words
     assert numbers["results"] == []
     assert not reader.of("svg")
@@ -478,10 +479,14 @@ def test_a_page_on_a_whole_log_loads_and_runs_nothing(finished):  # noqa: F811
     assert len(text) < 3e6
 
 
+def rendered(source: str, **values) -> str:
+    return environment().from_string(source).render(values)
+
+
 @given(st.text() | st.text(alphabet="<>&\"'/!-=script javasonloadx\u202e\0\n"))
-def test_escaped_words_are_read_back_as_words(words):
-    reader = Reader(tag("p", words, title=words))
-    shown = "".join(c if c.isprintable() or c in "\n\u00a0\u202f" else "\ufffd" for c in words)
+def test_what_templates_print_is_read_back_as_text(text):
+    reader = Reader(rendered('<p title="{{ text }}">{{ text }}</p>', text=text))
+    shown = "".join(c if c.isprintable() or c in "\n\u00a0\u202f" else "\ufffd" for c in text)
     assert [element for element, _ in reader.elements] == ["p"]
     assert "".join(reader.text) == shown
     assert reader.elements[0][1] == {"title": shown}
@@ -494,17 +499,31 @@ _VALUES = st.deferred(lambda: _LEAVES | st.lists(_VALUES, max_size=3) | st.dicti
 @given(_VALUES)
 def test_data_in_the_page_are_read_back_as_they_were(value):
     said = plain({"value": value})
-    element = script_json(said, "x")
+    element = rendered("<script>{{ value | tojson }}</script>", value=said)
     assert element.count("<") == element.count(">") == 2
     assert json.loads(element[element.index(">") + 1 : element.rindex("<")]) == said
 
 
-def test_markup_is_not_escaped_twice():
-    inner = tag("b", "<")
-    assert inner == "<b>&lt;</b>"
-    assert tag("p", inner, escape(inner)) == "<p><b>&lt;</b><b>&lt;</b></p>"
-    assert isinstance(escape("x"), Markup)
-    assert html.unescape(escape("a&b")) == "a&b"
+def test_missing_values_are_errors_not_text():
+    for source in ("{{ unknown }}", "{{ values.unknown }}", "{{ values.none }}"):
+        with pytest.raises((UndefinedError, ValueError)):
+            rendered(source, values={"none": None})
+
+
+@pytest.mark.parametrize("name", sorted(name for name in environment().list_templates() if name.endswith(".html")))
+def test_templates_print_in_text_and_quoted_attributes_only(name):
+    """Whatever a log holds: no value stands in a link, a style or a handler, or gets past the escaping."""
+    source = environment().loader.get_source(environment(), name)[0]
+    assert not re.search(r"\|\s*safe|autoescape|Markup|xmlattr", source)
+    assert not re.search(r"=\s*\{\{|\son\w+=|\sstyle=", source), "a value outside of quotes, a handler or a style"
+    for element in re.findall(r"</?\w*\{\{.*?\}\}", source):
+        assert re.fullmatch(r"</?h\{\{ level( \+ 1)? \}\}", element)
+    for link in re.findall(r'(?:href|src)="([^"]*)"', source):
+        assert link in ("data:,", "#{{ id }}") or re.fullmatch(
+            r"data:image/jpeg;base64,\{\{ [\w.]+ \| base64 \}\}", link
+        )
+    styles = re.findall(r"<style>(.*?)</style>", source)
+    assert not styles or re.findall(r"\{\{ (.*?) \}\}", styles[0]) == ["loop.index0", "colour"]
 
 
 # Files

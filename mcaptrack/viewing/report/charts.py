@@ -1,36 +1,40 @@
-"""Charts as SVG: lines with bands, histograms above each other, and pairs on a scale.
+"""Charts as coordinates, which ``templates/charts.html`` draws as SVG: lines with bands, histograms, pairs on a scale.
 
-Colours, and what of them changes in the dark, are classes of the page's style. A chart is about as wide as a phone, so
-that its words can be read there; where there is room the page puts several beside each other.
+Colours are classes of the page's style, so that light, dark and paper are one drawing. A chart is about as wide as a
+phone, so that its text can be read there; on wider screens the page shows several side by side.
+
+Letters: P points, B bins.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
-from mcaptrack.geometry.arrays import Floats
-from mcaptrack.viewing.report.markup import Markup, join, number, tag
+Floats = NDArray[np.float64]
+#: The values of a chart by name, for the macro ``draw`` of the template.
+Chart = dict[str, Any]
 
 WIDTH: Final = 460
 HEIGHT: Final = 270
 _LEFT, _RIGHT, _TOP, _BOTTOM = 46, 126, 26, 40
-#: Words beside each other need so much room.
+#: The height of a line of text.
 _LINE: Final = 14.0
-_MOST_LETTERS: Final = 48
-#: A line has no more points than this.
+_MAX_NAME: Final = 48
+#: A line has at most this many points.
 POINTS: Final = 160
 
 
 @dataclass(frozen=True)
 class Line:
-    """A line through x and y (P,), with a band from ``low`` to ``high`` where they are given.
+    """A line through ``x`` and ``y`` (P,), with a band from ``low`` to ``high`` (P,) if they are given.
 
-    ``role`` chooses the colour, ``name`` stands at its end.
+    ``role`` chooses the colour, ``name`` is printed at the end of the line.
     """
 
     name: str
@@ -44,91 +48,82 @@ class Line:
 
 @dataclass(frozen=True)
 class Axis:
-    """What an axis says, and from 0 to where it goes; ``percent`` says shares in percent."""
+    """An axis from 0 to ``most`` with its label; ``percent`` prints shares in percent."""
 
     label: str
     most: float
     percent: bool = False
 
-    def ticks(self) -> Floats:
-        """About five round numbers."""
+    def ticks(self) -> list[tuple[float, str]]:
+        """About five round numbers with their texts."""
         step = round_step(self.most / 4.5)
-        return np.arange(0, self.most + step * 1e-6, step)
+        values = np.arange(0, self.most + step * 1e-6, step).tolist()
+        return [(value, f"{100 * value:.0f}" if self.percent else f"{value:g}") for value in values]
 
-    def say(self, value: float) -> str:
-        """A tick in words."""
-        return f"{100 * value:.0f}" if self.percent else f"{value:g}"
+
+@dataclass(frozen=True)
+class Bars:
+    """A histogram: the share of values in each bin (B,), their median, and a text beside it."""
+
+    name: str
+    role: str
+    shares: Floats
+    median: float
+    text: str
 
 
 def round_step(least: float) -> float:
-    """The smallest of 1, 2, 2.5 and 5 times a power of ten that is not below ``least``."""
+    """The smallest of 1, 2, 2.5 and 5 times a power of ten that is at least ``least``."""
     power = 10.0 ** math.floor(math.log10(least)) if least > 0 and math.isfinite(least) else 1.0
     return next((k * power for k in (1, 2, 2.5, 5) if k * power >= least * (1 - 1e-9)), 10 * power)
 
 
-def round_most(values: Sequence[Floats], least: float = 0.0) -> float:
-    """Where an axis ends that shows these values."""
+def round_most(values: Iterable[Floats], least: float = 0.0) -> float:
+    """The round number at which an axis for these values ends."""
     top = max([least, *(float(np.nanmax(part)) for part in values if np.isfinite(part).any())])
     step = round_step(top / 4.5) if top > 0 else 1.0
     return max(math.ceil(top / step - 1e-9), 1) * step
 
 
-def line_chart(title: str, lines: Sequence[Line], x: Axis, y: Axis, diagonal: str = "") -> Markup:
-    """A chart of lines; ``diagonal`` names the line on which both axes are equal, where that means something."""
+def line_chart(title: str, lines: Sequence[Line], x: Axis, y: Axis, diagonal: str = "") -> Chart:
+    """A chart of lines; ``diagonal`` names the line on which both axes are equal, if that has a meaning."""
     width, height = WIDTH - _LEFT - _RIGHT, HEIGHT - _TOP - _BOTTOM
+    bottom = _TOP + height
 
-    def place(values_x: Floats, values_y: Floats) -> str:
+    def points(values_x: Floats, values_y: Floats) -> str:
         across = _LEFT + np.clip(values_x / x.most, 0, 1) * width
-        up = _TOP + height - np.clip(values_y / y.most, 0, 1) * height
+        up = bottom - np.clip(values_y / y.most, 0, 1) * height
         return " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(across.tolist(), up.tolist(), strict=True))
 
-    parts = list(_axes(x, y, width, height))
+    bands, drawn, ends = [], [], []
     if diagonal:
         top = min(x.most, y.most)
-        parts.append(tag("polyline", points=place(np.array([0, top]), np.array([0, top])), class_="l s-truth dash"))
-    ends: list[tuple[float, str, str]] = []
+        drawn.append({"points": points(np.array([0, top]), np.array([0, top])), "role": "truth", "dashed": True})
+        ends.append((bottom - top / y.most * height, diagonal, "truth"))
     for line in lines:
-        at_x, at_y = line.x, line.y
-        kept = np.isfinite(at_x) & np.isfinite(at_y)
-        if line.low is not None and line.high is not None and kept.any():
-            around = np.concatenate([at_x[kept], at_x[kept][::-1]])
-            band = np.concatenate([line.low[kept], line.high[kept][::-1]])
-            parts.append(tag("polygon", points=place(around, band), class_=f"band s-{line.role}"))
+        kept = np.isfinite(line.x) & np.isfinite(line.y)
         if not kept.any():
             continue
-        dash = " dash" if line.dashed else ""
-        parts.append(tag("polyline", points=place(at_x[kept], at_y[kept]), class_=f"l s-{line.role}{dash}"))
-        ends.append((_TOP + height - min(float(at_y[kept][-1]) / y.most, 1) * height, line.name, line.role))
-    if diagonal:
-        ends.append((_TOP + height - min(x.most, y.most) / y.most * height, diagonal, "truth"))
-    parts += _labels(ends, _LEFT + width + 6, height)
-    return chart(title, WIDTH, HEIGHT, parts)
+        if line.low is not None and line.high is not None:
+            around = np.concatenate([line.x[kept], line.x[kept][::-1]])
+            band = np.concatenate([line.low[kept], line.high[kept][::-1]])
+            bands.append({"points": points(around, band), "role": line.role})
+        drawn.append({"points": points(line.x[kept], line.y[kept]), "role": line.role, "dashed": line.dashed})
+        ends.append((bottom - min(float(line.y[kept][-1]) / y.most, 1) * height, line.name, line.role))
+    return {
+        "kind": "lines", "title": title, "width": WIDTH, "height": HEIGHT,
+        "left": _LEFT, "right": _LEFT + width, "bottom": bottom,
+        "x_ticks": [(_fixed(_LEFT + value / x.most * width), text) for value, text in x.ticks()],
+        "y_ticks": [(_fixed(bottom - value / y.most * height), text) for value, text in y.ticks()],
+        "x_label": x.label, "y_label": y.label, "x_middle": _LEFT + width / 2,
+        "bands": bands, "lines": drawn, "names": _names(ends, height), "names_x": _LEFT + width + 6,
+    }  # fmt: skip
 
 
-def chart(title: str, width: int, height: int, parts: Sequence[Markup]) -> Markup:
-    """An SVG of that size that says what it shows to those who don't see it."""
-    return tag("svg", tag("title", title), *parts, viewBox=f"0 0 {width} {height}", role="img", class_="chart")
-
-
-def _axes(x: Axis, y: Axis, width: float, height: float) -> Iterator[Markup]:
-    bottom = _TOP + height
-    for tick in y.ticks().tolist():
-        at = bottom - tick / y.most * height
-        yield tag("line", x1=_LEFT, x2=_LEFT + width, y1=f"{at:.1f}", y2=f"{at:.1f}", class_="rule")
-        yield tag("text", y.say(tick), x=_LEFT - 6, y=f"{at + 4:.1f}", class_="end")
-    for tick in x.ticks().tolist():
-        at = _LEFT + tick / x.most * width
-        yield tag("line", x1=f"{at:.1f}", x2=f"{at:.1f}", y1=bottom, y2=bottom + 4, class_="axis")
-        yield tag("text", x.say(tick), x=f"{at:.1f}", y=bottom + 17, class_="mid")
-    yield tag("line", x1=_LEFT, x2=_LEFT + width, y1=bottom, y2=bottom, class_="axis")
-    yield tag("text", y.label, x=4, y=13, class_="what")
-    yield tag("text", x.label, x=_LEFT + width / 2, y=HEIGHT - 5, class_="mid what")
-
-
-def _labels(ends: list[tuple[float, str, str]], x: float, height: float) -> Iterator[Markup]:
-    """Names at the ends of lines, pushed apart where they would lie on each other."""
+def _names(ends: Sequence[tuple[float, str, str]], height: float) -> list[tuple[str, str, str]]:
+    """Height, text and role of the names at the ends of lines, moved apart where they would overlap."""
     if not ends:
-        return
+        return []
     ends = sorted(ends)
     at = np.array([end[0] for end in ends])
     for k in range(1, len(at)):
@@ -138,114 +133,79 @@ def _labels(ends: list[tuple[float, str, str]], x: float, height: float) -> Iter
         at[-1] -= over
         for k in range(len(at) - 2, -1, -1):
             at[k] = min(at[k], at[k + 1] - _LINE)
-    for y, (_, words, role) in zip(at.tolist(), ends, strict=True):
-        yield tag("text", words, x=x, y=f"{y + 4:.1f}", class_=f"name s-{role}")
+    return [(_fixed(y + 4), name, role) for y, (_, name, role) in zip(at.tolist(), ends, strict=True)]
 
 
-@dataclass(frozen=True)
-class Bars:
-    """One histogram: the shares (B,) of what lies in each bin, and where the middle is."""
-
-    name: str
-    role: str
-    shares: Floats
-    median: float
-    words: str
-
-
-def histogram_chart(title: str, rows: Sequence[Bars], edges: Floats, label: str) -> Markup:
-    """Histograms above each other in the same bins with ``edges`` (B + 1,), all of one scale."""
+def histogram_chart(title: str, rows: Sequence[Bars], edges: Floats, label: str) -> Chart:
+    """Histograms one above the other, in the same bins with ``edges`` (B + 1,) and on the same scale."""
     x = Axis(label, float(edges[-1]))
-    width, row = WIDTH - _RIGHT - 12, 74
+    left, width, row = 12, WIDTH - _RIGHT - 12, 74
     top = max([1e-9, *(float(one.shares.max(initial=0)) for one in rows)])
     bottom = row * len(rows) + 6
 
     def at(value: float) -> float:
-        return 12 + min(max(value / x.most, 0), 1) * width
+        return left + min(max(value / x.most, 0), 1) * width
 
-    parts: list[Markup] = []
-    for k, one in enumerate(rows):
-        floor = row * (k + 1)
+    drawn = []
+    for k, one in enumerate(rows, start=1):
+        bars = []
         for low, high, share in zip(edges[:-1].tolist(), edges[1:].tolist(), one.shares.tolist(), strict=True):
             tall = share / top * (row - 14)
             if tall > 0:
-                wide = max(at(high) - at(low) - 1, 0.5)
-                size = {"width": f"{wide:.1f}", "height": f"{tall:.1f}"}
-                said = tag("title", f"{low:g} to {high:g}: {100 * share:.1f} %")
-                parts.append(
-                    tag("rect", said, x=f"{at(low):.1f}", y=f"{floor - tall:.1f}", **size, class_=f"bar s-{one.role}")
-                )
-        parts.append(tag("line", x1=12, x2=12 + width, y1=floor, y2=floor, class_="axis"))
-        middle = f"{at(one.median):.1f}"
-        parts.append(tag("line", x1=middle, x2=middle, y1=floor - row + 14, y2=floor, class_="middle"))
-        parts.append(tag("text", one.name, x=width + 20, y=floor - 30, class_=f"name s-{one.role}"))
-        parts.append(tag("text", one.words, x=width + 20, y=floor - 14))
-    for tick in x.ticks().tolist():
-        parts.append(
-            tag("line", x1=f"{at(tick):.1f}", x2=f"{at(tick):.1f}", y1=bottom - 6, y2=bottom - 2, class_="axis")
+                place = (at(low), row * k - tall, max(at(high) - at(low) - 1, 0.5), tall)
+                bars.append((*map(_fixed, place), f"{low:g} to {high:g}: {100 * share:.1f} %"))
+        median = _fixed(at(one.median))
+        drawn.append(
+            {"bars": bars, "floor": row * k, "median": median, "name": one.name, "role": one.role, "text": one.text}
         )
-        parts.append(tag("text", x.say(tick), x=f"{at(tick):.1f}", y=bottom + 11, class_="mid"))
-    parts.append(tag("text", label, x=12 + width / 2, y=bottom + 28, class_="mid what"))
-    return chart(title, WIDTH, bottom + 34, parts)
+    return {
+        "kind": "histogram", "title": title, "width": WIDTH, "height": bottom + 34,
+        "left": left, "right": left + width, "bottom": bottom, "row": row, "rows": drawn, "names_x": width + 20,
+        "x_ticks": [(_fixed(at(value)), text) for value, text in x.ticks()],
+        "x_label": label, "x_middle": left + width / 2,
+    }  # fmt: skip
 
 
-def pairs_chart(title: str, rows: Sequence[tuple[str, float, float]], axis: Axis, names: tuple[str, str]) -> Markup:
-    """From one value to another for each of several names, a row each; ``names`` say whose values these are."""
-    width, row = WIDTH - _LEFT - 24, 34
-    left, height = _LEFT - 26, 40 + row * len(rows) + _BOTTOM
-    bottom = height - _BOTTOM
+def pairs_chart(title: str, rows: Sequence[tuple[str, float, float]], axis: Axis, names: tuple[str, str]) -> Chart:
+    """For each of several names a value before and one after, a row each; ``names`` name the two values."""
+    left, row = _LEFT - 26, 34
+    width, height = WIDTH - _LEFT + 2, 40 + row * len(rows) + _BOTTOM
 
-    def at(value: float) -> float:
-        return left + min(max(value / axis.most, 0), 1) * (width + 26)
+    def at(value: float) -> str:
+        return _fixed(left + min(max(value / axis.most, 0), 1) * width)
 
-    parts = []
-    for tick in axis.ticks().tolist():
-        parts.append(tag("line", x1=f"{at(tick):.1f}", x2=f"{at(tick):.1f}", y1=28, y2=bottom, class_="rule"))
-        parts.append(tag("text", axis.say(tick), x=f"{at(tick):.1f}", y=bottom + 17, class_="mid"))
-    for number_of, (words, before, after) in enumerate(rows):
-        y = 54 + row * number_of
-        shown = words if len(words) <= _MOST_LETTERS else words[: _MOST_LETTERS - 1] + "…"
-        parts.append(tag("text", shown, x=left, y=y - 9, class_="what"))
-        parts.append(tag("line", x1=f"{at(before):.1f}", x2=f"{at(after):.1f}", y1=y, y2=y, class_="between"))
-        for value, role in ((before, "tracks"), (after, "offline")):
-            parts.append(tag("circle", cx=f"{at(value):.1f}", cy=y, r=5, class_=f"dot s-{role}"))
-    parts.append(tag("text", "● " + names[0], x=left, y=15, class_="name s-tracks"))
-    parts.append(tag("text", "● " + names[1], x=left + 150, y=15, class_="name s-offline"))
-    parts.append(tag("text", axis.label, x=WIDTH / 2, y=height - 5, class_="mid what"))
-    return chart(title, WIDTH, height, parts)
+    return {
+        "kind": "pairs", "title": title, "width": WIDTH, "height": height,
+        "left": left, "bottom": height - _BOTTOM, "names": names,
+        "x_ticks": [(at(value), text) for value, text in axis.ticks()], "x_label": axis.label,
+        "rows": [
+            {
+                "y": 54 + row * k,
+                "name": name if len(name) <= _MAX_NAME else name[: _MAX_NAME - 1] + "…",
+                "before": at(before),
+                "after": at(after),
+            }
+            for k, (name, before, after) in enumerate(rows)
+        ],
+    }  # fmt: skip
+
+
+def _fixed(value: float) -> str:
+    return f"{value:.1f}"
 
 
 def thinned(*columns: Floats) -> tuple[Floats, ...]:
-    """No more points than a chart can show, the first and the last among them."""
+    """At most ``POINTS`` points of equally long columns (P,), the first and the last among them."""
     count = len(columns[0])
     kept = np.unique(np.linspace(0, max(count - 1, 0), min(count, POINTS)).round().astype(int))
     return tuple(column[kept] for column in columns)
 
 
-def figure(content: object, *caption: object, class_: str | None = None) -> Markup:
-    """A figure with what there is to say about it."""
-    return tag("figure", content, tag("figcaption", *caption), class_=class_)
-
-
-def beside(figures: Sequence[Markup], class_: str = "grid") -> Markup:
-    """Figures beside each other where there is room; scenes need less than charts with words."""
-    return tag("div", join(figures), class_=class_) if figures else Markup("")
-
-
-#: What lies between the marks of a timeline, in seconds.
-_MARKS_S: Final = (0.1, 0.2, 0.5, 1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 14400, 43200, 86400)
+#: Possible distances between the ticks of a timeline, in seconds.
+_TICKS_S: Final = (0.1, 0.2, 0.5, 1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 14400, 43200, 86400)
 
 
 def time_ticks(span_s: float) -> Floats:
-    """About six round times from 0 on."""
-    step = next((mark for mark in _MARKS_S if span_s / mark <= 6.5), round_step(span_s / 6))
+    """About six round times from 0 to ``span_s``."""
+    step = next((tick for tick in _TICKS_S if span_s / tick <= 6.5), round_step(span_s / 6))
     return np.arange(0, span_s + step * 1e-6, step)
-
-
-def clock(seconds: float, span_s: float = 0.0) -> str:
-    """Seconds from the beginning, for people, all alike within a span."""
-    if max(seconds, span_s) < 60:
-        return number(seconds, 0 if seconds == round(seconds) else 1, "s")
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"

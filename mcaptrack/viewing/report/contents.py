@@ -1,4 +1,4 @@
-"""What a report says about one log: everything read and counted, nothing drawn yet."""
+"""The contents of a report on one log: everything read and computed, nothing rendered yet."""
 
 from __future__ import annotations
 
@@ -20,12 +20,18 @@ from mcaptrack.schema import EVENTS, TRACKS, Frame
 from mcaptrack.schema.framing import frame_times
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.pictures import Pictures
-from mcaptrack.viewing.report import measures
-from mcaptrack.viewing.report.markup import plain
-from mcaptrack.viewing.report.moments import Moment, Story, most_important, photograph, tell
-from mcaptrack.viewing.report.scenery import Backdrop, backdrop
+from mcaptrack.viewing.report import statistics
+from mcaptrack.viewing.report.formatting import plain
+from mcaptrack.viewing.report.identity_events import (
+    ChannelEvents,
+    IdentityEvent,
+    add_thumbnails,
+    most_important,
+    summarize_events,
+)
+from mcaptrack.viewing.report.scene_map import Background, background_picture
 
-#: The channels of a camera that a report is about, and the part that each plays in it: its colour.
+#: The channels of a camera in a report, and the role of each, which gives its colour.
 ROLES: Final = {
     "tracks": "tracks",
     "samples": "samples",
@@ -34,15 +40,15 @@ ROLES: Final = {
     "truth": "truth",
 }
 _TRACKERS: Final = {"sort": "SORT", "bytetrack": "ByteTrack", "ocsort": "OC-SORT"}
-#: Events are told of these.
-_TOLD: Final = ("tracks", "offline")
-#: So many of them are shown.
+#: The roles for which events are shown.
+_WITH_EVENTS: Final = ("tracks", "offline")
+#: The number of events with thumbnails.
 _THUMBNAILS: Final = 12
 
 
 @dataclass
 class TrackSet:
-    """A channel of tracks: the part it plays, what people call it, and its frames."""
+    """A channel of tracks: its topic, role, name for people, and frames."""
 
     topic: str
     role: str
@@ -52,46 +58,46 @@ class TrackSet:
 
 @dataclass
 class LogReport:
-    """All about one log. ``data`` is what goes into the page as JSON; ``lacks`` says why a section has nothing."""
+    """A report on one log. ``data`` goes into the page as JSON; ``missing`` says why a section has nothing."""
 
     file: str
     name: str
     prefix: str
     start_ns: int
     end_ns: int
-    sets: dict[str, TrackSet] = field(default_factory=dict)
+    track_sets: dict[str, TrackSet] = field(default_factory=dict)
     sequence: EvaluationInput | None = None
     results: list[EvaluationRow] = field(default_factory=list)
-    stories: list[Story] = field(default_factory=list)
-    shown: list[list[Moment]] = field(default_factory=list)
+    channel_events: list[ChannelEvents] = field(default_factory=list)
+    highlights: list[list[IdentityEvent]] = field(default_factory=list)
     planes: Planes = ()
-    behind: Backdrop | None = None
+    background: Background | None = None
     data: dict[str, Any] = field(default_factory=dict)
-    lacks: dict[str, str] = field(default_factory=dict)
+    missing: dict[str, str] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
-    drawn: str = ""
+    html: str = ""
 
     @property
     def start_s(self) -> float:
-        """When the log begins."""
+        """The start of the log in seconds."""
         return self.start_ns / NS_PER_S
 
     @property
-    def clocked(self) -> dict[str, TrackSet]:
-        """The tracks that are on the same clock: those of prediction, or else the tracker's."""
-        there = {role: one for role, one in self.sets.items() if role in ("samples", "offline")}
-        return there or {role: one for role, one in self.sets.items() if role == "tracks"}
+    def on_prediction_clock(self) -> dict[str, TrackSet]:
+        """The tracks at the prediction rate; without any, those of the tracker."""
+        there = {role: one for role, one in self.track_sets.items() if role in ("samples", "offline")}
+        return there or {role: one for role, one in self.track_sets.items() if role == "tracks"}
 
     @property
     def is_assumed(self) -> bool:
-        """Whether metres are guessed."""
+        """Whether the ground plane is a guess."""
         return any(plane.assumed for _, plane in self.planes)
 
 
 def gather(opened: log.Log, camera: str | None, progress: Callable[[str], None] = lambda _: None) -> LogReport:
-    """Read and count everything about one camera of a log.
+    """Read and compute everything about one camera of a log.
 
-    Raises McaptrackError where the log is damaged, or has several cameras and none is chosen.
+    Raises McaptrackError for a damaged log, and for one with several cameras if none is chosen.
     """
     prefix = pipeline.find_camera(opened, camera)
     out = LogReport(opened.path.name, opened.path.stem, prefix, opened.start_ns, opened.end_ns)
@@ -99,20 +105,22 @@ def gather(opened: log.Log, camera: str | None, progress: Callable[[str], None] 
     progress(f"{opened.path}: scores")
     _score(opened, out)
     progress(f"{opened.path}: events")
-    _tell(opened, out)
+    _find_events(opened, out)
     progress(f"{opened.path}: pictures")
-    _look(opened, out)
-    out.data = plain(_recording(opened) | {"name": out.name, "camera": prefix} | _numbers(out) | {"notes": out.notes})
+    _read_pictures(opened, out)
+    out.data = plain(
+        _recording(opened) | {"name": out.name, "camera": prefix} | _statistics(out) | {"notes": out.notes}
+    )
     return out
 
 
-def _said(error: McaptrackError, opened: log.Log) -> str:
-    """A fault in words; where the log lies on this machine is nobody's business who reads the page."""
+def _without_path(error: McaptrackError, opened: log.Log) -> str:
+    """The text of an error without the folder of the log, which readers of the page need not know."""
     return str(error).replace(str(opened.path), opened.path.name)
 
 
 def _read(opened: log.Log, out: LogReport) -> None:
-    """The tracks, and the ground."""
+    """Read the tracks and the ground planes."""
     camera = pipeline.camera_at(opened, out.prefix)
     channel = opened.channels.get(f"{out.prefix}/tracks")
     made = Provenance.from_metadata(channel.metadata) if channel else None
@@ -123,7 +131,7 @@ def _read(opened: log.Log, out: LogReport) -> None:
         "samples": f"{tracker}, sampled",
         "online": "re-tracked online",
         "offline": "re-tracked",
-        "truth": "truth",
+        "truth": "ground truth",
     }
     for below, role in ROLES.items():
         topic = camera.truth if role == "truth" else f"{out.prefix}/{below}"
@@ -133,20 +141,20 @@ def _read(opened: log.Log, out: LogReport) -> None:
         if there.schema_name != TRACKS.name or there.message_encoding != "protobuf":
             out.notes.append(f"{topic} holds {there.schema_name or 'no schema'}, not tracks; it is left out")
             continue
-        out.sets[role] = TrackSet(topic, role, names[role], opened.frames(topic, TRACKS))
+        out.track_sets[role] = TrackSet(topic, role, names[role], opened.frames(topic, TRACKS))
     try:
         out.planes = pipeline.read_planes(opened, out.prefix) or ()
     except DamagedError:
         raise
     except McaptrackError as error:
-        out.notes.append(_said(error, opened))
+        out.notes.append(_without_path(error, opened))
 
 
 def _score(opened: log.Log, out: LogReport) -> None:
     path = opened.path.name
-    if "truth" not in out.sets:
-        out.lacks["scores"] = (
-            "How right the tracks are can't be said: the log has no truth. Add labels with "
+    if "truth" not in out.track_sets:
+        out.missing["scores"] = (
+            "The tracks can't be scored: the log has no ground truth. Add labels with "
             f"{command('ingest', 'LABELS', '--as', 'truth', '--into', Path(path))}."
         )
         return
@@ -156,17 +164,17 @@ def _score(opened: log.Log, out: LogReport) -> None:
     except DamagedError:
         raise
     except McaptrackError as error:
-        out.lacks["scores"] = f"Nothing could be scored: {_said(error, opened)}."
+        out.missing["scores"] = f"Nothing could be scored: {_without_path(error, opened)}."
         return
     out.results = outcome.results
     out.notes += outcome.notes
 
 
-def _tell(opened: log.Log, out: LogReport) -> None:
-    """Events of the channels that are told of: those of the log, or made now where it has none that hold."""
-    truth = out.sets["truth"].frames if "truth" in out.sets else None
-    for role in _TOLD:
-        tracks = out.sets.get(role)
+def _find_events(opened: log.Log, out: LogReport) -> None:
+    """Read or compute the events of the channels in ``_WITH_EVENTS``."""
+    truth = out.track_sets["truth"].frames if "truth" in out.track_sets else None
+    for role in _WITH_EVENTS:
+        tracks = out.track_sets.get(role)
         if tracks is None or not any(len(frame.rows) for frame in tracks.frames):
             continue
         known = _recorded(opened, tracks.topic + "/events")
@@ -174,12 +182,14 @@ def _tell(opened: log.Log, out: LogReport) -> None:
             found = find_events(tracks.frames, truth, EventOptions(), out.name, tracks.topic)
             known = found.events, found.rule
         events, rule = known
-        out.stories.append(tell(tracks.topic, events, rule, tracks.frames, truth, (out.start_ns, out.end_ns)))
-    out.shown = most_important(out.stories, _THUMBNAILS)
+        out.channel_events.append(
+            summarize_events(tracks.topic, events, rule, tracks.frames, truth, (out.start_ns, out.end_ns))
+        )
+    out.highlights = most_important(out.channel_events, _THUMBNAILS)
 
 
 def _recorded(opened: log.Log, topic: str) -> tuple[list[Frame], MatchRule | None] | None:
-    """Events that stand in the log and by what rule they were matched, unless they are out of date."""
+    """The events in the log and the rule of their matches; None if there are none or they are out of date."""
     channel = opened.channels.get(topic)
     made = Provenance.from_metadata(channel.metadata) if channel else None
     if channel is None or made is None or channel.schema_name != EVENTS.name or pipeline.is_stale(opened, topic):
@@ -191,50 +201,52 @@ def _recorded(opened: log.Log, topic: str) -> tuple[list[Frame], MatchRule | Non
     return opened.frames(topic, EVENTS), rule
 
 
-def _look(opened: log.Log, out: LogReport) -> None:
+def _read_pictures(opened: log.Log, out: LogReport) -> None:
     topic = pipeline.camera_at(opened, out.prefix).pictures
     if topic is None:
-        out.lacks["pictures"] = "The log has no pictures of the scene"
+        out.missing["pictures"] = "The log has no pictures of the scene"
         return
     try:
         pictures = Pictures(opened, topic)
-        out.behind = backdrop(pictures)
-        for story, moments in zip(out.stories, out.shown, strict=True):
-            tracks = next(one for one in out.sets.values() if one.topic == story.topic)
-            photograph(moments, tracks.frames, pictures, out.start_ns)
+        out.background = background_picture(pictures)
+        for channel, events in zip(out.channel_events, out.highlights, strict=True):
+            tracks = next(one for one in out.track_sets.values() if one.topic == channel.topic)
+            add_thumbnails(events, tracks.frames, pictures, out.start_ns)
     except DamagedError:
         raise
     except McaptrackError as error:
-        out.lacks["pictures"] = f"The pictures can't be shown: {_said(error, opened)}"
+        out.missing["pictures"] = f"The pictures can't be shown: {_without_path(error, opened)}"
         return
-    if out.behind is None:
-        out.lacks["pictures"] = f"{topic} holds no pictures"
+    if out.background is None:
+        out.missing["pictures"] = f"{topic} holds no pictures"
 
 
-def _numbers(out: LogReport) -> dict[str, Any]:
-    """What is counted, as JSON."""
-    sets = [
-        {"topic": one.topic, "name": one.name, "role": one.role} | measures.describe_tracks(one.frames)
-        for one in out.sets.values()
+def _statistics(out: LogReport) -> dict[str, Any]:
+    """All statistics, as JSON."""
+    track_sets = [
+        {"topic": one.topic, "name": one.name, "role": one.role} | statistics.track_statistics(one.frames)
+        for one in out.track_sets.values()
     ]
-    clocked = {one.topic: one.frames for one in out.clocked.values()}
-    if "truth" in out.sets:
-        truth = out.sets["truth"]
-        at_ns = np.unique(np.concatenate([np.empty(0, np.int64), *map(frame_times, clocked.values())]))
-        clocked[truth.topic] = resample_frames(truth.frames, at_ns) if len(at_ns) else truth.frames
-    metric = {topic: frames for topic, frames in clocked.items() if has_positions(frames, "metres")}
+    resampled = {one.topic: one.frames for one in out.on_prediction_clock.values()}
+    if "truth" in out.track_sets:
+        truth = out.track_sets["truth"]
+        at_ns = np.unique(np.concatenate([np.empty(0, np.int64), *map(frame_times, resampled.values())]))
+        resampled[truth.topic] = resample_frames(truth.frames, at_ns) if len(at_ns) else truth.frames
+    metric = {topic: frames for topic, frames in resampled.items() if has_positions(frames, "metres")}
     return {
-        "tracks": sets,
-        "forecasts": measures.describe_forecasts(out.sequence, out.results) if out.sequence else [],
-        "events": [story.to_json() for story in out.stories],
-        "speed_m_per_s": measures.histograms({t: measures.speeds_m_per_s(frames) for t, frames in metric.items()}),
-        "dwell_s": measures.histograms({topic: measures.lives_s(frames) for topic, frames in clocked.items()}),
+        "tracks": track_sets,
+        "forecasts": statistics.forecast_statistics(out.sequence, out.results) if out.sequence else [],
+        "events": [channel.to_json() for channel in out.channel_events],
+        "speed_m_per_s": statistics.histograms({t: statistics.speeds_m_per_s(frames) for t, frames in metric.items()}),
+        "dwell_s": statistics.histograms(
+            {topic: statistics.durations_s(frames) for topic, frames in resampled.items()}
+        ),
         "ground_plane": None if not out.planes else "assumed" if out.is_assumed else "given",
     }
 
 
 def _recording(opened: log.Log) -> dict[str, Any]:
-    """What the log is, and how each of its channels was made."""
+    """The log and its channels with their provenance, as JSON."""
     messages = sum(sum(part.index.counts.values()) for part in opened.parts)
     return {
         "log": opened.path.name,
@@ -265,10 +277,10 @@ def _channel(opened: log.Log, channel: log.Channel) -> dict[str, Any]:
 
 
 def plane_of(report: LogReport) -> Any:
-    """The ground plane at the beginning of the log, if there is one."""
+    """The first ground plane of the log, if there is one."""
     return plane_at(report.planes, report.start_ns)
 
 
 def result_of(results: Sequence[EvaluationRow], topic: str, similarity: str, gate: float) -> EvaluationRow | None:
-    """The score of a channel by one rule."""
+    """The scores of a channel for one similarity and gate."""
     return next((r for r in results if (r.tracks, r.similarity, r.gate) == (topic, similarity, gate)), None)

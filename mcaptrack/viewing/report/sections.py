@@ -1,4 +1,4 @@
-"""What numbers say in a report: scores, forecasts, and how people move."""
+"""The values of the sections with numbers: scores, forecasts, and how people move."""
 
 from __future__ import annotations
 
@@ -11,210 +11,191 @@ import numpy as np
 from mcaptrack.errors import command
 from mcaptrack.evaluation import EvaluationRow
 from mcaptrack.evaluation.metrics import summary
-from mcaptrack.viewing.report.charts import Axis, Bars, Line, beside, figure, histogram_chart, line_chart, round_most
+from mcaptrack.viewing.report.charts import Axis, Bars, Line, histogram_chart, line_chart, round_most
 from mcaptrack.viewing.report.contents import LogReport
-from mcaptrack.viewing.report.headline import pair_of, rule_words
-from mcaptrack.viewing.report.markup import Markup, counted, join, lack, name, number, percent, short, table, tag
+from mcaptrack.viewing.report.formatting import counted, number, percent, short
+from mcaptrack.viewing.report.summary import before_after, rule_text
 
+#: The columns of the table of scores: whether a column is a share, and whether its lowest value is the best.
 _SCORES: Final = {"IDF1": True, "MOTA": True, "HOTA": True, "IDSW": False, "Frag": False, "FP": False, "FN": False}
-_LOWER: Final = ("IDSW", "Frag", "FP", "FN")
-_MEANINGS: Final = (
-    "IDF1: identities kept. MOTA: rows that are right, less misses, false rows and switches. HOTA: both, over many "
-    "thresholds. IDSW: identity switches. Frag: fragments. FP: false rows. FN: missed rows. Best of a group in bold."
-)
+_LOWEST: Final = ("IDSW", "Frag", "FP", "FN")
+
+Figure = dict[str, Any]
 
 
-def scores(report: LogReport) -> Markup:
-    """All scores by rule, and what can be said of tracks without truth."""
-    parts: list[Markup] = []
-    if report.results:
-        pair = pair_of(report, report.results)
-        first = [r for r in report.results if pair is None or (r.similarity, r.gate) == pair.rule]
-        rest = [r for r in report.results if r not in first]
-        parts.append(score_table(first, report))
-        parts.append(tag("p", _MEANINGS, class_="soft"))
-        if rest:
-            rules = sorted({(r.similarity, r.gate) for r in rest})
-            words = "The same " + "; ".join(rule_words(*rule) for rule in rules)
-            parts.append(tag("details", tag("summary", words), score_table(rest, report)))
-    if "scores" in report.lacks:
-        parts.append(lack(report.lacks["scores"]))
-    parts.append(_track_table(report))
-    return join(parts)
+def scores(report: LogReport) -> dict[str, Any]:
+    """All scores by rule, and statistics of tracks that need no ground truth."""
+    found = before_after(report, report.results) if report.results else None
+    first = [row for row in report.results if found is None or (row.similarity, row.gate) == found.rule]
+    rest = [row for row in report.results if row not in first]
+    rules = sorted({(row.similarity, row.gate) for row in rest})
+    return {
+        "columns": list(_SCORES),
+        "groups": _score_groups(first, report),
+        "other_groups": _score_groups(rest, report),
+        "other_rules": "; ".join(rule_text(*rule) for rule in rules),
+        "missing": report.missing.get("scores", ""),
+        "tracks": _track_rows(report),
+        "no_tracks": f"There are no tracks here; {command('run', Path(report.file))} makes them.",
+    }
 
 
-def score_table(results: Sequence[EvaluationRow], report: LogReport) -> Markup:
-    """Scores, a group of rows for each rule."""
-    called = {one.topic: (one.name, one.role) for one in report.sets.values()}
+def _score_groups(results: Sequence[EvaluationRow], report: LogReport) -> list[dict[str, Any]]:
+    """A group of rows for each rule; the best value of a group is marked."""
+    known = {one.topic: (one.name, one.role) for one in report.track_sets.values()}
     groups: dict[tuple[str, float], list[EvaluationRow]] = {}
-    for result in results:
-        groups.setdefault((result.similarity, result.gate), []).append(result)
-    body: list[Markup] = []
-    for (similarity, gate), members in sorted(groups.items()):
-        body.append(tag("tr", tag("th", rule_words(similarity, gate), colspan=2 + len(_SCORES), scope="rowgroup")))
-        all_values = [summary(result.score) for result in members]
-        for result, values in zip(members, all_values, strict=True):
-            words, role = called.get(result.tracks, (result.tracks, "truth"))
-            cells = [tag("th", tag("b", words, class_=f"s-{role}"), scope="row"), tag("td", name(result.tracks))]
-            for key, is_share in _SCORES.items():
-                among = [one[key] for one in all_values]
-                is_best = len(members) > 1 and values[key] == (min if key in _LOWER else max)(among)
-                said = percent(values[key]) if is_share else number(values[key])
-                cells.append(tag("td", said, class_="n best" if is_best else "n"))
-            body.append(tag("tr", *cells))
-    head = [tag("th", "tracks", scope="col"), tag("th", "channel", scope="col")]
-    head += [tag("th", key, scope="col", class_="n") for key in _SCORES]
-    caption = tag("caption", "Scores against the truth, as ", tag("code", "evaluate"), " gives them")
-    whole = tag("table", caption, tag("thead", tag("tr", *head)), tag("tbody", *body))
-    return tag("div", whole, class_="wide", tabindex="0", role="region", aria_label="scores")
+    for row in results:
+        groups.setdefault((row.similarity, row.gate), []).append(row)
+    out = []
+    for rule, members in sorted(groups.items()):
+        all_values = [summary(row.score) for row in members]
+        best = {key: (min if key in _LOWEST else max)(values[key] for values in all_values) for key in _SCORES}
+        rows = []
+        for row, values in zip(members, all_values, strict=True):
+            name, role = known.get(row.tracks, (row.tracks, "truth"))
+            cells = [
+                (
+                    percent(values[key]) if is_share else number(values[key]),
+                    len(members) > 1 and values[key] == best[key],
+                )
+                for key, is_share in _SCORES.items()
+            ]
+            rows.append({"name": name, "role": role, "topic": row.tracks, "cells": cells})
+        out.append({"rule": rule_text(*rule), "rows": rows})
+    return out
 
 
-def _track_table(report: LogReport) -> Markup:
-    if not report.sets:
-        run = command("run", Path(report.file))
-        return lack(f"There are no tracks here; {run} finds, tracks and re-tracks people.")
-    repairs = {story.topic: story.counts["joined"] + story.counts["parted"] for story in report.stories}
-    rows = [
-        (
-            tag("b", one["name"], class_=f"s-{one['role']}"),
-            name(one["topic"]),
-            number(one["tracks"]),
-            number(one["median_s"], 1, "s"),
-            number(one["longest_s"], 1, "s"),
-            percent(one["observed_share"], 0),
-            number(repairs.get(one["topic"]) if one["role"] == "offline" else None),
-        )
+def _track_rows(report: LogReport) -> list[dict[str, Any]]:
+    repairs = {one.topic: one.counts["joined"] + one.counts["parted"] for one in report.channel_events}
+    return [
+        {
+            "name": one["name"],
+            "role": one["role"],
+            "topic": one["topic"],
+            "cells": [
+                number(one["tracks"]),
+                number(one["median_s"], 1, "s"),
+                number(one["longest_s"], 1, "s"),
+                percent(one["observed_share"], 0),
+                number(repairs.get(one["topic"]) if one["role"] == "offline" else None),
+            ],
+        }
         for one in report.data["tracks"]
     ]
-    columns = ("tracks", "channel", "how many", "median length", "longest", "rows seen", "repairs")
-    caption = "Tracks as they are, whoever is right. Rows seen: a detection stands behind them; others were filled in."
-    return table(caption, columns, rows, words=2)
 
 
-def forecasts(report: LogReport) -> Markup:
-    """Errors over recall, errors by horizon, calibration."""
+def forecasts(report: LogReport) -> dict[str, Any]:
+    """Errors by recall and by horizon, and calibration."""
     found = report.data["forecasts"]
     if not found:
-        why = "There are no forecasts that could be scored"
-        reason = "the log has no truth" if "truth" not in report.sets else "none have a known future"
-        if not any(c["schema"] == "mcaptrack.Predictions" for c in report.data["channels"]):
+        reason = "the log has no ground truth" if "truth" not in report.track_sets else "none have a known future"
+        if not any(channel["schema"] == "mcaptrack.Predictions" for channel in report.data["channels"]):
             reason = f"the log holds none; {command('predict', Path(report.file))} makes them"
-        return lack(f"{why}: {reason}.")
-    roles = {one.topic: one for one in report.sets.values()}
+        return {"figures": [], "missing": [f"There are no forecasts that could be scored: {reason}."]}
+    known = {one.topic: (one.name, one.role) for one in report.track_sets.values()}
+    members = [(one, *known.get(one["tracks"], (one["tracks"], "truth"))) for one in found]
+    figures = [_by_recall(members)]
+    parts = [part for one in found for part in (one["by_horizon"], one["constant_velocity"]) if part]
+    most = round_most(np.array(part[key], float) for part in parts for key in ("mean_m", "three_quarters_m"))
+    figures += [_by_horizon(one, name, role, most) for one, name, role in members if one["by_horizon"]["n"]]
+    with_covariance = [
+        member for member in members if all(part["held"] is not None for part in member[0]["calibration"])
+    ]
+    if with_covariance:
+        return {"figures": [*figures, _calibration(with_covariance)], "missing": []}
+    why = "How well the ellipses are calibrated can't be said: the forecasts have no covariance."
+    return {"figures": figures, "missing": [why]}
 
-    def of(one: dict[str, Any]) -> tuple[str, str]:
-        known = roles.get(one["tracks"])
-        return (known.name, known.role) if known else (one["tracks"], "truth")
 
+def _by_recall(members: Sequence[tuple[dict[str, Any], str, str]]) -> Figure:
     lines = [
-        Line(short(of(one)[0]), of(one)[1], np.array(one["curve_recall"]), np.array(one["curve_ADE_m"]))
-        for one in found
+        Line(short(name), role, np.array(one["curve_recall"]), np.array(one["curve_ADE_m"]))
+        for one, name, role in members
     ]
-    y = Axis("mean displacement error, m", round_most([line.y for line in lines]))
+    y = Axis("mean displacement error, m", round_most(line.y for line in lines))
     x = Axis("recall: share of people with a forecast", 1.0)
-    figures = [
-        figure(
-            line_chart("Displacement error of forecasts over recall", lines, x, y),
-            tag("b", "Error over recall. "),
-            "From left to right, people whose past was tracked best come first. Lower and longer is better.",
-        )
-    ]
-    most = round_most(
-        [
-            np.array(part[key], float)
-            for one in found
-            for part in (one["by_horizon"], one["constant_velocity"])
-            if part
-            for key in ("mean_m", "three_quarters_m")
-        ]
-    )
-    figures += [_by_horizon(one, *of(one), most) for one in found if one["by_horizon"]["n"]]
-    held = [one for one in found if all(part["held"] is not None for part in one["calibration"])]
-    if held:
-        figures.append(_calibration([(*of(one), one["calibration"]) for one in held]))
-    else:
-        figures.append(lack("How well the ellipses are calibrated can't be said: the forecasts have no covariance."))
-    return beside(figures, "grid charts")
+    return {
+        "chart": line_chart("Displacement error of forecasts over recall", lines, x, y),
+        "title": "Error over recall.",
+        "caption": "From left to right, people whose past was tracked best come first. Lower and longer is better.",
+    }
 
 
-def _by_horizon(one: dict[str, Any], words: str, role: str, most: float) -> Markup:
-    part, plain = one["by_horizon"], one["constant_velocity"]
+def _by_horizon(one: dict[str, Any], name: str, role: str, most: float) -> Figure:
+    part, baseline = one["by_horizon"], one["constant_velocity"]
     ahead = np.array(part["ahead_s"])
     band = (np.array(part["quarter_m"]), np.array(part["three_quarters_m"]))
-    lines = [Line(short(words), role, ahead, np.array(part["mean_m"]), *band)]
-    said = f"{number(part['mean_m'][-1], 2, 'm')} after {number(float(ahead[-1]), 1, 's')}"
-    if plain and plain["n"]:
-        lines.append(Line("walking on", "truth", np.array(plain["ahead_s"]), np.array(plain["mean_m"]), dashed=True))
-        said += f"; walking on as before would be {number(plain['mean_m'][-1], 2, 'm')} off"
-    chart = line_chart(
-        f"Error of the forecasts of {words} by how far ahead they look",
-        lines,
-        Axis("seconds ahead", float(ahead[-1])),
-        Axis("distance from the truth, m", most),
-    )
-    caption = f"{said}. Line: mean of {counted(part['n'], 'forecast')}; band: the middle half."
-    return figure(chart, tag("b", f"Error by horizon, {words}. "), caption)
+    lines = [Line(short(name), role, ahead, np.array(part["mean_m"]), *band)]
+    text = f"{number(part['mean_m'][-1], 2, 'm')} after {number(float(ahead[-1]), 1, 's')}"
+    if baseline and baseline["n"]:
+        mean_m = np.array(baseline["mean_m"])
+        lines.append(Line("constant velocity", "truth", np.array(baseline["ahead_s"]), mean_m, dashed=True))
+        text += f"; constant velocity has {number(baseline['mean_m'][-1], 2, 'm')}"
+    title = f"Error of the forecasts of {name} by how far ahead they look"
+    axes = Axis("seconds ahead", float(ahead[-1])), Axis("distance from the ground truth, m", most)
+    return {
+        "chart": line_chart(title, lines, *axes),
+        "title": f"Error by horizon, {name}.",
+        "caption": f"{text}. Line: mean of {counted(part['n'], 'forecast')}; band: the middle half.",
+    }
 
 
-def _calibration(found: Sequence[tuple[str, str, list[dict[str, float]]]]) -> Markup:
+def _calibration(members: Sequence[tuple[dict[str, Any], str, str]]) -> Figure:
+    levels = [(name, role, one["calibration"]) for one, name, role in members]
     lines = [
-        Line(
-            short(words),
-            role,
-            np.array([part["nominal"] for part in levels]),
-            np.array([part["held"] for part in levels]),
-        )
-        for words, role, levels in found
+        Line(short(name), role, np.array([one["nominal"] for one in parts]), np.array([one["held"] for one in parts]))
+        for name, role, parts in levels
     ]
-    chart = line_chart(
-        "Share of true futures inside the forecast ellipses, against what they promise",
-        lines,
-        Axis("promised, %", 1.0, percent=True),
-        Axis("held, %", 1.0, percent=True),
-        diagonal="as promised",
+    title = "Share of true futures inside the forecast ellipses, against their probability"
+    axes = Axis("probability, %", 1.0, percent=True), Axis("share inside, %", 1.0, percent=True)
+    text = "; ".join(
+        f"{name}: " + ", ".join(f"{percent(one['held'], 0)} in {percent(one['nominal'], 0)}" for one in parts)
+        for name, _, parts in levels
     )
-    said = "; ".join(
-        f"{words}: " + ", ".join(f"{percent(part['held'], 0)} in {percent(part['nominal'], 0)}" for part in levels)
-        for words, _, levels in found
-    )
-    return figure(
-        chart, tag("b", "Calibration. "), f"{said}. Below the dashed line forecasts are too sure, above it too careful."
-    )
+    return {
+        "chart": line_chart(title, lines, *axes, diagonal="calibrated"),
+        "title": "Calibration.",
+        "caption": f"{text}. Below the dashed line forecasts are overconfident, above it too cautious.",
+    }
 
 
-def motion(report: LogReport) -> Markup:
-    """How fast people walk and how long they stay."""
-    figures: list[Markup] = []
-    speeds, dwell = report.data["speed_m_per_s"], report.data["dwell_s"]
-    guessed = " Metres are guessed from the size of people: nobody measured the ground." if report.is_assumed else ""
+def motion(report: LogReport) -> dict[str, Any]:
+    """Speeds of people, and durations of tracks."""
+    figures, missing = [], []
+    speeds, durations = report.data["speed_m_per_s"], report.data["dwell_s"]
     if speeds:
-        between = "From one row to the next" + (" on the clock of prediction" if "samples" in report.sets else "")
-        note = f"{between}; holes left out.{guessed}"
-        figures.append(_histogram(report, speeds, "Speed. ", "speed, m/s", note, "m/s", "step", 2))
-    elif report.sets:
-        words = "Speeds can't be said: nobody knows where on the ground people are"
-        figures.append(lack(words + "; a ground plane says it."))
-    if dwell:
+        note = "From one row to the next" + (" at the prediction rate" if "samples" in report.track_sets else "")
+        note += "; gaps left out."
+        note += " Metres are guessed from the size of people: the ground was not measured." if report.is_assumed else ""
+        figures.append(_histogram(report, speeds, "Speed.", "speed, m/s", note, "m/s", "step", 2))
+    elif report.track_sets:
+        missing.append("Speeds can't be said: positions on the ground are not known without a ground plane.")
+    if durations:
         note = "From the first row of a track to its last."
-        figures.append(_histogram(report, dwell, "Dwell. ", "time there, s", note, "s", "track", 1))
-    return beside(figures, "grid charts") if figures else lack("Nobody is there, so nobody moves.")
+        figures.append(_histogram(report, durations, "Duration.", "duration of a track, s", note, "s", "track", 1))
+    if not figures and not missing:
+        missing.append("There are no people, so there is no motion.")
+    return {"figures": figures, "missing": missing}
 
 
 def _histogram(
     report: LogReport, found: dict[str, Any], title: str, x: str, note: str, unit: str, of: str, digits: int
-) -> Markup:
-    roles = {one.topic: one for one in report.sets.values()}
+) -> Figure:
+    known = {one.topic: one for one in report.track_sets.values()}
     edges = np.array(found["edges"])
-    bars, said = [], []
+    bars, texts = [], []
     for part in found["series"]:
-        one = roles[part["topic"]]
         if not part["n"]:
             continue
+        one = known[part["topic"]]
         shares = np.array(part["counts"]) / part["n"]
-        words = f"median {number(part['median'], digits, unit)}"
-        bars.append(Bars(short(one.name), one.role, shares, part["median"], words))
+        median = f"median {number(part['median'], digits, unit)}"
+        bars.append(Bars(short(one.name), one.role, shares, part["median"], median))
         beyond = f" ({number(part['above'])} of them beyond)" if part["above"] else ""
-        said.append(f"{short(one.name)} {counted(part['n'], of)}{beyond}")
+        texts.append(f"{short(one.name)} {counted(part['n'], of)}{beyond}")
     high = f"the highest bar is {percent(max(float(one.shares.max(initial=0)) for one in bars), 0)}"
-    chart = histogram_chart(f"Histograms: {x}", bars, edges, x)
-    return figure(chart, tag("b", title), f"Shares of {', '.join(said)}; {high}; lines are medians. {note}")
+    return {
+        "chart": histogram_chart(f"Histograms: {x}", bars, edges, x),
+        "title": title,
+        "caption": f"Shares of {', '.join(texts)}; {high}; lines are medians. {note}",
+    }

@@ -1,0 +1,135 @@
+"""The values of the sections with pictures: tracks on a map of the scene, and events of identities."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from mcaptrack.foxglove.colours import COUNT as COLOURS
+from mcaptrack.geometry.clocks import NS_PER_S
+from mcaptrack.viewing.report.charts import time_ticks
+from mcaptrack.viewing.report.contents import LogReport, TrackSet, plane_of
+from mcaptrack.viewing.report.formatting import clock, counted, number
+from mcaptrack.viewing.report.identity_events import BARS, SIDE_PX, ChannelEvents, IdentityEvent, Thumbnail
+from mcaptrack.viewing.report.scene_map import (
+    TrackPath,
+    ground_map,
+    ground_paths,
+    ground_span,
+    picture_map,
+    pixel_paths,
+)
+from mcaptrack.viewing.report.summary import rule_text
+
+_NO_GROUND = (
+    "Tracks can't be drawn: there is no picture, and without a ground plane positions on the ground are not known."
+)
+
+
+def scene_map(report: LogReport) -> dict[str, Any]:
+    """Tracks over the picture, or on the ground."""
+    sets = [report.track_sets[role] for role in ("tracks", "offline", "truth") if role in report.track_sets]
+    sets = [one for one in sets if any(len(frame.rows) for frame in one.frames)]
+    if not sets:
+        return {"missing": "There are no tracks to draw.", "maps": []}
+    if report.background is not None:
+        plane = plane_of(report)
+        drawn = _with_paths(sets, [pixel_paths(one.frames, plane) for one in sets])
+        if drawn:
+            maps = [_map(one, paths, picture_map(paths, report.background, report.start_s)) for one, paths in drawn]
+            return {"missing": "", "maps": maps, "jpeg": report.background.jpeg}
+        why = "No track has a place in the picture"
+    else:
+        why = report.missing.get("pictures", "There are no pictures")
+    drawn = _with_paths(sets, [ground_paths(one.frames) for one in sets])
+    if not drawn:
+        return {"missing": _NO_GROUND, "maps": []}
+    span = ground_span([path.points for _, paths in drawn for path in paths])
+    maps = [_map(one, paths, ground_map(paths, span, report.start_s)) for one, paths in drawn]
+    return {"missing": f"{why}; here is the ground instead.", "maps": maps, "jpeg": b""}
+
+
+def _with_paths(sets: Sequence[TrackSet], paths: Sequence[list[TrackPath]]) -> list[tuple[TrackSet, list[TrackPath]]]:
+    return [(one, own) for one, own in zip(sets, paths, strict=True) if own]
+
+
+def _map(one: TrackSet, paths: Sequence[TrackPath], values: dict[str, Any]) -> dict[str, Any]:
+    return values | {"name": one.name, "role": one.role, "count": counted(len(paths), "track")}
+
+
+def identity_events(report: LogReport) -> dict[str, Any]:
+    """Timelines of identity switches or repairs, and thumbnails of the most important ones."""
+    has_rule = any(channel.rule for channel in report.channel_events)
+    pairs = list(zip(report.channel_events, report.highlights, strict=True))
+    return {
+        "has_channels": bool(pairs),
+        "has_ground_truth": has_rule,
+        "has_samples": has_rule and "samples" in report.track_sets,
+        "timelines": [_timeline(channel, shown, report) for channel, shown in pairs],
+        "highlights": [_highlights(channel, shown, report) for channel, shown in pairs if channel.events],
+    }
+
+
+def _set_of(report: LogReport, channel: ChannelEvents) -> TrackSet:
+    return next(one for one in report.track_sets.values() if one.topic == channel.topic)
+
+
+def _title(channel: ChannelEvents, name: str) -> str:
+    if channel.rule:
+        return f"{name}: {counted(len(channel.events), 'identity switch', 'identity switches')}"
+    return f"{name}: {counted(len(channel.events), 'repair')}" if channel.events else name
+
+
+def _timeline(channel: ChannelEvents, shown: Sequence[IdentityEvent], report: LogReport) -> dict[str, Any]:
+    one, span = _set_of(report, channel), channel.span_s
+    most = max([1, *channel.births, *channel.ends])
+    places = [f"{100 * (event.t_ns - report.start_ns) / NS_PER_S / span:.1f}%" for event in channel.events]
+    chosen = {id(event) for event in shown}
+    bars = enumerate(zip(channel.births, channel.ends, strict=True))
+    return {
+        "title": _title(channel, one.name),
+        "role": one.role,
+        "rule": rule_text(*channel.rule) if channel.rule else "",
+        "span": clock(span),
+        "bars": [(f"{100 * k / BARS:.2f}%", 18 * born / most, 12 * ended / most) for k, (born, ended) in bars],
+        "bar_width": f"{80 / BARS:.2f}%",
+        "most": most,
+        "bin": number(span / BARS, 2, "s"),
+        "marks": list(dict.fromkeys(places)),
+        "highlights": [(x, e.text) for e, x in zip(channel.events, places, strict=True) if id(e) in chosen],
+        "ticks": [
+            (f"{100 * tick / span:.2f}%", clock(tick, span), "end" if tick > 0.97 * span else "mid" if tick else "")
+            for tick in time_ticks(span).tolist()
+        ],
+    }
+
+
+def _highlights(channel: ChannelEvents, shown: Sequence[IdentityEvent], report: LogReport) -> dict[str, Any]:
+    rest = len(channel.events) - len(shown)
+    most = "the most important event" if len(shown) == 1 else f"the {len(shown)} most important events"
+    has_pictures = any(event.before or event.after for event in shown)
+    why = report.missing.get("pictures", "The events have no place in the picture")
+    return {
+        "title": f"{_set_of(report, channel).name}: {most}" + (f", and {number(rest)} more" if rest else ""),
+        "missing": "" if has_pictures else f"{why}; they are listed without.",
+        "events": [
+            {
+                "text": f"{event.text[:1].upper()}{event.text[1:]}.",
+                "thumbnails": [
+                    _thumbnail(one, when) for one, when in ((event.before, "before"), (event.after, "after")) if one
+                ],
+            }
+            for event in shown
+        ],
+    }
+
+
+def _thumbnail(one: Thumbnail, when: str) -> dict[str, Any]:
+    at = number(one.at_s, 1, "s")
+    values = {"jpeg": one.jpeg, "side": SIDE_PX, "when": f"{when} {at}", "title": f"{when}, at {at}", "box": None}
+    if one.box is None:
+        return values
+    x, y, w, h = (f"{value:.1f}" for value in one.box.xywh)
+    box = {"x": x, "y": y, "w": w, "h": h, "label": one.box.label, "colour": one.box.identity % COLOURS}
+    box |= {"label_x": f"{max(one.box.xywh[0], 2):.1f}", "label_y": f"{max(one.box.xywh[1] - 4, 14):.1f}"}
+    return values | {"title": f"{when}, at {at}: track {one.box.label}", "box": box}

@@ -1,0 +1,241 @@
+"""Identity switches and repairs: when they happened, and what the pictures showed before and after.
+
+Letters: R events.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaptrack.evaluation.event_text import describe
+from mcaptrack.evaluation.events import MatchRule
+from mcaptrack.geometry.arrays import Floats, Ints
+from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
+from mcaptrack.schema import EVENT_KINDS, EventKind, Frame, Rows
+from mcaptrack.sources.pictures import Pictures
+from mcaptrack.sources.video import encode_image
+from mcaptrack.viewing.report.statistics import frame_interval_s, rows_by_track
+
+#: The side of thumbnails, which are squares, and the part of the picture they show, in heights of a person.
+SIDE_PX: Final = 168
+_ROOM: Final = 2.4
+_LEAST_PX: Final = 40
+_QUALITY: Final = 74
+#: The number of bars of a timeline.
+BARS: Final = 72
+
+
+class MarkedBox(NamedTuple):
+    """A box (x, y, w, h) in pixels of a thumbnail, the id that gives its colour, and the id printed beside it."""
+
+    xywh: tuple[float, float, float, float]
+    identity: int
+    label: int
+
+
+class Thumbnail(NamedTuple):
+    """A part of a picture in JPEG, its time in the log, and the box marked in it."""
+
+    jpeg: bytes
+    at_s: float
+    box: MarkedBox | None
+
+
+@dataclass
+class IdentityEvent:
+    """An event of an identity; ``weight_s`` is the shorter duration of the states before and after it."""
+
+    t_ns: int
+    row: Any
+    weight_s: float
+    text: str
+    before: Thumbnail | None = None
+    after: Thumbnail | None = None
+
+
+@dataclass
+class ChannelEvents:
+    """The events of one channel of tracks, within ``span_s``.
+
+    ``events`` are of the ``kinds``: identity switches if there is ground truth, otherwise repairs.
+    """
+
+    topic: str
+    events: list[IdentityEvent]
+    kinds: tuple[EventKind, ...]
+    counts: dict[str, int]
+    births: list[int]
+    ends: list[int]
+    rule: MatchRule | None
+    span_s: float
+
+    def to_json(self) -> dict[str, Any]:
+        """The events as they stand in the report's data."""
+        return {
+            "topic": self.topic,
+            "similarity": self.rule[0] if self.rule else None,
+            "gate": self.rule[1] if self.rule else None,
+            "counts": self.counts,
+            "births": self.births,
+            "ends": self.ends,
+            "bin_s": self.span_s / BARS,
+            "moments": [
+                {
+                    "t_ns": event.t_ns,
+                    "kind": EVENT_KINDS[EventKind(int(event.row["kind"]))],
+                    **{name: int(event.row[name]) for name in ("truth_id", "previous_id", "track_id", "source_id")},
+                    **{name: float(event.row[name]) for name in ("x_m", "y_m", "x_px", "y_px", "duration_s")},
+                }
+                for event in self.events
+            ],
+        }
+
+
+def summarize_events(
+    topic: str,
+    events: Sequence[Frame],
+    rule: MatchRule | None,
+    tracks: Sequence[Frame],
+    ground_truth: Sequence[Frame] | None,
+    span_ns: tuple[int, int],
+) -> ChannelEvents:
+    """Collect the events of a channel of tracks."""
+    start_ns, end_ns = span_ns
+    all_rows = [(frame.t_ns, row) for frame in events for row in frame.rows]
+    t_ns = np.array([at for at, _ in all_rows], np.int64)
+    kind = np.array([int(row["kind"]) for _, row in all_rows], np.int64)
+    kinds = (EventKind.SWITCH,) if rule else (EventKind.JOINED, EventKind.PARTED)
+    interval = frame_interval_s(tracks)
+    chosen = [
+        IdentityEvent(at, row, 0.0, describe(row, f"at {(at - start_ns) / NS_PER_S:.1f} s", interval))
+        for at, row in all_rows
+        if int(row["kind"]) in kinds
+    ]
+    _set_weights(chosen, ground_truth if rule and ground_truth else tracks, "truth_id" if rule else "track_id")
+    span_s = max(end_ns - start_ns, 1) / NS_PER_S
+    edges = start_ns + np.linspace(0, max(end_ns - start_ns, 1), BARS + 1)
+    births, ends = (np.histogram(t_ns[kind == k], edges)[0].tolist() for k in (EventKind.BIRTH, EventKind.END))
+    counts = {name: int((kind == k).sum()) for k, name in EVENT_KINDS.items()}
+    return ChannelEvents(topic, chosen, kinds, counts, births, ends, rule, span_s)
+
+
+def _set_weights(events: Sequence[IdentityEvent], frames: Sequence[Frame], column: str) -> None:
+    """Set the weight of events: the shorter of the times for which the state before and the state after it lasted."""
+    rows, t_ns = rows_by_track(frames)
+    ids = rows["track_id"]
+    by_id: dict[int, list[IdentityEvent]] = {}
+    for event in events:
+        by_id.setdefault(int(event.row[column]), []).append(event)
+    for track_id, members in by_id.items():
+        low, high = np.searchsorted(ids, track_id, "left"), np.searchsorted(ids, track_id, "right")
+        if low == high:
+            continue
+        bounds = [int(t_ns[low]), *(event.t_ns for event in members), int(t_ns[high - 1])]
+        for k, event in enumerate(members, 1):
+            unseen_s = float(np.nan_to_num(event.row["duration_s"]))
+            before_s = (bounds[k] - bounds[k - 1]) / NS_PER_S - unseen_s
+            event.weight_s = max(min(before_s, (bounds[k + 1] - bounds[k]) / NS_PER_S), 0.0)
+
+
+def most_important(channels: Sequence[ChannelEvents], most: int) -> list[list[IdentityEvent]]:
+    """The events of each channel with the largest weights, ordered by time.
+
+    They are ``most`` together, with as many of each channel as possible.
+    """
+    ranked = [sorted(channel.events, key=lambda m: (-m.weight_s, m.t_ns)) for channel in channels]
+    shares = [0] * len(ranked)
+    while sum(shares) < most and any(share < len(part) for share, part in zip(shares, ranked, strict=True)):
+        open_ones = [k for k, part in enumerate(ranked) if shares[k] < len(part)]
+        shares[min(open_ones, key=lambda k: shares[k])] += 1
+    return [sorted(part[:share], key=lambda m: m.t_ns) for part, share in zip(ranked, shares, strict=True)]
+
+
+def add_thumbnails(events: Sequence[IdentityEvent], tracks: Sequence[Frame], pictures: Pictures, start_ns: int) -> None:
+    """Add thumbnails: the last picture before the event, and the picture of the event.
+
+    Events without a position in the picture get none. Raises McaptrackError for damaged pictures.
+    """
+    rows, t_ns = rows_by_track(tracks)
+    wanted: dict[int, list[tuple[IdentityEvent, bool, Any, Floats]]] = {}
+    for event in events:
+        event_row = event.row
+        is_join = int(event_row["kind"]) == EventKind.JOINED
+        # Seconds are rounded: a microsecond earlier is still after the previous frame.
+        unseen_ns = seconds_to_ns(float(np.nan_to_num(event_row["duration_s"]))) + 1000
+        old = _row_at(rows, t_ns, int(event_row["track_id" if is_join else "previous_id"]), event.t_ns - unseen_ns)
+        new = _row_at(rows, t_ns, int(event_row["track_id"]), event.t_ns)
+        region = _region([found[1] for found in (old, new) if found], event_row)
+        if region is None or not len(pictures.t_ns):
+            continue
+        usual_ns = seconds_to_ns(frame_interval_s(tracks))
+        before_ns = old[0] if old else event.t_ns - usual_ns
+        for at_ns, found, is_after in ((before_ns, old, False), (event.t_ns, new, True)):
+            number = max(int(np.searchsorted(pictures.t_ns, at_ns, "right")) - 1, 0)
+            wanted.setdefault(number, []).append((event, is_after, found[1] if found else None, region))
+    for frame in pictures.frames(wanted):
+        image = np.asarray(frame.rows, np.uint8)
+        for event, is_after, row, region in wanted[frame.index]:
+            thumbnail = _crop(image, region, (frame.t_ns - start_ns) / NS_PER_S, row, _label(event.row, is_after))
+            if is_after:
+                event.after = thumbnail
+            else:
+                event.before = thumbnail
+
+
+def _label(event_row: Any, is_after: bool) -> int:
+    """The id printed at the box: that of the tracker where re-tracking joined tracks, otherwise that of the track."""
+    if not is_after:
+        return int(event_row["previous_id"])
+    return int(event_row["source_id" if int(event_row["kind"]) == EventKind.JOINED else "track_id"])
+
+
+def _row_at(rows: Rows, t_ns: Ints, track_id: int, until_ns: int) -> tuple[int, Any] | None:
+    """Time and row of a track's last row up to a time; rows are ordered by track and time."""
+    low, high = (
+        np.searchsorted(rows["track_id"], track_id, "left"),
+        np.searchsorted(rows["track_id"], track_id, "right"),
+    )
+    at = int(low + np.searchsorted(t_ns[low:high], until_ns, "right")) - 1
+    return (int(t_ns[at]), rows[at]) if at >= low else None
+
+
+def _region(rows: Sequence[Any], event_row: Any) -> Floats | None:
+    """The square (x, y, side) around an event, in pixels; None if its position is not known."""
+    boxes = np.array([[row["x_px"], row["y_px"], row["w_px"], row["h_px"]] for row in rows], float).reshape(-1, 4)
+    boxes = boxes[np.isfinite(boxes).all(axis=1)]
+    place = np.array([event_row["x_px"], event_row["y_px"]], float)
+    corners = np.concatenate([boxes[:, :2], boxes[:, :2] + boxes[:, 2:]])
+    if np.isfinite(place).all():
+        corners = np.concatenate([corners, place[None]])
+    if not len(corners):
+        return None
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    person = float(boxes[:, 3].max()) if len(boxes) else _LEAST_PX / _ROOM
+    side = max(_ROOM * person, float((high - low).max()) * 1.2, _LEAST_PX)
+    return np.array([*((low + high - side) / 2), side])
+
+
+def _crop(image: NDArray[np.uint8], region: Floats, at_s: float, row: Any, label: int) -> Thumbnail | None:
+    """The square of a picture, moved inside at its border; None if it lies outside."""
+    import cv2
+
+    height, width = image.shape[:2]
+    side = int(min(region[2], width, height))
+    x, y = (int(np.clip(at, 0, most - side)) for at, most in zip(region[:2], (width, height), strict=True))
+    piece = image[y : y + side, x : x + side]
+    if side < 2:
+        return None
+    smooth = cv2.INTER_AREA if side > SIDE_PX else cv2.INTER_CUBIC
+    small = np.asarray(cv2.resize(piece, (SIDE_PX, SIDE_PX), interpolation=smooth), np.uint8)
+    box = None
+    if row is not None and np.isfinite([row["x_px"], row["y_px"], row["w_px"], row["h_px"]]).all():
+        scale = SIDE_PX / side
+        left, top = (float(row["x_px"]) - x) * scale, (float(row["y_px"]) - y) * scale
+        xywh = (left, top, float(row["w_px"]) * scale, float(row["h_px"]) * scale)
+        box = MarkedBox(xywh, int(row["track_id"]), label)
+    return Thumbnail(encode_image(small, "jpeg", _QUALITY), at_s, box)

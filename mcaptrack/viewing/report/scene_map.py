@@ -1,0 +1,178 @@
+"""Tracks over a picture of their scene, or on the plain ground if there is none, as coordinates for the templates.
+
+Letters: P points.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from mcaptrack.foxglove.colours import COUNT as COLOURS
+from mcaptrack.geometry.arrays import Floats, Image, Ints
+from mcaptrack.geometry.boxes import columns_to_boxes
+from mcaptrack.geometry.clocks import NS_PER_S
+from mcaptrack.geometry.plane import GroundPlane
+from mcaptrack.geometry.ragged import run_ends, run_starts
+from mcaptrack.schema import Frame, Rows
+from mcaptrack.sources.pictures import Pictures
+from mcaptrack.sources.video import encode_image
+from mcaptrack.viewing.report.charts import round_step
+from mcaptrack.viewing.report.formatting import number
+from mcaptrack.viewing.report.statistics import rows_by_track
+
+#: The background is the median of this many pictures, spread over the log: people who move vanish from it.
+_PICTURES: Final = 9
+_WIDTH_PX: Final = 800
+_QUALITY: Final = 72
+#: The largest number of points of a map, so that the page stays small.
+_MAX_POINTS: Final = 6000
+_MARGIN: Final = 14
+#: Above this number of tracks, lines are joined by colour and do not name their track.
+_MAX_NAMED: Final = 600
+#: The largest width and height of a map of the ground.
+_GROUND: Final = (460, 520)
+
+
+class Background(NamedTuple):
+    """A picture in JPEG to draw tracks on; ``scale`` converts pixels of the camera to pixels of this picture."""
+
+    jpeg: bytes
+    width: int
+    height: int
+    scale: float
+
+
+class TrackPath(NamedTuple):
+    """The path of a track: points (P, 2) in pixels or metres, and the log times in s of the first and the last."""
+
+    track_id: int
+    points: Floats
+    first_s: float
+    last_s: float
+
+
+def background_picture(pictures: Pictures) -> Background | None:
+    """The scene without moving people; None without pictures. Raises McaptrackError for damaged pictures."""
+    import cv2
+
+    count = len(pictures.t_ns)
+    numbers = np.unique(np.linspace(0, count - 1, min(count, _PICTURES)).round().astype(int)).tolist() if count else []
+    seen: list[Image] = []
+    scale = 1.0
+    for frame in pictures.frames(numbers):
+        high, wide = frame.rows.shape[:2]
+        scale = min(1.0, _WIDTH_PX / wide) if not seen else scale
+        size = (max(1, round(wide * scale)), max(1, round(high * scale)))
+        small = np.asarray(cv2.resize(frame.rows, size, interpolation=cv2.INTER_AREA), np.uint8)
+        if not seen or small.shape == seen[0].shape:
+            seen.append(small)
+    if not seen:
+        return None
+    still = np.median(np.stack(seen), axis=0)
+    # Grey and with less contrast, so that only tracks have colours.
+    grey = 0.55 * (still @ [0.114, 0.587, 0.299]) + 70
+    image = np.repeat(np.rint(grey).astype(np.uint8)[..., None], 3, axis=2)
+    return Background(encode_image(image, "jpeg", _QUALITY), image.shape[1], image.shape[0], scale)
+
+
+def pixel_paths(frames: Sequence[Frame], plane: GroundPlane | None) -> list[TrackPath]:
+    """The paths of tracks in the picture: the points of their boxes that touch the ground, in pixels."""
+    rows, t_ns = rows_by_track(frames)
+    boxes = columns_to_boxes(rows)
+    at = boxes[:, :2] + boxes[:, 2:] * [0.5, 0.5 if plane and plane.point == "center" else 1.0]
+    unseen = ~np.isfinite(at).all(axis=1)
+    if plane is not None and unseen.any():
+        at[unseen] = plane.metres_to_pixels(np.stack([rows["x_m"], rows["y_m"]], axis=-1)[unseen])
+    return _split(rows, t_ns, at)
+
+
+def ground_paths(frames: Sequence[Frame]) -> list[TrackPath]:
+    """The paths of tracks on the ground, in metres."""
+    rows, t_ns = rows_by_track(frames)
+    return _split(rows, t_ns, np.stack([rows["x_m"], rows["y_m"]], axis=-1))
+
+
+def _split(rows: Rows, t_ns: Ints, at: Floats) -> list[TrackPath]:
+    known = np.isfinite(at).all(axis=1)
+    rows, t_ns, at = rows[known], t_ns[known], at[known]
+    starts = run_starts(rows["track_id"])
+    spans = zip(np.flatnonzero(starts).tolist(), np.flatnonzero(run_ends(starts)).tolist(), strict=True)
+    return [
+        TrackPath(int(rows["track_id"][a]), at[a : b + 1], t_ns[a] / NS_PER_S, t_ns[b] / NS_PER_S) for a, b in spans
+    ]
+
+
+def simplified(paths: Sequence[Floats], tolerance: float) -> list[Floats]:
+    """Paths with fewer points, within ``tolerance`` of the given ones, or more if there are still too many points."""
+    while True:
+        out = [_simplified(path, tolerance) for path in paths]
+        if sum(map(len, out)) <= max(_MAX_POINTS, 2 * len(paths)) or tolerance > 1e4:
+            return out
+        tolerance *= 1.5
+
+
+def _simplified(path: Floats, tolerance: float) -> Floats:
+    import cv2
+
+    kept = cv2.approxPolyDP(path.astype(np.float32)[:, None], tolerance, False)[:, 0].astype(np.float64)
+    # OpenCV takes a line that returns to its start for a closed one, and drops the last point.
+    return kept if (kept[-1] == path[-1].astype(np.float32)).all() else np.concatenate([kept, path[-1:]])
+
+
+def picture_map(paths: Sequence[TrackPath], behind: Background, start_s: float) -> dict[str, Any]:
+    """The values of a map over the picture."""
+    low, high = np.array([-0.5, -0.5]) * behind.width, np.array([1.5, 1.5]) * behind.width
+    points = [np.clip(path.points * behind.scale, low, high) for path in paths]
+    return {"width": behind.width, "height": behind.height, **_lines(paths, simplified(points, 1.0), start_s)}
+
+
+def ground_map(paths: Sequence[TrackPath], span: tuple[Floats, Floats], start_s: float) -> dict[str, Any]:
+    """The values of a map of the ground between two corners in metres; the second axis points up."""
+    low, high = span
+    size = np.maximum(high - low, 1e-6)
+    scale = float(((np.array(_GROUND) - 2 * _MARGIN) / size).min())
+    width, height = (size * scale + 2 * _MARGIN).round().astype(int).tolist()
+    points = [(path.points - low) * [scale, -scale] + [_MARGIN, height - _MARGIN] for path in paths]
+    bar_m = round_step(float(size.max()) / 6)
+    return {
+        "width": width, "height": height, "view_width": _GROUND[0], "left": _MARGIN,
+        "bar_end": f"{_MARGIN + bar_m * scale:.1f}", "bar_label_x": f"{_MARGIN + bar_m * scale + 6:.1f}",
+        "bar_label": f"{bar_m:g} m", **_lines(paths, simplified(points, 0.5), start_s),
+    }  # fmt: skip
+
+
+def ground_span(all_points: Sequence[Floats]) -> tuple[Floats, Floats]:
+    """The corners of the ground that hold nearly all points."""
+    points = np.concatenate([np.zeros((0, 2)), *all_points])
+    if not len(points):
+        return np.zeros(2), np.ones(2)
+    low, high = np.percentile(points, [0.5, 99.5], axis=0)
+    return low, np.maximum(high, low + 1e-3)
+
+
+def _lines(paths: Sequence[TrackPath], drawn: Sequence[Floats], start_s: float) -> dict[str, Any]:
+    """``halo``: all lines as one, drawn dark below the others, so that any colour is seen on any ground; ``tracks``."""
+    ways = [_way(points) for points in drawn]
+    tracks = []
+    if len(paths) > _MAX_NAMED:
+        colours = [path.track_id % COLOURS for path in paths]
+        for colour in sorted(set(colours)):
+            joined = "".join(way for way, own in zip(ways, colours, strict=True) if own == colour)
+            tracks.append({"way": joined, "colour": colour, "title": ""})
+    else:
+        for path, way in zip(paths, ways, strict=True):
+            seconds = f"{number(path.first_s - start_s, 1)} to {number(path.last_s - start_s, 1, 's')}"
+            colour = path.track_id % COLOURS
+            tracks.append({"way": way, "colour": colour, "title": f"{path.track_id}: {seconds}"})
+    return {"halo": "".join(ways), "tracks": tracks}
+
+
+def _way(points: Floats) -> str:
+    """The data of an SVG path through points (P, 2), rounded to whole pixels."""
+    at = np.rint(points).astype(int)
+    kept = at[np.append(True, (np.diff(at, axis=0) != 0).any(axis=1))]
+    steps = np.diff(kept, axis=0, prepend=kept[:1] * 0).tolist()
+    return "M" + "l".join(f"{x} {y}" for x, y in steps) + ("h0" if len(steps) == 1 else "")

@@ -1,0 +1,129 @@
+"""The top of the page: how many identities tracking and re-tracking kept, in a sentence and a few numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from mcaptrack.errors import command
+from mcaptrack.evaluation import EvaluationRow, combined
+from mcaptrack.evaluation.metrics import summary
+from mcaptrack.viewing.report.contents import LogReport, result_of
+from mcaptrack.viewing.report.formatting import counted, number, percent, times
+
+#: The rules of the summary; the first by which tracks can be scored.
+_RULES = (("metres", 1.0), ("iou", 0.5))
+
+
+class BeforeAfter(NamedTuple):
+    """Tracking and re-tracking, scored by one rule; either may be missing."""
+
+    rule: tuple[str, float]
+    tracked: EvaluationRow | None
+    retracked: EvaluationRow | None
+
+    def values(self, name: str) -> list[float]:
+        """A score of those that exist."""
+        return [summary(row.score)[name] for row in (self.tracked, self.retracked) if row is not None]
+
+
+def rule_text(similarity: str, gate: float) -> str:
+    """A rule in words."""
+    return f"within {gate:g} m on the ground" if similarity == "metres" else f"by overlap of boxes of at least {gate:g}"
+
+
+def before_after(report: LogReport, results: Sequence[EvaluationRow]) -> BeforeAfter | None:
+    """The scores that the summary compares: before and after re-tracking, at the prediction rate if possible."""
+    for similarity, gate in _RULES:
+        found = {
+            role: result_of(results, one.topic, similarity, gate)
+            for role, one in report.track_sets.items()
+            if role in ("samples", "tracks", "offline", "online")
+        }
+        tracked = found.get("samples") or found.get("tracks")
+        retracked = found.get("offline") or found.get("online")
+        if tracked or retracked:
+            return BeforeAfter((similarity, gate), tracked, retracked)
+    return None
+
+
+def combined_results(reports: Sequence[LogReport]) -> list[EvaluationRow]:
+    """The scores of all logs together, if several have any."""
+    scored = [report for report in reports if report.results]
+    return combined([result for report in scored for result in report.results]) if len(scored) > 1 else []
+
+
+def summarize(reports: Sequence[LogReport]) -> dict[str, Any]:
+    """The text and the tiles of the summary."""
+    scored = [report for report in reports if report.results]
+    found = before_after(scored[0], combined_results(reports) or scored[0].results) if scored else None
+    if found is None:
+        return {"text": _without_ground_truth(reports), "tiles": []}
+    return {"text": _with_ground_truth(reports, scored, found), "tiles": _tiles(found)}
+
+
+def _with_ground_truth(reports: Sequence[LogReport], scored: Sequence[LogReport], found: BeforeAfter) -> str:
+    names = {one.track_sets["tracks"].name for one in scored if "tracks" in one.track_sets}
+    name = names.pop() if len(names) == 1 and "tracks" in scored[0].track_sets else "the tracker"
+    name = "the tracks as given" if name == "tracks as given" else name
+    switches = [times(int(value)) for value in found.values("IDSW")]
+    where = ""
+    if 1 < len(reports) == len(scored):
+        where = f"in {'both' if len(reports) == 2 else f'all {len(reports)}'} logs together, "
+    elif len(reports) > 1:
+        where = f"in {counted(len(scored), 'log')} with ground truth, "
+    if found.tracked and found.retracked:
+        text = f"{where}{name} switched identities {switches[0]}, re-tracking {switches[1]}."
+    elif found.tracked:
+        text = f"{where}{name} switched identities {switches[0]}; nothing has been re-tracked yet."
+    else:
+        text = f"{where}re-tracked, identities switched {switches[0]}."
+    rate = ", at the prediction rate" if "samples" in scored[0].track_sets else ""
+    return f"{text[0].upper()}{text[1:]} Counted {rule_text(*found.rule)}{rate}."
+
+
+def _without_ground_truth(reports: Sequence[LogReport]) -> str:
+    if not any(report.data["messages"] for report in reports):
+        return "There is nothing in here yet: no messages at all."
+    tracks = [one for report in reports for one in report.data["tracks"] if one["role"] != "truth"]
+    if not tracks:
+        run = command("run", *(Path(report.file) for report in reports))
+        return f"This log has no tracks yet; {run} makes them."
+
+    def total(role: str) -> int:
+        return sum(one["tracks"] for one in tracks if one["role"] == role)
+
+    text = f"Tracking found {counted(total('tracks'), 'track')}"
+    offline = {report.track_sets["offline"].topic for report in reports if "offline" in report.track_sets}
+    if offline:
+        events = [one for report in reports for one in report.data["events"] if one["topic"] in offline]
+        joined = sum(one["counts"]["joined"] for one in events)
+        text += (
+            f"; re-tracked there are {number(total('offline'))}, and "
+            f"{counted(joined, 'gap or mix-up', 'gaps and mix-ups')} {'was' if joined == 1 else 'were'} repaired by "
+            "joining"
+        )
+    return f"{text}. How right they are can't be said without ground truth."
+
+
+def _tiles(found: BeforeAfter) -> list[dict[str, str]]:
+    def change(name: str, is_share: bool) -> str:
+        values = [number(100 * value, 1) if is_share else number(int(value)) for value in found.values(name)]
+        return "\N{NO-BREAK SPACE}→ ".join(values) + ("\N{NO-BREAK SPACE}%" if is_share else "")
+
+    note = "before → after re-tracking" if found.tracked and found.retracked else ""
+    tiles = [
+        {"label": label, "value": change(name, is_share), "note": note}
+        for label, name, is_share in (
+            ("identity switches", "IDSW", False),
+            ("identities kept (IDF1)", "IDF1", True),
+            ("accuracy (MOTA)", "MOTA", True),
+            ("HOTA", "HOTA", True),
+        )
+    ]
+    if found.tracked and found.tracked.displacement:
+        errors = found.tracked.displacement.summary()
+        recall = f"at recall {percent(errors['recall'], 0)}"
+        tiles.append({"label": "forecast error (ADE)", "value": number(errors["ADE_m"], 2, "m"), "note": recall})
+    return tiles
