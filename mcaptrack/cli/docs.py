@@ -66,8 +66,8 @@ def documentation() -> dict[str, Path]:
     """The pages by name: inside the installed package, or beside it in a checkout."""
     package = Path(__file__).resolve().parent.parent
     inside = package / "docs"
-    folders = [inside] if inside.is_dir() else [package.parent, package.parent / "docs"]
-    shown = [path for folder in folders for path in sorted(folder.glob("*.md")) if path.stem != "ARCHITECTURE"]
+    beside = [path for path in package.parent.glob("*.md") if path.stem in ("README", "CHANGELOG")]
+    shown = inside.glob("*.md") if inside.is_dir() else [*beside, *(package.parent / "docs").glob("*.md")]
     return {
         path.stem.lower(): path for path in sorted(shown, key=lambda path: (path.stem != "README", path.stem.lower()))
     }

@@ -1,0 +1,134 @@
+"""What a repository has beside its code: how to contribute, to cite and to report, and what runs for every change."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from mcaptrack import __version__
+
+ROOT = Path(__file__).parent.parent
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+PAGES = ("CONTRIBUTING.md", "CODE_OF_CONDUCT.md", "SECURITY.md")
+HOME = PROJECT["urls"]["Homepage"]
+PYTHONS = {line.rpartition(" ")[2] for line in PROJECT["classifiers"] if re.search(r"Python :: 3\.\d", line)}
+#: The classifier of each system that runs in the workflow.
+SYSTEMS = {"ubuntu": "POSIX :: Linux", "macos": "MacOS", "windows": "Microsoft :: Windows"}
+
+
+def parsed(name: str) -> Any:
+    return yaml.safe_load((ROOT / name).read_text())
+
+
+@pytest.fixture(scope="module")
+def jobs() -> dict[str, Any]:
+    return parsed(".github/workflows/ci.yml")["jobs"]
+
+
+def steps(job: dict[str, Any]) -> list[str]:
+    return [step["run"] for step in job["steps"] if "run" in step]
+
+
+def checks_of_make() -> list[str]:
+    """The commands of ``make test`` after those that install."""
+    text = (ROOT / "Makefile").read_text()
+    return re.findall(r"^\t\$\(BIN\)/(.+)$", re.search(r"^test:.*\n((?:\t.*\n)+)", text, re.M)[1], re.M)
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_links_and_files_that_pages_name_exist(page):
+    text = (ROOT / page).read_text()
+    for target in re.findall(r"\]\(([^)]+)\)", text):
+        assert target.startswith("https://") or (ROOT / target).exists(), target
+    for path in re.findall(r"`((?:mcaptrack|tests|tools|docs|\.github)/[\w./-]*|\w+\.(?:md|toml|txt|cff))`", text):
+        assert (ROOT / path).exists() or path == "mcaptrack.toml", path
+    targets = set(re.findall(r"^(\w+):", (ROOT / "Makefile").read_text(), re.M))
+    assert set(re.findall(r"\bmake (\w+)[`\n]", text)) <= targets
+
+
+def test_security_names_the_line_of_releases_that_there_is_and_limits_that_exist():
+    from mcaptrack.environment import VARIABLES
+
+    text = (ROOT / "SECURITY.md").read_text()
+    assert f"| {'.'.join(__version__.split('.')[:2])}.x | yes |" in text
+    assert set(re.findall(r"MCAPTRACK_\w+", text)) <= set(VARIABLES)
+
+
+def test_the_citation_is_of_this_version_and_names_the_paper():
+    said = parsed("CITATION.cff")
+    assert {"cff-version", "message", "title", "authors"} <= set(said)  # what the format requires
+    assert said["version"] == __version__
+    assert ("date-released" in said) == (".dev" not in __version__)
+    assert (said["title"], said["license"]) == (PROJECT["name"], PROJECT["license"])
+    assert said["repository-code"] == PROJECT["urls"]["Repository"]
+    assert [author["name"] for author in said["authors"]] == [author["name"] for author in PROJECT["authors"]]
+    (paper,) = said["references"]
+    assert (paper["title"], paper["year"]) == ("Towards Robust Human Trajectory Prediction in Raw Videos", 2021)
+    assert [author["family-names"] for author in paper["authors"]] == ["Yu", "Zhou"]
+
+
+def test_the_date_of_a_release_is_the_same_in_the_changelog_and_in_the_citation():
+    if ".dev" in __version__:
+        pytest.skip("this is no release")
+    date = parsed("CITATION.cff")["date-released"]
+    assert f"## {__version__} ({date})\n" in (ROOT / "CHANGELOG.md").read_text()
+
+
+def test_the_pythons_and_systems_that_are_claimed_are_those_that_have_to_pass(jobs):
+    matrix = jobs["tests"]["strategy"]["matrix"]
+    assert set(matrix["python"]) == PYTHONS
+    claimed = {line.partition(":: ")[2] for line in PROJECT["classifiers"] if line.startswith("Operating System")}
+    assert {SYSTEMS[name.partition("-")[0]] for name in matrix["os"]} == claimed
+    # Whatever is only tried may fail; it isn't claimed.
+    for one in matrix["include"]:
+        assert one["tried"], one
+        assert one["python"] not in PYTHONS or one["os"] not in matrix["os"], one
+    assert jobs["tests"]["continue-on-error"] == "${{ matrix.tried || false }}"
+    assert set(jobs["installs"]["strategy"]["matrix"]["python"]) == PYTHONS
+    assert min(PYTHONS, key=lambda name: int(name[2:])) == PROJECT["requires-python"].removeprefix(">=")
+
+
+def test_the_workflow_checks_what_make_test_checks(jobs):
+    run = [re.sub(r"^(?:python -m )?", "", command) for command in steps(jobs["tests"])]
+    assert checks_of_make() == [command for command in run if not command.startswith("pip ")]
+    assert 'pip install --editable ".[test]"' in run
+    assert steps(jobs["make"]) == ["make demo", "make test"]
+
+
+def test_newest_and_lowest_releases_are_installed_by_the_tool_that_takes_the_bounds_from_pyproject(jobs):
+    (command,) = steps(jobs["installs"])
+    assert set(jobs["installs"]["strategy"]["matrix"]["releases"]) == {"newest", "lowest"}
+    assert command.startswith("python tools/installs.py --only ${{ matrix.releases }} --pythons ${{ matrix.python }}")
+    tool = (ROOT / "tools" / "installs.py").read_text()
+    # There is no second list of lowest releases that could differ from the lower bounds.
+    assert '"--resolution", "lowest-direct"' in tool
+    assert 'PROJECT["dependencies"]' in tool
+
+
+def test_the_hooks_are_the_checks_of_make_test_in_its_versions():
+    (local,) = parsed(".pre-commit-config.yaml")["repos"]
+    assert local["repo"] == "local"
+    entries = [hook["entry"].replace(" --force-exclude", "") for hook in local["hooks"]]
+    wanted = [command.replace(" --check", "") for command in checks_of_make() if not command.startswith("pytest")]
+    assert entries == [f".venv/bin/{command}" for command in wanted]
+    assert all(hook["language"] == "system" for hook in local["hooks"])
+
+
+@pytest.mark.parametrize(
+    "path", sorted((ROOT / ".github" / "ISSUE_TEMPLATE").glob("*.yml")), ids=lambda path: path.stem
+)
+def test_issue_templates_are_forms(path):
+    form = yaml.safe_load(path.read_text())
+    if path.stem == "config":
+        assert all(link["url"].startswith(HOME) for link in form["contact_links"])
+        return
+    assert {"name", "description", "body"} <= set(form)
+    names = [part["id"] for part in form["body"]]
+    assert len(names) == len(set(names))
+    assert all(part["type"] == "textarea" and part["attributes"]["label"] for part in form["body"])
+    assert any(part.get("validations", {}).get("required") for part in form["body"])
