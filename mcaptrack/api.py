@@ -26,7 +26,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import Frame
 from mcaptrack.sources import foreign
 from mcaptrack.sources.pictures import Pictures
-from mcaptrack.sources.video import brightness, colours
+from mcaptrack.sources.video import decode_bgr, decode_gray
 from mcaptrack.tables import export
 
 if TYPE_CHECKING:
@@ -176,7 +176,7 @@ class Recording:
         return dict(zip(numbers.tolist(), counts.tolist(), strict=True))
 
     def _decoded(self, topic: str, wanted: Mapping[int, int] | None, colour: Colour) -> Iterator[Frame]:
-        pixels = brightness if colour == "grey" else colours
+        pixels = decode_gray if colour == "grey" else decode_bgr
         found = Pictures(self._log, topic)
         for frame in found.frames(range(len(found.t_ns)) if wanted is None else wanted, pixels):
             yield frame._replace(rows=frame.rows[..., ::-1]) if colour == "rgb" else frame

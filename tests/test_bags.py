@@ -26,7 +26,7 @@ from mcaptrack import log
 from mcaptrack.cli import app
 from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import GROUND_PLANE, TRACKS
-from mcaptrack.schema.ground import rows_to_plane
+from mcaptrack.schema.ground_plane import rows_to_plane
 from mcaptrack.sources.ingest import IngestOptions, ingest
 
 T0 = 1_700_000_000_123_456_789

@@ -47,7 +47,7 @@ def some_logs(folder: Path) -> Iterator[tuple[str, bytes]]:
         yield name, path.read_bytes()
 
 
-def kinds_of(checked: log.Checked) -> set[str]:
+def kinds_of(checked: log.CheckResult) -> set[str]:
     return {found.kind for found in checked.findings if found.level == "error"}
 
 

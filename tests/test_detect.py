@@ -9,21 +9,21 @@ from mcaptrack.geometry.assignment import assign
 from mcaptrack.geometry.boxes import columns_to_boxes, iou
 from mcaptrack.geometry.clocks import FrameClock
 from mcaptrack.schema import Frame
-from mcaptrack.sources.scene import Scene
+from mcaptrack.sources.synthetic import SyntheticScene
 from mcaptrack.transforms.detect import Detect, _PersonSize
 from mcaptrack.transforms.detect.foreground import FrameDifference
 from mcaptrack.transforms.detect.motion import CameraMotion
 from tests.worlds import ns, small_scene
 
 
-def footage(scene: Scene) -> tuple[list[Frame], list[np.ndarray]]:
+def footage(scene: SyntheticScene) -> tuple[list[Frame], list[np.ndarray]]:
     """The brightness of a scene's pictures, and the true boxes in each."""
     shots = list(scene.shots())
     frames = [Frame(ns(shot.seconds), n, shot.image.mean(axis=2).astype(np.uint8)) for n, shot in enumerate(shots)]
     return frames, [shot.boxes for shot in shots]
 
 
-def found(detect: Detect, scene: Scene, from_frame: int = 15) -> tuple[float, float]:
+def found(detect: Detect, scene: SyntheticScene, from_frame: int = 15) -> tuple[float, float]:
     """Recall and precision at an overlap of 0.5, once the background is known."""
     frames, truth = footage(scene)
     hits = boxes = people = 0

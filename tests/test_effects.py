@@ -21,7 +21,7 @@ from typing import NamedTuple
 import pytest
 
 from mcaptrack import log
-from mcaptrack.sources import scene
+from mcaptrack.sources import synthetic
 from mcaptrack.transforms import ALTERNATIVES, TRANSFORMS
 from mcaptrack.viewing.serving import Server
 from tests.commands import GROUP, called, done, made_log
@@ -272,8 +272,8 @@ def _add_channels_of_others(path: Path) -> None:
 @pytest.fixture
 def see(template, tmp_path, monkeypatch) -> Callable[[str], Seen]:
     """Run a command line in a fresh copy of the template."""
-    monkeypatch.setitem(scene.SCENES, "square", lambda seed: small_scene(2.0, seed=seed))
-    monkeypatch.setitem(scene.SCENES, "crowd", lambda seed: small_scene(1.0, seed=seed))
+    monkeypatch.setitem(synthetic.SCENES, "square", lambda seed: small_scene(2.0, seed=seed))
+    monkeypatch.setitem(synthetic.SCENES, "crowd", lambda seed: small_scene(1.0, seed=seed))
     monkeypatch.setattr(Server, "serve_forever", _interrupted)
     monkeypatch.setattr(secrets, "token_urlsafe", lambda _: "secret")
     monkeypatch.setattr(webbrowser, "open", lambda address: print(f"opened {address}"))

@@ -19,7 +19,7 @@ from mcaptrack.cli import app
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import DETECTIONS, GROUND_PLANE, TRACKS, Frame
-from mcaptrack.schema.ground import plane_to_rows
+from mcaptrack.schema.ground_plane import plane_to_rows
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.tables.export import Contents, export, recording_name, topic_folder
 from tests.worlds import boxes_at, ns, tracks_at

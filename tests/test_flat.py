@@ -16,8 +16,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 import mcaptrack
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
-from mcaptrack.sources.foreign import Kind
-from mcaptrack.sources.foreign.flat import flattener
+from mcaptrack.sources.foreign import MessageType
+from mcaptrack.sources.foreign.flatten import flattener
 
 PROTO = """
 syntax = "proto3";
@@ -236,7 +236,7 @@ def test_whatever_json_holds_becomes_a_table(tmp_path_factory, values):
 def test_any_bytes_are_a_message_or_a_fault_in_one_line(state, payload, encoding):
     schema = {"protobuf": state[1], "json": b"", "ros1": ROS1_IMU.encode(), "cdr": b"float64[] x\nstring s"}[encoding]
     name = {"protobuf": "robot.State", "json": "", "ros1": "robot/Imu", "cdr": "robot/msg/S"}[encoding]
-    read = flattener(Kind(name, {"ros1": "ros1msg", "cdr": "ros2msg"}.get(encoding, encoding), schema, encoding))
+    read = flattener(MessageType(name, {"ros1": "ros1msg", "cdr": "ros2msg"}.get(encoding, encoding), schema, encoding))
     try:
         assert isinstance(read(payload), dict)
     except McaptrackError as error:

@@ -18,8 +18,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from mcaptrack import foxglove
 from mcaptrack.errors import McaptrackError
-from mcaptrack.sources.foreign import Classes, Kind, boxes_decoder, picture_decoder
-from mcaptrack.sources.video import RAW_ENCODINGS, Encoded, Layout, brightness
+from mcaptrack.sources.foreign import Classes, MessageType, boxes_decoder, picture_decoder
+from mcaptrack.sources.video import RAW_ENCODINGS, EncodedPicture, PixelLayout, decode_gray
 
 STAMP_NS = 1_700_000_000_123_456_789
 SEC, NSEC = divmod(STAMP_NS, 10**9)
@@ -102,7 +102,7 @@ class Ros:
             definition = self.store.generate_msgdef(self.types, ros_version=1 if ros1 else 2)[0]
         self.ros1, self.definition = ros1, definition
         encoding = ("ros1msg", "ros1") if ros1 else ("ros2msg", "cdr")
-        self.kind = Kind(name if ros1 else self.types, encoding[0], definition.encode(), encoding[1])
+        self.kind = MessageType(name if ros1 else self.types, encoding[0], definition.encode(), encoding[1])
 
     def new(self, name: str, *values, **named):
         return self.store.types["{}/msg/{}".format(*name.split("/"))](*values, **named)
@@ -120,7 +120,7 @@ def pixels(data: bytes) -> np.ndarray:
     return np.frombuffer(data, np.uint8)
 
 
-def ros_compressed(data: bytes, words: str, ros1: bool) -> tuple[Kind, bytes]:
+def ros_compressed(data: bytes, words: str, ros1: bool) -> tuple[MessageType, bytes]:
     ros = Ros("sensor_msgs/CompressedImage", ros1=ros1)
     message = ros.new("sensor_msgs/CompressedImage", ros.header(), words, pixels(data))
     return ros.kind, ros.pack(message)
@@ -134,7 +134,7 @@ def ros_raw(image: np.ndarray, encoding: str, ros1: bool, step: int | None = Non
     return ros.kind, ros.pack(message)
 
 
-def ros_foxglove(name: str, ros1: bool, *values) -> tuple[Kind, bytes]:
+def ros_foxglove(name: str, ros1: bool, *values) -> tuple[MessageType, bytes]:
     definition = FOXGLOVE[name].format(time="time" if ros1 else "builtin_interfaces/Time")
     if not ros1:
         definition += BAR + "MSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n"
@@ -143,13 +143,13 @@ def ros_foxglove(name: str, ros1: bool, *values) -> tuple[Kind, bytes]:
     return ros.kind, ros.pack(message)
 
 
-def proto(message, name: str) -> tuple[Kind, bytes]:
+def proto(message, name: str) -> tuple[MessageType, bytes]:
     message.timestamp.seconds, message.timestamp.nanos = SEC, NSEC
-    return Kind(*foxglove.schema_record(name), "protobuf"), message.SerializeToString()
+    return MessageType(*foxglove.schema_record(name), "protobuf"), message.SerializeToString()
 
 
-def as_json(name: str, **fields) -> tuple[Kind, bytes]:
-    return Kind(name, "jsonschema", b"{}", "json"), json.dumps(fields).encode()
+def as_json(name: str, **fields) -> tuple[MessageType, bytes]:
+    return MessageType(name, "jsonschema", b"{}", "json"), json.dumps(fields).encode()
 
 
 B64 = base64.b64encode(PNG).decode()
@@ -179,9 +179,9 @@ COMPRESSED = {
 }
 
 
-def bright(kind: Kind, payload: bytes) -> np.ndarray:
+def bright(kind: MessageType, payload: bytes) -> np.ndarray:
     picture = picture_decoder(kind)(payload)
-    (frame,) = brightness([Encoded(5, 0, picture.format, picture.data, picture.layout)])
+    (frame,) = decode_gray([EncodedPicture(5, 0, picture.format, picture.data, picture.layout)])
     assert (frame.t_ns, frame.index) == (5, 0)
     return frame.rows
 
@@ -235,15 +235,15 @@ class TestCompressed:
         with pytest.raises(
             McaptrackError, match=r"it holds std_msgs/msg/String, not pictures; foxglove\.CompressedVideo, .* are read"
         ):
-            picture_decoder(Kind("std_msgs/msg/String", "ros2msg", b"string data", "cdr"))
+            picture_decoder(MessageType("std_msgs/msg/String", "ros2msg", b"string data", "cdr"))
         with pytest.raises(
             McaptrackError, match="in the encoding 'flatbuffer' is not read; protobuf, json, ros1, cdr are"
         ):
-            picture_decoder(Kind("foxglove.RawImage", "flatbuffer", b"", "flatbuffer"))
+            picture_decoder(MessageType("foxglove.RawImage", "flatbuffer", b"", "flatbuffer"))
         with pytest.raises(McaptrackError, match="the log has no definition of it"):
-            picture_decoder(Kind("foxglove_msgs/msg/RawImage", "ros2msg", b"", "cdr"))
+            picture_decoder(MessageType("foxglove_msgs/msg/RawImage", "ros2msg", b"", "cdr"))
         with pytest.raises(McaptrackError, match="definition of it can't be understood"):
-            picture_decoder(Kind("sensor_msgs/msg/Image", "ros2msg", b"for while 3", "cdr"))
+            picture_decoder(MessageType("sensor_msgs/msg/Image", "ros2msg", b"for while 3", "cdr"))
         with pytest.raises(McaptrackError, match="depth in the format"):
             kind, payload = ros_compressed(PNG, "16UC1; compressedDepth png", False)
             picture_decoder(kind)(payload)
@@ -360,7 +360,7 @@ class TestRaw:
     )
     def test_whatever_pixels_are_they_are_shown_or_refused(self, encoding, data, size, big):
         try:
-            (frame,) = brightness([Encoded(0, 0, encoding, data, Layout(*size, big))])
+            (frame,) = decode_gray([EncodedPicture(0, 0, encoding, data, PixelLayout(*size, big))])
         except McaptrackError as error:
             assert "\n" not in str(error)
         else:
@@ -368,7 +368,7 @@ class TestRaw:
             assert frame.rows.dtype == np.uint8
 
 
-def vision(layout: str, boxes) -> tuple[Kind, bytes]:
+def vision(layout: str, boxes) -> tuple[MessageType, bytes]:
     """Boxes of (centre x, y, width, height, theta, [(id, score)])."""
     ros = Ros("vision_msgs/Detection2DArray", VISION[layout], ros1=layout == "ros1")
     point = ros.new("geometry_msgs/Point", 0.0, 0.0, 0.0)
@@ -445,10 +445,10 @@ class TestBoxes:
 
     def test_other_channels_are_refused(self):
         with pytest.raises(McaptrackError, match="it holds x, not detections; vision_msgs/Detection2DArray is read"):
-            boxes_decoder(Kind("x", "", b"", "json"), Classes())
+            boxes_decoder(MessageType("x", "", b"", "json"), Classes())
 
 
-def boxes(kind: Kind):
+def boxes(kind: MessageType):
     return boxes_decoder(kind, Classes())
 
 
@@ -518,7 +518,9 @@ class TestStrangers:
         for encoding in (("ros2msg", "cdr"), ("ros1msg", "ros1"), ("ros2idl", "cdr")):
             try:
                 decode = picture_decoder(
-                    Kind("foxglove_msgs/msg/RawImage", encoding[0], definition.encode("utf-8", "replace"), encoding[1])
+                    MessageType(
+                        "foxglove_msgs/msg/RawImage", encoding[0], definition.encode("utf-8", "replace"), encoding[1]
+                    )
                 )
             except McaptrackError as error:
                 assert "\n" not in str(error)

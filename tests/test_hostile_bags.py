@@ -19,8 +19,9 @@ import zstandard
 from mcap.reader import make_reader
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.sources.ingest import IngestOptions, ingest, plain_yaml
-from mcaptrack.sources.ingest import database as bag_database
+from mcaptrack.sources.ingest import IngestOptions, ingest
+from mcaptrack.sources.ingest.bags import plain_yaml
+from mcaptrack.sources.ingest.bags import sqlite_tables as bag_database
 from tests import bounded
 from tests.test_bags import ROS2, STRING1, database
 from tests.test_cli import start

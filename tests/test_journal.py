@@ -16,9 +16,9 @@ import pytest
 
 from mcaptrack import log, notices
 from mcaptrack.errors import McaptrackError
-from mcaptrack.log import journal, new_end
+from mcaptrack.log import in_place, journal
+from mcaptrack.log.byte_source import OpenFile
 from mcaptrack.log.journal import journal_of
-from mcaptrack.log.source import OpenFile
 from tests.test_log import SCHEMA, write_log
 from tests.test_log_interrupted import add_results, killed
 
@@ -44,7 +44,7 @@ def path(tmp_path) -> Path:
 def interrupt(path: Path) -> None:
     """Leave a log half written: killed in the middle of the second of several pieces."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(new_end, "_PIECE", 20_000)
+        patch.setattr(in_place, "_PIECE", 20_000)
         assert killed(lambda: add_results(path, 2, 200), 2, ["pwrite"])
     with notices.collected() as said, notices.listening(said.append), log.read(path):
         assert "was left half written" in said[0].message
@@ -236,7 +236,7 @@ def test_a_journal_that_fits_a_file_that_is_no_log_changes_nothing(tmp_path):
         journal_of(text).write_bytes(journal.pack_head(stream.fileno(), 100) + text.read_bytes()[100:])
         before = everything(tmp_path)
         with pytest.raises(McaptrackError, match="which is no MCAP file"):
-            new_end.settle(text, stream.fileno(), OpenFile.at(text))
+            in_place.settle(text, stream.fileno(), OpenFile.at(text))
     assert everything(tmp_path) == before
 
 

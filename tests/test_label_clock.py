@@ -31,9 +31,9 @@ from mcaptrack.geometry.clocks import FPS_RANGE
 from mcaptrack.schema import DETECTIONS, TRACKS
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.ingest import IngestOptions, ingest, label_frames
-from mcaptrack.sources.ingest.formats import READERS, Format, Role
-from mcaptrack.sources.ingest.labels import read_labels
-from mcaptrack.sources.ingest.timeline import Timeline
+from mcaptrack.sources.ingest.labels.formats import READERS, Format, Role
+from mcaptrack.sources.ingest.labels.reading import read_labels
+from mcaptrack.sources.ingest.labels.timeline import Timeline
 from mcaptrack.sources.video import H264Encoder
 from mcaptrack.sources.video.h264 import inspect
 from mcaptrack.tables.compared import compare_files, detections_and_truth

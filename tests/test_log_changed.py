@@ -14,7 +14,7 @@ from mcap.writer import CompressionType
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
-from mcaptrack.log import source
+from mcaptrack.log import byte_source
 from mcaptrack.schema import TRACKS
 from tests.test_log import write_stock
 from tests.worlds import tracks_at
@@ -79,7 +79,9 @@ def test_a_change_before_any_read_gives_the_old_content_the_new_one_or_an_error(
     tmp_path, monkeypatch, kind, change, look
 ):
     for name in ("BLOCK", "_LEAST_AHEAD", "_MOST_AHEAD"):
-        monkeypatch.setattr(source, name, 150)  # many small reads, so that the change comes between any two records
+        monkeypatch.setattr(
+            byte_source, name, 150
+        )  # many small reads, so that the change comes between any two records
     path = tmp_path / "a.mcap"
     new = write_value(path, 2, **KINDS[kind])
     wanted = [look(path)]

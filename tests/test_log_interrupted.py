@@ -15,7 +15,7 @@ import pytest
 
 from mcaptrack import log, notices
 from mcaptrack.errors import McaptrackError
-from mcaptrack.log import new_end
+from mcaptrack.log import in_place
 from mcaptrack.log.journal import journal_of
 from tests.test_log import write_stock
 from tests.test_log_in_place import SCHEMA, contents
@@ -98,8 +98,8 @@ def change(request, tmp_path_factory) -> Change:
 
 @pytest.fixture
 def path(tmp_path, tmp_path_factory, monkeypatch, change) -> Path:
-    monkeypatch.setattr(new_end, "_PIECE", 100_000)
-    monkeypatch.setattr(new_end, "_BLOCK", 200_000)
+    monkeypatch.setattr(in_place, "_PIECE", 100_000)
+    monkeypatch.setattr(in_place, "_BLOCK", 200_000)
     path = tmp_path / "a.mcap"
     path.write_bytes(change.old)
     if change.make is add_to_irregular:

@@ -10,7 +10,7 @@ import pytest
 
 from mcaptrack import log, notices
 from mcaptrack.files import can_replace, publish_bytes
-from mcaptrack.log import new_end
+from mcaptrack.log import in_place
 from mcaptrack.log.journal import journal_of
 from tests.test_log import SCHEMA, SOME, STOCK_OPTIONS, our_messages, write_log, write_stock
 from tests.test_log_interrupted import killed
@@ -117,7 +117,7 @@ def test_where_the_owner_cant_be_kept_the_file_stays_the_same_one(path, monkeypa
     if AS_ROOT:
         os.chown(path, other, -1)
     else:
-        monkeypatch.setattr("mcaptrack.log.change.can_replace", lambda _: False)
+        monkeypatch.setattr("mcaptrack.log.extend.can_replace", lambda _: False)
     monkeypatch.setattr(os, "chown", refused)
     node = path.stat().st_ino
     add(path)
@@ -132,12 +132,12 @@ def test_nobody_may_read_more_in_the_journal_than_in_the_log(tmp_path, monkeypat
     write_log(path, [("a", n, n, bytes([n]) * 3000) for n in range(100)], "media")
     path.chmod(0o604)
     old = path.read_bytes()
-    monkeypatch.setattr(new_end, "_PIECE", 1000)
+    monkeypatch.setattr(in_place, "_PIECE", 1000)
     assert killed(lambda: add(path), 1, ["pwrite"])
     assert journal_of(path).stat().st_mode & 0o7777 == 0o604
     journal_of(path).unlink()
     path.write_bytes(old)
-    monkeypatch.setattr(new_end, "keep_attributes", lambda *_: ["group"])
+    monkeypatch.setattr(in_place, "keep_attributes", lambda *_: ["group"])
     assert killed(lambda: add(path), 1, ["pwrite"])
     assert journal_of(path).stat().st_mode & 0o7777 == 0o600
 

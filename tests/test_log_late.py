@@ -93,7 +93,7 @@ def retime(path: Path, output: Path, when: Callable[[int], int]) -> None:
             numbers[number] = writer.add_channel(channel.topic, layout, channel.message_encoding, channel.metadata)
         for number, message in log.stream(opened):
             writer.add_message(numbers[number], when(message.t_ns), message.sequence, message.payload)
-        log.pass_on_extras(opened, writer)
+        log.copy_attachments_and_metadata(opened, writer)
 
 
 @pytest.fixture(scope="module")

@@ -21,8 +21,8 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.sources.ingest import IngestOptions, ingest
-from mcaptrack.sources.video import Keep, open_video
-from mcaptrack.sources.video.streams import CODECS
+from mcaptrack.sources.video import VideoOptions, open_video
+from mcaptrack.sources.video.codecs import CODECS
 from tests.test_cli import call
 from tests.worlds import write_clip
 
@@ -201,16 +201,16 @@ def test_what_viewers_would_show_wrongly_is_encoded_again_and_shows_what_players
 
 def test_h265_with_b_frames_is_encoded_again_though_h265_is_asked_for(tmp_path):
     path = TRAPS["h265 with B-frames"][0](tmp_path)
-    video = open_video(path, Keep(image_format="h265"))
+    video = open_video(path, VideoOptions(image_format="h265"))
     assert (video.format, video.why_transcode) == ("h264", "it has B-frames")
 
 
 def test_h264_alone_is_h264_alone(tmp_path):
     path = made("a.webm", codec="libvpx-vp9", options={"g": "10"}, size=(67, 51))(tmp_path)
-    video = open_video(path, Keep(image_format="h264"))
+    video = open_video(path, VideoOptions(image_format="h264"))
     assert (video.format, video.why_transcode) == ("h264", "it is VP9, not H.264")
     assert (video.width_px, video.height_px) == (68, 52)
-    still = open_video(path, Keep(image_format="png"))
+    still = open_video(path, VideoOptions(image_format="png"))
     assert (still.width_px, still.height_px, still.why_transcode) == (67, 51, "")
 
 
@@ -304,13 +304,14 @@ def test_quality_is_a_trade_for_size(tmp_path, image_format):
     path = made("a.mp4", options={"bf": "2"}, size=(160, 120))(tmp_path)
     steps = (1, 20, 51) if image_format == "h264" else (100, 60, 5)
     sizes = [
-        sum(len(p.data) for p in open_video(path, Keep(image_format=image_format, quality=q)).pictures()) for q in steps
+        sum(len(p.data) for p in open_video(path, VideoOptions(image_format=image_format, quality=q)).pictures())
+        for q in steps
     ]
     assert sizes[0] > sizes[1] > sizes[2]
 
 
 def test_a_quality_that_is_asked_for_is_given_though_the_stream_could_be_passed_on(tmp_path):
-    video = open_video(made("a.mp4", options=X264)(tmp_path), Keep(quality=30))
+    video = open_video(made("a.mp4", options=X264)(tmp_path), VideoOptions(quality=30))
     assert video.why_transcode == "a quality was asked for"
 
 
@@ -319,7 +320,7 @@ def test_key_pictures_are_as_close_as_asked_whatever_the_times(tmp_path, interva
     path = tmp_path / "a.mkv"
     times = np.cumsum([0] + [40, 40, 40, 400, 40, 900, 40] * 12).tolist()
     write_clip(path, frames=len(times), options={"bf": "2"}, times_ms=times)
-    found = list(open_video(path, Keep(keyframe_interval_s=interval_s)).pictures())
+    found = list(open_video(path, VideoOptions(keyframe_interval_s=interval_s)).pictures())
     assert [picture.t_ns for picture in found] == [ms * 1_000_000 for ms in times]
     keys = [p.t_ns / 1e9 for p in found if CODECS["h264"].inspect(p.data).is_key]
     before = {p.t_ns / 1e9: q.t_ns / 1e9 for p, q in zip(found[1:], found, strict=False)}
@@ -332,7 +333,7 @@ def test_key_pictures_are_as_close_as_asked_whatever_the_times(tmp_path, interva
 def test_a_longer_interval_lets_a_stream_with_few_key_pictures_pass(tmp_path):
     path = made("a.mp4", options={"bf": "0", "g": "60"}, frames=40)(tmp_path)
     assert open_video(path).why_transcode == "its key frames are more than 2 s apart"
-    assert open_video(path, Keep(keyframe_interval_s=5)).why_transcode == ""
+    assert open_video(path, VideoOptions(keyframe_interval_s=5)).why_transcode == ""
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="this system does not let a process choose its cores")
@@ -478,7 +479,7 @@ def test_a_file_with_bytes_that_changed_is_read_or_refused_in_a_line(tmp_path, n
 def test_bytes_of_strangers_are_no_key_picture_or_one_but_never_an_accident(name, data, start):
     codec = CODECS[name]
     for payload in (start + data, data + start, data + start + data):
-        head = codec.entry(payload)
+        head = codec.read_head(payload)
         unit = codec.inspect(payload)
         assert unit.pictures >= 0
         assert head.has_picture or not head.is_key

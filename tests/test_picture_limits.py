@@ -24,9 +24,9 @@ from mcaptrack.files import refuse_special
 from mcaptrack.schema import TRACKS
 from mcaptrack.sources.foreign import PICTURES_READ, is_compressed
 from mcaptrack.sources.ingest import IngestOptions, ingest
-from mcaptrack.sources.video import Encoded, Keep, Layout, brightness, colours, open_video
+from mcaptrack.sources.video import EncodedPicture, PixelLayout, VideoOptions, decode_bgr, decode_gray, open_video
+from mcaptrack.sources.video.codecs import CODECS
 from mcaptrack.sources.video.limits import ENVIRONMENT, still_size
-from mcaptrack.sources.video.streams import CODECS
 from tests.test_cli import start
 from tests.worlds import ids, ns, write_clip
 
@@ -102,7 +102,7 @@ def test_a_picture_that_says_that_it_is_huge_costs_nothing(tmp_path):
     assert exit_code == "1"
     assert int(kibibytes) < 200 * 1024
     with pytest.raises(McaptrackError, match="16000 x 16000 pixels; at most 100 megapixels"):
-        list(brightness([Encoded(0, 7, "png", bomb)]))
+        list(decode_gray([EncodedPicture(0, 7, "png", bomb)]))
 
 
 SIZE = (1100, 1000)
@@ -125,13 +125,13 @@ def stills() -> dict[str, bytes]:
     return {suffix: cv2.imencode(f".{suffix}", image)[1].tobytes() for suffix in SUFFIXES}
 
 
-@pytest.mark.parametrize("pixels", [brightness, colours])
+@pytest.mark.parametrize("pixels", [decode_gray, decode_bgr])
 @pytest.mark.parametrize("name", [*CODECS, *SUFFIXES, "raw"])
 def test_pictures_of_messages_are_bounded(monkeypatch, name, pixels):
     if name == "raw":
-        picture = Encoded(0, 0, "mono8", bytes(SIZE[0] * SIZE[1]), Layout(*SIZE))
+        picture = EncodedPicture(0, 0, "mono8", bytes(SIZE[0] * SIZE[1]), PixelLayout(*SIZE))
     else:
-        picture = Encoded(0, 0, name, encoded(CODEC_OF[name]) if name in CODECS else stills()[name])
+        picture = EncodedPicture(0, 0, name, encoded(CODEC_OF[name]) if name in CODECS else stills()[name])
     monkeypatch.setenv(ENVIRONMENT, "2")
     assert [frame.rows.shape[:2] for frame in pixels([picture])] == [SIZE[::-1]]
     monkeypatch.setenv(ENVIRONMENT, "1")
@@ -165,7 +165,7 @@ def test_pictures_of_files_are_bounded(tmp_path, monkeypatch, name):
 def test_a_limit_that_is_no_number_is_refused(monkeypatch, given):
     monkeypatch.setenv(ENVIRONMENT, given)
     with pytest.raises(McaptrackError, match=f"{ENVIRONMENT} needs a whole number"):
-        list(brightness([Encoded(0, 0, "png", png(8, 8))]))
+        list(decode_gray([EncodedPicture(0, 0, "png", png(8, 8))]))
 
 
 def test_pictures_that_no_h264_stream_holds_are_refused_with_what_helps(tmp_path):
@@ -173,8 +173,8 @@ def test_pictures_that_no_h264_stream_holds_are_refused_with_what_helps(tmp_path
     folder.mkdir()
     (folder / "0.png").write_bytes(png(8000, 4500))
     with pytest.raises(McaptrackError, match=r"8000 x 4500 pixels, .* at most 35.7 megapixels; --image-format jpeg"):
-        open_video(folder, Keep(fps=Fraction(1)))
-    assert open_video(folder, Keep(fps=Fraction(1), image_format="jpeg")).width_px == 8000
+        open_video(folder, VideoOptions(fps=Fraction(1)))
+    assert open_video(folder, VideoOptions(fps=Fraction(1), image_format="jpeg")).width_px == 8000
 
 
 # What is no file
@@ -206,7 +206,7 @@ def test_an_image_that_is_a_pipe_is_refused(tmp_path):
     (tmp_path / "0.png").write_bytes(png(8, 8))
     (tmp_path / "seqinfo.ini").write_text("frameRate=5")
     os.mkfifo(tmp_path / "1.png")
-    code = f"from pathlib import Path; from mcaptrack.sources.video import *; list(open_video(Path({str(tmp_path)!r}), Keep(image_format='png')).pictures())"
+    code = f"from pathlib import Path; from mcaptrack.sources.video import *; list(open_video(Path({str(tmp_path)!r}), VideoOptions(image_format='png')).pictures())"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
     assert "1.png is a pipe, not a file" in done.stderr
 
@@ -297,7 +297,7 @@ def test_a_picture_that_can_not_be_decoded_keeps_its_number_and_its_time(tmp_pat
         packets = [bytes(packet) for packet in container.demux(video=0) if packet.size]
     path.write_bytes(path.read_bytes().replace(packets[4], bytes(len(packets[4]))))
     for keep, options in (({}, {}), ({"fps": Fraction(10)}, {"fps": Fraction(10)})):
-        video = open_video(path, Keep(**keep))
+        video = open_video(path, VideoOptions(**keep))
         there = [(picture.index, picture.t_ns) for picture in video.pictures()]
         assert there == [(n, ns(n / 10)) for n in range(8) if n != 4]
         assert len(video.lost) == 1
@@ -360,7 +360,7 @@ def test_places_that_are_empty_are_no_loss(tmp_path, suffix, keep):
     count = every_second(path)
     with av.open(str(path)) as container:
         assert container.streams.video[0].frames == 2 * count
-    video = open_video(path, Keep(**keep))
+    video = open_video(path, VideoOptions(**keep))
     made = list(video.pictures())
     assert (len(made), video.lost) == (count, [])
     assert [picture.index for picture in made] == list(range(count))

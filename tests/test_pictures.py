@@ -15,7 +15,7 @@ from mcaptrack import foxglove, log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.sources.ingest import IngestOptions, ingest
 from mcaptrack.sources.pictures import Pictures
-from mcaptrack.sources.video import Encoded, H264Encoder, Keep, brightness, open_video
+from mcaptrack.sources.video import EncodedPicture, H264Encoder, VideoOptions, decode_gray, open_video
 from mcaptrack.viewing import rendering
 from tests.test_cli import done
 from tests.test_passing import SVT, X265
@@ -90,8 +90,8 @@ def test_what_is_seen_at_a_time_is_the_last_picture_until_then(made):
         found = pictures.at([250_000_000, 0, 299_999_999, 10**15, 3_000_000_000])
         assert [frame.index for frame in found] == [0, 2, 30, 59]
         assert pictures.decoded <= 4 * most
-        assert [frame.index for frame in pictures.at([0], brightness)] == [0]
-        (grey,) = pictures.frames([3], brightness)
+        assert [frame.index for frame in pictures.at([0], decode_gray)] == [0]
+        (grey,) = pictures.frames([3], decode_gray)
         assert grey.rows.ndim == 2
         assert list(pictures.at([])) == []
         with pytest.raises(McaptrackError, match="/camera/video has 60 pictures, not 60"):
@@ -178,7 +178,7 @@ def test_a_recording_that_begins_within_a_group_is_shown_from_its_first_key_pict
     clip, options = KINDS[name]
     path = tmp_path / ("a.webm" if name == "vp9" else "a.mkv")
     write_clip(path, frames=30, **clip)
-    data = [picture.data for picture in open_video(path, Keep(**options)).pictures()]
+    data = [picture.data for picture in open_video(path, VideoOptions(**options)).pictures()]
     with av.open(str(path)) as container:
         images = [frame.to_ndarray(format="bgr24") for frame in container.decode(video=0)]
     foreign_log(tmp_path / "a.mcap", "/v", [(n * 10**8, part) for n, part in enumerate(data[7:])], name)
@@ -188,7 +188,7 @@ def test_a_recording_that_begins_within_a_group_is_shown_from_its_first_key_pict
         for frame in found:
             np.testing.assert_array_equal(frame.rows, images[7 + frame.index])
         assert list(Pictures(opened, "/v").frames([1])) == []
-    seen = brightness(Encoded(number, number, name, part) for number, part in enumerate(data[7:]))
+    seen = decode_gray(EncodedPicture(number, number, name, part) for number, part in enumerate(data[7:]))
     assert [frame.index for frame in seen] == list(range(3, 23))
     _, err = done("detect", tmp_path / "a.mcap", "--topic", "/v", "--to", "/boxes")
     assert "/v: 3 of 23 messages were left out: a video has to begin with a key picture" in err

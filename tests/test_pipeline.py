@@ -15,7 +15,7 @@ from mcaptrack import log, pipeline
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation import EvaluateOptions, evaluate, sequence_of_log
 from mcaptrack.schema import DETECTIONS, GROUND_PLANE, PREDICTIONS, TRACKS
-from mcaptrack.schema.ground import rows_to_plane
+from mcaptrack.schema.ground_plane import rows_to_plane
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources import demo
 from mcaptrack.sources.ingest import IngestOptions, ingest

@@ -130,14 +130,14 @@ SCENES: dict[str, Callable[[Scene], str]] = {
     ),
     "cli/view.py:view:run": lambda s: s.untracked().says("view", "LOG"),
     "evaluation/__init__.py:sequence_of_log:run": lambda s: s.untracked().says("evaluate", "LOG"),
-    "evaluation/__init__.py:truth_of_log:ingest": lambda s: s.without("/camera/truth*").says("evaluate", "LOG"),
+    "evaluation/__init__.py:ground_truth_of_log:ingest": lambda s: s.without("/camera/truth*").says("evaluate", "LOG"),
     "cli/view.py:view:recover": lambda s: s.half_written().says("view", "LOG"),
     "tables/compared.py:pair_files:ingest": lambda s: s.without("/camera/truth*").says(
         "evaluate", "LOG", "--truth", "truth.txt"
     ),
-    "log/beside.py:recover_command:recover": Scene.damaged,
+    "log/journal_check.py:recover_command:recover": Scene.damaged,
     "log/snapshot.py:computing:drop": Scene.late,
-    "log/other_kinds.py:refuse_other_kinds:ingest": Scene.bag,
+    "log/recording_files.py:refuse_non_mcap:ingest": Scene.bag,
     "log/reader.py:channel:info": lambda s: s.says("export", "LOG", "--topic", "/nothing"),
     "pipeline/checks.py:_lacks:info": lambda s: s.says("sample", "LOG", "--topic", "/nothing"),
     "pipeline/checks.py:_lacks:ingest": lambda s: s.ingested("truth.txt", "--as", "truth", "--fps", "10").says(

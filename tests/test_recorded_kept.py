@@ -17,7 +17,7 @@ from mcaptrack import log
 from mcaptrack.cli import app
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.ingest import IngestOptions, ingest
-from mcaptrack.sources.ingest.formats import Role
+from mcaptrack.sources.ingest.labels.formats import Role
 from mcaptrack.transforms import TRANSFORMS
 from tests.test_bags import camera_bag
 from tests.test_label_clock import lines, robot_log

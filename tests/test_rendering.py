@@ -15,9 +15,9 @@ from mcaptrack import foxglove, log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.pipeline import find_views
 from mcaptrack.sources.video import write_clip
-from mcaptrack.sources.video.decode import Encoded, colours
+from mcaptrack.sources.video.decode import EncodedPicture, decode_bgr
 from mcaptrack.sources.video.encode import encode_image
-from mcaptrack.sources.video.raw import Layout
+from mcaptrack.sources.video.raw_pixels import PixelLayout
 from mcaptrack.viewing.rendering import draw
 from tests.test_cli import call, done, finished, footage  # noqa: F401
 
@@ -130,12 +130,12 @@ def test_pictures_of_every_kind_are_read_in_colour():
     rgb = image[:, :, ::-1].tobytes()
     grey = np.full((16, 16), 77, np.uint8)
     pictures = [
-        Encoded(0, 0, "png", encode_image(image, "png")),
-        Encoded(1, 1, "bgr8", image.tobytes(), Layout(16, 16)),
-        Encoded(2, 2, "rgb8", rgb, Layout(16, 16)),
-        Encoded(3, 3, "mono8", grey.tobytes(), Layout(16, 16)),
+        EncodedPicture(0, 0, "png", encode_image(image, "png")),
+        EncodedPicture(1, 1, "bgr8", image.tobytes(), PixelLayout(16, 16)),
+        EncodedPicture(2, 2, "rgb8", rgb, PixelLayout(16, 16)),
+        EncodedPicture(3, 3, "mono8", grey.tobytes(), PixelLayout(16, 16)),
     ]
-    found = [frame.rows for frame in colours(pictures)]
+    found = [frame.rows for frame in decode_bgr(pictures)]
     assert all(np.array_equal(rows, image) for rows in found[:3])
     assert np.array_equal(found[3], np.repeat(grey[..., None], 3, axis=2))
 

@@ -15,9 +15,17 @@ import pytest
 
 import mcaptrack
 from mcaptrack.errors import McaptrackError
-from mcaptrack.sources.video import Encoded, H264Encoder, Keep, brightness, encode_image, open_video, write_mp4
+from mcaptrack.sources.video import (
+    EncodedPicture,
+    H264Encoder,
+    VideoOptions,
+    decode_gray,
+    encode_image,
+    open_video,
+    write_mp4,
+)
 from mcaptrack.sources.video.h264 import inspect
-from mcaptrack.sources.video.source import images as upright_images
+from mcaptrack.sources.video.reader import images as upright_images
 from tests.worlds import write_clip
 
 NO_B = {"bf": "0", "g": "10"}
@@ -25,7 +33,7 @@ WITH_B = {"bf": "2", "g": "10"}
 
 
 def pictures(path, image_format="auto", start_ns=0, **keep):
-    return list(open_video(path, Keep(image_format=image_format, **keep)).pictures(start_ns))
+    return list(open_video(path, VideoOptions(image_format=image_format, **keep)).pictures(start_ns))
 
 
 def decoded(path) -> list[np.ndarray]:
@@ -35,7 +43,7 @@ def decoded(path) -> list[np.ndarray]:
 
 
 def through_the_log(made, image_format="h264") -> list[np.ndarray]:
-    return [frame.rows for frame in brightness(Encoded(p.t_ns, p.index, image_format, p.data) for p in made)]
+    return [frame.rows for frame in decode_gray(EncodedPicture(p.t_ns, p.index, image_format, p.data) for p in made)]
 
 
 @pytest.mark.parametrize("name", ["a.mp4", "a.mov", "a.mkv", "a.avi"])
@@ -283,7 +291,7 @@ def test_brightness_is_full_range_whatever_it_came_from():
 
 def test_pictures_that_are_broken_say_which():
     with pytest.raises(McaptrackError, match="frame 7 can't be decoded as jpeg"):
-        list(brightness([Encoded(0, 7, "jpeg", b"\xff\xd8 no picture")]))
+        list(decode_gray([EncodedPicture(0, 7, "jpeg", b"\xff\xd8 no picture")]))
 
 
 def test_a_decoder_that_is_let_go_while_its_threads_work_does_not_wait_for_ever(tmp_path):
@@ -291,12 +299,12 @@ def test_a_decoder_that_is_let_go_while_its_threads_work_does_not_wait_for_ever(
     code = (
         "import sys, numpy as np\n"
         "from fractions import Fraction\n"
-        "from mcaptrack.sources.video import Encoded, H264Encoder, brightness\n"
+        "from mcaptrack.sources.video import EncodedPicture, H264Encoder, decode_gray\n"
         "encoder = H264Encoder(640, 480, Fraction(10))\n"
         "noise = np.random.default_rng(1).integers(0, 255, (480, 640, 3), np.uint8)\n"
-        "pictures = [Encoded(n, n, 'h264', encoder.encode(np.roll(noise, n, axis=1))) for n in range(12)]\n"
+        "pictures = [EncodedPicture(n, n, 'h264', encoder.encode(np.roll(noise, n, axis=1))) for n in range(12)]\n"
         "for turn in range(60):\n"
-        "    frames = brightness(iter(pictures))\n"
+        "    frames = decode_gray(iter(pictures))\n"
         "    for _ in range(1 + turn % 6): next(frames)\n"
         "    frames.close()\n"
         "    del frames\n"

@@ -13,7 +13,7 @@ import numpy as np
 
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame
-from mcaptrack.sources.scene import Block, Scene, Walker
+from mcaptrack.sources.synthetic import Block, Pedestrian, SyntheticScene
 
 Positions = Mapping[int, tuple[float, float]]
 
@@ -80,15 +80,15 @@ def places(frame: Frame) -> dict[int, tuple[float, float]]:
     return {int(row["track_id"]): (round(float(row["x_m"]), 3), round(float(row["y_m"]), 3)) for row in frame.rows}
 
 
-def small_scene(seconds: float = 6.0, **changes) -> Scene:
+def small_scene(seconds: float = 6.0, **changes) -> SyntheticScene:
     """Three people on a small picture, one of them behind something for a while."""
     people = (
-        Walker(1, ((0.0, -5.0, 9.0), (seconds, 4.0, 12.0)), (30, 30, 30)),
-        Walker(2, ((0.0, 5.0, 13.0), (seconds, -4.0, 10.0)), (120, 40, 20)),
-        Walker(3, ((seconds / 3, 6.0, 15.5), (seconds, -1.0, 15.0)), (20, 60, 20)),
+        Pedestrian(1, ((0.0, -5.0, 9.0), (seconds, 4.0, 12.0)), (30, 30, 30)),
+        Pedestrian(2, ((0.0, 5.0, 13.0), (seconds, -4.0, 10.0)), (120, 40, 20)),
+        Pedestrian(3, ((seconds / 3, 6.0, 15.5), (seconds, -1.0, 15.0)), (20, 60, 20)),
     )
     options = {"fps": 10, "width_px": 320, "height_px": 180, "noise": 1.5, "blocks": (Block(2.5, 14.0, 1.2, 2.2),)}
-    return Scene(people, seconds, **(options | changes))
+    return SyntheticScene(people, seconds, **(options | changes))
 
 
 def write_clip(

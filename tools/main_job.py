@@ -23,14 +23,14 @@ import av
 import numpy as np
 
 import mcaptrack
-from mcaptrack.sources.scene import Scene, Walker
+from mcaptrack.sources.synthetic import Pedestrian, SyntheticScene
 
 ROOT = Path(__file__).resolve().parent.parent
 FPS, SECONDS = 10, 12.0
 PEOPLE = (
-    Walker(1, ((0.0, -6.0, 9.0), (SECONDS, 6.0, 11.0)), (30, 30, 30)),
-    Walker(2, ((0.0, 6.0, 14.0), (SECONDS, -6.0, 13.0)), (120, 40, 20)),
-    Walker(3, ((0.0, 5.0, 18.0), (SECONDS, -4.0, 17.5)), (20, 60, 20)),
+    Pedestrian(1, ((0.0, -6.0, 9.0), (SECONDS, 6.0, 11.0)), (30, 30, 30)),
+    Pedestrian(2, ((0.0, 6.0, 14.0), (SECONDS, -6.0, 13.0)), (120, 40, 20)),
+    Pedestrian(3, ((0.0, 5.0, 18.0), (SECONDS, -4.0, 17.5)), (20, 60, 20)),
 )
 #: What cameras and programs write: file, encoder, pixels, options. The first is what everything is run on.
 CLIPS = (
@@ -92,7 +92,7 @@ def everything(folder: Path, log: Path) -> None:
 
 def footage(folder: Path) -> list[np.ndarray]:
     """Draw people who walk, and encode it in every way; the pictures, BGR (height, width, 3)."""
-    scene = Scene(PEOPLE, SECONDS, fps=FPS, width_px=320, height_px=180, noise=1.5)
+    scene = SyntheticScene(PEOPLE, SECONDS, fps=FPS, width_px=320, height_px=180, noise=1.5)
     shots = list(scene.shots())
     lines = [
         ",".join(map(str, [number, who, *np.round(box, 2).tolist(), 1, 1, 1]))

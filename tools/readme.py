@@ -121,14 +121,14 @@ def run(words: list[object], work: Path, folder: Path, also_good: set[int] = fro
 
 def shots():
     """A scene of three people who walk, picture by picture."""
-    from mcaptrack.sources.scene import Scene, Walker
+    from mcaptrack.sources.synthetic import Pedestrian, SyntheticScene
 
     people = (
-        Walker(1, ((0.0, -6.0, 9.0), (SECONDS, 6.0, 11.0)), (30, 30, 30)),
-        Walker(2, ((0.0, 6.0, 14.0), (SECONDS, -6.0, 13.0)), (120, 40, 20)),
-        Walker(3, ((0.0, 5.0, 18.0), (SECONDS, -4.0, 17.5)), (20, 60, 20)),
+        Pedestrian(1, ((0.0, -6.0, 9.0), (SECONDS, 6.0, 11.0)), (30, 30, 30)),
+        Pedestrian(2, ((0.0, 6.0, 14.0), (SECONDS, -6.0, 13.0)), (120, 40, 20)),
+        Pedestrian(3, ((0.0, 5.0, 18.0), (SECONDS, -4.0, 17.5)), (20, 60, 20)),
     )
-    scene = Scene(people[:PEOPLE], SECONDS, fps=FPS, width_px=320, height_px=180, noise=1.5)
+    scene = SyntheticScene(people[:PEOPLE], SECONDS, fps=FPS, width_px=320, height_px=180, noise=1.5)
     return scene, list(scene.shots())
 
 

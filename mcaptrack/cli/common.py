@@ -332,7 +332,7 @@ def expand(paths: Sequence[Path], *, each: bool = False) -> list[Path]:
     Raises McaptrackError for a pattern that matches nothing.
     """
     from mcaptrack.files import follow_links
-    from mcaptrack.log import results_of
+    from mcaptrack.log import results_path
 
     out: list[Path] = []
     for path in paths:
@@ -344,7 +344,7 @@ def expand(paths: Sequence[Path], *, each: bool = False) -> list[Path]:
         if not found:
             raise McaptrackError(f"no file matches {path}")
         out += found
-    results = {results_of(follow_links(path)) for path in out}
+    results = {results_path(follow_links(path)) for path in out}
     return [path for path in out if each or follow_links(path) not in results]
 
 

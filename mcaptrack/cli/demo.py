@@ -53,7 +53,7 @@ def demo(
     from mcaptrack.files import publish_bytes
     from mcaptrack.sources import demo as drawing
     from mcaptrack.sources.ingest import IngestOptions, ingest
-    from mcaptrack.sources.scene import SCENES
+    from mcaptrack.sources.synthetic import SCENES
     from mcaptrack.tables.export import default_folder, export
 
     if output.exists() and not output.is_dir():

@@ -12,7 +12,7 @@ from mcaptrack.cli.text import console, show
 from mcaptrack.errors import McaptrackError
 
 if TYPE_CHECKING:
-    from mcaptrack.log import Checked, Log
+    from mcaptrack.log import CheckResult, Log
 
 _SHOWN = 20
 
@@ -37,7 +37,7 @@ def check(
     from mcaptrack import log
 
     paths = [part for path in common.expand(logs) for part in _parts(path)]
-    checked: list[Checked] = []
+    checked: list[CheckResult] = []
     with common.Talk(quiet, verbose).open() as talk:
         for path in paths:
             with talk.attempt(path, paths):
@@ -56,11 +56,11 @@ def _parts(path: Path) -> list[Path]:
     """A log, and its results if they stand beside it."""
     from mcaptrack import log
 
-    beside = log.results_of(path)
+    beside = log.results_path(path)
     return [path, beside] if beside != path and beside.exists() else [path]
 
 
-def _checked_as_data(checked: Checked) -> dict[str, object]:
+def _checked_as_data(checked: CheckResult) -> dict[str, object]:
     return {
         "log": str(checked.path),
         "sound": checked.is_sound,
@@ -73,7 +73,7 @@ def _checked_as_data(checked: Checked) -> dict[str, object]:
     }
 
 
-def _print_checked(checked: Checked, quiet: bool) -> None:
+def _print_checked(checked: CheckResult, quiet: bool) -> None:
     from rich.table import Table
     from rich.text import Text
 
@@ -171,13 +171,13 @@ def drop(
     from mcaptrack import log
     from mcaptrack.files import is_same_file, refuse_overwrite
     from mcaptrack.schema.provenance import Provenance
-    from mcaptrack.sources.ingest.place import recording_of
+    from mcaptrack.sources.ingest.sidecar import recording_of
 
     if output is not None:
         refuse_overwrite(output, force)
         if is_same_file(output, path):
             raise McaptrackError(f"{path} is both input and output; leave -o out to change it in place")
-    beside = log.results_of(path)
+    beside = log.results_path(path)
     with common.Talk(quiet, verbose).open() as talk:
         with log.read(path) as opened:
             dropped = _chosen(opened, topics)
@@ -190,7 +190,7 @@ def drop(
                     f"{path} is {recording}, which ROS tools read; -o writes a copy without "
                     f"{', '.join(sorted(recorded))}, --in-place changes it all the same"
                 )
-        targets = {path: output or path, beside: log.results_of(output) if output else beside}
+        targets = {path: output or path, beside: log.results_path(output) if output else beside}
         if output is not None and beside in holds:
             refuse_overwrite(targets[beside], force)
         for part, gone in holds.items():

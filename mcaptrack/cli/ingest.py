@@ -13,7 +13,7 @@ from mcaptrack.cli.command import warn_unused
 from mcaptrack.errors import McaptrackError
 
 if TYPE_CHECKING:
-    from mcaptrack.sources.ingest import IngestOptions, Report
+    from mcaptrack.sources.ingest import IngestOptions, IngestReport
 
 Inputs = Annotated[
     list[Path],
@@ -164,7 +164,7 @@ def ingest(
     from mcaptrack.files import is_same_file, refuse_overwrite
     from mcaptrack.sources.ingest import IngestOptions
     from mcaptrack.sources.ingest import ingest as make_log
-    from mcaptrack.sources.ingest.place import Place
+    from mcaptrack.sources.ingest.sidecar import SidecarChoice
 
     if into is not None and output is not None:
         raise McaptrackError("--into adds to a log in place; it does not go with -o")
@@ -197,7 +197,7 @@ def ingest(
                     refuse_overwrite(target, force or is_same_file(target, source))
                     report = make_log(source, target, options, progress=talk.progress)
                 else:
-                    place = Place(sidecar)
+                    place = SidecarChoice(sidecar)
                     with log.read(into, sidecar=place) as opened:
                         opened.lock()
                         report = make_log(source, target, options, into=opened, force=force, progress=talk.progress)
@@ -227,7 +227,7 @@ def ingest(
         raise typer.Exit(common.LOST)
 
 
-def _warn_unused(report: Report, options: IngestOptions) -> None:
+def _warn_unused(report: IngestReport, options: IngestOptions) -> None:
     """Say which options are about what wasn't there."""
     if not report.has_labels:
         warn_unused("there is no label file", "label_format")

@@ -46,7 +46,7 @@ def _run_on_log(
     """Plan and run on one log; what came of it, for programs."""
     from mcaptrack import log, pipeline
     from mcaptrack.files import is_same_file, publish_bytes, refuse_overwrite
-    from mcaptrack.sources.ingest.place import Place
+    from mcaptrack.sources.ingest.sidecar import SidecarChoice
 
     began = monotonic()
     output: Path | None = given["output"]
@@ -55,7 +55,7 @@ def _run_on_log(
         if is_same_file(output, path):
             raise McaptrackError(f"{path} is both input and output; leave -o out to add to it in place")
         refuse_overwrite(output, given["force"])
-    place = Place(given["sidecar"])
+    place = SidecarChoice(given["sidecar"])
     with log.read(path, sidecar=None if output else place) as opened:
         if output is None:
             opened.lock()  # a second writer is turned away before it computes anything

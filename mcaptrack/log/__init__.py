@@ -7,39 +7,39 @@ check(path)                             is it sound
 recover(path, output)                   what is whole in it, as a new one
 """
 
-from mcaptrack.log.change import extend, refuse_recorded
-from mcaptrack.log.check import Checked, check
+from mcaptrack.log.check import CheckResult, check
 from mcaptrack.log.check_summary import Finding
-from mcaptrack.log.messages import Columns, Message, Places
-from mcaptrack.log.names import results_of
-from mcaptrack.log.other_kinds import parts_in, refuse_other_kinds
+from mcaptrack.log.extend import extend, refuse_to_replace_recorded
+from mcaptrack.log.messages import ChannelRows, Message, MessageLocations
+from mcaptrack.log.paths import results_path
 from mcaptrack.log.reader import Channel, Log, read, topics_with_schema
-from mcaptrack.log.recover import Recovered, recover
-from mcaptrack.log.stream import header, pass_on_extras, stream
+from mcaptrack.log.recording_files import refuse_non_mcap, split_files_in
+from mcaptrack.log.recover import RecoverResult, recover
+from mcaptrack.log.stream import copy_attachments_and_metadata, header, stream
 from mcaptrack.log.writer import LIBRARY, LogWriter, create
 
 __all__ = [
     "LIBRARY",
     "Channel",
-    "Checked",
-    "Columns",
+    "ChannelRows",
+    "CheckResult",
     "Finding",
     "Log",
     "LogWriter",
     "Message",
-    "Places",
-    "Recovered",
+    "MessageLocations",
+    "RecoverResult",
     "check",
+    "copy_attachments_and_metadata",
     "create",
     "extend",
     "header",
-    "parts_in",
-    "pass_on_extras",
     "read",
     "recover",
-    "refuse_other_kinds",
-    "refuse_recorded",
-    "results_of",
+    "refuse_non_mcap",
+    "refuse_to_replace_recorded",
+    "results_path",
+    "split_files_in",
     "stream",
     "topics_with_schema",
 ]

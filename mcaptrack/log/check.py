@@ -16,7 +16,7 @@ from mcaptrack import notices
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import follow_links
 from mcaptrack.log import records
-from mcaptrack.log.beside import changed, find_journal
+from mcaptrack.log.byte_source import ByteSource, OpenFile, RunningChecksum, Signature
 from mcaptrack.log.check_summary import Finding, Findings, check_summary, record_name
 from mcaptrack.log.chunks import (
     HEAD,
@@ -30,14 +30,14 @@ from mcaptrack.log.chunks import (
 )
 from mcaptrack.log.index import Index, begins_as_log, ends_as_log, list_attachment, list_metadata
 from mcaptrack.log.journal import find_content, journal_of
+from mcaptrack.log.journal_check import changed, find_journal
 from mcaptrack.log.records import MAGIC, Bytes, ChunkIndexRecord, Damaged, Opcode, Reader, Record, walk
-from mcaptrack.log.source import OpenFile, RunningChecksum, Signature, Source
 
 Progress = Callable[[str, int, int], None]
 
 
 @dataclass
-class Checked:
+class CheckResult:
     """What was found in a log."""
 
     path: Path
@@ -51,7 +51,7 @@ class Checked:
         return all(finding.level != "error" for finding in self.findings)
 
 
-def check(path: Path, progress: Progress = lambda *_: None) -> Checked:
+def check(path: Path, progress: Progress = lambda *_: None) -> CheckResult:
     """Look at every byte of a log. Raises McaptrackError only if there is no file to look at.
 
     Checksums, sizes and times of chunks, message indexes, the order of each channel's messages, attachments, and
@@ -75,10 +75,10 @@ def check(path: Path, progress: Progress = lambda *_: None) -> Checked:
         if Signature.of(file.handle) != signature:
             raise changed(path)
     findings = sorted(look.findings, key=lambda found: (found.level, found.where))
-    return Checked(path, sum(look.found.counts.values()), len(look.found.chunks), findings)
+    return CheckResult(path, sum(look.found.counts.values()), len(look.found.chunks), findings)
 
 
-def is_sound(source: Source) -> bool:
+def is_sound(source: ByteSource) -> bool:
     """Whether a look at every byte finds no error."""
     look = _Look(source.front_to_back(), lambda *_: None)
     try:
@@ -88,7 +88,7 @@ def is_sound(source: Source) -> bool:
     return all(finding.level != "error" for finding in look.findings)
 
 
-def best_content(path: Path, source: Source, file: OpenFile) -> Source:
+def best_content(path: Path, source: ByteSource, file: OpenFile) -> ByteSource:
     """What to save of a log that a journal lies beside: the log as the journal has it where the file itself is damaged.
 
     Since the log itself stays as it is, a journal will do that doesn't prove that it is of this very file.
@@ -109,11 +109,11 @@ def best_content(path: Path, source: Source, file: OpenFile) -> Source:
 
 
 @contextmanager
-def open_bytes(path: Path) -> Iterator[tuple[Source, OpenFile]]:
+def open_bytes(path: Path) -> Iterator[tuple[ByteSource, OpenFile]]:
     """The bytes of a file. Raises McaptrackError if it is none or empty."""
     file = OpenFile.at(path)
     try:
-        source = Source.of(file)
+        source = ByteSource.of(file)
         if not len(source):
             raise McaptrackError(f"{path} is empty")
         yield source, file
@@ -124,7 +124,7 @@ def open_bytes(path: Path) -> Iterator[tuple[Source, OpenFile]]:
 class _Look:
     """One look at a file; ``found`` is what its records say, the way an index would say it."""
 
-    def __init__(self, buffer: Source, progress: Progress) -> None:
+    def __init__(self, buffer: ByteSource, progress: Progress) -> None:
         self.found = Index()
         self.findings = Findings()
         self._find = self.findings.add

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from mcaptrack import environment
 from mcaptrack.geometry.arrays import Ints
 from mcaptrack.log import records
+from mcaptrack.log.byte_source import ByteSource
 from mcaptrack.log.records import Bytes, ChunkHead, ChunkIndexRecord, Damaged, Opcode, Record, crc_of, walk
-from mcaptrack.log.source import Source
 
 Times = NDArray[np.uint64]
 Entries = NDArray[np.uint64]
@@ -90,7 +90,7 @@ def open_and_mark(buffer: Bytes, record: Record) -> tuple[Bytes, int]:
 
 
 def _data(buffer: Bytes, head: ChunkHead) -> Bytes:
-    if isinstance(buffer, Source) and is_left_in_file(head.compression, head.end - head.start):
+    if isinstance(buffer, ByteSource) and is_left_in_file(head.compression, head.end - head.start):
         return buffer.part(head.start, head.end)
     return buffer[head.start : head.end]
 

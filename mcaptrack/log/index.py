@@ -12,6 +12,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from mcaptrack.log import records
+from mcaptrack.log.byte_source import ByteSource, RunningChecksum
 from mcaptrack.log.chunks import Entries, chunk_entries, message_head, open_chunk
 from mcaptrack.log.records import (
     MAGIC,
@@ -25,7 +26,6 @@ from mcaptrack.log.records import (
     SchemaRecord,
     walk,
 )
-from mcaptrack.log.source import RunningChecksum, Source
 
 FOOTER_SIZE: Final = 9 + records.FOOTER_BODY.size + len(MAGIC)
 DATA_END_SIZE: Final = 9 + 4
@@ -94,7 +94,7 @@ def _equal(one: Entries | None, other: Entries | None) -> bool:
     return one is other or (one is not None and other is not None and np.array_equal(one, other))
 
 
-def read_index(source: Source) -> Index:
+def read_index(source: ByteSource) -> Index:
     """The contents of a log. Raises Damaged if it is none or is cut off."""
     if not begins_as_log(source):
         raise Damaged("it does not begin as an MCAP file does")
@@ -213,7 +213,7 @@ def take(index: Index, buffer: Bytes, record: Record) -> None:
         index.metadata.append(Listed(reader.text(), offset, bytes(buffer[record.start : record.end])))
 
 
-def _from_scan(buffer: Source) -> Index:
+def _from_scan(buffer: ByteSource) -> Index:
     """The contents from every record of the file, chunks opened."""
     index = Index()
     loose: dict[int, array[int]] = {}

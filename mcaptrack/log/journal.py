@@ -1,6 +1,6 @@
 """The journal beside a log: what stood at its end before it was changed, and proof of whose end that is.
 
-LOG.journal lies beside a log while its end is written anew (``log/new_end.py``), and stays if that is interrupted. It
+LOG.journal lies beside a log while its end is written anew (``log/in_place.py``), and stays if that is interrupted. It
 holds the old end, what tells the log from every other file, and checksums of each piece that was going to be written.
 So it can be told whether what stands in the file now is the old end, the new one, or a state between the two that
 only this change can have left. Only such a state is ever undone. Whoever only reads sees the old end through the
@@ -30,10 +30,10 @@ from numpy.typing import NDArray
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import sync_folder
+from mcaptrack.log.byte_source import ByteSource, OpenFile, Piece, file_type, read_exactly
 from mcaptrack.log.chunks import chunk_record, open_chunk
 from mcaptrack.log.index import begins_as_log, read_index
 from mcaptrack.log.records import MAGIC, Damaged
-from mcaptrack.log.source import OpenFile, Piece, Source, kind_of_file, read_exactly
 
 State = Literal["busy", "old", "new", "between"]
 
@@ -96,13 +96,13 @@ class Journal:
         """The log as it was: what is before the old end, and the old end."""
         return Piece(self.log, 0, self.start), Piece(self.file, self.at, self.size - self.start)
 
-    def overlay(self) -> Source:
+    def overlay(self) -> ByteSource:
         """The bytes of the log as it was."""
-        return Source(self.pieces())
+        return ByteSource(self.pieces())
 
-    def old_end(self) -> Source:
+    def old_end(self) -> ByteSource:
         """The bytes that stood from ``start`` on."""
-        return Source(self.pieces()[1:])
+        return ByteSource(self.pieces()[1:])
 
     def state(self) -> State:
         """What stands in the log. Raises Unfit if it is nothing that the change can have left."""
@@ -129,7 +129,7 @@ class _Comparison:
 
     def __init__(self, journal: Journal) -> None:
         self._journal = journal
-        self._now = Source.of(journal.log)
+        self._now = ByteSource.of(journal.log)
         self._first = journal.start // ROW
         final = journal.size if journal.final is None else journal.final
         #: From here on the file may hold zeros: it was made longer, and what follows did not reach the disk.
@@ -186,7 +186,7 @@ class _Comparison:
         return True
 
 
-def _rows(source: Source, low: int, high: int, until: int) -> NDArray[np.uint8]:
+def _rows(source: ByteSource, low: int, high: int, until: int) -> NDArray[np.uint8]:
     """The bytes from ``low`` to ``high`` in rows, with zeros behind them up to ``until`` and to the end of its row."""
     data = bytes(source[low:high]) if high > low else b""
     return np.frombuffer(data.ljust(-(-(until - low) // ROW) * ROW, b"\0"), np.uint8).reshape(-1, ROW)
@@ -252,7 +252,7 @@ def find(path: Path, log: OpenFile) -> Journal | None:
     journal, is_known = _read(file, log)
     if not is_known:
         raise Unfit(f"is of another file than {path} is now")
-    if not begins_as_log(Source.of(log)):
+    if not begins_as_log(ByteSource.of(log)):
         raise Unfit(f"can't be of {path}, which is no MCAP file")
     return journal
 
@@ -266,7 +266,7 @@ def is_left(path: Path) -> bool:
         return False
 
 
-def find_content(path: Path, log: OpenFile) -> Source | None:
+def find_content(path: Path, log: OpenFile) -> ByteSource | None:
     """The log as it was by a journal whose content fits, be it of version 1 or of a log that was copied since.
 
     None if there is none. For whoever writes that elsewhere: it does not prove that the journal is of this file.
@@ -275,7 +275,7 @@ def find_content(path: Path, log: OpenFile) -> Source | None:
         file = _open(journal_of(path), log)
         if file is None:
             return None
-        if bytes(Source.of(file)[0 : len(_MAGIC)]) == _FIRST_MAGIC:
+        if bytes(ByteSource.of(file)[0 : len(_MAGIC)]) == _FIRST_MAGIC:
             return _read_first(file, log)
         return _read(file, log)[0].overlay()
     except (Unfit, Damaged):
@@ -285,7 +285,7 @@ def find_content(path: Path, log: OpenFile) -> Source | None:
 def _open(path: Path, log: OpenFile) -> OpenFile | None:
     """What lies at LOG.journal, if it is a file of a user who may be trusted with the log."""
     try:
-        kind = kind_of_file(os.lstat(path).st_mode)
+        kind = file_type(os.lstat(path).st_mode)
         if kind:
             raise Unfit(f"is {kind}")
         file = OpenFile(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW | os.O_CLOEXEC))
@@ -295,7 +295,7 @@ def _open(path: Path, log: OpenFile) -> OpenFile | None:
         raise Unfit(f"can't be opened: {error.strerror}") from None
     found = os.fstat(file.handle)
     if not stat.S_ISREG(found.st_mode):
-        raise Unfit(f"is {kind_of_file(found.st_mode)}")
+        raise Unfit(f"is {file_type(found.st_mode)}")
     if found.st_uid not in (os.fstat(log.handle).st_uid, os.geteuid(), 0):
         raise Unfit("belongs to another user than the log")
     return file
@@ -303,7 +303,7 @@ def _open(path: Path, log: OpenFile) -> OpenFile | None:
 
 def _read(file: OpenFile, log: OpenFile) -> tuple[Journal, bool]:
     """A journal and whether it names the log as its own. Raises Unfit if it is none, or the log is not what it was."""
-    source = Source.of(file)
+    source = ByteSource.of(file)
     head = bytes(source[0:_HEAD_SIZE])
     if head.startswith(_FIRST_MAGIC):
         raise Unfit("was left by version 0.1.0, whose journals don't say which file they are of")
@@ -334,7 +334,7 @@ def _read(file: OpenFile, log: OpenFile) -> tuple[Journal, bool]:
     return journal, is_there and inode == there.st_ino
 
 
-def _read_added(journal: Journal, source: Source, at: int, digest: bytes) -> None:
+def _read_added(journal: Journal, source: ByteSource, at: int, digest: bytes) -> None:
     """Take what was going to be written into a journal, as far as that is whole."""
     while at + _ADDED.size <= len(source) and journal.final is None:
         place, size, final = _ADDED.unpack(source[at : at + _ADDED.size])
@@ -351,9 +351,9 @@ def _read_added(journal: Journal, source: Source, at: int, digest: bytes) -> Non
         at = end + _DIGEST_SIZE
 
 
-def _read_first(file: OpenFile, log: OpenFile) -> Source | None:
+def _read_first(file: OpenFile, log: OpenFile) -> ByteSource | None:
     """The log as it was by a journal of version 1, if its checksums are right."""
-    source = Source.of(file)
+    source = ByteSource.of(file)
     begin = len(_FIRST_MAGIC) + _FIRST_HEAD.size + 4
     head = bytes(source[len(_FIRST_MAGIC) : begin])
     if len(head) < begin - len(_FIRST_MAGIC) or zlib.crc32(head[:-4]).to_bytes(4, "little") != head[-4:]:

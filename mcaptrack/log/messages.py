@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack.geometry.arrays import Ints
+from mcaptrack.log.byte_source import ByteSource
 from mcaptrack.log.chunks import (
     MAX_NS,
     Entries,
@@ -40,7 +41,6 @@ from mcaptrack.log.records import (
     read_chunk,
     record_at,
 )
-from mcaptrack.log.source import Source
 from mcaptrack.schema import Rows, Schema
 
 Times = NDArray[np.uint64]
@@ -63,7 +63,7 @@ class Message(NamedTuple):
     payload: bytes
 
 
-class Columns(NamedTuple):
+class ChannelRows(NamedTuple):
     """All rows of a channel by time, and of each message its time, sequence number and how many rows are its own."""
 
     rows: Rows
@@ -72,7 +72,7 @@ class Columns(NamedTuple):
     counts: Ints
 
 
-class Places(NamedTuple):
+class MessageLocations(NamedTuple):
     """Where the messages of a channel stand, by time, (M,): chunks in the file, messages in their chunk, uncompressed.
 
     Outside of chunks ``chunk_offset`` is -1 and ``offset`` a place in the file.
@@ -83,7 +83,7 @@ class Places(NamedTuple):
     offset: Ints
 
 
-class Late(Exception):
+class TimeOutOfRange(Exception):
     """So many messages of a channel are later than ``MAX_NS``, the first of them at ``t_ns``."""
 
     def __init__(self, count: int, t_ns: int) -> None:
@@ -118,7 +118,7 @@ class Messages:
     Channels are given by their ids, one or several; the messages of several are read as those of one.
     """
 
-    def __init__(self, source: Source, index: Index) -> None:
+    def __init__(self, source: ByteSource, index: Index) -> None:
         self.source, self.index = source, index
         self._opened: OrderedDict[int, Bytes] = OrderedDict()  # contents of the last chunks, for other channels
         # What was read, to tell whether it still stands there: checksums of chunks, ends and checksums of pieces.
@@ -131,7 +131,7 @@ class Messages:
         """The times of messages, rising, (M,)."""
         return np.sort(signed(np.concatenate([_NO_TIMES, *(b.t_ns for b in self._batches(channels, span))])))
 
-    def places(self, channels: Sequence[int]) -> Places:
+    def places(self, channels: Sequence[int]) -> MessageLocations:
         """Where messages stand, in the order of ``by_time``."""
         batches = self._batches(channels)
         t_ns = signed(np.concatenate([_NO_TIMES, *(batch.t_ns for batch in batches)]))
@@ -139,7 +139,7 @@ class Messages:
         starts = np.array([batch.chunk.offset if batch.chunk else -1 for batch in batches], np.int64)
         chunk_offset = np.repeat(starts, [len(batch.t_ns) for batch in batches])
         order = np.argsort(t_ns, kind="stable")
-        return Places(t_ns[order], chunk_offset[order], offset[order])
+        return MessageLocations(t_ns[order], chunk_offset[order], offset[order])
 
     def at(self, chunk_offset: int | None, offset: int) -> tuple[int, Message]:
         """The message that stands at a place, and the number of its channel."""
@@ -192,7 +192,7 @@ class Messages:
                 del opened[number]
                 size -= batch.size
 
-    def columns(self, channels: Sequence[int], schema: Schema) -> Columns | None:
+    def columns(self, channels: Sequence[int], schema: Schema) -> ChannelRows | None:
         """Rows without a loop over messages; None where a message is laid out otherwise than ours."""
         batches = self._batches(channels)
         t_ns = signed(np.concatenate([_NO_TIMES, *(batch.t_ns for batch in batches)]))
@@ -218,7 +218,7 @@ class Messages:
             first, kept = (np.cumsum(counts) - counts)[order], counts[order]
             rows = rows[np.repeat(first - (np.cumsum(kept) - kept), kept) + np.arange(len(rows))]
         rows.flags.writeable = False
-        return Columns(rows, t_ns[order], sequence[order], counts[order])
+        return ChannelRows(rows, t_ns[order], sequence[order], counts[order])
 
     def fingerprint(self, channel_id: int | None = None) -> str:
         """The fingerprint of a channel, or of everything; worked out once."""
@@ -226,7 +226,7 @@ class Messages:
             self._fingerprints[channel_id] = fingerprint(self.source, self.index, channel_id, self._checksums)
         return self._fingerprints[channel_id]
 
-    def are_in(self, source: Source) -> bool:
+    def are_in(self, source: ByteSource) -> bool:
         """Whether what was read so far stands in ``source`` as it did when it was read."""
         pieces = all(crc_of(source, start, end) == crc for start, (end, crc) in self._pieces.items())
         return pieces and all(checksum_at(source, start) == crc for start, crc in self._chunks.items())
@@ -338,8 +338,8 @@ def _pieces(channel_id: int, chunk: ChunkIndexRecord | None, entries: Entries, s
 
 
 def signed(t_ns: Times) -> Ints:
-    """Times as signed numbers, as all arithmetic has them. Raises Late where one is too late for that."""
+    """Times as signed numbers, as all arithmetic has them. Raises TimeOutOfRange where one is too late for that."""
     late = t_ns[t_ns > np.uint64(MAX_NS)]
     if len(late):
-        raise Late(len(late), int(late.min()))
+        raise TimeOutOfRange(len(late), int(late.min()))
     return t_ns.astype(np.int64)

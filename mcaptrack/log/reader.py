@@ -14,10 +14,10 @@ import numpy as np
 from mcaptrack.errors import McaptrackError, command
 from mcaptrack.files import follow_links
 from mcaptrack.geometry.arrays import Ints
-from mcaptrack.log import new_end, records
+from mcaptrack.log import in_place, records
 from mcaptrack.log.chunks import MAX_NS
-from mcaptrack.log.messages import Columns, Message, Places
-from mcaptrack.log.names import RESULTS, results_of
+from mcaptrack.log.messages import ChannelRows, Message, MessageLocations
+from mcaptrack.log.paths import RESULTS_SUFFIX, results_path
 from mcaptrack.log.records import ChannelRecord, Damaged
 from mcaptrack.log.snapshot import take_snapshot
 from mcaptrack.log.writer import create
@@ -104,8 +104,8 @@ class Log:
                     "write to another file with -o, or beside it with --sidecar"
                 ) from None
             try:
-                new_end.lock(self.real_path, handle)
-                new_end.settle(self.real_path, handle, self.snapshot.file)
+                in_place.lock(self.real_path, handle)
+                in_place.settle(self.real_path, handle, self.snapshot.file)
                 if not self.snapshot.is_on_disk(os.fstat(handle)):
                     raise McaptrackError(f"{self.path} was replaced while it was being read; try again")
             except BaseException:
@@ -242,7 +242,7 @@ class Log:
 
         return heapq.merge(*map(named, topics), key=lambda found: found[1].t_ns)
 
-    def rows(self, topic: str, schema: Schema) -> Columns:
+    def rows(self, topic: str, schema: Schema) -> ChannelRows:
         """All rows of a channel as one array. Raises McaptrackError if the channel holds something else."""
         if (part := self.part(topic)) is not self:
             return part.rows(topic, schema)
@@ -261,7 +261,7 @@ class Log:
             except ValueError as error:
                 raise Damaged(f"{topic}: {error}") from None
         t_ns = np.array([message.t_ns for message in messages], np.int64)
-        return Columns(rows, t_ns, np.array([message.sequence for message in messages], np.int64), counts)
+        return ChannelRows(rows, t_ns, np.array([message.sequence for message in messages], np.int64), counts)
 
     def frames(self, topic: str, schema: Schema) -> list[Frame]:
         """The same, a frame a message."""
@@ -279,7 +279,7 @@ class Log:
         with self.snapshot.computing(topic):
             return self.snapshot.still(lambda messages: messages.times(channels), np.array_equal)
 
-    def places(self, topic: str) -> Places:
+    def places(self, topic: str) -> MessageLocations:
         """Where the messages of a channel stand in the file of its part, by time, without reading them."""
         if (part := self.part(topic)) is not self:
             return part.places(topic)
@@ -318,7 +318,7 @@ class Log:
         return self.snapshot.still(lambda messages: messages.fingerprint(channel_id), str.__eq__)
 
 
-def _are_equal(one: Places, other: Places) -> bool:
+def _are_equal(one: MessageLocations, other: MessageLocations) -> bool:
     return all(map(np.array_equal, one, other))
 
 
@@ -328,9 +328,9 @@ def read(path: Path, *, sidecar: bool | Callable[[Log], bool] | None = None) -> 
     ``sidecar`` may also be what decides, given the log alone. Raises McaptrackError, in one line, if it is none or is
     damaged.
     """
-    log, beside = Log(path), results_of(path)
+    log, beside = Log(path), results_path(path)
     try:
-        if not path.name.endswith(RESULTS) and (
+        if not path.name.endswith(RESULTS_SUFFIX) and (
             sidecar(log) if callable(sidecar) else sidecar or (sidecar is None and beside.exists())
         ):
             is_new = not beside.exists()

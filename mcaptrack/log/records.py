@@ -59,7 +59,7 @@ class Opcode(IntEnum):
 
 
 class Bytes(Protocol):
-    """Bytes that can be sliced: in memory (memoryview), or in a file (``Source``), where a slice is read."""
+    """Bytes that can be sliced: in memory (memoryview), or in a file (``ByteSource``), where a slice is read."""
 
     def __len__(self) -> int: ...
 

@@ -21,6 +21,7 @@ import numpy as np
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.log import records
+from mcaptrack.log.byte_source import ByteSource, RunningChecksum
 from mcaptrack.log.check import best_content, open_bytes
 from mcaptrack.log.check_summary import record_name
 from mcaptrack.log.chunks import Entries, chunk_entries, message_head, open_chunk
@@ -39,7 +40,6 @@ from mcaptrack.log.records import (
     crc_of,
     walk,
 )
-from mcaptrack.log.source import RunningChecksum, Source
 from mcaptrack.log.writer import LogWriter, create
 
 Progress = Callable[[str, int, int], None]
@@ -72,7 +72,7 @@ _NOT_BEHIND: Final = (Opcode.MESSAGE, Opcode.CHUNK, Opcode.MESSAGE_INDEX, Opcode
 
 
 @dataclass
-class Recovered:
+class RecoverResult:
     """What was saved, and what was lost and where."""
 
     path: Path
@@ -82,12 +82,12 @@ class Recovered:
     lost: list[str] = field(default_factory=list)
 
 
-def recover(path: Path, output: Path, progress: Progress = lambda *_: None) -> Recovered:
+def recover(path: Path, output: Path, progress: Progress = lambda *_: None) -> RecoverResult:
     """Write what is whole in the log ``path`` to a new log ``output``.
 
     Raises McaptrackError, and writes nothing, if there is no message to be saved.
     """
-    report = Recovered(path, output)
+    report = RecoverResult(path, output)
     with open_bytes(path) as (there, file), ExitStack() as stack:
         source = best_content(path, there, file)
         writer = stack.enter_context(create(output, header=_header(source)))
@@ -116,7 +116,7 @@ def _header(buffer: Bytes) -> bytes | None:
 class _Rescue:
     """Walks through a log and passes on what is whole."""
 
-    def __init__(self, buffer: Source, writer: LogWriter, report: Recovered, progress: Progress) -> None:
+    def __init__(self, buffer: ByteSource, writer: LogWriter, report: RecoverResult, progress: Progress) -> None:
         self._buffer, self._writer, self._report, self._progress = buffer, writer, report, progress
         self._said = whole_summary(buffer, summary_start(buffer)) or Index()
         places = {chunk.offset for chunk in self._said.chunks} | {self._said.data_end}

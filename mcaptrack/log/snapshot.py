@@ -12,11 +12,11 @@ from typing import Final, TypeVar
 from mcaptrack import notices
 from mcaptrack.errors import DamagedError, McaptrackError, command
 from mcaptrack.log import records
-from mcaptrack.log.beside import changed, find_journal, recover_words
+from mcaptrack.log.byte_source import ByteSource, OpenFile, Signature
 from mcaptrack.log.index import Index, read_index
-from mcaptrack.log.messages import Late, Messages
+from mcaptrack.log.journal_check import changed, find_journal, recover_words
+from mcaptrack.log.messages import Messages, TimeOutOfRange
 from mcaptrack.log.records import Damaged
-from mcaptrack.log.source import OpenFile, Signature, Source
 
 T = TypeVar("T")
 
@@ -33,7 +33,7 @@ class Snapshot:
     """
 
     def __init__(
-        self, path: Path, file: OpenFile, source: Source, index: Index, signature: Signature, is_certain: bool
+        self, path: Path, file: OpenFile, source: ByteSource, index: Index, signature: Signature, is_certain: bool
     ) -> None:
         self.path, self.file, self.source, self.index = path, file, source, index
         self.messages = Messages(source, index)
@@ -92,7 +92,7 @@ class Snapshot:
         try:
             with self.mending(topic):
                 yield
-        except Late as late:
+        except TimeOutOfRange as late:
             raise McaptrackError(
                 f"{self.path}: {topic} has {late.count} messages later than the year 2262, the first at {late.t_ns} "
                 "ns; they are kept as they are, but nothing is computed with such times "
@@ -113,7 +113,7 @@ class Snapshot:
                 return False
             if Signature.of(self.file.handle) == self._signature and self._is_certain:
                 return not self.is_through_journal
-            on_disk = Source.of(self.file)
+            on_disk = ByteSource.of(self.file)
             if not self.index.agrees_in_all(read_index(on_disk)):
                 return False
         except Damaged:
@@ -131,7 +131,7 @@ class Snapshot:
         if now == self._signature and self._is_certain:
             return None
         if now != self._fresh_at:
-            source = Source(self.source.pieces) if self.is_through_journal else Source.of(self.file)
+            source = ByteSource(self.source.pieces) if self.is_through_journal else ByteSource.of(self.file)
             self._fresh, self._fresh_at = Messages(source, read_index(source)), None
             if self.index.agrees_in_all(self._fresh.index) and self.messages.are_in(self._fresh.source):
                 self._signature, self._is_certain = now, is_certain
@@ -166,7 +166,7 @@ def _look(path: Path, file: OpenFile) -> Snapshot | McaptrackError:
     is_certain = signature.is_certain
     try:
         found = find_journal(path, file)
-        source = found.journal.overlay() if found and found.journal else Source.of(file)
+        source = found.journal.overlay() if found and found.journal else ByteSource.of(file)
         if not len(source):
             raise Damaged("it is empty")
         index = read_index(source)

@@ -43,7 +43,7 @@ def header(log: Log) -> tuple[str, str]:
         return records.read_header(whole, records.record_at(whole, 0))
 
 
-def pass_on_extras(log: Log, writer: LogWriter, *, without: Collection[str] = ()) -> None:
+def copy_attachments_and_metadata(log: Log, writer: LogWriter, *, without: Collection[str] = ()) -> None:
     """Write the log's attachments, and its metadata records of all names but these, as they are."""
     with log.snapshot.mending():
         for listed in log.index.metadata:

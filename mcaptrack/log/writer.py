@@ -23,11 +23,11 @@ from mcaptrack import __version__
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import publish_stream
 from mcaptrack.log import journal, records
+from mcaptrack.log.byte_source import ByteSource, OpenFile
 from mcaptrack.log.chunks import LOG_MAX_NS
 from mcaptrack.log.index import Index, Listed, list_attachment, list_metadata, read_index
-from mcaptrack.log.names import RESULTS, results_of
+from mcaptrack.log.paths import RESULTS_SUFFIX, results_path
 from mcaptrack.log.records import MAGIC, ChannelRecord, ChunkIndexRecord, Damaged, Opcode, SchemaRecord, crc_of
-from mcaptrack.log.source import OpenFile, Source
 
 #: What the headers of our logs name as their writer, before the version.
 LIBRARY: Final = "mcaptrack"
@@ -315,8 +315,8 @@ def _free_id(taken: Mapping[int, object], last: int, what: str) -> int:
 
 def refuse_earlier_results(path: Path) -> None:
     """Raise McaptrackError if a new log at ``path`` would be read with results that were made from another."""
-    beside = results_of(path)
-    if not path.name.endswith(RESULTS) and beside.exists():
+    beside = results_path(path)
+    if not path.name.endswith(RESULTS_SUFFIX) and beside.exists():
         raise McaptrackError(
             f"{beside} holds results of an earlier {path.name} and would be read with the new one; remove it first, or "
             "choose another name"
@@ -346,7 +346,7 @@ def verify(path: Path, writer: LogWriter, messages: int, start: int = 0, crc: in
     """
     file = OpenFile.at(path)
     try:
-        source = Source.of(file)
+        source = ByteSource.of(file)
         index = read_index(source)
         readable = sum(index.counts.values())
         is_right = crc_of(source, start, index.data_end, crc) == writer.crc and readable == messages

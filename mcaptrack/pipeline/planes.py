@@ -13,7 +13,7 @@ from mcaptrack import log
 from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.plane import LEAST_DEPTH, GroundPlane, Planes, assumed_plane, ground_depth
 from mcaptrack.schema import GROUND_PLANE, TRACKS, Frame
-from mcaptrack.schema.ground import plane_to_rows, rows_to_plane
+from mcaptrack.schema.ground_plane import plane_to_rows, rows_to_plane
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.cameras import camera_at
 

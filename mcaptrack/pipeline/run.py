@@ -26,7 +26,7 @@ from mcaptrack.schema import GROUND_PLANE, TRACKS, VIDEO, Frame, Schema
 from mcaptrack.schema.provenance import CLOCK, Provenance, distribution_of
 from mcaptrack.sources import foreign
 from mcaptrack.sources.cameras import FULL, ROUTES, camera_at
-from mcaptrack.sources.video import Encoded, brightness
+from mcaptrack.sources.video import EncodedPicture, decode_gray
 from mcaptrack.transforms import TRANSFORMS, Transform, choice, implementation_of
 from mcaptrack.transforms.to_video_rate import to_video_rate, unchanged_tracks
 
@@ -267,16 +267,16 @@ def _pictures(
 
     total = hashlib.sha256()
 
-    def encoded() -> Iterator[Encoded]:
+    def encoded() -> Iterator[EncodedPicture]:
         stamps.clear()
         for index, (message, picture) in enumerate(foreign.pictures(opened, channel.topic)):
             total.update(message.t_ns.to_bytes(8, "little") + message.payload)
             stamps.append(picture.stamp_ns)
             where = f"{opened.path}: {channel.topic} at {message.t_ns} ns: frame {index}"
-            yield Encoded(message.t_ns, index, picture.format, picture.data, picture.layout, where)
+            yield EncodedPicture(message.t_ns, index, picture.format, picture.data, picture.layout, where)
             progress(stage, index + 1, channel.messages)
 
-    return total.hexdigest, brightness(encoded())
+    return total.hexdigest, decode_gray(encoded())
 
 
 def input_of(

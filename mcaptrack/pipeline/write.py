@@ -114,7 +114,7 @@ def write(
     standing = {name for name, content in new.items() if opened.attachment(name) == content}
     replaced = [name for name in ATTACHMENTS if name not in standing]
     new_topics = {*made, *outdated, *(view.topic for view in (*drawn_first, *drawn_last))}
-    log.refuse_recorded(opened, new_topics, "write to another channel")
+    log.refuse_to_replace_recorded(opened, new_topics, "write to another channel")
     with log.extend(opened, output, drop={*made, *outdated}, drop_attachments=replaced) as writer:
         streams: list[Iterator[Numbered]] = []
 

@@ -15,7 +15,7 @@ import numpy as np
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import publish
 from mcaptrack.geometry.arrays import Image
-from mcaptrack.sources.scene import Scene
+from mcaptrack.sources.synthetic import SyntheticScene
 from mcaptrack.sources.video import write_mp4
 
 #: What the demonstration writes, by name.
@@ -53,7 +53,7 @@ class Footage:
 
 
 def draw(
-    scene: Scene,
+    scene: SyntheticScene,
     folder: Path,
     progress: Callable[[str, int, int], None] = lambda *_: None,
     *,

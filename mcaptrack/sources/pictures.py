@@ -16,10 +16,10 @@ import numpy as np
 from mcaptrack import log
 from mcaptrack.errors import DamagedError, McaptrackError
 from mcaptrack.geometry.arrays import Ints
-from mcaptrack.log.beside import recover_command
+from mcaptrack.log.journal_check import recover_command
 from mcaptrack.schema import Frame
 from mcaptrack.sources import foreign
-from mcaptrack.sources.video import Encoded, colours, entry
+from mcaptrack.sources.video import EncodedPicture, decode_bgr, read_head
 
 #: So many messages are looked at in the second step back to a key picture, so many times more in each further one, and
 #: never more than so many at once.
@@ -32,9 +32,9 @@ _BACK: Final = 2
 
 
 class Pixels(Protocol):
-    """Encoded pictures -> those that are wanted: ``video.colours`` or ``video.brightness``."""
+    """Encoded pictures -> those that are wanted: ``video.decode_bgr`` or ``video.decode_gray``."""
 
-    def __call__(self, pictures: Iterable[Encoded], wanted: Container[int] | None = None, /) -> Iterator[Frame]:
+    def __call__(self, pictures: Iterable[EncodedPicture], wanted: Container[int] | None = None, /) -> Iterator[Frame]:
         """Frames whose rows are pixels."""
 
 
@@ -51,7 +51,7 @@ class Pictures:
         self.t_ns: Ints = opened.times(topic)
         self.decoded = 0
 
-    def at(self, times_ns: Iterable[int], pixels: Pixels = colours) -> Iterator[Frame]:
+    def at(self, times_ns: Iterable[int], pixels: Pixels = decode_bgr) -> Iterator[Frame]:
         """What is seen at these times: for each the last picture that is not later, rising, each once.
 
         Times before the first picture are those of the first.
@@ -59,7 +59,7 @@ class Pictures:
         found = np.searchsorted(self.t_ns, np.fromiter(times_ns, np.int64), "right") - 1
         return self.frames(np.maximum(found, 0).tolist() if len(self.t_ns) else [], pixels)
 
-    def frames(self, numbers: Iterable[int], pixels: Pixels = colours) -> Iterator[Frame]:
+    def frames(self, numbers: Iterable[int], pixels: Pixels = decode_bgr) -> Iterator[Frame]:
         """The pictures with these numbers, rising, each once; ``index`` is the number.
 
         Rows are (height, width, 3) uint8, blue, green, red, or with ``pixels=brightness`` (height, width). Pictures of
@@ -90,25 +90,25 @@ class Pictures:
         while end > 0:
             start = max(0, end - step)
             for at, picture in reversed(list(self._read(start, end))):
-                head = entry(picture.format, picture.data)
+                head = read_head(picture.format, picture.data)
                 is_key |= head.is_key
                 if is_key and head.has_sets:
                     return at
             end, step = start, _STEP if step == 1 else min(step * _FURTHER, _MOST)
         return None
 
-    def _run(self, start: int, wanted: list[int], fed: dict[int, bool]) -> Iterator[Encoded]:
+    def _run(self, start: int, wanted: list[int], fed: dict[int, bool]) -> Iterator[EncodedPicture]:
         """What has to be decoded from ``start`` on, as far as it is of use.
 
         ``fed`` gets what that has of ``wanted``, and whether it holds a picture.
         """
-        waiting: list[Encoded] = []
+        waiting: list[EncodedPicture] = []
         for number, picture in self._read(start, len(self.t_ns)):
             if number < wanted[0]:
                 self.decoded += 1
                 yield picture
                 continue
-            head = entry(picture.format, picture.data)
+            head = read_head(picture.format, picture.data)
             begins = number > start and head.is_key and head.has_sets
             if begins and not picture.is_video:
                 waiting.clear()
@@ -134,7 +134,7 @@ class Pictures:
         where = f"{self._opened.path}: {self._topic} at {int(self.t_ns[number])} ns"
         raise McaptrackError(f"{where} can't be decoded, from the key picture before it on")
 
-    def _read(self, start: int, end: int) -> Iterator[tuple[int, Encoded]]:
+    def _read(self, start: int, end: int) -> Iterator[tuple[int, EncodedPicture]]:
         """The pictures from number ``start`` to before ``end``, as they stand in the log."""
         for first in range(start, end, _BLOCK):
             until = min(first + _BLOCK, end)
@@ -147,7 +147,10 @@ class Pictures:
                     read = number + 1
                     picture = self._picture(message)
                     where = f"{self._opened.path}: {self._topic} at {message.t_ns} ns"
-                    yield number, Encoded(message.t_ns, number, picture.format, picture.data, picture.layout, where)
+                    yield (
+                        number,
+                        EncodedPicture(message.t_ns, number, picture.format, picture.data, picture.layout, where),
+                    )
             if read < until:
                 raise DamagedError(
                     f"{self._opened.path} is damaged: messages of {self._topic} lie outside of the times that their "

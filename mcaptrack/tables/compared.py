@@ -25,11 +25,11 @@ from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.plane import GroundPlane, Point
 from mcaptrack.schema import Frame
 from mcaptrack.sources import ingest
-from mcaptrack.sources.ingest.formats import KITTI_HEIGHT_PX, PERSON, Aside, Labels, Role
+from mcaptrack.sources.ingest.bags.opening import is_mcap
 from mcaptrack.sources.ingest.job import IngestOptions, label_rows
 from mcaptrack.sources.ingest.label_job import LabelJob
-from mcaptrack.sources.ingest.labels import read_homography, read_labels
-from mcaptrack.sources.ingest.source import is_mcap
+from mcaptrack.sources.ingest.labels.formats import KITTI_HEIGHT_PX, PERSON, Aside, Labels, Role
+from mcaptrack.sources.ingest.labels.reading import read_homography, read_labels
 
 #: Formats whose rows say in which frame of the video they are.
 _COUNTING: Final = ("mot", "kitti", "parquet")

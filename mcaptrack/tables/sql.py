@@ -21,7 +21,7 @@ from typing import Any, Final, Protocol, Self
 from mcaptrack import log, tables
 from mcaptrack.errors import McaptrackError, command
 from mcaptrack.files import follow_links
-from mcaptrack.log.names import results_of
+from mcaptrack.log.paths import results_path
 from mcaptrack.tables import TABLES
 from mcaptrack.tables.export import TOPICS, Contents, default_folder, standing, topic_folder
 
@@ -239,7 +239,7 @@ class Database:
         readers = [_OfFolder(path, name) for name in sorted(found)]
         there = [reader for reader in readers if any(reader.part(table) for table in TABLES)]
         if not there:
-            log.refuse_other_kinds(path)
+            log.refuse_non_mcap(path)
             other = " (those in other formats are not read)" if found else ""
             raise McaptrackError(
                 f"{path} is a folder without tables in Parquet{other}; give a log, or a folder that one was exported to"
@@ -302,7 +302,7 @@ def _different(paths: Sequence[Path]) -> list[Path]:
     by_place: dict[Path, Path] = {}
     for path in paths:
         by_place.setdefault(follow_links(path), path)
-    results = {results_of(place) for place in by_place}
+    results = {results_path(place) for place in by_place}
     return [path for place, path in by_place.items() if place not in results]
 
 

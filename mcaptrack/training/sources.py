@@ -20,7 +20,7 @@ from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.plane import Planes
 from mcaptrack.schema import TRACKS, Frame
 from mcaptrack.sources.ingest import label_frames
-from mcaptrack.sources.ingest.labels import read_labels
+from mcaptrack.sources.ingest.labels.reading import read_labels
 from mcaptrack.training.recipe import Recipe
 from mcaptrack.training.walks import walks
 from mcaptrack.training.windows import Windows
@@ -67,7 +67,7 @@ def read_scenes(paths: Sequence[Path], options: SourceOptions, step_s: float) ->
 def _files(path: Path) -> list[Path]:
     """The files of a folder that can be sources, or the file itself."""
     if not path.is_dir():
-        log.refuse_other_kinds(path)
+        log.refuse_non_mcap(path)
         return [path]
     kinds = (".txt", ".parquet", ".mcap")
     found = sorted(file for file in path.rglob("*") if file.suffix.lower() in kinds and file.is_file())
@@ -76,7 +76,7 @@ def _files(path: Path) -> list[Path]:
     found = [file for file in found if not logs & set(file.parents)]
     found = [file for file in found if file.suffix.lower() != ".parquet" or tables.holds_tracks(file)]
     if not found:
-        log.refuse_other_kinds(path)
+        log.refuse_non_mcap(path)
         raise McaptrackError(f"{path} has no {', '.join(kinds)} to train on")
     return found
 

@@ -21,14 +21,14 @@ from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.notices import warn
 from mcaptrack.schema import Frame
 from mcaptrack.sources.foreign.boxes import DETECTIONS_READ, Classes, boxes_decoder
-from mcaptrack.sources.foreign.messages import Kind, guarded, plain_name
-from mcaptrack.sources.video import Layout
+from mcaptrack.sources.foreign.decoding import MessageType, guarded, plain_name
+from mcaptrack.sources.video import PixelLayout
 
 __all__ = [
     "DETECTIONS_READ",
     "PICTURES_READ",
     "Classes",
-    "Kind",
+    "MessageType",
     "Picture",
     "boxes_decoder",
     "detections",
@@ -62,7 +62,7 @@ class Picture(NamedTuple):
     stamp_ns: int
     format: str
     data: bytes
-    layout: Layout | None = None
+    layout: PixelLayout | None = None
 
 
 def holds_pictures(channel: log.Channel) -> bool:
@@ -123,20 +123,22 @@ def detections(opened: log.Log, topic: str) -> list[Frame]:
     return frames
 
 
-def _decoded(opened: log.Log, topic: str, make: Callable[[Kind], Callable[[bytes], Any]]) -> Iterator[tuple[Any, Any]]:
+def _decoded(
+    opened: log.Log, topic: str, make: Callable[[MessageType], Callable[[bytes], Any]]
+) -> Iterator[tuple[Any, Any]]:
     read = _reader(opened, topic, make)
     return ((message, read(message)) for message in opened.timed(topic))
 
 
 def _reader(
-    opened: log.Log, topic: str, make: Callable[[Kind], Callable[[bytes], Any]]
+    opened: log.Log, topic: str, make: Callable[[MessageType], Callable[[bytes], Any]]
 ) -> Callable[[log.Message], Any]:
     channel = opened.channel(topic)
     index = opened.part(channel.topic).index
     schema = index.schemas.get(index.channels[channel.id].schema_id)
     words = (schema.name, schema.encoding, bytes(schema.data)) if schema else ("", "", b"")
     try:
-        decode = make(Kind(*words, channel.message_encoding))
+        decode = make(MessageType(*words, channel.message_encoding))
     except McaptrackError as error:
         raise McaptrackError(f"{opened.path}: {topic}: {error}") from None
 
@@ -152,7 +154,7 @@ def _reader(
 # Pictures
 
 
-def picture_decoder(kind: Kind) -> Callable[[bytes], Picture]:
+def picture_decoder(kind: MessageType) -> Callable[[bytes], Picture]:
     """What makes pictures of the payloads of a channel.
 
     Raises McaptrackError if messages of this kind are not read; what it returns raises McaptrackError for payloads that
@@ -185,7 +187,7 @@ def _format(words: str) -> str:
 
 
 def _raw(message: Any) -> Picture:
-    layout = Layout(
+    layout = PixelLayout(
         _whole(message.width),
         _whole(message.height),
         _whole(message.step),

@@ -15,7 +15,7 @@ import numpy as np
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import DETECTIONS, Rows
-from mcaptrack.sources.foreign.messages import Kind, guarded, plain_name
+from mcaptrack.sources.foreign.decoding import MessageType, guarded, plain_name
 
 #: Schemas whose messages are boxes, but our own.
 DETECTIONS_READ: Final = ("vision_msgs/Detection2DArray",)
@@ -63,7 +63,7 @@ class Classes:
         return list(islice(zip(sorted(self._names), range(self._largest + 1, 2**32), strict=False), _SHOWN))
 
 
-def boxes_decoder(kind: Kind, classes: Classes) -> Callable[[bytes], Rows]:
+def boxes_decoder(kind: MessageType, classes: Classes) -> Callable[[bytes], Rows]:
     """What makes rows of detections (N,) of the payloads of a channel; raises as ``picture_decoder`` does.
 
     ``classes`` collects the names of classes.

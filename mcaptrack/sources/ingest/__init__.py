@@ -10,15 +10,15 @@ from mcaptrack import log, notices
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import is_same_file, refuse_special
 from mcaptrack.schema.provenance import CLOCK
-from mcaptrack.sources.ingest.bags import LogJob
-from mcaptrack.sources.ingest.formats import Format, Role
-from mcaptrack.sources.ingest.job import IngestOptions, Job, Progress, Report
+from mcaptrack.sources.ingest.bags.opening import open_recording
+from mcaptrack.sources.ingest.job import IngestOptions, IngestReport, Job, Progress
 from mcaptrack.sources.ingest.label_job import LabelJob, label_frames
-from mcaptrack.sources.ingest.source import open_source
+from mcaptrack.sources.ingest.labels.formats import Format, Role
+from mcaptrack.sources.ingest.recording_job import RecordingJob
 from mcaptrack.sources.ingest.video_job import VideoJob
 from mcaptrack.sources.video import IMAGE_SUFFIXES, ImageFormat
 
-__all__ = ["Format", "ImageFormat", "IngestOptions", "Report", "Role", "ingest", "label_frames"]
+__all__ = ["Format", "ImageFormat", "IngestOptions", "IngestReport", "Role", "ingest", "label_frames"]
 
 VIDEO_SUFFIXES: Final = (
     ".mp4",
@@ -48,7 +48,7 @@ def ingest(
     into: log.Log | None = None,
     force: bool = False,
     progress: Progress = lambda *_: None,
-) -> Report:
+) -> IngestReport:
     """Make the log ``output`` from ``source``, or add its channels to the log ``into``, which then is the output.
 
     Raises McaptrackError, and writes nothing, if anything of the input can't be understood.
@@ -73,9 +73,9 @@ def ingest(
 
 
 def _job(source: Path, options: IngestOptions, progress: Progress, there: log.Log | None) -> Job:
-    recorded = open_source(source)
+    recorded = open_recording(source)
     if recorded is not None:
-        return LogJob(source, options, recorded, progress, there)
+        return RecordingJob(source, options, recorded, progress, there)
     is_video = source.is_dir() or source.suffix.lower() in VIDEO_SUFFIXES or _is_binary(source)
     if is_video:
         return VideoJob(source, options, progress, there)

@@ -20,12 +20,12 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.plane import GroundPlane, Point
 from mcaptrack.notices import Notice, warn
 from mcaptrack.schema import DETECTIONS, GROUND_PLANE, TRACKS, Frame, Rows, Schema
-from mcaptrack.schema.ground import plane_to_rows
+from mcaptrack.schema.ground_plane import plane_to_rows
 from mcaptrack.schema.provenance import CLOCK, Provenance, digest
-from mcaptrack.sources.ingest.formats import Format, Labels, Role
-from mcaptrack.sources.ingest.labels import read_homography, read_labels
-from mcaptrack.sources.ingest.timeline import Placed, Timeline
-from mcaptrack.sources.video import ImageFormat, Keep
+from mcaptrack.sources.ingest.labels.formats import Format, Labels, Role
+from mcaptrack.sources.ingest.labels.reading import read_homography, read_labels
+from mcaptrack.sources.ingest.labels.timeline import Placed, Timeline
+from mcaptrack.sources.video import ImageFormat, VideoOptions
 
 Progress = Callable[[str, int, int], None]
 #: Frames, from the beginning whenever it is called.
@@ -41,9 +41,9 @@ _BLOCK: Final = 4096
 class IngestOptions:
     """How to make a log. ``labels`` maps what a label file says to the file; ``role`` is for an input that is one.
 
-    ``fps``, ``image_format``, ``quality`` and ``keyframe_interval_s`` are as in ``video.Keep``. ``first_frame`` is the
-    number that label files give the first picture, if it isn't that of their format; ``frames`` how many pictures there
-    are, where there are none.
+    ``fps``, ``image_format``, ``quality`` and ``keyframe_interval_s`` are as in ``video.VideoOptions``. ``first_frame``
+    is the number that label files give the first picture, if it isn't that of their format; ``frames`` is the number of
+    pictures, for labels without pictures.
     """
 
     camera: str = "camera"
@@ -61,9 +61,9 @@ class IngestOptions:
     role: Role | None = None
 
     @property
-    def keep(self) -> Keep:
+    def keep(self) -> VideoOptions:
         """How pictures are kept. Raises McaptrackError for what does not go together."""
-        return Keep(
+        return VideoOptions(
             image_format=self.image_format,
             quality=self.quality,
             keyframe_interval_s=self.keyframe_interval_s,
@@ -81,7 +81,7 @@ class IngestOptions:
 
 
 @dataclass
-class Report:
+class IngestReport:
     """What became of an input: messages by topic, what to say of it (``notes``: to some), what was lost.
 
     ``warnings`` are what was assumed, left out or looks odd. ``has_labels`` says whether there were label files, and
@@ -110,7 +110,7 @@ class Job:
 
     def __init__(self, source: Path, options: IngestOptions, there: log.Log | None = None) -> None:
         self._close = ExitStack()
-        self.source, self.options, self.there, self.report = source, options, there, Report()
+        self.source, self.options, self.there, self.report = source, options, there, IngestReport()
         self.prefix = "/" + options.camera.strip("/")
         #: The topic of the pictures that labels belong to, if there is one.
         self.pictures = ""
@@ -173,7 +173,7 @@ class Job:
         """
         taken = set(self.topics()) & set(there.channels) if there else set()
         if there and taken:
-            log.refuse_recorded(there, taken, self.instead(there.channels))
+            log.refuse_to_replace_recorded(there, taken, self.instead(there.channels))
         if there and taken and not force:
             raise McaptrackError(f"{there.path} has {', '.join(sorted(taken))} already; --force replaces them")
         return taken

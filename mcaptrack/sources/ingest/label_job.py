@@ -18,13 +18,13 @@ from mcaptrack.geometry.clocks import NS_PER_S, parse_ns
 from mcaptrack.geometry.plane import GroundPlane, Point
 from mcaptrack.notices import warn
 from mcaptrack.schema import GROUND_PLANE, Frame
-from mcaptrack.schema.ground import rows_to_plane
+from mcaptrack.schema.ground_plane import rows_to_plane
 from mcaptrack.schema.provenance import CLOCK
 from mcaptrack.sources.foreign import holds_pictures
-from mcaptrack.sources.ingest.cameras import Standing, camera_of, labels_of, seen_by, size_of, timeline_of
-from mcaptrack.sources.ingest.formats import Format, Labels, Role
 from mcaptrack.sources.ingest.job import IngestOptions, Job
-from mcaptrack.sources.ingest.timeline import MAX_FRAMES, Timeline, count_frames
+from mcaptrack.sources.ingest.labels.camera import Standing, camera_of, labels_of, seen_by, size_of, timeline_of
+from mcaptrack.sources.ingest.labels.formats import Format, Labels, Role
+from mcaptrack.sources.ingest.labels.timeline import MAX_FRAMES, Timeline, count_frames
 from mcaptrack.sources.video import SEQINFO, find_seqinfo
 
 _SDD_FPS: Final = Fraction(30)

@@ -3,33 +3,33 @@
 FFmpeg does the work, through PyAV; its wheels bring it along.
 """
 
-from mcaptrack.sources.video.decode import Encoded, brightness, colours
-from mcaptrack.sources.video.encode import H264Encoder, ImageFormat, Keep, encode_image, write_clip, write_mp4
-from mcaptrack.sources.video.folder import IMAGE_SUFFIXES
-from mcaptrack.sources.video.raw import RAW_ENCODINGS, Layout
+from mcaptrack.sources.video.codecs import is_video_codec, read_head
+from mcaptrack.sources.video.decode import EncodedPicture, decode_bgr, decode_gray
+from mcaptrack.sources.video.encode import H264Encoder, ImageFormat, VideoOptions, encode_image, write_clip, write_mp4
+from mcaptrack.sources.video.image_folder import IMAGE_SUFFIXES
+from mcaptrack.sources.video.raw_pixels import RAW_ENCODINGS, PixelLayout
+from mcaptrack.sources.video.reader import PictureMessage, Video, open_video
 from mcaptrack.sources.video.seqinfo import SEQINFO, SeqInfo, find_seqinfo
-from mcaptrack.sources.video.source import EncodedPicture, Video, open_video
-from mcaptrack.sources.video.streams import entry, is_video
 
 __all__ = [
     "IMAGE_SUFFIXES",
     "RAW_ENCODINGS",
     "SEQINFO",
-    "Encoded",
     "EncodedPicture",
     "H264Encoder",
     "ImageFormat",
-    "Keep",
-    "Layout",
+    "PictureMessage",
+    "PixelLayout",
     "SeqInfo",
     "Video",
-    "brightness",
-    "colours",
+    "VideoOptions",
+    "decode_bgr",
+    "decode_gray",
     "encode_image",
-    "entry",
     "find_seqinfo",
-    "is_video",
+    "is_video_codec",
     "open_video",
+    "read_head",
     "write_clip",
     "write_mp4",
 ]

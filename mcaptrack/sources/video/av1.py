@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Final, NamedTuple
 
-from mcaptrack.sources.video.units import Entry, Unit
+from mcaptrack.sources.video.bitstream import AccessUnit, PictureHead
 
 _SEQUENCE, _DELIMITER, _FRAME_HEADER, _FRAME = 1, 2, 3, 6
 _KEY_FRAME: Final = 0
@@ -38,7 +38,7 @@ def _obus(data: bytes) -> Iterator[_Obu]:
         at += size
 
 
-def inspect(data: bytes) -> Unit:
+def inspect(data: bytes) -> AccessUnit:
     """What a temporal unit holds."""
     pictures, is_key, sets = 0, False, []
     for obu in _obus(data):
@@ -50,17 +50,17 @@ def inspect(data: bytes) -> Unit:
             is_shown, key = _header(data[obu.body])
             is_key |= key and not pictures
             pictures += is_shown
-    return Unit(pictures, is_key, tuple(sets), bool(sets))
+    return AccessUnit(pictures, is_key, tuple(sets), bool(sets))
 
 
-def entry(data: bytes) -> Entry:
+def read_head(data: bytes) -> PictureHead:
     """What a message begins with; a key picture is one that is shown."""
     has_sequence = False
     for obu in _obus(data):
         has_sequence |= obu.kind == _SEQUENCE
         if obu.kind in (_FRAME_HEADER, _FRAME) and obu.body < len(data):
-            return Entry(True, _header(data[obu.body])[1], has_sequence)
-    return Entry(False, False, has_sequence)
+            return PictureHead(True, _header(data[obu.body])[1], has_sequence)
+    return PictureHead(False, False, has_sequence)
 
 
 def with_sets(data: bytes, sets: tuple[bytes, ...]) -> bytes:

@@ -13,17 +13,17 @@ from mcaptrack.geometry.arrays import Image
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.schema import Frame
 from mcaptrack.sources.video import h264
+from mcaptrack.sources.video.codecs import CODECS
 from mcaptrack.sources.video.container import is_size_error
 from mcaptrack.sources.video.limits import check_size, check_still, max_pixels, still_size, too_large
-from mcaptrack.sources.video.raw import Layout, raw_brightness, raw_colours
-from mcaptrack.sources.video.streams import CODECS
+from mcaptrack.sources.video.raw_pixels import PixelLayout, raw_brightness, raw_colours
 
 _FULL_RANGE: Final = 2  # AVCOL_RANGE_JPEG
 # Video keeps brightness in 16..235; detectors see 0..255 whatever the picture came from.
 _LIMITED_TO_FULL: Final = np.clip(np.rint((np.arange(256) - 16) * (255 / 219)), 0, 255).astype(np.uint8)
 
 
-class Encoded(NamedTuple):
+class EncodedPicture(NamedTuple):
     """A picture in a log: ``format`` is "h264", "jpeg" and so on; with a ``layout`` it is that of a pixel, "rgb8".
 
     ``where`` names the picture in errors; without it they say its number.
@@ -33,7 +33,7 @@ class Encoded(NamedTuple):
     index: int  # type: ignore[assignment]  # hides tuple.index, which nobody wants here
     format: str
     data: bytes
-    layout: Layout | None = None
+    layout: PixelLayout | None = None
     where: str = ""
 
     @property
@@ -47,7 +47,7 @@ class Encoded(NamedTuple):
         return self.where or f"frame {self.index}"
 
 
-def brightness(pictures: Iterable[Encoded], wanted: Container[int] | None = None) -> Iterator[Frame]:
+def decode_gray(pictures: Iterable[EncodedPicture], wanted: Container[int] | None = None) -> Iterator[Frame]:
     """Frames whose ``rows`` are the brightness of the picture, (height, width) uint8 from 0 to 255.
 
     Pictures of a video before the first that decoding can begin with are left out, as all viewers leave them out.
@@ -57,14 +57,14 @@ def brightness(pictures: Iterable[Encoded], wanted: Container[int] | None = None
     return _decoded(pictures, raw_brightness, _luma, wanted, is_grey=True)
 
 
-def colours(pictures: Iterable[Encoded], wanted: Container[int] | None = None) -> Iterator[Frame]:
+def decode_bgr(pictures: Iterable[EncodedPicture], wanted: Container[int] | None = None) -> Iterator[Frame]:
     """The same in colour: ``rows`` are (height, width, 3) uint8, blue, green, red."""
     return _decoded(pictures, raw_colours, _bgr, wanted, is_grey=False)
 
 
 def _decoded(
-    pictures: Iterable[Encoded],
-    of_pixels: Callable[[str, bytes, Layout], Image],
+    pictures: Iterable[EncodedPicture],
+    of_pixels: Callable[[str, bytes, PixelLayout], Image],
     of_frame: Callable[[Any], Image],
     wanted: Container[int] | None,
     is_grey: bool,
@@ -91,7 +91,7 @@ def _decoded(
         yield from decoder.flush()
 
 
-def _still(picture: Encoded, is_grey: bool) -> Image:
+def _still(picture: EncodedPicture, is_grey: bool) -> Image:
     import cv2
 
     size, image = still_size(picture.data), None
@@ -120,10 +120,10 @@ class _VideoDecoder:
         self._count, self._sets, self._begun, self._last = 0, b"", False, "the video"
         self._waiting: dict[int, tuple[int, int]] = {}
 
-    def decode(self, picture: Encoded) -> Iterator[Frame]:
+    def decode(self, picture: EncodedPicture) -> Iterator[Frame]:
         import av
 
-        head = CODECS[picture.format].entry(picture.data)
+        head = CODECS[picture.format].read_head(picture.data)
         self._begun |= head.has_sets
         if not head.has_picture:
             self._sets += picture.data  # some robots send these apart; FFmpeg takes them with a picture

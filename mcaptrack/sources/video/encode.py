@@ -45,7 +45,7 @@ _IN_MESSAGES: Final = {"x264-params": _X264["x264-params"] + ":repeat-headers=1:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Keep:
+class VideoOptions:
     """How the pictures of a video are kept.
 
     ``image_format`` "auto" passes H.264, VP9 and AV1 on as they are where viewers can play them, "h265" H.265 too,

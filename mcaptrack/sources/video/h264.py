@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from mcaptrack.sources.video.units import Bits, Entry, Unit, nal_starts, nal_units
+from mcaptrack.sources.video.bitstream import AccessUnit, Bits, PictureHead, nal_starts, nal_units
 
 _SLICE, _PARTITION, _IDR, _SPS, _PPS, _DELIMITER = 1, 2, 5, 7, 8, 9
 _PICTURES: Final = (_SLICE, _PARTITION, _IDR)
@@ -14,7 +14,7 @@ _B: Final = 1
 _HIGH: Final = (100, 110, 122, 244, 44, 83, 86, 118, 128, 138, 139, 134, 135)
 
 
-def inspect(data: bytes) -> Unit:
+def inspect(data: bytes) -> AccessUnit:
     """What the access unit ``data`` (Annex B) holds."""
     pictures, is_key, has_b = 0, False, False
     sets: dict[bytes, int] = {}
@@ -26,18 +26,18 @@ def inspect(data: bytes) -> Unit:
             pictures += bits.golomb() == 0  # first_mb_in_slice
             has_b |= bits.golomb() % 5 == _B  # slice_type
             is_key |= kind == _IDR
-    return Unit(pictures, is_key, tuple(sets), set(sets.values()) == _SETS, has_b)
+    return AccessUnit(pictures, is_key, tuple(sets), set(sets.values()) == _SETS, has_b)
 
 
-def entry(data: bytes) -> Entry:
+def read_head(data: bytes) -> PictureHead:
     """What a message begins with; nothing behind the head of its first slice is looked at."""
     found: set[int] = set()
     for start in nal_starts(data):
         kind = data[start] & 0x1F if start < len(data) else 0
         if kind in _PICTURES:
-            return Entry(True, kind == _IDR, found >= _SETS)
+            return PictureHead(True, kind == _IDR, found >= _SETS)
         found.add(kind)
-    return Entry(False, False, found >= _SETS)
+    return PictureHead(False, False, found >= _SETS)
 
 
 def with_sets(data: bytes, sets: tuple[bytes, ...]) -> bytes:

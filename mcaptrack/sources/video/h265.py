@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from mcaptrack.sources.video.units import Entry, Unit, nal_starts, nal_units
+from mcaptrack.sources.video.bitstream import AccessUnit, PictureHead, nal_starts, nal_units
 
 _SETS: Final = frozenset((32, 33, 34))  # VPS, SPS, PPS
 _DELIMITER: Final = 35
@@ -19,7 +19,7 @@ def _kind(data: bytes, at: int) -> int:
     return data[at] >> 1 & 0x3F if at < len(data) else 63
 
 
-def inspect(data: bytes) -> Unit:
+def inspect(data: bytes) -> AccessUnit:
     """What the access unit ``data`` (Annex B) holds. Layers above the first are passed over."""
     pictures, is_key, is_leading = 0, False, False
     sets: dict[bytes, int] = {}
@@ -32,18 +32,18 @@ def inspect(data: bytes) -> Unit:
             pictures += nal[2] >> 7  # first_slice_segment_in_pic_flag
             is_key |= kind in _RANDOM_ACCESS
             is_leading |= kind in _LEADING
-    return Unit(pictures, is_key, tuple(sets), set(sets.values()) == _SETS, is_leading)
+    return AccessUnit(pictures, is_key, tuple(sets), set(sets.values()) == _SETS, is_leading)
 
 
-def entry(data: bytes) -> Entry:
+def read_head(data: bytes) -> PictureHead:
     """What a message begins with; nothing behind the head of its first slice is looked at."""
     found: set[int] = set()
     for start in nal_starts(data):
         kind = _kind(data, start)
         if kind <= _LAST_PICTURE:
-            return Entry(True, kind in _RANDOM_ACCESS, found >= _SETS)
+            return PictureHead(True, kind in _RANDOM_ACCESS, found >= _SETS)
         found.add(kind)
-    return Entry(False, False, found >= _SETS)
+    return PictureHead(False, False, found >= _SETS)
 
 
 def with_sets(data: bytes, sets: tuple[bytes, ...]) -> bytes:

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Final
 
-from mcaptrack.sources.video.units import Bits, Entry, Unit
+from mcaptrack.sources.video.bitstream import AccessUnit, Bits, PictureHead
 
 _SYNC: Final = 0x498342
 _RGB: Final = 7
 _HEAD: Final = 16
 
 
-def inspect(data: bytes) -> Unit:
+def inspect(data: bytes) -> AccessUnit:
     """What a packet holds: a frame, or several of which one is shown."""
     pictures, is_key, size = 0, False, None
     for number, (start, end) in enumerate(_frames(data)):
@@ -20,13 +20,13 @@ def inspect(data: bytes) -> Unit:
         pictures += shown
         is_key |= key and number == 0
         size = said or size
-    return Unit(pictures, is_key, size=size)
+    return AccessUnit(pictures, is_key, size=size)
 
 
-def entry(data: bytes) -> Entry:
+def read_head(data: bytes) -> PictureHead:
     """What a message begins with; key pictures are their own parameter sets."""
     is_key = _header(data[:_HEAD])[1]
-    return Entry(True, is_key, is_key)
+    return PictureHead(True, is_key, is_key)
 
 
 def _frames(data: bytes) -> Iterator[tuple[int, int]]:

@@ -16,7 +16,7 @@ from mcaptrack.schema import DETECTIONS
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources import foreign
 from mcaptrack.sources.cameras import Camera, cameras
-from mcaptrack.sources.foreign.flat import flattener, kind_of
+from mcaptrack.sources.foreign.flatten import flattener, message_type_of
 from mcaptrack.tables import TABLES, Part, Pointers
 from mcaptrack.tables.export.names import file_name, recording_name
 
@@ -108,7 +108,7 @@ class Contents:
         Raises McaptrackError, with topic and time, for messages that can't be read.
         """
         places = self._pointers(topic, of_rows=False)
-        kind = kind_of(self.opened, topic)
+        kind = message_type_of(self.opened, topic)
         try:
             flatten = flattener(kind)
         except McaptrackError as error:

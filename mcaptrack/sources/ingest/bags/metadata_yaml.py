@@ -9,8 +9,8 @@ from pathlib import Path, PurePosixPath
 from typing import Any, Final
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.sources.ingest import plain_yaml
-from mcaptrack.sources.ingest.plain_yaml import Fields, NotPlainError
+from mcaptrack.sources.ingest.bags import plain_yaml
+from mcaptrack.sources.ingest.bags.plain_yaml import Fields, NotPlainError
 
 METADATA: Final = "metadata.yaml"
 _ROOT: Final = "rosbag2_bagfile_information"

@@ -20,21 +20,21 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Image
 from mcaptrack.geometry.clocks import LAST_NS, NS_PER_S
 from mcaptrack.notices import warn
+from mcaptrack.sources.video.codecs import CODECS
 from mcaptrack.sources.video.container import empty, fraction, has_slots, has_times, indexed, reading, videos
-from mcaptrack.sources.video.encode import H264Encoder, Keep, StillFormat, encode_image
-from mcaptrack.sources.video.folder import Images, find_images, read_image
+from mcaptrack.sources.video.encode import H264Encoder, StillFormat, VideoOptions, encode_image
+from mcaptrack.sources.video.frame_slots import count_slots
+from mcaptrack.sources.video.image_folder import Images, find_images, read_image
 from mcaptrack.sources.video.limits import check_h264, check_size
-from mcaptrack.sources.video.passing import look, packets
+from mcaptrack.sources.video.passthrough import look, packets
 from mcaptrack.sources.video.seqinfo import find_seqinfo
-from mcaptrack.sources.video.slots import count_slots
-from mcaptrack.sources.video.streams import CODECS
 
 #: As many on every machine, so that what is made of damaged streams is the same everywhere.
 _THREADS: Final = 4
 _FULL_RANGE, _LIMITED_RANGE = 2, 1  # AVCOL_RANGE_JPEG, AVCOL_RANGE_MPEG
 
 
-class EncodedPicture(NamedTuple):
+class PictureMessage(NamedTuple):
     """One picture as a message carries it."""
 
     t_ns: int
@@ -65,7 +65,7 @@ class Video:
     """
 
     path: Path
-    keep: Keep
+    keep: VideoOptions
     format: str
     width_px: int
     height_px: int
@@ -86,7 +86,7 @@ class Video:
         """How far apart the numbers of pictures are: 12 for images of which every twelfth has kept its number."""
         return self.images.every if self.images else 1
 
-    def pictures(self, start_ns: int = 0) -> Iterator[EncodedPicture]:
+    def pictures(self, start_ns: int = 0) -> Iterator[PictureMessage]:
         """All pictures in order, the first of them at ``start_ns``."""
         clock = _Clock(self, start_ns)
         if self.keep.is_still:
@@ -141,7 +141,7 @@ class _Clock:
         return self._last
 
 
-def open_video(path: Path, keep: Keep = Keep()) -> Video:  # noqa: B008  # frozen
+def open_video(path: Path, keep: VideoOptions = VideoOptions()) -> Video:  # noqa: B008  # frozen
     """Look at a video file or image folder. Raises McaptrackError unless it holds pictures that can be decoded."""
     if path.is_dir():
         return _open_folder(path, keep)
@@ -205,7 +205,7 @@ def _length_s(opened: Any, stream: Any) -> Fraction | None:
     return Fraction(opened.duration, 1_000_000) if opened.duration and len(opened.streams) == 1 else None
 
 
-def _open_folder(path: Path, keep: Keep) -> Video:
+def _open_folder(path: Path, keep: VideoOptions) -> Video:
     images = find_images(path)
     first = read_image(images.paths[0])
     if first is None:
@@ -237,7 +237,7 @@ def _creation_ns(text: str | None) -> int | None:
     return t_ns if 0 <= t_ns < LAST_NS else None
 
 
-def _pass_on(video: Video, clock: _Clock) -> Iterator[EncodedPicture]:
+def _pass_on(video: Video, clock: _Clock) -> Iterator[PictureMessage]:
     codec = CODECS[video.format]
     index, seconds = 0, None
     with reading(video.path) as opened:
@@ -247,17 +247,17 @@ def _pass_on(video: Video, clock: _Clock) -> Iterator[EncodedPicture]:
                 continue
             data = packet.data
             if video.sets:
-                head = codec.entry(data)
+                head = codec.read_head(data)
                 data = codec.with_sets(data, video.sets) if head.is_key and not head.has_sets else data
             seconds = packet.seconds
-            yield EncodedPicture(clock.time(index, seconds), index, data)
+            yield PictureMessage(clock.time(index, seconds), index, data)
             index += 1
         video.frames = video.frames or indexed(opened)
         hidden = empty(opened)
     video.note_missing(index, hidden, seconds)
 
 
-def _transcode(video: Video, clock: _Clock) -> Iterator[EncodedPicture]:
+def _transcode(video: Video, clock: _Clock) -> Iterator[PictureMessage]:
     keep, encoder = video.keep, None
     for index, seconds, picture in _shown(video):
         t_ns = clock.time(index, seconds)
@@ -267,15 +267,15 @@ def _transcode(video: Video, clock: _Clock) -> Iterator[EncodedPicture]:
             encoder = H264Encoder(video.width_px, video.height_px, fps, keep.crf, keep.key_every_s, like=fitted)
         data = encoder.encode(fitted, t_ns)
         del picture, fitted  # not kept while the next one is read: pictures may be large
-        yield EncodedPicture(t_ns, index, data)
+        yield PictureMessage(t_ns, index, data)
 
 
-def _stills(video: Video, clock: _Clock) -> Iterator[EncodedPicture]:
+def _stills(video: Video, clock: _Clock) -> Iterator[PictureMessage]:
     name: StillFormat = "jpeg" if video.format == "jpeg" else "png"
     for index, seconds, picture in _shown(video):
         data = encode_image(_upright(picture), name, video.keep.jpeg_quality)
         del picture
-        yield EncodedPicture(clock.time(index, seconds), index, data)
+        yield PictureMessage(clock.time(index, seconds), index, data)
 
 
 def images(video: Video) -> Iterator[tuple[Fraction | None, Image]]:

@@ -13,15 +13,15 @@ from typing import Final
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.schema.provenance import Provenance
-from mcaptrack.sources.ingest.bag_metadata import METADATA, holds_metadata, read_metadata
+from mcaptrack.sources.ingest.bags.metadata_yaml import METADATA, holds_metadata, read_metadata
 
 #: The profiles of MCAP's registry that ROS tools read, and what a recording with one is called.
 _PROFILES: Final = {"ros1": "ROS 1", "ros2": "ROS 2"}
 
 
 @dataclass
-class Place:
-    """Decides where results of a log go: ``log.read(path, sidecar=Place(wanted))`` opens the log accordingly.
+class SidecarChoice:
+    """Decides where results of a log go: ``log.read(path, sidecar=SidecarChoice(wanted))`` opens the log accordingly.
 
     ``wanted`` is True for a file beside the log, False for the log itself, None for what suits the log. ``why`` is the
     reason in words, "" where nothing needs to be said.
@@ -32,7 +32,7 @@ class Place:
 
     def __call__(self, opened: log.Log) -> bool:
         """Whether results go beside this log. Raises McaptrackError if they are beside it and must go into it."""
-        beside = log.results_of(opened.path)
+        beside = log.results_path(opened.path)
         self.why = ""
         if self.wanted is False and beside.exists():
             raise McaptrackError(

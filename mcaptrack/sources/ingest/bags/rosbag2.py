@@ -18,11 +18,11 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.files import follow_links, refuse_special
 from mcaptrack.notices import warn
 from mcaptrack.schema.provenance import CLOCK
-from mcaptrack.sources.ingest import unpack
-from mcaptrack.sources.ingest.bag_metadata import METADATA, Bag, holds_metadata, read_metadata
-from mcaptrack.sources.ingest.database import Database
-from mcaptrack.sources.ingest.definitions import known_definition
-from mcaptrack.sources.ingest.source import Connection, Found, Source
+from mcaptrack.sources.ingest.bags import decompression
+from mcaptrack.sources.ingest.bags.metadata_yaml import METADATA, Bag, holds_metadata, read_metadata
+from mcaptrack.sources.ingest.bags.recording import Connection, Findings, Recording
+from mcaptrack.sources.ingest.bags.ros_definitions import known_definition
+from mcaptrack.sources.ingest.bags.sqlite_tables import Database
 
 _MCAP_MAGIC, _SQLITE_MAGIC, _ZSTD_MAGIC = b"\x89MCAP0\r\n", b"SQLite format 3\0", b"\x28\xb5\x2f\xfd"
 #: A message that is larger decompressed is not read.
@@ -36,7 +36,7 @@ _NEEDED: Final = {
 _TABLES: Final = ("topics", "messages", "metadata", "schema", "message_definitions")
 
 
-def open_bag(folder: Path) -> Source:
+def open_bag(folder: Path) -> Recording:
     """The bag in a folder with a metadata.yaml. Raises McaptrackError if it can't be read or is incomplete."""
     bag, names = read_metadata(folder / METADATA)
     paths = [folder / name for name in names]
@@ -53,7 +53,7 @@ def open_bag(folder: Path) -> Source:
         if other is not path:
             raise McaptrackError(f"{folder / METADATA} names {other.name} and {path.name}, which are one file")
     source = open_files(paths, folder, bag) if paths else _Files([], folder, bag)
-    ours, results = {path.name for path in paths}, {log.results_of(path).name for path in paths}
+    ours, results = {path.name for path in paths}, {log.results_path(path).name for path in paths}
     beside = [
         entry.name
         for entry in folder.iterdir()
@@ -67,7 +67,7 @@ def open_bag(folder: Path) -> Source:
     return source
 
 
-def open_files(paths: Sequence[Path], whole: Path, bag: Bag | None = None) -> Source:
+def open_files(paths: Sequence[Path], whole: Path, bag: Bag | None = None) -> Recording:
     """The parts of a recording, which is called ``whole``, one after another."""
     if bag is None:
         bag = _bag_around(paths)
@@ -102,8 +102,8 @@ def _unpacked(path: Path, opened: ExitStack) -> Path:
     """The file, or what it holds if it is compressed as a whole."""
     if not _head(path).startswith(_ZSTD_MAGIC):
         return path
-    out = opened.enter_context(unpack.temporary_folder()) / path.name.removesuffix(".zstd")
-    unpack.unzstd_file(path, out)
+    out = opened.enter_context(decompression.temporary_folder()) / path.name.removesuffix(".zstd")
+    decompression.unzstd_file(path, out)
     return out
 
 
@@ -125,7 +125,7 @@ class _Files:
 
     def __init__(self, paths: Sequence[Path], whole: Path, bag: Bag) -> None:
         self.paths, self.whole, self.bag = paths, whole, bag
-        self.words = Found()
+        self.words = Findings()
         self.closing = ExitStack()
         self.claims: dict[Connection, int] = {}
         self._same: dict[tuple[object, ...], Connection] = {}
@@ -147,7 +147,7 @@ class _Files:
         """Let go of the files."""
         self.closing.close()
 
-    def messages(self, found: Found) -> Iterator[tuple[Connection, log.Message]]:
+    def messages(self, found: Findings) -> Iterator[tuple[Connection, log.Message]]:
         """All messages, file after file, as they stand there."""
         self._passed = {}
         for number in range(len(self.paths)):
@@ -161,7 +161,7 @@ class _Files:
     def _open(self, number: int) -> None:
         raise NotImplementedError
 
-    def _messages(self, number: int, found: Found) -> Iterator[tuple[Connection, log.Message]]:
+    def _messages(self, number: int, found: Findings) -> Iterator[tuple[Connection, log.Message]]:
         yield from ()
 
     def _connection(self, twins: dict[object, int], known: Connection, messages: int) -> Connection:
@@ -286,9 +286,9 @@ class Databases(_Files):
         text, self._undefined[kind] = known_definition(kind, self._distro.lower(), digest)
         return (kind, "ros2msg", text.encode()) if self._undefined[kind] else (kind, "", b"")
 
-    def _messages(self, number: int, found: Found) -> Iterator[tuple[Connection, log.Message]]:
+    def _messages(self, number: int, found: Findings) -> Iterator[tuple[Connection, log.Message]]:
         known, path = self._topics[number], self.paths[number]
-        left = unpack.limit_of(path.stat().st_size)
+        left = decompression.limit_of(path.stat().st_size)
         for key, t_ns, data in self._databases[number].rows("messages", ["topic_id", "timestamp", "data"]):
             connection = known.get(key)
             if connection is None:
@@ -318,13 +318,13 @@ class Logs(_Files):
         """The bag's metadata, and all attachments and metadata of the files."""
         super().extras(writer, has_clock, passed_on)
         for opened in [] if passed_on else self.logs:
-            log.pass_on_extras(opened, writer, without=[CLOCK] if has_clock else [])
+            log.copy_attachments_and_metadata(opened, writer, without=[CLOCK] if has_clock else [])
 
     def _open(self, number: int) -> None:
         path = self.paths[number]
         opened = self.closing.enter_context(log.read(path, sidecar=False))
-        if log.results_of(path).exists():
-            warn(f"{log.results_of(path)} holds results of {path.name}; they are left out", "left-out")
+        if log.results_path(path).exists():
+            warn(f"{log.results_path(path)} holds results of {path.name}; they are left out", "left-out")
         self.logs.append(opened)
         known: dict[int, Connection] = {}
         twins: dict[object, int] = {}
@@ -335,9 +335,9 @@ class Logs(_Files):
             known[channel.id] = self._connection(twins, described, opened.index.counts.get(channel.id, 0))
         self._channels.append(known)
 
-    def _messages(self, number: int, found: Found) -> Iterator[tuple[Connection, log.Message]]:
+    def _messages(self, number: int, found: Findings) -> Iterator[tuple[Connection, log.Message]]:
         known, path = self._channels[number], self.paths[number]
-        left = unpack.limit_of(path.stat().st_size)
+        left = decompression.limit_of(path.stat().st_size)
         for channel, message in log.stream(self.logs[number]):
             if self.bag.packed:
                 payload = _unpack_message(message.payload, path, message.t_ns, left)
@@ -360,6 +360,6 @@ def _in_order(key: Any) -> tuple[int, Any]:
 def _unpack_message(data: bytes, path: Path, t_ns: int, left: int) -> bytes:
     """A message that is compressed by itself; ``left`` is how much all that are to come may have, together."""
     try:
-        return unpack.unzstd(data, min(left, _MAX_MESSAGE_BYTES))
-    except unpack.NotUnpackedError as error:
+        return decompression.unzstd(data, min(left, _MAX_MESSAGE_BYTES))
+    except decompression.NotUnpackedError as error:
         raise McaptrackError(f"{path}: the message at {t_ns} ns can't be decompressed: {error}") from None

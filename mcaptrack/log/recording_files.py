@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Final
 
 from mcaptrack.errors import McaptrackError, command
-from mcaptrack.log.names import RESULTS
+from mcaptrack.log.paths import RESULTS_SUFFIX
 
 _BEGIN: Final = {b"#ROSBAG V": "a ROS 1 bag", b"SQLite format 3\0": "a database, as rosbag2 writes them"}
 _MATROSKA: Final = b"\x1a\x45\xdf\xa3"  # and WebM
@@ -16,7 +16,7 @@ _PARTS: Final = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd", ".bag")
 _SPLIT: Final = re.compile(r"(.+?)_(\d{1,9})(\.(?:mcap|db3)(?:\.zstd)?)")
 
 
-def refuse_other_kinds(path: Path) -> None:
+def refuse_non_mcap(path: Path) -> None:
     """Raise McaptrackError for a recording of another kind, with the command that makes a log of it.
 
     Everything else is for whoever opens it to judge.
@@ -34,18 +34,18 @@ def refuse_other_kinds(path: Path) -> None:
 def _folder(path: Path) -> str:
     if (path / "metadata.yaml").is_file():
         return "a rosbag2 folder"
-    parts = parts_in(path)
+    parts = split_files_in(path)
     is_log = len(parts) == 1 and parts[0].suffix == ".mcap"  # which needs no folder
     return "a folder with a recording" if parts and not is_log else ""
 
 
-def parts_in(folder: Path) -> list[Path]:
+def split_files_in(folder: Path) -> list[Path]:
     """The files of the only recording in a folder without a metadata.yaml, in order; none if there is none, or several.
 
     One file, or several whose names count as rosbag2 does: drive_0.mcap, drive_1.mcap.
     """
     names = [entry.name for entry in folder.iterdir() if entry.name.endswith(_PARTS)]
-    names = [name for name in names if not name.endswith(RESULTS)]
+    names = [name for name in names if not name.endswith(RESULTS_SUFFIX)]
     found = [match for match in map(_SPLIT.fullmatch, names) if match]
     if len(found) == len(names) and len({(match[1], match[3]) for match in found}) == 1:
         return [folder / match[0] for match in sorted(found, key=lambda match: int(match[2]))]

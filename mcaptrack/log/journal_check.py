@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 from mcaptrack.errors import McaptrackError, command
 from mcaptrack.files import follow_links
+from mcaptrack.log.byte_source import OpenFile
 from mcaptrack.log.journal import Journal, Unfit, find, find_content, journal_of, remove_words
-from mcaptrack.log.source import OpenFile
 
 
 class Found(NamedTuple):

@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Final
 
 #: How the name of a log ends that holds the results of another.
-RESULTS: Final = ".results.mcap"
+RESULTS_SUFFIX: Final = ".results.mcap"
 
 
-def results_of(path: Path) -> Path:
+def results_path(path: Path) -> Path:
     """Where the results of a log stand if they are not in it."""
-    return path.with_name(path.name.removesuffix(".mcap") + RESULTS)
+    return path.with_name(path.name.removesuffix(".mcap") + RESULTS_SUFFIX)

@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from mcaptrack.sources.video import av1, h264
+from mcaptrack.sources.video.codecs import CODECS
 from mcaptrack.sources.video.container import fraction, has_slots, reading, videos
-from mcaptrack.sources.video.encode import Keep
-from mcaptrack.sources.video.streams import CODECS
+from mcaptrack.sources.video.encode import VideoOptions
 
 _PIXELS: Final = ("yuv420p", "yuvj420p")
 _WORDS: Final = {"h264": "H.264", "h265": "H.265", "vp9": "VP9", "av1": "AV1"}
@@ -76,7 +76,7 @@ def packets(opened: Any, image_format: str) -> Iterator[Passed]:
         yield Passed(seconds, b"".join(bytes(unit) for unit in units), *flags)
 
 
-def look(path: Path, keep: Keep) -> Stream:
+def look(path: Path, keep: VideoOptions) -> Stream:
     """Whether and how the first video stream of a file can be passed on, from one pass over its packets."""
     with reading(path) as opened:
         stream = videos(opened)[0]
@@ -93,7 +93,7 @@ def look(path: Path, keep: Keep) -> Stream:
         return found
 
 
-def _why_not(image_format: str, name: str, keep: Keep, context: Any) -> str:
+def _why_not(image_format: str, name: str, keep: VideoOptions, context: Any) -> str:
     """What speaks against passing a stream on, of all that is known without looking at its packets."""
     if not image_format:
         return f"it is {name}, which viewers don't play"

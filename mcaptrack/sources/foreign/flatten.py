@@ -16,7 +16,7 @@ import numpy as np
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.clocks import NS_PER_S
-from mcaptrack.sources.foreign.messages import Kind, unpacker
+from mcaptrack.sources.foreign.decoding import MessageType, unpacker
 
 Path = tuple[str, ...]
 Value = bool | int | float | str | bytes | list[Any] | None
@@ -31,16 +31,16 @@ class _Messages(tuple[Any, ...]):
     """A list of messages: JSON even where it is empty, so that a column keeps its type."""
 
 
-def kind_of(opened: log.Log, topic: str) -> Kind:
+def message_type_of(opened: log.Log, topic: str) -> MessageType:
     """What a channel of a log says of its messages."""
     channel = opened.channel(topic)
     index = opened.part(topic).index
     schema = index.schemas.get(index.channels[channel.id].schema_id)
     words = (schema.name, schema.encoding, bytes(schema.data)) if schema else ("", "", b"")
-    return Kind(*words, channel.message_encoding)
+    return MessageType(*words, channel.message_encoding)
 
 
-def flattener(kind: Kind) -> Callable[[bytes], dict[Path, Value]]:
+def flattener(kind: MessageType) -> Callable[[bytes], dict[Path, Value]]:
     """What makes a row of the payload of a message: path of each field -> value.
 
     Raises McaptrackError if messages of this kind are not read; what it returns raises McaptrackError for payloads that
@@ -62,7 +62,7 @@ def flattener(kind: Kind) -> Callable[[bytes], dict[Path, Value]]:
     return flatten
 
 
-def _unpacker(kind: Kind) -> Callable[[bytes], Any]:
+def _unpacker(kind: MessageType) -> Callable[[bytes], Any]:
     if kind.encoding == "json":
         return json.loads
     if kind.encoding == "protobuf":
@@ -70,7 +70,7 @@ def _unpacker(kind: Kind) -> Callable[[bytes], Any]:
     return unpacker(kind)
 
 
-def _protobuf(kind: Kind) -> Callable[[bytes], Any]:
+def _protobuf(kind: MessageType) -> Callable[[bytes], Any]:
     """Protobuf by the definition that the log carries."""
     from google.protobuf.descriptor_pb2 import FileDescriptorSet
     from google.protobuf.descriptor_pool import DescriptorPool

@@ -26,7 +26,7 @@ _ROS_NAME: Final = re.compile(r"([A-Za-z]\w*)/(?:msg/)?([A-Za-z]\w*)", re.ASCII)
 _IDL_HEAD: Final = re.compile(r"^=+\r?\nIDL: .*\r?\n", re.MULTILINE)
 
 
-class Kind(NamedTuple):
+class MessageType(NamedTuple):
     """What a channel says of its messages: its schema record and its message encoding."""
 
     name: str
@@ -46,7 +46,7 @@ def plain_name(schema_name: str) -> str:
     return f"foxglove.{name}" if package == "foxglove_msgs" else f"{package}/{name}"
 
 
-def guarded(kind: Kind, convert: Callable[[Any], Any]) -> Callable[[bytes], Any]:
+def guarded(kind: MessageType, convert: Callable[[Any], Any]) -> Callable[[bytes], Any]:
     """Payload -> what ``convert`` makes of the message. Whatever goes wrong is the payload's fault: McaptrackError.
 
     Raises McaptrackError as ``unpacker`` does.
@@ -65,7 +65,7 @@ def guarded(kind: Kind, convert: Callable[[Any], Any]) -> Callable[[bytes], Any]
     return decode
 
 
-def unpacker(kind: Kind) -> Unpack:
+def unpacker(kind: MessageType) -> Unpack:
     """What reads the messages of a channel. Raises McaptrackError for what can't be read, whatever the messages are."""
     if kind.encoding == "protobuf" and kind.name.startswith("foxglove."):
         return lambda payload: foxglove.unpack(kind.name, payload)
@@ -78,7 +78,7 @@ def unpacker(kind: Kind) -> Unpack:
     )
 
 
-def _ros_unpacker(kind: Kind) -> Unpack:
+def _ros_unpacker(kind: MessageType) -> Unpack:
     from rosbags.typesys import Stores
 
     found = _ROS_NAME.fullmatch(kind.name)
@@ -97,7 +97,7 @@ def _ros_unpacker(kind: Kind) -> Unpack:
     return unpack
 
 
-def _typestore(name: str, kind: Kind, known: Any) -> Any:
+def _typestore(name: str, kind: MessageType, known: Any) -> Any:
     """The types of a channel: by its own definition, by that with ROS's own types added, or by ROS's own alone."""
     from rosbags.typesys import Stores, get_typestore
 
@@ -117,7 +117,7 @@ def _typestore(name: str, kind: Kind, known: Any) -> Any:
     raise McaptrackError(f"{kind.name} can't be read: {why}")
 
 
-def _types(name: str, kind: Kind) -> Any:
+def _types(name: str, kind: MessageType) -> Any:
     """The types that a schema record defines: the one of its name, and those that it is made of."""
     from rosbags.typesys import get_types_from_idl, get_types_from_msg
 

@@ -16,22 +16,27 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.clocks import LAST_NS
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.sources import foreign
-from mcaptrack.sources.ingest.cameras import choose, picture_test, timeline_of
+from mcaptrack.sources.ingest.bags.recording import Connection, Findings, Recording
 from mcaptrack.sources.ingest.job import IngestOptions, Job, Progress
-from mcaptrack.sources.ingest.source import Connection, Found, Source
-from mcaptrack.sources.ingest.timeline import Timeline
-from mcaptrack.sources.video import Encoded, brightness
+from mcaptrack.sources.ingest.labels.camera import choose, picture_test, timeline_of
+from mcaptrack.sources.ingest.labels.timeline import Timeline
+from mcaptrack.sources.video import EncodedPicture, decode_gray
 
 #: A larger message would make a chunk that no careful reader opens.
 _MAX_MESSAGE_BYTES: Final = 2**28 - 2**24
 _PROGRESS_EVERY: Final = 256
 
 
-class LogJob(Job):
+class RecordingJob(Job):
     """A recording, with labels beside its pictures."""
 
     def __init__(
-        self, source: Path, options: IngestOptions, recorded: Source, progress: Progress, there: log.Log | None = None
+        self,
+        source: Path,
+        options: IngestOptions,
+        recorded: Recording,
+        progress: Progress,
+        there: log.Log | None = None,
     ) -> None:
         self._recorded, self._progress = recorded, progress
         try:
@@ -141,7 +146,7 @@ class LogJob(Job):
         if len(self._connections) == 1:
             return timeline_of(opened, self.pictures)
         holds_picture = self._holds_picture()
-        return self._timeline(m.t_ns for c, m in self._recorded.messages(Found()) if holds_picture(c, m.payload))
+        return self._timeline(m.t_ns for c, m in self._recorded.messages(Findings()) if holds_picture(c, m.payload))
 
     def _timeline(self, t_ns: Iterable[int]) -> Timeline:
         in_order = sorted(t_ns)
@@ -155,12 +160,12 @@ class LogJob(Job):
 
     def _holds_picture(self) -> Callable[[Connection, bytes], bool]:
         """Whether a message is one of the pictures that labels belong to."""
-        kinds = {one: picture_test(foreign.Kind(*one.schema, one.encoding)) for one in self._connections}
+        kinds = {one: picture_test(foreign.MessageType(*one.schema, one.encoding)) for one in self._connections}
         return lambda connection, payload: connection in kinds and kinds[connection](payload)
 
     def _write_messages(self, writer: log.LogWriter) -> Timeline:
         """Write all channels and messages; returns the pictures that labels belong to."""
-        found, done, times, holds_picture = Found(), 0, array("Q"), self._holds_picture()
+        found, done, times, holds_picture = Findings(), 0, array("Q"), self._holds_picture()
         for connection in self._recorded.connections:
             self._channel(writer, connection)
         total = sum((self._recorded.claims or {}).values())
@@ -220,20 +225,20 @@ class LogJob(Job):
     def _plane(self) -> GroundPlane | None:
         if self.homography is None:
             return None
-        first = next(brightness(self._encoded()), None)
+        first = next(decode_gray(self._encoded()), None)
         if first is None:
             raise McaptrackError(f"{self.source}: {self.pictures} has no picture that can be decoded")
         height, width = first.rows.shape
         return self.plane(width, height)
 
-    def _encoded(self) -> Iterator[Encoded]:
+    def _encoded(self) -> Iterator[EncodedPicture]:
         """The pictures that labels belong to, as far as anybody asks."""
         decoders = {
-            connection: foreign.picture_decoder(foreign.Kind(*connection.schema, connection.encoding))
+            connection: foreign.picture_decoder(foreign.MessageType(*connection.schema, connection.encoding))
             for connection in self._connections
         }
-        for index, (connection, message) in enumerate(self._recorded.messages(Found())):
+        for index, (connection, message) in enumerate(self._recorded.messages(Findings())):
             if connection in decoders:
                 picture = decoders[connection](message.payload)
                 where = f"{self.source}: {self.pictures} at {message.t_ns} ns"
-                yield Encoded(message.t_ns, index, picture.format, picture.data, picture.layout, where)
+                yield EncodedPicture(message.t_ns, index, picture.format, picture.data, picture.layout, where)

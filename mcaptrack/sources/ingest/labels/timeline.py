@@ -20,7 +20,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Ints
 from mcaptrack.geometry.clocks import LAST_NS, NS_PER_S
 from mcaptrack.notices import warn
-from mcaptrack.sources.ingest.formats import Labels
+from mcaptrack.sources.ingest.labels.formats import Labels
 
 #: What a frame's number may be at most: more than three days at 30 a second.
 MAX_FRAMES: Final = 10_000_000

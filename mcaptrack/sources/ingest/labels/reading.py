@@ -10,8 +10,8 @@ import numpy as np
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import refuse_special
-from mcaptrack.sources.ingest.formats import READERS, Format, Labels, Role
-from mcaptrack.sources.ingest.text import lines_of, split
+from mcaptrack.sources.ingest.labels.formats import READERS, Format, Labels, Role
+from mcaptrack.sources.ingest.labels.number_table import lines_of, split
 
 FORMATS: Final = tuple(name for name in get_args(Format) if name != "auto")
 

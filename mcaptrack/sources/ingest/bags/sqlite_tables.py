@@ -15,7 +15,7 @@ from typing import Any, Final
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import follow_links, refuse_special
-from mcaptrack.sources.ingest import unpack
+from mcaptrack.sources.ingest.bags import decompression
 
 #: SQLite's steps between two looks for signals: some milliseconds.
 _STEPS: Final = 100_000
@@ -83,9 +83,9 @@ class Database:
         beside = [path.with_name(path.name + end) for end in ("-wal", "-journal")]
         left = [other for other in beside if other.is_file() and other.stat().st_size]
         if left:
-            folder = self._close.enter_context(unpack.temporary_folder())
+            folder = self._close.enter_context(decompression.temporary_folder())
             for other in (path, *left):
-                unpack.copy(other, folder / other.name)
+                decompression.copy(other, folder / other.name)
                 if other.name.endswith("-journal"):
                     with (folder / other.name).open("ab") as stream:
                         stream.write(_JOURNAL_END)

@@ -23,7 +23,7 @@ _STRIDE_HZ: Final = 1.8
 
 
 @dataclass(frozen=True)
-class Walker:
+class Pedestrian:
     """Someone who goes from point to point: ``route`` holds (seconds, x_m, y_m), and is only there between its ends."""
 
     id: int
@@ -47,7 +47,7 @@ class Block(NamedTuple):
     height_m: float
 
 
-class Shot(NamedTuple):
+class SyntheticFrame(NamedTuple):
     """One picture: BGR (height, width, 3), who is in it, their boxes (N, 4) in pixels and places (N, 2) in metres."""
 
     seconds: float
@@ -58,10 +58,10 @@ class Shot(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Scene:
+class SyntheticScene:
     """A square with people, seen from ``mast_m`` above the ground, looking down by ``tilt_deg``."""
 
-    people: tuple[Walker, ...]
+    people: tuple[Pedestrian, ...]
     seconds: float
     fps: int = 25
     width_px: int = 960
@@ -96,7 +96,7 @@ class Scene:
         homography = np.linalg.svd(np.array(rows))[2][-1]
         return GroundPlane(tuple((homography / homography[-1]).tolist()), self.width_px, self.height_px)
 
-    def shots(self, draw: bool = True) -> Iterator[Shot]:
+    def shots(self, draw: bool = True) -> Iterator[SyntheticFrame]:
         """All pictures in order. The same scene draws the same pixels every time.
 
         Without ``draw`` they are empty, and who is where is the same.
@@ -144,7 +144,7 @@ class Scene:
             inside = (xywh[:, 0] > -0.3 * xywh[:, 2]) & (xywh[:, 0] + 0.7 * xywh[:, 2] < self.width_px)
             inside &= (xywh[:, 1] > -0.3 * xywh[:, 3]) & (xywh[:, 1] + 0.7 * xywh[:, 3] < self.height_px)
             places = np.array([place for _, place in there]).reshape(-1, 2)
-            yield Shot(
+            yield SyntheticFrame(
                 now, image, [who for who, ok in zip(ids, inside, strict=True) if ok], xywh[inside], places[inside]
             )
 
@@ -167,7 +167,9 @@ class Scene:
             cv2.line(image, start, end, (128, 134, 136), 1, cv2.LINE_AA)
         return image
 
-    def _figure(self, image: Image, walker: Walker, place: tuple[float, float], now: float, draw: bool) -> list[float]:
+    def _figure(
+        self, image: Image, walker: Pedestrian, place: tuple[float, float], now: float, draw: bool
+    ) -> list[float]:
         """Draw someone, or only say their box."""
         import cv2
 
@@ -234,7 +236,7 @@ _KIOSK: Final = (Block(1.6, 14.9, 1.7, 2.3),)
 _TREE_AT_M: Final = (-6.8, 16.0)
 
 
-def demo_scene(seed: int = 2) -> Scene:
+def demo_scene(seed: int = 2) -> SyntheticScene:
     """The scene of the demonstration: the four ways in which tracking fails in the paper, within 40 seconds.
 
     Two people cross; two meet, go side by side and part; one passes behind a kiosk for a second; a tree sways; the
@@ -242,41 +244,41 @@ def demo_scene(seed: int = 2) -> Scene:
     """
     people = (
         # two who cross
-        Walker(1, ((0, -8.0, 9.0), (11, 7.5, 15.0)), (40, 30, 130)),
-        Walker(2, ((0, 7.5, 9.5), (11, -8.0, 15.0)), (140, 55, 20)),
+        Pedestrian(1, ((0, -8.0, 9.0), (11, 7.5, 15.0)), (40, 30, 130)),
+        Pedestrian(2, ((0, 7.5, 9.5), (11, -8.0, 15.0)), (140, 55, 20)),
         # two who meet, go side by side for a while and part
-        Walker(3, ((8, -8.0, 7.6), (14, -0.5, 12.1), (15.2, 0.5, 12.6), (21, 8.0, 17.0)), (25, 70, 25)),
-        Walker(4, ((8, -8.0, 17.0), (14, -0.3, 12.5), (15.2, 0.5, 12.1), (21, 8.0, 7.6)), (90, 25, 85)),
+        Pedestrian(3, ((8, -8.0, 7.6), (14, -0.5, 12.1), (15.2, 0.5, 12.6), (21, 8.0, 17.0)), (25, 70, 25)),
+        Pedestrian(4, ((8, -8.0, 17.0), (14, -0.3, 12.5), (15.2, 0.5, 12.1), (21, 8.0, 7.6)), (90, 25, 85)),
         # one who passes behind the kiosk
-        Walker(5, ((16, 9.5, 17.0), (31, -9.5, 16.0)), (30, 30, 30)),
+        Pedestrian(5, ((16, 9.5, 17.0), (31, -9.5, 16.0)), (30, 30, 30)),
         # two who walk towards each other and pass
-        Walker(6, ((23, -7.5, 9.0), (35, 8.0, 9.6)), (235, 235, 240)),
-        Walker(7, ((23, 8.0, 9.3), (35, -7.5, 9.3)), (60, 50, 20)),
+        Pedestrian(6, ((23, -7.5, 9.0), (35, 8.0, 9.6)), (235, 235, 240)),
+        Pedestrian(7, ((23, 8.0, 9.3), (35, -7.5, 9.3)), (60, 50, 20)),
         # others
-        Walker(8, ((26, -8.5, 12.0), (40, 8.5, 13.0)), (45, 45, 95)),
-        Walker(9, ((27, -8.5, 16.0), (40, 8.0, 15.0)), (70, 25, 35)),
-        Walker(10, ((0, 3.0, 20.0), (9, 2.5, 12.5), (17, 8.0, 8.0)), (225, 240, 235)),
-        Walker(11, ((28, 8.5, 14.5), (40, -5.0, 10.0)), (35, 20, 60)),
+        Pedestrian(8, ((26, -8.5, 12.0), (40, 8.5, 13.0)), (45, 45, 95)),
+        Pedestrian(9, ((27, -8.5, 16.0), (40, 8.0, 15.0)), (70, 25, 35)),
+        Pedestrian(10, ((0, 3.0, 20.0), (9, 2.5, 12.5), (17, 8.0, 8.0)), (225, 240, 235)),
+        Pedestrian(11, ((28, 8.5, 14.5), (40, -5.0, 10.0)), (35, 20, 60)),
     )
-    return Scene(people, 40.0, blocks=_KIOSK, tree_at_m=_TREE_AT_M, shake_px=0.8, seed=seed)
+    return SyntheticScene(people, 40.0, blocks=_KIOSK, tree_at_m=_TREE_AT_M, shake_px=0.8, seed=seed)
 
 
-def walkers_scene(seed: int = 1) -> Scene:
+def walkers_scene(seed: int = 1) -> SyntheticScene:
     """Ten people cross the same square on random routes."""
     rng = np.random.default_rng([seed, 1])
     return _square(tuple(_random_walker(rng, number) for number in range(1, 11)), seed)
 
 
-def crowd_scene(seed: int = 1) -> Scene:
+def crowd_scene(seed: int = 1) -> SyntheticScene:
     """Twenty people cross the same square on random routes, most of them at the same time."""
     rng = np.random.default_rng([seed, 2])
     return _square(tuple(_random_walker(rng, number, latest_s=20.0) for number in range(1, 21)), seed)
 
 
-def pairs_scene(seed: int = 1) -> Scene:
+def pairs_scene(seed: int = 1) -> SyntheticScene:
     """Three pairs of people walk side by side the whole way, 0.7 m apart."""
     rng = np.random.default_rng([seed, 3])
-    people: list[Walker] = []
+    people: list[Pedestrian] = []
     for pair in range(3):
         first = _random_walker(rng, 2 * pair + 1)
         # Beside the first one: across the picture, or in depth where they walk across it.
@@ -284,14 +286,14 @@ def pairs_scene(seed: int = 1) -> Scene:
         along = np.array([x1 - x0, y1 - y0]) / np.hypot(x1 - x0, y1 - y0)
         x, y = 0.7 * np.array([-along[1], along[0]])
         beside = tuple((seconds, float(px + x), float(py + y)) for seconds, px, py in first.route)
-        people += [first, Walker(2 * pair + 2, beside, _random_colour(rng))]
+        people += [first, Pedestrian(2 * pair + 2, beside, _random_colour(rng))]
     return _square(tuple(people), seed)
 
 
-def standing_scene(seed: int = 1) -> Scene:
+def standing_scene(seed: int = 1) -> SyntheticScene:
     """Six people come, stand still for 8 to 15 seconds, two of them together, and go on."""
     rng = np.random.default_rng([seed, 4])
-    people: list[Walker] = []
+    people: list[Pedestrian] = []
     for number in range(1, 7):
         walker = _random_walker(rng, number, latest_s=8.0)
         (start, x0, y0), (end, x1, y1) = walker.route
@@ -302,16 +304,16 @@ def standing_scene(seed: int = 1) -> Scene:
             x, y = x + 0.9, y + 0.2
         arrival = start + share * (end - start)
         route = ((start, x0, y0), (arrival, x, y), (arrival + stay, x, y), (end + stay, x1, y1))
-        people.append(Walker(number, route, walker.colour))
+        people.append(Pedestrian(number, route, walker.colour))
     return _square(tuple(people), seed)
 
 
-def _square(people: tuple[Walker, ...], seed: int) -> Scene:
+def _square(people: tuple[Pedestrian, ...], seed: int) -> SyntheticScene:
     """These people on the square of the demonstration."""
-    return Scene(people, 40.0, blocks=_KIOSK, tree_at_m=_TREE_AT_M, shake_px=0.8, seed=seed)
+    return SyntheticScene(people, 40.0, blocks=_KIOSK, tree_at_m=_TREE_AT_M, shake_px=0.8, seed=seed)
 
 
-def _random_walker(rng: np.random.Generator, number: int, latest_s: float = 26.0) -> Walker:
+def _random_walker(rng: np.random.Generator, number: int, latest_s: float = 26.0) -> Pedestrian:
     """A person who crosses the square on a straight line at 0.9 to 1.6 m/s, from one side to the other."""
     side = float(rng.choice([-1.0, 1.0]))
     start = np.array([side * 8.5, rng.uniform(8.0, 17.0)])
@@ -319,7 +321,7 @@ def _random_walker(rng: np.random.Generator, number: int, latest_s: float = 26.0
     seconds = float(np.hypot(*(end - start)) / rng.uniform(0.9, 1.6))
     begin = float(rng.uniform(0.0, latest_s))
     route = ((begin, float(start[0]), float(start[1])), (begin + seconds, float(end[0]), float(end[1])))
-    return Walker(number, route, _random_colour(rng))
+    return Pedestrian(number, route, _random_colour(rng))
 
 
 def _random_colour(rng: np.random.Generator) -> tuple[int, int, int]:
@@ -330,7 +332,7 @@ def _random_colour(rng: np.random.Generator) -> tuple[int, int, int]:
 
 
 #: The scenes of the demonstration by name: the one it shows, and others, most of them harder. Each takes a seed.
-SCENES: Final[Mapping[str, Callable[[int], Scene]]] = {
+SCENES: Final[Mapping[str, Callable[[int], SyntheticScene]]] = {
     "square": demo_scene,
     "walkers": walkers_scene,
     "crowd": crowd_scene,

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
-from mcaptrack.sources.ingest.text import Lines, Table
+from mcaptrack.sources.ingest.labels.number_table import Lines, Table
 
 Format = Literal["auto", "mot", "kitti", "sdd", "trajnet", "obsmat"]
 Role = Literal["detections", "tracks", "truth"]

@@ -14,8 +14,8 @@ from typing import BinaryIO, Final, NamedTuple
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.clocks import NS_PER_S
-from mcaptrack.sources.ingest import unpack
-from mcaptrack.sources.ingest.source import Connection, Found
+from mcaptrack.sources.ingest.bags import decompression
+from mcaptrack.sources.ingest.bags.recording import Connection, Findings
 
 _MESSAGE, _BAG, _CHUNK, _CHUNK_INFO, _CONNECTION = 2, 3, 5, 6, 7
 _MAGIC: Final = b"#ROSBAG V2.0\n"
@@ -51,11 +51,11 @@ class Bag1:
         self._size = path.stat().st_size
         self._known: dict[int, Connection] = {}
         self.claims: Mapping[Connection, int] | None = None
-        self.words = Found()
+        self.words = Findings()
         try:
             self._end, self._why_unindexed = self._read_index()
             if self._why_unindexed:
-                for _ in self.messages(Found()):
+                for _ in self.messages(Findings()):
                     pass
         except _Broken as error:
             self.close()
@@ -72,7 +72,7 @@ class Bag1:
     def extras(self, writer: log.LogWriter, has_clock: bool, passed_on: bool = False) -> None:
         """A bag holds nothing but messages."""
 
-    def messages(self, found: Found) -> Iterator[tuple[Connection, log.Message]]:
+    def messages(self, found: Findings) -> Iterator[tuple[Connection, log.Message]]:
         """All messages, as they stand in the bag. What can't be read goes to ``found``."""
         at, sequence = self._start, dict[int, int]()
         if self._why_unindexed:  # without an index nobody can say whether there was more, unless something is broken
@@ -173,7 +173,7 @@ class Bag1:
         if (known.topic, known.schema) != (described.topic, described.schema):
             raise _Broken(f"connection {number} is of {known.topic}, and of {described.topic} or of other words here")
 
-    def _loose(self, record: _Record, found: Found) -> Iterator[tuple[int, int, bytes]]:
+    def _loose(self, record: _Record, found: Findings) -> Iterator[tuple[int, int, bytes]]:
         """A record outside of chunks: messages stand there if a chunk was never finished."""
         if record.op in (_MESSAGE, _CONNECTION):
             try:
@@ -182,7 +182,7 @@ class Bag1:
             except _Broken as error:
                 found.lost.append(f"{self.path}: byte {record.data}: {error}")
 
-    def _chunk(self, record: _Record, found: Found) -> Iterator[tuple[int, int, bytes]]:
+    def _chunk(self, record: _Record, found: Findings) -> Iterator[tuple[int, int, bytes]]:
         """The messages of a chunk, or of what is there of it."""
         where = f"{self.path}: the chunk at byte {record.data}"
         try:
@@ -279,20 +279,20 @@ def _text(data: bytes) -> str:
 
 def _decompress(data: bytes, compression: bytes, size: int) -> bytes:
     """At most one byte more than ``size``; less if ``data`` is cut off."""
-    most = unpack.limit_of(len(data))
+    most = decompression.limit_of(len(data))
     if size > most:
-        raise _Broken(str(unpack.too_large(size, most)))
+        raise _Broken(str(decompression.too_large(size, most)))
     try:
         if compression == b"none":
             return data
         if compression == b"bz2":
             import bz2
 
-            return unpack.in_steps(bz2.BZ2Decompressor(), data, size + 1)
+            return decompression.in_steps(bz2.BZ2Decompressor(), data, size + 1)
         if compression == b"lz4":
             import lz4.frame
 
-            return unpack.in_steps(lz4.frame.LZ4FrameDecompressor(), data, size + 1)
+            return decompression.in_steps(lz4.frame.LZ4FrameDecompressor(), data, size + 1)
     except (OSError, ValueError, RuntimeError, EOFError) as error:
         raise _Broken(f"it can't be decompressed ({error})") from None
     raise _Broken(f"it is compressed with {compression.decode('utf-8', 'replace')!r}; bz2 and lz4 are read")

@@ -17,9 +17,9 @@ from mcaptrack import notices
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import keep_attributes, publish
 from mcaptrack.log import journal
+from mcaptrack.log.byte_source import OpenFile
 from mcaptrack.log.journal import Journal, Unfit, journal_of
 from mcaptrack.log.records import Damaged
-from mcaptrack.log.source import OpenFile
 
 #: How much is written at once.
 _PIECE: Final = 4 * 2**20

@@ -15,10 +15,10 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.clocks import parse_fps
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources import foreign
-from mcaptrack.sources.foreign.flat import kind_of
-from mcaptrack.sources.ingest.formats import Role
-from mcaptrack.sources.ingest.timeline import Timeline
-from mcaptrack.sources.video import Encoded, brightness, entry, is_video
+from mcaptrack.sources.foreign.flatten import message_type_of
+from mcaptrack.sources.ingest.labels.formats import Role
+from mcaptrack.sources.ingest.labels.timeline import Timeline
+from mcaptrack.sources.video import EncodedPicture, decode_gray, is_video_codec, read_head
 
 #: The camera where no one names another.
 DEFAULT: Final = "camera"
@@ -81,7 +81,7 @@ def camera_of(opened: log.Log, camera: str) -> Camera:
     return choose(opened.path, camera, topics)
 
 
-def picture_test(kind: foreign.Kind) -> Callable[[bytes], bool]:
+def picture_test(kind: foreign.MessageType) -> Callable[[bytes], bool]:
     """What tells whether a message of a channel is a picture: of a video, parameter sets may stand alone in one."""
     if not foreign.is_compressed(kind.name):
         return lambda _: True
@@ -92,7 +92,7 @@ def picture_test(kind: foreign.Kind) -> Callable[[bytes], bool]:
             picture = decode(payload)
         except McaptrackError:
             return True  # a damaged picture is one; whoever decodes it says what is wrong
-        return entry(picture.format, picture.data).has_picture
+        return read_head(picture.format, picture.data).has_picture
 
     return test
 
@@ -109,7 +109,7 @@ def timeline_of(opened: log.Log, topic: str) -> Timeline:
         if last + 1 != len(t_ns):  # pictures were lost on the way: the others keep their numbers
             index = np.array([message.sequence for message in opened.messages(topic)], np.int64)
     elif _may_be_video(opened, topic):
-        is_picture = picture_test(kind_of(opened, topic))
+        is_picture = picture_test(message_type_of(opened, topic))
         t_ns = np.array([m.t_ns for m in opened.messages(topic) if is_picture(m.payload)], np.int64)
         index = np.arange(len(t_ns))
     if not len(t_ns):
@@ -128,9 +128,9 @@ def _may_be_video(opened: log.Log, topic: str) -> bool:
     """Whether the first picture of a channel is of a video, or can't be read."""
     if not foreign.is_compressed(opened.channel(topic).schema_name):
         return False
-    decode = foreign.picture_decoder(kind_of(opened, topic))
+    decode = foreign.picture_decoder(message_type_of(opened, topic))
     try:
-        return any(is_video(decode(message.payload).format) for message in islice(opened.messages(topic), 1))
+        return any(is_video_codec(decode(message.payload).format) for message in islice(opened.messages(topic), 1))
     except McaptrackError:
         return True
 
@@ -161,8 +161,10 @@ def labels_of(opened: log.Log, prefix: str) -> dict[str, Standing]:
 def size_of(opened: log.Log, topic: str) -> tuple[int, int]:
     """Width and height of the pictures of a channel. Raises McaptrackError if none of them can be decoded."""
     found = foreign.pictures(opened, topic)
-    for frame in brightness(
-        Encoded(m.t_ns, number, picture.format, picture.data, picture.layout, f"{opened.path}: {topic} at {m.t_ns} ns")
+    for frame in decode_gray(
+        EncodedPicture(
+            m.t_ns, number, picture.format, picture.data, picture.layout, f"{opened.path}: {topic} at {m.t_ns} ns"
+        )
         for number, (m, picture) in enumerate(found)
     ):
         return frame.rows.shape[1], frame.rows.shape[0]

@@ -13,7 +13,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Bytes
 
 
-class Layout(NamedTuple):
+class PixelLayout(NamedTuple):
     """How the pixels of a picture that nobody compressed lie in its bytes.
 
     ``step`` is the distance of rows in bytes, 0 where rows follow one another; ``is_bigendian`` is about pixels of two
@@ -50,7 +50,7 @@ _WIDE: Final = {"mono16": "u2", "16uc1": "u2", "32fc1": "f4"}
 RAW_ENCODINGS: Final = (*_COLOURS, *_LUMA_AT, *_PLANAR, *_WIDE)
 
 
-def raw_brightness(encoding: str, data: bytes, layout: Layout) -> Bytes:
+def raw_brightness(encoding: str, data: bytes, layout: PixelLayout) -> Bytes:
     """The brightness (H, W) of a picture, from 0 to 255: of 16 bits the upper 8, of floats from 0 to 1 their share.
 
     Raises McaptrackError for an encoding that is not read, and for a size that ``data`` does not hold.
@@ -74,7 +74,7 @@ def raw_brightness(encoding: str, data: bytes, layout: Layout) -> Bytes:
     raise McaptrackError(f"pixels of the encoding {encoding[:40]!r} are not read; {', '.join(RAW_ENCODINGS)} are")
 
 
-def raw_colours(encoding: str, data: bytes, layout: Layout) -> Bytes:
+def raw_colours(encoding: str, data: bytes, layout: PixelLayout) -> Bytes:
     """Blue, green and red (H, W, 3) of a picture; grey where it is grey, or of an encoding that is rare."""
     import cv2
 
@@ -84,7 +84,7 @@ def raw_colours(encoding: str, data: bytes, layout: Layout) -> Bytes:
     return _converted(encoding, data, layout, size, conversion.replace("2GRAY", "2BGR").replace("COLOR_BGR2BGR", ""))
 
 
-def _converted(encoding: str, data: bytes, layout: Layout, size: int, conversion: str) -> Bytes:
+def _converted(encoding: str, data: bytes, layout: PixelLayout, size: int, conversion: str) -> Bytes:
     """Pixels after a conversion of OpenCV's, "" for none."""
     import cv2
 
@@ -98,7 +98,7 @@ def _converted(encoding: str, data: bytes, layout: Layout, size: int, conversion
         raise McaptrackError(f"{layout.width_px} x {layout.height_px} pixels are no {encoding} picture") from None
 
 
-def _rows(data: bytes, layout: Layout, size: int) -> Bytes:
+def _rows(data: bytes, layout: PixelLayout, size: int) -> Bytes:
     """The bytes of the pixels, (H, W * B), without what fills up rows. Never takes more memory than ``data``."""
     width, height = layout.width_px, layout.height_px
     row = width * size

@@ -11,7 +11,7 @@ _START_CODE: Final = b"\x00\x00\x01"
 _HEAD: Final = 24
 
 
-class Unit(NamedTuple):
+class AccessUnit(NamedTuple):
     """What one message holds.
 
     ``pictures`` is how many pictures a decoder shows of it. ``is_key``: everything before can be forgotten, given the
@@ -28,7 +28,7 @@ class Unit(NamedTuple):
     size: tuple[int, int] | None = None
 
 
-class Entry(NamedTuple):
+class PictureHead(NamedTuple):
     """What the first bytes of a message say.
 
     Whether it holds a picture, whether decoding can begin with that, given parameter sets, and whether it holds these.

@@ -17,12 +17,12 @@ from pathlib import Path
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import can_replace, publish_stream
 from mcaptrack.log import records
+from mcaptrack.log.byte_source import ByteSource
 from mcaptrack.log.chunks import chunk_record, message_head, open_chunk
+from mcaptrack.log.in_place import new_end
 from mcaptrack.log.index import Index
-from mcaptrack.log.new_end import new_end
 from mcaptrack.log.reader import Log
 from mcaptrack.log.records import BLOCK, MAGIC, Bytes, ChunkIndexRecord, Damaged, Opcode, Record, crc_of, walk
-from mcaptrack.log.source import Source
 from mcaptrack.log.writer import LogWriter, Sink, refuse_earlier_results, verify
 from mcaptrack.schema.provenance import Provenance
 
@@ -57,7 +57,7 @@ def extend(
     log.is_spent = output is None
 
 
-def refuse_recorded(log: Log, topics: Collection[str], instead: str) -> None:
+def refuse_to_replace_recorded(log: Log, topics: Collection[str], instead: str) -> None:
     """Raise McaptrackError if others recorded a channel of these topics: results never take its place.
 
     Of several channels that share a topic every one counts, in the log and in its results. ``instead`` says what to do.
@@ -108,12 +108,12 @@ def _as_copy(log: Log, change: _Change, output: Path | None) -> Iterator[LogWrit
         verify(copy, writer, messages, change.cut, crc or 0)
 
 
-def _pass_on(source: Source, end: int, stream: Sink) -> None:
+def _pass_on(source: ByteSource, end: int, stream: Sink) -> None:
     for at in range(0, end, BLOCK):
         stream.write(bytes(source[at : min(at + BLOCK, end)]))
 
 
-def _compare(source: Source, copy: Path, end: int) -> None:
+def _compare(source: ByteSource, copy: Path, end: int) -> None:
     """What was passed on is what was read. Raises McaptrackError otherwise."""
     with copy.open("rb") as stream:
         for at in range(0, end, BLOCK):
@@ -131,7 +131,7 @@ class _Change:
     """
 
     index: Index
-    source: Source
+    source: ByteSource
     dropped: set[int]
     metadata: Collection[str]
     attachments: Collection[str]
@@ -208,7 +208,7 @@ class _Change:
             metadata=[listed for listed in index.metadata if listed.offset < self.cut],
         )
 
-    def replay(self, writer: LogWriter, source: Source, base: int) -> None:
+    def replay(self, writer: LogWriter, source: ByteSource, base: int) -> None:
         """Write what stays of the records from the cut on. ``source`` is the file from ``base`` to its data's end."""
         try:
             self._replay(writer, source.front_to_back(), base)

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Final, NamedTuple, overload
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.log.other_kinds import refuse_other_kinds
+from mcaptrack.log.recording_files import refuse_non_mcap
 from mcaptrack.log.records import BLOCK, Damaged, crc_of
 
 #: Small reads fetch at least so much, and while they go on one after another twice as much each time, up to the most.
@@ -36,7 +36,7 @@ _KINDS: Final = {
 }
 
 
-def kind_of_file(mode: int) -> str:
+def file_type(mode: int) -> str:
     """What something is that is no regular file, in words; "" for a regular file."""
     return "" if stat.S_ISREG(mode) else _KINDS.get(stat.S_IFMT(mode), "something special")
 
@@ -70,14 +70,14 @@ class OpenFile:
     @classmethod
     def at(cls, path: Path) -> OpenFile:
         """Raises McaptrackError for what isn't there, may not be read, or is no file; never waits for a pipe."""
-        refuse_other_kinds(path)
+        refuse_non_mcap(path)
         try:
-            kind = kind_of_file(path.stat().st_mode)
+            kind = file_type(path.stat().st_mode)
             if not kind:
                 file = cls(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC))
         except OSError as error:
             raise McaptrackError(f"{path} can't be opened: {error.strerror}") from None
-        kind = kind or kind_of_file(os.fstat(file.handle).st_mode)  # it may have been replaced meanwhile
+        kind = kind or file_type(os.fstat(file.handle).st_mode)  # it may have been replaced meanwhile
         if kind:
             hint = "; give the logs in it, as in 'FOLDER/*.mcap'" if path.is_dir() else ""
             raise McaptrackError(f"{path} is {kind}, not an MCAP file{hint}")
@@ -112,7 +112,7 @@ class Piece(NamedTuple):
     size: int
 
 
-class Source:
+class ByteSource:
     """The bytes of one file, or of pieces of several as if they were one; ``source[start:end]`` reads them.
 
     Both ends of a slice are given, and count from the beginning.
@@ -130,7 +130,7 @@ class Source:
         self.anchor: int | None = None
 
     @classmethod
-    def of(cls, file: OpenFile) -> Source:
+    def of(cls, file: OpenFile) -> ByteSource:
         """The whole of a file, as long as it is now."""
         return cls([Piece(file, 0, os.fstat(file.handle).st_size)])
 
@@ -179,11 +179,11 @@ class Source:
             start, end = start - piece.size, end - piece.size
         return parts[0] if len(parts) == 1 else b"".join(parts)
 
-    def front_to_back(self) -> Source:
+    def front_to_back(self) -> ByteSource:
         """The same for whoever reads all of it in order."""
-        return Source(self.pieces, 2 * BLOCK)
+        return ByteSource(self.pieces, 2 * BLOCK)
 
-    def part(self, start: int, end: int) -> Source:
+    def part(self, start: int, end: int) -> ByteSource:
         """The bytes from ``start`` to ``end`` as a source of their own."""
         pieces = []
         for piece in self.pieces:
@@ -191,13 +191,13 @@ class Source:
             if low < high:
                 pieces.append(Piece(piece.file, piece.at + low, high - low))
             start, end = start - piece.size, end - piece.size
-        return Source(pieces)
+        return ByteSource(pieces)
 
 
 class RunningChecksum:
     """The CRC-32 of a source from its beginning to ``done``, brought on as records are passed."""
 
-    def __init__(self, source: Source) -> None:
+    def __init__(self, source: ByteSource) -> None:
         self._source, self._crc, self.done = source, 0, 0
         source.anchor = 0
 
