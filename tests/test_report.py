@@ -19,7 +19,7 @@ from mcaptrack import foxglove, log
 from mcaptrack.evaluation import Candidate, EvaluateOptions, EvaluationInput, evaluate
 from mcaptrack.evaluation.events import MatchRule, find_events
 from mcaptrack.evaluation.metrics.displacement import Forecasts, Positions, combine_displacements, displacement
-from mcaptrack.foxglove.colours import COUNT as COLOURS
+from mcaptrack.foxglove.palette import COUNT as COLOURS
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.transforms import Predict

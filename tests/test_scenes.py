@@ -11,7 +11,7 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
 from mcaptrack import foxglove, log
 from mcaptrack.foxglove.views import Drawing, ground, layouts
-from mcaptrack.foxglove.views.layouts import There, make
+from mcaptrack.foxglove.views.layouts import CameraChannels, make
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame
 from tests.test_cli import done, finished, footage  # noqa: F401
@@ -189,7 +189,7 @@ NAMES = [
 def test_layouts_name_only_what_there_is(names, pictures):
     if pictures is None:
         names = {name for name in names if not name.endswith("/view/image")}
-    made = make(There("/c", frozenset(names), pictures, "c/ground", EYE, 12))
+    made = make(CameraChannels("/c", frozenset(names), pictures, "c/ground", EYE, 12))
     assert bool(made) == any(name.endswith(("/view/image", "/view/scene")) for name in names)
     for content in made.values():
         layout = json.loads(content)

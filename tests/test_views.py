@@ -14,7 +14,7 @@ from mcap_protobuf.schema import build_file_descriptor_set
 
 from mcaptrack import foxglove
 from mcaptrack.foxglove.views import Drawing
-from mcaptrack.foxglove.views.people import around, ellipses
+from mcaptrack.foxglove.views.people import ellipse_points, ellipses
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import DETECTIONS, PREDICTIONS, TRACKS, Frame
 from tests.worlds import boxes_at, ns, tracks_at
@@ -242,7 +242,7 @@ def test_points_of_an_ellipse_lie_as_far_out_as_its_covariance_says(long, short,
     spread = rotation @ np.diag([long, short]) @ rotation.T
     half, found = ellipses(spread[None])
     assert half[0, 0] >= half[0, 1]
-    points = around(np.array([[x, y]]), half, found, 9)[0] - [x, y]
+    points = ellipse_points(np.array([[x, y]]), half, found, 9)[0] - [x, y]
     np.testing.assert_allclose(np.einsum("ni,ij,nj->n", points, np.linalg.inv(spread), points), 5.991464547, rtol=1e-6)
 
 

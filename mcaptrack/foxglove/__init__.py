@@ -1,7 +1,6 @@
-"""Rows as Foxglove and Lichtblick see them: pictures, what is drawn over them and on the ground, and layouts."""
+"""Messages and layouts for Foxglove and Lichtblick: pictures, drawings on them and on the ground."""
 
 from mcaptrack.foxglove.annotations import Annotations
-from mcaptrack.foxglove.colours import colour, colours
 from mcaptrack.foxglove.messages import (
     ANNOTATIONS,
     IMAGE,
@@ -18,7 +17,8 @@ from mcaptrack.foxglove.messages import (
     unpack,
     unpack_picture,
 )
-from mcaptrack.foxglove.scene import Figure, Scene
+from mcaptrack.foxglove.palette import colour, colours
+from mcaptrack.foxglove.scenes import PersonMarker, SceneMessages
 
 __all__ = [
     "ANNOTATIONS",
@@ -29,8 +29,8 @@ __all__ = [
     "TRANSFORM",
     "VIDEO",
     "Annotations",
-    "Figure",
-    "Scene",
+    "PersonMarker",
+    "SceneMessages",
     "colour",
     "colours",
     "message_class",

@@ -1,10 +1,10 @@
-"""What is drawn on pictures: ImageAnnotations messages, for many pictures at once.
+"""Drawings on pictures: ImageAnnotations messages, for many pictures at once.
 
-Rules that viewers hold (Foxglove, Lichtblick) and that shape what is written here: an annotation belongs to a picture
-if its timestamp is the picture's to the nanosecond; a picture is shown only if every annotation topic that is switched
-on has something for it, so every frame gets a message and an empty one holds a point that can't be seen.
+Two rules of the viewers (Foxglove, Lichtblick) shape these messages: an annotation belongs to a picture if its
+timestamp is the picture's to the nanosecond; a picture is shown only if each annotation topic that is switched on has a
+message for it. So each frame gets a message, and an empty one holds an invisible point.
 
-Letters: F pictures, N things that are drawn, P points of each, Q pairs of points.
+Letters: F pictures, N drawn objects, P points of each, Q pairs of points.
 """
 
 from __future__ import annotations
@@ -15,36 +15,45 @@ from typing import Any, Final
 
 import numpy as np
 
-from mcaptrack.foxglove.colours import ink
 from mcaptrack.foxglove.messages import ANNOTATIONS, message_class
-from mcaptrack.foxglove.template import STAMP, Each, Group, Slot, Template, Word, group, joined, nested, stamps
-from mcaptrack.foxglove.words import by_length
+from mcaptrack.foxglove.palette import ink
+from mcaptrack.foxglove.template import (
+    STAMP,
+    Each,
+    MessageParts,
+    Slot,
+    Template,
+    TextSlot,
+    group,
+    joined,
+    nested,
+    stamps,
+)
+from mcaptrack.foxglove.text_labels import by_length
 from mcaptrack.geometry.arrays import Floats, Ints
 
 #: Coordinates are multiples of a quarter of a pixel: numbers with few digits take few bytes of a compressed log.
 PER_PX: Final = 4
-#: The type of a PointsAnnotation.
+#: Types of a PointsAnnotation.
 DOTS, LINE_LOOP, LINE_LIST = 1, 2, 4
 _POINTS: Final = 2  # the field of ImageAnnotations
 
 
 class Annotations:
-    """The annotations of F pictures, which have these stamps. What belongs to a picture is given by its number (N,),
-    in rising order.
-    """
+    """The annotations of F pictures with these stamps. Objects name their picture by its index (N,), rising."""
 
     def __init__(self, stamp_ns: Ints) -> None:
         self._count = len(stamp_ns)
         self._seconds, self._nanos = stamps(stamp_ns)
-        self._groups: list[Group] = []
-        self._lines: dict[float, list[Group]] = {}
+        self._groups: list[MessageParts] = []
+        self._lines: dict[float, list[MessageParts]] = {}
         self._drawn = np.zeros(self._count, bool)
         self._add(np.arange(self._count), _head())
 
     def loops(
         self, frame: Ints, xy_px: Floats, rgb: Floats, alpha: Floats, thickness: float, fill: float = 0.0
     ) -> None:
-        """Closed lines through points (N, P, 2) in colours (N, 3); inside, ``fill`` times as opaque as the line."""
+        """Draw closed lines through points (N, P, 2) in colours (N, 3); inside with ``fill`` times their opacity."""
         count = xy_px.shape[1]
         more = (
             {} if not fill else {"fill_r": rgb[:, 0], "fill_g": rgb[:, 1], "fill_b": rgb[:, 2], "fill_a": alpha * fill}
@@ -53,9 +62,9 @@ class Annotations:
         self._draw(frame, template, xy_px, r=rgb[:, 0], g=rgb[:, 1], b=rgb[:, 2], a=alpha, **more)
 
     def pairs(self, frame: Ints, xy_px: Floats, rgb: Floats, alpha: Floats, thickness: float) -> None:
-        """Lines between each two of points (N, 2 Q, 2), in colours (N, 3), so opaque: (N, Q), or (Q,) for all.
+        """Draw lines between pairs of points (N, 2 Q, 2) in colours (N, 3) with opacities (N, Q), or (Q,) for all.
 
-        All that are equally thick become one annotation of a picture, because a stamp costs more than a line.
+        Lines of one thickness become one annotation of a picture, because a stamp takes more bytes than a line.
         """
         xy = _short(xy_px, PER_PX)
         shades = {f"colours__{name}": rgb[:, place, None] for place, name in enumerate("rgb")}
@@ -66,8 +75,8 @@ class Annotations:
         self._lines.setdefault(thickness, []).append(group(parts, frame, self._count))
         self._drawn[frame] = True
 
-    def words(self, frame: Ints, xy_px: Floats, numbers: Ints, rgb: Floats, size_px: float) -> None:
-        """Numbers (N,), written from (N, 2) on, on grounds of these colours (N, 3)."""
+    def labels(self, frame: Ints, xy_px: Floats, numbers: Ints, rgb: Floats, size_px: float) -> None:
+        """Write numbers (N,) from positions (N, 2) on, on backgrounds of colours (N, 3)."""
         xy, dark = _short(xy_px, PER_PX), ink(rgb)
         for length, chosen, texts in by_length(numbers):
             shades = {
@@ -76,7 +85,7 @@ class Annotations:
                 for place, name in enumerate("rgb")
             }
             at = {"x": xy[chosen, 0], "y": xy[chosen, 1]}
-            self._add(frame[chosen], _text(length, size_px), word=texts, **at, **shades)
+            self._add(frame[chosen], _text(length, size_px), text=texts, **at, **shades)
 
     def messages(self) -> Iterator[bytes]:
         """The message of each picture, in order."""
@@ -108,7 +117,7 @@ class Annotations:
 
 
 def _short(values: Floats, parts: int) -> Floats:
-    """The nearest numbers that are whole multiples of a binary part."""
+    """The nearest multiples of a binary fraction."""
     return np.rint(values * parts) / parts
 
 
@@ -165,7 +174,7 @@ def _loop(points: int, thickness: float, filled: bool) -> Template:
 def _text(length: int, size_px: float) -> Template:
     front, ground = ({**_paint(name), "a": opacity} for name, opacity in (("text_", 1.0), ("ground_", 0.75)))
     content = {
-        "text": Word("word", length),
+        "text": TextSlot("text", length),
         "font_size": size_px,
         "text_color": front,
         "background_color": ground,

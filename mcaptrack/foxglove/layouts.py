@@ -1,7 +1,7 @@
-"""Layout files, as Foxglove ("Import from file") and Lichtblick read them: panels, and how they share the window.
+"""Layout files of Foxglove ("Import from file") and Lichtblick: panels, and how they divide the window.
 
 Topics of annotations and scenes are off until a layout switches them on. Pictures don't wait for annotations
-(``synchronize`` is off, in the way of today's viewers and in that of earlier ones), so the video always shows.
+(``synchronize`` is off, for current and for earlier viewers), so the video always shows.
 """
 
 from __future__ import annotations
@@ -11,10 +11,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
 Config = Mapping[str, Any]
-#: A panel's name, or two parts beside each other ("row") or one above the other ("column"), and the share of the first.
+#: The name of a panel, or two parts in a "row" or a "column" and the share of the first in percent.
 Tree = str | tuple[str, "Tree", "Tree", float]
 
-#: How the frames of a camera that looks at the ground stand in a layout.
+#: The camera settings of a 3D panel, without its position.
 _CAMERA: Final = {
     "perspective": True,
     "target": [0, 0, 0],
@@ -23,12 +23,12 @@ _CAMERA: Final = {
     "near": 0.1,
     "far": 5000,
 }
-#: Grids have cells of a metre, or of ten where there would be too many.
+#: Grids have cells of 1 m, or of 10 m if there would be more cells than this.
 _MOST_CELLS: Final = 100
 
 
 class Eye(NamedTuple):
-    """From where a scene is seen: towards a point (metres), from how far, how steeply, and from which side.
+    """The position from which a scene is seen: the target in metres, distance, tilt and bearing.
 
     ``tilt_deg`` is 0 straight from above; ``bearing_deg`` is the direction of sight, clockwise from the second axis.
     """
@@ -41,12 +41,12 @@ class Eye(NamedTuple):
 
 
 def panel(title: str, config: Config) -> dict[str, Any]:
-    """A panel's settings with its title, under the name that each viewer has for it."""
+    """The settings of a panel with its title, under the name of each viewer for it."""
     return {**config, "foxglovePanelTitle": title, "lichtblickPanelTitle": title}
 
 
 def image_panel(title: str, image_topic: str, annotations: Mapping[str, bool]) -> dict[str, Any]:
-    """The pictures of a topic with annotations of these topics, on or off."""
+    """An image panel for a topic, with the topics of annotations that are on or off."""
     mode = {
         "imageTopic": image_topic,
         "synchronize": False,
@@ -56,7 +56,7 @@ def image_panel(title: str, image_topic: str, annotations: Mapping[str, bool]) -
 
 
 def scene_panel(title: str, frame_id: str, topics: Mapping[str, bool], eye: Eye) -> dict[str, Any]:
-    """Scenes of these topics, on or off, in a frame, over a grid."""
+    """A 3D panel for a coordinate frame with a grid, with the topics of scenes that are on or off."""
     size = max(10, round(eye.distance_m / 10) * 10 * 2)
     grid = {
         "layerId": "foxglove.Grid",
@@ -92,7 +92,7 @@ def scene_panel(title: str, frame_id: str, topics: Mapping[str, bool], eye: Eye)
 
 
 def plot_panel(title: str, paths: Mapping[str, str]) -> dict[str, Any]:
-    """Curves over time: message paths with their labels."""
+    """A plot over time: message paths with their labels."""
     curves = [
         {"value": value, "enabled": True, "timestampMethod": "receiveTime", "label": label}
         for value, label in paths.items()
@@ -111,19 +111,19 @@ def plot_panel(title: str, paths: Mapping[str, str]) -> dict[str, Any]:
 
 
 def log_panel(title: str, topic: str) -> dict[str, Any]:
-    """The lines of a log topic."""
+    """A panel with the lines of a log topic."""
     return panel(title, {"topicToRender": topic, "minLogLevel": 1, "searchTerms": []})
 
 
 def beside(parts: Sequence[Tree], direction: str = "row") -> Tree:
-    """Parts that share a row, or a column, in equal shares."""
+    """Parts in a row, or a column, with equal shares."""
     if len(parts) == 1:
         return parts[0]
     return direction, parts[0], beside(parts[1:], direction), 100 / len(parts)
 
 
 def layout(panels: Mapping[str, Config], tree: Tree) -> bytes:
-    """The layout file of panels by their names, such as "Image!picture", where the tree puts them."""
+    """The layout file of panels by their names, such as "Image!picture", arranged by the tree."""
     whole = {
         "configById": panels,
         "globalVariables": {},

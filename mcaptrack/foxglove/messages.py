@@ -1,4 +1,4 @@
-"""Foxglove's schemas: their records in a log, and whole messages of them."""
+"""Foxglove's schemas: their records in a log, and single messages."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ PICTURES: Final = (VIDEO, IMAGE)
 
 @cache
 def message_class(schema_name: str) -> Any:
-    """foxglove.X -> the generated class."""
+    """The generated class of a schema "foxglove.X"."""
     from importlib import import_module
 
     name = schema_name.removeprefix("foxglove.")
@@ -29,7 +29,7 @@ def message_class(schema_name: str) -> Any:
 
 @cache
 def schema_record(schema_name: str) -> tuple[str, str, bytes]:
-    """Name, encoding and data of the MCAP schema record of a foxglove schema, with all that it imports."""
+    """Name, encoding and data of the MCAP schema record of a Foxglove schema, with its imports."""
     from google.protobuf.descriptor_pb2 import FileDescriptorSet
 
     files = FileDescriptorSet()
@@ -59,7 +59,7 @@ def pack_picture(schema_name: str, t_ns: int, frame_id: str, image_format: str, 
 
 
 def pack_transform(t_ns: int, parent_frame_id: str, frame_id: str) -> bytes:
-    """A FrameTransform message: a frame that lies in its parent as it is."""
+    """A FrameTransform message: a frame with the pose of its parent."""
     message = message_class(TRANSFORM)(parent_frame_id=parent_frame_id, child_frame_id=frame_id)
     _stamp(message, t_ns)
     message.translation.SetInParent()
@@ -69,7 +69,7 @@ def pack_transform(t_ns: int, parent_frame_id: str, frame_id: str) -> bytes:
 
 
 def pack_log(t_ns: int, level: str, name: str, words: str) -> bytes:
-    """A Log message; ``level`` is "INFO", "WARNING" or "ERROR", ``name`` says whom it comes from."""
+    """A Log message; ``level`` is "DEBUG", "INFO", "WARNING" or "ERROR", ``name`` is that of the source."""
     kind = message_class(LOG)
     message = kind(level=kind.Level.Value(level), name=name, message=words)
     _stamp(message, t_ns)
@@ -78,7 +78,7 @@ def pack_log(t_ns: int, level: str, name: str, words: str) -> bytes:
 
 
 def unpack(schema_name: str, payload: bytes) -> Any:
-    """A message of a foxglove schema. Raises McaptrackError if it is none."""
+    """Parse a message of a Foxglove schema. Raises McaptrackError if it is none."""
     from google.protobuf.message import DecodeError
 
     message = message_class(schema_name)()

@@ -1,9 +1,8 @@
-"""Protobuf messages by the thousand: bytes that are the same in all of them once, and an array of what differs.
+"""Many protobuf messages at once: the constant bytes of a template, and an array of what differs.
 
-A template says what a message holds: constants, and slots for numbers of fixed width. All messages of one template are
-equally long, so they are a NumPy array with the tags and constants as padding, as the rows of a channel are
-(``schema.codec``); filling a slot is one assignment for all of them. What differs in length (words, lists) has a
-template for each length.
+A template holds constants, and slots for numbers of fixed width. All messages of a template have the same length, so
+they are a NumPy array with tags and constants as padding, like the rows of a channel (``schema.codec``); filling a slot
+is one assignment for all messages. Parts of variable length (texts, lists) need a template for each length.
 
 Letters: N messages, F frames.
 """
@@ -20,25 +19,25 @@ from numpy.typing import DTypeLike, NDArray
 from mcaptrack.geometry.arrays import Bytes, Ints
 from mcaptrack.geometry.clocks import NS_PER_S
 
-#: Bytes of a number in a slot for whole numbers, 7 bits each: enough for nanoseconds, and seconds to the year 3058.
+#: The number of bytes of a slot for whole numbers, 7 bits each: enough for nanoseconds, and seconds to the year 3058.
 _VARINT_BYTES: Final = 5
 
 
 class Slot(NamedTuple):
-    """A place for a float64 that has this name in the array."""
+    """A slot for a float64, with the name of its column in the array."""
 
     name: str
 
 
-class Word(NamedTuple):
-    """A place for a text of so many bytes."""
+class TextSlot(NamedTuple):
+    """A slot for a text of a fixed number of bytes."""
 
     name: str
     length: int
 
 
 class Each(NamedTuple):
-    """A field that is there so many times; in the array (N, times), with the names of what each holds."""
+    """A field that occurs a number of times; in the array (N, times), with the columns of its content."""
 
     name: str
     times: int
@@ -46,17 +45,17 @@ class Each(NamedTuple):
 
 
 class _Whole(NamedTuple):
-    """A place for a whole number, written in ``_VARINT_BYTES`` bytes whatever it is."""
+    """A slot for a whole number, always written in ``_VARINT_BYTES`` bytes."""
 
     name: str
 
 
-#: The timestamp of a message, to be filled by ``stamp``.
+#: The timestamp of a message; its columns are filled by ``stamps``.
 STAMP: Final = {"seconds": _Whole("seconds"), "nanos": _Whole("nanos")}
 
 
 def varint(value: int) -> bytes:
-    """A whole number as protobuf writes it, 7 bits a byte."""
+    """A whole number as a protobuf varint, 7 bits a byte."""
     out = bytearray()
     while value > 0x7F:
         out.append(value & 0x7F | 0x80)
@@ -65,7 +64,7 @@ def varint(value: int) -> bytes:
 
 
 def whole_numbers(values: Ints) -> Bytes:
-    """Whole numbers (N,) from 0 as slots hold them, (N, 5): all bytes but the last say that more follow."""
+    """Whole numbers (N,) from 0 on as slots hold them, (N, 5): all bytes but the last have the continuation bit."""
     out = (values[:, None] >> (7 * np.arange(_VARINT_BYTES)) & 0x7F).astype(np.uint8)
     out[:, :-1] |= 0x80
     return out
@@ -78,7 +77,7 @@ def stamps(t_ns: Ints) -> tuple[Bytes, Bytes]:
 
 
 class _Layout:
-    """Bytes, and what stands where in them: name, format and offset of each slot."""
+    """Bytes with the name, format and offset of each slot in them."""
 
     def __init__(self) -> None:
         self.data = bytearray()
@@ -105,7 +104,9 @@ class _Layout:
 
 
 class Template:
-    """Fields of a message, with their tags: ``descriptor`` is that of the message, ``content`` what its fields hold."""
+    """Fields of a message with their tags. ``descriptor`` is that of the message, ``content`` the content of its
+    fields.
+    """
 
     def __init__(self, descriptor: Any, content: Mapping[str, Any]) -> None:
         layout = _lay_out(descriptor, content)
@@ -113,7 +114,7 @@ class Template:
         self.dtype = layout.dtype()
 
     def filled(self, count: int, **columns: Any) -> NDArray[np.void]:
-        """``count`` messages; columns for slots, ``a__b`` for what stands inside a slot ``a`` that is there often."""
+        """``count`` messages with the slots filled from columns; ``a__b`` is the slot b inside of an `Each` named a."""
         out = np.frombuffer(bytearray(self._data) * count, self.dtype)
         for name, values in columns.items():
             target: Any = out
@@ -150,7 +151,7 @@ def _put(layout: _Layout, field: Any, value: Any) -> None:
             layout.put(b"", bytes(one.data) * times, (name, (one.dtype(), (times,))))
         case Slot(name):
             layout.put(tag, bytes(8), (name, "<f8"))
-        case Word(name, length):
+        case TextSlot(name, length):
             layout.put(tag + varint(length), bytes(length), (name, f"S{length}"))
         case _Whole(name):
             layout.put(tag, bytes(_VARINT_BYTES), (name, ("u1", (_VARINT_BYTES,))))
@@ -165,17 +166,17 @@ def _put(layout: _Layout, field: Any, value: Any) -> None:
             layout.put(tag, varint(int(value)))
 
 
-class Group(NamedTuple):
-    """Parts of messages, equally long: ``data`` are their bytes, ``at`` (F + 1,) where those of each frame begin."""
+class MessageParts(NamedTuple):
+    """Parts of messages of equal length: their bytes, and the offset ``at`` (F + 1,) of those of each frame."""
 
     data: memoryview
     at: list[int]
 
 
-def group(parts: NDArray[np.void], frame: Ints, frames: int) -> Group:
-    """Parts (N,) that belong to frames (N,), in rising order, of so many frames."""
+def group(parts: NDArray[np.void], frame: Ints, frames: int) -> MessageParts:
+    """The group of parts (N,) that belong to the frames (N,), rising, out of ``frames``."""
     at = np.searchsorted(frame, np.arange(frames + 1)) * parts.dtype.itemsize
-    return Group(parts.view(np.uint8).data, at.tolist())
+    return MessageParts(parts.view(np.uint8).data, at.tolist())
 
 
 def nested(number: int, content: bytes) -> bytes:
@@ -183,6 +184,6 @@ def nested(number: int, content: bytes) -> bytes:
     return varint(number << 3 | 2) + varint(len(content)) + content
 
 
-def joined(groups: Sequence[Group], frame: int) -> bytes:
+def joined(groups: Sequence[MessageParts], frame: int) -> bytes:
     """The bytes of all groups in a frame, group after group."""
     return b"".join([data[at[frame] : at[frame + 1]] for data, at in groups])

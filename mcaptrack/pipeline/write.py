@@ -216,11 +216,11 @@ class _Drawn:
 
     def there(
         self, topics: set[str], video: str | None, eye: Eye, last_step: int, is_truth_known: bool
-    ) -> layouts.There:
+    ) -> layouts.CameraChannels:
         """What layouts can show."""
         front = self._prefix + "/"
         names = frozenset(topic.removeprefix(front) for topic in topics if topic.startswith(front))
-        return layouts.There(self._prefix, names, video, self._frame_id, eye, last_step, is_truth_known)
+        return layouts.CameraChannels(self._prefix, names, video, self._frame_id, eye, last_step, is_truth_known)
 
 
 def _start_ns(opened: log.Log, camera: Camera, shown: Mapping[str, Shown], picture_ns: Ints) -> int:
@@ -312,7 +312,7 @@ def find_views(opened: log.Log, prefix: str, topics: Sequence[str] = ()) -> list
         for topic in opened.channels
         if topic.startswith(prefix + "/") and topic.endswith(views.SUFFIX)
     }
-    found = [f"{prefix}/{name}{views.SUFFIX}" for name in layouts.best(there)]
+    found = [f"{prefix}/{name}{views.SUFFIX}" for name in layouts.best_channels(there)]
     if not found:
         raise McaptrackError(f"{opened.path} has no views of {prefix} yet; {command('run', opened.path)} makes them")
     return found

@@ -1,4 +1,4 @@
-"""Rows drawn on the ground plane, in metres: a scene for every picture, or where there are none for every frame.
+"""Rows drawn on the ground plane, in metres: a scene for each picture, or without pictures for each frame.
 
 Letters: N people, P points.
 """
@@ -10,20 +10,19 @@ from typing import Final
 
 import numpy as np
 
-from mcaptrack.foxglove import Scene, colours
-from mcaptrack.foxglove.views import looks
+from mcaptrack.foxglove import SceneMessages, colours
 from mcaptrack.foxglove.views.image import View, fade
-from mcaptrack.foxglove.views.looks import Look
 from mcaptrack.foxglove.views.people import (
     People,
     by_count,
     ellipses,
     forecasts,
     latest,
-    pieces,
+    segments,
     shown_at,
     trails,
 )
+from mcaptrack.foxglove.views.style import INTERPOLATED, OBSERVED, TrackStyle
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.plane import GroundPlane, Planes
@@ -32,11 +31,11 @@ from mcaptrack.schema import Frame
 _BATCH: Final = 128
 _WHITE: Final = (1.0, 1.0, 1.0)
 _FORECAST_PX: Final = 3.0
-#: A picture's outline ends where pixels are so many times as large on the ground as in the middle of its lower edge:
-#: farther out there is the horizon.
+#: The outline of a picture ends where a pixel is this many times as large on the ground as in the middle of the lower
+#: edge; the horizon is farther away.
 _FARTHEST: Final = 20.0
 _OUTLINE: Final = (0.5, 0.5, 0.5, 0.75)
-#: How long a scene is to be seen, in usual times between two.
+#: The lifetime of a scene, in usual intervals between scenes.
 _LIFETIME: Final = 1.5
 
 
@@ -46,33 +45,33 @@ def frame_of(prefix: str) -> str:
 
 
 def world_of(prefix: str) -> str:
-    """The name of the frame that it lies in."""
+    """The name of the parent of that frame."""
     return f"{prefix.strip('/')}/world"
 
 
 def lifetime_ns(t_ns: Ints) -> int:
-    """How long scenes at these times are to be seen: until the next is due, and a little longer."""
+    """The lifetime of scenes at these times: until the next one is due, and a little longer."""
     steps = np.diff(t_ns)
     return round(_LIFETIME * float(np.quantile(steps, 0.95))) if len(steps) else NS_PER_S
 
 
 class _Instants:
-    """The instants of a channel's scenes, some at a time."""
+    """The instants of the scenes of a channel, in batches."""
 
     def __init__(self, t_ns: Ints, frame_id: str) -> None:
         self.t_ns, self._frame_id, self._lifetime_ns = t_ns, frame_id, lifetime_ns(t_ns)
 
-    def batches(self) -> Iterator[tuple[slice, Scene]]:
+    def batches(self) -> Iterator[tuple[slice, SceneMessages]]:
         for start in range(0, len(self.t_ns), _BATCH):
             span = slice(start, min(start + _BATCH, len(self.t_ns)))
-            yield span, Scene(self.t_ns[span], self._frame_id, self._lifetime_ns)
+            yield span, SceneMessages(self.t_ns[span], self._frame_id, self._lifetime_ns)
 
-    def numbered(self, span: slice, scene: Scene) -> View:
+    def numbered(self, span: slice, scene: SceneMessages) -> View:
         yield from zip(self.t_ns[span].tolist(), range(span.start, span.stop), scene.messages(), strict=True)
 
 
-def tracks(people: People, t_ns: Ints, frame_id: str, look: Look) -> View:
-    """Cylinders with their numbers, fainter where nobody was seen, and where people were before, fading.
+def tracks(people: People, t_ns: Ints, frame_id: str, style: TrackStyle) -> View:
+    """Draw cylinders with numbers and fading trails; interpolated positions are fainter.
 
     ``people`` are those at these times.
     """
@@ -80,8 +79,8 @@ def tracks(people: People, t_ns: Ints, frame_id: str, look: Look) -> View:
     known = np.asarray(np.isfinite(people.at_m).all(axis=1), np.bool_)
     lines = trails(people, known, t_ns)
     longest = lines.row.shape[1] - 1
-    rgb = np.broadcast_to(_WHITE, (len(people.number), 3)) if look.is_white else colours(people.number)
-    alpha = 0.875 * np.where(people.seen, looks.SEEN, looks.FILLED_IN)
+    rgb = np.broadcast_to(_WHITE, (len(people.number), 3)) if style.is_white else colours(people.number)
+    alpha = 0.875 * np.where(people.observed, OBSERVED, INTERPOLATED)
     bounds = np.searchsorted(people.frame, np.arange(len(t_ns) + 1))
     for span, scene in instants.batches():
         rows = np.arange(bounds[span.start], bounds[span.stop])
@@ -90,17 +89,17 @@ def tracks(people: People, t_ns: Ints, frame_id: str, look: Look) -> View:
             these = rows[chosen]
             trail = people.at_m[lines.row[these, -points:]]
             opacity = fade(points, longest + 1)
-            if look.figure.in_pieces:
-                trail, opacity = pieces(trail, look.dash), np.repeat(opacity[1:], 2)
+            if style.marker.in_pieces:
+                trail, opacity = segments(trail, style.dash), np.repeat(opacity[1:], 2)
             scene.people(
                 people.frame[these] - span.start, people.number[these], people.at_m[these], rgb[these], alpha[these],
-                look.figure, trail, opacity,
+                style.marker, trail, opacity,
             )  # fmt: skip
         yield from instants.numbered(span, scene)
 
 
 def predictions(frames: Sequence[Frame], t_ns: Ints, frame_id: str) -> View:
-    """The latest forecasts as lines that fade into the future, with the ellipses that hold 95 % of where they end."""
+    """Draw the latest forecasts as lines that fade into the future, with the 95 % ellipses of their last step."""
     instants = _Instants(t_ns, frame_id)
     wanted = latest(frames, t_ns)
     futures = [(future, ellipses(future.spread_m2), colours(future.number)) for future in forecasts(frames)]
@@ -119,12 +118,12 @@ def predictions(frames: Sequence[Frame], t_ns: Ints, frame_id: str) -> View:
 
 
 def outlines(planes: Planes, start_ns: int, frame_id: str) -> View:
-    """What the picture shows of the ground, at the times from which each plane holds; seen until the next."""
+    """Draw the outline of the picture on the ground, at the time from which each plane holds, until the next."""
     t_ns = np.array([max(start_ns, since) for since, _ in planes], np.int64)
     if len(t_ns):
         t_ns[0] = start_ns
     keep = np.append(t_ns[1:] > t_ns[:-1], True)[: len(t_ns)]
-    scene = Scene(t_ns[keep], frame_id, 0)
+    scene = SceneMessages(t_ns[keep], frame_id, 0)
     for number, (_, plane) in enumerate(plane for plane, kept in zip(planes, keep.tolist(), strict=True) if kept):
         around_m = outline(plane)
         if len(around_m):
@@ -133,7 +132,7 @@ def outlines(planes: Planes, start_ns: int, frame_id: str) -> View:
 
 
 def outline(plane: GroundPlane) -> Floats:
-    """The picture's outline on the ground, (P, 2) m, cut off before the horizon; nothing if no ground is to be seen."""
+    """The outline of the picture on the ground, (P, 2) m, cut off before the horizon; empty if no ground is visible."""
     width, height = float(plane.width_px), float(plane.height_px)
     corners = np.array([[0.0, 0], [width, 0], [width, height], [0, height]])
     depth = np.append(corners, np.ones((4, 1)), axis=1) @ plane.matrix[2]

@@ -1,4 +1,4 @@
-"""The layouts of a camera, filled in from what its log has: how tracking goes, tracks side by side, and forecasts."""
+"""The layouts of a camera, made for the channels of its log: tracking, tracks side by side, and forecasts."""
 
 from __future__ import annotations
 
@@ -13,29 +13,30 @@ from mcaptrack.foxglove.layouts import Eye, Tree, beside
 from mcaptrack.geometry.arrays import Floats
 from mcaptrack.geometry.plane import Planes, plane_at
 
-#: The layouts that there are, and how the file of each ends.
+#: The names of the layouts, and the suffix of each file.
 TRACKING, COMPARING, PREDICTIONS = "tracking", "comparing", "predictions"
 FILES: Final[Mapping[str, str]] = {
     TRACKING: ".layout.json",
     COMPARING: ".comparing.layout.json",
     PREDICTIONS: ".predictions.layout.json",
 }
-#: The best tracks that a layout switches on, below the prefix; the others can be switched on by hand.
+#: The channels that a layout switches on, below the prefix: the first that exists.
 _BEST: Final = ("retracks/full", "retracks", "tracks", "detections")
-#: Kinds of tracks that are compared: what they are called, and where they are.
+#: The kinds of tracks that are compared: title, and channels of which the first that exists is shown.
 _KINDS: Final = (
     ("SORT", ("tracks",)),
     ("Re-tracked", ("retracks/full", "retracks")),
     ("Truth", ("truth",)),
 )
 _TILT_DEG: Final = 45.0
-#: Below a channel of tracks: what happened to them, in words.
+#: The suffix of the text of events, after the topic of tracks.
 _EVENTS: Final = "/events/view/log"
 
 
-class There(NamedTuple):
-    """What a log has of a camera: its topics below the prefix, where the pictures are, how the ground is seen, how many
-    steps forecasts go ahead, and whether it is known how far off the truth they were.
+class CameraChannels(NamedTuple):
+    """What a log has of a camera: the names of its topics below the prefix, the topic of pictures, the coordinate frame
+    and the view of the ground, the number of steps of forecasts, and whether their errors against ground truth are
+    known.
     """
 
     prefix: str
@@ -47,12 +48,12 @@ class There(NamedTuple):
     is_truth_known: bool = False
 
     def topics(self, suffix: str, on: Collection[str]) -> dict[str, bool]:
-        """The topics of all views of one kind, with which are on."""
+        """The topics of all views with a suffix, and whether each is on."""
         found = sorted(name.removesuffix(suffix) for name in self.names if name.endswith(suffix))
         return {f"{self.prefix}/{name}{suffix}": name in on for name in found}
 
     def drawn(self, name: str) -> bool:
-        """Whether there is a view of a channel."""
+        """Whether a channel has a view."""
         return bool({name + "/view/image", name + "/view/scene"} & self.names)
 
     def is_seen(self) -> bool:
@@ -60,15 +61,15 @@ class There(NamedTuple):
         return any(name.endswith(("/view/image", "/view/scene")) for name in self.names)
 
 
-def best(names: Collection[str]) -> list[str]:
-    """The channels to look at first, of those below the prefix: the best tracks, and their forecasts."""
+def best_channels(names: Collection[str]) -> list[str]:
+    """The channels to switch on, of those below the prefix: the best tracks, and their forecasts."""
     found = [name for name in _BEST if name in names][:1]
     of_these = "retracks/predictions"
     return found + [of_these for name in found if name.startswith("retracks") and of_these in names]
 
 
 def eye_on(places_m: Floats, planes: Planes, t_ns: int) -> Eye:
-    """A view of where people are (N, 2), from the side that the camera looks from."""
+    """A view of the positions of people (N, 2), from the side of the camera."""
     known = places_m[np.isfinite(places_m).all(axis=1)]
     low, high = np.quantile(known, [0.02, 0.98], axis=0) if len(known) else (np.full(2, -5.0), np.full(2, 5.0))
     middle, radius = (low + high) / 2, max(2.5, float(np.hypot(*(high - low))) / 2)
@@ -83,8 +84,8 @@ def eye_on(places_m: Floats, planes: Planes, t_ns: int) -> Eye:
     )
 
 
-def make(there: There) -> dict[str, bytes]:
-    """The layout files that make sense for a log, by their names; none if there is nothing to see."""
+def make(there: CameraChannels) -> dict[str, bytes]:
+    """The layout files that are useful for a log, by their names; none if there is nothing to see."""
     if not there.is_seen():
         return {}
     made = {TRACKING: _tracking(there)}
@@ -95,16 +96,16 @@ def make(there: There) -> dict[str, bytes]:
     return made
 
 
-def _tracking(there: There) -> bytes:
+def _tracking(there: CameraChannels) -> bytes:
     channels = {name.removesuffix("/view/image").removesuffix("/view/scene") for name in there.names}
-    on = best([name for name in channels if there.drawn(name)])
+    on = best_channels([name for name in channels if there.drawn(name)])
     panels: dict[str, Any] = {}
     left = [*_image(there, panels, "picture", "Video", on), *_plots(there, panels)]
     right = [*_ground(there, panels, "ground", "Ground", on), *_words(there, panels)]
     return _file(panels, _columns(left, right, 55.0))
 
 
-def _comparing(there: There) -> bytes:
+def _comparing(there: CameraChannels) -> bytes:
     panels: dict[str, Any] = {}
     upper: list[Tree] = []
     shown = []
@@ -121,7 +122,7 @@ def _comparing(there: There) -> bytes:
     return _file(panels, ("column", beside(upper), beside(lower), 50.0) if lower else beside(upper))
 
 
-def _predictions(there: There) -> bytes:
+def _predictions(there: CameraChannels) -> bytes:
     future = next(name for name in ("retracks/predictions", "predictions") if there.drawn(name))
     past = "retracks/full" if future.startswith("retracks") else "tracks"
     on = [future, past, "truth"]
@@ -129,7 +130,7 @@ def _predictions(there: There) -> bytes:
     source = f"{there.prefix}/{future}"
     last = f"{source}.rows[:]{{step=={there.last_step}}}"
     spread = {f"{last}.cov_{axis}_m2": f"variance at the end, {axis[0]} (m2)" for axis in ("xx", "yy")}
-    panels["Plot!spread"] = layouts.plot_panel("How sure forecasts are", spread)
+    panels["Plot!spread"] = layouts.plot_panel("Uncertainty of forecasts", spread)
     told = "retracks" if future.startswith("retracks") else "tracks"
     left = [*_image(there, panels, "picture", "Forecasts", on), *_errors(there, panels)]
     right = [*_ground(there, panels, "ground", "Forecasts on the ground", on)]
@@ -137,8 +138,8 @@ def _predictions(there: There) -> bytes:
     return _file(panels, _columns(left, right, 50.0))
 
 
-def _errors(there: There, panels: dict[str, Any]) -> list[Tree]:
-    """How far off forecasts were: the truth, or if that is not known the tracks as they became."""
+def _errors(there: CameraChannels, panels: dict[str, Any]) -> list[Tree]:
+    """Errors of forecasts: against ground truth, or without it against the later tracks."""
     front = "" if there.is_truth_known else "later_"
     labels = {"retracks/predictions": "re-tracked", "predictions": "SORT"}
     paths = {
@@ -149,19 +150,19 @@ def _errors(there: There, panels: dict[str, Any]) -> list[Tree]:
     }
     if not paths:
         return []
-    words = "the truth" if there.is_truth_known else "where tracks went"
+    words = "ground truth" if there.is_truth_known else "later tracks"
     panels["Plot!errors"] = layouts.plot_panel(f"Prediction errors, against {words}", paths)
     return ["Plot!errors"]
 
 
-def _image(there: There, panels: dict[str, Any], name: str, title: str, on: Collection[str]) -> list[Tree]:
+def _image(there: CameraChannels, panels: dict[str, Any], name: str, title: str, on: Collection[str]) -> list[Tree]:
     if there.pictures is None:
         return []
     panels[f"Image!{name}"] = layouts.image_panel(title, there.pictures, there.topics("/view/image", on))
     return [f"Image!{name}"]
 
 
-def _ground(there: There, panels: dict[str, Any], name: str, title: str, on: Collection[str]) -> list[Tree]:
+def _ground(there: CameraChannels, panels: dict[str, Any], name: str, title: str, on: Collection[str]) -> list[Tree]:
     topics = there.topics("/view/scene", [*on, "ground_plane"])
     if not topics:
         return []
@@ -169,8 +170,8 @@ def _ground(there: There, panels: dict[str, Any], name: str, title: str, on: Col
     return [f"3D!{name}"]
 
 
-def _plots(there: There, panels: dict[str, Any]) -> list[Tree]:
-    """How many people there are, where it is counted; otherwise where they are."""
+def _plots(there: CameraChannels, panels: dict[str, Any]) -> list[Tree]:
+    """The number of people, if it is counted; otherwise their positions."""
     labels = {"tracks": "SORT", "retracks": "re-tracked", "retracks/full": "re-tracked", "truth": "truth"}
     counted = {
         f"{there.prefix}/{name}/counts.rows[:].tracked": label
@@ -191,16 +192,16 @@ def _plots(there: There, panels: dict[str, Any]) -> list[Tree]:
     return ["Plot!people"]
 
 
-def _events(there: There, panels: dict[str, Any], title: str, names: Collection[str]) -> list[Tree]:
-    """What happened to the first of these channels of which that is told."""
+def _events(there: CameraChannels, panels: dict[str, Any], title: str, names: Collection[str]) -> list[Tree]:
+    """The text of events of the first of these channels that has any."""
     found = [f"{name}{_EVENTS}" for name in names if f"{name}{_EVENTS}" in there.names][:1]
     for topic in found:
         panels[f"RosOut!{title}"] = layouts.log_panel(f"{title}: events", f"{there.prefix}/{topic}")
     return [f"RosOut!{title}" for _ in found]
 
 
-def _words(there: There, panels: dict[str, Any]) -> list[Tree]:
-    """What happened, where it is told; otherwise what is in the log."""
+def _words(there: CameraChannels, panels: dict[str, Any]) -> list[Tree]:
+    """The text of events, if there is any; otherwise the contents of the log."""
     found = _events(there, panels, "Tracking", ("retracks/full", "retracks", "tracks"))
     if not found:
         panels["SourceInfo!log"] = layouts.panel("Log", {})

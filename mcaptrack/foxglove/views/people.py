@@ -1,4 +1,4 @@
-"""Who is where at the times of the pictures, where they were, and where they are expected.
+"""The people at the times of pictures: their positions, their trails, and their forecasts.
 
 Letters: S people shown, N others, P points, F instants.
 """
@@ -15,47 +15,51 @@ from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.clocks import seconds_to_ns
 from mcaptrack.geometry.plane import GroundPlane, Planes
+from mcaptrack.geometry.ragged import group_index, ragged_range, run_starts
 from mcaptrack.schema import PREDICTIONS, Frame
+from mcaptrack.schema.framing import frame_times, join_frames
 from mcaptrack.schema.resampling import resample
 
-#: How far trails go back, and how many lines they are made of.
+#: The duration of trails, and their number of lines.
 _TRAIL_S: Final = 2.0
 _TRAIL_LINES: Final = 4
 _MAX_GAP_S: Final = 2.0
 #: Forecasts are shown until the next ones are due.
 _FORECAST_S: Final = 1.0
-#: Forecasts are lines through at most so many of their points.
+#: The largest number of points of the line of a forecast.
 _FORECAST_POINTS: Final = 5
-#: The 95 % quantile of the chi-squared distribution with two degrees of freedom: how many (squared) deviations an
-#: ellipse has to be wide to hold 95 %.
+#: The 95 % quantile of the chi-squared distribution with two degrees of freedom: the squared size, in standard
+#: deviations, of an ellipse with probability 95 %.
 CHI2_95: Final = 5.991464547107979
 
 
 class People(NamedTuple):
-    """S people at instants: numbers, instants, boxes (S, 4) px, feet (S, 2) px, places (S, 2) m, and whether seen."""
+    """S people at instants: ids, instants, boxes (S, 4) px, feet (S, 2) px, positions (S, 2) m, and whether
+    observed.
+    """
 
     number: Ints
     frame: Ints
     box_px: Floats
     foot_px: Floats
     at_m: Floats
-    seen: NDArray[np.bool_]
+    observed: NDArray[np.bool_]
 
 
 class Trails(NamedTuple):
-    """Where each of S people was before: rows of their own, (S, P), oldest first.
+    """Earlier positions of each of S people, as indices of people (S, P), oldest first.
 
-    Only the last ``points`` (S,) of the P count; the very last is where they are.
+    Only the last ``points`` (S,) of the P count; the very last is the current position.
     """
 
     row: Ints
     points: Ints
 
 
-class Forecasts(NamedTuple):
-    """N futures that are equally long: the message that each is from, whose, and the path (N, P, 2) m.
+class ForecastPaths(NamedTuple):
+    """N forecasts of equal length: index of the message, id, and the path (N, P, 2) m.
 
-    ``end_m`` (N, 2) and ``spread_m2`` (N, 2, 2) are mean and covariance of the last step, NaN where unknown.
+    ``end_m`` (N, 2) and ``spread_m2`` (N, 2, 2) are mean and covariance of the last step, NaN if unknown.
     """
 
     message: Ints
@@ -66,7 +70,7 @@ class Forecasts(NamedTuple):
 
 
 def by_plane(planes: Planes, t_ns: Ints) -> Iterator[tuple[GroundPlane, NDArray[np.bool_]]]:
-    """Each plane with which of the times (N,) it holds at; the first holds from the beginning."""
+    """Each plane and the times (N,) at which it holds; the first plane holds from the beginning."""
     since = np.array([start for start, _ in planes[1:]], np.int64)
     which = np.searchsorted(since, t_ns, "right")
     for number in np.unique(which).tolist() if planes else []:
@@ -74,7 +78,7 @@ def by_plane(planes: Planes, t_ns: Ints) -> Iterator[tuple[GroundPlane, NDArray[
 
 
 def people_at(frames: Sequence[Frame], at_ns: Ints, planes: Planes) -> People:
-    """The people of a channel of tracks at rising times; what only pixels or metres tell comes by the plane."""
+    """The people of a channel of tracks at rising times; missing pixels or metres are computed with the plane."""
     rows, frame = resample(frames, at_ns, seconds_to_ns(_MAX_GAP_S))
     box = columns_to_boxes(rows)
     at_m = np.stack([rows["x_m"], rows["y_m"]], axis=-1)
@@ -90,20 +94,19 @@ def people_at(frames: Sequence[Frame], at_ns: Ints, planes: Planes) -> People:
 
 
 def trails(people: People, known: NDArray[np.bool_], at_ns: Ints) -> Trails:
-    """The trails of those whose place is ``known`` (S,); nobody has one through a place that is not.
+    """The trails of people with a ``known`` position (S,); trails do not pass unknown positions.
 
-    Their points are where somebody was at the ticks of a slow clock: the same ones in picture after picture, so that
-    trails stand still and a log that is compressed hardly grows by them.
+    Their points are at the ticks of a slow clock, the same ones in picture after picture: so trails stand still, and a
+    compressed log hardly grows by them.
     """
     t_ns = at_ns[people.frame]
     order = np.lexsort((t_ns, people.number))
     order = order[known[order]]
     number, t_sorted = people.number[order], t_ns[order]
     tick = t_sorted // seconds_to_ns(_TRAIL_S / _TRAIL_LINES)
-    is_anchor = np.ones(len(order), bool)
-    is_anchor[1:] = (number[1:] != number[:-1]) | (tick[1:] != tick[:-1])
+    is_anchor = run_starts(number, tick)
     anchor = np.flatnonzero(is_anchor)
-    before = np.cumsum(is_anchor) - is_anchor  # how many anchors lie before each
+    before: Ints = np.cumsum(is_anchor) - is_anchor  # the number of earlier anchors
     wanted = before[:, None] - np.arange(_TRAIL_LINES, 0, -1)
     picked = anchor[np.maximum(wanted, 0)] if len(anchor) else np.empty((0, _TRAIL_LINES), np.int64)
     own = (wanted >= 0) & (number[picked] == number[:, None])
@@ -116,21 +119,18 @@ def trails(people: People, known: NDArray[np.bool_], at_ns: Ints) -> Trails:
 
 
 def by_count(count: Ints) -> Iterator[tuple[int, Ints]]:
-    """Each number of points that there is, and whose trails have it."""
+    """Each number of points that occurs, and the indices of the trails that have it."""
     for points in np.unique(count).tolist():
         yield points, np.flatnonzero(count == points)
 
 
-def forecasts(frames: Sequence[Frame]) -> Iterator[Forecasts]:
-    """The futures in a channel of predictions, for each number of steps that they have."""
-    rows = PREDICTIONS.joined([frame.rows for frame in frames])
-    message = np.repeat(np.arange(len(frames)), [len(frame.rows) for frame in frames])
+def forecasts(frames: Sequence[Frame]) -> Iterator[ForecastPaths]:
+    """The forecasts in a channel of predictions, for each number of steps."""
+    rows, message, _, _ = join_frames(PREDICTIONS, frames)
     order = np.lexsort((rows["step"], rows["track_id"], message))
     rows, message = rows[order], message[order]
     number = rows["track_id"].astype(np.int64)
-    is_first = np.ones(len(rows), bool)
-    is_first[1:] = (message[1:] != message[:-1]) | (number[1:] != number[:-1])
-    start = np.flatnonzero(is_first)
+    start = np.flatnonzero(run_starts(message, number))
     steps = np.diff(np.append(start, len(rows)))
     xy = np.stack([rows["x_m"], rows["y_m"]], axis=-1)
     for count, chosen in by_count(steps):
@@ -138,12 +138,12 @@ def forecasts(frames: Sequence[Frame]) -> Iterator[Forecasts]:
         shown = np.unique(np.linspace(0, count - 1, min(count, _FORECAST_POINTS)).round().astype(np.int64))
         names = ("cov_xx_m2", "cov_xy_m2", "cov_xy_m2", "cov_yy_m2")
         spread = np.stack([rows[name][last] for name in names], axis=-1).reshape(-1, 2, 2)
-        yield Forecasts(message[first], number[first], xy[first[:, None] + shown], xy[last], spread)
+        yield ForecastPaths(message[first], number[first], xy[first[:, None] + shown], xy[last], spread)
 
 
 def latest(frames: Sequence[Frame], at_ns: Ints) -> Ints:
-    """The number of the message whose forecasts are shown at each time (F,); -1 where none are."""
-    made_ns = np.array([frame.t_ns for frame in frames], np.int64)
+    """The index of the message whose forecasts are shown at each time (F,); -1 for none."""
+    made_ns = frame_times(frames)
     number = np.searchsorted(made_ns, at_ns, "right") - 1
     if len(made_ns):
         number[at_ns - made_ns[number] > seconds_to_ns(_FORECAST_S)] = -1
@@ -151,27 +151,26 @@ def latest(frames: Sequence[Frame], at_ns: Ints) -> Ints:
 
 
 def shown_at(message: Ints, wanted: Ints) -> tuple[Ints, Ints]:
-    """Of things that belong to messages (N,), in rising order: which are shown at F instants, and at which.
+    """Of objects that belong to messages (N,), rising: the indices of those shown at F instants, and their instants.
 
     ``wanted`` (F,) is the message that is shown at each instant, -1 for none.
     """
     low, high = np.searchsorted(message, wanted, "left"), np.searchsorted(message, wanted, "right")
     count = np.where(wanted < 0, 0, high - low)
-    frame = np.repeat(np.arange(len(wanted)), count)
-    return np.arange(len(frame)) - np.repeat(np.cumsum(count) - count, count) + np.repeat(low, count), frame
+    return ragged_range(low, count), group_index(count)
 
 
-def pieces(points: Floats, drawn: float = 1.0) -> Floats:
-    """The lines between points (N, P, 2) as their ends (N, 2 (P - 1), 2); of each the first part, if not all."""
+def segments(points: Floats, drawn: float = 1.0) -> Floats:
+    """The lines between points (N, P, 2) as pairs of ends (N, 2 (P - 1), 2); the first share ``drawn`` of each."""
     start = points[:, :-1]
     end = start + drawn * (points[:, 1:] - start)
     return np.stack([start, end], axis=2).reshape(len(points), -1, 2)
 
 
 def ellipses(spread_m2: Floats) -> tuple[Floats, Floats]:
-    """Half axes (N, 2), the longer first, and turns (N,) of the ellipses that hold 95 % of what covariances say.
+    """Half axes (N, 2), the longer first, and turns (N,) of the 95 % ellipses of covariances (N, 2, 2).
 
-    NaN where a covariance (N, 2, 2) is not known or is none.
+    NaN where a covariance is not known or not positive.
     """
     known = np.asarray(np.isfinite(spread_m2).all(axis=(1, 2)), np.bool_)
     values, vectors = np.linalg.eigh(np.where(known[:, None, None], spread_m2, np.eye(2)))
@@ -182,7 +181,7 @@ def ellipses(spread_m2: Floats) -> tuple[Floats, Floats]:
     return np.where(known[:, None], half, np.nan), np.where(known, turn, np.nan)
 
 
-def around(centre_m: Floats, half_m: Floats, turn: Floats, points: int) -> Floats:
+def ellipse_points(centre_m: Floats, half_m: Floats, turn: Floats, points: int) -> Floats:
     """Points (N, P, 2) on ellipses, evenly from the end of the longer half axis on."""
     angle = 2 * np.pi * np.arange(points) / points
     along, across = np.cos(angle) * half_m[:, :1], np.sin(angle) * half_m[:, 1:]

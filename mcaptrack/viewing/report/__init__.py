@@ -18,7 +18,7 @@ import numpy as np
 
 from mcaptrack import SCHEMA_VERSION, __version__, foxglove
 from mcaptrack.evaluation import EvaluationRow, metrics
-from mcaptrack.foxglove.colours import COUNT as COLOURS
+from mcaptrack.foxglove.palette import COUNT as COLOURS
 from mcaptrack.viewing.report import figures, lineage, sections
 from mcaptrack.viewing.report.charts import Axis, pairs_chart, round_most
 from mcaptrack.viewing.report.contents import LogReport, gather

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from mcaptrack.foxglove.colours import COUNT as COLOURS
+from mcaptrack.foxglove.palette import COUNT as COLOURS
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.viewing.report.charts import time_ticks
 from mcaptrack.viewing.report.contents import LogReport, TrackSet, plane_of

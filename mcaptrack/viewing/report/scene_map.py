@@ -10,7 +10,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from mcaptrack.foxglove.colours import COUNT as COLOURS
+from mcaptrack.foxglove.palette import COUNT as COLOURS
 from mcaptrack.geometry.arrays import Floats, Image, Ints
 from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.clocks import NS_PER_S

@@ -1,4 +1,4 @@
-"""Numbers in words: those that are equally long together, since their messages are equally long too."""
+"""Numbers as text, grouped by length, because messages with texts of one length have one length."""
 
 from __future__ import annotations
 
@@ -12,7 +12,9 @@ from mcaptrack.geometry.arrays import Ints
 
 
 def by_length(numbers: Ints) -> Iterator[tuple[int, Ints, NDArray[Any]]]:
-    """Of numbers (N,), for each length that their words have: the length, which they are, and the words as bytes."""
+    """Group numbers (N,) by the length of their text: for each length the length, the indices, and the texts as
+    bytes.
+    """
     known, which = np.unique(numbers, return_inverse=True)
     words = np.array([str(number).encode() for number in known.tolist()] or [b""])
     lengths = np.char.str_len(words)[which] if len(numbers) else np.empty(0, np.int64)

@@ -1,4 +1,4 @@
-"""The colour of an identity, the same in every panel, and apart for colour-blind people."""
+"""The colours of identities: the same in every panel, and distinct for colour-blind people."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from mcaptrack.geometry.arrays import Floats
 
 Rgba = tuple[float, float, float, float]
 
-# Okabe and Ito's colours, which stay apart for colour-blind people, without black; then again, lighter and darker.
+# Okabe and Ito's palette for colour-blind people, without black; then the same, lighter and darker.
 _HUES: Final = ("E69F00", "56B4E9", "009E73", "F0E442", "0072B2", "D55E00", "CC79A7")
 _SHADES: Final = (1.0, 1.35, 0.7)
-#: How many identities there are before a colour comes again.
+#: The number of colours; identities beyond it repeat them.
 COUNT: Final = len(_HUES) * len(_SHADES)
-#: Above this brightness a colour is light, and what is written on it dark.
+#: Colours brighter than this get dark text.
 _LIGHT: Final = 0.55
 
 
 @cache
 def colour(identity: int, alpha: float = 1.0) -> Rgba:
-    """The colour of an identity, the same in every panel."""
+    """The colour of an identity as RGBA, each part between 0 and 1."""
     base, shade = _HUES[identity % len(_HUES)], _SHADES[identity // len(_HUES) % len(_SHADES)]
     red, green, blue = (int(base[at : at + 2], 16) / 255 for at in (0, 2, 4))
     hue, light, saturation = colorsys.rgb_to_hls(red, green, blue)
-    # In 256ths, which take fewer bytes of a compressed log than any number between them.
+    # Multiples of 1/256 take fewer bytes of a compressed log than other numbers.
     red, green, blue = (
         round(part * 256) / 256 for part in colorsys.hls_to_rgb(hue, min(light * shade, 0.85), saturation)
     )
@@ -46,6 +46,6 @@ def _table() -> Floats:
 
 
 def ink(rgb: Floats) -> Floats:
-    """What to write in on colours (N, 3): black on light ones, white on dark ones, (N, 3)."""
+    """The colour of text on colours (N, 3): black on light ones, white on dark ones, (N, 3)."""
     is_light = rgb @ [0.299, 0.587, 0.114] > _LIGHT
     return np.where(is_light[:, None], 0.0, 1.0) * np.ones(3)

@@ -1,8 +1,8 @@
-"""What is drawn on the ground plane, in metres: SceneUpdate messages, for many instants at once.
+"""Drawings on the ground plane, in metres: SceneUpdate messages, for many instants at once.
 
-Rules that viewers hold and that shape what is written here: after a seek only the last message of a topic is there, so
-each holds all that is to be seen and first removes what was; what is not replaced goes away by itself after its
-lifetime, which counts from the log time; a frame that no transform has named hides what lies in it.
+Three rules of the viewers shape these messages: after a seek only the last message of a topic is known, so each message
+removes everything and holds everything; an entity disappears after its lifetime, which counts from the log time; a
+coordinate frame without a transform hides its entities.
 
 Letters: F instants, N people, P points of each.
 """
@@ -16,8 +16,8 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from mcaptrack.foxglove.messages import SCENE, message_class
-from mcaptrack.foxglove.template import STAMP, Each, Group, Slot, Template, Word, group, joined, stamps
-from mcaptrack.foxglove.words import by_length
+from mcaptrack.foxglove.template import STAMP, Each, MessageParts, Slot, Template, TextSlot, group, joined, stamps
+from mcaptrack.foxglove.text_labels import by_length
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.clocks import NS_PER_S
 
@@ -28,9 +28,9 @@ _LINE_STRIP, _LINE_LOOP, _LINE_LIST = 0, 1, 2
 _UPRIGHT: Final = {"w": 1.0}
 
 
-class Figure(NamedTuple):
-    """How a person is shown: a cylinder so wide and so high, its number so high above the ground, with lines so many
-    pixels thick, whole or in pieces.
+class PersonMarker(NamedTuple):
+    """How a person is drawn: a cylinder with its width and height, the height of the number above the ground, and the
+    thickness of the trail, which is drawn whole or in pieces.
     """
 
     width_m: float
@@ -40,33 +40,33 @@ class Figure(NamedTuple):
     in_pieces: bool = False
 
 
-class Scene:
-    """The scenes of F instants, in one frame. What belongs to an instant is given by its number (N,), in rising order.
+class SceneMessages:
+    """The scenes of F instants in one coordinate frame. Objects name their instant by its index (N,), rising.
 
-    Everything is gone ``lifetime_ns`` after its instant.
+    Everything disappears ``lifetime_ns`` after its instant.
     """
 
     def __init__(self, t_ns: Ints, frame_id: str, lifetime_ns: int) -> None:
         self._count = len(t_ns)
         self._frame_id, self._lifetime_ns = frame_id, lifetime_ns
         self._seconds, self._nanos = stamps(t_ns)
-        self._groups: list[Group] = []
+        self._groups: list[MessageParts] = []
         self._add(np.arange(self._count), _head())
 
     def people(
-        self, frame: Ints, numbers: Ints, xy_m: Floats, rgb: Floats, alpha: Floats, figure: Figure, trail_m: Floats,
-        fade: Floats,
+        self, frame: Ints, numbers: Ints, xy_m: Floats, rgb: Floats, alpha: Floats, marker: PersonMarker,
+        trail_m: Floats, fade: Floats,
     ) -> None:  # fmt: skip
-        """People at (N, 2) with their numbers, and a line through points (N, P, 2) where they were, oldest first.
+        """Draw people at (N, 2) with their numbers and a trail through points (N, P, 2), oldest first.
 
-        ``fade`` (P,) is how opaque it is there. A line in pieces is drawn between the first and the second point, the
-        third and the fourth and so on. People whose lines have other numbers of points are given in another call.
+        ``fade`` (P,) is the opacity at each point. A trail in pieces is drawn between the first and the second point,
+        the third and the fourth, and so on. People whose trails have other numbers of points need another call.
         """
         xy, trail = _short(xy_m), _short(trail_m)
         for length, chosen, words in by_length(numbers):
-            template = _person(self._frame_id, self._lifetime_ns, length, figure, trail.shape[1])
+            template = _person(self._frame_id, self._lifetime_ns, length, marker, trail.shape[1])
             self._add(
-                frame[chosen], template, word=words, again=words, x=xy[chosen, 0], y=xy[chosen, 1],
+                frame[chosen], template, entity_id=words, label=words, x=xy[chosen, 0], y=xy[chosen, 1],
                 text_x=xy[chosen, 0], text_y=xy[chosen, 1], a=alpha[chosen],
                 **_shades("", rgb[chosen]), **_shades("text_", rgb[chosen]), **_line(trail[chosen], rgb[chosen], fade),
             )  # fmt: skip
@@ -75,7 +75,8 @@ class Scene:
         self, frame: Ints, numbers: Ints, path_m: Floats, rgb: Floats, fade: Floats, thickness_px: float,
         ellipses: tuple[Floats, Floats, Floats] | None,
     ) -> None:  # fmt: skip
-        """Lines through points (N, P, 2), so opaque (P,), and ellipses: centres (N, 2), half axes (N, 2), turns (N,).
+        """Draw lines through points (N, P, 2) with opacities (P,), and ellipses: centres (N, 2), half axes (N, 2),
+        turns (N,).
 
         A turn is in radians, from the first axis of the plane to the first of the ellipse.
         """
@@ -89,10 +90,10 @@ class Scene:
                 more = {"x": _short(at[:, 0]), "y": _short(at[:, 1]), "wide": size[:, 0], "deep": size[:, 1], **shades}
                 more |= {"turn_z": _short(np.sin(turn / 2), 4096), "turn_w": _short(np.cos(turn / 2), 4096)}
             line = _line(path[chosen], rgb[chosen], fade)
-            self._add(frame[chosen], template, word=words, **more, **line)
+            self._add(frame[chosen], template, entity_id=words, **more, **line)
 
     def outline(self, frame: int, name: str, xy_m: Floats, rgba: tuple[float, float, float, float]) -> None:
-        """A closed line through points (P, 2) on the ground."""
+        """Draw a closed line through points (P, 2) on the ground."""
         template = _outline(self._frame_id, self._lifetime_ns, name, len(xy_m), rgba)
         xy = _short(xy_m)[None]
         self._add(np.array([frame]), template, points__x=xy[..., 0], points__y=xy[..., 1])
@@ -117,7 +118,7 @@ def _shades(front: str, rgb: Floats) -> dict[str, Floats]:
 
 
 def _line(points_m: Floats, rgb: Floats, fade: Floats) -> dict[str, Floats]:
-    """The columns of a line; a line of one point is none."""
+    """The columns of a line; none for a line of one point."""
     if points_m.shape[1] < 2:
         return {}
     shades = {f"colours__{name}": rgb[:, place, None] for place, name in enumerate("rgb")}
@@ -161,25 +162,25 @@ def _lines(count: int, thickness_px: float, in_pieces: bool = False) -> list[dic
 
 
 @cache
-def _person(frame_id: str, lifetime_ns: int, length: int, figure: Figure, points: int) -> Template:
+def _person(frame_id: str, lifetime_ns: int, length: int, marker: PersonMarker, points: int) -> Template:
     body = {
-        "pose": {"position": {"x": Slot("x"), "y": Slot("y"), "z": figure.height_m / 2}, "orientation": _UPRIGHT},
-        "size": {"x": figure.width_m, "y": figure.width_m, "z": figure.height_m},
+        "pose": {"position": {"x": Slot("x"), "y": Slot("y"), "z": marker.height_m / 2}, "orientation": _UPRIGHT},
+        "size": {"x": marker.width_m, "y": marker.width_m, "z": marker.height_m},
         "bottom_scale": 1.0,
         "top_scale": 1.0,
         "color": _paint(),
     }
-    above = {"x": Slot("text_x"), "y": Slot("text_y"), "z": figure.number_m}
+    above = {"x": Slot("text_x"), "y": Slot("text_y"), "z": marker.number_m}
     name = {
         "pose": {"position": above, "orientation": _UPRIGHT},
         "billboard": True,
         "font_size": 14.0,
         "scale_invariant": True,
         "color": {**_paint("text_"), "a": 1.0},
-        "text": Word("again", length),
+        "text": TextSlot("label", length),
     }
-    lines = _lines(points, figure.thickness_px, figure.in_pieces)
-    return _entity(frame_id, lifetime_ns, Word("word", length), cylinders=[body], texts=[name], lines=lines)
+    lines = _lines(points, marker.thickness_px, marker.in_pieces)
+    return _entity(frame_id, lifetime_ns, TextSlot("entity_id", length), cylinders=[body], texts=[name], lines=lines)
 
 
 @cache
@@ -197,7 +198,7 @@ def _forecast(
         "color": {**_paint(), "a": 0.25},
     }
     lines, discs = _lines(points, thickness_px), [disc] if has_ellipse else []
-    return _entity(frame_id, lifetime_ns, Word("word", length), cylinders=discs, lines=lines)
+    return _entity(frame_id, lifetime_ns, TextSlot("entity_id", length), cylinders=discs, lines=lines)
 
 
 @cache
