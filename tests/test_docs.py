@@ -1,44 +1,125 @@
-"""What the documents say is so."""
+"""What the documentation says is so: its blocks run, its commands exist, its site is built without a warning."""
 
 from __future__ import annotations
 
+import ast
+import importlib.util
+import io
+import json
+import os
 import re
+import shlex
+import shutil
+import subprocess
+import sys
 import tomllib
-import zipfile
+from collections.abc import Callable, Iterator
+from contextlib import chdir, contextmanager, redirect_stdout
+from itertools import pairwise
 from pathlib import Path
+from time import sleep
 
+import duckdb
 import pytest
-from typer.main import get_command
 
 from mcaptrack import __version__
-from mcaptrack.cli import app
+from tests.commands import GROUP, called, done
+from tools import pages, readme
+from tools.pages import NOT_RUN, ROOT, Block
 
-ROOT = Path(__file__).parent.parent
 README, ARCHITECTURE = (ROOT / name for name in ("README.md", "ARCHITECTURE.md"))
-COMMANDS = get_command(app).commands
+PAGES = pages.pages()
+EVERY_PAGE = pytest.mark.parametrize("page", PAGES, ids=[path.relative_to(ROOT).as_posix() for path in PAGES])
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+COMMANDS = GROUP.commands
+#: What a page finds where it names it: a copy of a prepared file or folder.
+PREPARED = {
+    "log.mcap": "log.mcap",
+    "log.tables": "log.tables",
+    "tables/": "log.tables",
+    "demo.tables": "log.tables",
+    "mcaptrack-demo/demo.mp4": "video.mp4",
+    "mcaptrack-demo/truth.txt": "gt.txt",
+    "mcaptrack-demo/ground_plane.txt": "homography.txt",
+}
 
 
-def written_commands() -> list[list[str]]:
-    """The mcaptrack commands in the shell blocks and in the running text of the README."""
-    text = README.read_text()
-    blocks = re.findall(r"```sh\n(.*?)```", text, re.S)
-    lines = [line for block in blocks for line in block.splitlines()]
-    lines += re.findall(r"`(mcaptrack [^`]+)`", text)
-    return [line.split() for line in lines if line.startswith("mcaptrack ")]
+@pytest.fixture(scope="session")
+def prepared(tmp_path_factory) -> Path:
+    """A folder with the files that pages name, made once for all processes that run these tests."""
+    worker = os.environ.get("PYTEST_XDIST_WORKER")
+    base = tmp_path_factory.getbasetemp()
+    folder = (base.parent if worker else base) / "prepared"
+    making = folder.with_suffix(".making")
+    try:
+        making.mkdir()
+    except FileExistsError:
+        for _ in range(1200):
+            if folder.exists():
+                return folder
+            sleep(0.1)
+        raise
+    prepare(making)
+    return making.rename(folder)
 
 
-@pytest.mark.parametrize("words", written_commands(), ids=" ".join)
-def test_commands_in_the_readme_exist_with_their_options(words):
-    command = COMMANDS[words[1]]
-    known = {name for parameter in command.params for name in (*parameter.opts, *parameter.secondary_opts)} | {"--help"}
-    for word in words[2:]:
-        if word.startswith("-"):
-            assert word in known, words
+@EVERY_PAGE
+def test_every_block_of_a_page_runs_and_prints_what_stands_below_it(page, prepared, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    run_page(pages.blocks(page), prepared)
 
 
-def test_every_command_is_in_the_readme():
-    documented = {words[1] for words in written_commands()} | set(re.findall(r"^make (\w+)$", README.read_text(), re.M))
-    assert set(COMMANDS) <= documented
+@EVERY_PAGE
+def test_commands_in_the_text_of_a_page_exist_with_their_options(page):
+    text = re.sub(r"^```.*?^```$", "", page.read_text(), flags=re.S | re.M)
+    for line in re.findall(r"(?<!`)`(mcaptrack [^`]+)`(?!`)", text):
+        if not re.search(r"\b[A-Z]{3,}\b|\.\.\.", line):  # forms, such as `mcaptrack COMMAND --help`
+            assert_exists(line)
+
+
+def test_blocks_have_known_languages_and_reasons_and_every_reason_is_used():
+    found = [block for page in PAGES for block in pages.blocks(page)]
+    assert {block.language for block in found} <= set(pages.LANGUAGES)
+    assert {block.marks["not run"] for block in found if "not run" in block.marks} == set(NOT_RUN)
+    kept = [block for block in found if "not run" not in block.marks and block.language != "text"]
+    assert len(kept) > 4 * sum("not run" in block.marks for block in found)
+
+
+def test_every_command_is_shown_on_a_page():
+    lines = [
+        line
+        for page in PAGES
+        for block in pages.blocks(page)
+        if block.language == "sh"
+        for line in block.text.splitlines()
+    ]
+    assert {line.split()[1] for line in lines if line.startswith("mcaptrack ")} >= set(COMMANDS)
+
+
+def test_a_page_shows_other_numbers_than_are_printed_but_no_other_words():
+    assert_same_words("1,200 boxes\n...\nend", " 7 boxes\nand more\nend\n")
+    for shown in ("7 tracks", "7 boxes", "7 boxes ... stop"):
+        with pytest.raises(AssertionError):
+            assert_same_words(shown, "7 boxes end")
+
+
+@pytest.mark.skipif(importlib.util.find_spec("mkdocs") is None, reason="mkdocs isn't installed")
+def test_the_site_is_built_without_a_warning_and_has_every_page(tmp_path):
+    words = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(tmp_path)]
+    outcome = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert outcome.returncode == 0, outcome.stderr
+    for page in (path.relative_to(ROOT / "docs") for path in PAGES if path != README):
+        name = page.with_suffix("") if page.stem != "index" else page.parent
+        html = (tmp_path / name / "index.html").read_text()
+        assert "<h1" in html
+        assert not re.search(r"<!-- (generated|not run|file|exit)", html)
+        assert not re.search(
+            r"(?:src|href)=\"(?:https?:)?//(?!github\.com|foxglove\.dev)[^\"]*\.(?:js|css|woff2?)", html
+        )
+
+
+def test_the_readme_is_one_page():
+    assert len(README.read_text().splitlines()) <= 150
 
 
 def test_the_two_commands_of_the_readme_are_those_of_the_makefile_and_of_ci():
@@ -46,13 +127,6 @@ def test_the_two_commands_of_the_readme_are_those_of_the_makefile_and_of_ci():
     targets = set(re.findall(r"^(\w+):", (ROOT / "Makefile").read_text(), re.M))
     assert {"demo", "test"} <= targets
     assert "exec make test" in (ROOT / ".ci" / "run").read_text()
-
-
-def test_the_example_configuration_names_options_that_exist():
-    (block,) = re.findall(r"```toml\n(.*?)```", README.read_text(), re.S)
-    for name, values in tomllib.loads(block).items():
-        known = {parameter.name for parameter in COMMANDS[name].params}
-        assert {key.replace("-", "_") for key in values} <= known
 
 
 def test_files_and_folders_that_the_map_names_exist():
@@ -76,10 +150,9 @@ def test_the_floors_on_the_map_are_those_that_are_held():
 
 
 def test_every_dependency_is_pinned():
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     wanted = [
-        *project["dependencies"],
-        *(d for extra in project["optional-dependencies"].values() for d in extra),
+        *PROJECT["dependencies"],
+        *(d for extra in PROJECT["optional-dependencies"].values() for d in extra),
         "hatchling",
     ]
     pinned = {
@@ -94,12 +167,160 @@ def test_the_changelog_knows_this_version():
     assert heading in (ROOT / "CHANGELOG.md").read_text()
 
 
-def test_the_wheel_carries_the_schemas(tmp_path):
-    from hatchling.builders.wheel import WheelBuilder
+# How the blocks of a page are run
 
-    (artifact,) = WheelBuilder(str(ROOT)).build(directory=str(tmp_path), versions=["standard"])
-    names = set(zipfile.ZipFile(artifact).namelist())
-    assert {f"mcaptrack/schemas/{path.name}" for path in (ROOT / "schemas").glob("*.proto")} <= names
-    assert {"mcaptrack/predictors/trained/red.safetensors", "mcaptrack/predictors/trained/lstm.safetensors"} <= names
-    assert "mcaptrack/py.typed" in names
-    assert not any(name.startswith(("tests/", "tools/")) for name in names)
+
+def prepare(folder: Path) -> None:
+    """One small recording, through all stages: what pages call log.mcap."""
+    with chdir(folder):
+        for name in ("video.mp4", "homography.txt", "gt.txt"):
+            readme.FILES[name](Path(name))
+        done("ingest", "video.mp4", "--ground-plane", "homography.txt", "--truth", "gt.txt", "-o", "log.mcap")
+        done("run", "log.mcap")
+
+
+def run_page(found: list[Block], prepared: Path) -> None:
+    """Run all blocks of a page in order, in the working folder."""
+    said: str | None = None
+    names: dict[str, object] = {"__name__": "__page__"}
+    with duckdb.connect() as connection:
+        for block in found:
+            try:
+                if block.language == "text":
+                    if said is not None:
+                        assert_same_words(block.text, said)
+                    said = None
+                elif "not run" in block.marks:
+                    parse(block)
+                    said = None
+                elif "file" in block.marks:
+                    Path(block.marks["file"]).write_text(block.text)
+                else:
+                    said = run(block, prepared, connection, names)
+            except BaseException as error:
+                error.add_note(f"in the block at {block.place}")
+                raise
+
+
+def run(block: Block, prepared: Path, connection: duckdb.DuckDBPyConnection, names: dict[str, object]) -> str:
+    """Run a block and give back what it prints."""
+    provide(block.text, prepared)
+    match block.language:
+        case "sh":
+            return "".join(run_line(line, int(block.marks.get("exit", 0))) for line in lines_of(block))
+        case "python":
+            printed = io.StringIO()
+            with redirect_stdout(printed), importable():
+                exec(compile(block.text, block.place, "exec"), names)
+            return printed.getvalue()
+        case "sql":
+            connection.execute(block.text)
+            return ""
+        case "toml":
+            provide("log.mcap", prepared)
+            use_settings(block.text)
+            return ""
+        case "json":
+            json.loads(block.text)
+            return ""
+    raise AssertionError(f"{block.language} can't be run; mark the block as `text` if it is output")
+
+
+def lines_of(block: Block) -> list[str]:
+    """The command lines of a block of sh."""
+    joined = block.text.replace("\\\n", " ")
+    return [line for line in joined.splitlines() if line.strip() and not line.startswith("#")]
+
+
+def run_line(line: str, code: int = 0) -> str:
+    """Run a command of mcaptrack; give back what it prints on stderr, then what it prints."""
+    words = shlex.split(line, comments=True)
+    assert words[0] == "mcaptrack", f"only commands of mcaptrack are run; mark the block ({', '.join(NOT_RUN)}): {line}"
+    for before, word in pairwise(words):
+        if before != "-o" and word in readme.FILES and not any(Path().glob(word.rstrip("/"))):
+            readme.FILES[word](Path(word))
+    with importable():
+        outcome = called(*words[1:])
+    assert outcome.code == code, f"{line}: exit {outcome.code}, {outcome.err}"
+    return outcome.err + outcome.out
+
+
+@contextmanager
+def importable() -> Iterator[None]:
+    """Modules of the working folder can be imported, and are forgotten afterwards."""
+    before, here = set(sys.modules), os.getcwd()
+    sys.path.insert(0, here)
+    try:
+        yield
+    finally:
+        sys.path.remove(here)
+        for name in set(sys.modules) - before:
+            if (getattr(sys.modules[name], "__file__", None) or "").startswith(here):
+                del sys.modules[name]
+
+
+def provide(text: str, prepared: Path) -> None:
+    """Put prepared files where a text names them, unless they are there, or the text makes them."""
+    for name, source in PREPARED.items():
+        target = Path(name)
+        if target.exists() or not re.search(rf"(?<![\w.-]){re.escape(name)}", text) or f"-o {name}" in text:
+            continue
+        target.parent.mkdir(exist_ok=True)
+        whole = prepared / source
+        shutil.copytree(whole, target) if whole.is_dir() else shutil.copy2(whole, target)
+
+
+def use_settings(text: str) -> None:
+    """Settings of commands are read by these commands; other TOML only has to be TOML."""
+    tables = tomllib.loads(text)
+    if not tables.keys() <= COMMANDS.keys():
+        assert not tables.keys() & COMMANDS.keys(), f"there is no command {tables.keys() - COMMANDS.keys()}"
+        return
+    Path("page.toml").write_text(text)
+    for name in tables:
+        done(name, "log.mcap", "--config", "page.toml", *(("-o", f"{name}-settings.mcap") if name != "info" else ()))
+
+
+def parse(block: Block) -> None:
+    """What is checked of a block that isn't run."""
+    assert block.marks["not run"] in NOT_RUN, block.place
+    PARSERS[block.language](block.text)
+
+
+def assert_exists(line: str) -> None:
+    """A command line names a command and options that exist; of others, targets of make and extras are checked."""
+    words = shlex.split(line, comments=True)
+    if words[0] == "make":
+        assert re.search(rf"^{words[1]}:", (ROOT / "Makefile").read_text(), re.M), line
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    for named in re.findall(r"\.\[([\w,]+)\]", line):
+        assert set(named.split(",")) <= extras.keys(), line
+    if words[0] != "mcaptrack" or len(words) == 1:
+        return
+    if words[1].startswith("-"):
+        assert words[1] in ("--help", "--version"), line
+        return
+    command = COMMANDS[words[1]]
+    known = {name for one in command.params for name in (*one.opts, *one.secondary_opts)} | {"--help"}
+    for word in words[2:]:
+        if word.startswith("-") and not re.fullmatch(r"-\d.*", word):
+            assert word.partition("=")[0] in known, line
+
+
+PARSERS: dict[str, Callable[[str], object]] = {
+    "sh": lambda text: [assert_exists(line) for line in text.replace("\\\n", " ").splitlines() if line.strip()],
+    "python": ast.parse,
+    "sql": duckdb.extract_statements,
+    "toml": tomllib.loads,
+    "json": json.loads,
+}
+
+
+def assert_same_words(shown: str, said: str) -> None:
+    """A page shows what was printed, up to numbers and blanks; ``...`` stands for anything."""
+
+    def bare(text: str) -> str:
+        return re.sub(r"[\s─]+", " ", re.sub(r"\d[\d,.]*|(?<!\S)-(?!\S)", "0", text)).strip()
+
+    pattern = ".*".join(re.escape(part) for part in bare(shown).split("..."))
+    assert re.fullmatch(pattern, bare(said), re.S), f"the page shows\n{shown}\nprinted was\n{said}"

@@ -490,7 +490,7 @@ class TestTimeline:
         ]
 
 
-def test_the_commands_of_the_readme_work_as_written(tmp_path, monkeypatch):
+def test_the_commands_of_the_page_work_as_written(tmp_path, monkeypatch):
     """One after the other, on files of the names that they have there; evaluate finds all at one time then."""
     monkeypatch.chdir(tmp_path)
     write_clip(Path("video.avi"), PICTURES, codec="mpeg4", options={"bf": "2"})
@@ -498,7 +498,7 @@ def test_the_commands_of_the_readme_work_as_written(tmp_path, monkeypatch):
     for name, who in (("gt", 1), ("tracks", 4), ("det", -1)):
         Path(f"{name}.txt").write_text("".join(f"{k},{who},{k},9,9,20,1,-1,-1,-1\n" for k in range(3, PICTURES - 3)))
     (block,) = re.findall(
-        r"### Labels\n+```sh\n(.*?)```", (Path(__file__).parent.parent / "README.md").read_text(), re.S
+        r"## Labels\n+```sh\n(.*?)```", (Path(__file__).parent.parent / "docs" / "ingest.md").read_text(), re.S
     )
     commands = [shlex.split(line) for line in block.splitlines()]
     assert len(commands) > 2

@@ -34,9 +34,9 @@ from mcaptrack.tables.sql import Database
 from tests.worlds import ns, tracks_at
 
 PAGE = (Path(__file__).parent.parent / "docs" / "sql.md").read_text()
-PRELUDE = re.findall(r"```sql prelude\n(.*?)```", PAGE, re.S)[0]
+PRELUDE = re.findall(r"```sql\n(create view.*?)```", PAGE, re.S)[0]
 #: Queries of the page with the answers below them; those of examples are for the log below.
-QUERIES = re.findall(r"```sql\n(.*?)```\n\n(For example:\n\n)?((?:\|[^\n]*\n)+)", PAGE, re.S)
+QUERIES = re.findall(r"```sql\n((?!create view).*?)```\n\n(For example:\n\n)?((?:\|[^\n]*\n)+)", PAGE, re.S)
 SURE = [(query, answer) for query, example, answer in QUERIES if not example]
 EXAMPLES = [query for query, example, _ in QUERIES if example]
 ZONE = next(answer for query, answer in SURE if "visits" in query)
@@ -241,7 +241,7 @@ def test_every_example_of_the_page_is_tried():
 
 
 def test_two_runs_beside_each_other(tmp_path):
-    (query,) = re.findall(r"```sql two\n(.*?)```", PAGE, re.S)
+    (query,) = re.findall(r"```sql\n([^`]*from metrics before join[^`]*)```", PAGE)
     known_log(tmp_path / "before.mcap")
     known_log(tmp_path / "after.mcap", tracked=(7,))
     outcome = run(tmp_path / "*.mcap", query, "--format", "jsonl")
@@ -253,7 +253,7 @@ def test_two_runs_beside_each_other(tmp_path):
 
 @pytest.mark.parametrize("library", ["polars", "pandas"])
 def test_the_same_in_other_libraries(square, monkeypatch, library):
-    (block,) = re.findall(rf"```python {library}\n(.*?)```", PAGE, re.S)
+    (block,) = re.findall(rf"```python\n(import {library} as .*?)```", PAGE, re.S)
     monkeypatch.chdir(square)
     names = {}
     exec(block, names)

@@ -18,6 +18,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from functools import cache
 from itertools import pairwise
 from pathlib import Path
 from time import monotonic
@@ -31,7 +32,7 @@ LEFT_OUT = {
 }
 #: Exit codes besides 0 that the README announces.
 ALSO_GOOD = {"recover": {3}}
-PEOPLE, SECONDS, FPS = 3, 10, 10
+PEOPLE, SECONDS, FPS = 3, 8, 10
 T0_NS = 1_777_000_000_000_000_000
 IMAGE, BOXES, IMU = "sensor_msgs/msg/CompressedImage", "vision_msgs/msg/Detection2DArray", "sensor_msgs/msg/Imu"
 #: The messages of vision_msgs that Detection2DArray needs, as ROS 2 has defined them since Humble.
@@ -119,6 +120,7 @@ def run(words: list[object], work: Path, folder: Path, also_good: set[int] = fro
 # The files that the commands name. What follows runs in the environment, where mcaptrack and its dependencies are.
 
 
+@cache
 def shots():
     """A scene of three people who walk, picture by picture."""
     from mcaptrack.sources.synthetic import Pedestrian, SyntheticScene
@@ -307,6 +309,7 @@ FILES: dict[str, Callable[[Path], None]] = {
     **dict.fromkeys(("logs/*.mcap", "runs/*.mcap"), logs),
     "broken.mcap": broken,
     "red:trained/red.safetensors": lambda path: trained(Path("trained/red.safetensors")),
+    "zones=zones.csv": lambda path: Path("zones.csv").write_text("track_id,zone\n1,door\n2,stairs\n") and None,
     "speed.sql": lambda path: (
         path.write_text("select recording, avg(mean_speed_m_s) from track_summary group by 1\n") and None
     ),

@@ -14,8 +14,10 @@ import duckdb
 
 DOCUMENT = Path(__file__).resolve().parent.parent / "docs" / "sql.md"
 #: A query, and its answer if it has one.
-QUERY = re.compile(r"```sql\n(?P<query>.*?)```\n(?P<answer>\n(?:For example:\n\n)?(?:\|[^\n]*\n)+)?", re.S)
-PRELUDE = re.compile(r"```sql prelude\n(.*?)```", re.S)
+QUERY = re.compile(
+    r"```sql\n(?P<query>(?!create view).*?)```\n(?P<answer>\n(?:For example:\n\n)?(?:\|[^\n]*\n)+)?", re.S
+)
+PRELUDE = re.compile(r"```sql\n(create view.*?)```", re.S)
 #: Only the answers that no tracker has a hand in are sure.
 SURE = re.compile(r"'/camera/(?!truth')")
 

@@ -1,0 +1,97 @@
+"""What the pages of the site leave to be generated: commands, messages, topics, the changelog.
+
+MkDocs calls ``on_page_markdown`` for each page (``hooks`` in mkdocs.yml). A page has the text
+``<!-- generated: NAME -->`` where something of ``GENERATED`` belongs.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, get_args
+
+ROOT = Path(__file__).resolve().parent.parent
+REPOSITORY = "https://github.com/mcaptrack/mcaptrack"
+_KINDS = {bool: "", int: "whole number", float: "number", Path: "path"}
+
+
+def on_page_markdown(markdown: str, **_: Any) -> str:
+    """The page, without the marks of its blocks, with what is generated."""
+    sys.path[:0] = [path for path in (str(ROOT),) if path not in sys.path]
+    text = re.sub(r"^ *<!-- (?:not run|file|exit): .+? -->\n", "", markdown, flags=re.M)
+    return re.sub(r"<!-- generated: (\w+) -->", lambda found: GENERATED[found[1]](), text)
+
+
+def commands() -> str:
+    """Every command with its options, as its help has them; those that all commands have stand above."""
+    from typer.main import get_command
+
+    from mcaptrack.cli import app
+    from mcaptrack.cli.command import LAST_PANELS
+
+    parts: list[str] = []
+    for name, command in get_command(app).commands.items():  # type: ignore[attr-defined]
+        panels: dict[str, list[str]] = {}
+        for one in command.params:
+            if one.param_type_name == "option" and not one.hidden:
+                panels.setdefault(one.rich_help_panel or "Options", []).append(_option(one, command.settings))
+        common = panels.pop(LAST_PANELS[-1], [])
+        if not parts:
+            parts.append(_table(LAST_PANELS[-1], common))
+        help_lines = (command.help or "").splitlines()
+        examples = [line.removeprefix("Example: ") for line in help_lines if line.startswith("Example: ")]
+        words = [line for line in help_lines if not line.startswith("Example: ")]
+        parts.append("\n".join([f"## {name}", "", *words, "", "```sh", *examples, "```"]))
+        parts += [_table(panel, rows) for panel, rows in panels.items()]
+    return "\n\n".join(parts)
+
+
+def _table(heading: str, rows: list[str]) -> str:
+    return "\n".join([f"**{heading}**", "", "| option | values | default | meaning |", "|---|---|---|---|", *rows])
+
+
+def _option(one: Any, settings: dict[str, Any]) -> str:
+    kind = next((setting.kind for setting in settings.values() if setting.parameter == one.name), str)
+    chosen = get_args(kind)
+    values = " ".join(f"`{value}`" for value in chosen) if chosen else _KINDS.get(kind, "text")
+    shown = one.show_default
+    is_shown = shown is not False and one.default is not None and not callable(one.default)
+    default = shown if isinstance(shown, str) else f"{one.default}" if is_shown else ""
+    names = ", ".join(f"`{name}`" for name in (*one.opts, *one.secondary_opts))
+    return f"| {names} | {values} | {_cell(default)} | {_cell(one.help or '')} |"
+
+
+def messages() -> str:
+    """Every message of the rows, as schemas/ defines it."""
+    parts = []
+    for path in sorted((ROOT / "schemas").glob("*.proto")):
+        text = path.read_text(encoding="utf-8")
+        about = re.match(r"// (.*)\n", text)
+        lines = [
+            f"## mcaptrack.{path.stem}",
+            "",
+            about[1] if about else "",
+            "",
+            "| field | type | meaning |",
+            "|---|---|---|",
+        ]
+        for optional, kind, name, words in re.findall(r"^ +(optional )?(\w+) (\w+) = \d+; *// (.*)$", text, re.M):
+            lines.append(f"| `{name}` | {kind}{', may be missing' if optional else ''} | {_cell(words)} |")
+        parts.append("\n".join(lines))
+    return "\n\n".join(parts)
+
+
+def changes() -> str:
+    """The changelog, its headings one level down."""
+    text = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8").split("\n", 1)[1]
+    return re.sub(r"\]\((?!https?:)([^)#]+)", rf"]({REPOSITORY}/blob/main/\1", text)
+
+
+def _cell(text: str) -> str:
+    """Text in a cell of a table."""
+    return re.sub(r"\s+", " ", text).replace("|", "\\|").replace("<", "&lt;").strip()
+
+
+GENERATED: dict[str, Callable[[], str]] = {"commands": commands, "messages": messages, "changes": changes}
