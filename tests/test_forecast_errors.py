@@ -386,7 +386,7 @@ def test_tracks_that_were_mended_since_are_held_against(tmp_path):
         assert set(rows["later_id"]) == {7}
         assert rows["later_ade_m"][0] == pytest.approx(0.0)
         layout = json.loads(opened.attachment("mcaptrack.predictions.layout.json"))
-        assert layout["configById"]["Plot!errors"]["foxglovePanelTitle"].endswith("where tracks went")
+        assert layout["configById"]["Plot!errors"]["foxglovePanelTitle"].endswith("later tracks")
     with log.read(path) as opened, log.extend(opened) as writer:
         made = Provenance("retrack", {}, "/camera/samples", digest="x").to_metadata()
         number = writer.add_channel("/camera/retracks", (TRACKS.name, "protobuf", TRACKS.descriptor), "protobuf", made)
