@@ -402,7 +402,7 @@ def test_the_layout_plots_what_is_known(tmp_path):
     watched(path)
     with log.read(path) as opened:
         panels = json.loads(opened.attachment("mcaptrack.predictions.layout.json"))["configById"]
-    assert panels["Plot!errors"]["foxglovePanelTitle"] == "Prediction errors, against the truth"
+    assert panels["Plot!errors"]["foxglovePanelTitle"] == "Prediction errors, against ground truth"
     assert {curve["value"]: curve["label"] for curve in panels["Plot!errors"]["paths"]} == {
         "/camera/predictions/scores.rows[:].ade_m": "SORT: ADE (m)",
         "/camera/predictions/scores.rows[:].fde_m": "SORT: FDE (m)",
