@@ -119,6 +119,19 @@ def test_the_hooks_are_the_checks_of_make_test_in_its_versions():
     assert all(hook["language"] == "system" for hook in local["hooks"])
 
 
+def test_the_page_about_tools_names_each_of_them_with_options_that_it_has():
+    text = (ROOT / "tools" / "README.md").read_text()
+    scripts = {path.relative_to(ROOT).as_posix() for path in (ROOT / "tools").rglob("*.py")}
+    modules = {name.replace(".", "/") + ".py" for name in re.findall(r"-m (tools\.[\w.]+)", text)}
+    assert set(re.findall(r"\btools/[\w/]+\.py", text)) | modules == scripts
+    assert all((ROOT / name).exists() for name in re.findall(r"\b(?:docs|tests|mcaptrack)/[\w/]+\.\w+", text))
+    for line in text.splitlines():
+        for script in re.findall(r"(?<=`)[^`]*?python3? (?:-m )?(tools[\w./]+)", line)[:1]:
+            path = ROOT / (script if script.endswith(".py") else script.replace(".", "/") + ".py")
+            for option in re.findall(r"(?<=[ `])--[\w-]+", line):
+                assert f'"{option}"' in path.read_text(), (script, option)
+
+
 @pytest.mark.parametrize(
     "path", sorted((ROOT / ".github" / "ISSUE_TEMPLATE").glob("*.yml")), ids=lambda path: path.stem
 )

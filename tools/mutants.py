@@ -245,5 +245,4 @@ def main() -> None:
 
 if __name__ == "__main__":
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    os.environ.setdefault("NUMBA_DISABLE_JIT", "1")  # run as Python: to compile each mutant anew takes a minute
     main()

@@ -11,6 +11,7 @@ exits with 1 and the output of the first command that fails.
 
 from __future__ import annotations
 
+import argparse
 import os
 import re
 import shlex
@@ -50,7 +51,9 @@ VISION = {
 
 
 def main() -> int:
-    folder = Path(sys.argv[1]).resolve()
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path)
+    folder = parser.parse_args().folder.resolve()
     folder.mkdir(parents=True)
     work = copy_of_the_repository(folder / "mcaptrack")
     subprocess.run([sys.executable, "-m", "venv", folder / "env"], check=True)

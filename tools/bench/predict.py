@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import argparse
 import os
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # a batch is too little to share out
@@ -51,6 +52,7 @@ def in_torch(name: str, past: np.ndarray, known: np.ndarray) -> Callable[[], obj
 
 
 def main() -> None:
+    argparse.ArgumentParser(description=__doc__).parse_args()
     rng = np.random.default_rng(0)
     print(f"{'predictor':<10}{'batch':>6}{'us a batch':>12}{'a second':>12}{'against torch':>15}")
     for name in NAMES:

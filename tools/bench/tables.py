@@ -14,7 +14,7 @@ One log of ten million rows takes 4 GB of memory.
 
 from __future__ import annotations
 
-import sys
+import argparse
 import tempfile
 import time
 from collections.abc import Callable, Iterable
@@ -155,7 +155,9 @@ def write_all(folder: Path, parts: Iterable[Part]) -> None:
 
 
 def main() -> None:
-    wanted = int(sys.argv[1]) if len(sys.argv) > 1 else 10_000_000
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("rows", type=int, nargs="?", default=10_000_000)
+    wanted = parser.parse_args().rows
     rng = np.random.default_rng(1)
     frames = tracked(rng)
     with tempfile.TemporaryDirectory() as name:

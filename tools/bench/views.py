@@ -10,7 +10,7 @@ channel's messages take when compressed alone.
 
 from __future__ import annotations
 
-import sys
+import argparse
 import tempfile
 import time
 from collections import Counter, defaultdict
@@ -167,6 +167,9 @@ def bytes_of(path: Path) -> Counter[str]:
 
 
 def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("log", type=Path, nargs="?")
+    options = parser.parse_args()
     channels = walkers()
     all_views({topic: (schema, frames[:50]) for topic, (schema, frames) in channels.items()})  # templates are made once
     best, made = 1e9, {}
@@ -179,9 +182,9 @@ def main() -> None:
     print(f"{PEOPLE} people, {len(made)} views: {raw / 1e3:.0f} kB a picture before compression")
     print(f"made in {best:.3f} ms a picture; by the generated classes {peer:.2f} ms, {peer / best:.0f} times as much")
     print(f"put into a log, compressed, in {written_ms(made):.3f} ms a picture")
-    if len(sys.argv) > 1:
-        taken = bytes_of(Path(sys.argv[1]))
-        with log.read(Path(sys.argv[1])) as opened:
+    if options.log:
+        taken = bytes_of(options.log)
+        with log.read(options.log) as opened:
             pictures = [c.topic for c in opened.channels.values() if c.schema_name in foxglove.PICTURES]
         shown = sum(size for topic, size in taken.items() if "/view/" in topic)
         for topic in sorted(taken):
