@@ -48,7 +48,7 @@ _NOW = replace(
 ABLATION: dict[str, tuple[str, Retrack]] = {
     "paper": ("--profile paper", PAPER),
     "authors": ("--profile authors", AUTHORS),
-    "expected against seen position now": (
+    "distance of current positions": (
         "--profile authors --distance now --certain-distance 0 --birth raw --no-filled --min-history 2 "
         "--backfill unclaimed --no-confirm",
         _NOW,
@@ -57,16 +57,16 @@ ABLATION: dict[str, tuple[str, Retrack]] = {
         "... --covariance predictor --predictor kalman --max-jump-m 3 --alpha 1 --beta 0",
         replace(_NOW, covariance="predictor", predictor="kalman", max_jump_m=3.0, alpha=1.0, beta=0.0),
     ),
-    "likelihood, noise found out": (
+    "likelihood, estimated noise": (
         "--link-s 0 --no-part --no-smooth --min-certainty 0",
         replace(DEFAULT, **_PLAIN),
     ),
-    "+ false tracks left out": (
+    "+ false-track removal": (
         "--link-s 0 --no-part --no-smooth",
         replace(DEFAULT, **_PLAIN | {"min_certainty": 0.5}),
     ),
     "+ offline linking": ("--no-part --no-smooth", replace(DEFAULT, part=False, smooth=False)),
-    "+ who is who after meetings": ("--no-smooth", replace(DEFAULT, smooth=False)),
+    "+ identity swaps at encounters": ("--no-smooth", replace(DEFAULT, smooth=False)),
     "+ smoothing (the default)": ("", DEFAULT),
 }
 
