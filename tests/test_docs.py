@@ -50,16 +50,20 @@ def prepared(tmp_path_factory) -> Path:
     worker = os.environ.get("PYTEST_XDIST_WORKER")
     base = tmp_path_factory.getbasetemp()
     folder = (base.parent if worker else base) / "prepared"
-    making = folder.with_suffix(".making")
     try:
-        making.mkdir()
+        folder.with_suffix(".lock").mkdir()
     except FileExistsError:
-        for _ in range(1200):
-            if folder.exists():
-                return folder
+        while not folder.exists():
+            assert not folder.with_suffix(".failed").exists(), "another process couldn't make these files"
             sleep(0.1)
+        return folder
+    making = folder.with_suffix(".making")
+    making.mkdir()
+    try:
+        prepare(making)
+    except BaseException:
+        folder.with_suffix(".failed").mkdir()
         raise
-    prepare(making)
     return making.rename(folder)
 
 
