@@ -32,6 +32,7 @@ Code = Literal[
     "option-not-used",
     "other",
     "other-settings",
+    "other-version",
     "out-of-date",
     "view-lost",
     "worse",

@@ -13,8 +13,8 @@ from mcaptrack import log, pipeline
 from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import TRACKS, Frame
 from mcaptrack.schema.provenance import Provenance, digest
-from mcaptrack.sources.cameras import ROUTES, camera_at, cameras, find_camera, name_above
-from mcaptrack.transforms import TRANSFORMS
+from mcaptrack.sources.cameras import camera_at, cameras, find_camera, name_above
+from mcaptrack.transforms import STAGES, TRANSFORMS
 from tests.commands import GROUP, called, done, made_log
 from tests.test_foreign_runs import write_log
 from tests.worlds import tracks_at
@@ -31,7 +31,7 @@ TARGETS = [
     "bare",
 ]
 #: Every stage somewhere, and something everywhere.
-PLACES = [*zip([*ROUTES, *ROUTES], TARGETS, strict=False)]
+PLACES = [*zip([*STAGES, *STAGES], TARGETS, strict=False)]
 #: How each command that can be told a camera is called on a log, and what of its JSON has to stay.
 READING = {
     "evaluate": (),
@@ -89,11 +89,11 @@ def test_what_a_stage_writes_belongs_to_the_camera_that_it_comes_from(path, stag
         assert find_camera(opened) == find_camera(opened, "camera") == find_camera(opened, None, target) == "/camera"
         assert target in camera_at(opened, "/camera").topics
     done("run", path, "-q")
-    for again in list(ROUTES)[list(ROUTES).index(stage) + 1 :]:  # and what is made from it stands with all the rest
+    for again in list(STAGES)[list(STAGES).index(stage) + 1 :]:  # and what is made from it stands with all the rest
         if TRANSFORMS[again].reads is TRANSFORMS[stage].writes[""] and stage != "retrack":
             done(again, path, "--topic", target, "-q")
             with log.read(path) as opened:
-                made = Provenance.from_metadata(opened.channel(f"/camera/{ROUTES[again].writes}").metadata)
+                made = Provenance.from_metadata(opened.channel(f"/camera/{STAGES[again].writes}").metadata)
                 assert made is not None
                 assert made.input == target
 
@@ -101,7 +101,7 @@ def test_what_a_stage_writes_belongs_to_the_camera_that_it_comes_from(path, stag
 def test_a_channel_elsewhere_is_made_again_when_its_input_is(path):
     done("track", path, "--to", "/elsewhere", "--max-age-s", 3, "-q")
     done("sample", path, "--topic", "/elsewhere", "-q")
-    done("detect", path, "--method", "mog2", "-q")
+    done("detect", path, "--detector", "mog2", "-q")
     said = done("run", path, "--no-tables").err
     assert "/elsewhere was made from an earlier /camera/detections: running track again, as before" in said
     with log.read(path) as opened:
@@ -148,11 +148,11 @@ def test_a_stage_does_not_replace_what_its_input_was_made_from(path):
     done("sample", path, "--topic", "/camera/retracks", "--to", "/camera/sampled", "-q")
 
 
-@pytest.mark.parametrize("stage", ROUTES)
+@pytest.mark.parametrize("stage", STAGES)
 def test_no_stage_replaces_what_it_did_not_make(path, stage):
     before = path.read_bytes()
-    for name in {"video", "truth", "ground_plane", *(route.writes for route in ROUTES.values())} - {
-        ROUTES[stage].writes
+    for name in {"video", "truth", "ground_plane", *(stage.writes for stage in STAGES.values())} - {
+        STAGES[stage].writes
     }:
         outcome = called(stage, path, "--to", f"/camera/{name}")
         assert (outcome.code, "another --to" in outcome.err) == (1, True), outcome.err
@@ -161,7 +161,7 @@ def test_no_stage_replaces_what_it_did_not_make(path, stage):
 
 @pytest.mark.parametrize(
     ("stage", "below"),
-    [*((stage, "") for stage in ROUTES), ("track", "/view/image"), ("retrack", "/view/scene")]
+    [*((stage, "") for stage in STAGES), ("track", "/view/image"), ("retrack", "/view/scene")]
     + [("retrack", f"/{suffix}") for suffix in ("online", "predictions", "full")],
 )
 def test_no_stage_replaces_what_others_recorded(path, stage, below):

@@ -273,7 +273,9 @@ class TestEvaluate:
 
 class TestConfig:
     def test_options_come_from_the_file_and_the_command_line_comes_first(self, fresh, tmp_path):
-        (tmp_path / "mcaptrack.toml").write_text('[track]\nmax-age-s = 2.5\nmin_iou = 0.4\n[detect]\nmethod = "mog2"\n')
+        (tmp_path / "mcaptrack.toml").write_text(
+            '[track]\nmax-age-s = 2.5\nmin_iou = 0.4\n[detect]\ndetector = "mog2"\n'
+        )
 
         def made(*words, environment=None):
             done("track", fresh, "-q", *words, folder=tmp_path, environment=environment)
@@ -389,7 +391,6 @@ class TestMistakes:
             ["track"],
             ["track", "a.mcap", "--min-iou", "much"],
             ["nonsense"],
-            ["detect", "a.mcap", "--method", "magic"],
         ):
             code, _, err = call(*words, folder=place)
             assert code == 2

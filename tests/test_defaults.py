@@ -27,7 +27,7 @@ SORT: dict[str, Any] = {
     "mix_classes": False,
 }
 DEFAULTS: dict[str, dict[str, Any]] = {
-    "detect": {"method": "knn", "threshold": None, "history_s": 60.0, "max_pixels": 1_000_000, "stabilise": True},
+    "detect": {"threshold": None, "history_s": 60.0, "max_pixels": 1_000_000, "stabilise": True},
     "track": SORT,
     "sort": SORT,
     "bytetrack": SORT | {"high_score": 0.5, "new_score": 0.6, "low_min_iou": 0.5},

@@ -10,7 +10,8 @@ from mcaptrack.geometry.boxes import columns_to_boxes, iou
 from mcaptrack.geometry.clocks import FrameClock
 from mcaptrack.schema import Frame
 from mcaptrack.sources.synthetic import SyntheticScene
-from mcaptrack.transforms.detect import Detect, _PersonSize
+from mcaptrack.transforms import FrameDifferenceDetector, KnnDetector, Mog2Detector, MotionDetector
+from mcaptrack.transforms.detect import _PersonSize
 from mcaptrack.transforms.detect.foreground import FrameDifference
 from mcaptrack.transforms.detect.motion import CameraMotion
 from tests.worlds import ns, small_scene
@@ -23,7 +24,7 @@ def footage(scene: SyntheticScene) -> tuple[list[Frame], list[np.ndarray]]:
     return frames, [shot.boxes for shot in shots]
 
 
-def found(detect: Detect, scene: SyntheticScene, from_frame: int = 15) -> tuple[float, float]:
+def found(detect: MotionDetector, scene: SyntheticScene, from_frame: int = 15) -> tuple[float, float]:
     """Recall and precision at an overlap of 0.5, once the background is known."""
     frames, truth = footage(scene)
     hits = boxes = people = 0
@@ -34,18 +35,18 @@ def found(detect: Detect, scene: SyntheticScene, from_frame: int = 15) -> tuple[
     return hits / people, hits / max(boxes, 1)
 
 
-@pytest.mark.parametrize("method", ["knn", "mog2"])
-def test_people_who_walk_are_found_and_little_else(method):
-    recall, precision = found(Detect(method=method), small_scene())
+@pytest.mark.parametrize("detector", [KnnDetector, Mog2Detector])
+def test_people_who_walk_are_found_and_little_else(detector):
+    recall, precision = found(detector(), small_scene())
     assert recall > 0.6
     assert precision > 0.6
 
 
 def test_a_shaking_camera_is_made_up_for():
     shaken = small_scene(shake_px=2.5, contrast=6.0)
-    _, unsteady = found(Detect(stabilise=False), shaken)
-    _, steadied = found(Detect(stabilise=True), shaken)
-    _, still = found(Detect(), small_scene(contrast=6.0))
+    _, unsteady = found(KnnDetector(stabilise=False), shaken)
+    _, steadied = found(KnnDetector(stabilise=True), shaken)
+    _, still = found(KnnDetector(), small_scene(contrast=6.0))
     assert steadied > unsteady + 0.2
     assert steadied > still - 0.25
 
@@ -54,7 +55,7 @@ def test_boxes_are_those_of_the_picture_as_it_is_though_the_camera_moved():
     scene = small_scene(shake_px=3.0)
     frames, truth = footage(scene)
     off = []
-    for (frame,), true in list(zip(Detect()(frames), truth, strict=True))[15:]:
+    for (frame,), true in list(zip(KnnDetector()(frames), truth, strict=True))[15:]:
         seen = columns_to_boxes(frame.rows)
         a, b = assign(1 - iou(true, seen), 0.5)
         off += ((true[a, :2] + true[a, 2:] / 2) - (seen[b, :2] + seen[b, 2:] / 2)).tolist()
@@ -84,8 +85,8 @@ def test_a_camera_that_looks_elsewhere_starts_anew():
 def test_large_pictures_are_halved_and_their_boxes_are_in_full_pixels():
     frames, _ = footage(small_scene(3.0))
     large = [frame._replace(rows=np.kron(frame.rows, np.ones((2, 2), np.uint8))) for frame in frames]
-    plain = [columns_to_boxes(f.rows) for (f,) in Detect(stabilise=False)(frames)]
-    halved = [columns_to_boxes(f.rows) for (f,) in Detect(stabilise=False, max_pixels=320 * 180)(large)]
+    plain = [columns_to_boxes(f.rows) for (f,) in KnnDetector(stabilise=False)(frames)]
+    halved = [columns_to_boxes(f.rows) for (f,) in KnnDetector(stabilise=False, max_pixels=320 * 180)(large)]
     for a, b in zip(plain, halved, strict=True):
         np.testing.assert_array_equal(2 * a, b)
 
@@ -96,7 +97,7 @@ def test_a_lamp_that_goes_on_is_not_a_person():
         f._replace(rows=np.clip(f.rows.astype(int) + 80 * (n > 20), 0, 255).astype(np.uint8))
         for n, f in enumerate(frames)
     ]
-    for (frame,) in Detect()(lit):
+    for (frame,) in KnnDetector()(lit):
         assert (frame.rows["w_px"] * frame.rows["h_px"] < 0.5 * 320 * 180).all()
 
 
@@ -108,7 +109,7 @@ def test_frame_difference_sees_what_moves_and_not_what_stands():
         image[20:60, 10 + 4 * number : 22 + 4 * number] = 200  # walks
         image[70:110, 100:112] = 200  # stands
         frames.append(Frame(ns(number / 10), number, image))
-    for (frame,) in list(Detect(method="frame-difference", stabilise=False)(frames))[10:25]:
+    for (frame,) in list(FrameDifferenceDetector(stabilise=False)(frames))[10:25]:
         boxes = columns_to_boxes(frame.rows)
         assert len(boxes) > 0
         assert (boxes[:, 1] + boxes[:, 3] < 66).all()
@@ -122,21 +123,24 @@ def blocks(*boxes: tuple[int, int, int, int], height: int = 120, width: int = 16
     return image
 
 
-def boxes_of(pictures: list[np.ndarray], **options) -> list[list[list[float]]]:
+STILL = KnnDetector(stabilise=False)
+
+
+def boxes_of(pictures: list[np.ndarray], detector: MotionDetector = STILL) -> list[list[list[float]]]:
     """The boxes in each picture, ten pictures a second."""
     frames = [Frame(ns(n / 10), n, picture) for n, picture in enumerate(pictures)]
-    return [columns_to_boxes(frame.rows).tolist() for (frame,) in Detect(stabilise=False, **options)(frames)]
+    return [columns_to_boxes(frame.rows).tolist() for (frame,) in detector(frames)]
 
 
 EMPTY = [blocks()] * 5
 
 
-@pytest.mark.parametrize("method", ["knn", "mog2"])
-def test_boxes_are_those_that_were_drawn_in_reading_order(method):
+@pytest.mark.parametrize("detector", [KnnDetector, Mog2Detector])
+def test_boxes_are_those_that_were_drawn_in_reading_order(detector):
     """Two people walk past each other, each a step further than they are wide; a third appears in the end."""
     drawn = [[(2 + 13 * n, 75, 12, 34), (146 - 11 * n, 20, 10, 30)] for n in range(10)]
     drawn[-1].append((75, 70, 11, 32))
-    found = boxes_of([*[blocks()] * 30, *(blocks(*each) for each in drawn)], method=method)
+    found = boxes_of([*[blocks()] * 30, *(blocks(*each) for each in drawn)], detector(stabilise=False))
     assert all(boxes == [] for boxes in found[:30])
     for boxes, each in zip(found[30:], drawn, strict=True):
         assert boxes == [list(map(float, box)) for box in sorted(each, key=lambda box: (box[1], box[0]))]

@@ -22,7 +22,7 @@ import pytest
 
 from mcaptrack import log
 from mcaptrack.sources import synthetic
-from mcaptrack.transforms import ALTERNATIVES, TRANSFORMS
+from mcaptrack.transforms import STAGES
 from mcaptrack.viewing.serving import Server
 from tests.commands import GROUP, called, done, made_log
 from tests.test_ros_recordings import plain
@@ -93,11 +93,11 @@ CASES: dict[str, dict[str, Case]] = {
         sidecar=("ingest truth.txt --fps 10 --as truth --camera left --into a.mcap", "--sidecar"),
         force=("ingest clip.mp4 -o a.mcap", "--force"),
     ),
-    "detect": stage("detect"),
+    "detect": stage("detect", detector="--detector mog2"),
     "track": stage("track", tracker="--tracker ocsort"),
     "sample": stage("sample"),
     "predict": stage("predict"),
-    "retrack": stage("retrack", profile="--profile paper", mode="--mode online"),
+    "retrack": stage("retrack", retracker="--retracker none", profile="--profile paper", mode="--mode online"),
     "run": common(
         "run fresh.mcap --no-tables",
         topic="--topic /none",
@@ -107,6 +107,10 @@ CASES: dict[str, dict[str, Case]] = {
         events="--no-events",
         tables=("run a.mcap", "--no-tables"),
         force=("run a.mcap", "--force"),
+        detector=("run a.mcap --no-tables", "--detector mog2"),
+        tracker=("run a.mcap --no-tables", "--tracker ocsort"),
+        predictor=("run a.mcap --no-tables", "--predictor cv"),
+        retracker=("run a.mcap --no-tables", "--retracker none"),
     ),
     "events": common(
         "events a.mcap",
@@ -223,10 +227,14 @@ class Seen(NamedTuple):
 
 def parameters(command: str) -> set[str]:
     """The options of a stage that its transforms declare."""
-    if command not in TRANSFORMS:
+    if command not in STAGES:
         return set()
-    kinds = ALTERNATIVES[command].kinds.values() if command in ALTERNATIVES else [TRANSFORMS[command]]
-    declared = [field for kind in kinds for field in fields(kind) if not field.metadata.get("context")]
+    declared = [
+        field
+        for kind in STAGES[command].built_in().values()
+        for field in fields(kind)
+        if not field.metadata.get("context")
+    ]
     return {field.name.replace("_", "-") for field in declared}
 
 

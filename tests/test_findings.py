@@ -6,7 +6,7 @@ import json
 import re
 import shutil
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from types import MappingProxyType
 from typing import ClassVar
@@ -19,7 +19,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.pipeline import findings
 from mcaptrack.schema import DETECTIONS, TRACKS, VIDEO, Frame, Schema
 from mcaptrack.schema.provenance import Provenance
-from mcaptrack.transforms import Detect
+from mcaptrack.transforms import KnnDetector
 from mcaptrack.transforms.protocol import option
 from tests.commands import called, done, made_log
 from tests.worlds import boxes_at, ns, tracks_at, walk
@@ -262,7 +262,7 @@ def looks(kind: str, n: int) -> np.ndarray:
 def test_a_camera_that_moves_is_noticed_and_one_that_stands_or_shakes_is_none(kind, codes):
     frames = [Frame(ns(n / 10), n, looks(kind, n)) for n in range(60)]
     with notices.collected() as said:
-        list(Detect()(frames))
+        list(KnnDetector()(frames))
     assert [notice.code for notice in said] == codes
 
 
@@ -270,7 +270,7 @@ def test_a_camera_that_moves_is_noticed_and_one_that_stands_or_shakes_is_none(ki
 def test_a_camera_that_moves_all_the_time_is_refused(kind):
     frames = [Frame(ns(n / 10), n, looks(kind, n)) for n in range(60)]
     with pytest.raises(McaptrackError, match=r"the camera moves in \d+% of the pictures"):
-        list(Detect()(frames))
+        list(KnnDetector()(frames))
 
 
 def test_a_camera_that_moved_is_said_by_all_that_is_made_from_what_it_saw(tmp_path):
@@ -322,7 +322,7 @@ class Single:
 class Sized(Fixed):
     """One with a parameter that no log can hold."""
 
-    sizes_px: tuple[float, ...] = option((8.0, 9.0), "how large boxes are")
+    sizes_px: dict[str, float] = field(default_factory=dict)
 
 
 def run_stage(path: Path, stage: str, transform: object) -> None:
@@ -331,43 +331,41 @@ def run_stage(path: Path, stage: str, transform: object) -> None:
 
 
 @pytest.mark.parametrize(
-    ("stage", "transform", "topic", "why"),
-    [
-        ("detect", Fixed(size_px=9.0), "detections", "is not made again, it"),
-        ("track", Single(), "tracks", "is out of date and"),
-    ],
+    ("stage", "transform", "kind"), [("detect", Fixed(size_px=9.0), "detector"), ("track", Single(), "tracker")]
 )
-def test_what_others_made_is_never_made_again_by_something_else(path, stage, transform, topic, why):
-    topic = f"/camera/{topic}"
+def test_results_of_a_class_that_only_the_log_names_are_not_made_again(path, stage, transform, kind):
+    """``run`` says which class made them and which option gives it, and leaves the log as it is."""
+    topic = {"detect": "/camera/detections", "track": "/camera/tracks"}[stage]
     run_stage(path, stage, transform)
-    first = made_by(path, topic)
-    assert (first.implementation, first.parameters) == (f"{__name__}:{type(transform).__name__}", asdict(transform))
+    first, name = made_by(path, topic), f"{__name__}:{type(transform).__name__}"
+    assert first.plugins["transform"].implementation == first.parameters[kind] == name
     done("run", path, "--no-tables", "-q")  # what was made from it follows
-    said = json.loads(done("run", path, "--no-tables", "--force", "--json", "-q").out)["warnings"]
-    assert [one["message"] for one in said if topic in one["message"]] == [
-        f"{topic} {why} stays as it is: {first.implementation} made it, which is not at hand"
-    ]
-    assert made_by(path, topic) == first
+    before = path.read_bytes()
+    refused = called("run", path, "--no-tables", "--force")
+    assert (refused.code, refused.err.count(str(path))) == (1, 1)
+    assert f"{kind} {name}" in refused.err.splitlines()[-1]
+    assert f"give --{kind} {name}, or another {kind} to replace it" in refused.err
+    assert path.read_bytes() == before
     with log.read(path) as opened:
         jobs = pipeline.plan_all(opened, "/camera", defaults={stage: type(transform)()}, anew=True)
         assert [type(job.transform) for job in jobs if job.stage == stage] == [type(transform)]
         pipeline.run(opened, "/camera", jobs)
-    assert made_by(path, topic).implementation == first.implementation
+    assert made_by(path, topic).plugins == first.plugins
     done("drop", path, topic, "-o", "left.mcap", "-q")
     assert "running " + stage in done("run", "left.mcap", "--no-tables").err
 
 
-def test_what_others_made_and_is_out_of_date_stays_and_is_said(path):
+def test_results_of_such_a_class_that_are_out_of_date_can_be_replaced(path):
     run_stage(path, "track", Single())
-    first = made_by(path, "/camera/tracks")
-    done("detect", path, "--method", "mog2", "-q")
-    said = json.loads(done("run", path, "--no-tables", "--json", "-q").out)["warnings"]
-    assert [one["code"] for one in said if "which is not at hand" in one["message"]] == ["out-of-date"]
-    assert made_by(path, "/camera/tracks") == first
+    done("detect", path, "--detector", "mog2", "-q")
+    assert "tracker tests.test_findings:Single made it" in called("run", path, "--no-tables", "-q").err
+    done("run", path, "--no-tables", "--tracker", "ocsort", "-q")
+    assert made_by(path, "/camera/tracks").parameters["tracker"] == "ocsort"
+    assert made_by(path, "/camera/tracks").plugins == {}
 
 
 def test_parameters_that_no_log_can_hold_are_refused(path):
     before = path.read_bytes()
-    with pytest.raises(McaptrackError, match=r"Sized\.sizes_px is a tuple\[float, \.\.\.\]; a parameter is a float"):
+    with pytest.raises(McaptrackError, match=r"Sized\.sizes_px is a dict\[str, float\]; a parameter is a float"):
         run_stage(path, "detect", Sized())
     assert path.read_bytes() == before

@@ -21,7 +21,7 @@ from mcaptrack.foxglove.views import SUFFIX
 from mcaptrack.notices import McaptrackWarning
 from mcaptrack.schema import DETECTIONS, TRACKS
 from mcaptrack.schema.provenance import Provenance
-from mcaptrack.transforms import Detect, Sort
+from mcaptrack.transforms import KnnDetector, Sort
 from tests.test_foreign import Ros, pixels, vision
 from tests.worlds import ns, small_scene
 
@@ -201,7 +201,7 @@ def test_what_others_recorded_is_never_replaced(tmp_path):
         with pytest.raises(
             McaptrackError, match=r"detect would replace /eye/detections, which was recorded by others \(vision"
         ):
-            pipeline.plan_stage(opened, "/eye", "detect", Detect(), "/eye/image")
+            pipeline.plan_stage(opened, "/eye", "detect", KnnDetector(), "/eye/image")
         with pytest.raises(
             McaptrackError, match=r"/eye/detections is there and was recorded by others .*; leave --topic out"
         ):
@@ -235,7 +235,7 @@ def test_channels_that_hold_something_else_say_what(robot, tmp_path):
             McaptrackError,
             match=r"/eye/boxes holds vision_msgs/msg/Detection2DArray; detect reads foxglove\.CompressedVideo or .* or sensor_msgs/Image$",
         ):
-            pipeline.plan_stage(opened, "/eye", "detect", Detect(), "/eye/boxes")
+            pipeline.plan_stage(opened, "/eye", "detect", KnnDetector(), "/eye/boxes")
         with pytest.raises(
             McaptrackError,
             match=r"/eye/image holds sensor_msgs/msg/CompressedImage; track reads mcaptrack\.Detections or vision_msgs/Detection2DArray",
@@ -257,7 +257,7 @@ def test_a_message_that_is_damaged_is_named_and_the_log_left_alone(robot, tmp_pa
         writer.finish()
     before = path.read_bytes()
     with log.read(path) as opened, pytest.raises(McaptrackError, match=r"bad\.mcap: /eye/image at 77 ns: ") as error:
-        pipeline.run(opened, "/eye", pipeline.plan_stage(opened, "/eye", "detect", Detect()))
+        pipeline.run(opened, "/eye", pipeline.plan_stage(opened, "/eye", "detect", KnnDetector()))
     assert "\n" not in str(error.value)
     assert path.read_bytes() == before
 

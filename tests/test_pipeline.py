@@ -19,7 +19,18 @@ from mcaptrack.schema.ground_plane import rows_to_plane
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources import demo
 from mcaptrack.sources.ingest import IngestOptions, ingest
-from mcaptrack.transforms import PROFILES, ByteTrack, Detect, OcSort, Predict, Retrack, Sample, Sort
+from mcaptrack.transforms import (
+    PROFILES,
+    STAGES,
+    ByteTrack,
+    KnnDetector,
+    Mog2Detector,
+    OcSort,
+    Predict,
+    Retrack,
+    Sample,
+    Sort,
+)
 from tests.worlds import small_scene
 
 ROWS = ("detections", "tracks", "samples", "predictions", "retracks", "retracks/online", "retracks/predictions")
@@ -111,7 +122,7 @@ def test_a_stage_run_again_replaces_its_channels_and_nothing_else(fresh):
 def test_what_was_made_from_something_replaced_is_said_and_made_again_as_it_was(fresh):
     run_stage(fresh, "track", Sort(max_age_s=0.7))
     run_all(fresh)
-    report, _ = run_stage(fresh, "detect", Detect(method="mog2"))
+    report, _ = run_stage(fresh, "detect", Mog2Detector())
     assert report.stale == ["/camera/tracks"]
     with log.read(fresh) as opened:
         assert pipeline.is_stale(opened, "/camera/tracks")
@@ -122,7 +133,7 @@ def test_what_was_made_from_something_replaced_is_said_and_made_again_as_it_was(
     with log.read(fresh) as opened:
         made = {topic: Provenance.from_metadata(c.metadata) for topic, c in opened.channels.items()}
         assert made["/camera/tracks"].parameters["max_age_s"] == 0.7
-        assert made["/camera/detections"].parameters["method"] == "mog2"
+        assert made["/camera/detections"].parameters["detector"] == "mog2"
         assert [topic for topic in opened.channels if pipeline.is_stale(opened, topic)] == []
 
 
@@ -134,7 +145,7 @@ def test_tracks_remember_their_tracker(fresh):
         made = Provenance.from_metadata(opened.channel("/camera/tracks").metadata).parameters
         assert (made["tracker"], made["inertia"]) == ("ocsort", 0.1)
         assert "low_min_iou" not in made
-    run_stage(fresh, "detect", Detect(method="mog2"))
+    run_stage(fresh, "detect", Mog2Detector())
     run_all(fresh)  # again, as before
     with log.read(fresh) as opened:
         made = Provenance.from_metadata(opened.channel("/camera/tracks").metadata).parameters
@@ -159,7 +170,7 @@ def test_outputs_that_are_not_wanted_stay_out(fresh):
 
 def test_another_file_is_written_and_the_log_left_alone(fresh, tmp_path):
     before = fresh.read_bytes()
-    run_stage(fresh, "detect", Detect(), output=tmp_path / "b.mcap")
+    run_stage(fresh, "detect", KnnDetector(), output=tmp_path / "b.mcap")
     assert fresh.read_bytes() == before
     with log.read(tmp_path / "b.mcap") as opened:
         assert "/camera/detections" in opened.channels
@@ -227,7 +238,7 @@ def test_two_cameras_share_a_log(footage, fresh):
         assert pipeline.find_camera(opened, None) == "/camera"
         assert pipeline.find_camera(opened, "gate") == "/gate"
         assert pipeline.find_camera(opened, None, "/gate/video") == "/gate"
-        pipeline.run(opened, "/gate", pipeline.plan_stage(opened, "/gate", "detect", Detect()))
+        pipeline.run(opened, "/gate", pipeline.plan_stage(opened, "/gate", "detect", KnnDetector()))
     with log.read(fresh) as opened:
         assert "/gate/detections" in opened.channels
         assert "/camera/detections" not in opened.channels
@@ -270,7 +281,7 @@ class TestTheWholeLine:
                 assert made.version
                 if made.transform not in ("ingest",):
                     assert made.input in opened.channels
-                if made.transform in pipeline.ROUTES:
+                if made.transform in STAGES:
                     source = Provenance.from_metadata(opened.channel(made.input).metadata)
                     assert made.input_digest == source.digest or made.input == "/camera/video"
                     json.dumps(made.parameters)
@@ -317,7 +328,7 @@ def test_a_guessed_scale_is_guessed_anew_from_new_detections(footage, tmp_path):
     path = tmp_path / "a.mcap"
     ingest(footage.video, path, IngestOptions())
     run_all(path)
-    run_stage(path, "detect", Detect(method="mog2", threshold=400.0))
+    run_stage(path, "detect", Mog2Detector(threshold=400.0))
     run_all(path)
     with log.read(path) as opened:
         (frame,) = opened.frames("/camera/ground_plane", GROUND_PLANE)

@@ -124,7 +124,7 @@ class Scene:
 SCENES: dict[str, Callable[[Scene], str]] = {
     "cli/render.py:render:info": lambda s: s.without("/camera/video").says("render", "LOG"),
     "cli/running.py:_run_on_log:*": lambda s: s.says("run", "LOG", "--no-tables"),
-    "cli/running.py:_run_on_log:run": lambda s: s.says("detect", "LOG", "--method", "mog2"),
+    "cli/running.py:_run_on_log:run": lambda s: s.says("detect", "LOG", "--detector", "mog2"),
     "cli/train.py:_print:predict": lambda s: s.says(
         "train", "synthetic", "--walks", "1000", "--epochs", "1", "-o", "my net"
     ),

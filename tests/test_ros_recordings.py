@@ -90,7 +90,7 @@ def on_recording(path: Path, elsewhere: Path) -> dict[str, list[object]]:
     return {
         "ingest": [truth, "--into", path],
         "run": [path],
-        "detect": [path, "--method", "frame-difference"],
+        "detect": [path, "--detector", "frame-difference"],
         "track": [path],
         "sample": [path],
         "predict": [path, "--predictor", "cv"],
@@ -145,14 +145,14 @@ def test_no_command_changes_a_recording_that_ros_tools_read(path, tmp_path):
 def test_mcap_ros2_reads_a_recording_that_has_results(path):
     before = by_mcap_ros2(path)
     assert before == by_rosbags(path.parent)
-    done("detect", path, "--method", "frame-difference")
+    done("detect", path, "--detector", "frame-difference")
     assert by_mcap_ros2(path) == before
 
 
 def test_what_was_written_where_and_why_stands_in_the_data(path):
     for why in ("--in-place writes into it all the same", "earlier results are there"):
         method = "mog2" if "there" in why else "frame-difference"
-        (result,) = json.loads(done("detect", path, "--method", method, "--json").out)["results"]
+        (result,) = json.loads(done("detect", path, "--detector", method, "--json").out)["results"]
         assert result["written_to"] == str(path.with_name("drive.results.mcap"))
         assert why in result["written_there_because"]
     (result,) = json.loads(done("detect", path, "--sidecar", "--json").out)["results"]
@@ -160,7 +160,7 @@ def test_what_was_written_where_and_why_stands_in_the_data(path):
 
 
 def test_results_that_a_pattern_matches_too_are_part_of_their_log(path):
-    done("detect", path, "--method", "frame-difference")
+    done("detect", path, "--detector", "frame-difference")
     pattern = path.parent / "*.mcap"
     assert len(list(path.parent.glob("*.mcap"))) == 2
     (result,) = json.loads(done("track", pattern, "--json").out)["results"]
@@ -170,7 +170,7 @@ def test_results_that_a_pattern_matches_too_are_part_of_their_log(path):
 
 
 def test_in_place_insists_and_what_is_in_place_goes_on_there(path):
-    result = done("detect", path, "--in-place", "--method", "frame-difference")
+    result = done("detect", path, "--in-place", "--detector", "frame-difference")
     assert f"results are in {path}: --in-place was given; ROS tools may stumble over them" in result.err
     with path.open("rb") as stream:
         assert "/robot/front/detections" in {c.topic for c in make_reader(stream).get_summary().channels.values()}
@@ -186,7 +186,7 @@ def test_in_place_insists_and_what_is_in_place_goes_on_there(path):
 
 
 def test_in_place_is_refused_where_results_stand_beside(path):
-    done("detect", path, "--method", "frame-difference")
+    done("detect", path, "--detector", "frame-difference")
     before = on_disk(path.parent)
     result = called("track", path, "--in-place")
     assert result.code == 1
@@ -195,7 +195,7 @@ def test_in_place_is_refused_where_results_stand_beside(path):
 
 
 def test_a_copy_without_channels_has_its_results_beside_it(path, tmp_path):
-    done("detect", path, "--method", "frame-difference")
+    done("detect", path, "--detector", "frame-difference")
     before = on_disk(path.parent)
     out = tmp_path / "small.mcap"
     done("drop", path, "/robot/front/image", "/robot/front/detections/*", "-o", out)

@@ -363,7 +363,7 @@ class TestRenamed:
         assert self.params(command, beside) == wanted
         assert capsys.readouterr().err == variable + line.format(setting.variable)
         monkeypatch.delenv(variable)
-        put(folder / "mcaptrack.toml", f"[{command}]\n{old} = {value}\n")
+        put(folder / "mcaptrack.toml", f"[{command}]\n{old} = {toml_value(value)}\n")
         assert self.params(command, beside) == wanted
         assert capsys.readouterr().err == f"mcaptrack.toml: [{command}] {old}" + line.format(setting.name)
         assert self.params(command, beside, "-q") == wanted | {"quiet": True}
@@ -371,10 +371,11 @@ class TestRenamed:
 
     def test_the_stronger_source_counts_whatever_the_name(self, command, setting, old, beside, folder, monkeypatch):
         variable = f"MCAPTRACK_{command}_{old}".upper().replace("-", "_")
-        monkeypatch.setenv(variable, "0.25")
-        assert self.params(command, beside, f"--{setting.name}", "0.5")[setting.parameter] == 0.5
-        put(folder / "mcaptrack.toml", f"[{command}]\n{setting.name} = 0.75\n")
-        assert self.params(command, beside)[setting.parameter] == 0.25
+        low, middle, high = ("a", "b", "c") if setting.kind is str else (0.25, 0.5, 0.75)
+        monkeypatch.setenv(variable, str(low))
+        assert self.params(command, beside, f"--{setting.name}", str(middle))[setting.parameter] == middle
+        put(folder / "mcaptrack.toml", f"[{command}]\n{setting.name} = {toml_value(high)}\n")
+        assert self.params(command, beside)[setting.parameter] == low
 
     def test_both_names_at_once_are_refused(self, command, setting, old, beside):
         others = [word for name, value in beside.items() for word in (f"--{name}", value)]

@@ -9,7 +9,8 @@ from mcaptrack import notices
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import DETECTIONS, Frame
-from mcaptrack.transforms.sort import TRACKERS, ByteTrack, OcSort, Sort
+from mcaptrack.transforms import TRACKERS
+from mcaptrack.transforms.sort import ByteTrack, OcSort, Sort
 from tests.worlds import boxes_at, detections, ids, ns
 
 FRAMES = {"max_age_frames": 2, "min_hits_frames": 2, "min_iou": 0.3}

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import DETECTIONS, Frame
-from mcaptrack.transforms.sort import TRACKERS
+from mcaptrack.transforms import TRACKERS
 from tests.references.sort import Box, ReferenceByteTrack, ReferenceOcSort, ReferenceSort
 from tests.worlds import ns
 

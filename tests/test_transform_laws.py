@@ -16,7 +16,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import TRACKS, VIDEO, Frame
-from mcaptrack.transforms import PROFILES, TRACKERS, TRANSFORMS, Retrack, Transform
+from mcaptrack.transforms import PROFILES, STAGES, TRACKERS, TRANSFORMS, Retrack, Transform
 from mcaptrack.transforms.protocol import bare_type
 from tests.worlds import boxes_at, ids, ns, walk
 
@@ -86,7 +86,7 @@ def variants() -> list[tuple[str, Transform]]:
     out += [("retrack", profile) for profile in PROFILES.values()]
     out += [("retrack", Retrack(distance="first", min_history=1, backfill="none", max_age_s=1.0))]
     out += [("predict", TRANSFORMS["predict"](predictor=name)) for name in ("cv", "holt-cv")]
-    out += [("detect", TRANSFORMS["detect"](method=name, stabilise=False)) for name in ("mog2", "frame-difference")]
+    out += [("detect", kind(stabilise=False)) for kind in STAGES["detect"].built_in().values()]
     plane = {"ground_planes": ((0, PLANE),)}
     out += [("track", kind()) for kind in TRACKERS.values()]
     out += [("track", kind(max_age_frames=9, min_hits_frames=3, cost="metres", **plane)) for kind in TRACKERS.values()]

@@ -13,7 +13,7 @@ from typer.main import get_command
 
 from mcaptrack.cli import app
 from mcaptrack.cli.settings import Setting
-from mcaptrack.transforms import ALTERNATIVES, PROFILES, TRANSFORMS
+from mcaptrack.transforms import STAGES, Stage
 from mcaptrack.transforms.protocol import bare_type, choices, limits
 
 DOCUMENT = Path(__file__).parent.parent / "docs" / "options.md"
@@ -28,22 +28,24 @@ _KINDS = {bool: "yes or no", int: "whole number", float: "number", str: "text"}
 def described() -> str:
     """All options of stages, and the numbers that other commands take, as Markdown."""
     parts = []
-    for command in TRANSFORMS:
-        kinds = dict(ALTERNATIVES[command].kinds) if command in ALTERNATIVES else {"": TRANSFORMS[command]}
+    for command, stage in STAGES.items():
         known: set[str] = set()
-        for name, kind in kinds.items():
-            made = PROFILES["default"] if command == "retrack" else kind()
+        for name, kind in stage.built_in().items():
+            made = kind()
             rows = [_row(made, field) for field in fields(kind) if not field.metadata.get("context")]
             new = [row for row in rows if row.split("`")[1] not in known]
             known |= {row.split("`")[1] for row in rows}
-            several = f", with `--{ALTERNATIVES[command].option} {name}` alone" if _stands(parts, command) else ""
+            if not new:
+                continue
+            new = new if _stands(parts, command) else [*_choice_row(stage), *new]
+            several = f", with `--{stage.kind} {name}` alone" if _stands(parts, command) else ""
             head = f"### {command}{several}"
             parts.append("\n".join([head, "", _HEAD, *new]))
     parts.append(_OTHERS)
     for name, command in get_command(app).commands.items():  # type: ignore[attr-defined]
         shown = {one.name: one for one in command.params if one.param_type_name == "option" and not one.hidden}
         numbers = [one for one in command.settings.values() if one.kind in (int, float) and one.parameter in shown]
-        if numbers and name not in TRANSFORMS:
+        if numbers and name not in STAGES:
             rows = [_number_row(one, shown[one.parameter]) for one in numbers]
             parts.append("\n".join([f"### {name}", "", _HEAD, *rows]))
     return "\n\n".join(parts)
@@ -54,6 +56,17 @@ def _number_row(setting: Setting, option: Any) -> str:
     default = option.show_default if isinstance(option.show_default, str) else option.default
     words = option.help.removesuffix(".").removesuffix(f"{range_[:1].upper()}{range_[1:]}").strip().removesuffix(".")
     return f"| `--{setting.name}` | {_KINDS[setting.kind]} {range_} | {default} | {words} |"
+
+
+def _choice_row(stage: Stage) -> list[str]:
+    """The option that chooses what does a stage."""
+    if not stage.kind:
+        return []
+    there = stage.built_in()
+    known = " ".join(f"`{name}`" for name in there)
+    words = f"The {stage.kind} to use"
+    known += ", one of an installed package, or `module:Class`"
+    return [f"| `--{stage.kind}` | {known} | {next(iter(there))} | {words} |"]
 
 
 def _stands(parts: list[str], command: str) -> bool:

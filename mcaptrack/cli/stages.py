@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import inspect
-import re
+import math
 from collections.abc import Callable, Mapping
-from dataclasses import Field, fields, replace
+from dataclasses import MISSING, Field, fields, replace
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, get_type_hints
 
 import typer
@@ -14,70 +15,93 @@ from mcaptrack.cli import common
 from mcaptrack.cli.command import is_on_command_line, settings_of
 from mcaptrack.cli.running import run_on_logs
 from mcaptrack.errors import McaptrackError
-from mcaptrack.transforms import ALTERNATIVES, PROFILES, TRANSFORMS, Transform
-from mcaptrack.transforms.protocol import bare_type
+from mcaptrack.registry import BUILT_IN, Kind, names
+from mcaptrack.transforms import STAGES, Stage, Transform
+from mcaptrack.transforms.protocol import choices, member_type
 
 if TYPE_CHECKING:
     from mcaptrack.log import Log
     from mcaptrack.pipeline import Job, Watch
 
-#: What a command says of itself, beyond its transform.
-_WORDS: Final = {
-    "detect": ("Example: mcaptrack detect log.mcap --method mog2", "{camera}/video", "{camera}/detections"),
-    "track": ("Example: mcaptrack track log.mcap --tracker bytetrack", "{camera}/detections", "{camera}/tracks"),
-    "sample": ("Example: mcaptrack sample log.mcap --rate-hz 2.5", "{camera}/tracks", "{camera}/samples"),
-    "predict": ("Example: mcaptrack predict log.mcap --predictor cv", "{camera}/samples", "{camera}/predictions"),
-    "retrack": ("Example: mcaptrack retrack log.mcap --profile authors", "{camera}/samples", "{camera}/retracks"),
+#: An example for the help of each command.
+_EXAMPLES: Final = {
+    "detect": "mcaptrack detect log.mcap --detector mog2",
+    "track": "mcaptrack track log.mcap --tracker bytetrack",
+    "sample": "mcaptrack sample log.mcap --rate-hz 2.5",
+    "predict": "mcaptrack predict log.mcap --predictor cv",
+    "retrack": "mcaptrack retrack log.mcap --profile authors",
 }
 Topic = Annotated[
     str | None, common.option("--topic", panel=common.FILES, help="Read this channel instead of the default one.")
 ]
-Mode = Literal["both", "offline", "online"]
-_OUTPUTS_OF: Final[Mapping[str, tuple[str, ...]]] = {
-    "both": ("", "online", "predictions"),
-    "offline": ("",),
-    "online": ("online", "predictions"),
-}
+#: Names that files in the working folder may give: they are built in, or installed. ``module:Class`` is neither.
+_NAME: Final = r"[A-Za-z0-9_-]+"
+
+
+def chooser(kind: Kind, was: str = "", words: str = "The {kind} to use", panel: str = "") -> Any:
+    """The option that names one of a kind in the registry."""
+    there = ", ".join(BUILT_IN[kind])
+    return common.option(
+        f"--{kind}",
+        tuning=_NAME,
+        was=was,
+        panel=panel,
+        metavar="NAME",
+        help=f"{words.format(kind=kind)}: {there}, one of an installed package, or module:Class.",
+        autocompletion=lambda: names(kind),
+    )
 
 
 _AFTER: Final = "After the stages"
+_AGAIN: Final = "Use this {kind}, also where another one was used before"
 
 
 def add_stages(app: typer.Typer, panel: str) -> None:
     """A command for all transforms, and one for each, below a heading of the help."""
     common.register(app, panel, "run", common.one_line(run_all))
-    for name, kind in TRANSFORMS.items():
-        common.register(app, panel, name, common.one_line(_stage_command(name, kind)), _help(name, kind))
+    for stage in STAGES.values():
+        common.register(app, panel, stage.name, common.one_line(_stage_command(stage)), _help(stage))
 
 
-def _help(name: str, kind: type[Transform]) -> str:
-    example, source, target = _WORDS[name]
-    first, last = source.format(camera="/camera"), target.format(camera="/camera")
-    where = f"From {first} to {last}. Inputs that are missing are made first."
-    others = [] if name not in ALTERNATIVES else [k for k in ALTERNATIVES[name].kinds.values() if k is not kind]
-    words = [inspect.cleandoc(one.__doc__ or "") for one in (kind, *others)]
-    return "\n\n".join([*words, where, example])
+def _help(stage: Stage) -> str:
+    where = f"From /camera/{stage.reads} to /camera/{stage.writes}. Inputs that are missing are made first."
+    words = [inspect.cleandoc(one.__doc__ or "") for one in stage.built_in().values()]
+    return "\n\n".join([*words, where, f"Example: {_EXAMPLES[stage.name]}"])
 
 
-def _option(field: Field[Any], annotation: Any, default: Any, whose: str = "") -> inspect.Parameter:
+def _option(field: Field[Any], annotation: Any, of: str = "") -> inspect.Parameter:
     """An option that is None unless it is given, and whose help shows what happens then.
 
-    ``whose`` names the one of several transforms that it belongs to, if it doesn't belong to all.
+    ``of`` names the one of several transforms that it belongs to, if it doesn't belong to all.
     """
-    kind, about = bare_type(annotation), field.metadata
+    (kind, is_tuple), about = member_type(annotation), field.metadata
     flag = "--" + field.name.replace("_", "-")
-    names = f"{flag}/--no-{flag[2:]}" if kind is bool else flag
-    shown = "none" if default is None else str(default).lower() if isinstance(default, bool) else f"{default}"
+    switch = f"{flag}/--no-{flag[2:]}" if kind is bool and not is_tuple else flag
+    default = default_of(field)
+    words = about.get("help", "") or f"parameter {field.name} of {of}"
     info = common.option(
-        names,
-        panel=f"Options of {whose} alone" if whose else about["theme"],
-        tuning="|".join(map(re.escape, about["names"])) or False if kind is str else True,
-        help=f"{about['help'][:1].upper()}{about['help'][1:]}.",
-        least=about["least"],
-        most=about["most"],
-        show_default=shown,
+        switch,
+        panel=f"Options of {of} alone" if of else about.get("theme", ""),
+        tuning=_NAME if about.get("kind") else bool(choices(kind)) or kind is not str,
+        help=f"{words[:1].upper()}{words[1:]}.",
+        least=about.get("least", -math.inf),
+        most=about.get("most", math.inf),
+        show_default=shown_default(default),
     )
-    return _parameter(field.name, Annotated[kind | None, info], None)
+    values: Any = list[kind] if is_tuple else kind  # type: ignore[valid-type]
+    return _parameter(field.name, Annotated[values | None, info], None)
+
+
+def default_of(field: Field[Any]) -> Any:
+    """What a field is unless it is given."""
+    return field.default_factory() if field.default_factory is not MISSING else field.default
+
+
+def shown_default(default: Any) -> str:
+    """A default in words."""
+    if isinstance(default, tuple):
+        return " ".join(map(str, default)) or "none"
+    return "none" if default is None else str(default).lower() if isinstance(default, bool) else f"{default}"
 
 
 def _options_of(kind: type[Transform]) -> dict[str, Field[Any]]:
@@ -89,38 +113,40 @@ def _parameter(name: str, annotation: Any, default: Any) -> inspect.Parameter:
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
 
 
-def _stage_command(name: str, kind: type[Transform]) -> Callable[..., None]:
-    """The function behind a stage's command: its signature is made of what the transform declares."""
-    several = ALTERNATIVES.get(name)
-    kinds = dict(several.kinds) if several else {name: kind}
-    defaults = {one: PROFILES["default"] if one == "retrack" else made() for one, made in kinds.items()}
-    own = {one: _options_of(made) for one, made in kinds.items()}
+def _stage_command(stage: Stage, plugins: Mapping[str, type[Transform]] = MappingProxyType({})) -> Callable[..., None]:
+    """The function behind a stage's command: its signature is made of what its transforms declare.
+
+    ``plugins`` are transforms of other packages whose options it has, too.
+    """
+    kinds = {**stage.built_in(), **plugins}
+    own = {name: _options_of(kind) for name, kind in kinds.items()}
     parameters = [_parameter("logs", common.Logs, inspect.Parameter.empty)]
-    if several:
-        words = common.option("--" + several.option, tuning=True, help=f"The {several.option} to use.")
-        default = next(one for one, made in kinds.items() if made is kind)
-        parameters.append(_parameter(several.option, Annotated[Literal[tuple(kinds)], words], default))
-    if name == "retrack":
+    if stage.kind:
+        usual = stage.entry(stage.default).name
+        parameters.append(_parameter(stage.kind, Annotated[str, chooser(stage.kind, stage.was)], usual))
+    if stage.profiles:
         words = common.option(
             "--profile",
             tuning=True,
             help="Values of all parameters: mcaptrack's own (default), the paper's, or those of its authors' program.",
         )
-        parameters.append(_parameter("profile", Annotated[Literal[tuple(PROFILES)], words], "default"))
+        parameters.append(_parameter("profile", Annotated[Literal[tuple(stage.profiles)], words], "default"))
+    if stage.modes:
         words = common.option(
             "--mode",
             tuning=True,
             help="Write tracks that use the whole log (offline), the past alone (online), or both.",
         )
-        parameters.append(_parameter("mode", Annotated[Mode, words], "both"))
+        parameters.append(_parameter("mode", Annotated[Literal[tuple(stage.modes)], words], "both"))
     there: dict[str, list[str]] = {}
-    for one, found in own.items():
-        for f in found:
-            there.setdefault(f, []).append(one)
+    for name, found in own.items():
+        for option in found:
+            there.setdefault(option, []).append(name)
+    shared = len(stage.built_in())
     for option, those in there.items():
-        one = those[0]
-        hint, shown = get_type_hints(kinds[one])[option], getattr(defaults[one], option)
-        parameters.append(_option(own[one][option], hint, shown, one if len(those) < len(kinds) else ""))
+        name = those[0]
+        hint = get_type_hints(kinds[name])[option]
+        parameters.append(_option(own[name][option], hint, name if len(those) < shared or name in plugins else ""))
     to = common.option("--to", panel=common.FILES, help="Write to this channel instead of the default one.")
     parameters += [
         _parameter("topic", Topic, None),
@@ -136,29 +162,53 @@ def _stage_command(name: str, kind: type[Transform]) -> Callable[..., None]:
     ]
 
     def command(**given: Any) -> None:
-        one = given[several.option] if several else name
-        base: Transform = PROFILES[given["profile"]] if name == "retrack" else kinds[one]()
         wanted = {option: given[option] for option in there if given[option] is not None}
-        for option in list(wanted):
-            if option not in own[one]:
-                flag = "--" + option.replace("_", "-")
-                if is_on_command_line(option):
-                    raise McaptrackError(f"{flag} is an option of {' and '.join(there[option])}, not of {one}")
-                del wanted[option]  # set in a file or in the environment, for when another one is chosen
-        transform = replace(base, **wanted)
-        keep = _OUTPUTS_OF[given["mode"]] if name == "retrack" else None
+        transform = _transform(stage, given, wanted, there)
+        keep = stage.modes[given["mode"]] if stage.modes else None
 
         def plan(opened: Log, prefix: str, say: Callable[[str], None]) -> list[Job]:
             from mcaptrack.pipeline import plan_stage
 
-            return plan_stage(opened, prefix, name, transform, given["topic"], given["to"], keep, say, _configured())
+            return plan_stage(
+                opened, prefix, stage.name, transform, given["topic"], given["to"], keep, say, _configured()
+            )
 
         run_on_logs(given, plan)
 
-    command.__name__ = name
+    command.__name__ = stage.name
     command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     command.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     return command
+
+
+def _transform(
+    stage: Stage,
+    given: Mapping[str, Any],
+    wanted: Mapping[str, Any],
+    there: Mapping[str, list[str]] = MappingProxyType({}),
+) -> Transform:
+    """The transform that is chosen, with the parameters that it has of those that are wanted.
+
+    ``there`` are the names of the transforms that have an option: one that is on the command line has to be of the
+    chosen one. What is set in files or in the environment may be for when another one is chosen.
+    """
+    name = given.get(stage.kind) if stage.kind else None
+    cls = stage.find(name).cls if name else stage.default
+    own = _options_of(cls)
+    for option in wanted:
+        if option in there and option not in own and is_on_command_line(option):
+            flag = "--" + option.replace("_", "-")
+            raise McaptrackError(f"{flag} is an option of {' and '.join(there[option])}, not of {name}")
+    hints = get_type_hints(cls)
+    values = {
+        option: tuple(value) if member_type(hints[option])[1] else value
+        for option, value in wanted.items()
+        if option in own
+    }
+    profile = stage.profiles.get(given.get("profile") or "default")
+    if profile is not None and type(profile) is cls:
+        return replace(profile, **values)
+    return stage.make(name or "", **values)
 
 
 def run_all(
@@ -186,6 +236,10 @@ def run_all(
     quiet: common.Quiet = False,
     verbose: common.Verbose = False,
     config: common.Config = None,
+    detector: Annotated[str | None, chooser("detector", words=_AGAIN)] = None,
+    tracker: Annotated[str | None, chooser("tracker", words=_AGAIN)] = None,
+    retracker: Annotated[str | None, chooser("retracker", words=_AGAIN)] = None,
+    predictor: Annotated[str | None, chooser("predictor", words=_AGAIN)] = None,
 ) -> None:
     """Run all stages that are missing or out of date, then events, views and tables.
 
@@ -202,10 +256,13 @@ def run_all(
     given |= {"json": json, "quiet": quiet, "verbose": verbose, "tables": tables}
     gates = (settings.get("similarity"), settings.get("gate_m"), settings.get("min_iou"))
 
+    named = {"detector": detector, "tracker": tracker, "retracker": retracker, "predictor": predictor}
+    chosen = {kind: name for kind, name in named.items() if name}
+
     def plan(opened: Log, prefix: str, say: Callable[[str], None]) -> list[Job]:
         from mcaptrack.pipeline import plan_all
 
-        return plan_all(opened, prefix, say, topic, _configured(), force)
+        return plan_all(opened, prefix, say, topic, _configured(chosen), force, chosen)
 
     run_on_logs(given, plan, watched(*gates, anew=force) if events else None, is_run=True)
 
@@ -220,15 +277,17 @@ def watched(
     return Watch(EventOptions(similarity, gate_m, min_iou), **chosen)
 
 
-def _configured() -> dict[str, Transform]:
-    """The stages as environment and files want them, for a command that makes them on its way; others aren't listed."""
+def _configured(chosen: Mapping[str, str] = MappingProxyType({})) -> dict[str, Transform]:
+    """The stages as environment and files want them, for a command that makes them on its way; others aren't listed.
+
+    ``chosen`` are names by kind that the command line gives.
+    """
     out: dict[str, Transform] = {}
-    for name, default in TRANSFORMS.items():
-        settings = settings_of(name)
-        several = ALTERNATIVES.get(name)
-        kind = several.kinds[settings[several.option]] if several and several.option in settings else default
-        base = PROFILES[settings.get("profile", "default")] if name == "retrack" else kind()
-        chosen = {option: value for option, value in settings.items() if option in _options_of(kind)}
-        if chosen or settings.keys() & {"tracker", "profile"}:
-            out[name] = replace(base, **chosen)
+    for stage in STAGES.values():
+        settings = settings_of(stage.name)
+        own = {option for kind in stage.built_in().values() for option in _options_of(kind)}
+        settings |= {kind: name for kind, name in chosen.items() if kind == stage.option}
+        wanted = {option: value for option, value in settings.items() if value is not None}
+        if wanted.keys() & {*own, stage.option, "profile"}:
+            out[stage.name] = _transform(stage, settings, wanted)
     return out

@@ -12,9 +12,10 @@ from mcaptrack.cli import common
 from mcaptrack.cli.command import warn_unused
 from mcaptrack.cli.config import NAME, read_toml, write_settings
 from mcaptrack.cli.settings import old_names
+from mcaptrack.cli.stages import chooser
 from mcaptrack.cli.text import console, show
 from mcaptrack.errors import McaptrackError
-from mcaptrack.transforms import ALTERNATIVES, TRANSFORMS, Transform
+from mcaptrack.transforms import STAGES, Transform
 
 if TYPE_CHECKING:
     from mcaptrack.evaluation.tuning import Range, Task, Trial
@@ -42,10 +43,7 @@ def tune(
         Literal["track", "sample", "retrack"],
         common.option("--stage", panel=_SEARCH, tuning=True, help="The stage to tune."),
     ] = "track",
-    tracker: Annotated[
-        Literal["sort", "bytetrack", "ocsort"],
-        common.option("--tracker", panel=_SEARCH, tuning=True, help="The tracker to tune."),
-    ] = "sort",
+    tracker: Annotated[str, chooser("tracker", words="The {kind} to tune", panel=_SEARCH)] = "sort",
     metric: Annotated[
         Literal["IDF1", "MOTA", "HOTA", "IDP", "IDR", "DetA", "AssA"],
         common.option("--metric", panel=common.SCORES, tuning=True, help="Score to maximise.", case_sensitive=False),
@@ -116,11 +114,12 @@ def tune(
     from mcaptrack.evaluation.tuning import tune as run
     from mcaptrack.evaluation.tuning import uses_optuna
 
-    kind = ALTERNATIVES[stage].kinds[tracker] if stage in ALTERNATIVES else TRANSFORMS[stage]
+    has_trackers = STAGES[stage].kind == "tracker"
+    kind = STAGES[stage].find(tracker).cls if has_trackers else STAGES[stage].default
     chosen = similarity or ("iou" if stage == "track" else "metres")
     scoring = EvaluateOptions(similarities=(chosen,), gates_m=(gate_m,), min_iou=min_iou)
     ranges = _ranges(kind, search or [])
-    which = tracker if stage in ALTERNATIVES else stage
+    which = tracker.replace(":", ".") if has_trackers else stage
     trials_file = study or output.with_name(f"{output.stem}.{which}.trials.jsonl")
     with common.Talk(quiet, verbose).open() as talk:
         read_toml(output)  # a file that can't be edited is refused before the search
@@ -133,7 +132,7 @@ def tune(
         else:
             tasks = _tasks_of_logs(common.expand(inputs), camera, topic, stage, kind)
             warn_unused("it is about label files; logs have theirs inside", "ground_plane", "point", "fps")
-        if stage not in ALTERNATIVES:
+        if not has_trackers:
             warn_unused(f"{stage} has no trackers", "tracker")
         warn_unused(*(("overlap is compared", "gate_m") if chosen == "iou" else ("distance is compared", "min_iou")))
         if force:
@@ -149,7 +148,7 @@ def tune(
         first, best = run(
             kind(), tasks, ranges, scoring, metric=metric, trials=trials, seed=seed, study=trials_file, on_trial=told
         )
-        settings = ({"tracker": tracker} if stage in ALTERNATIVES else {}) | dict(best.parameters)
+        settings = ({"tracker": tracker} if has_trackers else {}) | dict(best.parameters)
         if best is first:
             talk.say(f"nothing that was tried beats the defaults ({metric} {first.scores[metric]:.4f}); {output} stays")
         else:

@@ -10,11 +10,10 @@ from mcaptrack.pipeline.planes import read_planes
 from mcaptrack.pipeline.run import Report, input_of, run
 from mcaptrack.pipeline.summary import Summary, summarise
 from mcaptrack.pipeline.write import LAYOUTS, attachment_of, find_views, layout_path
-from mcaptrack.sources.cameras import ROUTES, Camera, camera_at, find_camera
+from mcaptrack.sources.cameras import Camera, camera_at, find_camera
 
 __all__ = [
     "LAYOUTS",
-    "ROUTES",
     "Camera",
     "Job",
     "Report",

@@ -15,8 +15,8 @@ from mcaptrack.foxglove import views
 from mcaptrack.schema import DETECTIONS, VIDEO, Schema
 from mcaptrack.schema.provenance import INGEST, VIEW, Provenance
 from mcaptrack.sources import foreign
-from mcaptrack.sources.cameras import FULL, ROUTES, USUAL, chain_of
-from mcaptrack.transforms import Transform
+from mcaptrack.sources.cameras import USUAL, chain_of
+from mcaptrack.transforms import FULL, STAGES, Transform
 from mcaptrack.transforms.protocol import check_options
 
 
@@ -36,7 +36,7 @@ class Job(NamedTuple):
     def kept(self) -> set[str]:
         """The topics that go into the log."""
         kept = {f"{self.target}/{suffix}".rstrip("/") for suffix in self.keep or self.transform.writes}
-        return kept | {self.target + FULL} if self.stage == "retrack" and self.target in kept else kept
+        return kept | {self.target + FULL} if STAGES[self.stage].at_video_rate and self.target in kept else kept
 
 
 def check_inputs(opened: log.Log, prefix: str, jobs: Sequence[Job]) -> None:
@@ -75,7 +75,7 @@ def _lacks(opened: log.Log, prefix: str, job: Job) -> str:
     """What is missing for a job, what there is, and what to do."""
     there = [topic for topic in sorted(opened.channels) if "/view/" not in topic]
     has, hint = f"it has {', '.join(there) or 'none'}", f"{command('info', opened.path)} shows more"
-    if job.source == f"{prefix}/{ROUTES['detect'].reads}":
+    if job.transform.reads is VIDEO and job.source == f"{prefix}/{STAGES[job.stage].reads}":
         pictures = [topic for topic in there if foreign.holds_pictures(opened.channels[topic])]
         if pictures:
             has, hint = f"it has pictures in {', '.join(pictures)}", "choose one with --topic"

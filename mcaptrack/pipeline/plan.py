@@ -6,7 +6,7 @@ with the parameters that it had, or left as it is where that can't be done.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import fields
 from typing import Final
 
@@ -15,12 +15,12 @@ from mcaptrack.errors import McaptrackError, command
 from mcaptrack.notices import warn
 from mcaptrack.pipeline.checks import Job, check_inputs, fits, how_it_came
 from mcaptrack.pipeline.planes import planes_to_json, read_planes
-from mcaptrack.predictors import weights_sha256
+from mcaptrack.pipeline.rebuild import MissingPluginError, rebuild
 from mcaptrack.schema import DETECTIONS, VIDEO
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources import foreign
-from mcaptrack.sources.cameras import ROUTES, USUAL, camera_at, chain_of, name_above, outputs_of
-from mcaptrack.transforms import TRANSFORMS, Transform, chosen, implementation_of
+from mcaptrack.sources.cameras import USUAL, camera_at, chain_of, name_above
+from mcaptrack.transforms import STAGES, Stage, Transform
 
 Say = Callable[[str], None]
 
@@ -46,7 +46,7 @@ def plan_stage(
     from, or if the stage would replace what it did not make.
     """
     planner = _Planner(opened, prefix, defaults=defaults)
-    usual = f"{prefix}/{ROUTES[stage].writes}"
+    usual = f"{prefix}/{STAGES[stage].writes}"
     source = source or planner.source_of(stage)
     planner.ensure(source)
     planner.jobs.append(Job(stage, transform, source, target or usual, keep))
@@ -60,16 +60,20 @@ def plan_all(
     source: str | None = None,
     defaults: Mapping[str, Transform] = {},
     anew: bool = False,
+    chosen: Collection[str] = (),
 ) -> list[Job]:
     """The jobs that bring everything about a camera up to date; none if it is.
 
     ``source`` is a topic with pictures or with boxes that others detected, to begin with; ``defaults`` as in
-    ``plan_stage``. With ``anew`` what is up to date is made again, too, as ``defaults`` say or else as before. Raises
-    McaptrackError as ``plan_stage`` does.
+    ``plan_stage``. With ``anew`` what is up to date is made again, too, as ``defaults`` say or else as before.
+    ``chosen`` are options by which ``defaults`` were chosen ("tracker"): what was made by another one is made again.
+    Raises McaptrackError as ``plan_stage`` does, and if what made a channel is not installed.
     """
-    planner = _Planner(opened, prefix, {_stage_from(opened, source): source} if source else {}, defaults, anew)
-    for target in ("predictions", "retracks"):
-        planner.ensure(f"{prefix}/{target}")
+    planner = _Planner(opened, prefix, {_stage_from(opened, source): source} if source else {}, defaults, anew, chosen)
+    read = {stage.reads for stage in STAGES.values()}
+    for stage in STAGES.values():
+        if stage.writes not in read:
+            planner.ensure(f"{prefix}/{stage.writes}")
     for topic in sorted(camera_at(opened, prefix).topics):  # also what was written elsewhere
         planner.ensure(topic)
     return planner.checked(say)
@@ -78,9 +82,9 @@ def plan_all(
 def _stage_from(opened: log.Log, source: str) -> str:
     """The first stage of a run that begins with this topic. Raises McaptrackError if none reads it."""
     channel = opened.channel(source)
-    for stage, reads in (("detect", VIDEO), ("track", DETECTIONS)):
-        if fits(channel, reads)[1]:
-            return stage
+    for stage in STAGES.values():
+        if stage.default.reads in (VIDEO, DETECTIONS) and fits(channel, stage.default.reads)[1]:
+            return stage.name
     wanted = ", ".join((*foreign.PICTURES_READ, DETECTIONS.name, *foreign.DETECTIONS_READ))
     raise McaptrackError(
         f"{opened.path}: {source} holds {channel.schema_name or 'no schema'}; run begins with one of {wanted}"
@@ -91,7 +95,8 @@ class _Planner:
     """Collects the jobs that make channels stand and be up to date.
 
     ``sources`` are inputs of stages and ``defaults`` transforms of stages, where they are not the usual ones. With
-    ``anew`` all stages run, whether or not their channels stand.
+    ``anew`` all stages run, whether or not their channels stand; those by whose options
+    (``chosen``) ``defaults`` take something else than before run, too.
     """
 
     def __init__(
@@ -101,10 +106,11 @@ class _Planner:
         sources: Mapping[str, str] = {},
         defaults: Mapping[str, Transform] = {},
         anew: bool = False,
+        chosen: Collection[str] = (),
     ) -> None:
         self.jobs: list[Job] = []
         self._opened, self._prefix = opened, prefix
-        self._sources, self._defaults, self._anew = sources, defaults, anew
+        self._sources, self._defaults, self._anew, self._chosen = sources, defaults, anew, chosen
         self._changes: dict[str, bool] = {}
         self._said: list[str] = []
         self._differing: set[str] = set()
@@ -118,16 +124,17 @@ class _Planner:
 
     def source_of(self, stage: str) -> str:
         """The topic that a stage reads, unless it was made from another one before."""
-        usual = f"{self._prefix}/{ROUTES[stage].reads}"
+        usual = f"{self._prefix}/{STAGES[stage].reads}"
         if stage in self._sources or usual in self._opened.channels:
             return self._sources.get(stage, usual)
         camera = camera_at(self._opened, self._prefix)
-        if stage == "detect" and camera.pictures:
+        reads = STAGES[stage].default.reads
+        if reads is VIDEO and camera.pictures:
             self._said.append(f"{usual} is missing: taking the pictures of {camera.pictures}")
             if camera.boxes:
                 self._said.append(f"boxes that others detected are in {camera.boxes}; --topic takes them instead")
             return camera.pictures
-        if stage == "track" and camera.boxes and not camera.pictures:
+        if reads is DETECTIONS and camera.boxes and not camera.pictures:
             self._said.append(f"{usual} is missing: taking the boxes of {camera.boxes}")
             return camera.boxes
         return usual
@@ -146,7 +153,7 @@ class _Planner:
         if channel is None:
             sibling = self._sibling(usual, topic)
             return self._make_again(sibling, usual, topic) if sibling else bool(usual) and self._make(usual, topic)
-        if made is None or made.transform not in TRANSFORMS:
+        if made is None or made.transform not in STAGES:
             if usual in self._sources and topic != self._sources[usual]:
                 raise McaptrackError(self._not_made(usual, topic))
             return False  # recorded or ingested: nothing makes it but its recording
@@ -154,7 +161,7 @@ class _Planner:
 
     def _sibling(self, stage: str, topic: str) -> Provenance | None:
         """How the other outputs of a stage were made whose output at ``topic`` is missing."""
-        topics = outputs_of(stage, _main(self._opened, stage, topic)) if stage else ()
+        topics = STAGES[stage].outputs(_main(self._opened, stage, topic)) if stage else ()
         found = (
             Provenance.from_metadata(self._opened.channels[one].metadata)
             for one in topics
@@ -167,7 +174,7 @@ class _Planner:
         source = self.source_of(stage)
         self.ensure(source)
         self._said.append(f"{topic} is missing: running {stage}")
-        transform = self._defaults.get(stage) or TRANSFORMS[stage]()
+        transform = self._defaults.get(stage) or STAGES[stage].default()
         self._add(Job(stage, transform, source, _main(self._opened, stage, topic)))
         return True
 
@@ -179,17 +186,18 @@ class _Planner:
         had = made.input or self.source_of(stage)
         source = self._sources.get(stage, had)
         is_due = self.ensure(source) or is_missing or is_stale(self._opened, topic) or source != had
-        before, why_not = _transform_of(stage, made, self._defaults)
+        before, why_not = self._before(stage, made)
         main = _main(self._opened, stage, topic)
-        is_usual = main == f"{self._prefix}/{ROUTES[stage].writes}"  # what stands elsewhere was asked for as it is
+        is_usual = main == f"{self._prefix}/{STAGES[stage].writes}"  # what stands elsewhere was asked for as it is
         wanted = self._defaults.get(stage, before) if is_usual else before
-        if wanted and not self._anew and (differing := _differing(before, wanted) if before else why_not):
-            self._warn_of_settings(main, differing)
-        if not is_due and not self._anew:
+        is_replaced = is_usual and self._is_replaced(STAGES[stage], before, wanted)
+        if wanted and not is_replaced and not self._anew:
+            self._warn_of_settings(main, _differing(before, wanted) if before else str(why_not))
+        if not is_due and not self._anew and not is_replaced:
             return False
-        transform = wanted if self._anew else before
+        transform = wanted if self._anew or is_replaced else before
         if transform is None:
-            if is_missing or source != had:
+            if is_missing or source != had or isinstance(why_not, MissingPluginError):
                 raise McaptrackError(f"{self._opened.path}: {topic} can't be made from {source}: {why_not}")
             why = "is out of date and" if is_due else "is not made again, it"
             warn(f"{topic} {why} stays as it is: {why_not}", "out-of-date" if is_due else "left-out")
@@ -198,6 +206,8 @@ class _Planner:
             self._said.append(f"{topic} is missing: running {stage}, as for what it made beside it")
         elif source != had:
             self._said.append(f"{topic} was made from {had}: running {stage} again, from {source}")
+        elif is_replaced:
+            self._said.append(f"{topic} was made by another {STAGES[stage].option}: running {stage} again")
         elif is_due and not self._anew:
             self._said.append(f"{topic} was made from an earlier {source}: running {stage} again, as before")
         there = [f"{main}/{suffix}".rstrip("/") for suffix in transform.writes]
@@ -206,9 +216,22 @@ class _Planner:
         self._add(Job(stage, transform, source, main, None if all(kept) else keep))
         return True
 
+    def _is_replaced(self, stage: Stage, before: Transform | None, wanted: Transform | None) -> bool:
+        """Whether something else is chosen for a stage than what it was done by."""
+        if wanted is None or stage.option not in self._chosen:
+            return False
+        return before is None or stage.choice(before) != stage.choice(wanted)
+
+    def _before(self, stage: str, made: Provenance) -> tuple[Transform | None, McaptrackError | None]:
+        """The transform that made a channel, with the parameters it had; None, and why, where it can't be had today."""
+        try:
+            return rebuild(STAGES[stage], made, self._defaults), None
+        except McaptrackError as error:
+            return None, error
+
     def _warn_of_settings(self, main: str, differing: str) -> None:
         """Say once for all outputs of a stage that they were made with other settings."""
-        if main in self._differing:
+        if main in self._differing or not differing:
             return
         self._differing.add(main)
         force = command("run", self._opened.path, "--force")
@@ -239,9 +262,9 @@ def _differing(before: Transform, wanted: Transform) -> str:
 
 def _main(opened: log.Log, stage: str, topic: str) -> str:
     """The topic that a stage writes to so that ``topic`` comes of it: itself, or what its last part stands below."""
-    for suffix in TRANSFORMS[stage].writes:
+    for suffix in STAGES[stage].default.writes:
         if suffix and topic.endswith("/" + suffix):
-            below = [one for one in outputs_of(stage, topic)[1:] if one in opened.channels]
+            below = [one for one in STAGES[stage].outputs(topic)[1:] if one in opened.channels]
             return topic if below else topic.removesuffix("/" + suffix)
     return topic
 
@@ -263,36 +286,3 @@ def is_stale(opened: log.Log, topic: str) -> bool:
         if now and now.digest and now.digest != then:
             return True
     return False
-
-
-def _transform_of(stage: str, made: Provenance, known: Mapping[str, Transform]) -> tuple[Transform | None, str]:
-    """The transform that made a channel, with the parameters it had; None, and why, where it can't be had today.
-
-    ``known`` are transforms by stage whose kinds may be used, beside the built-in ones. Nothing is ever imported
-    because a log names it.
-    """
-    had = dict(made.parameters)
-    kind: type[Transform] | None
-    if made.implementation:
-        given = known.get(stage)
-        kind = type(given) if given and implementation_of(stage, type(given)) == made.implementation else None
-        if kind is None:
-            where = f" ({made.distribution})" if made.distribution else ""
-            return None, f"{made.implementation}{where} made it, which is not at hand"
-    else:
-        option, name, kind = chosen(stage, had)
-        if kind is None:
-            return None, f"{option} {name} made it, which this version does not have"
-        had.pop(option, None)
-    options = {f.name: f for f in fields(kind)}
-    strange = sorted(set(had) - set(options))
-    if strange:
-        return None, f"it was made with {', '.join(strange)}, which {kind.__name__} does not have"
-    try:
-        transform = kind(**{name: value for name, value in had.items() if not options[name].metadata.get("context")})
-    except McaptrackError as error:
-        return None, str(error)
-    predictor = getattr(transform, "predictor", "")
-    if made.weights_sha256 and ":" in predictor and weights_sha256(predictor) != made.weights_sha256:
-        return None, f"{predictor} holds other weights than those it was made with"
-    return transform, ""

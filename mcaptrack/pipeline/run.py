@@ -20,14 +20,15 @@ from mcaptrack.pipeline.events import STAGE as EVENTS_STAGE
 from mcaptrack.pipeline.events import Watch, make_events, tally
 from mcaptrack.pipeline.findings import warn_of_memory, warn_of_nothing, warn_of_what_stands
 from mcaptrack.pipeline.planes import guess_plane, is_poor, read_planes
+from mcaptrack.pipeline.rebuild import plugins_of
 from mcaptrack.pipeline.write import Made, digest_of, write
 from mcaptrack.predictors import weights_sha256
-from mcaptrack.schema import GROUND_PLANE, TRACKS, VIDEO, Frame, Schema
-from mcaptrack.schema.provenance import CLOCK, Provenance, distribution_of
+from mcaptrack.schema import DETECTIONS, GROUND_PLANE, TRACKS, VIDEO, Frame, Schema
+from mcaptrack.schema.provenance import CLOCK, Provenance
 from mcaptrack.sources import foreign
-from mcaptrack.sources.cameras import FULL, ROUTES, camera_at
+from mcaptrack.sources.cameras import camera_at
 from mcaptrack.sources.video import EncodedPicture, decode_gray
-from mcaptrack.transforms import TRANSFORMS, Transform, choice, implementation_of
+from mcaptrack.transforms import FULL, STAGES, Transform
 from mcaptrack.transforms.to_video_rate import to_video_rate, unchanged_tracks
 
 Progress = Callable[[str, int, int], None]
@@ -89,12 +90,12 @@ def _run(
     for job in jobs:
         given = _input(opened, job, made, stamps, progress)
         # A guessed scale is guessed anew from new detections; a given one stands.
-        is_usual = job.target == f"{prefix}/{ROUTES[job.stage].writes}"
-        is_due = job.stage == "track" and is_usual and is_assumed(planes)
-        if is_due or (planes is None and job.stage in ("track", "sample")):
+        stage, has_boxes = STAGES[job.stage], job.transform.reads is DETECTIONS
+        is_due = has_boxes and job.target == f"{prefix}/{stage.writes}" and is_assumed(planes)
+        if is_due or (planes is None and stage.needs_scale):
             planes, channel = guess_plane(given.frames, job.source, given.digest())
             made |= {camera_at(opened, prefix).ground_plane: Made.of(GROUND_PLANE, *channel)} if channel else {}
-        if job.stage == "track":
+        if has_boxes:
             warn_of_memory(len(given.frames), sum(len(frame.rows) for frame in given.frames))
         made |= _run_job(opened, prefix, job, given, made, planes or ())
         for topic in (topic for topic in job.outputs() if topic in made):
@@ -113,7 +114,7 @@ def _run(
     digests = {topic: channel.provenance.digest for topic, channel in made.items()}
     for topic, there in sorted(opened.channels.items()):
         known = Provenance.from_metadata(there.metadata)
-        if topic not in made and known and known.transform in {*TRANSFORMS, EVENTS_STAGE}:
+        if topic not in made and known and known.transform in {*STAGES, EVENTS_STAGE}:
             is_late = any(digests.get(name, then) != then for name, then in known.made_from().items())
             report.stale += [topic] if is_late else []
     return report
@@ -142,7 +143,7 @@ def _run_job(
                 for frame, channel in zip(result, outputs, strict=True):
                     channel.append(frame)
             if not warnings:  # otherwise it is known why
-                warn_of_nothing(job.source, transform, given.frames, outputs[0])
+                warn_of_nothing(job.stage, job.source, transform, given.frames, outputs[0])
     except McaptrackError as error:
         where = "" if str(opened.path) in str(error) else f"{opened.path}: {job.source}: "
         raise type(error)(f"{where}{error}") from None
@@ -166,13 +167,13 @@ def _run_job(
 
 def _provenance_of(job: Job, transform: Transform, input_digest: str, warnings: Sequence[Notice]) -> Provenance:
     """How a job makes its channels. Raises McaptrackError for parameters that can't be kept in a log."""
-    kind = type(transform)
-    implementation = implementation_of(job.stage, kind)
+    stage = STAGES[job.stage]
+    entry = stage.entry(type(transform))
+    choice = {stage.kind: entry.name} if stage.kind else {}
     try:
-        parameters = json.loads(json.dumps(choice(job.stage, transform) | asdict(transform)))
+        parameters = json.loads(json.dumps(asdict(transform) | choice))
     except TypeError as error:
-        name = implementation or kind.__name__
-        raise McaptrackError(f"the parameters of {name} can't be kept in a log: {error}") from None
+        raise McaptrackError(f"the parameters of {entry} can't be kept in a log: {error}") from None
     predictor = getattr(transform, "predictor", None)
     return Provenance(
         job.stage,
@@ -180,8 +181,7 @@ def _provenance_of(job: Job, transform: Transform, input_digest: str, warnings: 
         job.source,
         input_digest,
         weights_sha256=weights_sha256(predictor) if isinstance(predictor, str) else "",
-        implementation=implementation,
-        distribution=distribution_of(kind.__module__) if implementation else "",
+        plugins=plugins_of(stage, transform),
         warnings=[(notice.code, notice.message) for notice in warnings],
     )
 
@@ -286,8 +286,8 @@ def input_of(
 
     Raises McaptrackError if the input isn't there.
     """
-    topic = source or f"{prefix}/{ROUTES[stage].reads}"
-    job = Job(stage, transform, topic, f"{prefix}/{ROUTES[stage].writes}")
+    topic = source or f"{prefix}/{STAGES[stage].reads}"
+    job = Job(stage, transform, topic, f"{prefix}/{STAGES[stage].writes}")
     check_inputs(opened, prefix, [job])
     frames = _frames(opened, topic, transform.reads)
     known = _in_context(opened, prefix, job, frames, read_planes(opened, prefix) or ())

@@ -14,7 +14,8 @@ from mcaptrack.notices import warn
 from mcaptrack.schema import DETECTIONS, GROUND_PLANE, PREDICTIONS, TRACKS, Rows, Schema
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources import foreign
-from mcaptrack.sources.cameras import ROUTES, camera_at
+from mcaptrack.sources.cameras import camera_at
+from mcaptrack.transforms import STAGES
 
 #: Tracks within this distance of the truth are right, as in the demonstration.
 _GATE_M = 1.0
@@ -64,7 +65,7 @@ def summarise(opened: log.Log, prefix: str) -> Summary:
     Warns where re-tracking lost more than it mended.
     """
     camera = camera_at(opened, prefix)
-    boxes, tracks, samples, predictions, retracks = (f"{prefix}/{route.writes}" for route in ROUTES.values())
+    boxes, tracks, samples, predictions, retracks = (f"{prefix}/{stage.writes}" for stage in STAGES.values())
     tracked, repaired = _rows(opened, tracks, TRACKS), _rows(opened, retracks, TRACKS)
     forecasts = _rows(opened, f"{retracks}/predictions", PREDICTIONS)
     forecasts = _rows(opened, predictions, PREDICTIONS) if forecasts is None else forecasts

@@ -23,7 +23,8 @@ from mcaptrack.pipeline.checks import how_it_came, may_replace
 from mcaptrack.schema import DETECTIONS, FORECAST_SCORES, GROUND_PLANE, PREDICTIONS, SCHEMAS, TRACKS, Frame, Schema
 from mcaptrack.schema.provenance import INGEST, VIEW, Provenance, digest
 from mcaptrack.sources import foreign
-from mcaptrack.sources.cameras import FULL, VIDEO, Camera, camera_at
+from mcaptrack.sources.cameras import VIDEO, Camera, camera_at
+from mcaptrack.transforms import FULL
 
 #: Log time, number of the channel, sequence and payload of a message.
 Numbered = tuple[int, int, int, bytes]

@@ -9,7 +9,7 @@ import hashlib
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final, Self, TypeVar
+from typing import Any, Final, NamedTuple, Self, TypeVar
 
 from mcaptrack import __version__
 
@@ -21,14 +21,25 @@ INGEST, VIEW = "ingest", "view"
 CLOCK: Final = "mcaptrack.clock"
 
 
+class Plugin(NamedTuple):
+    """A class of another package: the name it was chosen by (of an entry point, or ``module:Class``), where it is
+    defined (``module:Class``), and the installed package that it came from, "" where that wasn't known.
+    """
+
+    name: str
+    implementation: str
+    distribution: str = ""
+    version: str = ""
+
+
 @dataclass(frozen=True)
 class Provenance:
     """What made a channel, from what, and how. ``digest`` is of its own messages, ``input_digest`` of its input's.
 
     ``references`` are the topics that the input was compared with, and the digest of each: empty where there was
-    nothing of that name. ``implementation`` is where the transform is defined ("package.module:Class") if it is not
-    built in, and ``distribution`` what it was installed with ("name 1.2"). ``warnings`` are what was odd about it when
-    it was made: code and message of each.
+    nothing of that name. ``plugins`` are the classes of other packages that it consists of: the ``transform`` itself if
+    it is not built in, and the ``predictor`` in it. ``warnings`` are what was odd about it when it was made: code and
+    message of each.
     """
 
     transform: str
@@ -38,8 +49,7 @@ class Provenance:
     digest: str = ""
     weights_sha256: str = ""
     references: Mapping[str, str] = field(default_factory=dict)
-    implementation: str = ""
-    distribution: str = ""
+    plugins: Mapping[str, Plugin] = field(default_factory=dict)
     warnings: Sequence[Sequence[str]] = ()
     version: str = __version__
 
@@ -58,14 +68,15 @@ class Provenance:
             "digest": self.digest,
             "weights_sha256": self.weights_sha256,
             "references": json.dumps(dict(self.references), sort_keys=True, separators=(",", ":")),
-            "implementation": self.implementation,
-            "distribution": self.distribution,
+            "plugins": json.dumps({key: one._asdict() for key, one in self.plugins.items()}, sort_keys=True),
             "warnings": json.dumps(self.warnings, separators=(",", ":")),
         }
         if not self.warnings:
             del values["warnings"]
         if not self.references:
             del values["references"]
+        if not self.plugins:
+            del values["plugins"]
         return {_PREFIX + key: value for key, value in values.items() if value}
 
     @classmethod
@@ -75,9 +86,10 @@ class Provenance:
         if "transform" not in values:
             return None
         parameters, references = (_read(values.pop(key, ""), dict) for key in ("parameters", "references"))
+        plugins = _plugins(values)
         warnings = [one for one in _read(values.pop("warnings", ""), list) if _is_warning(one)]
         known = {key: value for key, value in values.items() if key in cls.__dataclass_fields__}
-        return cls(parameters=parameters, references=references, warnings=warnings, **known)
+        return cls(parameters=parameters, references=references, warnings=warnings, plugins=plugins, **known)
 
 
 def _read(text: str, kind: type[T]) -> T:
@@ -93,12 +105,21 @@ def _is_warning(value: object) -> bool:
     return isinstance(value, list) and len(value) == 2 and all(isinstance(part, str) for part in value)
 
 
-def distribution_of(module: str) -> str:
-    """Name and version of what a module was installed with, as in "name 1.2"; "" if that isn't known."""
-    from importlib.metadata import packages_distributions, version
+def _plugins(values: dict[str, str]) -> dict[str, Plugin]:
+    """What metadata say of classes of other packages; takes it out of ``values``.
 
-    names = packages_distributions().get(module.partition(".")[0], [])
-    return f"{names[0]} {version(names[0])}" if names else ""
+    Version 0.1 had ``implementation`` ("module:Class") and ``distribution`` ("name 1.2").
+    """
+    found = _read(values.pop("plugins", ""), dict)
+    before, package = values.pop("implementation", ""), values.pop("distribution", "")
+    if before:
+        name, _, version = package.rpartition(" ")
+        found.setdefault("transform", Plugin(before, before, name, version)._asdict())
+    return {
+        key: Plugin(**{name: str(one.get(name, "")) for name in Plugin._fields})
+        for key, one in found.items()
+        if isinstance(one, dict)
+    }
 
 
 def digest(messages: Iterable[tuple[int, int, bytes]]) -> str:

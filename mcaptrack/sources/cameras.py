@@ -19,42 +19,15 @@ from mcaptrack.notices import warn
 from mcaptrack.schema import DETECTIONS, SCHEMAS
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources import foreign
-from mcaptrack.transforms import TRANSFORMS
+from mcaptrack.transforms import STAGES
 
 #: The name of a camera that has no other.
 DEFAULT_CAMERA: Final = "camera"
 #: What is ingested, below the name of its camera.
 VIDEO, TRUTH, GROUND_PLANE = "video", "truth", "ground_plane"
-#: Below the re-tracked tracks: the same at the video's rate.
-FULL: Final = "/full"
-
-
-class Route(NamedTuple):
-    """Where a transform reads and writes, below the camera's name."""
-
-    reads: str
-    writes: str
-
-
-#: The channels between the stages, in the order in which they run.
-ROUTES: Final[Mapping[str, Route]] = {
-    "detect": Route(VIDEO, "detections"),
-    "track": Route("detections", "tracks"),
-    "sample": Route("tracks", "samples"),
-    "predict": Route("samples", "predictions"),
-    "retrack": Route("samples", "retracks"),
-}
-
-
-def outputs_of(stage: str, target: str) -> tuple[str, ...]:
-    """The topics that a stage takes if it writes to ``target``."""
-    topics = tuple(f"{target}/{suffix}".rstrip("/") for suffix in TRANSFORMS[stage].writes)
-    return (*topics, target + FULL) if stage == "retrack" else topics
-
-
 #: What stands below the name of a camera, and the stage that makes it; "" where it comes in.
 USUAL: Final[Mapping[str, str]] = {VIDEO: "", TRUTH: "", GROUND_PLANE: ""} | {
-    topic: stage for stage, route in ROUTES.items() for topic in outputs_of(stage, route.writes)
+    topic: stage.name for stage in STAGES.values() for topic in stage.outputs(stage.writes)
 }
 
 
@@ -149,7 +122,7 @@ def chain_of(opened: log.Log, topic: str) -> list[str]:
 def is_made_by_stage(channel: log.Channel) -> bool:
     """Whether a stage made a channel, so that it can make it again."""
     made = Provenance.from_metadata(channel.metadata)
-    return made is not None and made.transform in TRANSFORMS
+    return made is not None and made.transform in STAGES
 
 
 _KNOWN: Final[WeakKeyDictionary[log.Log, list[Camera]]] = WeakKeyDictionary()
@@ -209,7 +182,7 @@ class _Channels:
     def _usual_pictures(self, names: list[str]) -> str | None:
         """The video, or what detections were made from."""
         topics = [f"{name}/{VIDEO}" for name in names]
-        topics += [made.input for name in names if (made := self._made.get(f"{name}/{ROUTES['detect'].writes}"))]
+        topics += [made.input for name in names if (made := self._made.get(f"{name}/{STAGES['detect'].writes}"))]
         there = [self._opened.channels[topic] for topic in topics if topic in self._opened.channels]
         return next((channel.topic for channel in there if foreign.holds_pictures(channel)), None)
 

@@ -5,12 +5,12 @@ Letters: N people at one time, T future steps.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import ClassVar
 
-from mcaptrack.predictors import NAMES, PredictorName, check
+from mcaptrack.predictors import PredictorName, entry_of
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame, Schema
 from mcaptrack.transforms.forecasts import Forecaster
 from mcaptrack.transforms.protocol import check_options, context, option
@@ -25,8 +25,9 @@ class Predict:
 
     predictor: PredictorName = option(
         "red",
-        "predictor: cv, holt-cv, kalman, lstm, red; or with weights of your own, red:FILE, lstm:FILE, onnx:FILE",
-        names=NAMES,
+        "predictor: cv, holt-cv, kalman, lstm, red; with other weights red:FILE, lstm:FILE, onnx:FILE; one of an "
+        "installed package; or module:Class",
+        kind="predictor",
     )
     horizon_s: float = option(4.8, "how far ahead to predict, in seconds", least=0.1, most=60.0)
     min_history: int = option(
@@ -40,9 +41,14 @@ class Predict:
 
     def __post_init__(self) -> None:
         check_options(self)
-        check(self.predictor)
+        entry_of(self.predictor)
 
     def __call__(self, frames: Iterable[Frame]) -> Iterator[tuple[Frame, ...]]:
         forecaster = Forecaster(self.predictor, self.horizon_s, self.min_history, self.rate_hz)
         for frame in frames:
             yield (frame._replace(rows=forecaster.predict(frame)),)
+
+    def why_nothing(self, given: Sequence[Frame], made: Sequence[Frame]) -> str:
+        """Why no rows came of frames, for a warning."""
+        needed_s = (self.min_history - 1) / self.rate_hz
+        return f"no track is without a gap for the {needed_s:.3g} s that a forecast needs (min_history)"

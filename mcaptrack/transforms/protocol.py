@@ -4,7 +4,7 @@ A transform is a frozen, keyword-only dataclass. Its fields are its parameters: 
 of its name and a help text; they are at once the options of its command and what its channels say of their making.
 Calling it with a stream of frames gives a stream of tuples of frames, one for each of its outputs.
 
-Laws that hold for every transform, tested for all in ``TRANSFORMS``:
+Laws that hold for every transform, tested for all that are built in:
 
 * conforms: every output passes the gate of its schema;
 * keeps time: the times of an output never decrease;
@@ -19,11 +19,13 @@ from __future__ import annotations
 import math
 import typing
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import field, fields
+from dataclasses import MISSING, field, fields
+from functools import cache
 from types import UnionType
 from typing import Any, ClassVar, Final, Literal, Protocol, get_args, get_origin, get_type_hints
 
 from mcaptrack.errors import McaptrackError
+from mcaptrack.registry import Kind
 from mcaptrack.schema import Frame, Schema
 
 
@@ -53,7 +55,7 @@ def option(
     least: float = -math.inf,
     most: float | None = None,
     search: tuple[float, float] | None = None,
-    names: tuple[str, ...] = (),
+    kind: Kind | None = None,
     theme: str = "",
 ) -> Any:
     """A parameter of a transform: its default, what it means, and its range.
@@ -62,12 +64,12 @@ def option(
     counts of steps stay in 64 bits then.
 
     ``search`` is the part of the range that is worth a search (``mcaptrack tune``); None for what isn't tuned.
-    ``names`` are the built-in values of a text that may also name a file. ``theme`` is a heading that parameters share
-    in the help of a command that has many.
+    ``kind`` says that a text is a name of that kind in ``mcaptrack.registry``. ``theme`` is a heading that parameters
+    share in the help of a command that has many.
     """
     if most is None:
         most = math.inf if least == -math.inf else LARGEST
-    about = {"help": help, "least": least, "most": most, "search": search, "names": names, "theme": theme}
+    about = {"help": help, "least": least, "most": most, "search": search, "kind": kind, "theme": theme}
     return field(default=default, metadata=about)
 
 
@@ -91,33 +93,69 @@ def bare_type(annotation: Any) -> Any:
     return parts[0] if get_origin(annotation) in (UnionType, typing.Union) and len(parts) == 1 else annotation
 
 
+def member_type(annotation: Any) -> tuple[Any, bool]:
+    """The type of a parameter, or of the members of one that is a tuple of any length; and whether it is a tuple."""
+    kind = bare_type(annotation)
+    if get_origin(kind) is tuple and get_args(kind)[1:] == (Ellipsis,):
+        return get_args(kind)[0], True
+    return kind, False
+
+
+@cache
+def option_problem(cls: type[Any]) -> str:
+    """Why the parameters of a class can't be options, if they can't; "" if they can."""
+    try:
+        hints = get_type_hints(cls)
+    except Exception as error:  # annotations are code
+        return f"the types of its fields can't be read: {type(error).__name__}: {error}"
+    for parameter in fields(cls):
+        kind, _ = member_type(hints[parameter.name])
+        is_choice = bool(choices(kind)) and all(isinstance(one, str) for one in get_args(kind))
+        if not (parameter.metadata.get("context") or kind in _KINDS or is_choice):
+            return (
+                f"{cls.__name__}.{parameter.name} is a {_type_name(hints[parameter.name])}; a parameter is a float, an "
+                "int, a bool, a str, a Literal of names, a tuple of any length of one of these, or one of them or None"
+            )
+        if parameter.default is MISSING and parameter.default_factory is MISSING:
+            return f"{cls.__name__}.{parameter.name} has no default; every parameter needs one"
+    return ""
+
+
+def _type_name(annotation: Any) -> str:
+    return annotation.__name__ if isinstance(annotation, type) and not get_args(annotation) else str(annotation)
+
+
 def check_options(transform: Transform) -> None:
     """Refuse parameters that are out of range or of the wrong kind, by name and number. For ``__post_init__``.
 
     Raises McaptrackError; also for a class whose parameters are of types that no command line and no log can hold.
     """
+    if problem := option_problem(type(transform)):
+        raise McaptrackError(problem)
     hints = get_type_hints(type(transform))
     for parameter in fields(transform):
         if parameter.metadata.get("context"):
             continue
-        value, kind, name = getattr(transform, parameter.name), bare_type(hints[parameter.name]), parameter.name
-        if value is None and kind is not hints[name]:
+        value, name = getattr(transform, parameter.name), parameter.name
+        kind, is_tuple = member_type(hints[name])
+        if value is None and bare_type(hints[name]) is not hints[name]:
             continue
-        names = choices(kind)
-        if not (kind in _KINDS or (names and all(isinstance(one, str) for one in get_args(kind)))):
-            raise McaptrackError(
-                f"{type(transform).__name__}.{name} is a {hints[name]}; a parameter is a float, an int, a bool, a str "
-                "or a Literal of names, or one of these or None"
-            )
-        if names:
-            if value not in names:
-                raise McaptrackError(f"{name} is one of {', '.join(names)}, not {value}")
-            continue
-        if not isinstance(value, _KINDS[kind]) or (isinstance(value, bool) and kind is not bool):
-            raise McaptrackError(f"{name} needs {kind.__name__}, not {value!r}")
-        least, most = parameter.metadata.get("least", -math.inf), parameter.metadata.get("most", math.inf)
-        if kind in (int, float) and not least <= value <= most:
-            raise McaptrackError(f"{name} has to be {limits(least, most) or 'a number'}, not {value}")
+        if is_tuple and not isinstance(value, tuple):
+            raise McaptrackError(f"{name} needs a tuple, not {value!r}")
+        for one in value if is_tuple else (value,):
+            _check_value(name, one, kind, parameter.metadata)
+
+
+def _check_value(name: str, value: Any, kind: Any, about: Mapping[str, Any]) -> None:
+    if names := choices(kind):
+        if value not in names:
+            raise McaptrackError(f"{name} is one of {', '.join(names)}, not {value}")
+        return
+    if not isinstance(value, _KINDS[kind]) or (isinstance(value, bool) and kind is not bool):
+        raise McaptrackError(f"{name} needs {kind.__name__}, not {value!r}")
+    least, most = about.get("least", -math.inf), about.get("most", math.inf)
+    if kind in (int, float) and not least <= value <= most:
+        raise McaptrackError(f"{name} has to be {limits(least, most) or 'a number'}, not {value}")
 
 
 def limits(least: float, most: float) -> str:

@@ -6,7 +6,7 @@ or frames per second.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import ClassVar
@@ -59,6 +59,10 @@ class Sample:
         first, last = (np.searchsorted(at, np.arange(len(tick_ns)), side) for side in ("left", "right"))
         for index, t_ns, low, high in zip(*(a.tolist() for a in (shown, tick_ns, first, last)), strict=True):
             yield (Frame(t_ns, index, rows[low:high]),)
+
+    def why_nothing(self, given: Sequence[Frame], made: Sequence[Frame]) -> str:
+        """Why no rows came of frames, for a warning."""
+        return "no track is there at two ticks, or none stands on the ground plane"
 
     def _ticks(self, frame_ns: Ints, start: int) -> Ints:
         """The ticks at which somebody looked: between frames that are no further apart than a hole may be.

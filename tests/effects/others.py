@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from mcaptrack.schema import Frame
-from mcaptrack.transforms import Detect, Predict, Sample
+from mcaptrack.transforms import FrameDifferenceDetector, KnnDetector, Predict, Sample
 from tests.effects import Case, Outputs, change_of_forecasts, forecast_steps, line, rows, shaky
 from tests.worlds import ns, tracks_at
 
@@ -114,7 +114,7 @@ def shaken() -> list[Frame]:
     return [Frame(ns(n / 10), n, np.roll(floor, tuple(s), axis=(0, 1))) for n, s in enumerate(shifts)]
 
 
-STEADY = Detect(stabilise=False)
+STEADY = KnnDetector(stabilise=False)
 STOPS = film(stops, 60)
 case(
     "detect",
@@ -129,7 +129,7 @@ case(
     "detect",
     "threshold",
     pale.__doc__,
-    Detect(stabilise=False, method="frame-difference"),
+    FrameDifferenceDetector(stabilise=False),
     film(pale),
     last_boxes,
     {10.0: 1, 20.0: 0},
@@ -144,4 +144,4 @@ case(
     lambda o: float(o[0][-1].rows["x_px"][0]),
     {1_000_000: 51.0, 10_000: 50.0},
 )
-case("detect", "stabilise", shaken.__doc__, Detect(), shaken(), all_boxes, {False: "more", True: "least"})
+case("detect", "stabilise", shaken.__doc__, KnnDetector(), shaken(), all_boxes, {False: "more", True: "least"})

@@ -9,7 +9,7 @@ Letters: N boxes.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import ClassVar, Final
@@ -37,15 +37,11 @@ _PERSON: Final = 1
 
 
 @dataclass(frozen=True, kw_only=True)
-class Detect:
-    """Detect what moves, by background subtraction.
+class MotionDetector:
+    """What the motion detectors share: all but how a picture is compared with those before it."""
 
-    Reads video, writes detections: one box for each connected region that differs from the background.
-    """
-
-    method: Method = option("knn", "background model (knn, mog2), or difference of frames, as in the paper")
     threshold: float | None = option(
-        None, "difference from the background that counts as motion; each method has its own default", least=0.0
+        None, "difference from the background that counts as motion; each detector has its own default", least=0.0
     )
     history_s: float = option(60.0, "memory of the background model, in seconds", least=0.1)
     max_pixels: int = option(
@@ -53,6 +49,7 @@ class Detect:
     )
     stabilise: bool = option(True, "compensate the motion of a shaking camera")
 
+    method: ClassVar[Method]
     reads: ClassVar[Schema] = VIDEO
     writes: ClassVar[Mapping[str, Schema]] = MappingProxyType({"": DETECTIONS})
     latency_s: ClassVar[Mapping[str, float]] = MappingProxyType({"": 0.0})
@@ -76,6 +73,34 @@ class Detect:
             boxes = _boxes(mask, size.measure(mask))
             yield (Frame(frame.t_ns, frame.index, _rows(_back(boxes, to_reference) * 2**halvings)),)
         steadiness.judge()
+
+    def why_nothing(self, given: Sequence[Frame], made: Sequence[Frame]) -> str:
+        """Why no rows came of frames, for a warning."""
+        return f"nothing moves in its {len(made)} pictures that stands out by the threshold"
+
+
+@dataclass(frozen=True, kw_only=True)
+class KnnDetector(MotionDetector):
+    """Detect what moves, by subtracting a background model (k nearest neighbours).
+
+    Reads video, writes detections: one box for each connected region that differs from the background.
+    """
+
+    method: ClassVar[Method] = "knn"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mog2Detector(MotionDetector):
+    """With `--detector mog2` the background model is a mixture of Gaussians (Zivkovic, ICPR 2004)."""
+
+    method: ClassVar[Method] = "mog2"
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameDifferenceDetector(MotionDetector):
+    """With `--detector frame-difference` pictures are compared with those just before them, as in the paper."""
+
+    method: ClassVar[Method] = "frame-difference"
 
 
 def _halve(image: Image, max_pixels: int) -> tuple[Image, int]:

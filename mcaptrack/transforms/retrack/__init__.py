@@ -9,7 +9,7 @@ are passed on unchanged.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import ClassVar, Final, Literal
@@ -17,8 +17,9 @@ from typing import ClassVar, Final, Literal
 import numpy as np
 
 from mcaptrack.geometry.plane import Planes
-from mcaptrack.predictors import NAMES, PredictorName
+from mcaptrack.predictors import PredictorName
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame, Schema
+from mcaptrack.transforms.durations import longest_track_s
 from mcaptrack.transforms.forecasts import Forecaster
 from mcaptrack.transforms.protocol import check_options, context, option
 from mcaptrack.transforms.retrack.consistency import ConsistencyPass
@@ -44,8 +45,8 @@ class Retrack:
 
     predictor: PredictorName = option(
         "kalman",
-        "predictor: cv, holt-cv, kalman, lstm, red; or red:FILE, lstm:FILE, onnx:FILE",
-        names=NAMES,
+        "predictor: cv, holt-cv, kalman, lstm, red; red:FILE, lstm:FILE, onnx:FILE; or another, as for `predict`",
+        kind="predictor",
         theme=_PREDICTIONS,
     )
     horizon_s: float = option(4.8, "how far ahead to predict, in seconds", least=0.1, most=60.0, theme=_PREDICTIONS)
@@ -221,6 +222,14 @@ class Retrack:
         first, last = (np.searchsorted(step, run.steps, side) for side in ("left", "right"))
         for (online, predictions), low, high in zip(run.outputs(), first.tolist(), last.tolist(), strict=True):
             yield Frame(online.t_ns, online.index, rows[low:high]), online, predictions
+
+    def why_nothing(self, given: Sequence[Frame], made: Sequence[Frame]) -> str:
+        """Why no rows came of frames, for a warning."""
+        longest_s = longest_track_s(given)
+        if longest_s < self.min_track_s:
+            least_s = f"{self.min_track_s:g} s"
+            return f"the longest track lasts {longest_s:.3g} s; those under {least_s} are left out (min_track_s)"
+        return "no track is likely enough to be a person (min_certainty)"
 
 
 _PAPER: Final = Retrack(

@@ -6,16 +6,8 @@ and a track alike (``affinity``); each adds how boxes and tracks are paired.
 
 from __future__ import annotations
 
-from types import MappingProxyType
-from typing import Final
-
 from mcaptrack.transforms.sort.bytetrack import ByteTrack
 from mcaptrack.transforms.sort.ocsort import OcSort
 from mcaptrack.transforms.sort.tracker import Sort
 
-__all__ = ["TRACKERS", "ByteTrack", "OcSort", "Sort"]
-
-#: The trackers by the name that ``--tracker`` takes.
-TRACKERS: Final[MappingProxyType[str, type[Sort]]] = MappingProxyType(
-    {"sort": Sort, "bytetrack": ByteTrack, "ocsort": OcSort}
-)
+__all__ = ["ByteTrack", "OcSort", "Sort"]

@@ -1,0 +1,126 @@
+"""The transform that made a channel, made again from what its provenance says.
+
+Nothing is imported because a log names it, unless it is built in or an entry point of an installed package, or the user
+names it, too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import fields
+from typing import Any, get_type_hints
+
+from mcaptrack.errors import McaptrackError
+from mcaptrack.notices import warn
+from mcaptrack.predictors import entry_of as predictor_entry
+from mcaptrack.predictors import weights_sha256
+from mcaptrack.registry import Entry, find, is_installed
+from mcaptrack.schema.provenance import Plugin, Provenance
+from mcaptrack.transforms import Stage, Transform
+from mcaptrack.transforms.protocol import member_type
+
+
+class MissingPluginError(McaptrackError):
+    """A class of another package that made a channel is not installed, or not named by the user."""
+
+
+def plugins_of(stage: Stage, transform: Transform) -> dict[str, Plugin]:
+    """The classes of other packages that a transform consists of: the transform, and the predictor that it names."""
+    cls = type(transform)
+    found = {} if stage.is_built_in(cls) else {"transform": _plugin(stage.entry(cls))}
+    predictor = getattr(transform, "predictor", None)
+    if isinstance(predictor, str):
+        entry, _ = predictor_entry(predictor)
+        if not entry.is_built_in:
+            found["predictor"] = _plugin(entry)
+    return found
+
+
+def rebuild(stage: Stage, made: Provenance, known: Mapping[str, Transform]) -> Transform:
+    """The transform that made a channel, with the parameters it had.
+
+    ``known`` are transforms by stage that the user named; their classes may be used, beside those that are installed.
+    Raises MissingPluginError if a class of another package can't be had, and McaptrackError for parameters that there
+    are no more.
+    """
+    had = dict(made.parameters)
+    cls = _class_of(stage, made, had, known)
+    if plugin := made.plugins.get("predictor"):
+        named = {name for other in known.values() if isinstance(name := getattr(other, "predictor", None), str)}
+        if plugin.name not in named:
+            _installed("predictor", plugin)
+    types = {f.name: f for f in fields(cls)}
+    strange = sorted(set(had) - set(types))
+    if strange:
+        raise McaptrackError(f"it was made with {', '.join(strange)}, which {cls.__name__} does not have")
+    hints = get_type_hints(cls)
+    values = {
+        name: tuple(value) if isinstance(value, list) and member_type(hints[name])[1] else value
+        for name, value in had.items()
+        if not types[name].metadata.get("context")
+    }
+    transform: Transform = cls(**values)
+    predictor = getattr(transform, "predictor", "")
+    if made.weights_sha256 and ":" in predictor and weights_sha256(predictor) != made.weights_sha256:
+        raise McaptrackError(f"{predictor} holds other weights than those it was made with")
+    return transform
+
+
+def _class_of(stage: Stage, made: Provenance, had: dict[str, Any], known: Mapping[str, Transform]) -> type[Transform]:
+    """The class; takes the parameter that names it out of ``had``."""
+    name = str(had.pop(stage.kind, had.pop(stage.was, ""))) if stage.kind else ""
+    plugin = made.plugins.get("transform")
+    if plugin is None:
+        built_in = stage.built_in()
+        if name and name not in built_in:
+            raise McaptrackError(f"{stage.kind} {name} made it, which this version does not have")
+        return built_in[name] if name else stage.default
+    given = known.get(stage.name)
+    if given is not None and stage.entry(type(given)).implementation == plugin.implementation:
+        _compare_versions(stage.entry(type(given)), plugin)
+        return type(given)
+    if stage.kind is None:
+        raise MissingPluginError(f"{_words(stage.name, plugin)} made it; run it again from Python, with that class")
+    cls: type[Transform] = stage.find(_installed(stage.kind, plugin).name).cls
+    return cls
+
+
+def _installed(kind: Any, plugin: Plugin) -> Entry:
+    """The entry that a plug-in is, if it may be imported. Raises MissingPluginError."""
+    words = _words(kind, plugin)
+    if ":" in plugin.name:
+        raise MissingPluginError(
+            f"{words} made it, and a class that has no entry point is imported only if you name it: give "
+            f"--{kind} {plugin.name}, or another {kind} to replace it"
+        )
+    if not is_installed(kind, plugin.name):
+        package = f"{plugin.distribution} {plugin.version}".strip() or "the package that has it"
+        raise MissingPluginError(
+            f"{words} made it, which is not installed; install {package}, or replace it with another --{kind}"
+        )
+    entry = find(kind, plugin.name)
+    if entry.distribution != plugin.distribution:
+        raise MissingPluginError(
+            f"{words} made it; the {kind} of that name is now that of {entry.distribution or 'mcaptrack'}. Install "
+            f"{plugin.distribution}, or replace it with another --{kind}"
+        )
+    _compare_versions(entry, plugin)
+    return entry
+
+
+def _compare_versions(entry: Entry, plugin: Plugin) -> None:
+    if entry.version != plugin.version:
+        warn(
+            f"{entry.kind} {entry.name} is {entry.distribution} {entry.version} now; results in the log were made "
+            f"with {plugin.version or 'another version'}",
+            "other-version",
+        )
+
+
+def _words(kind: str, plugin: Plugin) -> str:
+    package = f"{plugin.distribution} {plugin.version}".strip()
+    return f"{kind} {plugin.name}" + (f" ({package})" if package else "")
+
+
+def _plugin(entry: Entry) -> Plugin:
+    return Plugin(entry.name, entry.implementation, entry.distribution, entry.version)

@@ -1,0 +1,54 @@
+"""The built-in predictors by name: each makes a predictor for ``steps`` steps of ``step_s`` seconds.
+
+A network has steps of its own, and may take a ``file`` of weights.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from mcaptrack.predictors.linear import LinearPredictor
+
+if TYPE_CHECKING:
+    from mcaptrack.predictors.lstm import Lstm
+    from mcaptrack.predictors.onnx import Onnx
+    from mcaptrack.predictors.red import Red
+
+
+def cv(steps: int, step_s: float) -> LinearPredictor:
+    """Constant velocity."""
+    return LinearPredictor("cv", steps, step_s)
+
+
+def holt_cv(steps: int, step_s: float) -> LinearPredictor:
+    """Constant velocity after Holt's double exponential smoothing."""
+    return LinearPredictor("holt-cv", steps, step_s)
+
+
+def kalman(steps: int, step_s: float) -> LinearPredictor:
+    """A Kalman filter with a constant-velocity model."""
+    return LinearPredictor("kalman", steps, step_s)
+
+
+def red(steps: int, step_s: float, file: Path | None = None) -> Red:
+    """A recurrent encoder with a dense head, with the weights of a file or those that come with mcaptrack."""
+    from mcaptrack.predictors.red import Red
+    from mcaptrack.predictors.weights import SHIPPED, load
+
+    return Red.of(load(file or SHIPPED / "red.safetensors"))
+
+
+def lstm(steps: int, step_s: float, file: Path | None = None) -> Lstm:
+    """An LSTM encoder and decoder, with the weights of a file or those that come with mcaptrack."""
+    from mcaptrack.predictors.lstm import Lstm
+    from mcaptrack.predictors.weights import SHIPPED, load
+
+    return Lstm.of(load(file or SHIPPED / "lstm.safetensors"))
+
+
+def onnx(steps: int, step_s: float, file: Path) -> Onnx:
+    """A network in ONNX format."""
+    from mcaptrack.predictors.onnx import Onnx
+
+    return Onnx.of(file)

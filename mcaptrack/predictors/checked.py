@@ -1,0 +1,84 @@
+"""A predictor of another package: whatever it does wrong becomes one line that names it.
+
+Letters: B batch, L past positions, T future steps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaptrack.errors import McaptrackError
+from mcaptrack.predictors.forecast import Forecast
+from mcaptrack.predictors.onnx import are_covariances
+from mcaptrack.registry import Entry, failure
+
+Floats = NDArray[np.float64]
+_WRONG = (TypeError, ValueError, OverflowError)
+
+
+@dataclass(frozen=True)
+class CheckedPredictor:
+    """``inner``, which the registry found as ``entry``."""
+
+    entry: Entry
+    inner: Any
+    steps: int
+    step_s: float
+    past: int
+
+    @classmethod
+    def of(cls, entry: Entry, parameters: Mapping[str, Any]) -> Self:
+        """Make the predictor. Raises McaptrackError if that fails, or if what comes of it is no predictor."""
+        try:
+            inner = entry.cls(**parameters)
+        except McaptrackError:
+            raise
+        except Exception as error:  # the code of others may raise anything
+            raise failure(entry, f"could not be made with {', '.join(parameters)}", error) from error
+        if not callable(getattr(inner, "predict", None)):
+            raise McaptrackError(f"{entry} has no method predict, so it is no predictor")
+        try:
+            steps, step_s, past = int(inner.steps), float(inner.step_s), int(inner.past)
+        except (AttributeError, *_WRONG) as error:
+            raise failure(entry, "needs the numbers steps, step_s and past", error) from error
+        if steps < 1 or past < 1 or not 0 < step_s < np.inf:
+            raise McaptrackError(f"{entry} has steps={steps}, step_s={step_s:g}, past={past}; all have to be above 0")
+        return cls(entry, inner, steps, step_s, past)
+
+    @property
+    def name(self) -> str:
+        return self.entry.name
+
+    @property
+    def weights_sha256(self) -> str | None:
+        found = getattr(self.inner, "weights_sha256", None)
+        return None if found is None else str(found)
+
+    def predict(self, xy_m: Floats, valid: NDArray[np.bool_]) -> Forecast:
+        """Positions (B, L', 2) of which ``valid`` (B, L') are known, the last one always -> forecasts."""
+        batch = len(valid)
+        if batch == 0:
+            return Forecast(np.empty((0, self.steps, 2)), np.empty((0, self.steps, 2, 2)))
+        try:
+            mean, cov = self.inner.predict(xy_m.copy(), valid.copy())
+            mean, cov = np.asarray(mean, np.float64), np.asarray(cov, np.float64)
+        except McaptrackError:
+            raise
+        except Exception as error:  # as above
+            raise failure(self.entry, f"failed on {batch} tracks", error) from error
+        wanted = (batch, self.steps, 2), (batch, self.steps, 2, 2)
+        if (mean.shape, cov.shape) != wanted:
+            raise McaptrackError(
+                f"{self.entry} gave mean and covariance of shape {mean.shape} and {cov.shape}; they have to be "
+                f"{wanted[0]} and {wanted[1]}"
+            )
+        if not (np.isfinite(mean).all() and np.isfinite(cov).all()):
+            raise McaptrackError(f"{self.entry} gave numbers that are not finite")
+        if not are_covariances(cov):
+            raise McaptrackError(f"{self.entry} gave covariances that are not symmetric with variances above 0")
+        return Forecast(mean, cov)

@@ -1,0 +1,224 @@
+"""The steps of the pipeline: which transforms can do each, and where it reads and writes below the name of a camera.
+
+To add a step: its transform, and a ``Stage`` in ``STAGES``. To add another transform for a step that has a kind: a line
+in ``mcaptrack.registry.BUILT_IN``. Its options, its help, its provenance and the tests of the laws follow.
+"""
+
+from __future__ import annotations
+
+import difflib
+import inspect
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, is_dataclass
+from types import MappingProxyType
+from typing import Any, Final
+
+from mcaptrack.errors import McaptrackError
+from mcaptrack.registry import BUILT_IN, Entry, Kind, entry_of, failure, find
+from mcaptrack.transforms.detect import KnnDetector
+from mcaptrack.transforms.predict import Predict
+from mcaptrack.transforms.protocol import Transform, option_problem
+from mcaptrack.transforms.retrack import PROFILES, Retrack
+from mcaptrack.transforms.sample import Sample
+from mcaptrack.transforms.sort import Sort
+
+#: Below the tracks of a stage that also writes them at the video's rate.
+FULL: Final = "/full"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stage:
+    """A step of the pipeline.
+
+    Attributes
+    ----------
+    name : str
+        Of the step and its command.
+    default : type[Transform]
+        The transform that does it unless another is chosen.
+    reads, writes : str
+        Topics below the name of a camera.
+    rows : str
+        What its rows are, in words.
+    kind : Kind or None
+        The kind in the registry whose entries can do it, which is also the name of the option that chooses; None if
+        there is one transform only.
+    was : str
+        The name that this option had before.
+    parameter : str
+        The parameter of its transform that chooses a part of it by name, as ``run`` may, too.
+    needs_scale : bool
+        Whether it brings boxes to metres, so that a scale is guessed where no ground plane is given.
+    at_video_rate : bool
+        Whether its tracks are also written at the video's rate, below ``FULL``.
+    profiles : Mapping[str, Transform]
+        Sets of parameters by name.
+    modes : Mapping[str, tuple[str, ...]]
+        Which of its outputs to write, by name.
+
+    """
+
+    name: str
+    default: type[Transform]
+    reads: str
+    writes: str
+    rows: str
+    kind: Kind | None = None
+    was: str = ""
+    parameter: str = ""
+    needs_scale: bool = False
+    at_video_rate: bool = False
+    profiles: Mapping[str, Transform] = field(default_factory=dict)
+    modes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+
+    def outputs(self, target: str) -> tuple[str, ...]:
+        """The topics that the stage takes if it writes to ``target``."""
+        topics = tuple(f"{target}/{suffix}".rstrip("/") for suffix in self.default.writes)
+        return (*topics, target + FULL) if self.at_video_rate else topics
+
+    def built_in(self) -> dict[str, type[Transform]]:
+        """Its built-in transforms by name, the default first."""
+        if self.kind is None:
+            return {self.name: self.default}
+        return {name: find(self.kind, name).cls for name in BUILT_IN[self.kind]}
+
+    def find(self, name: str) -> Entry:
+        """Find a transform by name (see ``mcaptrack.registry``).
+
+        Raises McaptrackError if there is none, or if it can't do this step.
+        """
+        if self.kind is None:
+            raise McaptrackError(f"{self.name} has one transform only, which can't be replaced by {name}")
+        entry = find(self.kind, name)
+        if not entry.is_built_in:
+            self._check(entry)
+        return entry
+
+    def entry(self, cls: type[Transform]) -> Entry:
+        """What the registry has of a class of transforms for this step."""
+        if self.kind is None and cls is self.default:
+            return Entry(self.name, self.name, cls, cls.__module__, "", "")
+        return entry_of(self.kind or self.name, cls)
+
+    @property
+    def option(self) -> str:
+        """The option that chooses what does this step; "" if there is no choice."""
+        return self.kind or self.parameter
+
+    def choice(self, transform: Transform) -> str:
+        """The name that stands for what a transform does this step by; "" if there is no choice."""
+        if self.parameter:
+            return str(getattr(transform, self.parameter))
+        return self.entry(type(transform)).name if self.kind else ""
+
+    def is_built_in(self, cls: type[Transform]) -> bool:
+        """Whether a class is one of those that come with mcaptrack for this step."""
+        return cls in self.built_in().values()
+
+    def make(self, chosen: str = "", /, **parameters: Any) -> Transform:
+        """Make the transform of this step.
+
+        Parameters
+        ----------
+        chosen : str
+            The name of the detector, tracker and so on (see ``mcaptrack.registry``); the default if it is "".
+        **parameters
+            Values of its fields.
+
+        Returns
+        -------
+        Transform
+
+        Raises
+        ------
+        McaptrackError
+            If there is none of that name, or if it does not take the parameters.
+
+        Examples
+        --------
+        >>> STAGES["track"].make("bytetrack", max_age_s=2.0).max_age_s
+        2.0
+
+        """
+        entry = self.find(chosen) if chosen else self.entry(self.default)
+        known = [f.name for f in fields(entry.cls) if f.init]
+        for name in parameters:
+            if name not in known:
+                close = difflib.get_close_matches(name, known, 1)
+                meant = f"did you mean {close[0]}? " if close else ""
+                raise McaptrackError(f"{entry} has no parameter {name}; {meant}there are {', '.join(known) or 'none'}")
+        try:
+            made: Transform = entry.cls(**parameters)
+        except McaptrackError as error:
+            raise error if entry.is_built_in else McaptrackError(f"{entry}: {error}") from None
+        except Exception as error:
+            if entry.is_built_in:
+                raise
+            raise failure(entry, "could not be made", error) from error
+        return made
+
+    def _check(self, entry: Entry) -> None:
+        """Raise McaptrackError if a class of another package can't do this step."""
+        cls, wanted = entry.cls, self.default
+        if not inspect.isclass(cls) or not is_dataclass(cls):
+            raise McaptrackError(f"{entry} is no dataclass; the fields of a transform are its parameters")
+        reads, writes = getattr(cls, "reads", None), getattr(cls, "writes", None)
+        if reads is not wanted.reads:
+            is_schema = getattr(reads, "name", "")
+            raise McaptrackError(
+                f"{entry} reads {is_schema or 'no schema (the class attribute reads)'}; a {entry.kind} reads "
+                f"{wanted.reads.name}"
+            )
+        main = writes.get("") if isinstance(writes, Mapping) else None
+        if main is not wanted.writes[""]:
+            raise McaptrackError(
+                f"{entry} writes {getattr(main, 'name', '') or 'nothing (the class attribute writes)'}; a {entry.kind} "
+                f"writes {wanted.writes[''].name} as its main output, as in writes = {{'': ...}}"
+            )
+        if "__call__" not in dir(cls):
+            raise McaptrackError(f"{entry} can't be called with frames; it needs a method __call__")
+        if any(one.name == self.kind for one in fields(cls)):
+            raise McaptrackError(f"{entry}: a parameter can't have the name of the option --{self.kind}")
+        if problem := option_problem(cls):
+            raise McaptrackError(f"{entry}: {problem}")
+
+
+_STAGES: Final = (
+    Stage(
+        name="detect",
+        default=KnnDetector,
+        kind="detector",
+        was="method",
+        reads="video",
+        writes="detections",
+        rows="boxes",
+    ),
+    Stage(
+        name="track",
+        default=Sort,
+        kind="tracker",
+        reads="detections",
+        writes="tracks",
+        rows="tracks",
+        needs_scale=True,
+    ),
+    Stage(name="sample", default=Sample, reads="tracks", writes="samples", rows="samples", needs_scale=True),
+    Stage(
+        name="predict", default=Predict, reads="samples", writes="predictions", rows="forecasts", parameter="predictor"
+    ),
+    Stage(
+        name="retrack",
+        default=Retrack,
+        kind="retracker",
+        reads="samples",
+        writes="retracks",
+        rows="re-tracked tracks",
+        at_video_rate=True,
+        profiles=PROFILES,
+        modes=MappingProxyType(
+            {"both": ("", "online", "predictions"), "offline": ("",), "online": ("online", "predictions")}
+        ),
+    ),
+)
+#: All steps by name, in the order in which they run.
+STAGES: Final[Mapping[str, Stage]] = MappingProxyType({stage.name: stage for stage in _STAGES})
