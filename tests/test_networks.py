@@ -166,9 +166,19 @@ class TestFiles:
         with pytest.raises(McaptrackError, match="its card does not say how many steps"):
             make(f"red:{tmp_path / 'x.safetensors'}", 3, 0.4)
 
-    @pytest.mark.parametrize("name", ["ret", "red:", "cv:file", "onnx", "", ":x"])
-    def test_names_that_mean_nothing_are_refused_before_anything_runs(self, name):
-        with pytest.raises(McaptrackError, match="predictor is one of cv, holt-cv, kalman, lstm, red, or lstm:FILE"):
+    @pytest.mark.parametrize(
+        ("name", "said"),
+        [
+            ("ret", r"no predictor is called ret; did you mean red\? there are red, cv, holt-cv, kalman, lstm, onnx;"),
+            ("red:", "cv, holt-cv, kalman, lstm, red, or red:FILE, lstm:FILE, onnx:FILE, not red:"),
+            ("cv:file", "cv, holt-cv, kalman, lstm, red, or red:FILE, lstm:FILE, onnx:FILE, not cv:file"),
+            ("onnx", "predictor onnx needs a file, as in onnx:FILE"),
+            ("", "no predictor is called ; there are"),
+            (":x", ":x is not of the form module:Class"),
+        ],
+    )
+    def test_names_that_mean_nothing_are_refused_before_anything_runs(self, name, said):
+        with pytest.raises(McaptrackError, match=said):
             Predict(predictor=name)
 
     def test_a_file_that_is_not_there_is_refused_before_anything_runs(self):
