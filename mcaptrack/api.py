@@ -57,7 +57,7 @@ class Recording:
 
     def __init__(self, path: Path) -> None:
         self._log = logs.read(path)
-        self._contents = export.Contents(self._log)
+        self._contents = export.LogTables(self._log)
 
     def __enter__(self) -> Self:
         return self
@@ -110,7 +110,7 @@ class Recording:
             self._log.channel(topic)
             if "topic" not in made.schema.names:
                 raise McaptrackError(f"the table {name} is not by channel")
-            made = tables.only(made, topic)
+            made = tables.rows_of_topic(made, topic)
         return tables.with_recording(made, self.name)
 
     def array(self, name: str, topic: str | None = None) -> NDArray[Any]:

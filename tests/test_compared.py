@@ -140,7 +140,7 @@ def test_a_tracker_that_found_nobody_is_scored(tmp_path):
         ),
         ([(n, 5, 0.1, 0.1, 0.02, 0.05) for n in range(1, 9)], WALK, "50 px high, those of t.txt 0.05, and none ever"),
         ([line(1, 5, 10), line(1, 5, 90)], WALK, "id 5 appears twice in frame 1"),
-        ([line(1, -1, 10)], WALK, "says of nobody who it is"),
+        ([line(1, -1, 10)], WALK, "has no ids"),
         (FOUND, [], "gt.txt holds no labels"),
     ],
     ids=["all classes 0", "none considered", "other frames", "other units", "twins", "no ids", "no truth"],
@@ -174,7 +174,7 @@ def test_files_are_paired_by_name_or_in_order(tmp_path):
     pairs, words = pair_files(made, [tmp_path / "x.txt", tmp_path / "y.txt"])
     assert [(n, t.name) for n, _, t in pairs] == [("b", "x.txt"), ("a", "y.txt")]
     assert "taken in the order given" in words
-    with pytest.raises(McaptrackError, match="2 files of tracks and 1 of truth"):
+    with pytest.raises(McaptrackError, match="2 files of tracks and 1 of ground truth"):
         pair_files(made, truth[:1])
 
 

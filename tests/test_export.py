@@ -21,7 +21,7 @@ from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import DETECTIONS, GROUND_PLANE, TRACKS, Frame
 from mcaptrack.schema.ground_plane import plane_to_rows
 from mcaptrack.schema.provenance import Provenance
-from mcaptrack.tables.export import Contents, export, recording_name, topic_folder
+from mcaptrack.tables.export import LogTables, export, recording_name, topic_folder
 from tests.worlds import boxes_at, ns, tracks_at
 
 IMU = {
@@ -124,7 +124,7 @@ def test_recordings_say_what_the_log_is(tmp_path):
         tmp_path / "p.mcap", **{"/camera/ground_plane": (GROUND_PLANE, [Frame(0, 0, plane_to_rows(plane))])}
     )
     with log.read(plain) as a, log.read(planar) as b:
-        first, second = (Contents(opened).table("recordings").to_pylist()[0] for opened in (a, b))
+        first, second = (LogTables(opened).table("recordings").to_pylist()[0] for opened in (a, b))
     assert (first["file"], first["messages"], first["duration_s"], first["ground_plane"]) == (
         "plain.mcap",
         14,
@@ -156,7 +156,7 @@ def test_tables_without_writing_them_are_those_of_the_folder(tmp_path):
     path = some_log(tmp_path / "a.mcap")
     exported(path, tmp_path / "tables")
     with log.read(path) as opened:
-        contents = Contents(opened)
+        contents = LogTables(opened)
         for name in tables.TABLES:
             (file,) = (tmp_path / "tables" / name).rglob("*.parquet")
             made = contents.table(name)
@@ -339,8 +339,8 @@ def test_other_formats_hold_the_same(tmp_path, form):
         "arrow": pl.read_ipc,
     }[form]
     with log.read(path) as opened:
-        wanted = Contents(opened).table("tracks")
-        imu = Contents(opened).messages("/imu")[0]
+        wanted = LogTables(opened).table("tracks")
+        imu = LogTables(opened).messages("/imu")[0]
     found = read(tmp_path / "t" / "tracks" / "recording=a" / f"part-0.{form}")
     for name in ("topic", "t_ns", "track_id", "x_m", "observed"):
         assert found[name].to_list() == wanted.column(name).to_pylist()

@@ -267,7 +267,7 @@ class TestIngest:
             ingest(clip, out, options(camera="../x y"))
 
     REFUSED = {
-        "labels of boxes that know nobody": ({"labels": {"truth": "0,-1,1,1,2,2\n"}}, "says of nobody who it is"),
+        "labels without ids": ({"labels": {"truth": "0,-1,1,1,2,2\n"}}, "has no ids"),
         "detections in metres": ({"labels": {"detections": TRAJNET}}, "holds positions, not boxes"),
         "a singular plane": ({"ground_plane": "1 0 0\n2 0 0\n0 0 1\n"}, "the homography is singular"),
         "no plane at all": ({"ground_plane": "1 0\n"}, "is not a homography"),

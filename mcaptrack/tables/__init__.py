@@ -1,12 +1,12 @@
-"""Rows as tables, and tables as files: one row an object a frame, with units, meaning and provenance in the metadata.
+"""Tables of rows, and tables as files: one row for each object in each frame; metadata hold units and provenance.
 
-TABLES                               what tables there are, with their columns
+TABLES                               all tables with their columns
 rows_table(schema, channels)         rows -> Arrow; missing numbers are null in tables and NaN in rows
 write(path, table, provenance)       Arrow -> Parquet, Arrow IPC, CSV or JSON lines
-verify(path)                         is a file what was written
+verify(path)                         check that a file holds what was written
 join(parts)                          the same table of several logs as one
-write_answer(path, table, form)      what a database answered, as a file
-read_tracks(path), read_columns(...) the way back, for files of others too
+write_answer(path, table, form)      the answer of a query as a file
+read_tracks(path), read_columns(...) files -> arrays and frames, also of files from other tools
 """
 
 from mcaptrack.tables.build import (
@@ -14,8 +14,8 @@ from mcaptrack.tables.build import (
     Pointers,
     frames_table,
     frames_to_part,
-    only,
     records_table,
+    rows_of_topic,
     rows_table,
     summary_table,
     table_of,
@@ -24,7 +24,7 @@ from mcaptrack.tables.build import (
     with_recording,
 )
 from mcaptrack.tables.fields import RECORDING, TABLE_VERSION, TABLES, Field, Table
-from mcaptrack.tables.files import FORMATS, Format, described, verify, write
+from mcaptrack.tables.files import FORMATS, Format, file_metadata, verify, write
 from mcaptrack.tables.join import join
 from mcaptrack.tables.messages import messages_table
 from mcaptrack.tables.read import holds_tracks, read_columns, read_tracks
@@ -42,17 +42,17 @@ __all__ = [
     "Pointers",
     "Table",
     "cells",
-    "described",
+    "file_metadata",
     "frames_table",
     "frames_to_part",
     "holds_tracks",
     "join",
     "messages_table",
-    "only",
     "pieces",
     "read_columns",
     "read_tracks",
     "records_table",
+    "rows_of_topic",
     "rows_table",
     "summary_table",
     "table_of",

@@ -1,4 +1,4 @@
-"""Arrays and records -> Arrow tables, as ``fields`` has them; and the way back.
+"""Arrays and records -> Arrow tables with the columns of ``fields``, and back.
 
 Letters: N rows, M messages.
 """
@@ -12,14 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack.geometry.arrays import Floats, Ints
+from mcaptrack.geometry.ragged import group_index
 from mcaptrack.schema import Frame, Rows, Schema
+from mcaptrack.schema.framing import split_rows
 from mcaptrack.tables.fields import RECORDING, TABLES, Table
 
 _BITS: Final = 16
 
 
 class Part(NamedTuple):
-    """The rows of one channel (N,), and of each message (M,) its time, frame and how many rows are its own."""
+    """The rows of one channel (N,), and the time, frame and number of rows of each message (M,)."""
 
     rows: Rows
     t_ns: Ints
@@ -28,7 +30,7 @@ class Part(NamedTuple):
 
 
 class Pointers(NamedTuple):
-    """The messages of one channel (M,): time, frame, rows (-1 for pictures), and where they stand in which file.
+    """The messages of one channel (M,): time, frame, number of rows (-1 for pictures), and their places in a file.
 
     ``chunk_offset`` is -1 for messages outside of chunks.
     """
@@ -42,19 +44,19 @@ class Pointers(NamedTuple):
 
 
 def frames_to_part(schema: Schema, frames: Sequence[Frame]) -> Part:
-    """Frames as the arrays that tables are made of."""
+    """Frames as the arrays from which tables are made."""
     t_ns, index = (np.array([getattr(frame, name) for frame in frames], np.int64) for name in ("t_ns", "index"))
     counts = np.array([len(frame.rows) for frame in frames], np.int64)
     return Part(np.concatenate([schema.empty(), *(frame.rows for frame in frames)]), t_ns, index, counts)
 
 
 def table_of(schema: Schema) -> Table:
-    """The table that the rows of a schema go to."""
+    """The table for rows of a schema."""
     return next(table for table in TABLES.values() if table.rows_of is schema)
 
 
 def rows_table(schema: Schema, channels: Mapping[str, Part | Sequence[Frame]]) -> Any:
-    """All rows of channels of one schema as one Arrow table, in the table's order; missing numbers are null."""
+    """All rows of channels of one schema as an Arrow table, in the table's order; missing numbers are null."""
     import pyarrow as pa
 
     table = table_of(schema)
@@ -72,10 +74,10 @@ def rows_table(schema: Schema, channels: Mapping[str, Part | Sequence[Frame]]) -
 
 
 def _rows_of(schema: Schema, table: Table, part: Part) -> dict[str, Any]:
-    """The columns of one channel, but its topic."""
+    """The columns of one channel, except its topic."""
     import pyarrow as pa
 
-    message = np.repeat(np.arange(len(part.t_ns)), part.counts)
+    message = group_index(part.counts)
     rows, order = part.rows, None
     if "track_id" in table.order:
         order = _stable_order(rows["track_id"])
@@ -91,7 +93,7 @@ def _rows_of(schema: Schema, table: Table, part: Part) -> dict[str, Any]:
 
 
 def _stable_order(values: NDArray[Any]) -> Ints:
-    """What sorts whole numbers, equal ones as they stand: 16 bits at a time, which NumPy sorts by counting."""
+    """A stable argsort of whole numbers, 16 bits at a time, for which NumPy uses radix sort."""
     if len(values) == 0:
         return np.empty(0, np.int64)
     low, high = int(values.min()), int(values.max())
@@ -147,10 +149,10 @@ def summary_table(channels: Mapping[str, Part]) -> Any:
 
 
 def _summary(part: Part) -> dict[str, NDArray[Any]]:
-    """One row a track of a channel."""
+    """One row for each track of a channel."""
     order = _stable_order(part.rows["track_id"])
     rows = part.rows[order]
-    message = np.repeat(np.arange(len(part.t_ns)), part.counts)[order]
+    message = group_index(part.counts)[order]
     t_ns, frame = part.t_ns[message], part.frame[message]
     who, first, count = np.unique(rows["track_id"], return_index=True, return_counts=True)
     last = first + count - 1
@@ -158,10 +160,11 @@ def _summary(part: Part) -> dict[str, NDArray[Any]]:
     for name, at in (("first", first), ("last", last)):
         out |= {f"{name}_t_ns": t_ns[at], f"{name}_t": t_ns[at], f"{name}_frame": frame[at]}
     out["duration_s"] = (t_ns[last] - t_ns[first]) / 1e9
-    share = np.bincount(np.repeat(np.arange(len(who)), count), rows["observed"], len(who))
+    track = group_index(count)
+    share = np.bincount(track, rows["observed"], len(who))
     out["observed_share"] = share / np.maximum(count, 1)
     place = np.stack([rows["x_m"], rows["y_m"]], axis=-1)
-    out |= _motion(place, t_ns, np.repeat(np.arange(len(who)), count), len(who))
+    out |= _motion(place, t_ns, track, len(who))
     for unit in ("m", "px"):
         ends = _ends(np.isfinite(rows[f"x_{unit}"]) & np.isfinite(rows[f"y_{unit}"]), first, last)
         for name, at in zip(("first", "last"), ends, strict=True):
@@ -172,7 +175,7 @@ def _summary(part: Part) -> dict[str, NDArray[Any]]:
 
 
 def _motion(place: Floats, t_ns: Ints, track: Ints, tracks: int) -> dict[str, Floats]:
-    """Path and speeds of tracks, over the positions that are known; NaN for a track without any."""
+    """Path and speeds of tracks over their known positions; NaN for a track without any."""
     known = np.isfinite(place).all(axis=1)
     place, t_ns, track = place[known], t_ns[known], track[known]
     same = track[1:] == track[:-1]
@@ -189,7 +192,7 @@ def _motion(place: Floats, t_ns: Ints, track: Ints, tracks: int) -> dict[str, Fl
 
 
 def _ends(known: NDArray[np.bool_], first: Ints, last: Ints) -> tuple[Ints, Ints]:
-    """For each stretch from ``first`` to ``last``, the first and the last place that is known; -1 where none is."""
+    """The first and last known position between ``first`` and ``last`` of each track; -1 if there is none."""
     at = np.flatnonzero(known)
     if len(at) == 0:
         return np.full(len(first), -1), np.full(len(first), -1)
@@ -200,7 +203,7 @@ def _ends(known: NDArray[np.bool_], first: Ints, last: Ints) -> tuple[Ints, Ints
 
 
 def records_table(table: Table, records: Sequence[Mapping[str, Any]]) -> Any:
-    """A table about a log from its rows; what a record lacks is null."""
+    """A table about a log from its records; missing values are null."""
     import pyarrow as pa
 
     kinds = {field.name: field.type for field in table.arrow}
@@ -216,11 +219,11 @@ def records_table(table: Table, records: Sequence[Mapping[str, Any]]) -> Any:
 
 
 def with_recording(table: Any, recording: str) -> Any:
-    """The table with the column that reading a folder adds, at the end as there."""
+    """The table with the column ``recording`` that reading a folder adds, also at the end."""
     return table.append_column(RECORDING.arrow, _repeated([recording], [table.num_rows]))
 
 
-def only(table: Any, topic: str) -> Any:
+def rows_of_topic(table: Any, topic: str) -> Any:
     """The rows of one channel."""
     import pyarrow.compute as pc
 
@@ -228,9 +231,9 @@ def only(table: Any, topic: str) -> Any:
 
 
 def table_to_array(table: Any) -> NDArray[Any]:
-    """A table as a structured array: times as datetime64[ns], text as such, missing numbers as NaN.
+    """A table as a structured array: times as datetime64[ns], text as str, missing numbers as NaN.
 
-    Whole numbers of which some are missing become float64.
+    Columns of whole numbers with missing values become float64.
     """
     import pyarrow as pa
 
@@ -253,8 +256,8 @@ def table_to_array(table: Any) -> NDArray[Any]:
 
 
 def table_to_frames(schema: Schema, rows: Any, frames: Any, topic: str) -> list[Frame]:
-    """The way back: the frames of one channel, empty ones too, from its table of rows and the table of frames."""
-    rows, frames = only(rows, topic), only(frames, topic)
+    """The frames of one channel, also empty ones, from its table of rows and the table of frames."""
+    rows, frames = rows_of_topic(rows, topic), rows_of_topic(frames, topic)
     order = np.argsort(rows.column("row").to_numpy(), kind="stable")
     columns = {}
     for column in schema.columns:
@@ -262,15 +265,12 @@ def table_to_frames(schema: Schema, rows: Any, frames: Any, topic: str) -> list[
         values = values.fill_null(np.nan) if column.optional else values
         columns[column.name] = values.to_numpy(zero_copy_only=False)[order]
     members = schema.rows(**columns)
-    ends = np.cumsum(np.array(frames.column("rows").to_pylist(), np.int64)).tolist()
-    spans = zip(
-        frames.column("t_ns").to_pylist(), frames.column("frame").to_pylist(), [0, *ends][:-1], ends, strict=True
-    )
-    return [Frame(t_ns, index, members[low:high]) for t_ns, index, low, high in spans]
+    times, numbers, counts = (frames.column(name).to_pylist() for name in ("t_ns", "frame", "rows"))
+    return split_rows(times, numbers, members, np.cumsum(counts))
 
 
 def _repeated(names: Sequence[str], counts: Sequence[int]) -> Any:
-    """Each name as often as it is said, as an Arrow dictionary of the different ones."""
+    """Each name, repeated by its count, as an Arrow dictionary."""
     import pyarrow as pa
 
     different = list(dict.fromkeys(names))

@@ -1,8 +1,8 @@
-"""Two files that are to be compared, tracks and truth, as frames; and which of several files belong together.
+"""Two files to be compared, tracks and ground truth, as frames; and pairs of files that belong together.
 
-Files that count frames are compared by these; tables and files with clocks of their own, by time.
+Files with frame numbers are compared by these; tables and files with times of their own, by time.
 
-Letters: N true boxes, K tracks' boxes in one frame.
+Letters: N boxes of the ground truth, K boxes of the tracks in one frame.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from mcaptrack.geometry.boxes import iou
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.plane import GroundPlane, Point
 from mcaptrack.schema import Frame
+from mcaptrack.schema.framing import split_rows
 from mcaptrack.sources import ingest
 from mcaptrack.sources.ingest.bags.opening import is_mcap
 from mcaptrack.sources.ingest.job import IngestOptions, label_rows
@@ -31,48 +32,56 @@ from mcaptrack.sources.ingest.label_job import LabelJob
 from mcaptrack.sources.ingest.labels.formats import KITTI_HEIGHT_PX, PERSON, Aside, Labels, Role
 from mcaptrack.sources.ingest.labels.reading import read_homography, read_labels
 
-#: Formats whose rows say in which frame of the video they are.
+#: Formats whose rows have the number of their frame in the video.
 _COUNTING: Final = ("mot", "kitti", "parquet")
 _ALIKE: Final = 0.5
-#: A file of nothing but blanks is no larger than this.
+#: The largest size of a file that can be blank.
 _BLANK_BYTES: Final = 4096
 _EPS: Final = float(np.finfo(float).eps)
 
 
 @dataclass
-class Compared:
-    """Truth and tracks as frames at the same times, and what is worth saying of them."""
+class AlignedFiles:
+    """Ground truth and tracks as frames at the same times, and notes for people."""
 
     truth: list[Frame]
     tracks: list[Frame]
     notes: list[str] = field(default_factory=list)
 
 
-def pair_files(tracks: Sequence[Path], truths: Sequence[Path]) -> tuple[list[tuple[str, Path, Path]], str]:
-    """Which truth belongs to which tracks, with a name for each pair, and in words how that was found.
+def pair_files(tracks: Sequence[Path], ground_truths: Sequence[Path]) -> tuple[list[tuple[str, Path, Path]], str]:
+    """Pair files of tracks and of ground truth: a name and both paths for each pair, and a note on how they were
+    paired.
 
-    By their names where these are the same (the file's, or a folder's above it: ``SEQ/gt/gt.txt``), otherwise in order.
-    Raises McaptrackError if there are not as many of one as of the other, and for a log, which holds its truth.
+    Files are paired by names, if these are the same (that of the file or of a folder above: ``SEQ/gt/gt.txt``),
+    otherwise in order. Raises McaptrackError if there are not as many of one as of the other, and for logs, which hold
+    their own ground truth.
     """
     for path in tracks:
         if is_mcap(path):
-            add = command("ingest", truths[0] if len(truths) == 1 else "LABELS", "--as", "truth", "--into", path)
-            raise McaptrackError(f"{path} is a log, not a file of labels; logs hold their own truth: add it with {add}")
-    if len(tracks) != len(truths):
-        raise McaptrackError(f"{len(tracks)} files of tracks and {len(truths)} of truth; give one truth for each")
-    track_names, truth_names = _names(tracks), _names(truths)
+            add = command(
+                "ingest", ground_truths[0] if len(ground_truths) == 1 else "LABELS", "--as", "truth", "--into", path
+            )
+            raise McaptrackError(
+                f"{path} is a log, not a file of labels; logs hold their own ground truth: add it with {add}"
+            )
+    if len(tracks) != len(ground_truths):
+        raise McaptrackError(
+            f"{len(tracks)} files of tracks and {len(ground_truths)} of ground truth; give one of ground truth for each"
+        )
+    track_names, truth_names = _names(tracks), _names(ground_truths)
     if len(tracks) == 1:
-        return [(tracks[0].stem, tracks[0], truths[0])], ""
+        return [(tracks[0].stem, tracks[0], ground_truths[0])], ""
     if set(track_names) == set(truth_names):
-        found = dict(zip(truth_names, truths, strict=True))
+        found = dict(zip(truth_names, ground_truths, strict=True))
         return [(name, path, found[name]) for name, path in zip(track_names, tracks, strict=True)], ""
-    pairs = list(zip(track_names, tracks, truths, strict=True))
+    pairs = list(zip(track_names, tracks, ground_truths, strict=True))
     words = ", ".join(f"{path} with {truth}" for _, path, truth in pairs)
-    return pairs, f"names of tracks and truth differ: taken in the order given, {words}"
+    return pairs, f"names of tracks and ground truth differ: taken in the order given, {words}"
 
 
 def _names(paths: Sequence[Path]) -> list[str]:
-    """The part of each path that tells them apart: the file's name, or that of a folder above."""
+    """The part of each path that distinguishes it: the name of the file, or of a folder above."""
     parts = [[path.stem, *(folder.name for folder in path.absolute().parents)] for path in paths]
     for level in zip(*parts, strict=False):
         if len(set(level)) == len(paths):
@@ -87,8 +96,8 @@ def compare_files(
     ground_plane: Path | None = None,
     point: Point = "foot",
     topics: Sequence[str] = (),
-) -> Compared:
-    """Tracks and truth as frames. Raises McaptrackError, with what is wrong, if they can't be read or compared."""
+) -> AlignedFiles:
+    """Tracks and ground truth as frames. Raises McaptrackError if they can't be read or compared."""
     both: dict[Role, tuple[Path, Labels]] = {
         "truth": (truth, _read(truth, "truth", topics)),
         "tracks": (tracks, _read(tracks, "tracks", topics)),
@@ -98,7 +107,7 @@ def compare_files(
         if "parquet" in formats:
             raise McaptrackError(f"{tracks} and {truth} share no clock: one counts frames, the other does not")
         frames = ingest.label_frames({"tracks": tracks, "truth": truth}, fps, ground_plane, point)
-        return Compared(frames["truth"], frames["tracks"])
+        return AlignedFiles(frames["truth"], frames["tracks"])
     notes = [f"{path} also holds {labels.left_out}" for path, labels in both.values() if labels.left_out]
     if fps is not None:
         notes.append("frames are compared by their numbers, whatever the frames per second")
@@ -106,8 +115,8 @@ def compare_files(
 
 
 @dataclass
-class Detected:
-    """Detections and truth as frames on one clock, and the ground plane, if there is one."""
+class AlignedDetections:
+    """Detections and ground truth as frames at the same times, and the ground plane, if there is one."""
 
     detections: list[Frame]
     truth: list[Frame]
@@ -116,21 +125,21 @@ class Detected:
 
 def detections_and_truth(
     detections: Path, truth: Path, fps: Fraction | None, ground_plane: Path | None, point: Point
-) -> Detected:
-    """A file of detections and the truth as frames, at the times that the frame rate gives them.
+) -> AlignedDetections:
+    """A file of detections and one of ground truth as frames, at the times that the frame rate gives.
 
-    Raises McaptrackError if they can't be read, or if nothing says how many frames a second there are.
+    Raises McaptrackError if they can't be read, or if the frame rate is not known.
     """
     options = IngestOptions(fps=fps, ground_plane=ground_plane, point=point)
     with _PairJob([("detections", detections), ("truth", truth)], options) as job:
         if any(labels.boxes_px is None for _, labels in job.labels.values()):
             raise McaptrackError(f"{detections} and {truth} have to hold boxes in pixels, both")
         planes = ((0, job.ground),) if job.ground else ()
-        return Detected(job.all_frames("detections"), job.all_frames("truth"), planes)
+        return AlignedDetections(job.all_frames("detections"), job.all_frames("truth"), planes)
 
 
 class _PairJob(LabelJob):
-    """Detections and the truth, which may be a table."""
+    """Labels of detections and of ground truth, which may be a table."""
 
     def read(self, path: Path, role: Role) -> Labels:
         return _read(path, role, ()) if role == "truth" else super().read(path, role)
@@ -140,10 +149,10 @@ def _read(path: Path, role: Role, topics: Sequence[str]) -> Labels:
     if path.suffix.lower() in (".parquet", ".pq"):
         return _read_parquet(path, role, topics)
     if role == "tracks" and path.is_file() and _is_blank(path):
-        return _nobody("mot")
+        return _no_tracks("mot")
     labels = read_labels(path, role=role)
     if not labels.identified:
-        raise McaptrackError(f"{path} says of nobody who it is (all ids are -1); {role} need ids")
+        raise McaptrackError(f"{path} has no ids (all are -1); {role} need ids")
     return labels
 
 
@@ -151,14 +160,14 @@ def _is_blank(path: Path) -> bool:
     return path.stat().st_size < _BLANK_BYTES and not path.read_bytes().strip()
 
 
-def _nobody(name: Any) -> Labels:
-    """A file of tracks without any: a tracker that found nobody."""
+def _no_tracks(name: Any) -> Labels:
+    """A file of tracks without rows: of a tracker that found no people."""
     none = np.empty(0, np.int64)
     return Labels(name, 1, none, none, np.empty((0, 4)), None, np.empty(0), none, np.empty(0, np.uint32))
 
 
 def _read_parquet(path: Path, role: Role, topics: Sequence[str]) -> Labels:
-    """A table of tracks as ``mcaptrack export`` writes it: the rows of one topic."""
+    """A table of tracks in the format of ``mcaptrack export``: the rows of one topic."""
     columns = ("topic", "frame", "track_id", "x_px", "y_px", "w_px", "h_px", "x_m", "y_m", "score")
     table = tables.read_columns(path, columns)
     there = sorted(set(table["topic"].tolist()))
@@ -192,8 +201,8 @@ def _read_parquet(path: Path, role: Role, topics: Sequence[str]) -> Labels:
 
 def _by_number(
     both: dict[Role, tuple[Path, Labels]], ground_plane: Path | None, point: Point, notes: list[str]
-) -> Compared:
-    """The frames that either file has rows of, by their numbers, both counted from 0."""
+) -> AlignedFiles:
+    """The frames with rows in either file, by their numbers, both counted from 0."""
     truth, tracks = both["truth"][1], both["tracks"][1]
     plane = _plane(ground_plane, point, truth, tracks)
     there = {role: labels.frame - labels.first_frame for role, (_, labels) in both.items()}
@@ -209,14 +218,14 @@ def _by_number(
     step = max(truth.step, tracks.step) if len(tracks.frame) else truth.step
     sparse = truth if truth.step >= tracks.step or not len(tracks.frame) else tracks
     start = int(sparse.labelled[0] - sparse.first_frame) % step
-    numbers = np.unique(np.concatenate([*there.values()]))  # a frame without rows of either counts for nothing
+    numbers = np.unique(np.concatenate([*there.values()]))  # frames without rows do not change any score
     numbers = numbers[numbers % step == start]
     frames = {role: _frames(labels, numbers, there[role], plane, role) for role, (_, labels) in both.items()}
     if truth.aside is not None and truth.boxes_px is not None:
-        frames["tracks"], gone = _without_forgiven(frames["truth"], frames["tracks"], truth)
+        frames["tracks"], gone = _without_ignored(frames["truth"], frames["tracks"], truth)
         if gone:
-            notes.append(f"{gone} boxes of {both['tracks'][0]} are of what doesn't count; they count neither way")
-    return Compared(frames["truth"], frames["tracks"], notes)
+            notes.append(f"{gone} boxes of {both['tracks'][0]} match labels that don't count; they are ignored")
+    return AlignedFiles(frames["truth"], frames["tracks"], notes)
 
 
 def _plane(path: Path | None, point: Point, truth: Labels, tracks: Labels) -> GroundPlane | None:
@@ -235,19 +244,14 @@ def _plane(path: Path | None, point: Point, truth: Labels, tracks: Labels) -> Gr
 def _frames(
     labels: Labels, numbers: NDArray[np.int64], there: NDArray[np.int64], plane: GroundPlane | None, role: Role
 ) -> list[Frame]:
-    """The rows of labels in the frames ``numbers``; ``there`` are the numbers of all rows, rising."""
+    """The rows of labels in the frames ``numbers``; ``there`` are the frame numbers of all rows, rising."""
     rows = label_rows(labels, role, plane)
-    low, high = (np.searchsorted(there, numbers, side).tolist() for side in ("left", "right"))
-    return [
-        Frame(number * NS_PER_S, number, rows[a:b]) for number, a, b in zip(numbers.tolist(), low, high, strict=True)
-    ]
+    kept = np.isin(there, numbers)
+    return split_rows(numbers * NS_PER_S, numbers, rows[kept], np.searchsorted(there[kept], numbers, "right"))
 
 
-def _without_forgiven(truth: Sequence[Frame], tracks: Sequence[Frame], labels: Labels) -> tuple[list[Frame], int]:
-    """Tracks without the boxes that are matched with labels nobody has to find, as MOTChallenge and KITTI do it.
-
-    Returns how many went, too.
-    """
+def _without_ignored(truth: Sequence[Frame], tracks: Sequence[Frame], labels: Labels) -> tuple[list[Frame], int]:
+    """Remove boxes that match labels which don't count, as MOTChallenge and KITTI do; returns their number, too."""
     assert labels.aside is not None
     aside = labels.aside
     order = np.argsort(aside.frame, kind="stable")
@@ -256,7 +260,7 @@ def _without_forgiven(truth: Sequence[Frame], tracks: Sequence[Frame], labels: L
     out, gone = [], 0
     for true, found in zip(truth, tracks, strict=True):
         low, high = np.searchsorted(at, [true.index, true.index + 1])
-        kept = ~_forgiven(_boxes(true), _boxes(found), _rows(aside, slice(low, high)), labels.format == "kitti")
+        kept = ~_is_ignored(_boxes(true), _boxes(found), _rows(aside, slice(low, high)), labels.format == "kitti")
         gone += int((~kept).sum())
         out.append(found if kept.all() else found._replace(rows=found.rows[kept]))
     return out, gone
@@ -270,8 +274,8 @@ def _boxes(frame: Frame) -> Floats:
     return np.stack([frame.rows[name] for name in ("x_px", "y_px", "w_px", "h_px")], axis=-1)
 
 
-def _forgiven(true: Floats, found: Floats, aside: Aside, kitti: bool) -> Bools:
-    """Which boxes of tracks (K,) count neither way, among true boxes (N, 4) and boxes aside."""
+def _is_ignored(true: Floats, found: Floats, aside: Aside, kitti: bool) -> Bools:
+    """Mark the boxes of tracks (K,) to ignore, given true boxes (N, 4) and labels that don't count."""
     forgiven = np.zeros(len(found), bool)
     if not len(found):
         return forgiven

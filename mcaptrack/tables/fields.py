@@ -1,6 +1,6 @@
-"""What the tables are: columns with units and meaning, keys, and the order of rows.
+"""The tables: columns with units and descriptions, keys, and the order of rows.
 
-Columns are only ever added, and what is added may be missing; then old files and new ones read together.
+Columns are only ever added, and added columns may be missing, so that old files and new ones can be read together.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ if TYPE_CHECKING:
 #: Version of the tables' columns: the second number grows when columns are added.
 TABLE_VERSION: Final = "1.1"
 
-#: The unit of numbers that count or name something.
+#: The unit of counts and ids.
 _NONE: Final = "1"
-#: The types that columns are declared with.
+#: The kinds of columns.
 _TEXT, _NAME, _INT, _FLOAT, _TIME, _FLAG = "text", "name", "int64", "float64", "time", "flag"
 
 
 @dataclass(frozen=True)
 class Field:
-    """One column. ``kind`` is text, name (text that repeats), int64, float64, time or flag."""
+    """A column. ``kind`` is text, name (text that repeats), int64, float64, time or flag."""
 
     name: str
     kind: str
@@ -53,7 +53,7 @@ class Field:
 
 @dataclass(frozen=True)
 class Table:
-    """A table: what a row of it is, which columns name one row of a recording, and how rows are ordered.
+    """A table: the meaning of a row, the key columns within a recording, and the order of rows.
 
     ``rows_of`` is the schema of the channels whose rows it holds, None for tables about a log.
     """
@@ -77,7 +77,7 @@ class Table:
 
 
 def _with_unit(field: Any) -> Any:
-    """A field of a row schema, with a unit where it has none."""
+    """A field of a row schema, with a unit if it has none."""
     import pyarrow as pa
 
     known = {key.decode(): value.decode() for key, value in (field.metadata or {}).items()}
@@ -88,18 +88,18 @@ def _with_unit(field: Any) -> Any:
 _TOPIC: Final = Field("topic", _NAME, "channel of the log that the row comes from")
 _FRAME: Final = Field("frame", _INT, "number of the frame: of the picture in the video, from 0")
 _T: Final = Field("t", _TIME, "log time", "ns")
-_T_NS: Final = Field("t_ns", _INT, "log time as a whole number since 1970, exact wherever it is read", "ns")
-#: What every table of rows begins with.
+_T_NS: Final = Field("t_ns", _INT, "log time as a whole number since 1970, exact in all readers", "ns")
+#: The first columns of each table of rows.
 TIMES: Final = (_TOPIC, _FRAME, _T, _T_NS)
 _ROW: Final = Field("row", _INT, "number of the row in its channel, in the order of the log, from 0")
 
-#: The column that says which log a row is of; in files it is in the name of the folder.
+#: The column with the name of the log; in files it is in the name of the folder.
 RECORDING: Final = Field("recording", _NAME, "the log, by name; the same in all tables")
 
 _FRAMES: Final = Table(
     "frames",
-    "One row a message of a channel of rows or pictures: where in the log it stands, and how many rows it holds. With "
-    "it a frame in which nothing was seen is told from one at which nobody looked.",
+    "One row a message of a channel of rows or pictures: its place in the log, and its number of rows. With it a frame "
+    "without people can be told from a time at which no frame was processed.",
     ("topic", "t_ns", "message_offset", "chunk_offset"),
     ("topic", "t_ns"),
     (
@@ -133,8 +133,8 @@ _SUMMARY: Final = Table(
         Field("last_frame", _INT, "frame of the last row"),
         Field("duration_s", _FLOAT, "from the first row to the last", "s"),
         Field("rows", _INT, "how many rows it has"),
-        Field("observed_share", _FLOAT, "share of rows that a detection stands behind, between 0 and 1"),
-        Field("path_m", _FLOAT, "length of the path over all known positions, straight over holes", "m", True),
+        Field("observed_share", _FLOAT, "share of rows with a detection, between 0 and 1"),
+        Field("path_m", _FLOAT, "length of the path over all known positions, straight over gaps", "m", True),
         Field("mean_speed_m_s", _FLOAT, "path by the time between the first and the last known position", "m/s", True),
         Field("max_speed_m_s", _FLOAT, "largest distance by time from one known position to the next", "m/s", True),
         Field("first_x_m", _FLOAT, "first known position on the ground plane, first axis", "m", True),
@@ -150,8 +150,8 @@ _SUMMARY: Final = Table(
 
 _METRICS: Final = Table(
     "metrics",
-    "One row a channel of tracks, similarity and gate: its scores against the truth of its camera, the numbers of "
-    "evaluate --json. No rows where the log has no truth.",
+    "One row a channel of tracks, similarity and gate: its scores against the ground truth of its camera, the numbers "
+    "of evaluate --json. No rows where the log has no ground truth.",
     ("topic", "similarity", "gate"),
     ("topic", "similarity", "gate"),
     (
@@ -159,16 +159,16 @@ _METRICS: Final = Table(
         Field("truth", _NAME, "the channel that they are scored against"),
         Field("mode", _TEXT, "online or offline for re-tracked tracks; null for others", nullable=True),
         Field("similarity", _TEXT, "iou: overlap of boxes; metres: distance on the ground"),
-        Field("gate", _FLOAT, "from which overlap, or within which distance in metres, two can be one"),
-        Field("rules", _TEXT, "whose rules for counting switches and fragments"),
-        Field("MOTA", _FLOAT, "CLEAR: 1 less misses, false positives and switches by true rows"),
+        Field("gate", _FLOAT, "least overlap, or largest distance in metres, of a match"),
+        Field("rules", _TEXT, "rules for identity switches and fragmentations"),
+        Field("MOTA", _FLOAT, "CLEAR: 1 less misses, false positives and switches by rows of the ground truth"),
         Field("IDF1", _FLOAT, "identity: F1 of rows under the best assignment of tracks to people"),
         Field("IDP", _FLOAT, "identity: precision"),
         Field("IDR", _FLOAT, "identity: recall"),
         Field("HOTA", _FLOAT, "higher order tracking accuracy, mean over thresholds"),
         Field("DetA", _FLOAT, "HOTA: accuracy of detection"),
         Field("AssA", _FLOAT, "HOTA: accuracy of association"),
-        Field("LocA", _FLOAT, "HOTA: accuracy of place"),
+        Field("LocA", _FLOAT, "HOTA: accuracy of localisation"),
         Field("IDSW", _INT, "identity switches"),
         Field("FP", _INT, "false positives"),
         Field("FN", _INT, "misses"),
@@ -176,14 +176,14 @@ _METRICS: Final = Table(
         Field("MT", _INT, "people tracked for at least 80 % of their time"),
         Field("PT", _INT, "people tracked for a part of their time"),
         Field("ML", _INT, "people tracked for less than 20 % of their time"),
-        Field("GT", _INT, "true people"),
-        Field("ADE_m", _FLOAT, "forecasts: mean distance from the truth", "m", True),
-        Field("FDE_m", _FLOAT, "forecasts: mean distance from the truth at the last step", "m", True),
+        Field("GT", _INT, "people of the ground truth"),
+        Field("ADE_m", _FLOAT, "forecasts: mean distance from the ground truth", "m", True),
+        Field("FDE_m", _FLOAT, "forecasts: mean distance from the ground truth at the last step", "m", True),
         Field("ADE_squared_m2", _FLOAT, "forecasts: mean squared distance, as in the paper", "m^2", True),
-        Field("recall", _FLOAT, "forecasts: share of true people that have one", nullable=True),
+        Field("recall", _FLOAT, "forecasts: share of people that have one", nullable=True),
         Field("AADE_m", _FLOAT, "forecasts: ADE averaged over recalls", "m", True),
-        Field("false_forecasts_per_frame", _FLOAT, "forecasts of nobody, by frames", nullable=True),
-        Field("consistency_m", _FLOAT, "forecasts: how far one lies from the one before of the same track", "m", True),
+        Field("false_forecasts_per_frame", _FLOAT, "forecasts without a person, by frames", nullable=True),
+        Field("consistency_m", _FLOAT, "forecasts: distance from the previous one of the same track", "m", True),
         Field("coverage_50", _FLOAT, "share of true futures in the 50 % ellipses", nullable=True),
         Field("coverage_90", _FLOAT, "share of true futures in the 90 % ellipses", nullable=True),
         Field("coverage_95", _FLOAT, "share of true futures in the 95 % ellipses", nullable=True),
@@ -233,8 +233,8 @@ _RECORDINGS: Final = Table(
         Field(
             "digest",
             _TEXT,
-            "SHA-256 of what the log says it holds: channels, chunks with times, counts and checksums, attachments; "
-            "another one when anything in the log changes",
+            "SHA-256 of the contents of the log: channels, chunks with times, counts and checksums, attachments; it "
+            "changes when anything in the log changes",
         ),
         Field(
             "results_file", _TEXT, "name of the log beside it that holds its results, if there is one", nullable=True
@@ -242,7 +242,7 @@ _RECORDINGS: Final = Table(
         Field(
             "ground_plane",
             _TEXT,
-            "given: somebody measured it; assumed: guessed from the size of people; mixed: some of each; null: none",
+            "given: measured; assumed: guessed from the size of people; mixed: some of each; null: none",
             nullable=True,
         ),
         Field(
@@ -252,7 +252,7 @@ _RECORDINGS: Final = Table(
     ),
 )
 
-#: How the rows of a track stand together in a file; tables that are not here go by time.
+#: Tables in which the rows of a track stand together; the others are ordered by time.
 _BY_TRACK: Final = ("tracks", "predictions", "forecast_errors")
 
 
@@ -270,7 +270,7 @@ def _of_rows(schema: Schema) -> Table:
 
 def _all_tables() -> Iterator[Table]:
     yield from (_FRAMES, *(_of_rows(schema) for schema in SCHEMAS.values()), _SUMMARY, _METRICS, _CHANNELS)
-    yield _RECORDINGS  # last: what a log has become is written when the rest is
+    yield _RECORDINGS  # last: its digest says that the others are complete
 
 
 #: All tables of a log by name, in the order in which they are written.

@@ -1,8 +1,8 @@
-"""Tables as files: there once they are complete and were read back, the same to the bit.
+"""Tables as files, published when they are complete and were read back identically.
 
 Parquet: floats are split by byte and whole numbers stored as differences, which makes files smaller and writing faster
-than the defaults; pages have checksums and an index. What a file was made from stands in its metadata as ``source``, a
-digest of the content as ``digest``; a file that would be the same is not touched.
+than the defaults; pages have checksums and an index. The metadata hold ``source``, which identifies the input, and
+``digest``, that of the content; a file that would not change is not touched.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from mcaptrack.tables.fields import TABLE_VERSION
 
 Format = Literal["parquet", "arrow", "csv", "jsonl"]
 FORMATS: Final[tuple[Format, ...]] = get_args(Format)
-#: Formats that carry metadata, so that it can be told whether they are up to date.
+#: Formats with metadata, by which a file can be found up to date.
 _DESCRIBED: Final = ("parquet", "arrow")
 
 _ROW_GROUP: Final = 128 * 1024
-_ZSTD_LEVEL: Final = 1  # what is left of floats when their bytes are split hardly gets smaller with more
+_ZSTD_LEVEL: Final = 1  # higher levels hardly make floats that are split by byte smaller
 _PREFIX: Final = "mcaptrack."
 
 
@@ -37,17 +37,17 @@ def write(
     form: Format = "parquet",
     anew: bool = False,
 ) -> bool:
-    """Write an Arrow table, there once it is complete and reads back the same. Returns whether it was needed.
+    """Write an Arrow table; the file appears when it is complete and reads back identically. Returns whether it was
+    written.
 
-    ``provenance`` goes into the metadata, ``order`` says by which columns rows are sorted. A file that has the same
-    content and metadata already is left as it is, unless it is to be written ``anew``. Raises McaptrackError if the
-    file can't be written.
+    ``provenance`` goes into the metadata, ``order`` names the columns by which rows are sorted. A file with the same
+    content and metadata is left as it is, unless ``anew``. Raises McaptrackError if the file can't be written.
     """
     words = {"table_version": TABLE_VERSION} | dict(provenance)
-    with ThreadPoolExecutor(1) as beside:  # adding up goes on while the file is written
+    with ThreadPoolExecutor(1) as beside:  # computes the digest while the file is written
         content = beside.submit(digest, table.schema, _pieces(table))
         if form in _DESCRIBED and not anew:
-            known = described(path, form)
+            known = file_metadata(path, form)
             if known is not None and _same(known, words | {"digest": content.result()}):
                 return False
         try:
@@ -76,7 +76,7 @@ def write(
 
 
 def _same(known: Mapping[str, str], words: Mapping[str, str]) -> bool:
-    """Whether metadata say the same; what it was made from may be another, if the content is the same."""
+    """Whether metadata are the same, apart from the source, which may change while the content does not."""
     return {**known, "source": ""} == {**words, "source": ""}
 
 
@@ -99,12 +99,12 @@ def _write_parquet(part: Path, table: Any, words: Mapping[str, str], order: Sequ
         )
         writer.write_table(table, row_group_size=_ROW_GROUP)
         writer.add_key_value_metadata({_PREFIX + "digest": content.result()})
-        # Not in a finally: closing writes the footer, and half a table with a footer looks like a whole one.
+        # Not in a finally: closing writes the footer, which would make half a table look complete.
         writer.close()
 
 
 def _encodings(schema: Any) -> dict[str, Any]:
-    """How each column is stored: text by dictionary, floats split by byte, whole numbers as differences."""
+    """The encoding of each column: text by dictionary, floats split by byte, whole numbers as differences."""
     import pyarrow as pa
 
     encodings, dictionaries = {}, []
@@ -127,17 +127,17 @@ def _write_arrow(part: Path, table: Any, words: Mapping[str, str]) -> None:
         writer.write_table(table.combine_chunks())
 
 
-def described(path: Path, form: Format) -> dict[str, str] | None:
-    """What the metadata of a file say of it, read from its end; None where it is not there or is no such file."""
+def file_metadata(path: Path, form: Format) -> dict[str, str] | None:
+    """The metadata of a file, read from its end; None if there is no such file."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
     try:
         if form not in ("parquet", "arrow"):
             return None
-        with path.open("rb") as stream:  # Arrow opens no file whose name is no text
-            described = pq.read_metadata(stream) if form == "parquet" else pa.ipc.open_file(stream).schema
-            found = described.metadata or {}
+        with path.open("rb") as stream:  # Arrow opens no file whose name is not UTF-8
+            file_metadata = pq.read_metadata(stream) if form == "parquet" else pa.ipc.open_file(stream).schema
+            found = file_metadata.metadata or {}
     except (OSError, pa.ArrowException):
         return None
     pairs = ((key.decode("utf-8", "replace"), value.decode("utf-8", "replace")) for key, value in found.items())
@@ -145,14 +145,14 @@ def described(path: Path, form: Format) -> dict[str, str] | None:
 
 
 def verify(path: Path, form: Format = "parquet") -> int:
-    """Read a whole file and hold its content against the digest in its metadata; returns the number of rows.
+    """Read a whole file and compare its content with the digest in its metadata; returns the number of rows.
 
     Raises McaptrackError if it can't be read, has no digest or holds something else.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    said = (described(path, form) or {}).get("digest")
+    said = (file_metadata(path, form) or {}).get("digest")
     if said is None:
         raise McaptrackError(f"{path} is no exported table: it has no digest")
     rows = [0]
@@ -179,13 +179,13 @@ def verify(path: Path, form: Format = "parquet") -> int:
 
 
 def _pieces(table: Any) -> Iterator[Any]:
-    """A table in pieces that are worked on without copying it as a whole."""
+    """A table in slices, so that it is never copied as a whole."""
     for start in range(0, table.num_rows, _ROW_GROUP):
         yield table.slice(start, _ROW_GROUP)
 
 
 def digest(schema: Any, pieces: Iterable[Any]) -> str:
-    """SHA-256 of the content of a table: names, types and values, however it is cut into pieces."""
+    """SHA-256 of the content of a table: names, types and values, independent of slices."""
     columns = [_ColumnDigest() for _ in schema]
     start = 0
     for piece in pieces:
@@ -200,14 +200,14 @@ def digest(schema: Any, pieces: Iterable[Any]) -> str:
 
 
 def _kind(kind: Any) -> str:
-    """A type, without what Parquet and Arrow call differently: the members of lists."""
+    """The name of a type, independent of the name that Parquet and Arrow give to members of lists."""
     import pyarrow as pa
 
     return f"list<{_kind(kind.value_type)}>" if pa.types.is_list(kind) else str(kind)
 
 
 class _ColumnDigest:
-    """Adds up the values of a column: bits of numbers, bytes of text, and which rows are null."""
+    """The digest of a column: bits of numbers, bytes of text, and which rows are null."""
 
     def __init__(self) -> None:
         self._values, self._missing, self._lengths = hashlib.sha256(), hashlib.sha256(), hashlib.sha256()
@@ -215,7 +215,7 @@ class _ColumnDigest:
         self._within: _ColumnDigest | None = None
 
     def add(self, array: Any) -> None:
-        """The next values, an Arrow array."""
+        """Add values, an Arrow array."""
         import pyarrow as pa
         import pyarrow.compute as pc
 
@@ -250,6 +250,6 @@ class _ColumnDigest:
         self._values.update(known[at].tobytes())
 
     def digest(self) -> str:
-        """What they add up to."""
+        """The digest of all added values."""
         parts = [self._values.hexdigest(), self._missing.hexdigest(), self._lengths.hexdigest()]
         return " ".join([*parts, self._within.digest() if self._within else ""])

@@ -1,4 +1,4 @@
-"""Tables of the same kind as one: of several logs, in memory or in files that are read as far as they are asked for."""
+"""The same table of several logs as one table, in memory or in files, which are read only as far as needed."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ _COLUMNS: Final = "these tables can't be one"
 
 
 def join(parts: Sequence[tuple[str, Any]], columns: Any = None) -> Any:
-    """Tables by the name of their log, each an Arrow table or the path of a Parquet file, as one with ``recording``.
+    """Join tables by the name of their log, each an Arrow table or the path of a Parquet file; adds ``recording``.
 
-    ``columns`` is an Arrow schema whose columns are there in any case, and first. What a part lacks is null there. The
-    result is an Arrow table, or a dataset where files are among the parts. Raises McaptrackError if a file can't be
-    read or a column is of two types.
+    ``columns`` is an Arrow schema with the first columns of the result. Columns that a part does not have are null. The
+    result is an Arrow table, or a dataset if files are among the parts. Raises McaptrackError if a file can't be read
+    or if a column has two types.
     """
     import pyarrow as pa
     import pyarrow.dataset as ds
@@ -54,7 +54,7 @@ def _columns(path: Path) -> Any:
 
 
 def _filled(table: Any, schema: Any) -> Any:
-    """A table with all columns, in order; those it lacks are null."""
+    """A table with all columns, in order; missing ones are null."""
     import pyarrow as pa
 
     columns = [
@@ -67,7 +67,7 @@ def _filled(table: Any, schema: Any) -> Any:
 
 
 def _dataset(files: Sequence[tuple[str, Path]], schema: Any) -> Any:
-    """Parquet files as one, checksums of pages looked at; the name of its log is known of all rows of a file."""
+    """Parquet files as one dataset with page checksums; the name of its log is a partition of each file."""
     import pyarrow as pa
     import pyarrow.compute as pc
     import pyarrow.dataset as ds

@@ -1,8 +1,8 @@
-"""Flat messages of others -> Arrow: a column a field, with names that SQL takes without quotes.
+"""Flat messages of foreign channels -> Arrow: a column for each field, with names that need no quotes in SQL.
 
-``angular_velocity.x`` becomes ``angular_velocity_x``, because a dot would have to be quoted in every query; the field's
-path stands in the column's metadata. Columns get the narrowest type that holds all values: flags, int64, float64, text,
-or lists of these; what is mixed becomes JSON text.
+``angular_velocity.x`` becomes ``angular_velocity_x``, because a dot would need quotes in every query; the path of the
+field is in the column's metadata. Columns get the narrowest type that holds all values: flags, int64, float64, text, or
+lists of these; mixed values become JSON text.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _MAX_INT, _MAX_UINT = 2**63, 2**64
 def messages_table(
     topic: str, schema_name: str, places: Pointers, rows: Iterable[Mapping[Path, Any]], blobs: bool = False
 ) -> tuple[Any, list[str]]:
-    """One channel as a table: when and where each message is, then its fields. Also the paths of what was left out.
+    """One channel as a table: time and place of each message, then its fields; and the paths of fields left out.
 
     Fields of bytes are left out unless ``blobs``.
     """
@@ -55,7 +55,7 @@ def messages_table(
 
 
 def _free_name(wanted: str, names: dict[str, Any]) -> str:
-    """The name, or the name with a number behind it where it is taken; capitals don't count, as in SQL."""
+    """The name, with a number if it is taken; case is ignored, as in SQL."""
     name, number = wanted, 1
     taken = {known.lower() for known in names}
     while name.lower() in taken:
@@ -81,7 +81,7 @@ def _array(values: Sequence[Any]) -> Any:
 
 
 def _kind(values: Sequence[Any]) -> str | None:
-    """The narrowest type that holds all values; None where only JSON does."""
+    """The narrowest type that holds all values; None if only JSON does."""
     kinds = {type(value) for value in values}
     if len(kinds) == 1 and kinds <= {bool, float, str, bytes}:
         return kinds.pop().__name__
@@ -95,7 +95,7 @@ def _kind(values: Sequence[Any]) -> str | None:
 
 
 def _clean(text: str) -> str:
-    """Text without halves of characters, which JSON can hold and UTF-8 can't."""
+    """Text without lone surrogates, which JSON allows and UTF-8 does not."""
     return text.encode("utf-8", "replace").decode("utf-8")
 
 

@@ -1,4 +1,4 @@
-"""Parquet files, ours or others', as arrays and frames."""
+"""Parquet files of mcaptrack or of other tools, as arrays and frames."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import Frame
+from mcaptrack.schema.framing import split_rows
 
 
 def read_columns(path: Path, names: Sequence[str]) -> dict[str, NDArray[Any]]:
@@ -22,7 +23,7 @@ def read_columns(path: Path, names: Sequence[str]) -> dict[str, NDArray[Any]]:
     import pyarrow.parquet as pq
 
     try:
-        with path.open("rb") as stream:  # a file alone: what its folders are called is no column
+        with path.open("rb") as stream:  # a single file: the names of its folders are no columns
             table = pq.read_table(stream)
     except OSError as error:
         raise McaptrackError(f"{path} can't be read: {error.strerror or error}") from None
@@ -42,7 +43,7 @@ def read_columns(path: Path, names: Sequence[str]) -> dict[str, NDArray[Any]]:
     return out
 
 
-#: What a table needs so that its rows are tracks in metres; ``topic`` and ``observed`` count if they are there.
+#: Required columns of tracks in metres; ``topic`` and ``observed`` are optional.
 _OF_TRACKS: Final = ("t_ns", "track_id", "x_m", "y_m")
 
 
@@ -53,7 +54,7 @@ def holds_tracks(path: Path) -> bool:
 
 
 def read_tracks(path: Path) -> dict[str, list[Frame]]:
-    """The tracks of a Parquet file, ours or another with the same columns, as frames by topic ("" where none is named).
+    """The tracks of a Parquet file with these columns, as frames by topic ("" without topics).
 
     Raises McaptrackError if it holds none.
     """
@@ -80,9 +81,7 @@ def read_tracks(path: Path) -> dict[str, list[Frame]]:
         given |= dict.fromkeys(("x_px", "y_px", "w_px", "h_px", "score"), nowhere)
         rows = TRACKS.rows(**{column: values[mine] for column, values in given.items()})
         times, first = np.unique(t_ns[mine], return_index=True)
-        ends = [*first[1:].tolist(), len(mine)]
-        spans = zip(times.tolist(), first.tolist(), ends, strict=True)
-        out[name] = [Frame(t, number, rows[low:high]) for number, (t, low, high) in enumerate(spans)]
+        out[name] = split_rows(times, range(len(times)), rows, np.append(first[1:], len(mine)))
     return out
 
 

@@ -1,7 +1,7 @@
-"""Answers of a database: Arrow tables of any types, as files, as text, and as cells for people to read.
+"""Answers of queries: Arrow tables of any types, as files, as text, and as cells for a terminal.
 
-In text, numbers and times are exact; a whole number of more than 64 bits, an interval, a date are text. For people,
-numbers have six digits after the point.
+Text has exact numbers and times; whole numbers of more than 64 bits, intervals and dates are text. Cells have six
+decimals.
 """
 
 from __future__ import annotations
@@ -15,15 +15,16 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.files import publish
 from mcaptrack.tables import text
 
-#: How an answer can be written.
+#: The formats of answers.
 ANSWERS: Final = ("csv", "json", "jsonl", "parquet", "arrow")
 _DIGITS: Final = 6
 
 
 def tidy(table: Any) -> Any:
-    """An answer with names that differ, and columns that every format takes: a sum of whole numbers is one, if it fits.
+    """An answer with unique column names and types that all formats support; sums of whole numbers become int64 if
+    possible.
 
-    The second of two columns ``a`` is ``a_1``; intervals are text.
+    The second of two columns ``a`` is ``a_1``; intervals become text.
     """
     import pyarrow as pa
 
@@ -48,7 +49,7 @@ def tidy(table: Any) -> Any:
 
 
 def pieces(table: Any, form: Literal["csv", "json", "jsonl"]) -> Iterator[bytes]:
-    """An answer as text; ``json`` is an array of one object a row."""
+    """An answer as text; ``json`` is an array with an object for each row."""
     flat = _for_text(table)
     if form == "csv":
         yield from text.csv(flat)
@@ -63,7 +64,7 @@ def pieces(table: Any, form: Literal["csv", "json", "jsonl"]) -> Iterator[bytes]
 
 
 def write_answer(path: Path, table: Any, form: str) -> None:
-    """Write an answer to a file that is there once it is complete. Raises McaptrackError if it can't be written."""
+    """Write an answer to a file, which appears when it is complete. Raises McaptrackError if it can't be written."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -83,7 +84,9 @@ def write_answer(path: Path, table: Any, form: str) -> None:
 
 
 def cells(table: Any, limit: int) -> tuple[list[bool], list[list[str | None]]]:
-    """The first rows of an answer for people: which columns are numbers, and the words of each row, None for null."""
+    """The first rows of an answer for a terminal: which columns are numbers, and the texts of each row, None for
+    null.
+    """
     import pyarrow as pa
 
     numbers = [pa.types.is_integer(field.type) or pa.types.is_floating(field.type) for field in table.schema]
@@ -110,7 +113,7 @@ def _word(value: Any) -> str | None:
 
 
 def _for_text(table: Any) -> Any:
-    """Dates, times of day and lists of times as text; the rest is known to ``text``."""
+    """Dates, times of day and lists of times as text; ``text`` handles the other types."""
     import pyarrow as pa
 
     for number, field in enumerate(table.schema):
@@ -126,7 +129,7 @@ def _for_text(table: Any) -> Any:
 
 
 def _interval(value: Any) -> str | None:
-    """As DuckDB says it: 1 month 2 days 00:00:01.5."""
+    """An interval as DuckDB prints it: 1 month 2 days 00:00:01.5."""
     if value is None:
         return None
     words = [f"{count} {name}{'s' * (abs(count) != 1)}" for count, name in _calendar(value) if count]

@@ -1,10 +1,10 @@
-"""SQL on logs: the tables of logs and of folders of tables in a database that reaches nothing else.
+"""SQL on logs: the tables of logs and of folders of tables, in a database without access to other files.
 
     with Database([Path("log.mcap")]) as database:
         answer = database.ask("select topic, count(distinct track_id) from tracks group by topic")
 
-A table comes in when a query names it: from the Parquet file beside the log where that is up to date, otherwise from
-the log. Any channel is a table too, under its name in double quotes. DuckDB is known to this module alone.
+A table is loaded when a query names it: from the Parquet file beside the log if that is up to date, otherwise from the
+log. Each channel is a table, too, under its name in double quotes. Only this module knows DuckDB.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from mcaptrack.errors import McaptrackError, command
 from mcaptrack.files import follow_links
 from mcaptrack.log.paths import results_path
 from mcaptrack.tables import TABLES
-from mcaptrack.tables.export import TOPICS, Contents, default_folder, standing, topic_folder
+from mcaptrack.tables.export import TOPICS, LogTables, current_file, default_folder, topic_folder
 
 __all__ = ["Database"]
 
-#: What the database may do: compute, with what is in memory. The rest of DuckDB's settings are locked as they are.
+#: Settings of a database that only computes with what is in memory. All settings are locked.
 _CLOSED: Final = {
     "autoinstall_known_extensions": "false",
     "autoload_known_extensions": "false",
@@ -35,10 +35,10 @@ _CLOSED: Final = {
     "python_enable_replacements": "false",
     "temp_directory": "",
 }
-#: Statements that ask, or that make something which is gone with the database.
+#: Statements that ask, or that create something temporary.
 _ASKING: Final = ("SELECT", "EXPLAIN", "CREATE", "SET", "VARIABLE_SET", "RELATION", "MULTI")
 _ANSWERING: Final = ("SELECT", "EXPLAIN", "RELATION", "MULTI")
-#: Files that can be given as tables, by the end of their name, and the method that reads them.
+#: The suffixes of files that can be given as tables, and the method that reads each.
 _READERS: Final = {
     ".parquet": "read_parquet",
     ".csv": "read_csv",
@@ -50,31 +50,31 @@ _READERS: Final = {
 _MISSING: Final = re.compile(r'Table with name "?(.+?)"? does not exist')
 
 
-class _Source(Protocol):
-    """A log, or what a folder of tables holds of one."""
+class _TableSource(Protocol):
+    """A log, or the tables of a log in a folder."""
 
     recording: str
     where: Path
 
     def part(self, name: str) -> Any:
-        """One of ``TABLES`` as Arrow or as a Parquet file; None if it isn't there."""
+        """One of ``TABLES`` as Arrow or as a Parquet file; None if it does not exist."""
 
     def channel(self, topic: str) -> Any:
-        """The table of a channel; None if it isn't there."""
+        """The table of a channel; None if it does not exist."""
 
     def channels(self) -> list[str]:
         """The channels that have tables of their own."""
 
 
-class _OfLog:
+class _LogTables:
     def __init__(self, path: Path) -> None:
         self.opened = log.read(path)
-        self.contents = Contents(self.opened)
+        self.contents = LogTables(self.opened)
         self.recording = self.contents.recording
         self.where = follow_links(path).parent
 
     def part(self, name: str) -> Any:
-        return standing(self.contents, default_folder(self.opened.path), name) or self.contents.table(name)
+        return current_file(self.contents, default_folder(self.opened.path), name) or self.contents.table(name)
 
     def channel(self, topic: str) -> Any:
         return self.contents.messages(topic)[0] if topic in self.opened.channels else None
@@ -83,7 +83,7 @@ class _OfLog:
         return sorted(self.opened.channels)
 
 
-class _OfFolder:
+class _FolderTables:
     def __init__(self, folder: Path, recording: str) -> None:
         self.folder, self.recording = folder, recording
         self.where = follow_links(folder)
@@ -98,30 +98,38 @@ class _OfFolder:
 
     def channels(self) -> list[str]:
         paths = sorted((self.folder / TOPICS).glob(f"*/{self._member.parent.name}/{self._member.name}"))
-        known = (tables.described(path, "parquet") or {} for path in paths)
+        known = (tables.file_metadata(path, "parquet") or {} for path in paths)
         return [words["topic"] for words in known if "topic" in words]
 
 
 class Database:
-    """The tables of logs, and of folders as ``mcaptrack export`` writes them, to be asked in SQL. A context manager.
+    """A database with the tables of logs, and of folders as ``mcaptrack export`` writes them. A context manager.
 
-    ``recording`` tells logs apart: by name, and by folder and name where two have the same. ``files`` are more tables,
-    by name: CSV, JSON or Parquet. Queries read these and nothing else, and leave nothing behind. Raises McaptrackError
-    if there is nothing to read, and if DuckDB isn't installed.
+    Parameters
+    ----------
+    paths : sequence of Path
+        Logs and folders. The column ``recording`` has their names, with folders where names are the same.
+    files : mapping of str to Path, optional
+        More tables by name: CSV, JSON or Parquet. Queries read nothing else, and leave nothing behind.
+
+    Raises
+    ------
+    McaptrackError
+        If there is nothing to read, or if DuckDB isn't installed.
     """
 
     def __init__(self, paths: Sequence[Path], files: Mapping[str, Path] | None = None) -> None:
         self._stack = ExitStack()
         with ExitStack() as opening:
             self._duckdb = _duckdb()
-            #: Where the tables that were asked for came from, in words.
+            #: The sources of the tables that were loaded, as text.
             self.notes: list[str] = []
-            self._here: set[str] = set()
-            self._sources = [source for path in _different(paths) for source in self._opened(path, opening)]
-            self._names = _told_apart(self._sources)
+            self._loaded: set[str] = set()
+            self._sources = [source for path in _unique_paths(paths) for source in self._opened(path, opening)]
+            self._names = _unique_names(self._sources)
             self._connection = opening.enter_context(self._duckdb.connect(":memory:", config=_CLOSED))
             for name, path in (files or {}).items():
-                self._take(name, path)
+                self._load_file(name, path)
             for setting in ("TimeZone = 'UTC'", "enable_external_access = false", "lock_configuration = true"):
                 self._connection.execute(f"SET {setting}")
             self._stack = opening.pop_all()
@@ -133,12 +141,12 @@ class Database:
         self.close()
 
     def close(self) -> None:
-        """Let go of all files."""
+        """Close all files."""
         self._stack.close()
 
     @property
     def recordings(self) -> tuple[str, ...]:
-        """The logs, as the column ``recording`` has them."""
+        """The names of the logs, as in the column ``recording``."""
         return tuple(self._names)
 
     @property
@@ -147,17 +155,17 @@ class Database:
         return tuple(sorted({topic for source in self._sources for topic in source.channels()}))
 
     def ask(self, query: str) -> Any:
-        """What the last question of a query answers, an Arrow table; times are UTC, to the nanosecond (DuckDB 2).
+        """The answer of the last question in a query, an Arrow table; times are UTC in nanoseconds (DuckDB 2).
 
-        Raises McaptrackError, in one line, for what DuckDB refuses.
+        Raises McaptrackError, in one line, for errors of DuckDB.
         """
         duckdb = self._duckdb
         try:
             answer = self._answer(query)
         except duckdb.OutOfMemoryException as error:
             raise McaptrackError(f"the query needs more memory than there is: {_first(error)}") from None
-        except (duckdb.Error, RuntimeError) as error:  # the latter is DuckDB's too
-            raise McaptrackError(self._words(str(error), query)) from None
+        except (duckdb.Error, RuntimeError) as error:  # DuckDB raises these, too
+            raise McaptrackError(self._error_text(str(error), query)) from None
         if answer is None:
             raise McaptrackError("the query asks nothing; it needs a SELECT")
         return tables.tidy(answer)
@@ -177,20 +185,25 @@ class Database:
         return answer
 
     def _run(self, statement: Any) -> Any:
-        """The answer of a statement, Arrow or None; the tables it names are brought in before, and when it fails."""
+        """The answer of a statement, Arrow or None; loads the tables that it names, and those that DuckDB then
+        misses.
+        """
         with suppress(self._duckdb.Error):
             for name in self._connection.get_table_names(statement.query):
-                self._bring(name)
+                self._load(name)
         while True:
             try:
                 return self._computed(statement)
             except self._duckdb.CatalogException as error:
                 missing = _MISSING.search(str(error))
-                if not missing or not self._bring(missing.group(1)):
+                if not missing or not self._load(missing.group(1)):
                     raise
 
     def _computed(self, statement: Any) -> Any:
-        """What a statement answers, Arrow or None. It runs beside, because Ctrl-C only reaches who does not compute."""
+        """The answer of a statement, Arrow or None.
+
+        Python handles SIGINT only between bytecodes, so the query runs in another thread, which this one can interrupt.
+        """
 
         def compute() -> Any:
             relation = self._connection.sql(statement)
@@ -206,10 +219,10 @@ class Database:
                     wait([running], 0.05)
                 raise
 
-    def _bring(self, name: str) -> bool:
-        """Make a table known to the database; False if it is known already or there is none."""
+    def _load(self, name: str) -> bool:
+        """Load a table; False if it is loaded already or does not exist."""
         lower = name.lower()
-        if name in self._here or lower in self._here:
+        if name in self._loaded or lower in self._loaded:
             return False
         if lower in TABLES:
             name, columns = lower, TABLES[lower].arrow
@@ -224,19 +237,19 @@ class Database:
             words = f"from {part}" if isinstance(part, Path) else "read from the log; exported tables would be quicker"
             self.notes.append(f"{recording}: {name} {words}")
         self._connection.register(name, tables.join(parts, columns))
-        self._here.add(name)
+        self._loaded.add(name)
         return True
 
-    def _named(self) -> list[tuple[str, _Source]]:
+    def _named(self) -> list[tuple[str, _TableSource]]:
         return list(zip(self._names, self._sources, strict=True))
 
-    def _opened(self, path: Path, opening: ExitStack) -> list[_Source]:
+    def _opened(self, path: Path, opening: ExitStack) -> list[_TableSource]:
         if not path.is_dir():
-            source = _OfLog(path)
+            source = _LogTables(path)
             opening.enter_context(source.opened)
             return [source]
         found = {member.name.partition("=")[2] for name in TABLES for member in (path / name).glob("recording=*")}
-        readers = [_OfFolder(path, name) for name in sorted(found)]
+        readers = [_FolderTables(path, name) for name in sorted(found)]
         there = [reader for reader in readers if any(reader.part(table) for table in TABLES)]
         if not there:
             log.refuse_non_mcap(path)
@@ -246,8 +259,8 @@ class Database:
             )
         return [*there]
 
-    def _take(self, name: str, path: Path) -> None:
-        """A file as a table, read now."""
+    def _load_file(self, name: str, path: Path) -> None:
+        """Load a file as a table."""
         reader = _READERS.get(path.suffix.lower())
         if reader is None:
             raise McaptrackError(f"{path}: tables are read from files that end with {', '.join(_READERS)}")
@@ -261,13 +274,13 @@ class Database:
             getattr(self._connection, reader)(str(path)).create(name)
         except self._duckdb.Error as error:
             raise McaptrackError(f"{path} can't be read as a table: {_first(error)}") from None
-        self._here.add(name.lower())
+        self._loaded.add(name.lower())
 
-    def _words(self, error: str, query: str) -> str:
-        """A message of DuckDB's in one line, with what there is."""
+    def _error_text(self, error: str, query: str) -> str:
+        """A message of DuckDB in one line, with the tables that exist."""
         if missing := _MISSING.search(error):
             name = missing.group(1)
-            known = [*TABLES, *sorted(self._here - set(TABLES))]
+            known = [*TABLES, *sorted(self._loaded - set(TABLES))]
             channels = self.channels if "/" in name else ()
             close = get_close_matches(name, [*known, *channels], 1) or get_close_matches(name.lower(), known, 1)
             nearest = f" (did you mean {close[0]}?)" if close else ""
@@ -297,8 +310,8 @@ def _duckdb() -> Any:
     return duckdb
 
 
-def _different(paths: Sequence[Path]) -> list[Path]:
-    """Paths, each once; the results of a log that is among them are part of it."""
+def _unique_paths(paths: Sequence[Path]) -> list[Path]:
+    """Paths without repetitions, and without results of a log that is among them."""
     by_place: dict[Path, Path] = {}
     for path in paths:
         by_place.setdefault(follow_links(path), path)
@@ -306,8 +319,8 @@ def _different(paths: Sequence[Path]) -> list[Path]:
     return [path for place, path in by_place.items() if place not in results]
 
 
-def _told_apart(sources: Sequence[_Source]) -> list[str]:
-    """The names of logs; those of the same name with as many of the folders they are in as it takes."""
+def _unique_names(sources: Sequence[_TableSource]) -> list[str]:
+    """Names of logs; equal ones get as many of their folders as make them differ."""
     names = [source.recording for source in sources]
     for depth in range(1, 1 + max((len(source.where.parts) for source in sources), default=0)):
         again = {name for name, count in Counter(names).items() if count > 1}

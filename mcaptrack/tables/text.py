@@ -1,7 +1,7 @@
-"""Tables as text: CSV as RFC 4180 has it, and a JSON object a line.
+"""Tables as text: CSV (RFC 4180), and JSON lines with an object for each row.
 
-What is missing is an empty field in CSV and null in JSON; numbers that JSON doesn't know are "Infinity", "-Infinity"
-and "NaN", as protobuf writes them. Times are text of ISO 8601 with nanoseconds. Lists in CSV are JSON.
+Missing values are empty in CSV and null in JSON; numbers that JSON does not have are "Infinity", "-Infinity" and "NaN",
+as in protobuf's JSON. Times are ISO 8601 with nanoseconds. Lists in CSV are JSON.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _PIECE = 16_384
 
 
 def write(path: Path, table: Any, form: str) -> None:
-    """Write a table as "csv" or "jsonl". Raises RuntimeError if reading it back gives something else."""
+    """Write a table as "csv" or "jsonl". Raises RuntimeError if it does not read back identically."""
     written = hashlib.sha256()
     with path.open("xb") as stream:
         for piece in csv(table) if form == "csv" else json_lines(table):
@@ -32,7 +32,7 @@ def write(path: Path, table: Any, form: str) -> None:
 
 
 def json_lines(table: Any) -> Iterator[bytes]:
-    """A table as JSON, an object a line."""
+    """A table as JSON, one object a line."""
     for row in rows(table):
         yield (json.dumps(row, ensure_ascii=False, allow_nan=False) + "\n").encode("utf-8")
 
@@ -57,7 +57,7 @@ def csv(table: Any) -> Iterator[bytes]:
 
 
 def iso(column: Any) -> Any:
-    """Times as text, with as many digits after the point as they have; a Z where they are known to be UTC."""
+    """Times as text, with their number of decimals; a Z if they are in UTC."""
     import pyarrow as pa
     import pyarrow.compute as pc
 
@@ -66,7 +66,7 @@ def iso(column: Any) -> Any:
 
 
 def rows(table: Any) -> Iterator[dict[str, Any]]:
-    """The rows of a table as JSON has them."""
+    """The rows of a table with values that JSON supports."""
     import pyarrow as pa
 
     for number, field in enumerate(table.schema):

@@ -130,7 +130,7 @@ class Job:
             if role == "detections" and labels.boxes_px is None:
                 raise McaptrackError(f"{path} holds positions, not boxes; detections are boxes")
             if role != "detections" and not labels.identified:
-                raise McaptrackError(f"{path} says of nobody who it is (all ids are -1); {role} need ids")
+                raise McaptrackError(f"{path} has no ids (all are -1); {role} need ids")
 
     def tell(self) -> None:
         """Say what of the labels is left out or taken for something."""

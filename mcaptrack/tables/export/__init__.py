@@ -1,10 +1,10 @@
-"""A log as tables: one folder a table, one file a log, ready for DuckDB, Polars and pandas.
+"""A log as tables: a folder for each table, a file for each log, ready for DuckDB, Polars and pandas.
 
     <folder>/<table>/recording=<name of the log>/part-0.parquet
-    <folder>/topics/<channel>/recording=<name of the log>/part-0.parquet     channels of others that were asked for
+    <folder>/topics/<channel>/recording=<name of the log>/part-0.parquet     foreign channels, on request
 
-What has not changed since it was exported is not touched. ``recordings`` is written last: where its digest is that of
-the log, so are the others.
+Files that have not changed since the last export are not touched. ``recordings`` is written last: if its digest is that
+of the log, all tables are up to date.
 """
 
 from __future__ import annotations
@@ -18,10 +18,19 @@ from typing import Final
 from mcaptrack import __version__, log, tables
 from mcaptrack.errors import McaptrackError
 from mcaptrack.tables import TABLES, Format
-from mcaptrack.tables.export.contents import Contents
+from mcaptrack.tables.export.contents import LogTables
 from mcaptrack.tables.export.names import file_name, recording_name, topic_folder
 
-__all__ = ["TOPICS", "Contents", "Exported", "default_folder", "export", "recording_name", "standing", "topic_folder"]
+__all__ = [
+    "TOPICS",
+    "Exported",
+    "LogTables",
+    "current_file",
+    "default_folder",
+    "export",
+    "recording_name",
+    "topic_folder",
+]
 
 #: The folder of the tables of single channels.
 TOPICS: Final = "topics"
@@ -29,7 +38,7 @@ TOPICS: Final = "topics"
 
 @dataclass
 class Exported:
-    """What a folder holds of a log now: rows of each table, which of them were written, and words about them."""
+    """The tables of a log in a folder: rows of each, which were written and removed, and notes for people."""
 
     rows: dict[str, int] = field(default_factory=dict)
     written: list[str] = field(default_factory=list)
@@ -38,14 +47,14 @@ class Exported:
 
 
 def default_folder(path: Path) -> Path:
-    """Where the tables of a log go unless said otherwise: log.mcap -> log.tables beside it."""
+    """The default folder for the tables of a log: log.mcap -> log.tables beside it."""
     return path.with_suffix(".tables")
 
 
-def standing(contents: Contents, folder: Path, name: str) -> Path | None:
-    """The Parquet file of a table in a folder, if it is what exporting the table now would write."""
+def current_file(contents: LogTables, folder: Path, name: str) -> Path | None:
+    """The Parquet file of a table in a folder, if it is up to date."""
     path = folder.joinpath(name, f"recording={contents.recording}", "part-0.parquet")
-    known = tables.described(path, "parquet") or {}
+    known = tables.file_metadata(path, "parquet") or {}
     said = (known.get("recording"), known.get("table_version"), known.get("source"))
     now = (file_name(contents.opened.path), tables.TABLE_VERSION)
     return path if said[:2] == now and said[2] == contents.source(name) else None
@@ -61,15 +70,32 @@ def export(
     blobs: bool = False,
     force: bool = False,
 ) -> Exported:
-    """Bring the tables of a log in a folder up to date. Tables without rows are written too, with their columns.
+    """Update the tables of a log in a folder. Tables without rows are written, too, with their columns.
 
-    With ``force`` all of them are made again, and those of another log of the same name are replaced.
+    Parameters
+    ----------
+    opened : Log
+    folder : Path
+    progress : callable
+        Called with a text, the number of finished tables and their total.
+    form : {"parquet", "arrow", "csv", "jsonl"}
+    topics : sequence of str
+        Foreign channels that get tables of their own. Existing ones are updated, and removed if their channel is gone.
+    blobs : bool
+        Whether these tables have fields of bytes.
+    force : bool
+        Write all tables again, and replace those of another log with the same name.
 
-    ``topics`` are channels of others that get tables of their own, with fields of bytes if ``blobs``; those that have
-    one already are kept up to date, and go when their channel is gone. Raises McaptrackError if a channel isn't there
-    or can't be read, and if the folder holds another log's tables under the name of this one.
+    Returns
+    -------
+    Exported
+
+    Raises
+    ------
+    McaptrackError
+        If a channel does not exist or can't be read, and if the folder holds tables of another log with the same name.
     """
-    contents = Contents(opened)
+    contents = LogTables(opened)
     for topic in topics:
         opened.channel(topic)
     job = _Job(contents, folder, form, force, Exported())
@@ -91,7 +117,7 @@ def export(
 
 @dataclass
 class _Job:
-    contents: Contents
+    contents: LogTables
     folder: Path
     form: Format
     force: bool
@@ -101,7 +127,7 @@ class _Job:
         return self.folder.joinpath(*names, f"recording={self.contents.recording}", f"part-0.{self.form}")
 
     def table(self, name: str) -> None:
-        """Bring one of ``TABLES`` up to date."""
+        """Update one of ``TABLES``."""
         words = {"lineage": self.contents.lineage(name), "source": self.contents.source(name)}
         path = self.path(name)
         if not self._stands(name, path, words["source"]):
@@ -111,11 +137,11 @@ class _Job:
             self.done.notes += [f"{name}: {note}"] if note else []
 
     def messages(self, topic: str, blobs: bool) -> None:
-        """Bring the table of a channel up to date."""
+        """Update the table of a channel."""
         name = f"{TOPICS}/{topic_folder(topic)}"
         path = self.path(*name.split("/"))
         words = {"topic": topic, "blobs": str(blobs).lower(), "source": self.contents.messages_source(topic, blobs)}
-        known = tables.described(path, self.form) or {}
+        known = tables.file_metadata(path, self.form) or {}
         if not self._stands(name, path, words["source"]):
             made, left_out = self.contents.messages(topic, blobs)
             words |= {"left_out": ", ".join(left_out)} if left_out else {}
@@ -124,10 +150,10 @@ class _Job:
         self.done.notes += [f"{topic}: {left} left out, bytes; --blobs keeps them"] if left else []
 
     def _stands(self, name: str, path: Path, source: str) -> bool:
-        """Whether a table is there already as it would be, and may stay."""
+        """Whether a table is up to date and may stay."""
         if self.force:
             return False
-        known = tables.described(path, self.form) or {}
+        known = tables.file_metadata(path, self.form) or {}
         file = file_name(self.contents.opened.path)
         if known.get("recording", file) != file:
             raise McaptrackError(
@@ -146,10 +172,10 @@ class _Job:
         self.done.rows[name] = rows
 
     def known_topics(self) -> dict[str, bool]:
-        """The channels of this log that have tables of their own in the folder, and whether with bytes."""
+        """The channels of this log with tables of their own in the folder, and whether these have bytes."""
         out = {}
         for path in self._topic_files():
-            known = tables.described(path, self.form) or {}
+            known = tables.file_metadata(path, self.form) or {}
             if known.get("recording") == file_name(self.contents.opened.path) and "topic" in known:
                 out[known["topic"]] = known.get("blobs") == "true"
         return out
@@ -161,7 +187,7 @@ class _Job:
         yield from (path for member in members if (path := member.joinpath(*tail)).is_file())
 
     def remove(self, topics: Sequence[str]) -> None:
-        """Tables of channels that are gone go too, with the folders that are empty then."""
+        """Remove tables of channels that are gone, and folders that are empty then."""
         for topic in topics:
             path = self.path(TOPICS, topic_folder(topic))
             path.unlink(missing_ok=True)

@@ -1,4 +1,4 @@
-"""What a log holds, as tables: each built when it is asked for, and told apart from what it was before."""
+"""The contents of a log as tables, built on demand, with digests that tell when they change."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ from mcaptrack.sources.foreign.flatten import flattener, message_type_of
 from mcaptrack.tables import TABLES, Part, Pointers
 from mcaptrack.tables.export.names import file_name, recording_name
 
-#: Tables that say where messages stand, or what the whole log is.
+#: Tables about the places of messages, or about the whole log.
 _OF_THE_WHOLE: Final = ("frames", "channels", "recordings")
 
 
-class Contents:
-    """The tables of a log. Rows are read once and kept, since several tables are made of the same."""
+class LogTables:
+    """The tables of a log. Rows are read once and kept, because several tables are made of them."""
 
     def __init__(self, opened: log.Log) -> None:
         self.opened = opened
         self.recording = recording_name(opened.path)
         self._parts: dict[str, Part] = {}
-        #: What tables have to say about themselves, by name.
+        #: Notes about tables, by name.
         self.notes: dict[str, str] = {}
 
     def table(self, name: str) -> Any:
@@ -53,7 +53,7 @@ class Contents:
         return made[name]()
 
     def topics(self, name: str) -> list[str]:
-        """The channels that a table is made of, in order."""
+        """The channels from which a table is made, in order."""
         if name in ("channels", "recordings"):
             return sorted(self.opened.channels)
         if name == "frames":
@@ -74,14 +74,14 @@ class Contents:
         return sorted(found)
 
     def source(self, name: str) -> str:
-        """What a table is made from: another digest when the table may be another. Reads no messages."""
+        """A digest of the input of a table, which changes when the table may change. Reads no messages."""
         whole = name in _OF_THE_WHOLE
         of = [self.opened.fingerprint()] if whole else [self.opened.fingerprint(topic) for topic in self.topics(name)]
         files = [file_name(part.path) for part in self.opened.parts]
         return _digest([name, __version__, self.recording, files, of])
 
     def lineage(self, name: str) -> str:
-        """How the channels of a table came about, back to what was recorded, as JSON."""
+        """The provenance of the channels of a table, back to recorded channels, as JSON."""
         out: dict[str, Any] = {}
         todo = [] if name in _OF_THE_WHOLE else list(self.topics(name))
         while todo:
@@ -93,17 +93,17 @@ class Contents:
                 todo.append(made.input)
         return json.dumps(out, sort_keys=True, separators=(",", ":"))
 
-    # Channels of others
+    # Foreign channels
 
     def messages_source(self, topic: str, blobs: bool) -> str:
-        """What ``messages`` of a topic are made from."""
+        """A digest of the input of ``messages`` of a topic."""
         places = self._pointers(topic, of_rows=False)
-        # The table says where messages stand: that they moved is a change.
+        # The table has the places of messages, so it changes when they move.
         where = hashlib.sha256(places.chunk_offset.tobytes() + places.message_offset.tobytes()).hexdigest()
         return _digest([topic, __version__, self.recording, places.file, self.opened.fingerprint(topic), where, blobs])
 
     def messages(self, topic: str, blobs: bool = False) -> tuple[Any, list[str]]:
-        """The messages of any channel as a table, flat, and the fields that were left out.
+        """The messages of any channel as a flat table, and the fields that were left out.
 
         Raises McaptrackError, with topic and time, for messages that can't be read.
         """
@@ -123,7 +123,7 @@ class Contents:
 
         return tables.messages_table(topic, kind.name, places, rows(), blobs)
 
-    # What tables are made of
+    # Parts of tables
 
     def _part(self, topic: str) -> Part:
         if topic not in self._parts:
@@ -139,7 +139,7 @@ class Contents:
         return self._parts[topic]
 
     def _boxes(self, topic: str) -> Part:
-        """Boxes of others; none, and a note, if they can't be read: the other tables don't depend on them."""
+        """Foreign boxes; none, and a note, if they can't be read: the other tables don't depend on them."""
         try:
             frames = foreign.detections(self.opened, topic)
         except McaptrackError as error:
@@ -162,7 +162,7 @@ class Contents:
         return Pointers(file, places.t_ns, frame, rows, places.chunk_offset, places.offset)
 
     def _labelled(self) -> list[Camera]:
-        """The cameras that have a ground truth."""
+        """The cameras with ground truth."""
         tracks = self.topics("tracks")
         return [camera for camera in cameras(self.opened) if camera.truth in tracks]
 
@@ -176,7 +176,7 @@ class Contents:
             try:
                 sequence = evaluation.sequence_of_log(self.opened, camera.prefix, ())
                 outcome = evaluation.evaluate([sequence], evaluation.EvaluateOptions())
-            except McaptrackError as error:  # there is nothing that could be compared
+            except McaptrackError as error:  # nothing can be compared
                 self._note("metrics", str(error))
                 continue
             for result in outcome.results:

@@ -1,4 +1,4 @@
-"""Names of logs and channels as names of folders: whatever they hold, nothing climbs and nothing collides by chance."""
+"""Names of logs and channels as names of folders: they can't leave the folder, and do not collide."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ import re
 from pathlib import Path
 from typing import Final
 
-#: Names that are longer are cut, with a digest of the whole behind them; file systems take 255 bytes.
+#: Longer names are cut, with a digest of the whole name; file systems allow 255 bytes.
 _MAX_BYTES: Final = 200
 
 
-#: Words that readers of partitions take for something else than text.
+#: Words that readers of partitions do not take for text.
 _NO_TEXT: Final = ("nan", "inf", "infinity", "true", "false", "null", "none")
 
 
 def recording_name(path: Path) -> str:
-    """The name of a log as it can stand in a path and in a partition: no slash, no equals sign, nothing that climbs.
+    """The name of a log for a path and a partition: without slashes, equals signs and leading dots.
 
     Names that readers would take for numbers or dates (0001 would become 1) get "log-" before them.
     """
@@ -27,7 +27,7 @@ def recording_name(path: Path) -> str:
 
 
 def file_name(path: Path) -> str:
-    """The name of a file as text; of bytes that are no UTF-8 the numbers, since tables hold nothing but text."""
+    """The name of a file as text; bytes that are not UTF-8 are escaped, because tables hold only text."""
     return os.fsencode(path.name).decode("utf-8", "backslashreplace")
 
 
