@@ -63,7 +63,7 @@ def test_mot17_distractors_count_neither_way(tmp_path):
     row, notes = scores(write(tmp_path / "t.txt", *found), write(tmp_path / "gt.txt", *truth))
     assert (row["GT"], row["FN"]) == (1, 0)
     assert row["FP"] == 10  # the car's and the other's; the statue's is forgiven
-    assert any("5 boxes of" in note and "count neither way" in note for note in notes)
+    assert any("5 boxes of" in note and "are ignored" in note for note in notes)
 
 
 def test_a_track_between_a_pedestrian_and_a_statue_is_the_pedestrians(tmp_path):
