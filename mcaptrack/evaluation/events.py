@@ -222,7 +222,7 @@ def _misses(comparison: _Comparison) -> tuple[Ints, Rows]:
 
 
 def _false_tracks(comparison: _Comparison) -> tuple[Ints, Rows]:
-    """Periods in which a track matches no person; ``previous_id`` is the person whom it matched last."""
+    """Periods in which a track matches no person; ``previous_id`` is the person of its last match."""
     found, (_, ground_truth, tracks) = comparison.found, comparison.compared
     t_ns, places, periods = _periods(tracks, found.column, comparison.t_ns)
     order = np.lexsort((found.frame, found.track))

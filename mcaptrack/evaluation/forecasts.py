@@ -53,7 +53,7 @@ class _PredictionClock(NamedTuple):
         return np.rint((t_ns - self.start_ns) / (self.step_s * NS_PER_S)).astype(np.int64)
 
     def positions(self, frames: Sequence[Frame]) -> Positions:
-        """The positions of tracks whose frames are ticks of this clock."""
+        """The positions of tracks with frames at ticks of this clock."""
         joined = join_frames(TRACKS, frames)
         ids = joined.rows["track_id"].astype(np.int64)
         return Positions(self.to_step(joined.row_ns), ids, on_ground(joined.rows))

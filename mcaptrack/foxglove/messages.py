@@ -14,7 +14,7 @@ ANNOTATIONS: Final = "foxglove.ImageAnnotations"
 SCENE: Final = "foxglove.SceneUpdate"
 TRANSFORM: Final = "foxglove.FrameTransform"
 LOG: Final = "foxglove.Log"
-#: Schemas whose messages are pictures.
+#: Schemas of pictures.
 PICTURES: Final = (VIDEO, IMAGE)
 
 

@@ -60,7 +60,7 @@ class SceneMessages:
         """Draw people at (N, 2) with their numbers and a trail through points (N, P, 2), oldest first.
 
         ``fade`` (P,) is the opacity at each point. A trail in pieces is drawn between the first and the second point,
-        the third and the fourth, and so on. People whose trails have other numbers of points need another call.
+        the third and the fourth, and so on. Trails with another number of points need another call.
         """
         xy, trail = _short(xy_m), _short(trail_m)
         for length, chosen, words in by_length(numbers):

@@ -32,7 +32,7 @@ from mcaptrack.sources.ingest.label_job import LabelJob
 from mcaptrack.sources.ingest.labels.formats import KITTI_HEIGHT_PX, PERSON, Aside, Labels, Role
 from mcaptrack.sources.ingest.labels.reading import read_homography, read_labels
 
-#: Formats whose rows have the number of their frame in the video.
+#: Formats that give the frame number of each row.
 _COUNTING: Final = ("mot", "kitti", "parquet")
 _ALIKE: Final = 0.5
 #: The largest size of a file that can be blank.

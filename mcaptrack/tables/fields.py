@@ -55,7 +55,7 @@ class Field:
 class Table:
     """A table: the meaning of a row, the key columns within a recording, and the order of rows.
 
-    ``rows_of`` is the schema of the channels whose rows it holds, None for tables about a log.
+    ``rows_of`` is the schema of its rows, None for tables about a log.
     """
 
     name: str

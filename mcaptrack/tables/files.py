@@ -135,7 +135,7 @@ def file_metadata(path: Path, form: Format) -> dict[str, str] | None:
     try:
         if form not in ("parquet", "arrow"):
             return None
-        with path.open("rb") as stream:  # Arrow opens no file whose name is not UTF-8
+        with path.open("rb") as stream:  # Arrow opens no file with a name that is not UTF-8
             file_metadata = pq.read_metadata(stream) if form == "parquet" else pa.ipc.open_file(stream).schema
             found = file_metadata.metadata or {}
     except (OSError, pa.ArrowException):

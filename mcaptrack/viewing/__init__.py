@@ -1,1 +1,1 @@
-"""What people look at: the report, pictures with what was found on them, and logs served to viewers."""
+"""What people look at: the report, videos with drawings, and logs served to viewers."""

@@ -1,4 +1,4 @@
-"""Where viewers are, and how an address tells them what to open."""
+"""Addresses that open logs in web viewers."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ FOXGLOVE: Final = "https://app.foxglove.dev/"
 
 
 def viewer_links(logs: list[str], layout: str | None, lichtblick: str = LICHTBLICK) -> dict[str, str]:
-    """Addresses that open logs in Lichtblick, with their layout, and in Foxglove, which imports layouts by hand."""
+    """Addresses that open logs in Lichtblick, with a layout, and in Foxglove, where layouts are imported by hand."""
     sources = [("ds", "remote-file"), *(("ds.url", address) for address in logs)]
     with_layout = [*sources, ("layoutUrl", layout)] if layout else sources
     return {

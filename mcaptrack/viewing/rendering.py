@@ -1,6 +1,6 @@
-"""The pictures of a log with what its views draw on them, as a video for people without a viewer.
+"""A video of the pictures of a log with the drawings of its views, for people without a viewer.
 
-What is drawn are the annotation messages themselves, so colours, ids, trails and forecasts are those of every viewer.
+The annotation messages themselves are drawn, so that colours, ids, trails and forecasts are the same as in viewers.
 
 Letters: P points.
 """
@@ -24,14 +24,14 @@ from mcaptrack.sources.pictures import Pictures
 from mcaptrack.sources.video import write_clip
 
 _LINE_LOOP, _LINE_STRIP, _LINE_LIST = 2, 3, 4
-#: Coordinates are drawn to this many binary places of a pixel.
+#: The number of binary places of pixel coordinates.
 _SHIFT: Final = 4
 _GIF_FPS: Final = 10.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class RenderOptions:
-    """What to draw: so many pixels wide (None: as the pictures are), at most so many pictures a second, which seconds.
+    """What to render: the width in pixels (None: that of the pictures), the highest frame rate, and the period.
 
     Seconds count from the first picture.
     """
@@ -50,10 +50,28 @@ def render(
     options: RenderOptions,
     progress: Callable[[str, int, int], None] = lambda *_: None,
 ) -> int:
-    """Draw views on the pictures of a channel, and write the video ``output``; returns how many pictures it has.
+    """Draw views on the pictures of a channel and write a video, .mp4 or .gif by the suffix of ``output``.
 
-    Its suffix says what it becomes: .mp4 or .gif. Raises McaptrackError if there is nothing to draw on, or if pictures
-    can't be decoded.
+    Parameters
+    ----------
+    opened : Log
+    picture_topic : str
+    view_topics : sequence of str
+        Channels of ImageAnnotations, drawn in this order.
+    output : Path
+    options : RenderOptions
+    progress : callable
+        Called with "render", the number of finished pictures and their total.
+
+    Returns
+    -------
+    int
+        The number of pictures in the video.
+
+    Raises
+    ------
+    McaptrackError
+        If there are no pictures in the period, or if they can't be decoded.
     """
     if output.suffix.lower() not in (".mp4", ".gif"):
         raise McaptrackError(f"{output}: a video is rendered to .mp4 or .gif, not to {output.suffix or 'no suffix'}")
@@ -97,7 +115,7 @@ def render(
 
 
 def _at_times(messages: Iterator[log.Message]) -> Callable[[int], bytes | None]:
-    """Messages by time, to be asked for at rising times; None where there is none of just that time."""
+    """A function that returns the message at a time, for rising times; None if there is none at exactly that time."""
     waiting: log.Message | None = next(messages, None)
 
     def at(t_ns: int) -> bytes | None:
@@ -110,7 +128,7 @@ def _at_times(messages: Iterator[log.Message]) -> Callable[[int], bytes | None]:
 
 
 def _scaled(image: Image, width_px: int | None) -> Image:
-    """In the width that was asked for, and of even size, as video has it."""
+    """The picture in the given width, and of even size, as video needs it."""
     import cv2
 
     height, width = image.shape[:2]
@@ -124,7 +142,7 @@ def _scaled(image: Image, width_px: int | None) -> Image:
 
 
 def draw(image: Image, annotations: Any, scale: float = 1.0) -> Image:
-    """An ImageAnnotations message drawn on a picture, BGR (height, width, 3), that is ``scale`` times its size."""
+    """Draw an ImageAnnotations message on a picture, BGR (height, width, 3), that has ``scale`` times its size."""
     import cv2
 
     paint, cover = np.zeros_like(image), np.zeros(image.shape[:2], np.uint8)
@@ -133,7 +151,7 @@ def draw(image: Image, annotations: Any, scale: float = 1.0) -> Image:
         if rgba.a <= 0:
             return
         bgr = tuple(round(255 * part) for part in (rgba.b, rgba.g, rgba.r))
-        # The colour is laid on a little wider than what shows of it, so that soft edges have it too.
+        # The colour is drawn a little wider than its mask, so that soft edges have it, too.
         cv2.polylines(paint, [line], is_closed, bgr, thickness + 2, cv2.LINE_8, _SHIFT)
         cv2.polylines(cover, [line], is_closed, round(255 * rgba.a), thickness, cv2.LINE_AA, _SHIFT)
 
@@ -165,7 +183,7 @@ def draw(image: Image, annotations: Any, scale: float = 1.0) -> Image:
 
 
 def _filled(image: Image, line: NDArray[np.int32], rgba: Any) -> Image:
-    """With the inside of a closed line painted; what others painted there before shows through."""
+    """Paint the inside of a closed line over what was painted before, with the line's opacity."""
     import cv2
 
     cover = np.zeros(image.shape[:2], np.uint8)

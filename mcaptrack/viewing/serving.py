@@ -1,9 +1,9 @@
-"""Logs for viewers in a browser: a few files by HTTP, to this machine alone.
+"""Serve logs to viewers in a browser: a few files by HTTP, only on this machine.
 
-Viewers read a log in ranges and from another origin, so ranges and CORS are what this is about. Addresses begin with a
-secret word, because any page that a browser has open could ask otherwise. Only the files that were named are served.
+Viewers read ranges of a log from another origin, so the server supports ranges and CORS. Addresses begin with a secret
+word, because any page in a browser could send requests. Only the given files are served.
 
-Requests are taken as RFC 9110 and RFC 9112 define them: what is malformed gets 400, and its connection is closed.
+Requests follow RFC 9110 and RFC 9112: malformed ones get 400, and their connection is closed.
 """
 
 from __future__ import annotations
@@ -37,17 +37,17 @@ _AUTHORITY: Final = re.compile(r"([0-9A-Za-z._~!$&'()*+,;=%-]+|\[[0-9A-Fa-f:.]+\
 _ABSOLUTE: Final = re.compile(r"http://([^/?#]*)(/[^#]*)?", re.IGNORECASE)
 _RANGES: Final = re.compile(r"bytes=(.*)", re.IGNORECASE)
 _RANGE: Final = re.compile(r"([0-9]*)-([0-9]*)")
-#: More digits than any size of a file has.
+#: More digits than the size of any file has.
 _MANY_DIGITS: Final = 20
 
 
 @dataclass(frozen=True)
 class Limits:
-    """How long and how many. Times are in seconds.
+    """Limits of connections; times are in seconds.
 
-    ``connections`` at once; one more takes the place of the one that has waited longest for its next request.
-    ``head_s`` for all lines of a request, ``idle_s`` for the next request of a connection, ``stall_s`` for a viewer to
-    take some of an answer.
+    ``connections`` is the largest number at once; a further one replaces the one that is idle for the longest time.
+    ``head_s`` is the time for all lines of a request, ``idle_s`` the time until the next request of a connection,
+    ``stall_s`` the time in which a viewer must take a part of an answer.
     """
 
     connections: int = 64
@@ -57,7 +57,7 @@ class Limits:
 
 
 class Server(ThreadingHTTPServer):
-    """Serves files and texts by the names that they are given. ``port`` 0 is any that is free.
+    """Serves files and bytes under their names. ``port`` 0 is any free port.
 
     Raises McaptrackError if the port is taken.
     """
@@ -70,7 +70,7 @@ class Server(ThreadingHTTPServer):
         self.limits = limits
         self.served = {f"/{self._word}/".encode() + os.fsencode(name): content for name, content in served.items()}
         self._lock = threading.Lock()
-        #: The open connections, and since when each waits for a request; None while it is answered.
+        #: The open connections, and the time since which each is idle; None while a request is answered.
         self._idle_since: dict[socket.socket, float | None] = {}
         try:
             super().__init__((LOOPBACK, port), _Handler)
@@ -79,11 +79,11 @@ class Server(ThreadingHTTPServer):
             raise McaptrackError(f"port {port} of this machine can't be used: {why}; choose another") from None
 
     def address(self, name: str) -> str:
-        """Where a viewer finds what has that name."""
+        """The address of a file."""
         return f"http://{LOOPBACK}:{self.server_port}/{self._word}/{quote(os.fsencode(name))}"
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """Answer in a thread, unless too many connections are being answered."""
+        """Answer in a thread, unless all connections are in use."""
         with self._lock:
             if len(self._idle_since) >= self.limits.connections and not self._end_one():
                 _refuse(request)
@@ -92,7 +92,7 @@ class Server(ThreadingHTTPServer):
         super().process_request(request, client_address)
 
     def _end_one(self) -> bool:
-        """End the connection that has waited longest for its next request; False if all are being answered."""
+        """Close the connection that is idle for the longest time; False if none is idle."""
         waiting = {connection: since for connection, since in self._idle_since.items() if since is not None}
         if not waiting:
             return False
@@ -102,7 +102,7 @@ class Server(ThreadingHTTPServer):
         return True
 
     def waits(self, connection: socket.socket, is_idle: bool) -> None:
-        """Note whether a connection waits for a request or is answered."""
+        """Note whether a connection is idle."""
         with self._lock:
             if connection in self._idle_since:
                 self._idle_since[connection] = monotonic() if is_idle else None
@@ -114,12 +114,12 @@ class Server(ThreadingHTTPServer):
         super().shutdown_request(request)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Viewers hang up when they have seen enough, and other threads end connections; that is no fault."""
+        """Report errors, except those of connections that viewers or other threads closed."""
         if not isinstance(sys.exception(), OSError):
             super().handle_error(request, client_address)
 
     def server_close(self) -> None:
-        """Stop listening, and end all connections."""
+        """Stop listening, and close all connections."""
         super().server_close()
         with self._lock:
             for connection in self._idle_since:
@@ -141,7 +141,7 @@ def _refuse(connection: socket.socket) -> None:
 
 
 class _Incoming(io.RawIOBase):
-    """What a connection sends until a moment; TimeoutError after it, also if bytes come one by one."""
+    """The bytes of a connection until a deadline; then TimeoutError, also if bytes arrive one by one."""
 
     def __init__(self, connection: socket.socket) -> None:
         self._connection = connection
@@ -196,11 +196,11 @@ class _Handler(BaseHTTPRequestHandler):
         return True  # the final status follows at once: no content is taken
 
     def _objection(self) -> HTTPStatus | None:
-        """Why a request isn't answered, as a status. A request with content isn't: what follows may be anything."""
+        """The status with which a request is refused, if it is. Requests with content are: none of ours have any."""
         if not self.request_version.startswith("HTTP/1."):
             return HTTPStatus.HTTP_VERSION_NOT_SUPPORTED
         fields = self.headers.items()
-        # The parser is one of mail, which takes a first line for an envelope.
+        # The parser is made for mail, and takes a first line "From ..." for an envelope.
         if self.headers.defects or self.headers.get_unixfrom():
             return HTTPStatus.BAD_REQUEST
         if not all(_TOKEN.fullmatch(name) and _VALUE.fullmatch(value) for name, value in fields):
@@ -217,7 +217,7 @@ class _Handler(BaseHTTPRequestHandler):
         lengths = [value.strip(" \t") for name, value in fields if name.lower() == "content-length"]
         if "Transfer-Encoding" in self.headers or any(not re.fullmatch("0+", length) for length in lengths):
             return HTTPStatus(413)
-        # A page whose name was made to point to this machine sends that name.
+        # A page from a name that resolves to this machine (DNS rebinding) sends that name.
         is_local = named and all(name is not None and name[1].lower() in _LOCAL for name in named)
         return None if is_local else HTTPStatus.NOT_FOUND
 
@@ -231,12 +231,12 @@ class _Handler(BaseHTTPRequestHandler):
         self._head(HTTPStatus.NO_CONTENT, {})
 
     def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
-        """Answer with a status alone, and close the connection."""
-        self.request_version = "HTTP/1.1"  # 0.9 would get no status
+        """Answer with a status, and close the connection."""
+        self.request_version = "HTTP/1.1"  # in 0.9 there would be no status
         self._head(HTTPStatus(code), {"Content-Length": "0", "Connection": "close"})
 
     def log_message(self, format: str, *words: object) -> None:  # noqa: A002  # the name that the library gives it
-        """Say nothing."""
+        """Print nothing."""
 
     def _answer(self, with_body: bool) -> None:
         content = self.server.served.get(unquote_to_bytes(self.path.partition("?")[0].encode("latin-1")))
@@ -260,7 +260,7 @@ class _Handler(BaseHTTPRequestHandler):
         there = os.fstat(stream.fileno())
         tag = f'"{there.st_size:x}-{there.st_mtime_ns:x}"'
         span, status = range(there.st_size), HTTPStatus.OK
-        if with_body and self.headers.get("If-Range", tag).strip(" \t") == tag:  # ranges are for GET alone
+        if with_body and self.headers.get("If-Range", tag).strip(" \t") == tag:  # only GET has ranges
             span, status = requested_range(self.headers.get_all("Range", []), there.st_size)
         headers = {
             "Content-Type": "application/json" if path.suffix == ".json" else "application/octet-stream",
@@ -276,9 +276,9 @@ class _Handler(BaseHTTPRequestHandler):
         if with_body and span:
             try:
                 sent = self.connection.sendfile(stream, span.start, len(span))
-            except OSError:  # the disk's or the viewer's: what was announced can't come any more
+            except OSError:  # the disk or the viewer failed: the announced bytes can't follow
                 sent = 0
-            self.close_connection |= sent < len(span)  # it became shorter
+            self.close_connection |= sent < len(span)  # the file became shorter
 
     def _head(self, status: HTTPStatus, headers: Mapping[str, str]) -> None:
         self.send_response(status)
@@ -297,7 +297,7 @@ class _Handler(BaseHTTPRequestHandler):
 
 
 def _regular(path: Path) -> BinaryIO:
-    """A file, open. Raises OSError for anything else: to open a pipe would wait for who writes to it."""
+    """Open a regular file. Raises OSError for anything else: opening a pipe would wait for a writer."""
     descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
         os.close(descriptor)
@@ -306,10 +306,10 @@ def _regular(path: Path) -> BinaryIO:
 
 
 def requested_range(fields: list[str], size: int) -> tuple[range, HTTPStatus]:
-    """Which bytes of ``size`` the values of a Range field ask for, and the status of the answer, by RFC 9110, 14.
+    """The bytes of a file of ``size`` that the values of a Range field ask for, and the status, by RFC 9110, 14.
 
-    The whole with 200 for no field, a malformed one, another unit, and several satisfiable ranges (which a server may
-    ignore); nothing with 416 where no range begins within the file.
+    The whole file with 200 for no field, a malformed one, another unit, and several satisfiable ranges (which a server
+    may ignore); nothing with 416 if no range begins within the file.
     """
     whole = range(size), HTTPStatus.OK
     asked = _RANGES.fullmatch(fields[0].strip(" \t")) if len(fields) == 1 else None
@@ -336,6 +336,6 @@ def requested_range(fields: list[str], size: int) -> tuple[range, HTTPStatus]:
 
 
 def _number(digits: str) -> int:
-    """A decimal number of any length; above all sizes for one that is too long to be one."""
+    """A decimal number of any length; numbers with too many digits become larger than any size."""
     digits = digits.lstrip("0") or "0"
     return int(digits) if len(digits) < _MANY_DIGITS else 10**_MANY_DIGITS

@@ -117,13 +117,13 @@ class Displacement:
     error_m: Floats  # (P, T): distance of each step from the ground truth; NaN beyond the horizon of shorter forecasts
 
     def curve(self) -> tuple[Floats, Floats]:
-        """Recall (P,) and ADE in m (P,): entry k is for the k + 1 pairs whose pasts agree best."""
+        """Recall (P,) and ADE in m (P,): entry k is for the k + 1 pairs with the most similar pasts."""
         order = np.argsort(self.d_obs_m2, kind="stable")
         count = np.arange(1, len(order) + 1)
         return count / max(self.people, 1), np.cumsum(self.ade_m[order]) / count
 
     def squared_at(self, recall: float) -> float:
-        """The squared ADE in m^2 of the pairs whose pasts agree best, up to a recall; NaN if it is not reached."""
+        """The squared ADE in m^2 of the pairs with the most similar pasts, up to a recall; NaN beyond."""
         count = round(recall * self.people)
         best = np.argsort(self.d_obs_m2, kind="stable")[:count]
         return float(self.ade_squared_m2[best].mean()) if 0 < count == len(best) else float("nan")
@@ -289,7 +289,7 @@ def _best(cost: Floats, row: Ints, column: Ints, which: Ints, down: Ints, across
 def displacement(
     ground_truth: Positions, tracks: Positions, forecasts: Forecasts, t_obs: int = 4, tau_m2: float = TAU_M2
 ) -> Displacement:
-    """Compare the forecasts made for tracks with the true future of the people to whom the tracks are assigned.
+    """Compare the forecasts made for tracks with the true future of the people assigned to the tracks.
 
     Parameters
     ----------
@@ -301,7 +301,7 @@ def displacement(
     t_obs : int
         The number of past positions by which tracks are assigned to people.
     tau_m2 : float, m^2
-        Forecasts whose past is farther from a person than this count as false [1]_.
+        Forecasts of tracks farther than this from a person count as false [1]_.
 
     Returns
     -------

@@ -142,7 +142,7 @@ def forecasts(frames: Sequence[Frame]) -> Iterator[ForecastPaths]:
 
 
 def latest(frames: Sequence[Frame], at_ns: Ints) -> Ints:
-    """The index of the message whose forecasts are shown at each time (F,); -1 for none."""
+    """The index of the message with the forecasts shown at each time (F,); -1 for none."""
     made_ns = frame_times(frames)
     number = np.searchsorted(made_ns, at_ns, "right") - 1
     if len(made_ns):

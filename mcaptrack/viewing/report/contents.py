@@ -29,7 +29,7 @@ from mcaptrack.viewing.report.identity_events import (
     most_important,
     summarize_events,
 )
-from mcaptrack.viewing.report.scene_map import Background, background_picture
+from mcaptrack.viewing.report.scene_map import SceneBackground, background_picture
 
 #: The channels of a camera in a report, and the role of each, which gives its colour.
 ROLES: Final = {
@@ -71,7 +71,7 @@ class LogReport:
     channel_events: list[ChannelEvents] = field(default_factory=list)
     highlights: list[list[IdentityEvent]] = field(default_factory=list)
     planes: Planes = ()
-    background: Background | None = None
+    background: SceneBackground | None = None
     data: dict[str, Any] = field(default_factory=dict)
     missing: dict[str, str] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
@@ -172,18 +172,18 @@ def _score(opened: log.Log, out: LogReport) -> None:
 
 def _find_events(opened: log.Log, out: LogReport) -> None:
     """Read or compute the events of the channels in ``_WITH_EVENTS``."""
-    truth = out.track_sets["truth"].frames if "truth" in out.track_sets else None
+    ground_truth = out.track_sets["truth"].frames if "truth" in out.track_sets else None
     for role in _WITH_EVENTS:
         tracks = out.track_sets.get(role)
         if tracks is None or not any(len(frame.rows) for frame in tracks.frames):
             continue
         known = _recorded(opened, tracks.topic + "/events")
         if known is None:
-            found = find_events(tracks.frames, truth, EventOptions(), out.name, tracks.topic)
+            found = find_events(tracks.frames, ground_truth, EventOptions(), out.name, tracks.topic)
             known = found.events, found.rule
         events, rule = known
         out.channel_events.append(
-            summarize_events(tracks.topic, events, rule, tracks.frames, truth, (out.start_ns, out.end_ns))
+            summarize_events(tracks.topic, events, rule, tracks.frames, ground_truth, (out.start_ns, out.end_ns))
         )
     out.highlights = most_important(out.channel_events, _THUMBNAILS)
 
@@ -229,9 +229,11 @@ def _statistics(out: LogReport) -> dict[str, Any]:
     ]
     resampled = {one.topic: one.frames for one in out.on_prediction_clock.values()}
     if "truth" in out.track_sets:
-        truth = out.track_sets["truth"]
+        ground_truth = out.track_sets["truth"]
         at_ns = np.unique(np.concatenate([np.empty(0, np.int64), *map(frame_times, resampled.values())]))
-        resampled[truth.topic] = resample_frames(truth.frames, at_ns) if len(at_ns) else truth.frames
+        resampled[ground_truth.topic] = (
+            resample_frames(ground_truth.frames, at_ns) if len(at_ns) else ground_truth.frames
+        )
     metric = {topic: frames for topic, frames in resampled.items() if has_positions(frames, "metres")}
     return {
         "tracks": track_sets,

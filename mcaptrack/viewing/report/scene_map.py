@@ -36,7 +36,7 @@ _MAX_NAMED: Final = 600
 _GROUND: Final = (460, 520)
 
 
-class Background(NamedTuple):
+class SceneBackground(NamedTuple):
     """A picture in JPEG to draw tracks on; ``scale`` converts pixels of the camera to pixels of this picture."""
 
     jpeg: bytes
@@ -54,7 +54,7 @@ class TrackPath(NamedTuple):
     last_s: float
 
 
-def background_picture(pictures: Pictures) -> Background | None:
+def background_picture(pictures: Pictures) -> SceneBackground | None:
     """The scene without moving people; None without pictures. Raises McaptrackError for damaged pictures."""
     import cv2
 
@@ -75,7 +75,7 @@ def background_picture(pictures: Pictures) -> Background | None:
     # Grey and with less contrast, so that only tracks have colours.
     grey = 0.55 * (still @ [0.114, 0.587, 0.299]) + 70
     image = np.repeat(np.rint(grey).astype(np.uint8)[..., None], 3, axis=2)
-    return Background(encode_image(image, "jpeg", _QUALITY), image.shape[1], image.shape[0], scale)
+    return SceneBackground(encode_image(image, "jpeg", _QUALITY), image.shape[1], image.shape[0], scale)
 
 
 def pixel_paths(frames: Sequence[Frame], plane: GroundPlane | None) -> list[TrackPath]:
@@ -122,7 +122,7 @@ def _simplified(path: Floats, tolerance: float) -> Floats:
     return kept if (kept[-1] == path[-1].astype(np.float32)).all() else np.concatenate([kept, path[-1:]])
 
 
-def picture_map(paths: Sequence[TrackPath], behind: Background, start_s: float) -> dict[str, Any]:
+def picture_map(paths: Sequence[TrackPath], behind: SceneBackground, start_s: float) -> dict[str, Any]:
     """The values of a map over the picture."""
     low, high = np.array([-0.5, -0.5]) * behind.width, np.array([1.5, 1.5]) * behind.width
     points = [np.clip(path.points * behind.scale, low, high) for path in paths]

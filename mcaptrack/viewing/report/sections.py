@@ -117,7 +117,7 @@ def _by_recall(members: Sequence[tuple[dict[str, Any], str, str]]) -> Figure:
     return {
         "chart": line_chart("Displacement error of forecasts over recall", lines, x, y),
         "title": "Error over recall.",
-        "caption": "From left to right, people whose past was tracked best come first. Lower and longer is better.",
+        "caption": "People with the best tracked past come first, from left to right. Lower and longer is better.",
     }
 
 

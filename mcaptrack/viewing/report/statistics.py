@@ -68,13 +68,13 @@ def speeds_m_per_s(frames: Sequence[Frame]) -> Floats:
 def track_statistics(frames: Sequence[Frame]) -> dict[str, Any]:
     """Counts and durations of tracks."""
     rows = join_frames(TRACKS, frames).rows
-    lives = durations_s(frames)
+    durations = durations_s(frames)
     return {
-        "tracks": len(lives),
+        "tracks": len(durations),
         "rows": len(rows),
         "frames": len(frames),
-        "median_s": float(np.median(lives)) if len(lives) else None,
-        "longest_s": float(lives.max()) if len(lives) else None,
+        "median_s": float(np.median(durations)) if len(durations) else None,
+        "longest_s": float(durations.max()) if len(durations) else None,
         "observed_share": float(rows["observed"].mean()) if len(rows) else None,
     }
 
