@@ -46,23 +46,23 @@ def weights(name: str, **changes: np.ndarray | None) -> Weights:
 
 
 class TestAgainstTorch:
-    def test_red_is_what_torch_makes_of_it(self):
+    def test_red_equals_torch(self):
         forecast = Red.of(weights("red")).predict(PAST, KNOWN)
         np.testing.assert_allclose(forecast.mean, TORCH["red"]["mean"], atol=1e-8)
         np.testing.assert_allclose(forecast.cov, TORCH["red"]["cov"], atol=1e-8)
 
-    def test_the_folded_lstm_is_what_torch_makes_of_it_unfolded(self):
+    def test_the_folded_lstm_equals_torch_unfolded(self):
         forecast = Lstm.of(weights("lstm")).predict(PAST[:, -4:], np.ones((len(PAST), 4), bool))
         np.testing.assert_allclose(forecast.mean, TORCH["lstm"]["mean"], atol=1e-8)
 
-    def test_the_spread_of_the_lstm_is_the_filters_times_what_was_measured(self):
+    def test_the_covariance_of_the_lstm_is_that_of_the_kalman_filter_times_its_calibration(self):
         wider = weights("lstm", spread=np.array([1.0, 2.0, 4.0]))
         known = np.ones((len(PAST), 8), bool)
         kalman = LinearPredictor("kalman", 3, 0.4).predict(PAST, known).cov
         factor = np.array([1.0, 2.0, 4.0])[:, None, None]
         np.testing.assert_allclose(Lstm.of(wider).predict(PAST, known).cov, kalman * factor)
 
-    def test_both_are_still_so_in_the_networks_that_are_trained(self):
+    def test_networks_for_training_give_the_same_forecasts(self):
         torch = pytest.importorskip("torch", reason="training needs torch")
         from mcaptrack.training.network import LstmNetwork, RedNetwork
 
@@ -87,7 +87,7 @@ class TestAgainstTorch:
 
 class TestShippedWeights:
     @pytest.mark.parametrize("name", ["red", "lstm"])
-    def test_they_are_small_and_say_where_they_come_from(self, name):
+    def test_they_are_small_and_have_a_model_card(self, name):
         shipped = load(SHIPPED / f"{name}.safetensors")
         assert sum(file.stat().st_size for file in SHIPPED.glob("*.safetensors")) < 500_000
         assert shipped.card["network"] == name
@@ -96,7 +96,7 @@ class TestShippedWeights:
         assert "ADE_m" in shipped.card["scores_clean"]
         assert make(name, 12, 0.4).weights_sha256 == shipped.sha256
 
-    def test_red_errs_less_than_linear_predictors_and_its_ellipses_hold_what_they_say(self):
+    def test_red_has_less_error_than_linear_predictors_and_is_calibrated(self):
         """On walks that it was not trained on, as they are and with the noise of a tracker."""
         windows = Windows.of(walks(3000, 20, 0.4, seed=12345)[0], 8)
         noise = 0.2 * ar1(np.random.default_rng(0), 3000, 8)
@@ -109,7 +109,7 @@ class TestShippedWeights:
             assert scores["red"]["NLL"] < min(scores["cv"]["NLL"], scores["kalman"]["NLL"]) - 0.3
             assert 0.93 < scores["red"]["coverage_95"] < 0.97
 
-    def test_what_was_foretold_says_by_which_weights(self, tmp_path):
+    def test_predictions_name_the_weights_that_made_them(self, tmp_path):
         lines = [f"{12 * n} 1 {0.4 * n} 0" for n in range(20)]
         (tmp_path / "t.txt").write_text("\n".join(lines))
         path = tmp_path / "t.mcap"
@@ -126,7 +126,7 @@ class TestShippedWeights:
 
 
 class TestFiles:
-    def test_weights_come_back_with_their_card(self, tmp_path):
+    def test_weights_and_card_survive_a_round_trip(self, tmp_path):
         save(tmp_path / "w.safetensors", STORED["red"], CARDS["red"])
         back = load(tmp_path / "w.safetensors")
         assert back.card == CARDS["red"]
@@ -135,14 +135,14 @@ class TestFiles:
         np.testing.assert_allclose(predictor.predict(PAST, KNOWN).mean, TORCH["red"]["mean"], atol=1e-5)
 
     @pytest.mark.parametrize("damage", ["empty", "text", "cut", "pickle"])
-    def test_what_is_no_file_of_weights_is_refused_in_one_line(self, tmp_path, damage):
+    def test_damaged_files_of_weights_are_refused_in_one_line(self, tmp_path, damage):
         path = tmp_path / "w.safetensors"
         save(path, STORED["red"], CARDS["red"])
         data = path.read_bytes()
         path.write_bytes(
             {"empty": b"", "text": b"not weights", "cut": data[:-40], "pickle": b"\x80\x04cos\nsystem\n."}[damage]
         )
-        with pytest.raises(McaptrackError, match=r"w\.safetensors is no file of weights"):
+        with pytest.raises(McaptrackError, match=r"w\.safetensors is not a file of weights"):
             make(f"red:{path}", 3, 0.4)
 
     @pytest.mark.parametrize(
@@ -163,7 +163,7 @@ class TestFiles:
         with pytest.raises(McaptrackError, match=r"w\.safetensors holds lstm, not red"):
             make(f"red:{tmp_path / 'w.safetensors'}", 3, 0.4)
         save(tmp_path / "x.safetensors", STORED["red"], CARDS["red"] | {"steps": "many"})
-        with pytest.raises(McaptrackError, match="its card does not say how many steps"):
+        with pytest.raises(McaptrackError, match="its card lacks the number of steps"):
             make(f"red:{tmp_path / 'x.safetensors'}", 3, 0.4)
 
     @pytest.mark.parametrize(
@@ -187,7 +187,7 @@ class TestFiles:
 
 
 class _Straight:
-    """Goes on as in the last step, and is as uncertain as the square of the time; its steps are 0.4 s."""
+    """Repeats the last displacement; the covariance grows with the square of time; its steps are 0.4 s."""
 
     name, past, steps, step_s, weights_sha256 = "straight", 4, 3, 0.4, None
 
@@ -202,7 +202,7 @@ class TestOwnClock:
     @pytest.mark.parametrize(
         ("step_s", "steps"), [(0.1, 30), (0.2, 4), (0.4, 2), (0.4, 8), (0.3, 5), (0.8, 3), (1.0, 4)]
     )
-    def test_who_walks_straight_goes_on_straight_at_any_rate(self, step_s, steps):
+    def test_straight_lines_are_extrapolated_at_any_rate(self, step_s, steps):
         inner = _Straight()
         outer = OnClock(_Forecasts(inner), steps, step_s)
         times = np.arange(-12, 1) * step_s
@@ -217,14 +217,14 @@ class TestOwnClock:
         assert inner.valid.all()
         np.testing.assert_allclose(inner.seen[0, -4:, 0], 2 * 0.4 * np.arange(-3, 1) + 1, atol=1e-9)
 
-    def test_between_positions_of_which_one_is_not_known_nothing_is(self):
+    def test_positions_beside_unknown_ones_are_unknown(self):
         inner = _Straight()
         known = np.ones((1, 7), bool)
         known[0, 3] = False  # 0.9 s ago: between 0.8 s and 1.2 s lie positions 0.6, 0.9 and 1.2 s ago
         OnClock(_Forecasts(inner), 2, 0.3).predict(np.zeros((1, 7, 2)), known)
         assert inner.valid.tolist() == [[True, False, True, True]]
 
-    def test_how_far_back_it_looks(self):
+    def test_the_number_of_past_positions_by_hand(self):
         assert [OnClock(_Forecasts(_Straight()), 3, step_s).past for step_s in (0.1, 0.3, 0.4, 1.0)] == [13, 5, 4, 3]
 
     def test_predictions_at_five_a_second_lie_between_those_at_two_and_a_half(self):
@@ -236,7 +236,7 @@ class TestOwnClock:
 
 
 class _Forecasts:
-    """A predictor whose answer is a plain tuple, as the protocol has it."""
+    """A predictor that returns a plain tuple, as the protocol allows."""
 
     def __init__(self, inner):
         self._inner = inner
@@ -268,7 +268,7 @@ class TestOnnx:
         path.write_bytes(base64.b64decode(text))
         return f"onnx:{path}"
 
-    def test_a_network_of_ones_own(self, tmp_path):
+    def test_a_network_in_onnx_format(self, tmp_path):
         predictor = make(self.file(tmp_path, LINE), 3, 0.4)
         past = np.array([[[5.0, 5.0], [np.nan, np.nan], [7.0, 5.5]]])
         forecast = predictor.predict(past, np.array([[True, False, True]]))
@@ -279,7 +279,7 @@ class TestOnnx:
         nothing = predictor.predict(np.empty((0, 3, 2)), np.empty((0, 3), bool))
         assert (nothing.mean.shape, nothing.cov.shape) == ((0, 3, 2), (0, 3, 2, 2))
 
-    def test_a_covariance_of_its_own_and_what_it_knows_of_holes(self, tmp_path):
+    def test_a_network_with_a_covariance_and_a_mask_of_gaps(self, tmp_path):
         predictor = make(self.file(tmp_path, WITH_COV), 3, 0.4)
         known = np.array([[True, False, False, True], [True, True, True, True]])
         cov = predictor.predict(np.zeros((2, 4, 2)), known).cov
@@ -300,12 +300,14 @@ class TestOnnx:
 
     @pytest.mark.parametrize("said", ["0", "-0.4", "inf", "nan", "half"])
     def test_a_step_that_is_no_number_of_seconds_is_refused(self, tmp_path, said):
-        with pytest.raises(McaptrackError, match=f"its metadata say step_s = '{said}', which is no number of seconds"):
+        with pytest.raises(McaptrackError, match=f"its metadata have step_s = '{said}'; a positive number"):
             make(self.with_step(tmp_path, said), 3, 0.4)
 
     @pytest.mark.parametrize(("declared", "given"), [(12, (8, 8)), ("T", (8, 12)), (8, (8, 12))])
-    def test_one_that_gives_other_steps_than_it_declares_is_refused(self, tmp_path, monkeypatch, declared, given):
-        """ONNX Runtime corrects what it can work out for itself; here is one where it can't."""
+    def test_a_network_that_returns_other_steps_than_it_declares_is_refused(
+        self, tmp_path, monkeypatch, declared, given
+    ):
+        """ONNX Runtime corrects declared shapes that it can infer; it can't infer this one."""
 
         class Session:
             def __init__(self, *_, **__):
@@ -328,10 +330,10 @@ class TestOnnx:
         monkeypatch.setitem(
             sys.modules, "onnxruntime", SimpleNamespace(SessionOptions=SimpleNamespace, InferenceSession=Session)
         )
-        with pytest.raises(McaptrackError, match=r"declares .* as its output, and gives \[8, 12\] steps"):
+        with pytest.raises(McaptrackError, match=r"declares the output .*, and returns \[8, 12\] steps"):
             make(f"onnx:{tmp_path / 'net.onnx'}", 12, 0.4)
 
-    def test_asked_for_more_steps_than_it_has_it_goes_on_straight_and_that_is_said(self, tmp_path):
+    def test_beyond_its_steps_it_is_extrapolated_with_a_warning(self, tmp_path):
         name = self.file(tmp_path, LINE)
         with notices.collected() as said:
             make(name, 3, 0.4)
@@ -344,15 +346,15 @@ class TestOnnx:
     @pytest.mark.parametrize(
         "cov", [[[1, 2], [2, 1]], [[0, 0], [0, 1]], [[-1, 0], [0, 1]], [[1, 0.5], [0.2, 1]], [[1, 0], [0, np.nan]]]
     )
-    def test_covariances_that_are_none_are_told(self, cov):
+    def test_matrices_that_are_no_covariances_are_recognised(self, cov):
         assert not are_covariances(np.full((1, 3, 2, 2), cov))
 
-    def test_what_can_not_be_used_is_refused_in_one_line(self, tmp_path):
+    def test_unusable_networks_are_refused_in_one_line(self, tmp_path):
         name = self.file(tmp_path, WRONG)
-        with pytest.raises(McaptrackError, match=r"net\.onnx has to give \(B, T, 2\)"):
+        with pytest.raises(McaptrackError, match=r"net\.onnx has to return \(B, T, 2\)"):
             make(name, 3, 0.4)
         (tmp_path / "net.onnx").write_bytes(b"nothing of the kind")
-        with pytest.raises(McaptrackError, match=r"net\.onnx is no network that ONNX Runtime can run"):
+        with pytest.raises(McaptrackError, match=r"net\.onnx can't be run by ONNX Runtime"):
             make(name, 3, 0.4)
 
     def test_without_onnx_runtime_it_says_what_to_install(self, tmp_path, monkeypatch):
@@ -391,7 +393,7 @@ class TestCalibration:
         squared = [o @ np.linalg.inv(c) @ o for c, o in zip(cov.reshape(-1, 2, 2), off.reshape(-1, 2), strict=True)]
         np.testing.assert_allclose(mahalanobis_squared(off, cov).ravel(), squared)
 
-    def test_ellipses_of_gaussian_errors_hold_what_they_say(self):
+    def test_ellipses_of_gaussian_errors_have_their_nominal_coverage(self):
         from scipy.stats import multivariate_normal
 
         cov = np.array([[2.0, 0.7], [0.7, 1.0]])

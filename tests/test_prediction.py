@@ -13,12 +13,12 @@ from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.predictors import make
 from mcaptrack.predictors.linear import (
     DRIFT_M2_PER_S3,
-    LEAST_SURPRISE,
-    MODEL_COUNT,
-    MOST_SURPRISE,
+    MAX_SCALE,
+    MIN_SCALE,
     POSITION_NOISE_M,
+    PRIOR_COUNT,
     SPEED_M_PER_S,
-    WIDENED,
+    TAIL_FACTOR,
     LinearPredictor,
     linear_variance,
 )
@@ -58,7 +58,7 @@ class TestSample:
         frames = [Frame(ns(1.0 + n / 10), n, tracks_at({1: (n / 10, 0)})) for n in range(10)]
         assert [frame.t_ns for frame in sampled(frames, start_ns=ns(0.0))] == [ns(1.2), ns(1.6)]
 
-    def test_a_hole_is_filled_and_says_so_and_a_long_one_stays(self):
+    def test_short_gaps_are_interpolated_and_marked_and_long_ones_stay(self):
         def path(n):
             return {} if 3 <= n <= 5 or (n > 10 and n < 18) else {1: (float(n), 0.0)}
 
@@ -68,7 +68,7 @@ class TestSample:
         assert [seen[tick]["x_m"].tolist() for tick in (3, 4, 5)] == [[3.0], [4.0], [5.0]]
         assert all(len(seen[tick]) == 0 for tick in range(11, 18))
 
-    def test_boxes_come_to_metres_by_the_plane_of_their_time(self):
+    def test_boxes_are_projected_by_the_plane_valid_at_their_time(self):
         rows = TRACKS.rows(
             track_id=[1], x_px=[10.0], y_px=[20.0], w_px=[4.0], h_px=[8.0], observed=[True], source_id=[-1]
         )
@@ -81,7 +81,7 @@ class TestSample:
         with pytest.raises(McaptrackError, match="tracks are in pixels and there is no ground plane"):
             sampled([Frame(0, 0, rows)])
 
-    def test_who_stands_above_the_horizon_is_nowhere(self):
+    def test_boxes_above_the_horizon_are_left_out(self):
         tilted = GroundPlane((0.01, 0, 0, 0, 0.01, 0, 0, 0.01, -1), 200, 200)
         rows = TRACKS.rows(
             track_id=[1, 2],
@@ -104,7 +104,7 @@ class TestSample:
 class TestPredictors:
     @every_predictor
     @given(past=PASTS, shift=hnp.arrays(float, 2, elements=st.floats(-1e3, 1e3)))
-    def test_moved_people_have_moved_futures(self, name, past, shift):
+    def test_translated_tracks_have_translated_forecasts(self, name, past, shift):
         predictor, known = make(name, 12, 0.4), np.ones(past.shape[:2], bool)
         here, there = predictor.predict(past, known), predictor.predict(past + shift, known)
         np.testing.assert_allclose(there.mean, here.mean + shift, atol=1e-6)
@@ -112,7 +112,7 @@ class TestPredictors:
 
     @pytest.mark.parametrize("name", [*LINEAR, "red"])
     @given(past=PASTS, angle=st.floats(0, 7))
-    def test_turned_people_have_turned_futures(self, name, past, angle):
+    def test_rotated_tracks_have_rotated_forecasts(self, name, past, angle):
         turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
         predictor, known = make(name, 12, 0.4), np.ones(past.shape[:2], bool)
         turned, straight = predictor.predict(past @ turn.T, known), predictor.predict(past, known)
@@ -121,7 +121,7 @@ class TestPredictors:
 
     @every_predictor
     @given(past=PASTS, seed=SEEDS)
-    def test_what_is_not_known_does_not_matter_and_ellipses_are_ellipses(self, name, past, seed):
+    def test_unknown_positions_do_not_matter_and_covariances_are_positive_definite(self, name, past, seed):
         rng, predictor = np.random.default_rng(seed), make(name, 12, 0.4)
         known = rng.random(past.shape[:2]) < 0.6
         known[:, -1] = True
@@ -137,7 +137,7 @@ class TestPredictors:
 
     @every_predictor
     @given(past=PASTS)
-    def test_a_batch_is_its_members(self, name, past):
+    def test_tracks_of_a_batch_do_not_affect_each_other(self, name, past):
         predictor, known = make(name, 12, 0.4), np.ones(past.shape[:2], bool)
         whole = predictor.predict(past, known)
         for number in range(len(past)):
@@ -146,7 +146,7 @@ class TestPredictors:
             np.testing.assert_allclose(whole.cov[number], alone.cov[0], atol=1e-9)
 
     @every_linear
-    def test_straight_lines_go_on(self, name):
+    def test_straight_lines_are_extrapolated(self, name):
         steps = np.arange(8)[:, None] * [0.5, -0.2]
         forecast = make(name, 12, 0.4).predict(steps[None], np.ones((1, 8), bool))
         ahead = 7 + np.arange(1, 13)
@@ -155,7 +155,7 @@ class TestPredictors:
         np.testing.assert_allclose(forecast.mean[0], wanted, rtol=0.02 if name == "kalman" else 1e-9)
 
     @every_linear
-    def test_one_known_position_stays_and_is_uncertain(self, name):
+    def test_one_known_position_is_predicted_to_stay_with_large_variance(self, name):
         past = np.array([[[np.nan, np.nan], [3.0, 4.0]]])
         forecast = make(name, 12, 0.4).predict(past, np.array([[False, True]]))
         np.testing.assert_allclose(forecast.mean[0], np.tile([3.0, 4.0], (12, 1)))
@@ -164,7 +164,7 @@ class TestPredictors:
         assert spread[-1] > 4.8 * SPEED_M_PER_S
 
     @every_predictor
-    def test_nobody_has_no_future(self, name):
+    def test_an_empty_batch_gives_no_forecasts(self, name):
         forecast = make(name, 12, 0.4).predict(np.empty((0, 8, 2)), np.empty((0, 8), bool))
         assert forecast.mean.shape == (0, 12, 2)
         assert forecast.cov.shape == (0, 12, 2, 2)
@@ -179,7 +179,7 @@ class TestPredictors:
         forecast = make("holt-cv", 2, 0.4).predict(past, np.ones((1, 4), bool))
         np.testing.assert_allclose(forecast.mean[0, :, 0], [9.875, 12.75])
 
-    def test_the_kalman_filter_is_the_kalman_filter(self):
+    def test_kalman_weights_equal_a_kalman_filter(self):
         """Against a filter with matrices, on noisy positions."""
         rng, step = np.random.default_rng(2), 0.4
         seen = np.cumsum(rng.normal(0.4, 0.2, 8))
@@ -193,7 +193,7 @@ class TestPredictors:
             surprise += 2 * (value - state[0]) ** 2 / (cov[0, 0] + POSITION_NOISE_M**2)  # along x and along y
             state, cov = state + gain * (value - state[0]), cov - np.outer(gain, cov[0])
         forecast = make("kalman", 12, step).predict(np.stack([seen, seen], -1)[None], np.ones((1, 8), bool))
-        scale = WIDENED * np.clip((MODEL_COUNT + surprise) / (MODEL_COUNT + 14), LEAST_SURPRISE, MOST_SURPRISE)
+        scale = TAIL_FACTOR * np.clip((PRIOR_COUNT + surprise) / (PRIOR_COUNT + 14), MIN_SCALE, MAX_SCALE)
         for ahead in range(1, 13):
             state, cov = move @ state, move @ cov @ move.T + noise
             np.testing.assert_allclose(forecast.mean[0, ahead - 1], state[0], rtol=1e-9)
@@ -201,8 +201,8 @@ class TestPredictors:
 
     @every_linear
     @pytest.mark.parametrize("known", [1, 2, 4, 8])
-    def test_uncertainty_is_what_walkers_show(self, name, known):
-        """Walkers of the stated kind, simulated: the errors spread as the forecast says."""
+    def test_variance_equals_that_of_simulated_motion(self, name, known):
+        """Simulate the motion model: the variance of the errors equals that of the forecast."""
         rng, step, fine, people = np.random.default_rng(known), 0.4, 8, 20_000
         speed = rng.normal(0, SPEED_M_PER_S, people)
         place, path = np.zeros(people), []
@@ -221,18 +221,18 @@ class TestPredictors:
         np.testing.assert_allclose(errors.std(axis=0), said, rtol=0.04)
 
     @every_linear
-    def test_who_has_surprised_is_more_uncertain_and_nobody_is_beyond_bounds(self, name):
-        """The same mean; a smooth past, a shaky one, one that leaps about."""
+    def test_larger_innovations_give_a_larger_covariance_within_limits(self, name):
+        """A smooth past, a noisy one, and one with outliers."""
         rng, line = np.random.default_rng(4), np.arange(8)[:, None] * [0.5, 0.0]
         pasts = np.stack([line, line + rng.normal(0, 0.25, (8, 2)), line + rng.normal(0, 5, (8, 2))])
         predictor = make(name, 12, 0.4)
         scale = predictor.predict(pasts, np.ones((3, 8), bool)).cov[:, 0, 0, 0] / predictor.table[1][predictor.past, 0]
-        assert scale[0] == pytest.approx(WIDENED * LEAST_SURPRISE)
+        assert scale[0] == pytest.approx(TAIL_FACTOR * MIN_SCALE)
         assert scale[0] < scale[1] < scale[2]
-        assert scale[2] == pytest.approx(WIDENED * MOST_SURPRISE)
+        assert scale[2] == pytest.approx(TAIL_FACTOR * MAX_SCALE)
 
     def test_variance_by_hand_for_standing_still(self):
-        """One position, weight 1, foretold 1 s ahead: noise, speed and drift add up."""
+        """One position, weight 1, predicted 1 s ahead: the variances of noise, velocity and drift add up."""
         variance = linear_variance(np.ones((1, 1)), np.array([0.0]), np.array([1.0]))
         assert variance[0] == pytest.approx(POSITION_NOISE_M**2 + SPEED_M_PER_S**2 + DRIFT_M2_PER_S3 / 3)
 
@@ -241,7 +241,7 @@ class TestPredict:
     def run(self, frames, **options):
         return [frame for (frame,) in Predict(**options)(frames)]
 
-    def test_one_row_a_step_for_everybody_seen_often_enough(self):
+    def test_one_row_per_step_for_each_track_with_enough_positions(self):
         out = self.run(
             walk(lambda n: {1: (0.5 * n, 0.0)} | ({2: (0.0, 1.0 * n)} if n >= 4 else {}), 10), predictor="cv"
         )
@@ -254,7 +254,7 @@ class TestPredict:
         np.testing.assert_allclose(rows["y_m"][12:15], [8.0, 9.0, 10.0])
         assert (rows["cov_xx_m2"] > 0).all()
 
-    def test_nothing_is_foretold_from_inside_a_hole(self):
+    def test_nothing_is_predicted_from_inside_a_gap(self):
         frames = walk(lambda n: {1: (float(n), 0.0)}, 10)
         frames[6] = frames[6]._replace(rows=tracks_at({1: (6.0, 0.0)}, observed=False))
         out = self.run(frames)

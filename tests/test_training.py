@@ -39,8 +39,8 @@ class TestWalks:
         np.testing.assert_array_equal(same.future, crowd.future[:50])
         assert not np.isclose(other.past, same.past).any()
 
-    def test_people_walk_as_people_do(self):
-        """Speeds of pedestrians by Weidmann: 1.3 m/s; some stand; nobody leaps, and people keep out of each other."""
+    def test_synthetic_walks_have_speeds_and_stops_of_pedestrians(self):
+        """Speeds of pedestrians (Weidmann): 1.3 m/s; some people stand; no jumps; people keep a distance."""
         paths, scene = walks(5760, 20, 0.4, 3)
         speed = np.linalg.norm(np.diff(paths, axis=1), axis=-1) / 0.4
         mean = speed.mean(axis=1)
@@ -72,7 +72,7 @@ class TestWindows:
         assert len(Windows.cut(xy[:, :2], past=3, steps=2, least=1)) == 0
         assert len(Windows.cut(np.empty((0, 9, 2)), past=3, steps=2, least=1)) == 0
 
-    def test_turned_mirrored_and_scaled_people_are_as_far_apart_as_before(self, crowd):
+    def test_augmentation_keeps_distances_up_to_the_scale(self, crowd):
         out = Corruption()(crowd, np.random.default_rng(1))
         for name in ("past", "future"):
             before, after = getattr(crowd, name), getattr(out, name)
@@ -87,7 +87,7 @@ class TestWindows:
         assert np.exp(-0.2) <= ratio.min() < 0.85
         assert 1.17 < ratio.max() <= np.exp(0.2)
 
-    def test_noise_and_gaps_touch_the_past_alone(self, crowd):
+    def test_noise_and_gaps_change_the_past_alone(self, crowd):
         quiet = Corruption(turn=False, mirror=False)
         plain = quiet(crowd, np.random.default_rng(1))
         hard = replace(quiet, noise_m=0.4, noisy=0.5, gaps=0.5, least=2)(crowd, np.random.default_rng(1))
@@ -98,7 +98,7 @@ class TestWindows:
         assert hard.known[:, -1].all()
         assert 0.2 < hard.known[:, :-1].mean() < 0.8
 
-    def test_the_noise_of_a_tracker_is_of_spread_one_and_remembers(self):
+    def test_simulated_tracker_noise_has_unit_variance_and_autocorrelation(self):
         noise = ar1(np.random.default_rng(1), 20_000, 6)
         np.testing.assert_allclose(noise.std(axis=0), 1, atol=0.02)
         for back, wanted in ((1, 0.5), (2, 0.25)):
@@ -208,7 +208,7 @@ class TestRecipes:
         rates = [PAPER.rate_at(epoch * 10 + 3, 10) for epoch in (0, 39, 40, 49)]
         np.testing.assert_allclose(rates, [1e-4, 1e-4, 2e-5, 2e-5])
 
-    def test_our_rate_rises_and_falls(self):
+    def test_the_one_cycle_rate_rises_and_falls(self):
         rates = [RED.rate_at(step, 10) for step in range(RED.epochs * 10)]
         assert max(rates) == pytest.approx(RED.rate_at(RED.epochs, 10)) == pytest.approx(RED.rate)
         assert (np.diff(rates[1:21]) > 0).all()
@@ -232,7 +232,7 @@ class TestRecipes:
         with pytest.raises(McaptrackError, match="consistency weight needs the recipe red"):
             PAPER.changed({"consistency_weight": 0.3}, {})
 
-    def test_a_card_says_what_was_changed(self):
+    def test_a_card_lists_the_changed_parameters(self):
         assert RED.words() == {}
         assert RED.changed({"epochs": 7}, {"gaps": 0.1}).words() == {"epochs": "7", "gaps": "0.1"}
 
@@ -251,7 +251,7 @@ def fit():
 
 
 class TestTraining:
-    def test_a_short_training_beats_what_it_began_with(self, fit, crowd, tmp_path):
+    def test_a_short_training_improves_on_its_start(self, fit, crowd, tmp_path):
         trained = fit(replace(SMALL, epochs=8), crowd, tmp_path)
         noisy = {name: scores["ADE_m"] for name, scores in trained.scores["noisy"].items()}
         assert noisy["red"] < min(noisy["kalman"], noisy["cv"])  # a fresh network is the Kalman filter
@@ -266,7 +266,7 @@ class TestTraining:
         assert trained.kept_epoch == 1 + errors.index(min(errors))
 
     @pytest.mark.parametrize("recipe", [SMALL, replace(PAPER, epochs=3), replace(SMALL, consistency_weight=1.0)])
-    def test_resumed_is_as_if_it_had_not_been_cut_off(self, fit, crowd, tmp_path, recipe):
+    def test_a_resumed_training_equals_an_uninterrupted_one(self, fit, crowd, tmp_path, recipe):
         windows = crowd if recipe.network == "red" else crowd.last(4)
         whole = fit(recipe, windows, tmp_path / "whole")
         stop = iter([None, KeyboardInterrupt()])
@@ -283,14 +283,14 @@ class TestTraining:
         with pytest.raises(McaptrackError, match="is of a training with another recipe or"):
             fit(replace(recipe, seed=5), windows, tmp_path / "cut", resume=True)
 
-    def test_it_ends_when_nothing_gets_better(self, fit, crowd, tmp_path):
+    def test_it_stops_without_improvement(self, fit, crowd, tmp_path):
         said = []
         patient = replace(SMALL, epochs=60, rate=0.05, patience=2)  # steps so wide that it soon gets worse
         trained = fit(patient, crowd, tmp_path, say=said.append)
         assert trained.kept_epoch == trained.epochs - 2 < 58
         assert "no better for 2 epochs" in said[0]
 
-    def test_a_rate_that_is_too_high_is_said(self, fit, crowd, tmp_path):
+    def test_a_rate_that_is_too_high_is_refused(self, fit, crowd, tmp_path):
         with pytest.raises(McaptrackError, match=r"the loss is (nan|inf) in epoch"):
             fit(replace(PAPER, rate=1e30), crowd.last(4), tmp_path)
 

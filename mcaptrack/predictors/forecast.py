@@ -1,4 +1,4 @@
-"""What a predictor says, and what a predictor is. Letters: B batch, L past positions, T future steps."""
+"""The interface of predictors: what they are given and what they return. Letters: B batch, L past, T future steps."""
 
 from __future__ import annotations
 
@@ -11,16 +11,35 @@ from mcaptrack.geometry.arrays import Floats
 
 
 class Forecast(NamedTuple):
-    """Where B people will be: ``mean`` (B, T, 2) in m, and ``cov`` (B, T, 2, 2) of the error in m^2."""
+    """Predicted positions of B tracks as Gaussian distributions.
+
+    Attributes
+    ----------
+    mean : (B, T, 2) of float, in m
+        Predicted positions.
+    cov : (B, T, 2, 2) of float, in m^2
+        Covariance of their errors.
+    """
 
     mean: Floats
     cov: Floats
 
 
 class Predictor(Protocol):
-    """Forecasts from past positions on a regular clock of ``step_s`` seconds, ``steps`` of them.
+    """A predictor on a regular clock.
 
-    ``past`` is how many positions count. ``weights_sha256`` names learned weights; None where nothing was learned.
+    Attributes
+    ----------
+    name : str
+        Name in messages and tables.
+    past : int
+        Number of past positions that it uses, the current one included.
+    steps : int
+        Number of future steps that it predicts.
+    step_s : float
+        Length of a step in seconds, in the past and in the future.
+    weights_sha256 : str or None
+        Digest of the learned weights; None if nothing is learned.
     """
 
     @property
@@ -35,5 +54,18 @@ class Predictor(Protocol):
     def weights_sha256(self) -> str | None: ...
 
     def predict(self, xy_m: Floats, valid: NDArray[np.bool_]) -> Forecast:
-        """Positions (B, L, 2), of which ``valid`` (B, L) are known and the last one always is -> B forecasts."""
+        """Predict a batch of tracks.
+
+        Parameters
+        ----------
+        xy_m : (B, L, 2) of float, in m
+            Past positions, the current one last; L may be longer or shorter than ``past``. Unknown ones may be NaN.
+        valid : (B, L) of bool
+            Which positions are known; the last one always is.
+
+        Returns
+        -------
+        Forecast
+            Of ``steps`` steps for each of the B tracks, which don't depend on the others of the batch.
+        """
         ...

@@ -1,9 +1,9 @@
-"""Predictors that weigh past positions: constant velocity, smoothed velocity, Kalman filter.
+"""Predictors that are linear in past positions: constant velocity, smoothed velocity, Kalman filter.
 
-A forecast that is linear in the past positions is a matrix of weights, and so is its error: for a walker whose velocity
-drifts at random and positions that are seen with noise, the variance of every future step follows exactly from the
-weights. Nothing is assumed about how uncertainty grows. How large it is, each track says itself: one that has surprised
-so far (its steps differ from what was expected of them) will do so again, and one that has gone smoothly will go on.
+A forecast that is linear in the past positions is a matrix of weights, and so is its error: for a velocity that drifts
+at random (white acceleration) and positions measured with noise, the variance of every future step follows exactly from
+the weights; no growth of the uncertainty is assumed. It is scaled for each track by the innovations so far: a track
+that was hard to predict will stay so.
 
 Letters: B batch, L past positions (the last one is now), n of them known, T future steps.
 """
@@ -21,21 +21,20 @@ from mcaptrack.geometry.arrays import Floats
 from mcaptrack.geometry.histories import Holt, fill_gaps
 from mcaptrack.predictors.forecast import Forecast
 
-#: How people walk, for the errors of forecasts: noise of a seen position, spread of velocity when nothing is known of
-#: it, and how fast velocity drifts (the power of its white acceleration). tools/calibrate.py says what they cover.
+#: Motion model for the errors of forecasts: standard deviation of a measured position, prior standard deviation of the
+#: velocity, and power of the white acceleration. tools/calibrate.py prints the coverage that follows.
 POSITION_NOISE_M: Final = 0.2
 SPEED_M_PER_S: Final = 1.0
 DRIFT_M2_PER_S3: Final = 0.06
-#: As many surprises (squared, in units of their variance) does the model's word count for, against those of a track,
-#: which move the variance between the least and the most; and by how much it is widened so that the 95 % ellipse holds
-#: 95 %: people's errors have heavier tails than Gauss's.
-MODEL_COUNT: Final = 4.0
-LEAST_SURPRISE, MOST_SURPRISE = 0.7, 2.0
-WIDENED: Final = 1.5
+#: Scaling of the variance by the squared innovations of a track: how many innovations the prior counts for, the limits
+#: of the scale, and a factor that makes 95 % ellipses hold 95 %, because errors have heavier tails than a Gaussian.
+PRIOR_COUNT: Final = 4.0
+MIN_SCALE, MAX_SCALE = 0.7, 2.0
+TAIL_FACTOR: Final = 1.5
 
 
 def _cv_weights(known: int, times: Floats, ahead: Floats) -> Floats:
-    """The mean velocity of the last three steps goes on."""
+    """Extrapolate the mean velocity of the last three steps."""
     back = min(3, known - 1)
     weights = np.zeros((len(ahead), known))
     weights[:, -1] = 1.0
@@ -47,7 +46,7 @@ def _cv_weights(known: int, times: Floats, ahead: Floats) -> Floats:
 
 
 def _holt_weights(known: int, times: Floats, ahead: Floats) -> Floats:
-    """The smoothed velocity (alpha = beta = 0.5, the paper's) goes on."""
+    """Extrapolate the smoothed velocity (alpha = beta = 0.5, as in the paper)."""
     weights = np.zeros((len(ahead), known))
     weights[:, -1] = 1.0
     if known > 1:
@@ -61,35 +60,35 @@ def _holt_weights(known: int, times: Floats, ahead: Floats) -> Floats:
 
 
 def _kalman_weights(known: int, times: Floats, ahead: Floats) -> Floats:
-    """A Kalman filter with the model of ``linear_variance`` itself: the least error of all weights."""
+    """A Kalman filter with the motion model of ``linear_variance``: the weights with the least error."""
     return _kalman(known, times, ahead)[0]
 
 
 def _kalman(known: int, times: Floats, ahead: Floats) -> tuple[Floats, Floats]:
-    """Weights (T, n) of the filter's forecasts, and (n - 1, n) of its surprises on the way: each of variance 1."""
-    surprises = np.zeros((known - 1, known))
+    """Weights (T, n) of the filter's forecasts, and (n - 1, n) of its normalised innovations: each of variance 1."""
+    innovations = np.zeros((known - 1, known))
     step = float(times[1] - times[0]) if known > 1 else 0.0
     move = np.array([[1.0, step], [0.0, 1.0]])
     noise = DRIFT_M2_PER_S3 * np.array([[step**3 / 3, step**2 / 2], [step**2 / 2, step]])
     cov = np.diag([POSITION_NOISE_M**2, SPEED_M_PER_S**2])
     state = np.zeros((2, known))  # position and velocity, each as weights on the positions
     state[0, 0] = 1.0
-    for seen in range(1, known):
+    for at in range(1, known):
         state, cov = move @ state, move @ cov @ move.T + noise
         gain = cov[:, 0] / (cov[0, 0] + POSITION_NOISE_M**2)
         innovation = -state[0]
-        innovation[seen] += 1.0
-        surprises[seen - 1] = innovation / np.sqrt(cov[0, 0] + POSITION_NOISE_M**2)
+        innovation[at] += 1.0
+        innovations[at - 1] = innovation / np.sqrt(cov[0, 0] + POSITION_NOISE_M**2)
         state = state + np.outer(gain, innovation)
         cov = cov - np.outer(gain, cov[0])
-    return state[0] + np.outer(ahead, state[1]), surprises
+    return state[0] + np.outer(ahead, state[1]), innovations
 
 
 def linear_variance(weights: Floats, times: Floats, ahead: Floats) -> Floats:
     """The variance (T,) in m^2 and per axis of a forecast by ``weights`` (T, n), which sum to 1 over n.
 
     ``times`` (n,) are those of the past positions and ``ahead`` (T,) those of the future ones after the last of them,
-    in seconds. The walker: integrated white acceleration, a velocity of unknown direction, positions seen with noise.
+    in seconds. The motion model: integrated white acceleration, unknown initial velocity, noisy measurements.
     """
     start = times[0]
     variance = np.empty(len(ahead))
@@ -106,18 +105,35 @@ def linear_variance(weights: Floats, times: Floats, ahead: Floats) -> Floats:
     return variance
 
 
-_RECIPES: Final = {"cv": _cv_weights, "holt-cv": _holt_weights, "kalman": _kalman_weights}
-#: How many past positions each one looks at.
+_WEIGHTS: Final = {"cv": _cv_weights, "holt-cv": _holt_weights, "kalman": _kalman_weights}
+#: Number of past positions that each one uses.
 _PAST: Final = {"cv": 4, "holt-cv": 8, "kalman": 8}
-#: How many past positions say how uncertain a forecast is.
-_MOST: Final = 8
+#: Number of past positions whose innovations scale the uncertainty.
+_SCALE_PAST: Final = 8
 
 
 @dataclass(frozen=True)
 class LinearPredictor:
-    """A predictor made of weights, for every number of known positions from 1 to ``past``.
+    """A predictor that multiplies past positions by weights, one set for each number of known positions.
 
-    Source: constant velocity as in Schoeller et al. (RA-L 2020); Holt's smoothing as in Eq. 3 of the paper; Kalman.
+    Attributes
+    ----------
+    name : str
+        ``cv`` (constant velocity, as in Schoeller et al., RA-L 2020), ``holt-cv`` (Holt's smoothing, as in Eq. 3 of Yu
+        and Zhou, IROS 2021) or ``kalman``.
+    steps : int
+        Number of future steps.
+    step_s : float
+        Length of a step in seconds.
+
+    Examples
+    --------
+    A track that moves by 0.4 m a step along x:
+
+    >>> predictor = LinearPredictor("cv", steps=2, step_s=0.4)
+    >>> xy_m = np.array([[[0.0, 0.0], [0.4, 0.0], [0.8, 0.0]]])
+    >>> predictor.predict(xy_m, np.ones((1, 3), bool)).mean.round(6).tolist()
+    [[[1.2, 0.0], [1.6, 0.0]]]
     """
 
     name: str
@@ -127,7 +143,7 @@ class LinearPredictor:
 
     @property
     def past(self) -> int:
-        """How many past positions count, L."""
+        """Number of past positions that are used, L."""
         return _PAST[self.name]
 
     @cached_property
@@ -138,39 +154,39 @@ class LinearPredictor:
         variance = np.zeros((self.past + 1, self.steps))
         for known in range(1, self.past + 1):
             times: Floats = self.step_s * np.arange(float(known))
-            recipe = _RECIPES[self.name](known, times, ahead)
-            weights[known, :, self.past - known :] = recipe
-            variance[known] = linear_variance(recipe, times, ahead)
+            row_weights = _WEIGHTS[self.name](known, times, ahead)
+            weights[known, :, self.past - known :] = row_weights
+            variance[known] = linear_variance(row_weights, times, ahead)
         return weights, variance
 
     @cached_property
-    def _surprises(self) -> Floats:
-        """Weights (8 + 1, 7, 8) of the surprises on the way, right-aligned, by the number of known positions."""
-        weights = np.zeros((_MOST + 1, _MOST - 1, _MOST))
-        for known in range(2, _MOST + 1):
+    def _innovations(self) -> Floats:
+        """Weights (8 + 1, 7, 8) of normalised innovations, right-aligned, by the number of known positions."""
+        weights = np.zeros((_SCALE_PAST + 1, _SCALE_PAST - 1, _SCALE_PAST))
+        for known in range(2, _SCALE_PAST + 1):
             times: Floats = self.step_s * np.arange(float(known))
-            weights[known, : known - 1, _MOST - known :] = _kalman(known, times, np.empty(0))[1]
+            weights[known, : known - 1, _SCALE_PAST - known :] = _kalman(known, times, np.empty(0))[1]
         return weights
 
     def predict(self, xy_m: Floats, valid: NDArray[np.bool_]) -> Forecast:
-        """Positions (B, L', 2) of which ``valid`` (B, L') are known, the last one always -> forecasts.
+        """Positions (B, L', 2), of which ``valid`` (B, L') are known, the last one always -> forecasts.
 
-        Holes are filled linearly; L' may be longer or shorter than ``past``. The mean looks at ``past`` positions, its
-        uncertainty at 8.
+        Gaps are interpolated linearly; L' may be longer or shorter than ``past``. The mean uses ``past`` positions, its
+        uncertainty 8.
         """
-        filled, known = fill_gaps(xy_m[:, -_MOST:], valid[:, -_MOST:])
+        filled, known = fill_gaps(xy_m[:, -_SCALE_PAST:], valid[:, -_SCALE_PAST:])
         now = filled[:, -1:]
         filled = filled - now
         counted = np.minimum(known, self.past)
         weights, variance = self.table
         recent = filled[:, -self.past :]
         mean = now + weights[counted][:, :, self.past - recent.shape[1] :] @ recent
-        scale = self._scale(filled, known, valid[:, -_MOST:])
+        scale = self._scale(filled, known, valid[:, -_SCALE_PAST:])
         return Forecast(mean, (variance[counted] * scale[:, None])[:, :, None, None] * np.eye(2))
 
     def _scale(self, filled: Floats, known: NDArray[np.int64], valid: NDArray[np.bool_]) -> Floats:
-        """How much more (or less) than the model the tracks (B,) have surprised so far, the model's word included."""
-        surprises = self._surprises[known][:, :, _MOST - filled.shape[1] :] @ filled
-        count = 2 * (valid.sum(axis=1) - 1)  # along both axes, of what was truly seen
-        scale = (MODEL_COUNT + (surprises**2).sum(axis=(1, 2))) / (MODEL_COUNT + count)
-        return np.where(known > 1, WIDENED * np.clip(scale, LEAST_SURPRISE, MOST_SURPRISE), 1.0)
+        """The scale of the variance of each track (B,): its mean squared innovation so far, shrunk towards 1."""
+        innovations = self._innovations[known][:, :, _SCALE_PAST - filled.shape[1] :] @ filled
+        count = 2 * (valid.sum(axis=1) - 1)  # along both axes, of positions that are not interpolated
+        scale = (PRIOR_COUNT + (innovations**2).sum(axis=(1, 2))) / (PRIOR_COUNT + count)
+        return np.where(known > 1, TAIL_FACTOR * np.clip(scale, MIN_SCALE, MAX_SCALE), 1.0)

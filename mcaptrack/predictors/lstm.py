@@ -1,8 +1,8 @@
 """``lstm``: the paper's network (Yu and Zhou 2021): an encoder and a decoder of one LSTM layer each, on displacements.
 
-Every position's displacement goes through a linear layer into the encoder; the decoder begins with the last one and is
-fed what it says itself. Nothing stands between these layers but sums, so that they fold into each other exactly: one
-matrix from the displacement to the gates of the encoder, and one from the decoder's state to its own next gates.
+Every displacement goes through a linear layer into the encoder; the decoder starts with the last one and is fed its own
+output. There is no nonlinearity between these layers, so they are folded into each other exactly: one matrix from the
+displacement to the gates of the encoder, and one from the decoder's state to its own next gates.
 
 Letters: B batch, L past positions (4), T future steps, H hidden numbers.
 """
@@ -26,23 +26,27 @@ PAST: Final = 4
 
 @dataclass(frozen=True)
 class Lstm(Network):
-    """The network in NumPy, folded. What is uncertain about it is what is about ``kalman``, times what was measured.
+    """The network in NumPy, folded. Its covariance is that of ``kalman``, scaled per step by a calibrated factor.
 
-    Holes are filled linearly; before the first known position people are taken to have stood.
+    Gaps are interpolated linearly; before the first known position people are assumed to stand.
+
+    References
+    ----------
+    Yu and Zhou, "Towards Robust Human Trajectory Prediction in Raw Videos", IROS 2021.
     """
 
     name: ClassVar[str] = "lstm"
     past: ClassVar[int] = PAST
 
     @cached_property
-    def _uncertain(self) -> LinearPredictor:
+    def _covariance_model(self) -> LinearPredictor:
         return LinearPredictor("kalman", self.steps, self.step_s)
 
     @cached_property
     def _layers(self) -> tuple[Floats, ...]:
         get = self.weights.get
         hidden = self.weights.tensors["out.weight"].shape[-1] if "out.weight" in self.weights.tensors else 0
-        # A sigmoid is a tanh of half the number. Each gate is a matrix of its own: what belongs together lies together.
+        # A sigmoid is a tanh of half the number. Each gate is a matrix of its own, contiguous in memory.
         half = np.array([0.5, 0.5, 1.0, 0.5])[:, None, None]
         folded = {}
         for part in ("encoder", "decoder"):
@@ -68,10 +72,10 @@ class Lstm(Network):
         )
 
     def predict(self, xy_m: Floats, valid: Bools) -> Forecast:
-        """Positions (B, L', 2) of which ``valid`` (B, L') are known, the last one always -> forecasts."""
+        """Positions (B, L', 2), of which ``valid`` (B, L') are known, the last one always -> forecasts."""
         into, bias, inside, into_d, bias_d, inside_d, fed, fed_bias, out, out_bias, spread = self._layers
         filled, _ = fill_gaps(*last_positions(xy_m, valid, PAST))
-        moves = np.diff(filled, axis=1, prepend=filled[:, :1])  # the first is 0, as the paper's program has it
+        moves = np.diff(filled, axis=1, prepend=filled[:, :1])  # the first is 0, as in the authors' program
         batch, hidden = len(moves), inside.shape[-1]
         state: Floats = np.zeros((batch, hidden))
         memory = np.zeros((batch, hidden))
@@ -85,7 +89,7 @@ class Lstm(Network):
             states[:, step] = state
             gates = state @ fed + fed_bias
         mean = filled[:, -1:] + np.cumsum(states @ out + out_bias, axis=1)
-        cov = self._uncertain.predict(xy_m, valid).cov * spread[:, None, None]
+        cov = self._covariance_model.predict(xy_m, valid).cov * spread[:, None, None]
         return Forecast(mean, cov)
 
 

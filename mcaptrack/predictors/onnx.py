@@ -1,8 +1,8 @@
-"""``onnx:FILE``: a user's own network, run by ONNX Runtime.
+"""``onnx:FILE``: a network in ONNX format, run by ONNX Runtime.
 
 Input: positions ``obs`` (B, L, 2) float32 in metres relative to the last one, and, if the network has a second input,
 ``valid`` (B, L) bool. Output: positions (B, T, 2) relative to the same point, and, if there is a second one, covariance
-(B, T, 2, 2) in m^2. B is free. Metadata of the file may say ``step_s`` (0.4 otherwise).
+(B, T, 2, 2) in m^2. B is dynamic. Metadata of the file may set ``step_s`` (0.4 otherwise).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _STEP_S: Final = 0.4
 
 @dataclass(frozen=True)
 class Onnx:
-    """See the module. A network without covariance has that of ``kalman``."""
+    """A network in ONNX format (see the module). Without a covariance of its own it has that of ``kalman``."""
 
     path: Path
     session: Any
@@ -38,7 +38,7 @@ class Onnx:
 
     @classmethod
     def of(cls, path: Path) -> Self:
-        """Open and try the network. Raises McaptrackError if it can't be run or is of another shape."""
+        """Open and test the network. Raises McaptrackError if it can't be run or has other inputs or outputs."""
         try:
             data = path.read_bytes()
         except OSError as error:
@@ -55,33 +55,37 @@ class Onnx:
                 f"onnx:{path} needs ONNX Runtime, which is not installed; `pip install 'mcaptrack[onnx]'` brings it"
             ) from None
         options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = 1  # a batch is a frame's people: too little to share out
+        options.intra_op_num_threads = 1  # a batch holds the tracks of one frame: too little for threads
         options.log_severity_level = 4
         try:
             session = onnxruntime.InferenceSession(path.read_bytes(), options, providers=["CPUExecutionProvider"])
-        except Exception as error:  # ONNX Runtime has no common base for what it raises
-            raise McaptrackError(f"{path} is no network that ONNX Runtime can run: {_first_line(error)}") from None
+        except Exception as error:  # ONNX Runtime has no common base class of its errors
+            raise McaptrackError(f"{path} can't be run by ONNX Runtime: {_first_line(error)}") from None
         shape = session.get_inputs()[0].shape
         if len(shape) != 3 or not isinstance(shape[1], int) or shape[2] != 2:
             raise McaptrackError(f"{path}: its first input has to be B x L x 2 with a fixed L, not {shape}")
-        said = session.get_modelmeta().custom_metadata_map.get("step_s", "")
+        text = session.get_modelmeta().custom_metadata_map.get("step_s", "")
         try:
-            step_s = float(said or _STEP_S)
+            step_s = float(text or _STEP_S)
         except ValueError:
             step_s = 0.0
         if not 0 < step_s < float("inf"):
-            raise McaptrackError(f"{path}: its metadata say step_s = {said!r}, which is no number of seconds")
+            raise McaptrackError(f"{path}: its metadata have step_s = {text!r}; a positive number of seconds is needed")
         tried = cls(path, session, shape[1], 0, step_s, sha256)
-        given = [tried._run(np.zeros((batch, shape[1], 2)), np.ones((batch, shape[1]), bool)) for batch in (1, 7)]
-        steps = {outputs[0].shape[1] for outputs in given}
-        declared = session.get_outputs()[0].shape or []  # some say nothing
+        outputs_by_batch = [
+            tried._run(np.zeros((batch, shape[1], 2)), np.ones((batch, shape[1]), bool)) for batch in (1, 7)
+        ]
+        steps = {outputs[0].shape[1] for outputs in outputs_by_batch}
+        declared = session.get_outputs()[0].shape or []  # some declare none
         steps |= {size for size in declared[1:2] if isinstance(size, int)}
         if len(steps) > 1:
-            raise McaptrackError(f"{path} declares {declared} as its output, and gives {sorted(steps)} steps, by batch")
+            raise McaptrackError(
+                f"{path} declares the output {declared}, and returns {sorted(steps)} steps, depending on the batch"
+            )
         return cls(path, session, shape[1], steps.pop(), step_s, sha256)
 
     @cached_property
-    def _uncertain(self) -> LinearPredictor:
+    def _covariance_model(self) -> LinearPredictor:
         return LinearPredictor("kalman", self.steps, self.step_s)
 
     def _run(self, xy_m: Floats, valid: Bools) -> list[Floats]:
@@ -97,29 +101,31 @@ class Onnx:
             fits = outputs[1].shape == (*mean.shape, 2)
         if not fits:
             shapes = " and ".join(str(output.shape) for output in outputs)
-            raise McaptrackError(f"{self.path} has to give (B, T, 2), and may give (B, T, 2, 2); it gives {shapes}")
+            raise McaptrackError(
+                f"{self.path} has to return (B, T, 2), and may return (B, T, 2, 2); it returns {shapes}"
+            )
         if not all(np.isfinite(output).all() for output in outputs):
-            raise McaptrackError(f"{self.path} gives numbers that are not finite")
+            raise McaptrackError(f"{self.path} returns numbers that are not finite")
         if len(outputs) > 1 and not are_covariances(outputs[1]):
             raise McaptrackError(
-                f"{self.path} gives covariances that are none: variances of 0 or less, or not symmetric"
+                f"{self.path} returns matrices that are no covariances: variances of 0 or less, or not symmetric"
             )
         return outputs
 
     def predict(self, xy_m: Floats, valid: Bools) -> Forecast:
-        """Positions (B, L', 2) of which ``valid`` (B, L') are known, the last one always -> forecasts."""
+        """Positions (B, L', 2), of which ``valid`` (B, L') are known, the last one always -> forecasts."""
         if len(valid) == 0:
             return Forecast(np.empty((0, self.steps, 2)), np.empty((0, self.steps, 2, 2)))
         padded, known = last_positions(xy_m, valid, self.past)
         filled, _ = fill_gaps(padded, known)
         now = filled[:, -1:]
         outputs = self._run(filled - now, known)
-        cov = outputs[1] if len(outputs) > 1 else self._uncertain.predict(xy_m, valid).cov
+        cov = outputs[1] if len(outputs) > 1 else self._covariance_model.predict(xy_m, valid).cov
         return Forecast(now + outputs[0], cov)
 
 
 def are_covariances(cov: Floats) -> bool:
-    """Whether matrices (B, T, 2, 2) are symmetric and positive definite, as far as 32 bits tell."""
+    """Whether matrices (B, T, 2, 2) are symmetric and positive definite, up to the precision of 32 bits."""
     xx, xy, yx, yy = cov[..., 0, 0], cov[..., 0, 1], cov[..., 1, 0], cov[..., 1, 1]
     scale = np.sqrt(np.maximum(xx, 0) * np.maximum(yy, 0))
     is_symmetric = np.abs(xy - yx) <= 1e-4 * scale

@@ -1,4 +1,4 @@
-"""A predictor that foretells steps of its own, on another clock.
+"""A predictor with steps of its own, resampled to another clock.
 
 Letters: B batch, L past positions, T future steps.
 """
@@ -16,10 +16,10 @@ from mcaptrack.predictors.forecast import Forecast, Predictor
 
 @dataclass(frozen=True)
 class OnClock:
-    """``inner`` for ``steps`` steps of ``step_s`` seconds.
+    """``inner``, resampled to ``steps`` steps of ``step_s`` seconds.
 
-    The past is read between positions that are known on both sides; forecasts are read between the inner steps. Beyond
-    the last of these people go on as in it, and spreads grow with the time.
+    The past is interpolated between positions that are known on both sides; forecasts are interpolated between the
+    inner steps. Beyond the last of these the forecast is extrapolated, and its covariance grows quadratically.
     """
 
     inner: Predictor
@@ -39,29 +39,29 @@ class OnClock:
         return int(np.ceil((self.inner.past - 1) * self.inner.step_s / self.step_s - 1e-6)) + 1
 
     def predict(self, xy_m: Floats, valid: Bools) -> Forecast:
-        """Positions (B, L', 2) of which ``valid`` (B, L') are known, the last one always -> forecasts."""
+        """Positions (B, L', 2), of which ``valid`` (B, L') are known, the last one always -> forecasts."""
         if abs(self.step_s / self.inner.step_s - 1) > 1e-6:
             xy_m, valid = self._past(xy_m, valid)
         return self._future(self.inner.predict(xy_m, valid), xy_m[:, -1])
 
     def _past(self, xy_m: Floats, valid: Bools) -> tuple[Floats, Bools]:
-        """The past on the inner clock."""
+        """Past positions and which are known, at the times of the inner clock."""
         length = xy_m.shape[1]
         back = np.arange(self.inner.past)[::-1] * (self.inner.step_s / self.step_s)
         at = length - 1 - back
         at = np.where(np.abs(at - np.rint(at)) < 1e-6, np.rint(at), at)
         low, high = np.floor(at).astype(int), np.ceil(at).astype(int)
-        there = low >= 0
+        is_inside = low >= 0
         low, high = np.maximum(low, 0), np.maximum(high, 0)
         share = (at - low)[:, None]
-        known = valid[:, low] & valid[:, high] & there
-        read = (1 - share) * xy_m[:, low] + share * xy_m[:, high]
-        # Beside a position that isn't known stands NaN, also where it counts for nothing.
-        read = np.where(share == 0, xy_m[:, low], read)
-        return np.where(known[..., None], read, np.nan), known
+        known = valid[:, low] & valid[:, high] & is_inside
+        past = (1 - share) * xy_m[:, low] + share * xy_m[:, high]
+        # A neighbour with share 0 may be NaN.
+        past = np.where(share == 0, xy_m[:, low], past)
+        return np.where(known[..., None], past, np.nan), known
 
     def _future(self, forecast: Forecast, now: Floats) -> Forecast:
-        """The forecast at the wanted times. At 0 people are where they are seen, half as uncertain as a step later."""
+        """The forecast at the wanted times. At 0 its standard deviation is half of that at the first inner step."""
         mean = np.concatenate([now[:, None], forecast.mean], axis=1)
         cov = np.concatenate([forecast.cov[:, :1] / 4, forecast.cov], axis=1)
         last = mean.shape[1] - 1
@@ -69,6 +69,6 @@ class OnClock:
         low = np.clip(np.round(at, 6).astype(int), 0, last - 1)
         share = at - low  # more than 1 beyond the last step
         within = np.minimum(share, 1.0)[:, None, None]
-        there = (1 - share[:, None]) * mean[:, low] + share[:, None] * mean[:, low + 1]
+        at_times = (1 - share[:, None]) * mean[:, low] + share[:, None] * mean[:, low + 1]
         spread = (1 - within) * cov[:, low] + within * cov[:, low + 1]
-        return Forecast(there, spread * (np.maximum(at / last, 1.0) ** 2)[:, None, None])
+        return Forecast(at_times, spread * (np.maximum(at / last, 1.0) ** 2)[:, None, None])

@@ -1,9 +1,9 @@
 """``red``: a recurrent encoder with a dense head (after Becker et al. 2018, "RED"), and a covariance for every step.
 
-The network corrects a linear forecast. It sees up to eight past positions, holes and short pasts masked, in a frame
-whose first axis is the way that the linear forecast goes, and says for each future step how far off that is, how wide
-the error is, how much wider along than across, and how these hang together. What depends on a direction fades with the
-speed, so that whoever stands has a round ellipse, and the whole turns with the people.
+The network corrects a linear forecast. Its input is up to eight past positions, with gaps and short histories masked,
+in a frame of reference whose first axis is the direction of the linear forecast. Its output is, for each future step, a
+correction, a width of the error, the ratio along / across, and a correlation. All that depends on the direction fades
+with the speed, so that people who stand have circular ellipses and forecasts rotate with their inputs.
 
 Letters: B batch, L past positions (8), K pairs of them (4), T future steps, H hidden numbers.
 """
@@ -21,28 +21,28 @@ from mcaptrack.geometry.histories import fill_gaps, last_positions
 from mcaptrack.predictors.forecast import Forecast
 from mcaptrack.predictors.weights import Network
 
-#: How many past positions the network looks at, and how many at a time.
+#: Number of past positions, and how many of them form one input of the recurrent unit.
 PAST: Final = 8
 PAIR: Final = 2
-#: How many numbers a pair of positions is: place, step and whether it was seen of each, and how far the forecast goes.
+#: Number of features of a pair: position, displacement and validity of each, and the length of the linear forecast.
 FEATURES: Final = 5 * PAIR + 1
-#: What the head says of a step: two corrections, width, elongation, correlation.
+#: Outputs per step: two corrections, width, elongation, correlation.
 OUTPUTS: Final = 5
 WIDTH: Final = 2
-#: At this distance of the linear forecast's end, what depends on the direction counts half.
+#: Length of the linear forecast at which direction-dependent outputs count half.
 _HALFWAY_M: Final = 0.3
-#: Less than anybody goes.
-_NOWHERE_M: Final = 1e-12
-#: The most that errors along and across can hang together.
+#: A length that is practically 0.
+_TINY_M: Final = 1e-12
+#: Largest correlation of errors along and across.
 MOST_CORRELATED: Final = 0.95
 
 
 class Inputs(NamedTuple):
-    """What the network is given, and the linear forecast that it corrects.
+    """The input of the network, and the linear forecast that it corrects.
 
-    ``features`` (B, K, FEATURES); ``started`` (B, K): whether the past begins before or in a pair; ``turn`` (B, 2, 2)
-    takes directions into the frame of the way; ``mean`` (B, T, 2) m; ``spread`` (B, T) m; ``gate`` (B,): how much
-    directions count.
+    ``features`` (B, K, FEATURES); ``started`` (B, K): whether the history begins before or in a pair; ``turn``
+    (B, 2, 2) rotates into the frame of the forecast; ``mean`` (B, T, 2) m; ``spread`` (B, T) m; ``gate`` (B,): weight
+    of direction-dependent outputs.
     """
 
     features: Floats
@@ -54,7 +54,7 @@ class Inputs(NamedTuple):
 
 
 def prepare(xy_m: Floats, valid: Bools, base_weights: Floats, base_spread: Floats) -> Inputs:
-    """Positions (B, L', 2), of which ``valid`` (B, L') are known and the last one always is, as the network sees them.
+    """Convert positions (B, L', 2), of which ``valid`` (B, L') are known, the last one always, to network inputs.
 
     ``base_weights`` (L + 1, T, L) and ``base_spread`` (L + 1, T): the linear forecast by the number of known positions.
     """
@@ -62,31 +62,36 @@ def prepare(xy_m: Floats, valid: Bools, base_weights: Floats, base_spread: Float
     batch = len(valid)
     filled, known = fill_gaps(xy_m, valid)
     now = filled[:, -1:]
-    place = filled - now
-    ahead = base_weights[known] @ place
-    east, north = ahead[:, -1, 0] + _NOWHERE_M, ahead[:, -1, 1]  # who goes nowhere goes east
+    relative = filled - now
+    ahead = base_weights[known] @ relative
+    east, north = ahead[:, -1, 0] + _TINY_M, ahead[:, -1, 1]  # a forecast of length 0 points east
     far = np.hypot(east, north)
     turn = np.empty((batch, 2, 2))
     turn[:, 0, 0] = turn[:, 1, 1] = east / far
     turn[:, 0, 1] = north / far
     turn[:, 1, 0] = -turn[:, 0, 1]
-    place = place @ turn.transpose(0, 2, 1)
+    relative = relative @ turn.transpose(0, 2, 1)
     features = np.zeros((batch, PAST, FEATURES // PAIR))
-    features[:, :, :2] = place
-    np.subtract(place[:, 1:], place[:, :-1], out=features[:, 1:, 2:4])
+    features[:, :, :2] = relative
+    np.subtract(relative[:, 1:], relative[:, :-1], out=features[:, 1:, 2:4])
     features[:, :, 2:4] *= 2.0
     features[:, :, 4] = valid
     pairs = PAST // PAIR
-    whole = np.empty((batch, pairs, FEATURES))
-    whole[:, :, :-1] = features.reshape(batch, pairs, FEATURES - 1)
-    whole[:, :, -1] = (far / 5)[:, None]
+    inputs = np.empty((batch, pairs, FEATURES))
+    inputs[:, :, :-1] = features.reshape(batch, pairs, FEATURES - 1)
+    inputs[:, :, -1] = (far / 5)[:, None]
     started = np.arange(1, pairs + 1) * PAIR > (PAST - known)[:, None]
-    return Inputs(whole, started, turn, now + ahead, base_spread[known], far / (far + _HALFWAY_M))
+    return Inputs(inputs, started, turn, now + ahead, base_spread[known], far / (far + _HALFWAY_M))
 
 
 @dataclass(frozen=True)
 class Red(Network):
-    """The network in NumPy. The forecasts are those of the network that was trained, to the rounding of 64 bits."""
+    """The network in NumPy. Its forecasts equal those of the trained network up to rounding of 64-bit numbers.
+
+    References
+    ----------
+    Becker et al., "RED: A simple but effective baseline predictor for the TrajNet benchmark", ECCV Workshops 2018.
+    """
 
     name: ClassVar[str] = "red"
     past: ClassVar[int] = PAST
@@ -98,7 +103,7 @@ class Red(Network):
         into, inside = get("gru.weight_ih", 3 * hidden, FEATURES).T, get("gru.weight_hh", 3 * hidden, hidden).T
         bias, bias_inside = get("gru.bias_ih", 3 * hidden).copy(), get("gru.bias_hh", 3 * hidden)
         # A sigmoid is a tanh of half the number: one call for both gates. All biases but the candidate's add up. Each
-        # gate is a matrix of its own, so that what belongs together lies together: that alone makes it twice as fast.
+        # gate is a matrix of its own, contiguous in memory: that alone makes it twice as fast.
         half = np.array([0.5, 0.5, 1.0])[:, None, None]
         bias[: 2 * hidden] += bias_inside[: 2 * hidden]
         by_output = np.arange(steps * OUTPUTS).reshape(steps, OUTPUTS).T
@@ -124,7 +129,7 @@ class Red(Network):
         hidden = len(bias_inside)
         given = given.reshape(3, pairs, batch, hidden)
         state: Floats = np.zeros((batch, hidden))
-        everybody: Bools = np.asarray(started.all(axis=0))
+        all_started: Bools = np.asarray(started.all(axis=0))
         for pair in range(pairs):
             old = state @ inside if pair else np.zeros((3, batch, hidden))
             gates = given[:2, pair] + old[:2]
@@ -139,24 +144,24 @@ class Red(Network):
             new = state - candidate
             new *= gates[1]
             new += candidate
-            state = new if everybody[pair] else np.where(started[:, pair, None], new, state)
+            state = new if all_started[pair] else np.where(started[:, pair, None], new, state)
         return state
 
     def predict(self, xy_m: Floats, valid: Bools) -> Forecast:
-        """Positions (B, L', 2) of which ``valid`` (B, L') are known, the last one always -> forecasts."""
+        """Positions (B, L', 2), of which ``valid`` (B, L') are known, the last one always -> forecasts."""
         *_, dense, dense_bias, head, head_bias, base_weights, base_spread = self._layers
         inputs = prepare(xy_m, valid, base_weights, base_spread)
         state = self._encode(inputs.features, inputs.started)
-        said = np.tanh(state @ dense + dense_bias) @ head + head_bias  # (OUTPUTS, B, T)
+        outputs = np.tanh(state @ dense + dense_bias) @ head + head_bias  # (OUTPUTS, B, T)
         gate, spread = inputs.gate[:, None], inputs.spread
-        off = said[:WIDTH] * (gate * spread)
+        off = outputs[:WIDTH] * (gate * spread)
         mean = inputs.mean + off.transpose(1, 2, 0) @ inputs.turn
-        width, longer = spread * np.exp(said[WIDTH]), np.exp(gate * said[3])
+        width, longer = spread * np.exp(outputs[WIDTH]), np.exp(gate * outputs[3])
         along, across = width * longer, width / longer
-        parts = np.empty((*along.shape, 3))  # along the way, across, and both
+        parts = np.empty((*along.shape, 3))  # variances along and across, and covariance
         parts[:, :, 0] = along * along
         parts[:, :, 1] = across * across
-        parts[:, :, 2] = MOST_CORRELATED * np.tanh(gate * said[4]) * along * across
+        parts[:, :, 2] = MOST_CORRELATED * np.tanh(gate * outputs[4]) * along * across
         cos, sin = inputs.turn[:, 0, 0], inputs.turn[:, 0, 1]
         turned = np.empty((len(mean), 3, 4))  # parts to xx, xy, yx, yy
         both = cos * sin

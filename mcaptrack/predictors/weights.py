@@ -1,4 +1,4 @@
-"""Files of learned weights: safetensors, with a model card in the header. Nothing is ever unpickled."""
+"""Files of learned weights: safetensors with a model card in the header. Nothing is unpickled."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Floats
 
-#: Where the weights are that come with mcaptrack.
+#: The folder of the weights that come with mcaptrack.
 SHIPPED: Final = Path(__file__).parent / "trained"
 
 
 @dataclass(frozen=True)
 class Weights:
-    """Named arrays, and what the card says of them: ``network``, ``steps``, ``step_s``, how they were trained."""
+    """Named arrays and their model card: ``network``, ``steps``, ``step_s``, and how they were trained."""
 
     path: Path
     tensors: Mapping[str, Floats]
@@ -30,7 +30,7 @@ class Weights:
     sha256: str
 
     def get(self, name: str, *shape: int | None) -> Floats:
-        """One array, with the shape it has to have (None for any). Raises McaptrackError."""
+        """One array, of the given shape (None for any size). Raises McaptrackError if it is missing or different."""
         found = self.tensors.get(name)
         if found is None:
             raise McaptrackError(f"{self.path} has no {name}; it has {', '.join(sorted(self.tensors)) or 'nothing'}")
@@ -42,36 +42,36 @@ class Weights:
         return found
 
     def clock(self, network: str) -> tuple[int, float]:
-        """Steps and their length in seconds, of weights of that network. Raises McaptrackError if they are others'."""
+        """Number of steps and their length in seconds. Raises McaptrackError if the weights are of another network."""
         if self.card.get("network") != network:
-            what = self.card.get("network") or "no network that mcaptrack trained"
+            what = self.card.get("network") or "weights that mcaptrack did not train"
             raise McaptrackError(f"{self.path} holds {what}, not {network}")
         try:
             steps, step_s = int(self.card["steps"]), float(self.card["step_s"])
         except (KeyError, ValueError):
             steps, step_s = 0, 0.0
         if steps < 1 or not 0 < step_s < float("inf"):
-            raise McaptrackError(f"{self.path}: its card does not say how many steps it foretells, and how long ones")
+            raise McaptrackError(f"{self.path}: its card lacks the number of steps or their length (steps, step_s)")
         return steps, step_s
 
 
 @dataclass(frozen=True)
 class Network:
-    """A network that was trained, run in NumPy: what its weights say of it."""
+    """A trained network that runs in NumPy."""
 
     weights: Weights
     name: ClassVar[str]
 
     @classmethod
     def of(cls, weights: Weights) -> Self:
-        """Raises McaptrackError if the weights are not those of this network."""
+        """Make the network. Raises McaptrackError if the weights are not of this network."""
         made = cls(weights)
         _ = made.steps, made._layers
         return made
 
     @property
     def _layers(self) -> tuple[Floats, ...]:
-        """The arrays of the network, as they are multiplied."""
+        """The arrays of the network in the layout that ``predict`` uses."""
         raise NotImplementedError
 
     @property
@@ -88,7 +88,7 @@ class Network:
 
 
 def load(path: Path) -> Weights:
-    """Read a file of weights. Raises McaptrackError if it is none."""
+    """Read a file of weights. Raises McaptrackError if it is not one."""
     try:
         stat = path.stat()
     except OSError as error:
@@ -106,20 +106,20 @@ def _load(path: Path, _changed: int, _size: int) -> Weights:
             tensors = {name: np.asarray(opened.get_tensor(name), np.float64) for name in opened.keys()}  # noqa: SIM118
         return Weights(path, tensors, card, hashlib.sha256(path.read_bytes()).hexdigest())
     except (SafetensorError, TypeError, ValueError) as error:
-        raise McaptrackError(f"{path} is no file of weights (safetensors): {error}") from None
+        raise McaptrackError(f"{path} is not a file of weights (safetensors): {error}") from None
     except OSError as error:
         raise McaptrackError(f"{path} can't be read: {error.strerror or error}") from None
 
 
 def save(path: Path, tensors: Mapping[str, NDArray[np.floating]], card: Mapping[str, str]) -> None:
-    """Write weights as 32-bit floats, with their card in the header; the same weights give the same bytes."""
+    """Write weights as 32-bit floats with their card in the header; the same weights give the same bytes."""
     import safetensors.numpy
 
     from mcaptrack.files import publish_bytes
 
     flat = {name: np.ascontiguousarray(value, np.float32) for name, value in sorted(tensors.items())}
     data = safetensors.numpy.save(flat, dict(card))
-    # The library writes the header in an order that changes from run to run: write it anew, in one that does not.
+    # The library writes the header in an order that changes from run to run: rewrite it in a fixed order.
     length = int.from_bytes(data[:8], "little")
     header = json.dumps(json.loads(data[8 : 8 + length]), sort_keys=True, separators=(",", ":")).encode()
     header += b" " * (-len(header) % 8)
