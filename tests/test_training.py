@@ -233,8 +233,8 @@ class TestRecipes:
             PAPER.changed({"consistency_weight": 0.3}, {})
 
     def test_a_card_lists_the_changed_parameters(self):
-        assert RED.words() == {}
-        assert RED.changed({"epochs": 7}, {"gaps": 0.1}).words() == {"epochs": "7", "gaps": "0.1"}
+        assert RED.changes() == {}
+        assert RED.changed({"epochs": 7}, {"gaps": 0.1}).changes() == {"epochs": "7", "gaps": "0.1"}
 
 
 @pytest.fixture
@@ -288,7 +288,7 @@ class TestTraining:
         patient = replace(SMALL, epochs=60, rate=0.05, patience=2)  # steps so wide that it soon gets worse
         trained = fit(patient, crowd, tmp_path, say=said.append)
         assert trained.kept_epoch == trained.epochs - 2 < 58
-        assert "no better for 2 epochs" in said[0]
+        assert "no improvement for 2 epochs" in said[0]
 
     def test_a_rate_that_is_too_high_is_refused(self, fit, crowd, tmp_path):
         with pytest.raises(McaptrackError, match=r"the loss is (nan|inf) in epoch"):

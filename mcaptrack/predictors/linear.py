@@ -108,7 +108,7 @@ def linear_variance(weights: Floats, times: Floats, ahead: Floats) -> Floats:
 _WEIGHTS: Final = {"cv": _cv_weights, "holt-cv": _holt_weights, "kalman": _kalman_weights}
 #: Number of past positions that each one uses.
 _PAST: Final = {"cv": 4, "holt-cv": 8, "kalman": 8}
-#: Number of past positions whose innovations scale the uncertainty.
+#: Number of past positions for the innovations that scale the uncertainty.
 _SCALE_PAST: Final = 8
 
 

@@ -1,7 +1,7 @@
 """``red``: a recurrent encoder with a dense head (after Becker et al. 2018, "RED"), and a covariance for every step.
 
 The network corrects a linear forecast. Its input is up to eight past positions, with gaps and short histories masked,
-in a frame of reference whose first axis is the direction of the linear forecast. Its output is, for each future step, a
+in a frame of reference with the direction of the linear forecast as first axis. Its output is, for each future step, a
 correction, a width of the error, the ratio along / across, and a correlation. All that depends on the direction fades
 with the speed, so that people who stand have circular ellipses and forecasts rotate with their inputs.
 

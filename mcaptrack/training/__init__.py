@@ -1,1 +1,1 @@
-"""Training of predictors: made-up walks or recorded tracks in, weights out. The only place that knows torch."""
+"""Training of predictors: synthetic walks or recorded tracks in, weights out. Only this package imports torch."""

@@ -1,4 +1,4 @@
-"""Training itself: epochs over windows, validation, the best weights, a state to go on from, a table at the end."""
+"""The training loop: epochs over windows, validation, the best weights, a state to resume from, final scores."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from mcaptrack.training.windows import Windows, ar1
 _LOG: Final = "epochs.csv"
 _STATE: Final = "state.safetensors"
 _COLUMNS: Final = ("epoch", "loss", "validation_ade_m", "rate", "seconds")
-#: The noise that networks are validated and calibrated with, beside none.
+#: Noise of the second set of validation windows; the first has none.
 _NOISE_M: Final = 0.2
 
 Progress = Callable[[str, int, int], None]
@@ -34,9 +34,9 @@ Progress = Callable[[str, int, int], None]
 
 @dataclass(frozen=True)
 class Trained:
-    """What a training left behind: the weights' file, their scores on the validation windows, and the epochs it took.
+    """The result of a training: the file of weights, their scores on the validation windows, and its epochs.
 
-    ``scores`` maps "clean" and "noisy" windows to predictors and these to their scores.
+    ``scores`` maps "clean" and "noisy" windows to predictors, and these to their scores.
     """
 
     weights: Path
@@ -50,7 +50,7 @@ class Trained:
 
 @dataclass
 class _State:
-    """Where a training is."""
+    """The progress of a training."""
 
     epoch: int = 0
     best_epoch: int = 0
@@ -70,11 +70,39 @@ def train(
     progress: Progress = lambda *_: None,
     say: Callable[[str], None] = lambda _: None,
 ) -> Trained:
-    """Train a network and leave weights, a log of the epochs and a state to go on from in ``folder``.
+    """Train a network; write weights, a log of the epochs and a state to resume from into ``folder``.
 
-    ``source`` says on the card what the windows came from. The same recipe, windows and device give the same weights,
-    also if the training was cut off and resumed. Raises McaptrackError if torch or the device is not there, or if the
-    state in the folder is of another training.
+    Parameters
+    ----------
+    recipe : Recipe
+        Network and hyperparameters.
+    training, validation : Windows
+        Windows to train and to validate on.
+    folder : Path
+        Where to write.
+    source : dict of str to str
+        Where the windows come from, for the model card.
+    device : str
+        ``auto``, ``cpu``, ``cuda`` or ``mps``.
+    threads : int or None
+        Number of threads of torch; its own default if None.
+    resume : bool
+        Continue from the state in ``folder``.
+    progress : callable
+        Called with "train", the number of the epoch and the number of epochs.
+    say : callable
+        Called with messages.
+
+    Returns
+    -------
+    Trained
+        The same recipe, windows and device give the same weights, also if the training was interrupted and resumed.
+
+    Raises
+    ------
+    McaptrackError
+        If torch or the device is missing, if there are no windows, if the loss diverges, or if the state in the folder
+        is of another training.
     """
     torch, where = _torch(), find_device(device)
     if threads is not None:
@@ -96,34 +124,34 @@ def train(
         run.save()
         progress("train", run.state.epoch, recipe.epochs)
         if recipe.patience and run.state.epoch - run.state.best_epoch >= recipe.patience:
-            say(f"no better for {recipe.patience} epochs: ending after {run.state.epoch}")
+            say(f"no improvement for {recipe.patience} epochs: stopping after {run.state.epoch}")
             break
     kept = run.state.best_epoch if recipe.kept == "best" else run.state.epoch
     card = {"trained_epochs": str(run.state.epoch), "kept_epoch": str(kept)}
     run.publish(validation, card)
     scores = compare(make(f"{recipe.network}:{run.weights}", recipe.steps, recipe.step_s), validation, recipe)
-    run.publish(validation, card | {f"scores_{k}": _brief(part[recipe.network]) for k, part in scores.items()})
+    run.publish(validation, card | {f"scores_{k}": _to_text(part[recipe.network]) for k, part in scores.items()})
     return Trained(
         run.weights, scores, run.state.epoch, kept, len(training), len(validation), round(run.state.seconds, 1)
     )
 
 
 def compare(predictor: Predictor, windows: Windows, recipe: Recipe) -> dict[str, dict[str, dict[str, float]]]:
-    """Scores of a predictor, constant velocity and the Kalman filter on the same windows, clean and with noise."""
-    rivals = [predictor, *(make(name, recipe.steps, recipe.step_s) for name in ("cv", "kalman"))]
+    """Scores of a predictor, constant velocity and the Kalman filter on the same windows, with and without noise."""
+    predictors = [predictor, *(make(name, recipe.steps, recipe.step_s) for name in ("cv", "kalman"))]
     return {
-        name: {rival.name: forecast_scores(*rival.predict(part.past, part.known), part.future) for rival in rivals}
+        name: {one.name: forecast_scores(*one.predict(part.past, part.known), part.future) for one in predictors}
         for name, part in (("clean", windows), ("noisy", _noisy(windows)))
     }
 
 
 def _noisy(windows: Windows) -> Windows:
-    """The same windows, their past seen with noise."""
+    """The same windows with noise in their past positions."""
     noise = _NOISE_M * ar1(np.random.default_rng(0), *windows.known.shape)
     return Windows(windows.past + noise, windows.known, windows.future, windows.scene)
 
 
-def _brief(scores: dict[str, float]) -> str:
+def _to_text(scores: dict[str, float]) -> str:
     return " ".join(f"{name}={value:.3f}" for name, value in scores.items())
 
 
@@ -132,30 +160,30 @@ def _torch() -> Any:
         import torch
     except ImportError:
         raise McaptrackError(
-            "training needs torch, which is not installed; `pip install 'mcaptrack[train]'` brings it"
+            "training needs torch, which is not installed; `pip install 'mcaptrack[train]'` installs it"
         ) from None
     return torch
 
 
 def find_device(name: str) -> str:
-    """What to compute on: the device of that name, or for "auto" the best there is.
+    """The device of that name, or for "auto" the fastest one available.
 
-    Raises McaptrackError if it is not there, or torch isn't.
+    Raises McaptrackError if it or torch is missing.
     """
-    torch, there = _torch(), ["cpu"]
+    torch, available = _torch(), ["cpu"]
     if torch.cuda.is_available():
-        there.insert(0, "cuda")
+        available.insert(0, "cuda")
     if torch.backends.mps.is_available():
-        there.insert(0, "mps")
+        available.insert(0, "mps")
     if name == "auto":
-        return there[0]
-    if name not in there:
-        raise McaptrackError(f"there is no device {name}; there is {', '.join(there)}")
+        return available[0]
+    if name not in available:
+        raise McaptrackError(f"there is no device {name}; there is {', '.join(available)}")
     return name
 
 
 class _Run:
-    """One training: network, optimiser, and the files that they go to."""
+    """One training: network, optimiser, and their files."""
 
     def __init__(
         self, torch: Any, recipe: Recipe, training: Windows, device: str, folder: Path, source: dict[str, str]
@@ -163,8 +191,8 @@ class _Run:
         from mcaptrack.training.network import LstmNetwork, RedNetwork
 
         torch.manual_seed(recipe.seed)
-        ours = recipe.network == "red"
-        self.network: Any = RedNetwork(recipe.steps, recipe.step_s) if ours else LstmNetwork(recipe.steps)
+        is_red = recipe.network == "red"
+        self.network: Any = RedNetwork(recipe.steps, recipe.step_s) if is_red else LstmNetwork(recipe.steps)
         self.network.to(device)
         self.optimiser = torch.optim.Adam(self.network.parameters(), lr=recipe.rate)
         self.state = _State()
@@ -175,7 +203,7 @@ class _Run:
             "past": str(recipe.past),
             "steps": str(recipe.steps),
             "step_s": str(recipe.step_s),
-            "recipe": json.dumps(recipe.words(), sort_keys=True),
+            "recipe": json.dumps(recipe.changes(), sort_keys=True),
             **source,
         }
         self.rate = recipe.rate
@@ -184,14 +212,14 @@ class _Run:
         self._best: dict[str, Any] = {}
 
     def epoch(self) -> float:
-        """One pass over the windows, corrupted anew; returns the mean loss of a window."""
+        """One pass over newly augmented windows; returns the mean loss per window."""
         recipe = self._recipe
         rng = np.random.default_rng([recipe.seed, self.state.epoch])
-        given = self._prepare(recipe.corruption(self._training, rng))
+        inputs = self._prepare(recipe.corruption(self._training, rng))
         later = None
         if recipe.consistency_weight:
-            given, later = self._consecutive(rng)
-        count = len(given["future"])
+            inputs, later = self._consecutive(rng)
+        count = len(inputs["future"])
         batches = max(1, round(count / recipe.batch))
         order = self._torch.tensor(rng.permutation(count), device=self._device)
         total = 0.0
@@ -199,7 +227,7 @@ class _Run:
             self.rate = recipe.rate_at(self.state.epoch * batches + number, batches)
             for group in self.optimiser.param_groups:
                 group["lr"] = self.rate
-            batch = {name: part[at] for name, part in given.items()}
+            batch = {name: part[at] for name, part in inputs.items()}
             if recipe.loss == "displacements":
                 loss = self.network.loss(batch, 2 * np.pi * rng.normal())
                 total += loss.item()
@@ -224,23 +252,23 @@ class _Run:
         return {name: part.to(self._device) for name, part in self.network.prepare(windows).items()}
 
     def _consecutive(self, rng: np.random.Generator) -> tuple[dict[str, Any], dict[str, Any]]:
-        """The same people twice, the second time a step later, with the same noise on what was seen both times."""
-        whole, recipe = self._training, self._recipe
-        path = np.concatenate([whole.past, whole.future[:, :1]], axis=1)
-        known = np.concatenate([whole.known, np.ones((len(whole), 1), bool)], axis=1)
-        later = recipe.corruption(Windows(path, known, whole.future, whole.scene), rng)
-        # Where somebody stands a step later is told by the uncorrupted future, whose first step it is.
-        length = whole.past.shape[1]
-        now = Windows(later.past[:, :length], later.known[:, :length].copy(), later.future, whole.scene)
+        """The same windows twice, the second time a step later, with the same noise at the same positions."""
+        windows, recipe = self._training, self._recipe
+        path = np.concatenate([windows.past, windows.future[:, :1]], axis=1)
+        known = np.concatenate([windows.known, np.ones((len(windows), 1), bool)], axis=1)
+        later = recipe.corruption(Windows(path, known, windows.future, windows.scene), rng)
+        # The position a step later is the first of the future, which is not corrupted.
+        length = windows.past.shape[1]
+        now = Windows(later.past[:, :length], later.known[:, :length].copy(), later.future, windows.scene)
         now.known[:, -1] = True
-        # Of the last step, a step later, nothing is known: it goes on as the one before.
+        # The last step, a step later, is unknown: extrapolate it.
         end = 2 * later.future[:, -1:] - later.future[:, -2:-1]
         ahead = np.concatenate([later.future[:, 1:], end], axis=1)
-        then = Windows(later.past[:, 1:], later.known[:, 1:], ahead, whole.scene)
+        then = Windows(later.past[:, 1:], later.known[:, 1:], ahead, windows.scene)
         return self._prepare(now), self._prepare(then)
 
     def validate(self, validation: Windows) -> float:
-        """Keep the weights if they are the best so far, or if the last ones are wanted; returns their error in m."""
+        """Keep the weights if they are the best so far, or if the last are kept; returns their error in m."""
         tensors = {name: np.array(part) for name, part in self.network.tensors().items()}
         predictor = self._predictor(tensors)
         parts = (validation, _noisy(validation))
@@ -253,10 +281,10 @@ class _Run:
         return ade_m
 
     def publish(self, validation: Windows, card: dict[str, str]) -> None:
-        """Calibrate the kept weights and write them, with their card.
+        """Calibrate the kept weights and write them with their card.
 
-        The covariance of every step is widened or narrowed until the 95 % ellipse holds 95 % of the validation windows,
-        as they are and with noise together.
+        The covariance of every step is scaled so that its 95 % ellipse covers 95 % of the validation windows, those
+        with and without noise together.
         """
         both = Windows.join([validation, _noisy(validation)])
         forecast = self._predictor(self._best).predict(both.past, both.known)
@@ -272,19 +300,19 @@ class _Run:
         save(self.weights, calibrated, self.card | card)
 
     def _predictor(self, tensors: dict[str, Any]) -> Predictor:
-        """The network as it is used, without a file in between."""
+        """The predictor with these weights, without a file."""
         weights = Weights(self.weights, {k: np.asarray(v, np.float64) for k, v in tensors.items()}, self.card, "")
         return red.Red.of(weights) if self._recipe.network == "red" else Lstm.of(weights)
 
     def save(self) -> None:
-        """Everything that the training needs to go on, and the log of its epochs."""
+        """Write the state that ``resume`` reads, and the log of the epochs."""
         tensors = {f"network.{name}": part for name, part in self.network.tensors().items()}
         tensors |= {f"best.{name}": part for name, part in self._best.items()}
         for number, parameter in enumerate(self.network.parameters()):
             for name, value in self.optimiser.state[parameter].items():
                 tensors[f"optimiser.{number}.{name}"] = np.atleast_1d(value.detach().cpu().numpy())
-        said = {"training": self._fingerprint(), "state": json.dumps(asdict(self.state)), "rows": json.dumps(self.rows)}
-        save(self._folder / _STATE, tensors, said)
+        card = {"training": self._fingerprint(), "state": json.dumps(asdict(self.state)), "rows": json.dumps(self.rows)}
+        save(self._folder / _STATE, tensors, card)
         text = io.StringIO()
         writer = csv.DictWriter(text, fieldnames=_COLUMNS, lineterminator="\n")
         writer.writeheader()
@@ -292,7 +320,7 @@ class _Run:
         publish_bytes(self._folder / _LOG, text.getvalue().encode())
 
     def resume(self) -> None:
-        """Go on from the state in the folder. Raises McaptrackError if it is of another training."""
+        """Continue from the state in the folder. Raises McaptrackError if it is of another training."""
         stored = load(self._folder / _STATE)
         if stored.card.get("training") != self._fingerprint():
             raise McaptrackError(
@@ -316,7 +344,7 @@ class _Run:
             }
 
     def _fingerprint(self) -> str:
-        """What has to be the same for a training to go on: recipe (but for its length), windows, device."""
+        """What has to be equal for a training to be resumed: recipe (but for its length), windows, device."""
         import hashlib
 
         total = hashlib.sha256(self._training.past.tobytes() + self._training.future.tobytes()).hexdigest()

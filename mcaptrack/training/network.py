@@ -16,14 +16,14 @@ from mcaptrack.predictors import red
 from mcaptrack.predictors.linear import LinearPredictor
 from mcaptrack.training.windows import Windows
 
-#: A torch.Tensor. torch is not there when the types are checked.
+#: A torch.Tensor; torch may be missing when types are checked.
 Tensor = Any
 
 _LSTM_HIDDEN = 64
 
 
 class RedNetwork(nn.Module):
-    """See ``mcaptrack.predictors.red``. A fresh one forecasts as the Kalman filter does."""
+    """See ``mcaptrack.predictors.red``. Before training its forecasts are those of the Kalman filter."""
 
     def __init__(self, steps: int, step_s: float, hidden: int = 64, dense: int = 128) -> None:
         super().__init__()
@@ -37,31 +37,31 @@ class RedNetwork(nn.Module):
         self.base = (weights.astype(np.float32), np.sqrt(variance).astype(np.float32))
 
     def prepare(self, windows: Windows) -> dict[str, Tensor]:
-        """What ``forward`` needs of windows, and their future, as tensors whose first axis is the window."""
+        """The inputs of ``forward`` and the true future, as tensors with the window as first axis."""
         inputs = red.prepare(windows.past, windows.known, *(part.astype(np.float64) for part in self.base))
         out = {name: torch.tensor(part) for name, part in inputs._asdict().items()}
         out["future"] = torch.tensor(windows.future)
         return {name: part.float() if part.is_floating_point() else part for name, part in out.items()}
 
     def forward(self, given: dict[str, Tensor]) -> tuple[Tensor, ...]:
-        """Means (B, T, 2) in m; spreads (B, T) along and across the way; their correlation (B, T)."""
+        """Means (B, T, 2) in m; standard deviations (B, T) along and across the direction; their correlation (B, T)."""
         features, started = given["features"], given["started"]
         state = features.new_zeros(len(features), self.hidden)
         for pair in range(features.shape[1]):
             new = self.gru(features[:, pair], state)
             state = torch.where(started[:, pair, None], new, state)
-        said = self.head(torch.tanh(self.dense(state))).reshape(-1, self.steps, red.OUTPUTS)
+        outputs = self.head(torch.tanh(self.dense(state))).reshape(-1, self.steps, red.OUTPUTS)
         gate, spread = given["gate"][:, None], given["spread"]
-        mean = given["mean"] + (said[..., :2] * (gate * spread)[..., None]) @ given["turn"]
-        width, longer = spread * torch.exp(said[..., 2]), torch.exp(gate * said[..., 3])
-        return mean, width * longer, width / longer, red.MOST_CORRELATED * torch.tanh(gate * said[..., 4])
+        mean = given["mean"] + (outputs[..., :2] * (gate * spread)[..., None]) @ given["turn"]
+        width, longer = spread * torch.exp(outputs[..., 2]), torch.exp(gate * outputs[..., 3])
+        return mean, width * longer, width / longer, red.MOST_CORRELATED * torch.tanh(gate * outputs[..., 4])
 
     def loss(self, given: dict[str, Tensor], distance_weight: float) -> tuple[Tensor, Tensor]:
-        """The mean loss of a batch, and the forecasts (B, T, 2) that it is of."""
-        mean, along, across, tied = self(given)
+        """The mean loss of a batch, and its forecasts (B, T, 2)."""
+        mean, along, across, correlation = self(given)
         off = (given["future"] - mean) @ given["turn"].transpose(1, 2)
-        x, y, free = off[..., 0] / along, off[..., 1] / across, 1 - tied**2
-        nll = (x * x + y * y - 2 * tied * x * y) / (2 * free) + torch.log(along * across) + torch.log(free) / 2
+        x, y, free = off[..., 0] / along, off[..., 1] / across, 1 - correlation**2
+        nll = (x * x + y * y - 2 * correlation * x * y) / (2 * free) + torch.log(along * across) + torch.log(free) / 2
         distance = torch.sqrt((off**2).sum(-1) + 1e-6)
         return nll.mean() + distance_weight * distance.mean(), mean
 
@@ -71,7 +71,7 @@ class RedNetwork(nn.Module):
         return _to_numpy(self) | {"base.weights": weights, "base.spread": spread}
 
 
-class _Half(nn.Module):
+class _Cell(nn.Module):
     """The encoder or the decoder of the paper's network."""
 
     def __init__(self) -> None:
@@ -80,7 +80,7 @@ class _Half(nn.Module):
         self.lstm = nn.LSTMCell(_LSTM_HIDDEN, _LSTM_HIDDEN)
 
     def folded(self) -> tuple[Tensor, ...]:
-        """The weights of an LSTM cell that sees displacements: the linear layer before it folded in, once a batch."""
+        """The weights of the LSTM cell with the linear layer before it folded in, computed once per batch."""
         cell, embed = self.lstm, self.embed
         into, bias = cell.weight_ih @ embed.weight, cell.weight_ih @ embed.bias + cell.bias_ih
         return into, cell.weight_hh, bias, cell.bias_hh
@@ -92,12 +92,12 @@ class LstmNetwork(nn.Module):
     def __init__(self, steps: int) -> None:
         super().__init__()
         self.steps = steps
-        self.encoder, self.decoder = _Half(), _Half()
+        self.encoder, self.decoder = _Cell(), _Cell()
         self.out = nn.Linear(_LSTM_HIDDEN, 2)
         self.spread = np.ones(steps, np.float32)
 
     def prepare(self, windows: Windows) -> dict[str, Tensor]:
-        """As that of ``RedNetwork``: displacements of the past and of the future."""
+        """Displacements of the past and of the future, as tensors with the window as first axis."""
         path = np.concatenate([windows.past, windows.future], axis=1)
         moves = np.diff(path, axis=1, prepend=path[:, :1])
         length = windows.past.shape[1]
@@ -118,7 +118,7 @@ class LstmNetwork(nn.Module):
         return torch.stack(out, dim=1)
 
     def loss(self, given: dict[str, Tensor], angle: float | None) -> Tensor:
-        """The sum of squared errors of a batch as it is and, with an ``angle``, turned by it as well."""
+        """The sum of squared errors of a batch and, if ``angle`` is given, of the batch rotated by it (radians)."""
         past, future = given["past"], given["future"]
         if angle is not None:
             cos, sin = math.cos(angle), math.sin(angle)

@@ -1,4 +1,4 @@
-"""How a network is trained, as parameters with names; recipes are sets of them."""
+"""Hyperparameters of training, and named sets of them (recipes)."""
 
 from __future__ import annotations
 
@@ -15,14 +15,44 @@ Network = Literal["red", "lstm"]
 
 @dataclass(frozen=True, kw_only=True)
 class Recipe:
-    """``past`` positions in, ``steps`` of ``step_s`` seconds out; ``least`` past positions make a window.
+    """Hyperparameters of a training.
 
-    ``loss``: "likelihood" is the Gaussian negative log-likelihood plus ``distance_weight`` times the mean distance;
-    "displacements" is the sum of squared errors of the displacements, of every batch as it is and turned at random (the
-    paper's). ``schedule``: "one-cycle" rises for a tenth of the time and falls to nothing; "step" divides the rate by
-    five at epoch ``drop_at``. ``consistency_weight`` is how much forecasts from one step to the next may not differ.
-    ``patience`` ends the training after so many epochs without a better validation; the best epoch is ``kept``, or the
-    last.
+    Attributes
+    ----------
+    network : {"red", "lstm"}
+        Which network.
+    past, steps : int
+        Number of past positions and of predicted steps.
+    step_s : float
+        Length of a step in seconds.
+    least : int
+        Number of past positions that a window needs.
+    stride : int
+        Every how many steps a window is cut.
+    epochs, batch : int
+        Passes over the windows, and windows per optimiser step.
+    rate : float
+        Learning rate, for the one-cycle schedule its maximum.
+    schedule : {"one-cycle", "step"}
+        "one-cycle" rises for a tenth of the time and falls to 0; "step" divides the rate by five at ``drop_at``.
+    drop_at : int
+        Epoch of that step.
+    loss : {"likelihood", "displacements"}
+        "likelihood" is the Gaussian negative log-likelihood plus ``distance_weight`` times the mean distance;
+        "displacements" is the sum of squared errors of displacements, of every batch and of a randomly rotated copy
+        (the paper's).
+    distance_weight : float
+        See ``loss``.
+    consistency_weight : float
+        Weight of the distance between forecasts of the same time from consecutive steps.
+    corruption : Corruption
+        Augmentation of the windows.
+    patience : int
+        Stop after so many epochs without improvement; 0 for never.
+    kept : {"best", "last"}
+        Which weights are kept: those of the best or of the last epoch.
+    seed : int
+        Random seed.
     """
 
     network: Network = "red"
@@ -51,10 +81,10 @@ class Recipe:
                     f"{name.replace('_', '-')} has to be at least {least:g}, not {getattr(self, name)}"
                 )
         if self.consistency_weight and self.loss == "displacements":
-            raise McaptrackError("a consistency weight needs the recipe red; paper compares displacements alone")
+            raise McaptrackError("a consistency weight needs the recipe red; paper compares displacements only")
 
     def changed(self, given: Mapping[str, object], corrupted: Mapping[str, object]) -> Self:
-        """With other parameters, and others of the corruption; None leaves one as it is. Raises McaptrackError."""
+        """The recipe with other hyperparameters and augmentation; None keeps a value. Raises McaptrackError."""
         for name, most in (("noise_m", 10.0), ("gaps", 0.9), ("scale", 1.0)):
             value = corrupted.get(name)
             if isinstance(value, float) and not 0 <= value <= most:
@@ -63,7 +93,7 @@ class Recipe:
         return replace(self, corruption=corruption, **{k: v for k, v in given.items() if v is not None})  # type: ignore[arg-type]
 
     def rate_at(self, step: int, per_epoch: int) -> float:
-        """The learning rate of the step-th batch, of which there are ``per_epoch`` in an epoch."""
+        """The learning rate of the batch number ``step``, with ``per_epoch`` batches in an epoch."""
         if self.schedule == "step":
             return self.rate / (5 if step // per_epoch >= self.drop_at else 1)
         from math import cos, pi
@@ -72,16 +102,16 @@ class Recipe:
         share = done / 0.1 if done < 0.1 else (1 + cos(pi * (done - 0.1) / 0.9)) / 2
         return self.rate * max(share, 1e-3)
 
-    def words(self) -> dict[str, str]:
-        """What differs from the default, as text for a card."""
+    def changes(self) -> dict[str, str]:
+        """The values that differ from the recipe "red", as text for the model card."""
         had = {f.name: getattr(RECIPES["red"], f.name) for f in fields(self)}
         out = {k: v for k, v in asdict(self).items() if k != "corruption" and getattr(self, k) != had[k]}
         out |= {k: v for k, v in asdict(self.corruption).items() if v != getattr(had["corruption"], k)}
         return {key: str(value) for key, value in out.items()}
 
 
-#: "red" is ours; "paper" is what the program of the paper's authors does: their network, Adam with 1e-4 and a fifth of
-#: it after epoch 40 of 50, some 60 windows a batch, every other window, turns and nothing else, the last epoch kept.
+#: "red" is this project's recipe; "paper" is that of the authors' program: their network, Adam with 1e-4 and a fifth of
+#: it after epoch 40 of 50, about 60 windows per batch, every other window, random rotations only, the last epoch kept.
 RECIPES: Final[Mapping[str, Recipe]] = MappingProxyType(
     {
         "red": Recipe(),

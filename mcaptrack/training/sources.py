@@ -1,6 +1,6 @@
-"""What predictors are trained on: label files, Parquet tables, logs' own tracks, or walks that are made up.
+"""Training data: label files, Parquet tables, tracks of logs, or synthetic walks.
 
-Letters: I people, S steps.
+Letters: I tracks, S steps.
 """
 
 from __future__ import annotations
@@ -27,26 +27,26 @@ from mcaptrack.training.windows import Windows
 from mcaptrack.transforms import Sample
 
 SYNTHETIC: Final = "synthetic"
-#: The channels of a log that are trained on, the best first.
+#: The channels of a log to train on, the best first.
 _BEST: Final = ("truth", "retracks", "samples", "tracks")
 _SDD_FPS: Final = Fraction(30)
 
 
 @dataclass(frozen=True)
 class Scene:
-    """People on a regular clock: ``xy_m`` (I, S, 2), NaN where they are not seen."""
+    """Tracks on a regular clock: ``xy_m`` (I, S, 2), NaN where they were not observed."""
 
     name: str
     xy_m: Floats
 
     def cut(self, recipe: Recipe, number: int) -> Windows:
-        """The windows that a recipe trains on."""
+        """The windows of a recipe; ``number`` is that of the scene."""
         return Windows.cut(self.xy_m, recipe.past, recipe.steps, recipe.least, recipe.stride, number)
 
 
 @dataclass(frozen=True, kw_only=True)
 class SourceOptions:
-    """How to read sources that don't say it: frames per second, where the ground is, which channel of a log."""
+    """How to read sources that don't specify it: frames per second, ground plane, channel of a log."""
 
     fps: Fraction | None = None
     ground_plane: Path | None = None
@@ -55,7 +55,7 @@ class SourceOptions:
 
 
 def read_scenes(paths: Sequence[Path], options: SourceOptions, step_s: float) -> list[Scene]:
-    """The scenes in files and folders: one a label file, and one a channel of tracks. Raises McaptrackError."""
+    """The scenes in files and folders: one per label file or channel of tracks. Raises McaptrackError."""
     scenes: list[Scene] = []
     for path in paths:
         members = _files(path)
@@ -65,13 +65,13 @@ def read_scenes(paths: Sequence[Path], options: SourceOptions, step_s: float) ->
 
 
 def _files(path: Path) -> list[Path]:
-    """The files of a folder that can be sources, or the file itself."""
+    """The files of a folder that can be read, or the file itself."""
     if not path.is_dir():
         log.refuse_non_mcap(path)
         return [path]
     kinds = (".txt", ".parquet", ".mcap")
     found = sorted(file for file in path.rglob("*") if file.suffix.lower() in kinds and file.is_file())
-    # Of tables those of tracks; and not those that tell again what the log beside them tells.
+    # Only tables of tracks, and none that repeat the log beside them.
     logs = {file.with_suffix(".tables") for file in found if file.suffix.lower() == ".mcap"}
     found = [file for file in found if not logs & set(file.parents)]
     found = [file for file in found if file.suffix.lower() != ".parquet" or tables.holds_tracks(file)]
@@ -84,20 +84,20 @@ def _files(path: Path) -> list[Path]:
 def _from_labels(path: Path, options: SourceOptions, step_s: float) -> list[Scene]:
     labels = read_labels(path, role="truth")
     if not labels.identified:
-        raise McaptrackError(f"{path} has boxes but doesn't say whose they are; predictors learn from tracks")
+        raise McaptrackError(f"{path} has boxes without track ids; predictors learn from tracks")
     fps = options.fps
     if fps is None and labels.format == "sdd":
         fps = _SDD_FPS
     if fps is None and labels.format == "mot":
         raise McaptrackError(f"{path}: how many frames a second? Say it with --fps")
-    if fps is None:  # annotated on the clock of prediction
+    if fps is None:  # annotated at the rate of prediction
         fps = Fraction(labels.step / step_s).limit_denominator(1000)
     plane = options.ground_plane
     if labels.xy_m is None and plane is None:
         raise McaptrackError(f"{path} is in pixels; give its homography with --ground-plane")
     frames = label_frames({"truth": path}, fps, plane, options.point)["truth"]
     first = next((number for number, frame in enumerate(frames) if len(frame.rows)), 0)
-    return [_scene(path.stem, frames[first:], step_s, ())]  # windows begin where labels do
+    return [_scene(path.stem, frames[first:], step_s, ())]  # windows begin with the first label
 
 
 def _from_log(path: Path, options: SourceOptions, step_s: float) -> list[Scene]:
@@ -131,7 +131,7 @@ def _rank(topic: str) -> int:
 
 
 def _scene(name: str, frames: Iterable[Frame], step_s: float, planes: Planes) -> Scene:
-    """Frames of tracks as a scene; what was only filled in counts as not seen."""
+    """Frames of tracks as a scene; interpolated positions count as not observed."""
     sampled = [frame for (frame,) in Sample(rate_hz=1 / step_s, ground_planes=tuple(planes))(frames)]
     if not sampled:
         return Scene(name, np.empty((0, 0, 2)))
@@ -139,10 +139,10 @@ def _scene(name: str, frames: Iterable[Frame], step_s: float, planes: Planes) ->
     step = [round((frame.t_ns - start) / (step_s * NS_PER_S)) for frame in sampled]
     rows = np.concatenate([frame.rows for frame in sampled])
     at = np.repeat(np.array(step, np.int64), [len(frame.rows) for frame in sampled])
-    seen = rows["observed"] & np.isfinite(rows["x_m"])
-    ids, who = np.unique(rows["track_id"][seen], return_inverse=True)
+    observed = rows["observed"] & np.isfinite(rows["x_m"])
+    ids, track = np.unique(rows["track_id"][observed], return_inverse=True)
     xy_m = np.full((len(ids), step[-1] + 1, 2), np.nan)
-    xy_m[who, at[seen]] = np.stack([rows["x_m"][seen], rows["y_m"][seen]], axis=-1)
+    xy_m[track, at[observed]] = np.stack([rows["x_m"][observed], rows["y_m"][observed]], axis=-1)
     return Scene(name, xy_m)
 
 
@@ -153,7 +153,7 @@ _READERS: Final[dict[str, Callable[[Path, SourceOptions, float], list[Scene]]]] 
 
 
 def synthetic(recipe: Recipe, count: int, seed: int) -> Windows:
-    """Windows of made-up walks."""
+    """Windows of synthetic walks."""
     paths, scene = walks(count, recipe.past + recipe.steps, recipe.step_s, seed)
     return Windows.of(paths, recipe.past, scene)
 
@@ -168,9 +168,9 @@ def windows_of(scenes: Sequence[Scene], recipe: Recipe) -> Windows:
 
 
 def split(windows: Windows, share: float, seed: int) -> tuple[Windows, Windows]:
-    """Windows to train on and to validate on: whole scenes apart, about ``share`` of the windows in the second.
+    """Split windows by scenes into those to train on and those to validate on, about ``share`` of all.
 
-    A single scene is split by its windows' order, which is that of people.
+    A single scene is split by the order of its windows, which is that of tracks.
     """
     scenes, count = np.unique(windows.scene, return_counts=True)
     if len(scenes) == 1:

@@ -1,9 +1,9 @@
-"""People who walk, made up: crowds to train predictors on, without anybody's data.
+"""Synthetic walks: simulated crowds to train predictors on without recordings.
 
-People have goals and go towards them at a speed of their own; they wander a little, turn at goals, stop and go on,
-stand about, walk in groups, and make way for one another. The numbers are what is known of pedestrians in general
-(speeds of 1.3 m/s with a spread of 0.26, as in Weidmann 1993; making way by a repulsion that falls off
-with distance, as in Helbing and Molnar 1995), not fitted to any recording.
+People walk towards goals at their own preferred speed; they wander a little, choose new goals, stop and continue,
+stand, walk in groups, and avoid each other. Parameters are general knowledge about pedestrians (speeds of 1.3 m/s with
+a standard deviation of 0.26, Weidmann 1993; a repulsion that decreases with distance, Helbing and Molnar 1995), not
+fitted to any recording.
 
 Letters: S scenes, M people in each, T steps, W walks.
 """
@@ -18,34 +18,34 @@ from numpy.typing import NDArray
 
 from mcaptrack.geometry.arrays import Bools, Floats
 
-#: How finely the crowd moves, in seconds, and how long it does before anybody looks.
+#: Time step of the simulation, and how long it runs before walks are recorded, in seconds.
 _FINE_S: Final = 0.2
 _SETTLE_S: Final = 8.0
 _SCENES, _PEOPLE = 48, 24
 _WALKS_EACH: Final = 5
-#: The share of scenes where people are more restless than elsewhere, up to seven times.
+#: Share of scenes with up to seven times as frequent changes of direction.
 _RESTLESS: Final = 0.1
-#: Shares of people by pace: those who mostly stand, who stroll, who walk, and who run or ride.
+#: Shares of people who mostly stand, stroll, walk, and run or ride.
 _PACES: Final = (0.24, 0.12, 0.61, 0.03)
 
 
 @dataclass
 class _Crowd:
-    """S scenes of M people: where they are, how they move, and what they are up to."""
+    """The state of S scenes with M people each."""
 
     rng: np.random.Generator
-    side_m: Floats  # (S, 1) of the square that each scene plays on
-    restless: Floats  # (S, 1) how much more often than elsewhere people change their minds, and how much more they veer
+    side_m: Floats  # (S, 1) side of the square of each scene
+    restless: Floats  # (S, 1) factor of changes of goal and of wandering
     place: Floats  # (S, M, 2)
     speed: Floats  # (S, M, 2) velocity
     goal: Floats  # (S, M, 2)
-    pace: Floats  # (S, M) m/s that somebody likes to walk at
-    stands: Bools  # (S, M) whether somebody mostly stands
-    rest_s: Floats  # (S, M) how long somebody stands yet
-    haste: Floats  # (S, M) share of the pace that somebody walks at now, wavering about 1
-    veer: Floats  # (S, M) radians off the way to the goal, wavering about 0
-    leader: NDArray[np.int64]  # (S, M) with whom somebody goes; themselves if alone
-    offset: Floats  # (S, M, 2) where in their group, in metres sideways and back
+    pace: Floats  # (S, M) preferred speed, m/s
+    stands: Bools  # (S, M) whether a person mostly stands
+    rest_s: Floats  # (S, M) remaining time of a stop
+    haste: Floats  # (S, M) current share of the preferred speed, fluctuating around 1
+    veer: Floats  # (S, M) angle off the direction of the goal in radians, fluctuating around 0
+    leader: NDArray[np.int64]  # (S, M) leader of the group; the person itself if alone
+    offset: Floats  # (S, M, 2) place in the group, metres sideways and back
 
     @classmethod
     def start(cls, rng: np.random.Generator) -> _Crowd:
@@ -60,11 +60,11 @@ class _Crowd:
         place = rng.uniform(0, 1, (*shape, 2)) * side[..., None]
         leader = np.tile(np.arange(_PEOPLE), (_SCENES, 1))
         offset = np.zeros((*shape, 2))
-        # A quarter goes with the one before them, at their pace, beside or a little behind.
+        # A quarter joins the person before, with its speed, beside or a little behind.
         joins = (rng.random(shape) < 0.25) & (np.arange(_PEOPLE) > 0)
-        for who in range(1, _PEOPLE):
-            ahead = leader[:, who - 1]
-            leader[:, who] = np.where(joins[:, who], ahead, who)
+        for person in range(1, _PEOPLE):
+            ahead = leader[:, person - 1]
+            leader[:, person] = np.where(joins[:, person], ahead, person)
         offset[joins] = np.stack(
             [
                 rng.choice([-1, 1], joins.sum()) * rng.uniform(0.5, 1.0, joins.sum()),
@@ -95,7 +95,7 @@ class _Crowd:
         return crowd
 
     def step(self) -> None:
-        """``_FINE_S`` later."""
+        """Advance by ``_FINE_S``."""
         rng, dt = self.rng, _FINE_S
         scene = np.arange(_SCENES)[:, None]
         shape = self.pace.shape
@@ -110,7 +110,7 @@ class _Crowd:
         way = np.stack([cos * way[..., 0] - sin * way[..., 1], sin * way[..., 0] + cos * way[..., 1]], -1)
         going = (self.rest_s <= 0) * self.pace * self.haste
         wish = way / np.maximum(away, 0.1)[..., None] * going[..., None]
-        # Who is in a group keeps to their place beside its first.
+        # Members of a group keep their place beside the leader.
         follows = self.leader != np.arange(_PEOPLE)
         first, along = self.place[scene, self.leader], self.speed[scene, self.leader]
         pace = np.hypot(along[..., 0], along[..., 1])
@@ -121,12 +121,12 @@ class _Crowd:
         off /= np.maximum(np.hypot(off[..., 0], off[..., 1]), 1.0)[..., None]
         wish = np.where(follows[..., None], along + 0.5 * off, wish)
         fidget = np.where(going > 0, 0.12, 0.06)[..., None] * rng.normal(size=(*shape, 2)) / np.sqrt(dt)
-        push = (wish - self.speed) / 0.55 + self._room() + 0.6 * fidget
+        push = (wish - self.speed) / 0.55 + self._repulsion() + 0.6 * fidget
         self.speed = self.speed + dt * push
         self.place = self.place + dt * self.speed
 
     def _rest(self, dt: float) -> None:
-        """People stop now and then, for seconds or longer, and go on, often another way."""
+        """Stop at random times, for seconds or longer, and continue, often in another direction."""
         rng, shape = self.rng, self.rest_s.shape
         ends = (self.rest_s > 0) & (self.rest_s <= dt)
         self.rest_s = np.maximum(self.rest_s - dt, 0.0)
@@ -136,23 +136,23 @@ class _Crowd:
         self._new_goal(ends & (rng.random(shape) < 0.5), spread=1.2)
 
     def _turn(self) -> None:
-        """Who is there goes somewhere else, mostly ahead; now and then people change their mind."""
+        """Choose a new goal, mostly ahead, after reaching one and at random times."""
         away = np.hypot(*np.moveaxis(self.goal - self.place, -1, 0))
         shape = away.shape
         self._new_goal((away < 1.0) | (self.rng.random(shape) < self.restless * _FINE_S / 140), spread=0.35)
 
-    def _new_goal(self, who: Bools, spread: float) -> None:
-        rng, shape = self.rng, who.shape
+    def _new_goal(self, which: Bools, spread: float) -> None:
+        rng, shape = self.rng, which.shape
         heading = np.arctan2(self.speed[..., 1], self.speed[..., 0])
         heading = heading + spread * rng.standard_t(3, shape) / 1.7
         far = np.exp(rng.uniform(np.log(12), np.log(100), shape)) / self.restless * np.maximum(self.pace / 1.3, 1.0)
         goal = self.place + far[..., None] * np.stack([np.cos(heading), np.sin(heading)], -1)
         outside = ((goal < 0) | (goal > self.side_m[..., None])).any(-1)
         goal = np.where(outside[..., None], rng.uniform(0, 1, (*shape, 2)) * self.side_m[..., None], goal)
-        self.goal = np.where(who[..., None], goal, self.goal)
+        self.goal = np.where(which[..., None], goal, self.goal)
 
-    def _room(self) -> Floats:
-        """Making way: away from those who are near, and more from those ahead than from those behind."""
+    def _repulsion(self) -> Floats:
+        """Accelerations away from people who are near, stronger from those ahead than from those behind."""
         east, north = (self.place[:, :, None, axis] - self.place[:, None, :, axis] for axis in (0, 1))
         near = np.sqrt(east**2 + north**2) + 1e-6
         strength = np.minimum(2.0 * np.exp((0.5 - near) / 0.35), 3.0)
@@ -177,7 +177,7 @@ def walks(count: int, steps: int, step_s: float, seed: int) -> tuple[Floats, NDA
         crowd = _Crowd.start(rng)
         for _ in range(round(_SETTLE_S / _FINE_S)):
             crowd.step()
-        # Several walks of each person, one after the other.
+        # Several consecutive walks of each person.
         path = []
         for _ in range(int(np.ceil(_WALKS_EACH * steps * every)) + 2):
             path.append(crowd.place)
@@ -186,8 +186,8 @@ def walks(count: int, steps: int, step_s: float, seed: int) -> tuple[Floats, NDA
         at = np.arange(_WALKS_EACH * steps) * every
         low = at.astype(int)
         share = (at - low)[:, None]
-        seen = (1 - share) * places[:, low] + share * places[:, low + 1]
-        out.append(seen.reshape(-1, steps, 2))
+        sampled = (1 - share) * places[:, low] + share * places[:, low + 1]
+        out.append(sampled.reshape(-1, steps, 2))
         made += len(out[-1])
     scene = np.arange(len(out) * _SCENES).repeat(_PEOPLE * _WALKS_EACH)
     return np.concatenate(out)[:count], scene[:count]

@@ -1,4 +1,4 @@
-"""Windows: what was seen of people, and where they went then. Cut from paths; corrupted as trackers corrupt.
+"""Windows of tracks: past positions and the true future. Cut from trajectories; augmented with errors of trackers.
 
 Letters: N windows, L past positions (the last one is now), T future steps.
 """
@@ -12,13 +12,13 @@ import numpy as np
 
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
 
-#: How fast the noise of a tracker forgets itself, from one step to the next.
+#: Autocorrelation of the noise of a tracker from one step to the next.
 _NOISE_MEMORY: Final = 0.5
 
 
 @dataclass(frozen=True)
 class Windows:
-    """``past`` (N, L, 2) in m, of which ``known`` (N, L) were seen, ``future`` (N, T, 2) in m, ``scene`` (N,)."""
+    """``past`` (N, L, 2) in m, of which ``known`` (N, L) are known, ``future`` (N, T, 2) in m, ``scene`` (N,)."""
 
     past: Floats
     known: Bools
@@ -33,27 +33,27 @@ class Windows:
 
     @classmethod
     def of(cls, paths: Floats, past: int, scene: Ints | None = None) -> Windows:
-        """Whole paths (N, L + T, 2), all of them seen."""
+        """Complete trajectories (N, L + T, 2)."""
         known = np.ones((len(paths), past), bool)
         return cls(paths[:, :past], known, paths[:, past:], np.zeros(len(paths), np.int64) if scene is None else scene)
 
     @classmethod
     def cut(cls, xy_m: Floats, past: int, steps: int, least: int, stride: int = 1, scene: int = 0) -> Windows:
-        """All windows in the paths (I, S, 2) of a scene, NaN where somebody is not seen, every ``stride`` steps.
+        """All windows in the trajectories (I, S, 2) of a scene, NaN where not observed, every ``stride`` steps.
 
-        The present and the ``steps`` after it have to be known, and at least ``least`` past positions.
+        The current position and the ``steps`` after it have to be known, and at least ``least`` past positions.
         """
-        people, length = xy_m.shape[:2]
-        padded = np.concatenate([np.full((people, past - 1, 2), np.nan), xy_m], axis=1)
-        if people == 0 or length < steps + 1:
+        tracks, length = xy_m.shape[:2]
+        padded = np.concatenate([np.full((tracks, past - 1, 2), np.nan), xy_m], axis=1)
+        if tracks == 0 or length < steps + 1:
             return cls.of(np.empty((0, past + steps, 2)), past)
         windows = np.lib.stride_tricks.sliding_window_view(padded, past + steps, axis=1).transpose(0, 1, 3, 2)
         known = np.isfinite(windows[..., 0])
-        whole = known[:, :, past - 1 :].all(axis=2) & (known[:, :, :past].sum(axis=2) >= least)
-        rank = np.cumsum(whole, axis=1) - 1  # of each person's own windows
-        who, start = np.nonzero(whole & (rank % stride == 0))
-        found, seen = windows[who, start], known[who, start, :past]
-        return cls(found[:, :past], seen, found[:, past:], np.full(len(found), scene))
+        complete = known[:, :, past - 1 :].all(axis=2) & (known[:, :, :past].sum(axis=2) >= least)
+        rank = np.cumsum(complete, axis=1) - 1  # among the windows of each track
+        track, start = np.nonzero(complete & (rank % stride == 0))
+        found, is_known = windows[track, start], known[track, start, :past]
+        return cls(found[:, :past], is_known, found[:, past:], np.full(len(found), scene))
 
     @classmethod
     def join(cls, parts: list[Windows]) -> Windows:
@@ -63,18 +63,29 @@ class Windows:
         )
 
     def last(self, count: int) -> Windows:
-        """Only the last ``count`` past positions."""
+        """The windows with only the last ``count`` past positions."""
         return Windows(self.past[:, -count:], self.known[:, -count:], self.future, self.scene)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Corruption:
-    """How windows are made harder, drawn anew every time: what a network is to bear.
+    """Random augmentation of windows, drawn anew in every epoch.
 
-    ``noise_m`` the most noise of a seen position (per axis; that of a window is anything below it, little more often
-    than much, on a share ``noisy`` of them, correlated from step to step), ``gaps`` the share of past positions that
-    were not seen, ``least`` the shortest past, ``scale`` the most that people are made larger or smaller (as a
-    logarithm), ``turn`` and ``mirror`` whether windows are turned and mirrored.
+    Attributes
+    ----------
+    noise_m : float
+        Largest standard deviation of position noise per axis; that of a window is drawn below it, small values more
+        often, and the noise is correlated from step to step.
+    noisy : float
+        Share of windows with noise.
+    gaps : float
+        Share of past positions to remove, in half of the windows.
+    least : int or None
+        Shortest past; None keeps all.
+    scale : float
+        Largest scaling, as a natural logarithm.
+    turn, mirror : bool
+        Whether to rotate and to mirror windows at random.
     """
 
     noise_m: float = 0.0
@@ -86,7 +97,7 @@ class Corruption:
     mirror: bool = True
 
     def __call__(self, windows: Windows, rng: np.random.Generator) -> Windows:
-        """The same windows, made harder, around the present position."""
+        """Augmented windows, relative to the current position."""
         count, length = windows.known.shape
         now = windows.past[:, -1:]
         past, future = windows.past - now, windows.future - now
@@ -115,7 +126,7 @@ class Corruption:
 
 
 def ar1(rng: np.random.Generator, count: int, length: int, memory: float = _NOISE_MEMORY) -> Floats:
-    """Noise (N, L, 2) of spread 1 that remembers a share ``memory`` of itself from step to step."""
+    """Noise (N, L, 2) of standard deviation 1 with autocorrelation ``memory`` from step to step (AR(1))."""
     fresh = rng.normal(size=(count, length, 2))
     out = np.empty_like(fresh)
     out[:, 0] = fresh[:, 0]

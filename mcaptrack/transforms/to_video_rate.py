@@ -22,7 +22,7 @@ _FROM_TRACKER: Final = ("x_px", "y_px", "w_px", "h_px", "score", "observed")
 
 
 def to_video_rate(tracks: Sequence[Frame], retracks: Sequence[Frame], planes: Planes) -> list[Frame]:
-    """The frames of ``tracks`` with the ids of ``retracks``, whose ``source_id`` names the tracks.
+    """The frames of ``tracks`` with the ids of ``retracks``.
 
     Each box of the tracker gets the re-tracked id that its track has at the nearest sample time. Where a re-tracked
     track has no box, its row is interpolated between the samples and not observed. Boxes of tracks that re-tracking
@@ -33,7 +33,7 @@ def to_video_rate(tracks: Sequence[Frame], retracks: Sequence[Frame], planes: Pl
     tracks : sequence of Frame
         Frames of Tracks at the video's rate, as the tracker made them.
     retracks : sequence of Frame
-        Frames of Tracks at sample times, as re-tracking made them of the samples of ``tracks``.
+        Frames of Tracks at sample times; ``source_id`` is the id in ``tracks``.
     planes : Planes
         Ground planes, for positions in metres of boxes that have none.
 

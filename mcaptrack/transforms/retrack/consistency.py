@@ -1,8 +1,8 @@
 """Re-tracking by prediction consistency: Algorithm 1 of the paper over one log, step by step.
 
 An observation is a sample with a prediction from its own past; its input id is dropped. A track is a prediction and an
-age. Observations are assigned to the tracks whose predictions agree with theirs; a matched track is smoothed and
-predicts again; an unmatched one ages.
+age. Observations are assigned to the tracks with similar predictions; a matched track is smoothed and predicts again;
+an unmatched one ages.
 
 Letters: K tracks, N observations, L past positions, T predicted steps.
 """
