@@ -342,6 +342,6 @@ class TestCommand:
         result = self.run("synthetic", "-o", tmp_path / "new")
         assert result.exit_code == 1
         assert result.stderr == (
-            "mcaptrack: training needs torch, which is not installed; `pip install 'mcaptrack[train]'` brings it\n"
+            "mcaptrack: training needs torch, which is not installed; `pip install 'mcaptrack[train]'` installs it\n"
         )
         assert not (tmp_path / "new").exists()

@@ -52,7 +52,7 @@ class Onnx:
             import onnxruntime
         except ImportError:
             raise McaptrackError(
-                f"onnx:{path} needs ONNX Runtime, which is not installed; `pip install 'mcaptrack[onnx]'` brings it"
+                f"onnx:{path} needs ONNX Runtime, which is not installed; `pip install 'mcaptrack[onnx]'` installs it"
             ) from None
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = 1  # a batch holds the tracks of one frame: too little for threads
