@@ -25,11 +25,11 @@ if TYPE_CHECKING:
 
 #: An example for the help of each command.
 _EXAMPLES: Final = {
-    "detect": "mcaptrack detect log.mcap --detector mog2",
-    "track": "mcaptrack track log.mcap --tracker bytetrack",
-    "sample": "mcaptrack sample log.mcap --rate-hz 2.5",
-    "predict": "mcaptrack predict log.mcap --predictor cv",
-    "retrack": "mcaptrack retrack log.mcap --profile authors",
+    "detect": "Example: mcaptrack detect log.mcap --detector mog2",
+    "track": "Example: mcaptrack track log.mcap --tracker bytetrack",
+    "sample": "Example: mcaptrack sample log.mcap --rate-hz 2.5",
+    "predict": "Example: mcaptrack predict log.mcap --predictor cv",
+    "retrack": "Example: mcaptrack retrack log.mcap --profile authors",
 }
 Topic = Annotated[
     str | None, common.option("--topic", panel=common.FILES, help="Read this channel instead of the default one.")
@@ -66,7 +66,7 @@ def add_stages(app: typer.Typer, panel: str) -> None:
 def _help(stage: Stage) -> str:
     where = f"From /camera/{stage.reads} to /camera/{stage.writes}. Inputs that are missing are made first."
     words = [inspect.cleandoc(one.__doc__ or "") for one in stage.built_in().values()]
-    return "\n\n".join([*words, where, f"Example: {_EXAMPLES[stage.name]}"])
+    return "\n\n".join([*words, where, _EXAMPLES[stage.name]])
 
 
 def _option(field: Field[Any], annotation: Any, of: str = "") -> inspect.Parameter:
