@@ -1,4 +1,4 @@
-"""Plain files of tracks against plain files of truth."""
+"""Files of tracks against files of ground truth."""
 
 from __future__ import annotations
 
@@ -53,8 +53,8 @@ def test_frames_outside_of_the_truth_count_as_trackeval_counts_them(tmp_path):
     assert (row["FP"], row["FN"]) == (7, 0)  # four of the walker before he is labelled, three of a ghost
 
 
-def test_mot17_distractors_count_neither_way(tmp_path):
-    """Beside a pedestrian: a statue, a car, somebody who isn't to be considered, each with a track of its own."""
+def test_mot17_distractors_are_ignored(tmp_path):
+    """Beside a pedestrian: a statue, a car, a person to ignore, each with a track of its own."""
     truth = []
     for n in range(1, 6):
         truth += [line(n, 1, 10 + n, 1, 1, 0.9), line(n, 2, 100, 0, 7, 1.0), line(n, 3, 200, 0, 3, 1.0)]
@@ -67,7 +67,7 @@ def test_mot17_distractors_count_neither_way(tmp_path):
 
 
 def test_a_track_between_a_pedestrian_and_a_statue_is_the_pedestrians(tmp_path):
-    """The assignment that forgives is one over all: whoever finds a pedestrian isn't taken away by a statue near by."""
+    """One assignment decides: a box matched with a pedestrian is not ignored because of a statue near by."""
     truth = [line(1, 1, 10, 1, 1, 1), line(1, 2, 16, 0, 7, 1)]
     row, _ = scores(write(tmp_path / "t.txt", line(1, 8, 11), line(1, 9, 16)), write(tmp_path / "gt.txt", *truth))
     assert (row["FP"], row["FN"]) == (0, 0)
@@ -78,7 +78,7 @@ def kitti(frame, who, kind, x, *, truncated=0, occluded=0, height=50.0, more=())
     return " ".join(map(str, (frame, who, kind, truncated, occluded, 0.1, *box, 1.7, 0.5, 0.5, 1, 1, 1, 0.0, *more)))
 
 
-def test_kitti_counts_pedestrians_and_forgives_what_it_says(tmp_path):
+def test_kitti_counts_pedestrians_and_ignores_its_regions(tmp_path):
     truth, found = [], []
     for n in range(5):
         truth += [kitti(n, 1, "Pedestrian", 10), kitti(n, 2, "Car", 100), kitti(n, 3, "Person_sitting", 200)]
@@ -103,7 +103,7 @@ def test_frames_that_count_from_0_meet_those_that_count_from_1(tmp_path):
     assert any("counts frames from 0" in note for note in notes)
 
 
-def test_tables_of_our_own(tmp_path):
+def test_exported_tables_are_scored(tmp_path):
     truth = [Frame(ns(n / 10), n, boxed({1: (10 + n, 10)})) for n in range(10)]
     tracks = [Frame(ns(n / 10), n, boxed({7: (11 + n, 10)})) for n in range(10)]
     path = tmp_path / "part-0.parquet"
@@ -123,7 +123,7 @@ def test_tables_of_our_own(tmp_path):
         scores(tmp_path / "no.parquet", gt)
 
 
-def test_a_tracker_that_found_nobody_is_scored(tmp_path):
+def test_a_file_without_tracks_is_scored(tmp_path):
     row, _ = scores(write(tmp_path / "t.txt"), write(tmp_path / "gt.txt", *WALK))
     assert (row["FN"], row["FP"], row["ML"], row["MOTA"]) == (10, 0, 1, 0.0)
 
@@ -145,7 +145,7 @@ def test_a_tracker_that_found_nobody_is_scored(tmp_path):
     ],
     ids=["all classes 0", "none considered", "other frames", "other units", "twins", "no ids", "no truth"],
 )
-def test_what_can_not_be_scored_is_said(tmp_path, found, truth, said):
+def test_files_that_cannot_be_scored_are_refused(tmp_path, found, truth, said):
     with pytest.raises(McaptrackError, match=said):
         scores(write(tmp_path / "t.txt", *found), write(tmp_path / "gt.txt", *truth))
 
@@ -159,7 +159,7 @@ def test_positions_in_metres_are_no_boxes(tmp_path):
     assert "share neither boxes nor positions in metres" in err
 
 
-def test_tracks_that_meet_nobody_are_scored_and_it_is_said(tmp_path):
+def test_tracks_without_any_match_are_scored_with_a_note(tmp_path):
     row, notes = scores(
         write(tmp_path / "t.txt", *(line(n, 5, 800) for n in range(1, 11))), write(tmp_path / "gt.txt", *WALK)
     )

@@ -1,4 +1,4 @@
-"""Logs and label files against the truth."""
+"""Scores of logs and label files against ground truth."""
 
 from __future__ import annotations
 
@@ -42,20 +42,20 @@ def test_at_common_times_nothing_is_interpolated():
     assert row["similarity"] == "metres"
 
 
-def test_a_frame_that_the_tracks_lack_counts_as_missed():
+def test_frames_without_tracks_count_as_missed():
     truth = walk(lambda n: {1: (float(n), 0.0)}, 10)
     (row,) = scored(truth, truth[:7])
     assert (row["FN"], row["FP"]) == (3, 0)
 
 
-def test_tracks_at_more_times_are_scored_at_those_of_the_truth():
+def test_tracks_with_more_frames_are_scored_at_labelled_times():
     truth = walk(lambda n: {1: (float(n), 0.0)}, 10)
     tracks = [Frame(ns(n / 30), n, tracks_at({1: (n / 12, 0.0)})) for n in range(9 * 12 + 1)]
     (row,) = scored(truth, tracks)
     assert (row["MOTA"], row["FN"], row["FP"]) == (1.0, 0, 0)
 
 
-def test_truth_is_brought_to_the_clock_of_prediction():
+def test_ground_truth_is_resampled_to_the_prediction_rate():
     """Truth at 7 frames a second, tracks at 2.5: no time in common but a few, all rows comparable."""
     truth = [Frame(ns(n / 7), n, tracks_at({1: (n / 7, 0.0)})) for n in range(71)]
     tracks = walk(lambda n: {1: (0.4 * n, 0.05)}, 26)
@@ -63,14 +63,14 @@ def test_truth_is_brought_to_the_clock_of_prediction():
     assert (row["MOTA"], row["FN"], row["FP"]) == (1.0, 0, 0)
 
 
-def test_where_nobody_labelled_nothing_is_scored():
+def test_unlabelled_times_are_not_scored():
     truth = [Frame(ns(n / 7), n, tracks_at({1: (0.0, 0.0)})) for n in range(35)]  # 5 s
     tracks = walk(lambda n: {1: (0.0, 0.0), 2: (50.0, 0.0)}, 50)  # 20 s
     (row,) = scored(truth, tracks)
     assert row["FP"] == 13  # the ghost, at the 13 ticks within the labels
 
 
-def test_boxes_and_metres_are_scored_as_far_as_there_are_both():
+def test_boxes_and_metres_are_scored_where_both_sides_have_them():
     boxes = [Frame(ns(n), n, boxed({1: (5 * n, 0)})) for n in range(5)]
     rows = scored(boxes, boxes, EvaluateOptions())
     assert [(row["similarity"], row["gate"], row["MOTA"]) for row in rows] == [("iou", 0.5, 1.0)]
@@ -80,7 +80,7 @@ def test_boxes_and_metres_are_scored_as_far_as_there_are_both():
         scored(boxes, walk(lambda n: {1: (0.0, 0.0)}, 13), EvaluateOptions())
 
 
-def test_impossible_input_is_said_and_never_scored_as_zeros():
+def test_input_that_cannot_be_compared_is_refused_not_scored_as_zero():
     truth = walk(lambda n: {1: (0.0, 0.0)}, 5)
     later = [frame._replace(t_ns=frame.t_ns + ns(1000)) for frame in truth]
     with pytest.raises(
@@ -103,8 +103,8 @@ def test_several_sequences_are_combined():
     assert rows[2]["GT"] == 2
 
 
-def test_forecasts_are_compared_with_what_came():
-    """Foretold at constant speed for someone who turns after 4 s: right before, wrong after, and not asked at the end."""
+def test_forecasts_are_compared_with_the_true_future():
+    """Constant velocity for a person who turns after 4 s: right before, wrong after, and not judged at the end."""
 
     def path(n):
         return {1: (0.5 * min(n, 10), 0.5 * max(n - 10, 0))}

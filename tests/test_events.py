@@ -1,4 +1,4 @@
-"""What happened to identities: worded scenes counted by hand, laws, and what it leaves in a log."""
+"""Events of tracks: small scenes counted by hand, laws, and the channels in a log."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ def test_a_person_is_missed_for_three_seconds():
     assert counted(found, "misses") == [0] * 20 + [1] * 30 + [0] * 30
 
 
-def test_a_track_is_nobody_for_two_seconds():
+def test_a_track_matches_no_person_for_two_seconds():
     truth = walk(lambda n: {4: (n / 10, 2.0)}, 50, 10)
     tracks = walk(lambda n: {1: (n / 10, 2.0)} | ({9: (3.0, 30.0)} if 10 <= n < 30 else {}), 50, 10)
     found = find_events(tracks, truth)
@@ -144,7 +144,7 @@ def test_a_track_that_drifts_off_is_one_message_and_comes_back():
     assert said(found)[1:] == [("WARNING", "person 4 and track 1 are apart for 2.0 s at 2.00 s, (2.0, 2.0) m")]
 
 
-def test_what_is_the_same_again_a_moment_later_is_one_event():
+def test_a_short_interruption_does_not_split_an_event():
     gone = {20, 21, 22, 26, 27, 28, 50}
     truth = walk(lambda n: {4: (n / 10, 2.0)}, 80, 10)
     tracks = walk(lambda n: {} if n in gone else {1: (n / 10, 2.0)}, 80, 10)
@@ -158,7 +158,7 @@ def test_what_is_the_same_again_a_moment_later_is_one_event():
     ]
 
 
-def test_a_switch_says_how_long_nobody_held_the_person():
+def test_a_switch_has_the_time_without_a_track():
     truth = walk(lambda n: {4: (n / 10, 2.0)}, 60, 10)
     tracks = walk(lambda n: {} if 20 <= n < 32 else {(7 if n < 20 else 12): (n / 10, 2.0)}, 60, 10)
     found = find_events(tracks, truth)
@@ -167,7 +167,7 @@ def test_a_switch_says_how_long_nobody_held_the_person():
     assert ("ERROR", "person 4: track 7 became track 12 at 3.20 s, (3.2, 2.0) m, 1.2 s unseen") in said(found)
 
 
-def test_without_truth_there_are_births_and_ends_and_what_is_not_known_is_missing():
+def test_without_ground_truth_there_are_births_and_ends_and_missing_counts():
     tracks = walk(lambda n: {1: (n / 10, 0.0)} if n < 25 else {2: (0.0, n / 10)}, 40, 10)
     found = find_events(tracks, None)
     assert (found.rule, found.notes) == (None, [])
@@ -177,13 +177,13 @@ def test_without_truth_there_are_births_and_ends_and_what_is_not_known_is_missin
     assert counted(found, "tracked") == [1] * 40
 
 
-def test_boxes_without_metres_say_where_in_pixels():
+def test_events_of_boxes_have_positions_in_pixels():
     found = find_events([Frame(0, 0, boxed({3: (20.0, 40.0)})), Frame(ns(2), 1, boxed({}))], None)
     assert said(found, start_ns=0)[0] == ("INFO", "track 3 begins at 0.00 s, (25, 50) px")
 
 
-def test_what_re_tracking_joined_and_parted():
-    """Track 1 goes on from source 5 to 8 after a hole of 0.5 s; source 5 goes on as track 2, who is new."""
+def test_repairs_join_and_part_tracks():
+    """Track 1 continues from source 5 to 8 after a gap of 0.5 s; source 5 continues as the new track 2."""
     path = lambda n: {1: (n / 10, 0.0)} | ({2: (n / 10, 6.0)} if n >= 40 else {})  # noqa: E731
     source = lambda n: {1: 5 if n < 20 else -1 if n < 25 else 8, 2: 5}  # noqa: E731
     found = find_events(follow(path, source, 60), None)
@@ -198,7 +198,7 @@ def test_what_re_tracking_joined_and_parted():
     assert counted(found, "repaired") == [0] * 25 + [1] * 15 + [2] * 20
 
 
-def test_a_source_that_is_another_for_a_moment_is_no_repair():
+def test_a_short_change_of_source_is_no_repair():
     flicker = lambda n: {1: 8 if n in (20, 21, 24, 25, 26) else 5}  # noqa: E731
     assert happened(find_events(follow(lambda n: {1: (n / 10, 0.0)}, flicker, 60), None), *OWN) == []
     lasting = lambda n: {1: 8 if n in (20, 21) or n >= 24 else 5}  # noqa: E731
@@ -206,7 +206,7 @@ def test_a_source_that_is_another_for_a_moment_is_no_repair():
     assert happened(found, *OWN) == [(2.4, EventKind.JOINED, 1, -1, 5)]
 
 
-def test_a_swap_that_re_tracking_undid_is_two_joins_and_one_message():
+def test_an_undone_swap_is_two_joins_and_one_message():
     source = lambda n: {1: 5 if n < 30 else 6, 2: 6 if n < 30 else 5}  # noqa: E731
     found = find_events(follow(lambda n: {1: (n / 10, 0.0), 2: (n / 10, 2.0)}, source, 60), None)
     assert happened(found, *OWN) == [(3.0, EventKind.JOINED, 1, -1, 5), (3.0, EventKind.JOINED, 2, -1, 6)]
@@ -216,7 +216,7 @@ def test_a_swap_that_re_tracking_undid_is_two_joins_and_one_message():
 # What is compared with what
 
 
-def test_boxes_at_the_videos_rate_go_by_overlap_and_other_clocks_by_metres():
+def test_boxes_at_video_rate_match_by_overlap_and_others_by_metres():
     boxes = [Frame(ns(n / 10), n, boxed({1: (n * 1.0, 0.0)})) for n in range(30)]
     assert find_events(boxes, boxes).rule == MatchRule("iou", 0.5)
     metres = walk(lambda n: {1: (n / 10, 0.0)}, 30, 10)
@@ -231,7 +231,7 @@ def test_boxes_at_the_videos_rate_go_by_overlap_and_other_clocks_by_metres():
     assert find_events(both, both, EventOptions("metres", 0.3)).rule == MatchRule("metres", 0.3)
 
 
-def test_truth_at_another_clock_is_brought_to_that_of_the_tracks():
+def test_ground_truth_at_other_times_is_resampled_to_the_tracks():
     truth = [Frame(ns(n / 7), n, tracks_at({1: (n / 7, 0.0)})) for n in range(71)]
     tracks = walk(lambda n: {(3 if n < 10 else 4): (n / 2.5, 0.0)}, 25)
     found = find_events(tracks, truth)
@@ -249,7 +249,7 @@ def test_tracks_at_more_times_than_the_truth_have_counts_there_and_no_scores():
     assert counted(found, "tracked") == [1] * 109
 
 
-def test_frames_of_the_truth_that_tracks_lack_are_there_too():
+def test_labelled_frames_without_tracks_have_counts():
     truth = walk(lambda n: {1: (n / 10, 0.0)}, 30, 10)
     found = find_events(truth[:20], truth)
     assert happened(found, *OWN) == [(2.0, MISS, -1, 1, 1)]
@@ -278,7 +278,7 @@ def test_frames_of_the_truth_that_tracks_lack_are_there_too():
         ),
     ],
 )
-def test_truth_that_cannot_be_compared_is_said_and_left_out(truth, options, words):
+def test_ground_truth_that_cannot_be_compared_is_reported_and_left_out(truth, options, words):
     tracks = walk(lambda n: {1: (n / 10, 0.0)}, 40, 10)
     found = find_events(tracks, truth, options, "a", "/t")
     (note,) = found.notes
@@ -289,7 +289,7 @@ def test_truth_that_cannot_be_compared_is_said_and_left_out(truth, options, word
 
 
 @pytest.mark.parametrize("truth", [None, []])
-def test_nothing_at_all_is_nothing(truth):
+def test_no_tracks_have_no_events(truth):
     found = find_events([], truth)
     assert (found.events, found.counts) == ([], [])
     empty = find_events(walk(lambda _: {}, 3), truth)
@@ -297,7 +297,7 @@ def test_nothing_at_all_is_nothing(truth):
     assert counted(empty, "tracked") == [0, 0, 0]
 
 
-def test_kinds_have_the_words_of_the_schema():
+def test_names_of_event_kinds_equal_the_schema():
     path = Path(__file__).parent.parent / "schemas" / "Events.proto"
     (kind,) = [column for column in parse(path.read_text(), path.name).columns if column.name == "kind"]
     assert dict(re.findall(r"(\d+) ([a-z ]+)", kind.doc)) == {str(int(k)): words for k, words in EVENT_KINDS.items()}
@@ -357,7 +357,7 @@ def test_the_order_of_rows_does_not_matter(scene, seed):
 
     truth, tracks = scene
     truth = [Frame(f.t_ns, f.index, f.rows.copy()) for f in truth]
-    for frame in truth:  # nobody is as near to one as to another
+    for frame in truth:  # no two distances are equal
         frame.rows["x_m"] += rng.uniform(0, 0.2, len(frame.rows))
         frame.rows["y_m"] += rng.uniform(0, 0.2, len(frame.rows))
     once = find_events(tracks, truth, EventOptions("metres"))
@@ -370,7 +370,7 @@ def test_the_order_of_rows_does_not_matter(scene, seed):
 
 
 def written(path: Path, made_by: str = "ingest", **channels: list[Frame]) -> Path:
-    """A log without pictures: channels of /camera, made by something; by nobody if that is empty."""
+    """A log without pictures: channels of /camera, made by a stage; without provenance if that is empty."""
     with log.create(path) as writer:
         for name, frames in channels.items():
             messages = [(f.t_ns, f.index, TRACKS.codec.encode(f.rows)) for f in frames]
@@ -408,7 +408,7 @@ def without_views(opened) -> set[str]:
     return {topic for topic in opened.channels if not topic.endswith(("/view/scene", "/view/tf"))}
 
 
-def test_events_words_and_counts_stand_beside_the_tracks(place):
+def test_events_texts_and_counts_are_channels_beside_the_tracks(place):
     report, notes = watched(place)
     assert (report.stages, notes) == (["events"], [])
     assert report.events == {
@@ -439,7 +439,7 @@ def test_events_words_and_counts_stand_beside_the_tracks(place):
         }
 
 
-def test_what_stands_is_left_and_what_is_made_again_is_the_same_to_the_byte(place):
+def test_events_are_kept_and_remade_identically(place):
     watched(place)
     once = place.read_bytes()
     assert watched(place)[0].stages == []
@@ -448,7 +448,7 @@ def test_what_stands_is_left_and_what_is_made_again_is_the_same_to_the_byte(plac
     assert place.read_bytes() == once
 
 
-def test_options_are_kept_until_others_are_asked_for(place):
+def test_options_of_events_are_kept_until_changed(place):
     def rule():
         with log.read(place) as opened:
             made = Provenance.from_metadata(opened.channel("/camera/tracks/counts").metadata)
@@ -471,7 +471,7 @@ def replaced(path: Path, topic: str, frames: list[Frame]) -> None:
 
 
 @pytest.mark.parametrize("topic", ["/camera/tracks", "/camera/truth"])
-def test_other_tracks_or_another_truth_make_events_out_of_date(place, topic):
+def test_changed_tracks_or_ground_truth_make_events_out_of_date(place, topic):
     watched(place)
     replaced(place, topic, walk(lambda n: {1: (n / 10, 0.0), 2: (n / 10, 4.0)}, 50, 10))
     with log.read(place) as opened:
@@ -482,7 +482,7 @@ def test_other_tracks_or_another_truth_make_events_out_of_date(place, topic):
     assert watched(place)[0].stages == []
 
 
-def test_truth_that_comes_or_goes_makes_events_anew(tmp_path):
+def test_added_or_removed_ground_truth_remakes_events(tmp_path):
     path = written(tmp_path / "a.mcap", tracks=SWAPPED)
     report, notes = watched(path)
     assert (report.events["/camera/tracks"]["identity switch"], notes) == (0, [])
@@ -495,7 +495,7 @@ def test_truth_that_comes_or_goes_makes_events_anew(tmp_path):
     assert watched(path)[0].stages == []
 
 
-def test_a_truth_that_cannot_be_compared_fails_nothing_and_is_said_once(tmp_path):
+def test_ground_truth_that_cannot_be_compared_is_reported_once(tmp_path):
     late = [Frame(frame.t_ns + ns(900), frame.index, frame.rows) for frame in TRUTH]
     path = written(tmp_path / "a.mcap", tracks=SWAPPED, truth=late)
     report, notes = watched(path)
@@ -505,7 +505,7 @@ def test_a_truth_that_cannot_be_compared_fails_nothing_and_is_said_once(tmp_path
     assert watched(path)[1] == []
 
 
-def test_tracks_that_others_wrote_are_watched_and_their_channels_are_never_replaced(tmp_path):
+def test_foreign_tracks_are_watched_and_never_replaced(tmp_path):
     path = written(tmp_path / "a.mcap", made_by="", tracks=SWAPPED, truth=TRUTH)
     assert watched(path)[0].events["/camera/tracks"]["identity switch"] == 2
     assert watched(path)[0].stages == []
@@ -519,7 +519,7 @@ def test_tracks_that_others_wrote_are_watched_and_their_channels_are_never_repla
         watched(path, "/camera/tracks", again=True)
 
 
-def test_channels_that_are_named_are_watched_from_then_on(tmp_path):
+def test_named_channels_stay_watched(tmp_path):
     path = written(tmp_path / "a.mcap", retracks_online=SWAPPED, truth=TRUTH)
     with pytest.raises(McaptrackError, match="has no tracks of /camera"):
         watched(path, again=True)
@@ -531,7 +531,7 @@ def test_channels_that_are_named_are_watched_from_then_on(tmp_path):
     assert watched(path)[0].events["/camera/retracks/online"]["identity switch"] == 0
 
 
-def test_tracks_that_are_made_again_leave_events_out_of_date_until_the_next_run(tmp_path):
+def test_remade_tracks_make_events_out_of_date_until_run(tmp_path):
     """The samples of true tracks, re-tracked in two ways."""
     path = written(tmp_path / "a.mcap", samples=walk(lambda n: {5 + n // 40: (n / 4, 0.0)}, 80), truth=[])
 
@@ -556,7 +556,7 @@ def test_a_log_of_tracks_without_rows(tmp_path):
     assert log.check(path).is_sound
 
 
-def test_the_command_writes_drop_takes_along_and_tables_have_what_happened(place):
+def test_the_command_drop_and_tables_handle_events(place):
     def call(*words):
         result = CliRunner().invoke(app, [str(word) for word in words], catch_exceptions=False)
         assert result.exit_code == 0, result.output

@@ -109,7 +109,7 @@ def test_scores_are_those_of_evaluate(tmp_path):
     assert set(wanted[0]) - {"sequence", "tracks", "displacement"} <= set(rows[0])
 
 
-def test_a_truth_that_nothing_can_be_scored_against_leaves_no_scores_and_says_why(tmp_path):
+def test_unusable_ground_truth_leaves_no_scores_and_a_note(tmp_path):
     with log.create(tmp_path / "a.mcap") as writer:
         add_rows(writer, "/camera/truth", TRACKS, [Frame(0, 0, tracks_at({1: (0, 0)}))], "ingest", "")
     done = exported(tmp_path / "a.mcap", tmp_path / "tables")
@@ -316,7 +316,7 @@ def test_two_logs_of_one_name_are_not_mixed_up(tmp_path):
 # Channels of others
 
 
-def test_a_channel_of_others_becomes_a_table_with_names_that_sql_takes(tmp_path):
+def test_a_foreign_channel_becomes_a_table_with_sql_names(tmp_path):
     done = exported(some_log(tmp_path / "a.mcap"), tmp_path, topics=["/imu"])
     assert done.rows["topics/imu"] == 4
     query = "select frame, t_ns, header_stamp_ns, header_frame_id, gyro_x, cov[2], n from '@/topics/imu/*/*.parquet' order by n"
@@ -349,7 +349,7 @@ def test_other_formats_hold_the_same(tmp_path, form):
     assert np.array_equal(np.signbit(found["gyro_y"].to_numpy()), [True] * 4)
 
 
-def test_what_a_channel_can_not_be_read_as_is_said_with_its_time(tmp_path):
+def test_an_unreadable_message_is_reported_with_its_time(tmp_path):
     with log.create(tmp_path / "a.mcap") as writer:
         number = writer.add_channel("/x", ("", "", b""), "json", {})
         writer.add_message(number, 5, 0, b"{")

@@ -1,4 +1,4 @@
-"""How far off forecasts were: scenes counted by hand, laws, and what it leaves in a log."""
+"""Errors of forecasts: scenes counted by hand, laws, and the channels in a log."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ from mcaptrack.predictors import Forecast
 from mcaptrack.schema import FORECAST_ERRORS, FORECAST_SCORES, PREDICTIONS, TRACKS, Frame
 from mcaptrack.schema.predictions import forecast_to_rows
 from mcaptrack.schema.provenance import Provenance, digest
-from tests.test_metrics import forecasts, foretold, positions
+from tests.test_metrics import forecasts, positions, predicted
 from tests.worlds import ns, walk
 
 STEP_S = 0.4
 
 
-def predictions(foretell, ticks: int, variance: float = 1.0, step_s: float = STEP_S) -> list[Frame]:
-    """Frames of forecasts; ``foretell`` gives the places that each id is foretold at, for every tick."""
+def predictions(predict, ticks: int, variance: float = 1.0, step_s: float = STEP_S) -> list[Frame]:
+    """Frames of forecasts; ``predict`` gives the places that each id is predicted at, for every tick."""
     frames = []
     for tick in range(ticks):
-        said = foretell(tick)
+        said = predict(tick)
         rows = PREDICTIONS.empty()
         if said:
             mean = np.array(list(said.values()), float)
@@ -62,7 +62,7 @@ def straight_on(tick: int):
 
 
 @pytest.mark.parametrize(("aside_m", "truth_id"), [((1.0, 1.0), -1), ((1.0, 0.99), 1)])
-def test_a_track_belongs_to_a_person_within_less_than_tau(aside_m, truth_id):
+def test_a_forecast_is_assigned_below_tau(aside_m, truth_id):
     """The mean squared distance of the pasts is 2 m^2, which is tau, and a little less."""
     truth = walk(straight_on, 12)
     tracks = walk(lambda n: {7: tuple(np.add(straight_on(n)[1], aside_m))}, 12)
@@ -90,8 +90,8 @@ def test_a_forecast_that_veers_off():
     assert (score["ade_m"], score["ade_so_far_m"]) == pytest.approx((7 / 3, 7 / 3))
 
 
-def test_truth_and_what_the_track_became_are_told_apart():
-    """The track was half a metre beside the person until it was mended: there are two answers."""
+def test_errors_against_ground_truth_and_later_tracks_differ():
+    """The track was half a metre beside the person until it was re-tracked: there are two errors."""
     truth = walk(straight_on, 12)
     tracks = walk(lambda n: {7: (0.5 * n, 0.5)}, 12)
     mended = walk(lambda n: {3: (0.5 * n, 0.2)}, 12)
@@ -102,7 +102,7 @@ def test_truth_and_what_the_track_became_are_told_apart():
 
 
 @pytest.mark.parametrize("truth", [None, [], walk(lambda n: {}, 12), walk(lambda n: {1: (np.nan, np.nan)}, 12)])
-def test_without_truth_there_is_what_the_track_became(truth):
+def test_without_ground_truth_forecasts_are_compared_with_later_tracks(truth):
     tracks = walk(straight_on, 12)
     made = predictions(lambda n: {1: [(0.5 * (n + k), 1.0) for k in (1, 2, 3)]} if n == 5 else {}, 12)
     row, score = only(find_forecast_errors(made, tracks, truth, tracks))
@@ -112,7 +112,7 @@ def test_without_truth_there_is_what_the_track_became(truth):
     assert (score["later_scored"], score["later_fde_m"]) == (1, 1.0)
 
 
-def test_truth_of_another_time_is_none():
+def test_ground_truth_of_another_time_is_ignored():
     tracks = walk(straight_on, 12)
     later = [frame._replace(t_ns=frame.t_ns + ns(100)) for frame in tracks]
     made = predictions(lambda n: {1: [(0.5 * (n + k), 1.0) for k in (1, 2, 3)]} if n == 5 else {}, 12)
@@ -120,7 +120,7 @@ def test_truth_of_another_time_is_none():
     assert np.isnan(score["false_forecasts"])
 
 
-def test_a_future_that_is_not_known_leaves_the_person_and_no_number():
+def test_an_unknown_future_has_a_person_and_no_error():
     truth = walk(straight_on, 8)
     made = predictions(lambda n: {1: [(0.5 * (n + k), 0.0) for k in (1, 2, 3)]} if n == 6 else {}, 8)
     row, score = only(find_forecast_errors(made, truth, truth, truth))
@@ -129,7 +129,7 @@ def test_a_future_that_is_not_known_leaves_the_person_and_no_number():
     assert (score["scored"], score["false_forecasts"], score["later_scored"]) == (0, 0, 0)
 
 
-def test_a_ghost_belongs_to_nobody():
+def test_a_forecast_of_a_false_track_has_no_person():
     truth = walk(straight_on, 12)
     tracks = walk(lambda n: {1: straight_on(n)[1], 9: (0.5 * n, 40.0)}, 12)
     kept = walk(straight_on, 12)  # what re-tracking left of it
@@ -157,14 +157,14 @@ def test_one_second_ahead_is_between_steps_and_not_outside(step_s, steps, wanted
     assert row["error_1s_m"] == pytest.approx(np.nan if wanted is None else wanted, nan_ok=True)
 
 
-def test_forecasts_of_several_lengths_are_said():
+def test_forecasts_of_different_lengths_are_refused():
     truth = walk(straight_on, 12)
     made = predictions(lambda n: {1: [(0.0, 0.0)] * (2 if n == 5 else 3)} if n in (5, 6) else {}, 12)
     with pytest.raises(McaptrackError, match="/p: not all forecasts have 3 steps"):
         find_forecast_errors(made, truth, truth, truth, "/p")
 
 
-def test_frames_without_forecasts_are_there():
+def test_frames_without_forecasts_have_scores():
     found = find_forecast_errors(predictions(lambda n: {}, 4), walk(straight_on, 4), walk(straight_on, 4), [])
     assert [len(frame.rows) for frame in found.errors] == [0] * 4
     assert rows_of(found.scores)["forecasts"].tolist() == [0] * 4
@@ -186,11 +186,11 @@ def scenes(draw):
     def frames(places, mask, first):
         return walk(lambda n: {first + p: tuple(places[p, n]) for p in range(people) if mask[p, n]}, ticks)
 
-    def foretell(n):
+    def predict(n):
         ahead = rng.normal(0, 1, (people, 3, 2))
         return {50 + p: seen[p, n] + ahead[p] for p in range(people) if tracked[p, n] and rng.random() < 0.9}
 
-    return frames(paths, there, 1), frames(seen, tracked, 50), predictions(foretell, ticks)
+    return frames(paths, there, 1), frames(seen, tracked, 50), predictions(predict, ticks)
 
 
 def evaluated(truth, tracks, made):
@@ -253,7 +253,7 @@ def test_pairs_are_those_of_least_total_distance(seed, people, tracks):
     asked = [(n, who) for n in range(9) for who in seen if rng.random() < 0.7]
     if not asked:
         return
-    made = forecasts(*(foretold(n, who, [(0.0, 0.0), (1.0, 1.0)]) for n, who in asked))
+    made = forecasts(*(predicted(n, who, [(0.0, 0.0), (1.0, 1.0)]) for n, who in asked))
     found = pair_forecasts(positions(truth), positions(seen), made)
 
     def filled(path, n):
@@ -284,11 +284,11 @@ def test_pairs_are_those_of_least_total_distance(seed, people, tracks):
     } == wanted
 
 
-def test_many_times_are_paired_as_few_are(monkeypatch):
-    """Pairs are looked at some at a time; where the cuts are doesn't show."""
+def test_pairing_is_independent_of_batches(monkeypatch):
+    """Pairs are assigned in batches; the result does not depend on them."""
     rng = np.random.default_rng(3)
     truth = {who: {n: tuple(rng.normal(0, 3, 2)) for n in range(30)} for who in range(5)}
-    made = forecasts(*(foretold(n, who, [(0.0, 0.0)]) for n in range(4, 29) for who in truth))
+    made = forecasts(*(predicted(n, who, [(0.0, 0.0)]) for n in range(4, 29) for who in truth))
     once = pair_forecasts(positions(truth), positions(truth), made)
     monkeypatch.setattr("mcaptrack.evaluation.metrics.displacement._PAIRS_AT_ONCE", 60)
     again = pair_forecasts(positions(truth), positions(truth), made)
@@ -302,7 +302,7 @@ def test_many_times_are_paired_as_few_are(monkeypatch):
 TRUTH = walk(straight_on, 20)
 SAMPLES = walk(lambda n: {7: (0.5 * n, 0.25)}, 20)
 BECAME = walk(lambda n: {3: (0.5 * n, 0.1)}, 20)
-FORETOLD = predictions(lambda n: {7: [(0.5 * (n + k), 0.25) for k in (1, 2, 3)]} if n > 3 else {}, 20)
+PREDICTED = predictions(lambda n: {7: [(0.5 * (n + k), 0.25) for k in (1, 2, 3)]} if n > 3 else {}, 20)
 ERRORS, SCORES = "/camera/predictions/errors", "/camera/predictions/scores"
 
 
@@ -325,16 +325,16 @@ def watched(path, again: bool = False):
         return pipeline.run(opened, "/camera", [], watch=pipeline.Watch(again=again))
 
 
-ALL = {"samples": SAMPLES, "predictions": FORETOLD, "retracks": BECAME, "truth": TRUTH}
+ALL = {"samples": SAMPLES, "predictions": PREDICTED, "retracks": BECAME, "truth": TRUTH}
 
 
-def test_errors_stand_beside_the_forecasts_and_stay(tmp_path):
+def test_errors_are_channels_beside_the_forecasts(tmp_path):
     path = written(tmp_path / "a.mcap", **ALL)
     watched(path)
     with log.read(path) as opened:
         errors, scores = opened.frames(ERRORS, FORECAST_ERRORS), opened.frames(SCORES, FORECAST_SCORES)
         assert [(f.t_ns, f.index) for f in errors] == [(f.t_ns, f.index) for f in scores]
-        assert [f.t_ns for f in errors] == [f.t_ns for f in FORETOLD]
+        assert [f.t_ns for f in errors] == [f.t_ns for f in PREDICTED]
         rows = rows_of(errors)
         assert set(rows["truth_id"]) == {1}
         assert set(rows["later_id"]) == {3}
@@ -355,7 +355,7 @@ def test_errors_stand_beside_the_forecasts_and_stay(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["predictions", "samples", "retracks", "truth"])
-def test_whatever_errors_are_made_from_makes_them_out_of_date(tmp_path, name):
+def test_every_input_makes_errors_out_of_date(tmp_path, name):
     path = written(tmp_path / "a.mcap", **ALL)
     watched(path)
     other = written(tmp_path / "b.mcap", **ALL | {name: ALL[name][:-2]})
@@ -377,9 +377,9 @@ def test_whatever_errors_are_made_from_makes_them_out_of_date(tmp_path, name):
     assert watched(path).stages == []
 
 
-def test_tracks_that_were_mended_since_are_held_against(tmp_path):
-    """Before re-tracking a forecast is held against its own track; then against what that became."""
-    path = written(tmp_path / "a.mcap", samples=SAMPLES, predictions=FORETOLD)
+def test_forecasts_are_compared_with_re_tracked_tracks(tmp_path):
+    """Before re-tracking a forecast is compared with its own track, afterwards with the re-tracked one."""
+    path = written(tmp_path / "a.mcap", samples=SAMPLES, predictions=PREDICTED)
     watched(path)
     with log.read(path) as opened:
         rows = rows_of(opened.frames(ERRORS, FORECAST_ERRORS))
@@ -410,7 +410,7 @@ def test_the_layout_plots_what_is_known(tmp_path):
     assert all("{step==3}" in curve["value"] for curve in panels["Plot!spread"]["paths"])
 
 
-def test_forecasts_that_cannot_be_held_against_anything_fail_nothing(tmp_path):
+def test_forecasts_without_reference_do_not_fail_a_run(tmp_path):
     odd = predictions(lambda n: {1: [(0.0, 0.0)] * (2 if n == 5 else 3)} if n in (5, 6) else {}, 20)
     path = written(tmp_path / "a.mcap", **ALL | {"predictions": odd})
     with log.read(path) as opened, notices.collected() as heard:
@@ -422,7 +422,7 @@ def test_forecasts_that_cannot_be_held_against_anything_fail_nothing(tmp_path):
         assert ERRORS not in opened.channels
 
 
-def test_a_channel_that_others_recorded_is_never_replaced(tmp_path):
+def test_a_recorded_channel_is_never_replaced(tmp_path):
     path = written(tmp_path / "a.mcap", **ALL)
     with log.read(path) as opened, log.extend(opened) as writer:
         writer.add_message(writer.add_channel(SCORES, ("", "", b""), "json", {}), 0, 0, b"{}")

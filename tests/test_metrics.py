@@ -38,7 +38,7 @@ CASES = {
     # what happens: truth, tracks, and what it counts
     "perfect": (ONE, ONE, {"MOTA": 1.0, "IDF1": 1.0, "HOTA": 1.0, "IDSW": 0, "FP": 0, "FN": 0, "Frag": 0, "MT": 1}),
     "all missed": (ONE, [{}] * 10, {"MOTA": 0.0, "IDF1": 0.0, "HOTA": 0.0, "FN": 10, "FP": 0, "ML": 1}),
-    "nobody there, nobody seen": ([{}] * 3, [{}] * 3, {"MOTA": 0.0, "IDF1": 0.0, "FP": 0, "FN": 0, "GT": 0}),
+    "no people, no tracks": ([{}] * 3, [{}] * 3, {"MOTA": 0.0, "IDF1": 0.0, "FP": 0, "FN": 0, "GT": 0}),
     "only ghosts": ([{}] * 5, [{7: 0.0}] * 5, {"FP": 5, "FN": 0, "IDF1": 0.0, "MOTA": 0.0}),
     "too far away": (ONE, [{1: n + 1.01} for n in range(10)], {"FP": 10, "FN": 10, "MOTA": -1.0, "IDF1": 0.0}),
     "just near enough": (ONE, [{1: n + 0.99} for n in range(10)], {"FP": 0, "FN": 0, "MOTA": 1.0}),
@@ -52,7 +52,7 @@ CASES = {
         [{9: 50.0} if n in (4, 5) else {5: float(n), 9: 50.0} for n in range(10)],
         {"FN": 2, "Frag": 1, "IDSW": 0, "MT": 1, "PT": 1},
     ),
-    "a hole while nobody at all is tracked, which the devkit passes over": (
+    "a gap without any track, which the devkit skips": (
         ONE,
         [{} if n in (4, 5) else {5: float(n)} for n in range(10)],
         {"FN": 2, "Frag": 0, "IDSW": 0, "PT": 1},
@@ -132,7 +132,7 @@ FRAMES = made()
 
 @given(FRAMES)
 @settings(max_examples=60)
-def test_counts_are_those_of_motmetrics(frames):
+def test_counts_equal_motmetrics(frames):
     import motmetrics
 
     truth, tracks = zip(*frames, strict=True)
@@ -263,7 +263,7 @@ def straight(who: int, steps: range, offset: float = 0.0, lane: float = 0.0) -> 
     return {who: {step: (step + offset, lane) for step in steps}}
 
 
-def foretold(step: int, who: int, mean: list[tuple[float, float]], variance: float = 1.0) -> tuple:
+def predicted(step: int, who: int, mean: list[tuple[float, float]], variance: float = 1.0) -> tuple:
     return step, who, mean, [variance * np.eye(2)] * len(mean)
 
 
@@ -277,7 +277,7 @@ class TestDisplacement:
         """One person at x = step; the track lies 0.1 m beside, the forecast misses by 1, 2 and 2 m."""
         truth = positions(straight(1, range(10)))
         tracks = positions({5: {step: (step, 0.1) for step in range(10)}})
-        made = forecasts(foretold(4, 5, [(5.0, 1.0), (6.0, 2.0), (9.0, 0.0)]))
+        made = forecasts(predicted(4, 5, [(5.0, 1.0), (6.0, 2.0), (9.0, 0.0)]))
         result = displacement(truth, tracks, made)
         found = result.summary()
         assert found["ADE_m"] == pytest.approx(5 / 3)
@@ -294,35 +294,37 @@ class TestDisplacement:
             straight(1, range(10)) | straight(2, range(6), lane=5.0) | straight(3, range(3, 10), lane=9.0)
         )
         tracks = positions(straight(7, range(10)) | straight(8, range(6), lane=5.0))
-        made = forecasts(foretold(4, 7, [(5.0, 0), (6.0, 0), (7.0, 0)]), foretold(4, 8, [(9.0, 9), (9.0, 9), (9.0, 9)]))
+        made = forecasts(
+            predicted(4, 7, [(5.0, 0), (6.0, 0), (7.0, 0)]), predicted(4, 8, [(9.0, 9), (9.0, 9), (9.0, 9)])
+        )
         result = displacement(truth, tracks, made)
         assert result.people == 1
         assert result.summary()["ADE_m"] == 0.0
         assert result.false_forecasts == 0  # 8 is person 2, who leaves: neither for nor against
 
-    def test_a_ghost_is_a_false_forecast(self):
+    def test_a_forecast_of_a_false_track_is_false(self):
         truth = positions(straight(1, range(10)))
         tracks = positions(straight(7, range(10)) | straight(8, range(10), lane=40.0))
-        made = forecasts(*(foretold(4, who, [(5.0, 0), (6.0, 0), (7.0, 0)]) for who in (7, 8)))
+        made = forecasts(*(predicted(4, who, [(5.0, 0), (6.0, 0), (7.0, 0)]) for who in (7, 8)))
         assert displacement(truth, tracks, made).summary()["false_forecasts_per_frame"] == 1.0
 
     def test_forecasts_of_tracks_without_positions_are_not_judged(self):
         """Neither of an id that is not in the tracks, nor at a time at which the track is not there."""
         truth, tracks = positions(straight(1, range(10))), positions(straight(7, range(10)))
         for step, who in ((4, 6), (4, 8), (-1, 7), (12, 7)):
-            found = displacement(truth, tracks, forecasts(foretold(step, who, [(5.0, 0), (6.0, 0), (7.0, 0)])))
+            found = displacement(truth, tracks, forecasts(predicted(step, who, [(5.0, 0), (6.0, 0), (7.0, 0)])))
             assert found.false_forecasts == 0
             assert found.ade_m.tolist() == []
 
-    def test_holes_of_a_track_are_filled_and_young_tracks_are_not_asked(self):
+    def test_gaps_are_interpolated_and_short_tracks_are_not_judged(self):
         truth = positions(straight(1, range(10)))
         holed = positions({7: {step: (step, 0.0) for step in (0, 1, 4, 5)}})
         young = positions({7: {step: (step, 0.0) for step in (3, 4, 5)}})
-        made = forecasts(foretold(5, 7, [(6.0, 0), (7.0, 0), (8.0, 0)]))
+        made = forecasts(predicted(5, 7, [(6.0, 0), (7.0, 0), (8.0, 0)]))
         assert displacement(truth, holed, made).summary()["recall"] == 1.0
         assert displacement(truth, young, made).summary()["recall"] == 0.0
 
-    def test_the_curve_is_that_of_every_threshold(self):
+    def test_the_curve_equals_matching_at_each_threshold(self):
         """Against the definition: match, then keep pairs under tau, for a sweep of tau."""
         rng = np.random.default_rng(0)
         truth, tracks, made = {}, {}, []
@@ -330,7 +332,7 @@ class TestDisplacement:
             lane, off = 30.0 * who, rng.gamma(1.0, 0.7)
             truth |= straight(who, range(10), lane=lane)
             tracks |= straight(who, range(10), lane=lane + off)
-            made.append(foretold(4, who, [(5 + rng.normal(), lane + rng.normal()) for _ in range(3)]))
+            made.append(predicted(4, who, [(5 + rng.normal(), lane + rng.normal()) for _ in range(3)]))
         result = displacement(positions(truth), positions(tracks), forecasts(*made))
         recall, ade = result.curve()
         for tau in rng.uniform(0, 4, 30):
@@ -340,12 +342,12 @@ class TestDisplacement:
                 assert recall[at] == pytest.approx(kept.mean())
                 assert ade[at] == pytest.approx(result.ade_m[kept].mean())
 
-    def test_errors_by_step_are_those_of_pairs_that_agree_on_the_past(self):
+    def test_errors_by_step_are_of_pairs_below_the_threshold(self):
         """Two people; one track is 1 m off and so d_obs is 1 m^2, the other 2 m off, which is 4 m^2."""
         truth = positions(straight(1, range(10)) | straight(2, range(10), lane=30.0))
         tracks = positions(straight(5, range(10), lane=1.0) | straight(6, range(10), lane=32.0))
         made = forecasts(
-            foretold(4, 5, [(5.0, 0.5), (6.0, 1.5), (7.0, 2.5)]), foretold(4, 6, [(5.0, 37), (6.0, 38), (7.0, 39)])
+            predicted(4, 5, [(5.0, 0.5), (6.0, 1.5), (7.0, 2.5)]), predicted(4, 6, [(5.0, 37), (6.0, 38), (7.0, 39)])
         )
         result = displacement(truth, tracks, made)
         assert sorted(result.d_obs_m2.tolist()) == pytest.approx([1.0, 4.0])
@@ -354,21 +356,23 @@ class TestDisplacement:
         assert result.errors_by_step(1.0).tolist() == []  # less than the threshold, not equal to it
         assert result.summary()["recall"] == 0.5
 
-    def test_drift_of_consecutive_forecasts_by_hand(self):
+    def test_consistency_of_consecutive_forecasts_by_hand(self):
         truth = positions(straight(1, range(10)))
-        made = forecasts(foretold(4, 7, [(5.0, 0), (6.0, 0), (7.0, 0)]), foretold(5, 7, [(6.0, 1), (7.0, 2), (8.0, 9)]))
+        made = forecasts(
+            predicted(4, 7, [(5.0, 0), (6.0, 0), (7.0, 0)]), predicted(5, 7, [(6.0, 1), (7.0, 2), (8.0, 9)])
+        )
         found = displacement(truth, positions(straight(7, range(10))), made).summary()
         assert found["consistency_m"] == pytest.approx(1.5)
 
-    def test_nothing_to_average_is_said_as_nothing(self):
+    def test_without_values_scores_are_none(self):
         truth = positions(straight(1, range(3)))
-        made = forecasts(foretold(1, 7, [(5.0, 0), (6.0, 0), (7.0, 0)]))
+        made = forecasts(predicted(1, 7, [(5.0, 0), (6.0, 0), (7.0, 0)]))
         found = displacement(truth, positions(straight(7, range(3))), made).summary()
         assert found["ADE_m"] is None
         assert found["recall"] is None
 
-    def test_several_sequences_are_pooled(self):
+    def test_pairs_of_several_sequences_are_pooled(self):
         truth, tracks = positions(straight(1, range(10))), positions(straight(5, range(10)))
-        good = displacement(truth, tracks, forecasts(foretold(4, 5, [(5.0, 0), (6.0, 0), (7.0, 0)])))
-        bad = displacement(truth, tracks, forecasts(foretold(4, 5, [(5.0, 2), (6.0, 2), (7.0, 2)])))
+        good = displacement(truth, tracks, forecasts(predicted(4, 5, [(5.0, 0), (6.0, 0), (7.0, 0)])))
+        bad = displacement(truth, tracks, forecasts(predicted(4, 5, [(5.0, 2), (6.0, 2), (7.0, 2)])))
         assert combine_displacements([good, bad]).summary()["ADE_m"] == pytest.approx(1.0)

@@ -1,4 +1,4 @@
-"""Scores against two other evaluators, on made-up tracks with whatever goes wrong with tracks."""
+"""Scores against two other evaluators, on synthetic tracks with all kinds of errors."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Sequence = tuple[list[dict[int, np.ndarray]], list[dict[int, np.ndarray]]]
 @st.composite
 def made(draw, exact: bool = False) -> Sequence:
     """People who walk side by side, and their tracks: missed, swapped, doubled, ghosts, ids that come again; frames in
-    which nobody is or nobody is seen; one frame alone. ``exact`` doubles lie on their originals to the bit.
+    which there are no people or no tracks; one frame alone. ``exact`` doubles lie on their originals to the bit.
     """
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     frames, people = draw(st.integers(1, 12)), draw(st.integers(0, 5))
@@ -109,17 +109,17 @@ def same(ours: dict, theirs: dict) -> None:
         assert ours[name] == pytest.approx(float(np.mean(theirs[other])), abs=1e-9), name
 
 
-NOBODY: Sequence = ([{}] * 3, [{}] * 3)
+EMPTY: Sequence = ([{}] * 3, [{}] * 3)
 GHOSTS: Sequence = ([{}] * 3, [{1: box((0, 0))}] * 3)
 ALL_MISSED: Sequence = ([{1: box((0, 0))}] * 3, [{}] * 3)
 
 
 @given(made(exact=True))
-@example(NOBODY)
+@example(EMPTY)
 @example(GHOSTS)
 @example(ALL_MISSED)
 @settings(max_examples=150)
-def test_all_scores_are_those_of_trackeval(sequence):
+def test_scores_equal_trackeval(sequence):
     part = matchup(*sequence)
     theirs = {name: value for _, result in by_trackeval(part) for name, value in result.items()}
     same(summary(score(part)), theirs)
@@ -127,10 +127,10 @@ def test_all_scores_are_those_of_trackeval(sequence):
 
 @given(st.lists(made(), min_size=2, max_size=3), st.sampled_from([0.3, 0.5, 0.7]))
 @settings(max_examples=40)
-def test_scores_of_several_sequences_are_those_of_trackeval(sequences, threshold):
+def test_combined_scores_equal_trackeval(sequences, threshold):
     parts = [matchup(*sequence, threshold) for sequence in sequences]
     if not any(part.ground_truth_rows for part in parts):
-        return  # with nobody at all TrackEval's sums and its single sequences disagree
+        return  # without people and tracks TrackEval's sums and its single sequences disagree
     results = [by_trackeval(part) for part in parts]
     theirs = {}
     for at, (kind, _) in enumerate(results[0]):
@@ -140,7 +140,7 @@ def test_scores_of_several_sequences_are_those_of_trackeval(sequences, threshold
 
 @given(made())
 @settings(max_examples=60)
-def test_counts_on_boxes_are_those_of_motmetrics(sequence):
+def test_counts_of_boxes_equal_motmetrics(sequence):
     import motmetrics
 
     truth, tracks = sequence

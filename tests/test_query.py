@@ -99,7 +99,7 @@ def test_the_queries_of_the_page_give_its_answers(square, query, answer):
         agree(rows_of(database.ask(query)), parsed(answer))
 
 
-def test_so_they_do_with_duckdb_alone(square):
+def test_the_queries_give_the_same_answers_in_duckdb(square):
     program = (
         "import duckdb, json, sys\n"
         "prelude, queries = json.load(sys.stdin)\n"

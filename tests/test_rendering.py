@@ -1,4 +1,4 @@
-"""The annotated video: what the views say, drawn where and as they say it."""
+"""The rendered video: the drawings of views, in their places and colours."""
 
 from __future__ import annotations
 
@@ -209,5 +209,5 @@ def test_nothing_is_left_of_a_clip_that_fails(tmp_path):
 def test_re_tracked_people_are_drawn_at_the_rate_of_the_video(finished):  # noqa: F811
     with log.read(finished) as opened:
         assert find_views(opened, "/camera", ["/camera/retracks"]) == ["/camera/retracks/full/view/image"]
-        with pytest.raises(McaptrackError, match="has no channel /camera/nobody/view/image"):
-            find_views(opened, "/camera", ["/camera/nobody"])
+        with pytest.raises(McaptrackError, match="has no channel /camera/unknown/view/image"):
+            find_views(opened, "/camera", ["/camera/unknown"])

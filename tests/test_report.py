@@ -1,4 +1,4 @@
-"""The report: its numbers are those of `evaluate`, and nothing in a log can do anything to who reads it."""
+"""The report: its numbers are those of `evaluate`, and names in a log can't run or load anything."""
 
 from __future__ import annotations
 
@@ -123,8 +123,8 @@ def test_several_logs_are_combined_as_evaluate_combines_them(finished, tmp_path)
 
 
 @pytest.fixture(scope="module")
-def foretold(tmp_path_factory) -> Path:
-    """Four people who turn, seen with noise and foretold, and their truth."""
+def predicted(tmp_path_factory) -> Path:
+    """Four people who turn, tracked with noise and predicted, and their ground truth."""
     noise = np.random.default_rng(5).normal(0, 0.1, (60, 5, 2))
 
     def path(tick, seen):
@@ -134,7 +134,7 @@ def foretold(tmp_path_factory) -> Path:
 
     samples = walk(lambda tick: path(tick, 1), 60)
     tracks = {"/camera/truth": walk(lambda tick: path(tick, 0), 60), "/camera/samples": samples}
-    file = tmp_path_factory.mktemp("foretold") / "foretold.mcap"
+    file = tmp_path_factory.mktemp("predicted") / "predicted.mcap"
     with log.create(file) as writer:
         for topic, frames in tracks.items():
             add(writer, topic, frames, TRACKS)
@@ -142,9 +142,9 @@ def foretold(tmp_path_factory) -> Path:
     return file
 
 
-def test_the_curve_and_the_errors_by_horizon_are_those_of_the_scores(foretold):
-    _, numbers, _ = report_on(foretold)
-    scored = json.loads(done("evaluate", foretold, "--json")[0])["results"]
+def test_the_curve_and_the_errors_by_horizon_are_those_of_the_scores(predicted):
+    _, numbers, _ = report_on(predicted)
+    scored = json.loads(done("evaluate", predicted, "--json")[0])["results"]
     whole = next(r["displacement"] for r in scored if r["similarity"] == "metres")
     (one,) = numbers["logs"][0]["forecasts"]
     assert one["by_horizon"]["n"] > 50
@@ -168,7 +168,7 @@ def test_errors_by_horizon_of_two_scenes_go_as_far_as_the_longer_forecasts():
     assert np.isnan(both.error_m[0, 3:]).all()
 
 
-def test_walking_on_is_right_about_who_walks_on_and_not_about_who_turns():
+def test_constant_velocity_is_right_for_straight_walks_and_wrong_for_turns():
     def path(tick):
         return {1: (0.4 * tick, 0.0), 2: (0.4 * min(tick, 12), 5.0 + 0.4 * max(tick - 12, 0))}
 
@@ -189,7 +189,7 @@ def test_walking_on_is_right_about_who_walks_on_and_not_about_who_turns():
     assert turning["mean_m"][-1] > 1.0
 
 
-def test_speeds_and_stays_by_hand():
+def test_speeds_and_durations_by_hand():
     frames = walk(lambda tick: {7: (0.5 * tick, 0.0)} if tick != 3 else {}, 6, rate_hz=2.0)
     frames[0] = Frame(0, 0, tracks_at({7: (0.0, 0.0), 9: (4.0, 4.0)}))
     # 7 is there from 0 to 2.5 s with a hole at 1.5 s, over which its speed is not known; 9 for one frame.
@@ -200,7 +200,7 @@ def test_speeds_and_stays_by_hand():
 
 
 @given(st.dictionaries(st.text(max_size=3), st.lists(st.floats(0, 1e6), max_size=60), max_size=3))
-def test_histograms_lose_nobody(values):
+def test_histograms_count_every_value(values):
     found = statistics.histograms({topic: np.array(part) for topic, part in values.items()})
     if not any(values.values()):
         assert found is None
@@ -212,7 +212,7 @@ def test_histograms_lose_nobody(values):
         assert sum(part["counts"]) + part["above"] == part["n"] == len(values[part["topic"]])
 
 
-def test_who_all_walk_at_one_speed_are_in_one_bin_of_a_histogram():
+def test_equal_values_are_in_one_bin_of_a_histogram():
     found = statistics.histograms({"t": np.array([1.0, 1.0 + 1e-12, 1.0 - 1e-12] * 50)})
     (part,) = found["series"]
     assert part["above"] == 0
@@ -265,7 +265,7 @@ def story():
     return summarize_events("/camera/tracks", found.events, found.rule, tracks, truth, (0, ns(9.9))), tracks
 
 
-def test_what_lasts_matters_more_than_what_flickers(story):
+def test_lasting_events_weigh_more_than_short_ones(story):
     told, _ = story
     assert [moment.t_ns for moment in told.events] == [ns(2.0), ns(2.2), ns(6.0)]
     assert [moment.weight_s for moment in told.events] == pytest.approx([0.2, 0.2, 3.8], abs=0.11)
@@ -291,7 +291,7 @@ class Film:
             yield Frame(int(self.t_ns[number]), number, image)
 
 
-def test_thumbnails_show_who_it_was_before_and_after(story):
+def test_thumbnails_show_the_tracks_before_and_after(story):
     told, tracks = story
     film = Film()
     add_thumbnails(told.events, tracks, film, 0)
@@ -333,7 +333,7 @@ def test_an_empty_log_says_so_in_every_section(tmp_path):
     assert not reader.of("svg")
 
 
-def test_without_truth_it_says_what_can_be_said_and_how_to_add_it(tmp_path):
+def test_without_ground_truth_it_says_how_to_add_it(tmp_path):
     frames = walk(lambda tick: {1: (tick * 0.4, 0.0), 2: (0.0, tick * 0.4)}, 20)
     path = write(tmp_path / "two.mcap", {"/camera/tracks": frames})
     _, numbers, reader = report_on(path)
@@ -363,7 +363,7 @@ def test_without_forecasts_it_says_which_command_makes_them(finished, tmp_path):
     assert all("displacement" not in result for result in numbers["results"])
 
 
-def test_a_truth_that_is_elsewhere_in_time_is_said_and_the_rest_is_there(tmp_path):
+def test_ground_truth_of_another_time_is_reported_and_the_rest_shown(tmp_path):
     frames = walk(lambda tick: {1: (tick * 0.4, 0.0)}, 20)
     later = [Frame(f.t_ns + ns(1000), f.index, f.rows) for f in frames]
     path = write(tmp_path / "apart.mcap", {"/camera/tracks": frames, "/camera/truth": later})
@@ -373,7 +373,7 @@ def test_a_truth_that_is_elsewhere_in_time_is_said_and_the_rest_is_there(tmp_pat
     assert str(tmp_path) not in "".join(reader.text)
 
 
-def test_pictures_that_are_damaged_are_said_and_the_ground_is_shown(tmp_path):
+def test_damaged_pictures_are_reported_and_the_ground_is_shown(tmp_path):
     path = tmp_path / "torn.mcap"
     frames = walk(lambda tick: {1: (tick * 0.4, 0.0)}, 20)
     with log.create(path) as writer:
@@ -387,7 +387,7 @@ def test_pictures_that_are_damaged_are_said_and_the_ground_is_shown(tmp_path):
     assert len(reader.of("svg")) > 1
 
 
-def test_channels_of_others_under_our_names_are_left_out_and_named(tmp_path):
+def test_channels_of_another_schema_are_left_out_and_named(tmp_path):
     path = write(tmp_path / "odd.mcap", {"/camera/tracks": [Frame(0, 0, PREDICTIONS.empty())]}, schema=PREDICTIONS)
     _, _, reader = report_on(path)
     assert "/camera/tracks holds mcaptrack.Predictions, not tracks" in "".join(reader.text)
@@ -452,7 +452,7 @@ def holds(reader: Reader) -> None:
     assert not reader.open
 
 
-def test_names_from_logs_are_words_and_nothing_else(nasty):
+def test_names_from_logs_are_only_text(nasty):
     text, _, reader = report_on(nasty)
     holds(reader)
     assert not [c for c in text if not (c.isprintable() or c in "\n\u00a0\u202f")]

@@ -1,4 +1,4 @@
-"""What a person sees on the ground: scenes that are whole after every seek, in metres, and layouts that show them."""
+"""Drawings on the ground: scenes that are complete after each seek, in metres, and layouts that show them."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def scenes(topic, schema, frames, times=PICTURES, planes=PLANE) -> list[SceneUpd
 
 
 def test_every_scene_is_whole():
-    """A seek delivers the last message alone: it has everybody who is there, and where they were."""
+    """A seek delivers only the last message: it has all people and their trails."""
     for number, message in enumerate(scenes("/c/retracks/full", TRACKS, WALK)):
         assert [entity.id for entity in message.entities] == ["2", "30"]
         for entity, wanted in zip(message.entities, [(0.1 * number, 1.0), (5.0, 0.2 * number)], strict=True):
@@ -61,7 +61,7 @@ def test_every_scene_is_whole():
                 assert opacity == sorted(opacity)
 
 
-def test_who_was_not_seen_is_fainter_and_who_is_nowhere_is_left_out():
+def test_interpolated_positions_are_fainter_and_unknown_ones_left_out():
     frames = [Frame(int(t), n, tracks_at({2: (1.0, 1.0)}, observed=n != 3)) for n, t in enumerate(PICTURES[:6])]
     alpha = [m.entities[0].cylinders[0].color.a for m in scenes("/c/tracks", TRACKS, frames)[:6]]
     assert alpha[3] < 0.5 * alpha[2]
@@ -70,7 +70,7 @@ def test_who_was_not_seen_is_fainter_and_who_is_nowhere_is_left_out():
     assert [entity.id for entity in message.entities] == ["3"]
 
 
-def test_kinds_of_tracks_tell_apart():
+def test_kinds_of_tracks_differ():
     shapes, heights = set(), []
     for name in ("tracks", "retracks/full", "truth"):
         entity = scenes(f"/c/{name}", TRACKS, WALK)[10].entities[0]

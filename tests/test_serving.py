@@ -1,4 +1,4 @@
-"""A log for a viewer in a browser: the bytes that it asks for, and nothing else to anybody else."""
+"""Logs served to a viewer in a browser: the requested bytes, only of these files, only on this machine."""
 
 from __future__ import annotations
 
@@ -195,7 +195,7 @@ def test_pages_of_any_origin_may_read_it_if_they_know_the_address(server, path):
     assert ask(server.address("layout.json"))[2] == b"{}"
 
 
-def test_nothing_else_is_served_and_to_nobody_else(server, path):
+def test_only_the_given_files_are_served_and_only_to_this_machine(server, path):
     address = server.address(path.name)
     base, word = address.split("/")[2], address.split("/")[3]
     for other in (
@@ -208,7 +208,7 @@ def test_nothing_else_is_served_and_to_nobody_else(server, path):
     ):
         assert ask(f"http://{base}/{other}")[0] == 404, other
     assert ask(f"http://{base}/{word}/../etc/passwd")[0] == 404
-    assert ask(address, Host="evil.example")[0] == 404  # a name that somebody made point to this machine
+    assert ask(address, Host="evil.example")[0] == 404  # DNS rebinding: the name resolves to this machine
     for method in ("POST", "PUT", "DELETE"):
         assert ask(address, method)[0] == 501
     assert server.server_address[0] == "127.0.0.1"
@@ -351,7 +351,7 @@ def test_content_of_a_request_is_never_taken_for_another_request(server):
     "fields",
     ["no colon", "A B: 1", "A : 1", ": 1", " A: 1", "A: 1\r\n 2", "A: \x00", "A: \x7f", "\xc4: 1", "From me\r\nA: 1"],
 )
-def test_fields_that_are_none_make_a_bad_request(server, fields):
+def test_malformed_fields_make_a_bad_request(server, fields):
     path = urlsplit(server.address("layout.json")).path
     for head in (f"Host: localhost\r\n{fields}", f"{fields}\r\nHost: localhost"):
         answer = exchange(server, f"GET {path} HTTP/1.1\r\n{head}\r\n\r\n".encode("latin-1"))

@@ -51,7 +51,7 @@ def some_tracks(people):
 
 @given(st.data())
 @settings(max_examples=60)
-def test_rows_survive_files_to_the_bit_with_frames_in_which_nobody_was(tmp_path_factory, data):
+def test_rows_and_empty_frames_survive_files_to_the_bit(tmp_path_factory, data):
     folder, schema = tmp_path_factory.mktemp("tables"), data.draw(ALL)
     form = data.draw(st.sampled_from(["parquet", "arrow"]))
     channels = {}
@@ -74,7 +74,7 @@ def test_rows_survive_files_to_the_bit_with_frames_in_which_nobody_was(tmp_path_
 @given(st.lists(st.tuples(TIMES, DOUBLES, st.none() | DOUBLES), min_size=1, max_size=12))
 @example([(0, 0.0, None), (2**63 - 1, 0.0, None)])
 @settings(max_examples=40)
-def test_others_read_the_same_bits_and_nanoseconds(tmp_path_factory, given_rows):
+def test_other_libraries_read_the_same_bits_and_nanoseconds(tmp_path_factory, given_rows):
     path = tmp_path_factory.mktemp("t") / "t.parquet"
     frames = []
     for number, (t_ns, x, y) in enumerate(sorted(given_rows, key=lambda row: row[0])):
@@ -276,7 +276,7 @@ def test_a_track_is_summed_up(tmp_path):
     assert second["first_x_px"] is None
 
 
-def test_a_track_that_is_nowhere_has_no_path_and_one_that_is_seen_once_no_speed():
+def test_a_track_without_positions_has_no_path_and_one_row_no_speed():
     rows = tracks_at({1: (np.nan, np.nan), 2: (5.0, 6.0)})
     nowhere, once = tables.summary_table({"/a": tables.build.frames_to_part(TRACKS, [Frame(5, 0, rows)])}).to_pylist()
     assert [nowhere[name] for name in ("path_m", "mean_speed_m_s", "max_speed_m_s", "first_x_m", "last_y_m")] == [
@@ -387,7 +387,7 @@ def test_killed_at_any_byte_or_call_the_file_is_the_old_one_or_the_new_one(tmp_p
 
 @pytest.mark.parametrize("form", tables.FORMATS)
 @pytest.mark.parametrize("error", [OSError(errno.ENOSPC, "No space left on device"), KeyboardInterrupt()])
-def test_when_the_disk_is_full_or_somebody_interrupts_it_is_the_old_file(tmp_path, monkeypatch, form, error):
+def test_a_full_disk_or_an_interrupt_leaves_the_old_file(tmp_path, monkeypatch, form, error):
     path, (old, new) = tmp_path / "t", two_tables()
     tables.write(path, old, {}, (), form)
     before, real = path.read_bytes(), Path.open
@@ -432,7 +432,7 @@ def test_when_the_disk_is_full_or_somebody_interrupts_it_is_the_old_file(tmp_pat
     assert at > 1
 
 
-def test_what_reads_back_differently_is_not_published(tmp_path, monkeypatch):
+def test_a_file_that_reads_back_differently_is_not_published(tmp_path, monkeypatch):
     path, (old, new) = tmp_path / "t.parquet", two_tables()
     tables.write(path, old, {})
     before = path.read_bytes()
@@ -462,13 +462,13 @@ def test_a_byte_that_changed_on_the_disk_is_noticed(tmp_path_factory, data):
         rows = tables.verify(path)
     except McaptrackError as error:
         assert "\n" not in str(error)
-    else:  # page headers and indexes hold bits that nobody needs to read the rows
+    else:  # page headers and indexes hold bits that are not needed to read the rows
         assert rows == table.num_rows
         assert pq.read_table(path).equals(table.replace_schema_metadata(pq.read_schema(path).metadata))
 
 
 @pytest.mark.parametrize("more", [(), ("topic",), ("observed",), ("topic", "observed")])
-def test_tracks_of_others_are_read_as_frames(tmp_path, more):
+def test_tracks_of_other_tools_are_read_as_frames(tmp_path, more):
     """Rows in any order; those without a place are left out; what a file doesn't say is unknown, or was observed."""
     table = {
         "t_ns": [5, 7, 5, 7, 7],

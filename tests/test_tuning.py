@@ -23,7 +23,7 @@ IOU = EvaluateOptions(similarities=("iou",))
 
 
 def scene() -> Task:
-    """Somebody walks, and is hidden for 2.5 s: who forgets later than that keeps the identity."""
+    """A person is hidden for 2.5 s: tracks that live longer than that keep the identity."""
     path = [(50 + 0.5 * n, 50) for n in range(80)]
     found = detections(lambda n: [] if 30 <= n < 55 else [path[n]], 80)
     truth = [Frame(ns(n / 10), n, boxed({1: (x - 5, y - 10)})) for n, (x, y) in enumerate(path)]
@@ -62,7 +62,7 @@ def test_optuna_finds_it_too():
 
 
 @pytest.mark.parametrize("with_optuna", [False, True])
-def test_a_search_that_was_ended_goes_on_where_it_was(with_optuna, tmp_path, monkeypatch):
+def test_an_ended_search_continues(with_optuna, tmp_path, monkeypatch):
     if not with_optuna:
         monkeypatch.setitem(sys.modules, "optuna", None)
     path, ranges, task = tmp_path / "study.jsonl", {"max_age_s": Range(0.1, 6.0, False)}, scene()
@@ -91,7 +91,7 @@ def test_a_study_of_another_search_is_refused(chance, tmp_path):
         tune(Sort(), [scene()], {}, IOU)
 
 
-def test_what_is_tried_is_what_is_written(chance):
+def test_tried_parameters_are_written_exactly(chance):
     seen = []
 
     @dataclass(frozen=True, kw_only=True)
@@ -183,7 +183,7 @@ def test_settings_go_into_a_file_that_exists_and_a_file_that_cannot_be_edited_is
 
 
 def test_empty_tracks_are_a_score_too(chance):
-    """A setting with which nobody is tracked is worth nothing, and ends no search."""
+    """Parameters without any track get a score of zero, and do not end the search."""
     task = scene()
     empty = Task("x", [f._replace(rows=f.rows[:0]) for f in task.frames], task.ground_truth, {})
     first, _ = tune(Sort(), [empty], {"min_iou": Range(0, 1, False)}, IOU, trials=2)

@@ -1,4 +1,4 @@
-"""What a person sees: one annotation message for every picture, at its very time."""
+"""Drawings on pictures: one annotation message for each picture, with its time."""
 
 from __future__ import annotations
 
@@ -138,7 +138,7 @@ def test_trails_stay_where_they_are_while_people_go_on_and_end_after_two_seconds
         assert oldest is None or 10 * (number - 14) <= oldest - 5 <= 10 * number
 
 
-def test_kinds_of_tracks_tell_apart():
+def test_kinds_of_tracks_differ():
     rows = [Frame(int(PICTURES[n]), n, track_rows({2: (n, 5)})) for n in range(6)]
     sort, retracked, true = (messages(f"/c/{name}", TRACKS, rows)[5] for name in ("tracks", "retracks/full", "truth"))
     assert [line.type for line in drawn(sort)] == [LIST]  # sides and trail, and no closed line
@@ -156,7 +156,7 @@ def test_kinds_of_tracks_tell_apart():
     assert len(places) == 3  # no number hides another
 
 
-def test_who_was_not_seen_is_fainter():
+def test_interpolated_positions_are_fainter():
     for name in ("tracks", "retracks/full"):
         rows = [Frame(int(PICTURES[n]), n, track_rows({2: (n, 5)}, observed=n != 4)) for n in range(6)]
         alpha = []
@@ -180,7 +180,7 @@ def test_numbers_of_any_length_are_written():
     assert sorted(text.text for text in message.texts) == sorted(map(str, people))
 
 
-def test_wide_pictures_get_thick_lines_and_large_words():
+def test_wide_pictures_get_thick_lines_and_large_text():
     wide = [(0, GroundPlane((0.1, 0, 0, 0, 0.1, 0, 0, 0, 1), 3840, 2160))]
     small, large = (messages(*CHANNELS["retracks"], planes)[5] for planes in (PLANE, wide))
     assert drawn(large)[0].thickness > 3 * drawn(small)[0].thickness
@@ -246,12 +246,12 @@ def test_points_of_an_ellipse_lie_as_far_out_as_its_covariance_says(long, short,
     np.testing.assert_allclose(np.einsum("ni,ij,nj->n", points, np.linalg.inv(spread), points), 5.991464547, rtol=1e-6)
 
 
-def test_what_is_no_covariance_has_no_ellipse():
+def test_an_invalid_covariance_has_no_ellipse():
     spread = np.array([[[np.nan, 0], [0, 1]], [[1, 5], [5, 1]], [[0, 0], [0, 0]]], float)
     half, turn = ellipses(spread)
     assert np.isnan(half[:2]).all()
     assert np.isnan(turn[:2]).all()
-    assert half[2].tolist() == [0, 0]  # somebody is sure
+    assert half[2].tolist() == [0, 0]  # no uncertainty
 
 
 def test_without_a_plane_there_are_no_forecasts_to_draw():
@@ -267,7 +267,7 @@ def test_stamps_are_those_of_the_pictures_where_they_differ_from_the_log():
         assert {part.timestamp.ToNanoseconds() for part in (message, *message.points, *message.texts)} == {stamp}
 
 
-def test_many_pictures_are_drawn_as_few_are():
+def test_drawings_are_independent_of_batches():
     """Messages are made in batches; where one ends is not to be seen."""
     pictures = np.arange(600) * ns(0.1)
     frames = [Frame(int(t), n, track_rows({2: (n, 5), 5: (5, n)})) for n, t in enumerate(pictures)]
