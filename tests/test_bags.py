@@ -541,7 +541,7 @@ class TestInto:
         for force in ([], ["--force"]):
             result = CliRunner().invoke(app, [*words, *force])
             assert result.exit_code == 1
-            assert "which others recorded (std_msgs/String) and which is never replaced; make" in result.stderr
+            assert "which other software recorded (std_msgs/String) and which is never replaced; make" in result.stderr
             assert recorded(tmp_path / "b.mcap") == sorted(said + other)
 
     @pytest.mark.parametrize("chunks", [True, False])

@@ -562,7 +562,7 @@ def test_what_is_whole_is_recovered_and_what_is_lost_makes_the_exit_code_three(f
     damaged.write_bytes(whole[: len(whole) * 2 // 3])
     code, _, err = call("info", damaged)
     assert code == 1
-    assert f"`mcaptrack recover {damaged}` saves what is whole" in err
+    assert f"`mcaptrack recover {damaged}` saves what is intact" in err
     code, out, err = call("recover", damaged, "--json")
     (result,) = json.loads(out)["results"]
     assert code == 3

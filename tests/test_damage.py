@@ -185,7 +185,7 @@ def test_what_is_lost_is_named(chunked, tmp_path):
     assert "it held messages of a, b, c from 0.000 to 0.000 s" in report.lost[0]
     lost = Counter(topic for topic, *_ in held)
     total = Counter(topic for topic, *_ in FORTY)
-    assert report.lost[1:] == [f"{t}: {total[t] - lost[t]} of {total[t]} messages are saved" for t in "abc"]
+    assert report.lost[1:] == [f"{t}: {total[t] - lost[t]} of {total[t]} messages are recovered" for t in "abc"]
 
 
 def test_a_log_that_is_cut_off_keeps_every_chunk_that_is_complete(chunked, tmp_path):
@@ -199,7 +199,7 @@ def test_a_log_that_is_cut_off_keeps_every_chunk_that_is_complete(chunked, tmp_p
         spans = [(low, high) for end, low, high in chunks if end <= path.stat().st_size]
         there = Counter((t, ns, data) for t, ns, _, data in FORTY if any(low <= ns <= high for low, high in spans))
         if not spans:
-            with pytest.raises(McaptrackError, match="no message in it is whole"):
+            with pytest.raises(McaptrackError, match="no message in it is intact"):
                 log.recover(path, saved)
             continue
         report = log.recover(path, saved)
@@ -265,7 +265,7 @@ def test_no_mutation_gives_a_wrong_message_or_a_traceback(tmp_path, seed):
         try:
             report = log.recover(path, saved)
         except McaptrackError as error:
-            assert "no message in it is whole" in str(error)
+            assert "no message in it is intact" in str(error)
             assert not is_sound
             continue
         found = triples(saved)
@@ -338,7 +338,7 @@ def test_hostile_logs_cost_neither_time_nor_memory(tmp_path):
 def test_what_nobody_can_save_is_said(tmp_path):
     for name, data in {"text.mcap": b"I am no log\n" * 9, "magic.mcap": MAGIC}.items():
         (tmp_path / name).write_bytes(data)
-        with pytest.raises(McaptrackError, match="no message in it is whole"):
+        with pytest.raises(McaptrackError, match="no message in it is intact"):
             log.recover(tmp_path / name, tmp_path / "saved.mcap")
     (tmp_path / "empty.mcap").write_bytes(b"")
     for verb in (log.check, lambda path: log.recover(path, tmp_path / "saved.mcap")):

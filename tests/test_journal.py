@@ -116,8 +116,8 @@ def anew(make: Callable[[Path], object]) -> Callable[[Path], object]:
 
 #: What lies beside the log, and what is said of it.
 THINGS: dict[str, tuple[Callable[[Path], object], str]] = {
-    "words": (lambda at: at.write_bytes(b"dear diary"), "is no journal of mcaptrack"),
-    "nothing in it": (lambda at: at.write_bytes(b""), "is no journal of mcaptrack"),
+    "words": (lambda at: at.write_bytes(b"dear diary"), "is not a journal of mcaptrack"),
+    "nothing in it": (lambda at: at.write_bytes(b""), "is not a journal of mcaptrack"),
     "48 bytes that fit all": (lambda at: at.write_bytes(first_journal(0, 0, b"", b"")), "version 0.1.0"),
     "the first bytes": (lambda at: at.write_bytes(at.read_bytes()[:90]), "is an incomplete or damaged journal"),
     "a head": (lambda at: at.write_bytes(at.read_bytes()[:240]), "is an incomplete or damaged journal"),
@@ -128,8 +128,8 @@ THINGS: dict[str, tuple[Callable[[Path], object], str]] = {
     "a socket": (anew(a_socket), "is a socket"),
     "a link to itself, elsewhere": (linked, "is a symbolic link"),
     "a link to nothing": (anew(lambda at: at.symlink_to("nothing")), "is a symbolic link"),
-    "one of another log": (of_another, "is of a log that began differently"),
-    "one of a copy": (of_a_copy, "is of another file than"),
+    "one of another log": (of_another, "belongs to a log with another beginning"),
+    "one of a copy": (of_a_copy, "belongs to another file than"),
 }
 if AS_ROOT:
     THINGS["a device"] = (anew(lambda at: os.mknod(at, 0o020644, os.makedev(1, 5))), "is a device")
@@ -156,10 +156,10 @@ def test_what_is_no_proof_is_said_in_a_line_and_never_used(path, tmp_path, thing
         assert everything(tmp_path) == before
         assert len(said) == 1
         assert "\n" not in said[0].message
-        if "saved as it was" not in said[0].message:
+        if "its state before that is recovered" not in said[0].message:
             assert said[0].message.startswith(f"{journal_of(path)} ")
             assert words in said[0].message
-            assert "is not used" in said[0].message
+            assert "it is ignored" in said[0].message
     assert out.exists()
 
 
@@ -178,7 +178,7 @@ def test_what_lies_in_the_way_is_refused_and_the_command_that_is_proposed_remove
         notices.collected(),
         notices.listening(lambda _: None),
         log.read(path) as opened,
-        pytest.raises(McaptrackError, match="lies where the journal goes") as refused,
+        pytest.raises(McaptrackError, match="needs that name for its journal") as refused,
         log.extend(opened),
     ):
         pass
@@ -235,8 +235,8 @@ def test_a_journal_that_fits_a_file_that_is_no_log_changes_nothing(tmp_path):
     with text.open("rb+") as stream:
         journal_of(text).write_bytes(journal.pack_head(stream.fileno(), 100) + text.read_bytes()[100:])
         before = everything(tmp_path)
-        with pytest.raises(McaptrackError, match="which is no MCAP file"):
-            in_place.settle(text, stream.fileno(), OpenFile.at(text))
+        with pytest.raises(McaptrackError, match="which is not an MCAP file"):
+            in_place.resolve_journal(text, stream.fileno(), OpenFile.at(text))
     assert everything(tmp_path) == before
 
 
@@ -296,7 +296,7 @@ def test_a_journal_that_comes_while_results_are_computed_is_not_overwritten(tmp_
     with log.read(path) as opened:
         opened.lock()
         journal_of(path).write_bytes(b"somebody's own")
-        with pytest.raises(McaptrackError, match="something lies there already"), log.extend(opened):
+        with pytest.raises(McaptrackError, match="there is something else with that name"), log.extend(opened):
             pass
     assert journal_of(path).read_bytes() == b"somebody's own"
     assert path.read_bytes() == whole
@@ -309,5 +309,5 @@ def test_a_log_may_be_moved_with_its_journal_and_is_then_saved_to_another_file(p
         shutil.copyfile(name, moved / name.name)
     with notices.collected() as said, notices.listening(said.append), pytest.raises(McaptrackError):
         look(moved / path.name)
-    assert "is of another file than" in said[0].message
+    assert "belongs to another file than" in said[0].message
     assert "If it was left half written, `mcaptrack recover" in said[0].message

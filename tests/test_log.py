@@ -164,7 +164,10 @@ def test_a_topic_can_be_taken_once(tmp_path):
 
 @pytest.mark.parametrize("t_ns", [-1, 2**64])
 def test_times_that_no_log_can_hold_are_refused(tmp_path, t_ns):
-    with pytest.raises(McaptrackError, match="is no time for a log"), log.create(tmp_path / "a.mcap") as writer:
+    with (
+        pytest.raises(McaptrackError, match="is not a time that a log can store"),
+        log.create(tmp_path / "a.mcap") as writer,
+    ):
         writer.add_message(writer.add_channel("a", SCHEMA, "json", {}), t_ns, 0, b"")
 
 
@@ -395,7 +398,7 @@ def test_chunks_outside_of_the_span_are_not_touched(tmp_path):
     path.write_bytes(raw)
     with log.read(path) as opened:
         assert [m.t_ns for m in opened.messages("a", 10, 20)] == list(range(10, 20))
-        with pytest.raises(McaptrackError, match=r"is damaged: byte .*`mcaptrack recover .*` saves what is whole"):
+        with pytest.raises(McaptrackError, match=r"is damaged: byte .*`mcaptrack recover .*` saves what is intact"):
             list(opened.messages("a", 10))
 
 
@@ -406,8 +409,10 @@ def test_chunks_that_all_overlap_are_not_all_open(tmp_path, monkeypatch):
     times = [(t * 37) % 400 for t in range(400)]
     write_stock(path, [("a", t, t, bytes([t % 256]) * 100) for t in times], chunk_size=1000)
     opened_chunks = []
-    opening = reading.open_and_mark
-    monkeypatch.setattr(reading, "open_and_mark", lambda *where: opened_chunks.append(where) or opening(*where))
+    opening = reading.open_chunk_with_checksum
+    monkeypatch.setattr(
+        reading, "open_chunk_with_checksum", lambda *where: opened_chunks.append(where) or opening(*where)
+    )
     with log.read(path) as opened:
         chunks = len(opened.index.chunks)
         assert [m.t_ns for m in opened.messages("a")] == sorted(times)

@@ -204,10 +204,10 @@ def test_what_is_lost_is_listed_once_and_nothing_else(chunked, tmp_path):
     for topic, words in zip("abc", lost[1:], strict=True):
         count = sum("abc"[n % 3] == topic for n in range(40))
         gone = sum("abc"[n % 3] == topic for n in held)
-        assert words == f"{topic}: {count - gone} of {count} messages are saved"
+        assert words == f"{topic}: {count - gone} of {count} messages are recovered"
     chunked.write_bytes(whole[:end])
     lost = log.recover(chunked, saved).lost
-    assert lost == [f"byte {end}: the file is cut off; if anything stood behind, it is lost"]
+    assert lost == [f"byte {end}: the file is cut off; anything that followed is lost"]
     attachment = summary_of_bytes(tmp_path, whole).attachment_indexes[0]
     chunked.write_bytes(whole)
     flip(chunked, attachment.offset + attachment.length - 6)

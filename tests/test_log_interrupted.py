@@ -185,7 +185,7 @@ def look(path: Path, change: Change) -> str:
     assert photo(path.parent) == before
     with notices.collected() as mended, notices.listening(mended.append):
         mend(path)
-    assert sum("has been put back as it was" in notice.message for notice in mended) == half
+    assert sum("its state before that has been restored" in notice.message for notice in mended) == half
     assert not journal_of(path).exists()
     left = path.read_bytes()
     assert left in (change.old, change.new)
@@ -269,7 +269,7 @@ def test_what_can_t_be_put_back_at_once_is_put_back_later(path, change, monkeypa
         with pytest.raises(McaptrackError) as said:
             change.make(path)
     if count[0] > 2:
-        assert "nor put back as it was" in str(said.value)
+        assert "its old state can't be restored" in str(said.value)
         assert "\n" not in str(said.value)
     assert look(path, change) == "old"
 
@@ -331,7 +331,7 @@ def test_a_writer_that_is_at_work_is_seen_beside(path, change):
     assert path.read_bytes() == change.new
     assert len(steps) > 1
     assert {notice.message for notice in said} == {
-        f"{path} is being written to by another process; it is seen as it was before"
+        f"{path} is being written to by another process; its state before that is read"
     }
 
 

@@ -136,7 +136,7 @@ SCENES: dict[str, Callable[[Scene], str]] = {
         "evaluate", "LOG", "--truth", "truth.txt"
     ),
     "log/journal_check.py:recover_command:recover": Scene.damaged,
-    "log/snapshot.py:computing:drop": Scene.late,
+    "log/snapshot.py:reporting_bad_times:drop": Scene.late,
     "log/recording_files.py:refuse_non_mcap:ingest": Scene.bag,
     "log/reader.py:channel:info": lambda s: s.says("export", "LOG", "--topic", "/nothing"),
     "pipeline/checks.py:_lacks:info": lambda s: s.says("sample", "LOG", "--topic", "/nothing"),

@@ -101,7 +101,7 @@ def test_the_next_command_that_writes_puts_it_back_and_says_so(half, whole, tmp_
     shutil.copy(whole, path)
     interrupt(path)
     outcome = done("drop", path, "/camera/truth", "-q")
-    assert "has been put back as it was before" in outcome.err
+    assert "its state before that has been restored" in outcome.err
     assert not journal_of(path).exists()
     other = tmp_path / "b.mcap"
     shutil.copy(whole, other)

@@ -149,7 +149,7 @@ def test_nothing_that_is_ingested_takes_the_place_of_a_recorded_channel(
     for force in ([], ["--force"]):
         code, err = mcaptrack("ingest", source, *options, *force, "--into", path)
         assert (code, err.count("\n")) == (1, 1), err
-        assert f"m.mcap has {topic}, which others recorded ({THEIRS}) and which is never replaced; " in err
+        assert f"m.mcap has {topic}, which other software recorded ({THEIRS}) and which is never replaced; " in err
         assert "--force" not in err
         assert path.read_bytes() == before
     camera = re.search(r"; --camera (\S+) puts", err)
@@ -168,7 +168,7 @@ def test_labels_beside_a_recording_that_has_such_a_channel(stock, tmp_path):
     for force in ([], ["--force"]):
         code, err = mcaptrack("ingest", path, "--truth", found, *force, "-o", out)
         assert (code, out.exists()) == (1, False)
-        assert "m.mcap has /camera/truth, which others recorded" in err
+        assert "m.mcap has /camera/truth, which other software recorded" in err
     options = shlex.split(re.search(r"(--camera \S+) puts", err)[1])
     assert mcaptrack("ingest", path, "--truth", found, *options, "-o", out)[0] == 0
     assert theirs(out) == theirs(path)

@@ -73,7 +73,7 @@ def test_each_topic_is_read_whole_or_refused(tmp_path_factory, channels, chunk_s
         for topic in opened.channels:
             those = [channel for channel in channels if channel[0] == topic and channel[3]]
             if len({(definition in ALIKE, encoding) for _, definition, encoding, _ in those}) > 1:
-                with pytest.raises(McaptrackError, match=f"messages of {topic} are laid out differently: "):
+                with pytest.raises(McaptrackError, match=f"messages of {topic} have different layouts: "):
                     list(opened.messages(topic))
                 with pytest.raises(McaptrackError, match="laid out differently"):
                     opened.times(topic)

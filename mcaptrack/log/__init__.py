@@ -1,10 +1,10 @@
-"""Logs: MCAP files, and nothing else here knows what is in them.
+"""Logs: MCAP files. No other package knows their format.
 
 with read(path) as log:                 channels, messages, frames
-    with extend(log) as writer: ...     the same file with channels added or left out
+    with extend(log) as writer: ...     add channels to the same file, or drop some
 with create(path) as writer: ...        a new one
-check(path)                             is it sound
-recover(path, output)                   what is whole in it, as a new one
+check(path)                             find damage
+recover(path, output)                   write what is intact to a new log
 """
 
 from mcaptrack.log.check import CheckResult, check

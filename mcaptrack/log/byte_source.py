@@ -1,7 +1,7 @@
-"""The bytes of a log, read when they are asked for.
+"""The bytes of a log, read on demand.
 
-Files are not mapped into memory: when another process makes a mapped file shorter, the kernel kills whoever touches a
-page behind its new end. Here a read comes back short instead, and that is Damaged.
+Files are not mapped into memory. When another process truncates a mapped file, the kernel kills every process that
+touches a page behind the new end. A read comes back short instead, which raises Damaged.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.log.recording_files import refuse_non_mcap
 from mcaptrack.log.records import BLOCK, Damaged, crc_of
 
-#: Small reads fetch at least so much, and while they go on one after another twice as much each time, up to the most.
-_LEAST_AHEAD: Final = 4 * 2**10
-_MOST_AHEAD: Final = 256 * 2**10
-#: So many bytes are summed at once at least.
-_LEAST_SUMMED: Final = 64 * 2**10
-#: File systems keep times in ticks: two changes within this time may carry the same time.
+#: Read-ahead of small reads in bytes: it starts with the minimum and doubles with every sequential read.
+_MIN_AHEAD: Final = 4 * 2**10
+_MAX_AHEAD: Final = 256 * 2**10
+#: The running checksum is updated in steps of at least this many bytes.
+_MIN_SUMMED: Final = 64 * 2**10
+#: Resolution of file times: two changes within this time may get the same timestamp.
 _TICK_S: Final = 0.05
 
 _KINDS: Final = {
@@ -37,12 +37,12 @@ _KINDS: Final = {
 
 
 def file_type(mode: int) -> str:
-    """What something is that is no regular file, in words; "" for a regular file."""
+    """The type of a file that is not a regular one, in words; "" for a regular file."""
     return "" if stat.S_ISREG(mode) else _KINDS.get(stat.S_IFMT(mode), "something special")
 
 
 class Signature(NamedTuple):
-    """What tells whether a file was changed: its size, and when content and description last changed."""
+    """Size and change times of a file: another signature means that the file was changed."""
 
     size: int
     written_ns: int
@@ -50,18 +50,18 @@ class Signature(NamedTuple):
 
     @classmethod
     def of(cls, handle: int) -> Signature:
-        """The signature of an open file now."""
+        """The current signature of an open file."""
         found = os.fstat(handle)
         return cls(found.st_size, found.st_mtime_ns, found.st_ctime_ns)
 
     @property
     def is_certain(self) -> bool:
-        """Whether a change from now on is sure to give another signature."""
+        """Whether every later change will give another signature."""
         return abs(time.time() - self.changed_ns / 1e9) > _TICK_S
 
 
 class OpenFile:
-    """A regular file, open for reading; closed with ``close``, or when nothing refers to it any more."""
+    """A regular file, open for reading; closed by ``close`` or by garbage collection."""
 
     def __init__(self, handle: int) -> None:
         self.handle = handle
@@ -69,7 +69,10 @@ class OpenFile:
 
     @classmethod
     def at(cls, path: Path) -> OpenFile:
-        """Raises McaptrackError for what isn't there, may not be read, or is no file; never waits for a pipe."""
+        """Open a file without ever blocking on a pipe.
+
+        Raises McaptrackError if it is missing, not readable or not a regular file.
+        """
         refuse_non_mcap(path)
         try:
             kind = file_type(path.stat().st_mode)
@@ -77,21 +80,21 @@ class OpenFile:
                 file = cls(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC))
         except OSError as error:
             raise McaptrackError(f"{path} can't be opened: {error.strerror}") from None
-        kind = kind or file_type(os.fstat(file.handle).st_mode)  # it may have been replaced meanwhile
+        kind = kind or file_type(os.fstat(file.handle).st_mode)  # the path may have been replaced since
         if kind:
             hint = "; give the logs in it, as in 'FOLDER/*.mcap'" if path.is_dir() else ""
             raise McaptrackError(f"{path} is {kind}, not an MCAP file{hint}")
         return file
 
     def read(self, at: int, size: int) -> bytes:
-        """Bytes of the file. Raises Damaged where it has become shorter or can't be read."""
+        """``size`` bytes from offset ``at``. Raises Damaged if the file has become shorter or can't be read."""
         if not self.close.alive:
             raise ValueError("the file is closed")
         return read_exactly(self.handle, at, size)
 
 
 def read_exactly(handle: int, at: int, size: int) -> bytes:
-    """Bytes of an open file. Raises Damaged where it is shorter or can't be read."""
+    """``size`` bytes of an open file from offset ``at``. Raises Damaged if it is shorter or can't be read."""
     try:
         data = os.pread(handle, size, at)
         while len(data) < size:
@@ -113,25 +116,24 @@ class Piece(NamedTuple):
 
 
 class ByteSource:
-    """The bytes of one file, or of pieces of several as if they were one; ``source[start:end]`` reads them.
+    """The bytes of one file, or of pieces of several files laid end to end; ``source[start:end]`` reads them.
 
-    Both ends of a slice are given, and count from the beginning.
-
-    ``ahead`` is how much a small read fetches for those that follow; by default it grows with their number.
+    Slices need both a start and an end, as offsets from the beginning. ``ahead`` is the read-ahead in bytes; by default
+    it grows while reads are sequential.
     """
 
     def __init__(self, pieces: Sequence[Piece], ahead: int = 0) -> None:
         self.pieces: tuple[Piece, ...] = tuple(pieces)
         self._size = sum(piece.size for piece in pieces)
         self._ahead = ahead
-        self._next_ahead = ahead or _LEAST_AHEAD
+        self._next_ahead = ahead or _MIN_AHEAD
         self._window: tuple[int, memoryview] = (0, memoryview(b""))
-        #: Bytes from here on are still wanted when what follows is fetched.
+        #: Offset from which bytes stay in the read-ahead window, because they will be read again.
         self.anchor: int | None = None
 
     @classmethod
     def of(cls, file: OpenFile) -> ByteSource:
-        """The whole of a file, as long as it is now."""
+        """The whole file, at its current size."""
         return cls([Piece(file, 0, os.fstat(file.handle).st_size)])
 
     def __len__(self) -> int:
@@ -159,8 +161,8 @@ class ByteSource:
         at, window = self._window
         if not self._ahead:
             behind = at + len(window)
-            is_next = behind - _LEAST_AHEAD <= start <= behind + _LEAST_AHEAD
-            self._next_ahead = min(self._next_ahead * 2, _MOST_AHEAD) if is_next else _LEAST_AHEAD
+            is_next = behind - _MIN_AHEAD <= start <= behind + _MIN_AHEAD
+            self._next_ahead = min(self._next_ahead * 2, _MAX_AHEAD) if is_next else _MIN_AHEAD
         low = start
         if self.anchor is not None and 0 <= start - self.anchor < self._next_ahead:
             low = self.anchor
@@ -179,12 +181,12 @@ class ByteSource:
             start, end = start - piece.size, end - piece.size
         return parts[0] if len(parts) == 1 else b"".join(parts)
 
-    def front_to_back(self) -> ByteSource:
-        """The same for whoever reads all of it in order."""
+    def sequential(self) -> ByteSource:
+        """The same bytes with a large read-ahead, for reading all of them in order."""
         return ByteSource(self.pieces, 2 * BLOCK)
 
     def part(self, start: int, end: int) -> ByteSource:
-        """The bytes from ``start`` to ``end`` as a source of their own."""
+        """The bytes from ``start`` to ``end`` as a separate source."""
         pieces = []
         for piece in self.pieces:
             low, high = max(start, 0), min(end, piece.size)
@@ -195,19 +197,19 @@ class ByteSource:
 
 
 class RunningChecksum:
-    """The CRC-32 of a source from its beginning to ``done``, brought on as records are passed."""
+    """The CRC-32 of the first ``done`` bytes of a source, updated while its records are read."""
 
     def __init__(self, source: ByteSource) -> None:
         self._source, self._crc, self.done = source, 0, 0
         source.anchor = 0
 
-    def pass_over(self, end: int) -> None:
-        """Everything before ``end`` has been looked at, or is about to be; short records are taken together."""
-        if end - self.done >= _LEAST_SUMMED:
-            self.upto(end)
+    def advance(self, end: int) -> None:
+        """Include the bytes before ``end``, if there are enough new ones; short records are summed together."""
+        if end - self.done >= _MIN_SUMMED:
+            self.up_to(end)
 
-    def upto(self, end: int) -> int:
-        """The checksum of everything before ``end``."""
+    def up_to(self, end: int) -> int:
+        """The checksum of all bytes before ``end``."""
         self._crc = crc_of(self._source, self.done, end, self._crc)
         self.done = self._source.anchor = end
         return self._crc

@@ -1,4 +1,4 @@
-"""Is a log sound? Every record is looked at, whatever the summary says; then the summary is held against them.
+"""Check a log for damage: read every record without relying on the summary, then compare the summary with them.
 
 Letters: M messages.
 """
@@ -22,14 +22,14 @@ from mcaptrack.log.chunks import (
     HEAD,
     MAX_NS,
     Entries,
-    chunk_entries,
-    heads_at,
-    listed_entries,
     message_head,
+    message_heads_at,
     open_chunk,
+    read_index_entries,
+    scan_entries,
 )
-from mcaptrack.log.index import Index, begins_as_log, ends_as_log, list_attachment, list_metadata
-from mcaptrack.log.journal import find_content, journal_of
+from mcaptrack.log.index import Index, attachment_entry, ends_with_magic, metadata_entry, starts_with_magic
+from mcaptrack.log.journal import journal_of, load_old_content
 from mcaptrack.log.journal_check import changed, find_journal
 from mcaptrack.log.records import MAGIC, Bytes, ChunkIndexRecord, Damaged, Opcode, Reader, Record, walk
 
@@ -38,7 +38,7 @@ Progress = Callable[[str, int, int], None]
 
 @dataclass
 class CheckResult:
-    """What was found in a log."""
+    """The result of ``check``."""
 
     path: Path
     messages: int = 0
@@ -47,15 +47,30 @@ class CheckResult:
 
     @property
     def is_sound(self) -> bool:
-        """Whether nothing is wrong; what could be better doesn't count."""
+        """Whether there are no errors; warnings don't count."""
         return all(finding.level != "error" for finding in self.findings)
 
 
 def check(path: Path, progress: Progress = lambda *_: None) -> CheckResult:
-    """Look at every byte of a log. Raises McaptrackError only if there is no file to look at.
+    """Check every byte of a log.
 
-    Checksums, sizes and times of chunks, message indexes, the order of each channel's messages, attachments, and
-    everything that the summary and the footer say. What is found is grouped by kind.
+    Parameters
+    ----------
+    path : Path
+        An MCAP file.
+    progress : callable, optional
+        Called with "check", the bytes read, and the size of the file.
+
+    Returns
+    -------
+    CheckResult
+        Findings about checksums, sizes and times of chunks, message indexes, the order of each channel's messages,
+        attachments, summary and footer; one finding of each kind, with the number of times.
+
+    Raises
+    ------
+    McaptrackError
+        Only if the file can't be read at all, or changes meanwhile.
     """
     with open_bytes(path) as (source, file):
         signature = Signature.of(file.handle)
@@ -64,13 +79,13 @@ def check(path: Path, progress: Progress = lambda *_: None) -> CheckResult:
             raise McaptrackError(f"{path} is being written to by another process; try again when it is done")
         half = found.journal if found else None
         if found and not half:
-            notices.warn(found.words, "journal")
-        look = _Look((half.overlay() if half else source).front_to_back(), progress)
+            notices.warn(found.message, "journal")
+        look = _Checker((half.old_content() if half else source).sequential(), progress)
         if found and half:
-            look.findings.add("half-written", half.start, found.words)
+            look.findings.add("half-written", half.start, found.message)
         try:
-            look.at_everything()
-        except Damaged as error:  # damage to the content is a finding
+            look.check_all()
+        except Damaged as error:  # an unreadable file; damaged content is a finding
             raise McaptrackError(f"{path} can't be read to its end: {error}") from None
         if Signature.of(file.handle) != signature:
             raise changed(path)
@@ -79,30 +94,30 @@ def check(path: Path, progress: Progress = lambda *_: None) -> CheckResult:
 
 
 def is_sound(source: ByteSource) -> bool:
-    """Whether a look at every byte finds no error."""
-    look = _Look(source.front_to_back(), lambda *_: None)
+    """Whether a check of every byte finds no error."""
+    look = _Checker(source.sequential(), lambda *_: None)
     try:
-        look.at_everything()
+        look.check_all()
     except Damaged:
         return False
     return all(finding.level != "error" for finding in look.findings)
 
 
-def best_content(path: Path, source: ByteSource, file: OpenFile) -> ByteSource:
-    """What to save of a log that a journal lies beside: the log as the journal has it where the file itself is damaged.
+def content_to_recover(path: Path, source: ByteSource, file: OpenFile) -> ByteSource:
+    """The content that `recover` reads: the old content by a journal if the file itself is damaged, else the file.
 
-    Since the log itself stays as it is, a journal will do that doesn't prove that it is of this very file.
+    The log itself is not written to, so a journal is good enough that doesn't prove that it belongs to this file.
     """
     found = find_journal(path, file)
     if found is None:
         return source
-    before = found.journal.overlay() if found.journal else find_content(follow_links(path), file)
+    before = found.journal.old_content() if found.journal else load_old_content(follow_links(path), file)
     if before is None or (not found.journal and is_sound(source)) or not is_sound(before):
-        notices.warn(found.words, "journal")
+        notices.warn(found.message, "journal")
         return source
     notices.warn(
-        f"{path} was left half written by a change that was interrupted; it is saved as it was before, by what "
-        f"{journal_of(follow_links(path)).name} holds",
+        f"{path} was left half written by an interrupted change; its state before that is recovered with the help "
+        f"of {journal_of(follow_links(path)).name}",
         "journal",
     )
     return before
@@ -110,7 +125,7 @@ def best_content(path: Path, source: ByteSource, file: OpenFile) -> ByteSource:
 
 @contextmanager
 def open_bytes(path: Path) -> Iterator[tuple[ByteSource, OpenFile]]:
-    """The bytes of a file. Raises McaptrackError if it is none or empty."""
+    """Open the bytes of a file. Raises McaptrackError if it is missing or empty."""
     file = OpenFile.at(path)
     try:
         source = ByteSource.of(file)
@@ -121,30 +136,32 @@ def open_bytes(path: Path) -> Iterator[tuple[ByteSource, OpenFile]]:
         file.close()
 
 
-class _Look:
-    """One look at a file; ``found`` is what its records say, the way an index would say it."""
+class _Checker:
+    """One check of a file; ``found`` is the index that its records should have."""
 
     def __init__(self, buffer: ByteSource, progress: Progress) -> None:
         self.found = Index()
         self.findings = Findings()
         self._find = self.findings.add
         self._buffer, self._progress = buffer, progress
-        self._chunk: tuple[Record, dict[int, int]] | None = None  # the last one, and the indexes behind it
-        self._latest: dict[int, int] = {}  # log time, of each channel
+        self._chunk: tuple[Record, dict[int, int]] | None = (
+            None  # the last chunk, and the offsets of its message indexes
+        )
+        self._latest: dict[int, int] = {}  # latest log time by channel
 
-    def at_everything(self) -> None:
+    def check_all(self) -> None:
         buffer = self._buffer
-        if not begins_as_log(buffer):
+        if not starts_with_magic(buffer):
             self._find("magic", 0, "the file does not begin as an MCAP file does")
             return
-        ends_well = ends_as_log(buffer)
+        ends_well = ends_with_magic(buffer)
         if not ends_well:
             self._find("cut-off", len(buffer), "the file is cut off: the magic bytes at its end are missing")
         end = len(buffer) - len(MAGIC) if ends_well else len(buffer)
         try:
             self._at_data(end)
         except Damaged as error:
-            self._find("structure", 0, f"{error}; what follows can't be looked at")
+            self._find("structure", 0, f"{error}; what follows can't be checked")
         self._close_chunk()
         if ends_well:
             check_summary(buffer, self.found, self.findings)
@@ -160,11 +177,11 @@ class _Look:
             is_first = False
             if record.opcode != Opcode.MESSAGE_INDEX:
                 self._close_chunk()
-                checksum.pass_over(record.start)
+                checksum.advance(record.start)
             if record.opcode == Opcode.DATA_END:
                 self.found.data_end = record.start
                 self.found.data_crc = Reader(buffer, record.body, record.end).number(4)
-                if self.found.data_crc and self.found.data_crc != checksum.upto(record.start):
+                if self.found.data_crc and self.found.data_crc != checksum.up_to(record.start):
                     self._find("data-checksum", record.start, "the checksum of the data section is wrong")
                 return
             try:
@@ -185,9 +202,9 @@ class _Look:
         elif record.opcode == Opcode.MESSAGE_INDEX:
             channel, _ = records.read_message_entries(buffer, record)
             if self._chunk is None:
-                self._find("stray-index", record.start, "a message index that stands behind no chunk")
+                self._find("stray-index", record.start, "a message index that follows no chunk")
             elif channel in self._chunk[1]:
-                self._find("double-index", record.start, f"two message indexes of channel {channel} behind one chunk")
+                self._find("double-index", record.start, f"two message indexes of channel {channel} for one chunk")
             else:
                 self._chunk[1][channel] = record.start
         elif record.opcode == Opcode.MESSAGE:
@@ -197,9 +214,9 @@ class _Look:
         elif record.opcode == Opcode.ATTACHMENT:
             if not records.attachment_is_whole(buffer, record):
                 self._find("attachment-checksum", record.start, "the checksum of an attachment is wrong")
-            found.attachments.append(list_attachment(buffer, record, record.start))
+            found.attachments.append(attachment_entry(buffer, record, record.start))
         elif record.opcode == Opcode.METADATA:
-            found.metadata.append(list_metadata(buffer, record, record.start))
+            found.metadata.append(metadata_entry(buffer, record, record.start))
         elif record.opcode == Opcode.HEADER:
             records.read_header(buffer, record)
         elif record.opcode == 0 or record.opcode in (Opcode.FOOTER, Opcode.STATISTICS, Opcode.CHUNK_INDEX):
@@ -208,22 +225,22 @@ class _Look:
             self._find("unknown", record.start, f"a record of kind {record.opcode:#04x}, which is not known", "warning")
 
     def _describe(self, buffer: Bytes, record: Record, where: int) -> None:
-        """A schema or channel, which is the same wherever it stands."""
+        """Register a schema or channel record; repeated ones must be equal."""
         if record.opcode == Opcode.SCHEMA:
             schema = records.read_schema(buffer, record)
             if schema.id == 0:
-                self._find("schema-zero", where, "a schema of number 0, which means none")
+                self._find("schema-zero", where, "a schema with id 0, which means no schema")
             elif self.found.schemas.setdefault(schema.id, schema) != schema:
-                self._find("two-schemas", where, f"schema {schema.id} is described in two ways")
+                self._find("two-schemas", where, f"two different schemas have the id {schema.id}")
         else:
             channel = records.read_channel(buffer, record)
             if channel.schema_id and channel.schema_id not in self.found.schemas:
                 self._find("no-schema", where, f"{channel.topic} has schema {channel.schema_id}, not described before")
             if self.found.channels.setdefault(channel.id, channel) != channel:
-                self._find("two-channels", where, f"channel {channel.id} ({channel.topic}) is described in two ways")
+                self._find("two-channels", where, f"two different channels have the id {channel.id} ({channel.topic})")
 
     def _close_chunk(self) -> None:
-        """Look into the last chunk, now that its indexes are known."""
+        """Check the last chunk, now that its message indexes are known."""
         if self._chunk is None:
             return
         (record, indexes), self._chunk = self._chunk, None
@@ -237,8 +254,8 @@ class _Look:
         head = records.read_chunk(buffer, record)
         content = open_chunk(buffer, record)
         if not head.uncompressed_crc and len(content):
-            self._find("no-checksum", record.start, "a chunk without a checksum: damage goes unseen", "warning")
-        entries = self._indexed(record, content, indexes) if indexes else chunk_entries(content)
+            self._find("no-checksum", record.start, "a chunk without a checksum, so damage is not detected", "warning")
+        entries = self._indexed(record, content, indexes) if indexes else scan_entries(content)
         if not indexes:
             self._describe_all(content, record.start)
             if entries:
@@ -249,7 +266,8 @@ class _Look:
         span = (min(times), max(times)) if times else (0, 0)
         if (head.start_ns, head.end_ns) != span:
             words = (
-                f"a chunk says it runs from {head.start_ns} to {head.end_ns} ns; its messages {span[0]} to {span[1]}"
+                f"a chunk declares times from {head.start_ns} to {head.end_ns} ns; its messages are from "
+                f"{span[0]} to {span[1]}"
             )
             self._find("chunk-times", record.start, words)
         last = max((records.record_at(buffer, at).end for at in indexes.values()), default=record.end)
@@ -263,22 +281,22 @@ class _Look:
                 self._describe(content, inner, where)
 
     def _indexed(self, record: Record, content: Bytes, indexes: Mapping[int, int]) -> dict[int, Entries]:
-        """What the indexes of a chunk list, which is all of its messages and nothing else."""
+        """The index entries of a chunk, which must list all of its messages and nothing else."""
         entries: dict[int, Entries] = {}
         starts, ends = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
         for channel, at in indexes.items():
-            listed = listed_entries(self._buffer, at, channel)
+            listed = read_index_entries(self._buffer, at, channel)
             try:
-                heads = heads_at(content, channel, listed[:, 0], listed[:, 1].astype(np.int64))
+                heads = message_heads_at(content, channel, listed[:, 0], listed[:, 1].astype(np.int64))
             except Damaged as error:
                 self._find("wrong-index", at, f"a message index does not fit its chunk: {error}")
                 self._describe_all(content, record.start)
-                return chunk_entries(content)
+                return scan_entries(content)
             entries[channel] = listed[np.argsort(listed[:, 1], kind="stable")]
             starts.append(heads.start - HEAD.itemsize)
             ends.append(heads.end)
         start, end = np.sort(np.concatenate(starts)), np.sort(np.concatenate(ends))
-        # Between the messages that are listed stand the others, and what describes them.
+        # The gaps between listed messages hold schemas, channels, and messages that are not listed.
         gap_from = np.concatenate([[0], end])
         gap_to = np.concatenate([start, [len(content)]])
         for low, high in zip(*(edge[gap_from != gap_to].tolist() for edge in (gap_from, gap_to)), strict=True):
@@ -287,13 +305,15 @@ class _Look:
                     self._describe(content, inner, record.start)
                 elif inner.opcode == Opcode.MESSAGE:
                     channel, _, t_ns, _ = message_head(content, inner)
-                    self._find("not-listed", record.start, f"a message of channel {channel} that no index lists")
+                    self._find(
+                        "not-listed", record.start, f"a message of channel {channel} that no message index lists"
+                    )
                     entry = np.array([[t_ns, inner.start]], "<u8")
                     entries[channel] = np.concatenate([entries.get(channel, entry[:0]), entry])
         return entries
 
     def _count(self, entries: Mapping[int, Entries], where: int) -> None:
-        """Add messages, in the order in which they stand, to what was found."""
+        """Add messages, in file order, to ``found``."""
         for channel, listed in entries.items():
             if not len(listed):
                 continue
@@ -305,7 +325,7 @@ class _Look:
             topic = known.topic if known else f"channel {channel}"
             behind = t_ns < np.maximum(np.maximum.accumulate(t_ns), np.uint64(latest))
             if behind.any():
-                words = f"messages of {topic} that stand behind later ones"
+                words = f"messages of {topic} that follow later ones"
                 self._find("order", where, words, "warning", int(behind.sum()))
             late = t_ns > np.uint64(MAX_NS)
             if late.any():

@@ -1,4 +1,4 @@
-"""A summary, held against what is in the log; and what a look at a log finds."""
+"""Compare the summary of a log with its data section; and the findings of a check."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from typing import Final, Literal, NamedTuple
 
-from mcaptrack.log.index import DATA_END_SIZE, FOOTER_SIZE, Index, read_footer, take
+from mcaptrack.log.index import DATA_END_SIZE, FOOTER_SIZE, Index, add_summary_record, read_footer
 from mcaptrack.log.records import MAGIC, Bytes, Damaged, Opcode, Reader, walk
 
 Level = Literal["error", "warning"]
 
-#: The numbers of a statistics record, in their order, and their sizes.
+#: The fields of a statistics record in order, and their sizes in bytes.
 _STATISTICS: Final = {
     "messages": 8,
     "schemas": 2,
@@ -26,7 +26,7 @@ _STATISTICS: Final = {
 
 
 class Finding(NamedTuple):
-    """What is wrong, or could be better: where first (a byte of the file), and how often."""
+    """An error or a warning: its first offset in the file, and how often it occurs."""
 
     level: Level
     kind: str
@@ -36,7 +36,7 @@ class Finding(NamedTuple):
 
 
 class Findings:
-    """What was found, one of each kind."""
+    """Findings, one of each kind."""
 
     def __init__(self) -> None:
         self._first: dict[tuple[Level, str], tuple[int, str]] = {}
@@ -47,13 +47,13 @@ class Findings:
             yield Finding(level, kind, where, words, self._times[level, kind])
 
     def add(self, kind: str, where: int, words: str, level: Level = "error", times: int = 1) -> None:
-        """One more of a kind."""
+        """Add a finding, or count it if there is one of its kind."""
         self._first.setdefault((level, kind), (where, words))
         self._times[level, kind] += times
 
 
 def record_name(opcode: int) -> str:
-    """What a kind of records is called."""
+    """The name of a record type."""
     try:
         return Opcode(opcode).name.lower().replace("_", "-")
     except ValueError:
@@ -61,22 +61,22 @@ def record_name(opcode: int) -> str:
 
 
 def check_summary(buffer: Bytes, found: Index, findings: Findings) -> None:
-    """Look at the summary and the footer of a log, ``found`` being what its data section holds."""
+    """Check summary and footer of a log; ``found`` is the index of its data section."""
     try:
-        _Look(buffer, found, findings).at_summary()
+        _Checker(buffer, found, findings).check()
     except Damaged as error:
         findings.add("summary-structure", found.data_end, f"the summary can't be read: {error}")
 
 
-class _Look:
+class _Checker:
     def __init__(self, buffer: Bytes, found: Index, findings: Findings) -> None:
         self._buffer, self._found, self._find = buffer, found, findings.add
 
-    def at_summary(self) -> None:
+    def check(self) -> None:
         buffer, found = self._buffer, self._found
         footer = read_footer(buffer)
         if footer is None:
-            self._find("no-footer", max(len(buffer) - FOOTER_SIZE, 0), "no footer where one belongs")
+            self._find("no-footer", max(len(buffer) - FOOTER_SIZE, 0), "there is no footer at the end of the file")
             return
         at, start, offsets_start, crc = footer
         behind = found.data_end + DATA_END_SIZE
@@ -84,25 +84,29 @@ class _Look:
             words = "there is no summary: opening the log takes a scan"
             self._find("no-summary", at, words, "warning")
             if behind != at and found.data_end:
-                self._find("footer", at, "records behind the data section that the footer does not know")
+                self._find("footer", at, "there are records after the data section, and the footer names no summary")
             return
         if not len(MAGIC) <= start <= at or (found.data_end and start != behind):
-            self._find("footer", at, f"the summary is said to start at byte {start}; the data section ends at {behind}")
+            self._find(
+                "footer", at, f"the footer places the summary at byte {start}; the data section ends at {behind}"
+            )
             return
         if crc and zlib.crc32(buffer[start : len(buffer) - len(MAGIC) - 4]) != crc:
             self._find("summary-checksum", start, "the checksum of the summary is wrong")
         if not crc:
-            self._find("no-summary-checksum", start, "the summary has no checksum: damage goes unseen", "warning")
+            self._find(
+                "no-summary-checksum", start, "the summary has no checksum, so damage is not detected", "warning"
+            )
         if offsets_start and not start <= offsets_start <= at:
-            self._find("footer", at, f"the summary offsets are said to start at byte {offsets_start}")
+            self._find("footer", at, f"the footer places the summary offsets at byte {offsets_start}")
             offsets_start = 0
-        groups: dict[int, tuple[int, int, int]] = {}  # where the records of a kind start and end, and their size
+        groups: dict[int, tuple[int, int, int]] = {}  # start, end and total size of the records of a type
         said, statistics = Index(), None
         for record in walk(buffer, start, offsets_start or at):
             low, _, kinds = groups.get(record.opcode, (record.start, 0, 0))
             groups[record.opcode] = (low, record.end, kinds + record.end - record.start)
             statistics = record if record.opcode == Opcode.STATISTICS else statistics
-            take(said, buffer, record)
+            add_summary_record(said, buffer, record)
         self._compare(said, start)
         if statistics is None:
             self._find("no-statistics", start, "there are no statistics: counting takes a scan", "warning")
@@ -119,7 +123,11 @@ class _Look:
         ):
             for number, record in theirs.items():
                 if ours.get(number, record) != record:
-                    self._find(f"summary-{name}", where, f"{name} {number} in the summary is not that of the data")
+                    self._find(
+                        f"summary-{name}",
+                        where,
+                        f"{name} {number} in the summary differs from that in the data section",
+                    )
             missing = ours.keys() - theirs.keys()
             if missing and theirs:
                 words = f"{name} {min(missing)} is missing in the summary"
@@ -130,7 +138,7 @@ class _Look:
             ("metadata", said.metadata, found.metadata),
         ):
             if listed and sorted(part.entry for part in listed) != sorted(part.entry for part in there):
-                self._find(f"{name}-index", where, f"the index of {name} is not that of the {name} in the log")
+                self._find(f"{name}-index", where, f"the {name} index differs from the {name} records in the log")
             if there and not listed:
                 self._find(f"no-{name}-index", where, f"the summary does not list {len(there)} {name}", "warning")
 
@@ -144,11 +152,13 @@ class _Look:
             known = ours.pop(chunk.offset, None)
             if known is None:
                 self._find(
-                    "chunk-index", where, f"the summary lists a chunk at byte {chunk.offset}; none is whole there"
+                    "chunk-index",
+                    where,
+                    f"the summary lists a chunk at byte {chunk.offset}, where there is no intact one",
                 )
             elif chunk != known:
                 names = [n for n, a, b in zip(chunk._fields, chunk, known, strict=True) if a != b]
-                words = f"the summary says otherwise of the chunk at byte {chunk.offset}: {', '.join(names)}"
+                words = f"the chunk index differs from the chunk at byte {chunk.offset}: {', '.join(names)}"
                 self._find("chunk-index", where, words)
         if ours:
             self._find("chunk-not-listed", min(ours), "a chunk that the summary does not list", times=len(ours))
@@ -161,9 +171,9 @@ class _Look:
             value = reader.number(size)
             only_described = name in ("schemas", "channels") and value == len(getattr(said, name))
             if value != number and not only_described:
-                self._find("statistics", where, f"the statistics say {value} for {name}, and there is {number}")
+                self._find("statistics", where, f"the statistics say {value} for {name}; it is {number}")
         if {n: count for n, count in said.counts.items() if count} != found.counts:
-            self._find("statistics-counts", where, "the statistics count other messages of a channel than there are")
+            self._find("statistics-counts", where, "the statistics have a wrong number of messages for a channel")
 
     def _compare_offsets(self, start: int, end: int, groups: Mapping[int, tuple[int, int, int]]) -> None:
         listed = set()
@@ -175,10 +185,13 @@ class _Look:
             opcode, low, size = reader.number(1), reader.number(8), reader.number(8)
             listed.add(opcode)
             if size == 0:
-                words = f"a summary offset of no {record_name(opcode)} records; some readers take it for damage"
+                words = (
+                    f"a summary offset of an empty group of {record_name(opcode)} records; some readers report "
+                    "it as damage"
+                )
                 self._find("empty-group", record.start, words, "warning")
             elif groups.get(opcode) != (low, low + size, size):
-                words = f"the {record_name(opcode)} records are not where their summary offset says"
+                words = f"the {record_name(opcode)} records are not at their summary offset"
                 self._find("summary-offset", record.start, words)
         missing = groups.keys() - listed
         if missing:

@@ -1,4 +1,4 @@
-"""Chunks and the messages in them: opened within bounds, checked, and read without a loop over messages.
+"""Chunks and their messages: decompressed within limits, checked, and parsed without a loop over messages.
 
 Letters: M messages.
 """
@@ -19,16 +19,16 @@ from mcaptrack.log.records import Bytes, ChunkHead, ChunkIndexRecord, Damaged, O
 Times = NDArray[np.uint64]
 Entries = NDArray[np.uint64]
 
-#: A chunk that says it is larger is not decompressed, unless the environment allows it.
+#: A chunk that declares a larger size is not decompressed, unless the environment variable allows it.
 MAX_CHUNK_MIB: Final = 256
 ENVIRONMENT: Final = "MCAPTRACK_MAX_CHUNK_MIB"
-#: A chunk that is not compressed and larger than this is not read into memory as a whole.
-_MOST_PLAIN_BYTES: Final = 64 * 2**20
-#: So many heads of messages are read one by one.
+#: A larger uncompressed chunk is not read into memory as a whole.
+_MAX_PLAIN_BYTES: Final = 64 * 2**20
+#: Up to this many message heads are read one by one.
 _FEW: Final = 16
-#: The last time that is worked with, in nanoseconds: a signed number of 64 bits, in the year 2262.
+#: The last time that can be computed with, in nanoseconds: the largest int64, in the year 2262.
 MAX_NS: Final = 2**63 - 1
-#: The last time that a log can hold.
+#: The last time that a log can store: the largest uint64.
 LOG_MAX_NS: Final = 2**64 - 1
 #: A message record up to its payload.
 HEAD: Final = np.dtype(
@@ -43,7 +43,7 @@ HEAD: Final = np.dtype(
 )
 
 
-class Heads(NamedTuple):
+class MessageHeads(NamedTuple):
     """M messages of one channel: their record heads (M,) of ``HEAD``, and where payloads start and end."""
 
     head: NDArray[np.void]
@@ -62,28 +62,28 @@ def message_head(buffer: Bytes, record: Record) -> tuple[int, int, int, int]:
 
 
 def chunk_record(buffer: Bytes, chunk: ChunkIndexRecord) -> Record:
-    """The chunk that an index points to."""
+    """The record of an indexed chunk."""
     return _chunk_at(buffer, chunk.offset)
 
 
 def _chunk_at(buffer: Bytes, offset: int) -> Record:
     record = records.record_at(buffer, offset)
     if record.opcode != Opcode.CHUNK:
-        raise Damaged("no chunk where one belongs", offset)
+        raise Damaged("there is no chunk where the index says", offset)
     return record
 
 
 def open_chunk(buffer: Bytes, record: Record) -> Bytes:
-    """The records inside a chunk, decompressed and checked. Memory is bounded by what the chunk says of itself.
+    """The records inside a chunk, decompressed and verified. The declared size limits the memory used.
 
-    A chunk that is large and not compressed stays in the file; its records are read when they are asked for.
+    A large uncompressed chunk stays in the file; its records are read on demand.
     """
     head = records.read_chunk(buffer, record)
     return _opened(head, _data(buffer, head), record.start)
 
 
-def open_and_mark(buffer: Bytes, record: Record) -> tuple[Bytes, int]:
-    """The same, and what ``checksum_at`` says of the chunk as it was read."""
+def open_chunk_with_checksum(buffer: Bytes, record: Record) -> tuple[Bytes, int]:
+    """The same, and the checksum of the chunk as it was read (see ``checksum_at``)."""
     head = records.read_chunk(buffer, record)
     data = _data(buffer, head)
     return _opened(head, data, record.start), head.uncompressed_crc or crc_of(data, 0, len(data))
@@ -96,9 +96,9 @@ def _data(buffer: Bytes, head: ChunkHead) -> Bytes:
 
 
 def _opened(head: ChunkHead, data: Bytes, where: int) -> Bytes:
-    if head.compression and head.uncompressed_size > _most_mib() * 2**20:
+    if head.compression and head.uncompressed_size > _max_chunk_mib() * 2**20:
         raise Damaged(
-            f"a chunk of {head.uncompressed_size} bytes, of at most {_most_mib()} MiB that are "
+            f"a chunk of {head.uncompressed_size} bytes, of at most {_max_chunk_mib()} MiB that are "
             f"opened (the variable {ENVIRONMENT} sets another limit)",
             where,
         )
@@ -111,22 +111,22 @@ def _opened(head: ChunkHead, data: Bytes, where: int) -> Bytes:
 
 
 def is_left_in_file(compression: str, size: int) -> bool:
-    """Whether a chunk is opened without reading it into memory as a whole."""
-    return not compression and size > _MOST_PLAIN_BYTES
+    """Whether a chunk is opened without reading all of it into memory."""
+    return not compression and size > _MAX_PLAIN_BYTES
 
 
 def checksum_at(buffer: Bytes, offset: int) -> int:
-    """What tells the chunk at ``offset`` from another there: its checksum, or if it has none that of its bytes."""
+    """The checksum that identifies the chunk at ``offset``: the stored one, or else that of its bytes."""
     head = records.read_chunk(buffer, _chunk_at(buffer, offset))
     return head.uncompressed_crc or crc_of(buffer, head.start, head.end)
 
 
-def _most_mib() -> int:
+def _max_chunk_mib() -> int:
     return environment.whole_number(ENVIRONMENT, MAX_CHUNK_MIB)
 
 
 def _decompress(data: Bytes, compression: str, size: int, where: int) -> Bytes:
-    """The data of a chunk that is ``size`` bytes long, or one byte more where it would be longer."""
+    """The decompressed data of a chunk of ``size`` bytes; at most one byte more if it would be longer."""
     if compression == "":
         return data
     try:
@@ -143,7 +143,9 @@ def _zstd(data: memoryview, size: int) -> bytes:
     import zstandard
 
     try:
-        if zstandard.frame_content_size(data) > size:  # -1 where the data don't say; then the limit holds
+        if (
+            zstandard.frame_content_size(data) > size
+        ):  # -1 if the frame doesn't declare its size; then the output limit applies
             return bytes(size + 1)
         return zstandard.ZstdDecompressor(max_window_size=2**27).decompress(data, max_output_size=max(size, 1))
     except zstandard.ZstdError as error:
@@ -160,24 +162,24 @@ def _lz4(data: memoryview, size: int) -> bytes:
     return content
 
 
-def listed_entries(buffer: Bytes, at: int, channel_id: int) -> Entries:
-    """What the message index at ``at`` lists of a channel: log time and offset inside the chunk, (M, 2)."""
+def read_index_entries(buffer: Bytes, at: int, channel_id: int) -> Entries:
+    """The entries of the message index at offset ``at``: log time and offset inside the chunk, (M, 2)."""
     record = records.record_at(buffer, at)
     channel, listed = records.read_message_entries(buffer, record)
     if channel != channel_id:
-        raise Damaged(f"no message index of channel {channel_id} where one belongs", at)
+        raise Damaged(f"there is no message index of channel {channel_id} where the chunk index says", at)
     if len(listed) % 16:
         raise Damaged(f"a message index of {len(listed)} bytes", at)
     entries = np.frombuffer(listed, "<u8").reshape(-1, 2)
     if len(entries) and entries[:, 1].max() > MAX_NS:
-        raise Damaged("a message index that points beyond any chunk", at)
+        raise Damaged("a message index points beyond any chunk", at)
     if len(entries) > 1 and len(np.unique(entries[:, 1])) != len(entries):
-        raise Damaged("a message index that lists a message twice", at)
+        raise Damaged("a message index lists a message twice", at)
     return entries
 
 
-def chunk_entries(content: Bytes) -> dict[int, Entries]:
-    """What the message indexes of a chunk have to say: for each channel log time and offset of its messages, (M, 2)."""
+def scan_entries(content: Bytes) -> dict[int, Entries]:
+    """The entries that the message indexes of a chunk must have: for each channel log time and offset, (M, 2)."""
     found: dict[int, list[tuple[int, int]]] = {}
     for record in walk(content, 0, len(content)):
         if record.opcode == Opcode.MESSAGE:
@@ -186,12 +188,12 @@ def chunk_entries(content: Bytes) -> dict[int, Entries]:
     return {channel: np.array(entries, "<u8") for channel, entries in found.items()}
 
 
-def heads_at(content: Bytes, channel_id: int, t_ns: Times, offset: Ints) -> Heads:
-    """The messages that an index says stand at these offsets, at these times. Raises Damaged where one does not."""
+def message_heads_at(content: Bytes, channel_id: int, t_ns: Times, offset: Ints) -> MessageHeads:
+    """The heads of indexed messages. Raises Damaged if there is no such message at one of the offsets."""
     room = len(content) - HEAD.itemsize
     outside = offset[(offset < 0) | (offset > room)]
     if len(outside):
-        raise Damaged(f"a message is said to stand at byte {outside[0]} of a chunk of {len(content)}")
+        raise Damaged(f"an index places a message at byte {outside[0]} of a chunk of {len(content)} bytes")
     if not len(offset):
         head = np.empty(0, HEAD)
     elif isinstance(content, memoryview) and len(offset) > _FEW:
@@ -202,9 +204,9 @@ def heads_at(content: Bytes, channel_id: int, t_ns: Times, offset: Ints) -> Head
     wrong = (head["opcode"] != Opcode.MESSAGE) | (head["channel"] != channel_id) | (head["t_ns"] != t_ns)
     wrong |= head["size"] < records.MESSAGE_HEAD.size
     start = offset + HEAD.itemsize
-    # A size beyond the chunk is found out here, before it is added to anything.
+    # A size beyond the chunk is rejected here, before it is used in a sum that could overflow.
     wrong |= head["size"] > (len(content) - start + records.MESSAGE_HEAD.size).astype(np.uint64)
     if wrong.any():
         time = int(t_ns[wrong.argmax()])
-        raise Damaged(f"no message of channel {channel_id} at {time} ns where the index says one is")
-    return Heads(head, start, start + head["size"].astype(np.int64) - records.MESSAGE_HEAD.size)
+        raise Damaged(f"there is no message of channel {channel_id} at {time} ns where the index says")
+    return MessageHeads(head, start, start + head["size"].astype(np.int64) - records.MESSAGE_HEAD.size)

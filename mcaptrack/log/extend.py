@@ -1,9 +1,9 @@
-"""A log that stands, with channels added and others left out.
+"""Add channels to an existing log, and drop others.
 
-What comes before the first record that goes is not touched: the end from there on is written anew, kept chunks as they
-are, new ones behind them, then a new summary. That is done in place where it is less work than a copy, so adding to a
-log costs what is added, and where a copy could not keep what belongs to the file beside its content: other names (hard
-links), owner, rights, attributes. A log without a usable summary, or with messages outside of chunks, is put in order.
+Everything before the first dropped record stays untouched. The tail from there on is rewritten: kept chunks unchanged,
+new chunks behind them, then a new summary. This happens in place if it is less work than a copy, so the cost of adding
+is proportional to what is added. It also happens in place if a copy could not keep the file's hard links, owner,
+permissions or extended attributes. A log without a usable summary, or with messages outside of chunks, is normalised.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from mcaptrack.files import can_replace, publish_stream
 from mcaptrack.log import records
 from mcaptrack.log.byte_source import ByteSource
 from mcaptrack.log.chunks import chunk_record, message_head, open_chunk
-from mcaptrack.log.in_place import new_end
+from mcaptrack.log.in_place import rewrite_tail
 from mcaptrack.log.index import Index
 from mcaptrack.log.reader import Log
 from mcaptrack.log.records import BLOCK, MAGIC, Bytes, ChunkIndexRecord, Damaged, Opcode, Record, crc_of, walk
@@ -36,10 +36,10 @@ def extend(
     drop_metadata: Collection[str] = (),
     drop_attachments: Collection[str] = (),
 ) -> Iterator[LogWriter]:
-    """The log with channels added and these topics, metadata and attachments left out, there once the block ends well.
+    """Add channels to a log and drop these topics, metadata records and attachments; complete when the block succeeds.
 
-    ``output`` is another file to write it to; the log itself stays as it is then. Where results stand in a log beside
-    it, that is extended instead. Raises McaptrackError if the log is damaged, can't be written to, or is being written
+    ``output`` is another file to write to, instead of the log itself. If the log's results are in a sidecar, the
+    sidecar is extended instead. Raises McaptrackError if the log is damaged, can't be written to, or is being written
     to by another process.
     """
     if log.results is not None:
@@ -48,19 +48,19 @@ def extend(
         log = log.results
     if output is None:
         log.lock()
-    with log.snapshot.mending():
-        change = _Change.plan(log, drop, drop_metadata, drop_attachments)
-        is_in_place = output is None and (change.is_small or not can_replace(log.real_path))
+    with log.snapshot.reporting_damage():
+        change = _Rewrite.plan(log, drop, drop_metadata, drop_attachments)
+        is_in_place = output is None and (change.is_cheaper_in_place or not can_replace(log.real_path))
         opened = _in_place(log, change) if is_in_place else _as_copy(log, change, output)
         with opened as writer:
             yield writer
-    log.is_spent = output is None
+    log.is_outdated = output is None
 
 
 def refuse_to_replace_recorded(log: Log, topics: Collection[str], instead: str) -> None:
-    """Raise McaptrackError if others recorded a channel of these topics: results never take its place.
+    """Raise McaptrackError if a channel of these topics was recorded by other software: results never replace it.
 
-    Of several channels that share a topic every one counts, in the log and in its results. ``instead`` says what to do.
+    All channels of a topic are checked, in the log and in its sidecar. ``instead`` says what to do.
     """
     for part in log.parts:
         for channel in part.index.channels.values():
@@ -68,38 +68,39 @@ def refuse_to_replace_recorded(log: Log, topics: Collection[str], instead: str) 
                 schema = part.index.schemas.get(channel.schema_id)
                 name = schema.name if schema else "no schema"
                 raise McaptrackError(
-                    f"{part.path} has {channel.topic}, which others recorded ({name}) and which is never replaced; "
+                    f"{part.path} has {channel.topic}, which other software recorded ({name}) and which is "
+                    "never replaced; "
                     f"{instead}"
                 )
 
 
 @contextmanager
-def _in_place(log: Log, change: _Change) -> Iterator[LogWriter]:
+def _in_place(log: Log, change: _Rewrite) -> Iterator[LogWriter]:
     index = log.index
     crc = change.crc_before()
     try:
-        with new_end(log.real_path, log.lock(), change.cut, log.snapshot.file) as end:
-            log.snapshot.source.pieces = end.journal.pieces()  # whoever goes on reading it reads what it was
-            writer = LogWriter(end, change.cut, crc, change.before())
-            change.replay(writer, end.journal.old_end().part(0, index.data_end - change.cut), change.cut)
+        with rewrite_tail(log.real_path, log.lock(), change.cut, log.snapshot.file) as end:
+            log.snapshot.source.pieces = end.journal.pieces()  # readers of this log continue to see the old content
+            writer = LogWriter(end, change.cut, crc, change.index_before())
+            change.copy_kept(writer, end.journal.old_tail().part(0, index.data_end - change.cut), change.cut)
             yield writer
             messages = writer.finish()
             end.close()
             verify(log.real_path, writer, messages, change.cut, crc or 0)
     except OSError as error:
-        raise McaptrackError(f"{log.path} can't be written: {error.strerror or error}; it is left as it was") from error
+        raise McaptrackError(f"{log.path} can't be written: {error.strerror or error}; it is unchanged") from error
 
 
 @contextmanager
-def _as_copy(log: Log, change: _Change, output: Path | None) -> Iterator[LogWriter]:
-    """Beside its final name, which it takes when it is complete, checked and on the disk."""
+def _as_copy(log: Log, change: _Rewrite, output: Path | None) -> Iterator[LogWriter]:
+    """Write a copy under a temporary name; it gets its final name when it is complete, verified and synced to disk."""
     if output is not None:
         refuse_earlier_results(output)
     with publish_stream(output or log.real_path) as stream:
         crc = change.crc_before()
-        _pass_on(log.snapshot.source, change.cut, stream)
-        writer = LogWriter(stream, change.cut, crc, change.before())
-        change.replay(writer, log.snapshot.source.part(0, log.index.data_end), 0)
+        _copy_bytes(log.snapshot.source, change.cut, stream)
+        writer = LogWriter(stream, change.cut, crc, change.index_before())
+        change.copy_kept(writer, log.snapshot.source.part(0, log.index.data_end), 0)
         yield writer
         messages = writer.finish()
         stream.flush()
@@ -108,26 +109,25 @@ def _as_copy(log: Log, change: _Change, output: Path | None) -> Iterator[LogWrit
         verify(copy, writer, messages, change.cut, crc or 0)
 
 
-def _pass_on(source: ByteSource, end: int, stream: Sink) -> None:
+def _copy_bytes(source: ByteSource, end: int, stream: Sink) -> None:
     for at in range(0, end, BLOCK):
         stream.write(bytes(source[at : min(at + BLOCK, end)]))
 
 
 def _compare(source: ByteSource, copy: Path, end: int) -> None:
-    """What was passed on is what was read. Raises McaptrackError otherwise."""
+    """Raise McaptrackError if the copied bytes differ from the source."""
     with copy.open("rb") as stream:
         for at in range(0, end, BLOCK):
             until = min(at + BLOCK, end)
             if stream.read(until - at) != source[at:until]:
-                raise McaptrackError(f"{copy} is not what was written to it; the disk can't be relied on")
+                raise McaptrackError(f"{copy} does not hold what was written to it; the disk is not reliable")
 
 
 @dataclass
-class _Change:
-    """What goes from a log, and where the first record stands that is written anew (``cut``).
+class _Rewrite:
+    """What is dropped from a log, and the offset of the first record that is rewritten (``cut``).
 
-    ``described`` are the channels that what stays in place describes; ``open_all`` says that any chunk may describe a
-    channel that goes.
+    ``open_all``: any chunk may describe a dropped channel, so all chunks have to be opened.
     """
 
     index: Index
@@ -139,7 +139,7 @@ class _Change:
     open_all: bool = False
 
     @classmethod
-    def plan(cls, log: Log, drop: Collection[str], metadata: Collection[str], attachments: Collection[str]) -> _Change:
+    def plan(cls, log: Log, drop: Collection[str], metadata: Collection[str], attachments: Collection[str]) -> _Rewrite:
         index = log.index
         dropped = {channel.id for channel in index.channels.values() if channel.topic in drop}
         change = cls(index, log.snapshot.source, dropped, metadata, attachments)
@@ -150,9 +150,9 @@ class _Change:
         places += [chunk.offset for chunk in index.chunks if not dropped.isdisjoint(chunk.message_index_offsets)]
         places += [listed.offset for listed in index.metadata if listed.name in metadata]
         places += [listed.offset for listed in index.attachments if listed.name in attachments]
-        undescribed = {channel for channel in dropped if not change._is_described_where_it_begins(channel)}
+        undescribed = {channel for channel in dropped if not change._first_chunk_describes(channel)}
         if undescribed:
-            for record in walk(log.snapshot.source.front_to_back(), len(MAGIC), index.data_end):
+            for record in walk(log.snapshot.source.sequential(), len(MAGIC), index.data_end):
                 if record.opcode == Opcode.CHANNEL:
                     channel = records.read_channel(log.snapshot.source, record).id
                     places += [record.start] if channel in dropped else []
@@ -161,20 +161,20 @@ class _Change:
         change.cut = len(MAGIC) if undescribed else min(places)
         return change
 
-    def _is_described_where_it_begins(self, channel_id: int) -> bool:
-        """Whether the first chunk with messages of a channel also describes it: then nothing outside of chunks does."""
+    def _first_chunk_describes(self, channel_id: int) -> bool:
+        """Whether the first chunk with messages of a channel describes it: then no record outside of chunks does."""
         for chunk in self.index.chunks:
             if channel_id in chunk.message_index_offsets:
                 return channel_id in _described_in(open_chunk(self.source, chunk_record(self.source, chunk)))[0]
         return False
 
     @property
-    def is_small(self) -> bool:
-        """Whether writing the end twice, to the journal and in place, is less than writing everything once."""
+    def is_cheaper_in_place(self) -> bool:
+        """Whether writing the tail twice (to the journal and in place) is less work than writing everything once."""
         return self.index.regular and self.cut > len(self.source) - self.cut
 
     def crc_before(self) -> int | None:
-        """The checksum of everything before the cut; None if the log has none."""
+        """The checksum of all bytes before the cut; None if the log has no checksum."""
         index = self.index
         if self.cut == len(MAGIC):
             return zlib.crc32(MAGIC)
@@ -183,8 +183,8 @@ class _Change:
         tail = crc_of(self.source, self.cut, index.data_end)
         return records.crc_before(index.data_crc, tail, index.data_end - self.cut)
 
-    def before(self) -> Index:
-        """What is in the log before the cut, of what stays."""
+    def index_before(self) -> Index:
+        """The index of the kept records before the cut."""
         index = self.index
         channels = {number: channel for number, channel in index.channels.items() if number not in self.dropped}
         only_dropped = {index.channels[number].schema_id for number in self.dropped}
@@ -208,39 +208,39 @@ class _Change:
             metadata=[listed for listed in index.metadata if listed.offset < self.cut],
         )
 
-    def replay(self, writer: LogWriter, source: ByteSource, base: int) -> None:
-        """Write what stays of the records from the cut on. ``source`` is the file from ``base`` to its data's end."""
+    def copy_kept(self, writer: LogWriter, source: ByteSource, base: int) -> None:
+        """Write the kept records after the cut. ``source`` is the file from ``base`` to the end of its data section."""
         try:
-            self._replay(writer, source.front_to_back(), base)
+            self._copy_kept(writer, source.sequential(), base)
         except Damaged as error:
             raise error.moved(base) from None
 
-    def _replay(self, writer: LogWriter, buffer: Bytes, base: int) -> None:
+    def _copy_kept(self, writer: LogWriter, buffer: Bytes, base: int) -> None:
         chunks = {chunk.offset: chunk for chunk in self.index.chunks if chunk.offset >= self.cut}
         described = {channel for chunk in writer.chunks for channel in chunk.message_index_offsets}
-        orphans: dict[int, None] = {}  # channels that stay, and that a chunk that went described
+        undescribed_channels: dict[int, None] = {}  # kept channels that a dropped chunk described
         for record in walk(buffer, self.cut - base, len(buffer)):
             if record.opcode == Opcode.CHUNK:
                 known = chunks.get(base + record.start)
                 if known is None:
-                    raise Damaged("a chunk that no index knows", record.start)
-                self._replay_chunk(writer, buffer, base, record, known, orphans, described)
+                    raise Damaged("a chunk is missing in the index", record.start)
+                self._copy_kept_chunk(writer, buffer, base, record, known, undescribed_channels, described)
             elif record.opcode == Opcode.MESSAGE:
                 channel, _, t_ns, _ = message_head(buffer, record)
                 if channel not in self.dropped:
-                    writer.put_message(channel, t_ns, buffer[record.start : record.end])
-            elif record.opcode != Opcode.MESSAGE_INDEX and self._stays(buffer, record):
+                    writer.copy_message(channel, t_ns, buffer[record.start : record.end])
+            elif record.opcode != Opcode.MESSAGE_INDEX and self._is_kept(buffer, record):
                 whole = bytes(buffer[record.start : record.end])
                 if record.opcode == Opcode.ATTACHMENT:
-                    writer.put_attachment(whole)
+                    writer.copy_attachment(whole)
                 elif record.opcode == Opcode.METADATA:
-                    writer.put_metadata(whole)
+                    writer.copy_metadata(whole)
                 else:
                     writer.write(whole)
-        for channel in orphans:
-            writer.put_description(channel)
+        for channel in undescribed_channels:
+            writer.write_description(channel)
 
-    def _stays(self, buffer: Bytes, record: Record) -> bool:
+    def _is_kept(self, buffer: Bytes, record: Record) -> bool:
         if record.opcode == Opcode.SCHEMA:
             schema = records.read_schema(buffer, record).id
             users = {channel.id for channel in self.index.channels.values() if channel.schema_id == schema}
@@ -253,34 +253,34 @@ class _Change:
             return records.read_metadata(buffer, record)[0] not in self.metadata
         return True
 
-    def _replay_chunk(
+    def _copy_kept_chunk(
         self,
         writer: LogWriter,
         buffer: Bytes,
         base: int,
         record: Record,
         known: ChunkIndexRecord,
-        orphans: dict[int, None],
+        undescribed_channels: dict[int, None],
         described: set[int],
     ) -> None:
         holds = set(known.message_index_offsets)
         content = None
-        if self.open_all or not holds.isdisjoint(self.dropped) or not holds.isdisjoint(orphans):
+        if self.open_all or not holds.isdisjoint(self.dropped) or not holds.isdisjoint(undescribed_channels):
             content = open_chunk(buffer, record)
             channels, schemas = _described_in(content)
             if holds and holds <= self.dropped:
                 about = {c.id for c in writer.channels.values() if c.id in channels or c.schema_id in schemas}
-                orphans |= dict.fromkeys(about - described)
+                undescribed_channels |= dict.fromkeys(about - described)
                 return
             if not self.dropped.isdisjoint(holds | channels):
                 kind = "rows" if known.compression else "media"
-                writer.put_part_of_chunk(kind, self._kept(content))  # type: ignore[arg-type]
+                writer.write_kept_records(kind, self._kept_records(content))  # type: ignore[arg-type]
                 return
-            for channel in sorted(holds & orphans.keys()):
+            for channel in sorted(holds & undescribed_channels.keys()):
                 if channel not in channels or writer.channels[channel].schema_id not in {0, *schemas}:
-                    writer.put_description(channel)
+                    writer.write_description(channel)
         for channel in holds:
-            orphans.pop(channel, None)
+            undescribed_channels.pop(channel, None)
         described |= holds
         indexes: dict[int, bytes] = {}
         if self.index.regular:
@@ -294,17 +294,17 @@ class _Change:
             low = min((int(entries[:, 0].min()) for entries in found.values()), default=0)
             high = max((int(entries[:, 0].max()) for entries in found.values()), default=0)
             known = known._replace(start_ns=low, end_ns=high)
-        writer.put_chunk(bytes(buffer[record.start : record.end]), known, indexes)
+        writer.copy_chunk(bytes(buffer[record.start : record.end]), known, indexes)
 
-    def _kept(self, content: Bytes) -> Iterator[tuple[int, int, memoryview]]:
-        """The records of a chunk that stay: channel, -1 for no message, log time, and the record."""
+    def _kept_records(self, content: Bytes) -> Iterator[tuple[int, int, memoryview]]:
+        """The kept records of a chunk: channel (-1 if it is not a message), log time, and the record."""
         for inner in walk(content, 0, len(content)):
             whole = content[inner.start : inner.end]
             if inner.opcode == Opcode.MESSAGE:
                 channel, _, t_ns, _ = message_head(content, inner)
                 if channel not in self.dropped:
                     yield channel, t_ns, whole
-            elif self._stays(content, inner):
+            elif self._is_kept(content, inner):
                 yield -1, 0, whole
 
 

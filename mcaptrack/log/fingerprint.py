@@ -1,4 +1,4 @@
-"""Whether a log, or a channel of one, is still the one it was: told from records and checksums, not from messages."""
+"""Fingerprints of logs and channels, made of index records and checksums instead of messages."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from mcaptrack.log.records import BLOCK, Bytes, ChunkIndexRecord, record_at
 def fingerprint(
     buffer: Bytes, index: Index, channel_id: int | None = None, checksums: dict[int, int | str] | None = None
 ) -> str:
-    """SHA-256 of a channel, or of everything: descriptions, and of each chunk its times and checksum.
+    """SHA-256 of a channel, or of the whole log: of schemas, channels, and the times and checksum of each chunk.
 
-    Where a chunk or attachment has no checksum, and outside of chunks, the bytes themselves count. ``checksums`` keeps
-    those of chunks, by offset, for the next call with the same ``buffer``.
+    Chunks and attachments without checksum, and messages outside of chunks, are hashed themselves. ``checksums`` caches
+    those of chunks by offset, for further calls with the same ``buffer``.
     """
     checksums = {} if checksums is None else checksums
     total = hashlib.sha256()
@@ -32,7 +32,8 @@ def fingerprint(
         say(channel.topic, channel.message_encoding, kept, described, index.counts.get(number, 0))
     for chunk in index.chunks:
         if channel_id is None or channel_id in chunk.message_index_offsets:
-            # Where a chunk stands matters to those who look for messages, not to those who read a channel's rows.
+            # The offset of a chunk matters for the whole log, whose messages are located by it, but not for one
+            # channel.
             place = (chunk.offset, *sorted(chunk.message_index_offsets)) if channel_id is None else ()
             if chunk.offset not in checksums:
                 checksums[chunk.offset] = _checksum(buffer, chunk)

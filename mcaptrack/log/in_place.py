@@ -1,7 +1,8 @@
-"""Writing the end of a log anew, in place, so that a kill at any instant leaves the old end or the new one.
+"""Rewrite the tail of a log in place, so that a kill at any moment leaves the old tail or the new one.
 
-Before the first byte changes, the old end stands complete and on the disk in a journal beside the log; before each
-piece is written, its checksums stand there too (``log/journal.py``). The journal goes when the new end is on the disk.
+Before the first byte changes, the old tail is complete and synced to disk in a journal beside the log. Before each
+piece is written, its checksums are in the journal too (``log/journal.py``). The journal is removed when the new tail is
+on the disk.
 """
 
 from __future__ import annotations
@@ -18,20 +19,23 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.files import keep_attributes, publish
 from mcaptrack.log import journal
 from mcaptrack.log.byte_source import OpenFile
-from mcaptrack.log.journal import Journal, Unfit, journal_of
+from mcaptrack.log.journal import Journal, UnusableJournal, journal_of
 from mcaptrack.log.records import Damaged
 
-#: How much is written at once.
+#: How many bytes are written at once.
 _PIECE: Final = 4 * 2**20
 _BLOCK: Final = 2**20
 
 
 def lock(path: Path, handle: int) -> None:
-    """Be the only one to write to an open file until the handle is closed. Raises McaptrackError if another is."""
+    """Lock an open file for writing until the handle is closed.
+
+    Raises McaptrackError if another process holds the lock.
+    """
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError:
-        raise _is_busy(path) from None
+        raise _busy_error(path) from None
     try:
         same = os.path.samestat(path.stat(), os.fstat(handle))
     except OSError:
@@ -40,10 +44,10 @@ def lock(path: Path, handle: int) -> None:
         raise McaptrackError(f"{path} was replaced while it was being read; try again")
 
 
-def settle(path: Path, handle: int, file: OpenFile) -> None:
-    """Undo what an interrupted change left in a locked log, and remove its journal; both are said as warnings.
+def resolve_journal(path: Path, handle: int, file: OpenFile) -> None:
+    """Roll back an interrupted change of a locked log and remove its journal; warn about both.
 
-    Raises McaptrackError if something else lies where the journal goes.
+    Raises McaptrackError if the journal's path holds something else.
     """
     try:
         found = journal.find(path, file)
@@ -51,87 +55,87 @@ def settle(path: Path, handle: int, file: OpenFile) -> None:
             return
         state = found.state()
         if state == "busy":
-            raise _is_busy(path)
+            raise _busy_error(path)
         if state == "between":
-            found.put_back(handle)
-    except Unfit as why:
+            found.restore(handle)
+    except UnusableJournal as why:
         raise McaptrackError(
-            f"{journal_of(path)} {why}; it lies where the journal goes while {path} is changed. "
-            f"If nothing else needs it, remove it with {journal.remove_words(path)}"
+            f"{journal_of(path)} {why}; changing {path} needs that name for its journal. "
+            f"If no other program needs it, remove it with {journal.remove_hint(path)}"
         ) from None
     journal.remove(path)
     if state == "between":
-        words = f"{path} was left half written by a change that was interrupted; it has been put back as it was before"
+        message = f"{path} was left half written by an interrupted change; its state before that has been restored"
     else:
-        words = f"{journal_of(path)} was left behind by a change that was interrupted; it has been removed"
-    notices.warn(words, "journal")
+        message = f"{journal_of(path)} was left behind by an interrupted change; it has been removed"
+    notices.warn(message, "journal")
 
 
-def _is_busy(path: Path) -> McaptrackError:
+def _busy_error(path: Path) -> McaptrackError:
     return McaptrackError(f"{path} is being written to by another process; try again when it is done")
 
 
-class End:
-    """The end of a locked log, being written anew. ``journal`` has what stood there."""
+class TailWriter:
+    """Writes the new tail of a locked log. ``journal`` holds the old one."""
 
     def __init__(self, handle: int, written: Journal, digest: bytes) -> None:
         self._handle, self.journal, self._digest = handle, written, digest
         self._at = written.start
-        self._waiting: list[bytes] = []
+        self._pending: list[bytes] = []
         self._size = 0
 
     def write(self, data: bytes) -> None:
-        """Put more behind what was written."""
-        self._waiting.append(data)
+        """Append bytes."""
+        self._pending.append(data)
         self._size += len(data)
         if self._size >= _PIECE:
             self._flush()
 
     def close(self) -> None:
-        """The file ends here; everything is on the disk."""
+        """Truncate the file here, and sync it to disk."""
         self._flush(is_last=True)
         if os.fstat(self._handle).st_size > self._at:
             os.ftruncate(self._handle, self._at)
         os.fsync(self._handle)
 
     def _flush(self, *, is_last: bool = False) -> None:
-        """Give what waits to the operating system, whole rows of it if more is to follow."""
-        data = b"".join(self._waiting)
+        """Write the buffered bytes: whole rows only, unless this is the last piece."""
+        data = b"".join(self._pending)
         size = len(data) if is_last else len(data) - (self._at + len(data)) % journal.ROW
-        record, self._digest = journal.pack_added(self._digest, self._at, data[:size], is_last=is_last)
+        record, self._digest = journal.pack_piece(self._digest, self._at, data[:size], is_last=is_last)
         _append(self.journal.file.handle, record)
         os.fsync(self.journal.file.handle)
         journal.write_at(self._handle, memoryview(data)[:size], self._at)
         self._at += size
-        self._waiting, self._size = [data[size:]], len(data) - size
+        self._pending, self._size = [data[size:]], len(data) - size
 
 
 @contextmanager
-def new_end(path: Path, handle: int, start: int, log: OpenFile) -> Iterator[End]:
-    """Write the end of a locked log anew, from ``start`` on; all of it, or as it was if the block fails.
+def rewrite_tail(path: Path, handle: int, start: int, log: OpenFile) -> Iterator[TailWriter]:
+    """Rewrite the tail of a locked log from ``start`` on; if the block fails, the old tail is restored.
 
-    ``handle`` is open for reading and writing. The block must call ``close`` when it is done. Raises McaptrackError if
-    the journal can't be written.
+    ``handle`` is open for reading and writing. The block must call ``close`` at its end. Raises McaptrackError if the
+    journal can't be written.
     """
     beside = journal_of(path)
-    if os.path.lexists(beside):  # it came since the log was locked
-        raise McaptrackError(f"{beside} can't be written: something lies there already")
+    if os.path.lexists(beside):  # created since the log was locked
+        raise McaptrackError(f"{beside} can't be written: there is something else with that name")
     try:
-        written, digest = _begin(path, handle, start, log)
+        written, digest = _write_journal(path, handle, start, log)
     except BaseException as why:
-        beside.unlink(missing_ok=True)  # nothing has been changed yet
+        beside.unlink(missing_ok=True)  # the log has not been changed yet
         if isinstance(why, OSError):
             raise McaptrackError(f"{beside} can't be written: {why.strerror or why}") from why
         raise
     try:
         try:
-            yield End(handle, written, digest)
+            yield TailWriter(handle, written, digest)
         except BaseException as why:
-            _undo(path, handle, written, why)
+            _roll_back(path, handle, written, why)
             raise
         try:
             journal.remove(path)
-        except OSError as error:  # what was to be done is done
+        except OSError as error:  # the change itself is complete
             notices.warn(
                 f"{path} is complete, but {beside} can't be removed ({error.strerror}); the next command that writes "
                 "to the log removes it",
@@ -141,26 +145,26 @@ def new_end(path: Path, handle: int, start: int, log: OpenFile) -> Iterator[End]
         fcntl.flock(written.file.handle, fcntl.LOCK_UN)
 
 
-def _undo(path: Path, handle: int, written: Journal, why: BaseException) -> None:
-    """Put the old end back. Raises McaptrackError if that can't be done now."""
+def _roll_back(path: Path, handle: int, written: Journal, why: BaseException) -> None:
+    """Restore the old tail. Raises McaptrackError if that fails."""
     try:
-        written.put_back(handle)
+        written.restore(handle)
         journal.remove(path)
     except (OSError, Damaged) as error:
         raise McaptrackError(
-            f"{path} can't be written ({why}), nor put back as it was ({error}); while {journal_of(path)} is there, "
-            "commands that read see it as it was, and the next that writes to it puts it back"
+            f"{path} can't be written ({why}), and its old state can't be restored ({error}); while {journal_of(path)} "
+            "exists, commands that read it see the old state, and the next command that writes to it restores that"
         ) from why
 
 
-def _begin(path: Path, handle: int, start: int, log: OpenFile) -> tuple[Journal, bytes]:
-    """Put a journal with the old end beside a log, on the disk; it stays open, and locked."""
+def _write_journal(path: Path, handle: int, start: int, log: OpenFile) -> tuple[Journal, bytes]:
+    """Write a journal with the old tail beside a log and sync it to disk; it stays open and locked."""
     there = os.fstat(handle)
     head = journal.pack_head(handle, start)
     with publish(journal_of(path)) as part:
         file = OpenFile(os.open(part, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_APPEND | os.O_CLOEXEC, 0o600))
         fcntl.flock(file.handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        if keep_attributes(path, part):  # whoever may not read the log may not read its end either
+        if keep_attributes(path, part):  # users who may not read the log may not read its tail either
             part.chmod(there.st_mode & 0o700)
         _append(file.handle, head)
         for at in range(start, there.st_size, _BLOCK):

@@ -1,4 +1,4 @@
-"""What is in a log and where: from its summary where that can be had, otherwise from a walk over the whole file."""
+"""The index of a log: read from its summary, or from a scan of the whole file if the summary can't be used."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 
 from mcaptrack.log import records
 from mcaptrack.log.byte_source import ByteSource, RunningChecksum
-from mcaptrack.log.chunks import Entries, chunk_entries, message_head, open_chunk
+from mcaptrack.log.chunks import Entries, message_head, open_chunk, scan_entries
 from mcaptrack.log.records import (
     MAGIC,
     Bytes,
@@ -31,8 +31,8 @@ FOOTER_SIZE: Final = 9 + records.FOOTER_BODY.size + len(MAGIC)
 DATA_END_SIZE: Final = 9 + 4
 
 
-class Listed(NamedTuple):
-    """An attachment or metadata record: its name, where it starts, and its entry in the summary."""
+class SummaryEntry(NamedTuple):
+    """An attachment or metadata record: its name, its offset, and its entry in the summary."""
 
     name: str
     offset: int
@@ -41,10 +41,10 @@ class Listed(NamedTuple):
 
 @dataclass
 class Index:
-    """The contents of a log. ``data_end`` is where the data section ends, ``data_crc`` its CRC if the file has one.
+    """The contents of a log. ``data_end`` is the end of the data section, ``data_crc`` its CRC if the file has one.
 
-    ``regular`` logs have a summary that reading can rely on, and all their messages in indexed chunks. For other logs
-    times and offsets of messages are kept here, by channel: offsets in the chunk, or in the file outside of chunks.
+    A ``regular`` log has a consistent summary, and all its messages are in indexed chunks. For other logs ``entries``
+    and ``loose`` hold log time and offset of each message: offsets in the chunk, or in the file outside of chunks.
     """
 
     data_end: int = 0
@@ -53,16 +53,18 @@ class Index:
     schemas: dict[int, SchemaRecord] = field(default_factory=dict)
     channels: dict[int, ChannelRecord] = field(default_factory=dict)
     chunks: list[ChunkIndexRecord] = field(default_factory=list)
-    entries: dict[int, dict[int, Entries]] = field(default_factory=dict)  # of chunks at these offsets, where scanned
-    loose: dict[int, Entries] = field(default_factory=dict)  # of messages outside of chunks
-    counts: dict[int, int] = field(default_factory=dict)  # messages of each channel
-    attachments: list[Listed] = field(default_factory=list)
-    metadata: list[Listed] = field(default_factory=list)
+    entries: dict[int, dict[int, Entries]] = field(
+        default_factory=dict
+    )  # by offset of the chunk and channel, for scanned chunks
+    loose: dict[int, Entries] = field(default_factory=dict)  # by channel, of messages outside of chunks
+    counts: dict[int, int] = field(default_factory=dict)  # number of messages by channel
+    attachments: list[SummaryEntry] = field(default_factory=list)
+    metadata: list[SummaryEntry] = field(default_factory=list)
     start_ns: int = 0
     end_ns: int = 0
 
-    def agrees(self, other: Index, channel_id: int) -> bool:
-        """Whether another index says the same of a channel."""
+    def has_same_channel(self, other: Index, channel_id: int) -> bool:
+        """Whether a channel has the same index entries in another index."""
         for name in ("channels", "counts"):
             if getattr(self, name).get(channel_id) != getattr(other, name).get(channel_id):
                 return False
@@ -78,8 +80,8 @@ class Index:
             if chunk.offset in self.entries
         )
 
-    def agrees_in_all(self, other: Index) -> bool:
-        """Whether another index says the same of the log."""
+    def equals(self, other: Index) -> bool:
+        """Whether another index is equal."""
         plain = ("data_end", "data_crc", "schemas", "channels", "chunks", "counts", "attachments", "metadata")
         if any(getattr(self, name) != getattr(other, name) for name in plain):
             return False
@@ -95,26 +97,29 @@ def _equal(one: Entries | None, other: Entries | None) -> bool:
 
 
 def read_index(source: ByteSource) -> Index:
-    """The contents of a log. Raises Damaged if it is none or is cut off."""
-    if not begins_as_log(source):
+    """Read the index of a log. Raises Damaged if the file is not an MCAP file or is cut off."""
+    if not starts_with_magic(source):
         raise Damaged("it does not begin as an MCAP file does")
-    if not ends_as_log(source):
+    if not ends_with_magic(source):
         raise Damaged("it is cut off: the end of an MCAP file is missing")
-    return read_summary(source) or _from_scan(source.front_to_back())
+    return read_summary(source) or _scan(source.sequential())
 
 
-def begins_as_log(buffer: Bytes) -> bool:
-    """Whether the first bytes are those of an MCAP file."""
+def starts_with_magic(buffer: Bytes) -> bool:
+    """Whether the file begins with the magic bytes of MCAP."""
     return bytes(buffer[0 : len(MAGIC)]) == MAGIC
 
 
-def ends_as_log(buffer: Bytes) -> bool:
-    """Whether the last bytes are those of an MCAP file, and are not the first ones."""
+def ends_with_magic(buffer: Bytes) -> bool:
+    """Whether the file ends with the magic bytes of MCAP, which are not the ones at its beginning."""
     return len(buffer) >= 2 * len(MAGIC) and bytes(buffer[len(buffer) - len(MAGIC) : len(buffer)]) == MAGIC
 
 
 def read_footer(buffer: Bytes) -> tuple[int, int, int, int] | None:
-    """Where the footer stands; where it says that the summary and its offsets start; the CRC of these. None if none."""
+    """Offset of the footer, start of the summary, start of the summary offsets, and their CRC.
+
+    None if there is none.
+    """
     at = len(buffer) - FOOTER_SIZE
     if at < len(MAGIC) or buffer[at] != Opcode.FOOTER:
         return None
@@ -122,10 +127,10 @@ def read_footer(buffer: Bytes) -> tuple[int, int, int, int] | None:
 
 
 def read_summary(buffer: Bytes) -> Index | None:
-    """The contents as the summary has them; None where it lacks something that reading by index stands on."""
+    """The index by the summary; None if the summary lacks something that reading by index needs."""
     footer = read_footer(buffer)
     if footer is None:
-        raise Damaged("it has no footer where one belongs")
+        raise Damaged("it has no footer at its end")
     at, summary_start, _, summary_crc = footer
     data_end = summary_start - DATA_END_SIZE
     if not len(MAGIC) <= data_end < at or buffer[data_end] != Opcode.DATA_END:
@@ -134,27 +139,27 @@ def read_summary(buffer: Bytes) -> Index | None:
     index.data_crc = Reader(buffer, data_end + 9, data_end + DATA_END_SIZE).number(4)
     summary = buffer[summary_start : len(buffer) - len(MAGIC) - 4]
     if summary_crc and zlib.crc32(summary) != summary_crc:
-        return None  # the data section says the same, with checksums of its own
+        return None  # the scan gives the same, and the data section has its own checksums
     try:
         for record in walk(summary, 0, at - summary_start):
             if record.opcode == Opcode.STATISTICS:
                 statistics = record
-            take(index, summary, record)
+            add_summary_record(index, summary, record)
     except Damaged as error:
         raise error.moved(summary_start) from None
     index.chunks.sort(key=lambda chunk: chunk.offset)
-    index.regular = statistics is not None and _adds_up(index, Reader(summary, statistics.body, statistics.end))
+    index.regular = statistics is not None and _is_consistent(index, Reader(summary, statistics.body, statistics.end))
     return index if index.regular else None
 
 
 def summary_start(buffer: Bytes) -> int:
-    """Where the summary is said to start; 0 if it is not said."""
-    footer = read_footer(buffer) if ends_as_log(buffer) else None
+    """The start of the summary according to the footer; 0 if there is none."""
+    footer = read_footer(buffer) if ends_with_magic(buffer) else None
     return footer[1] if footer and len(MAGIC) < footer[1] <= footer[0] else 0
 
 
-def whole_summary(buffer: Bytes, start: int) -> Index | None:
-    """What the summary of a damaged log says, if it stands at ``start`` and a checksum shows that it is whole."""
+def read_intact_summary(buffer: Bytes, start: int) -> Index | None:
+    """The summary of a damaged log, if it begins at ``start`` and its checksum is right; else None."""
     footer = read_footer(buffer)
     if footer is None or not len(MAGIC) < start <= footer[0]:
         return None
@@ -165,21 +170,21 @@ def whole_summary(buffer: Bytes, start: int) -> Index | None:
     index = Index(start - DATA_END_SIZE)
     with suppress(Damaged):
         for record in walk(summary, 0, at - start):
-            take(index, summary, record)
+            add_summary_record(index, summary, record)
         return index
     return None
 
 
-def _adds_up(index: Index, statistics: Reader) -> bool:
-    """Whether the summary describes all channels and lists all messages, and no part of the file twice."""
+def _is_consistent(index: Index, statistics: Reader) -> bool:
+    """Whether the summary describes all channels and lists all messages, and no chunks overlap."""
     statistics.skip(8)
     said = [statistics.number(size) for size in (2, 4, 4, 4, 4)]
     found = [len(part) for part in (index.schemas, index.channels, index.attachments, index.metadata, index.chunks)]
     known = {channel for chunk in index.chunks for channel in chunk.message_index_offsets}
     schemas = {0, *index.schemas}
     described = known <= set(index.channels) and all(c.schema_id in schemas for c in index.channels.values())
-    # The length of the message indexes says how many messages they list; fewer than there are means that some stand
-    # outside of chunks or were never indexed.
+    # The number of index entries follows from the length of the message indexes. If it is less than the number of
+    # messages, some are outside of chunks or were never indexed.
     listed = sum(c.message_index_length - 15 * len(c.message_index_offsets) for c in index.chunks)
     indexed = all(chunk.message_index_offsets for chunk in index.chunks) and listed == 16 * sum(index.counts.values())
     ends = [len(MAGIC), *(chunk.offset + chunk.length for chunk in index.chunks)]
@@ -188,8 +193,8 @@ def _adds_up(index: Index, statistics: Reader) -> bool:
     return said == found and described and indexed and apart
 
 
-def take(index: Index, buffer: Bytes, record: Record) -> None:
-    """Add a record of the summary to the index."""
+def add_summary_record(index: Index, buffer: Bytes, record: Record) -> None:
+    """Add a summary record to the index."""
     reader = Reader(buffer, record.body, record.end)
     if record.opcode == Opcode.SCHEMA:
         schema = records.read_schema(buffer, record)
@@ -206,15 +211,15 @@ def take(index: Index, buffer: Bytes, record: Record) -> None:
     elif record.opcode == Opcode.ATTACHMENT_INDEX:
         offset = reader.number(8)
         reader.skip(8 * 4)
-        index.attachments.append(Listed(reader.text(), offset, bytes(buffer[record.start : record.end])))
+        index.attachments.append(SummaryEntry(reader.text(), offset, bytes(buffer[record.start : record.end])))
     elif record.opcode == Opcode.METADATA_INDEX:
         offset = reader.number(8)
         reader.skip(8)
-        index.metadata.append(Listed(reader.text(), offset, bytes(buffer[record.start : record.end])))
+        index.metadata.append(SummaryEntry(reader.text(), offset, bytes(buffer[record.start : record.end])))
 
 
-def _from_scan(buffer: ByteSource) -> Index:
-    """The contents from every record of the file, chunks opened."""
+def _scan(buffer: ByteSource) -> Index:
+    """The index by reading every record of the file, chunks included."""
     index = Index()
     loose: dict[int, array[int]] = {}
     checksum = RunningChecksum(buffer)
@@ -222,33 +227,33 @@ def _from_scan(buffer: ByteSource) -> Index:
         if record.opcode == Opcode.DATA_END:
             index.data_end = record.start
             index.data_crc = Reader(buffer, record.body, record.end).number(4)
-            if index.data_crc and index.data_crc != checksum.upto(record.start):
+            if index.data_crc and index.data_crc != checksum.up_to(record.start):
                 raise Damaged("the checksum of its data section is wrong")
             continue
-        checksum.pass_over(record.end)
+        checksum.advance(record.end)
         if record.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-            take(index, buffer, record)  # those of the summary count too: some writers put them nowhere else
+            add_summary_record(index, buffer, record)  # also those of the summary: some writers write them only there
         elif record.opcode == Opcode.CHUNK:
             _scan_chunk(index, buffer, record)
         elif record.opcode == Opcode.MESSAGE:
             channel, _, t_ns, _ = message_head(buffer, record)
             loose.setdefault(channel, array("Q")).extend((t_ns, record.start))
         elif record.opcode == Opcode.ATTACHMENT:
-            index.attachments.append(list_attachment(buffer, record, record.start))
+            index.attachments.append(attachment_entry(buffer, record, record.start))
         elif record.opcode == Opcode.METADATA:
-            index.metadata.append(list_metadata(buffer, record, record.start))
+            index.metadata.append(metadata_entry(buffer, record, record.start))
     index.loose = {channel: np.array(entries, "<u8").reshape(-1, 2) for channel, entries in loose.items()}
     _count(index, index.loose)
     missing = set(index.counts) - set(index.channels)
     if missing:
-        raise Damaged(f"there are messages of channel {min(missing)}, which is not described anywhere")
+        raise Damaged(f"there are messages of channel {min(missing)}, which has no channel record")
     if index.data_end == 0:
         raise Damaged("its data section has no end")
     return index
 
 
 def _count(index: Index, found: Mapping[int, Entries]) -> None:
-    """Add messages to the numbers of each channel and to the span of time."""
+    """Add messages to the counts by channel and to the time span."""
     for channel, entries in found.items():
         first_ns, last_ns = int(entries[:, 0].min()), int(entries[:, 0].max())
         if not index.counts:
@@ -262,18 +267,18 @@ def _scan_chunk(index: Index, buffer: Bytes, record: Record) -> None:
     content = open_chunk(buffer, record)
     for inner in walk(content, 0, len(content)):
         if inner.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-            take(index, content, inner)
-    entries = chunk_entries(content)
+            add_summary_record(index, content, inner)
+    entries = scan_entries(content)
     _count(index, entries)
     index.entries[record.start] = entries
     edges = [int(edge) for listed in entries.values() for edge in (listed[:, 0].min(), listed[:, 0].max())]
     index.chunks.append(
         ChunkIndexRecord(
-            min(edges, default=head.start_ns),  # the chunk may say otherwise
+            min(edges, default=head.start_ns),  # the head of the chunk may be wrong
             max(edges, default=head.end_ns),
             record.start,
             record.end - record.start,
-            dict.fromkeys(entries, 0),  # there may be no message index; 0 says so
+            dict.fromkeys(entries, 0),  # 0: without message index
             0,
             head.compression,
             head.end - head.start,
@@ -282,17 +287,17 @@ def _scan_chunk(index: Index, buffer: Bytes, record: Record) -> None:
     )
 
 
-def list_attachment(buffer: Bytes, record: Record, offset: int) -> Listed:
-    """What indexes an attachment that stands at ``offset`` of a file."""
+def attachment_entry(buffer: Bytes, record: Record, offset: int) -> SummaryEntry:
+    """The summary entry of an attachment at ``offset`` of a file."""
     found = records.read_attachment(buffer, record)
     numbers = (offset, record.end - record.start, found.log_ns, found.create_ns, found.end - found.start)
     packed = b"".join(records.number(value, 8) for value in numbers)
     index = records.pack(Opcode.ATTACHMENT_INDEX, packed, records.text(found.name), records.text(found.media_type))
-    return Listed(found.name, offset, index)
+    return SummaryEntry(found.name, offset, index)
 
 
-def list_metadata(buffer: Bytes, record: Record, offset: int) -> Listed:
-    """What indexes a metadata record that stands at ``offset`` of a file."""
+def metadata_entry(buffer: Bytes, record: Record, offset: int) -> SummaryEntry:
+    """The summary entry of a metadata record at ``offset`` of a file."""
     name = records.read_metadata(buffer, record)[0]
     packed = records.number(offset, 8) + records.number(record.end - record.start, 8)
-    return Listed(name, offset, records.pack(Opcode.METADATA_INDEX, packed, records.text(name)))
+    return SummaryEntry(name, offset, records.pack(Opcode.METADATA_INDEX, packed, records.text(name)))

@@ -1,4 +1,4 @@
-"""What is found beside a log, and what is said of a log that another process changes."""
+"""Detect the journal that lies beside a log, and the messages about logs that changed or are damaged."""
 
 from __future__ import annotations
 
@@ -8,49 +8,53 @@ from typing import NamedTuple
 from mcaptrack.errors import McaptrackError, command
 from mcaptrack.files import follow_links
 from mcaptrack.log.byte_source import OpenFile
-from mcaptrack.log.journal import Journal, Unfit, find, find_content, journal_of, remove_words
+from mcaptrack.log.journal import Journal, UnusableJournal, find, journal_of, load_old_content, remove_hint
 
 
-class Found(NamedTuple):
-    """What lies at LOG.journal: ``journal`` if the log is to be seen through it, and words for people."""
+class JournalFinding(NamedTuple):
+    """What lies at LOG.journal: a message about it, and ``journal`` if the log must be read through it."""
 
-    words: str
+    message: str
     journal: Journal | None = None
     is_busy: bool = False
 
 
-def find_journal(path: Path, file: OpenFile) -> Found | None:
-    """What lies beside an open log, for whoever only reads; None if nothing does."""
+def find_journal(path: Path, file: OpenFile) -> JournalFinding | None:
+    """The state of the journal beside a log that is opened for reading; None if there is no journal."""
     real_path = follow_links(path)
     try:
         journal = find(real_path, file)
         state = journal.state() if journal else None
-    except Unfit as why:
-        words = f"{journal_of(real_path)} {why}; it is not used, and {path} is taken as it is. "
-        if find_content(real_path, file):
-            words += f"If it was left half written, {recover_command(path)} saves it as it was before. Then"
+    except UnusableJournal as why:
+        message = f"{journal_of(real_path)} {why}; it is ignored, and {path} is read as it is. "
+        if load_old_content(real_path, file):
+            message += (
+                f"If it was left half written, {recover_command(path)} restores its state before the change. Then"
+            )
         else:
-            words += "If nothing else needs it,"
-        return Found(f"{words} remove it with {remove_words(real_path)}")
+            message += "If no other program needs it,"
+        return JournalFinding(f"{message} remove it with {remove_hint(real_path)}")
     if state == "busy":
-        return Found(f"{path} is being written to by another process; it is seen as it was before", journal, True)
+        return JournalFinding(
+            f"{path} is being written to by another process; its state before that is read", journal, True
+        )
     if state == "between":
-        half = f"{path} was left half written by a change that was interrupted; it is seen as it was before"
-        return Found(f"{half}. The next command that writes to it puts that back on the disk", journal)
-    left = f"{journal_of(real_path)} was left behind by a change of {path} that was interrupted; the log is whole"
-    return Found(f"{left}. The next command that writes to it removes the journal") if state else None
+        half = f"{path} was left half written by an interrupted change; its state before that change is read"
+        return JournalFinding(f"{half}. The next command that writes to it restores that state on the disk", journal)
+    left = f"{journal_of(real_path)} was left behind by an interrupted change of {path}; the log is complete"
+    return JournalFinding(f"{left}. The next command that writes to it removes the journal") if state else None
 
 
 def changed(path: Path) -> McaptrackError:
-    """What is said of a file that turned out to be another one while it was read."""
+    """The error for a file that another process changed while it was read."""
     return McaptrackError(f"{path} was changed by another process while it was being read; try again")
 
 
-def recover_words(path: Path) -> str:
-    """What to do about a damaged log."""
-    return f"{recover_command(path)} saves what is whole"
+def recover_hint(path: Path) -> str:
+    """The hint for a damaged log: the command that recovers what is intact."""
+    return f"{recover_command(path)} saves what is intact"
 
 
 def recover_command(path: Path) -> str:
-    """The command that saves a damaged log."""
+    """The command that recovers a damaged log."""
     return command("recover", path)

@@ -1,4 +1,4 @@
-"""The messages of a channel, by time: found by index, opened a chunk at a time, within bounds of memory.
+"""The messages of a channel in time order: located by index, read chunk by chunk, within a memory limit.
 
 Letters: M messages.
 """
@@ -15,17 +15,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack.geometry.arrays import Ints
+from mcaptrack.geometry.ragged import ragged_range, run_starts
 from mcaptrack.log.byte_source import ByteSource
 from mcaptrack.log.chunks import (
     MAX_NS,
     Entries,
     checksum_at,
     chunk_record,
-    heads_at,
     is_left_in_file,
-    listed_entries,
     message_head,
-    open_and_mark,
+    message_heads_at,
+    open_chunk_with_checksum,
+    read_index_entries,
 )
 from mcaptrack.log.fingerprint import fingerprint
 from mcaptrack.log.index import Index
@@ -46,16 +47,16 @@ from mcaptrack.schema import Rows, Schema
 Times = NDArray[np.uint64]
 Span = tuple[int | None, int | None]
 
-#: Beyond this much, chunks that overlap are closed and opened again when their turn comes.
+#: Limit for open chunks in bytes; above it, overlapping chunks are closed and opened again later.
 OPEN_BYTES: Final = 128 * 2**20
-#: Messages outside of chunks that are further apart on the average are read one by one.
-_APART: Final = 16 * 2**10
+#: Messages outside of chunks are read one by one if their average distance in the file is larger.
+_MAX_GAP_BYTES: Final = 16 * 2**10
 _NONE: Final = np.empty(0, np.int64)
 _NO_TIMES: Final = np.empty(0, np.uint64)
 
 
 class Message(NamedTuple):
-    """A message as it stands in a log; times in nanoseconds."""
+    """A recorded message; times in nanoseconds."""
 
     t_ns: int
     sequence: int
@@ -64,7 +65,7 @@ class Message(NamedTuple):
 
 
 class ChannelRows(NamedTuple):
-    """All rows of a channel by time, and of each message its time, sequence number and how many rows are its own."""
+    """All rows of a channel in time order, and for each message its time, sequence number and number of rows, (M,)."""
 
     rows: Rows
     t_ns: Ints
@@ -73,9 +74,9 @@ class ChannelRows(NamedTuple):
 
 
 class MessageLocations(NamedTuple):
-    """Where the messages of a channel stand, by time, (M,): chunks in the file, messages in their chunk, uncompressed.
+    """The locations of a channel's messages in time order, (M,): chunk in the file, message in the uncompressed chunk.
 
-    Outside of chunks ``chunk_offset`` is -1 and ``offset`` a place in the file.
+    Outside of chunks ``chunk_offset`` is -1 and ``offset`` is an offset in the file.
     """
 
     t_ns: Ints
@@ -84,7 +85,7 @@ class MessageLocations(NamedTuple):
 
 
 class TimeOutOfRange(Exception):
-    """So many messages of a channel are later than ``MAX_NS``, the first of them at ``t_ns``."""
+    """``count`` messages of a channel are later than ``MAX_NS``, the first of them at ``t_ns``."""
 
     def __init__(self, count: int, t_ns: int) -> None:
         super().__init__(count, t_ns)
@@ -92,10 +93,10 @@ class TimeOutOfRange(Exception):
 
 
 class _Batch(NamedTuple):
-    """Messages of one channel that are read together, by time, (M,) each: all in a chunk, or near each other elsewhere.
+    """Messages of one channel that are read together, in time order, (M,) each: of one chunk, or near each other.
 
-    ``is_direct`` is for messages that are read from the file itself: those outside of chunks, and those in chunks that
-    are too large to be in memory.
+    ``is_direct``: the messages are read from the file itself, because they are outside of chunks or in an uncompressed
+    chunk that is too large for memory.
     """
 
     channel: int
@@ -106,35 +107,35 @@ class _Batch(NamedTuple):
 
     @property
     def size(self) -> int:
-        """The memory that it takes to have it open."""
+        """The memory in bytes that the open batch takes."""
         if self.chunk is not None and not self.is_direct:
             return self.chunk.uncompressed_size
         return int(self.offset.max() - self.offset.min()) if len(self.offset) else 0
 
 
 class Messages:
-    """What is in the chunks of a log. Everything here raises Damaged where the bytes are not what the index says.
+    """The messages of a log. All methods raise Damaged where the bytes contradict the index.
 
-    Channels are given by their ids, one or several; the messages of several are read as those of one.
+    Channels are given by id; the messages of several channels are read as if they were of one.
     """
 
     def __init__(self, source: ByteSource, index: Index) -> None:
         self.source, self.index = source, index
-        self._opened: OrderedDict[int, Bytes] = OrderedDict()  # contents of the last chunks, for other channels
-        # What was read, to tell whether it still stands there: checksums of chunks, ends and checksums of pieces.
+        self._opened: OrderedDict[int, Bytes] = OrderedDict()  # the last chunks that were opened, for other channels
+        # Checksums of what was read, to detect changes: of chunks by offset, of pieces by start with their end.
         self._chunks: dict[int, int] = {}
         self._pieces: dict[int, tuple[int, int]] = {}
         self._fingerprints: dict[int | None, str] = {}
         self._checksums: dict[int, int | str] = {}
 
     def times(self, channels: Sequence[int], span: Span = (None, None)) -> Ints:
-        """The times of messages, rising, (M,)."""
-        return np.sort(signed(np.concatenate([_NO_TIMES, *(b.t_ns for b in self._batches(channels, span))])))
+        """The sorted times of messages, (M,)."""
+        return np.sort(to_int64(np.concatenate([_NO_TIMES, *(b.t_ns for b in self._batches(channels, span))])))
 
     def places(self, channels: Sequence[int]) -> MessageLocations:
-        """Where messages stand, in the order of ``by_time``."""
+        """The locations of messages, in the order of ``by_time``."""
         batches = self._batches(channels)
-        t_ns = signed(np.concatenate([_NO_TIMES, *(batch.t_ns for batch in batches)]))
+        t_ns = to_int64(np.concatenate([_NO_TIMES, *(batch.t_ns for batch in batches)]))
         offset = np.concatenate([_NONE, *(batch.offset for batch in batches)])
         starts = np.array([batch.chunk.offset if batch.chunk else -1 for batch in batches], np.int64)
         chunk_offset = np.repeat(starts, [len(batch.t_ns) for batch in batches])
@@ -142,7 +143,7 @@ class Messages:
         return MessageLocations(t_ns[order], chunk_offset[order], offset[order])
 
     def at(self, chunk_offset: int | None, offset: int) -> tuple[int, Message]:
-        """The message that stands at a place, and the number of its channel."""
+        """The message at a location, and the id of its channel."""
         content: Bytes = self.source
         if chunk_offset is not None:
             chunk = next((chunk for chunk in self.index.chunks if chunk.offset == chunk_offset), None)
@@ -151,20 +152,19 @@ class Messages:
             content = self._content(chunk)
         record = record_at(content, offset)
         if record.opcode != Opcode.MESSAGE:
-            raise Damaged(f"no message stands at byte {offset} of the chunk at {chunk_offset}")
+            raise Damaged(f"there is no message at byte {offset} of the chunk at {chunk_offset}")
         whole = memoryview(bytes(content[record.start : record.end]))
         if chunk_offset is None:
-            self._note(record.start, whole)
+            self._remember(record.start, whole)
         head = Record(record.opcode, 0, record.body - record.start, len(whole))
         channel, sequence, t_ns, publish_ns = message_head(whole, head)
         return channel, Message(t_ns, sequence, publish_ns, bytes(whole[head.body + MESSAGE_HEAD.size :]))
 
     def by_time(self, channels: Sequence[int], span: Span = (None, None)) -> Iterator[Message]:
-        """Messages by time; those of one time channel by channel, as they stand in the file.
+        """Messages in time order; those of equal time by channel, then in file order.
 
-        ``span`` is from the first to before the last.
-
-        A chunk is open while its messages are due, unless too many are.
+        ``span`` is a half-open interval of times. Chunks stay open while they have messages to come, within the limit
+        ``OPEN_BYTES``.
         """
         batches = self._batches(channels, span)
         if not any(len(batch.t_ns) for batch in batches):
@@ -172,9 +172,8 @@ class Messages:
         t_ns = np.concatenate([batch.t_ns for batch in batches])
         batch_of = np.repeat(np.arange(len(batches)), [len(batch.t_ns) for batch in batches])
         in_order = batch_of[np.argsort(t_ns, kind="stable")]
-        # Chunks rarely overlap: as long as one goes on, its messages are passed on without a look at the others.
-        turns = np.flatnonzero(np.diff(in_order)) + 1
-        starts = np.concatenate([[0], turns, [len(in_order)]])
+        # Chunks rarely overlap: consecutive messages of one chunk are yielded together.
+        starts = np.append(np.flatnonzero(run_starts(in_order)), len(in_order))
         opened: OrderedDict[int, Iterator[Message]] = OrderedDict()
         taken = [0] * len(batches)
         size = 0
@@ -193,21 +192,21 @@ class Messages:
                 size -= batch.size
 
     def columns(self, channels: Sequence[int], schema: Schema) -> ChannelRows | None:
-        """Rows without a loop over messages; None where a message is laid out otherwise than ours."""
+        """Rows without a loop over messages; None if a message has another layout than the row codec writes."""
         batches = self._batches(channels)
-        t_ns = signed(np.concatenate([_NO_TIMES, *(batch.t_ns for batch in batches)]))
+        t_ns = to_int64(np.concatenate([_NO_TIMES, *(batch.t_ns for batch in batches)]))
         sequence, counts = np.empty_like(t_ns), np.empty_like(t_ns)
         rows, done, taken = schema.empty(), 0, 0
         for batch in batches:
             content, offset = self._open(batch)
-            found = heads_at(content, batch.channel, batch.t_ns, offset)
+            found = message_heads_at(content, batch.channel, batch.t_ns, offset)
             decoded = schema.codec.decode_at(np.frombuffer(content, np.uint8), found.start, found.end)
             if decoded is None:
                 return None
             part, counts_of = decoded
             until = done + len(batch.t_ns)
             sequence[done:until], counts[done:until] = found.head["sequence"], counts_of
-            if taken + len(part) > len(rows):  # as many more as the messages to come have if they are like those so far
+            if taken + len(part) > len(rows):  # room for the rest, if it has as many rows a message as so far
                 share = (len(t_ns) - done) / max(until - done, 1)
                 rows = schema.codec.longer(rows, taken, taken + int(len(part) * share * 1.02) + 1)
             schema.codec.put(rows, taken, part)
@@ -215,19 +214,18 @@ class Messages:
         rows = rows[:taken]
         order = np.argsort(t_ns, kind="stable")
         if (np.diff(order) != 1).any():
-            first, kept = (np.cumsum(counts) - counts)[order], counts[order]
-            rows = rows[np.repeat(first - (np.cumsum(kept) - kept), kept) + np.arange(len(rows))]
+            rows = rows[ragged_range((np.cumsum(counts) - counts)[order], counts[order])]
         rows.flags.writeable = False
         return ChannelRows(rows, t_ns[order], sequence[order], counts[order])
 
     def fingerprint(self, channel_id: int | None = None) -> str:
-        """The fingerprint of a channel, or of everything; worked out once."""
+        """The fingerprint of a channel, or of the whole log; computed once."""
         if channel_id not in self._fingerprints:
             self._fingerprints[channel_id] = fingerprint(self.source, self.index, channel_id, self._checksums)
         return self._fingerprints[channel_id]
 
-    def are_in(self, source: ByteSource) -> bool:
-        """Whether what was read so far stands in ``source`` as it did when it was read."""
+    def are_unchanged_in(self, source: ByteSource) -> bool:
+        """Whether everything that was read so far is unchanged in ``source``."""
         pieces = all(crc_of(source, start, end) == crc for start, (end, crc) in self._pieces.items())
         return pieces and all(checksum_at(source, start) == crc for start, crc in self._chunks.items())
 
@@ -235,7 +233,7 @@ class Messages:
         return [batch for channel_id in channels for batch in self._batches_of(channel_id, span)]
 
     def _batches_of(self, channel_id: int, span: Span) -> list[_Batch]:
-        """Where the messages of a channel stand; only chunks that reach into the span are looked at."""
+        """The batches of a channel in the chunks that overlap the span."""
         first, last = span
         found, listed = [], 0
         for chunk in self.index.chunks:
@@ -245,7 +243,7 @@ class Messages:
             if first is not None and chunk.end_ns < first:
                 continue
             if at:
-                entries = listed_entries(self.source, at, channel_id)
+                entries = read_index_entries(self.source, at, channel_id)
             else:
                 entries = self.index.entries[chunk.offset][channel_id]
             listed += len(entries)
@@ -265,17 +263,17 @@ class Messages:
         """The records in a chunk."""
         content = self._opened.pop(chunk.offset, None)
         if content is None:
-            content, mark = open_and_mark(self.source, chunk_record(self.source, chunk))
+            content, mark = open_chunk_with_checksum(self.source, chunk_record(self.source, chunk))
             self._chunks[chunk.offset] = mark
         if len(chunk.message_index_offsets) == 1 and isinstance(content, memoryview):
-            return content  # nobody else will ask for it
+            return content  # no other channel needs it
         self._opened[chunk.offset] = content
         while sum(map(len, self._opened.values())) > OPEN_BYTES // 4 and len(self._opened) > 1:
             self._opened.popitem(last=False)
         return content
 
     def _open(self, batch: _Batch) -> tuple[memoryview, Ints]:
-        """The records of a batch in memory, perhaps with others, and where in there its messages stand."""
+        """The bytes that contain a batch, and the offsets of its messages in them."""
         base = 0
         if batch.chunk is not None:
             content = self._content(batch.chunk)
@@ -283,31 +281,31 @@ class Messages:
                 return content, batch.offset
             base = read_chunk(self.source, chunk_record(self.source, batch.chunk)).start
             if not batch.is_direct:
-                raise Damaged("a chunk that is larger than the index says", batch.chunk.offset)
+                raise Damaged("a chunk is larger than its index says", batch.chunk.offset)
         if not len(batch.offset):
             return memoryview(b""), batch.offset
         places = batch.offset + base
         low, last = int(places.min()), int(places.max())
         end = record_at(self.source, last).end
-        if end - low <= len(places) * _APART:
-            self._note(low, whole := self.source[low:end])
+        if end - low <= len(places) * _MAX_GAP_BYTES:
+            self._remember(low, whole := self.source[low:end])
             return whole, places - low
-        parts = {}  # with much of something else between them
+        parts = {}  # far apart
         for at in np.sort(places).tolist():
             record = record_at(self.source, at)
-            self._note(at, whole := self.source[at : record.end])
+            self._remember(at, whole := self.source[at : record.end])
             parts[at] = whole
         starts = np.cumsum([0, *map(len, parts.values())])[:-1]
         return memoryview(b"".join(parts.values())), starts[np.searchsorted(list(parts), places)]
 
-    def _note(self, start: int, data: memoryview) -> None:
-        """Remember what was read where no chunk's checksum tells it."""
+    def _remember(self, start: int, data: memoryview) -> None:
+        """Remember the checksum of bytes that were read outside of chunks."""
         self._pieces[start] = (start + len(data), zlib.crc32(data))
 
     def _read(self, batch: _Batch, skip: int) -> Iterator[Message]:
-        """The messages of a batch without the first ``skip``."""
+        """The messages of a batch except the first ``skip``."""
         content, offset = self._open(batch)
-        found = heads_at(content, batch.channel, batch.t_ns[skip:], offset[skip:])
+        found = message_heads_at(content, batch.channel, batch.t_ns[skip:], offset[skip:])
         whole = content.obj
         data = whole if isinstance(whole, bytes) and len(whole) == len(content) else content
         spans = zip(found.start.tolist(), found.end.tolist(), strict=True)
@@ -329,16 +327,16 @@ def _batch(channel_id: int, chunk: ChunkIndexRecord | None, is_direct: bool, ent
 
 
 def _pieces(channel_id: int, chunk: ChunkIndexRecord | None, entries: Entries, span: Span) -> list[_Batch]:
-    """Messages that are read from the file itself: those near each other together."""
+    """Batches of messages that are read from the file itself, each of nearby messages."""
     if not len(entries):
         return []
     in_file = entries[np.argsort(entries[:, 1], kind="stable")]
-    turns = np.flatnonzero(np.diff(in_file[:, 1] // BLOCK)) + 1
-    return [_batch(channel_id, chunk, True, piece, span) for piece in np.split(in_file, turns)]
+    starts = np.flatnonzero(run_starts(in_file[:, 1] // BLOCK))
+    return [_batch(channel_id, chunk, True, piece, span) for piece in np.split(in_file, starts[1:])]
 
 
-def signed(t_ns: Times) -> Ints:
-    """Times as signed numbers, as all arithmetic has them. Raises TimeOutOfRange where one is too late for that."""
+def to_int64(t_ns: Times) -> Ints:
+    """Times as int64, as all arithmetic needs them. Raises TimeOutOfRange if one doesn't fit."""
     late = t_ns[t_ns > np.uint64(MAX_NS)]
     if len(late):
         raise TimeOutOfRange(len(late), int(late.min()))

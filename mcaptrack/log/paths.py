@@ -1,14 +1,14 @@
-"""How files of logs are named."""
+"""Names of files that belong to a log."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Final
 
-#: How the name of a log ends that holds the results of another.
+#: Suffix of a sidecar: a log that holds the results of another.
 RESULTS_SUFFIX: Final = ".results.mcap"
 
 
 def results_path(path: Path) -> Path:
-    """Where the results of a log stand if they are not in it."""
+    """The path of the sidecar of a log, which holds its results if they are not in the log itself."""
     return path.with_name(path.name.removesuffix(".mcap") + RESULTS_SUFFIX)

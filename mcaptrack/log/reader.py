@@ -19,7 +19,7 @@ from mcaptrack.log.chunks import MAX_NS
 from mcaptrack.log.messages import ChannelRows, Message, MessageLocations
 from mcaptrack.log.paths import RESULTS_SUFFIX, results_path
 from mcaptrack.log.records import ChannelRecord, Damaged
-from mcaptrack.log.snapshot import take_snapshot
+from mcaptrack.log.snapshot import open_snapshot
 from mcaptrack.log.writer import create
 from mcaptrack.schema import Frame, Schema
 
@@ -27,7 +27,7 @@ T = TypeVar("T")
 
 
 class Channel(NamedTuple):
-    """A channel of a log, or all channels of a topic: ``messages`` counts those of all, the rest is of the first."""
+    """A channel of a log, or all channels of a topic: ``messages`` is their total, the rest describes the first one."""
 
     id: int
     topic: str
@@ -40,21 +40,21 @@ class Channel(NamedTuple):
 class Log:
     """An MCAP file, open for reading. A context manager.
 
-    Channels are found by topic; several channels of one topic and one message layout are read as one, by time. With
-    ``results``, another log beside it, channels of both are there, those of the results first; what is added goes to
-    the results.
+    Channels are looked up by topic; several channels with the same topic and message layout are read as one, in time
+    order. With ``results``, a sidecar log, the channels of both are there, and those of the sidecar take precedence;
+    new channels are written to the sidecar.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.real_path = follow_links(path)
         self._lock: int | None = None
-        self.snapshot = take_snapshot(path)
+        self.snapshot = open_snapshot(path)
         self.index, self._messages = self.snapshot.index, self.snapshot.messages
         self.results: Log | None = None
-        self.is_new = False  # made a moment ago, and to be removed if nothing comes into it
-        self.is_spent = False  # extended: the file is another now, and this still shows what it was
-        #: Every channel of this file, also those that share a topic, and those that the results replace.
+        self.is_new = False  # just created; removed again if nothing is written to it
+        self.is_outdated = False  # the file has been extended; this log still shows its old content
+        #: All channels of this file, also those that share a topic and those that the sidecar replaces.
         self.recorded: tuple[Channel, ...] = tuple(map(self._channel, self.index.channels.values()))
         self._by_topic: dict[str, list[Channel]] = {}
         for channel in self.recorded:
@@ -64,8 +64,8 @@ class Log:
             first = next((channel for channel in those if channel.messages), those[0])
             self.channels[topic] = first._replace(messages=sum(channel.messages for channel in those))
 
-    def add_results(self, results: Log, is_new: bool) -> None:
-        """From now on the channels of both are there, and what is added goes to the results."""
+    def attach_results(self, results: Log, is_new: bool) -> None:
+        """Add the channels of a sidecar, which takes new channels from now on."""
         results.is_new = is_new
         self.results = results
         self.channels |= results.channels
@@ -87,13 +87,13 @@ class Log:
                     self.results.path.unlink()
 
     def lock(self) -> int:
-        """Be the only one to write to this log until it is closed; returns a handle to write with.
+        """Lock this log for writing until it is closed; returns a file descriptor to write to.
 
-        Raises McaptrackError if somebody else is, or if nobody may.
+        Raises McaptrackError if another process holds the lock, or if the file is not writable.
         """
         if self.results is not None:
             return self.results.lock()
-        if self.is_spent:
+        if self.is_outdated:
             raise McaptrackError(f"{self.path} was changed since it was opened; open it again")
         if self._lock is None:
             try:
@@ -105,7 +105,7 @@ class Log:
                 ) from None
             try:
                 in_place.lock(self.real_path, handle)
-                in_place.settle(self.real_path, handle, self.snapshot.file)
+                in_place.resolve_journal(self.real_path, handle, self.snapshot.file)
                 if not self.snapshot.is_on_disk(os.fstat(handle)):
                     raise McaptrackError(f"{self.path} was replaced while it was being read; try again")
             except BaseException:
@@ -116,35 +116,35 @@ class Log:
 
     @property
     def parts(self) -> tuple[Log, ...]:
-        """The log, and its results if they stand in another."""
+        """The log itself, and its sidecar if it has one."""
         return (self,) if self.results is None else (self, self.results)
 
     @property
     def size(self) -> int:
-        """How many bytes this log has, results aside."""
+        """The size of this log in bytes, without its sidecar."""
         return len(self.snapshot.source)
 
     @property
     def is_on_disk(self) -> bool:
-        """Whether other programs that open the file see the same: no change of it goes on or was interrupted."""
+        """Whether other programs that open the file see the same content: no change of it is unfinished."""
         return not any(part.snapshot.is_through_journal for part in self.parts)
 
     def part(self, topic: str) -> Log:
-        """The part that holds the channel of that topic."""
+        """The part (log or sidecar) that holds a topic."""
         return self.results if self.results is not None and topic in self.results.channels else self
 
     @property
     def start_ns(self) -> int:
-        """The time of the first message."""
+        """The time of the first message in nanoseconds."""
         return min((part.index.start_ns for part in self.parts if part.index.counts), default=0)
 
     @property
     def end_ns(self) -> int:
-        """The time of the last message."""
+        """The time of the last message in nanoseconds."""
         return max(part.index.end_ns for part in self.parts)
 
     def channel(self, topic: str) -> Channel:
-        """The channel of that topic. Raises McaptrackError, with what there is, if there is none."""
+        """The channel of a topic. Raises McaptrackError, with the topics that exist, if there is none."""
         if topic not in self.channels:
             there = [name for name in sorted(self.channels) if "/view/" not in name]
             more = command("info", self.path)
@@ -159,9 +159,9 @@ class Log:
         return Channel(record.id, record.topic, name, record.message_encoding, record.metadata, count)
 
     def _ids(self, topic: str) -> list[int]:
-        """The channels of a topic that hold messages, to be read as one.
+        """The ids of a topic's channels that hold messages.
 
-        Raises McaptrackError if there is no channel of that topic, or if their messages are laid out differently.
+        Raises McaptrackError if there is no channel of that topic, or if their messages have different layouts.
         """
         self.channel(topic)
         those = [channel for channel in self._by_topic[topic] if channel.messages]
@@ -172,11 +172,11 @@ class Log:
                 f"{channel.message_encoding or 'no encoding'})"
                 for channel in those
             )
-            raise McaptrackError(f"{self.path}: messages of {topic} are laid out differently: {kinds}")
+            raise McaptrackError(f"{self.path}: messages of {topic} have different layouts: {kinds}")
         return [channel.id for channel in those]
 
     def _layout(self, channel: Channel) -> tuple[str, ...]:
-        """What decides how a channel's messages are decoded. Comments and blanks in ROS definitions don't."""
+        """What determines how a channel's messages are decoded, without comments and white space of ROS definitions."""
         schema = self.index.schemas.get(self.index.channels[channel.id].schema_id)
         if schema is None:
             return (channel.message_encoding,)
@@ -193,7 +193,7 @@ class Log:
         found = [listed.offset for listed in self.index.metadata if listed.name == name]
         if not found:
             return None
-        with self.snapshot.mending():
+        with self.snapshot.reporting_damage():
             whole = self.snapshot.record(found[-1])
             return records.read_metadata(whole, records.record_at(whole, 0))[1]
 
@@ -204,38 +204,38 @@ class Log:
         found = [listed.offset for listed in self.index.attachments if listed.name == name]
         if not found:
             return None
-        with self.snapshot.mending():
+        with self.snapshot.reporting_damage():
             whole = self.snapshot.record(found[-1])
             attachment = records.read_attachment(whole, records.record_at(whole, 0))
             return bytes(whole[attachment.start : attachment.end])
 
     def messages(self, topic: str, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Message]:
-        """The messages of a channel by time, from ``start_ns`` to before ``end_ns``, all of them without these.
+        """The messages of a channel in time order, from ``start_ns`` (inclusive) to ``end_ns`` (exclusive), if given.
 
-        Chunks outside of that span are not touched. Raises McaptrackError where the file is damaged.
+        Chunks outside of this interval are not read. Raises McaptrackError where the file is damaged.
         """
         if (part := self.part(topic)) is not self:
             yield from part.messages(topic, start_ns, end_ns)
             return
         channels = self._ids(topic)
-        with self.snapshot.mending():
+        with self.snapshot.reporting_damage():
             yield from self._messages.by_time(channels, (start_ns, end_ns))
-            self.snapshot.confirm(channels)
+            self.snapshot.confirm_unchanged(channels)
 
     def timed(self, topic: str) -> Iterator[Message]:
-        """The messages of a channel by time, for code that computes with their times.
+        """The messages of a channel in time order, all of whose times fit into int64.
 
-        Raises McaptrackError at the first message whose time is too late for that, and as ``messages`` does.
+        Raises McaptrackError at the first message with a later time, and as ``messages`` does.
         """
         for message in self.messages(topic):
             if message.t_ns > MAX_NS:
-                self.times(topic)  # which says so
+                self.times(topic)  # raises the error
             yield message
 
     def merged(
         self, topics: Iterable[str], start_ns: int | None = None, end_ns: int | None = None
     ) -> Iterator[tuple[str, Message]]:
-        """The messages of several channels by time, with their topics; those of one time in the order of topics."""
+        """The messages of several topics in time order, each with its topic; equal times in the order of ``topics``."""
 
         def named(topic: str) -> Iterator[tuple[str, Message]]:
             return ((topic, message) for message in self.messages(topic, start_ns, end_ns))
@@ -243,16 +243,16 @@ class Log:
         return heapq.merge(*map(named, topics), key=lambda found: found[1].t_ns)
 
     def rows(self, topic: str, schema: Schema) -> ChannelRows:
-        """All rows of a channel as one array. Raises McaptrackError if the channel holds something else."""
+        """All rows of a channel as one array. Raises McaptrackError if the channel has another schema."""
         if (part := self.part(topic)) is not self:
             return part.rows(topic, schema)
         channel = self.channel(topic)
         if channel.schema_name != schema.name or channel.message_encoding != "protobuf":
             raise McaptrackError(f"{self.path}: {topic} holds {channel.schema_name or 'no schema'}, not {schema.name}")
         channels = self._ids(topic)
-        with self.snapshot.computing(topic):
+        with self.snapshot.reporting_bad_times(topic):
             found = self._messages.columns(channels, schema)
-            self.snapshot.confirm(channels)
+            self.snapshot.confirm_unchanged(channels)
             if found is not None:
                 return found
             messages = list(self.messages(topic))
@@ -264,7 +264,7 @@ class Log:
         return ChannelRows(rows, t_ns, np.array([message.sequence for message in messages], np.int64), counts)
 
     def frames(self, topic: str, schema: Schema) -> list[Frame]:
-        """The same, a frame a message."""
+        """All rows of a channel, one frame for each message."""
         found = self.rows(topic, schema)
         ends = np.cumsum(found.counts)
         columns = (found.t_ns, found.sequence, ends - found.counts, ends)
@@ -272,41 +272,41 @@ class Log:
         return [Frame(t_ns, sequence, found.rows[start:end]) for t_ns, sequence, start, end in spans]
 
     def times(self, topic: str) -> Ints:
-        """The times of a channel's messages, rising, without reading them."""
+        """The sorted times of a channel's messages, (M,) ns, without reading the messages."""
         if (part := self.part(topic)) is not self:
             return part.times(topic)
         channels = self._ids(topic)
-        with self.snapshot.computing(topic):
-            return self.snapshot.still(lambda messages: messages.times(channels), np.array_equal)
+        with self.snapshot.reporting_bad_times(topic):
+            return self.snapshot.consistent(lambda messages: messages.times(channels), np.array_equal)
 
     def places(self, topic: str) -> MessageLocations:
-        """Where the messages of a channel stand in the file of its part, by time, without reading them."""
+        """The locations of a channel's messages in time order, without reading the messages."""
         if (part := self.part(topic)) is not self:
             return part.places(topic)
         channels = self._ids(topic)
-        with self.snapshot.computing(topic):
-            return self.snapshot.still(lambda messages: messages.places(channels), _are_equal)
+        with self.snapshot.reporting_bad_times(topic):
+            return self.snapshot.consistent(lambda messages: messages.places(channels), _are_equal)
 
     def message_at(self, chunk_offset: int | None, offset: int) -> tuple[str, Message]:
-        """The message at a place in this file, results aside, and its topic; one chunk is opened.
+        """The message at a location in this file (not in its sidecar), and its topic; one chunk is opened.
 
-        Raises McaptrackError if none stands there.
+        Raises McaptrackError if there is none.
         """
-        with self.snapshot.mending():
+        with self.snapshot.reporting_damage():
             channel, message = self._messages.at(chunk_offset, offset)
             if channel not in self.index.channels:
-                raise Damaged(f"a message of channel {channel}, which is not described anywhere")
-            self.snapshot.confirm([channel])
+                raise Damaged(f"there is a message of channel {channel}, which has no channel record")
+            self.snapshot.confirm_unchanged([channel])
             return self.index.channels[channel].topic, message
 
     def fingerprint(self, topic: str | None = None) -> str:
-        """SHA-256 of what the file says a channel, or all of it, is: another one when anything of it has changed.
+        """A SHA-256 that identifies the content of a channel, or of the whole log: it changes with any change of that.
 
-        Made of records and checksums, so that no message is read but where checksums are missing.
+        It is made of index records and stored checksums; messages are read only where checksums are missing.
         """
         if topic is not None and (part := self.part(topic)) is not self:
             return part.fingerprint(topic)
-        with self.snapshot.mending():
+        with self.snapshot.reporting_damage():
             if topic is not None:
                 self.channel(topic)
                 those = [self._fingerprint(one.id) for one in self._by_topic[topic]]
@@ -315,7 +315,7 @@ class Log:
             return whole[0] if len(whole) == 1 else hashlib.sha256("".join(whole).encode()).hexdigest()
 
     def _fingerprint(self, channel_id: int | None = None) -> str:
-        return self.snapshot.still(lambda messages: messages.fingerprint(channel_id), str.__eq__)
+        return self.snapshot.consistent(lambda messages: messages.fingerprint(channel_id), str.__eq__)
 
 
 def _are_equal(one: MessageLocations, other: MessageLocations) -> bool:
@@ -323,10 +323,25 @@ def _are_equal(one: MessageLocations, other: MessageLocations) -> bool:
 
 
 def read(path: Path, *, sidecar: bool | Callable[[Log], bool] | None = None) -> Log:
-    """Open a log, with its results if they stand beside it; with ``sidecar`` they do from now on, without it never.
+    """Open a log.
 
-    ``sidecar`` may also be what decides, given the log alone. Raises McaptrackError, in one line, if it is none or is
-    damaged.
+    Parameters
+    ----------
+    path : Path
+        An MCAP file.
+    sidecar : bool or callable, optional
+        Whether to open the log with its sidecar, LOG.results.mcap: by default if it exists; True creates it, False
+        ignores it. A callable gets the log alone and returns which.
+
+    Returns
+    -------
+    Log
+        Close it, or use it as a context manager.
+
+    Raises
+    ------
+    McaptrackError
+        If the file is missing, not an MCAP file, or damaged.
     """
     log, beside = Log(path), results_path(path)
     try:
@@ -337,7 +352,7 @@ def read(path: Path, *, sidecar: bool | Callable[[Log], bool] | None = None) -> 
             if is_new:
                 with create(beside):
                     pass
-            log.add_results(Log(beside), is_new)
+            log.attach_results(Log(beside), is_new)
     except BaseException:
         log.__exit__()
         raise
@@ -345,5 +360,5 @@ def read(path: Path, *, sidecar: bool | Callable[[Log], bool] | None = None) -> 
 
 
 def topics_with_schema(log: Log, names: Sequence[str]) -> list[Channel]:
-    """The channels that hold one of these schemas, in order of topic."""
+    """The channels with one of these schemas, sorted by topic."""
     return [channel for _, channel in sorted(log.channels.items()) if channel.schema_name in names]

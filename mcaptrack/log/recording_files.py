@@ -1,4 +1,4 @@
-"""Recordings that are not MCAP files, detected by their first bytes: `mcaptrack ingest` makes logs of them."""
+"""Detect recordings in other formats than MCAP by their first bytes; `mcaptrack ingest` converts them."""
 
 from __future__ import annotations
 
@@ -17,16 +17,18 @@ _SPLIT: Final = re.compile(r"(.+?)_(\d{1,9})(\.(?:mcap|db3)(?:\.zstd)?)")
 
 
 def refuse_non_mcap(path: Path) -> None:
-    """Raise McaptrackError for a recording of another kind, with the command that makes a log of it.
+    """Raise McaptrackError for a recording in another format, with the command that converts it to a log.
 
-    Everything else is for whoever opens it to judge.
+    Other files pass: opening them reports what is wrong.
     """
     try:
         what = _folder(path) if path.is_dir() else _file(path) if path.is_file() else ""
     except OSError:
         return
     if what:
-        other_name = ("-o", "OTHER.mcap") if path.suffix == ".mcap" else ()  # a log would have the same name
+        other_name = (
+            ("-o", "OTHER.mcap") if path.suffix == ".mcap" else ()
+        )  # the default output would have the same name
         make = command("ingest", path, *other_name)
         raise McaptrackError(f"{path} is {what}, not an MCAP file; {make} makes a log of it")
 
@@ -35,14 +37,14 @@ def _folder(path: Path) -> str:
     if (path / "metadata.yaml").is_file():
         return "a rosbag2 folder"
     parts = split_files_in(path)
-    is_log = len(parts) == 1 and parts[0].suffix == ".mcap"  # which needs no folder
+    is_log = len(parts) == 1 and parts[0].suffix == ".mcap"  # which can be given itself
     return "a folder with a recording" if parts and not is_log else ""
 
 
 def split_files_in(folder: Path) -> list[Path]:
-    """The files of the only recording in a folder without a metadata.yaml, in order; none if there is none, or several.
+    """The files of the single recording in a folder without metadata.yaml, in order; empty if there is none or several.
 
-    One file, or several whose names count as rosbag2 does: drive_0.mcap, drive_1.mcap.
+    That is one file, or a recording that rosbag2 has split: drive_0.mcap, drive_1.mcap.
     """
     names = [entry.name for entry in folder.iterdir() if entry.name.endswith(_PARTS)]
     names = [name for name in names if not name.endswith(RESULTS_SUFFIX)]

@@ -1,6 +1,6 @@
-"""MCAP records <-> bytes, from the MCAP specification (version 0). Only this package knows them.
+"""MCAP records <-> bytes, by the MCAP specification (version 0). Only this package knows them.
 
-Numbers are little endian; strings, arrays and maps carry their length in bytes before them.
+Integers are little endian; strings, arrays and maps are preceded by their length in bytes.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from typing import Final, NamedTuple, Protocol, overload
 from mcaptrack.errors import McaptrackError
 
 MAGIC: Final = b"\x89MCAP0\r\n"
-#: How much of a file is worked on at once where all of it is.
+#: Block size in bytes for work on a whole file.
 BLOCK: Final = 8 * 2**20
 
 _HEAD: Final = struct.Struct("<BQ")
 MESSAGE_HEAD: Final = struct.Struct("<HIQQ")
 RECORD_MESSAGE_HEAD: Final = struct.Struct("<BQHIQQ")
 FOOTER_BODY: Final = struct.Struct("<QQI")
-#: A chunk up to its records, by its compression: times, size, checksum, length of the name, the name, size of the data.
+#: The head of a chunk, by compression: times, size, checksum, length of the name, the name, size of the records.
 _CHUNK_HEADS: Final = {name: struct.Struct(f"<QQQII{len(name)}xQ") for name in (b"zstd", b"", b"lz4")}
 _CHUNK_NAME_AT: Final = struct.calcsize("<QQQII")
 _CHUNK_HEAD_SIZE: Final = max(layout.size for layout in _CHUNK_HEADS.values())
@@ -32,10 +32,10 @@ _CHUNK_INDEX_OFFSET: Final = struct.Struct("<HQ")
 _CHUNK_INDEX_NAME: Final = struct.Struct("<QI")
 _CHUNK_INDEX_SIZES: Final = struct.Struct("<QQ")
 _CRC_POLYNOMIAL: Final = 0xEDB88320
-#: So much of a record is looked at together, so many records in a row, and so much is summed at once.
-_NEAR: Final = 1024
-_WALKED: Final = 64 * 2**10
-_SUMMED: Final = 2**20
+#: Bytes read at once: of one record, of consecutive records, and for a checksum.
+_LOOKAHEAD: Final = 1024
+_WALK_BLOCK: Final = 64 * 2**10
+_CRC_BLOCK: Final = 2**20
 
 
 class Opcode(IntEnum):
@@ -59,7 +59,7 @@ class Opcode(IntEnum):
 
 
 class Bytes(Protocol):
-    """Bytes that can be sliced: in memory (memoryview), or in a file (``ByteSource``), where a slice is read."""
+    """Bytes that can be sliced: in memory (memoryview) or in a file (``ByteSource``, which reads the slice)."""
 
     def __len__(self) -> int: ...
 
@@ -71,7 +71,7 @@ class Bytes(Protocol):
 
 
 class Record(NamedTuple):
-    """A record in a buffer: its opcode, where it starts, where its body starts, and where it ends."""
+    """A record in a buffer: its opcode, its offset, and the start and end of its body."""
 
     opcode: int
     start: int
@@ -95,7 +95,7 @@ class ChannelRecord(NamedTuple):
 
 
 class ChunkHead(NamedTuple):
-    """A chunk without its records, which stand in the buffer from ``start`` to ``end``."""
+    """The head of a chunk, whose records are in the buffer from ``start`` to ``end``."""
 
     start_ns: int
     end_ns: int
@@ -119,23 +119,23 @@ class ChunkIndexRecord(NamedTuple):
 
 
 class Damaged(McaptrackError):
-    """Bytes that are no MCAP, and at which byte, if that is known."""
+    """Bytes that violate the MCAP format, and their offset if it is known."""
 
     def __init__(self, words: str, at: int | None = None) -> None:
         super().__init__(words if at is None else f"byte {at}: {words}")
         self._words, self._at = words, at
 
     def moved(self, base: int) -> Damaged:
-        """The same, found in a part of a file that begins at byte ``base``."""
+        """The same error with its offset moved by ``base``, where the part of the file begins."""
         return Damaged(self._words, None if self._at is None else self._at + base)
 
 
 class Reader:
-    """Reads fields of one record body; never beyond its end."""
+    """Reads the fields of one record, never beyond its end."""
 
     def __init__(self, buffer: Bytes, start: int, end: int) -> None:
         self._buffer, self.at, self._end = buffer, start, end
-        self._near, self._near_from = buffer[start : min(end, start + _NEAR)], start  # most records are short
+        self._near, self._near_from = buffer[start : min(end, start + _LOOKAHEAD)], start  # most records are short
 
     def _at(self, at: int, size: int) -> memoryview:
         low = at - self._near_from
@@ -155,7 +155,7 @@ class Reader:
         self._take(size)
 
     def span(self, length_size: int = 4) -> tuple[int, int]:
-        """Where bytes stand that have their length before them."""
+        """Start and end of bytes that are preceded by their length."""
         size = self.number(length_size)
         at = self._take(size)
         return at, at + size
@@ -196,26 +196,26 @@ class Reader:
 
 
 def walk(buffer: Bytes, start: int, end: int) -> Iterator[Record]:
-    """The records that stand one after another between two offsets. Raises Damaged where there is none."""
+    """The consecutive records between two offsets. Raises Damaged where there is no record."""
     at = base = start
     near = buffer[start:start]
     while at < end:
         if at + _HEAD.size > base + len(near):
-            base, near = at, buffer[at : min(at + _WALKED, end)]
+            base, near = at, buffer[at : min(at + _WALK_BLOCK, end)]
         record = _record(near, at - base, at, end)
         yield record
         at = record.end
 
 
 def record_at(buffer: Bytes, offset: int) -> Record:
-    """The record that stands at an offset. Raises Damaged if there is none."""
+    """The record at an offset. Raises Damaged if there is none."""
     if not 0 <= offset < len(buffer):
-        raise Damaged(f"a record is said to stand at byte {offset} of {len(buffer)}")
+        raise Damaged(f"an index places a record at byte {offset} of {len(buffer)}")
     return _record(buffer[offset : offset + _HEAD.size], 0, offset, len(buffer))
 
 
 def _record(near: memoryview, low: int, at: int, end: int) -> Record:
-    """The record that begins at byte ``at``, which is byte ``low`` of what is near."""
+    """The record at offset ``at``, which is byte ``low`` of ``near``."""
     if end - at < _HEAD.size:
         raise Damaged(f"{end - at} bytes are too few for a record", at)
     opcode, length = _HEAD.unpack_from(near, low)
@@ -228,13 +228,13 @@ def _record(near: memoryview, low: int, at: int, end: int) -> Record:
 
 
 def crc_before(crc: int, tail_crc: int, tail_size: int) -> int:
-    """The CRC-32 of some bytes, from that of the same bytes with a tail behind them, whose CRC and size are given.
+    """The CRC-32 of the first part of some bytes, from the CRC of all of them and the CRC and size of the rest.
 
-    The CRC of a whole is that of its first part, shifted by as many zeros as the second part is long, plus that of the
-    second part (as zlib's crc32_combine has it); a shift can be undone.
+    The CRC of a concatenation is the CRC of the first part, shifted by the length of the second part, plus the CRC of
+    the second part (zlib's crc32_combine). The shift can be inverted.
     """
     shifted = crc ^ tail_crc
-    # One zero bit back, as what becomes of each of the 32 bits; squared, it goes back two, four, eight.
+    # The inverse shift by one bit as a 32 x 32 bit matrix; its squares shift back by two, four, eight bits.
     back = [1 << bit + 1 for bit in range(31)] + [(1 << 31 ^ _CRC_POLYNOMIAL) << 1 & 0xFFFFFFFF | 1]
     bits = 8 * tail_size
     while bits:
@@ -246,7 +246,7 @@ def crc_before(crc: int, tail_crc: int, tail_size: int) -> int:
 
 
 def _times(columns: Sequence[int], vector: int) -> int:
-    """A matrix over bits times a vector of bits."""
+    """Product of a bit matrix and a bit vector, over GF(2)."""
     out = 0
     for column in columns:
         if vector & 1:
@@ -267,7 +267,7 @@ def read_channel(buffer: Bytes, record: Record) -> ChannelRecord:
 
 def read_chunk(buffer: Bytes, record: Record) -> ChunkHead:
     near = buffer[record.body : min(record.body + _CHUNK_HEAD_SIZE, record.end)]
-    for name, layout in _CHUNK_HEADS.items():  # those that nearly all chunks have
+    for name, layout in _CHUNK_HEADS.items():  # fast path for the usual compressions
         if len(near) >= layout.size:
             first, last, size, crc, length, data_size = layout.unpack_from(near)
             start = record.body + layout.size
@@ -283,15 +283,15 @@ def read_chunk(buffer: Bytes, record: Record) -> ChunkHead:
 
 
 def read_message_index(buffer: Bytes, record: Record) -> tuple[int, int]:
-    """The channel of a message index and how many messages it lists."""
+    """The channel of a message index and the number of its entries."""
     channel, entries = read_message_entries(buffer, record)
     return channel, len(entries) // 16
 
 
 def read_message_entries(buffer: Bytes, record: Record) -> tuple[int, memoryview]:
-    """The channel of a message index and its entries, log time and offset of 8 bytes each."""
+    """The channel of a message index and its entries: log time and offset, 8 bytes each."""
     if record.opcode != Opcode.MESSAGE_INDEX:
-        raise Damaged("no message index where one belongs", record.start)
+        raise Damaged("there is no message index where the chunk index says", record.start)
     whole = buffer[record.body : record.end]
     if len(whole) < _INDEX_HEAD.size:
         raise Damaged(f"a message index of {len(whole)} bytes", record.start)
@@ -307,7 +307,7 @@ def read_metadata(buffer: Bytes, record: Record) -> tuple[str, dict[str, str]]:
 
 
 class AttachmentRecord(NamedTuple):
-    """An attachment without its data, which stand in the buffer from ``start`` to ``end``."""
+    """The head of an attachment, whose data is in the buffer from ``start`` to ``end``."""
 
     log_ns: int
     create_ns: int
@@ -323,14 +323,14 @@ def read_attachment(buffer: Bytes, record: Record) -> AttachmentRecord:
 
 
 def crc_of(buffer: Bytes, start: int, end: int, crc: int = 0) -> int:
-    """The CRC-32 of a part of a file, going on from that of what stands before; a block in memory at a time."""
-    for at in range(start, end, _SUMMED):
-        crc = zlib.crc32(buffer[at : min(at + _SUMMED, end)], crc)
+    """The CRC-32 of a part of a file, continuing from ``crc``; one block in memory at a time."""
+    for at in range(start, end, _CRC_BLOCK):
+        crc = zlib.crc32(buffer[at : min(at + _CRC_BLOCK, end)], crc)
     return crc
 
 
 def attachment_is_whole(buffer: Bytes, record: Record) -> bool:
-    """Whether the checksum of an attachment is right, or 0 for none."""
+    """Whether the checksum of an attachment is right; 0 means that it has none."""
     crc = int.from_bytes(buffer[record.end - 4 : record.end], "little")
     return not crc or crc_of(buffer, record.body, record.end - 4) == crc
 
@@ -402,7 +402,7 @@ def pack_chunk_index(index: ChunkIndexRecord) -> bytes:
 
 def read_chunk_index(buffer: Bytes, record: Record) -> ChunkIndexRecord:
     whole = buffer[record.body : record.end]
-    with suppress(struct.error, UnicodeDecodeError):  # then what is wrong with it is found out below
+    with suppress(struct.error, UnicodeDecodeError):  # the slow path below reports what is wrong
         first, last, offset, length, size = _CHUNK_INDEX_HEAD.unpack_from(whole)
         at = _CHUNK_INDEX_HEAD.size + size
         offsets = dict(_CHUNK_INDEX_OFFSET.iter_unpack(whole[_CHUNK_INDEX_HEAD.size : at]))

@@ -1,4 +1,4 @@
-"""A whole log as it stands in its file, for whoever passes everything on."""
+"""All records of a log in file order, to copy them to another log."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from mcaptrack.log.writer import LogWriter
 
 
 def stream(log: Log) -> Iterator[tuple[int, Message]]:
-    """The channel (its id) and the message of all messages, a chunk in memory at a time.
+    """All messages in file order, each with the id of its channel; one chunk in memory at a time.
 
     Raises McaptrackError where the log is damaged, and at the end if it was changed meanwhile.
     """
-    source = log.snapshot.source.front_to_back()
-    with log.snapshot.mending():
+    source = log.snapshot.source.sequential()
+    with log.snapshot.reporting_damage():
         for record in walk(source, len(MAGIC), log.index.data_end):
             if record.opcode == Opcode.MESSAGE:
                 yield _message(source, record)
@@ -27,7 +27,7 @@ def stream(log: Log) -> Iterator[tuple[int, Message]]:
                 for inner in walk(content, 0, len(content)):
                     if inner.opcode == Opcode.MESSAGE:
                         yield _message(content, inner)
-        log.snapshot.confirm_all()
+        log.snapshot.confirm_file_unchanged()
 
 
 def _message(buffer: Bytes, record: Record) -> tuple[int, Message]:
@@ -37,17 +37,17 @@ def _message(buffer: Bytes, record: Record) -> tuple[int, Message]:
 
 
 def header(log: Log) -> tuple[str, str]:
-    """The profile that the log's header names, and the library that wrote it."""
-    with log.snapshot.mending():
+    """The profile and the library in the header of a log."""
+    with log.snapshot.reporting_damage():
         whole = log.snapshot.record(len(MAGIC))
         return records.read_header(whole, records.record_at(whole, 0))
 
 
 def copy_attachments_and_metadata(log: Log, writer: LogWriter, *, without: Collection[str] = ()) -> None:
-    """Write the log's attachments, and its metadata records of all names but these, as they are."""
-    with log.snapshot.mending():
+    """Copy the attachments of a log, and its metadata records except those named in ``without``."""
+    with log.snapshot.reporting_damage():
         for listed in log.index.metadata:
             if listed.name not in without:
-                writer.put_metadata(bytes(log.snapshot.record(listed.offset)))
+                writer.copy_metadata(bytes(log.snapshot.record(listed.offset)))
         for listed in log.index.attachments:
-            writer.put_attachment(bytes(log.snapshot.record(listed.offset)))
+            writer.copy_attachment(bytes(log.snapshot.record(listed.offset)))

@@ -1,9 +1,9 @@
-"""Writing a log, record after record, and the summary behind them.
+"""Write a log record by record, and its summary.
 
-Pictures go to chunks of their own, uncompressed, because they are compressed already; rows go to zstd chunks of the
-stage that made them, so that a stage that is run again leaves its old chunks out as they are. What is drawn of rows
-repeats itself from message to message, which a stronger compression finds. Every chunk describes the channels it holds:
-it can be read if it is all that is left.
+Pictures are written to separate, uncompressed chunks, because they are compressed already. Rows are written to zstd
+chunks, separate for each stage: when a stage is run again, its old chunks are dropped without opening others. Views
+also get separate chunks. Every chunk contains the schemas and channels of its messages, so that it can be read even if
+it is all that is left of a file.
 """
 
 from __future__ import annotations
@@ -25,61 +25,61 @@ from mcaptrack.files import publish_stream
 from mcaptrack.log import journal, records
 from mcaptrack.log.byte_source import ByteSource, OpenFile
 from mcaptrack.log.chunks import LOG_MAX_NS
-from mcaptrack.log.index import Index, Listed, list_attachment, list_metadata, read_index
+from mcaptrack.log.index import Index, SummaryEntry, attachment_entry, metadata_entry, read_index
 from mcaptrack.log.paths import RESULTS_SUFFIX, results_path
 from mcaptrack.log.records import MAGIC, ChannelRecord, ChunkIndexRecord, Damaged, Opcode, SchemaRecord, crc_of
 
-#: What the headers of our logs name as their writer, before the version.
+#: The library name in the header record, before the version.
 LIBRARY: Final = "mcaptrack"
 
-Kind = Literal["media", "rows", "views"]
+ChunkKind = Literal["media", "rows", "views"]
 
-_CHUNK_BYTES: Final[Mapping[Kind, int]] = {"media": 4 * 2**20, "rows": 2**20, "views": 2**20}
-#: Views say the same again and again: the quickest level makes them smaller than the usual one.
-_ZSTD_LEVEL: Final[Mapping[Kind, int]] = {"rows": 3, "views": 1}
+_CHUNK_BYTES: Final[Mapping[ChunkKind, int]] = {"media": 4 * 2**20, "rows": 2**20, "views": 2**20}
+#: Views are so repetitive that the fastest level makes them smaller than the default one.
+_ZSTD_LEVEL: Final[Mapping[ChunkKind, int]] = {"rows": 3, "views": 1}
 _MAX_ID: Final = 2**16 - 1
 
 
 class Sink(Protocol):
-    """Where bytes go, one after another."""
+    """A destination for bytes, written sequentially."""
 
     def write(self, data: bytes, /) -> object:
-        """Put bytes behind those that were written."""
+        """Append bytes."""
 
 
 @dataclass
 class _OpenChunk:
-    """Records that wait to become a chunk, and for each channel the times and places of its messages."""
+    """A chunk under construction: its records, and log time and offset of each channel's messages."""
 
-    kind: Kind
+    kind: ChunkKind
     parts: list[bytes] = field(default_factory=list)
     size: int = 0
     entries: dict[int, array[int]] = field(default_factory=dict)  # time, offset, time, offset ...
 
 
 class LogWriter:
-    """Writes an MCAP file from front to back; made by ``create`` and ``extend``.
+    """Writes an MCAP file sequentially; made by ``create`` and ``extend``.
 
-    With an ``index`` it goes on at ``offset`` behind what that index describes, ``crc`` being the checksum of all bytes
-    so far, or None if nobody knows it.
+    With an ``index`` it continues at ``offset`` after the indexed records; ``crc`` is the checksum of all bytes so far,
+    None if it is not known.
     """
 
     def __init__(self, sink: Sink, offset: int = 0, crc: int | None = 0, index: Index | None = None) -> None:
         index = index or Index()
         self._sink, self.offset = sink, offset
-        #: The checksum of the data section, or of what this writer added to it where the rest is not known.
+        #: The checksum of the data section; only of what this writer added, if the rest is not known.
         self.crc = crc or 0
         self._crc_known = crc is not None
         self.schemas: dict[int, SchemaRecord] = index.schemas
         self.channels: dict[int, ChannelRecord] = index.channels
         self.counts: dict[int, int] = index.counts
         self.chunks: list[ChunkIndexRecord] = index.chunks
-        self._attachments: list[Listed] = index.attachments
-        self._metadata: list[Listed] = index.metadata
+        self._attachments: list[SummaryEntry] = index.attachments
+        self._metadata: list[SummaryEntry] = index.metadata
         full = [chunk for chunk in index.chunks if chunk.message_index_offsets]
         self._times = (min(c.start_ns for c in full), max(c.end_ns for c in full)) if full else None
-        self._groups: dict[int, tuple[Kind, str]] = {}
-        self._open: dict[tuple[Kind, str], _OpenChunk] = {}
+        self._groups: dict[int, tuple[ChunkKind, str]] = {}
+        self._open: dict[tuple[ChunkKind, str], _OpenChunk] = {}
         self._topics = {channel.topic for channel in self.channels.values()}
         self._schema_ids = {(s.name, s.encoding, bytes(s.data)): s.id for s in reversed(self.schemas.values())}
         self._last = max(self.schemas, default=0), max(self.channels, default=0)
@@ -87,7 +87,9 @@ class LogWriter:
     # Adding
 
     def header(self, profile: str = "", record: bytes | None = None) -> None:
-        """The first bytes; ``profile`` as in the MCAP registry, "" for none; ``record`` the header of another log."""
+        """Write magic bytes and header: with a ``profile`` of the MCAP registry, or the header ``record`` of another
+        log.
+        """
         self.write(MAGIC)
         self.write(
             record or records.pack(Opcode.HEADER, records.text(profile), records.text(f"{LIBRARY} {__version__}"))
@@ -99,15 +101,15 @@ class LogWriter:
         schema: tuple[str, str, bytes],
         message_encoding: str,
         metadata: Mapping[str, str],
-        kind: Kind = "rows",
+        kind: ChunkKind = "rows",
         group: str = "",
         *,
         another: bool = False,
     ) -> int:
-        """A new channel; returns its id. ``schema`` is its name, encoding and data; ("", "", b"") is none.
+        """Add a channel and return its id. ``schema`` is name, encoding and data; ("", "", b"") is no schema.
 
-        Channels of one ``group`` share chunks. Raises McaptrackError if the topic is taken and ``another`` channel of
-        it is not asked for, and if there are 65 535 channels.
+        Channels with the same ``group`` share chunks. Raises McaptrackError if the topic exists already, unless
+        ``another`` channel with it is wanted, and if there are 65 535 channels.
         """
         if topic in self._topics and not another:
             raise McaptrackError(f"there is a channel {topic} already")
@@ -126,9 +128,11 @@ class LogWriter:
     def add_message(
         self, channel_id: int, t_ns: int, sequence: int, payload: bytes, publish_ns: int | None = None
     ) -> None:
-        """A message of a channel that was added. Raises McaptrackError for times that no log can hold."""
+        """Write a message of an added channel. Raises McaptrackError for times that MCAP can't store."""
         if not 0 <= t_ns <= LOG_MAX_NS:
-            raise McaptrackError(f"{t_ns} ns is no time for a log; times run from 0 (1970) to 2^64 - 1 ns (2554)")
+            raise McaptrackError(
+                f"{t_ns} ns is not a time that a log can store; times run from 0 (1970) to 2^64 - 1 ns (2554)"
+            )
         group = self._groups[channel_id]
         chunk = self._open.get(group) or self._new_chunk(group)
         entries = chunk.entries.get(channel_id)
@@ -146,23 +150,25 @@ class LogWriter:
             self._close_chunk(group)
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
-        """A metadata record."""
-        self.put_metadata(records.pack(Opcode.METADATA, records.text(name), records.text_map(values)))
+        """Write a metadata record."""
+        self.copy_metadata(records.pack(Opcode.METADATA, records.text(name), records.text_map(values)))
 
     def add_attachment(self, name: str, media_type: str, data: bytes) -> None:
-        """A file inside the log."""
+        """Write an attachment."""
         body = bytes(16) + records.text(name) + records.text(media_type) + records.raw(data, 8)
-        self.put_attachment(records.pack(Opcode.ATTACHMENT, body, records.number(zlib.crc32(body), 4)))
+        self.copy_attachment(records.pack(Opcode.ATTACHMENT, body, records.number(zlib.crc32(body), 4)))
 
-    # Passing on
+    # Copying records of another log
 
-    def put_description(self, channel_id: int) -> None:
-        """The records that describe a channel, outside of chunks."""
+    def write_description(self, channel_id: int) -> None:
+        """Write the schema and channel records of a channel, outside of chunks."""
         self.write(self._description(channel_id))
 
-    def put_message(self, channel_id: int, t_ns: int, message: memoryview) -> None:
-        """The record of a message that stood outside of chunks. Readers that go by indexes would not find it there."""
-        group: tuple[Kind, str] = ("rows", "")
+    def copy_message(self, channel_id: int, t_ns: int, message: memoryview) -> None:
+        """Copy a message that was outside of chunks into a chunk, because readers that use the index don't find it
+        there.
+        """
+        group: tuple[ChunkKind, str] = ("rows", "")
         chunk = self._open.get(group) or self._new_chunk(group)
         if channel_id not in chunk.entries:
             self._describe(chunk, channel_id)
@@ -170,20 +176,20 @@ class LogWriter:
         if chunk.size >= _CHUNK_BYTES["rows"]:
             self._close_chunk(group)
 
-    def put_metadata(self, record: bytes) -> None:
-        """A whole metadata record."""
+    def copy_metadata(self, record: bytes) -> None:
+        """Copy a metadata record."""
         buffer = memoryview(record)
-        self._metadata.append(list_metadata(buffer, records.record_at(buffer, 0), self.offset))
+        self._metadata.append(metadata_entry(buffer, records.record_at(buffer, 0), self.offset))
         self.write(record)
 
-    def put_attachment(self, record: bytes) -> None:
-        """A whole attachment record."""
+    def copy_attachment(self, record: bytes) -> None:
+        """Copy an attachment record."""
         buffer = memoryview(record)
-        self._attachments.append(list_attachment(buffer, records.record_at(buffer, 0), self.offset))
+        self._attachments.append(attachment_entry(buffer, records.record_at(buffer, 0), self.offset))
         self.write(record)
 
-    def put_chunk(self, record: bytes, known: ChunkIndexRecord, indexes: Mapping[int, bytes]) -> None:
-        """A whole chunk, and behind it the entries of its message indexes (time and offset, 8 bytes each)."""
+    def copy_chunk(self, record: bytes, known: ChunkIndexRecord, indexes: Mapping[int, bytes]) -> None:
+        """Copy a chunk, and write its message indexes from their entries (time and offset, 8 bytes each)."""
         start = self.offset
         self.write(record)
         index_start, offsets = self.offset, {}
@@ -198,8 +204,8 @@ class LogWriter:
             low, high = self._times or (known.start_ns, known.end_ns)
             self._times = (min(low, known.start_ns), max(high, known.end_ns))
 
-    def put_part_of_chunk(self, kind: Kind, parts: Iterable[tuple[int, int, memoryview]]) -> None:
-        """What is kept of a chunk, as a chunk: channel (-1 for no message), log time and record of each part."""
+    def write_kept_records(self, kind: ChunkKind, parts: Iterable[tuple[int, int, memoryview]]) -> None:
+        """Write kept records as a new chunk: each with its channel (-1 if it is not a message) and log time."""
         chunk = _OpenChunk(kind)
         for channel_id, t_ns, record in parts:
             _append(chunk, channel_id, t_ns, record)
@@ -207,7 +213,7 @@ class LogWriter:
             self._put(chunk)
 
     def write(self, data: bytes) -> None:
-        """Bytes of the data section, as they are."""
+        """Write bytes of the data section."""
         self._sink.write(data)
         self.crc = zlib.crc32(data, self.crc)
         self.offset += len(data)
@@ -215,11 +221,11 @@ class LogWriter:
     # Finishing
 
     def finish(self) -> int:
-        """Close the open chunks, write the summary and the footer. Returns how many messages the file holds."""
+        """Close the open chunks, write summary and footer. Returns the number of messages in the file."""
         for group in tuple(self._open):
             self._close_chunk(group)
-        for channel_id in self._groups.keys() - self.counts.keys():  # those that no chunk describes
-            self.put_description(channel_id)
+        for channel_id in self._groups.keys() - self.counts.keys():  # without messages, so no chunk describes them
+            self.write_description(channel_id)
         data_crc = self.crc if self._crc_known else 0
         self._sink.write(records.pack(Opcode.DATA_END, records.number(data_crc, 4)))
         self._sink.write(self._summary(self.offset + 13))
@@ -236,7 +242,7 @@ class LogWriter:
         }
         summary, offsets = bytearray(), bytearray()
         for opcode, parts in groups.items():
-            if parts:  # an empty group has no offset: some readers take one for damage
+            if parts:  # no offset for an empty group: some readers report it as damage
                 group = b"".join(parts)
                 where = records.number(start + len(summary), 8) + records.number(len(group), 8)
                 offsets += records.pack(Opcode.SUMMARY_OFFSET, records.number(opcode, 1), where)
@@ -261,13 +267,13 @@ class LogWriter:
         counts = records.number_map(self.counts, 2, 8)
         return records.pack(Opcode.STATISTICS, *(records.number(value, size) for value, size in sizes), counts)
 
-    # Inside
+    # Chunks
 
-    def _new_chunk(self, group: tuple[Kind, str]) -> _OpenChunk:
+    def _new_chunk(self, group: tuple[ChunkKind, str]) -> _OpenChunk:
         return self._open.setdefault(group, _OpenChunk(group[0]))
 
     def _describe(self, chunk: _OpenChunk, channel_id: int) -> array[int]:
-        """Put the records that describe a channel into a chunk, before its first message there."""
+        """Write the schema and channel records of a channel into a chunk, before its first message there."""
         words = self._description(channel_id)
         chunk.parts.append(words)
         chunk.size += len(words)
@@ -278,7 +284,7 @@ class LogWriter:
         schema = records.pack_schema(self.schemas[channel.schema_id]) if channel.schema_id else b""
         return schema + records.pack_channel(channel)
 
-    def _close_chunk(self, group: tuple[Kind, str]) -> None:
+    def _close_chunk(self, group: tuple[ChunkKind, str]) -> None:
         self._put(self._open.pop(group))
 
     def _put(self, chunk: _OpenChunk) -> None:
@@ -293,11 +299,11 @@ class LogWriter:
             compression, data = "zstd", zstandard.ZstdCompressor(_ZSTD_LEVEL[chunk.kind]).compress(content)
         record = records.pack_chunk((first, last, len(content), zlib.crc32(content)), compression, data)
         known = ChunkIndexRecord(first, last, 0, len(record), {}, 0, compression, len(data), len(content))
-        self.put_chunk(record, known, {channel: entries.tobytes() for channel, entries in indexes.items()})
+        self.copy_chunk(record, known, {channel: entries.tobytes() for channel, entries in indexes.items()})
 
 
 def _append(chunk: _OpenChunk, channel_id: int, t_ns: int, record: memoryview) -> None:
-    """A whole record into a chunk; ``channel_id`` is -1 if it is no message."""
+    """Append a record to a chunk; ``channel_id`` is -1 if it is not a message."""
     if channel_id >= 0:
         chunk.entries.setdefault(channel_id, array("Q")).extend((t_ns, chunk.size))
     chunk.parts.append(bytes(record))
@@ -305,7 +311,7 @@ def _append(chunk: _OpenChunk, channel_id: int, t_ns: int, record: memoryview) -
 
 
 def _free_id(taken: Mapping[int, object], last: int, what: str) -> int:
-    """The first number after ``last`` that is not taken, or else the lowest."""
+    """The first free id after ``last``, else the lowest free one."""
     free = (number for number in chain(range(last + 1, _MAX_ID + 1), range(1, last + 1)) if number not in taken)
     found = next(free, None)
     if found is None:
@@ -314,7 +320,7 @@ def _free_id(taken: Mapping[int, object], last: int, what: str) -> int:
 
 
 def refuse_earlier_results(path: Path) -> None:
-    """Raise McaptrackError if a new log at ``path`` would be read with results that were made from another."""
+    """Raise McaptrackError if a new log at ``path`` would be read with the sidecar of an earlier one."""
     beside = results_path(path)
     if not path.name.endswith(RESULTS_SUFFIX) and beside.exists():
         raise McaptrackError(
@@ -325,9 +331,12 @@ def refuse_earlier_results(path: Path) -> None:
 
 @contextmanager
 def create(path: Path, profile: str = "", *, header: bytes | None = None) -> Iterator[LogWriter]:
-    """A new log at ``path``, there once the block has ended well. ``header`` is the header record of another."""
+    """Write a new log, which is published at ``path`` when the block succeeds.
+
+    ``header`` is the header of another log.
+    """
     refuse_earlier_results(path)
-    is_half_written = journal.is_left(path)
+    is_half_written = journal.is_left_behind(path)
     with publish_stream(path) as stream:
         writer = LogWriter(stream)
         writer.header(profile, header)
@@ -335,14 +344,14 @@ def create(path: Path, profile: str = "", *, header: bytes | None = None) -> Ite
         messages = writer.finish()
         stream.flush()
         verify(Path(stream.name), writer, messages)
-    if is_half_written:  # the log that it belonged to is gone
+    if is_half_written:  # of the log that was replaced
         journal.remove(path)
 
 
 def verify(path: Path, writer: LogWriter, messages: int, start: int = 0, crc: int = 0) -> None:
-    """Read back what was written from ``start`` on, ``crc`` being the checksum of what was there before.
+    """Read back what was written from ``start`` on; ``crc`` is the checksum of the bytes before it.
 
-    Raises McaptrackError if it is not what was written, or does not add up: then it must not stay.
+    Raises McaptrackError if it differs from what was written; then it must not be published.
     """
     file = OpenFile.at(path)
     try:
@@ -356,6 +365,6 @@ def verify(path: Path, writer: LogWriter, messages: int, start: int = 0, crc: in
         file.close()
     if not is_right:
         raise McaptrackError(
-            f"of {messages} messages that were written {readable} can be read again, or others; "
-            "the log does not add up, and is left as it was"
+            f"{path}: {readable} messages are read back of {messages} that were written, or their checksum differs; "
+            "the log is left as it was"
         )

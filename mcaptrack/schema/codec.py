@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mcaptrack.geometry.ragged import ragged_range
 from mcaptrack.schema.proto import KINDS, Definition
 
 if TYPE_CHECKING:
@@ -107,11 +108,9 @@ class RowCodec:
         counts, over = np.divmod(end - start, size)
         if over.any():
             return None
-        total = int(counts.sum())
-        if total == 0:
+        if not counts.any():
             return np.empty(0, self.dtype), counts
-        first = np.repeat(start - size * (np.cumsum(counts) - counts), counts) + size * np.arange(total)
-        block = np.lib.stride_tricks.sliding_window_view(raw, size)[first]
+        block = np.lib.stride_tricks.sliding_window_view(raw, size)[ragged_range(start, counts, step=size)]
         # A column at a time: few bytes of a row are fixed.
         if any(((block[:, at] & mask) != tag).any() for at, mask, tag in self._fixed_bytes):
             return None

@@ -141,7 +141,7 @@ class RecordingJob(Job):
         for number in writer.channels:
             self._written[number] = opened.index.counts.get(number, 0)
             if not self._written[number]:  # some writers describe channels without messages in the summary alone
-                writer.put_description(number)
+                writer.write_description(number)
         self._report({number: channel.topic for number, channel in writer.channels.items()})
         if len(self._connections) == 1:
             return timeline_of(opened, self.pictures)
