@@ -1,4 +1,4 @@
-"""The environment variables that are not options of a command, in one list: any other name is a mistake."""
+"""The list of environment variables that are not options of a command; other names are reported as mistakes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Final
 from mcaptrack.errors import McaptrackError
 
 PREFIX: Final = "MCAPTRACK_"
-#: Names and meanings.
+#: Names and descriptions.
 VARIABLES: Final[Mapping[str, str]] = MappingProxyType(
     {
         "MCAPTRACK_MAX_CHUNK_MIB": "chunks of a log that say they are larger than this are refused, in MiB",
@@ -22,15 +22,15 @@ VARIABLES: Final[Mapping[str, str]] = MappingProxyType(
 
 
 def variable(name: str) -> str:
-    """The value of one of ``VARIABLES``; "" where it is not set. Raises KeyError for a name that isn't listed."""
+    """The value of one of ``VARIABLES``; "" if it is not set. Raises KeyError for a name that isn't listed."""
     VARIABLES[name]
     return os.environ.get(name, "")
 
 
 def whole_number(name: str, otherwise: int) -> int:
-    """The value of one of ``VARIABLES`` as a number, at least 1; ``otherwise`` where it is not set.
+    """The value of one of ``VARIABLES`` as a whole number, at least 1; ``otherwise`` if it is not set.
 
-    Raises McaptrackError for a value that is none.
+    Raises McaptrackError if the value is not such a number.
     """
     text = variable(name)
     if not text:
@@ -41,5 +41,5 @@ def whole_number(name: str, otherwise: int) -> int:
 
 
 def hush_libraries() -> None:
-    """Keep OpenCV from printing what it finds wrong with pictures: the command says it, in one line."""
+    """Silence OpenCV's messages about damaged pictures, which the command reports in one line."""
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")

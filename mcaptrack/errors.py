@@ -1,4 +1,4 @@
-"""The one exception for faults that a user can mend, and the commands that its messages propose."""
+"""The exceptions for faults that a user can fix, and the commands that their messages propose."""
 
 from __future__ import annotations
 
@@ -7,21 +7,26 @@ from pathlib import Path
 
 
 class McaptrackError(Exception):
-    """A fault in the input, the options or the machine that its reader can mend.
+    """A fault in the input, the options or the machine that the user can fix.
 
-    The message is one line: what is wrong, where, what there is instead, and what to do. Every other exception is a
-    fault of the program and keeps its traceback.
+    The message is one line: what is wrong, where, what there is instead, and what to do. All other exceptions are
+    faults of the program and keep their traceback.
     """
 
 
 class DamagedError(McaptrackError):
-    """A file whose bytes are not what was written; what can be saved of it, `mcaptrack recover` saves."""
+    """A damaged log; `mcaptrack recover` saves what is intact."""
 
 
 def command(*words: str | Path) -> str:
-    """A command to propose in a message, in backquotes and as a shell takes it: ("run", Path("my log.mcap")).
+    """A command to propose in a message, in backquotes and quoted for a shell.
 
-    A path can't be taken for an option, whatever its name. What the user has to fill in is in capitals (LABELS).
+    A path is never mistaken for an option, whatever its name. Placeholders for the user to fill in are in capitals.
+
+    Examples
+    --------
+    >>> command("run", Path("my log.mcap"), "--truth", "LABELS")
+    "`mcaptrack run 'my log.mcap' --truth LABELS`"
     """
     return f"`mcaptrack {' '.join(_quoted(word) for word in words)}`"
 
@@ -35,5 +40,5 @@ def _quoted(word: str | Path) -> str:
 
 
 def _escape(character: str) -> str:
-    """A character as bash and zsh read it between $' and '."""
+    """A character in the $'...' syntax of bash and zsh."""
     return "".join(f"\\x{byte:02x}" for byte in character.encode("utf-8", "surrogateescape"))

@@ -1,4 +1,4 @@
-"""Files that are either complete or not there."""
+"""Write files atomically: they are either complete or not there."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from mcaptrack.errors import McaptrackError
 
 @contextmanager
 def publish(path: Path) -> Iterator[Path]:
-    """A path beside ``path`` to write to; when the block ends well the file there takes the place of ``path``.
+    """A temporary path beside ``path`` to write to; when the block succeeds, that file replaces ``path``.
 
-    The bytes are on the disk before the name changes, so whatever happens at whatever time leaves the old file or the
-    new one. If the block fails or is interrupted what it wrote is removed.
+    The bytes are synced to disk before the file is renamed, so that an interruption at any time leaves the old file or
+    the new one. If the block fails, the temporary file is removed.
     """
     _sweep(path)
     part = _part_of(path)
@@ -31,7 +31,7 @@ def publish(path: Path) -> Iterator[Path]:
         lost = keep_attributes(path, part) if path.exists() else []
         os.replace(part, path)
         if lost:
-            notices.warn(f"{path} is a new file now, which could not be given the {' and '.join(lost)} of the old one")
+            notices.warn(f"{path} is a new file now, without the {' and '.join(lost)} of the old one")
     finally:
         with suppress(FileNotFoundError):
             part.unlink()
@@ -40,7 +40,7 @@ def publish(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def publish_stream(path: Path) -> Iterator[IO[bytes]]:
-    """The same with an open file."""
+    """The same with an open file. Raises McaptrackError if it can't be written."""
     try:
         with publish(path) as part, part.open("xb") as stream:
             yield stream
@@ -51,15 +51,15 @@ def publish_stream(path: Path) -> Iterator[IO[bytes]]:
 
 
 def publish_bytes(path: Path, data: bytes) -> None:
-    """The same for a small file. Raises McaptrackError if it can't be written."""
+    """Write a small file atomically. Raises McaptrackError if it can't be written."""
     with publish_stream(path) as stream:
         stream.write(data)
 
 
 def keep_attributes(path: Path, new: Path) -> list[str]:
-    """Give a new file the owner, group, permissions and extended attributes (access control lists, too) of another.
+    """Copy owner, group, permissions and extended attributes (with access control lists) of a file to a new one.
 
-    Returns which of these it could not be given, in words.
+    Returns the names of those that could not be copied.
     """
     there, here = path.stat(), new.stat()
     lost: list[str] = []
@@ -71,7 +71,7 @@ def keep_attributes(path: Path, new: Path) -> list[str]:
             with _noting(name, lost):
                 os.chown(new, *owner)
     with _noting("permissions", lost):
-        new.chmod(there.st_mode & (0o777 if lost else 0o7777))  # no set-user-id for another user
+        new.chmod(there.st_mode & (0o777 if lost else 0o7777))  # no set-user-id bit for another user
     with _noting("extended attributes", lost):
         _keep_extended(path, new)
     return lost
@@ -97,10 +97,10 @@ def _keep_extended(path: Path, new: Path) -> None:
 
 
 def can_replace(path: Path) -> bool:
-    """Whether a new file can take the place of a file, and be like it in all but its content.
+    """Whether a new file can replace a file without losing anything but the old content.
 
-    It can't where the file has other names (hard links), which would go on leading to the old content, or where owner
-    and attributes can't be kept.
+    It can't if the file has hard links, which would still lead to the old content, or if its owner and attributes can't
+    be copied.
     """
     if path.stat().st_nlink > 1:
         return False
@@ -109,7 +109,7 @@ def can_replace(path: Path) -> bool:
         probe.touch(0o600, exist_ok=False)
         return not keep_attributes(path, probe)
     except OSError:
-        return True  # nothing can be made beside it: whoever tries says so
+        return True  # no file can be created here; writing will report that
     finally:
         with suppress(OSError):
             probe.unlink()
@@ -120,7 +120,7 @@ def _part_of(path: Path) -> Path:
 
 
 def _sweep(path: Path) -> None:
-    """Remove what processes that are gone left half written beside ``path``."""
+    """Remove temporary files beside ``path`` of processes that don't run any more."""
     for left in path.parent.glob(f".{glob.escape(path.name)}.*.part"):
         process = left.name.removeprefix(f".{path.name}.").partition(".")[0]
         if process.isdigit() and int(process) != os.getpid() and not _is_running(int(process)):
@@ -138,7 +138,7 @@ def _is_running(process: int) -> bool:
 
 
 def sync_folder(folder: Path) -> None:
-    """Names that were given or taken in a folder are on the disk."""
+    """Sync a folder to disk, with the files created, renamed and removed in it."""
     if not hasattr(os, "O_DIRECTORY"):
         return
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
@@ -149,12 +149,12 @@ def sync_folder(folder: Path) -> None:
 
 
 def follow_links(path: Path) -> Path:
-    """Where a path leads, links followed; links that lead in a circle are left for the one who opens the file."""
+    """A path with symbolic links resolved; circular links are left, and opening the file reports them."""
     return Path(os.path.realpath(path))  # Path.resolve raises RuntimeError for these up to Python 3.12
 
 
 def is_same_file(one: Path, other: Path) -> bool:
-    """Whether two paths lead to one file that is there."""
+    """Whether two paths lead to the same existing file."""
     return one.exists() and other.exists() and one.samefile(other)
 
 
@@ -163,11 +163,11 @@ def refuse_special(path: Path) -> None:
     try:
         mode = path.stat().st_mode
     except OSError:
-        return  # whoever opens it says why
+        return  # opening it reports the reason
     kinds = {stat.S_ISFIFO: "a pipe", stat.S_ISCHR: "a device", stat.S_ISBLK: "a device", stat.S_ISSOCK: "a socket"}
     for is_kind, what in kinds.items():
         if is_kind(mode):
-            raise McaptrackError(f"{path} is {what}, not a file; write what it gives to a file first")
+            raise McaptrackError(f"{path} is {what}, not a file; save its data to a file first")
 
 
 def refuse_overwrite(path: Path, force: bool) -> None:

@@ -1,9 +1,9 @@
-"""Warnings: what was assumed, left out or looks odd, said from anywhere below a command without printing.
+"""Warnings: what was assumed, left out or looks unusual, reported from any layer without printing.
 
-A note (which stage runs, where a file went) is routine and goes to a ``say`` callable. A warning is something that
-changes results or casts doubt on them; it is never hidden, and stands in the JSON of every command. Code warns with
-``warn``; whoever started the work hears it with ``listening`` or ``collected``. Where no one listens, warnings become
-Python's own (``McaptrackWarning``), so that a script or a notebook sees them.
+A note (which stage runs, where a file was written) is routine and goes to a ``say`` callable. A warning is something
+that changes results or casts doubt on them; it is never hidden, and is part of the JSON of every command. Code warns
+with ``warn``; callers receive warnings with ``listening`` or ``collected``. Without a listener, warnings become
+Python warnings (``McaptrackWarning``), so that scripts and notebooks show them.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import Final, Literal, NamedTuple, get_args
 
-#: What kind of thing a warning is about, for programs. docs/warnings.md says what each means.
+#: The codes of warnings, for programs. docs/warnings.md explains them.
 Code = Literal[
     "assumed-ground-plane",
     "camera-moves",
@@ -40,23 +40,23 @@ Code = Literal[
 
 
 def known_code(text: str) -> Code:
-    """A code that was read; "other" for one that this version doesn't know."""
+    """A code from a file; "other" if this version doesn't know it."""
     return next((code for code in get_args(Code) if code == text), "other")
 
 
 class McaptrackWarning(UserWarning):
-    """A warning that no listener heard."""
+    """A warning without a listener."""
 
 
 class Notice(NamedTuple):
-    """A warning: one line for people, a code for programs, and the log that it is about, if it is about one."""
+    """A warning: one line of text, a code for programs, and the log that it is about, if any."""
 
     message: str
     code: Code = "other"
     log: str | None = None
 
     def __str__(self) -> str:
-        """The line, with the name of the log in front unless it is there already."""
+        """The text, preceded by the name of the log unless it starts with it."""
         named = self.log is None or self.message.startswith(self.log)
         return self.message if named else f"{self.log}: {self.message}"
 
@@ -68,7 +68,7 @@ _LOG: Final[ContextVar[str | None]] = ContextVar("log", default=None)
 
 
 def warn(message: str, code: Code = "other") -> None:
-    """Say something that changes results or casts doubt on them: what, where, and what to do."""
+    """Warn of something that changes results or casts doubt on them: what, where, and what to do."""
     _pass_on(Notice(" ".join(message.splitlines()), code, _LOG.get()), _LISTENER.get())
 
 
@@ -81,7 +81,7 @@ def _pass_on(notice: Notice, listener: Listener | None) -> None:
 
 @contextmanager
 def about(log: object) -> Iterator[None]:
-    """Warnings inside are about this log."""
+    """Warnings in this block are about this log."""
     token = _LOG.set(str(log))
     try:
         yield
@@ -91,7 +91,7 @@ def about(log: object) -> Iterator[None]:
 
 @contextmanager
 def listening(listener: Listener) -> Iterator[None]:
-    """Warnings inside go to ``listener`` and nowhere else."""
+    """Warnings in this block go to ``listener`` only."""
     token = _LISTENER.set(listener)
     try:
         yield
@@ -101,7 +101,7 @@ def listening(listener: Listener) -> Iterator[None]:
 
 @contextmanager
 def collected() -> Iterator[list[Notice]]:
-    """Warnings inside are put into a list, and go on to whoever listens outside."""
+    """Collect the warnings of this block in a list, and pass them on to the outer listener."""
     outside, found = _LISTENER.get(), list[Notice]()
 
     def hear(notice: Notice) -> None:

@@ -18,7 +18,7 @@ from mcaptrack.geometry.clocks import FrameClock, seconds_to_ns
 from mcaptrack.geometry.histories import Histories, Holt, fill_gaps, rebuild_positions
 from mcaptrack.geometry.plane import GroundPlane, assumed_plane, plane_at
 from mcaptrack.schema import TRACKS, Frame
-from mcaptrack.schema.resampling import looked_at, resample
+from mcaptrack.schema.resampling import is_observed_at, resample
 from mcaptrack.sources.synthetic import demo_scene
 from tests.worlds import tracks_at
 
@@ -365,5 +365,5 @@ class TestResample:
 
     def test_looking_is_known_between_frames_that_are_close(self):
         frames, times = np.array([0, 10, 50]), np.array([-1, 0, 5, 10, 30, 50, 51])
-        assert looked_at(frames, times, 20).tolist() == [False, True, True, True, False, True, False]
-        assert not looked_at(np.empty(0, int), times, 20).any()
+        assert is_observed_at(frames, times, 20).tolist() == [False, True, True, True, False, True, False]
+        assert not is_observed_at(np.empty(0, int), times, 20).any()

@@ -105,5 +105,5 @@ def test_a_pipe_is_no_file(tmp_path):
         _, err = process.communicate(timeout=60)
         assert (process.returncode, err.splitlines()) == (
             1,
-            ["mcaptrack: pipe is a pipe, not a file; write what it gives to a file first"],
+            ["mcaptrack: pipe is a pipe, not a file; save its data to a file first"],
         )

@@ -178,5 +178,5 @@ def test_what_a_new_file_can_t_be_given_is_said(tmp_path, monkeypatch, refused):
     with notices.listening(lambda _: None), notices.collected() as said:
         publish_bytes(path, b"new")
     assert path.read_bytes() == b"new"
-    expected = f"{path} is a new file now, which could not be given the {refused} of the old one"
+    expected = f"{path} is a new file now, without the {refused} of the old one"
     assert [notice.message for notice in said] == [expected]

@@ -483,7 +483,7 @@ def test_bytes_of_strangers_are_no_key_picture_or_one_but_never_an_accident(name
         unit = codec.inspect(payload)
         assert unit.pictures >= 0
         assert head.has_picture or not head.is_key
-        codec.with_sets(payload, unit.sets)
+        codec.with_parameter_sets(payload, unit.sets)
 
 
 MISTAKES = {

@@ -165,7 +165,7 @@ def test_wide_rows_and_high_field_numbers_are_written_as_by_the_protobuf_runtime
 
 
 def test_bytes_that_are_no_message_are_refused():
-    with pytest.raises(ValueError, match=r"5 bytes are no mcaptrack\.Tracks message"):
+    with pytest.raises(ValueError, match=r"5 bytes are not a mcaptrack\.Tracks message"):
         TRACKS.codec.decode(b"\x0a\xff\xff\xff\xff")
 
 

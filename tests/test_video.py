@@ -72,7 +72,7 @@ def test_every_message_of_a_passed_on_stream_stands_on_its_own(tmp_path, name):
     for picture in pictures(path):
         unit = inspect(picture.data)
         assert picture.data.startswith(b"\x00\x00")
-        assert unit.is_key == unit.has_sets == (picture.index % 10 == 0)
+        assert unit.is_key == unit.has_parameter_sets == (picture.index % 10 == 0)
         assert not unit.reorders
 
 
@@ -199,7 +199,7 @@ BAD = {
         "can't be read as a video",
     ),
     "sound alone": (_audio_only, "holds no video, only audio"),
-    "unknown codec": (_renamed_codec, "in a codec that is not known here"),
+    "unknown codec": (_renamed_codec, "in an unknown codec"),
     "no images": (lambda p: p.mkdir(), "holds no images"),
 }
 

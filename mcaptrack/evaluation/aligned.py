@@ -19,7 +19,7 @@ from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
 from mcaptrack.geometry.ragged import cross_pairs
 from mcaptrack.schema import TRACKS, Frame, Rows
 from mcaptrack.schema.framing import frame_times, join_frames, split_rows
-from mcaptrack.schema.resampling import looked_at, resample
+from mcaptrack.schema.resampling import is_observed_at, resample
 
 Similarity = Literal["iou", "metres"]
 
@@ -51,7 +51,7 @@ def align(
     if have_same_times(ground_truth_ns, tracks_ns):
         empty = TRACKS.empty()
         return list(ground_truth), [by_time.get(f.t_ns, Frame(f.t_ns, f.index, empty)) for f in ground_truth]
-    kept = looked_at(ground_truth_ns, tracks_ns, seconds_to_ns(MAX_GAP_S))
+    kept = is_observed_at(ground_truth_ns, tracks_ns, seconds_to_ns(MAX_GAP_S))
     if not kept.any():
         spans = f"the ground truth ({_span(ground_truth_ns)}) and {tracks_name} ({_span(tracks_ns)})"
         raise McaptrackError(f"{name}: {spans} never overlap in time")

@@ -31,7 +31,7 @@ from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
 from mcaptrack.schema import FORECAST_ERRORS, FORECAST_SCORES, PREDICTIONS, TRACKS, Frame, Rows, Schema
 from mcaptrack.schema.framing import frame_times, join_frames, split_rows
-from mcaptrack.schema.resampling import looked_at
+from mcaptrack.schema.resampling import is_observed_at
 
 #: The channels of forecasts, below the camera's prefix, and the tracks from which each is made.
 FORECAST_INPUTS: Final[Mapping[str, str]] = {"predictions": "samples", "retracks/predictions": "retracks/online"}
@@ -63,7 +63,9 @@ class _PredictionClock(NamedTuple):
         last = int(self.to_step(np.array([self.last_ns]))[0])
         ticks = self.start_ns + np.rint(np.arange(last + 1) * (self.step_s * NS_PER_S)).astype(np.int64)
         return self.positions(
-            resample_frames(ground_truth, ticks[looked_at(frame_times(ground_truth), ticks, seconds_to_ns(MAX_GAP_S))])
+            resample_frames(
+                ground_truth, ticks[is_observed_at(frame_times(ground_truth), ticks, seconds_to_ns(MAX_GAP_S))]
+            )
         )
 
 

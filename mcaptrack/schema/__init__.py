@@ -1,7 +1,7 @@
-"""Shapes: what a frame is, and what the rows of each channel are.
+"""Schemas: what a frame is, and which columns the rows of each channel have.
 
-``schemas/*.proto`` are the single source. From one file follow the dtype of its rows, the Arrow schema of its table and
-the schema record of its MCAP channel; no second description exists anywhere.
+``schemas/*.proto`` are the single source. The dtype of rows, the Arrow schema of the table and the schema record of the
+MCAP channel are all derived from one file; there is no second definition.
 """
 
 from __future__ import annotations
@@ -42,27 +42,33 @@ __all__ = [
 
 
 class Frame(NamedTuple):
-    """What one message says: ``rows`` at time ``t_ns``.
+    """The content of one message: ``rows`` at time ``t_ns``.
 
-    ``t_ns`` is the log time in nanoseconds, ``index`` the frame number of the video (the message's sequence number).
-    ``rows`` is a structured array; on the video channel it is the picture's brightness, (height, width) uint8. A frame
-    without rows is data: looked, saw nothing.
+    Parameters
+    ----------
+    t_ns : int
+        Log time in nanoseconds.
+    index : int
+        Frame number in the video (the sequence number of the message).
+    rows : (N,) structured array
+        On the video channel the picture in gray, (height, width) uint8. A frame without rows is data, too: nothing was
+        detected.
     """
 
     t_ns: int
-    index: int  # type: ignore[assignment]  # hides tuple.index, which nobody wants here
+    index: int  # type: ignore[assignment]  # hides tuple.index, which is not needed here
     rows: NDArray[Any]
 
 
 def _folder() -> Path:
-    """schemas/ lies inside the installed package, and beside it in a checkout."""
+    """The folder schemas/: inside the installed package, beside it in a checkout."""
     package = Path(__file__).resolve().parent.parent
     inside = package / "schemas"
     return inside if inside.is_dir() else package.parent / "schemas"
 
 
 class Schema:
-    """The rows of one kind of channel, named as in MCAP: "mcaptrack.Tracks"."""
+    """The schema of a row channel, with its name in MCAP: "mcaptrack.Tracks"."""
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -72,7 +78,7 @@ class Schema:
 
     @cached_property
     def definition(self) -> Definition:
-        """The schema file, read."""
+        """The parsed schema file."""
         path = _folder() / f"{self.name.rpartition('.')[2]}.proto"
         return parse(path.read_text(encoding="utf-8"), path.name)
 
@@ -98,7 +104,7 @@ class Schema:
 
     @cached_property
     def arrow(self) -> pa.Schema:
-        """The Arrow fields of the columns: unit and description as metadata, nullable where a number may be missing."""
+        """The Arrow schema: unit and description of columns as metadata, optional columns nullable."""
         import pyarrow as pa
 
         def field(column: Column) -> pa.Field:
@@ -113,20 +119,37 @@ class Schema:
         return pa.schema([field(column) for column in self.columns])
 
     def empty(self, count: int = 0) -> Rows:
-        """``count`` rows of zeros, to be filled."""
+        """``count`` rows of zeros."""
         return np.zeros(count, self.dtype)
 
     def joined(self, parts: Sequence[Rows]) -> Rows:
-        """Rows of this schema laid end to end; as bytes where they are laid out alike, since NumPy goes by fields."""
+        """Concatenate rows of this schema; as bytes if their layouts are equal, because NumPy copies field by field."""
         if all(part.dtype == self.dtype for part in parts):
             return np.frombuffer(bytearray().join(part.tobytes() for part in parts), self.dtype)
         return np.concatenate([self.empty(), *parts])
 
     def rows(self, **columns: NDArray[Any] | Sequence[Any]) -> Rows:
-        """Rows from columns, through the gate. Optional columns that are left out are missing (NaN).
+        """Make rows from columns, and validate them.
 
-        Raises ValueError, with the column and the schema, unless there are exactly the schema's columns, all of one
-        length, whole numbers where whole numbers belong, and no required number missing.
+        Parameters
+        ----------
+        **columns : (N,) array or sequence
+            By name of the column. Optional columns may be left out; they are filled with NaN.
+
+        Returns
+        -------
+        (N,) structured array
+
+        Raises
+        ------
+        ValueError
+            With column and schema, if a column is unknown or missing, has another length, other than whole numbers in
+            an integer column, or NaN in a required one.
+
+        Examples
+        --------
+        >>> DETECTIONS.rows(x_px=[1], y_px=[2], w_px=[3], h_px=[4], score=[0.5], class_id=[1])["w_px"].tolist()
+        [3.0]
         """
         known = {column.name: column for column in self.columns}
         for name in columns:
@@ -149,9 +172,9 @@ class Schema:
         return out
 
     def check(self, rows: NDArray[Any]) -> Rows:
-        """The gate for rows that exist: exactly this schema's columns, and nothing required missing.
+        """Validate rows: exactly this schema's columns, and no NaN in required ones.
 
-        Returns ``rows``; raises ValueError with the column and the schema otherwise.
+        Returns ``rows``. Raises ValueError, with column and schema, otherwise.
         """
         names = rows.dtype.names
         wanted = tuple(column.name for column in self.columns)
@@ -209,12 +232,12 @@ SCHEMAS: Final = {
         FORECAST_SCORES,
     )
 }
-#: Not rows but pictures: a transform that reads this gets the brightness of each frame.
+#: Pictures instead of rows: a transform that reads this schema gets each frame in gray.
 VIDEO: Final = Schema("foxglove.CompressedVideo")
 
 
 class EventKind(IntEnum):
-    """The column ``kind`` of events."""
+    """The values of the column ``kind`` of events."""
 
     MISS = 2
     FALSE_TRACK = 3
@@ -225,7 +248,7 @@ class EventKind(IntEnum):
     PARTED = 8
 
 
-#: The words for them, as the schema has them.
+#: Their names, as in the comments of the schema.
 EVENT_KINDS: Final = {
     EventKind.MISS: "miss",
     EventKind.FALSE_TRACK: "false track",

@@ -1,9 +1,9 @@
-"""The row codec: protobuf payloads that are NumPy arrays.
+"""The row codec: protobuf payloads as NumPy arrays, without a loop over rows.
 
-All fields of a row have a fixed width, so every row of a schema takes the same number of bytes on the wire and the tag
-bytes always stand at the same places. A payload is therefore a structured array with the tags as padding: encoding
-fills a template, decoding is a view. What another protobuf writer made of the same schema (default values left out,
-fields in another order) has another length or other tags; that is detected and given to the protobuf runtime.
+All fields of a row have a fixed width, so that every row of a schema has the same number of bytes on the wire, with tag
+bytes at fixed offsets. A payload is therefore a structured array with the tags as padding: encoding fills a template,
+decoding is a view. Payloads of other protobuf writers (default values omitted, fields in another order) have another
+length or other tags; they are detected and decoded by the protobuf runtime.
 
 Letters: N rows, M messages.
 """
@@ -35,7 +35,7 @@ def _varint(value: int) -> bytes:
 
 
 class RowCodec:
-    """Rows of one schema <-> payload bytes. ``dtype`` is the layout of a row on the wire, tags included as padding."""
+    """Rows of one schema <-> payload bytes. ``dtype`` is the layout of a row on the wire, with tags as padding."""
 
     def __init__(self, definition: Definition) -> None:
         self._definition = definition
@@ -56,8 +56,8 @@ class RowCodec:
                 "itemsize": len(self._template),
             }
         )
-        # Which bits of a row are ours to say: all of the tags, and of a bool all but the lowest, since any byte but 0
-        # and 1 would be a longer varint or a true that NumPy can't hold.
+        # The fixed bits of a row: all bits of tags, and all but the lowest bit of a bool, because other bytes than 0
+        # and 1 are longer varints, or true values that NumPy can't represent.
         fixed = np.full(len(self._template), 0xFF, np.uint8)
         for column, offset in zip(definition.columns, offsets, strict=True):
             fixed[offset : offset + KINDS[column.kind][1]] = 0xFE if column.kind == "bool" else 0
@@ -68,7 +68,7 @@ class RowCodec:
         self._fixed_bytes = [(at, fixed[at], self._template[at] & fixed[at]) for at in fixed_at]
 
     def encode(self, rows: Rows) -> bytes:
-        """One payload of N rows. ``rows`` must have the columns of the schema, in any memory layout."""
+        """Encode N rows as one payload. ``rows`` must have the columns of the schema, in any memory layout."""
         if rows.dtype == self.dtype:
             raw = np.ascontiguousarray(rows).view(np.uint8).reshape(-1, len(self._template))
             return (raw & self._data | self._template).tobytes()
@@ -78,16 +78,16 @@ class RowCodec:
         return self.encode(wire)
 
     def decode(self, payload: bytes) -> Rows:
-        """The N rows of one payload, read-only; a view of ``payload`` where it is laid out as ours.
+        """Decode one payload to N read-only rows; a view of ``payload`` if it has this codec's layout.
 
-        Raises ValueError if the payload is no message of this schema.
+        Raises ValueError if the payload is not a message of this schema.
         """
         if self._is_ours(payload):
             return np.frombuffer(payload, self.dtype)
         return self._decode_foreign(payload)
 
     def decode_all(self, payloads: Sequence[bytes]) -> tuple[Rows, NDArray[np.int64]]:
-        """Many payloads as one array of rows, and the number of rows in each."""
+        """Decode many payloads to one array of rows, and the number of rows in each."""
         joined = b"".join(payloads)
         size = self.dtype.itemsize
         if self._is_ours(joined) and all(len(payload) % size == 0 for payload in payloads):
@@ -100,9 +100,9 @@ class RowCodec:
     def decode_at(
         self, raw: NDArray[np.uint8], start: NDArray[np.int64], end: NDArray[np.int64]
     ) -> tuple[Rows, NDArray[np.int64]] | None:
-        """Payloads that stand from ``start`` (M,) to ``end`` (M,) in ``raw``, as ``decode_all`` gives them.
+        """Decode the payloads from ``start`` (M,) to ``end`` (M,) in ``raw``, as ``decode_all`` does.
 
-        None where one is laid out otherwise than ours.
+        None if one has another layout than this codec's.
         """
         size = self.dtype.itemsize
         counts, over = np.divmod(end - start, size)
@@ -111,26 +111,26 @@ class RowCodec:
         if not counts.any():
             return np.empty(0, self.dtype), counts
         block = np.lib.stride_tricks.sliding_window_view(raw, size)[ragged_range(start, counts, step=size)]
-        # A column at a time: few bytes of a row are fixed.
+        # By column, because few bytes of a row are fixed.
         if any(((block[:, at] & mask) != tag).any() for at, mask, tag in self._fixed_bytes):
             return None
         return block.view(self.dtype)[:, 0], counts
 
     def longer(self, rows: Rows, taken: int, length: int) -> Rows:
-        """An array of this length that begins with the first ``taken`` rows; what follows is not set."""
+        """An array of ``length`` rows that begins with the first ``taken`` rows; the others are not initialised."""
         out = np.empty((length, self.dtype.itemsize), np.uint8)
         out[:taken] = self._bytes(rows[:taken])
         return out.view(self.dtype)[:, 0]
 
     def put(self, rows: Rows, at: int, part: Rows) -> None:
-        """Rows of this layout into others; as bytes, since NumPy copies structured arrays field by field."""
+        """Copy rows into others of this layout; as bytes, because NumPy copies structured arrays field by field."""
         self._bytes(rows)[at : at + len(part)] = self._bytes(part)
 
     def _bytes(self, rows: Rows) -> NDArray[np.uint8]:
         return np.asarray(rows.view(np.uint8).reshape(-1, self.dtype.itemsize), np.uint8)
 
     def _is_ours(self, payload: bytes) -> bool:
-        """Whether every tag stands where our encoder puts it: then each byte between them is what we say it is."""
+        """Whether every tag is where ``encode`` writes it; then all other bytes are values of the columns."""
         size = len(self._template)
         if len(payload) % size:
             return False
@@ -144,7 +144,7 @@ class RowCodec:
         try:
             message.ParseFromString(payload)
         except DecodeError as error:
-            raise ValueError(f"{len(payload)} bytes are no {self._definition.name} message: {error}") from None
+            raise ValueError(f"{len(payload)} bytes are not a {self._definition.name} message: {error}") from None
         found: Iterable[Message] = message.rows  # type: ignore[attr-defined]  # a class made at run time
         rows = np.zeros(len(list(found)), self.dtype)
         for column in self._definition.columns:
@@ -157,7 +157,7 @@ class RowCodec:
 
     @cached_property
     def message_class(self) -> type[Message]:
-        """The protobuf runtime's class for this schema, in a pool of its own."""
+        """The class of the protobuf runtime for this schema, in a separate descriptor pool."""
         from google.protobuf.descriptor_pool import DescriptorPool
         from google.protobuf.message_factory import GetMessageClass
 

@@ -1,4 +1,4 @@
-"""Ground planes <-> rows of their channel."""
+"""Ground planes <-> rows of the channel `ground_plane`."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from mcaptrack.schema import GROUND_PLANE, Rows
 
 
 def plane_to_rows(plane: GroundPlane) -> Rows:
-    """A ground plane as the one row of its message."""
+    """Encode a ground plane as the single row of its message."""
     names = [f"h{row}{column}" for row in range(3) for column in range(3)]
     return GROUND_PLANE.rows(
         **{name: [value] for name, value in zip(names, plane.homography, strict=True)},
@@ -20,7 +20,7 @@ def plane_to_rows(plane: GroundPlane) -> Rows:
 
 
 def rows_to_plane(rows: Rows) -> GroundPlane:
-    """The way back. Raises McaptrackError if the message holds no plane."""
+    """Decode a ground plane. Raises McaptrackError unless there is exactly one row."""
     if len(rows) != 1:
         raise McaptrackError(f"a ground plane message holds one row, not {len(rows)}")
     row = rows[0]

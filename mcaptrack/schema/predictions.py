@@ -1,4 +1,4 @@
-"""Forecasts <-> rows of their channel. Letters: N people at one time, T future steps."""
+"""Predictions -> rows of their channel. Letters: N tracks at one time, T future steps."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from mcaptrack.schema import PREDICTIONS, Rows
 
 
 def forecast_to_rows(ids: NDArray[np.int64], forecast: Forecast, step_s: float) -> Rows:
-    """Forecasts of N people as N x T rows."""
+    """Predictions of N tracks as N x T rows."""
     count, steps = forecast.mean.shape[:2]
     step = np.tile(np.arange(1, steps + 1), count)
     mean, cov = forecast.mean.reshape(-1, 2), forecast.cov.reshape(-1, 2, 2)

@@ -1,8 +1,8 @@
-"""Read the row schemas: a strict subset of proto3 in which every field has a fixed width.
+"""Parse the row schemas: a strict subset of proto3 in which every field has a fixed width.
 
 A schema file holds one message with one nested message ``Row`` and one field ``repeated Row rows = 1``. Everything
-else of the language is refused, because the row codec stands on rows that all take the same number of bytes. The
-comments of the file are kept: they are what ``--help``, Arrow and Parquet say about a column.
+else is refused, because the row codec requires that all rows have the same number of bytes. The comments of the file
+are the descriptions of columns in ``--help``, Arrow and Parquet.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _MESSAGE = re.compile(r"message\s+([A-Z]\w*)\s*\{$")
 
 @dataclass(frozen=True)
 class Column:
-    """One field of a row. ``optional`` means that the number may be missing: NaN in rows, null in tables."""
+    """One column of a row. ``optional``: the value may be missing, which is NaN in rows and null in tables."""
 
     name: str
     kind: str
@@ -43,7 +43,7 @@ class Column:
 
     @property
     def unit(self) -> str:
-        """The unit that the name ends on ("px", "m", "m^2", "s"), or "" for a plain number."""
+        """The unit in the suffix of the name ("px", "m", "m^2", "s"), "" if there is none."""
         return UNITS.get(self.name.rpartition("_")[2], "") if "_" in self.name else ""
 
 
@@ -56,7 +56,7 @@ class Definition:
     columns: tuple[Column, ...]
 
     def file_descriptor_set(self) -> FileDescriptorSet:
-        """The protobuf descriptor of the file, as MCAP's schema record carries it."""
+        """The protobuf descriptor of the file, as stored in MCAP schema records."""
         from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorSet
 
         package, _, message_name = self.name.rpartition(".")
@@ -81,7 +81,7 @@ class Definition:
                 label=FieldDescriptorProto.LABEL_OPTIONAL,
                 type=FieldDescriptorProto.Type.ValueType(KINDS[column.kind][3]),
             )
-            if column.optional:  # proto3 wraps each optional scalar in a oneof of its own
+            if column.optional:  # proto3 wraps each optional scalar in a separate oneof
                 field.proto3_optional = True
                 field.oneof_index = len(row.oneof_decl)
                 row.oneof_decl.add(name=f"_{column.name}")
@@ -89,7 +89,7 @@ class Definition:
 
 
 def parse(text: str, origin: str) -> Definition:
-    """Read the text of one schema file; ``origin`` names it in errors.
+    """Parse the text of one schema file; ``origin`` names it in errors.
 
     Raises ValueError, with the line, for anything outside the subset.
     """

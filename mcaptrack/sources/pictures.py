@@ -92,7 +92,7 @@ class Pictures:
             for at, picture in reversed(list(self._read(start, end))):
                 head = read_head(picture.format, picture.data)
                 is_key |= head.is_key
-                if is_key and head.has_sets:
+                if is_key and head.has_parameter_sets:
                     return at
             end, step = start, _STEP if step == 1 else min(step * _FURTHER, _MOST)
         return None
@@ -109,7 +109,7 @@ class Pictures:
                 yield picture
                 continue
             head = read_head(picture.format, picture.data)
-            begins = number > start and head.is_key and head.has_sets
+            begins = number > start and head.is_key and head.has_parameter_sets
             if begins and not picture.is_video:
                 waiting.clear()
             elif begins and waiting:

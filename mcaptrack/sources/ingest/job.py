@@ -61,8 +61,8 @@ class IngestOptions:
     role: Role | None = None
 
     @property
-    def keep(self) -> VideoOptions:
-        """How pictures are kept. Raises McaptrackError for what does not go together."""
+    def video_options(self) -> VideoOptions:
+        """How pictures are stored. Raises McaptrackError for options that contradict each other."""
         return VideoOptions(
             image_format=self.image_format,
             quality=self.quality,

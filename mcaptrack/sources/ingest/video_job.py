@@ -37,7 +37,7 @@ class VideoJob(Job):
             raise McaptrackError(f"{source} is no label file; --as is for those")
         if options.frames is not None:
             raise McaptrackError(f"{source} is no label file; --frames is for those that stand alone")
-        self.video: Video = open_video(source, options.keep)
+        self.video: Video = open_video(source, options.video_options)
         if self.video.images and not (options.fps or self.video.fps):
             raise McaptrackError(f"{source}: a folder of images has no clock; give the frames per second with --fps")
         self._plane = self.plane(self.video.width_px, self.video.height_px)
@@ -51,7 +51,7 @@ class VideoJob(Job):
 
     def write(self, writer: log.LogWriter, has_clock: bool) -> None:
         """Write the pictures, then labels at their times."""
-        options, video, keep = self.options, self.video, self.options.keep
+        options, video, keep = self.options, self.video, self.options.video_options
         start_ns = video.start_ns if options.start_ns is None else options.start_ns
         start_ns = 0 if start_ns is None else start_ns
         schema_name = foxglove.IMAGE if keep.is_still else foxglove.VIDEO

@@ -1,6 +1,6 @@
-"""Packets and pixels: video files and image folders in, brightness and colours out, H.264 and JPEG between.
+"""Read video files and image folders, decode pictures to gray or BGR, and encode H.264, JPEG and PNG.
 
-FFmpeg does the work, through PyAV; its wheels bring it along.
+FFmpeg does the work, through PyAV, whose wheels include it.
 """
 
 from mcaptrack.sources.video.codecs import is_video_codec, read_head

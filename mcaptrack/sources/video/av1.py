@@ -1,4 +1,4 @@
-"""What has to be known about an AV1 stream (its specification, 5.3 to 5.9) before it is passed on or entered."""
+"""Parse AV1 streams (AV1 specification, 5.3 to 5.9) as far as passing them through and seeking in them need it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class _Obu(NamedTuple):
 
 
 def _obus(data: bytes) -> Iterator[_Obu]:
-    """The open bitstream units of a temporal unit in the low-overhead format; none after one that says no length."""
+    """The open bitstream units (OBUs) of a temporal unit in the low-overhead format, up to one without a length."""
     at = 0
     while at < len(data):
         head, start = data[at], at
@@ -39,7 +39,7 @@ def _obus(data: bytes) -> Iterator[_Obu]:
 
 
 def inspect(data: bytes) -> AccessUnit:
-    """What a temporal unit holds."""
+    """Parse a temporal unit."""
     pictures, is_key, sets = 0, False, []
     for obu in _obus(data):
         if obu.end > len(data):
@@ -54,7 +54,7 @@ def inspect(data: bytes) -> AccessUnit:
 
 
 def read_head(data: bytes) -> PictureHead:
-    """What a message begins with; a key picture is one that is shown."""
+    """Parse the first bytes of a message; only key frames that are shown count as key pictures."""
     has_sequence = False
     for obu in _obus(data):
         has_sequence |= obu.kind == _SEQUENCE
@@ -63,22 +63,22 @@ def read_head(data: bytes) -> PictureHead:
     return PictureHead(False, False, has_sequence)
 
 
-def with_sets(data: bytes, sets: tuple[bytes, ...]) -> bytes:
-    """A temporal unit with sequence headers in it, behind its delimiter."""
+def with_parameter_sets(data: bytes, sets: tuple[bytes, ...]) -> bytes:
+    """Insert sequence headers into a temporal unit, after its delimiter."""
     first = next(_obus(data), None)
     at = first.end if first and first.kind == _DELIMITER else 0
     return data[:at] + b"".join(sets) + data[at:]
 
 
 def sequence_headers(configuration: bytes) -> tuple[bytes, ...]:
-    """Those in the configuration record of a container (AV1 in ISO BMFF, 2.3), as far as it has any."""
+    """The sequence headers in the configuration record of a container (AV1 in ISO BMFF, 2.3)."""
     body = configuration[4:]
     return tuple(body[obu.start : obu.end] for obu in _obus(body) if obu.kind == _SEQUENCE)
 
 
 def _header(byte: int) -> tuple[bool, bool]:
-    """Of an uncompressed header: whether a frame is shown, and whether that is a key frame of its own."""
+    """From an uncompressed header: whether a frame is shown, and whether it is a key frame."""
     if byte >> 7:
-        return True, False  # a frame from before is shown
+        return True, False  # show_existing_frame
     is_shown = bool(byte >> 4 & 1)
     return is_shown, is_shown and byte >> 5 & 3 == _KEY_FRAME

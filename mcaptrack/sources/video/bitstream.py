@@ -1,4 +1,4 @@
-"""What one message's bytes of a video stream hold, said the same way for every codec, and how bytes are taken apart."""
+"""Access units and their first bytes, described in the same way for all codecs; and a reader of bits and NAL units."""
 
 from __future__ import annotations
 
@@ -7,40 +7,40 @@ from itertools import pairwise
 from typing import Final, NamedTuple
 
 _START_CODE: Final = b"\x00\x00\x01"
-#: Enough of a slice's NAL unit for all that is read of it.
+#: Bytes of a slice's NAL unit that are enough for the fields that are read.
 _HEAD: Final = 24
 
 
 class AccessUnit(NamedTuple):
-    """What one message holds.
+    """The content of one message.
 
-    ``pictures`` is how many pictures a decoder shows of it. ``is_key``: everything before can be forgotten, given the
-    parameter sets. ``sets`` are the parameter sets (H.264, H.265) or the sequence header (AV1) that stand in it, and
-    ``has_sets`` says whether these are all that a decoder needs. ``reorders``: pictures are shown in another order than
-    they stand in. ``size`` is the width and height that a picture says, where no parameter set says them.
+    ``pictures`` is the number of pictures that a decoder shows of it. ``is_key``: decoding can begin here, given the
+    parameter sets. ``sets`` are the parameter sets (H.264, H.265) or sequence headers (AV1) in it, and
+    ``has_parameter_sets`` says whether they are all that a decoder needs. ``reorders``: display order differs from
+    decoding order. ``size`` is (width, height) in pixels if the picture itself states it (VP9).
     """
 
     pictures: int
     is_key: bool
     sets: tuple[bytes, ...] = ()
-    has_sets: bool = True
+    has_parameter_sets: bool = True
     reorders: bool = False
     size: tuple[int, int] | None = None
 
 
 class PictureHead(NamedTuple):
-    """What the first bytes of a message say.
+    """What the first bytes of a message tell.
 
-    Whether it holds a picture, whether decoding can begin with that, given parameter sets, and whether it holds these.
+    Whether it has a picture, whether decoding can begin with it, given the parameter sets, and whether it has these.
     """
 
     has_picture: bool
     is_key: bool
-    has_sets: bool
+    has_parameter_sets: bool
 
 
 class Bits:
-    """The bits of ``data``, from the first on; zeros where it has ended."""
+    """Reads the bits of ``data`` from the beginning; zeros after its end."""
 
     def __init__(self, data: bytes) -> None:
         self._bits = int.from_bytes(data, "big")
@@ -48,7 +48,7 @@ class Bits:
 
     @classmethod
     def of_nal(cls, nal: bytes) -> Bits:
-        """Those of a NAL unit, without the bytes that keep start codes out of it."""
+        """The bits of a NAL unit, without emulation prevention bytes."""
         return cls(nal.replace(b"\x00\x00\x03", b"\x00\x00"))
 
     def take(self, count: int) -> int:
@@ -70,7 +70,7 @@ class Bits:
 
 
 def nal_starts(data: bytes) -> Iterator[int]:
-    """Where the NAL units of an Annex B stream begin, behind their start codes; found as they are asked for."""
+    """The offsets of NAL units in an Annex B stream, after their start codes; searched lazily."""
     at = data.find(_START_CODE)
     while at >= 0:
         yield at + 3
@@ -78,9 +78,9 @@ def nal_starts(data: bytes) -> Iterator[int]:
 
 
 def nal_units(data: bytes, whole: frozenset[int], shift: int, mask: int) -> Iterator[tuple[int, bytes]]:
-    """The type and the bytes of each NAL unit; of types that are not in ``whole`` the first bytes alone.
+    """The type and the bytes of each NAL unit; only the first bytes of types that are not in ``whole``.
 
-    The type is in the first byte, ``shift`` bits from its end under ``mask``.
+    The type is ``mask`` applied to the first byte, shifted right by ``shift`` bits.
     """
     starts = [*nal_starts(data), len(data) + 3]
     for start, following in pairwise(starts):

@@ -1,4 +1,4 @@
-"""Video files as PyAV opens them, and what its versions give differently. Only this module calls ``av.open``."""
+"""Open video files with PyAV, and hide the differences between its versions. Only this module calls ``av.open``."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ _LAST_WITH_METADATA_ERRORS: Final = 18
 
 @contextmanager
 def reading(path: Path) -> Iterator[Any]:
-    """An open video file. Raises McaptrackError if it is none, or is damaged beyond reading.
+    """Open a video file for reading. Raises McaptrackError if it is not a video, or too damaged to read.
 
-    Metadata that is not UTF-8 comes with surrogates in every version of PyAV.
+    Metadata that is not UTF-8 contains surrogate escapes, with every version of PyAV.
     """
     import av
 
@@ -42,18 +42,18 @@ def reading(path: Path) -> Iterator[Any]:
         if is_size_error(error):
             why = f"{why}: it is damaged, or its pictures are too large, {too_large()}"
         raise McaptrackError(
-            f"{path} can't be read as a video ({why}); give an mp4, mov, mkv, avi or webm file that is whole"
+            f"{path} can't be read as a video ({why}); give a complete mp4, mov, mkv, avi or webm file"
         ) from error
 
 
 def is_size_error(error: Any) -> bool:
-    """Whether an error of FFmpeg's is one of those that its decoders give for pictures that are too large."""
+    """Whether an FFmpeg error is one of those that its decoders raise for pictures that are too large."""
     return error.errno in (errno.EINVAL, errno.ENOMEM, errno.ERANGE)
 
 
 @contextmanager
 def writing(path: Path, name: str) -> Iterator[Any]:
-    """A new video file of the format that FFmpeg calls ``name``."""
+    """Open a new video file in the container format that FFmpeg calls ``name``."""
     import av
 
     with av.open(_url(path), "w", format=name) as opened:
@@ -61,41 +61,43 @@ def writing(path: Path, name: str) -> Iterator[Any]:
 
 
 def _url(path: Path) -> str:
-    """A path as FFmpeg takes it: without the prefix it reads ``12:30.mp4`` as a file of the protocol ``12``."""
+    """A path as a URL for FFmpeg, which would take ``12:30.mp4`` for a URL with the protocol ``12``."""
     return f"file:{path}"
 
 
 def videos(opened: Any) -> list[Any]:
-    """The streams of pictures in a container, without cover pictures."""
+    """The video streams of a container, without attached cover pictures."""
     return [stream for stream in opened.streams.video if not stream.disposition.value & _COVER]
 
 
 def fraction(ratio: Any) -> Fraction | None:
-    """A ratio of FFmpeg's; None for one that is not known, which PyAV gives as None or as 0/1, by its version."""
+    """A ratio of FFmpeg as a Fraction; None if it is unknown, which PyAV returns as None or 0/1, depending on its
+    version.
+    """
     return Fraction(ratio.numerator, ratio.denominator) if ratio else None
 
 
 def has_slots(opened: Any) -> bool:
-    """Whether a container has no times but slots for pictures, in the order of decoding; some may be empty."""
+    """Whether a container has numbered slots for pictures instead of timestamps (AVI); slots may be empty."""
     return "avi" in opened.format.name.split(",")
 
 
 def has_times(opened: Any) -> bool:
-    """Whether pictures have times at all; what FFmpeg gives for raw streams it makes up."""
+    """Whether pictures have timestamps; those that FFmpeg returns for raw streams are invented."""
     return not opened.format.flags & _NO_TIMESTAMPS
 
 
-def indexed(opened: Any) -> int:
-    """How many pictures the parts of a fragmented MP4 list that were read so far; 0 if it is none."""
+def count_indexed(opened: Any) -> int:
+    """The number of pictures in the fragments of a fragmented MP4 that were read so far; 0 for other files."""
     return len(_mp4_entries(opened))
 
 
-def empty(opened: Any) -> int:
-    """How many pictures an MP4 lists that have no bytes: nothing was recorded there."""
+def count_empty(opened: Any) -> int:
+    """The number of MP4 samples without data: nothing was recorded there."""
     return sum(entry.size == 0 for entry in _mp4_entries(opened))
 
 
 def _mp4_entries(opened: Any) -> Any:
-    """The list of pictures of an MP4; of other formats nothing."""
+    """The sample index of an MP4; empty for other formats."""
     stream = videos(opened)[0]
     return stream.index_entries if "mp4" in opened.format.name.split(",") else ()

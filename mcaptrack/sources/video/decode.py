@@ -1,4 +1,4 @@
-"""Encoded pictures -> brightness, for detectors, and colours, for people."""
+"""Decode pictures: to gray for detectors, to BGR for people."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from mcaptrack.sources.video import h264
 from mcaptrack.sources.video.codecs import CODECS
 from mcaptrack.sources.video.container import is_size_error
 from mcaptrack.sources.video.limits import check_size, check_still, max_pixels, still_size, too_large
-from mcaptrack.sources.video.raw_pixels import PixelLayout, raw_brightness, raw_colours
+from mcaptrack.sources.video.raw_pixels import PixelLayout, raw_bgr, raw_gray
 
 _FULL_RANGE: Final = 2  # AVCOL_RANGE_JPEG
-# Video keeps brightness in 16..235; detectors see 0..255 whatever the picture came from.
+# Video stores luma in 16..235; detectors get 0..255 from every kind of picture.
 _LIMITED_TO_FULL: Final = np.clip(np.rint((np.arange(256) - 16) * (255 / 219)), 0, 255).astype(np.uint8)
 
 
 class EncodedPicture(NamedTuple):
-    """A picture in a log: ``format`` is "h264", "jpeg" and so on; with a ``layout`` it is that of a pixel, "rgb8".
+    """A picture in a log: ``format`` is "h264", "jpeg" and so on; with a ``layout`` it is a pixel format, as in "rgb8".
 
-    ``where`` names the picture in errors; without it they say its number.
+    ``where`` names the picture in errors; by default its number does.
     """
 
     t_ns: int
-    index: int  # type: ignore[assignment]  # hides tuple.index, which nobody wants here
+    index: int  # type: ignore[assignment]  # hides tuple.index, which is not needed here
     format: str
     data: bytes
     layout: PixelLayout | None = None
@@ -38,28 +38,41 @@ class EncodedPicture(NamedTuple):
 
     @property
     def is_video(self) -> bool:
-        """Whether it may need pictures before it."""
+        """Whether it may depend on earlier pictures."""
         return self.format in CODECS and not self.layout
 
     @property
     def name(self) -> str:
-        """The picture, as errors say it."""
+        """The name of the picture in errors."""
         return self.where or f"frame {self.index}"
 
 
 def decode_gray(pictures: Iterable[EncodedPicture], wanted: Container[int] | None = None) -> Iterator[Frame]:
-    """Frames whose ``rows`` are the brightness of the picture, (height, width) uint8 from 0 to 255.
+    """Decode pictures to gray.
 
-    Pictures of a video before the first that decoding can begin with are left out, as all viewers leave them out.
-    With ``wanted`` those of other indexes are decoded, where the next ones need them, and left out. Raises
-    McaptrackError for a format that can't be decoded and for pictures that are broken.
+    Parameters
+    ----------
+    pictures : iterable of EncodedPicture
+        In decoding order. Pictures before the first one at which decoding can begin are left out, as viewers do.
+    wanted : container of int, optional
+        Indexes of the pictures to yield; others are decoded only if later ones depend on them.
+
+    Yields
+    ------
+    Frame
+        ``rows`` is the picture, (height, width) uint8 from 0 to 255.
+
+    Raises
+    ------
+    McaptrackError
+        For a format that can't be decoded, and for damaged pictures.
     """
-    return _decoded(pictures, raw_brightness, _luma, wanted, is_grey=True)
+    return _decoded(pictures, raw_gray, _luma, wanted, is_grey=True)
 
 
 def decode_bgr(pictures: Iterable[EncodedPicture], wanted: Container[int] | None = None) -> Iterator[Frame]:
-    """The same in colour: ``rows`` are (height, width, 3) uint8, blue, green, red."""
-    return _decoded(pictures, raw_colours, _bgr, wanted, is_grey=False)
+    """Decode pictures to BGR: as ``decode_gray``, but ``rows`` is (height, width, 3) uint8 (blue, green, red)."""
+    return _decoded(pictures, raw_bgr, _bgr, wanted, is_grey=False)
 
 
 def _decoded(
@@ -100,7 +113,7 @@ def _still(picture: EncodedPicture, is_grey: bool) -> Image:
         try:
             how = cv2.IMREAD_GRAYSCALE if is_grey else cv2.IMREAD_COLOR
             image = cv2.imdecode(np.frombuffer(picture.data, np.uint8), how)
-        except cv2.error:  # of a header that promises what can't be
+        except cv2.error:  # the header contradicts the data
             image = None
     if image is None:
         raise McaptrackError(f"{picture.name} can't be decoded as {picture.format or 'an image'}")
@@ -117,28 +130,30 @@ class _VideoDecoder:
         self._codec.thread_type = "AUTO"
         self._codec.options = {"max_pixels": str(max_pixels())}
         self._base = Fraction(1, NS_PER_S)
-        self._count, self._sets, self._begun, self._last = 0, b"", False, "the video"
-        self._waiting: dict[int, tuple[int, int]] = {}
+        self._count, self._sets, self._has_started, self._last = 0, b"", False, "the video"
+        self._pending: dict[int, tuple[int, int]] = {}
 
     def decode(self, picture: EncodedPicture) -> Iterator[Frame]:
         import av
 
         head = CODECS[picture.format].read_head(picture.data)
-        self._begun |= head.has_sets
+        self._has_started |= head.has_parameter_sets
         if not head.has_picture:
-            self._sets += picture.data  # some robots send these apart; FFmpeg takes them with a picture
+            self._sets += (
+                picture.data
+            )  # some robots send parameter sets separately; FFmpeg needs them together with a picture
             return
-        if not self._begun:
-            return  # a recording may begin anywhere; nothing can be made of what is before the first parameter sets
-        # A copy in FFmpeg's own memory: its threads can't let go of Python's while Python waits for them to end.
+        if not self._has_started:
+            return  # a recording may begin anywhere; decoding starts with the first parameter sets
+        # Copied to memory of FFmpeg: its threads can't release Python memory while Python waits for them (a deadlock).
         data = self._sets + picture.data
-        if picture.format == "h264" and (self._sets or head.has_sets):  # FFmpeg says no more than that these are bad
-            check_size(*h264.largest(data), picture.name)
+        if picture.format == "h264" and (self._sets or head.has_parameter_sets):  # FFmpeg only reports them as invalid
+            check_size(*h264.largest_size(data), picture.name)
         packet = av.Packet(len(data))
         packet.update(data)
-        packet.pts = packet.dts = self._count  # not its time: messages of others may share one
+        packet.pts = packet.dts = self._count  # not the time: recorded messages may share one
         packet.time_base = self._base
-        self._waiting[self._count], self._sets = (picture.t_ns, picture.index), b""
+        self._pending[self._count], self._sets = (picture.t_ns, picture.index), b""
         self._count += 1
         self._last = picture.name
         yield from self._frames(packet, picture.name)
@@ -157,7 +172,7 @@ class _VideoDecoder:
                 why = f"{why}; it is damaged, or too large: {too_large()}"
             raise McaptrackError(f"{where} can't be decoded: {why}") from error
         for frame in decoded:
-            t_ns, index = self._waiting.pop(frame.pts)
+            t_ns, index = self._pending.pop(frame.pts)
             if self._wanted is None or index in self._wanted:
                 yield Frame(t_ns, index, self._of_frame(frame))
 
@@ -167,7 +182,7 @@ def _bgr(frame: Any) -> Image:
 
 
 def _luma(frame: Any) -> Image:
-    """The brightness of a decoded picture; its Y plane where it has one of 8 bits."""
+    """A decoded picture in gray; its Y plane if it has one with 8 bits."""
     import cv2
 
     if not frame.format.name.startswith(("yuv4", "yuvj4", "nv12", "gray")) or frame.format.components[0].bits != 8:

@@ -1,4 +1,4 @@
-"""Pictures -> H.264, JPEG, PNG; and a video file of pictures."""
+"""Encode pictures as H.264, JPEG or PNG, and write video files."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ _STILLS: Final = ("jpeg", "png")
 _JPEG_QUALITY: Final = 90
 _CRF: Final = 23
 _KEY_EVERY_S: Final = 1.0
-#: Viewers go back to the last key picture; from further away than this it takes long.
+#: Viewers seek by decoding from the last key picture; a longer distance makes seeking slow.
 _KEY_WITHIN_S: Final = 2.0
-#: JPEG's scale, and x264's constant rate factor: without 0, which browsers don't play.
+#: The ranges of JPEG quality and of x264's constant rate factor (0 is lossless, which browsers don't play).
 _QUALITIES: Final = {"jpeg": (1, 100), "h264": (1, 51)}
 _INTERVALS_S: Final = (0.01, 60.0)
-# No B-frames, key pictures with their parameter sets, four slices whatever the machine's cores: the same input gives
-# the same bytes everywhere.
+# No B-frames; key pictures with parameter sets; always four slices, so that the output doesn't depend on the number of
+# cores.
 _X264: Final = {
     "preset": "veryfast",
     "tune": "zerolatency",
@@ -46,13 +46,25 @@ _IN_MESSAGES: Final = {"x264-params": _X264["x264-params"] + ":repeat-headers=1:
 
 @dataclass(frozen=True, kw_only=True)
 class VideoOptions:
-    """How the pictures of a video are kept.
+    """How the pictures of a video are stored in a log.
 
-    ``image_format`` "auto" passes H.264, VP9 and AV1 on as they are where viewers can play them, "h265" H.265 too,
-    "h264" H.264 alone; all else is encoded as H.264. ``quality`` is from 1 to 100 (best) for JPEG; for H.264 the
-    constant rate factor from 1 (best) to 51, and what has to have one is encoded. ``keyframe_interval_s`` is the
-    longest time between key pictures: of what is passed on (2 unless given) and of what is encoded (1 unless given).
-    ``fps`` spaces pictures evenly instead of by the times of the container.
+    Parameters
+    ----------
+    image_format : str
+        "auto" passes H.264, VP9 and AV1 through unchanged if viewers can play them, "h265" also H.265, "h264" only
+        H.264; other streams are transcoded to H.264. "jpeg" and "png" store every picture by itself.
+    quality : int, optional
+        For JPEG from 1 to 100 (best). For H.264 the constant rate factor from 1 (best) to 51; then every stream is
+        transcoded.
+    keyframe_interval_s : float, optional
+        Maximum time between key pictures: of streams that are passed through (default 2) and transcoded (default 1).
+    fps : Fraction, optional
+        Frame rate that replaces the timestamps of the container.
+
+    Raises
+    ------
+    McaptrackError
+        For values out of range, and for options that contradict each other.
     """
 
     image_format: ImageFormat = "auto"
@@ -82,12 +94,12 @@ class VideoOptions:
 
     @property
     def is_still(self) -> bool:
-        """Whether every picture stands alone."""
+        """Whether every picture is stored by itself."""
         return self.image_format in _STILLS
 
     @property
     def jpeg_quality(self) -> int:
-        """From 1 to 100."""
+        """JPEG quality from 1 to 100."""
         return _JPEG_QUALITY if self.quality is None else self.quality
 
     @property
@@ -97,20 +109,20 @@ class VideoOptions:
 
     @property
     def key_every_s(self) -> float:
-        """How often what is encoded has a key picture."""
+        """Seconds between key pictures of transcoded streams."""
         return self.keyframe_interval_s or _KEY_EVERY_S
 
     @property
     def key_within_s(self) -> float:
-        """How far apart the key pictures may be of what is passed on."""
+        """Maximum seconds between key pictures of streams that are passed through."""
         return self.keyframe_interval_s or _KEY_WITHIN_S
 
 
 class H264Encoder:
-    """Pictures -> H.264 in Annex B form, one access unit a picture, without B-frames.
+    """Encodes pictures as H.264 in Annex B format, one access unit for each picture, without B-frames.
 
-    Key pictures are at most ``key_every_s`` apart, by the times that pictures are given, without these by ``fps``. What
-    colours mean is said as a frame of FFmpeg's, ``like``, says it; images are converted as in ITU-R BT.601.
+    Key pictures are at most ``key_every_s`` apart, by the times of the pictures or, without times, by ``fps``. The
+    colour space is that of ``like``, a frame of FFmpeg; arrays are converted by ITU-R BT.601.
     """
 
     def __init__(
@@ -139,7 +151,7 @@ class H264Encoder:
         self._key_every_ns, self._key_ns = round(key_every_s * NS_PER_S), 0
 
     def encode(self, image: Image | Any, t_ns: int | None = None) -> bytes:
-        """One picture, BGR (height, width, 3), or a frame of FFmpeg's of just this size."""
+        """Encode one picture: BGR (height, width, 3) uint8, or a frame of FFmpeg with exactly this size."""
         import av
         from av.video.frame import PictureType
 
@@ -154,14 +166,14 @@ class H264Encoder:
         try:
             packets = self._codec.encode(frame)
         except av.error.FFmpegError as error:
-            raise _refused(frame, error) from error
+            raise _encoder_error(frame, error) from error
         if t_ns is not None and any(packet.is_keyframe for packet in packets):
             self._key_ns = t_ns
         return b"".join(bytes(packet) for packet in packets)
 
 
-def _refused(frame: Any, error: Exception) -> McaptrackError:
-    """What to say of a picture that the encoder doesn't take; libx264 wants at most 16384 rows and columns."""
+def _encoder_error(frame: Any, error: Exception) -> McaptrackError:
+    """The error for a picture that the encoder rejects; libx264 takes at most 16384 rows and columns."""
     why = getattr(error, "strerror", None) or error
     return McaptrackError(
         f"pictures of {frame.width} x {frame.height} can't be encoded as H.264 ({why}); jpeg and png can be larger"
@@ -169,7 +181,7 @@ def _refused(frame: Any, error: Exception) -> McaptrackError:
 
 
 def encode_image(image: Image, image_format: StillFormat, quality: int = _JPEG_QUALITY) -> bytes:
-    """One picture, BGR, as JPEG or PNG. ``quality``, from 1 to 100, is JPEG's."""
+    """Encode one picture, BGR (height, width, 3) uint8, as JPEG with a ``quality`` from 1 to 100, or as PNG."""
     import cv2
 
     options = [cv2.IMWRITE_JPEG_QUALITY, quality] if image_format == "jpeg" else []
@@ -180,15 +192,15 @@ def encode_image(image: Image, image_format: StillFormat, quality: int = _JPEG_Q
 
 
 def write_mp4(path: Path, images: Iterable[Image], fps: int) -> int:
-    """Write pictures, BGR of one even size, as an H.264 file, there once it is complete. Returns how many."""
+    """Write pictures, BGR of one even size, to an H.264 file, published when complete. Returns their number."""
     step = Fraction(NS_PER_S, fps)
     return write_clip(path, ((round(number * step), image) for number, image in enumerate(images)), Fraction(fps))
 
 
 def write_clip(path: Path, images: Iterable[tuple[int, Image]], fps: Fraction) -> int:
-    """Write pictures, BGR of one even size, with their times in nanoseconds, as an H.264 file or, by its suffix, a GIF.
+    """Write pictures, BGR of one even size, with times in nanoseconds, to an H.264 file or (suffix .gif) a GIF.
 
-    It is there once it is complete. ``fps`` is about how many there are in a second. Returns how many they were.
+    The file is published when it is complete. ``fps`` is the approximate frame rate. Returns the number of pictures.
     """
     import av
 
@@ -202,7 +214,7 @@ def write_clip(path: Path, images: Iterable[tuple[int, Image]], fps: Fraction) -
             try:
                 packets = stream.encode(frame)
             except av.error.FFmpegError as error:
-                raise (_refused(frame, error) if frame else error) from error
+                raise (_encoder_error(frame, error) if frame else error) from error
             for packet in packets:
                 container.mux(packet)
 
@@ -230,7 +242,7 @@ def write_clip(path: Path, images: Iterable[tuple[int, Image]], fps: Fraction) -
 
 
 class _Palette:
-    """Pictures -> the same in the 256 colours that suit all of them best, as a GIF needs them."""
+    """Reduces pictures to the 256 colours that suit all of them best, for a GIF."""
 
     def __init__(self) -> None:
         self._graph: Any = None

@@ -1,7 +1,7 @@
-"""How many places for pictures a container has that counts places instead of times: AVI and IVF.
+"""Count the slots for pictures in containers that number pictures instead of storing times: AVI and IVF.
 
-Places may be empty: where nothing moved, or no picture came. What a container claims is how many places it has, and
-what is missing of these was cut off.
+Slots may be empty, where nothing moved or no picture arrived. The container declares its number of slots; if there are
+fewer, the file was cut off.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ _LISTS: Final = (b"movi", b"rec ")
 
 
 class _File(Protocol):
-    """A file without a buffer: only heads of chunks are read, far apart."""
+    """An unbuffered file: only the heads of chunks are read, far apart."""
 
     def read(self, size: int, /) -> bytes: ...
 
@@ -22,7 +22,7 @@ class _File(Protocol):
 
 
 def count_slots(path: Path, stream: int) -> int | None:
-    """The places that a file has for pictures of a stream, as far as it reaches; None for other containers."""
+    """The number of slots of a stream that the file really holds; None for other containers."""
     with path.open("rb", buffering=0) as file:
         head = file.read(_RIFF_HEAD)
         if head[:4] == b"RIFF" and head[8:12] == b"AVI ":
@@ -33,7 +33,7 @@ def count_slots(path: Path, stream: int) -> int | None:
 
 
 def _avi(file: _File, size: int, name: bytes) -> int:
-    """Chunks of pictures, "00dc" or "00db", in all lists of all parts of the file."""
+    """Count the chunks "00dc" and "00db" in all lists of all RIFF parts of the file."""
     count, at = 0, 0
     while at + _CHUNK_HEAD <= size:
         file.seek(at)

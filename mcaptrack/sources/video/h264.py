@@ -1,4 +1,4 @@
-"""What has to be known about an H.264 stream (ITU-T H.264, 7.3 and Annex B) before it is passed on or entered."""
+"""Parse H.264 streams (ITU-T H.264, 7.3 and Annex B) as far as passing them through and seeking in them need it."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ _SLICE, _PARTITION, _IDR, _SPS, _PPS, _DELIMITER = 1, 2, 5, 7, 8, 9
 _PICTURES: Final = (_SLICE, _PARTITION, _IDR)
 _SETS: Final = frozenset((_SPS, _PPS))
 _B: Final = 1
-#: Profiles whose parameter sets say how colour is sampled.
+#: Profiles whose sequence parameter sets contain chroma_format_idc.
 _HIGH: Final = (100, 110, 122, 244, 44, 83, 86, 118, 128, 138, 139, 134, 135)
 
 
 def inspect(data: bytes) -> AccessUnit:
-    """What the access unit ``data`` (Annex B) holds."""
+    """Parse an access unit in Annex B format."""
     pictures, is_key, has_b = 0, False, False
     sets: dict[bytes, int] = {}
     for kind, nal in nal_units(data, _SETS, 0, 0x1F):
@@ -30,7 +30,7 @@ def inspect(data: bytes) -> AccessUnit:
 
 
 def read_head(data: bytes) -> PictureHead:
-    """What a message begins with; nothing behind the head of its first slice is looked at."""
+    """Parse the first bytes of a message, up to the header of its first slice."""
     found: set[int] = set()
     for start in nal_starts(data):
         kind = data[start] & 0x1F if start < len(data) else 0
@@ -40,8 +40,8 @@ def read_head(data: bytes) -> PictureHead:
     return PictureHead(False, False, found >= _SETS)
 
 
-def with_sets(data: bytes, sets: tuple[bytes, ...]) -> bytes:
-    """An access unit with parameter sets before its slices, behind its delimiter."""
+def with_parameter_sets(data: bytes, sets: tuple[bytes, ...]) -> bytes:
+    """Insert parameter sets into an access unit, after its delimiter."""
     first = next(nal_starts(data), len(data))
     at = 0
     if first < len(data) and data[first] & 0x1F == _DELIMITER:
@@ -50,18 +50,18 @@ def with_sets(data: bytes, sets: tuple[bytes, ...]) -> bytes:
 
 
 def is_interlaced(sets: tuple[bytes, ...]) -> bool:
-    """Whether pictures may be made of two fields."""
+    """Whether pictures may consist of two fields."""
     return any(not _geometry(nal)[2] for nal in sets if nal[0] & 0x1F == _SPS)
 
 
-def largest(data: bytes) -> tuple[int, int]:
-    """The width and height, in whole blocks, of the largest pictures that sequence parameter sets announce."""
+def largest_size(data: bytes) -> tuple[int, int]:
+    """The largest picture size in the sequence parameter sets: width and height, rounded up to macroblocks."""
     sizes = [_geometry(nal)[:2] for kind, nal in nal_units(data, _SETS, 0, 0x1F) if kind == _SPS]
     return max(sizes, key=lambda size: size[0] * size[1], default=(0, 0))
 
 
 def _geometry(sps: bytes) -> tuple[int, int, bool]:
-    """Width and height in whole blocks, and frame_mbs_only_flag, of a sequence parameter set (7.3.2.1.1)."""
+    """Width and height in pixels, rounded up to macroblocks, and frame_mbs_only_flag of an SPS (7.3.2.1.1)."""
     bits = Bits.of_nal(sps[1:])
     profile = bits.take(8)
     bits.take(16)  # constraints, level
@@ -74,7 +74,7 @@ def _geometry(sps: bytes) -> tuple[int, int, bool]:
         if bits.take(1):
             for number in range(8 if chroma != 3 else 12):
                 if bits.take(1):
-                    _pass_scaling_list(bits, 16 if number < 6 else 64)
+                    _skip_scaling_list(bits, 16 if number < 6 else 64)
     bits.golomb()  # log2_max_frame_num
     order = bits.golomb()  # pic_order_cnt_type
     if order == 0:
@@ -85,12 +85,12 @@ def _geometry(sps: bytes) -> tuple[int, int, bool]:
         for _ in range(min(bits.golomb(), 255)):
             bits.golomb()
     bits.golomb(), bits.take(1)  # references, gaps
-    blocks, units = bits.golomb() + 1, bits.golomb() + 1  # of a height of one block, or of two in pairs of fields
+    blocks, units = bits.golomb() + 1, bits.golomb() + 1  # map units are one macroblock high, or two in pairs of fields
     frames_only = bool(bits.take(1))
     return 16 * blocks, 16 * units * (1 if frames_only else 2), frames_only
 
 
-def _pass_scaling_list(bits: Bits, size: int) -> None:
+def _skip_scaling_list(bits: Bits, size: int) -> None:
     last = following = 8
     for _ in range(size):
         if following:

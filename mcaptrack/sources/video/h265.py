@@ -1,4 +1,4 @@
-"""What has to be known about an H.265 stream (ITU-T H.265, 7.3 and Annex B) before it is passed on or entered."""
+"""Parse H.265 streams (ITU-T H.265, 7.3 and Annex B) as far as passing them through and seeking in them need it."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ _SETS: Final = frozenset((32, 33, 34))  # VPS, SPS, PPS
 _DELIMITER: Final = 35
 _LAST_PICTURE: Final = 31
 _RANDOM_ACCESS: Final = range(16, 24)
-#: Pictures that are shown before the key picture that they follow, and may need those before it.
+#: Leading pictures (RASL, RADL): they follow a key picture but are shown before it, and may need earlier pictures.
 _LEADING: Final = range(6, 10)
 
 
 def _kind(data: bytes, at: int) -> int:
-    """The type of the NAL unit that begins there; a type that nothing has where it is cut off."""
+    """The type of the NAL unit at an offset; 63, an unused type, if it is cut off."""
     return data[at] >> 1 & 0x3F if at < len(data) else 63
 
 
 def inspect(data: bytes) -> AccessUnit:
-    """What the access unit ``data`` (Annex B) holds. Layers above the first are passed over."""
+    """Parse an access unit in Annex B format. Layers above the base layer are skipped."""
     pictures, is_key, is_leading = 0, False, False
     sets: dict[bytes, int] = {}
     for kind, nal in nal_units(data, _SETS, 1, 0x3F):
@@ -36,7 +36,7 @@ def inspect(data: bytes) -> AccessUnit:
 
 
 def read_head(data: bytes) -> PictureHead:
-    """What a message begins with; nothing behind the head of its first slice is looked at."""
+    """Parse the first bytes of a message, up to the header of its first slice."""
     found: set[int] = set()
     for start in nal_starts(data):
         kind = _kind(data, start)
@@ -46,8 +46,8 @@ def read_head(data: bytes) -> PictureHead:
     return PictureHead(False, False, found >= _SETS)
 
 
-def with_sets(data: bytes, sets: tuple[bytes, ...]) -> bytes:
-    """An access unit with parameter sets before its slices, behind its delimiter."""
+def with_parameter_sets(data: bytes, sets: tuple[bytes, ...]) -> bytes:
+    """Insert parameter sets into an access unit, after its delimiter."""
     first = next(nal_starts(data), len(data))
     at = first + 3 if _kind(data, first) == _DELIMITER else 0
     return data[:at] + b"".join(b"\x00\x00\x00\x01" + nal for nal in sets) + data[at:]

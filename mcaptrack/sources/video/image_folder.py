@@ -1,4 +1,4 @@
-"""Folders of images, which are videos: their order, their numbers, and their pixels.
+"""Read folders of images as videos: their order, the numbers in their names, and their pixels.
 
 Letters: P pictures.
 """
@@ -20,15 +20,15 @@ from mcaptrack.sources.video.limits import check_still, still_size
 
 IMAGE_SUFFIXES: Final = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
 _NUMBERED: Final = re.compile(r"(.*?)([0-9]{1,18})(\D*)")
-#: Numbers in names count pictures if at least this share of them is there.
+#: Numbers in names count as frame numbers if at least this share of them exists.
 _DENSE: Final = 0.5
 _SHOWN: Final = 3
 
 
 class Images(NamedTuple):
-    """The images of a folder in order: ``place`` (P,) of each in the sequence, from 0, with gaps for missing ones.
+    """The images of a folder in order: ``place`` (P,) is their position in the sequence, with gaps for missing ones.
 
-    ``every`` is the distance of the numbers in their names: 12 where every twelfth picture was kept under its number.
+    ``every`` is the step of the numbers in their names: 12 if every twelfth picture was kept with its number.
     """
 
     paths: list[Path]
@@ -57,14 +57,14 @@ def find_images(folder: Path) -> Images:
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:
-    """Sort key by which 2.jpg comes before 10.jpg."""
+    """Sort key for natural order: 2.jpg comes before 10.jpg."""
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"([0-9]+)", path.name) if part]
 
 
 def read_image(path: Path) -> NDArray[np.uint8] | None:
     """An image, BGR (height, width, 3), upright; None if it can't be decoded.
 
-    Raises McaptrackError if it is too large, or no file.
+    Raises McaptrackError if it is too large, or not a file.
     """
     import cv2
 

@@ -1,7 +1,7 @@
-"""Packets of a container -> messages with the same pictures, where every viewer can play them as they stand.
+"""Pass video streams through without transcoding: packets of a container become messages with the same pictures.
 
-What viewers ask: one picture a message, none shown in another order than they stand in, upright, progressive, 8-bit
-4:2:0, of one size; key pictures that can be decoded on their own, with their parameter sets, close to one another.
+Viewers require: one picture in each message, display order equal to decoding order, upright, progressive, 8-bit 4:2:0,
+one size; key pictures that can be decoded independently, with their parameter sets, at short intervals.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ _WORDS: Final = {"h264": "H.264", "h265": "H.265", "vp9": "VP9", "av1": "AV1"}
 _ONLY_SOME: Final = "it is H.265, which viewers play only where the hardware does (--image-format h265 keeps it)"
 
 
-class Passed(NamedTuple):
-    """A packet as a message: its time in seconds, if it has one, and what its container says of it."""
+class StreamPacket(NamedTuple):
+    """A packet as a message: its time in seconds, if it has one, and its flags in the container."""
 
     seconds: Fraction | None
     data: bytes
@@ -34,11 +34,11 @@ class Passed(NamedTuple):
 
 
 @dataclass
-class Stream:
-    """What a look at all packets found.
+class StreamCheck:
+    """The result of checking all packets of a stream.
 
-    ``format`` is as messages name it, "" where they have no name for it. ``why_not`` says why it can't be passed on, ""
-    if it can; then ``sets`` are the parameter sets that key pictures need and that are not with all of them.
+    ``format`` is the format name in messages, "" if they have none. ``why_not`` says why the stream can't be passed
+    through, "" if it can; then ``sets`` are the parameter sets to insert before key pictures that lack them.
     """
 
     format: str
@@ -46,8 +46,8 @@ class Stream:
     sets: tuple[bytes, ...] = ()
 
 
-def packets(opened: Any, image_format: str) -> Iterator[Passed]:
-    """The packets of the first video stream as messages, as far as they can be read."""
+def packets(opened: Any, image_format: str) -> Iterator[StreamPacket]:
+    """The packets of the first video stream as messages, up to the first one that can't be read."""
     import av
     from av.bitstream import BitStreamFilterContext
 
@@ -59,8 +59,8 @@ def packets(opened: Any, image_format: str) -> Iterator[Passed]:
     while True:
         try:
             packet = next(found, None)
-        except av.error.FFmpegError:  # FFmpeg reads no further
-            yield Passed(None, b"", False, False, True, False)
+        except av.error.FFmpegError:  # FFmpeg can't read on
+            yield StreamPacket(None, b"", False, False, True, False)
             return
         if packet is None:
             return
@@ -70,49 +70,51 @@ def packets(opened: Any, image_format: str) -> Iterator[Passed]:
         seconds = None if ticks is None else ticks * base
         flags = (packet.is_keyframe, packet.is_discard, packet.is_corrupt, packet.has_sidedata("new_extradata"))
         try:
-            units = to_annex_b.filter(packet) if to_annex_b else [packet]  # takes the packet's contents with it
+            units = to_annex_b.filter(packet) if to_annex_b else [packet]  # moves the data out of the packet
         except av.error.FFmpegError:
             units, flags = [], (*flags[:2], True, flags[3])
-        yield Passed(seconds, b"".join(bytes(unit) for unit in units), *flags)
+        yield StreamPacket(seconds, b"".join(bytes(unit) for unit in units), *flags)
 
 
-def look(path: Path, keep: VideoOptions) -> Stream:
-    """Whether and how the first video stream of a file can be passed on, from one pass over its packets."""
+def check_stream(path: Path, options: VideoOptions) -> StreamCheck:
+    """Check in one pass over its packets whether the first video stream of a file can be passed through."""
     with reading(path) as opened:
         stream = videos(opened)[0]
         context = stream.codec_context
         name = context.codec.canonical_name
         image_format = next((key for key, codec in CODECS.items() if codec.name == name), "")
-        why_not = _why_not(image_format, name, keep, context)
+        why_not = _rejected_by_codec(image_format, name, options, context)
         if why_not:
-            return Stream(image_format, why_not)
-        found = Stream(image_format, "", _outside(image_format, context))
-        found.why_not = _look_at(packets(opened, image_format), found, keep.fps, Fraction(keep.key_within_s))
-        if image_format == "h265" and keep.image_format != "h265" and not found.why_not:
+            return StreamCheck(image_format, why_not)
+        found = StreamCheck(image_format, "", _container_sets(image_format, context))
+        found.why_not = _check_packets(
+            packets(opened, image_format), found, options.fps, Fraction(options.key_within_s)
+        )
+        if image_format == "h265" and options.image_format != "h265" and not found.why_not:
             found.why_not = _ONLY_SOME
         return found
 
 
-def _why_not(image_format: str, name: str, keep: VideoOptions, context: Any) -> str:
-    """What speaks against passing a stream on, of all that is known without looking at its packets."""
+def _rejected_by_codec(image_format: str, name: str, options: VideoOptions, context: Any) -> str:
+    """Why a stream can't be passed through, judged by codec and options alone; "" if they allow it."""
     if not image_format:
         return f"it is {name}, which viewers don't play"
-    if keep.image_format == "h264" and image_format != "h264":
+    if options.image_format == "h264" and image_format != "h264":
         return f"it is {_WORDS[image_format]}, not H.264"
-    if keep.quality is not None:
+    if options.quality is not None:
         return "a quality was asked for"
     if context.pix_fmt not in _PIXELS:
         return f"its pixels are {context.pix_fmt}, not 8-bit 4:2:0"
     return "it has B-frames" if context.has_b_frames else ""
 
 
-def _outside(image_format: str, context: Any) -> tuple[bytes, ...]:
-    """The sequence headers that a container keeps beside its packets; for H.264 and H.265 the filter puts them in."""
+def _container_sets(image_format: str, context: Any) -> tuple[bytes, ...]:
+    """Sequence headers that the container stores outside of packets; for H.264 and H.265 the filter inserts them."""
     return av1.sequence_headers(bytes(context.extradata or b"")) if image_format == "av1" else ()
 
 
-def _look_at(found: Iterator[Passed], stream: Stream, fps: Fraction | None, within_s: Fraction) -> str:
-    """Why these packets can't be passed on; notes parameter sets that have to be put beside key pictures."""
+def _check_packets(found: Iterator[StreamPacket], stream: StreamCheck, fps: Fraction | None, within_s: Fraction) -> str:
+    """Why these packets can't be passed through, "" if they can; records the parameter sets to insert."""
     inspect = CODECS[stream.format].inspect
     known: tuple[bytes, ...] = stream.sets
     size: tuple[int, int] | None = None
@@ -123,7 +125,7 @@ def _look_at(found: Iterator[Passed], stream: Stream, fps: Fraction | None, with
         if cut_off:
             return "some of its packets are damaged"
         if packet.is_damaged:
-            cut_off = True  # at the very end it is left out; anywhere else what follows needs it
+            cut_off = True  # the last packet can be left out; others are needed by those that follow
             continue
         if packet.is_hidden:
             return "an edit list hides some of its frames"
@@ -140,16 +142,16 @@ def _look_at(found: Iterator[Passed], stream: Stream, fps: Fraction | None, with
             return "it has B-frames"
         if unit.pictures != 1:
             return "its packets are not one picture each"
-        if count == 0 and not (unit.is_key and (unit.has_sets or known)):
+        if count == 0 and not (unit.is_key and (unit.has_parameter_sets or known)):
             return "it does not begin with a key frame"
         if packet.is_key and not unit.is_key:
             return "not every key frame can be decoded on its own (open groups of pictures)"
         if unit.is_key:
             key_at = seconds
-            all_have_sets &= unit.has_sets
+            all_have_sets &= unit.has_parameter_sets
         elif seconds - key_at > within_s:
             return f"its key frames are more than {float(within_s):g} s apart"
-        if count == 0:  # what stands in the stream counts; the container's own words may differ
+        if count == 0:  # the stream itself decides; the container may say something else
             known = unit.sets or known
         if not set(unit.sets) <= set(known) or (size and unit.size and size != unit.size):
             return "it changes its size or its parameters on the way"

@@ -1,4 +1,4 @@
-"""Pixels that nobody compressed -> brightness, or colours.
+"""Convert uncompressed pictures to gray or BGR.
 
 Letters: H rows, W columns, B bytes a pixel.
 """
@@ -14,10 +14,10 @@ from mcaptrack.geometry.arrays import Bytes
 
 
 class PixelLayout(NamedTuple):
-    """How the pixels of a picture that nobody compressed lie in its bytes.
+    """The memory layout of an uncompressed picture.
 
-    ``step`` is the distance of rows in bytes, 0 where rows follow one another; ``is_bigendian`` is about pixels of two
-    and four bytes.
+    ``step`` is the distance of rows in bytes, 0 for contiguous rows; ``is_bigendian`` applies to pixels of two and four
+    bytes.
     """
 
     width_px: int
@@ -26,7 +26,7 @@ class PixelLayout(NamedTuple):
     is_bigendian: bool = False
 
 
-#: Encoding -> bytes a pixel and the name of OpenCV's conversion; "" where the first plane is the brightness already.
+#: Encoding -> bytes of a pixel and OpenCV's conversion to gray; "" if the picture is gray already.
 _COLOURS: Final = {
     "mono8": (1, ""),
     "8uc1": (1, ""),
@@ -42,7 +42,7 @@ _COLOURS: Final = {
     "bayer_gbrg8": (1, "COLOR_BayerGBRG2GRAY"),
     "bayer_grbg8": (1, "COLOR_BayerGRBG2GRAY"),
 }
-#: Packed YUV: where in a pair of bytes the brightness stands.
+#: Packed YUV: the index of the luma byte in each pair of bytes.
 _LUMA_AT: Final = {"uyvy": 1, "yuv422": 1, "yuyv": 0, "yuv422_yuy2": 0}
 _PLANAR: Final = ("nv12", "nv21")
 _WIDE: Final = {"mono16": "u2", "16uc1": "u2", "32fc1": "f4"}
@@ -50,10 +50,10 @@ _WIDE: Final = {"mono16": "u2", "16uc1": "u2", "32fc1": "f4"}
 RAW_ENCODINGS: Final = (*_COLOURS, *_LUMA_AT, *_PLANAR, *_WIDE)
 
 
-def raw_brightness(encoding: str, data: bytes, layout: PixelLayout) -> Bytes:
-    """The brightness (H, W) of a picture, from 0 to 255: of 16 bits the upper 8, of floats from 0 to 1 their share.
+def raw_gray(encoding: str, data: bytes, layout: PixelLayout) -> Bytes:
+    """A picture in gray (H, W) uint8: the upper 8 bits of 16-bit pixels, and floats from 0 to 1 scaled to 0 to 255.
 
-    Raises McaptrackError for an encoding that is not read, and for a size that ``data`` does not hold.
+    Raises McaptrackError for an unknown encoding, and if ``data`` is too short for the size.
     """
     if encoding in _COLOURS:
         size, conversion = _COLOURS[encoding]
@@ -74,18 +74,18 @@ def raw_brightness(encoding: str, data: bytes, layout: PixelLayout) -> Bytes:
     raise McaptrackError(f"pixels of the encoding {encoding[:40]!r} are not read; {', '.join(RAW_ENCODINGS)} are")
 
 
-def raw_colours(encoding: str, data: bytes, layout: PixelLayout) -> Bytes:
-    """Blue, green and red (H, W, 3) of a picture; grey where it is grey, or of an encoding that is rare."""
+def raw_bgr(encoding: str, data: bytes, layout: PixelLayout) -> Bytes:
+    """A picture in BGR (H, W, 3) uint8; in gray for gray pictures and for rare encodings."""
     import cv2
 
     size, conversion = _COLOURS.get(encoding, (0, ""))
     if not conversion:
-        return np.asarray(cv2.cvtColor(raw_brightness(encoding, data, layout), cv2.COLOR_GRAY2BGR), np.uint8)
+        return np.asarray(cv2.cvtColor(raw_gray(encoding, data, layout), cv2.COLOR_GRAY2BGR), np.uint8)
     return _converted(encoding, data, layout, size, conversion.replace("2GRAY", "2BGR").replace("COLOR_BGR2BGR", ""))
 
 
 def _converted(encoding: str, data: bytes, layout: PixelLayout, size: int, conversion: str) -> Bytes:
-    """Pixels after a conversion of OpenCV's, "" for none."""
+    """Apply a colour conversion of OpenCV, "" for none."""
     import cv2
 
     rows = _rows(data, layout, size)
@@ -99,7 +99,7 @@ def _converted(encoding: str, data: bytes, layout: PixelLayout, size: int, conve
 
 
 def _rows(data: bytes, layout: PixelLayout, size: int) -> Bytes:
-    """The bytes of the pixels, (H, W * B), without what fills up rows. Never takes more memory than ``data``."""
+    """The bytes of the pixels, (H, W * B), without row padding. Never takes more memory than ``data``."""
     width, height = layout.width_px, layout.height_px
     row = width * size
     step = layout.step or row

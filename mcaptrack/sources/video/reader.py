@@ -1,7 +1,7 @@
-"""Video files and image folders -> encoded pictures with exact times, one a message.
+"""Read video files and image folders as encoded pictures with exact times, one for each message.
 
-A stream is passed on without re-encoding where every viewer can play it as it stands (``passing``); otherwise it is
-decoded and encoded again, and the reason is said.
+A stream is passed through without transcoding if every viewer can play it (``passthrough``); otherwise it is decoded
+and encoded again, and the reason is reported.
 """
 
 from __future__ import annotations
@@ -21,31 +21,39 @@ from mcaptrack.geometry.arrays import Image
 from mcaptrack.geometry.clocks import LAST_NS, NS_PER_S
 from mcaptrack.notices import warn
 from mcaptrack.sources.video.codecs import CODECS
-from mcaptrack.sources.video.container import empty, fraction, has_slots, has_times, indexed, reading, videos
+from mcaptrack.sources.video.container import (
+    count_empty,
+    count_indexed,
+    fraction,
+    has_slots,
+    has_times,
+    reading,
+    videos,
+)
 from mcaptrack.sources.video.encode import H264Encoder, StillFormat, VideoOptions, encode_image
 from mcaptrack.sources.video.frame_slots import count_slots
 from mcaptrack.sources.video.image_folder import Images, find_images, read_image
 from mcaptrack.sources.video.limits import check_h264, check_size
-from mcaptrack.sources.video.passthrough import look, packets
+from mcaptrack.sources.video.passthrough import check_stream, packets
 from mcaptrack.sources.video.seqinfo import find_seqinfo
 
-#: As many on every machine, so that what is made of damaged streams is the same everywhere.
+#: A fixed number of threads, so that damaged streams decode to the same pictures on every machine.
 _THREADS: Final = 4
 _FULL_RANGE, _LIMITED_RANGE = 2, 1  # AVCOL_RANGE_JPEG, AVCOL_RANGE_MPEG
 
 
 class PictureMessage(NamedTuple):
-    """One picture as a message carries it."""
+    """One encoded picture, to be written as a message."""
 
     t_ns: int
     index: int  # type: ignore[assignment]  # hides tuple.index, which is not needed here
     data: bytes
 
 
-class Shown(NamedTuple):
-    """One picture as it is shown: its number, its time in seconds, if it has one, and FFmpeg's frame or BGR (H, W, 3).
+class DecodedPicture(NamedTuple):
+    """One decoded picture: its number, its time in seconds, if it has one, and a frame of FFmpeg or BGR (H, W, 3).
 
-    Pictures that can't be decoded have numbers, too.
+    Pictures that can't be decoded are counted, too.
     """
 
     index: int  # type: ignore[assignment]  # hides tuple.index, which is not needed here
@@ -55,17 +63,17 @@ class Shown(NamedTuple):
 
 @dataclass
 class Video:
-    """A video file or image folder that can be read; made by ``open_video``.
+    """A video file or image folder, open for reading; made by ``open_video``.
 
-    ``format`` is what its messages are: "h264", "vp9", "jpeg" and so on. ``width_px`` and ``height_px`` are of these.
-    ``frames`` is what the container claims, 0 if nothing. ``start_ns`` is when the recording began, if it says.
-    ``images`` are those of a folder, of which every so many are there by the numbers in their names (``every``).
-    ``why_transcode`` is empty where the stream is passed on, or where stills are asked for. ``lost`` and ``notes``
-    collect, while pictures are read, what could not be, and what is worth saying.
+    ``format`` is the format of its messages ("h264", "vp9", "jpeg" and so on), ``width_px`` and ``height_px`` their
+    size. ``frames`` is the number of frames that the container declares, 0 if it doesn't. ``start_ns`` is the recording
+    time, if the container has it. ``images`` are those of a folder; ``every`` is the step of the numbers in their
+    names. ``why_transcode`` is empty for streams that are passed through, and for stills. While pictures are read,
+    ``lost`` collects what could not be read, and ``notes`` what else is worth reporting.
     """
 
     path: Path
-    keep: VideoOptions
+    options: VideoOptions
     format: str
     width_px: int
     height_px: int
@@ -83,27 +91,27 @@ class Video:
 
     @property
     def every(self) -> int:
-        """How far apart the numbers of pictures are: 12 for images of which every twelfth has kept its number."""
+        """The step of the picture numbers: 12 for images of which every twelfth was kept with its number."""
         return self.images.every if self.images else 1
 
     def pictures(self, start_ns: int = 0) -> Iterator[PictureMessage]:
         """All pictures in order, the first of them at ``start_ns``."""
         clock = _Clock(self, start_ns)
-        if self.keep.is_still:
-            yield from _stills(self, clock)
+        if self.options.is_still:
+            yield from _encode_stills(self, clock)
         elif self.why_transcode:
             yield from _transcode(self, clock)
         else:
-            yield from _pass_on(self, clock)
+            yield from _remux(self, clock)
 
     def note_missing(self, read: int, hidden: int = 0, last_s: Fraction | None = None) -> None:
-        """Compare what was read with what the container claims; ``hidden`` is what it says not to show, or is empty."""
+        """Compare the number of pictures read with the declared number, of which ``hidden`` are not shown."""
         if self.has_slots and self.fps and last_s is not None:
-            hidden += round(last_s * self.fps) + 1 - read  # slots that are empty
+            hidden += round(last_s * self.fps) + 1 - read  # empty slots
         if self.frames and read + hidden < self.frames:
             slots = None if self.images else count_slots(self.path, self.stream)
             if slots is not None and slots >= self.frames:
-                return  # the file is whole: what was not read is empty, or was said to be lost
+                return  # the file is complete: the others are empty slots, or reported as lost
             self.lost.append(f"{self.path} claims {self.frames} frames; {read} could be read")
         elif not self.frames and self.length_s and last_s is not None and self.fps:
             gap = self.length_s - last_s
@@ -113,10 +121,10 @@ class Video:
 
 
 class _Clock:
-    """Times of pictures: from the container, exact in its time base; or evenly spaced."""
+    """Times of pictures: from the container, exact in its time base, or evenly spaced."""
 
     def __init__(self, video: Video, start_ns: int) -> None:
-        self.fps = video.keep.fps or (video.fps if video.images else None)
+        self.fps = video.options.fps or (video.fps if video.images else None)
         self._where = video.path
         self._start_ns = start_ns
         self._first: Fraction | None = None
@@ -137,14 +145,14 @@ class _Clock:
             raise McaptrackError(
                 f"{self._where}: picture {index} is {float(seconds):g} s after the first; times reach to the year 2262"
             )
-        self._last = max(t_ns, self._last + 1)  # two pictures never share a time
+        self._last = max(t_ns, self._last + 1)  # times are strictly increasing
         return self._last
 
 
-def open_video(path: Path, keep: VideoOptions = VideoOptions()) -> Video:  # noqa: B008  # frozen
-    """Look at a video file or image folder. Raises McaptrackError unless it holds pictures that can be decoded."""
+def open_video(path: Path, options: VideoOptions = VideoOptions()) -> Video:  # noqa: B008  # frozen
+    """Open a video file or image folder. Raises McaptrackError if it holds no pictures that can be decoded."""
     if path.is_dir():
-        return _open_folder(path, keep)
+        return _open_folder(path, options)
     with reading(path) as opened:
         there = videos(opened)
         if not there:
@@ -153,18 +161,18 @@ def open_video(path: Path, keep: VideoOptions = VideoOptions()) -> Video:  # noq
         stream = there[0]
         context = stream.codec_context
         if context is None:
-            raise McaptrackError(f"{path} holds video in a codec that is not known here; convert it to H.264 first")
+            raise McaptrackError(f"{path} holds video in an unknown codec; convert it to H.264 first")
         check_size(context.width, context.height, path)
         first = next(opened.decode(stream), None)
         if first is None:
             raise McaptrackError(f"{path} is a video without frames")
-        if not (has_times(opened) or keep.fps):
+        if not (has_times(opened) or options.fps):
             raise McaptrackError(f"{path} has no times of its own; give the frames per second with --fps")
         sideways = first.rotation % 180 != 0
         video = Video(
             path,
-            keep,
-            keep.image_format if keep.is_still else "h264",
+            options,
+            options.image_format if options.is_still else "h264",
             first.height if sideways else first.width,
             first.width if sideways else first.height,
             fraction(stream.average_rate),
@@ -179,10 +187,10 @@ def open_video(path: Path, keep: VideoOptions = VideoOptions()) -> Video:  # noq
             video.notes.append(f"{path} holds {len(there)} videos; the first is taken")
         if first.interlaced_frame:
             video.why_transcode = video.why_transcode or "it is interlaced"
-    if keep.is_still:
+    if options.is_still:
         video.why_transcode = ""
     elif not video.why_transcode:
-        found = look(path, keep)
+        found = check_stream(path, options)
         video.why_transcode, video.sets = found.why_not, found.sets
         video.format = "h264" if found.why_not else found.format
     _make_even(video)
@@ -190,7 +198,7 @@ def open_video(path: Path, keep: VideoOptions = VideoOptions()) -> Video:  # noq
 
 
 def _make_even(video: Video) -> None:
-    """Pictures that are encoded as H.264 have an even number of rows and columns."""
+    """Round the size of transcoded pictures up to even numbers, which H.264 needs."""
     if video.why_transcode:
         check_h264(video.width_px, video.height_px, video.path)
         video.width_px += video.width_px % 2
@@ -198,23 +206,23 @@ def _make_even(video: Video) -> None:
 
 
 def _length_s(opened: Any, stream: Any) -> Fraction | None:
-    """How long a container says that its pictures are; None if it says it of all streams together."""
+    """The duration of the video stream that the container declares; None if it only declares that of all streams."""
     said = re.fullmatch(r"(\d+):(\d\d):(\d\d(?:\.\d+)?)", stream.metadata.get("DURATION", ""))
     if said:
         return int(said[1]) * 3600 + int(said[2]) * 60 + Fraction(said[3])
     return Fraction(opened.duration, 1_000_000) if opened.duration and len(opened.streams) == 1 else None
 
 
-def _open_folder(path: Path, keep: VideoOptions) -> Video:
+def _open_folder(path: Path, options: VideoOptions) -> Video:
     images = find_images(path)
     first = read_image(images.paths[0])
     if first is None:
         raise McaptrackError(f"{images.paths[0]} can't be read as an image")
     height, width = first.shape[:2]
-    name = keep.image_format if keep.is_still else "h264"
-    why, info = "" if keep.is_still else "it is a folder of images", find_seqinfo(path)
+    name = options.image_format if options.is_still else "h264"
+    why, info = "" if options.is_still else "it is a folder of images", find_seqinfo(path)
     video = Video(
-        path, keep, name, width, height, info.fps if info else None, len(images.paths), None, why, images=images
+        path, options, name, width, height, info.fps if info else None, len(images.paths), None, why, images=images
     )
     if images.missing:
         warn(f"{path}: {images.missing} are missing; their times stay empty", "clock")
@@ -225,7 +233,7 @@ def _open_folder(path: Path, keep: VideoOptions) -> Video:
 
 
 def _creation_ns(text: str | None) -> int | None:
-    """When a recording began, by its container, whose times are UTC; None if it says nothing or nothing possible."""
+    """The recording time (UTC) in the metadata of the container; None if it is missing or invalid."""
     try:
         moment = datetime.fromisoformat(text) if text else None
     except ValueError:
@@ -237,55 +245,57 @@ def _creation_ns(text: str | None) -> int | None:
     return t_ns if 0 <= t_ns < LAST_NS else None
 
 
-def _pass_on(video: Video, clock: _Clock) -> Iterator[PictureMessage]:
+def _remux(video: Video, clock: _Clock) -> Iterator[PictureMessage]:
     codec = CODECS[video.format]
     index, seconds = 0, None
     with reading(video.path) as opened:
         for packet in packets(opened, video.format):
-            if packet.is_damaged:  # the last one
+            if packet.is_damaged:  # only the last packet can be damaged
                 video.lost.append(f"{video.path} is cut off or damaged after {index} frames; the rest is left out")
                 continue
             data = packet.data
             if video.sets:
                 head = codec.read_head(data)
-                data = codec.with_sets(data, video.sets) if head.is_key and not head.has_sets else data
+                data = (
+                    codec.with_parameter_sets(data, video.sets) if head.is_key and not head.has_parameter_sets else data
+                )
             seconds = packet.seconds
             yield PictureMessage(clock.time(index, seconds), index, data)
             index += 1
-        video.frames = video.frames or indexed(opened)
-        hidden = empty(opened)
+        video.frames = video.frames or count_indexed(opened)
+        hidden = count_empty(opened)
     video.note_missing(index, hidden, seconds)
 
 
 def _transcode(video: Video, clock: _Clock) -> Iterator[PictureMessage]:
-    keep, encoder = video.keep, None
-    for index, seconds, picture in _shown(video):
+    options, encoder = video.options, None
+    for index, seconds, picture in _decoded_pictures(video):
         t_ns = clock.time(index, seconds)
         fitted = _fit(video, picture)
         if encoder is None:
             fps = clock.fps or video.fps or Fraction(30)
-            encoder = H264Encoder(video.width_px, video.height_px, fps, keep.crf, keep.key_every_s, like=fitted)
+            encoder = H264Encoder(video.width_px, video.height_px, fps, options.crf, options.key_every_s, like=fitted)
         data = encoder.encode(fitted, t_ns)
-        del picture, fitted  # not kept while the next one is read: pictures may be large
+        del picture, fitted  # released before the next picture is read, to save memory
         yield PictureMessage(t_ns, index, data)
 
 
-def _stills(video: Video, clock: _Clock) -> Iterator[PictureMessage]:
+def _encode_stills(video: Video, clock: _Clock) -> Iterator[PictureMessage]:
     name: StillFormat = "jpeg" if video.format == "jpeg" else "png"
-    for index, seconds, picture in _shown(video):
-        data = encode_image(_upright(picture), name, video.keep.jpeg_quality)
+    for index, seconds, picture in _decoded_pictures(video):
+        data = encode_image(_upright(picture), name, video.options.jpeg_quality)
         del picture
         yield PictureMessage(clock.time(index, seconds), index, data)
 
 
 def images(video: Video) -> Iterator[tuple[Fraction | None, Image]]:
-    """Decoded pictures, BGR (height, width, 3), upright, with their times in seconds."""
-    for _, seconds, picture in _shown(video):
+    """Decoded pictures, BGR (height, width, 3), upright, each after its time in seconds."""
+    for _, seconds, picture in _decoded_pictures(video):
         yield seconds, _upright(picture)
 
 
-def _shown(video: Video) -> Iterator[Shown]:
-    """All pictures as they are shown; what could not be read is noted."""
+def _decoded_pictures(video: Video) -> Iterator[DecodedPicture]:
+    """All decoded pictures; those that can't be read are added to ``lost``."""
     if video.images is None:
         yield from _decoded(video)
         return
@@ -294,11 +304,11 @@ def _shown(video: Video) -> Iterator[Shown]:
         if image is None:
             video.lost.append(f"{path} can't be read as an image; it is left out")
         else:
-            yield Shown(place, None, image)
+            yield DecodedPicture(place, None, image)
             del image
 
 
-def _decoded(video: Video) -> Iterator[Shown]:
+def _decoded(video: Video) -> Iterator[DecodedPicture]:
     import av
 
     read, failed, damaged, hidden, cut_off, seconds = 0, 0, 0, 0, 0, None
@@ -327,10 +337,10 @@ def _decoded(video: Video) -> Iterator[Shown]:
                 ticks = slots[min(read + failed, len(slots) - 1)] if slots else frame.pts
                 seconds = None if ticks is None else ticks * base
                 damaged += frame.is_corrupt
-                yield Shown(read + failed, seconds, frame)
+                yield DecodedPicture(read + failed, seconds, frame)
                 read += 1
-        video.frames = video.frames or indexed(opened)
-        hidden += empty(opened)
+        video.frames = video.frames or count_indexed(opened)
+        hidden += count_empty(opened)
     if cut_off:
         video.lost.append(f"{video.path}: {cut_off} packets are cut off or damaged")
     if damaged:
@@ -339,16 +349,16 @@ def _decoded(video: Video) -> Iterator[Shown]:
 
 
 def _upright(picture: Any) -> Image:
-    """BGR, as it is to be seen."""
+    """A picture in BGR, rotated upright."""
     if isinstance(picture, np.ndarray):
         return picture
     return np.rot90(picture.to_ndarray(format="bgr24"), picture.rotation // 90)
 
 
 def _fit(video: Video, picture: Any) -> Any:
-    """A picture as the encoder takes it, of the (even) size of the video.
+    """A picture in the (even) size of the video, in a format that the encoder takes.
 
-    One row or column that is missing is the one before it again. Pictures of other sizes are scaled, and that is noted.
+    A missing last row or column repeats the one before it. Pictures of other sizes are scaled, which is noted.
     """
     width, height = video.width_px, video.height_px
     if (

@@ -17,7 +17,7 @@ _FRAMES: Final = re.compile(r"^\s*seqLength\s*=\s*([0-9]{1,9})\s*$", re.MULTILIN
 
 
 class SeqInfo(NamedTuple):
-    """What a seqinfo.ini says: frames per second and their number, None for what it doesn't say."""
+    """Frame rate and number of frames in a seqinfo.ini; None for a missing value."""
 
     path: Path
     fps: Fraction | None

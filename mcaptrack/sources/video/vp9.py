@@ -1,4 +1,4 @@
-"""What has to be known about a VP9 stream (its specification, 6.2 and Annex B) before it is passed on or entered."""
+"""Parse VP9 streams (VP9 specification, 6.2 and Annex B) as far as passing them through and seeking in them need it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _HEAD: Final = 16
 
 
 def inspect(data: bytes) -> AccessUnit:
-    """What a packet holds: a frame, or several of which one is shown."""
+    """Parse a packet: one frame, or a superframe of which one frame is shown."""
     pictures, is_key, size = 0, False, None
     for number, (start, end) in enumerate(_frames(data)):
         shown, key, said = _header(data[start : min(end, start + _HEAD)])
@@ -24,13 +24,13 @@ def inspect(data: bytes) -> AccessUnit:
 
 
 def read_head(data: bytes) -> PictureHead:
-    """What a message begins with; key pictures are their own parameter sets."""
+    """Parse the first bytes of a message; key pictures of VP9 need no parameter sets."""
     is_key = _header(data[:_HEAD])[1]
     return PictureHead(True, is_key, is_key)
 
 
 def _frames(data: bytes) -> Iterator[tuple[int, int]]:
-    """Where the frames of a packet stand, by the index at its end if it has one."""
+    """Start and end of the frames of a packet, by the superframe index at its end if it has one."""
     marker = data[-1] if data else 0
     count, width = (marker & 7) + 1, (marker >> 3 & 3) + 1
     at = len(data) - 2 - count * width
@@ -46,7 +46,7 @@ def _frames(data: bytes) -> Iterator[tuple[int, int]]:
 
 
 def _header(head: bytes) -> tuple[bool, bool, tuple[int, int] | None]:
-    """Of an uncompressed header: is the frame shown, is it a key frame, what width and height does it say?"""
+    """From an uncompressed header: whether the frame is shown, whether it is a key frame, its size if it has one."""
     bits = Bits(head)
     if bits.take(2) != 2:
         return False, False, None
@@ -54,12 +54,12 @@ def _header(head: bytes) -> tuple[bool, bool, tuple[int, int] | None]:
     if profile == 3:
         bits.take(1)
     if bits.take(1):
-        return True, False, None  # a frame from before is shown
+        return True, False, None  # show_existing_frame
     is_inter, is_shown, is_resilient = bits.take(1), bool(bits.take(1)), bits.take(1)
     if not is_inter:
         if bits.take(24) != _SYNC:
             return is_shown, False, None
-        _pass_colours(bits, profile)
+        _skip_colour_config(bits, profile)
         return is_shown, True, _size(bits)
     is_intra_only = not is_shown and bool(bits.take(1))
     if not is_resilient:
@@ -67,10 +67,10 @@ def _header(head: bytes) -> tuple[bool, bool, tuple[int, int] | None]:
     if is_intra_only:
         bits.take(24)
         if profile:
-            _pass_colours(bits, profile)
+            _skip_colour_config(bits, profile)
         bits.take(8)
         return is_shown, False, _size(bits)
-    bits.take(8 + 3 * 4)  # what it is kept as, what it refers to
+    bits.take(8 + 3 * 4)  # refresh_frame_flags, ref_frame_idx and sign biases
     has_size_of_another = any(bits.take(1) for _ in range(3))
     return is_shown, False, None if has_size_of_another else _size(bits)
 
@@ -79,7 +79,7 @@ def _size(bits: Bits) -> tuple[int, int]:
     return bits.take(16) + 1, bits.take(16) + 1
 
 
-def _pass_colours(bits: Bits, profile: int) -> None:
+def _skip_colour_config(bits: Bits, profile: int) -> None:
     if profile >= 2:
         bits.take(1)
     if bits.take(3) != _RGB:
