@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Iterable
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any, get_args
 
@@ -83,6 +84,63 @@ def messages() -> str:
     return "\n\n".join(parts)
 
 
+def library() -> str:
+    """What the package exports."""
+    import mcaptrack
+
+    return _references(mcaptrack, sorted(getattr(mcaptrack, "__all__", None) or mcaptrack._LAZY, key=str.lower))
+
+
+def transforms() -> str:
+    """What a transform is, then the transforms with their parameters."""
+    from mcaptrack import transforms
+    from mcaptrack.transforms import protocol
+
+    parts = [_references(protocol, ["Transform", "option", "context"])]
+    plain = "    options: { members: false, show_bases: false, show_signature: false }"
+    for name in transforms.__all__:
+        one = getattr(transforms, name)
+        if not (isinstance(one, type) and is_dataclass(one) and hasattr(one, "writes")):
+            continue
+        rows = [
+            f"| `{field.name}` | <code>{_cell(str(field.type))}</code> | {_cell(str(field.default))} | "
+            f"{_cell(field.metadata['help'])} |"
+            for field in fields(one)
+            if "help" in field.metadata
+        ]
+        table = "\n".join(["| parameter | type | default | meaning |", "|---|---|---|---|", *rows])
+        parts += [f"::: {one.__module__}.{one.__qualname__}\n{plain}", table if rows else ""]
+    return "\n\n".join(parts)
+
+
+def predictors() -> str:
+    """What a predictor is, and what makes one."""
+    from mcaptrack import predictors
+
+    return _references(predictors, predictors.__all__)
+
+
+def metrics() -> str:
+    """The metrics, and what they are computed from."""
+    from importlib import import_module
+
+    from mcaptrack.evaluation import metrics
+
+    parts = [_references(metrics, metrics.__all__)]
+    for name in ("clear", "identity", "hota", "displacement", "calibration"):
+        module = import_module(f"{metrics.__name__}.{name}")
+        own = [each for each, found in vars(module).items() if getattr(found, "__module__", "") == module.__name__]
+        parts.append(_references(module, [each for each in own if not each.startswith("_")], set(metrics.__all__)))
+    return "\n\n".join(parts)
+
+
+def _references(module: Any, names: Iterable[str], known: Collection[str] = ()) -> str:
+    """Directives of mkdocstrings for classes and functions of a module, where they are defined."""
+    found = [getattr(module, name) for name in names if name not in known]
+    places = [f"{one.__module__}.{one.__qualname__}" for one in found if isinstance(one, type) or callable(one)]
+    return "\n\n".join(f"::: {place}" for place in dict.fromkeys(places) if place.startswith("mcaptrack."))
+
+
 def changes() -> str:
     """The changelog, its headings one level down."""
     text = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8").split("\n", 1)[1]
@@ -91,7 +149,9 @@ def changes() -> str:
 
 def _cell(text: str) -> str:
     """Text in a cell of a table."""
-    return re.sub(r"\s+", " ", text).replace("|", "\\|").replace("<", "&lt;").strip()
+    return re.sub(r"\s+", " ", text).replace("|", "&#124;").replace("<", "&lt;").strip()
 
 
-GENERATED: dict[str, Callable[[], str]] = {"commands": commands, "messages": messages, "changes": changes}
+GENERATED: dict[str, Callable[[], str]] = {
+    made.__name__: made for made in (commands, messages, library, transforms, predictors, metrics, changes)
+}
