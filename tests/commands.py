@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import io
+import subprocess
+import sys
+from collections.abc import Mapping
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import NamedTuple
 
+import pytest
 from typer.main import get_command
 
 from mcaptrack.cli import app
@@ -23,11 +27,15 @@ class Outcome(NamedTuple):
     err: str
 
 
-def called(*words: object) -> Outcome:
-    """Run a command here, which is quicker than in a process of its own."""
+def call(*words: object, folder: Path | None = None, environment: Mapping[str, str] | None = None) -> Outcome:
+    """Run a command in this process, which is quicker than in one of its own."""
     out, err = io.StringIO(), io.StringIO()
     code: object = 0
-    with redirect_stdout(out), redirect_stderr(err):
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(out), redirect_stderr(err):
+        if folder:
+            patch.chdir(folder)
+        for name, value in (environment or {}).items():
+            patch.setenv(name, value)
         try:
             GROUP.main([str(word) for word in words], prog_name="mcaptrack")
         except SystemExit as ended:
@@ -36,11 +44,24 @@ def called(*words: object) -> Outcome:
     return Outcome(code, out.getvalue(), err.getvalue())
 
 
-def done(*words: object) -> Outcome:
+def done(*words: object, folder: Path | None = None, environment: Mapping[str, str] | None = None) -> Outcome:
     """Run a command that has to succeed."""
-    outcome = called(*words)
+    outcome = call(*words, folder=folder, environment=environment)
     assert outcome.code == 0, outcome.err
     return outcome
+
+
+def printed(
+    *words: object, folder: Path | None = None, environment: Mapping[str, str] | None = None
+) -> tuple[str, str]:
+    """What a command that has to succeed prints to stdout and stderr."""
+    return done(*words, folder=folder, environment=environment)[1:]
+
+
+def start(*words: object, folder: Path | None = None) -> subprocess.Popen[str]:
+    """A command in a process of its own."""
+    command = [sys.executable, "-m", "mcaptrack", *map(str, words)]
+    return subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
 def toml_value(value: object) -> str:

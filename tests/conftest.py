@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 import os
+import shutil
+import signal
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, settings
+
+from mcaptrack.sources import demo
+from tests.commands import done
+from tests.worlds import small_scene
 
 # The same examples each time, so that a run says something about a change; `--hypothesis-profile search` looks for new
 # ones, and for many more.
@@ -31,3 +37,51 @@ def data() -> Path:
     if not folder:
         pytest.skip("MCAPTRACK_DATA names no folder with reference data")
     return Path(folder)
+
+
+@pytest.fixture(scope="session")
+def footage(tmp_path_factory) -> demo.Footage:
+    """Three people on a small picture, with labels and the ground plane."""
+    return demo.draw(small_scene(), tmp_path_factory.mktemp("footage"))
+
+
+@pytest.fixture(scope="session")
+def _ingested(footage, tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("ingested") / "walk.mcap"
+    done("ingest", footage.video, "--ground-plane", footage.ground_plane, "--truth", footage.truth, "-o", path, "-q")
+    return path
+
+
+@pytest.fixture(scope="session")
+def _finished(_ingested, tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("finished") / "walk.mcap"
+    shutil.copyfile(_ingested, path)
+    done("run", path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def finished(_finished, tmp_path_factory) -> Path:
+    """A log with everything in it, and its companions. Not to be changed."""
+    folder = tmp_path_factory.mktemp("finished")
+    shutil.copytree(_finished.parent, folder, dirs_exist_ok=True)
+    return folder / _finished.name
+
+
+@pytest.fixture
+def fresh(_ingested, tmp_path) -> Path:
+    """A log of pictures, labels and the ground plane, before the first stage."""
+    return Path(shutil.copyfile(_ingested, tmp_path / "walk.mcap"))
+
+
+@pytest.fixture
+def never_waits() -> Iterator[None]:
+    """A test that waits for something that never comes fails after a minute."""
+
+    def late(*_: object) -> None:
+        raise TimeoutError("it waits")
+
+    signal.signal(signal.SIGALRM, late)
+    signal.alarm(60)
+    yield
+    signal.alarm(0)

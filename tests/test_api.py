@@ -19,7 +19,7 @@ from mcaptrack.cli import app
 from mcaptrack.errors import McaptrackError
 from mcaptrack.sources import ingest
 from mcaptrack.sources.demo import draw
-from tests.test_export import some_log
+from tests.logs import some_log
 from tests.worlds import small_scene, write_clip
 
 ROOT = Path(__file__).parent.parent

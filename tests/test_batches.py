@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.commands import GROUP, called, made_log
+from tests.commands import GROUP, call, made_log
 
 #: Commands that make one thing of all their inputs: without one of them it would be another thing, so they refuse.
 COMBINING = {"report", "query", "evaluate", "tune", "train"}
@@ -52,7 +52,7 @@ def inputs(command: str, *names: str) -> list[str]:
 def test_a_broken_input_stops_no_other(command, folder):
     bad = ["missing.mcap"] if command == "check" else ["broken.mcap", "missing.mcap"]  # check tells what is broken
     *bad, good = inputs(command, *bad, "a.mcap")
-    outcome = called(command, *bad, good, "--json")
+    outcome = call(command, *bad, good, "--json")
     assert outcome.code == 1, outcome.err
     data = json.loads(outcome.out)
     assert [Path(one["log"]).name for one in data["results"]] == ["a.mcap"]
@@ -66,7 +66,7 @@ def test_a_broken_input_stops_no_other(command, folder):
 
 @pytest.mark.parametrize("command", sorted(SEVERAL - COMBINING))
 def test_a_single_input_that_is_missing_is_one_line(command, folder):
-    outcome = called(command, "missing.mcap", "--json")
+    outcome = call(command, "missing.mcap", "--json")
     assert (outcome.code, outcome.out) == (1, "")
     assert outcome.err.count("\n") == 1
     assert outcome.err.startswith("mcaptrack: ")
@@ -76,7 +76,7 @@ def test_a_single_input_that_is_missing_is_one_line(command, folder):
 def test_what_is_made_of_all_inputs_is_not_made_of_some(command, folder):
     more = [] if command == "tune" else ["--json"]
     before = sorted(folder.rglob("*"))
-    outcome = called(command, "a.mcap", "broken.mcap", *WORDS.get(command, []), "-o", "out.html", *more)
+    outcome = call(command, "a.mcap", "broken.mcap", *WORDS.get(command, []), "-o", "out.html", *more)
     assert (outcome.code, outcome.out) == (1, "")
     assert "broken.mcap" in outcome.err
     assert sorted(folder.rglob("*")) == before
@@ -84,5 +84,5 @@ def test_what_is_made_of_all_inputs_is_not_made_of_some(command, folder):
 
 def test_what_all_can_not_be_written_to_is_refused_before_anything_is_done(folder):
     before = {path: path.read_bytes() for path in folder.iterdir()}
-    assert called("run", "a.mcap", "z.mcap", "-o", "b.mcap").code == 1
+    assert call("run", "a.mcap", "z.mcap", "-o", "b.mcap").code == 1
     assert {path: path.read_bytes() for path in folder.iterdir()} == before

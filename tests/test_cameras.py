@@ -15,8 +15,8 @@ from mcaptrack.schema import TRACKS, Frame
 from mcaptrack.schema.provenance import Provenance, digest
 from mcaptrack.sources.cameras import camera_at, cameras, find_camera, name_above
 from mcaptrack.transforms import STAGES, TRANSFORMS
-from tests.commands import GROUP, called, done, made_log
-from tests.test_foreign_runs import write_log
+from tests.commands import GROUP, call, done, made_log
+from tests.robots import write_log
 from tests.worlds import tracks_at
 
 #: Where a stage may be told to write: beside its usual channel, below it, elsewhere, and under names that mean something
@@ -142,7 +142,7 @@ def test_outputs_that_are_missing_are_made_as_those_beside_them_were(path):
 
 def test_a_stage_does_not_replace_what_its_input_was_made_from(path):
     before = path.read_bytes()
-    outcome = called("sample", path, "--topic", "/camera/retracks")
+    outcome = call("sample", path, "--topic", "/camera/retracks")
     assert (outcome.code, path.read_bytes()) == (1, before)
     assert "/camera/retracks was itself made from /camera/samples, which sample would replace" in outcome.err
     done("sample", path, "--topic", "/camera/retracks", "--to", "/camera/sampled", "-q")
@@ -154,7 +154,7 @@ def test_no_stage_replaces_what_it_did_not_make(path, stage):
     for name in {"video", "truth", "ground_plane", *(stage.writes for stage in STAGES.values())} - {
         STAGES[stage].writes
     }:
-        outcome = called(stage, path, "--to", f"/camera/{name}")
+        outcome = call(stage, path, "--to", f"/camera/{name}")
         assert (outcome.code, "another --to" in outcome.err) == (1, True), outcome.err
     assert path.read_bytes() == before
 
@@ -169,7 +169,7 @@ def test_no_stage_replaces_what_others_recorded(path, stage, below):
     with log.read(path) as opened, log.extend(opened) as writer:
         channel = writer.add_channel(f"/theirs{below}", ("", "", b""), "json", {})
         writer.add_message(channel, 1, 0, b'{"mine": 1}')
-    outcome = called(stage, path, "--to", "/theirs")
+    outcome = call(stage, path, "--to", "/theirs")
     with log.read(path) as opened:
         assert [message.payload for message in opened.messages(f"/theirs{below}")] == [b'{"mine": 1}']
     takes = {"", *(f"/{suffix}" for suffix in TRANSFORMS[stage].writes)} | ({"/full"} if stage == "retrack" else set())
@@ -183,7 +183,7 @@ def test_boxes_that_were_ingested_are_not_replaced(template, tmp_path):
     path = tmp_path / "boxes.mcap"
     done("ingest", template.with_name("clip.mp4"), "--detections", tmp_path / "det.txt", "-o", path, "-q")
     before = path.read_bytes()
-    outcome = called("detect", path)
+    outcome = call("detect", path)
     assert (outcome.code, path.read_bytes()) == (1, before)
     assert "detect would replace /camera/detections, which was ingested; write to another channel" in outcome.err
 
@@ -263,7 +263,7 @@ def test_each_of_two_cameras_has_its_boxes_and_its_results(tmp_path):
         ):
             find_camera(opened)
         assert find_camera(opened, "front") == find_camera(opened, "front/yolo") == "/front/yolo"
-    outcome = called("run", path, "--topic", "/front/yolo/boxes", "--camera", "rear")
+    outcome = call("run", path, "--topic", "/front/yolo/boxes", "--camera", "rear")
     assert (outcome.code, "belongs to the camera front/yolo, not to rear" in outcome.err) == (1, True)
 
 
@@ -284,4 +284,4 @@ def test_a_chain_of_inputs_that_goes_round_ends(tmp_path):
             writer.add_channel(f"/x/{name}", (TRACKS.name, "protobuf", TRACKS.descriptor), "protobuf", how)
     with log.read(path) as opened:
         assert [camera.prefix for camera in cameras(opened)] == ["/x"]
-    assert called("run", path).code == 1
+    assert call("run", path).code == 1

@@ -6,6 +6,7 @@ import csv
 import io
 import json
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -17,51 +18,11 @@ import pytest
 from mcaptrack import __version__, log
 from mcaptrack.cli.demo import _next_commands
 from mcaptrack.schema import COUNTS, EVENTS, EventKind
-from mcaptrack.sources import demo
+from mcaptrack.sources import synthetic
+from tests.commands import call, printed, start
 from tests.worlds import small_scene, write_clip
 
 LAYOUTS = [".comparing.layout.json", ".layout.json"]
-
-
-def start(*words, folder: Path | None = None, environment: dict[str, str] | None = None) -> subprocess.Popen:
-    command = [sys.executable, "-m", "mcaptrack", *map(str, words)]
-    env = {k: v for k, v in os.environ.items() if not k.startswith("MCAPTRACK_")} | (environment or {})
-    return subprocess.Popen(command, cwd=folder, env=env, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-
-
-def call(*words, **options) -> tuple[int, str, str]:
-    """Exit code, stdout and stderr of a command."""
-    process = start(*words, **options)
-    out, err = process.communicate(timeout=120)
-    return process.returncode, out, err
-
-
-def done(*words, **options) -> tuple[str, str]:
-    code, out, err = call(*words, **options)
-    assert code == 0, err
-    return out, err
-
-
-@pytest.fixture(scope="module")
-def footage(tmp_path_factory) -> demo.Footage:
-    return demo.draw(small_scene(), tmp_path_factory.mktemp("footage"))
-
-
-@pytest.fixture(scope="module")
-def finished(footage, tmp_path_factory) -> Path:
-    """A log with everything in it. Not to be changed."""
-    folder = tmp_path_factory.mktemp("finished")
-    path = folder / "walk.mcap"
-    done("ingest", footage.video, "--ground-plane", footage.ground_plane, "--truth", footage.truth, "-o", path)
-    done("run", path)
-    return path
-
-
-@pytest.fixture
-def fresh(footage, tmp_path) -> Path:
-    path = tmp_path / "walk.mcap"
-    done("ingest", footage.video, "--ground-plane", footage.ground_plane, "--truth", footage.truth, "-o", path, "-q")
-    return path
 
 
 class TestHelp:
@@ -77,7 +38,7 @@ class TestHelp:
         assert done_.stdout.splitlines()[-1].split() == ["LOADED"]
 
     def test_version(self):
-        assert done("--version")[0].strip() == f"mcaptrack {__version__}"
+        assert printed("--version")[0].strip() == f"mcaptrack {__version__}"
 
 
 class TestTheUsualWay:
@@ -92,14 +53,14 @@ class TestTheUsualWay:
 
     def test_running_again_has_nothing_to_do(self, finished):
         before = finished.read_bytes()
-        _, err = done("run", finished)
+        _, err = printed("run", finished)
         assert "nothing to do, everything is up to date" in err
         assert finished.read_bytes() == before
 
     def test_another_tracker_replaces_the_tracks(self, finished, tmp_path):
         path = tmp_path / "other.mcap"
-        done("track", finished, "--tracker", "bytetrack", "--new-score", 0.3, "-o", path)
-        channels = {c["topic"]: c for c in json.loads(done("info", path, "--json")[0])["results"][0]["channels"]}
+        printed("track", finished, "--tracker", "bytetrack", "--new-score", 0.3, "-o", path)
+        channels = {c["topic"]: c for c in json.loads(printed("info", path, "--json")[0])["results"][0]["channels"]}
         assert channels["/camera/tracks"]["parameters"]["tracker"] == "bytetrack"
         assert channels["/camera/tracks"]["parameters"]["new_score"] == 0.3
         code, _, err = call("track", path, "--tracker", "ocsort", "--new-score", 0.3)
@@ -107,20 +68,20 @@ class TestTheUsualWay:
         assert err == "mcaptrack: --new-score is an option of bytetrack, not of ocsort\n"
 
     def test_a_stage_says_what_it_has_to_make_first(self, fresh):
-        _, err = done("track", fresh)
+        _, err = printed("track", fresh)
         assert "/camera/detections is missing: running detect" in err
         assert f"{fresh}: detect, track" in err
 
     def test_quiet_is_quiet(self, fresh):
-        assert done("track", fresh, "-q") == ("", "")
+        assert printed("track", fresh, "-q") == ("", "")
 
     def test_no_progress_goes_to_a_pipe(self, fresh):
-        _, err = done("detect", fresh)
+        _, err = printed("detect", fresh)
         assert "\x1b" not in err
         assert "\r" not in err
 
     def test_info_shows_channels_and_lineage(self, finished):
-        out, err = done("info", finished)
+        out, err = printed("info", finished)
         assert err == ""
         for words in ("/camera/retracks/online", "foxglove.CompressedVideo", "lineage"):
             assert words in out
@@ -132,7 +93,7 @@ class TestTheUsualWay:
         ]
 
     def test_info_as_data(self, finished):
-        data = json.loads(done("info", finished, "--json")[0])
+        data = json.loads(printed("info", finished, "--json")[0])
         assert data["schema_version"] == 1
         (result,) = data["results"]
         channels = {channel["topic"]: channel for channel in result["channels"]}
@@ -142,14 +103,14 @@ class TestTheUsualWay:
         assert result["messages"] == sum(channel["messages"] for channel in result["channels"])
 
     def test_export_to_a_folder(self, finished, tmp_path):
-        out, _ = done("export", finished, "-o", tmp_path / "tables", "--json")
+        out, _ = printed("export", finished, "-o", tmp_path / "tables", "--json")
         rows = json.loads(out)["results"][0]["rows"]
         assert rows["detections"] > 0
         assert (tmp_path / "tables" / "tracks" / "recording=walk" / "part-0.parquet").is_file()
 
     def test_several_logs_and_patterns(self, fresh, tmp_path):
         (tmp_path / "other.mcap").write_bytes(fresh.read_bytes())
-        _, err = done("sample", tmp_path / "*.mcap")
+        _, err = printed("sample", tmp_path / "*.mcap")
         assert f"{tmp_path / 'other.mcap'}: detect, track, sample" in err
         assert f"{fresh}: detect, track, sample" in err
         code, _, err = call("sample", tmp_path / "*.mcap", "-o", tmp_path / "x.mcap")
@@ -157,18 +118,18 @@ class TestTheUsualWay:
         assert "2 inputs can't all be written to" in err
 
     def test_stages_as_data(self, fresh):
-        out, _ = done("track", fresh, "--json", "-q")
+        out, _ = printed("track", fresh, "--json", "-q")
         (result,) = json.loads(out)["results"]
         assert result["stages"] == ["detect", "track"]
         assert result["frames"]["/camera/tracks"] == 60
 
     def test_another_file_and_a_profile_and_a_mode(self, finished, tmp_path):
         before = finished.read_bytes()
-        done(
+        printed(
             "retrack", finished, "--profile", "paper", "--sigma-m", "2", "--mode", "offline", "-o", tmp_path / "p.mcap"
         )
         assert finished.read_bytes() == before
-        (result,) = json.loads(done("info", tmp_path / "p.mcap", "--json")[0])["results"]
+        (result,) = json.loads(printed("info", tmp_path / "p.mcap", "--json")[0])["results"]
         made = {channel["topic"]: channel["parameters"] for channel in result["channels"]}
         assert (made["/camera/retracks"]["distance"], made["/camera/retracks"]["sigma_m"]) == ("mean", 2.0)
         assert made["/camera/retracks/online"]["distance"] == "likelihood"  # only the other output was made
@@ -176,12 +137,12 @@ class TestTheUsualWay:
 
 class TestEvaluate:
     def test_a_table_for_people(self, finished):
-        out, _ = done("evaluate", finished)
+        out, _ = printed("evaluate", finished)
         for words in ("IDF1", "IoU 0.5", "0.5 m", "2 m", "/camera/retracks/online", "forecasts of", "ADE m"):
             assert words in out
 
     def test_data_for_programs(self, finished):
-        rows = json.loads(done("evaluate", finished, "--json")[0])["results"]
+        rows = json.loads(printed("evaluate", finished, "--json")[0])["results"]
         keys = {
             "sequence",
             "tracks",
@@ -232,14 +193,16 @@ class TestEvaluate:
         assert wanted <= set(displaced[0]["displacement"])
 
     def test_rows_for_a_spreadsheet(self, finished):
-        out, _ = done("evaluate", finished, "--csv", "--similarity", "iou", "--topic", "/camera/tracks")
+        out, _ = printed("evaluate", finished, "--csv", "--similarity", "iou", "--topic", "/camera/tracks")
         (row,) = csv.DictReader(io.StringIO(out))
         assert (row["tracks"], row["similarity"]) == ("/camera/tracks", "iou")
 
     def test_several_logs_have_a_combined_row(self, finished, tmp_path):
         (tmp_path / "other.mcap").write_bytes(finished.read_bytes())
         rows = json.loads(
-            done("evaluate", finished, tmp_path / "other.mcap", "--similarity", "metres", "--gate-m", "1", "--json")[0]
+            printed("evaluate", finished, tmp_path / "other.mcap", "--similarity", "metres", "--gate-m", "1", "--json")[
+                0
+            ]
         )["results"]
         combined = {row["tracks"]: row for row in rows if row["sequence"] == "COMBINED"}
         single = {row["tracks"]: row for row in rows if row["sequence"] == "walk"}
@@ -247,15 +210,15 @@ class TestEvaluate:
         assert combined["/camera/samples"]["MOTA"] == pytest.approx(single["/camera/samples"]["MOTA"])
 
     def test_label_files_without_a_log(self, footage):
-        rows = json.loads(done("evaluate", footage.truth, "--truth", footage.truth, "--json")[0])["results"]
+        rows = json.loads(printed("evaluate", footage.truth, "--truth", footage.truth, "--json")[0])["results"]
         assert [(row["similarity"], row["MOTA"], row["IDF1"]) for row in rows] == [("iou", 1.0, 1.0)]
-        out, _ = done(
+        out, _ = printed(
             "evaluate", footage.truth, "--truth", footage.truth, "--ground-plane", footage.ground_plane, "--json"
         )
         assert [row["similarity"] for row in json.loads(out)["results"]] == ["iou", "metres", "metres", "metres"]
 
     def test_results_can_go_to_a_file(self, finished, tmp_path):
-        out, _ = done("evaluate", finished, "--json", "-o", tmp_path / "scores.json")
+        out, _ = printed("evaluate", finished, "--json", "-o", tmp_path / "scores.json")
         assert out == ""
         assert json.loads((tmp_path / "scores.json").read_text())["results"]
         code, _, err = call("info", finished, "-o", tmp_path / "scores.json")
@@ -278,8 +241,8 @@ class TestConfig:
         )
 
         def made(*words, environment=None):
-            done("track", fresh, "-q", *words, folder=tmp_path, environment=environment)
-            (result,) = json.loads(done("info", fresh, "--json")[0])["results"]
+            printed("track", fresh, "-q", *words, folder=tmp_path, environment=environment)
+            (result,) = json.loads(printed("info", fresh, "--json")[0])["results"]
             return next(c["parameters"] for c in result["channels"] if c["topic"] == "/camera/tracks")
 
         assert (made()["max_age_s"], made()["min_iou"]) == (2.5, 0.4)
@@ -316,7 +279,7 @@ def place(tmp_path_factory) -> Path:
     (folder / "bad.txt").write_text("1,1,1,1,2,2\n2,1,x,1,2,2\n")
     (folder / "good.txt").write_text("1,1,1,1,2,2\n")
     write_clip(folder / "clip.mp4", options={"bf": "0"})
-    done("ingest", "clip.mp4", "-o", "a.mcap", folder=folder)
+    printed("ingest", "clip.mp4", "-o", "a.mcap", folder=folder)
     return folder
 
 
@@ -412,7 +375,7 @@ class TestMistakes:
         assert err == f"mcaptrack: {said}mcaptrack track --help` lists the options\n"
 
     def test_stages_that_cannot_run_are_not_announced(self, place):
-        done("ingest", "good.txt", "--as", "truth", "--fps", "10", "-o", place / "labels.mcap", folder=place)
+        printed("ingest", "good.txt", "--as", "truth", "--fps", "10", "-o", place / "labels.mcap", folder=place)
         code, _, err = call("run", "labels.mcap", folder=place)
         (place / "labels.mcap").unlink()
         assert code == 1
@@ -443,7 +406,7 @@ class TestMistakes:
 def test_an_interruption_at_any_moment_leaves_the_old_log_or_the_new_one(fresh, finished, sent):
     before, after = fresh.read_bytes(), finished.read_bytes()
     started = time.monotonic()
-    done("run", fresh, "--no-tables", "-q")
+    printed("run", fresh, "--no-tables", "-q")
     whole = time.monotonic() - started
     assert fresh.read_bytes() == after
     for part in (0.3, 0.6, 0.8, 0.9, 0.97):
@@ -496,28 +459,37 @@ def test_an_interruption_that_a_library_turns_into_its_own_error_is_still_one(se
 
 def test_the_demonstration(tmp_path, monkeypatch):
     """Everything on a scene that it draws itself; a short one here."""
-    code = (
-        "import sys; from mcaptrack.sources import scene; from tests.worlds import small_scene\n"
-        "scene.SCENES['square'] = lambda seed: small_scene(seed=seed); sys.argv = ['mcaptrack', 'demo', '-o', sys.argv[1]]\n"
-        "from mcaptrack.__main__ import main; main()\n"
-    )
-    run = [sys.executable, "-c", code, str(tmp_path / "d")]
-    shown = subprocess.run(run, capture_output=True, text=True, check=True)
+    monkeypatch.setitem(synthetic.SCENES, "square", lambda seed: small_scene(seed=seed))
+    monkeypatch.setattr(sys, "argv", ["mcaptrack", "demo"])
+    folder = tmp_path / "d"
+    shown, _ = printed("demo", "-o", folder)
     for words in ("SORT", "re-tracked", "identity switches", "demo.mcap", "Lichtblick"):
-        assert words in shown.stdout
-    names = sorted(path.name for path in (tmp_path / "d").iterdir())
-    proposed = shown.stdout.partition("See more:\n")[2].splitlines()
-    assert len(proposed) == 4
-    for line in proposed:  # works as it stands, where the demonstration was called
-        subprocess.run(line, shell=True, capture_output=True, check=True, env=os.environ | {"PATH": "/usr/bin:/bin"})
-    assert names == [
+        assert words in shown
+    assert sorted(path.name for path in folder.iterdir()) == [
         *(f"demo{end}" for end in (*LAYOUTS, ".mcap", ".mp4", ".predictions.layout.json", ".tables")),
         "ground_plane.txt",
         "truth.txt",
     ]
-    again = subprocess.run(run, capture_output=True, text=True, check=False)
-    assert again.returncode == 1
-    assert "exists; give another folder with -o, or --force" in again.stderr
+    scored = json.loads(
+        printed("evaluate", folder / "demo.mcap", "--similarity", "metres", "--gate-m", "1", "--json")[0]
+    )
+    one, other = ({r["tracks"]: r for r in scored["results"]}[f"/camera/{name}"] for name in ("samples", "retracks"))
+    compared = [line.split()[-4:] for line in shown.splitlines()[1:7]]
+    assert [words[-4:] for words in compared[:2]] == [
+        [f"{100 * one[name]:.1f}", "%", f"{100 * other[name]:.1f}", "%"] for name in ("IDF1", "MOTA")
+    ]
+    assert [words[-2:] for words in compared[2:]] == [
+        [str(one[name]), str(other[name])] for name in ("IDSW", "FP", "FN", "Frag")
+    ]
+    proposed = [shlex.split(line) for line in shown.partition("See more:\n")[2].splitlines()]
+    assert len(proposed) == 4
+    subprocess.run(proposed[0], capture_output=True, check=True, env=os.environ | {"PATH": "/usr/bin:/bin"})
+    for words in proposed:  # works as it stands, where the demonstration was called
+        assert words[:3] == proposed[0][:3]
+        assert any(printed(*words[3:]))
+    again = call("demo", "-o", folder)
+    assert again.code == 1
+    assert "exists; give another folder with -o, or --force" in again.err
 
 
 def test_the_demonstration_proposes_commands_as_the_shell_finds_them(tmp_path, monkeypatch):
@@ -540,7 +512,7 @@ def test_the_demonstration_proposes_commands_as_the_shell_finds_them(tmp_path, m
 
 
 def test_a_log_is_checked_and_what_is_wrong_stands_in_a_table(finished, tmp_path):
-    out, err = done("check", finished)
+    out, err = printed("check", finished)
     assert out.startswith(f"{finished}: sound; ")
     assert "error" not in out + err
     raw = bytearray(finished.read_bytes())
@@ -569,20 +541,20 @@ def test_what_is_whole_is_recovered_and_what_is_lost_makes_the_exit_code_three(f
     assert result["output"] == str(tmp_path / "bad.recovered.mcap")
     assert "chunks are saved" in err
     assert f"lost: {result['lost'][0]}" in err
-    done("check", result["output"])
+    printed("check", result["output"])
     code, _, err = call("recover", damaged)
     assert code == 1
     assert "bad.recovered.mcap exists; give another name with -o, or --force to replace it" in err
     code, _, err = call("recover", finished, "-o", finished, "--force")
     assert code == 1
     assert "is both input and output" in err
-    _, err = done("recover", finished, "-o", tmp_path / "all.mcap")
+    _, err = printed("recover", finished, "-o", tmp_path / "all.mcap")
     assert "nothing was lost" in err
 
 
 def test_events_follow_a_run_unless_they_are_not_wanted(fresh, finished):
     """A log with pictures: events and counts add up to what evaluate prints, by overlap."""
-    scores = json.loads(done("evaluate", finished, "--json", "--similarity", "iou", "--topic", "/camera/tracks")[0])
+    scores = json.loads(printed("evaluate", finished, "--json", "--similarity", "iou", "--topic", "/camera/tracks")[0])
     (score,) = scores["results"]
     with log.read(finished) as opened:
         counts = opened.rows("/camera/tracks/counts", COUNTS).rows
@@ -591,18 +563,18 @@ def test_events_follow_a_run_unless_they_are_not_wanted(fresh, finished):
     assert counts["mota"][-1] == pytest.approx(score["MOTA"], abs=1e-12)
     assert (counts["misses"].sum(), counts["false_tracks"].sum()) == (score["FN"], score["FP"])
     assert (events["kind"] == EventKind.SWITCH).sum() == counts["switches"][-1] == score["IDSW"]
-    done("run", fresh, "--no-events", "--no-tables")
-    out, _ = done("run", fresh, "--no-tables", "--json")
+    printed("run", fresh, "--no-events", "--no-tables")
+    out, _ = printed("run", fresh, "--no-tables", "--json")
     (result,) = json.loads(out)["results"]
     assert result["stages"] == ["events"]
     assert result["events"]["/camera/tracks"]["birth"] == counts["born"][-1]
 
 
 def test_channels_are_dropped_with_their_views_and_nothing_else(finished, tmp_path):
-    before = json.loads(done("info", finished, "--json")[0])["results"][0]["channels"]
-    out, _ = done("drop", finished, "/camera/retracks*", "/camera/video", "-o", tmp_path / "small.mcap", "--json")
+    before = json.loads(printed("info", finished, "--json")[0])["results"][0]["channels"]
+    out, _ = printed("drop", finished, "/camera/retracks*", "/camera/video", "-o", tmp_path / "small.mcap", "--json")
     (result,) = json.loads(out)["results"]
-    after = json.loads(done("info", tmp_path / "small.mcap", "--json")[0])["results"][0]["channels"]
+    after = json.loads(printed("info", tmp_path / "small.mcap", "--json")[0])["results"][0]["channels"]
     assert {c["topic"] for c in before} - {c["topic"] for c in after} == set(result["dropped"])
     assert "/camera/retracks/full/view/image" in result["dropped"]
     for channel in before:  # what was held against the re-tracked people has nothing to be held against any more

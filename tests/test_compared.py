@@ -13,9 +13,8 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation import EvaluateOptions, evaluate, sequence_of_files
 from mcaptrack.schema import TRACKS, Frame
 from mcaptrack.tables.compared import compare_files, pair_files
-from tests.test_cli import call, done
-from tests.test_evaluation import boxed
-from tests.worlds import ns
+from tests.commands import call, printed
+from tests.worlds import boxed, ns
 
 
 def write(path: Path, *rows) -> Path:
@@ -183,7 +182,7 @@ def test_several_files_at_the_command_line(tmp_path):
         write(tmp_path / name / "gt" / "gt.txt", *WALK)
         write(tmp_path / f"{name}.txt", *(FOUND if name == "a" else FOUND[:5]))
     words = ("evaluate", tmp_path / "[ab].txt", "--truth", tmp_path / "*/gt/gt.txt", "--json")
-    out, _ = done(*words)
+    out, _ = printed(*words)
     rows = json.loads(out)["results"]
     assert [(row["sequence"], row["FN"]) for row in rows] == [("a", 0), ("b", 5), ("COMBINED", 5)]
     assert rows[-1]["tracks"] == "2 files"

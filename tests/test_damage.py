@@ -18,11 +18,9 @@ from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.log import records
 from mcaptrack.log.records import MAGIC
-from tests.commands import called, made_log
-from tests.test_log import MESSAGES, SCHEMA, STOCK_OPTIONS, our_messages, stock_messages, write_log, write_stock
+from tests.commands import call, made_log
+from tests.logs import FORTY, MESSAGES, SCHEMA, STOCK_OPTIONS, our_messages, stock_messages, write_log, write_stock
 
-#: Forty messages of three channels, each of which could be told from all others.
-FORTY = [("abc"[n % 3], n * 10, n, bytes([n]) * 40) for n in range(40)]
 WITH_CHECKSUMS = {
     "small chunks": {"chunk_size": 100, "enable_data_crcs": True},
     "no chunks, a checksum": {"use_chunking": False, "enable_data_crcs": True},
@@ -363,8 +361,8 @@ def test_recovering_is_proposed_where_something_shows_that_it_is_a_log(what, tmp
         "neither": b"\0" * 8 + whole[8 : len(whole) * 2 // 3],
     }[what]
     path.write_bytes(content)
-    refused = called("info", path)
+    refused = call("info", path)
     assert refused.code == 1
     is_proposed = f"`mcaptrack recover {path}`" in refused.err
     assert is_proposed == (what in ("no beginning", "no end"))
-    assert not is_proposed or called("recover", path, "-o", tmp_path / "saved.mcap").code == 3
+    assert not is_proposed or call("recover", path, "-o", tmp_path / "saved.mcap").code == 3

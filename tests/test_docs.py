@@ -23,7 +23,7 @@ import duckdb
 import pytest
 
 from mcaptrack import __version__
-from tests.commands import GROUP, called, done
+from tests.commands import GROUP, call, done
 from tools import pages, readme
 from tools.pages import NOT_RUN, ROOT, Block
 
@@ -244,7 +244,7 @@ def run_line(line: str, code: int = 0) -> str:
         if before != "-o" and word in readme.FILES and not any(Path().glob(word.rstrip("/"))):
             readme.FILES[word](Path(word))
     with importable():
-        outcome = called(*words[1:])
+        outcome = call(*words[1:])
     assert outcome.code == code, f"{line}: exit {outcome.code}, {outcome.err}"
     return outcome.err + outcome.out
 

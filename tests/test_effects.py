@@ -14,7 +14,7 @@ import shlex
 import shutil
 import webbrowser
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from pathlib import Path
 from typing import NamedTuple
 
@@ -24,196 +24,10 @@ from mcaptrack import log
 from mcaptrack.sources import synthetic
 from mcaptrack.transforms import STAGES
 from mcaptrack.viewing.serving import Server
-from tests.commands import GROUP, called, done, made_log
-from tests.test_ros_recordings import plain
+from tests.bags import plain
+from tests.commands import GROUP, call, done, made_log
+from tests.effects.commands import CASES
 from tests.worlds import small_scene
-
-
-@dataclass(frozen=True)
-class Case:
-    """How to see an option: a command line without it, and what it adds."""
-
-    base: str
-    words: str
-
-
-def cases(base: str, **words: str | tuple[str, str]) -> dict[str, Case]:
-    """Options by name: words that are added to ``base``, or another base and words."""
-    pairs = {
-        name.replace("_", "-"): given if isinstance(given, tuple) else (base, given) for name, given in words.items()
-    }
-    return {name: Case(*pair) for name, pair in pairs.items()}
-
-
-def common(base: str, **others: str | tuple[str, str]) -> dict[str, Case]:
-    """The options that all commands have."""
-    return cases(base, json="--json", quiet=(f"{base} -v", "-q"), verbose="-v", config="--config verbose.toml") | cases(
-        base, **others
-    )
-
-
-def stage(command: str, **others: str | tuple[str, str]) -> dict[str, Case]:
-    """The options of a stage that its transform doesn't declare."""
-    base = f"{command} a.mcap"
-    return common(
-        base,
-        topic="--topic /other/detections" if command == "track" else "--topic /none",
-        to="--to /camera/others",
-        camera="--camera other",
-        output="-o b.mcap",
-        sidecar="--sidecar",
-        force=(f"{base} -o clip.mp4", "--force"),
-        **others,
-    )
-
-
-SCORED = "evaluate tall.txt --truth truth.txt"
-TUNED = "tune tall.txt --truth truth.txt --trials 1 --fps 10"
-#: For every option of every command, but parameters of transforms: a command line that it changes.
-CASES: dict[str, dict[str, Case]] = {
-    "ingest": common(
-        "ingest clip.mp4",
-        output="-o b.mcap",
-        camera="--camera left",
-        fps="--fps 5",
-        start_time="--start-time 2026-05-01T12:00:00Z",
-        image_format="--image-format jpeg",
-        quality="--quality 40",
-        keyframe_interval_s="--keyframe-interval-s 0.5",
-        ground_plane="--ground-plane plane.txt",
-        point=("ingest clip.mp4 --ground-plane plane.txt", "--point center"),
-        detections="--detections truth.txt",
-        tracks="--tracks truth.txt",
-        truth="--truth truth.txt",
-        format=("ingest truth.txt --fps 10", "--format kitti"),
-        first_frame=("ingest truth.txt --fps 10", "--first-frame 0"),
-        frames=("ingest truth.txt --fps 10", "--frames 500"),
-        **{"as": ("ingest truth.txt --fps 10", "--as truth")},
-        into=("ingest truth.txt --fps 10 --as tracks", "--into a.mcap"),
-        sidecar=("ingest truth.txt --fps 10 --as truth --camera left --into a.mcap", "--sidecar"),
-        force=("ingest clip.mp4 -o a.mcap", "--force"),
-    ),
-    "detect": stage("detect", detector="--detector mog2"),
-    "track": stage("track", tracker="--tracker ocsort"),
-    "sample": stage("sample"),
-    "predict": stage("predict"),
-    "retrack": stage("retrack", retracker="--retracker none", profile="--profile paper", mode="--mode online"),
-    "run": common(
-        "run fresh.mcap --no-tables",
-        topic="--topic /none",
-        camera="--camera other",
-        output="-o b.mcap",
-        sidecar="--sidecar",
-        events="--no-events",
-        tables=("run a.mcap", "--no-tables"),
-        force=("run a.mcap", "--force"),
-        detector=("run a.mcap --no-tables", "--detector mog2"),
-        tracker=("run a.mcap --no-tables", "--tracker ocsort"),
-        predictor=("run a.mcap --no-tables", "--predictor cv"),
-        retracker=("run a.mcap --no-tables", "--retracker none"),
-    ),
-    "events": common(
-        "events a.mcap",
-        topic="--topic /camera/tracks",
-        similarity="--similarity metres",
-        gate_m=("events a.mcap --similarity metres", "--gate-m 0.01"),
-        min_iou=("events a.mcap --similarity iou", "--min-iou 0.99"),
-        camera="--camera other",
-        output="-o b.mcap",
-        sidecar="--sidecar",
-        force=("events a.mcap -o clip.mp4", "--force"),
-    ),
-    "evaluate": common(
-        "evaluate a.mcap",
-        truth=("evaluate truth.txt", "--truth truth.txt"),
-        similarity="--similarity iou",
-        gate_m="--gate-m 0.01",
-        min_iou="--min-iou 0.99",
-        rules=("evaluate a.mcap --json", "--rules motmetrics"),
-        topic="--topic /camera/samples",
-        camera="--camera other",
-        ground_plane=(SCORED, "--ground-plane plane.txt"),
-        point=(f"{SCORED} --ground-plane plane.txt --gate-m 0.1", "--point center"),
-        fps=("evaluate truth.txt --truth walk.txt --ground-plane plane.txt", "--fps 10"),
-        fail_under="--fail-under idf1=2",
-        csv="--csv",
-        output="-o scores.txt",
-        force=("evaluate a.mcap -o clip.mp4", "--force"),
-    ),
-    "tune": common(
-        "tune a.mcap --trials 2 --search min-iou",
-        truth=("tune truth.txt --trials 1", "--truth truth.txt"),
-        stage="--stage sample --search max-hole-s",
-        tracker="--tracker bytetrack",
-        metric="--metric mota",
-        trials="--trials 3",
-        search="--search max-age-s",
-        seed="--seed 3",
-        study="--study b.jsonl",
-        similarity="--similarity metres",
-        gate_m=("tune a.mcap --trials 1 --similarity metres", "--gate-m 0.01"),
-        min_iou=("tune a.mcap --trials 1", "--min-iou 0.99"),
-        fps=("tune truth.txt --truth truth.txt --trials 1", "--fps 1"),
-        ground_plane=(f"{TUNED} --similarity metres", "--ground-plane plane.txt"),
-        point=(f"{TUNED} --similarity metres --ground-plane plane.txt --gate-m 0.1", "--point center"),
-        topic="--topic /none",
-        camera="--camera other",
-        output="-o b.toml",
-        force=("tune a.mcap --trials 1 --study old.jsonl", "--force"),
-    ),
-    "export": common(
-        "export a.mcap",
-        output="-o b",
-        format="--format csv",
-        topic="--topic /others",
-        blobs=("export a.mcap --topic /others", "--blobs"),
-        force=("export a.mcap -o taken", "--force"),
-    ),
-    "query": common(
-        "query a.mcap 'select topic, t_ns from tracks order by all'",
-        file=("query a.mcap", "--file query.sql"),
-        format="--format csv",
-        **{"with": ("query a.mcap 'from more'", "--with more=more.csv")},
-        rows="--rows 2",
-        tables=("query a.mcap", "--tables"),
-        output="-o b.csv",
-        force=("query a.mcap 'select 1' -o clip.mp4", "--force"),
-        verbose=("query a.mcap 'select 1'", "-v"),
-    ),
-    "info": common("info a.mcap", output="-o b.txt", force=("info a.mcap -o clip.mp4", "--force")),
-    "view": common(
-        "view a.mcap",
-        port="--port 1",
-        lichtblick="--lichtblick http://localhost:1",
-        layout="--layout tracking",
-        open="--open",
-    ),
-    "render": common(
-        "render a.mcap",
-        topic="--topic /camera/detections/view/image",
-        width="--width 32",
-        max_fps="--max-fps 5",
-        start_s="--start-s 1",
-        end_s="--end-s 1",
-        gif="--gif",
-        camera="--camera other",
-        output="-o b.mp4",
-        force=("render a.mcap -o clip.mp4", "--force"),
-    ),
-    "report": common(
-        "report a.mcap", camera="--camera other", output="-o b.html", force=("report a.mcap -o clip.mp4", "--force")
-    ),
-    "check": common("check a.mcap", output="-o b.txt", force=("check a.mcap -o clip.mp4", "--force")),
-    "recover": common("recover a.mcap", output="-o b.mcap", force=("recover a.mcap -o clip.mp4", "--force")),
-    "drop": common(
-        "drop a.mcap /camera/retracks",
-        output="-o b.mcap",
-        in_place=("drop robot.mcap /a", "--in-place"),
-        force=("drop a.mcap /camera/retracks -o clip.mp4", "--force"),
-    ),
-    "demo": common("demo", output="-o b", force=("demo -o taken", "--force"), scene="--scene crowd", seed="--seed 3"),
-    "docs": common("docs", output="-o pages.txt", force=("docs -o clip.mp4", "--force")),
-}
 
 
 class Seen(NamedTuple):
@@ -291,7 +105,7 @@ def see(template, tmp_path, monkeypatch) -> Callable[[str], Seen]:
         shutil.rmtree(folder, ignore_errors=True)
         shutil.copytree(template, folder)
         monkeypatch.chdir(folder)
-        code, out, err = called(*shlex.split(line))
+        code, out, err = call(*shlex.split(line))
         out = re.sub(r"(?<=127\.0\.0\.1)(:|%3A)\d{5}\b", ":any", out)  # a port that was free
         out, err = re.sub(r'"seconds": [\d.]+', "", out), re.sub(r" in [\d.]+ s\b", "", err)  # how long it took
         files = {str(path.relative_to(folder)): _digest(path) for path in folder.rglob("*") if path.is_file()}

@@ -8,25 +8,11 @@ import pytest
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation import Candidate, EvaluateOptions, EvaluationInput, evaluate
 from mcaptrack.predictors import Forecast
-from mcaptrack.schema import PREDICTIONS, TRACKS, Frame
+from mcaptrack.schema import PREDICTIONS, Frame
 from mcaptrack.schema.predictions import forecast_to_rows
-from tests.worlds import ns, tracks_at, walk
+from tests.worlds import boxed, ns, tracks_at, walk
 
 METRES = EvaluateOptions(similarities=("metres",), gates_m=(1.0,))
-
-
-def boxed(people):
-    """{id: (left, top)} with boxes of 10 x 20, and no metres."""
-    xy = np.array(list(people.values()), float).reshape(-1, 2)
-    return TRACKS.rows(
-        track_id=np.array(list(people), np.int64),
-        x_px=xy[:, 0],
-        y_px=xy[:, 1],
-        w_px=np.full(len(xy), 10.0),
-        h_px=np.full(len(xy), 20.0),
-        observed=np.ones(len(xy), bool),
-        source_id=np.full(len(xy), -1),
-    )
 
 
 def scored(truth, tracks, options=METRES, forecasts=None):

@@ -25,8 +25,7 @@ from mcaptrack.schema import COUNTS, EVENT_KINDS, EVENTS, TRACKS, EventKind, Fra
 from mcaptrack.schema.proto import parse
 from mcaptrack.schema.provenance import Provenance, digest
 from mcaptrack.transforms import PROFILES
-from tests.test_evaluation import boxed
-from tests.worlds import ns, tracks_at, walk
+from tests.worlds import boxed, ns, tracks_at, walk
 
 BIRTH, END, MISS, FALSE, SWITCH = (
     EventKind.BIRTH,

@@ -18,41 +18,11 @@ from mcaptrack import log, tables
 from mcaptrack.cli import app
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.plane import GroundPlane
-from mcaptrack.schema import DETECTIONS, GROUND_PLANE, TRACKS, Frame
+from mcaptrack.schema import GROUND_PLANE, TRACKS, Frame
 from mcaptrack.schema.ground_plane import plane_to_rows
-from mcaptrack.schema.provenance import Provenance
 from mcaptrack.tables.export import LogTables, export, recording_name, topic_folder
-from tests.worlds import boxes_at, ns, tracks_at
-
-IMU = {
-    "header": {"stamp": {"sec": 1, "nanosec": 5}, "frame_id": "imu"},
-    "gyro": {"x": 0.5, "y": -0.0},
-    "cov": [1.5, 2.0],
-}
-
-
-def add_rows(writer, topic, schema, frames, transform="track", source="/camera/detections"):
-    made = Provenance(transform, {"max_age_s": 1.4}, source).to_metadata()
-    number = writer.add_channel(topic, (schema.name, "protobuf", schema.descriptor), "protobuf", made, group=topic)
-    for frame in frames:
-        writer.add_message(number, frame.t_ns, frame.index, schema.codec.encode(frame.rows))
-
-
-def some_log(path, **more):
-    """Two people who walk, detected and tracked, and an IMU that others recorded."""
-    people = [{4: (n * 0.5, 2.5), 9: (1.0, n * 0.25)} for n in range(3)]
-    walk = [Frame(ns(n), n, tracks_at(who)) for n, who in enumerate(people)]
-    with log.create(path) as writer:
-        imu = writer.add_channel("/imu", ("robot/Imu", "jsonschema", b"{}"), "json", {}, group="imu")
-        for n in range(4):
-            writer.add_message(imu, ns(n) + 7, n, json.dumps(IMU | {"n": n}).encode())
-        boxes = [Frame(ns(n), n, boxes_at([(5, 5), (9, 9)][: 2 - n])) for n in range(3)]
-        add_rows(writer, "/camera/detections", DETECTIONS, boxes, "detect", "/camera/video")
-        add_rows(writer, "/camera/tracks", TRACKS, [*walk, Frame(ns(3), 3, TRACKS.empty())])
-        add_rows(writer, "/camera/truth", TRACKS, walk, "ingest", "")
-        for topic, (schema, frames) in more.items():
-            add_rows(writer, topic, schema, frames)
-    return path
+from tests.logs import add_rows, some_log
+from tests.worlds import ns, tracks_at
 
 
 def ask(query, folder):

@@ -21,7 +21,7 @@ from mcaptrack.schema import DETECTIONS, TRACKS, VIDEO, Frame, Schema
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.transforms import KnnDetector
 from mcaptrack.transforms.protocol import option
-from tests.commands import called, done, made_log
+from tests.commands import call, done, made_log
 from tests.worlds import boxes_at, ns, tracks_at, walk
 
 
@@ -157,7 +157,7 @@ def test_what_was_odd_is_said_again_by_every_run_and_by_quiet_ones(path):
 
 def test_what_is_missing_is_said_once(path):
     done("drop", path, "/camera/[!t]*", "/camera/tracks", "-q")
-    outcome = called("run", path)
+    outcome = call("run", path)
     (line,) = outcome.err.splitlines()
     assert (outcome.code, "/camera/video" in line, "mcaptrack ingest VIDEO --into" in line) == (1, True, True)
 
@@ -341,7 +341,7 @@ def test_results_of_a_class_that_only_the_log_names_are_not_made_again(path, sta
     assert first.plugins["transform"].implementation == first.parameters[kind] == name
     done("run", path, "--no-tables", "-q")  # what was made from it follows
     before = path.read_bytes()
-    refused = called("run", path, "--no-tables", "--force")
+    refused = call("run", path, "--no-tables", "--force")
     assert (refused.code, refused.err.count(str(path))) == (1, 1)
     assert f"{kind} {name}" in refused.err.splitlines()[-1]
     assert f"give --{kind} {name}, or another {kind} to replace it" in refused.err
@@ -358,7 +358,7 @@ def test_results_of_a_class_that_only_the_log_names_are_not_made_again(path, sta
 def test_results_of_such_a_class_that_are_out_of_date_can_be_replaced(path):
     run_stage(path, "track", Single())
     done("detect", path, "--detector", "mog2", "-q")
-    assert "tracker tests.test_findings:Single made it" in called("run", path, "--no-tables", "-q").err
+    assert "tracker tests.test_findings:Single made it" in call("run", path, "--no-tables", "-q").err
     done("run", path, "--no-tables", "--tracker", "ocsort", "-q")
     assert made_by(path, "/camera/tracks").parameters["tracker"] == "ocsort"
     assert made_by(path, "/camera/tracks").plugins == {}

@@ -22,7 +22,7 @@ from mcaptrack.predictors import Forecast
 from mcaptrack.schema import FORECAST_ERRORS, FORECAST_SCORES, PREDICTIONS, TRACKS, Frame
 from mcaptrack.schema.predictions import forecast_to_rows
 from mcaptrack.schema.provenance import Provenance, digest
-from tests.test_metrics import forecasts, positions, predicted
+from tests.forecasts import forecasts, positions, predicted
 from tests.worlds import ns, walk
 
 STEP_S = 0.4

@@ -6,7 +6,6 @@ import json
 import shutil
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
@@ -22,43 +21,11 @@ from mcaptrack.notices import McaptrackWarning
 from mcaptrack.schema import DETECTIONS, TRACKS
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.transforms import KnnDetector, Sort
-from tests.test_foreign import Ros, pixels, vision
+from tests.robots import START_NS, stamp_of, write_log
+from tests.ros_messages import Ros, pixels, vision
 from tests.worlds import ns, small_scene
 
-START_NS = 1_700_000_000_000_000_000
-LATE_NS = 41_234_567  # what a message takes from the camera to the log
 IMAGES = "/robot/front/image"
-
-
-def stamp_of(number: int) -> int:
-    return START_NS + ns(number / 10) + 17 * number
-
-
-def write_log(path: Path, *topics: str, boxes: str | None = None) -> list:
-    """A log as a robot writes it: a scene on these topics, boxes of what is truly there. Returns the scene's shots."""
-    ros = Ros("sensor_msgs/CompressedImage")
-    shots = list(small_scene(5.0).shots())
-    with path.open("wb") as stream:
-        writer = Writer(stream)
-        writer.start(profile="ros2", library="theirs")
-        schema = writer.register_schema(ros.kind.name, "ros2msg", ros.kind.schema)
-        channels = [writer.register_channel(topic, "cdr", schema, {"offered_qos_profiles": ""}) for topic in topics]
-        if boxes:
-            kind = vision("v4", [])[0]
-            found = writer.register_channel(boxes, "cdr", writer.register_schema(kind.name, "ros2msg", kind.schema))
-        for number, shot in enumerate(shots):
-            t_ns = stamp_of(number) + LATE_NS
-            data = cv2.imencode(".jpg", shot.image, [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
-            message = ros.new("sensor_msgs/CompressedImage", ros.header(stamp_of(number)), "jpeg", pixels(data))
-            for channel in channels:
-                writer.add_message(channel, t_ns, ros.pack(message), stamp_of(number), number + 1000)
-            if boxes:
-                payload = vision(
-                    "v4", [(x + w / 2, y + h / 2, w, h, 0.0, [("person", 0.9)]) for x, y, w, h in shot.boxes.tolist()]
-                )[1]
-                writer.add_message(found, t_ns + 5, payload, t_ns)
-        writer.finish()
-    return shots
 
 
 def content(path: Path) -> dict[str, list]:

@@ -15,7 +15,7 @@ import pytest
 
 from mcaptrack import environment
 from mcaptrack.cli.command import LAST_PANELS
-from tests.commands import GROUP, called
+from tests.commands import GROUP, call
 
 ROOT = Path(__file__).parent.parent
 PAGE = (ROOT / "docs" / "options.md").read_text()
@@ -37,14 +37,14 @@ class TestHelp:
         assert max(panels.values()) <= 8
 
     def test_the_first_page_names_every_command(self):
-        words = called("--help").out
+        words = call("--help").out
         assert [name for name in COMMANDS if not re.search(rf"│ {name} ", words)] == []
 
     @EVERY_COMMAND
     @pytest.mark.parametrize("width", ["80", "120"])
     def test_names_of_options_are_whole_at_every_width(self, command, width, monkeypatch):
         monkeypatch.setenv("COLUMNS", width)
-        words = set(called(command, "--help").out.split())
+        words = set(call(command, "--help").out.split())
         assert {name for option in shown(command) for name in (*option.opts, *option.secondary_opts)} <= words
 
     @EVERY_COMMAND
@@ -63,7 +63,7 @@ class TestHelp:
 
     def test_parameters_of_transforms_are_shown_with_their_defaults(self, monkeypatch):
         monkeypatch.setenv("COLUMNS", "160")
-        words = called("track", "--help").out
+        words = call("track", "--help").out
         for option, default in (("--max-age-s", "1.4"), ("--min-iou", "0.2"), ("--min-hits-frames", "none")):
             assert option in words
             assert f"[default: ({default})]" in words
@@ -126,7 +126,7 @@ class TestWrongUsage:
 
     @staticmethod
     def refused(*words: str) -> str:
-        code, out, err = called(*words)
+        code, out, err = call(*words)
         assert (code, out, err.count("\n")) == (2, "", 1)
         assert err.startswith("mcaptrack: ")
         return err
@@ -228,7 +228,7 @@ class TestPage:
                         where = f"set.toml: [{case.command}] {case.name}"
                         Path("set.toml").write_text(f"[{case.command}]\n{case.name} = {text}\n")
                         words += ["--config", "set.toml"]
-                    code, out, err = called(*words)
+                    code, out, err = call(*words)
                 assert (code, out) == (1, "")
                 assert err.startswith(f"mcaptrack: {where} has to be ") is not is_taken, (case, text, err)
                 assert err.count("\n") == 1
@@ -239,7 +239,7 @@ class TestPage:
             if setting.kind is float and not setting.parameter.startswith("old_"):
                 chosen = next((case.chosen for case in BOUNDED if case[::2][:2] == (command, setting.name)), ())
                 words = [command, *WORDS[command], *chosen, f"--{setting.name}=nan"]
-                _, _, err = called(*words)
+                _, _, err = call(*words)
                 assert err.startswith(f"mcaptrack: --{setting.name} has to be "), err
 
     def test_numbers_of_all_commands_have_two_ends(self):

@@ -23,8 +23,8 @@ from mcaptrack.sources.ingest import IngestOptions, ingest
 from mcaptrack.sources.ingest.bags import plain_yaml
 from mcaptrack.sources.ingest.bags import sqlite_tables as bag_database
 from tests import bounded
-from tests.test_bags import ROS2, STRING1, database
-from tests.test_cli import start
+from tests.bags import ROS2, STRING1, database
+from tests.commands import start
 
 TOPICS = [(1, "/a", STRING1, "cdr", "")]
 

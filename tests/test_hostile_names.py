@@ -18,8 +18,8 @@ from mcap.writer import Writer
 from mcaptrack.cli.text import printable
 from mcaptrack.sources import synthetic
 from mcaptrack.viewing.serving import Server
-from tests.commands import GROUP, Outcome, called, done, made_log
-from tests.test_effects import CASES
+from tests.commands import GROUP, Outcome, call, done, made_log
+from tests.effects.commands import CASES
 from tests.worlds import small_scene
 
 #: A line end, a sequence that clears the screen, one in a single character, writing from right to left, markup.
@@ -92,16 +92,16 @@ def run(template, tmp_path, monkeypatch):
     monkeypatch.setattr(Server, "serve_forever", _interrupted)
     folders = (tmp_path / str(number) for number in itertools.count())
 
-    def call(line: str) -> Outcome:
+    def tried(line: str) -> Outcome:
         folder = next(folders)
         shutil.copytree(template, folder)
         monkeypatch.chdir(folder)
         words = [_evil(word) for word in shlex.split(line)]
         logs = any(word.endswith(".mcap") for word in words)
         is_of_camera = logs and "camera" in GROUP.commands[words[0]].settings and words[0] != "ingest"
-        return called(*words, *(["--camera", EVIL] if is_of_camera else []))
+        return call(*words, *(["--camera", EVIL] if is_of_camera else []))
 
-    return call
+    return tried
 
 
 def _interrupted(*_: object, **__: object) -> None:
@@ -128,7 +128,7 @@ def test_no_name_reaches_the_terminal_as_it_is(command, line, run):
 @pytest.mark.parametrize("command", sorted(set(GROUP.commands) - {"demo"}))
 def test_names_of_files_that_are_not_there(command, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    outcome = called(command, f"{EVIL}.mcap", *(["/a"] if command == "drop" else []))
+    outcome = call(command, f"{EVIL}.mcap", *(["/a"] if command == "drop" else []))
     check(outcome.err)
     assert outcome.out == ""
     assert outcome.err.count("\n") == 1 or outcome.code == 2
@@ -139,7 +139,7 @@ def test_a_name_that_is_no_text(tmp_path, template):
     path = Path(os.fsdecode(os.fsencode(tmp_path) + b"/a\xff\x1b.mcap"))
     shutil.copy(template / RENAMED["a.mcap"], path)
     for command in ("info", "check", "evaluate", "run"):
-        outcome = called(command, path)
+        outcome = call(command, path)
         assert outcome.code in (0, 1)
         check(outcome.out + outcome.err)
         assert r"a\udcff\x1b.mcap" in outcome.out + outcome.err or command == "evaluate"

@@ -15,7 +15,7 @@ from mcaptrack.cli import app
 from mcaptrack.cli.inputs import refuse_url
 from mcaptrack.errors import McaptrackError
 from mcaptrack.transforms import TRANSFORMS
-from tests.test_cli import start
+from tests.commands import start
 
 COMMANDS = get_command(app).commands
 #: Arguments that are words, some of which are paths.

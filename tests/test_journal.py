@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import os
 import shutil
-import signal
 import socket
-import struct
 import subprocess
-import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -19,17 +16,12 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.log import in_place, journal
 from mcaptrack.log.byte_source import OpenFile
 from mcaptrack.log.journal import journal_of
-from tests.test_log import SCHEMA, write_log
-from tests.test_log_interrupted import add_results, killed
+from tests.interrupted import add_results, everything, first_journal, interrupt
+from tests.logs import SCHEMA, write_log
 
 SOME = [("abc"[n % 3], n, n, bytes([n]) * 3000) for n in range(100)]
 AS_ROOT = os.geteuid() == 0
-
-
-def first_journal(start: int, size: int, before: bytes, old: bytes) -> bytes:
-    """A journal as version 0.1.0 wrote them."""
-    head = struct.pack("<QQII", start, size, zlib.crc32(before[-65536:]), zlib.crc32(old))
-    return b"mcaptrack journal 1\n" + head + zlib.crc32(head).to_bytes(4, "little") + old
+pytestmark = pytest.mark.usefixtures("never_waits")
 
 
 @pytest.fixture
@@ -39,38 +31,6 @@ def path(tmp_path) -> Path:
     write_log(path, SOME, "media")
     interrupt(path)
     return path
-
-
-def interrupt(path: Path) -> None:
-    """Leave a log half written: killed in the middle of the second of several pieces."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(in_place, "_PIECE", 20_000)
-        assert killed(lambda: add_results(path, 2, 200), 2, ["pwrite"])
-    with notices.collected() as said, notices.listening(said.append), log.read(path):
-        assert "was left half written" in said[0].message
-
-
-def everything(folder: Path) -> dict[str, tuple[object, ...]]:
-    """All that is in a folder, without following links or waiting for pipes."""
-    found: dict[str, tuple[object, ...]] = {}
-    for at, folders, files in os.walk(folder):
-        for name in [*folders, *files]:
-            entry = Path(at, name)
-            there = entry.lstat()
-            content = entry.read_bytes() if entry.is_file() and not entry.is_symlink() else None
-            found[str(entry)] = (there.st_mode, there.st_ino, there.st_mtime_ns, there.st_size, content)
-    return found
-
-
-@pytest.fixture(autouse=True)
-def never_waits() -> Iterator[None]:
-    def late(*_: object) -> None:
-        raise TimeoutError("it waits")
-
-    signal.signal(signal.SIGALRM, late)
-    signal.alarm(60)
-    yield
-    signal.alarm(0)
 
 
 def a_socket(at: Path) -> None:

@@ -37,13 +37,12 @@ from mcaptrack.sources.ingest.labels.timeline import Timeline
 from mcaptrack.sources.video import H264Encoder
 from mcaptrack.sources.video.h264 import inspect
 from mcaptrack.tables.compared import compare_files, detections_and_truth
-from tests.test_bags import camera_bag
-from tests.test_foreign import Ros, pixels
+from tests.bags import camera_bag
+from tests.robots import FPS, PICTURES, ROBOT_NS, lines, robot_log
 from tests.worlds import ns, write_clip
 
 ROLES: tuple[Role, ...] = get_args(Role)
 FORMATS = tuple(name for name in get_args(Format) if name != "auto")
-PICTURES, FPS = 24, 10
 #: By hand: the pictures that are labelled, and by whom. The first ones and the last ones are empty.
 SEEN = {k: [1, 2] if k % 2 else [1] for k in (3, 4, 5, 7, 15)}
 #: For formats that are labelled every so many frames by custom.
@@ -100,27 +99,6 @@ def by_ffmpeg(path: Path) -> list[int]:
 def by_the_stock_library(path: Path, topic: str) -> list[int]:
     with path.open("rb") as stream:
         return [message.log_time for _, _, message in make_reader(stream).iter_messages([topic])]
-
-
-ROBOT_NS = 1_700_000_000_000_000_000
-
-
-def robot_log(path: Path, *topics: str, boxes: bool = False) -> Path:
-    """Pictures as a robot logs them: late by another time each."""
-    ros = Ros("sensor_msgs/CompressedImage")
-    data = pixels(cv2.imencode(".jpg", np.zeros((48, 64), np.uint8))[1].tobytes())
-    with path.open("wb") as stream:
-        writer = Writer(stream)
-        writer.start(library="theirs")
-        schema = writer.register_schema(ros.kind.name, "ros2msg", ros.kind.schema)
-        channels = [writer.register_channel(topic, "cdr", schema) for topic in topics]
-        for k in range(PICTURES):
-            stamp = ROBOT_NS + ns(k / FPS)
-            payload = ros.pack(ros.new("sensor_msgs/CompressedImage", ros.header(stamp), "jpeg", data))
-            for channel in channels:
-                writer.add_message(channel, stamp + 1_000_000 * (k % 7), payload, stamp, 500 + 3 * k)
-        writer.finish()
-    return path
 
 
 def add(source: Path, path: Path, **options) -> None:
@@ -323,11 +301,6 @@ def test_a_file_that_counts_from_elsewhere_can_say_so(tmp_path, stock):
         ]
         made = Provenance.from_metadata(opened.channel("/camera/truth").metadata)
         assert (made.parameters["first_frame"], made.input) == (1000, "/camera/video")
-
-
-def lines(path: Path, *numbers: int) -> Path:
-    path.write_text("".join(f"{number},7,1,1,2,2\n" for number in numbers))
-    return path
 
 
 REFUSED = {

@@ -16,55 +16,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
-from mcap.writer import CompressionType, IndexType, Writer
 from mcap_protobuf.decoder import DecoderFactory
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.log import records
 from mcaptrack.schema import TRACKS, Frame
+from tests.logs import MESSAGES, SCHEMA, SOME, STOCK_OPTIONS, our_messages, stock_messages, write_log, write_stock
 from tests.worlds import tracks_at
-
-SCHEMA = ("test.Thing", "jsonschema", b"{}")
-
-MESSAGES = st.lists(
-    st.tuples(st.sampled_from("abc"), st.integers(0, 2**62), st.integers(0, 2**32 - 1), st.binary(max_size=50)),
-    max_size=30,
-)
-
-
-def stock_messages(path: Path) -> list[tuple[str, int, int, bytes]]:
-    """What the stock reader finds, with all checksums checked."""
-    with path.open("rb") as stream:
-        reader = make_reader(stream, validate_crcs=True)
-        return [(c.topic, m.log_time, m.sequence, m.data) for _, c, m in reader.iter_messages()]
-
-
-def our_messages(path: Path) -> dict[str, list[tuple[int, int, bytes]]]:
-    with log.read(path) as opened:
-        return {topic: [(m.t_ns, m.sequence, m.payload) for m in opened.messages(topic)] for topic in opened.channels}
-
-
-def write_log(path: Path, messages, kind: str = "rows") -> None:
-    with log.create(path) as writer:
-        numbers = {topic: writer.add_channel(topic, SCHEMA, "json", {"about": topic}, kind) for topic in "abc"}
-        for topic, t_ns, sequence, payload in messages:
-            writer.add_message(numbers[topic], t_ns, sequence, payload)
-
-
-def write_stock(path: Path, messages, **options) -> None:
-    """A log that somebody else recorded, with an attachment and metadata."""
-    with path.open("wb") as stream:
-        writer = Writer(stream, **options)
-        writer.start("ros2", "somebody")
-        schema = writer.register_schema(*SCHEMA)
-        numbers = {topic: writer.register_channel(topic, "json", schema, {"about": topic}) for topic in "abc"}
-        for count, (topic, t_ns, sequence, payload) in enumerate(messages):
-            writer.add_message(numbers[topic], t_ns, payload, publish_time=t_ns // 2, sequence=sequence)
-            if count == 1:
-                writer.add_attachment(1, 2, "notes.txt", "text/plain", b"hello")
-                writer.add_metadata("about", {"robot": "r2"})
-        writer.finish()
 
 
 @given(messages=MESSAGES, kind=st.sampled_from(["rows", "media"]))
@@ -76,18 +35,6 @@ def test_what_is_written_is_read_back_by_us_and_by_the_stock_reader(tmp_path_fac
         wanted = sorted((m[1:] for m in messages if m[0] == topic), key=lambda m: m[0])
         assert ours[topic] == wanted
     assert sorted(stock_messages(path)) == sorted(messages)
-
-
-STOCK_OPTIONS = {
-    "zstd": {},
-    "lz4": {"compression": CompressionType.LZ4},
-    "plain": {"compression": CompressionType.NONE, "chunk_size": 64},
-    "no chunks": {"use_chunking": False},
-    "no repeated channels": {"repeat_channels": False, "repeat_schemas": False, "chunk_size": 64},
-    "no statistics": {"use_statistics": False},
-    "no message index": {"index_types": IndexType.CHUNK},
-}
-SOME = [("a", 10, 1, b"x"), ("b", 30, 2, b"yy"), ("a", 20, 3, b"zzz" * 30), ("c", 5, 4, b""), ("b", 40, 5, b"w" * 200)]
 
 
 @pytest.mark.parametrize("options", STOCK_OPTIONS.values(), ids=STOCK_OPTIONS)

@@ -16,7 +16,7 @@ from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.log import byte_source
 from mcaptrack.schema import TRACKS
-from tests.test_log import write_stock
+from tests.logs import write_stock
 from tests.worlds import tracks_at
 
 KINDS = {

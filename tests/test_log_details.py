@@ -16,8 +16,7 @@ from mcaptrack.log import records
 from mcaptrack.log.records import Opcode
 from mcaptrack.schema.provenance import Provenance
 from tests.commands import done
-from tests.test_damage import FORTY
-from tests.test_log import SCHEMA, write_stock
+from tests.logs import FORTY, SCHEMA, write_stock
 
 MIB = 2**20
 

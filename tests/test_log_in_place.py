@@ -11,13 +11,11 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from mcap.reader import make_reader
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.log import records
-
-SCHEMA = ("test.Thing", "jsonschema", b"{}")
+from tests.interrupted import SCHEMA, contents
 
 
 def recorded(path: Path) -> None:
@@ -40,24 +38,6 @@ def add_results(path: Path, value: int, count: int = 50) -> None:
                 for n in range(count):
                     writer.add_message(number, n * 10, n, bytes([value]) * (40 + value))
             writer.add_attachment("layout", "application/json", bytes([value]) * 100)
-
-
-def contents(path: Path) -> dict[str, list[bytes]]:
-    """Digests of what the stock reader finds, checksums of chunks checked; and the data section's by hand."""
-    whole = path.read_bytes()
-    with path.open("rb") as stream:
-        reader = make_reader(stream, validate_crcs=True)
-        found: dict[str, list[bytes]] = {}
-        for _, channel, message in reader.iter_messages():
-            found.setdefault(channel.topic, []).append(zlib.crc32(message.data).to_bytes(4, "little"))
-        summary = reader.get_summary()
-        found |= {attachment.name: [attachment.data] for attachment in reader.iter_attachments()}
-    assert summary is not None
-    assert summary.statistics.message_count == sum(len(found[c.topic]) for c in summary.channels.values())
-    with log.read(path) as opened:
-        assert zlib.crc32(whole[: opened.index.data_end]) == opened.index.data_crc
-        assert opened.index.regular
-    return found
 
 
 @given(st.binary(max_size=200), st.binary(max_size=5000))

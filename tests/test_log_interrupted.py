@@ -6,8 +6,7 @@ import errno
 import os
 import random
 import shutil
-import signal
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,23 +16,11 @@ from mcaptrack import log, notices
 from mcaptrack.errors import McaptrackError
 from mcaptrack.log import in_place
 from mcaptrack.log.journal import journal_of
-from tests.test_log import write_stock
-from tests.test_log_in_place import SCHEMA, contents
+from tests.interrupted import CALLS, SCHEMA, add_results, contents, killed, sabotage
+from tests.logs import write_stock
 
 #: Results of so many messages are replaced by so many others.
 CHANGES = {"grows": (30, 1500), "shrinks": (1500, 30), "stays as long": (400, 400)}
-
-
-def add_results(path: Path, seed: int, count: int) -> None:
-    """Replace the results of a log by random ones."""
-    noise = random.Random(seed)
-    with log.read(path) as opened:
-        there = [topic for topic in opened.channels if topic.startswith("/result")]
-        with log.extend(opened, drop=there, drop_attachments=["layout"]) as writer:
-            number = writer.add_channel("/result", SCHEMA, "json", {}, "media")  # not compressed: as long as it is
-            for n in range(count):
-                writer.add_message(number, n * 10, n, noise.randbytes(400))
-            writer.add_attachment("layout", "application/json", noise.randbytes(100))
 
 
 def seen(path: Path) -> dict[str, list[bytes]]:
@@ -105,45 +92,6 @@ def path(tmp_path, tmp_path_factory, monkeypatch, change) -> Path:
     if change.make is add_to_irregular:
         os.link(path, tmp_path_factory.mktemp("elsewhere") / "also")
     return path
-
-
-CALLS = ("pwrite", "write", "fsync", "replace", "unlink", "ftruncate", "chmod", "fchown")
-
-
-def sabotage(at: int, fault: Callable[[], object], calls: Sequence[str] = CALLS) -> list[str]:
-    """The ``at``-th call that changes something on the disk does half of its work, if it writes, and then ``fault``."""
-    done: list[str] = []
-
-    def patched(name, real):
-        def call(*args, **kwargs):
-            done.append(name)
-            if len(done) == at:
-                if name in ("pwrite", "write"):
-                    real(args[0], bytes(args[1])[: len(args[1]) // 2], *args[2:])
-                fault()
-            return real(*args, **kwargs)
-
-        return call
-
-    for name in calls:
-        setattr(os, name, patched(name, getattr(os, name)))
-    return done
-
-
-def killed(work: Callable[[], object], at: int, calls: Sequence[str] = CALLS) -> bool:
-    """Whether a process that does this work is killed at its ``at``-th call that changes something on the disk."""
-    child = os.fork()
-    if child == 0:  # in the child: nothing of pytest is to run again
-        try:
-            sabotage(at, lambda: os.kill(os.getpid(), signal.SIGKILL), calls)
-            with notices.collected(), notices.listening(lambda _: None):
-                work()
-            os._exit(0)
-        finally:
-            os._exit(1)
-    _, status = os.waitpid(child, 0)
-    assert status in (0, signal.SIGKILL), status
-    return status != 0
 
 
 def left_behind(path: Path, change: Change, work: Callable[[], object]) -> Iterator[int]:

@@ -12,8 +12,8 @@ from mcaptrack import log, notices
 from mcaptrack.files import can_replace, publish_bytes
 from mcaptrack.log import in_place
 from mcaptrack.log.journal import journal_of
-from tests.test_log import SCHEMA, SOME, STOCK_OPTIONS, our_messages, write_log, write_stock
-from tests.test_log_interrupted import killed
+from tests.interrupted import killed
+from tests.logs import SCHEMA, SOME, STOCK_OPTIONS, our_messages, write_log, write_stock
 
 AS_ROOT = os.geteuid() == 0
 #: An access control list of one more user, as Linux keeps it: entries of tag, rights and number.

@@ -17,11 +17,10 @@ from mcaptrack.log.chunks import LOG_MAX_NS, MAX_NS
 from mcaptrack.schema import Frame
 from mcaptrack.schema.resampling import resample
 from mcaptrack.sources.pictures import Pictures
-from tests.commands import called, done, made_log
+from tests.commands import call, done, made_log
+from tests.interrupted import everything
 from tests.log_mutants import CHUNK, parts, without_summary
-from tests.test_journal import everything
-from tests.test_log import SCHEMA, SOME, STOCK_OPTIONS, our_messages, stock_messages, write_stock
-from tests.test_read_only import READING
+from tests.logs import READING, SCHEMA, SOME, STOCK_OPTIONS, our_messages, stock_messages, write_stock
 from tests.worlds import tracks_at
 
 LATE = [
@@ -75,7 +74,7 @@ def test_tables_leave_out_what_they_can_t_hold_and_say_so(tmp_path):
     assert "recordings: messages are later than the year 2262, which tables can't hold" in outcome.err
     answer = done("query", theirs, "select start_t_ns, end_t_ns, messages from recordings", "--json")
     assert json.loads(answer.out)["results"] == [{"start_t_ns": 5, "end_t_ns": None, "messages": 9}]
-    refused = called("export", theirs, "--topic", "a", "-o", tmp_path / "tables")
+    refused = call("export", theirs, "--topic", "a", "-o", tmp_path / "tables")
     assert refused.code == 1
     assert f"a has 1 messages later than the year 2262, the first at {LOG_MAX_NS} ns" in refused.err
     proposed = refused.err.split("`mcaptrack ")[1].split("`")[0].replace("OTHER.mcap", str(tmp_path / "other.mcap"))
@@ -116,7 +115,7 @@ def ours(request, early, tmp_path_factory) -> Path:
 def test_every_command_keeps_them_or_refuses_in_a_line(command, ours, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     before = everything(ours.parent)
-    outcome = called(command, *READING[command](ours, tmp_path))
+    outcome = call(command, *READING[command](ours, tmp_path))
     assert everything(ours.parent) == before
     assert outcome.code in (0, 1), outcome.err
     if outcome.code:
@@ -153,7 +152,7 @@ def test_boxes_of_others_at_such_times_are_not_tracked(tmp_path):
         for t_ns in (MAX_NS, MAX_NS + 1):
             writer.add_message(number, t_ns, 0, json.dumps(boxes).encode())
     before = everything(tmp_path)
-    outcome = called("track", path, "--topic", "/boxes")
+    outcome = call("track", path, "--topic", "/boxes")
     assert outcome.code == 1
     assert "/boxes has 1 messages later than the year 2262, the first at 9223372036854775808 ns" in outcome.err
     assert everything(tmp_path) == before

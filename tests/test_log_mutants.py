@@ -16,7 +16,7 @@ from mcaptrack import log
 from tests import bounded
 from tests.commands import made_log
 from tests.log_mutants import KINDS, mutant
-from tests.test_read_only import READING
+from tests.logs import READING
 
 FEW = 12
 MUTANTS = int(os.environ.get("LOG_MUTANTS", str(FEW)))

@@ -10,8 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mcaptrack.evaluation.metrics import Matchup, combine, distances, metres_to_similarity, score, summary
-from mcaptrack.evaluation.metrics.displacement import Forecasts, Positions, combine_displacements, displacement
+from mcaptrack.evaluation.metrics.displacement import combine_displacements, displacement
 from mcaptrack.geometry.boxes import iou
+from tests.forecasts import forecasts, positions, predicted
 
 
 def matchup(truth, tracks, gate: float = 1.0) -> Matchup:
@@ -252,24 +253,8 @@ def test_numbers_of_the_evaluators_on_real_sequences(data, rules, columns):
         )
 
 
-def positions(people: dict[int, dict[int, tuple[float, float]]]) -> Positions:
-    """{id: {step: place}} as arrays."""
-    rows = [(step, who, *place) for who, path in people.items() for step, place in path.items()]
-    table = np.array(rows, float).reshape(-1, 4)
-    return Positions(table[:, 0].astype(int), table[:, 1].astype(int), table[:, 2:])
-
-
 def straight(who: int, steps: range, offset: float = 0.0, lane: float = 0.0) -> dict:
     return {who: {step: (step + offset, lane) for step in steps}}
-
-
-def predicted(step: int, who: int, mean: list[tuple[float, float]], variance: float = 1.0) -> tuple:
-    return step, who, mean, [variance * np.eye(2)] * len(mean)
-
-
-def forecasts(*parts: tuple) -> Forecasts:
-    steps, who, means, covs = zip(*parts, strict=True)
-    return Forecasts(np.array(steps), np.array(who), np.array(means, float), np.array(covs))
 
 
 class TestDisplacement:

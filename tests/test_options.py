@@ -19,7 +19,7 @@ from mcaptrack.predictors import NAMES
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.transforms import PROFILES, TRACKERS, TRANSFORMS
 from mcaptrack.transforms.protocol import bare_type, choices
-from tests.commands import called, done, made_log, toml_value
+from tests.commands import call, done, made_log, toml_value
 
 
 @pytest.fixture(scope="session")
@@ -117,7 +117,7 @@ def test_every_parameter_of_a_stage_arrives_in_the_provenance(stage, way, folder
             monkeypatch.setenv(f"MCAPTRACK_{stage.command}_{name}".upper(), str(value))
     else:
         Path("mcaptrack.toml").write_text(toml(stage.command, values))
-    code, _, err = called(*words)
+    code, _, err = call(*words)
     assert code == 0, err
     assert stage.made(folder / "b.mcap") == values
 
@@ -126,7 +126,7 @@ def test_every_parameter_of_a_stage_arrives_in_the_provenance(stage, way, folder
 def test_the_default_can_be_said_and_changes_nothing(stage, folder):
     """Also ``--smooth`` where it is on and ``--no-confirm`` where it is off."""
     values = {name: value for name, value in stage.parameters().items() if value is not None}
-    code, _, err = called(stage.command, "a.mcap", "-o", "b.mcap", *flags(dict(stage.chosen) | values))
+    code, _, err = call(stage.command, "a.mcap", "-o", "b.mcap", *flags(dict(stage.chosen) | values))
     assert code == 0, err
     assert stage.made(folder / "b.mcap") == stage.parameters()
 

@@ -21,7 +21,7 @@ from typer.main import get_command
 
 from mcaptrack import __version__
 from mcaptrack.cli import app
-from tests.test_cli import call
+from tests.commands import call
 
 ROOT = Path(__file__).parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]

@@ -23,12 +23,10 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.sources.ingest import IngestOptions, ingest
 from mcaptrack.sources.video import VideoOptions, open_video
 from mcaptrack.sources.video.codecs import CODECS
-from tests.test_cli import call
-from tests.worlds import write_clip
+from tests.commands import call
+from tests.worlds import SVT, X265, write_clip
 
 X264 = {"bf": "0", "g": "10"}
-X265 = {"x265-params": "keyint=10:min-keyint=10:bframes=0:log-level=none"}
-SVT = {"g": "10", "preset": "12"}
 DECODERS = {"h264": "h264", "h265": "hevc", "vp9": "vp9", "av1": "libdav1d"}
 
 PASSED = {

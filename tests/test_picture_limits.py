@@ -27,7 +27,7 @@ from mcaptrack.sources.ingest import IngestOptions, ingest
 from mcaptrack.sources.video import EncodedPicture, PixelLayout, VideoOptions, decode_bgr, decode_gray, open_video
 from mcaptrack.sources.video.codecs import CODECS
 from mcaptrack.sources.video.limits import ENVIRONMENT, still_size
-from tests.test_cli import start
+from tests.commands import start
 from tests.worlds import ids, ns, write_clip
 
 SUFFIXES = ("png", "jpg", "bmp", "webp", "tif", "avif")

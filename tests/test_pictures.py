@@ -17,9 +17,8 @@ from mcaptrack.sources.ingest import IngestOptions, ingest
 from mcaptrack.sources.pictures import Pictures
 from mcaptrack.sources.video import EncodedPicture, H264Encoder, VideoOptions, decode_gray, open_video
 from mcaptrack.viewing import rendering
-from tests.test_cli import done
-from tests.test_passing import SVT, X265
-from tests.worlds import write_clip
+from tests.commands import printed
+from tests.worlds import SVT, X265, write_clip
 
 TOPIC = "/camera/video"
 COUNT, GROUP = 60, 10
@@ -190,7 +189,7 @@ def test_a_recording_that_begins_within_a_group_is_shown_from_its_first_key_pict
         assert list(Pictures(opened, "/v").frames([1])) == []
     seen = decode_gray(EncodedPicture(number, number, name, part) for number, part in enumerate(data[7:]))
     assert [frame.index for frame in seen] == list(range(3, 23))
-    _, err = done("detect", tmp_path / "a.mcap", "--topic", "/v", "--to", "/boxes")
+    _, err = printed("detect", tmp_path / "a.mcap", "--topic", "/v", "--to", "/boxes")
     assert "/v: 3 of 23 messages were left out: a video has to begin with a key picture" in err
     with log.read(tmp_path / "a.mcap") as opened:
         assert opened.times("/boxes").tolist() == [number * 10**8 for number in range(3, 23)]

@@ -18,10 +18,10 @@ from mcaptrack.errors import McaptrackError, command
 from mcaptrack.schema import TRACKS
 from mcaptrack.training.sources import SourceOptions, read_scenes
 from mcaptrack.viewing import serving
-from tests.commands import GROUP, called, done, made_log
-from tests.test_bags import bag1
-from tests.test_foreign_runs import write_log
-from tests.test_journal import interrupt
+from tests.bags import bag1
+from tests.commands import GROUP, call, done, made_log
+from tests.interrupted import interrupt
+from tests.robots import write_log
 
 PACKAGE = Path(mcaptrack.__file__).parent
 #: A name that a shell, an option parser and a reader of messages can all stumble over.
@@ -48,7 +48,7 @@ class Scene:
     def says(self, *words: str) -> str:
         """What a command on the log prints, its name in the place of LOG."""
         given = [f"./{NAME}" if word == "LOG" else word for word in words]
-        outcome = called(*given)
+        outcome = call(*given)
         return outcome.err + outcome.out
 
     def without(self, *topics: str) -> Scene:
@@ -248,7 +248,7 @@ def test_what_is_proposed_works(where, template, tmp_path, monkeypatch):
         words = [given.get(word, word) for word in words_of(line)]
         if "boxes.txt" in words:
             words += ["--as", "detections", "--fps", "10"]
-        outcome = called(*words)
+        outcome = call(*words)
         assert outcome.code in (0, 3), f"{line}: {outcome.err}"
 
 

@@ -6,40 +6,18 @@ import json
 import os
 import shutil
 from collections.abc import Callable
-from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
 
 from mcaptrack.log.journal import journal_of
-from tests.commands import GROUP, called, done, made_log
-from tests.test_journal import everything, first_journal, interrupt, never_waits  # noqa: F401
+from tests.commands import GROUP, call, done, made_log
+from tests.interrupted import everything, first_journal, interrupt
+from tests.logs import READING
 
-#: How each command is run so that it only reads the log; nothing comes into the log's folder.
-READING: dict[str, Callable[[Path, Path], list[object]]] = {
-    "check": lambda log, out: [log],
-    "drop": lambda log, out: [log, "/camera/truth", "-o", out / "dropped.mcap"],
-    "evaluate": lambda log, out: [log],
-    "export": lambda log, out: [log, "-o", out / "tables"],
-    "info": lambda log, out: [log],
-    "ingest": lambda log, out: [log, "-o", out / "ingested.mcap"],
-    "query": lambda log, out: [log, "select count(*) from tracks"],
-    "recover": lambda log, out: [log, "-o", out / "recovered.mcap"],
-    "render": lambda log, out: [log, "-o", out / "rendered.gif", "--width", "64", "--end-s", "0.2"],
-    "report": lambda log, out: [log, "-o", out / "report.html"],
-    "tune": lambda log, out: [log, "--trials", "1", "-o", out / "tuned.json"],
-    "view": lambda log, out: [log, "--layout", "no such layout"],
-    **{
-        name: lambda log, out: [log, "-o", out / "other.mcap"]
-        for name in ("detect", "track", "sample", "predict", "retrack", "run", "events")
-    },
-}
 #: Those that read no log.
-OTHERS = {"demo", "docs"}
-if find_spec("torch"):  # without it `train` reads nothing
-    READING["train"] = lambda log, out: [log, "-o", out / "trained", "--epochs", "1", "--device", "cpu"]
-else:
-    OTHERS |= {"train"}
+OTHERS = {"demo", "docs"} | ({"train"} - READING.keys())
+pytestmark = pytest.mark.usefixtures("never_waits")
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +48,7 @@ def test_every_command_is_tried():
 def test_a_half_written_log_stays_as_it_is_and_is_read_as_it_was(command, half, whole, out):
     before = everything(half.parent)
     words = READING[command](half, out)
-    outcome = called(command, *words)
+    outcome = call(command, *words)
     assert everything(half.parent) == before
     said = [line for line in outcome.err.splitlines() if "left half written" in line]
     if command == "view":
@@ -83,7 +61,7 @@ def test_a_half_written_log_stays_as_it_is_and_is_read_as_it_was(command, half, 
         assert [line.startswith("warning: ") for line in said] == [True]
     shutil.rmtree(out)
     out.mkdir()
-    other = called(command, *READING[command](whole, out))
+    other = call(command, *READING[command](whole, out))
     if command not in ("view", "check"):
         assert outcome.code == other.code
         assert outcome.out.replace(str(half), str(whole)) == other.out
@@ -125,7 +103,7 @@ def test_what_lies_where_the_journal_goes_harms_and_stops_nothing(command, thing
     shutil.copy(whole, path)
     BESIDE[thing](journal_of(path))
     before = everything(folder)
-    outcome = called(command, *READING[command](path, out))
+    outcome = call(command, *READING[command](path, out))
     assert everything(folder) == before
     said = [line for line in outcome.err.splitlines() if str(journal_of(path)) in line]
     assert [line.startswith("warning: ") for line in said] == [True]
@@ -144,7 +122,7 @@ def test_what_is_no_file_is_refused_in_a_line(command, out):
     kinds = {"pipe.mcap": "pipe", "folder.mcap": "folder", "beside.mcap": "", "circle.mcap": "circle.mcap"}
     for name, words in kinds.items():
         before = everything(folder)
-        outcome = called(command, *READING[command](folder / name, out))
+        outcome = call(command, *READING[command](folder / name, out))
         assert outcome.code in (1, 2)
         assert "Traceback" not in outcome.err
         assert len([line for line in outcome.err.splitlines() if words in line]) == 1 or not words

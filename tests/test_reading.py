@@ -16,8 +16,8 @@ from pathlib import Path
 import pytest
 
 from mcaptrack.viewing.serving import Server
-from tests.commands import GROUP, called, done, made_log
-from tests.test_effects import CASES
+from tests.commands import GROUP, call, done, made_log
+from tests.effects.commands import CASES
 
 #: What a command is given, where the case without options of the other tests isn't what reads most.
 LINES = {
@@ -130,7 +130,7 @@ def test_what_is_read_stays_as_it_is(
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(folder)
     before = seen(folder)
-    outcome = called(*shlex.split(line_of(command).format(elsewhere=tmp_path / "elsewhere")))
+    outcome = call(*shlex.split(line_of(command).format(elsewhere=tmp_path / "elsewhere")))
     assert outcome.code in (0, 1), outcome.err
     assert outcome.code == 0 or beside is not nothing, outcome.err
     after = seen(folder)

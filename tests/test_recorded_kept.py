@@ -19,8 +19,8 @@ from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.ingest import IngestOptions, ingest
 from mcaptrack.sources.ingest.labels.formats import Role
 from mcaptrack.transforms import TRANSFORMS
-from tests.test_bags import camera_bag
-from tests.test_label_clock import lines, robot_log
+from tests.bags import camera_bag
+from tests.robots import lines, robot_log
 from tests.worlds import write_clip
 
 ROLES = get_args(Role)

@@ -15,16 +15,16 @@ from mcaptrack.predictors import make
 from mcaptrack.training.recipe import RECIPES
 from mcaptrack.training.sources import SourceOptions, read_scenes, windows_of
 from mcaptrack.training.windows import ar1
-from tests.test_cli import done
+from tests.commands import printed
 
 
 @pytest.fixture(scope="module")
 def scores(data, tmp_path_factory) -> dict[tuple[str, str, float], dict]:
     folder, path = data / "pets09-s2l1", tmp_path_factory.mktemp("pets") / "pets.mcap"
     plane = ("--ground-plane", folder / "homography.txt", "--point", "foot")
-    done("ingest", folder / "video.avi", "--fps", 7, *plane, "--truth", folder / "gt.txt", "-o", path)
-    done("run", path)
-    rows = json.loads(done("evaluate", path, "--json")[0])["results"]
+    printed("ingest", folder / "video.avi", "--fps", 7, *plane, "--truth", folder / "gt.txt", "-o", path)
+    printed("run", path)
+    rows = json.loads(printed("evaluate", path, "--json")[0])["results"]
     return {(row["tracks"].removeprefix("/camera/"), row["similarity"], row["gate"]): row for row in rows}
 
 

@@ -19,7 +19,7 @@ from mcaptrack.sources.video.decode import EncodedPicture, decode_bgr
 from mcaptrack.sources.video.encode import encode_image
 from mcaptrack.sources.video.raw_pixels import PixelLayout
 from mcaptrack.viewing.rendering import draw
-from tests.test_cli import call, done, finished, footage  # noqa: F401
+from tests.commands import call, printed
 
 GREY = np.full((100, 200, 3), 100, np.uint8)
 
@@ -140,13 +140,13 @@ def test_pictures_of_every_kind_are_read_in_colour():
     assert np.array_equal(found[3], np.repeat(grey[..., None], 3, axis=2))
 
 
-def test_a_log_becomes_a_video_of_its_pictures(finished, tmp_path):  # noqa: F811
-    out, _ = done("render", finished, "-o", tmp_path / "all.mp4", "--json")
+def test_a_log_becomes_a_video_of_its_pictures(finished, tmp_path):
+    out, _ = printed("render", finished, "-o", tmp_path / "all.mp4", "--json")
     (result,) = json.loads(out)["results"]
     assert result["views"] == ["/camera/retracks/full/view/image", "/camera/retracks/predictions/view/image"]
     found = clip(tmp_path / "all.mp4")
     assert len(found) == result["pictures"]
-    done(
+    printed(
         "render",
         finished,
         "--topic",
@@ -175,7 +175,7 @@ MISTAKES = {
 
 
 @pytest.mark.parametrize("words", MISTAKES.values(), ids=MISTAKES)
-def test_mistakes_are_said_in_a_line(finished, tmp_path, words):  # noqa: F811
+def test_mistakes_are_said_in_a_line(finished, tmp_path, words):
     code, out, err = call(
         "render", finished, *(["-o", "b.mp4"] if "-o" not in words[0] else []), *words[0], folder=tmp_path
     )
@@ -185,12 +185,12 @@ def test_mistakes_are_said_in_a_line(finished, tmp_path, words):  # noqa: F811
     assert not list(tmp_path.iterdir())
 
 
-def test_a_log_without_views_says_what_makes_them(footage, tmp_path):  # noqa: F811
+def test_a_log_without_views_says_what_makes_them(footage, tmp_path):
     path = tmp_path / "a.mcap"
-    done("ingest", footage.video, "-o", path)
+    printed("ingest", footage.video, "-o", path)
     code, _, err = call("render", path)
     assert (code, "has no views of /camera yet; `mcaptrack run" in err) == (1, True)
-    done("ingest", footage.truth, "--as", "truth", "--fps", 10, "-o", tmp_path / "labels.mcap")
+    printed("ingest", footage.truth, "--as", "truth", "--fps", 10, "-o", tmp_path / "labels.mcap")
     code, _, err = call("render", tmp_path / "labels.mcap")
     assert (code, "has no pictures of /camera to draw on" in err) == (1, True)
 
@@ -206,7 +206,7 @@ def test_nothing_is_left_of_a_clip_that_fails(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_re_tracked_people_are_drawn_at_the_rate_of_the_video(finished):  # noqa: F811
+def test_re_tracked_people_are_drawn_at_the_rate_of_the_video(finished):
     with log.read(finished) as opened:
         assert find_views(opened, "/camera", ["/camera/retracks"]) == ["/camera/retracks/full/view/image"]
         with pytest.raises(McaptrackError, match="has no channel /camera/unknown/view/image"):

@@ -28,7 +28,7 @@ from mcaptrack.viewing.report.formatting import plain
 from mcaptrack.viewing.report.html import environment
 from mcaptrack.viewing.report.identity_events import SIDE_PX, add_thumbnails, most_important, summarize_events
 from mcaptrack.viewing.report.scene_map import simplified
-from tests.test_cli import call, done, finished, footage  # noqa: F401
+from tests.commands import call, printed
 from tests.worlds import ns, tracks_at, walk
 
 
@@ -100,22 +100,22 @@ def without_curves(results):
     return results
 
 
-def test_its_scores_are_those_of_evaluate_and_json_prints_what_the_page_holds(finished, tmp_path):  # noqa: F811
+def test_its_scores_are_those_of_evaluate_and_json_prints_what_the_page_holds(finished, tmp_path):
     target = tmp_path / "report.html"
-    printed = json.loads(done("report", finished, "-o", target, "--json")[0])
-    (scored,) = [json.loads(done("evaluate", finished, "--json")[0])["results"]]
+    shown = json.loads(printed("report", finished, "-o", target, "--json")[0])
+    (scored,) = [json.loads(printed("evaluate", finished, "--json")[0])["results"]]
     assert len(scored) > 8
-    assert without_curves(printed["results"]) == without_curves(scored)
+    assert without_curves(shown["results"]) == without_curves(scored)
     inside = numbers_in(Reader(target.read_text()))
     inside["results"] = without_curves(inside["results"])
-    assert inside == {key: value for key, value in printed.items() if key not in ("failed", "warnings")}
+    assert inside == {key: value for key, value in shown.items() if key not in ("failed", "warnings")}
 
 
-def test_several_logs_are_combined_as_evaluate_combines_them(finished, tmp_path):  # noqa: F811
+def test_several_logs_are_combined_as_evaluate_combines_them(finished, tmp_path):
     other = tmp_path / "other.mcap"
     other.write_bytes(finished.read_bytes())
     _, numbers, reader = report_on(finished, other)
-    scored = json.loads(done("evaluate", finished, other, "--json")[0])["results"]
+    scored = json.loads(printed("evaluate", finished, other, "--json")[0])["results"]
     assert without_curves(numbers["results"]) == without_curves(scored)
     assert any(result["sequence"] == "COMBINED" for result in scored)
     assert len([one for one in reader.of("details") if one.get("class") == "log"]) == 2
@@ -144,7 +144,7 @@ def predicted(tmp_path_factory) -> Path:
 
 def test_the_curve_and_the_errors_by_horizon_are_those_of_the_scores(predicted):
     _, numbers, _ = report_on(predicted)
-    scored = json.loads(done("evaluate", predicted, "--json")[0])["results"]
+    scored = json.loads(printed("evaluate", predicted, "--json")[0])["results"]
     whole = next(r["displacement"] for r in scored if r["similarity"] == "metres")
     (one,) = numbers["logs"][0]["forecasts"]
     assert one["by_horizon"]["n"] > 50
@@ -312,7 +312,7 @@ def test_thumbnails_show_the_tracks_before_and_after(story):
             assert seen[around].mean() < 60
 
 
-def test_colours_are_those_of_viewers(finished):  # noqa: F811
+def test_colours_are_those_of_viewers(finished):
     text, _, reader = report_on(finished)
     for identity in (0, 1, 8, 20, 21, 47):
         red, green, blue, _ = (round(255 * part) for part in foxglove.colour(identity))
@@ -354,9 +354,9 @@ def test_without_metres_it_says_that_speeds_are_not_known(tmp_path):
     assert numbers["logs"][0]["dwell_s"]["series"][0]["median"] == pytest.approx(3.0)
 
 
-def test_without_forecasts_it_says_which_command_makes_them(finished, tmp_path):  # noqa: F811
+def test_without_forecasts_it_says_which_command_makes_them(finished, tmp_path):
     less = tmp_path / "less.mcap"
-    done("drop", finished, "*predictions*", "-o", less, "-q")
+    printed("drop", finished, "*predictions*", "-o", less, "-q")
     _, numbers, reader = report_on(less)
     assert "mcaptrack predict less.mcap" in "".join(reader.text)
     assert numbers["logs"][0]["forecasts"] == []
@@ -471,7 +471,7 @@ def test_the_data_keep_names_as_they_are_and_what_is_not_a_number_as_null(nasty)
     assert entry["channels"][0]["parameters"]["</script>"] == ["</ScRiPt x", None]
 
 
-def test_a_page_on_a_whole_log_loads_and_runs_nothing(finished):  # noqa: F811
+def test_a_page_on_a_whole_log_loads_and_runs_nothing(finished):
     text, _, reader = report_on(finished)
     holds(reader)
     assert not re.search(r"https?://|@import|url\(", text)
@@ -529,22 +529,22 @@ def test_templates_print_in_text_and_quoted_attributes_only(name):
 # Files
 
 
-def test_the_same_log_gives_the_same_bytes_wherever_it_lies(finished, tmp_path):  # noqa: F811
+def test_the_same_log_gives_the_same_bytes_wherever_it_lies(finished, tmp_path):
     moved = tmp_path / finished.name
     moved.write_bytes(finished.read_bytes())
     assert report_on(finished)[0] == report_on(moved)[0]
 
 
-def test_the_page_stands_beside_the_log_and_is_not_replaced_unasked(finished, tmp_path):  # noqa: F811
+def test_the_page_stands_beside_the_log_and_is_not_replaced_unasked(finished, tmp_path):
     path = tmp_path / "walk.mcap"
     path.write_bytes(finished.read_bytes())
     before = path.read_bytes()
-    done("report", path, "-q")
+    printed("report", path, "-q")
     first = (tmp_path / "walk.report.html").read_bytes()
     code, _, err = call("report", path)
     assert code == 1
     assert "--force" in err
-    done("report", path, "--force", "-q")
+    printed("report", path, "--force", "-q")
     assert (tmp_path / "walk.report.html").read_bytes() == first
     assert path.read_bytes() == before
     assert sorted(p.name for p in tmp_path.iterdir()) == ["walk.mcap", "walk.report.html"]
@@ -554,13 +554,13 @@ def test_the_page_stands_beside_the_log_and_is_not_replaced_unasked(finished, tm
     assert path.read_bytes() == before
 
 
-def test_several_logs_need_a_name_for_their_page(finished):  # noqa: F811
+def test_several_logs_need_a_name_for_their_page(finished):
     code, _, err = call("report", finished, finished)
     assert code == 1
     assert "-o" in err
 
 
-def test_a_damaged_log_is_refused_in_one_line(finished, tmp_path):  # noqa: F811
+def test_a_damaged_log_is_refused_in_one_line(finished, tmp_path):
     path = tmp_path / "broken.mcap"
     with log.read(finished) as opened:
         number = opened.channel("/camera/predictions").id

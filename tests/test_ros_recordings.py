@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mcap.reader import make_reader
-from mcap.writer import Writer as McapWriter
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
@@ -18,8 +17,8 @@ from rosbags.rosbag2 import Writer as Writer2
 from mcaptrack import log
 from mcaptrack.schema import TRACKS
 from mcaptrack.schema.provenance import Provenance
-from tests.commands import GROUP, called, done
-from tests.test_bags import MOT, ROS2, T0, bag1, bag2, picture
+from tests.bags import MOT, ROS2, T0, bag1, bag2, picture, plain
+from tests.commands import GROUP, call, done
 
 COMMANDS = GROUP.commands
 FRAMES = 24
@@ -179,7 +178,7 @@ def test_in_place_insists_and_what_is_in_place_goes_on_there(path):
     assert f"results are in {path}: earlier results are in it; ROS tools may stumble over them" in line
     assert [entry.name for entry in path.parent.glob("*.mcap")] == ["drive.mcap"]
     done("drop", path, "/robot/front/*detections*", "/robot/front/tracks*")  # ours
-    result = called("drop", path, "/robot/front/image")
+    result = call("drop", path, "/robot/front/image")
     assert result.code == 1
     assert "-o writes a copy without /robot/front/image, --in-place changes it all the same" in result.err
     done("drop", path, "/robot/front/image", "--in-place")
@@ -188,7 +187,7 @@ def test_in_place_insists_and_what_is_in_place_goes_on_there(path):
 def test_in_place_is_refused_where_results_stand_beside(path):
     done("detect", path, "--detector", "frame-difference")
     before = on_disk(path.parent)
-    result = called("track", path, "--in-place")
+    result = call("track", path, "--in-place")
     assert result.code == 1
     assert "--in-place would leave them there and make others: remove drive.results.mcap first" in result.err
     assert on_disk(path.parent) == before
@@ -204,18 +203,8 @@ def test_a_copy_without_channels_has_its_results_beside_it(path, tmp_path):
         assert "/robot/front/image" not in opened.channels
         assert opened.channel("/robot/front/detections").messages == FRAMES
         assert opened.results is not None
-    result = called("track", path, "--in-place", "-o", tmp_path / "b.mcap")
+    result = call("track", path, "--in-place", "-o", tmp_path / "b.mcap")
     assert (result.code, "--in-place and -o are two places" in result.err) == (1, True)
-
-
-def plain(path: Path, profile: str, library: str = "robot") -> Path:
-    """A log with one channel of JSON."""
-    with path.open("wb") as stream:
-        writer = McapWriter(stream)
-        writer.start(profile, library)
-        writer.add_message(writer.register_channel("/a", "json", 0), 1, b"{}", 1)
-        writer.finish()
-    return path
 
 
 METADATA = "rosbag2_bagfile_information:\n  relative_file_paths: [{}]\n"
@@ -292,7 +281,7 @@ def test_whatever_is_given_a_recording_that_is_no_log_says_how_to_make_one(tmp_p
         for name, words in (on_recording(Path("RECORDING"), tmp_path) | {"view": [Path("RECORDING")]}).items():
             if not words or name == "ingest" or (number > 1 and name != "info"):
                 continue  # the kinds are told apart in one place
-            result = called(name, *(recording if word == Path("RECORDING") else word for word in words))
+            result = call(name, *(recording if word == Path("RECORDING") else word for word in words))
             assert result.code == 1, (name, recording, result.err)
             assert result.err.count("\n") == 1, (name, recording, result.err)
             said.add(result.err.split("`")[1])

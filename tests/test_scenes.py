@@ -14,9 +14,8 @@ from mcaptrack.foxglove.views import Drawing, ground, layouts
 from mcaptrack.foxglove.views.layouts import CameraChannels, make
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame
-from tests.test_cli import done, finished, footage  # noqa: F401
-from tests.test_views import FORECAST, PICTURES, PLANE
-from tests.worlds import ns, tracks_at
+from tests.commands import printed
+from tests.worlds import FORECAST, PICTURES, PLANE, ns, tracks_at
 
 M = 1 / 128 + 1e-9
 WALK = [Frame(int(t), n, tracks_at({2: (0.1 * n, 1.0), 30: (5.0, 0.2 * n)})) for n, t in enumerate(PICTURES)]
@@ -214,7 +213,7 @@ def test_the_eye_looks_where_the_camera_looks():
 
 
 class TestAFinishedLog:
-    def test_has_a_scene_for_every_picture(self, finished):  # noqa: F811
+    def test_has_a_scene_for_every_picture(self, finished):
         with log.read(finished) as opened:
             pictures = opened.times("/camera/video").tolist()
             views = {topic for topic in opened.channels if topic.endswith("/view/scene")}
@@ -233,7 +232,7 @@ class TestAFinishedLog:
             assert transform.parent_frame_id != transform.child_frame_id
             assert transform.rotation.w == 1
 
-    def test_has_three_layouts_of_what_is_in_it(self, finished):  # noqa: F811
+    def test_has_three_layouts_of_what_is_in_it(self, finished):
         with log.read(finished) as opened:
             there = set(opened.channels)
             for end in (".layout.json", ".comparing.layout.json", ".predictions.layout.json"):
@@ -246,10 +245,10 @@ class TestAFinishedLog:
                 assert {"Image", "3D", "Plot"} <= kinds
 
 
-def test_labels_without_pictures_have_scenes_too(footage, tmp_path):  # noqa: F811
+def test_labels_without_pictures_have_scenes_too(footage, tmp_path):
     path = tmp_path / "labels.mcap"
-    done("ingest", footage.truth, "--as", "tracks", "--fps", 10, "--ground-plane", footage.ground_plane, "-o", path)
-    done("run", path)
+    printed("ingest", footage.truth, "--as", "tracks", "--fps", 10, "--ground-plane", footage.ground_plane, "-o", path)
+    printed("run", path)
     with log.read(path) as opened:
         for name in ("tracks", "predictions", "retracks/full"):
             times = opened.times(f"/camera/{name}").tolist()
@@ -264,13 +263,13 @@ def test_labels_without_pictures_have_scenes_too(footage, tmp_path):  # noqa: F8
         assert {"3D!ground", "Plot!people"} <= set(layout["configById"])
 
 
-def test_a_stage_that_is_run_again_replaces_its_views(finished, tmp_path):  # noqa: F811
+def test_a_stage_that_is_run_again_replaces_its_views(finished, tmp_path):
     """In place and more than once: what is read of a log is read before its end is written anew."""
     path = tmp_path / "walk.mcap"
     path.write_bytes(finished.read_bytes())
     for stage in ("retrack", "track", "run"):
-        done(stage, path)
-    done("check", path)
+        printed(stage, path)
+    printed("check", path)
     with log.read(path) as opened, log.read(finished) as before:
         assert set(opened.channels) == set(before.channels)
         for topic in before.channels:

@@ -30,8 +30,8 @@ from mcap.reader import make_reader
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.viewing.serving import Limits, Server, requested_range
-from tests.test_cli import call
-from tests.test_log import SOME, stock_messages, write_log
+from tests.commands import call
+from tests.logs import SOME, stock_messages, write_log
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,7 @@ import pytest
 from mcaptrack import environment
 from mcaptrack.cli.config import MAX_BYTES, user_file
 from mcaptrack.cli.settings import CALL_ONLY, Setting
-from tests.commands import GROUP, called, toml_value
+from tests.commands import GROUP, call, toml_value
 
 COMMANDS = GROUP.commands
 #: Arguments of commands, as far as they need any.
@@ -153,7 +153,7 @@ def test_the_nearest_source_counts(folder, monkeypatch):
 
 def refused(*words: str) -> str:
     """The one line of a command that is refused because of its options, before it does anything."""
-    outcome = called(*words)
+    outcome = call(*words)
     assert (outcome.code, outcome.out) == (2, ""), outcome
     assert outcome.err.startswith("mcaptrack: ")
     assert outcome.err.count("\n") == 1
@@ -168,7 +168,7 @@ class TestUnknownNames:
             wrong = name[:-1] if name[:-1] not in known and len(name) > 3 else name + "x"
             nearest = difflib.get_close_matches(wrong, known, 1)
             assert nearest, name
-            outcome = called(command, f"--{wrong}", "x")
+            outcome = call(command, f"--{wrong}", "x")
             assert outcome.code == 2
             assert "no such option" in outcome.err
             assert f"--{nearest[0]}" in outcome.err
@@ -188,19 +188,19 @@ class TestUnknownNames:
     def test_variables_that_are_no_options_stand_in_one_list(self, monkeypatch):
         for name in environment.VARIABLES:
             monkeypatch.setenv(name, "1")
-        assert called("info", "x.mcap").code == 1
+        assert call("info", "x.mcap").code == 1
         package = Path(environment.__file__).parent
         for path in package.rglob("*.py"):
             if path.name not in ("environment.py", "settings.py"):
                 assert not re.search(r"environ\b|getenv", path.read_text()), path
 
     def test_a_limit_that_is_no_number_is_refused(self, tmp_path, monkeypatch):
-        from tests.test_log import SOME, write_log
+        from tests.logs import SOME, write_log
 
         write_log(tmp_path / "a.mcap", SOME)
         for text in ("many", "-1", "0", "9" * 5000):
             monkeypatch.setenv("MCAPTRACK_MAX_CHUNK_MIB", text)
-            outcome = called("check", tmp_path / "a.mcap")
+            outcome = call("check", tmp_path / "a.mcap")
             assert outcome.code == 1
             assert "MCAPTRACK_MAX_CHUNK_MIB needs a whole number" in outcome.out + outcome.err
 
@@ -383,6 +383,6 @@ class TestRenamed:
         assert f"--{old} is the old name of --{setting.name}; give one of them" in words
 
     def test_the_help_knows_the_new_name_alone(self, command, setting, old, beside):
-        words = called(command, "--help").out
+        words = call(command, "--help").out
         assert f"--{setting.name} " in words
         assert not re.search(rf"--{old}\b(?!-)", words)

@@ -15,7 +15,7 @@ from mcap.writer import Writer
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import TRACKS, Frame
-from tests.test_cli import done
+from tests.commands import printed
 from tests.worlds import tracks_at
 
 #: Definitions that decode alike, and one that doesn't.
@@ -125,12 +125,12 @@ def test_counts_add_up_to_the_statistics(tmp_path):
             writer.add_message(channel, t_ns, 0, b"{}")
     parts = {"log": path, "results": tmp_path / "a.results.mcap"}
     total = sum(stock(part)[0] for part in parts.values())
-    data = json.loads(done("info", path, "--json")[0])["results"][0]
+    data = json.loads(printed("info", path, "--json")[0])["results"][0]
     assert data["messages"] == sum(channel["messages"] for channel in data["channels"]) == total == 10
     said = [(channel["part"], channel["topic"], channel["messages"]) for channel in data["channels"]]
     assert sorted(said) == sorted((name, *channel) for name, part in parts.items() for channel in stock(part)[1])
     assert [(c["part"], c["topic"]) for c in data["channels"] if c["replaced"]] == [("log", "/talk")]
-    out, _ = done("info", path)
+    out, _ = printed("info", path)
     rows = [line.split() for line in out.splitlines() if line.startswith(("/tf", "/talk"))]
     assert sorted((row[0], int(row[-1])) for row in rows) == sorted(channel[1:] for channel in said)
     assert "/talk  (replaced by the results)" in out
@@ -145,7 +145,7 @@ def test_a_table_of_a_topic_has_the_messages_of_all_its_channels(tmp_path):
         for t_ns in range(12):
             writer.add_message(channels[t_ns % 3], t_ns, b'{"x": %d}' % t_ns, t_ns)
         writer.finish()
-    done("export", path, "--topic", "/pose", "--format", "csv", "-o", tmp_path / "tables")
+    printed("export", path, "--topic", "/pose", "--format", "csv", "-o", tmp_path / "tables")
     (table,) = (tmp_path / "tables" / "topics").rglob("*.csv")
     assert [row["x"] for row in csv.DictReader(table.read_text().splitlines())] == [str(number) for number in range(12)]
     (table,) = (tmp_path / "tables" / "channels").rglob("*.csv")

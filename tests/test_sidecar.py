@@ -11,8 +11,8 @@ from mcap.reader import make_reader
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
-from tests.test_cli import call, done, footage, fresh  # noqa: F401
-from tests.test_log import SCHEMA, SOME, our_messages, write_log
+from tests.commands import call, printed
+from tests.logs import SCHEMA, SOME, our_messages, write_log
 
 
 def add(path: Path, topic: str, payload: bytes, sidecar: bool | None = None) -> None:
@@ -83,7 +83,7 @@ def test_results_of_an_earlier_log_are_not_taken_for_those_of_a_new_one(path, tm
     assert sorted(our_messages(path)) == ["a", "b", "c", "new"]
 
 
-def test_all_stages_run_beside_a_log_that_nobody_may_write_to(fresh, tmp_path):  # noqa: F811
+def test_all_stages_run_beside_a_log_that_nobody_may_write_to(fresh, tmp_path):
     before = fresh.read_bytes()
     os.chmod(fresh, 0o444)
     if not os.access(fresh, os.W_OK):  # whoever is root may write to anything
@@ -92,10 +92,10 @@ def test_all_stages_run_beside_a_log_that_nobody_may_write_to(fresh, tmp_path): 
         assert (
             "can't be written to: Permission denied; write to another file with -o, or beside it with --sidecar" in err
         )
-    done("detect", fresh, "--sidecar")
-    done("run", fresh)
+    printed("detect", fresh, "--sidecar")
+    printed("run", fresh)
     assert fresh.read_bytes() == before
-    data = json.loads(done("info", fresh, "--json")[0])["results"][0]
+    data = json.loads(printed("info", fresh, "--json")[0])["results"][0]
     assert data["results"] == str(fresh.with_name("walk.results.mcap"))
     topics = {channel["topic"]: channel for channel in data["channels"]}
     assert not any(channel["stale"] for channel in topics.values())
@@ -105,7 +105,7 @@ def test_all_stages_run_beside_a_log_that_nobody_may_write_to(fresh, tmp_path): 
     assert {"/camera/video", "/camera/truth"} & theirs == set()
     assert {"/camera/detections", "/camera/retracks", "/camera/retracks/full/view/image"} <= theirs <= set(topics)
     assert (tmp_path / "walk.tables").is_dir()
-    out, _ = done("evaluate", fresh, "--json")
+    out, _ = printed("evaluate", fresh, "--json")
     assert json.loads(out)["results"]
     code, _, err = call("track", fresh, "--sidecar", "-o", tmp_path / "b.mcap")
     assert (code, "are two places for the same results" in err) == (1, True)

@@ -12,18 +12,11 @@ import pytest
 
 from tests import bounded
 from tests.commands import GROUP, done, made_log
-from tests.test_effects import CASES
+from tests.effects.commands import line_of
 
 #: Seconds of processor time that a command may still take: the time on a clock depends on what else the machine does.
 SOON_S = 2
 SIGNALS = {"Ctrl-C": signal.SIGINT, "kill": signal.SIGTERM}
-#: Where the case without options of the other tests isn't what takes longest, or doesn't do all that a command does.
-LINES = {
-    "tune": "tune a.mcap --trials 1 --search min-iou -o b.toml",
-    "docs": "docs tables",
-    "run": "run fresh.mcap",
-    "train": "train a.mcap -o b --epochs 1 --device cpu",
-}
 #: What is looked at of a command, where it is not the reading, and the writing and publishing of those that write.
 DEEDS = {"demo": ["write"], "tune": ["read", "write"], "view": ["read", "serve"]}
 MOMENTS = [
@@ -32,10 +25,6 @@ MOMENTS = [
     for deed in DEEDS.get(command, ["read"] if known.reads else ["read", "write", "publish"])
 ]
 DOCS = Path(__file__).parent.parent / "docs"
-
-
-def line_of(command: str) -> str:
-    return LINES.get(command) or CASES[command]["json"].base
 
 
 def contents(folder: Path) -> dict[str, bytes]:

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from mcaptrack.schema import TRACKS, Frame
 from mcaptrack.transforms.to_video_rate import to_video_rate
-from tests.test_cli import done
+from tests.commands import printed
 from tests.worlds import ns
 
 
@@ -98,9 +98,9 @@ def test_nobody_is_at_two_places_and_no_box_is_two_people(seed):
 def test_a_log_gets_them_beside_the_others(tmp_path):
     rows = "".join(f"{frame},1,{10 + frame},20,10,30,1,-1,-1,-1\n" for frame in range(1, 41))
     (tmp_path / "t.txt").write_text(rows)
-    done("ingest", tmp_path / "t.txt", "--as", "tracks", "--fps", 10, "-o", tmp_path / "l.mcap")
-    done("retrack", tmp_path / "l.mcap")
-    (result,) = json.loads(done("info", tmp_path / "l.mcap", "--json")[0])["results"]
+    printed("ingest", tmp_path / "t.txt", "--as", "tracks", "--fps", 10, "-o", tmp_path / "l.mcap")
+    printed("retrack", tmp_path / "l.mcap")
+    (result,) = json.loads(printed("info", tmp_path / "l.mcap", "--json")[0])["results"]
     channels = {channel["topic"]: channel for channel in result["channels"]}
     assert channels["/camera/retracks/full"]["messages"] == channels["/camera/tracks"]["messages"] == 40
     assert not channels["/camera/retracks/full"]["stale"]

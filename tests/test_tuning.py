@@ -15,9 +15,8 @@ from mcaptrack.evaluation import EvaluateOptions
 from mcaptrack.evaluation.tuning import Range, Task, declared_ranges, tune
 from mcaptrack.schema import Frame
 from mcaptrack.transforms import TRACKERS, TRANSFORMS, Sort
-from tests.test_cli import call, done
-from tests.test_evaluation import boxed
-from tests.worlds import boxes_at, detections, ns
+from tests.commands import call, printed
+from tests.worlds import boxed, boxes_at, detections, ns
 
 IOU = EvaluateOptions(similarities=("iou",))
 
@@ -129,16 +128,18 @@ def write_files(folder):
 def test_at_the_command_line_from_files_to_settings_that_commands_read(tmp_path):
     write_files(tmp_path)
     words = ("tune", "det.txt", "--truth", "gt.txt", "--fps", 10, "--trials", 12, "--search", "max-age-s=0.1:6")
-    out, err = done(*words, "--json", folder=tmp_path)
+    out, err = printed(*words, "--json", folder=tmp_path)
     row = json.loads(out)["results"][0]
     assert row["scores"]["IDF1"] > row["default_scores"]["IDF1"]
     settings = tomllib.loads((tmp_path / "mcaptrack.toml").read_text())["track"]
     assert settings["tracker"] == "sort"
     assert settings["max-age-s"] == row["settings"]["max_age_s"]
     assert "mcaptrack.toml: IDF1" in err
-    done("ingest", "det.txt", "--as", "detections", "--truth", "gt.txt", "--fps", 10, "-o", "a.mcap", folder=tmp_path)
-    done("run", "a.mcap", "--no-tables", "-q", folder=tmp_path)
-    channels = json.loads(done("info", "a.mcap", "--json", folder=tmp_path)[0])["results"][0]["channels"]
+    printed(
+        "ingest", "det.txt", "--as", "detections", "--truth", "gt.txt", "--fps", 10, "-o", "a.mcap", folder=tmp_path
+    )
+    printed("run", "a.mcap", "--no-tables", "-q", folder=tmp_path)
+    channels = json.loads(printed("info", "a.mcap", "--json", folder=tmp_path)[0])["results"][0]["channels"]
     made = {channel["topic"]: channel["parameters"] for channel in channels}
     assert made["/camera/tracks"]["max_age_s"] == settings["max-age-s"]
 
@@ -146,12 +147,12 @@ def test_at_the_command_line_from_files_to_settings_that_commands_read(tmp_path)
 def test_a_log_can_be_tuned_and_mistakes_are_said(tmp_path):
     write_files(tmp_path)
     log = tmp_path / "a.mcap"
-    done("ingest", tmp_path / "det.txt", "--as", "detections", "--fps", 10, "-o", log)
+    printed("ingest", tmp_path / "det.txt", "--as", "detections", "--fps", 10, "-o", log)
     code, _, err = call("tune", log, "--trials", 2, folder=tmp_path)
     assert code == 1
     assert "has no channel /camera/truth" in err
-    done("ingest", tmp_path / "gt.txt", "--as", "truth", "--fps", 10, "--into", log)
-    out, _ = done("tune", log, "--trials", 2, "--tracker", "ocsort", "-q", folder=tmp_path)
+    printed("ingest", tmp_path / "gt.txt", "--as", "truth", "--fps", 10, "--into", log)
+    out, _ = printed("tune", log, "--trials", 2, "--tracker", "ocsort", "-q", folder=tmp_path)
     assert "defaults" in out
     code, _, err = call("tune", log, "--search", "speed=1:2", folder=tmp_path)
     assert code == 1
@@ -167,7 +168,7 @@ def test_settings_go_into_a_file_that_exists_and_a_file_that_cannot_be_edited_is
     settings = tmp_path / "mcaptrack.toml"
     settings.write_bytes(b"# mine\r\n[ track ]  # spaced\r\nmax_age_s = 1.4 # seconds\r\nretrack.profile = 'paper'\r\n")
     settings.write_bytes(settings.read_bytes().replace(b"retrack.", b"[retrack]\r\n"))
-    done(*words, folder=tmp_path)
+    printed(*words, folder=tmp_path)
     written = settings.read_bytes()
     best = tomllib.loads(written.decode())["track"]["max_age_s"]
     assert best > 2.4

@@ -17,10 +17,8 @@ from mcaptrack.foxglove.views import Drawing
 from mcaptrack.foxglove.views.people import ellipse_points, ellipses
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import DETECTIONS, PREDICTIONS, TRACKS, Frame
-from tests.worlds import boxes_at, ns, tracks_at
+from tests.worlds import FORECAST, PICTURES, PLANE, boxes_at, ns, tracks_at
 
-PLANE = [(0, GroundPlane((0.1, 0, 0, 0, 0.1, 0, 0, 0, 1), 640, 480))]
-PICTURES = np.array([ns(n / 7) for n in range(20)])
 LOOP, LIST = 2, 4
 #: Coordinates are written to a quarter of a pixel.
 PX = 0.126
@@ -67,16 +65,6 @@ def xy(line) -> list[tuple[float, float]]:
     return [(p.x, p.y) for p in line.points]
 
 
-FORECAST = PREDICTIONS.rows(
-    track_id=[3, 3],
-    step=[1, 2],
-    ahead_s=[0.4, 0.8],
-    x_m=[1.0, 2.0],
-    y_m=[3.0, 4.0],
-    cov_xx_m2=[1.0, 1],
-    cov_xy_m2=[0.0, 0],
-    cov_yy_m2=[1.0, 1],
-)
 CHANNELS = {
     "detections": ("/c/detections", DETECTIONS, [Frame(int(PICTURES[4]), 4, boxes_at([(50, 60)]))]),
     "tracks": ("/c/tracks", TRACKS, [Frame(int(PICTURES[n]), n, track_rows({2: (n, 5)})) for n in range(3, 6)]),

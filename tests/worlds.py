@@ -12,7 +12,8 @@ import av
 import numpy as np
 
 from mcaptrack.geometry.clocks import NS_PER_S
-from mcaptrack.schema import DETECTIONS, TRACKS, Frame
+from mcaptrack.geometry.plane import GroundPlane
+from mcaptrack.schema import DETECTIONS, PREDICTIONS, TRACKS, Frame
 from mcaptrack.sources.synthetic import Block, Pedestrian, SyntheticScene
 
 Positions = Mapping[int, tuple[float, float]]
@@ -205,3 +206,41 @@ def crossing_tracks(rng: np.random.Generator, ticks: int = 50, rate_hz: float = 
         rows = tracked(rng, np.array(who, int), np.array(seen).reshape(-1, 2))
         frames.append(Frame(ns(tick / rate_hz), tick, rows))
     return frames
+
+
+def boxed(people):
+    """{id: (left, top)} with boxes of 10 x 20, and no metres."""
+    xy = np.array(list(people.values()), float).reshape(-1, 2)
+    return TRACKS.rows(
+        track_id=np.array(list(people), np.int64),
+        x_px=xy[:, 0],
+        y_px=xy[:, 1],
+        w_px=np.full(len(xy), 10.0),
+        h_px=np.full(len(xy), 20.0),
+        observed=np.ones(len(xy), bool),
+        source_id=np.full(len(xy), -1),
+    )
+
+
+X265 = {"x265-params": "keyint=10:min-keyint=10:bframes=0:log-level=none"}
+
+
+SVT = {"g": "10", "preset": "12"}
+
+
+PLANE = [(0, GroundPlane((0.1, 0, 0, 0, 0.1, 0, 0, 0, 1), 640, 480))]
+
+
+PICTURES = np.array([ns(n / 7) for n in range(20)])
+
+
+FORECAST = PREDICTIONS.rows(
+    track_id=[3, 3],
+    step=[1, 2],
+    ahead_s=[0.4, 0.8],
+    x_m=[1.0, 2.0],
+    y_m=[3.0, 4.0],
+    cov_xx_m2=[1.0, 1],
+    cov_xy_m2=[0.0, 0],
+    cov_yy_m2=[1.0, 1],
+)

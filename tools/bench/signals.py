@@ -17,7 +17,7 @@ import time
 from pathlib import Path
 
 from tests.commands import GROUP, done, made_log
-from tests.test_signals import line_of
+from tests.effects.commands import line_of
 
 #: Seconds from a signal to the end of the process that are soon.
 SOON_S = 2

@@ -1,0 +1,131 @@
+"""Small logs, written by ours and by the stock library, and how each command reads one."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from importlib.util import find_spec
+from pathlib import Path
+
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, IndexType, Writer
+
+from mcaptrack import log
+from mcaptrack.schema import DETECTIONS, TRACKS, Frame
+from mcaptrack.schema.provenance import Provenance
+from tests.worlds import boxes_at, ns, tracks_at
+
+SCHEMA = ("test.Thing", "jsonschema", b"{}")
+
+
+MESSAGES = st.lists(
+    st.tuples(st.sampled_from("abc"), st.integers(0, 2**62), st.integers(0, 2**32 - 1), st.binary(max_size=50)),
+    max_size=30,
+)
+
+
+def stock_messages(path: Path) -> list[tuple[str, int, int, bytes]]:
+    """What the stock reader finds, with all checksums checked."""
+    with path.open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        return [(c.topic, m.log_time, m.sequence, m.data) for _, c, m in reader.iter_messages()]
+
+
+def our_messages(path: Path) -> dict[str, list[tuple[int, int, bytes]]]:
+    with log.read(path) as opened:
+        return {topic: [(m.t_ns, m.sequence, m.payload) for m in opened.messages(topic)] for topic in opened.channels}
+
+
+def write_log(path: Path, messages, kind: str = "rows") -> None:
+    with log.create(path) as writer:
+        numbers = {topic: writer.add_channel(topic, SCHEMA, "json", {"about": topic}, kind) for topic in "abc"}
+        for topic, t_ns, sequence, payload in messages:
+            writer.add_message(numbers[topic], t_ns, sequence, payload)
+
+
+def write_stock(path: Path, messages, **options) -> None:
+    """A log that somebody else recorded, with an attachment and metadata."""
+    with path.open("wb") as stream:
+        writer = Writer(stream, **options)
+        writer.start("ros2", "somebody")
+        schema = writer.register_schema(*SCHEMA)
+        numbers = {topic: writer.register_channel(topic, "json", schema, {"about": topic}) for topic in "abc"}
+        for count, (topic, t_ns, sequence, payload) in enumerate(messages):
+            writer.add_message(numbers[topic], t_ns, payload, publish_time=t_ns // 2, sequence=sequence)
+            if count == 1:
+                writer.add_attachment(1, 2, "notes.txt", "text/plain", b"hello")
+                writer.add_metadata("about", {"robot": "r2"})
+        writer.finish()
+
+
+STOCK_OPTIONS = {
+    "zstd": {},
+    "lz4": {"compression": CompressionType.LZ4},
+    "plain": {"compression": CompressionType.NONE, "chunk_size": 64},
+    "no chunks": {"use_chunking": False},
+    "no repeated channels": {"repeat_channels": False, "repeat_schemas": False, "chunk_size": 64},
+    "no statistics": {"use_statistics": False},
+    "no message index": {"index_types": IndexType.CHUNK},
+}
+
+
+SOME = [("a", 10, 1, b"x"), ("b", 30, 2, b"yy"), ("a", 20, 3, b"zzz" * 30), ("c", 5, 4, b""), ("b", 40, 5, b"w" * 200)]
+
+
+#: Forty messages of three channels, each of which could be told from all others.
+FORTY = [("abc"[n % 3], n * 10, n, bytes([n]) * 40) for n in range(40)]
+
+
+IMU = {
+    "header": {"stamp": {"sec": 1, "nanosec": 5}, "frame_id": "imu"},
+    "gyro": {"x": 0.5, "y": -0.0},
+    "cov": [1.5, 2.0],
+}
+
+
+def add_rows(writer, topic, schema, frames, transform="track", source="/camera/detections"):
+    made = Provenance(transform, {"max_age_s": 1.4}, source).to_metadata()
+    number = writer.add_channel(topic, (schema.name, "protobuf", schema.descriptor), "protobuf", made, group=topic)
+    for frame in frames:
+        writer.add_message(number, frame.t_ns, frame.index, schema.codec.encode(frame.rows))
+
+
+def some_log(path, **more):
+    """Two people who walk, detected and tracked, and an IMU that others recorded."""
+    people = [{4: (n * 0.5, 2.5), 9: (1.0, n * 0.25)} for n in range(3)]
+    walk = [Frame(ns(n), n, tracks_at(who)) for n, who in enumerate(people)]
+    with log.create(path) as writer:
+        imu = writer.add_channel("/imu", ("robot/Imu", "jsonschema", b"{}"), "json", {}, group="imu")
+        for n in range(4):
+            writer.add_message(imu, ns(n) + 7, n, json.dumps(IMU | {"n": n}).encode())
+        boxes = [Frame(ns(n), n, boxes_at([(5, 5), (9, 9)][: 2 - n])) for n in range(3)]
+        add_rows(writer, "/camera/detections", DETECTIONS, boxes, "detect", "/camera/video")
+        add_rows(writer, "/camera/tracks", TRACKS, [*walk, Frame(ns(3), 3, TRACKS.empty())])
+        add_rows(writer, "/camera/truth", TRACKS, walk, "ingest", "")
+        for topic, (schema, frames) in more.items():
+            add_rows(writer, topic, schema, frames)
+    return path
+
+
+#: How each command is run so that it only reads the log; nothing comes into the log's folder.
+READING: dict[str, Callable[[Path, Path], list[object]]] = {
+    "check": lambda log, out: [log],
+    "drop": lambda log, out: [log, "/camera/truth", "-o", out / "dropped.mcap"],
+    "evaluate": lambda log, out: [log],
+    "export": lambda log, out: [log, "-o", out / "tables"],
+    "info": lambda log, out: [log],
+    "ingest": lambda log, out: [log, "-o", out / "ingested.mcap"],
+    "query": lambda log, out: [log, "select count(*) from tracks"],
+    "recover": lambda log, out: [log, "-o", out / "recovered.mcap"],
+    "render": lambda log, out: [log, "-o", out / "rendered.gif", "--width", "64", "--end-s", "0.2"],
+    "report": lambda log, out: [log, "-o", out / "report.html"],
+    "tune": lambda log, out: [log, "--trials", "1", "-o", out / "tuned.json"],
+    "view": lambda log, out: [log, "--layout", "no such layout"],
+    **{
+        name: lambda log, out: [log, "-o", out / "other.mcap"]
+        for name in ("detect", "track", "sample", "predict", "retrack", "run", "events")
+    },
+}
+if find_spec("torch"):  # without it `train` reads nothing
+    READING["train"] = lambda log, out: [log, "-o", out / "trained", "--epochs", "1", "--device", "cpu"]
