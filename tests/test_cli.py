@@ -329,7 +329,7 @@ class TestMistakes:
         "no limit": (["evaluate", "a.mcap", "--fail-under", "luck=1"], "--fail-under needs one of"),
         "truth without tracks to match": (
             ["evaluate", "bad.txt", "good.txt", "--truth", "good.txt"],
-            "give one truth for each",
+            "give one of ground truth for each",
         ),
         "a label file without a clock": (
             ["ingest", "good.txt", "-o", "x.mcap"],
@@ -362,7 +362,7 @@ class TestMistakes:
     @pytest.mark.parametrize(
         ("words", "said"),
         [
-            (["--predictor", "red"], "no such option: --predictor (predict, retrack have it); `"),
+            (["--predictor", "red"], "no such option: --predictor (run, predict, retrack have it); `"),
             (["--min_iou", "0.5"], "no such option: --min_iou; did you mean --min-iou? `"),
             (["--max-age", "2"], "no such option: --max-age; did you mean --max-age-s or --max-age-frames? `"),
             (["--max-age-s", "2s"], "invalid value for '--max-age-s': '2s' is not a number; `"),

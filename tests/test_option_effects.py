@@ -9,7 +9,7 @@ from typing import get_type_hints
 import numpy as np
 import pytest
 
-from mcaptrack.transforms import TRACKERS, TRANSFORMS
+from mcaptrack.transforms import STAGES, TRACKERS, TRANSFORMS
 from mcaptrack.transforms.protocol import bare_type
 from tests.effects import Case, others, retrack, sort
 
@@ -32,6 +32,13 @@ def test_an_option_has_the_effect_that_its_scene_says(option: str, case: Case):
         assert all(more > 1.02 * less for less, more in pairwise(numbers)), found
     else:
         assert found == pytest.approx(case.wanted), case.scene
+
+
+def test_detectors_differ_in_how_long_they_see_people_who_stop():
+    found = {}
+    for name, kind in STAGES["detect"].built_in().items():
+        found[name] = others.all_boxes([[frame for (frame,) in kind(stabilise=False)(others.STOPS)]])
+    assert found["frame-difference"] < found["mog2"] < found["knn"]
 
 
 def test_every_option_has_a_scene():

@@ -226,3 +226,15 @@ def test_encounters_begin_and_end_as_in_the_reference():
         found = zip(*(column.tolist() for column in find_encounters(out)), strict=True)
         names = sorted(paths)
         assert [(names[i], names[j], low, high) for i, j, low, high in found] == encounters(paths)
+
+
+def test_every_occlusion_is_timed_anew():
+    """Two walk abreast and are one detection twice, for 2.4 s each; a track outlives 3 s of that and coasts 1.2 s more."""
+
+    def path(tick: int):
+        if tick in range(15, 21) or tick in range(25, 31):
+            return {1: (0.4 * tick, 0.0)}
+        return {1: (0.4 * tick, 0.6), 2: (0.4 * tick, -0.6)}
+
+    online = [len(frame.rows) for _, frame, _ in FEW(walk(path, 34))]
+    assert online[10:] == [2] * 24

@@ -4,9 +4,9 @@ A mutant is a copy of the project with one changed expression or statement: a co
 condition, a swapped pair of arguments, a deleted statement. A test that fails on it has caught it. A survivor is code
 that no test guards, code that does nothing, or a change that makes no difference.
 
-The project is copied to a temporary folder, so the working tree is never touched. The tests run once unchanged, to
-record which of them call which function; a mutant then runs only those that call the function it is in, the quickest
-first.
+The project is copied to a temporary folder, so the working tree is never touched. Each test file runs once unchanged,
+to record which test runs which lines, in processes that it starts as well; the record is kept until the test file
+changes, in `.mutants_cache/`. A mutant then runs only the tests that run its lines, the quickest first.
 
     python -m tools.mutants mcaptrack/transforms/retrack --count 40 --seed 3
 """
@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import argparse
 import difflib
-import json
 import os
 import re
 import shutil
@@ -29,31 +28,15 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
+from tools.lines_kept import Records
+from tools.lines_run import LinesRun
 from tools.mutations import ROOT, Mutant, find, sample
 
-RETRACK = "retrack offline offline_reference retracking_reference retracking_laws retracking_thresholds"
-#: The test files that cover a folder or a file, beside those of the folders around it; all tests where none are named.
-COVERS = {
-    "mcaptrack/evaluation": "evaluation events events_reference forecast_errors metrics_oracles compared",
-    "mcaptrack/sources/ingest": "ingest label_clock compared recorded_kept",
-    "mcaptrack/evaluation/metrics": "metrics metrics_oracles networks forecast_errors evaluation",
-    "mcaptrack/predictors": "prediction networks",
-    "mcaptrack/schema": "schema events tables",
-    "mcaptrack/tables": "tables",
-    "mcaptrack/transforms": "transform_laws option_effects defaults",
-    "mcaptrack/transforms/detect": "detect",
-    "mcaptrack/transforms/predict.py": "prediction sample_reference",
-    "mcaptrack/transforms/retrack": RETRACK,
-    "mcaptrack/transforms/sample.py": "prediction sample_reference",
-    "mcaptrack/transforms/sort": "sort sort_reference",
-    "mcaptrack/sources/video": "picture_limits video passing",
-}
-#: Time that tests get at most, beside five times what they take unchanged.
+#: Time that tests get at most, beside ten times what they take unchanged.
 SLACK_S = 60.0
-PYTEST = ("-x", "-q", "-p", "no:cacheprovider", "-W", "ignore::pytest.PytestAssertRewriteWarning")
+PYTEST = ("-x", "-q", "-p", "no:cacheprovider", "-p", "no:xdist", "-W", "ignore::pytest.PytestAssertRewriteWarning")
 #: Loaded once for all mutants.
 WARM = (
     "pytest",
@@ -64,40 +47,6 @@ WARM = (
     "google.protobuf",
     "cv2",
 )
-
-
-def covering(path: str) -> list[str]:
-    """The test files that cover a file, relative to the root."""
-    names = " ".join(tests for place, tests in COVERS.items() if path == place or path.startswith(f"{place}/")).split()
-    return [f"tests/test_{name}.py" for name in names] or ["tests"]
-
-
-class Recorder:
-    """A plugin of pytest: notes, for each test, how long it took and which functions of the package it called."""
-
-    def __init__(self, root: Path) -> None:
-        self._front = str(root) + os.sep
-        self.calls: dict[str, list[str]] = {}
-        self.took_s: dict[str, float] = {}
-
-    def pytest_runtest_protocol(self, item: Any, nextitem: Any) -> bool:
-        from _pytest.runner import runtestprotocol
-
-        called: set[tuple[str, int]] = set()
-
-        def note(frame: FrameType, _event: str, _arg: object) -> None:
-            called.add((frame.f_code.co_filename, frame.f_code.co_firstlineno))
-
-        begin = time.perf_counter()
-        sys.settrace(note)
-        try:
-            runtestprotocol(item, nextitem=nextitem)
-        finally:
-            sys.settrace(None)
-        ours = (f"{file.removeprefix(self._front)}:{line}" for file, line in called if file.startswith(self._front))
-        self.calls[item.nodeid] = sorted(ours)
-        self.took_s[item.nodeid] = time.perf_counter() - begin
-        return True
 
 
 class Chooser:
@@ -116,11 +65,10 @@ class Bench:
     This process has loaded the libraries, but nothing of the project.
     """
 
-    def __init__(self, folder: Path) -> None:
-        self._folder, self._root = folder, folder / "copy"
+    def __init__(self, folder: Path, records: Records) -> None:
+        self._folder, self._root, self._records = folder, folder / "copy", records
         ignored = shutil.ignore_patterns(".git", ".venv", "__pycache__", ".*_cache", "mcaptrack-demo", ".hypothesis")
         shutil.copytree(ROOT, self._root, ignore=ignored)
-        self._records: dict[tuple[str, ...], dict[str, Any]] = {}
         for name in WARM:
             with suppress(ImportError):
                 import_module(name)
@@ -138,12 +86,14 @@ class Bench:
                 os.chdir(self._root)
                 os.environ |= {"PYTHONPATH": str(self._root)} | environment
                 sys.path[:] = [str(self._root), *(place for place in sys.path if place not in ("", str(ROOT)))]
-                sys.dont_write_bytecode = bool(environment)
+                sys.dont_write_bytecode = "PYTHONDONTWRITEBYTECODE" in environment
                 import pytest
 
-                code = int(pytest.main([*PYTEST, *files], [plugin]))
-                if isinstance(plugin, Recorder):
-                    (self._folder / "record.json").write_text(json.dumps(vars(plugin)))
+                once = isinstance(plugin, LinesRun)
+                code = int(pytest.main([*PYTEST[once:], *files], [plugin]))
+                if once:
+                    self._records.write(files[0], plugin.record())
+                    code = 0
             except BaseException:
                 traceback.print_exc()
             finally:
@@ -160,36 +110,23 @@ class Bench:
         os.waitpid(child, 0)
         return None
 
-    def record(self, files: Sequence[str]) -> dict[str, Any]:
-        """What the tests in these files call, once they have passed unchanged."""
-        key = tuple(files)
-        if key not in self._records:
-            if self._pytest(files, float("inf"), Recorder(self._root)) != 0:
-                sys.exit(f"{' '.join(files)}: tests fail without any change\n{self._said()[-3000:]}")
-            self._records[key] = json.loads((self._folder / "record.json").read_text())
-        return self._records[key]
+    def record(self, file: str) -> None:
+        """Note which lines the tests of a file run."""
+        lines = self._folder / "lines"
+        if self._pytest([file], 3600, LinesRun(self._root, lines)) != 0:
+            print(f"{file}: not recorded\n{self._said()[-3000:]}")
+        shutil.rmtree(lines)
+        (self._root / "sitecustomize.py").unlink()
 
     def _said(self) -> str:
         return (self._folder / "out.txt").read_text(errors="replace")
 
-    def tests_of(self, mutant: Mutant, record: dict[str, Any]) -> list[str]:
-        """The tests that call the function that is changed; all where none does, those that use the file first.
-
-        Constants and defaults of a module or a class may matter to tests that call nothing in it.
-        """
-        calls, took_s = record["calls"], record["took_s"]
-        place = f"{mutant.path}:{mutant.scope}"
-        chosen = [test for test, called in calls.items() if place in called] if mutant.scope else []
-        if chosen:
-            return sorted(chosen, key=lambda test: took_s[test])
-        uses = {test: any(call.startswith(f"{mutant.path}:") for call in called) for test, called in calls.items()}
-        return sorted(calls, key=lambda test: (not uses[test], took_s[test]))
-
     def survives(self, mutant: Mutant, files: Sequence[str]) -> tuple[bool, str]:
         """Whether all tests pass on the mutant; and if not, what caught it."""
-        record = self.record(files)
-        names = self.tests_of(mutant, record)
-        limit_s = SLACK_S + 5 * sum(record["took_s"][name] for name in names)
+        names, took_s = self._records.tests_of(mutant, files)
+        if not names:
+            return True, "no test runs it"
+        limit_s = SLACK_S + 10 * took_s
         path = self._root / mutant.path
         source, times = path.read_bytes(), path.stat()
         try:
@@ -201,8 +138,10 @@ class Bench:
             os.utime(path, ns=(times.st_atime_ns, times.st_mtime_ns))  # its bytecode is good again
         if code is None:
             return False, f"more than {limit_s:.0f} s"
+        if code in (0, 5):
+            return True, f"{len(names)} tests, {took_s:.0f} s" if code == 0 else "no test runs it"
         failed = re.search(r"^(?:FAILED|ERROR) (.*)$", self._said(), re.MULTILINE)
-        return code == 0, failed.group(1)[:160] if failed else f"exit {code}"
+        return False, failed.group(1)[:160] if failed else f"exit {code}"
 
 
 def difference(mutant: Mutant) -> Iterator[str]:
@@ -219,10 +158,13 @@ def main() -> None:
     parser.add_argument("places", nargs="*", default=["mcaptrack/transforms"], help="files and folders to change")
     parser.add_argument("--count", type=int, default=40, help="how many mutants")
     parser.add_argument("--seed", type=int, default=1, help="random seed")
-    parser.add_argument("--tests", nargs="*", help="test files, instead of those that cover the places")
+    parser.add_argument("--tests", nargs="*", help="test files; all by default")
     parser.add_argument("--mutant", action="append", help="try this one, by its printed name")
+    parser.add_argument("--records", type=Path, default=ROOT / ".mutants_cache", help="which test runs which lines")
+    parser.add_argument("--stale", action="store_true", help="use records of test files that have changed since")
     parser.add_argument("--verbose", action="store_true", help="print what caught the others")
     options = parser.parse_args()
+    files = options.tests or sorted(path.relative_to(ROOT).as_posix() for path in (ROOT / "tests").glob("test_*.py"))
     mutants = find(options.places)
     if options.mutant:
         chosen = [mutant for mutant in mutants if mutant.name in options.mutant]
@@ -230,12 +172,16 @@ def main() -> None:
         chosen = sample(mutants, options.count, options.seed)
     tally: dict[str, Counter[bool]] = defaultdict(Counter)
     with tempfile.TemporaryDirectory() as folder:
-        bench = Bench(Path(folder))
+        records = Records(options.records, options.stale)
+        bench = Bench(Path(folder), records)
+        for file in files:
+            if not records.knows(file):
+                bench.record(file)
         for mutant in chosen:
-            survived, why = bench.survives(mutant, options.tests or covering(mutant.path))
+            survived, why = bench.survives(mutant, files)
             tally[str(Path(mutant.path).parent)][survived] += 1
             if survived or options.verbose:
-                print(f"{'SURVIVED' if survived else 'caught  '} {mutant.name}{'' if survived else '  ' + why}")
+                print(f"{'SURVIVED' if survived else 'caught  '} {mutant.name}  {why}")
                 print("\n".join(f"    {line}" for line in difference(mutant)), flush=True)
     for folder, counts in sorted(tally.items()):
         print(f"{folder}: {counts[False]} of {counts.total()} caught")

@@ -55,7 +55,11 @@ _WORDS = {"left": "right", "right": "left"}
 
 @dataclass(frozen=True)
 class Mutant:
-    """Bytes ``start`` to ``end`` of a file, replaced by ``new``, inside the function that begins at line ``scope``."""
+    """Bytes ``start`` to ``end`` of a file, replaced by ``new``.
+
+    ``statement`` holds the first and the last line of the statement that they are in, and ``function`` those of the
+    function; zeros outside of functions.
+    """
 
     path: str
     line: int
@@ -63,7 +67,8 @@ class Mutant:
     start: int
     end: int
     new: bytes
-    scope: int
+    statement: tuple[int, int]
+    function: tuple[int, int]
 
     @property
     def name(self) -> str:
@@ -71,6 +76,12 @@ class Mutant:
 
     def applied(self, source: bytes) -> bytes:
         return source[: self.start] + self.new + source[self.end :]
+
+
+def _lines_of(statement: ast.stmt) -> tuple[int, int]:
+    """The first and the last line of a statement, without those that stand in it."""
+    inner = getattr(statement, "body", None)
+    return statement.lineno, max(statement.lineno, inner[0].lineno - 1) if inner else statement.end_lineno
 
 
 class _Finder:
@@ -83,93 +94,98 @@ class _Finder:
         self._offsets = [0]
         for line in lines:
             self._offsets.append(self._offsets[-1] + len(line))
-        self._visit(ast.parse(source), 0)
+        self._statement, self._function = (0, 0), (0, 0)
+        self._visit(ast.parse(source))
 
     def _span(self, node: ast.AST) -> tuple[int, int]:
         start = self._offsets[node.lineno - 1] + node.col_offset
         return start, self._offsets[node.end_lineno - 1] + node.end_col_offset
 
-    def _add(self, node: ast.AST, kind: str, span: tuple[int, int], new: str | bytes, scope: int) -> None:
+    def _add(self, node: ast.AST, kind: str, span: tuple[int, int], new: str | bytes) -> None:
         data = new.encode() if isinstance(new, str) else new
         if self.source[span[0] : span[1]] != data:
-            self.found.append(Mutant(self.path, node.lineno, kind, *span, data, scope))
+            where = self._statement, self._function
+            self.found.append(Mutant(self.path, node.lineno, kind, *span, data, *where))
 
-    def _token(self, node: ast.AST, kind: str, low: ast.AST, high: ast.AST, old: str, new: str, scope: int) -> None:
+    def _token(self, node: ast.AST, kind: str, low: ast.AST, high: ast.AST, old: str, new: str) -> None:
         """The operator between two nodes."""
         start, end = self._span(low)[1], self._span(high)[0]
         words = re.escape(old).replace(r"\ ", r"\s+")
         match = re.search(words.encode(), self.source[start:end])
         if match:
-            self._add(node, kind, (start + match.start(), start + match.end()), new, scope)
+            self._add(node, kind, (start + match.start(), start + match.end()), new)
 
-    def _visit(self, node: ast.AST, scope: int) -> None:
+    def _visit(self, node: ast.AST) -> None:
         if isinstance(node, (ast.Raise, ast.JoinedStr, ast.Import, ast.ImportFrom)):
             return
         if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
             return
         if isinstance(node, ast.keyword) and node.arg == "strict":  # of zip(): a safeguard that never acts
             return
-        if isinstance(node, (ast.FunctionDef, ast.Lambda)):
-            # the line at which Python says that a function begins is that of its first decorator
-            decorators = getattr(node, "decorator_list", [])
-            scope = decorators[0].lineno if decorators else node.lineno
-        self._mutate(node, scope)
+        before = self._statement, self._function
+        if isinstance(node, ast.stmt):
+            self._statement = _lines_of(node)
+        if isinstance(node, ast.FunctionDef):
+            self._function = node.lineno, node.end_lineno
+        self._mutate(node)
         for name, value in ast.iter_fields(node):
             if name in ("annotation", "returns", "decorator_list"):
                 continue
             for child in value if isinstance(value, list) else [value]:
                 if isinstance(child, ast.AST):
-                    self._visit(child, scope)
+                    self._visit(child)
         if isinstance(node, (ast.FunctionDef, ast.For, ast.While, ast.If, ast.With, ast.Try)):
             for body in (getattr(node, part, []) for part in ("body", "orelse", "finalbody")):
-                self._delete(body, scope)
+                self._delete(body)
+        self._statement, self._function = before
 
-    def _delete(self, body: list[ast.stmt], scope: int) -> None:
+    def _delete(self, body: list[ast.stmt]) -> None:
         for statement in body:
             doc = isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant)
             stores = isinstance(statement, ast.Assign) and not isinstance(statement.targets[0], (ast.Name, ast.Tuple))
             kinds = (ast.Expr, ast.AugAssign, ast.If, ast.Continue, ast.Break, ast.For)
+            self._statement = _lines_of(statement)
             if (isinstance(statement, kinds) and not doc) or stores:
-                self._add(statement, "deleted", self._span(statement), "pass", scope)
+                self._add(statement, "deleted", self._span(statement), "pass")
 
-    def _mutate(self, node: ast.AST, scope: int) -> None:
+    def _mutate(self, node: ast.AST) -> None:
         match node:
             case ast.Compare(left=left, ops=ops, comparators=others):
                 for low, op, high in zip([left, *others], ops, others, strict=False):
                     old, *new = _COMPARISONS[type(op)]
                     for one in new:
-                        self._token(node, "compared", low, high, old, one, scope)
+                        self._token(node, "compared", low, high, old, one)
             case ast.BinOp(left=left, op=ast.Pow(), right=right):
                 text = f"({ast.unparse(left)} * {ast.unparse(right)})"
-                self._add(node, "operator", self._span(node), text, scope)
+                self._add(node, "operator", self._span(node), text)
             case ast.BinOp(left=left, op=op, right=right):
-                self._token(node, "operator", left, right, *_OPERATORS[type(op)], scope)
+                self._token(node, "operator", left, right, *_OPERATORS[type(op)])
             case ast.AugAssign(target=target, op=op, value=value) if type(op) in _OPERATORS:
-                self._token(node, "operator", target, value, *_OPERATORS[type(op)], scope)
+                self._token(node, "operator", target, value, *_OPERATORS[type(op)])
             case ast.UnaryOp(op=ast.Not() | ast.USub() | ast.Invert(), operand=operand):
-                self._add(node, "unary", self._span(node), f"({ast.unparse(operand)})", scope)
+                self._add(node, "unary", self._span(node), f"({ast.unparse(operand)})")
             case ast.BoolOp(op=op, values=values):
                 other = ast.BoolOp(ast.Or() if isinstance(op, ast.And) else ast.And(), values)
-                self._add(node, "and/or", self._span(node), f"({ast.unparse(other)})", scope)
+                self._add(node, "and/or", self._span(node), f"({ast.unparse(other)})")
             case ast.If(test=test) | ast.IfExp(test=test) | ast.While(test=test):
-                self._add(test, "negated", self._span(test), f"(not ({ast.unparse(test)}))", scope)
+                self._add(test, "negated", self._span(test), f"(not ({ast.unparse(test)}))")
             case ast.Call(func=func, args=args) if ast.unparse(func).rpartition(".")[2] not in _SYMMETRIC:
                 for one, two in pairwise(args):
                     if not isinstance(one, ast.Starred) and not isinstance(two, ast.Starred):
                         (a, b), (c, d) = self._span(one), self._span(two)
-                        self._add(one, "swapped", (a, d), self.source[c:d] + self.source[b:c] + self.source[a:b], scope)
+                        self._add(one, "swapped", (a, d), self.source[c:d] + self.source[b:c] + self.source[a:b])
             case ast.Attribute(value=value, attr=attr) if attr in _NAMES:
                 end = self._span(node)[1]
-                self._add(value, "name", (end - len(attr), end), _NAMES[attr], scope)
+                self._add(value, "name", (end - len(attr), end), _NAMES[attr])
             case ast.Name(id=name) if name in _NAMES and isinstance(node.ctx, ast.Load):
-                self._add(node, "name", self._span(node), _NAMES[name], scope)
+                self._add(node, "name", self._span(node), _NAMES[name])
             case ast.Constant(value=bool(value)):
-                self._add(node, "constant", self._span(node), str(not value), scope)
+                self._add(node, "constant", self._span(node), str(not value))
             case ast.Constant(value=int(value) | float(value)):
                 for new in (value + 1, value - 1):
-                    self._add(node, "constant", self._span(node), f"({new})" if new < 0 else repr(new), scope)
+                    self._add(node, "constant", self._span(node), f"({new})" if new < 0 else repr(new))
             case ast.Constant(value=str(value)) if value in _WORDS:
-                self._add(node, "word", self._span(node), repr(_WORDS[value]), scope)
+                self._add(node, "word", self._span(node), repr(_WORDS[value]))
 
 
 def mutants_of(path: str, source: bytes) -> list[Mutant]:

@@ -118,15 +118,6 @@ STEADY = KnnDetector(stabilise=False)
 STOPS = film(stops, 60)
 case(
     "detect",
-    "method",
-    stops.__doc__,
-    STEADY,
-    STOPS,
-    all_boxes,
-    {"frame-difference": "least", "mog2": "more", "knn": "most"},
-)
-case(
-    "detect",
     "threshold",
     pale.__doc__,
     FrameDifferenceDetector(stabilise=False),
