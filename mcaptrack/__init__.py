@@ -4,14 +4,35 @@ __version__ = "0.2.0.dev0"
 #: Version of the shape of everything that is printed, or put into a page, as JSON.
 SCHEMA_VERSION = 1
 
-#: What the package gives beyond its parts, and where it stands.
-_LAZY = {"open": "mcaptrack.api", "Recording": "mcaptrack.api", "McaptrackError": "mcaptrack.errors"}
+_PARTS = {
+    "contents": ["ChannelInfo", "LogInfo", "info"],
+    "ingesting": ["IngestResult", "ingest"],
+    "outputs": ["ExportResult", "RenderResult", "ReportResult", "export", "query", "render", "report"],
+    "recording": ["FetchedMessage", "Recording", "open"],
+    "running": ["RunResult"],
+    "scoring": ["Scores", "evaluate"],
+    "stages": ["detect", "predict", "retrack", "sample", "track"],
+    "upkeep": ["DropResult", "LogCheck", "LogRecovery", "check", "drop", "recover"],
+    "whole": ["events", "run"],
+}
+#: Where the names of the package are defined; each is imported when it is first used.
+_MODULES = {name: f"mcaptrack.api.{module}" for module, names in _PARTS.items() for name in names} | {
+    "McaptrackError": "mcaptrack.errors",
+    "McaptrackWarning": "mcaptrack.notices",
+    "Notice": "mcaptrack.notices",
+}
+__all__ = sorted(_MODULES)  # noqa: PLE0605  # __init__.pyi lists them for tools
 
 
 def __getattr__(name: str) -> object:
-    """``mcaptrack.open`` and so on, once somebody asks: importing the package stays light."""
-    if name not in _LAZY:
+    """Import a name of the package when it is first used: ``import mcaptrack`` stays light."""
+    if name not in _MODULES:
         raise AttributeError(f"module 'mcaptrack' has no attribute {name!r}")
     from importlib import import_module
 
-    return getattr(import_module(_LAZY[name]), name)
+    return getattr(import_module(_MODULES[name]), name)
+
+
+def __dir__() -> list[str]:
+    """List the names of the package, also those that were not imported yet."""
+    return sorted({*globals(), *__all__})

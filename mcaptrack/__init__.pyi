@@ -1,6 +1,73 @@
-from mcaptrack.api import Recording as Recording
-from mcaptrack.api import open as open  # noqa: A004
+from mcaptrack.api.contents import ChannelInfo as ChannelInfo
+from mcaptrack.api.contents import LogInfo as LogInfo
+from mcaptrack.api.contents import info as info
+from mcaptrack.api.ingesting import IngestResult as IngestResult
+from mcaptrack.api.ingesting import ingest as ingest
+from mcaptrack.api.outputs import ExportResult as ExportResult
+from mcaptrack.api.outputs import RenderResult as RenderResult
+from mcaptrack.api.outputs import ReportResult as ReportResult
+from mcaptrack.api.outputs import export as export
+from mcaptrack.api.outputs import query as query
+from mcaptrack.api.outputs import render as render
+from mcaptrack.api.outputs import report as report
+from mcaptrack.api.recording import FetchedMessage as FetchedMessage
+from mcaptrack.api.recording import Recording as Recording
+from mcaptrack.api.recording import open as open  # noqa: A004
+from mcaptrack.api.running import RunResult as RunResult
+from mcaptrack.api.scoring import Scores as Scores
+from mcaptrack.api.scoring import evaluate as evaluate
+from mcaptrack.api.stages import detect as detect
+from mcaptrack.api.stages import predict as predict
+from mcaptrack.api.stages import retrack as retrack
+from mcaptrack.api.stages import sample as sample
+from mcaptrack.api.stages import track as track
+from mcaptrack.api.upkeep import DropResult as DropResult
+from mcaptrack.api.upkeep import LogCheck as LogCheck
+from mcaptrack.api.upkeep import LogRecovery as LogRecovery
+from mcaptrack.api.upkeep import check as check
+from mcaptrack.api.upkeep import drop as drop
+from mcaptrack.api.upkeep import recover as recover
+from mcaptrack.api.whole import events as events
+from mcaptrack.api.whole import run as run
 from mcaptrack.errors import McaptrackError as McaptrackError
+from mcaptrack.notices import McaptrackWarning as McaptrackWarning
+from mcaptrack.notices import Notice as Notice
 
+__all__ = [
+    "ChannelInfo",
+    "DropResult",
+    "ExportResult",
+    "FetchedMessage",
+    "IngestResult",
+    "LogCheck",
+    "LogInfo",
+    "LogRecovery",
+    "McaptrackError",
+    "McaptrackWarning",
+    "Notice",
+    "Recording",
+    "RenderResult",
+    "ReportResult",
+    "RunResult",
+    "Scores",
+    "check",
+    "detect",
+    "drop",
+    "evaluate",
+    "events",
+    "export",
+    "info",
+    "ingest",
+    "open",
+    "predict",
+    "query",
+    "recover",
+    "render",
+    "report",
+    "retrack",
+    "run",
+    "sample",
+    "track",
+]
 __version__: str
 SCHEMA_VERSION: int

@@ -1,9 +1,14 @@
-"""The exceptions for faults that a user can fix, and the commands that their messages propose."""
+"""The exceptions for faults that a user can fix, and the calls and commands that messages propose.
+
+Messages name parameters as Python writes them, in backquotes: `fps=`, or with a value `first_frame=1`. The command line
+shows the option instead, and a command instead of a call.
+"""
 
 from __future__ import annotations
 
 import shlex
 from pathlib import Path
+from typing import Any
 
 
 class McaptrackError(Exception):
@@ -15,11 +20,28 @@ class McaptrackError(Exception):
 
 
 class DamagedError(McaptrackError):
-    """A damaged log; `mcaptrack recover` saves what is intact."""
+    """A damaged log; `mcaptrack.recover` saves what is intact."""
+
+
+def call(function: str, *values: str | Path, **parameters: Any) -> str:
+    """A call to propose in a message, in backquotes. Placeholders for the user to fill in are in capitals.
+
+    Examples
+    --------
+    >>> call("ingest", "LABELS", into=Path("my log.mcap"))
+    "`mcaptrack.ingest('LABELS', into='my log.mcap')`"
+    """
+    words = [_literal(value) for value in values]
+    words += [f"{name}={_literal(value)}" for name, value in parameters.items()]
+    return f"`mcaptrack.{function}({', '.join(words)})`"
+
+
+def _literal(value: Any) -> str:
+    return repr(str(value) if isinstance(value, Path) else value).replace("`", "\\x60")
 
 
 def command(*words: str | Path) -> str:
-    """A command to propose in a message, in backquotes and quoted for a shell.
+    """A command to propose at a terminal or on a page, in backquotes and quoted for a shell.
 
     A path is never mistaken for an option, whatever its name. Placeholders for the user to fill in are in capitals.
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import glob
 import os
+import re
 import secrets
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import IO
+from typing import IO, Final
 
 from mcaptrack import notices
 from mcaptrack.errors import McaptrackError
@@ -170,6 +171,18 @@ def refuse_special(path: Path) -> None:
             raise McaptrackError(f"{path} is {what}, not a file; save its data to a file first")
 
 
+#: A URL, also one that has become a path: "s3://bucket/a" is "s3:/bucket/a" then.
+_URL: Final = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):/+([^\s]+)")
+
+
+def refuse_url(path: Path | str) -> None:
+    """Raise McaptrackError for a URL, with the slashes that it had."""
+    found = _URL.fullmatch(str(path))
+    if found and not Path(path).exists():
+        scheme, rest = found.groups()
+        raise McaptrackError(f"{scheme}://{rest} is a URL; only files are read and written: copy it here first")
+
+
 def refuse_overwrite(path: Path, force: bool) -> None:
     """Raise McaptrackError if ``path`` can't be written to, or exists and ``force`` is not given."""
     if path.is_dir():
@@ -177,4 +190,4 @@ def refuse_overwrite(path: Path, force: bool) -> None:
     if not path.parent.is_dir():
         raise McaptrackError(f"the folder {path.parent} does not exist")
     if path.exists() and not force:
-        raise McaptrackError(f"{path} exists; give another name with -o, or --force to replace it")
+        raise McaptrackError(f"{path} exists; give another name with `output=`, or `force=True` to replace it")

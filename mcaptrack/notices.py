@@ -8,10 +8,14 @@ Python warnings (``McaptrackWarning``), so that scripts and notebooks show them.
 
 from __future__ import annotations
 
+import os
+import sys
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+from pathlib import Path
+from types import FrameType
 from typing import Final, Literal, NamedTuple, get_args
 
 #: The codes of warnings, for programs. docs/warnings.md explains them.
@@ -74,9 +78,22 @@ def warn(message: str, code: Code = "other") -> None:
 
 def _pass_on(notice: Notice, listener: Listener | None) -> None:
     if listener is None:
-        warnings.warn(str(notice), McaptrackWarning, stacklevel=3)
+        warnings.warn(str(notice), McaptrackWarning, stacklevel=_level_of_caller())
     else:
         listener(notice)
+
+
+def _level_of_caller() -> int:
+    """How many calls up the first line outside of the package is, from whoever calls this."""
+    package = str(Path(__file__).parent) + os.sep
+    frame, level = sys._getframe(1), 1
+    while frame.f_back is not None and (frame.f_code.co_filename.startswith(package) or _is_contextlib(frame)):
+        frame, level = frame.f_back, level + 1
+    return level
+
+
+def _is_contextlib(frame: FrameType) -> bool:
+    return frame.f_globals.get("__name__") == "contextlib"
 
 
 @contextmanager

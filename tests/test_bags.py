@@ -412,7 +412,7 @@ class TestBesideLabels:
 
     def test_of_several_cameras_one_is_chosen(self, tmp_path, files):
         camera_bag(tmp_path / "a.bag", "/left/image", "/right/image")
-        with pytest.raises(McaptrackError, match=r"/left/image, /right/image; .* choose with --camera left"):
+        with pytest.raises(McaptrackError, match=r"/left/image, /right/image; .* choose with `camera='left'`"):
             make(tmp_path / "a.bag", tmp_path / "a.mcap", **files)
         assert not (tmp_path / "a.mcap").exists()
         assert make(tmp_path / "a.bag", tmp_path / "a.mcap", camera="right", **files).messages["/right/truth"] == 30

@@ -259,7 +259,7 @@ def test_each_of_two_cameras_has_its_boxes_and_its_results(tmp_path):
     with log.read(path) as opened:
         assert [camera.pictures for camera in cameras(opened)] == ["/front/image", "/rear/image"]
         with pytest.raises(
-            McaptrackError, match="has several cameras, /front/yolo, /rear/yolo; choose one with --camera"
+            McaptrackError, match="has several cameras, /front/yolo, /rear/yolo; choose one with `camera=`"
         ):
             find_camera(opened)
         assert find_camera(opened, "front") == find_camera(opened, "front/yolo") == "/front/yolo"

@@ -114,7 +114,7 @@ def test_exported_tables_are_scored(tmp_path):
     assert row["MOTA"] == 1.0
     more = {"/camera/tracks": tracks, "/camera/samples": tracks[::4]}
     tables.write(path, tables.rows_table(TRACKS, more), {})
-    with pytest.raises(McaptrackError, match=r"holds /camera/samples, /camera/tracks; choose one with --topic"):
+    with pytest.raises(McaptrackError, match=r"holds /camera/samples, /camera/tracks; choose one with `topic=`"):
         scores(path, gt)
     assert scores(path, gt, topics=("/camera/tracks",))[0]["MOTA"] == 1.0
     (tmp_path / "no.parquet").write_bytes(b"PAR1 but not really")

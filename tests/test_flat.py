@@ -144,12 +144,12 @@ def test_bytes_are_kept_where_they_are_asked_for(tmp_path, state):
 
     with log.read(tmp_path / "a.mcap") as opened:
         done = export(opened, tmp_path / "t", topics=["/x"])
-        assert done.notes == ["/x: picture left out, bytes; --blobs keeps them"]
+        assert done.notes == ["/x: picture left out, bytes; `blobs=True` keeps them"]
         export(opened, tmp_path / "t", topics=["/x"], blobs=True)
         assert export(opened, tmp_path / "t").written == []  # and they stay
         assert export(opened, tmp_path / "t", topics=["/y"], blobs=True).rows["topics/y"] == 1
         (words,) = export(opened, tmp_path / "t", topics=["/y"]).notes
-        assert words == "/y: picture left out, bytes; --blobs keeps them"  # of /y alone
+        assert words == "/y: picture left out, bytes; `blobs=True` keeps them"  # of /y alone
     import pyarrow.parquet as pq
 
     (file,) = (tmp_path / "t" / "topics" / "x").rglob("*.parquet")

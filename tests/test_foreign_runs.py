@@ -13,7 +13,8 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 from typer.testing import CliRunner
 
-from mcaptrack import api, log, pipeline
+from mcaptrack import log, pipeline
+from mcaptrack.api import recording
 from mcaptrack.cli import app
 from mcaptrack.errors import McaptrackError
 from mcaptrack.foxglove.views import SUFFIX
@@ -130,7 +131,7 @@ def test_of_several_cameras_one_has_to_be_chosen(tmp_path):
         pipeline.plan_all(opened, pipeline.find_camera(opened, None))
     assert str(error.value) == (
         f"{path} has no channel /camera/video for detect; it has pictures in /left/image, /right/image. "
-        "choose one with --topic"
+        "choose one with `topic=`"
     )
     mcaptrack("run", path, "-q", "--topic", "/left/image")
     mcaptrack("detect", path, "-q", "--topic", "/right/image")
@@ -170,7 +171,7 @@ def test_what_others_recorded_is_never_replaced(tmp_path):
         ):
             pipeline.plan_stage(opened, "/eye", "detect", KnnDetector(), "/eye/image")
         with pytest.raises(
-            McaptrackError, match=r"/eye/detections is there and was recorded by others .*; leave --topic out"
+            McaptrackError, match=r"/eye/detections is there and was recorded by others .*; leave `topic=` out"
         ):
             pipeline.plan_all(opened, "/eye", source="/eye/image")
     mcaptrack("detect", path, "-q", "--topic", "/eye/image", "--to", "/eye/found")
@@ -266,7 +267,7 @@ def test_boxes_of_others_are_in_the_table_of_detections(tmp_path):
     """With the numbers that names got, and joined with the messages they stand in."""
     path = tmp_path / "a.mcap"
     counts = boxes_log(path, "person", "car", "7")
-    with api.open(path) as opened, pytest.warns(McaptrackWarning, match="1 is a person, 8 is 'car'"):
+    with recording.open(path) as opened, pytest.warns(McaptrackWarning, match="1 is a person, 8 is 'car'"):
         rows, frames = opened.array("detections"), opened.array("frames")
     assert frames[["topic", "t_ns", "rows"]].tolist() == [
         ("/lidar/boxes", START_NS + ns(n / 10), count) for n, count in enumerate(counts)

@@ -196,11 +196,11 @@ class TestIngest:
         out = tmp_path / "a.mcap"
         found = write(tmp_path / "t.txt", "3,4,1,1,2,2\n4,4,1,1,2,2\n7,4,1,1,2,2\n")
         report = ingest(found, out, options(fps=Fraction(10), frames=9))
-        assert report.said == [f"{found}: 9 frames (by --frames) from 1 on, 10 a second (by --fps)"]
+        assert report.said == [f"{found}: 9 frames (by `frames=`) from 1 on, 10 a second (by `fps=`)"]
         with log.read(out) as opened:
             assert [len(f.rows) for f in opened.frames("/camera/tracks", TRACKS)] == [0, 0, 1, 1, 0, 0, 1, 0, 0]
         report = ingest(found, out, options(fps=Fraction(10)))
-        assert report.said == [f"{found}: 7 frames (by the last label) from 1 on, 10 a second (by --fps)"]
+        assert report.said == [f"{found}: 7 frames (by the last label) from 1 on, 10 a second (by `fps=`)"]
         with log.read(out) as opened:
             assert [len(f.rows) for f in opened.frames("/camera/tracks", TRACKS)] == [0, 0, 1, 1, 0, 0, 1]
 
@@ -230,7 +230,7 @@ class TestIngest:
             ]
         report = ingest(found, out, options(role="truth", fps=Fraction(7), frames=3))
         assert [(notice.message, notice.code) for notice in report.warnings] == [
-            (f"{found}: 14 frames a second by seqinfo.ini, and 7 by --fps, which is taken", "clock")
+            (f"{found}: 14 frames a second by seqinfo.ini, and 7 by `fps=`, which is taken", "clock")
         ]
         write(tmp_path / "seqinfo.ini", "frameRate=14\nseqLength=1\n")
         with pytest.raises(
@@ -254,7 +254,7 @@ class TestIngest:
         assert before[100:2000] in out.read_bytes()
         with (
             log.read(out) as opened,
-            pytest.raises(McaptrackError, match="has /camera/truth already; --force replaces"),
+            pytest.raises(McaptrackError, match="has /camera/truth already; `force=True` replaces"),
         ):
             ingest(found, out, options(role="truth"), into=opened)
         with log.read(out) as opened:
@@ -272,7 +272,7 @@ class TestIngest:
         "a singular plane": ({"ground_plane": "1 0 0\n2 0 0\n0 0 1\n"}, "the homography is singular"),
         "no plane at all": ({"ground_plane": "1 0\n"}, "is not a homography"),
         "labels after the end": ({"labels": {"truth": "900,1,1,1,2,2\n"}}, "all labels are of frames after"),
-        "a role for a video": ({"role": "truth"}, "is no label file; --as is for those"),
+        "a role for a video": ({"role": "truth"}, "is no label file; `role=` is for those"),
     }
 
     @pytest.mark.parametrize(("given", "words"), REFUSED.values(), ids=REFUSED)
@@ -288,7 +288,7 @@ class TestIngest:
         assert sorted(tmp_path.iterdir()) == before
 
     def test_labels_alone_need_a_clock(self, tmp_path):
-        with pytest.raises(McaptrackError, match="has no clock of its own; give the frames per second with --fps"):
+        with pytest.raises(McaptrackError, match="has no clock of its own; give the frames per second with `fps=`"):
             ingest(write(tmp_path / "a.txt", MOT15), tmp_path / "a.mcap", options())
 
     def test_input_and_output_are_not_one(self, clip):

@@ -228,7 +228,7 @@ def test_the_first_versions_journal_saves_a_log_to_another_file_and_is_not_put_b
         with pytest.raises(McaptrackError, match="can't be read as an MCAP file"):
             log.read(path)
         assert everything(tmp_path) == before
-        assert "If it was left half written, `mcaptrack recover" in said[0].message
+        assert "If it was left half written, `mcaptrack.recover(" in said[0].message
         assert log.recover(path, saved).lost == []
     with log.read(saved) as one:
         assert sum(channel.messages for channel in one.channels.values()) == len(SOME)
@@ -270,4 +270,4 @@ def test_a_log_may_be_moved_with_its_journal_and_is_then_saved_to_another_file(p
     with notices.collected() as said, notices.listening(said.append), pytest.raises(McaptrackError):
         look(moved / path.name)
     assert "belongs to another file than" in said[0].message
-    assert "If it was left half written, `mcaptrack recover" in said[0].message
+    assert "If it was left half written, `mcaptrack.recover(" in said[0].message

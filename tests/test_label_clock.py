@@ -313,14 +313,14 @@ REFUSED = {
     "all of them after the pictures": (
         range(900, 910),
         {},
-        "all labels are of frames after the last picture.*say so with --first-frame 900",
+        "all labels are of frames after the last picture.*say so with `first_frame=900`",
     ),
     "before the first picture": (
         [3, 20],
         {"first_frame": 5},
         "its first label is of frame 3, and frame 5 is said to be the first picture",
     ),
-    "how many frames there are": ([3], {"frames": 9}, "--frames is for those that stand alone"),
+    "how many frames there are": ([3], {"frames": 9}, "`frames=` is for those that stand alone"),
 }
 
 
@@ -336,32 +336,32 @@ INTO_REFUSED = {
     "another rate": (
         "clip",
         {"fps": Fraction(7)},
-        "the pictures of /camera/video are 10 a second, not 7; .* leave --fps",
+        "the pictures of /camera/video are 10 a second, not 7; .* leave `fps=",
     ),
     "nearly the same rate": ("clip", {"fps": Fraction(995, 100)}, None),
     "a rate of pictures that have none": ("jumps", {"fps": Fraction(24)}, "a second, not 24; labels take the times"),
     "another start": (
         "clip",
         {"start_ns": 5},
-        "take the times of the pictures of /camera/video; leave --start-time out",
+        "take the times of the pictures of /camera/video; leave `start_time=` out",
     ),
-    "a number of frames": ("clip", {"frames": 5}, "leave --frames out"),
+    "a number of frames": ("clip", {"frames": 5}, "leave `frames=` out"),
     "too many": ("clip", {}, "all labels are of frames after the last picture"),
     "one of two cameras": (
         "two",
         {},
-        "has pictures of several cameras, /left/image, /right/image; .*--camera left",
+        "has pictures of several cameras, /left/image, /right/image; .*`camera='left'`",
     ),
     "one of two topics": (
         "same",
         {"camera": "front"},
-        "/front has several topics of pictures, /front/a, /front/b; name one with --camera front/a",
+        "/front has several topics of pictures, /front/a, /front/b; name one with `camera='front/a'`",
     ),
-    "a camera that isn't there": ("robot", {"camera": "rear"}, "no clock of its own.*--camera front/image_raw"),
+    "a camera that isn't there": ("robot", {"camera": "rear"}, "no clock of its own.*`camera='front/image_raw'`"),
     "a camera that isn't there, at a time that isn't": (
         "robot",
         {"camera": "rear", "fps": Fraction(10)},
-        r"is from 1700000000.000 s to 1700000002.302 s, the labels would be from 0.000 s to .*--start-time",
+        r"is from 1700000000.000 s to 1700000002.302 s, the labels would be from 0.000 s to .*`start_time=`",
     ),
 }
 
@@ -394,7 +394,9 @@ def test_a_camera_without_pictures_has_a_clock_where_the_log_has_something(tmp_p
 def test_pictures_that_are_added_to_labels_have_their_times(tmp_path, stock):
     path = tmp_path / "a.mcap"
     ingest(lines(tmp_path / "gt.txt", 4), path, IngestOptions(role="truth", fps=Fraction(7)))
-    with pytest.raises(McaptrackError, match=r"/camera/truth has labels at other times than .*clip.mp4; give --fps 7"):
+    with pytest.raises(
+        McaptrackError, match=r"/camera/truth has labels at other times than .*clip.mp4; give `fps='7'`"
+    ):
         add(stock / "clip.mp4", path)
     add(stock / "clip.mp4", path, fps=Fraction(7))
     with log.read(path) as opened:

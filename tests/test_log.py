@@ -345,7 +345,7 @@ def test_chunks_outside_of_the_span_are_not_touched(tmp_path):
     path.write_bytes(raw)
     with log.read(path) as opened:
         assert [m.t_ns for m in opened.messages("a", 10, 20)] == list(range(10, 20))
-        with pytest.raises(McaptrackError, match=r"is damaged: byte .*`mcaptrack recover .*` saves what is intact"):
+        with pytest.raises(McaptrackError, match=r"is damaged: byte .*`mcaptrack\.recover\(.*\)` saves what is intact"):
             list(opened.messages("a", 10))
 
 

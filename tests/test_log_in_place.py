@@ -105,7 +105,7 @@ def test_a_log_that_may_not_be_written_to_says_what_to_do(tmp_path, monkeypatch)
     with log.read(path) as opened, monkeypatch.context() as patch:
         patch.setattr(os, "open", refused)
         with pytest.raises(
-            McaptrackError, match="can't be written to: Permission denied; write to another file with -o"
+            McaptrackError, match="can't be written to: Permission denied; write to another file with `output=`"
         ):
             opened.lock()
     with log.read(path) as opened, log.extend(opened, tmp_path / "copy.mcap") as writer:
@@ -124,7 +124,7 @@ def test_damage_that_is_in_the_way_is_said_where_it_stands_and_nothing_changes(t
     path.write_bytes(whole)
     with pytest.raises(
         McaptrackError,
-        match=rf"is damaged: byte {chunk.offset}: .*; `mcaptrack recover .*a.mcap` saves what is intact$",
+        match=rf"is damaged: byte {chunk.offset}: .*; `mcaptrack\.recover\(.*a.mcap'\)` saves what is intact$",
     ):
         add_results(path, 2)
     assert path.read_bytes() == bytes(whole)

@@ -78,7 +78,7 @@ def test_another_client_sees_every_picture_of_the_clip_in_a_message_of_its_own(t
     report = ingest(path, output, IngestOptions(image_format=image_format, start_ns=7))
     assert report.lost == []
     if codec in ("vp9", "av1"):
-        assert "which Foxglove plays and Lichtblick does not (--image-format h264 is for both)" in report.said[0]
+        assert "which Foxglove plays and Lichtblick does not (`image_format='h264'` is for both)" in report.said[0]
     else:
         assert report.said == []
     images, packets = by_ffmpeg(path)
@@ -214,7 +214,9 @@ def test_h264_alone_is_h264_alone(tmp_path):
 
 def test_a_stream_without_times_needs_a_rate_and_is_passed_on_with_one(tmp_path):
     path = made("a.h264", options=X264)(tmp_path)
-    with pytest.raises(McaptrackError, match=r"a\.h264 has no times of its own; give the frames per second with --fps"):
+    with pytest.raises(
+        McaptrackError, match=r"a\.h264 has no times of its own; give the frames per second with `fps=`"
+    ):
         ingest(path, tmp_path / "a.mcap", IngestOptions())
     report = ingest(path, tmp_path / "a.mcap", IngestOptions(fps=Fraction(10)))
     assert report.said == []

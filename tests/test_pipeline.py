@@ -183,7 +183,9 @@ def test_a_log_without_what_is_needed_says_what_there_is_and_what_to_do(fresh, t
         McaptrackError, match=r"has no channel /camera/video for detect; it has /imu\. add pictures with"
     ):
         run_stage(tmp_path / "empty.mcap", "retrack", Retrack())
-    with pytest.raises(McaptrackError, match=r"has no channel /nope for track; it has .*/camera/video.*mcaptrack info"):
+    with pytest.raises(
+        McaptrackError, match=r"has no channel /nope for track; it has .*/camera/video.*mcaptrack\.info"
+    ):
         run_stage(fresh, "track", Sort(), source="/nope")
     with pytest.raises(
         McaptrackError, match=r"/camera/video holds foxglove\.CompressedVideo; track reads mcaptrack\.Detections"

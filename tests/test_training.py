@@ -149,9 +149,9 @@ class TestSources:
         (tmp_path / "h.txt").write_text("0.1 0 -10\n0 0.1 -6\n0 0 1")
         options = {"fps": Fraction(10), "ground_plane": tmp_path / "h.txt"}
         self.check(self.read(tmp_path / "gt.txt", **options))
-        with pytest.raises(McaptrackError, match=r"gt\.txt: how many frames a second\? Say it with --fps"):
+        with pytest.raises(McaptrackError, match=r"gt\.txt: how many frames a second\? Say it with `fps=`"):
             self.read(tmp_path / "gt.txt")
-        with pytest.raises(McaptrackError, match=r"gt\.txt is in pixels; give its homography with --ground-plane"):
+        with pytest.raises(McaptrackError, match=r"gt\.txt is in pixels; give its homography with `ground_plane=`"):
             self.read(tmp_path / "gt.txt", fps=Fraction(10))
 
     def test_stanford_drone(self, tmp_path):

@@ -7,20 +7,19 @@ import difflib
 import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from contextvars import ContextVar
 from pathlib import Path
 from typing import Any, ClassVar, Final
 
 import typer
 from typer.core import TyperCommand, TyperGroup
 
+from mcaptrack.cli.flags import RUNNING
 from mcaptrack.cli.settings import Given, Setting, declared_settings, found_of, gather
 from mcaptrack.cli.text import refuse_usage, say
 from mcaptrack.notices import warn
 
 #: Headings of options that stand last in the help: what is read and written, and what every command has.
 LAST_PANELS: Final = ("Input and output", "Options of all commands")
-_RUNNING: Final[ContextVar[typer.Context]] = ContextVar("running")
 
 
 #: What Typer raises for a command line that it does not understand.
@@ -157,7 +156,7 @@ class Command(TyperCommand):
 
     def invoke(self, ctx: Any) -> Any:
         """Run it; with --verbose say first which options are not as usual, and where each was set."""
-        _RUNNING.set(ctx)
+        RUNNING.set(ctx)
         if ctx.params.get("verbose") and not ctx.params.get("quiet"):
             say(self._said(ctx))
         return super().invoke(ctx)
@@ -247,7 +246,7 @@ def converted(context: Any, command: str) -> dict[str, Any]:
 
 def settings_of(command: str) -> dict[str, Any]:
     """What environment and files say of another command's options, by parameter: for what the running one makes."""
-    context: Any = _RUNNING.get()
+    context: Any = RUNNING.get()
     values, found = converted(context, command), found_of(command)
     other: Command = context.parent.command.commands[command]
     places = {name: (given.rank, given.where) for name, (_, given) in found.items()}
@@ -259,7 +258,7 @@ def settings_of(command: str) -> dict[str, Any]:
 
 def check_ranges(values: Mapping[str, Any]) -> None:
     """Raise McaptrackError for a number out of range among the values of the running command's options, if one runs."""
-    context: Any = _RUNNING.get(None)
+    context: Any = RUNNING.get()
     if context is None:  # its function was called, without a command line
         return
     found = found_of(context.info_name)
@@ -269,13 +268,13 @@ def check_ranges(values: Mapping[str, Any]) -> None:
 
 def is_on_command_line(parameter: str) -> bool:
     """Whether an option of the running command was given on its command line."""
-    source = _RUNNING.get().get_parameter_source(parameter)
+    source = RUNNING.get().get_parameter_source(parameter)
     return source is not None and source.name == "COMMANDLINE"
 
 
 def warn_unused(reason: str, *parameters: str) -> None:
     """Warn of options on the command line that change nothing here, and say why."""
-    command: Any = _RUNNING.get().command
+    command: Any = RUNNING.get().command
     for setting in command.settings.values():
         if setting.parameter in parameters and is_on_command_line(setting.parameter):
             warn(f"--{setting.name} changes nothing here: {reason}", "option-not-used")

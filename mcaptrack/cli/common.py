@@ -5,6 +5,7 @@ from __future__ import annotations
 import glob
 import io
 import json
+import logging
 import math
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -20,11 +21,12 @@ import typer
 
 from mcaptrack import SCHEMA_VERSION, notices
 from mcaptrack.cli.command import LAST_PANELS, Command, Reading, check_ranges, read_config
-from mcaptrack.cli.inputs import check_paths, refuse_url
+from mcaptrack.cli.flags import with_flags
+from mcaptrack.cli.inputs import check_paths
 from mcaptrack.cli.settings import Declared
 from mcaptrack.cli.text import say
 from mcaptrack.errors import McaptrackError
-from mcaptrack.files import publish_bytes, refuse_overwrite
+from mcaptrack.files import publish_bytes, refuse_overwrite, refuse_url
 from mcaptrack.notices import Code, Notice
 from mcaptrack.transforms.protocol import limits
 
@@ -224,15 +226,15 @@ class Talk:
             words = words if str(path) in words else f"{path}: {words}"
             self._stop()
             say(f"mcaptrack: {words}")
-            batch.failed.append(Failed(str(path), words))
+            batch.failed.append(Failed(str(path), with_flags(words)))
 
     def _hear(self, notice: Notice) -> None:
         self._stop()
         _show_warning(notice)
 
-    def progress(self, stage: str, done: int, total: int) -> None:
-        """How far a stage is."""
-        if self.quiet or not sys.stderr.isatty():
+    def progress(self, stage: str, done: float, total: float | None) -> None:
+        """Show how far a stage is."""
+        if total is None or self.quiet or not sys.stderr.isatty():
             return
         now = monotonic()
         if now - self._shown < 0.1 and done < total:
@@ -259,12 +261,37 @@ class Talk:
 
     @contextmanager
     def open(self) -> Iterator[Talk]:
-        """Takes warnings; leaves the terminal as it was."""
-        with notices.listening(self._hear):
+        """Print warnings and notes of the library; leave the terminal as it was."""
+        with notices.listening(self._hear), _printing_notes(self):
             try:
                 yield self
             finally:
                 self._stop()
+
+
+class _Printer(logging.Handler):
+    """Prints what the library logs: what is routine, and with --verbose details."""
+
+    def __init__(self, talk: Talk) -> None:
+        super().__init__()
+        self._talk = talk
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Print one record."""
+        (self._talk.say if record.levelno >= logging.INFO else self._talk.detail)(record.getMessage())
+
+
+@contextmanager
+def _printing_notes(talk: Talk) -> Iterator[None]:
+    logger, printer = logging.getLogger("mcaptrack"), _Printer(talk)
+    level = logger.level
+    logger.addHandler(printer)
+    logger.setLevel(logging.DEBUG)
+    try:
+        yield
+    finally:
+        logger.removeHandler(printer)
+        logger.setLevel(level)
 
 
 def one_line(command: Callable[P, None]) -> Callable[P, None]:
@@ -297,6 +324,7 @@ def one_line(command: Callable[P, None]) -> Callable[P, None]:
 def _show_warning(notice: Notice) -> None:
     """A warning on stderr, once."""
     warned = _WARNED.get()
+    notice = notice._replace(message=with_flags(notice.message))
     if notice not in warned:
         warned.append(notice)
         say(f"warning: {notice}")

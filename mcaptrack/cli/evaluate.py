@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 import typer
 
@@ -15,11 +14,9 @@ from mcaptrack.cli.text import console, printable, say
 from mcaptrack.errors import McaptrackError
 
 if TYPE_CHECKING:
-    from mcaptrack.evaluation import EvaluationInput, EvaluationResult
+    from mcaptrack import Scores
 
 _COLUMNS: Final = ("MOTA", "IDF1", "HOTA", "IDSW", "FP", "FN", "Frag")
-_TABLES: Final = (".parquet", ".pq")
-_FILES: Final = (".txt", ".csv", *_TABLES)
 _FORECAST_COLUMNS: Final = {
     "ADE_m": "ADE m",
     "FDE_m": "FDE m",
@@ -94,49 +91,47 @@ def evaluate(
 
     Example: mcaptrack evaluate tracks.txt --truth gt.txt --fail-under idf1=0.7
     """
-    from mcaptrack.evaluation import EvaluateOptions
-    from mcaptrack.evaluation import evaluate as score
+    import mcaptrack
+    from mcaptrack.api.scoring import holds_tables
 
-    options = EvaluateOptions(
-        similarities=(similarity,) if similarity else (),
-        gates_m=_gates(gate_m),
-        min_iou=min_iou,
-        rules=rules,
-        topics=tuple(topic or ()),
-    )
-    limits = [_limit(text) for text in fail_under or ()]
-    with common.Talk(quiet, verbose).open() as talk:
-        paths = common.expand(inputs)
-        if truth:
-            plane_options = {"ground_plane": ground_plane, "point": point, "fps": fps, "topics": options.topics}
-            sequences = _from_files(paths, common.expand(truth), plane_options, talk)
+    limits = dict(_limit(text) for text in fail_under or ())
+    gates = _gates(gate_m)
+    with common.Talk(quiet, verbose).open():
+        paths, truths = common.expand(inputs), common.expand(truth) if truth else None
+        scores = mcaptrack.evaluate(
+            paths,
+            truth=truths,
+            similarity=similarity,
+            gate_m=gates,
+            min_iou=min_iou,
+            rules=rules,
+            topic=topic,
+            camera=camera,
+            ground_plane=ground_plane,
+            point=point,
+            fps=fps,
+        )
+        if truths:
             warn_unused("files of tracks are of no camera", "camera")
             if ground_plane is None:
                 warn_unused("there is no ground plane", "point")
-            if not any(path.suffix.lower() in _TABLES for path in paths):
+            if not any(map(holds_tables, paths)):
                 warn_unused("only tables hold several channels", "topic")
         else:
-            for path in paths:
-                if path.suffix.lower() in _FILES:
-                    raise McaptrackError(f"{path} is no log; to score a file of tracks give the truth with --truth")
-            sequences = _from_logs(paths, camera, options.topics)
             warn_unused("it is about label files; logs have theirs inside", "ground_plane", "point", "fps")
-        outcome = score(sequences, options, talk.detail)
-        compared = {result.similarity for result in outcome.results}
+        compared = {result.similarity for result in scores.results}
         if "metres" not in compared:
             warn_unused("nothing is compared by distance on the ground", "gate_m")
         if "iou" not in compared:
             warn_unused("nothing is compared by overlap", "min_iou")
-        for words in outcome.notes:
-            talk.warn(words, "not-compared")
     with common.printed_to(output, force):
         if json:
-            common.print_json({"results": [result.to_json() for result in outcome.results]})
+            common.print_json({"results": scores.rows()})
         elif csv:
-            _print_csv(outcome)
+            _print_csv(scores)
         else:
-            print_results(outcome)
-    missed = [words for limit in limits for words in _misses(outcome, *limit)]
+            print_results(scores)
+    missed = scores.below(limits)
     for words in missed:
         say(words)
     if missed:
@@ -154,7 +149,9 @@ def _gates(text: str) -> tuple[float, ...]:
 
 
 def _limit(text: str) -> tuple[str, float]:
-    names = {name.lower(): name for name in ("MOTA", "IDF1", "IDP", "IDR", "HOTA", "DetA", "AssA", "LocA")}
+    from mcaptrack.api.scoring import LIMITS
+
+    names = {name.lower(): name for name in LIMITS}
     name, _, value = text.partition("=")
     try:
         return names[name.strip().lower()], float(value)
@@ -164,62 +161,19 @@ def _limit(text: str) -> tuple[str, float]:
         ) from None
 
 
-def _misses(outcome: EvaluationResult, name: str, least: float) -> list[str]:
-    rows = [result.to_json() for result in outcome.results]
-    final = [row for row in rows if row["sequence"] == "COMBINED"] or rows
-    return [
-        f"{row['sequence']} {row['tracks']} {row['similarity']} {row['gate']:g}: "
-        f"{name} {row[name]:.4f} is under {least:g}"
-        for row in final
-        if row[name] < least
-    ]
-
-
-def _from_logs(paths: Sequence[Path], camera: str | None, topics: tuple[str, ...]) -> list[EvaluationInput]:
-    from mcaptrack import log, pipeline
-    from mcaptrack.evaluation import sequence_of_log
-
-    sequences = []
-    for path in paths:
-        with log.read(path) as opened:
-            sequences.append(sequence_of_log(opened, pipeline.find_camera(opened, camera), topics))
-    return sequences
-
-
-def _from_files(
-    tracks: Sequence[Path], truths: Sequence[Path], given: dict[str, Any], talk: common.Talk
-) -> list[EvaluationInput]:
-    from mcaptrack.cli.ingest import parse_fps
-    from mcaptrack.evaluation import sequence_of_files
-    from mcaptrack.tables.compared import compare_files, pair_files
-
-    pairs, words = pair_files(tracks, truths)
-    if words:
-        talk.say(words)
-    sequences = []
-    for name, path, truth in pairs:
-        both = compare_files(
-            path, truth, parse_fps(given["fps"]), given["ground_plane"], given["point"], given["topics"]
-        )
-        for note in both.notes:
-            talk.say(note)
-        sequences.append(sequence_of_files(name, path, both.truth, both.tracks, len(pairs)))
-    return sequences
-
-
-def print_results(outcome: EvaluationResult) -> None:
+def print_results(scores: Scores) -> None:
     """The scores as a table on stdout, and the forecasts below it."""
     from rich.table import Table
 
     out = console()
     table = Table(box=None, pad_edge=False, header_style="bold")
-    several = len({result.sequence for result in outcome.results}) > 1
+    several = len({result.sequence for result in scores.results}) > 1
     for name in (*(("sequence",) if several else ()), "tracks", "by"):
         table.add_column(name, no_wrap=True)
     for name in _COLUMNS:
         table.add_column(name, justify="right", no_wrap=True)
     previous = None
-    for result in sorted(outcome.results, key=lambda r: (r.sequence == "COMBINED", r.sequence, r.similarity, r.gate)):
+    for result in sorted(scores.results, key=lambda r: (r.sequence == "COMBINED", r.sequence, r.similarity, r.gate)):
         row = result.to_json()
         by = f"IoU {result.gate:g}" if result.similarity == "iou" else f"{result.gate:g} m"
         if previous not in (None, (result.sequence, by)):
@@ -230,7 +184,7 @@ def print_results(outcome: EvaluationResult) -> None:
         table.add_row(*first, result.tracks, by, *numbers)
     out.print(table)
     forecasts: dict[tuple[str, str], dict[str, float | None]] = {}
-    for result in outcome.results:
+    for result in scores.results:
         if result.displacement is not None:
             forecasts.setdefault((result.sequence, result.tracks), result.displacement.summary())
     if forecasts:
@@ -247,10 +201,10 @@ def print_results(outcome: EvaluationResult) -> None:
         out.print(table)
 
 
-def _print_csv(outcome: EvaluationResult) -> None:
+def _print_csv(scores: Scores) -> None:
     import csv
 
-    rows = [{k: v for k, v in result.to_json().items() if k != "displacement"} for result in outcome.results]
+    rows = [{k: v for k, v in result.to_json().items() if k != "displacement"} for result in scores.results]
     rows = [{k: printable(v) if isinstance(v, str) else v for k, v in row.items()} for row in rows]
     writer = csv.DictWriter(sys.stdout, fieldnames=list(rows[0]), lineterminator="\n")
     writer.writeheader()

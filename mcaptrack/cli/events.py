@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
 
 from mcaptrack.cli import common
 from mcaptrack.cli.command import warn_unused
 from mcaptrack.cli.running import run_on_logs
-from mcaptrack.cli.stages import watched
+
+if TYPE_CHECKING:
+    from mcaptrack import RunResult
 
 
 @common.one_line
@@ -51,6 +54,11 @@ def events(
     """
     if similarity is not None:
         warn_unused(f"people and tracks are compared by {similarity}", "gate_m" if similarity == "iou" else "min_iou")
-    watch = watched(similarity, gate_m, min_iou, topics=tuple(topic or ()), again=True)
-    given = {"logs": logs, "camera": camera, "output": output, "sidecar": sidecar, "topic": None, "force": force}
-    run_on_logs(given | {"json": json, "quiet": quiet, "verbose": verbose}, lambda *_: [], watch)
+    given = {"logs": logs, "camera": camera, "output": output, "sidecar": sidecar, "force": force}
+
+    def run(path: Path, **where: Any) -> RunResult:
+        import mcaptrack
+
+        return mcaptrack.events(path, topic=topic, similarity=similarity, gate_m=gate_m, min_iou=min_iou, **where)
+
+    run_on_logs(given | {"json": json, "quiet": quiet, "verbose": verbose}, run, shows_events=True)

@@ -9,10 +9,10 @@ import typer
 
 from mcaptrack.cli import common
 from mcaptrack.cli.text import console, show
-from mcaptrack.errors import McaptrackError
 
 if TYPE_CHECKING:
-    from mcaptrack.log import CheckResult, Log
+    from mcaptrack import LogRecovery
+    from mcaptrack.log import CheckResult
 
 _SHOWN = 20
 
@@ -34,14 +34,15 @@ def check(
 
     Example: mcaptrack check log.mcap
     """
-    from mcaptrack import log
+    import mcaptrack
+    from mcaptrack.api.upkeep import files_of
 
-    paths = [part for path in common.expand(logs) for part in _parts(path)]
+    paths = [part for path in common.expand(logs) for part in files_of(path)]
     checked: list[CheckResult] = []
     with common.Talk(quiet, verbose).open() as talk:
-        for path in paths:
+        for path in dict.fromkeys(paths):
             with talk.attempt(path, paths):
-                checked.append(log.check(path, talk.progress))
+                checked += mcaptrack.check(path, progress=talk.progress).files[:1]
     with common.printed_to(output, force):
         if json:
             common.print_json({"results": [_checked_as_data(one) for one in checked]})
@@ -50,14 +51,6 @@ def check(
                 _print_checked(one, quiet)
     if not all(one.is_sound for one in checked):
         raise typer.Exit(common.REFUSED)
-
-
-def _parts(path: Path) -> list[Path]:
-    """A log, and its results if they stand beside it."""
-    from mcaptrack import log
-
-    beside = log.results_path(path)
-    return [path, beside] if beside != path and beside.exists() else [path]
 
 
 def _checked_as_data(checked: CheckResult) -> dict[str, object]:
@@ -109,22 +102,17 @@ def recover(
 
     Example: mcaptrack recover broken.mcap -o saved.mcap
     """
-    from mcaptrack import log
-    from mcaptrack.files import is_same_file, refuse_overwrite
+    import mcaptrack
 
     paths = common.expand(logs, each=True)
     common.only_one_output(paths, output)
-    reports = []
+    reports: list[LogRecovery] = []
     with common.Talk(quiet, verbose).open() as talk:
         for path in paths:
             with talk.attempt(path, paths):
-                target = output or path.with_suffix(".recovered.mcap")
-                if is_same_file(target, path):
-                    raise McaptrackError(f"{path} is both input and output; give another name with -o")
-                refuse_overwrite(target, force)
-                report = log.recover(path, target, talk.progress)
+                report = mcaptrack.recover(path, output, force=force, progress=talk.progress)
                 reports.append(report)
-                talk.say(f"{target}: {report.messages} messages in {report.chunks} chunks are saved")
+                talk.say(f"{report.output}: {report.messages} messages in {report.chunks} chunks are saved")
                 for words in report.lost if verbose else report.lost[:_SHOWN]:
                     talk.say(f"lost: {words}")
                 if len(report.lost) > _SHOWN and not verbose:
@@ -133,7 +121,13 @@ def recover(
                     talk.say("nothing was lost")
     if json:
         results = [
-            {"log": str(r.path), "output": str(r.output), "messages": r.messages, "chunks": r.chunks, "lost": r.lost}
+            {
+                "log": str(r.log),
+                "output": str(r.output),
+                "messages": r.messages,
+                "chunks": r.chunks,
+                "lost": list(r.lost),
+            }
             for r in reports
         ]
         common.print_json({"results": results})
@@ -168,62 +162,14 @@ def drop(
 
     Example: mcaptrack drop log.mcap /camera/video -o small.mcap
     """
-    from mcaptrack import log
-    from mcaptrack.files import is_same_file, refuse_overwrite
-    from mcaptrack.schema.provenance import Provenance
-    from mcaptrack.sources.ingest.sidecar import recording_of
+    import mcaptrack
 
-    if output is not None:
-        refuse_overwrite(output, force)
-        if is_same_file(output, path):
-            raise McaptrackError(f"{path} is both input and output; leave -o out to change it in place")
-    beside = log.results_path(path)
     with common.Talk(quiet, verbose).open() as talk:
-        with log.read(path) as opened:
-            dropped = _chosen(opened, topics)
-            holds = {part.path: [c for c in part.recorded if c.topic in dropped] for part in opened.parts}
-            messages = sum(channel.messages for gone in holds.values() for channel in gone)
-            before = sum(part.size for part in opened.parts)
-            recorded = {c.topic for c in holds[path] if Provenance.from_metadata(c.metadata) is None}
-            if recorded and output is None and not in_place and (recording := recording_of(opened)):
-                raise McaptrackError(
-                    f"{path} is {recording}, which ROS tools read; -o writes a copy without "
-                    f"{', '.join(sorted(recorded))}, --in-place changes it all the same"
-                )
-        targets = {path: output or path, beside: log.results_path(output) if output else beside}
-        if output is not None and beside in holds:
-            refuse_overwrite(targets[beside], force)
-        for part, gone in holds.items():
-            if gone or output is not None:
-                target = targets[part] if output else None
-                with log.read(part, sidecar=False) as opened, log.extend(opened, target, drop={c.topic for c in gone}):
-                    pass
-        after = sum(targets[part].stat().st_size for part in holds)
+        done = mcaptrack.drop(path, topics, output=output, in_place=in_place, force=force)
         talk.say(
-            f"{output or path}: {', '.join(sorted(dropped))} with {messages} messages left out; "
-            f"{before} bytes became {after}"
+            f"{done.log}: {', '.join(done.dropped)} with {done.messages} messages left out; "
+            f"{done.bytes_before} bytes became {done.bytes}"
         )
     if json:
-        result = {"log": str(output or path), "dropped": sorted(dropped), "messages": messages, "bytes": after}
+        result = {"log": str(done.log), "dropped": list(done.dropped), "messages": done.messages, "bytes": done.bytes}
         common.print_json({"results": [result]})
-
-
-def _chosen(opened: Log, patterns: list[str]) -> set[str]:
-    """The topics that fit any of the patterns, with what only tells of them.
-
-    Raises McaptrackError for a pattern that fits none.
-    """
-    from fnmatch import fnmatchcase
-
-    from mcaptrack.schema.provenance import Provenance
-
-    chosen: set[str] = set()
-    for pattern in patterns:
-        found = {topic for topic in opened.channels if topic == pattern or fnmatchcase(topic, pattern)}
-        if not found:
-            opened.channel(pattern)  # says what there is
-        chosen |= found
-    made = {topic: Provenance.from_metadata(channel.metadata) for topic, channel in opened.channels.items()}
-    for transform in ("events", "view"):  # in this order: events have views
-        chosen |= {topic for topic, how in made.items() if how and how.transform == transform and how.input in chosen}
-    return chosen

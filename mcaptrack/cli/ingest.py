@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
@@ -10,10 +9,10 @@ import typer
 
 from mcaptrack.cli import common
 from mcaptrack.cli.command import warn_unused
-from mcaptrack.errors import McaptrackError
+from mcaptrack.cli.flags import with_flags
 
 if TYPE_CHECKING:
-    from mcaptrack.sources.ingest import IngestOptions, IngestReport
+    from mcaptrack import IngestResult
 
 Inputs = Annotated[
     list[Path],
@@ -160,115 +159,63 @@ def ingest(
 
     Example: mcaptrack ingest video.mp4 --ground-plane homography.txt --truth gt.txt -o log.mcap
     """
-    from mcaptrack import log
-    from mcaptrack.files import is_same_file, refuse_overwrite
-    from mcaptrack.sources.ingest import IngestOptions
-    from mcaptrack.sources.ingest import ingest as make_log
-    from mcaptrack.sources.ingest.sidecar import SidecarChoice
+    import mcaptrack
 
-    if into is not None and output is not None:
-        raise McaptrackError("--into adds to a log in place; it does not go with -o")
-    if into is None and sidecar is not None:
-        raise McaptrackError("--sidecar and --in-place are about a log that is added to; name it with --into")
     sources = common.expand(inputs, each=True)
     common.only_one_output(sources, output or into)
-    given = {"detections": detections, "tracks": tracks, "truth": truth}
-    options = IngestOptions(
-        camera=camera,
-        fps=parse_fps(fps),
-        start_ns=_start_ns(start_time),
-        image_format=image_format,
-        quality=quality,
-        keyframe_interval_s=keyframe_interval_s,
-        ground_plane=ground_plane,
-        point=point,
-        labels={name: path for name, path in given.items() if path is not None},  # type: ignore[misc]
-        label_format=label_format,
-        first_frame=first_frame,
-        frames=frames,
-        role=role,
-    )
-    results, lost = [], False
+    given: dict[str, Any] = {
+        "camera": camera,
+        "fps": fps,
+        "start_time": start_time,
+        "image_format": image_format,
+        "quality": quality,
+        "keyframe_interval_s": keyframe_interval_s,
+        "ground_plane": ground_plane,
+        "point": point,
+        "detections": detections,
+        "tracks": tracks,
+        "truth": truth,
+        "label_format": label_format,
+        "first_frame": first_frame,
+        "frames": frames,
+        "role": role,
+        "into": into,
+        "sidecar": sidecar,
+        "force": force,
+    }
+    results: list[IngestResult] = []
     with common.Talk(quiet, verbose).open() as talk:
         for source in sources:
             with talk.attempt(source, sources):
-                target = into or output or Path((source.name if source.is_dir() else source.stem) + ".mcap")
-                if into is None:
-                    refuse_overwrite(target, force or is_same_file(target, source))
-                    report = make_log(source, target, options, progress=talk.progress)
-                else:
-                    place = SidecarChoice(sidecar)
-                    with log.read(into, sidecar=place) as opened:
-                        opened.lock()
-                        report = make_log(source, target, options, into=opened, force=force, progress=talk.progress)
-                        written_to = opened.parts[-1].path
-                    if place.why:
-                        report.said.append(place.words(written_to))
-                _warn_unused(report, options)
-                for words in report.said:
+                done = mcaptrack.ingest(source, output, progress=talk.progress, **given)
+                results.append(done)
+                _warn_unused(done, ground_plane)
+                for words in done.notes:
                     talk.say(words)
-                for words in report.notes:
+                for words in done.details:
                     talk.detail(words)
-                for words in report.lost:
-                    talk.warn(f"lost: {words}", "lost")
-                lost |= bool(report.lost)
-                talk.say(f"{target}: " + ", ".join(f"{topic} {count}" for topic, count in report.messages.items()))
-                results.append(
-                    {
-                        "log": str(target),
-                        "messages": report.messages,
-                        "notes": report.said + report.notes,
-                        "lost": report.lost,
-                    }
-                )
+                talk.say(f"{done.log}: " + ", ".join(f"{topic} {count}" for topic, count in done.messages.items()))
     if json:
-        common.print_json({"results": results})
-    if lost:
+        common.print_json({"results": [_as_data(done) for done in results]})
+    if any(done.lost for done in results):
         raise typer.Exit(common.LOST)
 
 
-def _warn_unused(report: IngestReport, options: IngestOptions) -> None:
+def _as_data(done: IngestResult) -> dict[str, Any]:
+    """What came of an input, for programs."""
+    return {
+        "log": str(done.log),
+        "messages": done.messages,
+        "notes": [with_flags(words) for words in (*done.notes, *done.details)],
+        "lost": [with_flags(words) for words in done.lost],
+    }
+
+
+def _warn_unused(done: IngestResult, ground_plane: Path | None) -> None:
     """Say which options are about what wasn't there."""
-    if not report.has_labels:
+    if not done.has_labels:
         warn_unused("there is no label file", "label_format")
-    if options.ground_plane is None:
+    if ground_plane is None:
         warn_unused("there is no ground plane", "point")
-    if not report.uses_camera:
+    if not done.uses_camera:
         warn_unused("the channels of a recording keep their names", "camera")
-
-
-def parse_fps(text: str | None) -> Fraction | None:
-    """Frames per second from "25", "29.97" or "30000/1001"."""
-    from mcaptrack.geometry import clocks
-
-    try:
-        return None if text is None else clocks.parse_fps(text)
-    except ValueError:
-        raise McaptrackError(
-            f"--fps needs a number like 25, 29.97 or 30000/1001, from one frame a day to 10000 a second, not {text!r}"
-        ) from None
-
-
-def _start_ns(text: str | None) -> int | None:
-    """ISO 8601, or seconds since 1970."""
-    if text is None:
-        return None
-    from datetime import UTC, datetime
-
-    from mcaptrack.geometry.clocks import LAST_NS, NS_PER_S, parse_ratio
-
-    try:
-        seconds = parse_ratio(text)
-    except ValueError:
-        try:
-            moment = datetime.fromisoformat(text)
-        except ValueError:
-            raise McaptrackError(
-                f"--start-time needs 2026-05-01T12:00:00Z or seconds since 1970, not {text!r}"
-            ) from None
-        moment = moment if moment.tzinfo else moment.replace(tzinfo=UTC)
-        passed = moment - datetime(1970, 1, 1, tzinfo=UTC)
-        seconds = Fraction(passed.days * 86400 + passed.seconds) + Fraction(passed.microseconds, 1_000_000)
-    if not 0 <= seconds < LAST_NS // NS_PER_S:
-        raise McaptrackError(f"--start-time has to lie between 1970 and 2262, not {text!r}")
-    return round(seconds * NS_PER_S)

@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
-from mcaptrack.errors import McaptrackError
-from mcaptrack.files import refuse_special
-
-#: A URL, also one that has become a path: "s3://bucket/a" is "s3:/bucket/a" then.
-_URL: Final = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):/+([^\s]+)")
+from mcaptrack.files import refuse_special, refuse_url
 
 
 def check_paths(values: Iterable[Any]) -> None:
@@ -21,11 +16,3 @@ def check_paths(values: Iterable[Any]) -> None:
             if isinstance(path, Path):
                 refuse_url(path)
                 refuse_special(path)
-
-
-def refuse_url(path: Path | str) -> None:
-    """Raise McaptrackError for a URL, with the slashes that it had."""
-    found = _URL.fullmatch(str(path))
-    if found and not Path(path).exists():
-        scheme, rest = found.groups()
-        raise McaptrackError(f"{scheme}://{rest} is a URL; only files are read and written: copy it here first")

@@ -11,9 +11,9 @@ import typer
 
 from mcaptrack.cli import common
 from mcaptrack.cli.command import warn_unused
-from mcaptrack.cli.inputs import refuse_url
 from mcaptrack.cli.text import console, printable, show
 from mcaptrack.errors import McaptrackError
+from mcaptrack.files import refuse_url
 
 if TYPE_CHECKING:
     from mcaptrack.tables.sql import Database
@@ -52,7 +52,7 @@ def query(
             "--format", panel=_QUERY, help="Format of the answer.", show_default="table, or what -o ends with"
         ),
     ] = None,
-    beside: Annotated[
+    files: Annotated[
         list[str] | None,
         common.option(
             "--with",
@@ -114,7 +114,7 @@ def query(
             raise McaptrackError(f"{output} is both input and output; give another name with -o")
     from mcaptrack.tables.sql import Database
 
-    with common.Talk(quiet, verbose).open() as talk, Database(paths, _named(beside or [])) as database:
+    with common.Talk(quiet, verbose).open() as talk, Database(paths, _named(files or [])) as database:
         if tables:
             with common.printed_to(output, force):
                 _print_tables(database, json)

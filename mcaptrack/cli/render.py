@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated, Any, Final
 
 from mcaptrack.cli import common
 from mcaptrack.cli.command import warn_unused
-from mcaptrack.errors import McaptrackError, command
 
 _PICTURE: Final = "Pictures"
 
@@ -88,30 +87,23 @@ def render(
 
     Example: mcaptrack render log.mcap -o walk.gif --width 480 --start-s 2 --end-s 8
     """
-    from mcaptrack import log, pipeline
-    from mcaptrack.files import refuse_overwrite
-    from mcaptrack.viewing import rendering
+    import mcaptrack
 
     paths = common.expand(logs)
     common.only_one_output(paths, output)
-    options = rendering.RenderOptions(width_px=width, max_fps=max_fps, start_s=start_s, end_s=end_s)
     if output is not None:
         warn_unused("the name that -o gives says what is written", "gif")
+    given: dict[str, Any] = {"topic": topic, "width": width, "max_fps": max_fps, "start_s": start_s, "end_s": end_s}
+    given |= {"gif": gif, "camera": camera, "force": force}
     results = []
     with common.Talk(quiet, verbose).open() as talk:
         for path in paths:
             with talk.attempt(path, paths):
-                target = output or path.with_suffix(".gif" if gif else ".mp4")
-                refuse_overwrite(target, force)
-                with log.read(path) as opened:
-                    prefix = pipeline.find_camera(opened, camera)
-                    pictures = pipeline.camera_at(opened, prefix).pictures
-                    if pictures is None:
-                        more = command("info", path)
-                        raise McaptrackError(f"{path} has no pictures of {prefix} to draw on; {more} shows what it has")
-                    views = pipeline.find_views(opened, prefix, topic or ())
-                    count = rendering.render(opened, pictures, views, target, options, talk.progress)
-                talk.say(f"{target}: {count} pictures with {', '.join(views) or 'nothing drawn'}")
-                results.append({"log": str(path), "output": str(target), "pictures": count, "views": views})
+                done = mcaptrack.render(path, output, progress=talk.progress, **given)
+                drawn = ", ".join(done.views) or "nothing drawn"
+                talk.say(f"{done.video}: {done.pictures} pictures with {drawn}")
+                results.append(
+                    {"log": str(path), "output": str(done.video), "pictures": done.pictures, "views": list(done.views)}
+                )
     if json:
         common.print_json({"results": results})

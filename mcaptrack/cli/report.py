@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Annotated
 
 from mcaptrack.cli import common
-from mcaptrack.errors import McaptrackError
 
 
 @common.one_line
@@ -35,27 +34,11 @@ def report(
 
     Example: mcaptrack report 'logs/*.mcap' -o report.html
     """
-    from mcaptrack import log
-    from mcaptrack.files import is_same_file, publish_bytes, refuse_overwrite
-    from mcaptrack.viewing.report import data, draw, gather, page
+    import mcaptrack
 
     paths = common.expand(logs)
-    if output is None and len(paths) > 1:
-        raise McaptrackError(f"{len(paths)} logs become one page; say which with -o")
-    target = output or paths[0].with_suffix(".report.html")
-    if any(is_same_file(path, target) for path in paths):
-        raise McaptrackError(f"{target} is a log; give the page another name with -o")
-    refuse_overwrite(target, force)
-    reports = []
     with common.Talk(quiet, verbose).open() as talk:
-        for done, path in enumerate(paths):
-            talk.progress("report", done, len(paths))
-            with log.read(path) as opened:
-                reports.append(gather(opened, camera, talk.detail))
-                draw(reports[-1], done, len(paths))
-        whole = page(reports).encode("utf-8")
-        publish_bytes(target, whole)
-        talk.progress("report", len(paths), len(paths))
-        talk.say(f"{target}: {len(paths)} log{'s' if len(paths) > 1 else ''}, {len(whole) / 1e6:.2f} MB")
+        done = mcaptrack.report(paths, output, camera=camera, force=force, progress=talk.progress)
+        talk.say(f"{done.page}: {len(paths)} log{'s' if len(paths) > 1 else ''}, {done.size / 1e6:.2f} MB")
     if json:
-        common.print_json(data(reports))
+        common.print_json(dict(done.data))

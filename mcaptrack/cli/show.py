@@ -7,12 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 from mcaptrack.cli import common
 from mcaptrack.cli.text import console, printable
-from mcaptrack.errors import McaptrackError
 
 if TYPE_CHECKING:
     from rich.tree import Tree
-
-    from mcaptrack.log import Log
 
 
 @common.one_line
@@ -31,64 +28,26 @@ def info(
 
     Example: mcaptrack info log.mcap
     """
-    from mcaptrack import log
+    import mcaptrack
 
     results = []
     paths = common.expand(logs)
     with common.Talk(quiet, verbose).open() as talk, common.printed_to(output, force):
         for path in paths:
-            with talk.attempt(path, paths), log.read(path) as opened:
+            with talk.attempt(path, paths):
+                data = mcaptrack.info(path).to_json()
                 if json:
-                    results.append(_as_data(opened))
+                    results.append(data)
                 else:
-                    _print(opened, verbose)
+                    _print(data, verbose)
         if json:
             common.print_json({"results": results})
 
 
-def _as_data(opened: Log) -> dict[str, Any]:
-    from mcaptrack.pipeline import is_stale
-    from mcaptrack.schema.provenance import Provenance
-
-    channels = []
-    every = [(channel, part) for part in opened.parts for channel in part.recorded]
-    for channel, part in sorted(every, key=lambda found: (found[0].topic, found[1] is opened, found[0].id)):
-        made = Provenance.from_metadata(channel.metadata)
-        replaced = opened.part(channel.topic) is not part
-        channels.append(
-            {
-                "topic": channel.topic,
-                "id": channel.id,
-                "part": "log" if part is opened else "results",
-                "replaced": replaced,
-                "schema": channel.schema_name,
-                "encoding": channel.message_encoding,
-                "messages": channel.messages,
-                "transform": made.transform if made else None,
-                "input": made.input or None if made else None,
-                "version": made.version if made else None,
-                "references": dict(made.references) if made else None,
-                "parameters": dict(made.parameters) if made else None,
-                "stale": not replaced and is_stale(opened, channel.topic),
-            }
-        )
-    return {
-        "log": str(opened.path),
-        "bytes": opened.size,
-        "start_ns": opened.start_ns,
-        "end_ns": opened.end_ns,
-        "results": str(opened.results.path) if opened.results else None,
-        "messages": sum(sum(part.index.counts.values()) for part in opened.parts),
-        "attachments": [listed.name for part in opened.parts for listed in part.index.attachments],
-        "channels": channels,
-    }
-
-
-def _print(opened: Log, verbose: bool) -> None:
+def _print(data: dict[str, Any], verbose: bool) -> None:
     from rich.table import Table
     from rich.text import Text
 
-    data = _as_data(opened)
     out = console()
     seconds = (data["end_ns"] - data["start_ns"]) / 1e9
     name = Text(printable(data["log"]), "bold")
@@ -191,36 +150,22 @@ def export(
 
     Example: mcaptrack export robot.mcap --topic /imu --format csv
     """
-    from mcaptrack import log
-    from mcaptrack.files import follow_links
-    from mcaptrack.tables.export import default_folder, recording_name
-    from mcaptrack.tables.export import export as write_tables
+    import mcaptrack
+    from mcaptrack.api.outputs import refuse_same_tables
 
     results = []
     paths = common.expand(logs)
-    if output is not None and output.exists() and not output.is_dir():
-        raise McaptrackError(f"{output} is a file; tables go to a folder")
-    if blobs and not topic:
-        raise McaptrackError("--blobs is about the fields of a channel; say of which with --topic")
-    folders: dict[tuple[Path, str], Path] = {}
-    for path in paths:
-        other = folders.setdefault((output or default_folder(path), recording_name(path)), path)
-        if follow_links(other) != follow_links(path):
-            raise McaptrackError(
-                f"{other} and {path} would both be {recording_name(path)} in the tables; export them to two folders"
-            )
+    refuse_same_tables(paths, output)
+    given: dict[str, Any] = {"form": form, "topic": topic, "blobs": blobs, "force": force}
     with common.Talk(quiet, verbose).open() as talk:
         for path in paths:
-            folder = output or default_folder(path)
             with talk.attempt(path, paths):
-                with log.read(path) as opened:
-                    done = write_tables(
-                        opened, folder, talk.progress, form=form, topics=topic or (), blobs=blobs, force=force
-                    )
-                for words in done.notes:
-                    talk.warn(words, "left-out")
-                talk.say(f"{folder}: " + ", ".join(f"{name} {rows}" for name, rows in done.rows.items()))
-                talk.detail(f"{folder}: written {', '.join(done.written) or 'nothing, all tables are up to date'}")
-                results.append({"log": str(path), "folder": str(folder), "rows": done.rows, "written": done.written})
+                done = mcaptrack.export(path, output, progress=talk.progress, **given)
+                talk.say(f"{done.folder}: " + ", ".join(f"{name} {rows}" for name, rows in done.rows.items()))
+                written = ", ".join(done.written) or "nothing, all tables are up to date"
+                talk.detail(f"{done.folder}: written {written}")
+                results.append(
+                    {"log": str(path), "folder": str(done.folder), "rows": done.rows, "written": list(done.written)}
+                )
     if json:
         common.print_json({"results": results})

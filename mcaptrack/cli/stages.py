@@ -6,6 +6,7 @@ import inspect
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import MISSING, Field, fields, replace
+from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, get_type_hints
 
@@ -20,8 +21,7 @@ from mcaptrack.transforms import STAGES, Stage, Transform
 from mcaptrack.transforms.protocol import choices, member_type
 
 if TYPE_CHECKING:
-    from mcaptrack.log import Log
-    from mcaptrack.pipeline import Job, Watch
+    from mcaptrack import RunResult
 
 #: An example for the help of each command.
 _EXAMPLES: Final = {
@@ -164,16 +164,14 @@ def _stage_command(stage: Stage, plugins: Mapping[str, type[Transform]] = Mappin
     def command(**given: Any) -> None:
         wanted = {option: given[option] for option in there if given[option] is not None}
         transform = _transform(stage, given, wanted, there)
-        keep = stage.modes[given["mode"]] if stage.modes else None
 
-        def plan(opened: Log, prefix: str, say: Callable[[str], None]) -> list[Job]:
-            from mcaptrack.pipeline import plan_stage
+        def run(path: Path, **where: Any) -> RunResult:
+            from mcaptrack.api.running import run_stage
 
-            return plan_stage(
-                opened, prefix, stage.name, transform, given["topic"], given["to"], keep, say, _configured()
-            )
+            where |= {"topic": given["topic"], "to": given["to"], "stages": _configured(), "mode": given.get("mode")}
+            return run_stage(stage.name, transform, path, **where)
 
-        run_on_logs(given, plan)
+        run_on_logs(given, run)
 
     command.__name__ = stage.name
     command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
@@ -251,30 +249,25 @@ def run_all(
 
     Example: mcaptrack run log.mcap
     """
-    given = {"logs": logs, "camera": camera, "output": output, "sidecar": sidecar, "topic": topic, "force": force}
-    settings = settings_of("events")
-    given |= {"json": json, "quiet": quiet, "verbose": verbose, "tables": tables}
-    gates = (settings.get("similarity"), settings.get("gate_m"), settings.get("min_iou"))
-
+    given = {"logs": logs, "camera": camera, "output": output, "sidecar": sidecar, "force": force}
+    given |= {"json": json, "quiet": quiet, "verbose": verbose}
     named = {"detector": detector, "tracker": tracker, "retracker": retracker, "predictor": predictor}
     chosen = {kind: name for kind, name in named.items() if name}
 
-    def plan(opened: Log, prefix: str, say: Callable[[str], None]) -> list[Job]:
-        from mcaptrack.pipeline import plan_all
+    def run(path: Path, **where: Any) -> RunResult:
+        import mcaptrack
+        from mcaptrack.evaluation.events import EventOptions
 
-        return plan_all(opened, prefix, say, topic, _configured(chosen), force, chosen)
+        settings, stages = settings_of("events"), _configured(chosen)
+        for stage in STAGES.values():
+            if stage.option in chosen:
+                where[stage.option] = stages.pop(stage.name)
+        watched = EventOptions(*(settings.get(name) for name in ("similarity", "gate_m", "min_iou")))
+        return mcaptrack.run(
+            path, topic=topic, events=watched if events else False, tables=tables, stages=stages, **where
+        )
 
-    run_on_logs(given, plan, watched(*gates, anew=force) if events else None, is_run=True)
-
-
-def watched(
-    similarity: common.SimilarityName | None, gate_m: float | None, min_iou: float | None, **chosen: Any
-) -> Watch:
-    """What `mcaptrack events` and `run` are to look for."""
-    from mcaptrack.evaluation.events import EventOptions
-    from mcaptrack.pipeline import Watch
-
-    return Watch(EventOptions(similarity, gate_m, min_iou), **chosen)
+    run_on_logs(given, run)
 
 
 def _configured(chosen: Mapping[str, str] = MappingProxyType({})) -> dict[str, Transform]:

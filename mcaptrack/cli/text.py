@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any, Final, NoReturn
 
 import typer
 
+from mcaptrack.cli.flags import with_flags
+
 if TYPE_CHECKING:
     from rich.console import Console
 
@@ -35,8 +37,8 @@ def show(*lines: str) -> None:
 
 
 def say(line: str) -> None:
-    """A line on stderr: what is done, and what is odd about it."""
-    print(printable(line), file=sys.stderr)
+    """Print a line to stderr: what is done, and what is odd about it."""
+    print(printable(with_flags(line)), file=sys.stderr)
 
 
 def refuse_usage(line: str) -> NoReturn:

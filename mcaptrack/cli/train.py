@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 import typer
 
 from mcaptrack.cli import common
-from mcaptrack.cli.inputs import refuse_url
 from mcaptrack.cli.text import console, show
 from mcaptrack.errors import McaptrackError, command
+from mcaptrack.files import refuse_url
 
 if TYPE_CHECKING:
     from mcaptrack.training.loop import Trained
@@ -255,7 +255,7 @@ def train(
 
 
 def _options(fps: str | None, ground_plane: Path | None, point: Literal["center", "foot"], topic: str | None) -> Any:
-    from mcaptrack.cli.ingest import parse_fps
+    from mcaptrack.api.ingesting import parse_fps
     from mcaptrack.training.sources import SourceOptions
 
     return SourceOptions(fps=parse_fps(fps), ground_plane=ground_plane, point=point, topic=topic)

@@ -193,7 +193,7 @@ def _ranges(kind: type[Transform], wanted: Sequence[str]) -> dict[str, Range]:
 def _tasks_of_files(
     paths: Sequence[Path], truths: Sequence[Path], stage: str, given: dict[str, Any], talk: common.Talk
 ) -> list[Task]:
-    from mcaptrack.cli.ingest import parse_fps
+    from mcaptrack.api.ingesting import parse_fps
     from mcaptrack.evaluation.tuning import Task
     from mcaptrack.tables.compared import detections_and_truth, pair_files
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from mcaptrack import log
-from mcaptrack.errors import McaptrackError, command
+from mcaptrack.errors import McaptrackError, call
 from mcaptrack.evaluation import metrics
 from mcaptrack.evaluation.aligned import (
     IOU_THRESHOLD,
@@ -124,7 +124,7 @@ def ground_truth_of_log(opened: log.Log, prefix: str) -> list[Frame]:
     """The frames of the ground truth of a camera. Raises McaptrackError if there is none."""
     topic = camera_at(opened, prefix).truth
     if topic not in opened.channels:
-        add = command("ingest", "LABELS", "--as", "truth", "--into", opened.path)
+        add = call("ingest", "LABELS", role="truth", into=opened.path)
         raise McaptrackError(f"{opened.path} has no channel {topic}; add one with {add}")
     return opened.frames(topic, TRACKS)
 
@@ -135,7 +135,7 @@ def sequence_of_log(opened: log.Log, prefix: str, topics: Sequence[str]) -> Eval
     usual = [f"{prefix}/{name}" for name in SCORED]
     chosen = list(topics) or [topic for topic in usual if topic in opened.channels]
     if not chosen:
-        raise McaptrackError(f"{opened.path} has no tracks to score; {command('run', opened.path)} makes them")
+        raise McaptrackError(f"{opened.path} has no tracks to score; {call('run', opened.path)} makes them")
     forecasts_of = {f"{prefix}/{tracks}": f"{prefix}/{name}" for name, tracks in FORECAST_INPUTS.items()}
     candidates = []
     for topic in chosen:

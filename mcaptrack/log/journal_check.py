@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import NamedTuple
 
-from mcaptrack.errors import McaptrackError, command
+from mcaptrack.errors import McaptrackError, call
 from mcaptrack.files import follow_links
 from mcaptrack.log.byte_source import OpenFile
 from mcaptrack.log.journal import Journal, UnusableJournal, find, journal_of, load_old_content, remove_hint
@@ -57,4 +57,4 @@ def recover_hint(path: Path) -> str:
 
 def recover_command(path: Path) -> str:
     """The command that recovers a damaged log."""
-    return command("recover", path)
+    return call("recover", path)

@@ -11,7 +11,7 @@ from typing import NamedTuple, Self, TypeVar
 
 import numpy as np
 
-from mcaptrack.errors import McaptrackError, command
+from mcaptrack.errors import McaptrackError, call
 from mcaptrack.files import follow_links
 from mcaptrack.geometry.arrays import Ints
 from mcaptrack.log import in_place, records
@@ -101,7 +101,7 @@ class Log:
             except OSError as error:
                 raise McaptrackError(
                     f"{self.path} can't be written to: {error.strerror}; "
-                    "write to another file with -o, or beside it with --sidecar"
+                    "write to another file with `output=`, or beside it with `sidecar=True`"
                 ) from None
             try:
                 in_place.lock(self.real_path, handle)
@@ -147,7 +147,7 @@ class Log:
         """The channel of a topic. Raises McaptrackError, with the topics that exist, if there is none."""
         if topic not in self.channels:
             there = [name for name in sorted(self.channels) if "/view/" not in name]
-            more = command("info", self.path)
+            more = call("info", self.path)
             raise McaptrackError(
                 f"{self.path} has no channel {topic}; it has {', '.join(there) or 'none'}. {more} shows more"
             )

@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 from typing import Final
 
-from mcaptrack.errors import McaptrackError, command
+from mcaptrack.errors import McaptrackError, call
 from mcaptrack.log.paths import RESULTS_SUFFIX
 
 _BEGIN: Final = {b"#ROSBAG V": "a ROS 1 bag", b"SQLite format 3\0": "a database, as rosbag2 writes them"}
@@ -26,10 +26,9 @@ def refuse_non_mcap(path: Path) -> None:
     except OSError:
         return
     if what:
-        other_name = (
-            ("-o", "OTHER.mcap") if path.suffix == ".mcap" else ()
-        )  # the default output would have the same name
-        make = command("ingest", path, *other_name)
+        # the default output would have the same name
+        other_name = {"output": "OTHER.mcap"} if path.suffix == ".mcap" else {}
+        make = call("ingest", path, **other_name)
         raise McaptrackError(f"{path} is {what}, not an MCAP file; {make} makes a log of it")
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Final, TypeVar
 
 from mcaptrack import notices
-from mcaptrack.errors import DamagedError, McaptrackError, command
+from mcaptrack.errors import DamagedError, McaptrackError, call
 from mcaptrack.log import records
 from mcaptrack.log.byte_source import ByteSource, OpenFile, Signature
 from mcaptrack.log.index import Index, read_index
@@ -98,7 +98,7 @@ class Snapshot:
             raise McaptrackError(
                 f"{self.path}: {topic} has {late.count} messages later than the year 2262, the first at {late.t_ns} "
                 "ns; they are kept as they are, but nothing is computed with such times "
-                f"({command('drop', self.path, topic, '-o', 'OTHER.mcap')} leaves them out)"
+                f"({call('drop', self.path, topic, output='OTHER.mcap')} leaves them out)"
             ) from None
 
     # The file

@@ -10,7 +10,7 @@ from dataclasses import is_dataclass
 from typing import NamedTuple
 
 from mcaptrack import log
-from mcaptrack.errors import McaptrackError, command
+from mcaptrack.errors import McaptrackError, call
 from mcaptrack.foxglove import views
 from mcaptrack.schema import DETECTIONS, VIDEO, Schema
 from mcaptrack.schema.provenance import INGEST, VIEW, Provenance
@@ -74,14 +74,14 @@ def fits(channel: log.Channel, reads: Schema) -> tuple[str, bool]:
 def _lacks(opened: log.Log, prefix: str, job: Job) -> str:
     """What is missing for a job, what there is, and what to do."""
     there = [topic for topic in sorted(opened.channels) if "/view/" not in topic]
-    has, hint = f"it has {', '.join(there) or 'none'}", f"{command('info', opened.path)} shows more"
+    has, hint = f"it has {', '.join(there) or 'none'}", f"{call('info', opened.path)} shows more"
     if job.transform.reads is VIDEO and job.source == f"{prefix}/{STAGES[job.stage].reads}":
         pictures = [topic for topic in there if foreign.holds_pictures(opened.channels[topic])]
         if pictures:
-            has, hint = f"it has pictures in {', '.join(pictures)}", "choose one with --topic"
+            has, hint = f"it has pictures in {', '.join(pictures)}", "choose one with `topic=`"
         else:
-            add = command("ingest", "VIDEO", "--into", opened.path)
-            hint = f"add pictures with {add}, or name what to begin with by --topic"
+            add = call("ingest", "VIDEO", into=opened.path)
+            hint = f"add pictures with {add}, or name what to begin with by `topic=`"
     return f"{opened.path} has no channel {job.source} for {job.stage}; {has}. {hint}"
 
 
@@ -90,12 +90,12 @@ def _check_outputs(opened: log.Log, prefix: str, job: Job) -> None:
     usual = USUAL.get(job.target.removeprefix(prefix + "/")) if job.target.startswith(prefix + "/") else None
     if usual not in (None, job.stage):
         by = f"what {usual} makes" if usual else "what is ingested"
-        raise McaptrackError(f"{opened.path}: {job.target} is the name of {by}; give {job.stage} another --to")
+        raise McaptrackError(f"{opened.path}: {job.target} is the name of {by}; give {job.stage} another `to=`")
     for above in chain_of(opened, job.source):
         if above in job.kept():
             raise McaptrackError(
                 f"{opened.path}: {job.source} was itself made from {above}, which {job.stage} would replace; write to "
-                "another channel with --to"
+                "another channel with `to=`"
             )
     for topic in sorted(job.kept()):
         maker = {topic: job.stage} | {topic + suffix: VIEW for suffix in views.SUFFIXES}
@@ -103,7 +103,7 @@ def _check_outputs(opened: log.Log, prefix: str, job: Job) -> None:
             if not may_replace(opened, name, transform):
                 raise McaptrackError(
                     f"{opened.path}: {job.stage} would replace {name}, which {how_it_came(opened, name)}; "
-                    "write to another channel with --to"
+                    "write to another channel with `to=`"
                 )
 
 

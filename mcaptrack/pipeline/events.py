@@ -17,7 +17,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from mcaptrack import foxglove, log
-from mcaptrack.errors import McaptrackError, command
+from mcaptrack.errors import McaptrackError, call
 from mcaptrack.evaluation.event_text import SUFFIX, log_messages
 from mcaptrack.evaluation.events import EventOptions, find_events
 from mcaptrack.evaluation.forecasts import FORECAST_INPUTS, find_forecast_errors
@@ -76,7 +76,7 @@ def make_events(opened: log.Log, prefix: str, made: Mapping[str, Made], watch: W
     out: dict[str, Made] = {}
     topics = watch.topics or _watched(opened, prefix, made)
     if watch.again and not topics:
-        raise McaptrackError(f"{opened.path} has no tracks of {prefix}; {command('run', opened.path)} makes them")
+        raise McaptrackError(f"{opened.path} has no tracks of {prefix}; {call('run', opened.path)} makes them")
 
     @cache
     def truth() -> _Truth:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Final
 
 from mcaptrack import log
-from mcaptrack.errors import command
+from mcaptrack.errors import call
 from mcaptrack.geometry.plane import Planes, is_assumed
 from mcaptrack.notices import known_code, warn
 from mcaptrack.schema import VIDEO, Frame
@@ -81,7 +81,7 @@ def warn_of_what_stands(
             warn(message, known_code(code))
     if is_assumed(planes) and stages & _IN_METRES:
         metres = 1 / planes[0][1].homography[0]
-        give = command("ingest", "INPUT", "--ground-plane", "HOMOGRAPHY")
+        give = call("ingest", "INPUT", ground_plane="HOMOGRAPHY")
         warn(
             f"no ground plane is known: taking {metres:.3g} px for a metre, since people are 1.7 m high; distances, "
             f"speeds and re-tracking go by it. Give one with {give}",
@@ -92,6 +92,6 @@ def warn_of_what_stands(
     ):
         warn(
             "tracks were not re-tracked but passed on: without a ground plane that needs a camera that looks down, and "
-            f"this one looks along the ground. To insist: {command('retrack', opened.path, '--side-view')}",
+            f"this one looks along the ground. To insist: {call('retrack', opened.path, side_view=True)}",
             "held-back",
         )

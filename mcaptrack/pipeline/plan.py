@@ -11,7 +11,7 @@ from dataclasses import fields
 from typing import Final
 
 from mcaptrack import log
-from mcaptrack.errors import McaptrackError, command
+from mcaptrack.errors import McaptrackError, call
 from mcaptrack.notices import warn
 from mcaptrack.pipeline.checks import Job, check_inputs, fits, how_it_came
 from mcaptrack.pipeline.planes import planes_to_json, read_planes
@@ -132,7 +132,7 @@ class _Planner:
         if reads is VIDEO and camera.pictures:
             self._said.append(f"{usual} is missing: taking the pictures of {camera.pictures}")
             if camera.boxes:
-                self._said.append(f"boxes that others detected are in {camera.boxes}; --topic takes them instead")
+                self._said.append(f"boxes that others detected are in {camera.boxes}; `topic=` takes them instead")
             return camera.pictures
         if reads is DETECTIONS and camera.boxes and not camera.pictures:
             self._said.append(f"{usual} is missing: taking the boxes of {camera.boxes}")
@@ -234,7 +234,7 @@ class _Planner:
         if main in self._differing or not differing:
             return
         self._differing.add(main)
-        force = command("run", self._opened.path, "--force")
+        force = call("run", self._opened.path, force=True)
         warn(f"{main} was made with other settings than now ({differing}); {force} takes these", "other-settings")
 
     def _add(self, job: Job) -> None:
@@ -243,10 +243,10 @@ class _Planner:
 
     def _not_made(self, stage: str, topic: str) -> str:
         source = self._sources[stage]
-        other = command(stage, self._opened.path, "--topic", source, "--to", f"{topic}_again")
+        other = call(stage, self._opened.path, topic=source, to=f"{topic}_again")
         return (
-            f"{self._opened.path}: {topic} is there and {how_it_came(self._opened, topic)}; leave --topic out to go on "
-            f"from it, or run {other}"
+            f"{self._opened.path}: {topic} is there and {how_it_came(self._opened, topic)}; leave `topic=` out to go "
+            f"on from it, or run {other}"
         )
 
 

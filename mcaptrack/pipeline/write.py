@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack import foxglove, log
-from mcaptrack.errors import McaptrackError, command
+from mcaptrack.errors import McaptrackError, call
 from mcaptrack.foxglove import views
 from mcaptrack.foxglove.layouts import Eye
 from mcaptrack.foxglove.views import layouts
@@ -315,7 +315,7 @@ def find_views(opened: log.Log, prefix: str, topics: Sequence[str] = ()) -> list
     }
     found = [f"{prefix}/{name}{views.SUFFIX}" for name in layouts.best_channels(there)]
     if not found:
-        raise McaptrackError(f"{opened.path} has no views of {prefix} yet; {command('run', opened.path)} makes them")
+        raise McaptrackError(f"{opened.path} has no views of {prefix} yet; {call('run', opened.path)} makes them")
     return found
 
 

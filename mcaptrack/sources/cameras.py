@@ -64,7 +64,7 @@ def find_camera(opened: log.Log, name: str | None = None, topic: str | None = No
         prefix = _of_topic(opened, topic)
         if name and "/" + name.strip("/") not in (prefix, *camera_at(opened, prefix).names):
             raise McaptrackError(
-                f"{opened.path}: {topic} belongs to the camera {prefix[1:]}, not to {name}; leave --camera out"
+                f"{opened.path}: {topic} belongs to the camera {prefix[1:]}, not to {name}; leave `camera=` out"
             )
         return prefix
     if name:
@@ -80,8 +80,8 @@ def find_camera(opened: log.Log, name: str | None = None, topic: str | None = No
     names = ", ".join(camera.prefix for camera in chosen)
     usual = [camera.prefix for camera in chosen if f"/{DEFAULT_CAMERA}" in camera.names]
     if not usual:
-        raise McaptrackError(f"{opened.path} has several cameras, {names}; choose one with --camera")
-    warn(f"several cameras, {names}: taking {usual[0]}; --camera chooses another", "chosen-camera")
+        raise McaptrackError(f"{opened.path} has several cameras, {names}; choose one with `camera=`")
+    warn(f"several cameras, {names}: taking {usual[0]}; `camera=` chooses another", "chosen-camera")
     return usual[0]
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack import tables
-from mcaptrack.errors import McaptrackError, command
+from mcaptrack.errors import McaptrackError, call
 from mcaptrack.geometry.arrays import Bools, Floats
 from mcaptrack.geometry.assignment import solve
 from mcaptrack.geometry.boxes import iou
@@ -59,9 +59,8 @@ def pair_files(tracks: Sequence[Path], ground_truths: Sequence[Path]) -> tuple[l
     """
     for path in tracks:
         if is_mcap(path):
-            add = command(
-                "ingest", ground_truths[0] if len(ground_truths) == 1 else "LABELS", "--as", "truth", "--into", path
-            )
+            labels = ground_truths[0] if len(ground_truths) == 1 else "LABELS"
+            add = call("ingest", labels, role="truth", into=path)
             raise McaptrackError(
                 f"{path} is a log, not a file of labels; logs hold their own ground truth: add it with {add}"
             )
@@ -179,7 +178,7 @@ def _read_parquet(path: Path, role: Role, topics: Sequence[str]) -> Labels:
     if len(wanted) != 1:
         raise McaptrackError(
             f"{path} holds {', '.join(there) or 'no rows'}; "
-            + ("choose one with --topic" if wanted else f"none of them is {role}")
+            + ("choose one with `topic=`" if wanted else f"none of them is {role}")
         )
     mine = table["topic"] == wanted[0]
     frame, who = table["frame"][mine], table["track_id"][mine]

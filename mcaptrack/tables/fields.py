@@ -151,7 +151,7 @@ _SUMMARY: Final = Table(
 _METRICS: Final = Table(
     "metrics",
     "One row a channel of tracks, similarity and gate: its scores against the ground truth of its camera, the numbers "
-    "of evaluate --json. No rows where the log has no ground truth.",
+    "of evaluate. No rows where the log has no ground truth.",
     ("topic", "similarity", "gate"),
     ("topic", "similarity", "gate"),
     (

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, Final, Protocol, Self
 
 from mcaptrack import log, tables
-from mcaptrack.errors import McaptrackError, command
+from mcaptrack.errors import McaptrackError, call
 from mcaptrack.files import follow_links
 from mcaptrack.log.paths import results_path
 from mcaptrack.tables import TABLES
@@ -174,7 +174,7 @@ class Database:
         """The answer of the last statement that gives one, Arrow or None."""
         if re.match(r"\s*show\s+(all\s+)?tables\b", query, re.IGNORECASE):
             raise McaptrackError(
-                f"tables come in when a query names them; {command('query', 'LOG', '--tables')} lists them"
+                f"tables come in when a query names them; {call('query', 'LOG', tables=True)} lists them"
             )
         statements = self._connection.extract_statements(query)
         _refuse_writing([statement.type.name for statement in statements])
@@ -290,7 +290,7 @@ class Database:
         line = re.search(r"^LINE (\d+):", words, re.M)
         words = " ".join(re.split(r"^LINE \d+:|\n\s*Candidate functions:", words, maxsplit=1, flags=re.M)[0].split())
         if "file system operations are disabled" in error or "is disabled through configuration" in error:
-            return f"queries only read what they are given ({words}); --with NAME=FILE gives a file"
+            return f"queries only read what they are given ({words}); `files=` gives a file"
         if re.search(r'Referenced column "[^"]*[/ ][^"]*" not found', words):
             words += " (text stands in 'single quotes', names in \"double\" ones)"
         if "TIMESTAMPTZ_NS" in words:
@@ -337,7 +337,7 @@ def _refuse_writing(kinds: Sequence[str]) -> None:
     for kind in kinds:
         if kind not in _ASKING:
             raise McaptrackError(
-                f"queries only read: {kind} is refused; -o FILE writes an answer, --with NAME=FILE gives a file"
+                f"queries only read: {kind} is refused; `output=` writes an answer, `files=` gives a file"
             )
 
 

@@ -239,7 +239,7 @@ class _Run:
                     loss = (loss + more) / 2 + recipe.consistency_weight * apart
                 total += loss.item() * len(at)
             if not np.isfinite(total):
-                raise McaptrackError(f"the loss is {total} in epoch {self.state.epoch + 1}; try a lower --rate")
+                raise McaptrackError(f"the loss is {total} in epoch {self.state.epoch + 1}; try a lower `rate=`")
             self.optimiser.zero_grad()
             loss.backward()
             if recipe.loss == "likelihood":
@@ -324,7 +324,7 @@ class _Run:
         stored = load(self._folder / _STATE)
         if stored.card.get("training") != self._fingerprint():
             raise McaptrackError(
-                f"{stored.path} is of a training with another recipe or other data; leave --resume out"
+                f"{stored.path} is of a training with another recipe or other data; leave `resume=True` out"
             )
         torch = self._torch
         self.state, self.rows = _State(**json.loads(stored.card["state"])), json.loads(stored.card["rows"])

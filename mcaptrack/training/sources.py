@@ -14,7 +14,7 @@ from typing import Final, Literal
 import numpy as np
 
 from mcaptrack import log, pipeline, tables
-from mcaptrack.errors import McaptrackError, command
+from mcaptrack.errors import McaptrackError, call
 from mcaptrack.geometry.arrays import Floats
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.plane import Planes
@@ -89,12 +89,12 @@ def _from_labels(path: Path, options: SourceOptions, step_s: float) -> list[Scen
     if fps is None and labels.format == "sdd":
         fps = _SDD_FPS
     if fps is None and labels.format == "mot":
-        raise McaptrackError(f"{path}: how many frames a second? Say it with --fps")
+        raise McaptrackError(f"{path}: how many frames a second? Say it with `fps=`")
     if fps is None:  # annotated at the rate of prediction
         fps = Fraction(labels.step / step_s).limit_denominator(1000)
     plane = options.ground_plane
     if labels.xy_m is None and plane is None:
-        raise McaptrackError(f"{path} is in pixels; give its homography with --ground-plane")
+        raise McaptrackError(f"{path} is in pixels; give its homography with `ground_plane=`")
     frames = label_frames({"truth": path}, fps, plane, options.point)["truth"]
     first = next((number for number, frame in enumerate(frames) if len(frame.rows)), 0)
     return [_scene(path.stem, frames[first:], step_s, ())]  # windows begin with the first label
@@ -106,7 +106,7 @@ def _from_log(path: Path, options: SourceOptions, step_s: float) -> list[Scene]:
         topics = [options.topic] if options.topic else [f"{prefix}/{name}" for name in _BEST]
         found = [topic for topic in topics if topic in opened.channels and opened.channels[topic].messages]
         if not found:
-            raise McaptrackError(f"{path} has none of {', '.join(topics)}; {command('run', path)} makes tracks")
+            raise McaptrackError(f"{path} has none of {', '.join(topics)}; {call('run', path)} makes tracks")
         if opened.channels[found[0]].schema_name != TRACKS.name:
             raise McaptrackError(f"{path}: {found[0]} holds {opened.channels[found[0]].schema_name}, not {TRACKS.name}")
         planes = pipeline.read_planes(opened, prefix) or ()

@@ -59,10 +59,10 @@ def ingest(
         raise McaptrackError(f"{source} does not exist")
     refuse_special(source)
     if into is None and is_same_file(output, source):
-        raise McaptrackError(f"{source} is both input and output; give another name with -o")
+        raise McaptrackError(f"{source} is both input and output; give another name with `output=`")
     with notices.collected() as warned, _job(source, options, progress, into) as job:
         if options.first_frame is not None and not job.labels:
-            raise McaptrackError(f"{source}: --first-frame is about label files, and none is given")
+            raise McaptrackError(f"{source}: `first_frame=` is about label files, and none is given")
         job.tell()
         with job.opened(output, into, force) as writer:
             job.write(writer, has_clock=bool(into and into.metadata(CLOCK)))

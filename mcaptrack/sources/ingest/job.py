@@ -73,9 +73,9 @@ class IngestOptions:
     def for_videos(self) -> str:
         """The first option given that is about the pictures of videos; "" if there is none."""
         given = {
-            "--image-format": self.image_format != "auto",
-            "--quality": self.quality is not None,
-            "--keyframe-interval-s": self.keyframe_interval_s is not None,
+            "`image_format=`": self.image_format != "auto",
+            "`quality=`": self.quality is not None,
+            "`keyframe_interval_s=`": self.keyframe_interval_s is not None,
         }
         return next((name for name, is_given in given.items() if is_given), "")
 
@@ -136,7 +136,7 @@ class Job:
         """Say what of the labels is left out or taken for something."""
         firsts = {labels.first_frame: f"frame {labels.first_frame} of {path}" for path, labels in self.labels.values()}
         if len(firsts) > 1:
-            warn(f"{' and '.join(firsts.values())} are taken as one picture; --first-frame says otherwise", "clock")
+            warn(f"{' and '.join(firsts.values())} are taken as one picture; `first_frame=` says otherwise", "clock")
         for role, (path, labels) in self.labels.items():
             if labels.left_out:
                 warn(f"{path} also holds {labels.left_out}; left out of {role}", "left-out")
@@ -175,7 +175,7 @@ class Job:
         if there and taken:
             log.refuse_to_replace_recorded(there, taken, self.instead(there.channels))
         if there and taken and not force:
-            raise McaptrackError(f"{there.path} has {', '.join(sorted(taken))} already; --force replaces them")
+            raise McaptrackError(f"{there.path} has {', '.join(sorted(taken))} already; `force=True` replaces them")
         return taken
 
     def instead(self, topics: Collection[str]) -> str:
@@ -186,7 +186,7 @@ class Job:
         while any(f"/{free}{end}" in topics for end in ends):
             number += 1
             free = f"{name}{number}"
-        return f"--camera {free} puts these beside them"
+        return f"`camera={free!r}` puts these beside them"
 
     def write(self, writer: log.LogWriter, has_clock: bool) -> None:
         """Write all channels; ``has_clock`` says that the log has a clock already."""

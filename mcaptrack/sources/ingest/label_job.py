@@ -68,7 +68,7 @@ class LabelJob(Job):
         if options.for_videos():
             raise McaptrackError(f"{self.source} is a label file; {options.for_videos()} is for videos")
         if options.frames is not None and not 0 < options.frames <= MAX_FRAMES:
-            raise McaptrackError(f"--frames is a number from 1 to {MAX_FRAMES}, not {options.frames}")
+            raise McaptrackError(f"`frames=` is a number from 1 to {MAX_FRAMES}, not {options.frames}")
         size = self._extent()
         self._fps: Fraction | None = None
         self._clock = ("", False)  # what to say of times that don't come from pictures, and whether they are assumed
@@ -90,7 +90,7 @@ class LabelJob(Job):
             role = "tracks" if labels.identified else "detections"
             labels = labels if role == "tracks" else self.read(path, role)
         if role in self.labels:
-            raise McaptrackError(f"{path} and {self.labels[role][0]} are both {role}; say with --as what {path} is")
+            raise McaptrackError(f"{path} and {self.labels[role][0]} are both {role}; say with `role=` what {path} is")
         self.labels = {role: (path, labels), **self.labels}
 
     def _extent(self) -> tuple[int, int]:
@@ -115,9 +115,9 @@ class LabelJob(Job):
         if options.fps and not timeline.fits(options.fps):
             raise McaptrackError(
                 f"{there.path}: {timeline.of} are {timeline.fps:.6g} a second, not {float(options.fps):g}; labels take "
-                "the times of their pictures, so leave --fps out"
+                "the times of their pictures, so leave `fps=` out"
             )
-        for given, name in ((options.start_ns, "--start-time"), (options.frames, "--frames")):
+        for given, name in ((options.start_ns, "`start_time=`"), (options.frames, "`frames=`")):
             if given is not None:
                 raise McaptrackError(f"{there.path}: labels take the times of {timeline.of}; leave {name} out")
         return timeline
@@ -129,16 +129,16 @@ class LabelJob(Job):
         rates = {one.fps: one.of for one in known if one.fps}
         if self.options.fps:
             self._other_rates = [
-                f"{self.source}: {float(rate):g} frames a second by {of}, and {float(self.options.fps):g} by --fps, "
+                f"{self.source}: {float(rate):g} frames a second by {of}, and {float(self.options.fps):g} by `fps=`, "
                 "which is taken"
                 for rate, of in rates.items()
                 if rate != self.options.fps
             ]
-            rates = {self.options.fps: "--fps"}
+            rates = {self.options.fps: "`fps=`"}
         rates = rates or {labels.fps: topic for topic, labels in standing.items() if labels.fps}
         if len(rates) > 1:
             words = " and ".join(f"{float(fps):g} by {of}" for fps, of in rates.items())
-            raise McaptrackError(f"{self.source}: {words}: say how many frames a second there are with --fps")
+            raise McaptrackError(f"{self.source}: {words}: say how many frames a second there are with `fps=`")
         if not rates and default is None:
             raise McaptrackError(self._no_clock())
         fps, of = next(iter(rates.items()), (default or Fraction(1), _ASSUMED))
@@ -166,7 +166,7 @@ class LabelJob(Job):
             warn(words, "clock")
         words, is_assumed = self._clock
         if is_assumed:
-            warn(f"{words}; --fps says otherwise", "clock")
+            warn(f"{words}; `fps=` says otherwise", "clock")
         elif words:
             self.report.said.append(words)
 
@@ -176,13 +176,13 @@ class LabelJob(Job):
             if topic not in self.topics() and labels.fps not in (None, fps):
                 raise McaptrackError(
                     f"{there.path}: {topic} has {float(labels.fps or 0):g} frames a second, not {float(fps):g}, and "
-                    "labels of one camera are of the same pictures; give the same --fps, or another --camera"
+                    "labels of one camera are of the same pictures; give the same `fps=`, or another `camera=`"
                 )
 
     def _count(self, known: Sequence[_Known], standing: Mapping[str, Standing]) -> tuple[int, str]:
         """How many frames there are, and who says so."""
         if self.options.frames is not None:
-            return self.options.frames, "--frames"
+            return self.options.frames, "`frames=`"
         said = {one.frames: one.of for one in known if one.frames}
         if said:
             return max(said), said[max(said)]
@@ -196,15 +196,15 @@ class LabelJob(Job):
             raise McaptrackError(
                 f"{there.path} is from {_seconds(there.start_ns)} to {_seconds(there.end_ns)}, the labels would be "
                 f"from {_seconds(first)} to {_seconds(last)}, and {self.prefix} has no pictures to take times from; "
-                f"say when frame {next(iter(self.labels.values()))[1].first_frame} was with --start-time"
+                f"say when frame {next(iter(self.labels.values()))[1].first_frame} was with `start_time=`"
             )
 
     def _no_clock(self) -> str:
-        words = f"{self.source} has no clock of its own; give the frames per second with --fps"
+        words = f"{self.source} has no clock of its own; give the frames per second with `fps=`"
         pictures = sorted(c.topic for c in self.there.channels.values() if holds_pictures(c)) if self.there else []
         if pictures and self.there:
             camera = pictures[0].strip("/")
-            words += f", or choose the pictures of {', '.join(pictures)} in {self.there.path} with --camera {camera}"
+            words += f", or choose the pictures of {', '.join(pictures)} in {self.there.path} with `camera={camera!r}`"
         return words
 
     def write(self, writer: log.LogWriter, has_clock: bool) -> None:

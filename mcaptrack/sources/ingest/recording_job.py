@@ -41,11 +41,11 @@ class RecordingJob(Job):
         self._recorded, self._progress = recorded, progress
         try:
             for given, name in (
-                (options.fps, "--fps"),
-                (options.start_ns is not None, "--start-time"),
+                (options.fps, "`fps=`"),
+                (options.start_ns is not None, "`start_time=`"),
                 (options.for_videos(), options.for_videos()),
-                (options.role, "--as"),
-                (options.frames is not None, "--frames"),
+                (options.role, "`role=`"),
+                (options.frames is not None, "`frames=`"),
             ):
                 if given:
                     raise McaptrackError(
@@ -66,7 +66,7 @@ class RecordingJob(Job):
         self._close.callback(recorded.close)
 
     def _find_pictures(self) -> None:
-        """Find the camera that labels belong to: the only one with pictures, or the one that --camera names."""
+        """Find the camera that labels belong to: the only one with pictures, or the one that ``camera`` names."""
         by_topic: dict[str, list[Connection]] = {}
         for connection in self._recorded.connections:
             is_empty = self._recorded.claims is not None and not self._recorded.claims[connection]
@@ -76,7 +76,7 @@ class RecordingJob(Job):
         if not self.pictures:
             raise McaptrackError(
                 f"{self.source}: labels and ground planes belong to the pictures of one camera; the log has "
-                f"{', '.join(sorted(by_topic)) or 'none'}. Choose one with --camera, the part of its topic before the "
+                f"{', '.join(sorted(by_topic)) or 'none'}. Choose one with `camera=`, the part of its topic before the "
                 "last /"
             )
         self._connections = by_topic[self.pictures]
@@ -118,7 +118,7 @@ class RecordingJob(Job):
 
     def instead(self, topics: Collection[str]) -> str:
         """Words on where to put a recording, or labels beside one, where topics are taken."""
-        return super().instead(topics) if self._passed_on else "make a log of its own of it with -o"
+        return super().instead(topics) if self._passed_on else "make a log of its own of it with `output=`"
 
     def check(self, output: Path) -> None:
         """Every channel has the messages that were given to it."""

@@ -1,7 +1,7 @@
 """Where results of a log are written: into the log itself, or into LOG.results.mcap beside it.
 
 ROS tools expect that all channels of a recording hold ROS messages, and that its metadata.yaml counts all of them. So a
-recording that ROS tools read stays as it is, unless --in-place is given.
+recording that ROS tools read stays as it is, unless ``sidecar`` is False.
 """
 
 from __future__ import annotations
@@ -36,16 +36,18 @@ class SidecarChoice:
         self.why = ""
         if self.wanted is False and beside.exists():
             raise McaptrackError(
-                f"{beside} holds results of {opened.path}; --in-place would leave them there and make others: remove "
-                f"{beside.name} first, or leave --in-place out"
+                f"{beside} holds results of {opened.path}; `sidecar=False` would leave them there and make others: "
+                f"remove {beside.name} first, or leave `sidecar=False` out"
             )
         if self.wanted:
-            self.why = "--sidecar was given"
+            self.why = "`sidecar=True` was given"
             return True
         recording = recording_of(opened)
         if self.wanted is False:
             self.why = (
-                f"--in-place was given; ROS tools may stumble over them, for it is {recording}" if recording else ""
+                f"`sidecar=False` was given; ROS tools may stumble over them, for it is {recording}"
+                if recording
+                else ""
             )
             return False
         if beside.exists():
@@ -56,7 +58,9 @@ class SidecarChoice:
         if any(Provenance.from_metadata(channel.metadata) for channel in opened.recorded):
             self.why = f"earlier results are in it; ROS tools may stumble over them, for it is {recording}"
             return False
-        self.why = f"{opened.path.name} is {recording}, which ROS tools read; --in-place writes into it all the same"
+        self.why = (
+            f"{opened.path.name} is {recording}, which ROS tools read; `sidecar=False` writes into it all the same"
+        )
         return True
 
     def words(self, written_to: Path) -> str:

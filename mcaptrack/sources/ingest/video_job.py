@@ -34,12 +34,12 @@ class VideoJob(Job):
         super().__init__(source, options, there)
         self._progress = progress
         if options.role:
-            raise McaptrackError(f"{source} is no label file; --as is for those")
+            raise McaptrackError(f"{source} is no label file; `role=` is for those")
         if options.frames is not None:
-            raise McaptrackError(f"{source} is no label file; --frames is for those that stand alone")
+            raise McaptrackError(f"{source} is no label file; `frames=` is for those that stand alone")
         self.video: Video = open_video(source, options.video_options)
         if self.video.images and not (options.fps or self.video.fps):
-            raise McaptrackError(f"{source}: a folder of images has no clock; give the frames per second with --fps")
+            raise McaptrackError(f"{source}: a folder of images has no clock; give the frames per second with `fps=`")
         self._plane = self.plane(self.video.width_px, self.video.height_px)
         self.pictures = f"{self.prefix}/video"
         self._standing = {} if there is None else labels_of(there, self.prefix)
@@ -67,7 +67,7 @@ class VideoJob(Job):
             self.report.said.append(f"{video.path} is encoded again, as H.264: {video.why_transcode}")
         elif video.format in _FOXGLOVE_ALONE:
             kept = f"{video.path} is kept as {_FOXGLOVE_ALONE[video.format]}, which Foxglove plays"
-            self.report.said.append(f"{kept} and Lichtblick does not (--image-format h264 is for both)")
+            self.report.said.append(f"{kept} and Lichtblick does not (`image_format='h264'` is for both)")
         elif video.format == "jpeg":
             words["quality"] = keep.jpeg_quality
         channel = writer.add_channel(
@@ -102,14 +102,18 @@ class VideoJob(Job):
         own = self.video.fps
         if own and abs(fps - own) > _SAME_FPS * own:
             words = f"{self.video.path} says {float(own):g} frames a second; its pictures are put at {float(fps):g}"
-            warn(f"{words} by --fps", "clock")
+            warn(f"{words} by `fps=`", "clock")
 
     def _check_standing(self, timeline: Timeline) -> None:
         """Labels that are in the log already are of these pictures: they have their times."""
         for topic, labels in self._standing.items():
             if self.there and topic not in self.topics() and not np.isin(labels.t_ns, timeline.t_ns).all():
-                how = f"give --fps {labels.fps}" if labels.fps else "give the --fps and --start-time that they have"
+                how = (
+                    f"give `fps={str(labels.fps)!r}`"
+                    if labels.fps
+                    else "give the `fps=` and `start_time=` that they have"
+                )
                 raise McaptrackError(
-                    f"{self.there.path}: {topic} has labels at other times than {timeline.of}; {how}, or --camera for "
+                    f"{self.there.path}: {topic} has labels at other times than {timeline.of}; {how}, or `camera=` for "
                     "another camera"
                 )

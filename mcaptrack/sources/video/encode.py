@@ -76,19 +76,19 @@ class VideoOptions:
         name = self.image_format
         low, high = _QUALITIES.get(name, _QUALITIES["h264"])
         if self.quality is not None and name == "png":
-            raise McaptrackError("--quality is for H.264 and JPEG; PNG keeps pictures exactly as they are")
+            raise McaptrackError("`quality=` is for H.264 and JPEG; PNG keeps pictures exactly as they are")
         if self.quality is not None and not low <= self.quality <= high:
             scale = "JPEG's" if name == "jpeg" else "H.264's constant rate factor"
             best = high if name == "jpeg" else low
             raise McaptrackError(
-                f"--quality is {scale}, a number from {low} to {high} ({best} is best), not {self.quality}"
+                f"`quality=` is {scale}, a number from {low} to {high} ({best} is best), not {self.quality}"
             )
         if self.keyframe_interval_s is not None:
             if self.is_still:
-                raise McaptrackError(f"--keyframe-interval-s is for video; as {name}, every picture stands alone")
+                raise McaptrackError(f"`keyframe_interval_s=` is for video; as {name}, every picture stands alone")
             if not _INTERVALS_S[0] <= self.keyframe_interval_s <= _INTERVALS_S[1]:
                 raise McaptrackError(
-                    f"--keyframe-interval-s is a number from {_INTERVALS_S[0]:g} to {_INTERVALS_S[1]:g}, "
+                    f"`keyframe_interval_s=` is a number from {_INTERVALS_S[0]:g} to {_INTERVALS_S[1]:g}, "
                     f"not {self.keyframe_interval_s:g}"
                 )
 

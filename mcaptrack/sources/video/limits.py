@@ -70,7 +70,7 @@ def check_h264(width: int, height: int, where: object) -> None:
     if width * height > _H264_PIXELS:
         raise McaptrackError(
             f"{where} has pictures of {width} x {height} pixels, and those of H.264 have at most "
-            f"{_H264_PIXELS / _MILLION:.1f} megapixels; --image-format jpeg keeps larger ones"
+            f"{_H264_PIXELS / _MILLION:.1f} megapixels; `image_format='jpeg'` keeps larger ones"
         )
 
 

@@ -19,7 +19,7 @@ from mcaptrack.sources.video.encode import VideoOptions
 
 _PIXELS: Final = ("yuv420p", "yuvj420p")
 _WORDS: Final = {"h264": "H.264", "h265": "H.265", "vp9": "VP9", "av1": "AV1"}
-_ONLY_SOME: Final = "it is H.265, which viewers play only where the hardware does (--image-format h265 keeps it)"
+_ONLY_SOME: Final = "it is H.265, which viewers play only where the hardware does (`image_format='h265'` keeps it)"
 
 
 class StreamPacket(NamedTuple):

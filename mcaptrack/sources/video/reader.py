@@ -135,7 +135,7 @@ class _Clock:
             seconds = index / self.fps
         elif seconds is None:
             raise McaptrackError(
-                f"{self._where}: picture {index} has no time in its container; space them evenly with --fps"
+                f"{self._where}: picture {index} has no time in its container; space them evenly with `fps=`"
             )
         else:
             self._first = seconds if self._first is None else self._first
@@ -167,7 +167,7 @@ def open_video(path: Path, options: VideoOptions = VideoOptions()) -> Video:  # 
         if first is None:
             raise McaptrackError(f"{path} is a video without frames")
         if not (has_times(opened) or options.fps):
-            raise McaptrackError(f"{path} has no times of its own; give the frames per second with --fps")
+            raise McaptrackError(f"{path} has no times of its own; give the frames per second with `fps=`")
         sideways = first.rotation % 180 != 0
         video = Video(
             path,

@@ -147,7 +147,7 @@ class _Job:
             words |= {"left_out": ", ".join(left_out)} if left_out else {}
             self._write(name, path, made, words, ("topic", "t_ns"))
         left = words.get("left_out") or known.get("left_out")
-        self.done.notes += [f"{topic}: {left} left out, bytes; --blobs keeps them"] if left else []
+        self.done.notes += [f"{topic}: {left} left out, bytes; `blobs=True` keeps them"] if left else []
 
     def _stands(self, name: str, path: Path, source: str) -> bool:
         """Whether a table is up to date and may stay."""
@@ -157,7 +157,8 @@ class _Job:
         file = file_name(self.contents.opened.path)
         if known.get("recording", file) != file:
             raise McaptrackError(
-                f"{path.parent} holds the tables of {known['recording']}, not of {file}; give another folder with -o"
+                f"{path.parent} holds the tables of {known['recording']}, not of {file}; give another folder with "
+                "`output=`"
             )
         if (known.get("source"), known.get("table_version")) != (source, tables.TABLE_VERSION):
             return False

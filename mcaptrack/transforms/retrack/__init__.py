@@ -256,7 +256,7 @@ _PAPER: Final = Retrack(
 #: number (sigma, d_min, t_max, the probation) it is that of the authors' program. "authors" is what their program does:
 #: the largest distance instead of the mean, near pairs first, tracks that start from the smoothed past, and assignments
 #: that two matches in a row confirm. "default" is this project's method.
-PROFILES: Final = MappingProxyType(
+PROFILES: Final[Mapping[str, Retrack]] = MappingProxyType(
     {
         "default": Retrack(),
         "paper": _PAPER,

@@ -48,7 +48,7 @@ def choose(where: object, camera: str, topics: Collection[str]) -> Camera:
         if found:
             raise McaptrackError(
                 f"{where}: {at} has several topics of pictures, {', '.join(found)}; name one with "
-                f"--camera {found[0].strip('/')}"
+                f"`camera={found[0].strip('/')!r}`"
             )
     if camera != DEFAULT or not topics:
         return Camera(prefix, "")
@@ -57,7 +57,7 @@ def choose(where: object, camera: str, topics: Collection[str]) -> Camera:
         names = names if len(names) == len(topics) else sorted(topic.strip("/") for topic in topics)
         raise McaptrackError(
             f"{where} has pictures of several cameras, {', '.join(sorted(topics))}; labels and ground planes belong to "
-            f"those of one: choose with --camera {names[0]}"
+            f"those of one: choose with `camera={names[0]!r}`"
         )
     (topic,) = topics
     return Camera(folder_of(topic), topic)

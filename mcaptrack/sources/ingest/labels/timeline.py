@@ -91,7 +91,7 @@ class Timeline:
         if at[0] < 0:
             raise McaptrackError(
                 f"{path}: its first label is of frame {labels.frame[0]}, and frame {labels.first_frame} is said to be "
-                "the first picture; say with --first-frame which one it is"
+                "the first picture; say with `first_frame=` which one it is"
             )
         beyond = int((at >= end).sum())
         if beyond and (self.is_complete or beyond == len(at)):
@@ -122,7 +122,7 @@ class Timeline:
             f"{end}, the labels with frame {last}"
         )
         if last - first <= end - labels.first_frame and first != labels.first_frame:
-            return f"{words}; if frame {first} of the file is the first picture, say so with --first-frame {first}"
+            return f"{words}; if frame {first} of the file is the first picture, say so with `first_frame={first}`"
         return f"{words}; give the labels of these pictures, or the part of the file that is of them"
 
 
@@ -145,8 +145,8 @@ def count_frames(path: Path, labels: Labels) -> int:
     count = last - labels.first_frame + 1
     most = max(_EMPTY_FRAMES, _EMPTY_A_LABELLED * len(labels.labelled) * labels.step)
     if count > min(most, MAX_FRAMES):
-        first = f"give the number of the first picture with --first-frame {labels.labelled[0]}"
-        mend = f"--frames {count} takes it so" if count <= MAX_FRAMES else f"at most {MAX_FRAMES} are read"
+        first = f"give the number of the first picture with `first_frame={labels.labelled[0]}`"
+        mend = f"`frames={count}` takes it so" if count <= MAX_FRAMES else f"at most {MAX_FRAMES} are read"
         raise McaptrackError(
             f"{path}: frame {last} would be the last of {count} frames, of which {len(labels.labelled)} are labelled; "
             f"{mend}, or {first}"

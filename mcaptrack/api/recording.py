@@ -190,6 +190,26 @@ def _whole(value: Any) -> int | None:
 def open(path: str | Path) -> Recording:  # noqa: A001  # mcaptrack.open is what it is
     """Open a log, with its results if they stand beside it.
 
-    Raises McaptrackError, in one line, if it is no MCAP file or is damaged.
+    Parameters
+    ----------
+    path : path
+        The log.
+
+    Returns
+    -------
+    Recording
+        The open log; a context manager.
+
+    Raises
+    ------
+    McaptrackError
+        If it is no MCAP file, or damaged.
+
+    Examples
+    --------
+    >>> import mcaptrack
+    >>> with mcaptrack.open("log.mcap") as log:
+    ...     log.table("tracks", "/camera/tracks").num_rows > 0
+    True
     """
     return Recording(Path(path))

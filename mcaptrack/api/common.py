@@ -1,0 +1,85 @@
+"""What all functions of the library share: paths, progress, warnings and notes."""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Final
+
+from mcaptrack import notices
+from mcaptrack.errors import McaptrackError
+from mcaptrack.files import is_same_file, refuse_special, refuse_url
+from mcaptrack.notices import Notice
+
+PathLike = str | os.PathLike[str]
+#: Called with the name of a stage, how much of it is done, and how much there is (None where that is not known).
+Progress = Callable[[str, float, float | None], None]
+
+#: Where routine notes go ("/camera/tracks is missing: running track"): INFO, and DEBUG for details.
+_LOGGER: Final = logging.getLogger("mcaptrack")
+
+
+def no_progress(stage: str, done: float, total: float | None) -> None:
+    """Show nothing."""
+
+
+def as_path(path: PathLike) -> Path:
+    """Return a path to a file or folder. Raises McaptrackError for a URL, a pipe, a device, and for "-"."""
+    found = Path(path)
+    refuse_url(found)
+    refuse_special(found)
+    if str(path) == "-":
+        raise McaptrackError("- is not a file here: nothing is read from or written to a pipe; give the name of a file")
+    return found
+
+
+def optional_path(path: PathLike | None) -> Path | None:
+    """Return ``as_path`` of a path; None for None."""
+    return None if path is None else as_path(path)
+
+
+def paths_of(paths: PathLike | Sequence[PathLike]) -> list[Path]:
+    """Return one path, or several, as a list."""
+    return [as_path(path) for path in ([paths] if isinstance(paths, str | os.PathLike) else paths)]
+
+
+def names_of(names: str | Sequence[str] | None) -> tuple[str, ...]:
+    """Return one name, several, or none, as a tuple."""
+    return () if names is None else (names,) if isinstance(names, str) else tuple(names)
+
+
+def log_output(path: PathLike, source: Path) -> Path:
+    """Return the path of a log to write, made from ``source``.
+
+    Raises McaptrackError for a name that does not end with .mcap. That ``source`` is no output is for others to say.
+    """
+    found = as_path(path)
+    if found.is_dir():
+        raise McaptrackError(f"{found} is a folder; give the name of a file")
+    if found.suffix.lower() != ".mcap" and not is_same_file(found, source):
+        raise McaptrackError(f"{found} is no name for a log: logs are MCAP files; give a name that ends with .mcap")
+    return found
+
+
+@contextmanager
+def warnings_about(log: object) -> Iterator[list[Notice]]:
+    """Collect the warnings inside, which are about ``log``; each of them is also passed on."""
+    with notices.about(log), notices.collected() as warnings:
+        yield warnings
+
+
+class Notes(list[str]):
+    """Routine notes of one call: kept for its result, and logged as they come."""
+
+    def say(self, note: str) -> None:
+        """Take a note."""
+        self.append(note)
+        _LOGGER.info(note)
+
+
+def detail(note: str) -> None:
+    """Log a note that matters to few people."""
+    _LOGGER.debug(note)

@@ -1,0 +1,167 @@
+"""What is in a log: its channels, and what was made from what."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from mcaptrack import log as logs
+from mcaptrack import pipeline
+from mcaptrack.api.common import PathLike, as_path, warnings_about
+from mcaptrack.notices import Notice
+from mcaptrack.schema.provenance import Provenance
+
+
+@dataclass(frozen=True)
+class ChannelInfo:
+    """A channel of a log, and how it was made.
+
+    Attributes
+    ----------
+    topic : str
+        Its topic.
+    id : int
+        Its number in the file.
+    part : {"log", "results"}
+        Whether it is in the log or in LOG.results.mcap beside it.
+    replaced : bool
+        Whether the results beside the log have a channel that replaces it.
+    schema, encoding : str
+        Name of its schema, and encoding of its messages.
+    messages : int
+        Number of messages.
+    transform, input, version : str or None
+        What made it, from which channel, and with which version of mcaptrack; None if it was recorded by others.
+    references : dict or None
+        Topics that it was compared with, with their digests.
+    parameters : dict or None
+        The options it was made with.
+    stale : bool
+        Whether it is out of date, because what it was made from has changed.
+
+    """
+
+    topic: str
+    id: int
+    part: Literal["log", "results"]
+    replaced: bool
+    schema: str
+    encoding: str
+    messages: int
+    transform: str | None
+    input: str | None
+    version: str | None
+    references: Mapping[str, str] | None
+    parameters: Mapping[str, Any] | None
+    stale: bool
+
+
+@dataclass(frozen=True)
+class LogInfo:
+    """What is in a log.
+
+    Attributes
+    ----------
+    log : pathlib.Path
+        The log.
+    bytes : int
+        Its size.
+    start_ns, end_ns : int
+        Time of the first and last message, in nanoseconds.
+    results : pathlib.Path or None
+        The file with its results, if it stands beside the log.
+    messages : int
+        Number of messages.
+    attachments : tuple of str
+        Names of its attachments.
+    channels : tuple of ChannelInfo
+        Its channels by topic.
+    warnings : tuple of mcaptrack.Notice
+        What looks odd.
+
+    """
+
+    log: Path
+    bytes: int
+    start_ns: int
+    end_ns: int
+    results: Path | None
+    messages: int
+    attachments: tuple[str, ...]
+    channels: tuple[ChannelInfo, ...]
+    warnings: tuple[Notice, ...]
+
+    def to_json(self) -> dict[str, Any]:
+        """Return it as JSON has it, without the warnings."""
+        results = str(self.results) if self.results else None
+        out = asdict(self) | {"log": str(self.log), "results": results, "attachments": list(self.attachments)}
+        del out["warnings"]
+        return out | {"channels": list(out["channels"])}
+
+
+def info(log: PathLike) -> LogInfo:
+    """Return the channels of a log, their number of messages, and what was made from what.
+
+    Reads the summary of the log only.
+
+    Parameters
+    ----------
+    log : path
+        The log.
+
+    Returns
+    -------
+    LogInfo
+        What is in it.
+
+    Raises
+    ------
+    McaptrackError
+        If it is no log, or damaged.
+
+    Examples
+    --------
+    >>> import mcaptrack
+    >>> made = {channel.topic: channel.transform for channel in mcaptrack.info("log.mcap").channels}
+    >>> made["/camera/tracks"]
+    'track'
+
+    """
+    path = as_path(log)
+    with warnings_about(path) as warnings, logs.read(path) as opened:
+        every = [(channel, part) for part in opened.parts for channel in part.recorded]
+        every.sort(key=lambda found: (found[0].topic, found[1] is opened, found[0].id))
+        channels = tuple(_channel(opened, part, channel) for channel, part in every)
+        return LogInfo(
+            log=path,
+            bytes=opened.size,
+            start_ns=opened.start_ns,
+            end_ns=opened.end_ns,
+            results=opened.results.path if opened.results else None,
+            messages=sum(sum(part.index.counts.values()) for part in opened.parts),
+            attachments=tuple(listed.name for part in opened.parts for listed in part.index.attachments),
+            channels=channels,
+            warnings=tuple(dict.fromkeys(warnings)),
+        )
+
+
+def _channel(opened: logs.Log, part: logs.Log, channel: logs.Channel) -> ChannelInfo:
+    made = Provenance.from_metadata(channel.metadata)
+    replaced = opened.part(channel.topic) is not part
+    return ChannelInfo(
+        topic=channel.topic,
+        id=channel.id,
+        part="log" if part is opened else "results",
+        replaced=replaced,
+        schema=channel.schema_name,
+        encoding=channel.message_encoding,
+        messages=channel.messages,
+        transform=made.transform if made else None,
+        input=made.input or None if made else None,
+        version=made.version if made else None,
+        references=dict(made.references) if made else None,
+        parameters=dict(made.parameters) if made else None,
+        stale=not replaced and pipeline.is_stale(opened, channel.topic),
+    )

@@ -1,0 +1,223 @@
+"""Make a log of what exists: videos, folders of images, recordings, label files."""
+
+from __future__ import annotations
+
+import datetime as dt
+from collections.abc import Mapping
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import Final
+
+from mcaptrack import log as logs
+from mcaptrack.api.common import PathLike, Progress, as_path, log_output, no_progress, optional_path, warnings_about
+from mcaptrack.errors import McaptrackError
+from mcaptrack.files import is_same_file, refuse_overwrite
+from mcaptrack.geometry import clocks
+from mcaptrack.geometry.plane import Point
+from mcaptrack.notices import Notice, warn
+from mcaptrack.sources.ingest import Format, ImageFormat, IngestOptions, Role
+from mcaptrack.sources.ingest import ingest as make_log
+from mcaptrack.sources.ingest.sidecar import SidecarChoice
+
+_EPOCH: Final = dt.datetime(1970, 1, 1, tzinfo=dt.UTC)
+
+
+@dataclass(frozen=True)
+class IngestResult:
+    """What became of an input.
+
+    Attributes
+    ----------
+    log : pathlib.Path
+        The log.
+    messages : dict of str to int
+        Number of messages that were written, by topic.
+    notes, details : tuple of str
+        What was done with the input, such as why a video was encoded again; details matter to few.
+    lost : tuple of str
+        What could not be read, such as damaged pictures.
+    warnings : tuple of mcaptrack.Notice
+        What was assumed, left out or looks odd, and what was lost.
+    has_labels : bool
+        Whether there were label files.
+    uses_camera : bool
+        Whether anything was written below the name of the camera.
+
+    """
+
+    log: Path
+    messages: Mapping[str, int]
+    notes: tuple[str, ...]
+    details: tuple[str, ...]
+    lost: tuple[str, ...]
+    warnings: tuple[Notice, ...]
+    has_labels: bool
+    uses_camera: bool
+
+
+def ingest(
+    source: PathLike,
+    output: PathLike | None = None,
+    *,
+    camera: str = "camera",
+    fps: float | str | Fraction | None = None,
+    start_time: float | str | dt.datetime | None = None,
+    image_format: ImageFormat = "auto",
+    quality: int | None = None,
+    keyframe_interval_s: float | None = None,
+    ground_plane: PathLike | None = None,
+    point: Point = "foot",
+    detections: PathLike | None = None,
+    tracks: PathLike | None = None,
+    truth: PathLike | None = None,
+    label_format: Format = "auto",
+    first_frame: int | None = None,
+    frames: int | None = None,
+    role: Role | None = None,
+    into: PathLike | None = None,
+    sidecar: bool | None = None,
+    force: bool = False,
+    progress: Progress = no_progress,
+) -> IngestResult:
+    """Make a log of a video, a folder of images, a ROS bag, an MCAP file, or a label file.
+
+    Parameters
+    ----------
+    source : path
+        The input.
+    output : path, optional
+        The log to write, by default SOURCE.mcap in the working folder.
+    camera : str, default "camera"
+        Name of the camera; its topics begin with /NAME.
+    fps : float, str or Fraction, optional
+        Frames per second, such as 25 or "30000/1001", instead of the timestamps of the file.
+    start_time : float, str or datetime, optional
+        When the recording began: seconds since 1970, or 2026-05-01T12:00:00Z. By default as the file says, or 0.
+    image_format : {"auto", "h264", "h265", "jpeg", "png"}, default "auto"
+        How pictures are stored.
+    quality : int, optional
+        Quality of encoding: for H.264 the constant rate factor, 1 (best) to 51; for JPEG 1 to 100 (best).
+    keyframe_interval_s : float, optional
+        Longest time between keyframes in seconds.
+    ground_plane : path, optional
+        File with a 3x3 homography from pixels to metres on the ground.
+    point : {"foot", "center"}, default "foot"
+        Which point of a box touches the ground.
+    detections, tracks, truth : path, optional
+        Label files with detections, tracks and ground truth.
+    label_format : {"auto", "mot", "kitti", "sdd", "trajnet", "obsmat"}, default "auto"
+        Format of the label files.
+    first_frame : int, optional
+        Number of the first picture in label files.
+    frames : int, optional
+        Number of frames, if there are labels but no pictures.
+    role : {"detections", "tracks", "truth"}, optional
+        What ``source`` holds, if it is a label file; by default as its ids tell.
+    into : path, optional
+        Add to this log instead of making a new one.
+    sidecar : bool, optional
+        With ``into``: write into LOG.results.mcap beside the log (True) or into the log (False).
+    force : bool, default False
+        Overwrite the log; with ``into``, replace the channels that it has already.
+    progress : callable, optional
+        Called as ``progress(stage, done, total)``.
+
+    Returns
+    -------
+    IngestResult
+        The log, and what was written into it.
+
+    Raises
+    ------
+    McaptrackError
+        If anything of the input cannot be understood, or if the log exists; nothing is written then.
+
+    Examples
+    --------
+    >>> import mcaptrack
+    >>> result = mcaptrack.ingest("video.mp4", "new.mcap", ground_plane="plane.txt", truth="truth.txt")
+    >>> sorted(result.messages)
+    ['/camera/ground_plane', '/camera/truth', '/camera/video']
+
+    """
+    if into is not None and output is not None:
+        raise McaptrackError("`into=` adds to a log in place; it does not go with `output=`")
+    if into is None and sidecar is not None:
+        raise McaptrackError(f"`sidecar={sidecar}` is about a log that is added to; name it with `into=`")
+    path, labels = as_path(source), {"detections": detections, "tracks": tracks, "truth": truth}
+    options = IngestOptions(
+        camera=camera,
+        fps=parse_fps(fps),
+        start_ns=parse_start_time(start_time),
+        image_format=image_format,
+        quality=quality,
+        keyframe_interval_s=keyframe_interval_s,
+        ground_plane=optional_path(ground_plane),
+        point=point,
+        labels={name: as_path(label) for name, label in labels.items() if label is not None},  # type: ignore[misc]
+        label_format=label_format,
+        first_frame=first_frame,
+        frames=frames,
+        role=role,
+    )
+    with warnings_about(path) as warnings:
+        if into is None:
+            target = default_log(path) if output is None else log_output(output, path)
+            refuse_overwrite(target, force or is_same_file(target, path))
+            report = make_log(path, target, options, progress=progress)
+        else:
+            target, place = as_path(into), SidecarChoice(sidecar)
+            with logs.read(target, sidecar=place) as opened:
+                opened.lock()
+                report = make_log(path, target, options, into=opened, force=force, progress=progress)
+                written_to = opened.parts[-1].path
+            if place.why:
+                report.said.append(place.words(written_to))
+        for lost in report.lost:
+            warn(f"lost: {lost}", "lost")
+    return IngestResult(
+        log=target,
+        messages=report.messages,
+        notes=tuple(report.said),
+        details=tuple(report.notes),
+        lost=tuple(report.lost),
+        warnings=tuple(dict.fromkeys(warnings)),
+        has_labels=report.has_labels,
+        uses_camera=report.uses_camera,
+    )
+
+
+def default_log(source: Path) -> Path:
+    """Return the name of the log that is made of an input: in the working folder."""
+    return Path((source.name if source.is_dir() else source.stem) + ".mcap")
+
+
+def parse_fps(fps: float | str | Fraction | None) -> Fraction | None:
+    """Return frames per second as a fraction, from 25, "29.97" or "30000/1001"."""
+    try:
+        return None if fps is None else clocks.parse_fps(str(fps))
+    except ValueError:
+        raise McaptrackError(
+            f"`fps=` needs a number like 25, 29.97 or 30000/1001, from one frame a day to 10000 a second, not {fps!r}"
+        ) from None
+
+
+def parse_start_time(time: float | str | dt.datetime | None) -> int | None:
+    """Return nanoseconds since 1970 from ISO 8601, seconds since 1970, or a datetime (UTC unless it says otherwise)."""
+    if time is None:
+        return None
+    try:
+        seconds = clocks.parse_ratio(str(time))
+    except ValueError:
+        try:
+            moment = time if isinstance(time, dt.datetime) else dt.datetime.fromisoformat(str(time))
+        except ValueError:
+            raise McaptrackError(
+                f"`start_time=` needs 2026-05-01T12:00:00Z or seconds since 1970, not {time!r}"
+            ) from None
+        passed = (moment if moment.tzinfo else moment.replace(tzinfo=dt.UTC)) - _EPOCH
+        seconds = Fraction(passed.days * 86400 + passed.seconds) + Fraction(passed.microseconds, 1_000_000)
+    if not 0 <= seconds < clocks.LAST_NS // clocks.NS_PER_S:
+        raise McaptrackError(f"`start_time=` has to lie between 1970 and 2262, not {time!r}")
+    return round(seconds * clocks.NS_PER_S)

@@ -1,0 +1,351 @@
+"""Look at logs: what is in them, tables, reports, videos, and answers to queries."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mcaptrack import log as logs
+from mcaptrack import pipeline
+from mcaptrack.api.common import (
+    PathLike,
+    Progress,
+    as_path,
+    detail,
+    names_of,
+    no_progress,
+    optional_path,
+    paths_of,
+    warnings_about,
+)
+from mcaptrack.errors import McaptrackError, call
+from mcaptrack.files import follow_links, is_same_file, publish_bytes, refuse_overwrite
+from mcaptrack.notices import Notice, collected, warn
+from mcaptrack.tables import Format
+from mcaptrack.tables.export import default_folder, recording_name
+from mcaptrack.tables.export import export as write_tables
+from mcaptrack.viewing import report as pages
+from mcaptrack.viewing.rendering import RenderOptions
+from mcaptrack.viewing.rendering import render as draw_video
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+
+@dataclass(frozen=True)
+class ExportResult:
+    """The tables of a log in a folder.
+
+    Attributes
+    ----------
+    log, folder : pathlib.Path
+        The log, and the folder with its tables.
+    rows : dict of str to int
+        Number of rows of each table.
+    written : tuple of str
+        The tables that were written; the others were up to date.
+    warnings : tuple of mcaptrack.Notice
+        What was left out.
+
+    """
+
+    log: Path
+    folder: Path
+    rows: Mapping[str, int]
+    written: tuple[str, ...]
+    warnings: tuple[Notice, ...]
+
+
+def export(
+    log: PathLike,
+    output: PathLike | None = None,
+    *,
+    form: Format = "parquet",
+    topic: str | Sequence[str] | None = None,
+    blobs: bool = False,
+    force: bool = False,
+    progress: Progress = no_progress,
+) -> ExportResult:
+    """Write a log as tables, one row per object and frame.
+
+    Parameters
+    ----------
+    log : path
+        The log.
+    output : path, optional
+        Folder for the tables, by default LOG.tables beside the log.
+    form : {"parquet", "arrow", "csv", "jsonl"}, default "parquet"
+        Format of the files.
+    topic : str or sequence of str, optional
+        Also write a table of all messages of these channels.
+    blobs : bool, default False
+        With ``topic``: include binary fields, such as pictures and point clouds.
+    force : bool, default False
+        Write all tables again, also over those of another log of this name.
+    progress : callable, optional
+        Called as ``progress(stage, done, total)``.
+
+    Returns
+    -------
+    ExportResult
+        The folder, and the number of rows of each table.
+
+    Raises
+    ------
+    McaptrackError
+        If the log cannot be read, or if the folder holds the tables of another log.
+
+    Examples
+    --------
+    >>> import mcaptrack
+    >>> mcaptrack.export("log.mcap", "tables").rows["tracks"] > 0
+    True
+
+    """
+    path = as_path(log)
+    folder = optional_path(output) or default_folder(path)
+    if folder.exists() and not folder.is_dir():
+        raise McaptrackError(f"{folder} is a file; tables go to a folder")
+    if blobs and not topic:
+        raise McaptrackError("`blobs=True` is about the fields of a channel; name it with `topic=`")
+    with warnings_about(path) as warnings:
+        with logs.read(path) as opened:
+            done = write_tables(opened, folder, progress, form=form, topics=names_of(topic), blobs=blobs, force=force)
+        for words in done.notes:
+            warn(words, "left-out")
+    return ExportResult(path, folder, done.rows, tuple(done.written), tuple(dict.fromkeys(warnings)))
+
+
+def refuse_same_tables(logs_to_export: Sequence[Path], output: Path | None) -> None:
+    """Raise McaptrackError if two different logs would have the same name in the tables of one folder."""
+    folders: dict[tuple[Path, str], Path] = {}
+    for path in logs_to_export:
+        other = folders.setdefault((output or default_folder(path), recording_name(path)), path)
+        if follow_links(other) != follow_links(path):
+            raise McaptrackError(
+                f"{other} and {path} would both be {recording_name(path)} in the tables; export them to two folders"
+            )
+
+
+@dataclass(frozen=True)
+class ReportResult:
+    """A report about one or several logs.
+
+    Attributes
+    ----------
+    page : pathlib.Path
+        The HTML file.
+    size : int
+        Its size in bytes.
+    data : dict
+        The numbers in the page, as JSON has them.
+    warnings : tuple of mcaptrack.Notice
+        What could not be compared or looks odd.
+
+    """
+
+    page: Path
+    size: int
+    data: Mapping[str, Any]
+    warnings: tuple[Notice, ...]
+
+
+def report(
+    log: PathLike | Sequence[PathLike],
+    output: PathLike | None = None,
+    *,
+    camera: str | None = None,
+    force: bool = False,
+    progress: Progress = no_progress,
+) -> ReportResult:
+    """Write one HTML page about a log, or several: scores, predictions, tracks over the scene, identity switches.
+
+    Parameters
+    ----------
+    log : path or sequence of paths
+        The log, or several.
+    output : path, optional
+        The page, by default LOG.report.html beside the log; several logs need a name.
+    camera : str, optional
+        Name of the camera, if a log has several.
+    force : bool, default False
+        Overwrite the page if it exists.
+    progress : callable, optional
+        Called as ``progress(stage, done, total)``.
+
+    Returns
+    -------
+    ReportResult
+        The page and its numbers.
+
+    Raises
+    ------
+    McaptrackError
+        If a log cannot be read, or if the page exists.
+
+    Examples
+    --------
+    >>> import mcaptrack
+    >>> mcaptrack.report("log.mcap", "page.html").page.name
+    'page.html'
+
+    """
+    paths = paths_of(log)
+    if output is None and len(paths) != 1:
+        raise McaptrackError(f"{len(paths)} logs become one page; name it with `output=`")
+    target = optional_path(output) or paths[0].with_suffix(".report.html")
+    if any(is_same_file(path, target) for path in paths):
+        raise McaptrackError(f"{target} is a log; give the page another name with `output=`")
+    refuse_overwrite(target, force)
+    reports = []
+    with collected() as warnings:
+        for done, path in enumerate(paths):
+            progress("report", done, len(paths))
+            with logs.read(path) as opened:
+                reports.append(pages.gather(opened, camera, detail))
+                pages.draw(reports[-1], done, len(paths))
+        content = pages.page(reports).encode("utf-8")
+        publish_bytes(target, content)
+        progress("report", len(paths), len(paths))
+    return ReportResult(target, len(content), pages.data(reports), tuple(dict.fromkeys(warnings)))
+
+
+@dataclass(frozen=True)
+class RenderResult:
+    """A video with what was drawn on it.
+
+    Attributes
+    ----------
+    log, video : pathlib.Path
+        The log, and the video or GIF.
+    pictures : int
+        Number of pictures.
+    views : tuple of str
+        Topics of the views that were drawn.
+    warnings : tuple of mcaptrack.Notice
+        What looks odd.
+
+    """
+
+    log: Path
+    video: Path
+    pictures: int
+    views: tuple[str, ...]
+    warnings: tuple[Notice, ...]
+
+
+def render(
+    log: PathLike,
+    output: PathLike | None = None,
+    *,
+    topic: str | Sequence[str] | None = None,
+    width: int | None = None,
+    max_fps: float | None = None,
+    start_s: float = 0.0,
+    end_s: float | None = None,
+    gif: bool = False,
+    camera: str | None = None,
+    force: bool = False,
+    progress: Progress = no_progress,
+) -> RenderResult:
+    """Draw boxes, trails and predictions on the video of a log.
+
+    Parameters
+    ----------
+    log : path
+        The log.
+    output : path, optional
+        The video, .mp4 or .gif; by default LOG.mp4 beside the log.
+    topic : str or sequence of str, optional
+        Draw these views; by default those that the layout shows.
+    width : int, optional
+        Width in pixels; by default that of the video.
+    max_fps : float, optional
+        Largest number of pictures per second; by default all, in a GIF 10.
+    start_s, end_s : float, optional
+        Begin and end at these times of the log, in seconds.
+    gif : bool, default False
+        Write LOG.gif if ``output`` names no file.
+    camera : str, optional
+        Name of the camera, if the log has several.
+    force : bool, default False
+        Overwrite the video if it exists.
+    progress : callable, optional
+        Called as ``progress(stage, done, total)``.
+
+    Returns
+    -------
+    RenderResult
+        The video, and what was drawn.
+
+    Raises
+    ------
+    McaptrackError
+        If the log has no pictures, or if the video exists.
+
+    Examples
+    --------
+    >>> import mcaptrack
+    >>> mcaptrack.render("log.mcap", "walk.gif", width=160, end_s=1.0).pictures > 1
+    True
+
+    """
+    path = as_path(log)
+    target = optional_path(output) or path.with_suffix(".gif" if gif else ".mp4")
+    refuse_overwrite(target, force)
+    options = RenderOptions(width_px=width, max_fps=max_fps, start_s=start_s, end_s=end_s)
+    with warnings_about(path) as warnings, logs.read(path) as opened:
+        prefix = pipeline.find_camera(opened, camera)
+        pictures = pipeline.camera_at(opened, prefix).pictures
+        if pictures is None:
+            more = call("info", path)
+            raise McaptrackError(f"{path} has no pictures of {prefix} to draw on; {more} shows what it has")
+        views = pipeline.find_views(opened, prefix, names_of(topic))
+        count = draw_video(opened, pictures, views, target, options, progress)
+    return RenderResult(path, target, count, tuple(views), tuple(dict.fromkeys(warnings)))
+
+
+def query(
+    log: PathLike | Sequence[PathLike],
+    sql: str,
+    *,
+    files: Mapping[str, PathLike] | None = None,
+) -> pa.Table:
+    """Query the tables of logs in SQL. Needs DuckDB.
+
+    Parameters
+    ----------
+    log : path or sequence of paths
+        Logs, or folders of tables; the column ``recording`` tells several apart.
+    sql : str
+        The query.
+    files : mapping of str to path, optional
+        CSV, JSON or Parquet files as more tables, by name.
+
+    Returns
+    -------
+    pyarrow.Table
+        The answer; times are UTC.
+
+    Raises
+    ------
+    McaptrackError
+        If a log cannot be read, and for what DuckDB refuses.
+
+    Examples
+    --------
+    >>> import mcaptrack
+    >>> mcaptrack.query("log.mcap", "select count(*) > 0 as found from tracks").to_pydict()
+    {'found': [True]}
+
+    """
+    from mcaptrack.tables.sql import Database
+
+    named = {name: as_path(path) for name, path in (files or {}).items()}
+    with Database(paths_of(log), named) as database:
+        answer = database.ask(sql)
+        for note in database.notes:
+            detail(note)
+    return answer

@@ -1,0 +1,209 @@
+"""Running stages on one log: what comes of it, and how results get into the log."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields, replace
+from difflib import get_close_matches
+from pathlib import Path
+from time import monotonic
+from typing import Literal
+
+from mcaptrack import log as logs
+from mcaptrack import pipeline
+from mcaptrack.api.common import Notes, PathLike, Progress, as_path, log_output, no_progress, warnings_about
+from mcaptrack.errors import McaptrackError, call
+from mcaptrack.files import is_same_file, publish_bytes, refuse_overwrite
+from mcaptrack.notices import Notice, warn
+from mcaptrack.pipeline import Job, Summary, Watch
+from mcaptrack.sources.ingest.sidecar import SidecarChoice
+from mcaptrack.tables.export import default_folder, export
+from mcaptrack.transforms import STAGES, Transform
+
+#: The value of a transform's option.
+Option = float | int | bool | str | None
+Mode = Literal["both", "offline", "online"]
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """What stages made of a log.
+
+    Attributes
+    ----------
+    log : pathlib.Path
+        The log that holds the results.
+    stages : tuple of str
+        The stages that ran, in order; empty if everything was up to date.
+    frames, rows, tracks : dict of str to int
+        Number of frames, rows and track ids by topic, of the channels that were made.
+    events : dict of str to dict of str to int
+        Number of events of each kind by the topic of the tracks.
+    stale : tuple of str
+        Topics that are out of date now, because what they were made from was replaced.
+    layouts : tuple of pathlib.Path
+        Layout files for Foxglove and Lichtblick that were written.
+    tables : dict of str to int
+        Number of rows of each table that was written; only ``run`` writes tables.
+    summary : mcaptrack.pipeline.Summary or None
+        What the log holds now, in numbers; only ``run`` counts it.
+    written_to : pathlib.Path or None
+        The file that holds the new channels: the log, or LOG.results.mcap beside it; None if nothing was written.
+    written_because : str
+        Why the results went there, where that needs a reason.
+    warnings : tuple of mcaptrack.Notice
+        What was assumed, left out or looks odd.
+    notes : tuple of str
+        Routine notes, such as which stages ran because their channels were missing.
+    seconds : float
+        How long it took.
+
+    """
+
+    log: Path
+    stages: tuple[str, ...]
+    frames: Mapping[str, int]
+    rows: Mapping[str, int]
+    tracks: Mapping[str, int]
+    events: Mapping[str, Mapping[str, int]]
+    stale: tuple[str, ...]
+    layouts: tuple[Path, ...]
+    tables: Mapping[str, int]
+    summary: Summary | None
+    written_to: Path | None
+    written_because: str
+    warnings: tuple[Notice, ...]
+    notes: tuple[str, ...]
+    seconds: float
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """The topics of the channels that were made."""
+        return tuple(self.frames)
+
+
+#: Plans what to run on an open log: from the prefix of its camera, and with what takes notes.
+Plan = Callable[[logs.Log, str, Callable[[str], None]], list[Job]]
+
+
+@dataclass(frozen=True)
+class Where:
+    """Which log and camera, and where results go."""
+
+    log: PathLike
+    camera: str | None
+    topic: str | None
+    output: PathLike | None
+    sidecar: bool | None
+    force: bool
+
+
+def work(where: Where, plan: Plan, watch: Watch | None, progress: Progress, tables: bool | None) -> RunResult:
+    """Plan and run on one log. ``tables`` is None where a single stage runs, which neither exports nor summarises."""
+    began = monotonic()
+    path = as_path(where.log)
+    output = None if where.output is None else log_output(where.output, path)
+    target, notes = output or path, Notes()
+    if output is not None and where.sidecar is not None:
+        raise McaptrackError(f"`sidecar={where.sidecar}` and `output=` are two places for the same results; give one")
+    with warnings_about(target) as warnings:
+        if output is not None:
+            if is_same_file(output, path):
+                raise McaptrackError(f"{path} is both input and output; leave `output=` out to add to it in place")
+            refuse_overwrite(output, where.force)
+        place = SidecarChoice(where.sidecar)
+        with logs.read(path, sidecar=None if output else place) as opened:
+            if output is None:
+                opened.lock()  # a second writer is turned away before it computes anything
+            topics = watch.topics if watch else ()
+            prefix = pipeline.find_camera(opened, where.camera, where.topic or next(iter(topics), None))
+            report = pipeline.run(opened, prefix, plan(opened, prefix, notes.say), output, progress, watch)
+            written_to = output or opened.parts[-1].path
+        layouts = [pipeline.layout_path(target, name) for name in report.layouts]
+        for layout, content in zip(layouts, report.layouts.values(), strict=True):
+            publish_bytes(layout, content)
+        for topic in report.stale:
+            again = call("run", target)
+            warn(f"{topic} was made from what has just been replaced; {again} brings it up to date", "out-of-date")
+        rows = _export(target, where.force, progress) if tables else {}
+        summary = None
+        if tables is not None:
+            with logs.read(target) as opened:
+                summary = pipeline.summarise(opened, prefix)
+    return RunResult(
+        log=target,
+        stages=tuple(report.stages),
+        frames=report.frames,
+        rows=report.rows,
+        tracks=report.tracks,
+        events=report.events,
+        stale=tuple(report.stale),
+        layouts=tuple(layouts),
+        tables=rows,
+        summary=summary,
+        written_to=written_to if report.stages else None,
+        written_because=place.why,
+        warnings=tuple(dict.fromkeys(warnings)),
+        notes=tuple(notes),
+        seconds=round(monotonic() - began, 3),
+    )
+
+
+def _export(target: Path, force: bool, progress: Progress) -> dict[str, int]:
+    """Write the tables beside a log; how many rows each has."""
+    with logs.read(target) as opened:
+        exported = export(opened, default_folder(target), progress, force=force)
+    for words in exported.notes:
+        warn(words, "left-out")
+    return exported.rows
+
+
+def transform_of(stage: str, chosen: str | Transform | None, options: Mapping[str, Option]) -> Transform:
+    """Return the transform of a stage: the one of this name, or this one; with these options.
+
+    Raises McaptrackError for a name or an option that does not exist.
+    """
+    if chosen is None or isinstance(chosen, str):
+        step = STAGES[stage]
+        if chosen and step.parameter:
+            return step.make(**{step.parameter: chosen, **options})
+        return step.make(chosen or "", **options)
+    return _with_options(chosen, options)
+
+
+def _with_options(base: Transform, options: Mapping[str, Option]) -> Transform:
+    """Return a transform with other values of some options. Raises McaptrackError for one that it does not have."""
+    known = [f.name for f in fields(base) if not f.metadata.get("context")]
+    for name in options:
+        if name not in known:
+            close = get_close_matches(name, known, 1)
+            meant = f"did you mean {close[0]}? " if close else ""
+            raise McaptrackError(
+                f"{type(base).__name__} has no parameter {name}; {meant}there are {', '.join(known) or 'none'}"
+            )
+    return replace(base, **options)
+
+
+def run_stage(
+    stage: str,
+    transform: Transform,
+    log: PathLike,
+    *,
+    topic: str | None = None,
+    to: str | None = None,
+    camera: str | None = None,
+    output: PathLike | None = None,
+    sidecar: bool | None = None,
+    force: bool = False,
+    stages: Mapping[str, Transform] | None = None,
+    mode: Mode | None = None,
+    progress: Progress = no_progress,
+) -> RunResult:
+    """Run one stage with a transform; ``detect``, ``track`` and the others are this with a transform of theirs."""
+    modes = STAGES[stage].modes
+    keep = modes[mode or "both"] if modes else None
+
+    def plan(opened: logs.Log, prefix: str, say: Callable[[str], None]) -> list[Job]:
+        return pipeline.plan_stage(opened, prefix, stage, transform, topic, to, keep, say, stages or {})
+
+    return work(Where(log, camera, topic, output, sidecar, force), plan, None, progress, None)

@@ -1,0 +1,204 @@
+"""Score tracks and predictions against ground truth."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import Any, Final
+
+from mcaptrack import log as logs
+from mcaptrack import pipeline
+from mcaptrack.api.common import Notes, PathLike, detail, names_of, optional_path, paths_of
+from mcaptrack.api.ingesting import parse_fps
+from mcaptrack.errors import McaptrackError
+from mcaptrack.evaluation import (
+    COMBINED,
+    EvaluateOptions,
+    EvaluationInput,
+    EvaluationRow,
+    sequence_of_files,
+    sequence_of_log,
+)
+from mcaptrack.evaluation import evaluate as score_sequences
+from mcaptrack.evaluation.aligned import Similarity
+from mcaptrack.evaluation.metrics import Rules
+from mcaptrack.geometry.plane import Point
+from mcaptrack.notices import Notice, collected, warn
+from mcaptrack.tables.compared import compare_files, pair_files
+
+#: Files that are tracks, not logs, by the end of their name; those that hold several channels.
+_TABLES: Final = (".parquet", ".pq")
+_FILES: Final = (".txt", ".csv", *_TABLES)
+#: The scores that a limit can be set for.
+LIMITS: Final = ("MOTA", "IDF1", "IDP", "IDR", "HOTA", "DetA", "AssA", "LocA")
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Scores of tracks and predictions against ground truth.
+
+    Attributes
+    ----------
+    results : tuple of mcaptrack.evaluation.EvaluationRow
+        One for each sequence, channel of tracks, similarity and gate; with several sequences also one for all of them
+        together, whose ``sequence`` is "COMBINED".
+    notes : tuple of str
+        How files were paired and read.
+    warnings : tuple of mcaptrack.Notice
+        What was assumed, and what could not be compared.
+
+    """
+
+    results: tuple[EvaluationRow, ...]
+    notes: tuple[str, ...]
+    warnings: tuple[Notice, ...]
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Return the results as dictionaries, for a ``pandas.DataFrame``: shares from 0 to 1, lengths in metres."""
+        return [result.to_json() for result in self.results]
+
+    def score(self, name: str, tracks: str = "", similarity: str = "", gate: float | None = None) -> float:
+        """Return one score, such as "IDF1", of the only result that fits the rest.
+
+        ``tracks`` is a topic or the end of one ("retracks"). Of several sequences, all together count. Raises
+        McaptrackError if no result fits, or several.
+        """
+        rows = [
+            row for row in self.final() if row["tracks"].endswith(tracks) and row["similarity"].startswith(similarity)
+        ]
+        rows = [row for row in rows if gate in (None, row["gate"])]
+        whole = [row for row in rows if row["tracks"] == tracks or row["tracks"].endswith(f"/{tracks}")]
+        rows = whole or rows
+        if len(rows) != 1 or name not in rows[0]:
+            there = ", ".join(f"{row['tracks']} {row['similarity']} {row['gate']:g}" for row in self.final())
+            raise McaptrackError(f"{len(rows)} results fit {tracks} {similarity} {gate} {name}; there are {there}")
+        return float(rows[0][name])
+
+    def final(self) -> list[dict[str, Any]]:
+        """Return the rows of all sequences together; those of the only sequence, if there is one."""
+        rows = self.rows()
+        return [row for row in rows if row["sequence"] == COMBINED] or rows
+
+    def below(self, limits: Mapping[str, float]) -> list[str]:
+        """Return a line for each final score that is below its limit, such as ``{"IDF1": 0.7}``."""
+        return [
+            f"{row['sequence']} {row['tracks']} {row['similarity']} {row['gate']:g}: "
+            f"{name} {row[name]:.4f} is under {least:g}"
+            for name, least in limits.items()
+            for row in self.final()
+            if row[name] < least
+        ]
+
+
+def evaluate(
+    tracks: PathLike | Sequence[PathLike],
+    *,
+    truth: PathLike | Sequence[PathLike] | None = None,
+    similarity: Similarity | None = None,
+    gate_m: float | Sequence[float] = (0.5, 1.0, 2.0),
+    min_iou: float = 0.5,
+    rules: Rules = "trackeval",
+    topic: str | Sequence[str] | None = None,
+    camera: str | None = None,
+    ground_plane: PathLike | None = None,
+    point: Point = "foot",
+    fps: float | str | Fraction | None = None,
+) -> Scores:
+    """Score tracks and predictions against ground truth.
+
+    Parameters
+    ----------
+    tracks : path or sequence of paths
+        Logs, which hold their ground truth; or, with ``truth``, files of tracks: MOTChallenge, KITTI tracking, Parquet,
+        and the label files that ``ingest`` reads.
+    truth : path or sequence of paths, optional
+        Ground truth for files of tracks: one file for each, matched by name or in order.
+    similarity : {"iou", "metres"}, optional
+        Match by overlap of boxes or by distance on the ground; by default both, as far as there are boxes and metres.
+    gate_m : float or sequence of float, default (0.5, 1, 2)
+        Largest distance of a match in metres; scores are given for each.
+    min_iou : float, default 0.5
+        Least overlap (IoU) of a match.
+    rules : {"trackeval", "motmetrics"}, default "trackeval"
+        Rules for counting switches and fragments.
+    topic : str or sequence of str, optional
+        Score these channels. By default tracks, samples, retracks and retracks/online.
+    camera : str, optional
+        Name of the camera, if a log has several.
+    ground_plane : path, optional
+        For files: 3x3 homography from pixels to metres on the ground.
+    point : {"foot", "center"}, default "foot"
+        For files: which point of a box touches the ground.
+    fps : float, str or Fraction, optional
+        For files: frames per second.
+
+    Returns
+    -------
+    Scores
+        A result for each channel, similarity and gate.
+
+    Raises
+    ------
+    McaptrackError
+        If there is no ground truth, or if nothing can be compared.
+
+    Examples
+    --------
+    >>> import mcaptrack
+    >>> scores = mcaptrack.evaluate("log.mcap", similarity="metres", gate_m=1.0)
+    >>> 0.5 < scores.score("IDF1", "retracks") <= 1.0
+    True
+
+    """
+    topics, notes = names_of(topic), Notes()
+    gates = tuple(map(float, gate_m)) if isinstance(gate_m, Sequence) else (float(gate_m),)
+    options = EvaluateOptions((similarity,) if similarity else (), gates, min_iou, rules, topics)
+    paths = paths_of(tracks)
+    with collected() as warnings:
+        if truth is None:
+            sequences = _from_logs(paths, camera, topics)
+        else:
+            plane = optional_path(ground_plane)
+            sequences = _from_files(paths, paths_of(truth), parse_fps(fps), plane, point, topics, notes)
+        outcome = score_sequences(sequences, options, detail)
+        for words in outcome.notes:
+            warn(words, "not-compared")
+    return Scores(tuple(outcome.results), tuple(notes), tuple(dict.fromkeys(warnings)))
+
+
+def holds_tables(path: Path) -> bool:
+    """Return whether a file is a table of tracks, which may hold several channels."""
+    return path.suffix.lower() in _TABLES
+
+
+def _from_logs(paths: Sequence[Path], camera: str | None, topics: tuple[str, ...]) -> list[EvaluationInput]:
+    sequences = []
+    for path in paths:
+        if path.suffix.lower() in _FILES:
+            raise McaptrackError(f"{path} is no log; to score a file of tracks give the ground truth with `truth=`")
+        with logs.read(path) as opened:
+            sequences.append(sequence_of_log(opened, pipeline.find_camera(opened, camera), topics))
+    return sequences
+
+
+def _from_files(
+    tracks: Sequence[Path],
+    truths: Sequence[Path],
+    fps: Fraction | None,
+    ground_plane: Path | None,
+    point: Point,
+    topics: tuple[str, ...],
+    notes: Notes,
+) -> list[EvaluationInput]:
+    pairs, words = pair_files(tracks, truths)
+    if words:
+        notes.say(words)
+    sequences = []
+    for name, path, truth in pairs:
+        both = compare_files(path, truth, fps, ground_plane, point, topics)
+        for note in both.notes:
+            notes.say(note)
+        sequences.append(sequence_of_files(name, path, both.truth, both.tracks, len(pairs)))
+    return sequences

@@ -1,0 +1,401 @@
+"""Run one stage on a log: detect, track, sample, predict, retrack.
+
+Each function writes channels into the log (or into a copy, ``output``) and returns what came of it. Inputs that are
+missing are made first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from mcaptrack.api.common import PathLike, Progress, no_progress
+from mcaptrack.api.running import Mode, Option, RunResult, run_stage, transform_of
+from mcaptrack.errors import McaptrackError
+from mcaptrack.transforms import PROFILES, Transform
+
+
+def detect(
+    log: PathLike,
+    *,
+    detector: str | Transform | None = None,
+    topic: str | None = None,
+    to: str | None = None,
+    camera: str | None = None,
+    output: PathLike | None = None,
+    sidecar: bool | None = None,
+    force: bool = False,
+    stages: Mapping[str, Transform] | None = None,
+    progress: Progress = no_progress,
+    **options: Option,
+) -> RunResult:
+    """Detect what moves in the video of a log.
+
+    Parameters
+    ----------
+    log : path
+        The log.
+    detector : str or Transform, optional
+        "knn" (the default), "mog2" or "frame-difference", the name of an installed detector, "module:Class", or a
+        transform.
+    topic : str, optional
+        Read this channel instead of the usual one, /camera/video.
+    to : str, optional
+        Write to this channel instead of the usual one, /camera/detections.
+    camera : str, optional
+        Name of the camera, if the log has several.
+    output : path, optional
+        Write to this file instead; the log stays unchanged.
+    sidecar : bool, optional
+        Write into LOG.results.mcap beside the log (True) or into the log (False). By default beside recordings that
+        ROS tools read, otherwise into the log.
+    force : bool, default False
+        Overwrite ``output`` if it exists.
+    stages : mapping of str to Transform, optional
+        Transforms by stage, for channels that are missing and have to be made first.
+    progress : callable, optional
+        Called as ``progress(stage, done, total)``.
+    **options
+        Options of the detector; `mcaptrack detect --help` lists them.
+
+    Returns
+    -------
+    RunResult
+        What was made: ``rows`` has the number of detections.
+
+    Raises
+    ------
+    McaptrackError
+        If the log cannot be read or written, if there is nothing to start from, or for an option that does not exist.
+
+    Examples
+    --------
+    >>> import mcaptrack
+    >>> mcaptrack.detect("log.mcap", detector="mog2", output="boxes.mcap").stages
+    ('detect',)
+
+    """
+    return run_stage(
+        "detect",
+        transform_of("detect", detector, options),
+        log,
+        topic=topic,
+        to=to,
+        camera=camera,
+        output=output,
+        sidecar=sidecar,
+        force=force,
+        stages=stages,
+        progress=progress,
+    )
+
+
+def track(
+    log: PathLike,
+    *,
+    tracker: str | Transform | None = None,
+    topic: str | None = None,
+    to: str | None = None,
+    camera: str | None = None,
+    output: PathLike | None = None,
+    sidecar: bool | None = None,
+    force: bool = False,
+    stages: Mapping[str, Transform] | None = None,
+    progress: Progress = no_progress,
+    **options: Option,
+) -> RunResult:
+    """Track detections: give each object an id that it keeps from frame to frame.
+
+    Parameters
+    ----------
+    log : path
+        The log.
+    tracker : str or Transform, optional
+        "sort" (the default), "bytetrack" or "ocsort", the name of an installed tracker, "module:Class", or a
+        transform.
+    topic : str, optional
+        Read this channel instead of the usual one, /camera/detections.
+    to : str, optional
+        Write to this channel instead of the usual one, /camera/tracks.
+    camera : str, optional
+        Name of the camera, if the log has several.
+    output : path, optional
+        Write to this file instead; the log stays unchanged.
+    sidecar : bool, optional
+        Write into LOG.results.mcap beside the log (True) or into the log (False). By default beside recordings that
+        ROS tools read, otherwise into the log.
+    force : bool, default False
+        Overwrite ``output`` if it exists.
+    stages : mapping of str to Transform, optional
+        Transforms by stage, for channels that are missing and have to be made first.
+    progress : callable, optional
+        Called as ``progress(stage, done, total)``.
+    **options
+        Options of the tracker, such as ``max_age_s``; `mcaptrack track --help` lists them.
+
+    Returns
+    -------
+    RunResult
+        What was made: ``tracks`` has the number of track ids.
+
+    Raises
+    ------
+    McaptrackError
+        If the log cannot be read or written, if there is nothing to start from, or for an option that does not exist.
+
+    Examples
+    --------
+    >>> import mcaptrack
+    >>> result = mcaptrack.track("log.mcap", tracker="bytetrack", max_age_s=1.0, output="tracks.mcap")
+    >>> list(result.tracks)
+    ['/camera/tracks']
+
+    """
+    return run_stage(
+        "track",
+        transform_of("track", tracker, options),
+        log,
+        topic=topic,
+        to=to,
+        camera=camera,
+        output=output,
+        sidecar=sidecar,
+        force=force,
+        stages=stages,
+        progress=progress,
+    )
+
+
+def sample(
+    log: PathLike,
+    *,
+    transform: Transform | None = None,
+    topic: str | None = None,
+    to: str | None = None,
+    camera: str | None = None,
+    output: PathLike | None = None,
+    sidecar: bool | None = None,
+    force: bool = False,
+    stages: Mapping[str, Transform] | None = None,
+    progress: Progress = no_progress,
+    **options: Option,
+) -> RunResult:
+    """Resample tracks to a fixed rate and project them to the ground plane.
+
+    Parameters
+    ----------
+    log : path
+        The log.
+    transform : Transform, optional
+        The transform to use instead of ``mcaptrack.transforms.Sample``.
+    topic : str, optional
+        Read this channel instead of the usual one, /camera/tracks.
+    to : str, optional
+        Write to this channel instead of the usual one, /camera/samples.
+    camera : str, optional
+        Name of the camera, if the log has several.
+    output : path, optional
+        Write to this file instead; the log stays unchanged.
+    sidecar : bool, optional
+        Write into LOG.results.mcap beside the log (True) or into the log (False). By default beside recordings that
+        ROS tools read, otherwise into the log.
+    force : bool, default False
+        Overwrite ``output`` if it exists.
+    stages : mapping of str to Transform, optional
+        Transforms by stage, for channels that are missing and have to be made first.
+    progress : callable, optional
+        Called as ``progress(stage, done, total)``.
+    **options
+        Options such as ``rate_hz``; `mcaptrack sample --help` lists them.
+
+    Returns
+    -------
+    RunResult
+        What was made.
+
+    Raises
+    ------
+    McaptrackError
+        If the log cannot be read or written, if there is nothing to start from, or for an option that does not exist.
+
+    Examples
+    --------
+    >>> import mcaptrack
+    >>> mcaptrack.sample("log.mcap", rate_hz=5.0, output="samples.mcap").channels
+    ('/camera/samples',)
+
+    """
+    return run_stage(
+        "sample",
+        transform_of("sample", transform, options),
+        log,
+        topic=topic,
+        to=to,
+        camera=camera,
+        output=output,
+        sidecar=sidecar,
+        force=force,
+        stages=stages,
+        progress=progress,
+    )
+
+
+def predict(
+    log: PathLike,
+    *,
+    predictor: str | Transform | None = None,
+    topic: str | None = None,
+    to: str | None = None,
+    camera: str | None = None,
+    output: PathLike | None = None,
+    sidecar: bool | None = None,
+    force: bool = False,
+    stages: Mapping[str, Transform] | None = None,
+    progress: Progress = no_progress,
+    **options: Option,
+) -> RunResult:
+    """Predict the future positions of tracks, with covariance.
+
+    Parameters
+    ----------
+    log : path
+        The log.
+    predictor : str or Transform, optional
+        "red" (the default), "lstm", "kalman", "holt-cv", "cv", "red:FILE", "onnx:FILE", the name of an installed
+        predictor, or "module:Class"; or a transform.
+    topic : str, optional
+        Read this channel instead of the usual one, /camera/samples.
+    to : str, optional
+        Write to this channel instead of the usual one, /camera/predictions.
+    camera : str, optional
+        Name of the camera, if the log has several.
+    output : path, optional
+        Write to this file instead; the log stays unchanged.
+    sidecar : bool, optional
+        Write into LOG.results.mcap beside the log (True) or into the log (False). By default beside recordings that
+        ROS tools read, otherwise into the log.
+    force : bool, default False
+        Overwrite ``output`` if it exists.
+    stages : mapping of str to Transform, optional
+        Transforms by stage, for channels that are missing and have to be made first.
+    progress : callable, optional
+        Called as ``progress(stage, done, total)``.
+    **options
+        Options such as ``horizon_s``; `mcaptrack predict --help` lists them.
+
+    Returns
+    -------
+    RunResult
+        What was made.
+
+    Raises
+    ------
+    McaptrackError
+        If the log cannot be read or written, if there is nothing to start from, or for an option that does not exist.
+
+    Examples
+    --------
+    >>> import mcaptrack
+    >>> mcaptrack.predict("log.mcap", predictor="kalman", output="predictions.mcap").channels
+    ('/camera/predictions',)
+
+    """
+    return run_stage(
+        "predict",
+        transform_of("predict", predictor, options),
+        log,
+        topic=topic,
+        to=to,
+        camera=camera,
+        output=output,
+        sidecar=sidecar,
+        force=force,
+        stages=stages,
+        progress=progress,
+    )
+
+
+def retrack(
+    log: PathLike,
+    *,
+    retracker: str | Transform | None = None,
+    profile: str = "default",
+    mode: Mode = "both",
+    topic: str | None = None,
+    to: str | None = None,
+    camera: str | None = None,
+    output: PathLike | None = None,
+    sidecar: bool | None = None,
+    force: bool = False,
+    stages: Mapping[str, Transform] | None = None,
+    progress: Progress = no_progress,
+    **options: Option,
+) -> RunResult:
+    """Re-track by prediction: link and repair tracks, and leave out false ones.
+
+    Parameters
+    ----------
+    log : path
+        The log.
+    retracker : str or Transform, optional
+        "prediction" (the default), the name of an installed re-tracker, "module:Class", or a transform.
+    profile : {"default", "paper", "authors"}, default "default"
+        Values of all options of the default re-tracker: those of this project, those of the paper (Yu and Zhou, IROS
+        2021), or those of its authors' program.
+    mode : {"both", "offline", "online"}, default "both"
+        Write tracks that use the whole log (offline), those that use the past alone (online), or both.
+    topic : str, optional
+        Read this channel instead of the usual one, /camera/samples.
+    to : str, optional
+        Write to this channel instead of the usual one, /camera/retracks.
+    camera : str, optional
+        Name of the camera, if the log has several.
+    output : path, optional
+        Write to this file instead; the log stays unchanged.
+    sidecar : bool, optional
+        Write into LOG.results.mcap beside the log (True) or into the log (False). By default beside recordings that
+        ROS tools read, otherwise into the log.
+    force : bool, default False
+        Overwrite ``output`` if it exists.
+    stages : mapping of str to Transform, optional
+        Transforms by stage, for channels that are missing and have to be made first.
+    progress : callable, optional
+        Called as ``progress(stage, done, total)``.
+    **options
+        Options that differ from the profile; `mcaptrack retrack --help` lists them.
+
+    Returns
+    -------
+    RunResult
+        What was made: ``tracks`` has the number of track ids.
+
+    Raises
+    ------
+    McaptrackError
+        If the log cannot be read or written, if there is nothing to start from, or for an option that does not exist.
+
+    Examples
+    --------
+    >>> import mcaptrack
+    >>> result = mcaptrack.retrack("log.mcap", profile="paper", output="retracks.mcap")
+    >>> result.channels[:2]
+    ('/camera/retracks', '/camera/retracks/online')
+
+    """
+    if profile not in PROFILES:
+        raise McaptrackError(f"there is no profile {profile}; there are {', '.join(PROFILES)}")
+    if retracker is None:
+        retracker = PROFILES[profile]
+    return run_stage(
+        "retrack",
+        transform_of("retrack", retracker, options),
+        log,
+        mode=mode,
+        topic=topic,
+        to=to,
+        camera=camera,
+        output=output,
+        sidecar=sidecar,
+        force=force,
+        stages=stages,
+        progress=progress,
+    )

@@ -1,0 +1,275 @@
+"""Check and repair logs, and remove channels from them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from pathlib import Path
+
+from mcaptrack import log as logs
+from mcaptrack.api.common import PathLike, Progress, as_path, log_output, names_of, no_progress, warnings_about
+from mcaptrack.errors import McaptrackError
+from mcaptrack.files import is_same_file, refuse_overwrite
+from mcaptrack.log import CheckResult, Finding
+from mcaptrack.notices import Notice
+from mcaptrack.schema.provenance import Provenance
+from mcaptrack.sources.ingest.sidecar import recording_of
+
+
+@dataclass(frozen=True)
+class LogCheck:
+    """What was found in a log.
+
+    Attributes
+    ----------
+    log : pathlib.Path
+        The log.
+    files : tuple of mcaptrack.log.CheckResult
+        What was found in each file: the log, and LOG.results.mcap if it stands beside it. Each has ``path``,
+        ``messages``, ``chunks``, ``findings`` and ``is_sound``.
+    warnings : tuple of mcaptrack.Notice
+        What looks odd.
+
+    """
+
+    log: Path
+    files: tuple[CheckResult, ...]
+    warnings: tuple[Notice, ...]
+
+    @property
+    def is_sound(self) -> bool:
+        """Whether there are no errors."""
+        return all(file.is_sound for file in self.files)
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """Errors, and warnings about what could be better."""
+        return tuple(found for file in self.files for found in file.findings)
+
+
+def check(log: PathLike, *, progress: Progress = no_progress) -> LogCheck:
+    """Check every byte of a log: structure, checksums, indexes, statistics, order of messages.
+
+    Parameters
+    ----------
+    log : path
+        The log; results that stand beside it are checked, too.
+    progress : callable, optional
+        Called as ``progress(stage, done, total)``.
+
+    Returns
+    -------
+    LogCheck
+        Whether the log is sound, and what was found.
+
+    Raises
+    ------
+    McaptrackError
+        If there is no file to check. Damage is a finding, not an error.
+
+    Examples
+    --------
+    >>> import mcaptrack
+    >>> mcaptrack.check("log.mcap").is_sound
+    True
+
+    """
+    path = as_path(log)
+    with warnings_about(path) as warnings:
+        files = tuple(logs.check(part, progress) for part in files_of(path))
+    return LogCheck(path, files, tuple(dict.fromkeys(warnings)))
+
+
+def files_of(log: Path) -> list[Path]:
+    """Return the files of a log: itself, and its results if they stand beside it."""
+    beside = logs.results_path(log)
+    return [log, beside] if beside != log and beside.exists() else [log]
+
+
+@dataclass(frozen=True)
+class LogRecovery:
+    """What was saved of a damaged log.
+
+    Attributes
+    ----------
+    log, output : pathlib.Path
+        The damaged log, and the log with what is intact.
+    messages, chunks : int
+        Number of messages and chunks that were saved.
+    lost : tuple of str
+        What was lost.
+    warnings : tuple of mcaptrack.Notice
+        What looks odd.
+
+    """
+
+    log: Path
+    output: Path
+    messages: int
+    chunks: int
+    lost: tuple[str, ...]
+    warnings: tuple[Notice, ...]
+
+
+def recover(
+    log: PathLike, output: PathLike | None = None, *, force: bool = False, progress: Progress = no_progress
+) -> LogRecovery:
+    """Save what is intact in a damaged log; the damaged log stays unchanged.
+
+    Parameters
+    ----------
+    log : path
+        The damaged log.
+    output : path, optional
+        The log to write, by default LOG.recovered.mcap beside the log.
+    force : bool, default False
+        Overwrite ``output`` if it exists.
+    progress : callable, optional
+        Called as ``progress(stage, done, total)``.
+
+    Returns
+    -------
+    LogRecovery
+        What was saved and what was lost.
+
+    Raises
+    ------
+    McaptrackError
+        If nothing can be saved, or if ``output`` exists.
+
+    Examples
+    --------
+    >>> import mcaptrack
+    >>> mcaptrack.recover("log.mcap", "saved.mcap").lost
+    ()
+
+    """
+    path = as_path(log)
+    target = path.with_suffix(".recovered.mcap") if output is None else log_output(output, path)
+    if is_same_file(target, path):
+        raise McaptrackError(f"{path} is both input and output; give another name with `output=`")
+    refuse_overwrite(target, force)
+    with warnings_about(path) as warnings:
+        done = logs.recover(path, target, progress)
+    return LogRecovery(path, target, done.messages, done.chunks, tuple(done.lost), tuple(dict.fromkeys(warnings)))
+
+
+@dataclass(frozen=True)
+class DropResult:
+    """What was removed from a log.
+
+    Attributes
+    ----------
+    log : pathlib.Path
+        The log without the channels.
+    dropped : tuple of str
+        The topics of the channels that were removed.
+    messages : int
+        Number of messages that were removed.
+    bytes_before, bytes : int
+        Size of the log, with its results, before and after.
+    warnings : tuple of mcaptrack.Notice
+        What looks odd.
+
+    """
+
+    log: Path
+    dropped: tuple[str, ...]
+    messages: int
+    bytes_before: int
+    bytes: int
+    warnings: tuple[Notice, ...]
+
+
+def drop(
+    log: PathLike,
+    topics: str | Sequence[str],
+    *,
+    output: PathLike | None = None,
+    in_place: bool = False,
+    force: bool = False,
+) -> DropResult:
+    """Remove channels from a log, in place or in a copy; all others stay unchanged, to the byte.
+
+    Channels that only describe a removed one (its views, events and scores) are removed with it.
+
+    Parameters
+    ----------
+    log : path
+        The log.
+    topics : str or sequence of str
+        Channels to remove, or patterns such as "/camera/*".
+    output : path, optional
+        Write a copy to this file; the log stays unchanged.
+    in_place : bool, default False
+        Also change a recording in place that ROS tools may have to read.
+    force : bool, default False
+        Overwrite ``output`` if it exists.
+
+    Returns
+    -------
+    DropResult
+        What was removed.
+
+    Raises
+    ------
+    McaptrackError
+        If no channel fits one of the topics, or for a recording that ROS tools read.
+
+    Examples
+    --------
+    >>> import mcaptrack
+    >>> mcaptrack.drop("log.mcap", "/camera/video", output="small.mcap").dropped
+    ('/camera/video',)
+
+    """
+    path = as_path(log)
+    copy = None if output is None else log_output(output, path)
+    if copy is not None:
+        refuse_overwrite(copy, force)
+        if is_same_file(copy, path):
+            raise McaptrackError(f"{path} is both input and output; leave `output=` out to change it in place")
+    beside = logs.results_path(path)
+    with warnings_about(path) as warnings:
+        with logs.read(path) as opened:
+            dropped = _chosen(opened, names_of(topics))
+            holds = {part.path: [c for c in part.recorded if c.topic in dropped] for part in opened.parts}
+            messages = sum(channel.messages for gone in holds.values() for channel in gone)
+            before = sum(part.size for part in opened.parts)
+            recorded = {c.topic for c in holds[path] if Provenance.from_metadata(c.metadata) is None}
+            if recorded and copy is None and not in_place and (recording := recording_of(opened)):
+                raise McaptrackError(
+                    f"{path} is {recording}, which ROS tools read; `output=` writes a copy without "
+                    f"{', '.join(sorted(recorded))}, `in_place=True` changes it all the same"
+                )
+        targets = {path: copy or path, beside: logs.results_path(copy) if copy else beside}
+        if copy is not None and beside in holds:
+            refuse_overwrite(targets[beside], force)
+        for part, gone in holds.items():
+            if gone or copy is not None:
+                target = targets[part] if copy else None
+                with (
+                    logs.read(part, sidecar=False) as opened,
+                    logs.extend(opened, target, drop={c.topic for c in gone}),
+                ):
+                    pass
+        after = sum(targets[part].stat().st_size for part in holds)
+    return DropResult(copy or path, tuple(sorted(dropped)), messages, before, after, tuple(dict.fromkeys(warnings)))
+
+
+def _chosen(opened: logs.Log, patterns: Sequence[str]) -> set[str]:
+    """The topics that fit any of the patterns, with the channels that only describe them.
+
+    Raises McaptrackError for a pattern that fits none.
+    """
+    chosen: set[str] = set()
+    for pattern in patterns:
+        found = {topic for topic in opened.channels if topic == pattern or fnmatchcase(topic, pattern)}
+        if not found:
+            opened.channel(pattern)  # raises, with the channels that there are
+        chosen |= found
+    made = {topic: Provenance.from_metadata(channel.metadata) for topic, channel in opened.channels.items()}
+    for transform in ("events", "view"):  # in this order: events have views
+        chosen |= {topic for topic, how in made.items() if how and how.transform == transform and how.input in chosen}
+    return chosen

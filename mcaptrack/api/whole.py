@@ -1,0 +1,157 @@
+"""Run all stages on a log, and write what happened to tracks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+
+from mcaptrack import log as logs
+from mcaptrack import pipeline
+from mcaptrack.api.common import PathLike, Progress, names_of, no_progress
+from mcaptrack.api.running import RunResult, Where, transform_of, work
+from mcaptrack.evaluation.aligned import Similarity
+from mcaptrack.evaluation.events import EventOptions
+from mcaptrack.pipeline import Job, Watch
+from mcaptrack.transforms import STAGES, Transform
+
+
+def run(
+    log: PathLike,
+    *,
+    topic: str | None = None,
+    camera: str | None = None,
+    output: PathLike | None = None,
+    sidecar: bool | None = None,
+    events: bool | EventOptions = True,
+    tables: bool = True,
+    force: bool = False,
+    detector: str | Transform | None = None,
+    tracker: str | Transform | None = None,
+    retracker: str | Transform | None = None,
+    predictor: str | Transform | None = None,
+    stages: Mapping[str, Transform] | None = None,
+    progress: Progress = no_progress,
+) -> RunResult:
+    """Run all stages that are missing or out of date, then write events, views, layouts and tables.
+
+    Channels that are up to date stay as they are; those that are out of date are made again with the options that
+    they had.
+
+    Parameters
+    ----------
+    log : path
+        The log.
+    topic : str, optional
+        Begin with the pictures, or the detections, of this channel.
+    camera : str, optional
+        Name of the camera, if the log has several.
+    output : path, optional
+        Write to this file instead; the log stays unchanged.
+    sidecar : bool, optional
+        Write into LOG.results.mcap beside the log (True) or into the log (False). By default beside recordings that
+        ROS tools read, otherwise into the log.
+    events : bool or EventOptions, default True
+        Write events of tracks and errors of predictions, and how tracks are matched with the ground truth for them.
+    tables : bool, default True
+        Write Parquet tables beside the log.
+    force : bool, default False
+        Run everything again, and overwrite ``output`` if it exists.
+    detector, tracker, retracker, predictor : str or Transform, optional
+        Use this one, also where another one was used before: a built-in name, the name of an installed one,
+        "module:Class", or a transform.
+    stages : mapping of str to Transform, optional
+        Transforms by stage, for channels that are missing; with ``force`` also for those that exist.
+    progress : callable, optional
+        Called as ``progress(stage, done, total)``.
+
+    Returns
+    -------
+    RunResult
+        What was made; ``summary`` has what the log holds now, and its scores if it has ground truth.
+
+    Raises
+    ------
+    McaptrackError
+        If the log cannot be read or written, or if there is nothing to start from.
+
+    Examples
+    --------
+    >>> import mcaptrack
+    >>> from mcaptrack.transforms import ByteTrack
+    >>> result = mcaptrack.run("log.mcap", output="done.mcap", tracker=ByteTrack(max_age_s=1.0))
+    >>> result.summary.tracks > 0
+    True
+
+    """
+    named = {"detector": detector, "tracker": tracker, "retracker": retracker, "predictor": predictor}
+    chosen = {kind: one for kind, one in named.items() if one is not None}
+    transforms = dict(stages or {})
+    transforms |= {s.name: transform_of(s.name, chosen[s.option], {}) for s in STAGES.values() if s.option in chosen}
+
+    def plan(opened: logs.Log, prefix: str, say: Callable[[str], None]) -> list[Job]:
+        return pipeline.plan_all(opened, prefix, say, topic, transforms, force, chosen)
+
+    options = events if isinstance(events, EventOptions) else EventOptions()
+    watch = Watch(options, anew=force) if events else None
+    return work(Where(log, camera, topic, output, sidecar, force), plan, watch, progress, tables)
+
+
+def events(
+    log: PathLike,
+    *,
+    topic: str | Sequence[str] | None = None,
+    similarity: Similarity | None = None,
+    gate_m: float | None = None,
+    min_iou: float | None = None,
+    camera: str | None = None,
+    output: PathLike | None = None,
+    sidecar: bool | None = None,
+    force: bool = False,
+    progress: Progress = no_progress,
+) -> RunResult:
+    """Write events of tracks (begin, end, identity switches) and errors of predictions into a log.
+
+    Parameters
+    ----------
+    log : path
+        The log.
+    topic : str or sequence of str, optional
+        Write events of these channels of tracks. By default of /camera/tracks and /camera/retracks, with the errors
+        of predictions.
+    similarity : {"iou", "metres"}, optional
+        How ground truth and tracks are matched: by overlap of boxes or by distance on the ground. By default by
+        overlap where tracks are at the video's rate, otherwise by distance.
+    gate_m : float, optional
+        Largest distance of a match in metres, by default 1.
+    min_iou : float, optional
+        Least overlap of a match, by default 0.5.
+    camera : str, optional
+        Name of the camera, if the log has several.
+    output : path, optional
+        Write to this file instead; the log stays unchanged.
+    sidecar : bool, optional
+        Write into LOG.results.mcap beside the log (True) or into the log (False).
+    force : bool, default False
+        Overwrite ``output`` if it exists.
+    progress : callable, optional
+        Called as ``progress(stage, done, total)``.
+
+    Returns
+    -------
+    RunResult
+        What was made: ``events`` has the number of events of each kind.
+
+    Raises
+    ------
+    McaptrackError
+        If the log cannot be read or written, or has no tracks.
+
+    Examples
+    --------
+    >>> import mcaptrack
+    >>> result = mcaptrack.events("log.mcap", similarity="metres", gate_m=0.5)
+    >>> sorted(result.events)
+    ['/camera/retracks', '/camera/tracks']
+
+    """
+    watch = Watch(EventOptions(similarity, gate_m, min_iou), topics=names_of(topic), again=True)
+    return work(Where(log, camera, None, output, sidecar, force), lambda *_: [], watch, progress, None)

@@ -1,0 +1,255 @@
+"""What the command line does, as functions: the same results, results to look at, and nothing printed."""
+
+from __future__ import annotations
+
+import ast
+import doctest
+import importlib
+import inspect
+import json
+import logging
+import re
+import shutil
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import mcaptrack
+from mcaptrack import log
+from mcaptrack.cli.flags import with_flags
+from mcaptrack.errors import McaptrackError
+from mcaptrack.errors import call as proposed
+from mcaptrack.schema import TRACKS
+from mcaptrack.transforms import ByteTrack
+from tests.commands import GROUP, call, done, made_log
+
+PACKAGE = Path(mcaptrack.__file__).parent
+FUNCTIONS = [name for name in mcaptrack.__all__ if inspect.isfunction(getattr(mcaptrack, name))]
+
+
+@pytest.fixture(scope="module")
+def template(tmp_path_factory) -> Path:
+    """A folder with a log that has all results, and what it was made from. Not to be changed."""
+    folder = made_log(tmp_path_factory.mktemp("made")).parent
+    (folder / "a.mcap").rename(folder / "log.mcap")
+    shutil.copy(folder / "clip.mp4", folder / "video.mp4")
+    return folder
+
+
+@pytest.fixture
+def place(template, tmp_path, monkeypatch) -> Path:
+    for path in template.iterdir():
+        if path.is_file():
+            shutil.copy(path, tmp_path)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def rows(path: Path, topic: str) -> bytes:
+    with log.read(path) as opened:
+        return opened.rows(topic, TRACKS).rows.tobytes()
+
+
+class TestTheSameAsTheCommandLine:
+    def test_track_with_options_gives_the_same_rows(self, place):
+        mcaptrack.track("log.mcap", tracker="bytetrack", max_age_s=0.5, output="library.mcap")
+        mcaptrack.track("log.mcap", tracker=ByteTrack(max_age_s=0.5), output=place / "object.mcap")
+        done("track", "log.mcap", "--tracker", "bytetrack", "--max-age-s", "0.5", "-o", "command.mcap")
+        bytes_of = {Path(f"{name}.mcap").read_bytes() for name in ("library", "object", "command")}
+        assert len(bytes_of) == 1
+
+    def test_ingest_and_run_give_the_same_bytes(self, place):
+        ingested = mcaptrack.ingest("clip.mp4", "b.mcap", ground_plane="plane.txt", truth="truth.txt")
+        assert ingested.messages["/camera/video"] == 30
+        assert mcaptrack.run("b.mcap").stages == ("detect", "track", "sample", "predict", "retrack", "events")
+        assert Path("b.mcap").read_bytes() == Path("log.mcap").read_bytes()
+        again = mcaptrack.run("b.mcap")
+        assert (again.stages, again.written_to) == ((), None)
+
+    def test_scores_are_those_that_the_command_prints(self, place):
+        said = json.loads(done("evaluate", "log.mcap", "--json").out)["results"]
+        assert json.loads(json.dumps(mcaptrack.evaluate("log.mcap").rows())) == said
+
+    def test_info_is_what_the_command_prints(self, place):
+        said = json.loads(done("info", "log.mcap", "--json").out)["results"]
+        assert [mcaptrack.info("log.mcap").to_json()] == said
+
+    @pytest.mark.parametrize("name", FUNCTIONS)
+    def test_functions_and_commands_call_parameters_the_same(self, name):
+        """What a command line can say of the work itself, a call can say under the same name."""
+        command = GROUP.commands.get(name)
+        if command is None:
+            return
+        said = {one.name for one in command.params if not getattr(one, "hidden", False)}
+        said -= {"json", "quiet", "verbose", "config", "help", "logs", "log", "inputs", "path", "words", "topics"}
+        said -= {"fail_under", "csv", "file", "rows", "tables"} if name in ("evaluate", "query") else set()
+        if name in ("info", "check", "query", "evaluate"):
+            said -= {"output", "force", "form"}  # of what is printed
+        signature = inspect.signature(getattr(mcaptrack, name))
+        if not any(one.kind is one.VAR_KEYWORD for one in signature.parameters.values()):
+            assert said <= set(signature.parameters)
+
+
+class TestResults:
+    def test_nothing_is_printed_and_progress_is_told(self, place, capfd):
+        told = []
+        result = mcaptrack.track("log.mcap", tracker="ocsort", output="b.mcap", progress=lambda *now: told.append(now))
+        assert told[-1] == ("track", 30, 30)
+        assert capfd.readouterr() == ("", "")
+        assert result.written_to == Path("b.mcap")
+        assert result.tracks["/camera/tracks"] == len(np.unique(mcaptrack.open("b.mcap").array("tracks")["track_id"]))
+
+    def test_notes_are_logged_and_in_the_result(self, place, caplog):
+        done("drop", "log.mcap", "/camera/tracks")
+        with caplog.at_level(logging.INFO, "mcaptrack"):
+            notes = mcaptrack.sample("log.mcap").notes
+        assert notes == ("/camera/tracks is missing: running track",)
+        assert [record.getMessage() for record in caplog.records] == list(notes)
+
+    def test_warnings_are_python_warnings_at_the_line_of_the_caller_and_in_the_result(self, place):
+        done("ingest", "video.mp4", "-o", "plain.mcap")
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            result = mcaptrack.run("plain.mcap", tables=False)
+        assert "assumed-ground-plane" in [notice.code for notice in result.warnings]
+        mine = [one for one in caught if issubclass(one.category, mcaptrack.McaptrackWarning)]
+        assert len(mine) == len(result.warnings)
+        assert {one.filename for one in mine} == {__file__}
+
+    def test_a_score_is_found_by_the_end_of_a_topic(self, place):
+        scores = mcaptrack.evaluate("log.mcap", gate_m=1.0)
+        (row,) = [r for r in scores.rows() if (r["tracks"], r["similarity"]) == ("/camera/retracks", "metres")]
+        assert scores.score("IDF1", "retracks", "metres") == row["IDF1"]
+        with pytest.raises(McaptrackError, match="2 results fit retracks"):
+            scores.score("IDF1", "retracks")
+
+    def test_what_is_below_a_limit_is_told(self, place):
+        scores = mcaptrack.evaluate("log.mcap", similarity="metres", gate_m=1.0)
+        assert scores.below({"IDF1": 0.0}) == []
+        assert len(scores.below({"IDF1": 1.1})) == len(scores.rows())
+
+
+class TestRefused:
+    @pytest.mark.parametrize(
+        ("work", "words"),
+        {
+            "an option that is not there": (
+                lambda: mcaptrack.track("log.mcap", max_ages_s=1.0),
+                "tracker sort has no parameter max_ages_s; did you mean max_age_s? there are",
+            ),
+            "a tracker that is not there": (lambda: mcaptrack.track("log.mcap", tracker="dart"), "dart"),
+            "a name that is no log's": (
+                lambda: mcaptrack.ingest("video.mp4", "out.mp4"),
+                "out.mp4 is no name for a log: logs are MCAP files; give a name that ends with .mcap",
+            ),
+            "standard output": (lambda: mcaptrack.ingest("video.mp4", "-"), "- is not a file here"),
+            "two places": (
+                lambda: mcaptrack.track("log.mcap", output="b.mcap", sidecar=True),
+                "`sidecar=True` and `output=` are two places",
+            ),
+            "a URL": (lambda: mcaptrack.info("s3://bucket/a.mcap"), "s3://bucket/a.mcap is a URL"),
+            "what exists": (lambda: mcaptrack.recover("log.mcap", "log.mcap"), "both input and output"),
+            "frames per second": (lambda: mcaptrack.ingest("video.mp4", "b.mcap", fps=0), "`fps=` needs a number"),
+        }.values(),
+    )
+    def test_in_one_line_that_names_parameters(self, place, work, words):
+        before = {path: path.read_bytes() for path in place.iterdir() if path.is_file()}
+        with pytest.raises(McaptrackError) as refused:
+            work()
+        assert words in str(refused.value)
+        assert "\n" not in str(refused.value)
+        assert {path: path.read_bytes() for path in place.iterdir() if path.is_file()} == before
+
+    @pytest.mark.parametrize("words", ["ingest video.mp4 -o out.mp4", "ingest video.mp4 -o -", "track log.mcap -o -"])
+    def test_the_command_line_refuses_names_that_are_no_logs(self, place, words):
+        outcome = call(*words.split())
+        assert (outcome.code, outcome.err.count("\n")) == (1, 1)
+        assert not Path("-").exists()
+        assert not Path("out.mp4").exists()
+
+
+class TestWordsOfTheCommandLine:
+    """The library names parameters and functions; the command line shows options and commands."""
+
+    def test_parameters_become_options(self):
+        assert with_flags("give it with `fps=`") == "give it with --fps"
+        assert with_flags("`first_frame=3` or `force=True`") == "--first-frame 3 or --force"
+        assert with_flags("`not a parameter` stays, `x=` too") == "`not a parameter` stays, --x too"
+
+    def test_options_are_those_of_the_command_that_runs(self, place):
+        err = call("ingest", "video.mp4", "-o", "log.mcap").err
+        assert err == "mcaptrack: log.mcap exists; give another name with -o, or --force to replace it\n"
+        assert "--as is for those" in call("ingest", "video.mp4", "-o", "b.mcap", "--as", "truth").err
+
+    @pytest.mark.parametrize("name", ["a.mcap", "a b.mcap", "it's.mcap", "-o.mcap", "b`c.mcap", 'say "a".mcap', "a\nb"])
+    def test_calls_become_commands_whatever_the_file_is_called(self, name):
+        import shlex
+
+        line = with_flags(proposed("run", Path(name), topic="/a b", force=True))
+        assert line.count("`") == (3 if "`" in name else 2)
+        if name.isprintable():
+            path = f"./{name}" if name.startswith("-") else name
+            assert shlex.split(line[1:-1]) == ["mcaptrack", "run", path, "--topic", "/a b", "--force"]
+
+    def test_a_call_can_be_given_as_it_stands(self, place):
+        shutil.copy("log.mcap", "it's`.mcap")
+        names = {"mcaptrack": mcaptrack}
+        assert eval(proposed("info", Path("it's`.mcap")).strip("`"), names).messages > 0
+
+    def test_the_library_names_no_option_of_the_command_line(self):
+        """Texts outside the command line that are no documentation, no help, and no page."""
+        found = []
+        for path in PACKAGE.rglob("*.py"):
+            if {"cli", "viewing"} & set(path.relative_to(PACKAGE).parts):
+                continue
+            tree = ast.parse(path.read_text(encoding="utf-8"))
+            documents = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+            if "transforms" in path.parts:  # help of options
+                documents |= {
+                    id(part)
+                    for node in ast.walk(tree)
+                    if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "option"
+                    for part in ast.walk(node)
+                }
+            texts = [node for node in ast.walk(tree) if isinstance(node, ast.Constant) and isinstance(node.value, str)]
+            found += [
+                f"{path.relative_to(PACKAGE)}:{node.lineno}: {node.value}"
+                for node in texts
+                if id(node) not in documents and re.search(r"(?<![\w-])(--[a-z]|-o\b)", node.value)
+            ]
+        assert found == []
+
+
+class TestDocumentation:
+    def test_the_stub_names_what_the_package_gives(self):
+        tree = ast.parse((PACKAGE / "__init__.pyi").read_text())
+        named = {alias.asname for node in tree.body if isinstance(node, ast.ImportFrom) for alias in node.names}
+        (listed,) = [ast.literal_eval(node.value) for node in tree.body if isinstance(node, ast.Assign)]
+        assert named == set(mcaptrack.__all__) == set(listed)
+        for node in tree.body:
+            if isinstance(node, ast.ImportFrom):
+                for alias in node.names:
+                    assert getattr(importlib.import_module(node.module), alias.name) is getattr(mcaptrack, alias.name)
+
+    @pytest.mark.parametrize("name", FUNCTIONS)
+    def test_functions_are_documented_as_numpydoc_has_it(self, name):
+        function = getattr(mcaptrack, name)
+        text = inspect.getdoc(function)
+        sections = re.findall(r"^(\w+)\n-+$", text, re.M)
+        assert sections == ["Parameters", "Returns", "Raises", "Examples"]
+        (block,) = re.findall(r"^Parameters\n-+\n(.*?)\n\nReturns", text, re.M | re.S)
+        named = [one for line in re.findall(r"^(\S.*?)(?: : .*)?$", block, re.M) for one in line.split(", ")]
+        assert [one.lstrip("*") for one in named] == list(inspect.signature(function).parameters)
+
+    @pytest.mark.parametrize("name", FUNCTIONS)
+    def test_examples_run(self, name, place):
+        if name == "query":
+            pytest.importorskip("duckdb", reason="queries need DuckDB")
+        tests = doctest.DocTestFinder(recurse=False).find(getattr(mcaptrack, name), name, globs={})
+        runner = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS)
+        assert tests[0].examples
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", mcaptrack.McaptrackWarning)
+            assert all(runner.run(test).failed == 0 for test in tests)
