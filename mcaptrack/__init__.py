@@ -9,6 +9,7 @@ _PARTS = {
     "ingesting": ["IngestResult", "ingest"],
     "outputs": ["ExportResult", "RenderResult", "ReportResult", "export", "query", "render", "report"],
     "recording": ["FetchedMessage", "Recording", "open"],
+    "rows": ["detections"],
     "running": ["RunResult"],
     "scoring": ["Scores", "evaluate"],
     "stages": ["detect", "predict", "retrack", "sample", "track"],

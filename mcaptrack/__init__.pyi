@@ -13,6 +13,7 @@ from mcaptrack.api.outputs import report as report
 from mcaptrack.api.recording import FetchedMessage as FetchedMessage
 from mcaptrack.api.recording import Recording as Recording
 from mcaptrack.api.recording import open as open  # noqa: A004
+from mcaptrack.api.rows import detections as detections
 from mcaptrack.api.running import RunResult as RunResult
 from mcaptrack.api.scoring import Scores as Scores
 from mcaptrack.api.scoring import evaluate as evaluate
@@ -52,6 +53,7 @@ __all__ = [
     "Scores",
     "check",
     "detect",
+    "detections",
     "drop",
     "evaluate",
     "events",

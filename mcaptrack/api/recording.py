@@ -22,8 +22,11 @@ from numpy.typing import NDArray
 
 from mcaptrack import log as logs
 from mcaptrack import tables
+from mcaptrack.api.common import as_path, log_output
+from mcaptrack.api.rows import supervision_of
 from mcaptrack.errors import McaptrackError
-from mcaptrack.schema import Frame
+from mcaptrack.files import refuse_overwrite
+from mcaptrack.schema import DETECTIONS, SCHEMAS, TRACKS, Frame
 from mcaptrack.sources import foreign
 from mcaptrack.sources.pictures import Pictures
 from mcaptrack.sources.video import decode_bgr, decode_gray
@@ -56,6 +59,9 @@ class Recording:
     """
 
     def __init__(self, path: Path) -> None:
+        self._open(path)
+
+    def _open(self, path: Path) -> None:
         self._log = logs.read(path)
         self._contents = export.LogTables(self._log)
 
@@ -157,6 +163,80 @@ class Recording:
             raise McaptrackError(old)
         return FetchedMessage(topic, message.t_ns, message.publish_ns, message.sequence, message.payload)
 
+    def supervision(self, topic: str) -> Iterator[tuple[int, Any]]:
+        """Yield detections or tracks as ``supervision.Detections``, frame by frame.
+
+        Parameters
+        ----------
+        topic : str
+            The channel, or the end of its topic: "tracks" for /camera/tracks.
+
+        Yields
+        ------
+        tuple of int and supervision.Detections
+            Time in nanoseconds, and the boxes in pixels, with ``tracker_id`` for tracks and ``class_id`` for
+            detections. Rows without a box are left out.
+
+        Raises
+        ------
+        McaptrackError
+            If the channel has neither detections nor tracks, or if supervision is not installed.
+        """
+        there = {c.topic: SCHEMAS.get(c.schema_name) for c in self._log.channels.values()}
+        boxes = {name: schema for name, schema in there.items() if schema in (DETECTIONS, TRACKS)}
+        found = [name for name in boxes if topic == name] or [
+            name for name in boxes if name.endswith("/" + topic.strip("/"))
+        ]
+        if len(found) != 1:
+            raise McaptrackError(
+                f"{self.path} has {len(found) or 'no'} channels {topic} of boxes; it has {', '.join(sorted(boxes))}"
+            )
+        schema = boxes[found[0]]
+        return supervision_of(self._log.frames(found[0], schema or TRACKS))
+
+    def write(self, topic: str, rows: Any, *, replace: bool = False, sidecar: bool | None = None) -> int:
+        """Write detections or tracks as a channel of the log; ``track``, ``run`` and ``info`` then use it.
+
+        Parameters
+        ----------
+        topic : str
+            The channel, such as "/camera/detections", or its name below the only camera, "detections". Channels named
+            detections hold detections; those named tracks or truth hold tracks.
+        rows : iterable of Frame, structured array, pyarrow.Table, or mapping
+            Frames as ``mcaptrack.detections`` makes them; or an array or table with a column ``t_ns`` and those of the
+            rows; or ``supervision.Detections`` by time in nanoseconds, as a mapping or as pairs.
+        replace : bool, default False
+            Replace the channel if it exists. Channels that others recorded are never replaced.
+        sidecar : bool, optional
+            Write into LOG.results.mcap beside the log (True) or into the log (False). By default beside recordings
+            that ROS tools read, otherwise into the log.
+
+        Returns
+        -------
+        int
+            Number of frames that were written.
+
+        Raises
+        ------
+        McaptrackError
+            If the rows do not fit, or if the channel exists.
+
+        Examples
+        --------
+        >>> import mcaptrack
+        >>> with mcaptrack.open("log.mcap") as log:
+        ...     frames = [mcaptrack.detections([[9, 20, 17, 28]], t_ns=0, box_format="xyxy")]
+        ...     log.write("/mine/detections", frames)
+        1
+        """
+        from mcaptrack.api.writing import write_rows
+
+        path = self.path
+        count = write_rows(path, topic, rows, replace=replace, sidecar=sidecar)
+        self.close()
+        self._open(path)
+        return count
+
     def _pictures(self, topic: str) -> str:
         there = [c.topic for c in self._log.channels.values() if foreign.holds_pictures(c)]
         found = [name for name in there if topic in (name, name.removeprefix("/"))]
@@ -187,13 +267,15 @@ def _whole(value: Any) -> int | None:
     return None if value is None or value != value else int(value)  # noqa: PLR0124  # NaN is not itself
 
 
-def open(path: str | Path) -> Recording:  # noqa: A001  # mcaptrack.open is what it is
+def open(path: str | Path, *, create: bool = False) -> Recording:  # noqa: A001  # mcaptrack.open is its name
     """Open a log, with its results if they stand beside it.
 
     Parameters
     ----------
     path : path
         The log.
+    create : bool, default False
+        Make a new, empty log; one that exists is refused.
 
     Returns
     -------
@@ -203,7 +285,7 @@ def open(path: str | Path) -> Recording:  # noqa: A001  # mcaptrack.open is what
     Raises
     ------
     McaptrackError
-        If it is no MCAP file, or damaged.
+        If it is no MCAP file, or damaged; with ``create``, if it exists.
 
     Examples
     --------
@@ -212,4 +294,9 @@ def open(path: str | Path) -> Recording:  # noqa: A001  # mcaptrack.open is what
     ...     log.table("tracks", "/camera/tracks").num_rows > 0
     True
     """
-    return Recording(Path(path))
+    if create:
+        made = log_output(path, Path(path))
+        refuse_overwrite(made, force=False)
+        with logs.create(made):
+            pass
+    return Recording(as_path(path))
