@@ -21,6 +21,7 @@ from mcaptrack.geometry.plane import Planes
 from mcaptrack.notices import warn
 from mcaptrack.pipeline.checks import how_it_came, may_replace
 from mcaptrack.schema import DETECTIONS, FORECAST_SCORES, GROUND_PLANE, PREDICTIONS, SCHEMAS, TRACKS, Frame, Schema
+from mcaptrack.schema.framing import frame_times
 from mcaptrack.schema.provenance import INGEST, VIEW, Provenance, digest
 from mcaptrack.sources import foreign
 from mcaptrack.sources.cameras import VIDEO, Camera, camera_at
@@ -203,7 +204,7 @@ class _Drawn:
                 drawn = drawing.on_pictures(self._picture_ns, self._stamp_ns)
                 yield View(topic + views.SUFFIX, foxglove.ANNOTATIONS, made_from, group, drawn)
             if channel.schema in _ON_GROUND:
-                own_ns = np.array([frame.t_ns for frame in channel.frames], np.int64)
+                own_ns = frame_times(channel.frames)
                 t_ns = self._picture_ns if len(self._picture_ns) else own_ns
                 scene = drawing.on_ground(t_ns, self._frame_id)
                 yield View(topic + views.SCENE_SUFFIX, foxglove.SCENE, made_from, group, scene)

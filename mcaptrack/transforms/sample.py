@@ -19,6 +19,7 @@ from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
 from mcaptrack.geometry.plane import Planes, plane_at
 from mcaptrack.schema import TRACKS, Frame, Rows, Schema
+from mcaptrack.schema.framing import frame_times
 from mcaptrack.schema.resampling import resample
 from mcaptrack.transforms.protocol import check_options, context, option
 
@@ -50,7 +51,7 @@ class Sample:
         members = [frame._replace(rows=_in_metres(frame, self.ground_planes)) for frame in frames]
         if not members:
             return
-        frame_ns = np.array([frame.t_ns for frame in members], np.int64)
+        frame_ns = frame_times(members)
         indices = np.array([frame.index for frame in members])
         tick_ns = self._ticks(frame_ns, int(frame_ns[0]) if self.start_ns is None else self.start_ns)
         rows, at = resample(members, tick_ns, seconds_to_ns(self.max_hole_s))

@@ -13,8 +13,9 @@ import numpy as np
 from mcaptrack.geometry.arrays import Ints
 from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.plane import Planes, plane_at
-from mcaptrack.geometry.ragged import group_index, run_starts
+from mcaptrack.geometry.ragged import run_starts
 from mcaptrack.schema import TRACKS, Frame, Rows
+from mcaptrack.schema.framing import frame_times, join_frames, split_rows
 from mcaptrack.schema.resampling import resample
 
 #: Columns taken from the tracker where it has a box.
@@ -44,15 +45,13 @@ def to_video_rate(tracks: Sequence[Frame], retracks: Sequence[Frame], planes: Pl
     """
     if not tracks or not retracks:
         return [Frame(frame.t_ns, frame.index, TRACKS.empty()) for frame in tracks]
-    frame_ns = np.array([frame.t_ns for frame in tracks], np.int64)
-    tick_ns = np.array([frame.t_ns for frame in retracks], np.int64)
+    tick_ns = frame_times(retracks)
     period = int(np.median(np.diff(tick_ns))) if len(tick_ns) > 1 else 1
+    boxes, at, frame_ns, _ = join_frames(TRACKS, tracks)
     base, base_at = resample(retracks, frame_ns, round(1.5 * period))
     base["observed"], base["source_id"] = False, -1
 
-    boxes = TRACKS.joined([frame.rows for frame in tracks])
-    at = group_index([len(frame.rows) for frame in tracks])
-    ids, distance_ns = _retracked_ids(boxes["track_id"], frame_ns[at], retracks, tick_ns)
+    ids, distance_ns = _retracked_ids(boxes["track_id"], frame_ns[at], retracks)
     kept = (ids >= 0) & (distance_ns <= 1.5 * period)
     # of two boxes with one id, the one with the nearer sample time
     order = np.lexsort((distance_ns, ids, at))
@@ -76,9 +75,8 @@ def to_video_rate(tracks: Sequence[Frame], retracks: Sequence[Frame], planes: Pl
     rows_at = np.concatenate([base_at, at[~inside]])
     order = np.lexsort((rows["track_id"], rows_at))
     rows, rows_at = rows[order], rows_at[order]
-    bounds = np.searchsorted(rows_at, np.arange(len(tracks) + 1)).tolist()
-    spans = zip(tracks, bounds[:-1], bounds[1:], strict=True)
-    return [Frame(frame.t_ns, frame.index, rows[low:high]) for frame, low, high in spans]
+    ends = np.searchsorted(rows_at, np.arange(len(tracks)), "right")
+    return split_rows(frame_ns, [frame.index for frame in tracks], rows, ends)
 
 
 def unchanged_tracks(tracks: Sequence[Frame], planes: Planes) -> list[Frame]:
@@ -92,13 +90,13 @@ def unchanged_tracks(tracks: Sequence[Frame], planes: Planes) -> list[Frame]:
     return out
 
 
-def _retracked_ids(track: Ints, t_ns: Ints, retracks: Sequence[Frame], tick_ns: Ints) -> tuple[Ints, Ints]:
+def _retracked_ids(track: Ints, t_ns: Ints, retracks: Sequence[Frame]) -> tuple[Ints, Ints]:
     """The re-tracked id of each video-rate row at the nearest sample time of its track, and the distance to it in ns.
 
     Rows are given by ``track`` (N,) and ``t_ns`` (N,). The id is -1 for tracks without a sample.
     """
-    rows = TRACKS.joined([frame.rows for frame in retracks])
-    row_ns = np.repeat(tick_ns, [len(frame.rows) for frame in retracks])
+    joined = join_frames(TRACKS, retracks)
+    rows, row_ns = joined.rows, joined.row_ns
     has_source = rows["source_id"] >= 0
     source, owner, row_ns = rows["source_id"][has_source], rows["track_id"][has_source], row_ns[has_source]
     order = np.lexsort((row_ns, source))

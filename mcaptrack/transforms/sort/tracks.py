@@ -20,6 +20,7 @@ from mcaptrack.geometry.arrays import Bools, Floats, Indices
 from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.plane import Planes, plane_at
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame
+from mcaptrack.schema.framing import join_frames
 
 #: Rows of a table of tracks, below those of the filter: score and class of the last box; how long the track has been
 #: missed, 0 if it was just seen; how long it has been seen without a break; its name.
@@ -73,10 +74,8 @@ def look(frames: Sequence[Frame], min_score: float | None, class_id: int | None)
     A box without a score passes. Returns the columns of ``Seen`` for all frames, and where those of each begin and end
     (F + 1,).
     """
-    ends = np.cumsum([0] + [len(frame.rows) for frame in frames])
-    rows = DETECTIONS.empty(int(ends[-1]))
-    for low, frame in zip(ends.tolist(), frames, strict=False):  # concatenate() is slow with padded rows
-        rows[low : low + len(frame.rows)] = frame.rows
+    joined = join_frames(DETECTIONS, frames)
+    rows, ends = joined.rows, joined.ends
     boxes = columns_to_boxes(rows)
     kept = (boxes[:, 2:] > _LEAST_PX).all(axis=1) & (np.abs(boxes) < _MOST_PX).all(axis=1)
     if min_score is not None:
