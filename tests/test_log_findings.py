@@ -1,0 +1,199 @@
+"""What `check` finds in logs that are put together record by record, one thing wrong in each: what, and at which byte."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from mcaptrack import log
+from tests.logs import SOME, write_stock
+
+MAGIC = b"\x89MCAP0\r\n"
+
+
+def text(words: str) -> bytes:
+    return struct.pack("<I", len(words)) + words.encode()
+
+
+def record(opcode: int, body: bytes = b"") -> bytes:
+    return struct.pack("<BQ", opcode, len(body)) + body
+
+
+HEADER, END = record(0x01, text("") + text("")), record(0x0F, bytes(4))
+
+
+def schema(number: int, name: str = "Thing") -> bytes:
+    return record(0x03, struct.pack("<H", number) + text(name) + text("json") + text("{}"))
+
+
+def channel(number: int, of: int, topic: str = "/a") -> bytes:
+    return record(0x04, struct.pack("<HH", number, of) + text(topic) + text("json") + bytes(4))
+
+
+def message(number: int, t_ns: int) -> bytes:
+    return record(0x05, struct.pack("<HIQQ", number, 0, t_ns, t_ns) + b"{}")
+
+
+def chunk(*records: bytes, times: tuple[int, int] = (0, 0), has_checksum: bool = True) -> bytes:
+    content = b"".join(records)
+    checksum = zlib.crc32(content) if has_checksum else 0
+    return record(
+        0x06,
+        struct.pack("<QQQI", *times, len(content), checksum) + text("") + struct.pack("<Q", len(content)) + content,
+    )
+
+
+def index(number: int, *entries: tuple[int, int]) -> bytes:
+    return record(
+        0x07, struct.pack("<HI", number, 16 * len(entries)) + b"".join(struct.pack("<QQ", *e) for e in entries)
+    )
+
+
+A, B = schema(1), channel(2, 1)
+SIZE = len(message(2, 5))
+BESIDE = len(A) + len(B)
+WHOLE = [chunk(message(2, 5), message(2, 7), times=(5, 7)), index(2, (5, 0), (7, SIZE))]
+
+#: The records of a data section: which of them the finding names by its first byte, its kind, and how bad it is.
+CASES: dict[str, tuple[Sequence[bytes], int, str, str]] = {
+    "no header": ([A, HEADER, B, *WHOLE, END], 0, "no-header", "error"),
+    "an index without a chunk": ([HEADER, A, B, index(2, (5, 0)), *WHOLE, END], 3, "stray-index", "error"),
+    "an index after another record": ([HEADER, A, B, *WHOLE, A, index(2, (5, 0)), END], 6, "stray-index", "error"),
+    "two indexes of a channel": ([HEADER, A, B, *WHOLE, WHOLE[1], END], 5, "double-index", "error"),
+    "a message outside": ([HEADER, A, B, *WHOLE, message(2, 9), END], 5, "unchunked", "warning"),
+    "statistics before the end": ([HEADER, A, B, *WHOLE, record(0x0B, bytes(46)), END], 5, "misplaced", "error"),
+    "a record of a kind to come": ([HEADER, A, B, *WHOLE, record(0x10, b"?"), END], 5, "unknown", "warning"),
+    "a schema of number zero": ([HEADER, A, schema(0), B, *WHOLE, END], 2, "schema-zero", "error"),
+    "a schema that changes": ([HEADER, A, B, schema(1, "Other"), *WHOLE, END], 3, "two-schemas", "error"),
+    "a channel that changes": ([HEADER, A, B, channel(2, 1, "/b"), *WHOLE, END], 3, "two-channels", "error"),
+    "a channel of a schema that comes later": ([HEADER, B, A, *WHOLE, END], 1, "no-schema", "error"),
+    "messages of a channel that comes later": ([HEADER, A, *WHOLE, B, END], 2, "no-channel", "error"),
+    "a message of a channel that comes later": ([HEADER, A, message(2, 5), B, END], 2, "no-channel", "error"),
+    "a chunk without a checksum": (
+        [HEADER, A, B, chunk(message(2, 5), times=(5, 5), has_checksum=False), index(2, (5, 0)), END],
+        3,
+        "no-checksum",
+        "warning",
+    ),
+    "a chunk without an index": ([HEADER, A, B, WHOLE[0], END], 3, "no-message-index", "warning"),
+    "a chunk that ends later than it says": (
+        [HEADER, A, B, chunk(message(2, 5), times=(5, 4)), index(2, (5, 0)), END],
+        3,
+        "chunk-times",
+        "error",
+    ),
+    "a chunk that begins earlier than it says": (
+        [HEADER, A, B, chunk(message(2, 5), times=(6, 5)), index(2, (5, 0)), END],
+        3,
+        "chunk-times",
+        "error",
+    ),
+    "a message that no index lists": (
+        [HEADER, A, B, chunk(message(2, 5), message(2, 7), times=(5, 7)), index(2, (5, 0)), END],
+        3,
+        "not-listed",
+        "error",
+    ),
+    "an index that points elsewhere": (
+        [HEADER, A, B, chunk(message(2, 5), times=(5, 5)), index(2, (5, 3)), END],
+        4,
+        "wrong-index",
+        "error",
+    ),
+    "an index with another time": (
+        [HEADER, A, B, chunk(message(2, 5), times=(5, 5)), index(2, (6, 0)), END],
+        4,
+        "wrong-index",
+        "error",
+    ),
+    "messages that go back within a chunk": (
+        [HEADER, A, B, chunk(message(2, 7), message(2, 5), times=(5, 7)), index(2, (7, 0), (5, SIZE)), END],
+        3,
+        "order",
+        "warning",
+    ),
+    "messages that go back from chunk to chunk": (
+        [HEADER, A, B, *WHOLE, chunk(message(2, 6), times=(6, 6)), index(2, (6, 0)), END],
+        5,
+        "order",
+        "warning",
+    ),
+    "a message after the year 2262": (
+        [HEADER, A, B, chunk(message(2, 2**63), times=(2**63, 2**63)), index(2, (2**63, 0)), END],
+        3,
+        "late",
+        "warning",
+    ),
+    "a schema that changes within a chunk": (
+        [
+            HEADER,
+            A,
+            B,
+            chunk(schema(1, "Other"), message(2, 5), times=(5, 5)),
+            index(2, (5, len(schema(1, "Other")))),
+            END,
+        ],
+        3,
+        "two-schemas",
+        "error",
+    ),
+    "no end of the data": ([HEADER, A, B, *WHOLE], 5, "no-data-end", "error"),
+}
+
+
+def put_together(path: Path, records: Sequence[bytes]) -> list[int]:
+    """Write a log of these records without a summary; returns where each begins, and where the last one ends."""
+    places = [len(MAGIC)]
+    for one in records:
+        places.append(places[-1] + len(one))
+    tail = record(0x02, bytes(20)) if records[-1] == END else b""
+    path.write_bytes(MAGIC + b"".join(records) + tail + MAGIC)
+    return places
+
+
+#: What is found of a log besides: it has no summary here.
+BESIDES = {"no-summary"}
+
+
+def test_a_log_without_faults_has_no_findings_but_that_it_has_no_summary(tmp_path):
+    put_together(tmp_path / "a.mcap", [HEADER, A, B, *WHOLE, A, B, END])
+    checked = log.check(tmp_path / "a.mcap")
+    assert {finding.kind for finding in checked.findings} == BESIDES
+    assert (checked.messages, checked.chunks, checked.is_sound) == (2, 1, True)
+
+
+@pytest.mark.parametrize(("records", "at", "kind", "level"), CASES.values(), ids=CASES)
+def test_a_fault_is_found_where_it_is_and_nothing_else(records, at, kind, level, tmp_path):
+    places = put_together(tmp_path / "a.mcap", records)
+    checked = log.check(tmp_path / "a.mcap")
+    found = [(f.kind, f.where, f.level, f.times) for f in checked.findings if f.kind not in BESIDES]
+    assert (kind, places[at], level, 1) in found
+    assert checked.is_sound == (level == "warning")
+    others = {"no-footer"} if kind == "no-data-end" else {"unchunked"} if kind == "no-channel" else set()
+    assert {f[0] for f in found} - others == {kind}
+
+
+def test_no_changed_byte_of_a_summary_goes_unnoticed(tmp_path):
+    """Every number of the summary is held against the data, also where its checksum was made anew.
+
+    The length of the footer is not looked at: readers find the footer at its distance from the end.
+    """
+    path = tmp_path / "a.mcap"
+    write_stock(path, SOME, chunk_size=60)
+    assert log.check(path).findings == []
+    whole = path.read_bytes()
+    footer = len(whole) - len(MAGIC) - 20
+    start = int.from_bytes(whole[footer : footer + 8], "little")
+    unnoticed = []
+    for at in (*range(start, footer - 8), *range(footer, footer + 16)):
+        changed = bytearray(whole)
+        changed[at] ^= 1
+        changed[footer + 16 : footer + 20] = zlib.crc32(changed[start : footer + 16]).to_bytes(4, "little")
+        path.write_bytes(changed)
+        if not log.check(path).findings:
+            unnoticed.append(at - start)
+    assert unnoticed == []
