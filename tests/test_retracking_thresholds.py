@@ -238,3 +238,15 @@ def test_every_occlusion_is_timed_anew():
 
     online = [len(frame.rows) for _, frame, _ in FEW(walk(path, 34))]
     assert online[10:] == [2] * 24
+
+
+def test_an_exchange_at_the_last_step_of_both_is_undone():
+    """Two stand 1.5 m apart, and only their last positions are exchanged."""
+    paths = {
+        track: {step: (left if step < 39 else 1.5 - left, 0.0) for step in range(40)}
+        for track, left in ((3, 0.0), (5, 1.5))
+    }
+    out, at = laid_out(paths)
+    owner, changed = resolve_swaps(MODEL, out, at, np.repeat([3, 5], 40), 0.4)
+    assert changed == 1
+    assert owner.tolist() == [0] * 39 + [1] + [1] * 39 + [0]

@@ -101,8 +101,8 @@ class Records:
         """The tests that run the line that is changed, the quickest first, and the time that they take.
 
         Where the statement or the function begins, if no test runs that line. Defaults and constants run when modules
-        are imported: those matter to all tests that run anything of the function or of the file, or of files that
-        import it.
+        are imported: those matter to all tests that run anything of the function or of the file, to those that stand
+        beside them, and to those that run anything of files that import it.
         """
         every = [(*test, file) for file in files for test in self._tests(file)]
         spans = [(mutant.line, mutant.line), mutant.statement, mutant.function]
@@ -114,9 +114,11 @@ class Records:
                 break
         else:
             near = [t for t in every if t[2].get(mutant.path)]
-            users = self._users(mutant.path)
             chosen = sorted(near, key=lambda t: t[1])
-            chosen += [t for t in every if t not in near and any(t[2].get(path) for path in users)]
+            around = {test[3] for test in near}
+            chosen += [t for t in every if t not in near and t[3] in around]
+            users = self._users(mutant.path)
+            chosen += [t for t in every if t[3] not in around and any(t[2].get(path) for path in users)]
             return [t[0] for t in chosen], sum(t[1] for t in chosen)
         return [t[0] for t in sorted(chosen, key=lambda t: t[1])], sum(t[1] for t in chosen)
 
