@@ -85,10 +85,10 @@ def messages() -> str:
 
 
 def library() -> str:
-    """What the package exports."""
+    """What the package exports: functions, then classes."""
     import mcaptrack
 
-    return _references(mcaptrack, sorted(getattr(mcaptrack, "__all__", None) or mcaptrack._LAZY, key=str.lower))
+    return _references(mcaptrack, sorted(mcaptrack.__all__, key=lambda name: (name[0].isupper(), name)))
 
 
 def transforms() -> str:
