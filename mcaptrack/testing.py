@@ -1,0 +1,323 @@
+"""Test a transform against the laws that hold for every transform.
+
+    from mcaptrack.testing import check_transform
+
+    check_transform(MyTracker())
+
+Letters: N rows, H and W pixels.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, fields, is_dataclass
+from typing import Any, Final
+
+import numpy as np
+
+from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
+from mcaptrack.schema import DETECTIONS, TRACKS, VIDEO, Frame, Schema
+from mcaptrack.transforms.protocol import Transform, check_options
+
+__all__ = ["LAWS", "LawError", "check_transform", "sample_frames"]
+
+Result = list[tuple[Frame, ...]]
+
+
+class LawError(AssertionError):
+    """A transform breaks a law; the message says which one, and where."""
+
+
+def check_transform(transform: Transform, frames: Sequence[Frame] | None = None, *, seed: int = 0) -> None:
+    """Check a transform against the laws that hold for every transform.
+
+    The laws: it declares what the protocol asks for; every output has the rows of its schema, at times that increase;
+    the same input gives the same output, also while it runs on another input, and is not changed; the output of the
+    past does not depend on the future, but for ``latency_s``; shuffling the rows of a frame changes ids at most; frames
+    without rows, and no frames at all, are valid input; the parameters can be kept in a log and give the same transform
+    again.
+
+    Parameters
+    ----------
+    transform : Transform
+        The transform, with any parameters.
+    frames : sequence of mcaptrack.schema.Frame, optional
+        What it reads; by default ``sample_frames`` of its schema.
+    seed : int, default 0
+        Random seed of the sample, and of shuffling rows.
+
+    Raises
+    ------
+    LawError
+        If it breaks a law; the message names the law, the output, the frame and its time.
+
+    Examples
+    --------
+    >>> from mcaptrack.testing import check_transform
+    >>> from mcaptrack.transforms import ByteTrack
+    >>> check_transform(ByteTrack(max_age_s=1.0))
+    """
+    declares(transform, (), seed)
+    given = list(sample_frames(transform.reads, seed) if frames is None else frames)
+    if not given:
+        raise LawError("there are no frames to check the transform with")
+    for law in LAWS.values():
+        law(transform, [frame._replace(rows=frame.rows.copy()) for frame in given], seed)
+
+
+def sample_frames(schema: Schema, seed: int = 0, step_s: float = 0.0) -> list[Frame]:
+    """Return frames to test transforms with.
+
+    Parameters
+    ----------
+    schema : Schema
+        ``VIDEO`` gives pictures (H, W) of brightness on which a block moves; ``DETECTIONS`` gives boxes of people who
+        are missed now and then, and false positives, at uneven times; ``TRACKS`` gives tracks in pixels and metres with
+        gaps, births, ends and changing ids.
+    seed : int, default 0
+        Random seed.
+    step_s : float, optional
+        Time between frames of tracks in seconds, by default 0.4.
+
+    Returns
+    -------
+    list of mcaptrack.schema.Frame
+        12 pictures, 30 frames of detections or 40 frames of tracks.
+
+    Examples
+    --------
+    >>> from mcaptrack.schema import TRACKS
+    >>> from mcaptrack.testing import sample_frames
+    >>> len(sample_frames(TRACKS))
+    40
+    """
+    rng = np.random.default_rng(seed)
+    if schema is VIDEO:
+        return _pictures(rng)
+    if schema is DETECTIONS:
+        return _detections(rng)
+    if schema is TRACKS:
+        return _tracks(rng, step_s or 0.4)
+    raise LawError(f"declares: there is no sample of {schema.name}; give frames")
+
+
+def _pictures(rng: np.random.Generator) -> list[Frame]:
+    floor = rng.integers(60, 140, (48, 64))
+    frames = []
+    for number in range(12):
+        image = floor + rng.integers(-3, 4, floor.shape)
+        image[10:30, 4 * number : 4 * number + 8] = 230
+        frames.append(Frame(seconds_to_ns(number / 10), number, image.astype(np.uint8)))
+    return frames
+
+
+def _detections(rng: np.random.Generator) -> list[Frame]:
+    start, speed = rng.uniform(50, 500, (4, 2)), rng.normal(0, 6, (4, 2))
+    frames, now = [], 0.0
+    for number in range(30):
+        now += 0.1 * rng.choice([1, 1, 1, 1, 1, 4]) + rng.uniform(-0.01, 0.01)
+        seen = (start + speed * number)[rng.random(4) > 0.25]
+        centre = rng.permutation(np.concatenate([seen, rng.uniform(0, 600, (rng.poisson(0.3), 2))]))
+        size = np.array([20.0, 50.0])
+        x, y = (centre - size / 2).T
+        count = len(centre)
+        rows = DETECTIONS.rows(
+            x_px=x,
+            y_px=y,
+            w_px=np.full(count, size[0]),
+            h_px=np.full(count, size[1]),
+            score=rng.uniform(0.2, 1.0, count),
+            class_id=np.ones(count, np.uint32),
+        )
+        frames.append(Frame(seconds_to_ns(now), number, rows))
+    return frames
+
+
+def _tracks(rng: np.random.Generator, step_s: float) -> list[Frame]:
+    place, speed, names = rng.uniform(-5, 5, (5, 2)), rng.normal(0, 1, (5, 2)), rng.permutation(50)[:5]
+    frames = []
+    for number in range(40):
+        place = place + speed * step_s + rng.normal(0, 0.05, place.shape)
+        there = np.flatnonzero(rng.random(5) > 0.2)
+        if rng.random() < 0.1:
+            names[rng.integers(5)] = 50 + number
+        rows = TRACKS.rows(
+            track_id=names[there].astype(np.int64),
+            x_px=place[there, 0] * 20 + 200,
+            y_px=place[there, 1] * 20 + 200,
+            w_px=np.full(len(there), 10.0),
+            h_px=np.full(len(there), 30.0),
+            x_m=place[there, 0],
+            y_m=place[there, 1],
+            score=rng.random(len(there)),
+            observed=rng.random(len(there)) > 0.1,
+            source_id=np.full(len(there), -1),
+        )
+        frames.append(Frame(seconds_to_ns(number * step_s), number, rows[rng.permutation(len(rows))]))
+    return frames
+
+
+# The laws: each takes the transform, frames, and a random seed
+
+
+def declares(transform: Transform, frames: Sequence[Frame], seed: int) -> None:
+    """It is a frozen dataclass that declares ``reads``, ``writes`` and ``latency_s``, and parameters in range."""
+    name = type(transform).__name__
+    if not is_dataclass(transform):
+        raise LawError(f"declares: {name} is no dataclass; the fields of a transform are its parameters")
+    if not type(transform).__dataclass_params__.frozen:  # type: ignore[attr-defined]
+        raise LawError(f"declares: {name} is not frozen; make it with @dataclass(frozen=True, kw_only=True)")
+    for attribute, kind in (("reads", Schema), ("writes", Mapping)):
+        if not isinstance(getattr(transform, attribute, None), kind):
+            raise LawError(f"declares: {name}.{attribute} is no {kind.__name__}")
+    if "" not in transform.writes:
+        raise LawError(f"declares: {name}.writes has no main output; it needs the key ''")
+    if set(transform.latency_s) != set(transform.writes):
+        raise LawError(f"declares: {name}.latency_s is of {[*transform.latency_s]}, writes is of {[*transform.writes]}")
+    check_options(transform)
+
+
+def conforms(transform: Transform, frames: Sequence[Frame], seed: int) -> None:
+    """Every output has the rows of its schema, at times that increase."""
+    for number, result in enumerate(transform(frames)):
+        if not isinstance(result, tuple) or len(result) != len(transform.writes):
+            raise LawError(f"conforms: result {number} is no tuple of {len(transform.writes)} frames, one an output")
+    for (suffix, schema), output in zip(transform.writes.items(), _outputs(transform, frames), strict=True):
+        for number, frame in enumerate(output):
+            try:
+                schema.check(frame.rows)
+            except ValueError as error:
+                raise LawError(f"conforms: {_where(suffix, number, frame)}: {error}") from None
+            if number and frame.t_ns <= output[number - 1].t_ns:
+                before = output[number - 1].t_ns
+                raise LawError(f"conforms: {_where(suffix, number, frame)} is not later than {before} ns before it")
+
+
+def repeats(transform: Transform, frames: Sequence[Frame], seed: int) -> None:
+    """The same input gives the same output, also while it runs on another input; and the input is not changed."""
+    before = [_key(frame) for frame in frames]
+    alone = [[_key(frame) for frame in result] for result in transform(frames)]
+    for number, frame in enumerate(frames):
+        if _key(frame) != before[number]:
+            raise LawError(f"pure: it changes its input, first in frame {number} at {frame.t_ns} ns")
+    other = transform(frames[1:])
+    for number, result in enumerate(transform(frames)):
+        if number >= len(alone) or [_key(frame) for frame in result] != alone[number]:
+            raise LawError(f"pure: the second run differs from the first in result {number} at {result[0].t_ns} ns")
+        next(other, None)
+
+
+def causal(transform: Transform, frames: Sequence[Frame], seed: int) -> None:
+    """The run of a prefix is a prefix of the run, but for what lies within ``latency_s`` of the prefix's end."""
+    for cut in sorted({1, len(frames) // 2, len(frames) - 1} - {0}):
+        prefix = list(frames[:cut])
+        whole, part = _outputs(transform, frames), _outputs(transform, prefix)
+        for (suffix, latency), of_whole, of_part in zip(transform.latency_s.items(), whole, part, strict=True):
+            if latency == float("inf"):
+                continue
+            certain = prefix[-1].t_ns - latency * NS_PER_S
+            then, now = ([frame for frame in output if frame.t_ns <= certain] for output in (of_part, of_whole))
+            if len(then) != len(now):
+                raise LawError(
+                    f"causal: output '{suffix}' has {len(now)} frames up to {certain:.0f} ns, and {len(then)} without "
+                    f"the frames after number {cut - 1}"
+                )
+            for number, (a, b) in enumerate(zip(then, now, strict=True)):
+                if _key(a) != _key(b):
+                    raise LawError(f"causal: {_where(suffix, number, b)} depends on frames after number {cut - 1}")
+
+
+def order_blind(transform: Transform, frames: Sequence[Frame], seed: int) -> None:
+    """Shuffling the rows of a frame changes the ids of tracks at most."""
+    if transform.reads is VIDEO:
+        return  # pictures have no rows
+    rng = np.random.default_rng(seed)
+    shuffled = [frame._replace(rows=frame.rows[rng.permutation(len(frame.rows))]) for frame in frames]
+    renamed: dict[int, int] = {}
+    pairs = zip(_outputs(transform, frames), _outputs(transform, shuffled), strict=True)
+    for suffix, (output, other) in zip(transform.writes, pairs, strict=True):
+        if len(output) != len(other):
+            raise LawError(f"order-blind: output '{suffix}' has another number of frames when rows are shuffled")
+        for number, (a, b) in enumerate(zip(output, other, strict=True)):
+            rows_a, rows_b = _without_ids(a.rows), _without_ids(b.rows)
+            ids = [(x, y) for (_, x), (_, y) in zip(rows_a, rows_b, strict=False) if x is not None and y is not None]
+            same_ids = all(renamed.setdefault(x, y) == y for x, y in ids)
+            if [row for row, _ in rows_a] != [row for row, _ in rows_b] or not same_ids:
+                raise LawError(f"order-blind: {_where(suffix, number, a)} depends on the order of rows in a frame")
+    if len(set(renamed.values())) != len(renamed):
+        raise LawError("order-blind: two ids become one when rows are shuffled")
+
+
+def empties(transform: Transform, frames: Sequence[Frame], seed: int) -> None:
+    """Frames without rows, and no frames at all, are valid input; nothing comes of them."""
+    if transform.reads is VIDEO:
+        silent = [frame._replace(rows=np.full_like(frame.rows, 100)) for frame in frames]
+    else:
+        silent = [frame._replace(rows=frame.rows[:0]) for frame in frames]
+    outputs = _outputs(transform, silent)
+    for suffix, output in zip(transform.writes, outputs, strict=True):
+        for number, frame in enumerate(output):
+            if len(frame.rows):
+                raise LawError(f"empties: {_where(suffix, number, frame)} has rows, though its input has none")
+    if not any(outputs):
+        raise LawError("empties: frames without rows give no frames; a frame without rows says that nothing was there")
+    if list(transform([])):
+        raise LawError("empties: no frames give frames")
+
+
+def rebuilds(transform: Transform, frames: Sequence[Frame], seed: int) -> None:
+    """Its parameters can be kept in a log as JSON, and give the same transform again."""
+    names = [field.name for field in fields(transform) if not field.metadata.get("context")]
+    try:
+        kept = json.loads(json.dumps({name: asdict(transform)[name] for name in names}))
+    except TypeError as error:
+        raise LawError(f"provenance: the parameters can't be kept in a log: {error}") from None
+    values = {name: tuple(value) if isinstance(value, list) else value for name, value in kept.items()}
+    again = type(transform)(**values)
+    for name in names:
+        if getattr(again, name) != getattr(transform, name):
+            raise LawError(f"provenance: {name} is {getattr(again, name)!r} when it was kept, not the same as before")
+
+
+#: The laws by name, in the order in which they are checked.
+LAWS: Final[Mapping[str, Callable[[Transform, Sequence[Frame], int], None]]] = {
+    "declares": declares,
+    "conforms": conforms,
+    "pure": repeats,
+    "causal": causal,
+    "order-blind": order_blind,
+    "empties": empties,
+    "provenance": rebuilds,
+}
+
+
+def _outputs(transform: Transform, frames: Sequence[Frame]) -> list[list[Frame]]:
+    """The frames of each output."""
+    outputs: list[list[Frame]] = [[] for _ in transform.writes]
+    for result in transform(frames):
+        for frame, output in zip(result, outputs, strict=True):
+            output.append(frame)
+    return outputs
+
+
+def _where(suffix: str, number: int, frame: Frame) -> str:
+    return f"output '{suffix}', frame {number} at {frame.t_ns} ns"
+
+
+def _key(frame: Frame) -> tuple[int, int, bytes]:
+    """A frame to the bit, but for padding between columns."""
+    names = frame.rows.dtype.names
+    content = b"".join(frame.rows[name].tobytes() for name in names) if names else frame.rows.tobytes()
+    return frame.t_ns, frame.index, content
+
+
+def _without_ids(rows: Any) -> list[tuple[tuple[Any, ...], int | None]]:
+    """Rows in an order of their own, with the id apart; numbers to 9 digits, since sums depend on the order."""
+    names = [name for name in rows.dtype.names if name != "track_id"]
+    has_ids = "track_id" in rows.dtype.names
+    out = []
+    for row in rows:
+        values = tuple("nan" if row[n] != row[n] else round(float(row[n]), 9) for n in names)
+        out.append((values, int(row["track_id"]) if has_ids else None))
+    return sorted(out, key=lambda pair: [str(value) for value in pair[0]])

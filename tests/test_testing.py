@@ -1,0 +1,127 @@
+"""check_transform names the law that a transform breaks, and where."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+import pytest
+
+from mcaptrack.schema import DETECTIONS, TRACKS, VIDEO, Frame
+from mcaptrack.testing import LawError, check_transform, sample_frames
+from mcaptrack.transforms import STAGES
+
+
+@dataclass(frozen=True, kw_only=True)
+class Numbered:
+    """A tracker that gives each box an id of its own, and breaks the law that it is told to."""
+
+    breaks: str = ""
+    reads: ClassVar = DETECTIONS
+    writes: ClassVar = {"": TRACKS}
+    seen: ClassVar[list[int]] = []
+
+    @property
+    def latency_s(self) -> dict[str, float]:
+        return {"": 0.0}
+
+    def __call__(self, frames: Iterable[Frame]) -> Iterator[tuple[Frame]]:
+        frames, count = list(frames) if self.breaks in ("causal", "late") else frames, 0
+        for frame in frames:
+            if self.breaks == "skip" and not len(frame.rows):
+                continue
+            if self.breaks == "input" and len(frame.rows):
+                frame.rows["score"] = 0.5
+            given = frame.rows if self.breaks == "order" else np.sort(frame.rows, order=["x_px", "y_px"])
+            ids = count + np.arange(len(given), dtype=np.int64)
+            count += len(given)
+            if self.breaks == "state":
+                self.seen.append(1)
+                ids += len(self.seen)
+            if self.breaks == "order" and len(given):
+                given = given.copy()
+                given["score"][0] = 0.25
+            rows = TRACKS.rows(
+                track_id=ids,
+                **{name: given[name] for name in ("x_px", "y_px", "w_px", "h_px", "score")},
+                observed=np.ones(len(given), bool),
+                source_id=np.full(len(given), len(frames) if self.breaks == "causal" else -1),
+            )
+            if self.breaks == "ghost" and not len(rows):
+                rows = TRACKS.empty(1)
+            if self.breaks == "schema":
+                rows = rows[["track_id"]]
+            t_ns = 0 if self.breaks == "time" else frame.t_ns
+            result = (Frame(t_ns, frame.index, rows),)
+            yield result * 2 if self.breaks == "tuple" else result
+
+
+def test_a_transform_that_keeps_all_laws_passes():
+    check_transform(Numbered())
+    check_transform(Numbered(), [frame for frame in sample_frames(DETECTIONS, 5) if len(frame.rows)])
+
+
+@pytest.mark.parametrize("stage", STAGES.values(), ids=STAGES)
+def test_all_defaults_pass(stage):
+    check_transform(stage.default())
+
+
+@pytest.mark.parametrize(
+    ("breaks", "words"),
+    [
+        ("schema", "conforms: output '', frame 0 at .* ns: mcaptrack.Tracks has the columns"),
+        ("time", "conforms: output '', frame 1 at 0 ns is not later than 0 ns before it"),
+        ("tuple", "conforms: result 0 is no tuple of 1 frames"),
+        ("state", "pure: the second run differs from the first in result 0 at"),
+        ("input", "pure: it changes its input, first in frame 0 at"),
+        ("causal", "causal: output '', frame 0 at .* depends on frames after number 0"),
+        ("order", "order-blind: output '', frame . at .* depends on the order of rows"),
+        ("ghost", "empties: output '', frame 0 at .* has rows, though its input has none"),
+        ("skip", "empties: frames without rows give no frames"),
+    ],
+)
+def test_a_broken_law_is_named_with_its_place(breaks, words):
+    with pytest.raises(LawError, match=words):
+        check_transform(Numbered(breaks=breaks))
+
+
+def test_declarations_and_parameters_are_checked():
+    class NotData:
+        reads, writes, latency_s = DETECTIONS, {"": TRACKS}, {"": 0.0}
+
+    @dataclass
+    class Thawed(NotData):
+        pass
+
+    @dataclass(frozen=True)
+    class NoLatency(NotData):
+        latency_s: ClassVar = {}
+
+    @dataclass(frozen=True, kw_only=True)
+    class Unkept(Numbered):
+        how: float = 1.0
+
+        def __post_init__(self) -> None:
+            object.__setattr__(self, "how", self.how + 1)
+
+    for transform, words in (
+        (NotData(), "declares: NotData is no dataclass"),
+        (Thawed(), "declares: Thawed is not frozen"),
+        (NoLatency(), "declares: NoLatency.latency_s is of [], writes is of ['']"),
+        (Unkept(), "provenance: how is 3.0 when it was kept"),
+    ):
+        with pytest.raises(LawError, match=re.escape(words)):
+            check_transform(transform)
+
+
+def test_samples_are_what_their_schemas_say():
+    for schema in (DETECTIONS, TRACKS):
+        frames = sample_frames(schema)
+        assert sum(len(schema.check(frame.rows)) for frame in frames) > 60
+        assert sample_frames(schema, 1)[0].rows.tobytes() != frames[0].rows.tobytes()
+    assert {frame.rows.dtype for frame in sample_frames(VIDEO)} == {np.dtype(np.uint8)}
+    with pytest.raises(LawError, match="no frames"):
+        check_transform(Numbered(), [])
