@@ -250,3 +250,17 @@ def test_an_exchange_at_the_last_step_of_both_is_undone():
     owner, changed = resolve_swaps(MODEL, out, at, np.repeat([3, 5], 40), 0.4)
     assert changed == 1
     assert owner.tolist() == [0] * 39 + [1] + [1] * 39 + [0]
+
+
+def test_the_input_id_0_counts_as_any_other():
+    """How far apart two have to stand until exchanged positions are exchanged back, against ids that say otherwise."""
+
+    def exchanged_back(near: float, first: int) -> bool:
+        side = 1.5 - near
+        paths = {t: {s: (a if s < 25 else side - a, 0.0) for s in range(50)} for t, a in ((3, 0.0), (5, side))}
+        names = {s: 7 if s < 15 else first for s in range(50)}
+        return ours_exchanged(paths, {3: names, 5: dict.fromkeys(range(50), 5)})
+
+    assert edge(lambda near: exchanged_back(near, 0), 0.0, 1.49) == edge(
+        lambda near: exchanged_back(near, 3), 0.0, 1.49
+    )
