@@ -76,3 +76,10 @@ def test_a_sample_is_the_same_for_the_same_seed_and_takes_no_place_twice():
     one, two, three = (sample(everything, 30, seed) for seed in (1, 1, 2))
     assert one == two != three
     assert len({(mutant.path, mutant.start) for mutant in one}) == len(one) == 30
+
+
+@pytest.mark.parametrize("operator", ["+", "-", "*", "/", "//", "%", "&", "|", "^", "<<", ">>", "@", "**"])
+def test_every_operator_of_two_numbers_is_changed_into_another(operator):
+    for source in (f"c = a {operator} b\n", f"a {operator}= b\n"):
+        made = [m.applied(source.encode()).decode() for m in mutants_of("x.py", source.encode())]
+        assert [text for text in made if text != source and ast.parse(text)] or (operator == "**" and "=" in source)

@@ -15,6 +15,7 @@ from tests.effects import Case, others, retrack, sort
 
 CASES = retrack.CASES | sort.CASES | others.CASES
 KINDS = dict(TRANSFORMS) | dict(TRACKERS)
+BUILT_IN = {f"{stage} {name}": kind for stage, one in STAGES.items() for name, kind in one.built_in().items()}
 ORDER = ("least", "more", "most")
 
 
@@ -63,10 +64,10 @@ SHARES = {"alpha", "beta", "min_iou", "low_min_iou", "min_certainty"}
 ANY = {"min_score", "high_score", "new_score"}
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", BUILT_IN.values(), ids=BUILT_IN)
 def test_ranges_quantities_are_not_negative_and_shares_are_within_0_and_1(kind):
-    for option in fields(KINDS[kind]):
-        name, hint = option.name, get_type_hints(KINDS[kind])[option.name]
+    for option in fields(kind):
+        name, hint = option.name, get_type_hints(kind)[option.name]
         if option.metadata.get("context") or bare_type(hint) not in (int, float):
             continue
         usual = (0.0, 1.0) if name in SHARES else (-np.inf, np.inf) if name in ANY else (0.0, 1e6)

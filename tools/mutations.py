@@ -32,6 +32,7 @@ _OPERATORS = {
     ast.Mod: ("%", "//"),
     ast.BitAnd: ("&", "|"),
     ast.BitOr: ("|", "&"),
+    ast.BitXor: ("^", "|"),
     ast.LShift: ("<<", ">>"),
     ast.RShift: (">>", "<<"),
     ast.MatMult: ("@", "*"),
