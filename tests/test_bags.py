@@ -288,7 +288,7 @@ class TestRosbag2:
         words = " ".join(report.notes)
         assert "does not say what sensor_msgs/msg/Image is; its definition is that of ROS 2" in words
         assert ("Humble" in words) == (version >= 3)
-        assert "robot_msgs/msg/Secret is; nobody here knows its definition" in words
+        assert "robot_msgs/msg/Secret is; its definition is not known" in words
 
     def test_definitions_are_kept_as_they_are(self, tmp_path):
         idl = "=" * 80 + "\nIDL: robot_msgs/msg/Secret\nmodule robot_msgs {};"
@@ -360,7 +360,7 @@ class TestRosbag2:
             make(tmp_path / "e.db3", tmp_path / "out.mcap")
         (tmp_path / "f").mkdir()
         (tmp_path / "f" / "metadata.yaml").write_text("rosbag2_bagfile_information: [1, 2]")
-        with pytest.raises(McaptrackError, match=r"metadata\.yaml is no metadata of a rosbag2 bag"):
+        with pytest.raises(McaptrackError, match=r"metadata\.yaml is not the metadata of a rosbag2 bag"):
             make(tmp_path / "f", tmp_path / "out.mcap")
         (tmp_path / "g").mkdir()
         for name in ("one.mcap", "two.mcap"):
@@ -435,7 +435,10 @@ class TestInto:
         for force in ([], ["--force"]):
             result = CliRunner().invoke(app, [*words, *force])
             assert result.exit_code == 1
-            assert "which other software recorded (std_msgs/String) and which is never replaced; make" in result.stderr
+            assert (
+                "which other software recorded (std_msgs/String) and which is never replaced; write it to a separate log with -o"
+                in result.stderr
+            )
             assert recorded(tmp_path / "b.mcap") == sorted(said + other)
 
     @pytest.mark.parametrize("chunks", [True, False])

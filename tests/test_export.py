@@ -323,7 +323,7 @@ def test_an_unreadable_message_is_reported_with_its_time(tmp_path):
     with log.create(tmp_path / "a.mcap") as writer:
         number = writer.add_channel("/x", ("", "", b""), "json", {})
         writer.add_message(number, 5, 0, b"{")
-    with pytest.raises(McaptrackError, match=r"/x at 5 ns: 1 bytes are no json message"):
+    with pytest.raises(McaptrackError, match=r"/x at 5 ns: 1 bytes are not a json message"):
         exported(tmp_path / "a.mcap", tmp_path / "t", topics=["/x"])
     outcome = CliRunner().invoke(app, ["export", str(tmp_path / "a.mcap"), "--blobs"])
     assert (outcome.exit_code, "with --topic" in outcome.stderr) == (1, True)

@@ -226,7 +226,9 @@ def test_only_tables_are_read(commands, folder, name):
         db.execute(SCHEMAS[name])
     db.close()
     refused(
-        commands, folder / "a.db3", "is computed" if "zeros" in name and "view" not in name else "is no ordinary table"
+        commands,
+        folder / "a.db3",
+        "is computed" if "zeros" in name and "view" not in name else "is not an ordinary table",
     )
 
 
@@ -397,9 +399,7 @@ def test_a_journal_names_no_file_that_is_removed(commands, folder, tmp_path):
 def test_a_temporary_copy_needs_space(folder, monkeypatch):
     left_behind(folder, "WAL")
     monkeypatch.setattr(shutil, "disk_usage", lambda _: type("Disk", (), {"free": 100})())
-    with pytest.raises(
-        McaptrackError, match=r"a\.db3 needs \d+ bytes or more in .*, where 90 can be had; TMPDIR chooses"
-    ):
+    with pytest.raises(McaptrackError, match=r"a\.db3 needs \d+ bytes or more in .*, where 90 are free; TMPDIR sets"):
         ingest(folder / "a.db3", folder.parent / "out.mcap", IngestOptions())
 
 

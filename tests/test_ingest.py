@@ -230,7 +230,7 @@ class TestIngest:
             ]
         report = ingest(found, out, options(role="truth", fps=Fraction(7), frames=3))
         assert [(notice.message, notice.code) for notice in report.warnings] == [
-            (f"{found}: 14 frames a second by seqinfo.ini, and 7 by `fps=`, which is taken", "clock")
+            (f"{found}: 14 frames a second by seqinfo.ini, and 7 by `fps=`, which is used", "clock")
         ]
         write(tmp_path / "seqinfo.ini", "frameRate=14\nseqLength=1\n")
         with pytest.raises(
@@ -272,7 +272,7 @@ class TestIngest:
         "a singular plane": ({"ground_plane": "1 0 0\n2 0 0\n0 0 1\n"}, "the homography is singular"),
         "no plane at all": ({"ground_plane": "1 0\n"}, "is not a homography"),
         "labels after the end": ({"labels": {"truth": "900,1,1,1,2,2\n"}}, "all labels are of frames after"),
-        "a role for a video": ({"role": "truth"}, "is no label file; `role=` is for those"),
+        "a role for a video": ({"role": "truth"}, "is not a label file; `role=` applies to those"),
     }
 
     @pytest.mark.parametrize(("given", "words"), REFUSED.values(), ids=REFUSED)

@@ -318,9 +318,9 @@ REFUSED = {
     "before the first picture": (
         [3, 20],
         {"first_frame": 5},
-        "its first label is of frame 3, and frame 5 is said to be the first picture",
+        "its first label is of frame 3, and frame 5 is assumed to be the first picture",
     ),
-    "how many frames there are": ([3], {"frames": 9}, "`frames=` is for those that stand alone"),
+    "how many frames there are": ([3], {"frames": 9}, "`frames=` applies to labels without pictures"),
 }
 
 
@@ -461,7 +461,7 @@ class TestTimeline:
         assert (placed.number.tolist(), placed.t_ns.tolist()) == ([1, 2, 4, 5], [0, 10, 30, 40])
         assert [words.partition(": ")[2] for words in lost] == [
             "1 labels are of frames after the last picture that could be read, 4",
-            "1 labels are of frames whose pictures are missing",
+            "1 labels are of frames with missing pictures",
         ]
 
 

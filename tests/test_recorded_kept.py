@@ -154,7 +154,7 @@ def test_nothing_that_is_ingested_takes_the_place_of_a_recorded_channel(
         assert path.read_bytes() == before
     camera = re.search(r"; --camera (\S+) puts", err)
     more = ["--camera", camera[1], "--into", path] if camera else ["-o", "other.mcap"]
-    assert bool(camera) != ("make a log of its own of it with -o" in err)
+    assert bool(camera) != ("write it to a separate log with -o" in err)
     code, err = mcaptrack("ingest", source, *options, *more)
     assert code == 0, err
     assert theirs(path) == content

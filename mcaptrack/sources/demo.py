@@ -1,4 +1,4 @@
-"""The demonstration: a scene with known truth, drawn to a real video file, and everything run on it."""
+"""The demonstration: a synthetic scene with known ground truth, rendered to a video file."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from mcaptrack.geometry.arrays import Image
 from mcaptrack.sources.synthetic import SyntheticScene
 from mcaptrack.sources.video import write_mp4
 
-#: What the demonstration writes, by name.
+#: The files that the demonstration writes.
 VIDEO: Final = "demo.mp4"
 TRUTH: Final = "truth.txt"
 PLANE: Final = "ground_plane.txt"
@@ -29,7 +29,7 @@ SCORES: Final = "demo_scores.json"
 
 
 def read_scores() -> dict[str, Any]:
-    """Scores of SORT and of re-tracking for each scene, a value a seed, within 1 m on the clock of prediction.
+    """Scores of SORT and of re-tracking for each scene and seed, matched within 1 m at the sampling rate.
 
     ``{"version": ..., "seeds": [...], "scenes": {scene: {"SORT" | "re-tracked": {score: [a value a seed]}}}}``
     """
@@ -45,7 +45,7 @@ def mean_and_range(values: Sequence[float], scale: float = 1.0, digits: int = 1)
 
 @dataclass(frozen=True)
 class Footage:
-    """A drawn scene on disk: the video, its true boxes (MOTChallenge) and its ground plane (3x3)."""
+    """A synthetic scene on disk: the video, its ground truth boxes (MOTChallenge) and its ground plane (3x3)."""
 
     video: Path
     truth: Path
@@ -59,9 +59,9 @@ def draw(
     *,
     video: bool = True,
 ) -> Footage:
-    """Draw a scene into a folder: what a person with a camera and much patience would have.
+    """Write a synthetic scene to a folder: video, ground truth and ground plane.
 
-    Without ``video`` only the truth and the ground plane are written, the same ones.
+    Without ``video`` only ground truth and ground plane are written.
     """
     footage = Footage(folder / VIDEO, folder / TRUTH, folder / PLANE)
     lines: list[str] = []

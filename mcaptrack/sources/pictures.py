@@ -1,7 +1,7 @@
-"""Any picture of a log, without decoding the video from its beginning.
+"""Random access to the pictures of a log, without decoding the video from its beginning.
 
-Decoding begins at the last key picture that has its parameter sets with it. Which one that is, the first bytes of the
-messages say, from the wanted picture backwards.
+Decoding begins at the last key picture with parameter sets before the wanted picture. It is found by the first bytes of
+messages, searching backwards.
 
 Letters: M messages.
 """
@@ -21,28 +21,28 @@ from mcaptrack.schema import Frame
 from mcaptrack.sources import foreign
 from mcaptrack.sources.video import EncodedPicture, decode_bgr, read_head
 
-#: So many messages are looked at in the second step back to a key picture, so many times more in each further one, and
-#: never more than so many at once.
+#: The backward search for a key picture: messages in the second step, the factor for each further step, and the maximum
+#: in one step.
 _STEP, _FURTHER, _MOST = 8, 4, 512
-#: Pictures that are no further apart than this are reached by reading on.
+#: Wanted pictures at most this far apart are decoded in one run.
 _NEAR: Final = 64
 _BLOCK: Final = 128
-#: So many groups before its own a picture is looked for that its own does not show.
+#: How many earlier groups of pictures are tried for a picture that decoding from its own key picture doesn't show.
 _BACK: Final = 2
 
 
 class Pixels(Protocol):
-    """Encoded pictures -> those that are wanted: ``video.decode_bgr`` or ``video.decode_gray``."""
+    """The interface of ``video.decode_bgr`` and ``video.decode_gray``."""
 
     def __call__(self, pictures: Iterable[EncodedPicture], wanted: Container[int] | None = None, /) -> Iterator[Frame]:
-        """Frames whose rows are pixels."""
+        """Decode the wanted pictures."""
 
 
 class Pictures:
-    """The pictures of a channel, each for the decoding of one group of pictures at most.
+    """The pictures of a channel with random access: each costs the decoding of one group of pictures at most.
 
-    ``t_ns`` are their log times, rising, (M,); pictures are numbered in that order. ``decoded`` is how many have been
-    decoded so far. Raises McaptrackError if the channel is not there or holds something else.
+    ``t_ns`` are their sorted log times, (M,); pictures are numbered in this order. ``decoded`` counts the pictures that
+    have been decoded. Raises McaptrackError if there is no such channel, or if it holds no pictures.
     """
 
     def __init__(self, opened: log.Log, topic: str) -> None:
@@ -52,15 +52,15 @@ class Pictures:
         self.decoded = 0
 
     def at(self, times_ns: Iterable[int], pixels: Pixels = decode_bgr) -> Iterator[Frame]:
-        """What is seen at these times: for each the last picture that is not later, rising, each once.
+        """The pictures at these times: for each time the latest picture that is not later, in order, without repeats.
 
-        Times before the first picture are those of the first.
+        Times before the first picture give the first one.
         """
         found = np.searchsorted(self.t_ns, np.fromiter(times_ns, np.int64), "right") - 1
         return self.frames(np.maximum(found, 0).tolist() if len(self.t_ns) else [], pixels)
 
     def frames(self, numbers: Iterable[int], pixels: Pixels = decode_bgr) -> Iterator[Frame]:
-        """The pictures with these numbers, rising, each once; ``index`` is the number.
+        """The pictures with these numbers, in order, without repeats; ``index`` is the number.
 
         Rows are (height, width, 3) uint8, blue, green, red, or with ``pixels=brightness`` (height, width). Pictures of
         a video before the first that decoding can begin with are left out. Raises McaptrackError for pictures that are
@@ -71,7 +71,7 @@ class Pictures:
             raise McaptrackError(f"{self._opened.path}: {self._topic} has {len(self.t_ns)} pictures, not {wanted[-1]}")
         while wanted:
             entered, fed = self._entry(wanted[0]), dict[int, bool]()
-            start = entered or 0  # without a key picture from the beginning, since some streams refresh bit by bit
+            start = entered or 0  # without a key picture from the beginning, because some streams use gradual refresh
             missing = set(wanted)
             for frame in pixels(self._run(start, wanted, fed), set(wanted)):
                 missing.discard(frame.index)
@@ -82,7 +82,7 @@ class Pictures:
             wanted = wanted[len(fed) :]
 
     def _entry(self, number: int) -> int | None:
-        """Where decoding begins that is to show a picture: the last key picture up to it, or where its sets stand.
+        """Where to begin decoding for a picture: at the last key picture before it, or at its parameter sets.
 
         None if there is none.
         """
@@ -98,9 +98,9 @@ class Pictures:
         return None
 
     def _run(self, start: int, wanted: list[int], fed: dict[int, bool]) -> Iterator[EncodedPicture]:
-        """What has to be decoded from ``start`` on, as far as it is of use.
+        """The pictures to decode from ``start`` on.
 
-        ``fed`` gets what that has of ``wanted``, and whether it holds a picture.
+        The wanted ones among them are added to ``fed``, with whether their message has a picture.
         """
         waiting: list[EncodedPicture] = []
         for number, picture in self._read(start, len(self.t_ns)):
@@ -113,7 +113,7 @@ class Pictures:
             if begins and not picture.is_video:
                 waiting.clear()
             elif begins and waiting:
-                return  # nothing of what waits is wanted, and what is wanted later need not have it
+                return  # none of the pending pictures is wanted, and later wanted ones don't depend on them
             waiting.append(picture)
             if number == wanted[len(fed)]:
                 self.decoded += len(waiting)
@@ -124,7 +124,7 @@ class Pictures:
                     return
 
     def _from_before(self, number: int, start: int, pixels: Pixels) -> Frame:
-        """A picture that its key picture does not show: leading pictures of open groups need the group before."""
+        """A picture that needs an earlier key picture: leading pictures of open groups depend on the previous group."""
         for _ in range(_BACK):
             if start == 0:
                 break
@@ -135,10 +135,10 @@ class Pictures:
         raise McaptrackError(f"{where} can't be decoded, from the key picture before it on")
 
     def _read(self, start: int, end: int) -> Iterator[tuple[int, EncodedPicture]]:
-        """The pictures from number ``start`` to before ``end``, as they stand in the log."""
+        """The encoded pictures with numbers from ``start`` (inclusive) to ``end`` (exclusive)."""
         for first in range(start, end, _BLOCK):
             until = min(first + _BLOCK, end)
-            # Messages may share a time: then some that are not meant come along.
+            # Messages may share a time, so the interval may contain others.
             before = int(np.searchsorted(self.t_ns, self.t_ns[first]))
             span = int(self.t_ns[first]), int(self.t_ns[until - 1]) + 1
             read = first
@@ -154,5 +154,5 @@ class Pictures:
             if read < until:
                 raise DamagedError(
                     f"{self._opened.path} is damaged: messages of {self._topic} lie outside of the times that their "
-                    f"chunk names; {recover_command(self._opened.path)} mends that"
+                    f"chunk names; {recover_command(self._opened.path)} repairs that"
                 )

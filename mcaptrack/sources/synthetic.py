@@ -1,7 +1,7 @@
-"""Scenes with known truth, drawn from scratch: people who walk over a square, seen by a camera on a mast.
+"""Synthetic scenes with known ground truth: people who walk across a square, seen by a camera on a mast.
 
-What makes tracking hard is in them by name: people who cross, who meet and part, who pass behind something, a tree that
-sways, a camera that shakes. Used by the demonstration, by tests and by whoever wants footage without a licence.
+They contain what makes tracking hard: people who cross paths, meet and separate, or are occluded; a swaying tree; a
+shaking camera. Used by the demonstration, by tests, and for footage without a licence.
 
 Letters: N people in a picture. Ground: x to the right, y away from the camera, in metres.
 """
@@ -24,14 +24,14 @@ _STRIDE_HZ: Final = 1.8
 
 @dataclass(frozen=True)
 class Pedestrian:
-    """Someone who goes from point to point: ``route`` holds (seconds, x_m, y_m), and is only there between its ends."""
+    """A person who walks along ``route``, points of (seconds, x_m, y_m); visible only between its ends."""
 
     id: int
     route: tuple[tuple[float, float, float], ...]
     colour: tuple[int, int, int] = (90, 60, 40)
 
     def at(self, seconds: float) -> tuple[float, float] | None:
-        """Where they are; None before and after."""
+        """The position in metres; None before and after the route."""
         times, xs, ys = zip(*self.route, strict=True)
         if not times[0] <= seconds <= times[-1]:
             return None
@@ -39,7 +39,7 @@ class Pedestrian:
 
 
 class Block(NamedTuple):
-    """Something that stands on the ground and hides what is behind it: its middle, width and height in metres."""
+    """An occluder on the ground: its centre, width and height in metres."""
 
     x_m: float
     y_m: float
@@ -48,7 +48,7 @@ class Block(NamedTuple):
 
 
 class SyntheticFrame(NamedTuple):
-    """One picture: BGR (height, width, 3), who is in it, their boxes (N, 4) in pixels and places (N, 2) in metres."""
+    """One picture, BGR (height, width, 3), and its people: ids, boxes (N, 4) in px, positions (N, 2) in m."""
 
     seconds: float
     image: Image
@@ -97,9 +97,9 @@ class SyntheticScene:
         return GroundPlane(tuple((homography / homography[-1]).tolist()), self.width_px, self.height_px)
 
     def shots(self, draw: bool = True) -> Iterator[SyntheticFrame]:
-        """All pictures in order. The same scene draws the same pixels every time.
+        """All pictures in order. The same scene gives the same pixels every time.
 
-        Without ``draw`` they are empty, and who is where is the same.
+        Without ``draw`` the pictures are empty, with the same ground truth.
         """
         import cv2
 
@@ -114,7 +114,7 @@ class SyntheticScene:
             people = [(walker, walker.at(now)) for walker in self.people]
             there = [(walker, place) for walker, place in people if place]
             boxes = {walker.id: self._figure(image, walker, place, now, draw=False) for walker, place in there}
-            # From the far end to the near one, so that what is nearer hides what is behind it.
+            # From far to near, so that nearer objects occlude those behind them.
             acts: list[tuple[float, Callable[[], object]]] = [
                 (place[1], partial(self._figure, image, who, place, now, draw=True)) for who, place in there
             ]
@@ -170,7 +170,7 @@ class SyntheticScene:
     def _figure(
         self, image: Image, walker: Pedestrian, place: tuple[float, float], now: float, draw: bool
     ) -> list[float]:
-        """Draw someone, or only say their box."""
+        """Draw a person, or only return the box."""
         import cv2
 
         foot, head = self._project(np.array([[*place, 0.0], [*place, _PERSON_M]]))
@@ -231,7 +231,7 @@ def _point(xy: Floats) -> Sequence[int]:
     return [round(float(xy[0])), round(float(xy[1]))]
 
 
-#: What stands on the square.
+#: The objects on the square.
 _KIOSK: Final = (Block(1.6, 14.9, 1.7, 2.3),)
 _TREE_AT_M: Final = (-6.8, 16.0)
 
@@ -239,17 +239,17 @@ _TREE_AT_M: Final = (-6.8, 16.0)
 def demo_scene(seed: int = 2) -> SyntheticScene:
     """The scene of the demonstration: the four ways in which tracking fails in the paper, within 40 seconds.
 
-    Two people cross; two meet, go side by side and part; one passes behind a kiosk for a second; a tree sways; the
-    camera shakes a little; others just walk. ``seed`` draws the pixels and the shaking; the routes stay.
+    Two people cross; two meet, walk side by side and separate; one is occluded by a kiosk for a second; a tree sways;
+    the camera shakes a little; others just walk. ``seed`` changes the noise and the shaking, but not the routes.
     """
     people = (
         # two who cross
         Pedestrian(1, ((0, -8.0, 9.0), (11, 7.5, 15.0)), (40, 30, 130)),
         Pedestrian(2, ((0, 7.5, 9.5), (11, -8.0, 15.0)), (140, 55, 20)),
-        # two who meet, go side by side for a while and part
+        # two who meet, walk side by side for a while and separate
         Pedestrian(3, ((8, -8.0, 7.6), (14, -0.5, 12.1), (15.2, 0.5, 12.6), (21, 8.0, 17.0)), (25, 70, 25)),
         Pedestrian(4, ((8, -8.0, 17.0), (14, -0.3, 12.5), (15.2, 0.5, 12.1), (21, 8.0, 7.6)), (90, 25, 85)),
-        # one who passes behind the kiosk
+        # one who is occluded by the kiosk
         Pedestrian(5, ((16, 9.5, 17.0), (31, -9.5, 16.0)), (30, 30, 30)),
         # two who walk towards each other and pass
         Pedestrian(6, ((23, -7.5, 9.0), (35, 8.0, 9.6)), (235, 235, 240)),
@@ -264,13 +264,13 @@ def demo_scene(seed: int = 2) -> SyntheticScene:
 
 
 def walkers_scene(seed: int = 1) -> SyntheticScene:
-    """Ten people cross the same square on random routes."""
+    """Ten people cross the square on random routes."""
     rng = np.random.default_rng([seed, 1])
     return _square(tuple(_random_walker(rng, number) for number in range(1, 11)), seed)
 
 
 def crowd_scene(seed: int = 1) -> SyntheticScene:
-    """Twenty people cross the same square on random routes, most of them at the same time."""
+    """Twenty people cross the square on random routes, most of them at the same time."""
     rng = np.random.default_rng([seed, 2])
     return _square(tuple(_random_walker(rng, number, latest_s=20.0) for number in range(1, 21)), seed)
 
@@ -325,13 +325,13 @@ def _random_walker(rng: np.random.Generator, number: int, latest_s: float = 26.0
 
 
 def _random_colour(rng: np.random.Generator) -> tuple[int, int, int]:
-    """Clothes: dark, or bright; not that of the paving."""
+    """A colour of clothes: dark or bright, unlike the paving."""
     low, high = (15, 100) if rng.random() < 0.75 else (200, 245)
     b, g, r = rng.integers(low, high, 3).tolist()
     return b, g, r
 
 
-#: The scenes of the demonstration by name: the one it shows, and others, most of them harder. Each takes a seed.
+#: The scenes of the demonstration by name: the default one and others, most of them harder. Each takes a seed.
 SCENES: Final[Mapping[str, Callable[[int], SyntheticScene]]] = {
     "square": demo_scene,
     "walkers": walkers_scene,

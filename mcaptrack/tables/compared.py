@@ -29,7 +29,7 @@ from mcaptrack.sources import ingest
 from mcaptrack.sources.ingest.bags.opening import is_mcap
 from mcaptrack.sources.ingest.job import IngestOptions, label_rows
 from mcaptrack.sources.ingest.label_job import LabelJob
-from mcaptrack.sources.ingest.labels.formats import KITTI_HEIGHT_PX, PERSON, Aside, Labels, Role
+from mcaptrack.sources.ingest.labels.formats import KITTI_HEIGHT_PX, PERSON, IgnoredBoxes, Labels, Role
 from mcaptrack.sources.ingest.labels.reading import read_homography, read_labels
 
 #: Formats that give the frame number of each row.
@@ -150,7 +150,7 @@ def _read(path: Path, role: Role, topics: Sequence[str]) -> Labels:
     if role == "tracks" and path.is_file() and _is_blank(path):
         return _no_tracks("mot")
     labels = read_labels(path, role=role)
-    if not labels.identified:
+    if not labels.has_ids:
         raise McaptrackError(f"{path} has no ids (all are -1); {role} need ids")
     return labels
 
@@ -220,7 +220,7 @@ def _by_number(
     numbers = np.unique(np.concatenate([*there.values()]))  # frames without rows do not change any score
     numbers = numbers[numbers % step == start]
     frames = {role: _frames(labels, numbers, there[role], plane, role) for role, (_, labels) in both.items()}
-    if truth.aside is not None and truth.boxes_px is not None:
+    if truth.ignored is not None and truth.boxes_px is not None:
         frames["tracks"], gone = _without_ignored(frames["truth"], frames["tracks"], truth)
         if gone:
             notes.append(f"{gone} boxes of {both['tracks'][0]} match labels that don't count; they are ignored")
@@ -251,35 +251,35 @@ def _frames(
 
 def _without_ignored(truth: Sequence[Frame], tracks: Sequence[Frame], labels: Labels) -> tuple[list[Frame], int]:
     """Remove boxes that match labels which don't count, as MOTChallenge and KITTI do; returns their number, too."""
-    assert labels.aside is not None
-    aside = labels.aside
-    order = np.argsort(aside.frame, kind="stable")
-    aside = _rows(aside, order)
-    at = aside.frame - labels.first_frame
+    assert labels.ignored is not None
+    ignored = labels.ignored
+    order = np.argsort(ignored.frame, kind="stable")
+    ignored = _rows(ignored, order)
+    at = ignored.frame - labels.first_frame
     out, gone = [], 0
     for true, found in zip(truth, tracks, strict=True):
         low, high = np.searchsorted(at, [true.index, true.index + 1])
-        kept = ~_is_ignored(_boxes(true), _boxes(found), _rows(aside, slice(low, high)), labels.format == "kitti")
+        kept = ~_is_ignored(_boxes(true), _boxes(found), _rows(ignored, slice(low, high)), labels.format == "kitti")
         gone += int((~kept).sum())
         out.append(found if kept.all() else found._replace(rows=found.rows[kept]))
     return out, gone
 
 
-def _rows(aside: Aside, at: slice | NDArray[np.intp]) -> Aside:
-    return Aside(aside.frame[at], aside.boxes_px[at], aside.forgiven[at], aside.region[at])
+def _rows(ignored: IgnoredBoxes, at: slice | NDArray[np.intp]) -> IgnoredBoxes:
+    return IgnoredBoxes(ignored.frame[at], ignored.boxes_px[at], ignored.forgiven[at], ignored.region[at])
 
 
 def _boxes(frame: Frame) -> Floats:
     return np.stack([frame.rows[name] for name in ("x_px", "y_px", "w_px", "h_px")], axis=-1)
 
 
-def _is_ignored(true: Floats, found: Floats, aside: Aside, kitti: bool) -> Bools:
+def _is_ignored(true: Floats, found: Floats, ignored: IgnoredBoxes, kitti: bool) -> Bools:
     """Mark the boxes of tracks (K,) to ignore, given true boxes (N, 4) and labels that don't count."""
     forgiven = np.zeros(len(found), bool)
     if not len(found):
         return forgiven
-    other = ~aside.region
-    alike = iou(np.concatenate([true, aside.boxes_px[other]]), found)
+    other = ~ignored.region
+    alike = iou(np.concatenate([true, ignored.boxes_px[other]]), found)
     alike[alike < _ALIKE - _EPS] = 0
     matched = forgiven.copy()
     if alike.size:
@@ -288,10 +288,10 @@ def _is_ignored(true: Floats, found: Floats, aside: Aside, kitti: bool) -> Bools
         rows, columns = rows[real], columns[real]
         matched[columns] = True
         of_aside = rows >= len(true)
-        forgiven[columns[of_aside]] = aside.forgiven[other][rows[of_aside] - len(true)]
+        forgiven[columns[of_aside]] = ignored.forgiven[other][rows[of_aside] - len(true)]
     if kitti:
         forgiven |= ~matched & (found[:, 3] <= KITTI_HEIGHT_PX + _EPS)
-        for region in aside.boxes_px[aside.region]:
+        for region in ignored.boxes_px[ignored.region]:
             low, high = (
                 np.maximum(found[:, :2], region[:2]),
                 np.minimum(found[:, :2] + found[:, 2:], region[:2] + region[2:]),

@@ -83,7 +83,7 @@ def _files(path: Path) -> list[Path]:
 
 def _from_labels(path: Path, options: SourceOptions, step_s: float) -> list[Scene]:
     labels = read_labels(path, role="truth")
-    if not labels.identified:
+    if not labels.has_ids:
         raise McaptrackError(f"{path} has boxes without track ids; predictors learn from tracks")
     fps = options.fps
     if fps is None and labels.format == "sdd":

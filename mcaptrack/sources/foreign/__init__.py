@@ -1,7 +1,7 @@
-"""Messages that others recorded -> ours: pictures for detectors, boxes that somebody else detected.
+"""Adapters for messages of other software: pictures for detectors, and boxes of other detectors.
 
-A message has two times: when it was logged, which orders everything, and the stamp that its maker gave it, by which
-viewers match what is drawn to a picture.
+A message has two times: the log time, which orders everything, and the stamp of its publisher, by which viewers match
+drawings to a picture.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.notices import warn
 from mcaptrack.schema import Frame
 from mcaptrack.sources.foreign.boxes import DETECTIONS_READ, Classes, boxes_decoder
-from mcaptrack.sources.foreign.decoding import MessageType, guarded, plain_name
+from mcaptrack.sources.foreign.decoding import MessageType, decoder_with_errors, plain_name
 from mcaptrack.sources.video import PixelLayout
 
 __all__ = [
@@ -44,9 +44,9 @@ __all__ = [
 
 _COMPRESSED: Final = (foxglove.VIDEO, foxglove.IMAGE, "sensor_msgs/CompressedImage")
 _RAW: Final = ("foxglove.RawImage", "sensor_msgs/Image")
-#: Schemas whose messages are pictures, as ROS 1 and Foxglove name them; ROS 2 has "/msg/" between.
+#: Schemas of pictures, by their names in ROS 1 and Foxglove; ROS 2 adds "/msg/".
 PICTURES_READ: Final = (*_COMPRESSED, *_RAW)
-#: Words in the format of a compressed picture that name a video codec; all others are still images.
+#: Words for video codecs in the format of a compressed picture; other formats are still images.
 _VIDEO_WORDS: Final = {"h264": "h264", "avc": "h264", "h265": "h265", "hevc": "h265", "vp9": "vp9", "av1": "av1"}
 _RFC3339: Final = re.compile(r"(\d{4}-\d\d-\d\d)[Tt ](\d\d:\d\d:\d\d)(?:\.(\d{1,9})\d*)?(Z|z|[+-]\d\d:\d\d)", re.ASCII)
 _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
@@ -54,9 +54,9 @@ _LIMIT_NS: Final = 2**63
 
 
 class Picture(NamedTuple):
-    """A picture as its maker gave it: ``format`` is "h264", "jpeg" and so on, or with a ``layout`` that of pixels.
+    """A recorded picture: ``format`` is "h264", "jpeg" and so on, or with a ``layout`` a pixel format.
 
-    ``stamp_ns`` is the time in the message itself, from 1970.
+    ``stamp_ns`` is the stamp in the message, in nanoseconds since 1970.
     """
 
     stamp_ns: int
@@ -76,12 +76,12 @@ def is_picture(schema_name: str) -> bool:
 
 
 def is_compressed(schema_name: str) -> bool:
-    """Whether messages of this schema are pictures that are compressed already."""
+    """Whether messages of this schema are compressed pictures."""
     return plain_name(schema_name) in _COMPRESSED
 
 
 def holds_detections(channel: log.Channel) -> bool:
-    """Whether a channel's messages are boxes that others detected, by the name of their schema."""
+    """Whether a channel's messages are boxes of another detector, by the name of their schema."""
     return plain_name(channel.schema_name) in DETECTIONS_READ
 
 
@@ -89,7 +89,7 @@ def holds_detections(channel: log.Channel) -> bool:
 
 
 def pictures(opened: log.Log, topic: str) -> Iterator[tuple[log.Message, Picture]]:
-    """The messages of a channel, and the picture in each.
+    """The messages of a channel with their pictures.
 
     Raises McaptrackError, with topic and time, for messages that can't be read.
     """
@@ -97,19 +97,19 @@ def pictures(opened: log.Log, topic: str) -> Iterator[tuple[log.Message, Picture
 
 
 def picture_reader(opened: log.Log, topic: str) -> Callable[[log.Message], Picture]:
-    """What makes pictures of the messages of a channel; it and what it returns raise as ``pictures`` does."""
+    """A function that decodes messages of a channel to pictures; both raise errors as ``pictures`` does."""
     return _reader(opened, topic, picture_decoder)
 
 
 def stamps(opened: log.Log, topic: str) -> Ints:
-    """The stamps of a channel's pictures, in the order of their log times."""
+    """The stamps of a channel's pictures in log time order, (M,) ns."""
     return np.array([picture.stamp_ns for _, picture in pictures(opened, topic)], np.int64)
 
 
 def detections(opened: log.Log, topic: str) -> list[Frame]:
-    """What others detected, a frame a message. Raises McaptrackError, with topic and time, as ``pictures`` does.
+    """The boxes of another detector, one frame for each message. Raises McaptrackError as ``pictures`` does.
 
-    Classes that have names get numbers (see ``boxes.Classes``); a warning says which.
+    Class names are converted to ids (see ``boxes.Classes``), which a warning lists.
     """
     classes = Classes()
     found = _decoded(opened, topic, lambda kind: boxes_decoder(kind, classes))
@@ -155,16 +155,16 @@ def _reader(
 
 
 def picture_decoder(kind: MessageType) -> Callable[[bytes], Picture]:
-    """What makes pictures of the payloads of a channel.
+    """A function that decodes payloads of a channel to pictures.
 
-    Raises McaptrackError if messages of this kind are not read; what it returns raises McaptrackError for payloads that
-    are malformed.
+    Raises McaptrackError if messages of this type are not supported; the returned function raises McaptrackError for
+    malformed payloads.
     """
     name = plain_name(kind.name)
     if name in _COMPRESSED:
-        return guarded(kind, _compressed)
+        return decoder_with_errors(kind, _compressed)
     if name in _RAW:
-        return guarded(kind, _raw)
+        return decoder_with_errors(kind, _raw)
     raise McaptrackError(f"it holds {kind.name or 'no schema'}, not pictures; {', '.join(PICTURES_READ)} are read")
 
 
@@ -176,7 +176,7 @@ def _compressed(message: Any) -> Picture:
 
 
 def _format(words: str) -> str:
-    """The codec that a format names: "h264", "rgb8; jpeg compressed bgr8" -> "jpeg"."""
+    """The codec in a format: "h264" -> "h264", "rgb8; jpeg compressed bgr8" -> "jpeg"."""
     found = re.findall(r"[a-z0-9]+", words.lower().replace("h.26", "h26"))
     for word in found:
         if word in _VIDEO_WORDS:
@@ -188,16 +188,18 @@ def _format(words: str) -> str:
 
 def _raw(message: Any) -> Picture:
     layout = PixelLayout(
-        _whole(message.width),
-        _whole(message.height),
-        _whole(message.step),
-        bool(getattr(message, "is_bigendian", False)),  # Foxglove's has none: little-endian always
+        _integer(message.width),
+        _integer(message.height),
+        _integer(message.step),
+        bool(
+            getattr(message, "is_bigendian", False)
+        ),  # foxglove.RawImage has no such field: it is always little-endian
     )
     return Picture(_stamp_of(message), _text(message.encoding).lower(), _bytes(message.data), layout)
 
 
 def _stamp_of(message: Any) -> int:
-    """The time in a message, in nanoseconds: of Foxglove's ``timestamp`` or of ROS's ``header``."""
+    """The stamp of a message in nanoseconds: ``timestamp`` in Foxglove messages, ``header.stamp`` in ROS messages."""
     stamp = message.timestamp if hasattr(message, "timestamp") else message.header.stamp
     if isinstance(stamp, str):
         found = _RFC3339.fullmatch(stamp)
@@ -207,21 +209,23 @@ def _stamp_of(message: Any) -> int:
         passed = datetime.fromisoformat(f"{day}T{clock}{zone.upper()}") - _EPOCH
         t_ns = (passed.days * 86400 + passed.seconds) * NS_PER_S + int((fraction or "").ljust(9, "0"))
     else:
-        t_ns = _part(stamp, "sec", "secs", "seconds") * NS_PER_S + _part(stamp, "nsec", "nsecs", "nanosec", "nanos")
+        t_ns = _time_field(stamp, "sec", "secs", "seconds") * NS_PER_S + _time_field(
+            stamp, "nsec", "nsecs", "nanosec", "nanos"
+        )
     if not -_LIMIT_NS <= t_ns < _LIMIT_NS:
         raise ValueError(f"its stamp, {t_ns} ns, is out of range")
     return t_ns
 
 
-def _part(stamp: Any, *names: str) -> int:
+def _time_field(stamp: Any, *names: str) -> int:
     for name in names:
         if hasattr(stamp, name):
-            return _whole(getattr(stamp, name))
+            return _integer(getattr(stamp, name))
     raise ValueError(f"its stamp has no {names[0]}")
 
 
-def _whole(value: Any) -> int:
-    if isinstance(value, float) and value.is_integer():  # JSON of writers that know one kind of number
+def _integer(value: Any) -> int:
+    if isinstance(value, float) and value.is_integer():  # JSON of writers without an integer type
         value = int(value)
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or not -_LIMIT_NS <= value < _LIMIT_NS:
         raise ValueError(f"{str(value)[:40]!r} where a whole number belongs")
@@ -235,7 +239,7 @@ def _text(value: Any) -> str:
 
 
 def _bytes(value: Any) -> bytes:
-    """Bytes as they come: from protobuf, ROS (an array), JSON (base64 or, from ROS bridges, numbers)."""
+    """Bytes of a field: from protobuf, ROS (an array), JSON (base64, or numbers from ROS bridges)."""
     if isinstance(value, str):
         return base64.b64decode(value, validate=True)
     if isinstance(value, np.ndarray):

@@ -1,4 +1,4 @@
-"""Boxes that others detected -> rows of detections, and numbers for the classes that they name.
+"""Convert boxes of other detectors to rows of detections, and their class names to class ids.
 
 Letters: N boxes.
 """
@@ -15,26 +15,27 @@ import numpy as np
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import DETECTIONS, Rows
-from mcaptrack.sources.foreign.decoding import MessageType, guarded, plain_name
+from mcaptrack.sources.foreign.decoding import MessageType, decoder_with_errors, plain_name
 
-#: Schemas whose messages are boxes, but our own.
+#: Schemas of boxes of other software.
 DETECTIONS_READ: Final = ("vision_msgs/Detection2DArray",)
 
 _UNKNOWN, _PERSON = 0, 1
 _PEOPLE: Final = ("person", "pedestrian", "human")
 _NUMBER: Final = re.compile(r"[0-9]{1,10}")
 _NAME: Final = re.compile(r"[^\W\d_]")
-#: A channel has no more named classes than this; class ids from here on stand for names until all names are known.
+#: The maximum number of class names of a channel; ids from ``_FIRST_NAME`` on are placeholders until all names are
+#: known.
 _MAX_NAMES: Final = 1024
 _FIRST_NAME: Final = 2**32 - _MAX_NAMES
 _SHOWN: Final = 12
 
 
 class Classes:
-    """The classes of one channel: numbers stay what they are, people are 1, and other names get numbers.
+    """The classes of one channel: numeric classes keep their id, people are 1, and other names get new ids.
 
-    These follow the largest number of the channel, in the order of the alphabet, so that they don't depend on what was
-    seen first.
+    New ids follow the largest id of the channel in alphabetical order, so that they don't depend on the order of
+    messages.
     """
 
     def __init__(self) -> None:
@@ -42,7 +43,7 @@ class Classes:
         self._largest = _PERSON
 
     def class_id(self, said: str) -> int:
-        """The number of a class; for one that has a name, what ``numbers`` knows it by."""
+        """The id of a class; for a name a placeholder, which ``numbers`` maps to the final id."""
         if said.lower() in _PEOPLE:
             return _PERSON
         if _NUMBER.fullmatch(said):
@@ -54,25 +55,25 @@ class Classes:
         return self._names.setdefault(said, _FIRST_NAME + len(self._names))
 
     def numbers(self) -> dict[int, int]:
-        """The final number of each class that has a name, by what ``class_id`` gave."""
+        """The final id of each class name, by the placeholder from ``class_id``."""
         order = enumerate(sorted(self._names), start=self._largest + 1)
         return {self._names[name]: number for number, name in order}
 
     def named(self) -> list[tuple[str, int]]:
-        """The first names in the order of the alphabet, with their numbers."""
+        """The first class names in alphabetical order, with their ids."""
         return list(islice(zip(sorted(self._names), range(self._largest + 1, 2**32), strict=False), _SHOWN))
 
 
 def boxes_decoder(kind: MessageType, classes: Classes) -> Callable[[bytes], Rows]:
-    """What makes rows of detections (N,) of the payloads of a channel; raises as ``picture_decoder`` does.
+    """A function that decodes payloads of a channel to rows of detections (N,); raises as ``picture_decoder`` does.
 
-    ``classes`` collects the names of classes.
+    ``classes`` collects the class names.
     """
     if plain_name(kind.name) not in DETECTIONS_READ:
         raise McaptrackError(
             f"it holds {kind.name or 'no schema'}, not detections; {', '.join(DETECTIONS_READ)} is read"
         )
-    return guarded(kind, lambda message: _boxes(message, classes))
+    return decoder_with_errors(kind, lambda message: _boxes(message, classes))
 
 
 def _boxes(message: Any, classes: Classes) -> Rows:
@@ -89,9 +90,9 @@ def _boxes(message: Any, classes: Classes) -> Rows:
 
 
 def _box(detection: Any, classes: Classes) -> tuple[float, float, float, float, float, int]:
-    """Left, top, width and height of the upright box around a detection, its best score and what that says it is."""
+    """Left, top, width and height of the upright box around a detection, its best score, and its class id."""
     centre = detection.bbox.center
-    place = getattr(centre, "position", centre)  # vision_msgs 4 put a point where 3 had a pose
+    place = getattr(centre, "position", centre)  # a Point2D in vision_msgs 4, a Pose2D in version 3
     x, y, theta, w, h = (
         float(value)
         for value in (place.x, place.y, getattr(centre, "theta", 0.0), detection.bbox.size_x, detection.bbox.size_y)

@@ -1,7 +1,7 @@
-"""Payload bytes -> a message whose fields are attributes, whatever it was written with.
+"""Decode payloads to messages whose fields are attributes, in all supported encodings.
 
-Protobuf is read with the classes of the Foxglove schemas, JSON as it is, ROS 1 and ROS 2 by the definition that the
-log carries for them, so that a robot's own version of a message is read too. rosbags does that.
+Protobuf is decoded with the classes of the Foxglove schemas, JSON directly, ROS 1 and ROS 2 messages (by rosbags) with
+the definition in the log, so that modified versions of a message are read, too.
 """
 
 from __future__ import annotations
@@ -15,19 +15,19 @@ from typing import Any, Final, NamedTuple
 from mcaptrack import foxglove
 from mcaptrack.errors import McaptrackError
 
-#: Payload -> message. What is malformed raises some exception: only its caller knows what it was to be.
+#: Payload -> message. Malformed payloads raise various exceptions, which the caller handles.
 Unpack = Callable[[bytes], Any]
 
-#: The message encodings that are read.
+#: The supported message encodings.
 ENCODINGS: Final = ("protobuf", "json", "ros1", "cdr")
-#: A definition that is longer describes no picture; parsing one takes time.
+#: Longer definitions are refused, because parsing them takes long.
 _MAX_DEFINITION: Final = 2**20
 _ROS_NAME: Final = re.compile(r"([A-Za-z]\w*)/(?:msg/)?([A-Za-z]\w*)", re.ASCII)
 _IDL_HEAD: Final = re.compile(r"^=+\r?\nIDL: .*\r?\n", re.MULTILINE)
 
 
 class MessageType(NamedTuple):
-    """What a channel says of its messages: its schema record and its message encoding."""
+    """The message type of a channel: its schema record and its message encoding."""
 
     name: str
     schema_encoding: str
@@ -36,8 +36,8 @@ class MessageType(NamedTuple):
 
 
 def plain_name(schema_name: str) -> str:
-    """The name that a message goes by in all encodings: sensor_msgs/msg/Image and sensor_msgs/Image are one, and so
-    are foxglove_msgs/msg/RawImage and foxglove.RawImage.
+    """The normalised name of a schema: sensor_msgs/Image for sensor_msgs/msg/Image, and foxglove.RawImage for
+    foxglove_msgs/msg/RawImage.
     """
     found = _ROS_NAME.fullmatch(schema_name)
     if not found:
@@ -46,8 +46,8 @@ def plain_name(schema_name: str) -> str:
     return f"foxglove.{name}" if package == "foxglove_msgs" else f"{package}/{name}"
 
 
-def guarded(kind: MessageType, convert: Callable[[Any], Any]) -> Callable[[bytes], Any]:
-    """Payload -> what ``convert`` makes of the message. Whatever goes wrong is the payload's fault: McaptrackError.
+def decoder_with_errors(kind: MessageType, convert: Callable[[Any], Any]) -> Callable[[bytes], Any]:
+    """A function that decodes a payload and applies ``convert``; all failures become McaptrackError.
 
     Raises McaptrackError as ``unpacker`` does.
     """
@@ -58,15 +58,15 @@ def guarded(kind: MessageType, convert: Callable[[Any], Any]) -> Callable[[bytes
             return convert(unpack(payload))
         except McaptrackError:
             raise
-        except Exception as error:  # bytes of strangers through parsers of others: no list of exceptions is complete
+        except Exception as error:  # untrusted bytes in third-party parsers, which raise various exceptions
             why = " ".join(str(error).split())[:120] or type(error).__name__
-            raise McaptrackError(f"{len(payload)} bytes are no {kind.name} message ({why})") from None
+            raise McaptrackError(f"{len(payload)} bytes are not a {kind.name} message ({why})") from None
 
     return decode
 
 
 def unpacker(kind: MessageType) -> Unpack:
-    """What reads the messages of a channel. Raises McaptrackError for what can't be read, whatever the messages are."""
+    """A function that decodes messages of this type. Raises McaptrackError if the type is not supported."""
     if kind.encoding == "protobuf" and kind.name.startswith("foxglove."):
         return lambda payload: foxglove.unpack(kind.name, payload)
     if kind.encoding == "json":
@@ -83,14 +83,14 @@ def _ros_unpacker(kind: MessageType) -> Unpack:
 
     found = _ROS_NAME.fullmatch(kind.name)
     if not found:
-        raise McaptrackError(f"{kind.name!r} is no name of a ROS message; those are like sensor_msgs/Image")
+        raise McaptrackError(f"{kind.name!r} is not the name of a ROS message; those are like sensor_msgs/Image")
     name = "{}/msg/{}".format(*found.groups())
     is_ros1 = kind.encoding == "ros1"
     store = _typestore(name, kind, Stores.ROS1_NOETIC if is_ros1 else Stores.LATEST)
     read = store.deserialize_ros1 if is_ros1 else store.deserialize_cdr
 
     def unpack(payload: bytes) -> Any:
-        # No sequence has more members than its message has bytes; one of an empty type could go on forever.
+        # A sequence can't have more members than the message has bytes; one of an empty type could be endless.
         store.max_sequence_length = len(payload)
         return read(payload, name)
 
@@ -98,10 +98,10 @@ def _ros_unpacker(kind: MessageType) -> Unpack:
 
 
 def _typestore(name: str, kind: MessageType, known: Any) -> Any:
-    """The types of a channel: by its own definition, by that with ROS's own types added, or by ROS's own alone."""
+    """The types of a channel: from its definition, supplemented by the standard types of ROS if necessary."""
     from rosbags.typesys import Stores, get_typestore
 
-    why = "the log has no definition of it, and it is none of ROS's own"
+    why = "the log has no definition of it, and it is not a standard type of ROS"
     for base in (Stores.EMPTY, known):
         store = get_typestore(base)
         try:
@@ -109,7 +109,7 @@ def _typestore(name: str, kind: MessageType, known: Any) -> Any:
             if types:
                 store.register(types)
             store.get_msgdef(name)
-        except Exception as error:  # noqa: BLE001, RUF100  # of a parser that fails in its own many ways
+        except Exception as error:  # noqa: BLE001, RUF100  # a third-party parser that raises various exceptions
             if kind.schema:
                 why = f"the log's definition of it can't be understood ({' '.join(str(error).split())[:120]})"
         else:
@@ -118,7 +118,7 @@ def _typestore(name: str, kind: MessageType, known: Any) -> Any:
 
 
 def _types(name: str, kind: MessageType) -> Any:
-    """The types that a schema record defines: the one of its name, and those that it is made of."""
+    """The types that a schema record defines: the named one and those of its fields."""
     from rosbags.typesys import get_types_from_idl, get_types_from_msg
 
     text = kind.schema.decode("utf-8", "replace")

@@ -1,7 +1,7 @@
-"""Messages of any schema as flat rows: each field that holds one value, or a list of such, by its path.
+"""Flatten messages of any schema to rows: every field with a value, or a list of values, by its path.
 
-Times and durations (seconds and nanoseconds) become one whole number of nanoseconds; lists of messages become JSON;
-bytes are told apart, since pictures and point clouds are no columns.
+Times and durations (seconds and nanoseconds) become an integer in nanoseconds; lists of messages become JSON; bytes are
+kept as bytes, so that pictures and point clouds can be excluded from tables.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ Value = bool | int | float | str | bytes | list[Any] | None
 
 _MAX_DEPTH: Final = 32
 _MAX_DESCRIPTOR: Final = 4 * 2**20
-#: How the parts of a time are called: in ROS 1, ROS 2, JSON of bridges, protobuf.
+#: The field names of times in ROS 1, ROS 2, JSON of bridges, and protobuf.
 _TIMES: Final = (("secs", "nsecs"), ("sec", "nsec"), ("sec", "nanosec"), ("seconds", "nanos"))
 
 
 class _Messages(tuple[Any, ...]):
-    """A list of messages: JSON even where it is empty, so that a column keeps its type."""
+    """A list of messages, which becomes JSON even if it is empty, so that a column keeps its type."""
 
 
 def message_type_of(opened: log.Log, topic: str) -> MessageType:
-    """What a channel of a log says of its messages."""
+    """The message type of a channel of a log."""
     channel = opened.channel(topic)
     index = opened.part(topic).index
     schema = index.schemas.get(index.channels[channel.id].schema_id)
@@ -41,10 +41,10 @@ def message_type_of(opened: log.Log, topic: str) -> MessageType:
 
 
 def flattener(kind: MessageType) -> Callable[[bytes], dict[Path, Value]]:
-    """What makes a row of the payload of a message: path of each field -> value.
+    """A function that flattens a payload to a row: path of each field -> value.
 
-    Raises McaptrackError if messages of this kind are not read; what it returns raises McaptrackError for payloads that
-    are malformed.
+    Raises McaptrackError if messages of this type are not supported; the returned function raises McaptrackError for
+    malformed payloads.
     """
     unpack = _unpacker(kind)
 
@@ -54,9 +54,11 @@ def flattener(kind: MessageType) -> Callable[[bytes], dict[Path, Value]]:
             found = dict(_walk(message, ()))
         except McaptrackError:
             raise
-        except Exception as error:  # bytes of strangers through parsers of others: no list of exceptions is complete
+        except Exception as error:  # untrusted bytes in third-party parsers, which raise various exceptions
             why = " ".join(str(error).split())[:120] or type(error).__name__
-            raise McaptrackError(f"{len(payload)} bytes are no {kind.name or kind.encoding} message ({why})") from None
+            raise McaptrackError(
+                f"{len(payload)} bytes are not a {kind.name or kind.encoding} message ({why})"
+            ) from None
         return found
 
     return flatten
@@ -71,7 +73,7 @@ def _unpacker(kind: MessageType) -> Callable[[bytes], Any]:
 
 
 def _protobuf(kind: MessageType) -> Callable[[bytes], Any]:
-    """Protobuf by the definition that the log carries."""
+    """A decoder for protobuf, by the definition in the log."""
     from google.protobuf.descriptor_pb2 import FileDescriptorSet
     from google.protobuf.descriptor_pool import DescriptorPool
     from google.protobuf.message_factory import GetMessageClass
@@ -83,7 +85,7 @@ def _protobuf(kind: MessageType) -> Callable[[bytes], Any]:
         for file in FileDescriptorSet.FromString(kind.schema).file:
             pool.Add(file)
         made: Any = GetMessageClass(pool.FindMessageTypeByName(kind.name))
-    except Exception as error:  # of a parser that fails in its own many ways
+    except Exception as error:  # a third-party parser that raises various exceptions
         why = " ".join(str(error).split())[:120] or type(error).__name__
         raise McaptrackError(
             f"{kind.name} can't be read: the log's definition of it can't be understood ({why})"
@@ -107,13 +109,13 @@ def _walk(value: Any, path: Path) -> Iterator[tuple[Path, Value]]:
 
 
 def _fields(value: Any) -> Mapping[str, Any] | None:
-    """The fields of a message, of any encoding; None of what is no message."""
+    """The fields of a message in any encoding; None for other values."""
     if isinstance(value, dict):
         return value
     if hasattr(value, "DESCRIPTOR"):
         return {field.name: _member(value, field) for field in value.DESCRIPTOR.fields}
     fields = getattr(value, "__dataclass_fields__", None)
-    if fields is not None:  # constants of the definition stand among the fields, and say so
+    if fields is not None:  # the fields include constants, which are marked as ClassVar
         kinds = {name: str(field.type) for name, field in fields.items()}
         return {name: _ros(getattr(value, name), kind) for name, kind in kinds.items() if "ClassVar" not in kind}
     return None
@@ -125,7 +127,7 @@ def _ros(value: Any, kind: str) -> Any:
 
 
 def _member(message: Any, field: Any) -> Any:
-    """A field of a protobuf message: None where it is not set, enumerations by name."""
+    """A field of a protobuf message: None if it is not set, enumerations by name."""
     if field.has_presence and not message.HasField(field.name):
         return None
     value = getattr(message, field.name)
@@ -172,7 +174,7 @@ def _json(value: Any) -> str:
 
 
 def _plain(value: Any, depth: int) -> Any:
-    """A message as JSON has it; numbers that JSON doesn't know as text, bytes by their number."""
+    """A message as JSON data; non-finite numbers as text, bytes as their number."""
     if depth > _MAX_DEPTH:
         raise ValueError(f"it is more than {_MAX_DEPTH} messages deep")
     fields = _fields(value)

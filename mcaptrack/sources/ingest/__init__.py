@@ -1,4 +1,4 @@
-"""Whatever exists becomes a log: a video, a folder of images, a recording, label files beside them or alone."""
+"""Make logs of videos, folders of images, recordings and label files."""
 
 from __future__ import annotations
 
@@ -49,9 +49,32 @@ def ingest(
     force: bool = False,
     progress: Progress = lambda *_: None,
 ) -> IngestReport:
-    """Make the log ``output`` from ``source``, or add its channels to the log ``into``, which then is the output.
+    """Make a log of a video, image folder, recording or label file, or add its channels to a log.
 
-    Raises McaptrackError, and writes nothing, if anything of the input can't be understood.
+    Parameters
+    ----------
+    source : Path
+        The input; its format is detected.
+    output : Path
+        The log to write; the path of ``into``, if that is given.
+    options : IngestOptions
+        How to make the log, and label files beside the input.
+    into : Log, optional
+        An existing log to which the channels are added.
+    force : bool
+        Replace channels that the log has already.
+    progress : callable, optional
+        Called with "ingest", the number of messages written, and their total.
+
+    Returns
+    -------
+    IngestReport
+        Messages by topic, warnings, and what could not be read.
+
+    Raises
+    ------
+    McaptrackError
+        If a part of the input can't be understood; then nothing is written.
     """
     if not re.fullmatch(r"[A-Za-z0-9_\-/]+", options.camera) or options.camera.strip("/") == "":
         raise McaptrackError(f"a camera's name is made of letters, digits, _, - and /, not {options.camera!r}")
@@ -63,7 +86,7 @@ def ingest(
     with notices.collected() as warned, _job(source, options, progress, into) as job:
         if options.first_frame is not None and not job.labels:
             raise McaptrackError(f"{source}: `first_frame=` is about label files, and none is given")
-        job.tell()
+        job.report_assumptions()
         with job.opened(output, into, force) as writer:
             job.write(writer, has_clock=bool(into and into.metadata(CLOCK)))
         job.check(output)

@@ -1,4 +1,4 @@
-"""What all inputs have in common: options, what is reported, labels and the ground plane of a camera.
+"""Common parts of all inputs: options, the report, labels and the ground plane of a camera.
 
 Letters: N rows.
 """
@@ -28,18 +28,18 @@ from mcaptrack.sources.ingest.labels.timeline import Placed, Timeline
 from mcaptrack.sources.video import ImageFormat, VideoOptions
 
 Progress = Callable[[str, int, int], None]
-#: Frames, from the beginning whenever it is called.
+#: A function that yields frames, from the beginning with each call.
 Frames = Callable[[], Iterator[Frame]]
 
 _SCHEMA_OF: Final[Mapping[Role, Schema]] = {"detections": DETECTIONS, "tracks": TRACKS, "truth": TRACKS}
-#: The names of classes, by their numbers, in the metadata of a channel.
+#: The key in the metadata of a channel for class names by class id.
 _CLASSES: Final = "mcaptrack.classes"
 _BLOCK: Final = 4096
 
 
 @dataclass(frozen=True, kw_only=True)
 class IngestOptions:
-    """How to make a log. ``labels`` maps what a label file says to the file; ``role`` is for an input that is one.
+    """How to make a log. ``labels`` are label files by role; ``role`` is that of an input which is a label file itself.
 
     ``fps``, ``image_format``, ``quality`` and ``keyframe_interval_s`` are as in ``video.VideoOptions``. ``first_frame``
     is the number that label files give the first picture, if it isn't that of their format; ``frames`` is the number of
@@ -71,7 +71,7 @@ class IngestOptions:
         )
 
     def for_videos(self) -> str:
-        """The first option given that is about the pictures of videos; "" if there is none."""
+        """The first given option that applies only to videos; "" if there is none."""
         given = {
             "`image_format=`": self.image_format != "auto",
             "`quality=`": self.quality is not None,
@@ -82,10 +82,10 @@ class IngestOptions:
 
 @dataclass
 class IngestReport:
-    """What became of an input: messages by topic, what to say of it (``notes``: to some), what was lost.
+    """The result of ``ingest``: messages by topic, remarks (``said``), details (``notes``), and what was lost.
 
-    ``warnings`` are what was assumed, left out or looks odd. ``has_labels`` says whether there were label files, and
-    ``uses_camera`` whether anything was put below the camera's name.
+    ``warnings`` report what was assumed, left out or looks unusual. ``has_labels``: there were label files.
+    ``uses_camera``: topics below the camera's name were written.
     """
 
     messages: dict[str, int] = field(default_factory=dict)
@@ -98,21 +98,21 @@ class IngestReport:
 
 
 class Job:
-    """What videos and labels have in common: the topics of a camera, its ground plane, rows to messages.
+    """Base class of inputs: the topics of a camera, its labels and its ground plane.
 
-    ``there`` is the log that a job adds to, if it doesn't make one.
+    ``there`` is the log to which channels are added, if it is not a new one.
     """
 
-    #: Whether a clock that a log has is replaced by the job's own.
+    #: Whether the start time in the log's metadata is replaced.
     drops_clock = False
-    #: What a camera is called that stands beside one whose topics are taken.
+    #: The proposed camera name if the topics exist already.
     beside = "{camera}/labels"
 
     def __init__(self, source: Path, options: IngestOptions, there: log.Log | None = None) -> None:
         self._close = ExitStack()
         self.source, self.options, self.there, self.report = source, options, there, IngestReport()
         self.prefix = "/" + options.camera.strip("/")
-        #: The topic of the pictures that labels belong to, if there is one.
+        #: The topic of the pictures that labels belong to; "" if there is none.
         self.pictures = ""
         self.homography = read_homography(options.ground_plane) if options.ground_plane else None
         self.labels: dict[Role, tuple[Path, Labels]] = {
@@ -121,22 +121,22 @@ class Job:
         self.check_labels()
 
     def read(self, path: Path, role: Role) -> Labels:
-        """A label file, as the options have it."""
+        """Read a label file with the format options."""
         return read_labels(path, self.options.label_format, role, self.options.first_frame)
 
     def check_labels(self) -> None:
-        """Refuse labels that can't be what they are given as."""
+        """Refuse labels that don't suit their role."""
         for role, (path, labels) in self.labels.items():
             if role == "detections" and labels.boxes_px is None:
                 raise McaptrackError(f"{path} holds positions, not boxes; detections are boxes")
-            if role != "detections" and not labels.identified:
+            if role != "detections" and not labels.has_ids:
                 raise McaptrackError(f"{path} has no ids (all are -1); {role} need ids")
 
-    def tell(self) -> None:
-        """Say what of the labels is left out or taken for something."""
+    def report_assumptions(self) -> None:
+        """Report what is assumed about the labels, and what of them is left out."""
         firsts = {labels.first_frame: f"frame {labels.first_frame} of {path}" for path, labels in self.labels.values()}
         if len(firsts) > 1:
-            warn(f"{' and '.join(firsts.values())} are taken as one picture; `first_frame=` says otherwise", "clock")
+            warn(f"{' and '.join(firsts.values())} are assumed to be the same picture; `first_frame=` sets the number", "clock")
         for role, (path, labels) in self.labels.items():
             if labels.left_out:
                 warn(f"{path} also holds {labels.left_out}; left out of {role}", "left-out")
@@ -157,29 +157,31 @@ class Job:
         self._close.close()
 
     def opened(self, output: Path, into: log.Log | None, force: bool) -> AbstractContextManager[log.LogWriter]:
-        """What writes to ``output``, which is new or is the log ``into``.
+        """Open ``output``, which is a new log or the log ``into``, for writing.
 
-        Raises McaptrackError if the log has a channel of this job already and ``force`` is not given.
+        Raises McaptrackError if the log has one of the topics already and ``force`` is false.
         """
-        taken = self.taken(into, force)
+        topics_to_replace = self.topics_to_replace(into, force)
         if into is None:
             return log.create(output)
-        return log.extend(into, drop=taken, drop_metadata=[CLOCK] if self.drops_clock else [])
+        return log.extend(into, drop=topics_to_replace, drop_metadata=[CLOCK] if self.drops_clock else [])
 
-    def taken(self, there: log.Log | None, force: bool) -> set[str]:
-        """The topics of a log that this job replaces.
+    def topics_to_replace(self, there: log.Log | None, force: bool) -> set[str]:
+        """The topics of a log that are replaced.
 
-        Raises McaptrackError if others recorded one of them, whatever ``force`` is, and without it if there is any.
+        Raises McaptrackError if other software recorded one of them, and, unless ``force`` is true, if there is any.
         """
-        taken = set(self.topics()) & set(there.channels) if there else set()
-        if there and taken:
-            log.refuse_to_replace_recorded(there, taken, self.instead(there.channels))
-        if there and taken and not force:
-            raise McaptrackError(f"{there.path} has {', '.join(sorted(taken))} already; `force=True` replaces them")
-        return taken
+        topics_to_replace = set(self.topics()) & set(there.channels) if there else set()
+        if there and topics_to_replace:
+            log.refuse_to_replace_recorded(there, topics_to_replace, self.hint_other_topic(there.channels))
+        if there and topics_to_replace and not force:
+            raise McaptrackError(
+                f"{there.path} has {', '.join(sorted(topics_to_replace))} already; `force=True` replaces them"
+            )
+        return topics_to_replace
 
-    def instead(self, topics: Collection[str]) -> str:
-        """Words on where to write where topics are taken."""
+    def hint_other_topic(self, topics: Collection[str]) -> str:
+        """A hint for topics that exist already: the option that chooses others."""
         ends = [topic.removeprefix(self.prefix) for topic in self.topics() if topic.startswith(self.prefix)]
         name = free = self.beside.format(camera=self.prefix.strip("/"))
         number = 1
@@ -189,14 +191,14 @@ class Job:
         return f"`camera={free!r}` puts these beside them"
 
     def write(self, writer: log.LogWriter, has_clock: bool) -> None:
-        """Write all channels; ``has_clock`` says that the log has a clock already."""
+        """Write all channels; ``has_clock``: the log has a start time already."""
         raise NotImplementedError
 
     def check(self, output: Path) -> None:
-        """Compare what stands in ``output`` with the input. Raises McaptrackError for a difference."""
+        """Compare the written log with the input. Raises McaptrackError if they differ."""
 
     def topics(self) -> Iterator[str]:
-        """The topics that this job writes."""
+        """The topics that will be written."""
         yield from (f"{self.prefix}/{role}" for role in self.labels)
         if self.homography:
             yield f"{self.prefix}/ground_plane"
@@ -211,7 +213,7 @@ class Job:
             raise McaptrackError(f"{self.options.ground_plane}: {error}") from None
 
     def write_plane(self, writer: log.LogWriter, plane: GroundPlane | None, t_ns: int) -> None:
-        """Write the ground plane, if there is one, as it holds from a time on."""
+        """Write the ground plane, if there is one, valid from a time on."""
         if plane is not None and self.options.ground_plane:
             rows = plane_to_rows(plane)
             words = {"file": self.options.ground_plane.name, "point": self.options.point}
@@ -227,11 +229,11 @@ class Job:
             self.write_rows(writer, role, _SCHEMA_OF[role], frames, words, classes)
 
     def label_words(self, labels: Labels) -> dict[str, Any]:
-        """What else the provenance of labels says."""
+        """Additional parameters in the provenance of labels."""
         return {} if self.options.first_frame is None else {"first_frame": labels.first_frame}
 
     def frames(self, role: Role, plane: GroundPlane | None, placed: Placed) -> Frames:
-        """The labels of these frames; empty ones too."""
+        """The labels of these frames, including empty frames."""
         labels = self.labels[role][1]
         rows = label_rows(labels, role, plane)
         first, last = (np.searchsorted(labels.frame, placed.number, side) for side in ("left", "right"))
@@ -253,9 +255,9 @@ class Job:
         words: Mapping[str, Any],
         classes: Mapping[str, str] = {},
     ) -> None:
-        """Write a channel below the camera's; ``words`` say what it was made of, ``classes`` what its classes are.
+        """Write a channel of the camera; ``words`` are the parameters in its provenance, ``classes`` its class names.
 
-        Frames are made twice, for the digest and for the channel, and never stand in memory all together.
+        Frames are generated twice, for the digest and for the channel, so that they are never all in memory.
         """
 
         def messages() -> Iterator[tuple[int, int, bytes]]:
@@ -274,7 +276,7 @@ class Job:
 
 
 def label_rows(labels: Labels, role: Role, plane: GroundPlane | None) -> Rows:
-    """The N rows of labels as rows of detections or tracks; in metres too, given a plane."""
+    """Convert the N rows of labels to rows of detections or tracks, with positions in metres if a plane is given."""
     if role == "detections" and labels.boxes_px is not None:
         x, y, w, h = labels.boxes_px.T
         return DETECTIONS.rows(x_px=x, y_px=y, w_px=w, h_px=h, score=labels.score, class_id=labels.class_id)

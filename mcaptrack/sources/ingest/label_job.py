@@ -1,4 +1,4 @@
-"""Label files without pictures, or for pictures that a log has already.
+"""Ingest label files alone: without pictures, or for the pictures of an existing log.
 
 Letters: N rows.
 """
@@ -22,25 +22,32 @@ from mcaptrack.schema.ground_plane import rows_to_plane
 from mcaptrack.schema.provenance import CLOCK
 from mcaptrack.sources.foreign import holds_pictures
 from mcaptrack.sources.ingest.job import IngestOptions, Job
-from mcaptrack.sources.ingest.labels.camera import Standing, camera_of, labels_of, seen_by, size_of, timeline_of
+from mcaptrack.sources.ingest.labels.camera import (
+    ExistingLabels,
+    camera_of,
+    detections_topic,
+    labels_of,
+    picture_size,
+    timeline_of,
+)
 from mcaptrack.sources.ingest.labels.formats import Format, Labels, Role
 from mcaptrack.sources.ingest.labels.timeline import MAX_FRAMES, Timeline, count_frames
 from mcaptrack.sources.video import SEQINFO, find_seqinfo
 
 _SDD_FPS: Final = Fraction(30)
-#: Why a file is taken to have a frame rate that no one gave.
+#: Formats with a known frame rate, and its reason.
 _BY_FORMAT: Final[Mapping[Format, str]] = {
     "sdd": "Stanford Drone",
     "trajnet": "trajnet, a label every 0.4 s",
     "obsmat": "obsmat, a label every 0.4 s",
 }
 _ASSUMED: Final = "assumption"
-#: The step of labels in formats that are annotated on the clock of prediction.
+#: The label interval of formats that are annotated at the sampling rate of prediction benchmarks.
 _LABEL_STEP_S: Final = Fraction(2, 5)
 
 
 class _Known(NamedTuple):
-    """What is known of the frames of a label file: their rate, their number, and who says so."""
+    """The known frame rate and number of frames of a label file, and the source of this information."""
 
     fps: Fraction | None
     frames: int | None
@@ -48,10 +55,10 @@ class _Known(NamedTuple):
 
 
 class LabelJob(Job):
-    """Label files without pictures, or for pictures that a log has. The first of ``inputs`` is the input itself.
+    """Label files without pictures, or for the pictures of a log. The first of ``inputs`` is the input itself.
 
-    A role that is None follows from whether there are ids. ``default_fps`` is for files that say nothing. ``ground`` is
-    the ground plane, if one is given or the log has one.
+    If its role is None, it depends on whether the file has ids. ``default_fps`` is the frame rate of files without one.
+    ``ground`` is the ground plane, if it is given or in the log.
     """
 
     def __init__(
@@ -69,17 +76,17 @@ class LabelJob(Job):
             raise McaptrackError(f"{self.source} is a label file; {options.for_videos()} is for videos")
         if options.frames is not None and not 0 < options.frames <= MAX_FRAMES:
             raise McaptrackError(f"`frames=` is a number from 1 to {MAX_FRAMES}, not {options.frames}")
-        size = self._extent()
+        size = self._boxes_extent()
         self._fps: Fraction | None = None
-        self._clock = ("", False)  # what to say of times that don't come from pictures, and whether they are assumed
+        self._clock = ("", False)  # remark on times that don't come from pictures, and whether they are assumed
         self._other_rates: list[str] = []
         self._start_ns = options.start_ns or 0
         if there is not None:
             self.prefix, self.pictures = camera_of(there, options.camera)
-        seen = seen_by(there, self.prefix) if there is not None and not self.pictures else ""
+        seen = detections_topic(there, self.prefix) if there is not None and not self.pictures else ""
         if there is not None and (self.pictures or seen):
             self.timeline = self._of_pictures(there, self.pictures or seen)
-            size = size_of(there, self.pictures) if self.homography and self.pictures else size
+            size = picture_size(there, self.pictures) if self.homography and self.pictures else size
         else:
             self.timeline = self._of_rate(default_fps)
         self.ground = self.plane(*size) or self._measured_plane()
@@ -87,14 +94,14 @@ class LabelJob(Job):
     def _add(self, role: Role | None, path: Path) -> None:
         labels = self.read(path, role or "tracks")
         if role is None:
-            role = "tracks" if labels.identified else "detections"
+            role = "tracks" if labels.has_ids else "detections"
             labels = labels if role == "tracks" else self.read(path, role)
         if role in self.labels:
-            raise McaptrackError(f"{path} and {self.labels[role][0]} are both {role}; say with `role=` what {path} is")
+            raise McaptrackError(f"{path} and {self.labels[role][0]} are both {role}; give the role of {path} with `role=`")
         self.labels = {role: (path, labels), **self.labels}
 
-    def _extent(self) -> tuple[int, int]:
-        """The size of the image as far as boxes tell."""
+    def _boxes_extent(self) -> tuple[int, int]:
+        """The image size that contains all boxes, (width, height) in pixels."""
         boxes = [labels.boxes_px for _, labels in self.labels.values() if labels.boxes_px is not None]
         if not boxes:
             return 0, 0
@@ -102,7 +109,7 @@ class LabelJob(Job):
         return max(0, int(np.ceil(corner[0]))), max(0, int(np.ceil(corner[1])))
 
     def _measured_plane(self) -> GroundPlane | None:
-        """The ground plane that the log has for the camera, if it was measured and holds throughout."""
+        """The ground plane of the camera in the log, if it was measured and doesn't change."""
         topic = f"{self.prefix}/ground_plane"
         if self.there is None or topic not in self.there.channels:
             return None
@@ -110,7 +117,7 @@ class LabelJob(Job):
         return planes[0] if len(planes) == 1 and not planes[0].assumed else None
 
     def _of_pictures(self, there: log.Log, topic: str) -> Timeline:
-        """The pictures that stand in the log. Raises McaptrackError if options say that they are others."""
+        """The pictures in the log. Raises McaptrackError if options contradict them."""
         options, timeline = self.options, timeline_of(there, topic)
         if options.fps and not timeline.fits(options.fps):
             raise McaptrackError(
@@ -123,32 +130,32 @@ class LabelJob(Job):
         return timeline
 
     def _of_rate(self, default: Fraction | None) -> Timeline:
-        """Pictures that aren't there, by the frame rate that is given, or that files or the log know."""
-        standing = labels_of(self.there, self.prefix) if self.there else {}
+        """The times of missing pictures, by the frame rate from the options, the files or the log."""
+        existing = labels_of(self.there, self.prefix) if self.there else {}
         known = [_known(path, labels) for path, labels in self.labels.values()]
         rates = {one.fps: one.of for one in known if one.fps}
         if self.options.fps:
             self._other_rates = [
                 f"{self.source}: {float(rate):g} frames a second by {of}, and {float(self.options.fps):g} by `fps=`, "
-                "which is taken"
+                "which is used"
                 for rate, of in rates.items()
                 if rate != self.options.fps
             ]
             rates = {self.options.fps: "`fps=`"}
-        rates = rates or {labels.fps: topic for topic, labels in standing.items() if labels.fps}
+        rates = rates or {labels.fps: topic for topic, labels in existing.items() if labels.fps}
         if len(rates) > 1:
             words = " and ".join(f"{float(fps):g} by {of}" for fps, of in rates.items())
-            raise McaptrackError(f"{self.source}: {words}: say how many frames a second there are with `fps=`")
+            raise McaptrackError(f"{self.source}: {words}: give the frames per second with `fps=`")
         if not rates and default is None:
             raise McaptrackError(self._no_clock())
         fps, of = next(iter(rates.items()), (default or Fraction(1), _ASSUMED))
         self._fps = fps
         if self.there:
-            self._check_standing(self.there, standing, fps)
+            self._check_existing(self.there, existing, fps)
             if self.options.start_ns is None:
                 said = self.there.metadata(CLOCK) or {}
                 self._start_ns = parse_ns(said.get("start_ns", "")) or 0
-        count, counted_by = self._count(known, standing)
+        count, counted_by = self._count(known, existing)
         timeline = Timeline.spaced(count, fps, self._start_ns, f"the frames that {counted_by} counts")
         if self.there and any(part.index.counts for part in self.there.parts):
             self._check_overlap(self.there, timeline)
@@ -159,38 +166,38 @@ class LabelJob(Job):
         )
         return timeline
 
-    def tell(self) -> None:
-        """Say at what times labels without pictures were put, too."""
-        super().tell()
+    def report_assumptions(self) -> None:
+        """Report also the assumed times of labels without pictures."""
+        super().report_assumptions()
         for words in self._other_rates:
             warn(words, "clock")
         words, is_assumed = self._clock
         if is_assumed:
-            warn(f"{words}; `fps=` says otherwise", "clock")
+            warn(f"{words}; `fps=` sets another rate", "clock")
         elif words:
             self.report.said.append(words)
 
-    def _check_standing(self, there: log.Log, standing: Mapping[str, Standing], fps: Fraction) -> None:
-        """Labels of one camera share a clock."""
-        for topic, labels in standing.items():
+    def _check_existing(self, there: log.Log, existing: Mapping[str, ExistingLabels], fps: Fraction) -> None:
+        """Check that the labels of one camera have one frame rate."""
+        for topic, labels in existing.items():
             if topic not in self.topics() and labels.fps not in (None, fps):
                 raise McaptrackError(
                     f"{there.path}: {topic} has {float(labels.fps or 0):g} frames a second, not {float(fps):g}, and "
                     "labels of one camera are of the same pictures; give the same `fps=`, or another `camera=`"
                 )
 
-    def _count(self, known: Sequence[_Known], standing: Mapping[str, Standing]) -> tuple[int, str]:
-        """How many frames there are, and who says so."""
+    def _count(self, known: Sequence[_Known], existing: Mapping[str, ExistingLabels]) -> tuple[int, str]:
+        """The number of frames, and the source of this number."""
         if self.options.frames is not None:
             return self.options.frames, "`frames=`"
         said = {one.frames: one.of for one in known if one.frames}
         if said:
             return max(said), said[max(said)]
         counts = [count_frames(path, labels) for path, labels in self.labels.values()]
-        return max(*counts, *(label.frames for label in standing.values()), 1), "the last label"
+        return max(*counts, *(label.frames for label in existing.values()), 1), "the last label"
 
     def _check_overlap(self, there: log.Log, timeline: Timeline) -> None:
-        """Labels without pictures are at times at which the log has something."""
+        """Check that labels without pictures overlap in time with the log."""
         first, last = int(timeline.t_ns[0]), int(timeline.t_ns[-1])
         if first > there.end_ns or last < there.start_ns:
             raise McaptrackError(
@@ -215,11 +222,11 @@ class LabelJob(Job):
         self.write_labels(writer, self.ground, self.timeline)
 
     def label_words(self, labels: Labels) -> dict[str, Any]:
-        """The rate that frames were counted at, where there were no pictures."""
+        """The frame rate, if there were no pictures."""
         return super().label_words(labels) | ({} if self._fps is None else {"fps": str(self._fps)})
 
     def all_frames(self, role: Role) -> list[Frame]:
-        """The labels of a role as frames, empty ones too."""
+        """The labels of a role as frames, including empty frames."""
         path, labels = self.labels[role]
         return list(self.frames(role, self.ground, self.timeline.place(path, labels, self.report.lost))())
 
@@ -229,7 +236,7 @@ def _seconds(t_ns: int) -> str:
 
 
 def _known(path: Path, labels: Labels) -> _Known:
-    """What a label file's format, or a file beside it, says of its frames."""
+    """Frame rate and number of frames by the format of a label file, or by seqinfo.ini."""
     if labels.format == "sdd":
         return _Known(_SDD_FPS, None, _BY_FORMAT[labels.format])
     if labels.format in ("trajnet", "obsmat"):  # annotated at 2.5 Hz, whatever the video's rate
@@ -245,12 +252,12 @@ def label_frames(
     point: Point,
     label_format: Format = "auto",
 ) -> dict[Role, list[Frame]]:
-    """Label files that share a clock as frames, without a log between. Raises McaptrackError as ``ingest`` does.
+    """Read label files with a common clock as frames, without writing a log.
 
-    Only the order and the distances of times matter to whoever compares such files; without ``fps`` files that have no
-    clock count one frame a second.
+    Raises McaptrackError as ``ingest`` does. For comparisons only the order and intervals of times matter, so files
+    without a frame rate get one frame per second unless ``fps`` is given.
     """
     options = IngestOptions(fps=fps, ground_plane=ground_plane, point=point, label_format=label_format)
     job = LabelJob([(role, path) for role, path in files.items()], options, default_fps=Fraction(1))
-    job.tell()
+    job.report_assumptions()
     return {role: job.all_frames(role) for role in files}

@@ -1,4 +1,4 @@
-"""Recordings of others -> a log with everything that is in them: messages, schemas and times as they are."""
+"""Ingest recordings: a log with all of their messages, schemas and times unchanged."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.sources import foreign
 from mcaptrack.sources.ingest.bags.recording import Connection, Findings, Recording
 from mcaptrack.sources.ingest.job import IngestOptions, Job, Progress
-from mcaptrack.sources.ingest.labels.camera import choose, picture_test, timeline_of
+from mcaptrack.sources.ingest.labels.camera import choose_camera, picture_predicate, timeline_of
 from mcaptrack.sources.ingest.labels.timeline import Timeline
 from mcaptrack.sources.video import EncodedPicture, decode_gray
 
-#: A larger message would make a chunk that no careful reader opens.
+#: A larger message would need a chunk that readers with a size limit refuse.
 _MAX_MESSAGE_BYTES: Final = 2**28 - 2**24
 _PROGRESS_EVERY: Final = 256
 
 
 class RecordingJob(Job):
-    """A recording, with labels beside its pictures."""
+    """A recording, with labels for its pictures."""
 
     def __init__(
         self,
@@ -52,9 +52,9 @@ class RecordingJob(Job):
                         f"{source} is a log: its messages stay as they are, and so do their times; leave {name} out"
                     )
             super().__init__(source, options, there)
-            #: What is passed on as a whole, if anything is.
-            self._passed_on: log.Log | None = None
-            #: The connections with the pictures that labels belong to.
+            #: The MCAP file that is copied as a whole, if the recording is one.
+            self._copied_log: log.Log | None = None
+            #: The connections of the pictures that labels belong to.
             self._connections: list[Connection] = []
             self._channels: dict[Connection, int] = {}
             self._written: dict[int, int] = {}
@@ -69,10 +69,10 @@ class RecordingJob(Job):
         """Find the camera that labels belong to: the only one with pictures, or the one that ``camera`` names."""
         by_topic: dict[str, list[Connection]] = {}
         for connection in self._recorded.connections:
-            is_empty = self._recorded.claims is not None and not self._recorded.claims[connection]
+            is_empty = self._recorded.declared_counts is not None and not self._recorded.declared_counts[connection]
             if foreign.is_picture(connection.schema[0]) and not is_empty:
                 by_topic.setdefault(connection.topic, []).append(connection)
-        self.prefix, self.pictures = choose(self.source, self.options.camera, by_topic)
+        self.prefix, self.pictures = choose_camera(self.source, self.options.camera, by_topic)
         if not self.pictures:
             raise McaptrackError(
                 f"{self.source}: labels and ground planes belong to the pictures of one camera; the log has "
@@ -82,33 +82,35 @@ class RecordingJob(Job):
         self._connections = by_topic[self.pictures]
 
     def topics(self) -> Iterator[str]:
-        """The topics that are new in the log: of a recording that is passed on, those of labels."""
-        if not self._passed_on:
+        """The new topics: only those of labels, if an MCAP file is copied."""
+        if not self._copied_log:
             yield from {connection.topic: None for connection in self._recorded.connections}
         yield from super().topics()
 
     def opened(self, output: Path, into: log.Log | None, force: bool) -> AbstractContextManager[log.LogWriter]:
-        """As for all jobs; an MCAP file that becomes a new log is copied as it is."""
+        """As in the base class; an MCAP file that becomes a new log is copied as a whole."""
         if into is not None:
-            itself = self._recorded.as_it_is
+            itself = self._recorded.as_log
             if itself is not None and itself.real_path == into.real_path:
                 raise McaptrackError(f"{self.source} can't be added to itself")
-            return log.extend(into, drop=self.taken(into, force))
-        self._passed_on = self._recorded.as_it_is
-        if self._passed_on is not None:
-            return log.extend(self._passed_on, output, drop=self.taken(self._passed_on, force))
+            return log.extend(into, drop=self.topics_to_replace(into, force))
+        self._copied_log = self._recorded.as_log
+        if self._copied_log is not None:
+            return log.extend(self._copied_log, output, drop=self.topics_to_replace(self._copied_log, force))
         recorded = {connection.topic for connection in self._recorded.connections}
         doubled = recorded & set(super().topics())
         if doubled:
-            raise McaptrackError(f"{self.source} has {', '.join(sorted(doubled))} already; {super().instead(recorded)}")
+            raise McaptrackError(
+                f"{self.source} has {', '.join(sorted(doubled))} already; {super().hint_other_topic(recorded)}"
+            )
         return log.create(output, self._recorded.profile)
 
     def write(self, writer: log.LogWriter, has_clock: bool) -> None:
-        """Write all that the recording holds, then labels."""
+        """Write everything in the recording, then the labels."""
         self.report.notes += self._recorded.words.notes
         self.report.lost += self._recorded.words.lost
-        timeline = self._pass_on(writer) if self._passed_on else self._write_messages(writer)
-        self._recorded.extras(writer, has_clock, passed_on=self._passed_on is not None)
+        timeline = self._count_copied(writer) if self._copied_log else self._write_messages(writer)
+        self._recorded.extras(writer, has_clock, is_copied=self._copied_log is not None)
         if self._connections:
             if not len(timeline.t_ns):
                 raise McaptrackError(f"{self.source}: {self.pictures} has no pictures that labels could be of")
@@ -116,12 +118,12 @@ class RecordingJob(Job):
             self.write_plane(writer, plane, int(timeline.t_ns[0]))
             self.write_labels(writer, plane, timeline)
 
-    def instead(self, topics: Collection[str]) -> str:
-        """Words on where to put a recording, or labels beside one, where topics are taken."""
-        return super().instead(topics) if self._passed_on else "make a log of its own of it with `output=`"
+    def hint_other_topic(self, topics: Collection[str]) -> str:
+        """A hint for topics that exist already."""
+        return super().hint_other_topic(topics) if self._copied_log else "write it to a separate log with `output=`"
 
     def check(self, output: Path) -> None:
-        """Every channel has the messages that were given to it."""
+        """Check that every channel has all of its messages."""
         with log.read(output) as done:
             index = done.parts[-1].index
             for number, count in self._written.items():
@@ -134,13 +136,13 @@ class RecordingJob(Job):
 
     # Messages
 
-    def _pass_on(self, writer: log.LogWriter) -> Timeline:
-        """Count what is in the log that is passed on as it is; returns the pictures that labels belong to."""
-        opened = self._passed_on
+    def _count_copied(self, writer: log.LogWriter) -> Timeline:
+        """Count the messages of the copied log; returns the pictures that labels belong to."""
+        opened = self._copied_log
         assert opened is not None
         for number in writer.channels:
             self._written[number] = opened.index.counts.get(number, 0)
-            if not self._written[number]:  # some writers describe channels without messages in the summary alone
+            if not self._written[number]:  # some writers write channels without messages only to the summary
                 writer.write_description(number)
         self._report({number: channel.topic for number, channel in writer.channels.items()})
         if len(self._connections) == 1:
@@ -159,8 +161,8 @@ class RecordingJob(Job):
         return Timeline(np.arange(len(times)), times, f"the pictures of {self.pictures}", not self.report.lost)
 
     def _holds_picture(self) -> Callable[[Connection, bytes], bool]:
-        """Whether a message is one of the pictures that labels belong to."""
-        kinds = {one: picture_test(foreign.MessageType(*one.schema, one.encoding)) for one in self._connections}
+        """A predicate: whether a message is one of the pictures that labels belong to."""
+        kinds = {one: picture_predicate(foreign.MessageType(*one.schema, one.encoding)) for one in self._connections}
         return lambda connection, payload: connection in kinds and kinds[connection](payload)
 
     def _write_messages(self, writer: log.LogWriter) -> Timeline:
@@ -168,7 +170,7 @@ class RecordingJob(Job):
         found, done, times, holds_picture = Findings(), 0, array("Q"), self._holds_picture()
         for connection in self._recorded.connections:
             self._channel(writer, connection)
-        total = sum((self._recorded.claims or {}).values())
+        total = sum((self._recorded.declared_counts or {}).values())
         for connection, message in self._recorded.messages(found):
             number = self._channels[connection]
             if len(message.payload) > _MAX_MESSAGE_BYTES:
@@ -203,8 +205,8 @@ class RecordingJob(Job):
         self._written[number] = 0
 
     def _compare(self) -> None:
-        """What was read with what the recording says that it holds."""
-        for connection, said in (self._recorded.claims or {}).items():
+        """Compare the messages read with the counts that the recording declares."""
+        for connection, said in (self._recorded.declared_counts or {}).items():
             count = self._written[self._channels[connection]]
             if count < said and self.report.lost:
                 self.report.lost.append(f"{connection.topic}: {said - count} of {said} messages")
@@ -232,7 +234,7 @@ class RecordingJob(Job):
         return self.plane(width, height)
 
     def _encoded(self) -> Iterator[EncodedPicture]:
-        """The pictures that labels belong to, as far as anybody asks."""
+        """The pictures that labels belong to, lazily."""
         decoders = {
             connection: foreign.picture_decoder(foreign.MessageType(*connection.schema, connection.encoding))
             for connection in self._connections

@@ -1,7 +1,7 @@
-"""Where results of a log are written: into the log itself, or into LOG.results.mcap beside it.
+"""Decide where the results of a log are written: into the log itself, or into a sidecar, LOG.results.mcap.
 
-ROS tools expect that all channels of a recording hold ROS messages, and that its metadata.yaml counts all of them. So a
-recording that ROS tools read stays as it is, unless ``sidecar`` is False.
+ROS tools expect that all channels of a recording hold ROS messages, and that metadata.yaml counts all of them. A
+recording that ROS tools read is therefore not changed, unless ``sidecar`` is False.
 """
 
 from __future__ import annotations
@@ -15,23 +15,23 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.ingest.bags.metadata_yaml import METADATA, holds_metadata, read_metadata
 
-#: The profiles of MCAP's registry that ROS tools read, and what a recording with one is called.
+#: The profiles of the MCAP registry that ROS tools read, and their names in messages.
 _PROFILES: Final = {"ros1": "ROS 1", "ros2": "ROS 2"}
 
 
 @dataclass
 class SidecarChoice:
-    """Decides where results of a log go: ``log.read(path, sidecar=SidecarChoice(wanted))`` opens the log accordingly.
+    """Decides whether results go to a sidecar: ``log.read(path, sidecar=SidecarChoice(wanted))`` applies it.
 
-    ``wanted`` is True for a file beside the log, False for the log itself, None for what suits the log. ``why`` is the
-    reason in words, "" where nothing needs to be said.
+    ``wanted`` is True for a sidecar, False for the log itself, None to decide by the log. ``why`` is the reason, "" if
+    it needs no mention.
     """
 
     wanted: bool | None = None
     why: str = field(default="", init=False)
 
     def __call__(self, opened: log.Log) -> bool:
-        """Whether results go beside this log. Raises McaptrackError if they are beside it and must go into it."""
+        """Whether to use a sidecar. Raises McaptrackError if there is one, but results must go into the log itself."""
         beside = log.results_path(opened.path)
         self.why = ""
         if self.wanted is False and beside.exists():
@@ -64,12 +64,12 @@ class SidecarChoice:
         return True
 
     def words(self, written_to: Path) -> str:
-        """Where results went, and why."""
+        """A line that says where results were written, and why."""
         return f"results are in {written_to}: {self.why}"
 
 
 def recording_of(opened: log.Log) -> str:
-    """What ROS tools take a log for: "a ROS 2 recording"; "" if it is none of theirs."""
+    """How ROS tools see a log: "a ROS 2 recording"; "" if they don't read it."""
     for path in (opened.path, opened.real_path):
         metadata = path.with_name(METADATA)
         if _is_named(metadata, path.name):
@@ -81,7 +81,7 @@ def recording_of(opened: log.Log) -> str:
 
 
 def _is_named(metadata: Path, name: str) -> bool:
-    """Whether a metadata.yaml names this file, or can't be understood, so that it may."""
+    """Whether a metadata.yaml names this file; true also if the metadata can't be parsed."""
     if not holds_metadata(metadata):
         return False
     try:

@@ -1,4 +1,4 @@
-"""A video or a folder of images becomes a camera of a log, with labels beside its pictures."""
+"""Ingest a video or a folder of images as a camera, with labels for its pictures."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from mcaptrack.sources.ingest.labels.timeline import Timeline
 from mcaptrack.sources.video import Video, open_video
 
 _FOXGLOVE_ALONE: Final = {"vp9": "VP9", "av1": "AV1"}
-#: Frame rates that differ by a smaller share than this are the same: 29.97 and 30000/1001.
+#: Frame rates with a smaller relative difference are equal: 29.97 and 30000/1001.
 _SAME_FPS: Final = Fraction(1, 1000)
 
 
 class VideoJob(Job):
-    """A video or image folder, with labels beside it."""
+    """A video or image folder, with its labels."""
 
     drops_clock = True
     beside = "{camera}2"
@@ -34,23 +34,23 @@ class VideoJob(Job):
         super().__init__(source, options, there)
         self._progress = progress
         if options.role:
-            raise McaptrackError(f"{source} is no label file; `role=` is for those")
+            raise McaptrackError(f"{source} is not a label file; `role=` applies to those")
         if options.frames is not None:
-            raise McaptrackError(f"{source} is no label file; `frames=` is for those that stand alone")
+            raise McaptrackError(f"{source} is not a label file; `frames=` applies to labels without pictures")
         self.video: Video = open_video(source, options.video_options)
         if self.video.images and not (options.fps or self.video.fps):
             raise McaptrackError(f"{source}: a folder of images has no clock; give the frames per second with `fps=`")
         self._plane = self.plane(self.video.width_px, self.video.height_px)
         self.pictures = f"{self.prefix}/video"
-        self._standing = {} if there is None else labels_of(there, self.prefix)
+        self._existing_labels = {} if there is None else labels_of(there, self.prefix)
 
     def topics(self) -> Iterator[str]:
-        """The pictures, and what labels there are."""
+        """The topics of pictures and labels."""
         yield self.pictures
         yield from super().topics()
 
     def write(self, writer: log.LogWriter, has_clock: bool) -> None:
-        """Write the pictures, then labels at their times."""
+        """Write the pictures, then the labels at the times of their pictures."""
         options, video, keep = self.options, self.video, self.options.video_options
         start_ns = video.start_ns if options.start_ns is None else options.start_ns
         start_ns = 0 if start_ns is None else start_ns
@@ -93,20 +93,20 @@ class VideoJob(Job):
         self.report.lost += video.lost
         of = f"the pictures of {video.path}"
         timeline = Timeline(np.array(numbers), np.array(times), of, not video.lost, video.every)
-        self._check_standing(timeline)
+        self._check_existing(timeline)
         self.write_plane(writer, self._plane, times[0])
         self.write_labels(writer, self._plane, timeline)
 
     def _say_fps(self, fps: Fraction) -> None:
-        """Say that pictures are spaced by another rate than their own."""
+        """Warn if the given frame rate differs from that of the video."""
         own = self.video.fps
         if own and abs(fps - own) > _SAME_FPS * own:
-            words = f"{self.video.path} says {float(own):g} frames a second; its pictures are put at {float(fps):g}"
+            words = f"{self.video.path} has {float(own):g} frames a second; its pictures are written at {float(fps):g}"
             warn(f"{words} by `fps=`", "clock")
 
-    def _check_standing(self, timeline: Timeline) -> None:
-        """Labels that are in the log already are of these pictures: they have their times."""
-        for topic, labels in self._standing.items():
+    def _check_existing(self, timeline: Timeline) -> None:
+        """Check that existing labels in the log have the times of these pictures."""
+        for topic, labels in self._existing_labels.items():
             if self.there and topic not in self.topics() and not np.isin(labels.t_ns, timeline.t_ns).all():
                 how = (
                     f"give `fps={str(labels.fps)!r}`"

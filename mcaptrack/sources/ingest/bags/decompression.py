@@ -1,4 +1,4 @@
-"""Decompression within bounds: a small file can claim, or become, any size."""
+"""Decompression within limits: a small file can declare any size, or expand to it."""
 
 from __future__ import annotations
 
@@ -13,36 +13,36 @@ from mcaptrack import environment
 from mcaptrack.errors import McaptrackError
 
 ENVIRONMENT: Final = "MCAPTRACK_MAX_UNPACKED_MIB"
-#: What is compressed may become so many times as large, and in any case so many MiB, unless the environment says more.
-_RATIO, _LEAST_MIB = 64, 64
-#: Small enough for Python to notice a signal between two pieces.
+#: The limit is this ratio, but at least this many MiB, unless the environment variable sets another one.
+_RATIO, _MIN_MIB = 64, 64
+#: Small enough that Python handles signals between two pieces.
 _PIECE_BYTES: Final = 2**20
-#: One byte of zstd can become 32 KiB: without a declared size it is fed in pieces that stay small.
+#: One byte of zstd can expand to 32 KiB: without a declared size the input is fed in small pieces.
 _FED_BYTES: Final = 2**10
 _WINDOW_BYTES: Final = 2**27
-#: The part of the free disk that temporary files may take.
-_OF_DISK: Final = 0.9
+#: The share of the free disk space that temporary files may use.
+_DISK_SHARE: Final = 0.9
 
 
 class NotUnpackedError(ValueError):
-    """Data that can't be decompressed, or would become too large; the message says why."""
+    """Data that can't be decompressed, or would be too large; the message says why."""
 
 
 def limit_of(packed: int) -> int:
-    """How many bytes may come out of ``packed`` bytes."""
+    """The size limit for decompressing ``packed`` bytes."""
     mib = environment.whole_number(ENVIRONMENT, 0)
-    return mib * 2**20 if mib else max(_RATIO * packed, _LEAST_MIB * 2**20)
+    return mib * 2**20 if mib else max(_RATIO * packed, _MIN_MIB * 2**20)
 
 
 def too_large(size: int | None, most: int) -> NotUnpackedError:
-    """What to say of data that are, or say that they are, larger than ``most`` bytes."""
+    """The error for data that are larger, or declare to be larger, than ``most`` bytes."""
     mib = f"{most / 2**20:.0f} MiB"
     said = f"it has more than {mib}" if size is None else f"it says that it has {size} bytes, more than {mib}"
     return NotUnpackedError(f"{said} when decompressed, which is unusual; {ENVIRONMENT} sets another limit")
 
 
 def unzstd(data: bytes, most: int) -> bytes:
-    """One zstd frame as bytes, at most ``most``. Raises NotUnpackedError."""
+    """Decompress one zstd frame to at most ``most`` bytes. Raises NotUnpackedError."""
     import zstandard
 
     try:
@@ -52,15 +52,15 @@ def unzstd(data: bytes, most: int) -> bytes:
         if size >= 0:
             return zstandard.ZstdDecompressor(max_window_size=_WINDOW_BYTES).decompress(data)
         unpacker = zstandard.ZstdDecompressor(max_window_size=_WINDOW_BYTES).decompressobj()
-        return in_pieces(lambda piece, _: unpacker.decompress(piece), lambda: unpacker.eof, data, most)
+        return decompress_pieces(lambda piece, _: unpacker.decompress(piece), lambda: unpacker.eof, data, most)
     except zstandard.ZstdError as error:
         raise NotUnpackedError(str(error)) from None
 
 
-def in_steps(unpacker: Any, data: bytes, most: int) -> bytes:
-    """The first ``most`` bytes of what ``data`` becomes, or less; ``unpacker`` is as those of Python's bz2 are.
+def decompress_steps(unpacker: Any, data: bytes, most: int) -> bytes:
+    """Decompress ``data`` to at most ``most`` bytes; ``unpacker`` has the interface of bz2.BZ2Decompressor.
 
-    Step by step, since Python notices signals only between two of them.
+    In steps, because Python handles signals only between them.
     """
     parts, size = [], 0
     while size < most and not unpacker.eof and (data or not unpacker.needs_input):
@@ -70,8 +70,10 @@ def in_steps(unpacker: Any, data: bytes, most: int) -> bytes:
     return b"".join(parts)
 
 
-def in_pieces(unpack: Callable[[bytes, int], bytes], ended: Callable[[], bool], data: bytes, most: int) -> bytes:
-    """What ``unpack`` makes of ``data``, piece by piece, until it has ``ended``. Raises NotUnpackedError."""
+def decompress_pieces(
+    unpack: Callable[[bytes, int], bytes], ended: Callable[[], bool], data: bytes, most: int
+) -> bytes:
+    """Decompress ``data`` piece by piece with ``unpack``, until it has ``ended``. Raises NotUnpackedError."""
     parts, size = [], 0
     for at in range(0, len(data), _FED_BYTES):
         if ended():
@@ -88,13 +90,13 @@ def in_pieces(unpack: Callable[[bytes, int], bytes], ended: Callable[[], bool], 
 
 @contextmanager
 def temporary_folder() -> Iterator[Path]:
-    """A folder of our own, gone afterwards."""
+    """A temporary folder, removed afterwards."""
     with TemporaryDirectory(prefix="mcaptrack-") as name:
         yield Path(name)
 
 
 def unzstd_file(path: Path, out: Path) -> None:
-    """A file that is compressed as a whole, decompressed. Raises McaptrackError."""
+    """Decompress a file. Raises McaptrackError."""
     import zstandard
 
     most = limit_of(path.stat().st_size)
@@ -112,7 +114,7 @@ def unzstd_file(path: Path, out: Path) -> None:
 
 
 def copy(path: Path, out: Path) -> None:
-    """A copy to a temporary folder. Raises McaptrackError if there is no space for it."""
+    """Copy a file to a temporary folder. Raises McaptrackError if there is not enough space."""
     size = path.stat().st_size
     try:
         with path.open("rb") as stream:
@@ -124,8 +126,8 @@ def copy(path: Path, out: Path) -> None:
 
 
 def _write(stream: Any, out: Path, expected: int, most: int) -> None:
-    """All of a stream to a file, at most ``most`` bytes and what the disk has."""
-    free = int(shutil.disk_usage(out.parent).free * _OF_DISK)
+    """Write a stream to a file, limited to ``most`` bytes and the free disk space."""
+    free = int(shutil.disk_usage(out.parent).free * _DISK_SHARE)
     size = expected
     try:
         with out.open("wb") as file:
@@ -140,6 +142,6 @@ def _write(stream: Any, out: Path, expected: int, most: int) -> None:
         raise too_large(None, most)
     if size > free:
         raise McaptrackError(
-            f"{out.name} needs {size} bytes or more in {out.parent.parent}, where {free} can be had; TMPDIR chooses "
+            f"{out.name} needs {size} bytes or more in {out.parent.parent}, where {free} are free; TMPDIR sets "
             "another folder"
         )

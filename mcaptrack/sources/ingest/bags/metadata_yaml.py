@@ -10,7 +10,7 @@ from typing import Any, Final
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.sources.ingest.bags import plain_yaml
-from mcaptrack.sources.ingest.bags.plain_yaml import Fields, NotPlainError
+from mcaptrack.sources.ingest.bags.plain_yaml import Fields, UnsupportedYamlError
 
 METADATA: Final = "metadata.yaml"
 _ROOT: Final = "rosbag2_bagfile_information"
@@ -18,23 +18,23 @@ _ROOT: Final = "rosbag2_bagfile_information"
 
 @dataclass
 class Bag:
-    """What a metadata.yaml says of a bag."""
+    """The content of a metadata.yaml."""
 
     text: bytes = b""
     distro: str = ""
-    #: Whether each message is compressed by itself.
+    #: Whether messages are compressed one by one.
     packed: bool = False
-    #: Topic, type, serialization, quality of service, type hash, and how many messages the bag holds.
+    #: Topic, type, serialization, quality of service, type hash, and number of messages.
     topics: Sequence[tuple[str, str, str, str, str, int]] = ()
 
 
 def holds_metadata(path: Path) -> bool:
-    """Whether a file is there and looks like the metadata of a bag."""
+    """Whether a file exists and looks like the metadata of a bag."""
     return path.is_file() and _ROOT.encode() in _start(path)
 
 
 def _start(path: Path) -> bytes:
-    """All that is read of it, and a byte more if there is more."""
+    """The first bytes up to the limit, and one more if there are more."""
     try:
         with path.open("rb") as stream:
             return stream.read(plain_yaml.MAX_BYTES + 1)
@@ -43,7 +43,7 @@ def _start(path: Path) -> bytes:
 
 
 def read_metadata(path: Path) -> tuple[Bag, list[str]]:
-    """A metadata.yaml, and the files that it names. Raises McaptrackError if it is none."""
+    """Read a metadata.yaml; returns it and the files that it names. Raises McaptrackError if it is invalid."""
     text = _start(path)
     try:
         said = Fields(plain_yaml.load(text), "it").map(_ROOT)
@@ -51,8 +51,8 @@ def read_metadata(path: Path) -> tuple[Bag, list[str]]:
         topics = [_topic(Fields(entry, "a topic")) for entry in said.values("topics_with_message_count")]
         names = [_name(entry) for entry in said.values("relative_file_paths")]
         bag = Bag(text, said.text("ros_distro", ""), mode.lower() == "message", topics)
-    except NotPlainError as error:
-        raise McaptrackError(f"{path} is no metadata of a rosbag2 bag ({str(error)[:200]})") from None
+    except UnsupportedYamlError as error:
+        raise McaptrackError(f"{path} is not the metadata of a rosbag2 bag ({str(error)[:200]})") from None
     twice = next((name for name, times in Counter(names).items() if times > 1), "")
     if twice:
         raise McaptrackError(f"{path} names {twice} twice; its messages would be there twice")
@@ -65,16 +65,16 @@ def _topic(entry: Fields) -> tuple[str, str, str, str, str, int]:
     topic = entry.map("topic_metadata")
     name, kind, encoding = topic.text("name"), topic.text("type"), topic.text("serialization_format", "cdr")
     qos = topic.any("offered_qos_profiles")
-    # Text before ROS 2 Jazzy; since then, YAML inside of YAML.
+    # Text before ROS 2 Jazzy; since then nested YAML.
     words = "" if qos is None else str(qos) if isinstance(qos, str) else plain_yaml.dump(qos)
     return name, kind, encoding, words, topic.text("type_description_hash", ""), entry.whole("message_count")
 
 
 def _name(entry: Any) -> str:
-    """The name of a file in the bag's folder. Before ROS 2 Galactic the folder's name stood before it."""
+    """The name of a file in the bag's folder, without the folder, which was included before ROS 2 Galactic."""
     if not isinstance(entry, str) or not PurePosixPath(entry).name:
-        raise NotPlainError(f"relative_file_paths names {entry!r}, which is no file"[:120])
+        raise UnsupportedYamlError(f"relative_file_paths names {entry!r}, which is no file"[:120])
     path = PurePosixPath(entry)
     if path.is_absolute() or ".." in path.parts or "\0" in entry:
-        raise NotPlainError(f"relative_file_paths names {entry!r}, which lies outside of the bag's folder"[:200])
+        raise UnsupportedYamlError(f"relative_file_paths names {entry!r}, which lies outside of the bag's folder"[:200])
     return path.name

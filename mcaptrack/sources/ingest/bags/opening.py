@@ -19,7 +19,7 @@ _SUFFIXES: Final = {".mcap": "an MCAP file", ".bag": "a ROS bag", ".db3": "a ros
 
 
 def open_recording(path: Path) -> Recording | None:
-    """The recording at ``path``; None if it is something else.
+    """Open the recording at ``path``; None if it is something else.
 
     Raises McaptrackError for a recording that can't be read.
     """
@@ -42,7 +42,7 @@ def open_recording(path: Path) -> Recording | None:
 
 
 def is_mcap(path: Path) -> bool:
-    """Whether a file begins as an MCAP file does; False for what can't be read."""
+    """Whether a file begins with the magic bytes of MCAP; False if it can't be read."""
     refuse_special(path)
     try:
         with path.open("rb") as stream:

@@ -1,7 +1,7 @@
-"""YAML of strangers as plain data: scalars, lists and maps, within bounds.
+"""Read untrusted YAML as plain data: scalars, lists and maps, within limits.
 
-A small file must not become a large one, so there are no aliases, no tags and no directives, and scalars stay text:
-what a field is, its reader says.
+Aliases, tags and directives are refused, so that a small file can't expand to a large one. Scalars stay text; the
+reader of a field determines its type.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import re
 from collections.abc import Iterator, Mapping
 from typing import Any, Final, Self
 
-#: The metadata of a recording with thousands of topics and files is smaller.
+#: Larger than the metadata of a recording with thousands of topics and files.
 MAX_BYTES: Final = 8 * 2**20
 _MAX_VALUES: Final = 500_000
 _MAX_DEPTH: Final = 32
@@ -20,21 +20,21 @@ _DIRECTIVE: Final = re.compile(rb"^%", re.MULTILINE)
 
 
 class Scalar(str):
-    """A scalar as it was written, without its quotes."""
+    """A scalar as written, without quotes."""
 
     __slots__ = ("is_plain",)
     is_plain: bool
 
     @classmethod
     def of(cls, text: str, is_plain: bool) -> Self:
-        """The text, and whether it had no quotes around it."""
+        """Make a scalar; ``is_plain``: it was written without quotes."""
         scalar = cls(text)
         scalar.is_plain = is_plain
         return scalar
 
 
-class NotPlainError(ValueError):
-    """Text that is no YAML, or none that is read here; the message says where and why."""
+class UnsupportedYamlError(ValueError):
+    """Invalid YAML, or features that are not supported; the message says where and why."""
 
 
 def load(data: bytes) -> Any:
@@ -42,32 +42,32 @@ def load(data: bytes) -> Any:
     import yaml
 
     if len(data) > MAX_BYTES:
-        raise NotPlainError(f"it has {len(data)} bytes; at most {MAX_BYTES} are read")
+        raise UnsupportedYamlError(f"it has {len(data)} bytes; at most {MAX_BYTES} are read")
     if _DIRECTIVE.search(data):
-        raise NotPlainError("it has a line that begins with %; directives are not read")
+        raise UnsupportedYamlError("it has a line that begins with %; directives are not read")
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise NotPlainError(f"byte {error.start} is no UTF-8") from None
+        raise UnsupportedYamlError(f"byte {error.start} is no UTF-8") from None
     loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     try:
         return _build(yaml, yaml.parse(text, Loader=loader))
     except yaml.YAMLError as error:
-        raise NotPlainError(" ".join(str(error).split())) from None
+        raise UnsupportedYamlError(" ".join(str(error).split())) from None
 
 
 def _build(yaml: Any, events: Iterator[Any]) -> Any:
-    """The value that parser events describe. One loop, because nesting must not use the stack."""
+    """Build the value from parser events, in one loop, because deep nesting must not use the stack."""
     documents: list[Any] = []
-    open_values: list[tuple[Any, list[str]]] = [(documents, [])]  # each with the key that waits for its value
+    open_values: list[tuple[Any, list[str]]] = [(documents, [])]  # each with the key whose value comes next
     for number, event in enumerate(events):
         where = f"line {event.start_mark.line + 1}"
         if number > _MAX_VALUES:
-            raise NotPlainError(f"{where}: it has more than {_MAX_VALUES} values")
+            raise UnsupportedYamlError(f"{where}: it has more than {_MAX_VALUES} values")
         if getattr(event, "anchor", None) is not None:
-            raise NotPlainError(f"{where}: anchors and aliases are not read")
+            raise UnsupportedYamlError(f"{where}: anchors and aliases are not read")
         if getattr(event, "tag", None) not in (None, "!"):
-            raise NotPlainError(f"{where}: tags are not read")
+            raise UnsupportedYamlError(f"{where}: tags are not read")
         value: Any
         if isinstance(event, yaml.ScalarEvent):
             value = Scalar.of(event.value, event.implicit[0])
@@ -85,22 +85,22 @@ def _build(yaml: Any, events: Iterator[Any]) -> Any:
         elif keys:
             parent[keys.pop()] = value
         elif not isinstance(value, str):
-            raise NotPlainError(f"{where}: a list or a map is a key")
+            raise UnsupportedYamlError(f"{where}: a list or a map is a key")
         elif value in parent:
-            raise NotPlainError(f"{where}: {value[:40]!r} is there twice")
+            raise UnsupportedYamlError(f"{where}: {value[:40]!r} is there twice")
         else:
             keys.append(value)
         if not isinstance(value, str):
             open_values.append((value, []))
             if len(open_values) > _MAX_DEPTH:
-                raise NotPlainError(f"{where}: it is nested more than {_MAX_DEPTH} deep")
+                raise UnsupportedYamlError(f"{where}: it is nested more than {_MAX_DEPTH} deep")
     if len(documents) != 1:
-        raise NotPlainError(f"it holds {len(documents)} documents, not one")
+        raise UnsupportedYamlError(f"it holds {len(documents)} documents, not one")
     return documents[0]
 
 
 def dump(value: Any) -> str:
-    """What was loaded as YAML again, a line for each value."""
+    """Write a loaded value as YAML, one line for each value."""
     import yaml
 
     dumper = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
@@ -137,12 +137,12 @@ class Fields:
 
     def __init__(self, value: Any, where: str) -> None:
         if not isinstance(value, dict):
-            raise NotPlainError(f"{where} is {_kind(value)}, not a map")
+            raise UnsupportedYamlError(f"{where} is {_kind(value)}, not a map")
         self._fields: Mapping[str, Any] = value
         self._where = where
 
     def text(self, name: str, default: str | None = None) -> str:
-        """Text; an empty field, or none at all, is the ``default`` if there is one."""
+        """A text field; ``default``, if given, for an empty or missing one."""
         value = self._fields.get(name)
         if default is not None and (value is None or _is_null(value)):
             return default
@@ -151,7 +151,7 @@ class Fields:
         return str(value)
 
     def whole(self, name: str) -> int:
-        """A whole number from 0 to 2^63 - 1."""
+        """An integer field from 0 to 2^63 - 1."""
         value = self._fields.get(name)
         number = int(value) if isinstance(value, Scalar) and value.is_plain and _WHOLE.fullmatch(value) else -1
         if not 0 <= number < 2**63:
@@ -159,7 +159,7 @@ class Fields:
         return number
 
     def values(self, name: str) -> list[Any]:
-        """A list; an empty field, or none at all, is an empty one."""
+        """A list field; empty for an empty or missing one."""
         value = self._fields.get(name)
         if value is None or _is_null(value):
             return []
@@ -168,16 +168,16 @@ class Fields:
         return value
 
     def map(self, name: str) -> Fields:
-        """A map."""
+        """A map field."""
         return Fields(self._fields.get(name), f"{self._where}: {name}")
 
     def any(self, name: str) -> Any:
-        """Whatever it is; None if it is empty or not there."""
+        """A field of any type; None if it is empty or missing."""
         value = self._fields.get(name)
         return None if value is None or _is_null(value) else value
 
-    def _wrong(self, name: str, value: Any, wanted: str) -> NotPlainError:
-        return NotPlainError(f"{self._where}: {name} is {_kind(value)}, not {wanted}")
+    def _wrong(self, name: str, value: Any, wanted: str) -> UnsupportedYamlError:
+        return UnsupportedYamlError(f"{self._where}: {name} is {_kind(value)}, not {wanted}")
 
 
 def _is_null(value: Any) -> bool:

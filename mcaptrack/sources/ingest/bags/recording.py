@@ -1,4 +1,4 @@
-"""What every recording gives, whatever its format: connections, messages, and how many messages it claims to have."""
+"""The interface of recordings in all formats: connections, messages, and the declared number of messages."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from mcaptrack import log
 
 @dataclass(frozen=True, eq=False)
 class Connection:
-    """What becomes a channel. ``schema`` is the name, the encoding and the data of a schema record."""
+    """A topic of a recording, which becomes a channel. ``schema`` is name, encoding and data of the schema record."""
 
     topic: str
     schema: tuple[str, str, bytes]
@@ -21,7 +21,7 @@ class Connection:
 
 @dataclass
 class Findings:
-    """Words about a recording: worth saying, and what of it can't be read."""
+    """Remarks about a recording (``notes``), and the parts that can't be read (``lost``)."""
 
     notes: list[str] = field(default_factory=list)
     lost: list[str] = field(default_factory=list)
@@ -32,29 +32,29 @@ class Recording(Protocol):
 
     @property
     def profile(self) -> str:
-        """As in the MCAP registry: ros1, ros2."""
+        """The profile in the MCAP registry: ros1, ros2."""
 
     @property
     def words(self) -> Findings:
-        """What there is to say before any message is read."""
+        """Findings before any message is read."""
 
     @property
     def connections(self) -> list[Connection]:
-        """All connections, also those without messages."""
+        """All connections, including those without messages."""
 
     @property
-    def claims(self) -> Mapping[Connection, int] | None:
-        """How many messages each connection has, as the recording itself says; None if it doesn't."""
+    def declared_counts(self) -> Mapping[Connection, int] | None:
+        """The declared number of messages of each connection; None if the recording doesn't declare it."""
 
     @property
-    def as_it_is(self) -> log.Log | None:
-        """The recording as a log, if it is one already."""
+    def as_log(self) -> log.Log | None:
+        """The recording as a log, if it is a single MCAP file; else None."""
 
     def messages(self, found: Findings) -> Iterator[tuple[Connection, log.Message]]:
-        """All messages, as they stand in the recording; from the start whenever it is called."""
+        """All messages in the order of the recording; every call starts from the beginning."""
 
-    def extras(self, writer: log.LogWriter, has_clock: bool, passed_on: bool = False) -> None:
-        """Write what the recording holds beside messages, and beside ``as_it_is`` if that is passed on."""
+    def extras(self, writer: log.LogWriter, has_clock: bool, is_copied: bool = False) -> None:
+        """Write what the recording holds beside messages, and beside ``as_log`` if that is passed on."""
 
     def close(self) -> None:
-        """Let go of its files."""
+        """Close its files."""

@@ -1,4 +1,4 @@
-"""What rosbags knows of ROS's own message types, for recordings that don't define theirs."""
+"""Definitions of standard ROS messages, from rosbags, for recordings that don't contain them."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from functools import cache
 
 @cache
 def known_definition(kind: str, distro: str, digest: str) -> tuple[str, str]:
-    """The definition of a type and whose it is: of the distribution, or else of the newest whose hash is the same.
+    """The definition of a message type, and the ROS distribution that it is from.
 
-    ("", "") if none has it.
+    That is the given distribution, or else the newest one with the same type hash; ("", "") if there is none.
     """
     from rosbags.typesys import Stores, get_typestore
 
@@ -21,6 +21,6 @@ def known_definition(kind: str, distro: str, digest: str) -> tuple[str, str]:
             if digest.startswith("RIHS01_") and types.hash_rihs01(kind) != digest:
                 continue
             return types.generate_msgdef(kind, ros_version=2)[0], f"ROS 2 {name.capitalize()}"
-        except Exception:  # noqa: BLE001, PERF203, S112, RUF100  # it fails in many ways for types it has not
+        except Exception:  # noqa: BLE001, PERF203, S112, RUF100  # it raises various exceptions for unknown types
             continue
     return "", ""

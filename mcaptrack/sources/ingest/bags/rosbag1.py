@@ -1,7 +1,7 @@
 """ROS 1 bags, version 2.0, as http://wiki.ros.org/Bags/Format/2.0 describes them.
 
-Read from front to back, a chunk at a time, and checked against the index: so memory does not grow with the bag, and a
-bag whose recording was cut off gives what is complete in it.
+Read sequentially, chunk by chunk, and checked against the index: memory does not grow with the bag, and of a bag that
+was cut off the complete part is read.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ _MAGIC: Final = b"#ROSBAG V2.0\n"
 _U32: Final = struct.Struct("<I")
 _U32_PAIR: Final = struct.Struct("<II")
 _MAX_HEADER_BYTES: Final = 2**20
-#: A record whose data are longer is not read.
+#: Records with more data are not read.
 _MAX_DATA_BYTES: Final = 2**28
 
 Fields = Mapping[bytes, bytes]
 
 
-class _Broken(Exception):
-    """Bytes that are no record, or not a whole one."""
+class _InvalidRecord(Exception):
+    """Bytes that are not a complete, valid record."""
 
 
 class _Record(NamedTuple):
@@ -43,21 +43,21 @@ class Bag1:
     """A ROS 1 bag, open for reading."""
 
     profile = "ros1"
-    as_it_is: log.Log | None = None
+    as_log: log.Log | None = None
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self._file: BinaryIO = path.open("rb")
         self._size = path.stat().st_size
         self._known: dict[int, Connection] = {}
-        self.claims: Mapping[Connection, int] | None = None
+        self.declared_counts: Mapping[Connection, int] | None = None
         self.words = Findings()
         try:
             self._end, self._why_unindexed = self._read_index()
             if self._why_unindexed:
                 for _ in self.messages(Findings()):
                     pass
-        except _Broken as error:
+        except _InvalidRecord as error:
             self.close()
             raise McaptrackError(f"{path} can't be read as a ROS bag: {error}") from None
         except BaseException:
@@ -66,25 +66,25 @@ class Bag1:
         self.connections = list(self._known.values())
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close the file."""
         self._file.close()
 
-    def extras(self, writer: log.LogWriter, has_clock: bool, passed_on: bool = False) -> None:
+    def extras(self, writer: log.LogWriter, has_clock: bool, is_copied: bool = False) -> None:
         """A bag holds nothing but messages."""
 
     def messages(self, found: Findings) -> Iterator[tuple[Connection, log.Message]]:
-        """All messages, as they stand in the bag. What can't be read goes to ``found``."""
+        """All messages in the order of the bag. Parts that can't be read are reported in ``found``."""
         at, sequence = self._start, dict[int, int]()
-        if self._why_unindexed:  # without an index nobody can say whether there was more, unless something is broken
+        if self._why_unindexed:  # without an index there is no way to tell whether messages are missing
             words = found.lost if self._index_at else found.notes
             words.append(f"{self.path} {self._why_unindexed}; what is complete in it is read")
         while at < self._end:
             try:
                 record = self._record(at, self._end)
-            except _Broken as error:
+            except _InvalidRecord as error:
                 found.lost.append(f"{self.path}: byte {at} and what follows: {error}")
                 return
-            parts = self._chunk(record, found) if record.op == _CHUNK else self._loose(record, found)
+            parts = self._chunk(record, found) if record.op == _CHUNK else self._unchunked(record, found)
             for number, t_ns, payload in parts:
                 connection = self._known.get(number)
                 if connection is None:
@@ -98,16 +98,16 @@ class Bag1:
     # The file
 
     def _read_index(self) -> tuple[int, str]:
-        """Where messages end, and why there is no index if there is none."""
+        """The end of the messages, and why there is no usable index ("" if there is one)."""
         magic = self._at(0, min(len(_MAGIC), self._size))
         if magic != _MAGIC:
             version = magic.removeprefix(b"#ROSBAG V").split(b"\n")[0].decode("ascii", "replace")
-            raise _Broken(f"it is of version {version}; 2.0 is read")
+            raise _InvalidRecord(f"it is of version {version}; 2.0 is read")
         bag = self._record(len(_MAGIC), self._size)
         if bag.op != _BAG:
-            raise _Broken("it has no header")
+            raise _InvalidRecord("it has no header")
         if bag.fields.get(b"encryptor"):
-            raise _Broken(f"it is encrypted by {bag.fields[b'encryptor'].decode('utf-8', 'replace')}")
+            raise _InvalidRecord(f"it is encrypted by {bag.fields[b'encryptor'].decode('utf-8', 'replace')}")
         self._start = bag.end
         self._index_at = int.from_bytes(bag.fields.get(b"index_pos", b""), "little")
         if not self._index_at:
@@ -115,13 +115,15 @@ class Bag1:
         if self._index_at > self._size:
             return self._size, f"is cut off: {self._size} bytes, and its index would begin at byte {self._index_at}"
         try:
-            self._read_claims(self._number(bag.fields, b"conn_count"), self._number(bag.fields, b"chunk_count"))
-        except _Broken as error:
+            self._read_declared_counts(
+                self._number(bag.fields, b"conn_count"), self._number(bag.fields, b"chunk_count")
+            )
+        except _InvalidRecord as error:
             self._known.clear()
             return self._index_at, f"has an index that can't be read ({error})"
         return self._index_at, ""
 
-    def _read_claims(self, connections: int, chunks: int) -> None:
+    def _read_declared_counts(self, connections: int, chunks: int) -> None:
         at, counts, seen = self._index_at, dict[int, int](), 0
         while at < self._size:
             record = self._record(at, self._size)
@@ -134,35 +136,35 @@ class Bag1:
                     counts[number] = counts.get(number, 0) + count
             at = record.end
         if len(self._known) != connections or seen != chunks:
-            raise _Broken(
+            raise _InvalidRecord(
                 f"{len(self._known)} connections and {seen} chunks where the header says {connections} and {chunks}"
             )
         if not counts.keys() <= self._known.keys():
-            raise _Broken("it counts messages of connections that it does not describe")
-        self.claims = {connection: counts.get(number, 0) for number, connection in self._known.items()}
+            raise _InvalidRecord("it counts messages of connections that it does not describe")
+        self.declared_counts = {connection: counts.get(number, 0) for number, connection in self._known.items()}
 
     def _at(self, start: int, end: int) -> bytes:
         if end - start > _MAX_DATA_BYTES:
-            raise _Broken(f"a record has {end - start} bytes; at most {_MAX_DATA_BYTES} are read")
+            raise _InvalidRecord(f"a record has {end - start} bytes; at most {_MAX_DATA_BYTES} are read")
         self._file.seek(start)
         data = self._file.read(end - start)
         if len(data) != end - start:
-            raise _Broken("the file is shorter than it was")
+            raise _InvalidRecord("the file is shorter than it was")
         return data
 
     def _record(self, at: int, end: int) -> _Record:
-        """The record at a place of the file; its data may reach beyond ``end`` for a chunk that is cut off."""
+        """The record at an offset of the file; the data of a chunk that is cut off may extend beyond ``end``."""
         if end - at < 4:
-            raise _Broken("a record is cut off")
+            raise _InvalidRecord("a record is cut off")
         size = _U32.unpack(self._at(at, at + 4))[0]
         if size > min(_MAX_HEADER_BYTES, end - at - 8):
-            raise _Broken("a record is cut off, or is none")
+            raise _InvalidRecord("a record is cut off, or is none")
         head = self._at(at + 4, at + 8 + size)
         fields = _fields(head[:size])
         data = at + 8 + size
         record = _Record(_op(fields), fields, data, data + _U32.unpack_from(head, size)[0])
         if record.end > end and record.op != _CHUNK:
-            raise _Broken("a record is cut off")
+            raise _InvalidRecord("a record is cut off")
         return record
 
     # Records
@@ -171,25 +173,27 @@ class Bag1:
         number, described = self._number(fields, b"conn"), _connection(fields, _fields(data))
         known = self._known.setdefault(number, described)
         if (known.topic, known.schema) != (described.topic, described.schema):
-            raise _Broken(f"connection {number} is of {known.topic}, and of {described.topic} or of other words here")
+            raise _InvalidRecord(
+                f"connection {number} is of {known.topic}, and of {described.topic} or of other words here"
+            )
 
-    def _loose(self, record: _Record, found: Findings) -> Iterator[tuple[int, int, bytes]]:
-        """A record outside of chunks: messages stand there if a chunk was never finished."""
+    def _unchunked(self, record: _Record, found: Findings) -> Iterator[tuple[int, int, bytes]]:
+        """A record outside of chunks: messages of a chunk that was never finished."""
         if record.op in (_MESSAGE, _CONNECTION):
             try:
                 whole = self._at(record.data, record.end)
                 yield from self._take(record.op, record.fields, whole)
-            except _Broken as error:
+            except _InvalidRecord as error:
                 found.lost.append(f"{self.path}: byte {record.data}: {error}")
 
     def _chunk(self, record: _Record, found: Findings) -> Iterator[tuple[int, int, bytes]]:
-        """The messages of a chunk, or of what is there of it."""
+        """The messages of a chunk, or of its complete part."""
         where = f"{self.path}: the chunk at byte {record.data}"
         try:
             size = self._number(record.fields, b"size")
             data = self._at(record.data, min(record.end, self._end))
             content = _decompress(data, record.fields.get(b"compression", b"none"), size)
-        except _Broken as error:
+        except _InvalidRecord as error:
             found.lost.append(f"{where}: {error}")
             return
         at = 0
@@ -199,8 +203,8 @@ class Bag1:
                 yield from self._take(_op(fields), fields, content[start:end])
                 at = end
             if record.end > self._end or len(content) != size:
-                raise _Broken("its records end there")
-        except _Broken as error:
+                raise _InvalidRecord("its records end there")
+        except _InvalidRecord as error:
             cut = "which is cut off, " if record.end > self._end else ""
             found.lost.append(f"{where}, {cut}from its byte {at} of {size} on: {error}")
 
@@ -210,7 +214,7 @@ class Bag1:
         elif op == _MESSAGE:
             time = fields.get(b"time", b"")
             if len(time) != _U32_PAIR.size:
-                raise _Broken("a message has no time")
+                raise _InvalidRecord("a message has no time")
             seconds, nanoseconds = _U32_PAIR.unpack(time)
             yield self._number(fields, b"conn"), seconds * NS_PER_S + nanoseconds, data
 
@@ -218,31 +222,31 @@ class Bag1:
     def _number(fields: Fields, name: bytes) -> int:
         value = fields.get(name, b"")
         if len(value) != _U32.size:
-            raise _Broken(f"a record has no {name.decode()}")
+            raise _InvalidRecord(f"a record has no {name.decode()}")
         return int.from_bytes(value, "little")
 
 
 def _record_in(content: bytes, at: int) -> tuple[Fields, int, int]:
-    """The record at a place of a chunk: its fields, and where its data starts and ends."""
+    """The record at an offset of a chunk: its fields, and start and end of its data."""
     if len(content) - at < 4:
-        raise _Broken("a record is cut off")
+        raise _InvalidRecord("a record is cut off")
     start = at + 8 + _U32.unpack_from(content, at)[0]
     if start > len(content):
-        raise _Broken("a record is cut off")
+        raise _InvalidRecord("a record is cut off")
     end = start + _U32.unpack_from(content, start - 4)[0]
     if end > len(content):
-        raise _Broken("a record is cut off")
+        raise _InvalidRecord("a record is cut off")
     return _fields(content[at + 4 : start - 4]), start, end
 
 
 def _fields(data: bytes) -> dict[bytes, bytes]:
-    """A record's header: name=value, each with its length before it."""
+    """Parse the header of a record: name=value fields, each preceded by its length."""
     fields, at = {}, 0
     while at < len(data):
         end = at + 4 + _U32.unpack_from(data, at)[0] if len(data) - at >= 4 else len(data) + 1
         name, sign, value = data[at + 4 : end].partition(b"=")
         if end > len(data) or not sign:
-            raise _Broken("a record's header is none")
+            raise _InvalidRecord("a record's header is none")
         fields[name] = value
         at = end
     return fields
@@ -251,26 +255,26 @@ def _fields(data: bytes) -> dict[bytes, bytes]:
 def _op(fields: Fields) -> int:
     value = fields.get(b"op", b"")
     if len(value) != 1:
-        raise _Broken("a record does not say what it is")
+        raise _InvalidRecord("a record does not say what it is")
     return value[0]
 
 
 def _connection(fields: Fields, said: Mapping[bytes, bytes]) -> Connection:
-    """``fields`` is the record's header; ``said`` is what the publisher said of itself."""
+    """Parse a connection: ``fields`` is the header of the record, ``said`` the connection header of the publisher."""
     topic = _text(fields.get(b"topic", b""))
     if not topic or not said.get(b"type"):
-        raise _Broken("a connection has no topic or no type")
+        raise _InvalidRecord("a connection has no topic or no type")
     schema = (_text(said.get(b"type", b"")), "ros1msg", _text(said.get(b"message_definition", b"")).encode())
     metadata = {
         _text(name): _text(value) for name, value in said.items() if name not in (b"type", b"message_definition")
     }
-    if "latching" in metadata:  # the profile of MCAP's registry has words for it
+    if "latching" in metadata:  # as the ros1 profile of the MCAP registry has it
         metadata["latching"] = "true" if metadata["latching"].strip() == "1" else "false"
     return Connection(topic, schema, "ros1", metadata)
 
 
 def _text(data: bytes) -> str:
-    """UTF-8, or what was written before everybody wrote that: remarks in definitions often were."""
+    """Decode UTF-8, or else Latin-1, which old definitions often have in comments."""
     try:
         return data.decode("utf-8")
     except UnicodeDecodeError:
@@ -278,21 +282,21 @@ def _text(data: bytes) -> str:
 
 
 def _decompress(data: bytes, compression: bytes, size: int) -> bytes:
-    """At most one byte more than ``size``; less if ``data`` is cut off."""
+    """Decompress to at most ``size`` + 1 bytes; to less if ``data`` is cut off."""
     most = decompression.limit_of(len(data))
     if size > most:
-        raise _Broken(str(decompression.too_large(size, most)))
+        raise _InvalidRecord(str(decompression.too_large(size, most)))
     try:
         if compression == b"none":
             return data
         if compression == b"bz2":
             import bz2
 
-            return decompression.in_steps(bz2.BZ2Decompressor(), data, size + 1)
+            return decompression.decompress_steps(bz2.BZ2Decompressor(), data, size + 1)
         if compression == b"lz4":
             import lz4.frame
 
-            return decompression.in_steps(lz4.frame.LZ4FrameDecompressor(), data, size + 1)
+            return decompression.decompress_steps(lz4.frame.LZ4FrameDecompressor(), data, size + 1)
     except (OSError, ValueError, RuntimeError, EOFError) as error:
-        raise _Broken(f"it can't be decompressed ({error})") from None
-    raise _Broken(f"it is compressed with {compression.decode('utf-8', 'replace')!r}; bz2 and lz4 are read")
+        raise _InvalidRecord(f"it can't be decompressed ({error})") from None
+    raise _InvalidRecord(f"it is compressed with {compression.decode('utf-8', 'replace')!r}; bz2 and lz4 are read")

@@ -1,4 +1,4 @@
-"""rosbag2: folders with a metadata.yaml, their SQLite databases and MCAP files, and such files alone.
+"""Read rosbag2 recordings: folders with metadata.yaml, SQLite databases and MCAP files, also single ones.
 
 The databases are read as rosbag2's sqlite3 storage plugin lays them out (schema versions 1 to 4): nothing that they
 hold is made sense of, so nothing is refused. rosbags knows the definitions of ROS's own messages, for databases that
@@ -27,7 +27,7 @@ from mcaptrack.sources.ingest.bags.sqlite_tables import Database
 _MCAP_MAGIC, _SQLITE_MAGIC, _ZSTD_MAGIC = b"\x89MCAP0\r\n", b"SQLite format 3\0", b"\x28\xb5\x2f\xfd"
 #: A message that is larger decompressed is not read.
 _MAX_MESSAGE_BYTES: Final = 2**28
-#: So many numbers of topics that are not described are named.
+#: At most this many unknown topic ids are named.
 _MAX_STRANGE: Final = 10
 _NEEDED: Final = {
     "topics": {"id", "name", "type", "serialization_format"},
@@ -37,7 +37,7 @@ _TABLES: Final = ("topics", "messages", "metadata", "schema", "message_definitio
 
 
 def open_bag(folder: Path) -> Recording:
-    """The bag in a folder with a metadata.yaml. Raises McaptrackError if it can't be read or is incomplete."""
+    """Open the bag in a folder with metadata.yaml. Raises McaptrackError if it can't be read or is incomplete."""
     bag, names = read_metadata(folder / METADATA)
     paths = [folder / name for name in names]
     paths = [path if path.exists() else path.with_name(path.name + ".zstd") for path in paths]
@@ -68,12 +68,12 @@ def open_bag(folder: Path) -> Recording:
 
 
 def open_files(paths: Sequence[Path], whole: Path, bag: Bag | None = None) -> Recording:
-    """The parts of a recording, which is called ``whole``, one after another."""
+    """Open the files of a split recording as one; ``whole`` names it in messages."""
     if bag is None:
-        bag = _bag_around(paths)
+        bag = _metadata_beside(paths)
     with ExitStack() as opened:
-        parts = [_unpacked(path, opened) for path in paths]
-        heads = [_head(path) for path in parts]
+        parts = [_decompressed_file(path, opened) for path in paths]
+        heads = [_first_bytes(path) for path in parts]
         source: _Files
         if all(head.startswith(_SQLITE_MAGIC) for head in heads):
             source = Databases(parts, whole, bag)
@@ -89,7 +89,7 @@ def open_files(paths: Sequence[Path], whole: Path, bag: Bag | None = None) -> Re
         return source
 
 
-def _head(path: Path) -> bytes:
+def _first_bytes(path: Path) -> bytes:
     refuse_special(path)
     try:
         with path.open("rb") as stream:
@@ -98,17 +98,17 @@ def _head(path: Path) -> bytes:
         raise McaptrackError(f"{path} can't be read: {error.strerror}") from None
 
 
-def _unpacked(path: Path, opened: ExitStack) -> Path:
-    """The file, or what it holds if it is compressed as a whole."""
-    if not _head(path).startswith(_ZSTD_MAGIC):
+def _decompressed_file(path: Path, opened: ExitStack) -> Path:
+    """The file, or its decompressed copy if it is compressed as a whole."""
+    if not _first_bytes(path).startswith(_ZSTD_MAGIC):
         return path
     out = opened.enter_context(decompression.temporary_folder()) / path.name.removesuffix(".zstd")
     decompression.unzstd_file(path, out)
     return out
 
 
-def _bag_around(paths: Sequence[Path]) -> Bag:
-    """What the metadata.yaml beside a single file says of it, if there is one that names it: not how much there is."""
+def _metadata_beside(paths: Sequence[Path]) -> Bag:
+    """The metadata.yaml beside a single file, if it names the file; without the number of messages."""
     beside = paths[0].with_name(METADATA)
     if len(paths) == 1 and holds_metadata(beside):
         bag, names = read_metadata(beside)
@@ -118,18 +118,18 @@ def _bag_around(paths: Sequence[Path]) -> Bag:
 
 
 class _Files:
-    """What databases and MCAP files have in common. ``words`` is known before any message is read."""
+    """Common parts of databases and MCAP files. ``words`` is known before any message is read."""
 
     profile = "ros2"
-    as_it_is: log.Log | None = None
+    as_log: log.Log | None = None
 
     def __init__(self, paths: Sequence[Path], whole: Path, bag: Bag) -> None:
         self.paths, self.whole, self.bag = paths, whole, bag
         self.words = Findings()
         self.closing = ExitStack()
-        self.claims: dict[Connection, int] = {}
-        self._same: dict[tuple[object, ...], Connection] = {}
-        self._passed: dict[Connection, int] = {}
+        self.declared_counts: dict[Connection, int] = {}
+        self._known_connections: dict[tuple[object, ...], Connection] = {}
+        self._message_counts: dict[Connection, int] = {}
         try:
             for number in range(len(paths)):
                 self._open(number)
@@ -141,20 +141,20 @@ class _Files:
     @property
     def connections(self) -> list[Connection]:
         """All connections, also those without messages."""
-        return list(self.claims)
+        return list(self.declared_counts)
 
     def close(self) -> None:
-        """Let go of the files."""
+        """Close the files."""
         self.closing.close()
 
     def messages(self, found: Findings) -> Iterator[tuple[Connection, log.Message]]:
-        """All messages, file after file, as they stand there."""
-        self._passed = {}
+        """All messages, file by file, in their order there."""
+        self._message_counts = {}
         for number in range(len(self.paths)):
             yield from self._messages(number, found)
 
-    def extras(self, writer: log.LogWriter, has_clock: bool, passed_on: bool = False) -> None:
-        """The bag's metadata.yaml, which is no part of what is passed on as it is."""
+    def extras(self, writer: log.LogWriter, has_clock: bool, is_copied: bool = False) -> None:
+        """Write metadata.yaml, which a copied MCAP file doesn't contain."""
         if self.bag.text:
             writer.add_attachment(METADATA, "application/yaml", self.bag.text)
 
@@ -164,26 +164,26 @@ class _Files:
     def _messages(self, number: int, found: Findings) -> Iterator[tuple[Connection, log.Message]]:
         yield from ()
 
-    def _connection(self, twins: dict[object, int], known: Connection, messages: int) -> Connection:
+    def _connection(self, repeats: dict[object, int], known: Connection, messages: int) -> Connection:
         """The connection that a part of the recording describes: the parts have the same ones.
 
-        ``twins`` counts, in one part, those that are described in the same words.
+        ``repeats`` counts, in one part, those that are described in the same words.
         """
         words = (known.topic, known.schema, known.encoding, *sorted(known.metadata.items()))
-        twins[words] = twins.get(words, 0) + 1
-        connection = self._same.setdefault((*words, twins[words]), known)
-        self.claims[connection] = self.claims.get(connection, 0) + messages
+        repeats[words] = repeats.get(words, 0) + 1
+        connection = self._known_connections.setdefault((*words, repeats[words]), known)
+        self.declared_counts[connection] = self.declared_counts.get(connection, 0) + messages
         return connection
 
     def _compare(self) -> None:
-        """What the metadata has and the files have not."""
+        """Report topics and messages that metadata.yaml lists and the files lack."""
         holds: Counter[str] = Counter()
-        for connection, count in self.claims.items():
+        for connection, count in self.declared_counts.items():
             holds[connection.topic] += count
         for topic, kind, encoding, qos, digest, messages in self.bag.topics:
             if topic not in holds:
                 metadata = {"offered_qos_profiles": qos, "topic_type_hash": digest}
-                self.claims[Connection(topic, (kind, "", b""), encoding, metadata)] = holds[topic] = 0
+                self.declared_counts[Connection(topic, (kind, "", b""), encoding, metadata)] = holds[topic] = 0
                 self.words.notes.append(f"{topic} ({kind}) is in {METADATA} alone; its channel has no schema")
             if holds[topic] < messages:
                 self.words.lost.append(
@@ -201,14 +201,12 @@ class Databases(_Files):
         self._undefined: dict[str, str] = {}
         super().__init__(paths, whole, bag)
         for kind, where in sorted(self._undefined.items()):
-            words = (
-                f"its definition is that of {where}" if where else "nobody here knows its definition: it has no schema"
-            )
+            words = f"its definition is that of {where}" if where else "its definition is not known: it has no schema"
             self.words.notes.append(f"{whole} does not say what {kind} is; {words}")
 
-    def extras(self, writer: log.LogWriter, has_clock: bool, passed_on: bool = False) -> None:
-        """The bag's metadata, and those in the databases, as rosbag2 writes them to MCAP files."""
-        super().extras(writer, has_clock, passed_on)
+    def extras(self, writer: log.LogWriter, has_clock: bool, is_copied: bool = False) -> None:
+        """Write metadata.yaml and the metadata in the databases, as rosbag2 writes them to MCAP files."""
+        super().extras(writer, has_clock, is_copied)
         if self._distro:
             writer.add_metadata("mcaptrack.bag", {"file": self.whole.name, "ros_distro": self._distro})
         for database in self._databases:
@@ -240,13 +238,13 @@ class Databases(_Files):
             metadata = {"offered_qos_profiles": qos, "topic_type_hash": digest or defined_digest}
             described[key] = Connection(topic, schema, encoding, metadata)
         counts = self._count(database, described)
-        twins: dict[object, int] = {}
+        repeats: dict[object, int] = {}
         self._topics.append(
-            {key: self._connection(twins, described[key], counts[key]) for key in sorted(described, key=_in_order)}
+            {key: self._connection(repeats, described[key], counts[key]) for key in sorted(described, key=_in_order)}
         )
 
     def _count(self, database: Database, described: dict[int, Connection]) -> Counter[int]:
-        """The messages of each topic. Those of topics that are not described are lost."""
+        """Count the messages of each topic. Messages of unknown topics are lost."""
         counts: Counter[int] = Counter()
         strange: Counter[object] = Counter()
         for (key,) in database.rows("messages", ["topic_id"]):
@@ -266,7 +264,7 @@ class Databases(_Files):
         return counts
 
     def _definitions(self, database: Database) -> dict[str, tuple[tuple[str, str, bytes], str]]:
-        """The schema record and the hash of each type that a database defines."""
+        """Schema record and type hash of each message type that a database defines."""
         if not self._distro and "ros_distro" in database.columns("schema"):
             self._distro = next((_text(row[0]) for row in database.rows("schema", ["ros_distro"])), "")
         has = database.columns("message_definitions")
@@ -282,7 +280,7 @@ class Databases(_Files):
         }
 
     def _schema(self, kind: str, digest: str) -> tuple[str, str, bytes]:
-        """The schema record of a type that the database does not define."""
+        """The schema record of a message type that the database does not define."""
         text, self._undefined[kind] = known_definition(kind, self._distro.lower(), digest)
         return (kind, "ros2msg", text.encode()) if self._undefined[kind] else (kind, "", b"")
 
@@ -295,11 +293,13 @@ class Databases(_Files):
                 continue
             if not isinstance(t_ns, int) or not isinstance(data, bytes):
                 raise McaptrackError(f"{path} is damaged: a message without time or data")
-            if self.bag.packed or (data.startswith(_ZSTD_MAGIC) and connection.encoding == "cdr"):  # CDR begins with 0
+            if self.bag.packed or (
+                data.startswith(_ZSTD_MAGIC) and connection.encoding == "cdr"
+            ):  # CDR starts with a zero byte
                 data = _unpack_message(data, path, t_ns, left)  # noqa: PLW2901
                 left -= len(data)
-            count = self._passed.get(connection, 0)
-            self._passed[connection] = count + 1
+            count = self._message_counts.get(connection, 0)
+            self._message_counts[connection] = count + 1
             yield connection, log.Message(t_ns, count % 2**32, t_ns, data)
 
 
@@ -312,12 +312,12 @@ class Logs(_Files):
         super().__init__(paths, whole, bag)
         profiles = {log.header(opened)[0] for opened in self.logs}
         self.profile = profiles.pop() if len(profiles) == 1 else ""
-        self.as_it_is = self.logs[0] if len(self.logs) == 1 and not bag.packed else None
+        self.as_log = self.logs[0] if len(self.logs) == 1 and not bag.packed else None
 
-    def extras(self, writer: log.LogWriter, has_clock: bool, passed_on: bool = False) -> None:
-        """The bag's metadata, and all attachments and metadata of the files."""
-        super().extras(writer, has_clock, passed_on)
-        for opened in [] if passed_on else self.logs:
+    def extras(self, writer: log.LogWriter, has_clock: bool, is_copied: bool = False) -> None:
+        """Write metadata.yaml, and all attachments and metadata records of the files."""
+        super().extras(writer, has_clock, is_copied)
+        for opened in [] if is_copied else self.logs:
             log.copy_attachments_and_metadata(opened, writer, without=[CLOCK] if has_clock else [])
 
     def _open(self, number: int) -> None:
@@ -327,12 +327,12 @@ class Logs(_Files):
             warn(f"{log.results_path(path)} holds results of {path.name}; they are left out", "left-out")
         self.logs.append(opened)
         known: dict[int, Connection] = {}
-        twins: dict[object, int] = {}
+        repeats: dict[object, int] = {}
         for channel in opened.index.channels.values():
             found = opened.index.schemas.get(channel.schema_id)
             schema = (found.name, found.encoding, found.data) if found else ("", "", b"")
             described = Connection(channel.topic, schema, channel.message_encoding, channel.metadata)
-            known[channel.id] = self._connection(twins, described, opened.index.counts.get(channel.id, 0))
+            known[channel.id] = self._connection(repeats, described, opened.index.counts.get(channel.id, 0))
         self._channels.append(known)
 
     def _messages(self, number: int, found: Findings) -> Iterator[tuple[Connection, log.Message]]:
@@ -348,17 +348,17 @@ class Logs(_Files):
 
 
 def _text(value: Any) -> str:
-    """Text that a database holds, as bytes or as something else."""
+    """Text of a database, which may be bytes or another type."""
     return value.decode("utf-8", "replace") if isinstance(value, bytes) else "" if value is None else str(value)
 
 
 def _in_order(key: Any) -> tuple[int, Any]:
-    """Numbers of topics by size; what else SQLite lets stand there behind them."""
+    """Sort key: integer topic ids first, then other values, which SQLite allows, too."""
     return (0, key) if isinstance(key, int) else (1, str(key))
 
 
 def _unpack_message(data: bytes, path: Path, t_ns: int, left: int) -> bytes:
-    """A message that is compressed by itself; ``left`` is how much all that are to come may have, together."""
+    """Decompress a single message; ``left`` is the limit for all remaining messages together."""
     try:
         return decompression.unzstd(data, min(left, _MAX_MESSAGE_BYTES))
     except decompression.NotUnpackedError as error:

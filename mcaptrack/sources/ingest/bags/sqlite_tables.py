@@ -1,8 +1,8 @@
-"""SQLite files of strangers: their tables, row by row, and nothing else that a schema can hold.
+"""Read the tables of untrusted SQLite files row by row, and nothing else that their schema can contain.
 
-A schema is a program. Views, virtual tables and generated columns can run for ever or make gigabytes of nothing, pages
-that stand for several others can do the same. So tables are read in full and in order, what they may give is bounded by
-the size of the file, and a signal ends every query. Nothing is ever written beside the file.
+An SQLite schema is a program: views, virtual tables and generated columns, and pages that are referenced repeatedly,
+can run forever or produce gigabytes from a small file. Tables are therefore read completely and in order, the output is
+limited by the size of the file, and signals interrupt every query. Nothing is written beside the file.
 """
 
 from __future__ import annotations
@@ -17,26 +17,26 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.files import follow_links, refuse_special
 from mcaptrack.sources.ingest.bags import decompression
 
-#: SQLite's steps between two looks for signals: some milliseconds.
+#: Virtual machine steps of SQLite between two checks for signals: a few milliseconds.
 _STEPS: Final = 100_000
-#: A query may take so many steps, and so many more for each byte of the file. A row takes about ten.
-_LEAST_STEPS, _STEPS_A_BYTE = 2_000_000, 4
-#: What a row takes of the file at least, whatever is in it.
+#: The step limit of a query: a minimum, and steps per byte of the file. A row takes about ten steps.
+_MIN_STEPS, _STEPS_PER_BYTE = 2_000_000, 4
+#: The minimum size of a row in the file.
 _ROW_BYTES: Final = 6
-#: Text in UTF-16 becomes longer in UTF-8, by half at most.
-_BYTES_A_BYTE: Final = 1.5
-#: No value of a row may be longer: as much as a message of a log.
+#: UTF-16 text grows in UTF-8, by at most half.
+_MAX_EXPANSION: Final = 1.5
+#: The size limit of a value, the same as for messages of a log.
 _MAX_VALUE_BYTES: Final = 2**28
-#: How a SQL text may be long, that of the schema too.
+#: The length limit of SQL text, including the schema.
 _MAX_SQL_BYTES: Final = 2**20
-#: Bytes behind a rollback journal that end it, so that no name of another journal is read from it.
+#: Bytes appended to a rollback journal, so that SQLite reads no name of a master journal from its end.
 _JOURNAL_END: Final = bytes(16)
-#: What SQLite says of a column that is neither hidden nor computed.
+#: The value in PRAGMA table_xinfo for columns that are neither hidden nor generated.
 _ORDINARY: Final = 0
 
 
 class Database:
-    """A SQLite file, open for reading. Raises McaptrackError, in one line, for whatever is wrong with it."""
+    """An SQLite file, open for reading. Raises McaptrackError, in one line, for everything that is wrong with it."""
 
     def __init__(self, path: Path, tables: Collection[str]) -> None:
         self.path = path
@@ -49,37 +49,38 @@ class Database:
             self._size = path.stat().st_size
             self._database = self._opened()
             self._columns = {table: self._find(table) for table in tables}
-            self._guard()
+            self._restrict_to_tables()
         except BaseException:
             self.close()
             raise
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close the file."""
         self._close.close()
 
     def columns(self, table: str) -> Collection[str]:
-        """The columns of one of the tables; none if it isn't there."""
+        """The columns of one of the tables; empty if there is no such table."""
         return self._columns[table]
 
     def rows(self, table: str, columns: Sequence[str]) -> Iterator[tuple[Any, ...]]:
-        """These columns of all rows, in the order of the table; text as bytes."""
+        """These columns of all rows, in table order; text as bytes."""
         names = ", ".join(f'"{name}"' for name in columns)
-        left = int(_BYTES_A_BYTE * self._size)
-        for row in self._ask(f'SELECT {names} FROM "{table}" NOT INDEXED'):  # noqa: S608
+        left = int(_MAX_EXPANSION * self._size)
+        for row in self._query(f'SELECT {names} FROM "{table}" NOT INDEXED'):  # noqa: S608
             left -= _ROW_BYTES + sum(len(value) for value in row if isinstance(value, bytes))
             if left < 0:
                 raise McaptrackError(f"{self.path} is damaged: its table {table} holds more than the file can")
             yield row
 
     def count(self, table: str) -> int:
-        """How many rows a table has, by its index if there is one."""
-        ((count,),) = self._ask(f'SELECT sum(1) FROM "{table}"')  # noqa: S608  # count(*) would not see signals
+        """The number of rows of a table, by its index if there is one."""
+        ((count,),) = self._query(f'SELECT sum(1) FROM "{table}"')  # noqa: S608  # count(*) would not check for signals
         return count or 0
 
     def _opened(self) -> sqlite3.Connection:
         path, is_copy = follow_links(self.path), False
-        # What a recorder that was killed left beside it belongs to it. It is read in a copy, since reading it writes.
+        # A killed recorder leaves a journal that belongs to the file. It is opened in a copy, because opening it
+        # writes.
         beside = [path.with_name(path.name + end) for end in ("-wal", "-journal")]
         left = [other for other in beside if other.is_file() and other.stat().st_size]
         if left:
@@ -115,46 +116,48 @@ class Database:
         database.set_progress_handler(self._watching.__next__, _STEPS)
         self._database = database
         for pragma in ("trusted_schema=OFF", "cell_size_check=ON", "mmap_size=0"):
-            list(self._ask(f"PRAGMA {pragma}"))
+            list(self._query(f"PRAGMA {pragma}"))
         return database
 
     def _watch(self) -> Iterator[int]:
-        """1 for a query that is to end, otherwise 0.
+        """Yields 1 to abort the query, otherwise 0.
 
-        A generator, so that whatever a signal raises is raised inside of it: SQLite would swallow it.
+        A generator, so that exceptions of signal handlers are raised inside it; SQLite would swallow them.
         """
         try:
             while True:
-                yield int(self._steps > self._most_steps)
+                yield int(self._steps > self._max_steps)
                 self._steps += _STEPS
         except GeneratorExit:
             raise
-        except BaseException as raised:  # goes on in _ask
+        except BaseException as raised:  # raised again in _query
             self._interruption = raised
         while True:
             yield 1
 
     @property
-    def _most_steps(self) -> int:
-        return _LEAST_STEPS + _STEPS_A_BYTE * self._size
+    def _max_steps(self) -> int:
+        return _MIN_STEPS + _STEPS_PER_BYTE * self._size
 
     def _find(self, table: str) -> Collection[str]:
-        """The columns of a table, as far as its rows hold them. Raises McaptrackError for a view or the like."""
-        columns = [(_text(row[1]), row[6]) for row in self._ask(f'PRAGMA main.table_xinfo("{table}")')]
+        """The stored columns of a table. Raises McaptrackError for views, virtual tables and generated columns."""
+        columns = [(_text(row[1]), row[6]) for row in self._query(f'PRAGMA main.table_xinfo("{table}")')]
         if not columns:
             return ()
         query = f"SELECT sql FROM main.sqlite_master WHERE name = '{table}' COLLATE NOCASE"  # noqa: S608
-        made_by = [_text(row[0]) for row in self._ask(query)]
-        # SQLite goes by the text alone, and writes it like this, whatever was typed.
+        made_by = [_text(row[0]) for row in self._query(query)]
+        # SQLite normalises the SQL text to this form, and decides by it.
         if not (made_by and all(text.startswith("CREATE TABLE ") for text in made_by)):
-            raise McaptrackError(f"{self.path}: {table} is no ordinary table; views and virtual tables are not read")
+            raise McaptrackError(
+                f"{self.path}: {table} is not an ordinary table; views and virtual tables are not read"
+            )
         computed = [name for name, kind in columns if kind != _ORDINARY]
         if computed:
             raise McaptrackError(f"{self.path}: the column {computed[0]} of {table} is computed; stored ones are read")
         return {name for name, _ in columns}
 
-    def _guard(self) -> None:
-        """From now on nothing but the tables can be read."""
+    def _restrict_to_tables(self) -> None:
+        """Deny everything but reading these tables from now on."""
         allowed = {table.lower() for table, columns in self._columns.items() if columns}
 
         def may(action: int, first: str | None, second: str | None, _: str | None, view: str | None) -> int:
@@ -167,15 +170,15 @@ class Database:
 
         self._database.set_authorizer(may)
 
-    def _ask(self, query: str) -> Iterator[tuple[Any, ...]]:
+    def _query(self, query: str) -> Iterator[tuple[Any, ...]]:
         self._steps = 0
         try:
             yield from self._database.execute(query)
-        except (sqlite3.Error, UnicodeDecodeError, OverflowError) as error:  # SQLite quotes what is damaged
+        except (sqlite3.Error, UnicodeDecodeError, OverflowError) as error:  # messages of SQLite may quote damaged text
             if self._interruption is not None:
                 raise self._interruption from None
             why = "it can't be understood" if isinstance(error, UnicodeDecodeError) else str(error)
-            if self._steps > self._most_steps:
+            if self._steps > self._max_steps:
                 why = "its tables go on for longer than the file can"
             raise McaptrackError(f"{self.path} is damaged: {why}") from None
 

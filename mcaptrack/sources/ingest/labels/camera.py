@@ -1,4 +1,4 @@
-"""Which pictures labels belong to: a camera is the part of a topic before its last "/"."""
+"""Find the pictures that labels belong to. A camera is the part of a topic before its last "/"."""
 
 from __future__ import annotations
 
@@ -20,29 +20,30 @@ from mcaptrack.sources.ingest.labels.formats import Role
 from mcaptrack.sources.ingest.labels.timeline import Timeline
 from mcaptrack.sources.video import EncodedPicture, decode_gray, is_video_codec, read_head
 
-#: The camera where no one names another.
+#: The default camera name.
 DEFAULT: Final = "camera"
 
 
 class Camera(NamedTuple):
-    """What everything of a camera lies under, and the topic of its pictures, "" if there are none."""
+    """The prefix of all topics of a camera, and the topic of its pictures, "" if there are none."""
 
     prefix: str
     pictures: str
 
 
-def choose(where: object, camera: str, topics: Collection[str]) -> Camera:
-    """The camera of this name, among topics of pictures.
+def choose_camera(where: object, camera: str, topics: Collection[str]) -> Camera:
+    """The camera with this name, among topics of pictures.
 
-    The name may also be a topic of pictures itself, or lie below a camera: labels that can't stand beside the pictures
-    of ``front`` go to ``front/labels``. Unless another camera is named, it is the only one with pictures. Raises
-    McaptrackError, with the names, if a camera has several topics of pictures or if none of several is named.
+    The name may also be a topic of pictures itself, or be below a camera: a second set of labels for the pictures of
+    ``front`` goes to ``front/labels``. With the default name it is the only camera with pictures. Raises
+    McaptrackError, with the names, if a camera has several topics of pictures, or if there are several cameras and none
+    is named.
     """
     prefix = "/" + camera.strip("/")
     for at in (prefix, *_above(prefix)):
         if at in topics:
-            return Camera(folder_of(at) if at == prefix else prefix, at)
-        found = sorted(topic for topic in topics if folder_of(topic) == at)
+            return Camera(camera_prefix(at) if at == prefix else prefix, at)
+        found = sorted(topic for topic in topics if camera_prefix(topic) == at)
         if len(found) == 1 or f"{at}/video" in found:
             return Camera(prefix, f"{at}/video" if len(found) > 1 else found[0])
         if found:
@@ -53,14 +54,14 @@ def choose(where: object, camera: str, topics: Collection[str]) -> Camera:
     if camera != DEFAULT or not topics:
         return Camera(prefix, "")
     if len(topics) > 1:
-        names = sorted({folder_of(topic).strip("/") for topic in topics})
+        names = sorted({camera_prefix(topic).strip("/") for topic in topics})
         names = names if len(names) == len(topics) else sorted(topic.strip("/") for topic in topics)
         raise McaptrackError(
             f"{where} has pictures of several cameras, {', '.join(sorted(topics))}; labels and ground planes belong to "
             f"those of one: choose with `camera={names[0]!r}`"
         )
     (topic,) = topics
-    return Camera(folder_of(topic), topic)
+    return Camera(camera_prefix(topic), topic)
 
 
 def _above(prefix: str) -> Iterator[str]:
@@ -69,20 +70,20 @@ def _above(prefix: str) -> Iterator[str]:
         yield prefix
 
 
-def folder_of(topic: str) -> str:
-    """What everything beside a topic lies under."""
+def camera_prefix(topic: str) -> str:
+    """The prefix of the camera that a topic belongs to."""
     folder, slash, _ = topic.strip("/").rpartition("/")
     return f"/{folder}" if slash else f"/{DEFAULT}"
 
 
 def camera_of(opened: log.Log, camera: str) -> Camera:
-    """The camera of this name in a log. Raises McaptrackError as ``choose`` does."""
+    """The camera with this name in a log. Raises McaptrackError as ``choose_camera`` does."""
     topics = [c.topic for c in opened.channels.values() if foreign.holds_pictures(c) and c.messages]
-    return choose(opened.path, camera, topics)
+    return choose_camera(opened.path, camera, topics)
 
 
-def picture_test(kind: foreign.MessageType) -> Callable[[bytes], bool]:
-    """What tells whether a message of a channel is a picture: of a video, parameter sets may stand alone in one."""
+def picture_predicate(kind: foreign.MessageType) -> Callable[[bytes], bool]:
+    """A predicate: whether a message of a channel has a picture; video messages may have parameter sets alone."""
     if not foreign.is_compressed(kind.name):
         return lambda _: True
     decode = foreign.picture_decoder(kind)
@@ -91,14 +92,14 @@ def picture_test(kind: foreign.MessageType) -> Callable[[bytes], bool]:
         try:
             picture = decode(payload)
         except McaptrackError:
-            return True  # a damaged picture is one; whoever decodes it says what is wrong
+            return True  # a damaged picture counts; decoding it reports what is wrong
         return read_head(picture.format, picture.data).has_picture
 
     return test
 
 
 def timeline_of(opened: log.Log, topic: str) -> Timeline:
-    """The pictures of a channel with messages. Raises McaptrackError if it is damaged, or none of them is a picture."""
+    """The pictures of a channel. Raises McaptrackError if it is damaged, or holds no pictures."""
     t_ns: NDArray[np.int64] = opened.times(topic)
     index, every, of = np.arange(len(t_ns)), 1, f"the pictures of {topic}"
     made = Provenance.from_metadata(opened.channel(topic).metadata)
@@ -106,10 +107,10 @@ def timeline_of(opened: log.Log, topic: str) -> Timeline:
         said = made.parameters.get("every")
         every = said if isinstance(said, int) and said > 0 else 1
         last = max(message.sequence for message in opened.messages(topic, int(t_ns[-1])))
-        if last + 1 != len(t_ns):  # pictures were lost on the way: the others keep their numbers
+        if last + 1 != len(t_ns):  # some pictures could not be read; the others keep their numbers
             index = np.array([message.sequence for message in opened.messages(topic)], np.int64)
     elif _may_be_video(opened, topic):
-        is_picture = picture_test(message_type_of(opened, topic))
+        is_picture = picture_predicate(message_type_of(opened, topic))
         t_ns = np.array([m.t_ns for m in opened.messages(topic) if is_picture(m.payload)], np.int64)
         index = np.arange(len(t_ns))
     if not len(t_ns):
@@ -117,15 +118,15 @@ def timeline_of(opened: log.Log, topic: str) -> Timeline:
     return Timeline(index, t_ns, of, len(index) == index[-1] + 1, every)
 
 
-def seen_by(opened: log.Log, prefix: str) -> str:
-    """The detections of a camera whose pictures are gone: they have a frame for each; "" if there are none."""
+def detections_topic(opened: log.Log, prefix: str) -> str:
+    """The topic of detections made from pictures that were dropped since; "" if there is none."""
     channel = opened.channels.get(f"{prefix}/detections")
     made = Provenance.from_metadata(channel.metadata) if channel else None
     return channel.topic if channel and channel.messages and made and made.transform == "detect" else ""
 
 
 def _may_be_video(opened: log.Log, topic: str) -> bool:
-    """Whether the first picture of a channel is of a video, or can't be read."""
+    """Whether the first picture of a channel is video, or can't be read."""
     if not foreign.is_compressed(opened.channel(topic).schema_name):
         return False
     decode = foreign.picture_decoder(message_type_of(opened, topic))
@@ -135,16 +136,16 @@ def _may_be_video(opened: log.Log, topic: str) -> bool:
         return True
 
 
-class Standing(NamedTuple):
-    """Labels that stand in a log: their times, rising, how many frames they count, at which rate if they say it."""
+class ExistingLabels(NamedTuple):
+    """Labels in a log: their sorted times, the number of frames, and the frame rate if it is known."""
 
     t_ns: NDArray[np.int64]
     frames: int
     fps: Fraction | None
 
 
-def labels_of(opened: log.Log, prefix: str) -> dict[str, Standing]:
-    """The labels of a camera that were put into a log, by topic."""
+def labels_of(opened: log.Log, prefix: str) -> dict[str, ExistingLabels]:
+    """The ingested labels of a camera in a log, by topic."""
     out = {}
     for role in get_args(Role):
         channel = opened.channels.get(f"{prefix}/{role}")
@@ -154,11 +155,11 @@ def labels_of(opened: log.Log, prefix: str) -> dict[str, Standing]:
             said = made.parameters.get("fps")
             fps = parse_fps(said) if isinstance(said, str) else None
             frames = 1 + max(message.sequence for message in opened.messages(channel.topic, int(t_ns[-1])))
-            out[channel.topic] = Standing(t_ns, frames, fps)
+            out[channel.topic] = ExistingLabels(t_ns, frames, fps)
     return out
 
 
-def size_of(opened: log.Log, topic: str) -> tuple[int, int]:
+def picture_size(opened: log.Log, topic: str) -> tuple[int, int]:
     """Width and height of the pictures of a channel. Raises McaptrackError if none of them can be decoded."""
     found = foreign.pictures(opened, topic)
     for frame in decode_gray(

@@ -1,4 +1,4 @@
-"""The formats of label files, and what all of them become: ``Labels``.
+"""Parse the formats of label files into ``Labels``.
 
 | format  | columns                                                                        | frames | unit |
 |---------|--------------------------------------------------------------------------------|--------|------|
@@ -9,8 +9,8 @@
 | obsmat  | frame id x z y vx vz vy; blank separated                                       | from 0 | m    |
 
 MOTChallenge's truth names the class of a box in column 8 since MOT16; in MOT15, which has 10 columns, a position stands
-there. Truth also holds boxes of what isn't scored: see ``Aside``. Tracks and truth are of people, since their rows have
-no class; detections keep all classes.
+there. Truth also holds boxes of what isn't scored: see ``IgnoredBoxes``. Tracks and ground truth are restricted to
+people, because their rows have no class; detections keep all classes.
 
 Letters: N rows, F frames.
 """
@@ -40,20 +40,19 @@ PERSON: Final = 1
 _MAX_PLACE: Final = 1e8
 _MAX_SCORE: Final = 1e9
 _MAX_FRAME: Final = 2**31 - 1
-#: Formats that are labelled every so many frames by custom.
+#: Formats in which labels at regular steps are the rule.
 _POSITIONS: Final = ("trajnet", "obsmat")
-#: Boxes are labelled every so many frames, rather than seldom seen, if there are at least so many labelled frames.
+#: With fewer labelled frames a regular step of boxes may be a coincidence.
 _SPARSE_FRAMES: Final = 3
 
-#: Classes of MOT16, 17 and 20 that are people but none to be found: on a vehicle, standing still (a statue),
-#: distractors, reflections.
+#: Distractor classes of MOT16, 17 and 20: person on a vehicle, static person, distractor, reflection.
 _DISTRACTORS: Final = (2, 7, 8, 12)
-#: Occluded more than this, or truncated at all, KITTI's people don't count; boxes up to this height don't count against
-#: anybody.
+#: People in KITTI that are occluded more than this, or truncated, are not scored; boxes up to this height are not
+#: counted as false positives.
 _KITTI_OCCLUDED: Final = 2
 KITTI_HEIGHT_PX: Final = 25.0
-#: The classes that formats name, as they are numbered in detections; others get numbers after these. KITTI's tracking
-#: labels call Person what its detection labels call Person_sitting.
+#: Class ids of the class names in formats; other names get the following ids. Person in the tracking labels of KITTI is
+#: Person_sitting in its detection labels.
 _KITTI_CLASSES: Final = {
     "pedestrian": PERSON,
     "cyclist": 2,
@@ -71,11 +70,11 @@ _MAX_NAMES: Final = 256
 
 
 @dataclass(frozen=True)
-class Aside:
-    """Labelled boxes that need not be found: frames (N,) as in the file, boxes (N, 4).
+class IgnoredBoxes:
+    """Labelled boxes that are not scored: frames (N,) as in the file, boxes (N, 4) in px.
 
-    ``forgiven`` (N,): a track that is matched with the box counts neither for nor against; otherwise it counts as
-    false. ``region`` (N,): so do tracks that match no person and lie in the box.
+    ``forgiven`` (N,): a track that is matched with the box is ignored, instead of counted as a false positive.
+    ``region`` (N,): tracks inside the box without a match are ignored, too.
     """
 
     frame: Ints
@@ -86,13 +85,13 @@ class Aside:
 
 @dataclass(frozen=True)
 class Labels:
-    """The rows of a label file, ordered by frame and id.
+    """The rows of a label file, sorted by frame and id.
 
     ``frame`` (N,) is the number in the file, which is ``first_frame`` for the video's first frame. ``id`` (N,) is -1 in
     detections. ``boxes_px`` (N, 4) or ``xy_m`` (N, 2) is None where the format has none. ``score`` (N,) is NaN where
     there is none. ``labelled`` (F,) are the frames that the file has rows of, rising; also of rows that aren't kept.
     ``class_id`` (N,) is as in the schema of detections; ``classes`` are the names of those that have one. ``left_out``
-    says what the file holds that isn't kept; of truth, ``aside`` holds it.
+    says what the file holds that isn't kept; of truth, ``ignored`` holds it.
     """
 
     format: Format
@@ -106,45 +105,45 @@ class Labels:
     class_id: Classes
     classes: Mapping[int, str] = field(default_factory=dict)
     left_out: str = ""
-    aside: Aside | None = None
+    ignored: IgnoredBoxes | None = None
 
     @property
     def step(self) -> int:
-        """Every how many frames there are labels: 1, or 12 where every twelfth frame was labelled."""
+        """The step of labelled frames: 12 if every twelfth frame is labelled."""
         least = 2 if self.format in _POSITIONS else _SPARSE_FRAMES
         return int(np.gcd.reduce(np.diff(self.labelled))) if len(self.labelled) >= least else 1
 
     @property
-    def identified(self) -> bool:
-        """Whether the rows say who it is."""
+    def has_ids(self) -> bool:
+        """Whether the rows have ids."""
         return bool((self.id != NO_ID).any())
 
 
-class _Names:
-    """The names in a column of classes, numbered from 0 as they come."""
+class _ClassNames:
+    """The class names of a column, numbered from 0 in order of appearance."""
 
     def __init__(self) -> None:
         self._numbers: dict[str, int] = {}
 
     def number(self, name: str) -> int:
-        """The number of a name. Raises ValueError for more names than there are classes."""
+        """The number of a name. Raises ValueError if there are too many names."""
         if name not in self._numbers and len(self._numbers) == _MAX_NAMES:
             raise ValueError(f"the column of classes has more than {_MAX_NAMES} names")
         return self._numbers.setdefault(name, len(self._numbers))
 
     def are(self, numbers: Floats, name: str) -> Bools:
-        """Which of a column's names are this one, which is in lower case."""
+        """Which entries of a column have this name (lower case)."""
         same = np.array([other.lower() == name for other in self._numbers], bool)
         return np.asarray(same[numbers.astype(int)], bool)
 
     def count(self, numbers: Floats) -> str:
-        """How often each name comes in a column, in words."""
+        """The number of occurrences of each name, as text."""
         names = list(self._numbers)
         counts = Counter(numbers.astype(int).tolist())
         return ", ".join(f"{count} {names[number]}" for number, count in counts.most_common())
 
     def ids(self, numbers: Floats, known: Mapping[str, int]) -> tuple[Classes, dict[int, str]]:
-        """A column as class ids, and the names of these."""
+        """Convert a column to class ids; returns them and their names."""
         others = sorted({name.lower() for name in self._numbers} - known.keys())
         places = {**known, **{name: number for number, name in enumerate(others, start=max(known.values()) + 1)}}
         ids = np.array([places[name.lower()] for name in self._numbers], np.uint32)
@@ -153,12 +152,12 @@ class _Names:
         return column, {number: names[number] for number in np.unique(column).tolist()}
 
 
-def _all_people(count: int) -> Classes:
+def _all_persons(count: int) -> Classes:
     return np.full(count, PERSON, np.uint32)
 
 
 def _boxes(table: Table, columns: slice, corners: bool = False) -> Floats:
-    """Left, top, width and height (N, 4) from columns that hold them, or that hold left, top, right and bottom."""
+    """Boxes (N, 4) of left, top, width, height; ``corners``: the columns are left, top, right, bottom."""
     boxes = table.within(columns, "a coordinate", _MAX_PLACE)
     if corners:
         boxes = np.concatenate([boxes[:, :2], boxes[:, 2:] - boxes[:, :2]], axis=1)
@@ -174,7 +173,7 @@ def _frame(table: Table, column: int) -> Ints:
 
 
 def _score(table: Table, column: int) -> Floats:
-    """A column of scores, NaN where there is none."""
+    """A column of scores, NaN for missing ones."""
     score = table.values[:, column]
     table.refuse(np.abs(score) > _MAX_SCORE, lambda row: f"a score can't be {score[row]:g}")
     return score
@@ -190,7 +189,7 @@ def read_mot(path: Path, lines: Lines, role: Role) -> Labels:
 
     def parse(parts: list[str]) -> list[float]:
         _columns(parts, 6, 10)
-        # Of 10 columns, which are MOT15's, the eighth is no class.
+        # With 10 columns it is MOT15, whose column 8 is not a class.
         more = parts[6:8] if len(parts) < 10 else parts[6:7]
         return [*map(float, parts[:6]), *map(float, more), *[np.nan] * (2 - len(more))]
 
@@ -203,13 +202,13 @@ def read_mot(path: Path, lines: Lines, role: Role) -> Labels:
         if (kind == 0).all():
             raise McaptrackError(
                 f"{path}: the class of all {len(kind)} boxes (column 8) is 0; pedestrians are 1 there since MOT16, and "
-                "-1 or no column 8 says that there are no classes"
+                "-1 or no column 8 means that there are no classes"
             )
-        # A score of 0 marks boxes that don't count.
+        # A score of 0 marks boxes that are not scored.
         kept = (score != 0) & ((kind == PERSON) | (kind == NO_ID) | np.isnan(kind))
         if not kept.any():
             raise McaptrackError(f"{path}: all {len(kept)} boxes are marked as not counting (score 0 or a class but 1)")
-    class_id = _all_people(len(frame))
+    class_id = _all_persons(len(frame))
     if role == "detections":
         table.refuse(
             named & ~((kind == np.rint(kind)) & (kind >= NO_ID) & (kind < 2**32)),
@@ -220,10 +219,10 @@ def read_mot(path: Path, lines: Lines, role: Role) -> Labels:
     others = f"{int(gone.sum())} boxes that don't count (score 0 or a class but 1)" if gone.any() else ""
     if role == "tracks" and ((kind > 0) & (kind != PERSON)).any():
         others = f"the classes of {int(((kind > 0) & (kind != PERSON)).sum())} boxes that aren't people (column 8)"
-    aside = Aside(frame[gone], boxes[gone], np.isin(kind[gone], _DISTRACTORS), np.zeros(int(gone.sum()), bool))
+    ignored = IgnoredBoxes(frame[gone], boxes[gone], np.isin(kind[gone], _DISTRACTORS), np.zeros(int(gone.sum()), bool))
     return Labels(
         "mot",
-        0 if (frame == 0).any() else 1,  # some programs count from 0 in this format too, and show it by a frame 0
+        0 if (frame == 0).any() else 1,  # some programs number frames from 0 in this format, too
         frame[kept],
         who[kept],
         boxes[kept],
@@ -232,13 +231,13 @@ def read_mot(path: Path, lines: Lines, role: Role) -> Labels:
         np.unique(frame),
         class_id[kept],
         left_out=others,
-        aside=aside if (kind > 0).any() else None,
+        ignored=ignored if (kind > 0).any() else None,
     )
 
 
 def read_kitti(path: Path, lines: Lines, role: Role) -> Labels:
-    """KITTI tracking. Scores (column 18) are those of a tracker's."""
-    names = _Names()
+    """KITTI tracking. Column 18 is the score of a tracker, if there is one."""
+    names = _ClassNames()
 
     def parse(parts: list[str]) -> list[float]:
         _columns(parts, 17, 18)
@@ -279,13 +278,13 @@ def read_kitti(path: Path, lines: Lines, role: Role) -> Labels:
         class_id,
         classes,
         " and ".join(left),
-        Aside(frame[beside], boxes[beside], ~region[beside], region[beside]) if role == "truth" else None,
+        IgnoredBoxes(frame[beside], boxes[beside], ~region[beside], region[beside]) if role == "truth" else None,
     )
 
 
 def read_sdd(path: Path, lines: Lines, role: Role) -> Labels:
     """Stanford Drone annotations."""
-    names = _Names()
+    names = _ClassNames()
 
     def parse(parts: list[str]) -> list[float]:
         _columns(parts, 10, 10)
@@ -337,7 +336,7 @@ def _positions(path: Path, lines: Lines, name: Format, what: str, columns: int, 
     table = Table(path, lines, what, columns, parse)
     frame, who = _frame(table, 0), table.whole(1, "the id", 0)
     xy_m, none = table.within(place, "a position", _MAX_PLACE), np.full(len(frame), np.nan)
-    return Labels(name, 0, frame, who, None, xy_m, none, np.unique(frame), _all_people(len(frame)))
+    return Labels(name, 0, frame, who, None, xy_m, none, np.unique(frame), _all_persons(len(frame)))
 
 
 READERS: Final[Mapping[str, Callable[[Path, Lines, Role], Labels]]] = {

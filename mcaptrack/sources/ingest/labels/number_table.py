@@ -1,4 +1,4 @@
-"""Text files of numbers, line by line, with bounds on everything: what is wrong is said with its line.
+"""Read text files of numbers line by line, within limits; errors name the line.
 
 Letters: N rows, C columns.
 """
@@ -16,19 +16,19 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.files import refuse_special
 from mcaptrack.geometry.arrays import Floats, Ints
 
-#: A line that isn't empty and no remark, with its number.
+#: Line numbers and lines, without empty lines and comments.
 Lines = Iterator[tuple[int, str]]
 
 _MAX_ROWS: Final = 10_000_000
 _MAX_LINE: Final = 4096
-#: Whole numbers from here on aren't exact where the text is read as floating point.
+#: Integers from here on are not exact as float64.
 _EXACT: Final = 2**53
-#: How much of a line an error shows.
+#: The number of characters of a line that errors show.
 _SHOWN: Final = 60
 
 
 def lines_of(path: Path) -> Lines:
-    """The lines of a text file. Raises McaptrackError if it can't be read, isn't text or has too long lines."""
+    """The lines of a text file. Raises McaptrackError if it can't be read, isn't text, or has too long lines."""
     refuse_special(path)
     try:
         with path.open(encoding="utf-8-sig") as stream:
@@ -46,15 +46,15 @@ def lines_of(path: Path) -> Lines:
 
 
 def split(line: str) -> list[str]:
-    """The parts of a line, comma or blank separated."""
+    """Split a line at commas, or at blanks if it has no commas."""
     return [part.strip() for part in line.split(",")] if "," in line else line.split()
 
 
 class Table:
-    """Rows of numbers: ``values`` (N, C), and the ``line`` (N,) that each stands in.
+    """Rows of numbers: ``values`` (N, C), and their line numbers ``line`` (N,).
 
-    ``parse`` makes the C numbers of the parts of a line, and raises ValueError if they aren't those of a row. ``what``
-    names the format and its columns. Raises McaptrackError, with the line, for what is no row and for too many rows.
+    ``parse`` converts the parts of a line to C numbers, and raises ValueError if they are not a valid row. ``what``
+    names the format and its columns. Raises McaptrackError, with the line, for an invalid row and for too many rows.
     """
 
     def __init__(
@@ -75,13 +75,15 @@ class Table:
         self.line: Ints = np.frombuffer(numbers, np.int64)
 
     def refuse(self, wrong: Any, words: Callable[[int], str]) -> None:
-        """Raise McaptrackError for the first row of which ``wrong`` (N,) is true, with what ``words`` say of it."""
+        """Raise McaptrackError for the first row where ``wrong`` (N,) is true, with the text that ``words`` returns for
+        it.
+        """
         if wrong.any():
             row = int(wrong.argmax())
             raise McaptrackError(f"{self._path}:{self.line[row]}: {words(row)}")
 
     def within(self, columns: slice, what: str, most: float) -> Floats:
-        """Columns (N, C) of finite numbers up to ``most``, in both directions."""
+        """Columns (N, C) of finite numbers with absolute values up to ``most``."""
         values = self.values[:, columns]
         self.refuse(~np.isfinite(values).all(axis=1), lambda _: "a number is not finite")
         largest = np.abs(values).max(axis=1, initial=0)

@@ -1,4 +1,4 @@
-"""Label files and homographies as they are given: which format a file has, and its rows in order."""
+"""Read label files, with detection of their format, and homographies."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from mcaptrack.sources.ingest.labels.number_table import lines_of, split
 
 FORMATS: Final = tuple(name for name in get_args(Format) if name != "auto")
 
-#: What files begin with that are no tables, and what they are then.
+#: First bytes of other formats than tables, and their names.
 _OTHERS: Final = {b"{": "JSON", b"[": "JSON", b"<": "XML"}
-#: How much of such a file is looked at, and words that tell the JSON of COCO.
+#: Bytes to inspect of such a file, and the keys that identify COCO JSON.
 _HEAD: Final = 65536
 _COCO: Final = (b'"images"', b'"annotations"', b'"image_id"', b'"categories"')
 
@@ -25,20 +25,39 @@ _COCO: Final = (b'"images"', b'"annotations"', b'"image_id"', b'"categories"')
 def read_labels(
     path: Path, label_format: Format = "auto", role: Role = "tracks", first_frame: int | None = None
 ) -> Labels:
-    """Read a label file. ``first_frame`` is the number of the first picture, if it isn't that of the format.
+    """Read a label file.
 
-    Raises McaptrackError, with the line, if the file is not of that format or not of any.
+    Parameters
+    ----------
+    path : Path
+        A text file.
+    label_format : str
+        "auto" detects it from the first row.
+    role : str
+        "detections", "tracks" or "truth" (ground truth).
+    first_frame : int, optional
+        The number of the first picture in the file, if it isn't the one of the format.
+
+    Returns
+    -------
+    Labels
+        Sorted by frame and id.
+
+    Raises
+    ------
+    McaptrackError
+        With the line, if the file doesn't have this format, or none of the known ones.
     """
-    _refuse_others(path)
+    _refuse_other_formats(path)
     if label_format == "auto":
         found = next(lines_of(path), None)
         if found is None:
             raise McaptrackError(f"{path} holds no labels")
         label_format = _guess(path, *found)
     labels = READERS[label_format](path, lines_of(path), role)
-    if labels.identified and role != "detections":
-        _refuse_twins(path, labels)
-    order = np.lexsort((labels.id, labels.frame)) if labels.identified else np.argsort(labels.frame, kind="stable")
+    if labels.has_ids and role != "detections":
+        _refuse_repeated_ids(path, labels)
+    order = np.lexsort((labels.id, labels.frame)) if labels.has_ids else np.argsort(labels.frame, kind="stable")
     boxes, xy = labels.boxes_px, labels.xy_m
     return replace(
         labels,
@@ -52,8 +71,8 @@ def read_labels(
     )
 
 
-def _refuse_others(path: Path) -> None:
-    """Raise McaptrackError for a file of another kind that labels are often in."""
+def _refuse_other_formats(path: Path) -> None:
+    """Raise McaptrackError for JSON and XML, which labels are often in."""
     refuse_special(path)
     try:
         with path.open("rb") as stream:
@@ -87,18 +106,21 @@ def _guess(path: Path, number: int, line: str) -> Format:
     )
 
 
-def _refuse_twins(path: Path, labels: Labels) -> None:
-    """Nobody can be in two places in one frame."""
+def _refuse_repeated_ids(path: Path, labels: Labels) -> None:
+    """Raise McaptrackError if an id appears twice in a frame."""
     order = np.lexsort((labels.id, labels.frame))
     frame, who = labels.frame[order], labels.id[order]
-    twins = np.flatnonzero((frame[1:] == frame[:-1]) & (who[1:] == who[:-1]))
-    if len(twins):
-        at = twins[0]
+    repeats = np.flatnonzero((frame[1:] == frame[:-1]) & (who[1:] == who[:-1]))
+    if len(repeats):
+        at = repeats[0]
         raise McaptrackError(f"{path}: id {who[at]} appears twice in frame {frame[at]}")
 
 
 def read_homography(path: Path) -> tuple[float, ...]:
-    """A 3x3 homography, comma or blank separated, as 9 numbers row by row. Raises McaptrackError if it is none."""
+    """Read a 3x3 homography, separated by commas or blanks, as 9 numbers in row order.
+
+    Raises McaptrackError if invalid.
+    """
     words = f"{path} is not a homography: it needs 3 rows of 3 numbers"
     rows: list[list[float]] = []
     for _, line in lines_of(path):

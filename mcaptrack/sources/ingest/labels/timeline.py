@@ -1,8 +1,8 @@
-"""Which picture a labelled frame is, and when that was: one way for all the ways that labels come in.
+"""Assign labelled frames to pictures and their times, in one way for all inputs.
 
-Label files count pictures, from 0 or 1 by their format. Frame ``first_frame`` of a file is picture 0 of the camera that
-the labels belong to, the next frame is picture 1, and so on, whether the pictures come along, stand in a log already or
-are not there at all and follow from a frame rate.
+Label files number pictures, from 0 or 1 depending on the format. Frame ``first_frame`` of a file is picture 0 of the
+camera, the next frame is picture 1, and so on: for pictures that are ingested together with the labels, for pictures of
+an existing log, and for missing pictures, whose times follow from a frame rate.
 
 Letters: P pictures, F labelled frames.
 """
@@ -22,17 +22,17 @@ from mcaptrack.geometry.clocks import LAST_NS, NS_PER_S
 from mcaptrack.notices import warn
 from mcaptrack.sources.ingest.labels.formats import Labels
 
-#: What a frame's number may be at most: more than three days at 30 a second.
+#: The largest frame number: more than three days at 30 frames a second.
 MAX_FRAMES: Final = 10_000_000
-#: Frame numbers of a file without pictures may leave this many frames empty, or this many for each labelled one.
+#: Limits for unlabelled frames of a file without pictures: in total, and for each labelled frame.
 _EMPTY_FRAMES: Final = 100_000
 _EMPTY_A_LABELLED: Final = 100
-#: Pictures are as far apart as a frame rate says if none is further from its place than this share of a frame.
+#: Pictures match a frame rate if none deviates by more than this share of a frame.
 _OFF_FRAMES: Final = Fraction(1, 2)
 
 
 class Placed(NamedTuple):
-    """The labelled frames of a file (F,): their numbers in the file, as pictures counted from 0, and their times."""
+    """The labelled frames of a file (F,): their numbers in the file, picture indexes from 0, and times in ns."""
 
     number: Ints
     index: Ints  # type: ignore[assignment]  # hides tuple.index, which is not needed here
@@ -41,10 +41,10 @@ class Placed(NamedTuple):
 
 @dataclass(frozen=True)
 class Timeline:
-    """The pictures of a camera: ``index`` (P,), counted from 0, and ``t_ns`` (P,), both rising.
+    """The pictures of a camera: ``index`` (P,), counted from 0, and ``t_ns`` (P,), both strictly increasing.
 
-    ``of`` says in words what they are. ``is_complete`` is false where pictures are known to be lost. ``every`` is how
-    far apart their own numbers are: 12 for images of which every twelfth was kept under its number.
+    ``of`` describes them in messages. ``is_complete`` is false if pictures are known to be lost. ``every`` is the step
+    of the numbers in their names: 12 for images of which every twelfth was kept with its number.
     """
 
     index: Ints
@@ -57,7 +57,7 @@ class Timeline:
     def spaced(cls, count: int, fps: Fraction, start_ns: int, of: str) -> Self:
         """``count`` pictures at a frame rate, the first at ``start_ns``.
 
-        Raises McaptrackError if they don't end before 2262, when nanoseconds no longer fit.
+        Raises McaptrackError if they end after 2262, the limit of int64 nanoseconds.
         """
         index = np.arange(count)
         last_ns = start_ns + round(Fraction(max(count - 1, 0)) / fps * NS_PER_S)
@@ -69,29 +69,29 @@ class Timeline:
         return cls(index, start_ns + _times(index, fps), of)
 
     def fits(self, fps: Fraction) -> bool:
-        """Whether the pictures are spaced as a frame rate says, to half a frame."""
+        """Whether the pictures match a frame rate, within half a frame."""
         wanted = self.t_ns[0] + _times(self.index - self.index[0], fps)
         return bool((np.abs(self.t_ns - wanted) <= float(_OFF_FRAMES / fps * NS_PER_S)).all())
 
     @property
     def fps(self) -> float:
-        """Pictures a second, by the usual distance of two; 0 if there are less than two."""
+        """Frame rate by the median interval; 0 if there are less than two pictures."""
         gaps = np.diff(self.t_ns) / np.diff(self.index)
         return NS_PER_S / float(np.median(gaps)) if len(gaps) else 0.0
 
     def place(self, path: Path, labels: Labels, lost: list[str]) -> Placed:
-        """The labelled frames of a file among the pictures, those without labels in between too.
+        """Assign the labelled frames of a file to pictures, including frames without labels in between.
 
-        Raises McaptrackError if labels are of frames before the first or after the last picture. Where pictures are
-        known to be lost, ``lost`` gets words on the labels that went with them instead.
+        Raises McaptrackError if there are labels before the first or after the last picture. If pictures are known to
+        be lost, such labels are reported in ``lost`` instead.
         """
         every = self._every(path, labels)
         at = (labels.frame - labels.first_frame) // every
         end = int(self.index[-1]) + 1
         if at[0] < 0:
             raise McaptrackError(
-                f"{path}: its first label is of frame {labels.frame[0]}, and frame {labels.first_frame} is said to be "
-                "the first picture; say with `first_frame=` which one it is"
+                f"{path}: its first label is of frame {labels.frame[0]}, and frame {labels.first_frame} is assumed to "
+                "be the first picture; give the right number with `first_frame=`"
             )
         beyond = int((at >= end).sum())
         if beyond and (self.is_complete or beyond == len(at)):
@@ -100,13 +100,13 @@ class Timeline:
             lost.append(f"{path}: {beyond} labels are of frames after the last picture that could be read, {end - 1}")
         missing = ~np.isin(at[at < end], self.index)
         if missing.any():
-            lost.append(f"{path}: {int(missing.sum())} labels are of frames whose pictures are missing")
+            lost.append(f"{path}: {int(missing.sum())} labels are of frames with missing pictures")
         step = labels.step // every or 1
         known = self.index % step == (int(labels.labelled[0]) - labels.first_frame) // every % step
         return Placed(every * self.index[known] + labels.first_frame, self.index[known], self.t_ns[known])
 
     def _every(self, path: Path, labels: Labels) -> int:
-        """How many numbers of a label file make a picture: those of labels may be those in the names of images."""
+        """The step of frame numbers in a label file, which may use the numbers in the names of images."""
         if self.every == 1 or ((labels.labelled - labels.first_frame) % self.every).any():
             return 1
         if int(labels.labelled[-1]) > labels.first_frame:
@@ -114,7 +114,7 @@ class Timeline:
         return self.every
 
     def _beyond(self, path: Path, labels: Labels, beyond: int, end: int) -> str:
-        """Words on labels after frame ``end`` of the file, which is the last picture."""
+        """The error for labels after frame ``end`` of the file, the last picture."""
         first, last = int(labels.frame[0]), int(labels.frame[-1])
         some = "all" if beyond == len(labels.frame) else beyond
         words = (
@@ -127,7 +127,7 @@ class Timeline:
 
 
 def _times(index: Ints, fps: Fraction) -> Ints:
-    """When pictures (P,) are at a frame rate, in nanoseconds, rounded to the nearest, halves to the even one."""
+    """The times of pictures (P,) at a frame rate in nanoseconds, rounded half to even."""
     most = int(np.abs(index).max(initial=1)) * fps.denominator * NS_PER_S
     if most >= 2**62 or fps.numerator >= 2**62:
         return np.array([round(Fraction(int(number)) / fps * NS_PER_S) for number in index], np.int64)
@@ -137,9 +137,9 @@ def _times(index: Ints, fps: Fraction) -> Ints:
 
 
 def count_frames(path: Path, labels: Labels) -> int:
-    """How many frames there are up to the last one that a file labels.
+    """The number of frames up to the last one that a file labels.
 
-    Raises McaptrackError if nearly all of them would be empty: then the number is wrong.
+    Raises McaptrackError if nearly all of them would be empty, which means that the numbers are wrong.
     """
     last = max(int(labels.labelled[-1]), int(labels.frame[-1]))
     count = last - labels.first_frame + 1
