@@ -13,9 +13,9 @@ PREFIX: Final = "MCAPTRACK_"
 #: Names and descriptions.
 VARIABLES: Final[Mapping[str, str]] = MappingProxyType(
     {
-        "MCAPTRACK_MAX_CHUNK_MIB": "chunks of a log that say they are larger than this are refused, in MiB",
-        "MCAPTRACK_MAX_MEGAPIXELS": "pictures that say they are larger than this are refused, in millions of pixels",
-        "MCAPTRACK_MAX_UNPACKED_MIB": "what becomes larger than this when it is decompressed is refused, in MiB",
+        "MCAPTRACK_MAX_CHUNK_MIB": "chunks of a log with a larger stated size are refused, in MiB",
+        "MCAPTRACK_MAX_MEGAPIXELS": "pictures with a larger stated size are refused, in millions of pixels",
+        "MCAPTRACK_MAX_UNPACKED_MIB": "compressed data that unpacks to more is refused, in MiB",
         "MCAPTRACK_DATA": "a folder with reference recordings, for the tests",
     }
 )

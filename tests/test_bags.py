@@ -164,7 +164,7 @@ class TestRos1:
             (b"", "is empty"),
             (b"#ROSBAG V1.2\nwhatever", "of version 1.2; 2.0 is read"),
             (b"#ROSBAG V2.0\n", "a record is cut off"),
-            (b"#ROSBAG V2.0\n" + b"\xff" * 5000, "a record is cut off, or is none"),
+            (b"#ROSBAG V2.0\n" + b"\xff" * 5000, "a record is cut off or invalid"),
             (b"hello", "does not begin as one does"),
         ],
     )

@@ -267,7 +267,7 @@ def test_labels_of_images_that_are_missing_or_damaged_are_lost_and_the_others_st
         ingest(found, out, IngestOptions(fps=Fraction(10)))
         with log.read(out) as opened:
             report = ingest(truth, out, IngestOptions(role="truth"), into=opened)
-    assert report.lost[-1] == f"{truth}: 2 labels are of frames whose pictures are missing"
+    assert report.lost[-1] == f"{truth}: 2 labels are of frames with missing pictures"
     assert tracks(out) == {0: [2], ns(0.1): [3], ns(0.3): [5], ns(0.5): [7]}
 
 
@@ -304,7 +304,7 @@ def test_a_picture_that_can_not_be_decoded_keeps_its_number_and_its_time(tmp_pat
         truth = labelled(tmp_path / "gt.txt", *range(1, 9))
         report = ingest(path, tmp_path / "a.mcap", IngestOptions(labels={"truth": truth}, **options))
         assert tracks(tmp_path / "a.mcap") == {ns(n / 10): [n + 2] for n in range(8) if n != 4}
-        assert report.lost[-1] == f"{truth}: 1 labels are of frames whose pictures are missing"
+        assert report.lost[-1] == f"{truth}: 1 labels are of frames with missing pictures"
 
 
 # What is lost, and what is only empty

@@ -15,8 +15,9 @@ from pathlib import Path
 from typing import Final, NamedTuple, overload
 
 from mcaptrack.errors import McaptrackError
+from mcaptrack.log.checksums import crc_of
 from mcaptrack.log.recording_files import refuse_non_mcap
-from mcaptrack.log.records import BLOCK, Damaged, crc_of
+from mcaptrack.log.records import BLOCK, Damaged
 
 #: Read-ahead of small reads in bytes: it starts with the minimum and doubles with every sequential read.
 _MIN_AHEAD: Final = 4 * 2**10

@@ -18,6 +18,7 @@ from mcaptrack.files import follow_links
 from mcaptrack.log import records
 from mcaptrack.log.byte_source import ByteSource, OpenFile, RunningChecksum, Signature
 from mcaptrack.log.check_summary import Finding, Findings, check_summary, record_name
+from mcaptrack.log.checksums import attachment_is_whole
 from mcaptrack.log.chunks import (
     HEAD,
     MAX_NS,
@@ -31,7 +32,16 @@ from mcaptrack.log.chunks import (
 from mcaptrack.log.index import Index, attachment_entry, ends_with_magic, metadata_entry, starts_with_magic
 from mcaptrack.log.journal import journal_of, load_old_content
 from mcaptrack.log.journal_check import changed, find_journal
-from mcaptrack.log.records import MAGIC, Bytes, ChunkIndexRecord, Damaged, Opcode, Reader, Record, walk
+from mcaptrack.log.records import (
+    MAGIC,
+    Bytes,
+    ChunkIndexRecord,
+    Damaged,
+    Opcode,
+    Reader,
+    Record,
+    walk,
+)
 
 Progress = Callable[[str, int, int], None]
 
@@ -212,7 +222,7 @@ class _Checker:
             self._find("unchunked", record.start, "a message outside of chunks: finding it takes a scan", "warning")
             self._count({channel: np.array([[t_ns, record.start]], "<u8")}, record.start)
         elif record.opcode == Opcode.ATTACHMENT:
-            if not records.attachment_is_whole(buffer, record):
+            if not attachment_is_whole(buffer, record):
                 self._find("attachment-checksum", record.start, "the checksum of an attachment is wrong")
             found.attachments.append(attachment_entry(buffer, record, record.start))
         elif record.opcode == Opcode.METADATA:

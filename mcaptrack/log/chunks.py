@@ -14,7 +14,16 @@ from mcaptrack import environment
 from mcaptrack.geometry.arrays import Ints
 from mcaptrack.log import records
 from mcaptrack.log.byte_source import ByteSource
-from mcaptrack.log.records import Bytes, ChunkHead, ChunkIndexRecord, Damaged, Opcode, Record, crc_of, walk
+from mcaptrack.log.checksums import crc_of
+from mcaptrack.log.records import (
+    Bytes,
+    ChunkHead,
+    ChunkIndexRecord,
+    Damaged,
+    Opcode,
+    Record,
+    walk,
+)
 
 Times = NDArray[np.uint64]
 Entries = NDArray[np.uint64]

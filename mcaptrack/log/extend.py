@@ -18,11 +18,21 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.files import can_replace, publish_stream
 from mcaptrack.log import records
 from mcaptrack.log.byte_source import ByteSource
+from mcaptrack.log.checksums import crc_before, crc_of
 from mcaptrack.log.chunks import chunk_record, message_head, open_chunk
 from mcaptrack.log.in_place import rewrite_tail
 from mcaptrack.log.index import Index
 from mcaptrack.log.reader import Log
-from mcaptrack.log.records import BLOCK, MAGIC, Bytes, ChunkIndexRecord, Damaged, Opcode, Record, crc_of, walk
+from mcaptrack.log.records import (
+    BLOCK,
+    MAGIC,
+    Bytes,
+    ChunkIndexRecord,
+    Damaged,
+    Opcode,
+    Record,
+    walk,
+)
 from mcaptrack.log.writer import LogWriter, Sink, refuse_earlier_results, verify
 from mcaptrack.schema.provenance import Provenance
 
@@ -181,7 +191,7 @@ class _Rewrite:
         if not index.data_crc:
             return None
         tail = crc_of(self.source, self.cut, index.data_end)
-        return records.crc_before(index.data_crc, tail, index.data_end - self.cut)
+        return crc_before(index.data_crc, tail, index.data_end - self.cut)
 
     def index_before(self) -> Index:
         """The index of the kept records before the cut."""

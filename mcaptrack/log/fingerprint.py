@@ -32,8 +32,7 @@ def fingerprint(
         say(channel.topic, channel.message_encoding, kept, described, index.counts.get(number, 0))
     for chunk in index.chunks:
         if channel_id is None or channel_id in chunk.message_index_offsets:
-            # The offset of a chunk matters for the whole log, whose messages are located by it, but not for one
-            # channel.
+            # Offsets of chunks matter for the whole log, because they locate its messages, but not for one channel.
             place = (chunk.offset, *sorted(chunk.message_index_offsets)) if channel_id is None else ()
             if chunk.offset not in checksums:
                 checksums[chunk.offset] = _checksum(buffer, chunk)

@@ -268,7 +268,7 @@ def is_left_behind(path: Path) -> bool:
 
 
 def load_old_content(path: Path, log: OpenFile) -> ByteSource | None:
-    """The old content of the log by any journal whose checksums fit: also of version 1, or of a log that was copied.
+    """The old content of the log by any journal with matching checksums: also of version 1, or of a copied log.
 
     None if there is none. Only for writing the content to another file, because it does not prove that the journal
     belongs to this file.
@@ -308,7 +308,9 @@ def _read(file: OpenFile, log: OpenFile) -> tuple[Journal, bool]:
     source = ByteSource.of(file)
     head = bytes(source[0:_HEAD_SIZE])
     if head.startswith(_MAGIC_1):
-        raise UnusableJournal("was left by version 0.1.0, whose journals don't name the file that they belong to")
+        raise UnusableJournal(
+            "was left by version 0.1.0; journals of that version don't name the file that they belong to"
+        )
     if not head.startswith(_MAGIC):
         raise UnusableJournal("is not a journal of mcaptrack")
     incomplete = UnusableJournal("is an incomplete or damaged journal of mcaptrack")

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from mcaptrack.geometry.arrays import Ints
 from mcaptrack.geometry.ragged import ragged_range, run_starts
 from mcaptrack.log.byte_source import ByteSource
+from mcaptrack.log.checksums import crc_of
 from mcaptrack.log.chunks import (
     MAX_NS,
     Entries,
@@ -38,7 +39,6 @@ from mcaptrack.log.records import (
     Damaged,
     Opcode,
     Record,
-    crc_of,
     read_chunk,
     record_at,
 )

@@ -223,7 +223,7 @@ class Log:
             self.snapshot.confirm_unchanged(channels)
 
     def timed(self, topic: str) -> Iterator[Message]:
-        """The messages of a channel in time order, all of whose times fit into int64.
+        """The messages of a channel in time order, with times that fit into int64.
 
         Raises McaptrackError at the first message with a later time, and as ``messages`` does.
         """

@@ -6,8 +6,7 @@ Integers are little endian; strings, arrays and maps are preceded by their lengt
 from __future__ import annotations
 
 import struct
-import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from enum import IntEnum
 from typing import Final, NamedTuple, Protocol, overload
@@ -31,11 +30,9 @@ _CHUNK_INDEX_HEAD: Final = struct.Struct("<QQQQI")
 _CHUNK_INDEX_OFFSET: Final = struct.Struct("<HQ")
 _CHUNK_INDEX_NAME: Final = struct.Struct("<QI")
 _CHUNK_INDEX_SIZES: Final = struct.Struct("<QQ")
-_CRC_POLYNOMIAL: Final = 0xEDB88320
-#: Bytes read at once: of one record, of consecutive records, and for a checksum.
+#: Bytes read at once: of one record, and of consecutive records.
 _LOOKAHEAD: Final = 1024
 _WALK_BLOCK: Final = 64 * 2**10
-_CRC_BLOCK: Final = 2**20
 
 
 class Opcode(IntEnum):
@@ -56,6 +53,20 @@ class Opcode(IntEnum):
     METADATA_INDEX = 0x0D
     SUMMARY_OFFSET = 0x0E
     DATA_END = 0x0F
+
+
+#: The records of a data section.
+DATA_OPCODES: Final = (
+    Opcode.HEADER,
+    Opcode.SCHEMA,
+    Opcode.CHANNEL,
+    Opcode.MESSAGE,
+    Opcode.CHUNK,
+    Opcode.MESSAGE_INDEX,
+    Opcode.ATTACHMENT,
+    Opcode.METADATA,
+    Opcode.DATA_END,
+)
 
 
 class Bytes(Protocol):
@@ -95,7 +106,7 @@ class ChannelRecord(NamedTuple):
 
 
 class ChunkHead(NamedTuple):
-    """The head of a chunk, whose records are in the buffer from ``start`` to ``end``."""
+    """The head of a chunk. Its records are in the buffer from ``start`` to ``end``."""
 
     start_ns: int
     end_ns: int
@@ -227,34 +238,6 @@ def _record(near: memoryview, low: int, at: int, end: int) -> Record:
     return Record(opcode, at, body, body + length)
 
 
-def crc_before(crc: int, tail_crc: int, tail_size: int) -> int:
-    """The CRC-32 of the first part of some bytes, from the CRC of all of them and the CRC and size of the rest.
-
-    The CRC of a concatenation is the CRC of the first part, shifted by the length of the second part, plus the CRC of
-    the second part (zlib's crc32_combine). The shift can be inverted.
-    """
-    shifted = crc ^ tail_crc
-    # The inverse shift by one bit as a 32 x 32 bit matrix; its squares shift back by two, four, eight bits.
-    back = [1 << bit + 1 for bit in range(31)] + [(1 << 31 ^ _CRC_POLYNOMIAL) << 1 & 0xFFFFFFFF | 1]
-    bits = 8 * tail_size
-    while bits:
-        if bits & 1:
-            shifted = _times(back, shifted)
-        back = [_times(back, column) for column in back]
-        bits >>= 1
-    return shifted
-
-
-def _times(columns: Sequence[int], vector: int) -> int:
-    """Product of a bit matrix and a bit vector, over GF(2)."""
-    out = 0
-    for column in columns:
-        if vector & 1:
-            out ^= column
-        vector >>= 1
-    return out
-
-
 def read_schema(buffer: Bytes, record: Record) -> SchemaRecord:
     r = Reader(buffer, record.body, record.end)
     return SchemaRecord(r.number(2), r.text(), r.text(), bytes(r.raw()))
@@ -307,7 +290,7 @@ def read_metadata(buffer: Bytes, record: Record) -> tuple[str, dict[str, str]]:
 
 
 class AttachmentRecord(NamedTuple):
-    """The head of an attachment, whose data is in the buffer from ``start`` to ``end``."""
+    """The head of an attachment. Its data is in the buffer from ``start`` to ``end``."""
 
     log_ns: int
     create_ns: int
@@ -320,19 +303,6 @@ class AttachmentRecord(NamedTuple):
 def read_attachment(buffer: Bytes, record: Record) -> AttachmentRecord:
     r = Reader(buffer, record.body, record.end)
     return AttachmentRecord(r.number(8), r.number(8), r.text(), r.text(), *r.span(8))
-
-
-def crc_of(buffer: Bytes, start: int, end: int, crc: int = 0) -> int:
-    """The CRC-32 of a part of a file, continuing from ``crc``; one block in memory at a time."""
-    for at in range(start, end, _CRC_BLOCK):
-        crc = zlib.crc32(buffer[at : min(at + _CRC_BLOCK, end)], crc)
-    return crc
-
-
-def attachment_is_whole(buffer: Bytes, record: Record) -> bool:
-    """Whether the checksum of an attachment is right; 0 means that it has none."""
-    crc = int.from_bytes(buffer[record.end - 4 : record.end], "little")
-    return not crc or crc_of(buffer, record.body, record.end - 4) == crc
 
 
 def read_header(buffer: Bytes, record: Record) -> tuple[str, str]:

@@ -24,10 +24,12 @@ from mcaptrack.log import records
 from mcaptrack.log.byte_source import ByteSource, RunningChecksum
 from mcaptrack.log.check import content_to_recover, open_bytes
 from mcaptrack.log.check_summary import record_name
+from mcaptrack.log.checksums import attachment_is_whole, crc_of
 from mcaptrack.log.chunks import Entries, message_head, open_chunk, scan_entries
 from mcaptrack.log.index import Index, read_intact_summary, starts_with_magic, summary_start
 from mcaptrack.log.records import (
     BLOCK,
+    DATA_OPCODES,
     MAGIC,
     Bytes,
     ChannelRecord,
@@ -37,7 +39,6 @@ from mcaptrack.log.records import (
     Reader,
     Record,
     SchemaRecord,
-    crc_of,
     walk,
 )
 from mcaptrack.log.writer import LogWriter, create
@@ -57,17 +58,6 @@ _FIRST_STEP: Final = 64 * 2**10
 _LONGEST: Final = 64
 #: This many consecutive messages are not a coincidence.
 _CHAIN: Final = 3
-_IN_DATA: Final = (
-    Opcode.HEADER,
-    Opcode.SCHEMA,
-    Opcode.CHANNEL,
-    Opcode.MESSAGE,
-    Opcode.CHUNK,
-    Opcode.MESSAGE_INDEX,
-    Opcode.ATTACHMENT,
-    Opcode.METADATA,
-    Opcode.DATA_END,
-)
 _NOT_BEHIND: Final = (Opcode.MESSAGE, Opcode.CHUNK, Opcode.MESSAGE_INDEX, Opcode.ATTACHMENT, Opcode.METADATA)
 
 
@@ -186,7 +176,7 @@ class _Recovery:
             return None
         following = bisect_right(self._known_offsets, at)
         reaches_over = following < len(self._known_offsets) and self._known_offsets[following] < record.end
-        return record if (record.opcode in _IN_DATA or record.opcode >= 0x80) and not reaches_over else None
+        return record if (record.opcode in DATA_OPCODES or record.opcode >= 0x80) and not reaches_over else None
 
     def _skip_damage(self, at: int, uncertain_from: int | None) -> int:
         """The offset at which to continue when there is no record at ``at``."""
@@ -196,7 +186,7 @@ class _Recovery:
         if uncertain_from is not None and following < at:  # the length of the last record is wrong
             self._pending, at = None, uncertain_from
         self._copy_pending()
-        is_half = following == len(self._buffer) and not self._known_offsets and self._buffer[at] in _IN_DATA
+        is_half = following == len(self._buffer) and not self._known_offsets and self._buffer[at] in DATA_OPCODES
         words = f"an incomplete {record_name(self._buffer[at])} record" if is_half else "no record can be read here"
         self._report_lost(at, following, self._words(at, words))
         return following
@@ -251,7 +241,7 @@ class _Recovery:
         said = Reader(buffer, record.body, record.end).number(4)
         if self._is_done and said and not self._report.lost and said != self._checksum.up_to(record.start):
             self._report.lost.append(
-                f"byte {record.start}: the checksum of the data section is wrong; chunks with checksums of their own "
+                f"byte {record.start}: the checksum of the data section is wrong; chunks with their own checksums "
                 "are intact, other records may not be"
             )
 
@@ -274,7 +264,7 @@ class _Recovery:
                 self._describe(record)
             elif record.opcode == Opcode.ATTACHMENT:
                 records.read_attachment(buffer, record)
-                if not records.attachment_is_whole(buffer, record):
+                if not attachment_is_whole(buffer, record):
                     raise Damaged("the checksum of an attachment is wrong")
                 writer.copy_attachment(bytes(buffer[record.start : record.end]))
             elif record.opcode == Opcode.METADATA:
@@ -356,7 +346,7 @@ class _Recovery:
             self._describe_if_new(channel.id)
 
     def _add_channel(self, number: int) -> ChannelRecord:
-        """Add a channel to the new log, whose chunks will describe it."""
+        """Add a channel to the new log; the chunks that are copied describe it."""
         channel = self._channels.get(number)
         if channel is None or channel.schema_id not in {0, *self._schemas}:
             raise Damaged(f"a message of channel {number}, which has no intact channel record")

@@ -24,10 +24,11 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.files import publish_stream
 from mcaptrack.log import journal, records
 from mcaptrack.log.byte_source import ByteSource, OpenFile
+from mcaptrack.log.checksums import crc_of
 from mcaptrack.log.chunks import LOG_MAX_NS
 from mcaptrack.log.index import Index, SummaryEntry, attachment_entry, metadata_entry, read_index
 from mcaptrack.log.paths import RESULTS_SUFFIX, results_path
-from mcaptrack.log.records import MAGIC, ChannelRecord, ChunkIndexRecord, Damaged, Opcode, SchemaRecord, crc_of
+from mcaptrack.log.records import MAGIC, ChannelRecord, ChunkIndexRecord, Damaged, Opcode, SchemaRecord
 
 #: The library name in the header record, before the version.
 LIBRARY: Final = "mcaptrack"

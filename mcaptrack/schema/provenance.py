@@ -1,6 +1,6 @@
-"""How a channel was made: kept in its metadata, so that a log explains itself.
+"""The provenance of a channel, stored in its metadata: what made it, from which input, and how.
 
-No wall clock and no path goes in: the same input and command give the same bytes.
+It contains no wall clock time and no path, so that the same input and command give the same bytes.
 """
 
 from __future__ import annotations
@@ -15,15 +15,15 @@ from mcaptrack import __version__
 
 T = TypeVar("T", dict[str, Any], list[Any])
 _PREFIX: Final = "mcaptrack."
-#: The transforms of channels that no stage made: what came in, and what shows others.
+#: ``transform`` of channels that were ingested, and of views.
 INGEST, VIEW = "ingest", "view"
-#: The metadata record that says when the clock of a log's cameras begins, as ``start_ns``.
+#: The metadata record with the start time of a log's cameras, ``start_ns``.
 CLOCK: Final = "mcaptrack.clock"
 
 
 class Plugin(NamedTuple):
-    """A class of another package: the name it was chosen by (of an entry point, or ``module:Class``), where it is
-    defined (``module:Class``), and the installed package that it came from, "" where that wasn't known.
+    """A class of another package: the name that selects it (an entry point, or ``module:Class``), its definition
+    (``module:Class``), and the installed distribution with its version, "" if it is not known.
     """
 
     name: str
@@ -34,12 +34,11 @@ class Plugin(NamedTuple):
 
 @dataclass(frozen=True)
 class Provenance:
-    """What made a channel, from what, and how. ``digest`` is of its own messages, ``input_digest`` of its input's.
+    """How a channel was made. ``digest`` is of its own messages, ``input_digest`` of the messages of its input.
 
-    ``references`` are the topics that the input was compared with, and the digest of each: empty where there was
-    nothing of that name. ``plugins`` are the classes of other packages that it consists of: the ``transform`` itself if
-    it is not built in, and the ``predictor`` in it. ``warnings`` are what was odd about it when it was made: code and
-    message of each.
+    ``references`` are the topics that the input was compared with, and their digests; empty for missing topics.
+    ``plugins`` are the classes of other packages that were used: the ``transform`` itself if it is not built in, and
+    its ``predictor``. ``warnings`` are the warnings when it was made, with code and message.
     """
 
     transform: str
@@ -54,11 +53,11 @@ class Provenance:
     version: str = __version__
 
     def made_from(self) -> dict[str, str]:
-        """All that it was made from and compared with, with their digests."""
+        """The topics that it was made from and compared with, and their digests."""
         return {self.input: self.input_digest, **self.references}
 
     def to_metadata(self) -> dict[str, str]:
-        """As the metadata of an MCAP channel."""
+        """The provenance as metadata of an MCAP channel."""
         values = {
             "transform": self.transform,
             "version": self.version,
@@ -81,7 +80,7 @@ class Provenance:
 
     @classmethod
     def from_metadata(cls, metadata: Mapping[str, str]) -> Self | None:
-        """The way back; None for a channel that mcaptrack did not make."""
+        """Parse the metadata of a channel; None if mcaptrack did not make the channel."""
         values = {key.removeprefix(_PREFIX): value for key, value in metadata.items() if key.startswith(_PREFIX)}
         if "transform" not in values:
             return None
@@ -93,7 +92,7 @@ class Provenance:
 
 
 def _read(text: str, kind: type[T]) -> T:
-    """A JSON object or array; an empty one for anything else."""
+    """Parse a JSON object or array; an empty one for anything else."""
     try:
         value = json.loads(text)
     except (ValueError, RecursionError):
@@ -123,7 +122,7 @@ def _plugins(values: dict[str, str]) -> dict[str, Plugin]:
 
 
 def digest(messages: Iterable[tuple[int, int, bytes]]) -> str:
-    """SHA-256 of messages: time, frame and payload of each."""
+    """SHA-256 of messages: of time, frame number and payload of each."""
     total = hashlib.sha256()
     for t_ns, index, payload in messages:
         total.update(t_ns.to_bytes(8, "little") + index.to_bytes(8, "little") + len(payload).to_bytes(8, "little"))

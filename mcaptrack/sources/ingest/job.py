@@ -136,7 +136,10 @@ class Job:
         """Report what is assumed about the labels, and what of them is left out."""
         firsts = {labels.first_frame: f"frame {labels.first_frame} of {path}" for path, labels in self.labels.values()}
         if len(firsts) > 1:
-            warn(f"{' and '.join(firsts.values())} are assumed to be the same picture; `first_frame=` sets the number", "clock")
+            warn(
+                f"{' and '.join(firsts.values())} are assumed to be the same picture; `first_frame=` sets the number",
+                "clock",
+            )
         for role, (path, labels) in self.labels.items():
             if labels.left_out:
                 warn(f"{path} also holds {labels.left_out}; left out of {role}", "left-out")

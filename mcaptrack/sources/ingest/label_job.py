@@ -97,7 +97,9 @@ class LabelJob(Job):
             role = "tracks" if labels.has_ids else "detections"
             labels = labels if role == "tracks" else self.read(path, role)
         if role in self.labels:
-            raise McaptrackError(f"{path} and {self.labels[role][0]} are both {role}; give the role of {path} with `role=`")
+            raise McaptrackError(
+                f"{path} and {self.labels[role][0]} are both {role}; give the role of {path} with `role=`"
+            )
         self.labels = {role: (path, labels), **self.labels}
 
     def _boxes_extent(self) -> tuple[int, int]:

@@ -1,6 +1,6 @@
 """Read video files and image folders, decode pictures to gray or BGR, and encode H.264, JPEG and PNG.
 
-FFmpeg does the work, through PyAV, whose wheels include it.
+FFmpeg does the work, through PyAV (its wheels include FFmpeg).
 """
 
 from mcaptrack.sources.video.codecs import is_video_codec, read_head

@@ -10,7 +10,7 @@ _SLICE, _PARTITION, _IDR, _SPS, _PPS, _DELIMITER = 1, 2, 5, 7, 8, 9
 _PICTURES: Final = (_SLICE, _PARTITION, _IDR)
 _SETS: Final = frozenset((_SPS, _PPS))
 _B: Final = 1
-#: Profiles whose sequence parameter sets contain chroma_format_idc.
+#: Profiles with chroma_format_idc in their sequence parameter sets.
 _HIGH: Final = (100, 110, 122, 244, 44, 83, 86, 118, 128, 138, 139, 134, 135)
 
 

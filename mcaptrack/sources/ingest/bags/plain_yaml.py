@@ -59,7 +59,7 @@ def load(data: bytes) -> Any:
 def _build(yaml: Any, events: Iterator[Any]) -> Any:
     """Build the value from parser events, in one loop, because deep nesting must not use the stack."""
     documents: list[Any] = []
-    open_values: list[tuple[Any, list[str]]] = [(documents, [])]  # each with the key whose value comes next
+    open_values: list[tuple[Any, list[str]]] = [(documents, [])]  # each with the key of the next value
     for number, event in enumerate(events):
         where = f"line {event.start_mark.line + 1}"
         if number > _MAX_VALUES:

@@ -54,7 +54,7 @@ class Recording(Protocol):
         """All messages in the order of the recording; every call starts from the beginning."""
 
     def extras(self, writer: log.LogWriter, has_clock: bool, is_copied: bool = False) -> None:
-        """Write what the recording holds beside messages, and beside ``as_log`` if that is passed on."""
+        """Write attachments and metadata; if ``is_copied``, only those that ``as_log`` does not contain."""
 
     def close(self) -> None:
         """Close its files."""

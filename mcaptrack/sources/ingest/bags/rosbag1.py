@@ -158,7 +158,7 @@ class Bag1:
             raise _InvalidRecord("a record is cut off")
         size = _U32.unpack(self._at(at, at + 4))[0]
         if size > min(_MAX_HEADER_BYTES, end - at - 8):
-            raise _InvalidRecord("a record is cut off, or is none")
+            raise _InvalidRecord("a record is cut off or invalid")
         head = self._at(at + 4, at + 8 + size)
         fields = _fields(head[:size])
         data = at + 8 + size
@@ -246,7 +246,7 @@ def _fields(data: bytes) -> dict[bytes, bytes]:
         end = at + 4 + _U32.unpack_from(data, at)[0] if len(data) - at >= 4 else len(data) + 1
         name, sign, value = data[at + 4 : end].partition(b"=")
         if end > len(data) or not sign:
-            raise _InvalidRecord("a record's header is none")
+            raise _InvalidRecord("the header of a record is invalid")
         fields[name] = value
         at = end
     return fields

@@ -219,11 +219,7 @@ class Databases(_Files):
         database = Database(path, _TABLES)
         self.closing.callback(database.close)
         self._databases.append(database)
-        wanted = {
-            "topics": {"id", "name", "type", "serialization_format"},
-            "messages": {"topic_id", "timestamp", "data"},
-        }
-        if not all(columns <= set(database.columns(table)) for table, columns in wanted.items()):
+        if not all(columns <= set(database.columns(table)) for table, columns in _NEEDED.items()):
             raise McaptrackError(f"{path} is a database, but none of rosbag2: it has no topics and messages")
         definitions = self._definitions(database)
         has = database.columns("topics")

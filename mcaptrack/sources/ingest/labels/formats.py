@@ -8,9 +8,9 @@
 | trajnet | frame id x y; comma or blank separated                                         | from 0 | m    |
 | obsmat  | frame id x z y vx vz vy; blank separated                                       | from 0 | m    |
 
-MOTChallenge's truth names the class of a box in column 8 since MOT16; in MOT15, which has 10 columns, a position stands
-there. Truth also holds boxes of what isn't scored: see ``IgnoredBoxes``. Tracks and ground truth are restricted to
-people, because their rows have no class; detections keep all classes.
+Ground truth of MOTChallenge has the class of a box in column 8 since MOT16; MOT15, with 10 columns, has a position
+there. Ground truth also contains boxes that are not scored: see ``IgnoredBoxes``. Tracks and ground truth are
+restricted to people, because their rows have no class; detections keep all classes.
 
 Letters: N rows, F frames.
 """
@@ -87,11 +87,11 @@ class IgnoredBoxes:
 class Labels:
     """The rows of a label file, sorted by frame and id.
 
-    ``frame`` (N,) is the number in the file, which is ``first_frame`` for the video's first frame. ``id`` (N,) is -1 in
-    detections. ``boxes_px`` (N, 4) or ``xy_m`` (N, 2) is None where the format has none. ``score`` (N,) is NaN where
-    there is none. ``labelled`` (F,) are the frames that the file has rows of, rising; also of rows that aren't kept.
-    ``class_id`` (N,) is as in the schema of detections; ``classes`` are the names of those that have one. ``left_out``
-    says what the file holds that isn't kept; of truth, ``ignored`` holds it.
+    ``frame`` (N,) is the number in the file; ``first_frame`` is that of the first picture. ``id`` (N,) is -1 in
+    detections. ``boxes_px`` (N, 4) or ``xy_m`` (N, 2) is None if the format has none. ``score`` (N,) is NaN for missing
+    scores. ``labelled`` (F,) are the sorted frames with rows in the file, including rows that were left out.
+    ``class_id`` (N,) is as in the schema of detections; ``classes`` are names by class id. ``left_out`` describes the
+    rows that were left out; those of ground truth are in ``ignored``.
     """
 
     format: Format
@@ -189,7 +189,7 @@ def read_mot(path: Path, lines: Lines, role: Role) -> Labels:
 
     def parse(parts: list[str]) -> list[float]:
         _columns(parts, 6, 10)
-        # With 10 columns it is MOT15, whose column 8 is not a class.
+        # With 10 columns it is MOT15, where column 8 is not a class.
         more = parts[6:8] if len(parts) < 10 else parts[6:7]
         return [*map(float, parts[:6]), *map(float, more), *[np.nan] * (2 - len(more))]
 

@@ -2,7 +2,7 @@
 
 Label files number pictures, from 0 or 1 depending on the format. Frame ``first_frame`` of a file is picture 0 of the
 camera, the next frame is picture 1, and so on: for pictures that are ingested together with the labels, for pictures of
-an existing log, and for missing pictures, whose times follow from a frame rate.
+an existing log, and for missing pictures, with times by a frame rate.
 
 Letters: P pictures, F labelled frames.
 """
