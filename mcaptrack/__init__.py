@@ -1,6 +1,6 @@
 """Find people in a video or a log, track them, repair the tracks, predict where they go, and write it all back."""
 
-__version__ = "0.2.0.dev0"
+__version__ = "0.2.0"
 #: Version of the shape of everything that is printed, or put into a page, as JSON.
 SCHEMA_VERSION = 1
 
