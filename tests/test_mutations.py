@@ -6,6 +6,7 @@ import ast
 
 import pytest
 
+from tools import lines_kept
 from tools.mutations import find, mutants_of, sample
 
 SOURCE = b'''"""A docstring with 1 < 2."""
@@ -83,3 +84,24 @@ def test_every_operator_of_two_numbers_is_changed_into_another(operator):
     for source in (f"c = a {operator} b\n", f"a {operator}= b\n"):
         made = [m.applied(source.encode()).decode() for m in mutants_of("x.py", source.encode())]
         assert [text for text in made if text != source and ast.parse(text)] or (operator == "**" and "=" in source)
+
+
+def test_a_mutant_is_tried_on_the_tests_that_run_its_line_also_after_the_code_has_moved(tmp_path, monkeypatch):
+    body = "def f():\n    x = 1\n    return x + 2\n\n\nLIMIT = 3\n"
+    other = "from mcaptrack.b import LIMIT\n"
+    monkeypatch.setattr(lines_kept, "_package", lambda: {"mcaptrack/a.py": body, "mcaptrack/c.py": other})
+    tests = {
+        "first": {"took_s": 2.0, "lines": {"mcaptrack/a.py": [2, 3]}},
+        "second": {"took_s": 1.0, "lines": {"mcaptrack/a.py": [2, 3], "no longer": [1]}},
+        "third": {"took_s": 0.5, "lines": {"mcaptrack/a.py": [2]}},
+        "beside": {"took_s": 0.1, "lines": {}},
+    }
+    file = "tests/test_mutations.py"
+    lines_kept.Records(tmp_path).write(file, {"collected": {}, "tests": tests, "failed": []})
+    moved = f"import os\n\n{body}"
+    monkeypatch.setattr(lines_kept, "_package", lambda: {"mcaptrack/b.py": moved, "mcaptrack/c.py": other})
+    records = lines_kept.Records(tmp_path)
+    assert records.knows(file)
+    mutants = {m.new: m for m in mutants_of("mcaptrack/b.py", moved.encode())}
+    assert records.tests_of(mutants[b"-"], [file]) == (["second", "first"], 3.0)
+    assert records.tests_of(mutants[b"4"], [file])[0] == ["third", "second", "first", "beside"]  # LIMIT

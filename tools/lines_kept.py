@@ -72,6 +72,8 @@ class Records:
             return {path: set(numbers) for path, numbers in lines.items()}
         out = {}
         for path, numbers in lines.items():
+            if path not in self._old(sources):
+                continue
             now, moved = self._moved(sources, path)
             out[now] = {new for number in numbers for new in moved.get(number, ())}
         return out
@@ -116,7 +118,7 @@ class Records:
             near = [t for t in every if t[2].get(mutant.path)]
             chosen = sorted(near, key=lambda t: t[1])
             around = {test[3] for test in near}
-            chosen += [t for t in every if t not in near and t[3] in around]
+            chosen += sorted((t for t in every if t not in near and t[3] in around), key=lambda t: t[1])
             users = self._users(mutant.path)
             chosen += [t for t in every if t[3] not in around and any(t[2].get(path) for path in users)]
             return [t[0] for t in chosen], sum(t[1] for t in chosen)

@@ -95,7 +95,7 @@ class LinesRun:
         for path in [self._folder / "own", *self._folder.glob("lines.*")]:
             data = coverage.CoverageData(str(path))
             data.read()
-            for file in data.measured_files():
+            for file in filter(lambda name: name.endswith(".py"), data.measured_files()):
                 for line, contexts in data.contexts_by_lineno(file).items():
                     for context in contexts:
                         name = self._names[int(context) - 1] if context.isdigit() else "collecting"
