@@ -187,10 +187,16 @@ def test_the_document_runs_from_top_to_bottom(tmp_path, monkeypatch):
     )
     with log.read(path) as opened:
         pipeline.run(opened, "/camera", pipeline.plan_all(opened, "/camera"))
+    for own, name in (
+        (footage.video, "video.mp4"),
+        (footage.ground_plane, "homography.txt"),
+        (footage.truth, "gt.txt"),
+    ):
+        own.rename(tmp_path / name)
     monkeypatch.chdir(tmp_path)
     blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "python.md").read_text(), re.S)
     names: dict[str, object] = {}
-    exec(compile("\n".join(blocks), "docs/python.md", "exec"), names)
+    exec(compile("\n".join(blocks), "docs/python.md", "exec", dont_inherit=True), names)
     assert isinstance(names["frame"], pd.DataFrame)
     assert names["picture"].rows.ndim == 3
     assert names["message"].topic == "/camera/video"

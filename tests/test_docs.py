@@ -220,7 +220,7 @@ def run(block: Block, prepared: Path, connection: duckdb.DuckDBPyConnection, nam
         case "python":
             printed = io.StringIO()
             with redirect_stdout(printed), importable():
-                exec(compile(block.text, block.place, "exec"), names)
+                exec(compile(block.text, block.place, "exec", dont_inherit=True), names)
             return printed.getvalue()
         case "sql":
             connection.execute(block.text)

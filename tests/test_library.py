@@ -253,3 +253,20 @@ class TestDocumentation:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", mcaptrack.McaptrackWarning)
             assert all(runner.run(test).failed == 0 for test in tests)
+
+
+class TestSurprises:
+    """What was once done without a word is refused or said."""
+
+    def test_a_camera_that_is_not_there_is_refused(self, place):
+        before = Path("log.mcap").read_bytes()
+        outcome = call("run", "log.mcap", "--camera", "camra")
+        assert (outcome.code, outcome.err) == (1, "mcaptrack: log.mcap has no camera camra; it has camera\n")
+        assert Path("log.mcap").read_bytes() == before
+
+    def test_predictions_at_the_rate_of_the_video_are_said(self, place):
+        said = mcaptrack.predict("log.mcap", topic="/camera/tracks", to="/camera/p").warnings
+        assert [(one.code, one.message.partition(",")[0]) for one in said] == [
+            ("clock", "/camera/tracks has 10 frames a second")
+        ]
+        assert mcaptrack.predict("log.mcap", output="b.mcap").warnings == ()

@@ -28,7 +28,7 @@ from mcaptrack.schema.provenance import CLOCK, Provenance
 from mcaptrack.sources import foreign
 from mcaptrack.sources.cameras import camera_at
 from mcaptrack.sources.video import EncodedPicture, decode_gray
-from mcaptrack.transforms import FULL, STAGES, Transform
+from mcaptrack.transforms import FULL, STAGES, Sample, Transform
 from mcaptrack.transforms.to_video_rate import to_video_rate, unchanged_tracks
 
 Progress = Callable[[str, int, int], None]
@@ -218,6 +218,13 @@ def _in_context(opened: log.Log, prefix: str, job: Job, frames: Sequence[Frame],
         steps = np.diff([frame.t_ns for frame in frames])
         if (steps > 0).any():  # frames may share a time
             known["rate_hz"] = round(NS_PER_S / float(np.median(steps[steps > 0])), 6)
+            usual = f"{prefix}/{STAGES[job.stage].reads}"
+            if job.source != usual and known["rate_hz"] > 2 * Sample().rate_hz:
+                warn(
+                    f"{job.source} has {known['rate_hz']:g} frames a second, and {job.stage} takes steps at that rate; "
+                    f"{usual} has {Sample().rate_hz:g} unless it was made otherwise",
+                    "clock",
+                )
     if "poor_scale" in names and is_assumed(planes):
         known["poor_scale"] = is_poor(frames)
     return replace(job.transform, **known)

@@ -68,6 +68,7 @@ def find_camera(opened: log.Log, name: str | None = None, topic: str | None = No
             )
         return prefix
     if name:
+        _refuse_unknown(opened, name)
         return camera_at(opened, "/" + name.strip("/")).prefix
     known = cameras(opened)
     # Recordings of which nothing was made yet count where there is nothing else.
@@ -83,6 +84,13 @@ def find_camera(opened: log.Log, name: str | None = None, topic: str | None = No
         raise McaptrackError(f"{opened.path} has several cameras, {names}; choose one with `camera=`")
     warn(f"several cameras, {names}: taking {usual[0]}; `camera=` chooses another", "chosen-camera")
     return usual[0]
+
+
+def _refuse_unknown(opened: log.Log, name: str) -> None:
+    """Raise McaptrackError for a name that no camera of the log has, if it has any."""
+    names = [one.strip("/") for camera in cameras(opened) for one in camera.names]
+    if names and name.strip("/") not in names:
+        raise McaptrackError(f"{opened.path} has no camera {name}; it has {', '.join(sorted(names))}")
 
 
 def _of_topic(opened: log.Log, topic: str) -> str:
