@@ -181,18 +181,12 @@ def test_what_is_no_log_is_said_in_a_line(tmp_path):
 
 
 def test_the_document_runs_from_top_to_bottom(tmp_path, monkeypatch):
-    footage, path = draw(small_scene(12.0), tmp_path), tmp_path / "log.mcap"
+    footage, path = draw(small_scene(12.0), tmp_path / "mcaptrack-demo"), tmp_path / "log.mcap"
     ingest.ingest(
         footage.video, path, ingest.IngestOptions(ground_plane=footage.ground_plane, labels={"truth": footage.truth})
     )
     with log.read(path) as opened:
         pipeline.run(opened, "/camera", pipeline.plan_all(opened, "/camera"))
-    for own, name in (
-        (footage.video, "video.mp4"),
-        (footage.ground_plane, "homography.txt"),
-        (footage.truth, "gt.txt"),
-    ):
-        own.rename(tmp_path / name)
     monkeypatch.chdir(tmp_path)
     blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "python.md").read_text(), re.S)
     names: dict[str, object] = {}
