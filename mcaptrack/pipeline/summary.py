@@ -33,7 +33,7 @@ class Repair:
 
 
 @dataclass(frozen=True)
-class Scores:
+class SummaryScores:
     """Identity scores (IDF1, 0 to 1) and switches of samples and of re-tracked tracks, and how they were matched."""
 
     idf1: tuple[float, float]
@@ -51,7 +51,7 @@ class Summary:
     repair: Repair | None = None
     forecasts: int | None = None
     horizon_s: float | None = None
-    scores: Scores | None = None
+    scores: SummaryScores | None = None
     ground_plane: str | None = None
 
     def to_json(self) -> dict[str, Any]:
@@ -121,7 +121,7 @@ def _repair(tracked: Rows, repaired: Rows) -> Repair:
     )
 
 
-def _scores(opened: log.Log, truth: str, topics: tuple[str, str]) -> Scores | None:
+def _scores(opened: log.Log, truth: str, topics: tuple[str, str]) -> SummaryScores | None:
     """Scores before and after re-tracking, on the clock that both share; None if they can't be compared."""
     there = [opened.channels.get(topic) for topic in (truth, *topics)]
     if not all(channel and channel.schema_name == TRACKS.name for channel in there):
@@ -138,5 +138,5 @@ def _scores(opened: log.Log, truth: str, topics: tuple[str, str]) -> Scores | No
         except McaptrackError:
             continue  # one of them has no places in these units
         idf1, switches = (tuple(row[name] for row in rows) for name in ("IDF1", "IDSW"))
-        return Scores((idf1[0], idf1[1]), (switches[0], switches[1]), by)
+        return SummaryScores((idf1[0], idf1[1]), (switches[0], switches[1]), by)
     return None
