@@ -11,7 +11,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.files import is_same_file, refuse_special
 from mcaptrack.schema.provenance import CLOCK
 from mcaptrack.sources.ingest.bags.opening import open_recording
-from mcaptrack.sources.ingest.job import IngestOptions, IngestReport, Job, Progress
+from mcaptrack.sources.ingest.job import IngestJob, IngestOptions, IngestReport, Progress
 from mcaptrack.sources.ingest.label_job import LabelJob, label_frames
 from mcaptrack.sources.ingest.labels.formats import Format, Role
 from mcaptrack.sources.ingest.recording_job import RecordingJob
@@ -95,7 +95,7 @@ def ingest(
     return job.report
 
 
-def _job(source: Path, options: IngestOptions, progress: Progress, there: log.Log | None) -> Job:
+def _job(source: Path, options: IngestOptions, progress: Progress, there: log.Log | None) -> IngestJob:
     recorded = open_recording(source)
     if recorded is not None:
         return RecordingJob(source, options, recorded, progress, there)

@@ -97,7 +97,7 @@ class IngestReport:
     uses_camera: bool = False
 
 
-class Job:
+class IngestJob:
     """Base class of inputs: the topics of a camera, its labels and its ground plane.
 
     ``there`` is the log to which channels are added, if it is not a new one.

@@ -21,7 +21,7 @@ from mcaptrack.schema import GROUND_PLANE, Frame
 from mcaptrack.schema.ground_plane import rows_to_plane
 from mcaptrack.schema.provenance import CLOCK
 from mcaptrack.sources.foreign import holds_pictures
-from mcaptrack.sources.ingest.job import IngestOptions, Job
+from mcaptrack.sources.ingest.job import IngestJob, IngestOptions
 from mcaptrack.sources.ingest.labels.camera import (
     ExistingLabels,
     camera_of,
@@ -54,7 +54,7 @@ class _Known(NamedTuple):
     of: str
 
 
-class LabelJob(Job):
+class LabelJob(IngestJob):
     """Label files without pictures, or for the pictures of a log. The first of ``inputs`` is the input itself.
 
     If its role is None, it depends on whether the file has ids. ``default_fps`` is the frame rate of files without one.

@@ -16,8 +16,8 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.clocks import LAST_NS
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.sources import foreign
-from mcaptrack.sources.ingest.bags.recording import Connection, Findings, Recording
-from mcaptrack.sources.ingest.job import IngestOptions, Job, Progress
+from mcaptrack.sources.ingest.bags.recording import Connection, ReadingNotes, RecordingReader
+from mcaptrack.sources.ingest.job import IngestJob, IngestOptions, Progress
 from mcaptrack.sources.ingest.labels.camera import choose_camera, picture_predicate, timeline_of
 from mcaptrack.sources.ingest.labels.timeline import Timeline
 from mcaptrack.sources.video import EncodedPicture, decode_gray
@@ -27,14 +27,14 @@ _MAX_MESSAGE_BYTES: Final = 2**28 - 2**24
 _PROGRESS_EVERY: Final = 256
 
 
-class RecordingJob(Job):
+class RecordingJob(IngestJob):
     """A recording, with labels for its pictures."""
 
     def __init__(
         self,
         source: Path,
         options: IngestOptions,
-        recorded: Recording,
+        recorded: RecordingReader,
         progress: Progress,
         there: log.Log | None = None,
     ) -> None:
@@ -148,7 +148,7 @@ class RecordingJob(Job):
         if len(self._connections) == 1:
             return timeline_of(opened, self.pictures)
         holds_picture = self._holds_picture()
-        return self._timeline(m.t_ns for c, m in self._recorded.messages(Findings()) if holds_picture(c, m.payload))
+        return self._timeline(m.t_ns for c, m in self._recorded.messages(ReadingNotes()) if holds_picture(c, m.payload))
 
     def _timeline(self, t_ns: Iterable[int]) -> Timeline:
         in_order = sorted(t_ns)
@@ -167,7 +167,7 @@ class RecordingJob(Job):
 
     def _write_messages(self, writer: log.LogWriter) -> Timeline:
         """Write all channels and messages; returns the pictures that labels belong to."""
-        found, done, times, holds_picture = Findings(), 0, array("Q"), self._holds_picture()
+        found, done, times, holds_picture = ReadingNotes(), 0, array("Q"), self._holds_picture()
         for connection in self._recorded.connections:
             self._channel(writer, connection)
         total = sum((self._recorded.declared_counts or {}).values())
@@ -239,7 +239,7 @@ class RecordingJob(Job):
             connection: foreign.picture_decoder(foreign.MessageType(*connection.schema, connection.encoding))
             for connection in self._connections
         }
-        for index, (connection, message) in enumerate(self._recorded.messages(Findings())):
+        for index, (connection, message) in enumerate(self._recorded.messages(ReadingNotes())):
             if connection in decoders:
                 picture = decoders[connection](message.payload)
                 where = f"{self.source}: {self.pictures} at {message.t_ns} ns"

@@ -14,7 +14,7 @@ from mcaptrack import foxglove, log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import warn
 from mcaptrack.schema.provenance import CLOCK, Provenance
-from mcaptrack.sources.ingest.job import IngestOptions, Job, Progress
+from mcaptrack.sources.ingest.job import IngestJob, IngestOptions, Progress
 from mcaptrack.sources.ingest.labels.camera import labels_of
 from mcaptrack.sources.ingest.labels.timeline import Timeline
 from mcaptrack.sources.video import Video, open_video
@@ -24,7 +24,7 @@ _FOXGLOVE_ALONE: Final = {"vp9": "VP9", "av1": "AV1"}
 _SAME_FPS: Final = Fraction(1, 1000)
 
 
-class VideoJob(Job):
+class VideoJob(IngestJob):
     """A video or image folder, with its labels."""
 
     drops_clock = True

@@ -9,7 +9,7 @@ from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import refuse_special
 from mcaptrack.sources.ingest.bags.metadata_yaml import METADATA, holds_metadata
-from mcaptrack.sources.ingest.bags.recording import Recording
+from mcaptrack.sources.ingest.bags.recording import RecordingReader
 from mcaptrack.sources.ingest.bags.rosbag1 import Bag1
 from mcaptrack.sources.ingest.bags.rosbag2 import open_bag, open_files
 from mcaptrack.sources.video import IMAGE_SUFFIXES
@@ -18,7 +18,7 @@ _MCAP, _ROS1, _SQLITE, _ZSTD = b"\x89MCAP0\r\n", b"#ROSBAG V", b"SQLite format 3
 _SUFFIXES: Final = {".mcap": "an MCAP file", ".bag": "a ROS bag", ".db3": "a rosbag2 database"}
 
 
-def open_recording(path: Path) -> Recording | None:
+def open_recording(path: Path) -> RecordingReader | None:
     """Open the recording at ``path``; None if it is something else.
 
     Raises McaptrackError for a recording that can't be read.
@@ -51,7 +51,7 @@ def is_mcap(path: Path) -> bool:
         return False
 
 
-def _open_folder(path: Path) -> Recording | None:
+def _open_folder(path: Path) -> RecordingReader | None:
     if holds_metadata(path / METADATA):
         return open_bag(path)
     names = sorted(entry.name for entry in path.iterdir())

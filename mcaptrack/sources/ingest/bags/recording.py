@@ -20,14 +20,14 @@ class Connection:
 
 
 @dataclass
-class Findings:
+class ReadingNotes:
     """Remarks about a recording (``notes``), and the parts that can't be read (``lost``)."""
 
     notes: list[str] = field(default_factory=list)
     lost: list[str] = field(default_factory=list)
 
 
-class Recording(Protocol):
+class RecordingReader(Protocol):
     """A recording, open for reading."""
 
     @property
@@ -35,7 +35,7 @@ class Recording(Protocol):
         """The profile in the MCAP registry: ros1, ros2."""
 
     @property
-    def words(self) -> Findings:
+    def words(self) -> ReadingNotes:
         """Findings before any message is read."""
 
     @property
@@ -50,7 +50,7 @@ class Recording(Protocol):
     def as_log(self) -> log.Log | None:
         """The recording as a log, if it is a single MCAP file; else None."""
 
-    def messages(self, found: Findings) -> Iterator[tuple[Connection, log.Message]]:
+    def messages(self, found: ReadingNotes) -> Iterator[tuple[Connection, log.Message]]:
         """All messages in the order of the recording; every call starts from the beginning."""
 
     def extras(self, writer: log.LogWriter, has_clock: bool, is_copied: bool = False) -> None:

@@ -15,7 +15,7 @@ from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.sources.ingest.bags import decompression
-from mcaptrack.sources.ingest.bags.recording import Connection, Findings
+from mcaptrack.sources.ingest.bags.recording import Connection, ReadingNotes
 
 _MESSAGE, _BAG, _CHUNK, _CHUNK_INFO, _CONNECTION = 2, 3, 5, 6, 7
 _MAGIC: Final = b"#ROSBAG V2.0\n"
@@ -51,11 +51,11 @@ class Bag1:
         self._size = path.stat().st_size
         self._known: dict[int, Connection] = {}
         self.declared_counts: Mapping[Connection, int] | None = None
-        self.words = Findings()
+        self.words = ReadingNotes()
         try:
             self._end, self._why_unindexed = self._read_index()
             if self._why_unindexed:
-                for _ in self.messages(Findings()):
+                for _ in self.messages(ReadingNotes()):
                     pass
         except _InvalidRecord as error:
             self.close()
@@ -72,7 +72,7 @@ class Bag1:
     def extras(self, writer: log.LogWriter, has_clock: bool, is_copied: bool = False) -> None:
         """A bag holds nothing but messages."""
 
-    def messages(self, found: Findings) -> Iterator[tuple[Connection, log.Message]]:
+    def messages(self, found: ReadingNotes) -> Iterator[tuple[Connection, log.Message]]:
         """All messages in the order of the bag. Parts that can't be read are reported in ``found``."""
         at, sequence = self._start, dict[int, int]()
         if self._why_unindexed:  # without an index there is no way to tell whether messages are missing
@@ -177,7 +177,7 @@ class Bag1:
                 f"connection {number} is of {known.topic}, and of {described.topic} or of other words here"
             )
 
-    def _unchunked(self, record: _Record, found: Findings) -> Iterator[tuple[int, int, bytes]]:
+    def _unchunked(self, record: _Record, found: ReadingNotes) -> Iterator[tuple[int, int, bytes]]:
         """A record outside of chunks: messages of a chunk that was never finished."""
         if record.op in (_MESSAGE, _CONNECTION):
             try:
@@ -186,7 +186,7 @@ class Bag1:
             except _InvalidRecord as error:
                 found.lost.append(f"{self.path}: byte {record.data}: {error}")
 
-    def _chunk(self, record: _Record, found: Findings) -> Iterator[tuple[int, int, bytes]]:
+    def _chunk(self, record: _Record, found: ReadingNotes) -> Iterator[tuple[int, int, bytes]]:
         """The messages of a chunk, or of its complete part."""
         where = f"{self.path}: the chunk at byte {record.data}"
         try:

@@ -20,9 +20,9 @@ from mcaptrack.notices import warn
 from mcaptrack.schema.provenance import CLOCK
 from mcaptrack.sources.ingest.bags import decompression
 from mcaptrack.sources.ingest.bags.metadata_yaml import METADATA, Bag, holds_metadata, read_metadata
-from mcaptrack.sources.ingest.bags.recording import Connection, Findings, Recording
+from mcaptrack.sources.ingest.bags.recording import Connection, ReadingNotes, RecordingReader
 from mcaptrack.sources.ingest.bags.ros_definitions import known_definition
-from mcaptrack.sources.ingest.bags.sqlite_tables import Database
+from mcaptrack.sources.ingest.bags.sqlite_tables import SqliteTables
 
 _MCAP_MAGIC, _SQLITE_MAGIC, _ZSTD_MAGIC = b"\x89MCAP0\r\n", b"SQLite format 3\0", b"\x28\xb5\x2f\xfd"
 #: A message that is larger decompressed is not read.
@@ -36,7 +36,7 @@ _NEEDED: Final = {
 _TABLES: Final = ("topics", "messages", "metadata", "schema", "message_definitions")
 
 
-def open_bag(folder: Path) -> Recording:
+def open_bag(folder: Path) -> RecordingReader:
     """Open the bag in a folder with metadata.yaml. Raises McaptrackError if it can't be read or is incomplete."""
     bag, names = read_metadata(folder / METADATA)
     paths = [folder / name for name in names]
@@ -67,7 +67,7 @@ def open_bag(folder: Path) -> Recording:
     return source
 
 
-def open_files(paths: Sequence[Path], whole: Path, bag: Bag | None = None) -> Recording:
+def open_files(paths: Sequence[Path], whole: Path, bag: Bag | None = None) -> RecordingReader:
     """Open the files of a split recording as one; ``whole`` names it in messages."""
     if bag is None:
         bag = _metadata_beside(paths)
@@ -125,7 +125,7 @@ class _Files:
 
     def __init__(self, paths: Sequence[Path], whole: Path, bag: Bag) -> None:
         self.paths, self.whole, self.bag = paths, whole, bag
-        self.words = Findings()
+        self.words = ReadingNotes()
         self.closing = ExitStack()
         self.declared_counts: dict[Connection, int] = {}
         self._known_connections: dict[tuple[object, ...], Connection] = {}
@@ -147,7 +147,7 @@ class _Files:
         """Close the files."""
         self.closing.close()
 
-    def messages(self, found: Findings) -> Iterator[tuple[Connection, log.Message]]:
+    def messages(self, found: ReadingNotes) -> Iterator[tuple[Connection, log.Message]]:
         """All messages, file by file, in their order there."""
         self._message_counts = {}
         for number in range(len(self.paths)):
@@ -161,7 +161,7 @@ class _Files:
     def _open(self, number: int) -> None:
         raise NotImplementedError
 
-    def _messages(self, number: int, found: Findings) -> Iterator[tuple[Connection, log.Message]]:
+    def _messages(self, number: int, found: ReadingNotes) -> Iterator[tuple[Connection, log.Message]]:
         yield from ()
 
     def _connection(self, repeats: dict[object, int], known: Connection, messages: int) -> Connection:
@@ -195,7 +195,7 @@ class Databases(_Files):
     """SQLite databases."""
 
     def __init__(self, paths: Sequence[Path], whole: Path, bag: Bag) -> None:
-        self._databases: list[Database] = []
+        self._databases: list[SqliteTables] = []
         self._topics: list[dict[int, Connection]] = []
         self._distro = bag.distro
         self._undefined: dict[str, str] = {}
@@ -216,7 +216,7 @@ class Databases(_Files):
 
     def _open(self, number: int) -> None:
         path = self.paths[number]
-        database = Database(path, _TABLES)
+        database = SqliteTables(path, _TABLES)
         self.closing.callback(database.close)
         self._databases.append(database)
         if not all(columns <= set(database.columns(table)) for table, columns in _NEEDED.items()):
@@ -239,7 +239,7 @@ class Databases(_Files):
             {key: self._connection(repeats, described[key], counts[key]) for key in sorted(described, key=_in_order)}
         )
 
-    def _count(self, database: Database, described: dict[int, Connection]) -> Counter[int]:
+    def _count(self, database: SqliteTables, described: dict[int, Connection]) -> Counter[int]:
         """Count the messages of each topic. Messages of unknown topics are lost."""
         counts: Counter[int] = Counter()
         strange: Counter[object] = Counter()
@@ -259,7 +259,7 @@ class Databases(_Files):
         ]
         return counts
 
-    def _definitions(self, database: Database) -> dict[str, tuple[tuple[str, str, bytes], str]]:
+    def _definitions(self, database: SqliteTables) -> dict[str, tuple[tuple[str, str, bytes], str]]:
         """Schema record and type hash of each message type that a database defines."""
         if not self._distro and "ros_distro" in database.columns("schema"):
             self._distro = next((_text(row[0]) for row in database.rows("schema", ["ros_distro"])), "")
@@ -280,7 +280,7 @@ class Databases(_Files):
         text, self._undefined[kind] = known_definition(kind, self._distro.lower(), digest)
         return (kind, "ros2msg", text.encode()) if self._undefined[kind] else (kind, "", b"")
 
-    def _messages(self, number: int, found: Findings) -> Iterator[tuple[Connection, log.Message]]:
+    def _messages(self, number: int, found: ReadingNotes) -> Iterator[tuple[Connection, log.Message]]:
         known, path = self._topics[number], self.paths[number]
         left = decompression.limit_of(path.stat().st_size)
         for key, t_ns, data in self._databases[number].rows("messages", ["topic_id", "timestamp", "data"]):
@@ -331,7 +331,7 @@ class Logs(_Files):
             known[channel.id] = self._connection(repeats, described, opened.index.counts.get(channel.id, 0))
         self._channels.append(known)
 
-    def _messages(self, number: int, found: Findings) -> Iterator[tuple[Connection, log.Message]]:
+    def _messages(self, number: int, found: ReadingNotes) -> Iterator[tuple[Connection, log.Message]]:
         known, path = self._channels[number], self.paths[number]
         left = decompression.limit_of(path.stat().st_size)
         for channel, message in log.stream(self.logs[number]):

@@ -35,7 +35,7 @@ _JOURNAL_END: Final = bytes(16)
 _ORDINARY: Final = 0
 
 
-class Database:
+class SqliteTables:
     """An SQLite file, open for reading. Raises McaptrackError, in one line, for everything that is wrong with it."""
 
     def __init__(self, path: Path, tables: Collection[str]) -> None:

@@ -24,14 +24,14 @@ from mcaptrack.sources.video import EncodedPicture, decode_gray, is_video_codec,
 DEFAULT: Final = "camera"
 
 
-class Camera(NamedTuple):
+class CameraTopics(NamedTuple):
     """The prefix of all topics of a camera, and the topic of its pictures, "" if there are none."""
 
     prefix: str
     pictures: str
 
 
-def choose_camera(where: object, camera: str, topics: Collection[str]) -> Camera:
+def choose_camera(where: object, camera: str, topics: Collection[str]) -> CameraTopics:
     """The camera with this name, among topics of pictures.
 
     The name may also be a topic of pictures itself, or be below a camera: a second set of labels for the pictures of
@@ -42,17 +42,17 @@ def choose_camera(where: object, camera: str, topics: Collection[str]) -> Camera
     prefix = "/" + camera.strip("/")
     for at in (prefix, *_above(prefix)):
         if at in topics:
-            return Camera(camera_prefix(at) if at == prefix else prefix, at)
+            return CameraTopics(camera_prefix(at) if at == prefix else prefix, at)
         found = sorted(topic for topic in topics if camera_prefix(topic) == at)
         if len(found) == 1 or f"{at}/video" in found:
-            return Camera(prefix, f"{at}/video" if len(found) > 1 else found[0])
+            return CameraTopics(prefix, f"{at}/video" if len(found) > 1 else found[0])
         if found:
             raise McaptrackError(
                 f"{where}: {at} has several topics of pictures, {', '.join(found)}; name one with "
                 f"`camera={found[0].strip('/')!r}`"
             )
     if camera != DEFAULT or not topics:
-        return Camera(prefix, "")
+        return CameraTopics(prefix, "")
     if len(topics) > 1:
         names = sorted({camera_prefix(topic).strip("/") for topic in topics})
         names = names if len(names) == len(topics) else sorted(topic.strip("/") for topic in topics)
@@ -61,7 +61,7 @@ def choose_camera(where: object, camera: str, topics: Collection[str]) -> Camera
             f"those of one: choose with `camera={names[0]!r}`"
         )
     (topic,) = topics
-    return Camera(camera_prefix(topic), topic)
+    return CameraTopics(camera_prefix(topic), topic)
 
 
 def _above(prefix: str) -> Iterator[str]:
@@ -76,7 +76,7 @@ def camera_prefix(topic: str) -> str:
     return f"/{folder}" if slash else f"/{DEFAULT}"
 
 
-def camera_of(opened: log.Log, camera: str) -> Camera:
+def camera_of(opened: log.Log, camera: str) -> CameraTopics:
     """The camera with this name in a log. Raises McaptrackError as ``choose_camera`` does."""
     topics = [c.topic for c in opened.channels.values() if foreign.holds_pictures(c) and c.messages]
     return choose_camera(opened.path, camera, topics)

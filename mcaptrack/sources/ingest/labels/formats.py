@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
-from mcaptrack.sources.ingest.labels.number_table import Lines, Table
+from mcaptrack.sources.ingest.labels.number_table import Lines, NumberTable
 
 Format = Literal["auto", "mot", "kitti", "sdd", "trajnet", "obsmat"]
 Role = Literal["detections", "tracks", "truth"]
@@ -156,7 +156,7 @@ def _all_persons(count: int) -> Classes:
     return np.full(count, PERSON, np.uint32)
 
 
-def _boxes(table: Table, columns: slice, corners: bool = False) -> Floats:
+def _boxes(table: NumberTable, columns: slice, corners: bool = False) -> Floats:
     """Boxes (N, 4) of left, top, width, height; ``corners``: the columns are left, top, right, bottom."""
     boxes = table.within(columns, "a coordinate", _MAX_PLACE)
     if corners:
@@ -168,11 +168,11 @@ def _boxes(table: Table, columns: slice, corners: bool = False) -> Floats:
     return boxes
 
 
-def _frame(table: Table, column: int) -> Ints:
+def _frame(table: NumberTable, column: int) -> Ints:
     return table.whole(column, "the frame (a count of pictures, no time)", 0, _MAX_FRAME)
 
 
-def _score(table: Table, column: int) -> Floats:
+def _score(table: NumberTable, column: int) -> Floats:
     """A column of scores, NaN for missing ones."""
     score = table.values[:, column]
     table.refuse(np.abs(score) > _MAX_SCORE, lambda row: f"a score can't be {score[row]:g}")
@@ -193,7 +193,7 @@ def read_mot(path: Path, lines: Lines, role: Role) -> Labels:
         more = parts[6:8] if len(parts) < 10 else parts[6:7]
         return [*map(float, parts[:6]), *map(float, more), *[np.nan] * (2 - len(more))]
 
-    table = Table(path, lines, "MOTChallenge (frame, id, left, top, width, height, score, ...)", 8, parse)
+    table = NumberTable(path, lines, "MOTChallenge (frame, id, left, top, width, height, score, ...)", 8, parse)
     frame, who = _frame(table, 0), table.whole(1, "the id", NO_ID)
     boxes, score, kind = _boxes(table, slice(2, 6)), _score(table, 6), table.values[:, 7]
     named = np.isfinite(kind)
@@ -245,7 +245,7 @@ def read_kitti(path: Path, lines: Lines, role: Role) -> Labels:
         return [*(float(parts[at]) for at in (0, 1, 3, 4, 6, 7, 8, 9)), score, names.number(parts[2])]
 
     columns = "frame id type truncated occluded alpha left top right bottom height width length x y z rotation score"
-    table = Table(path, lines, f"KITTI tracking ({columns})", 10, parse)
+    table = NumberTable(path, lines, f"KITTI tracking ({columns})", 10, parse)
     frame, who = _frame(table, 0), table.whole(1, "the id", NO_ID)
     boxes, score, kind = _boxes(table, slice(4, 8), corners=True), _score(table, 8), table.values[:, 9]
     truncated, occluded = table.values[:, 2], table.values[:, 3]
@@ -291,7 +291,7 @@ def read_sdd(path: Path, lines: Lines, role: Role) -> Labels:
         return [*map(float, parts[:9]), names.number(parts[9].strip('"'))]
 
     columns = 'id xmin ymin xmax ymax frame lost occluded generated "label"'
-    table = Table(path, lines, f"Stanford Drone annotations ({columns})", 10, parse)
+    table = NumberTable(path, lines, f"Stanford Drone annotations ({columns})", 10, parse)
     frame, who = _frame(table, 5), table.whole(0, "the id", 0)
     boxes, kind = _boxes(table, slice(1, 5), corners=True), table.values[:, 9]
     lost = table.values[:, 6] != 0
@@ -333,7 +333,7 @@ def _positions(path: Path, lines: Lines, name: Format, what: str, columns: int, 
         _columns(parts, columns, columns)
         return [float(part) for part in parts]
 
-    table = Table(path, lines, what, columns, parse)
+    table = NumberTable(path, lines, what, columns, parse)
     frame, who = _frame(table, 0), table.whole(1, "the id", 0)
     xy_m, none = table.within(place, "a position", _MAX_PLACE), np.full(len(frame), np.nan)
     return Labels(name, 0, frame, who, None, xy_m, none, np.unique(frame), _all_persons(len(frame)))

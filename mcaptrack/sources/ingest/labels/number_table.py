@@ -50,7 +50,7 @@ def split(line: str) -> list[str]:
     return [part.strip() for part in line.split(",")] if "," in line else line.split()
 
 
-class Table:
+class NumberTable:
     """Rows of numbers: ``values`` (N, C), and their line numbers ``line`` (N,).
 
     ``parse`` converts the parts of a line to C numbers, and raises ValueError if they are not a valid row. ``what``
