@@ -1,4 +1,4 @@
-"""The command line: parse, call, print. One verb a question; ``mcaptrack --help`` lists them.
+"""The command line: each command parses, calls the library, and prints. ``mcaptrack --help`` lists them.
 
 The command itself is ``mcaptrack.__main__``, which loads this.
 """

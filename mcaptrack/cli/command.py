@@ -1,4 +1,4 @@
-"""A command as Typer knows it, whose options also come from the environment and from files, and may have old names."""
+"""Typer commands with options that can also be set in the environment and in files, and that may have old names."""
 
 from __future__ import annotations
 

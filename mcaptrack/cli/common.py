@@ -1,4 +1,4 @@
-"""What all commands share: options, words and progress on stderr, JSON on stdout, faults in one line."""
+"""What all commands share: options, notes and progress on stderr, JSON on stdout, errors in one line."""
 
 from __future__ import annotations
 
@@ -148,21 +148,21 @@ LabelFps = Annotated[
 
 
 def similarity(shown: str) -> Any:
-    """What makes a person and a track alike; ``shown`` says what happens unless it is given."""
-    words = "How a person and a track are compared: overlap of boxes (iou), or distance on the ground (metres)."
+    """The option for how ground truth and tracks are matched; ``shown`` says what happens unless it is given."""
+    words = "How ground truth and tracks are matched: by overlap of boxes (iou) or distance on the ground (metres)."
     return option("--similarity", panel=SCORES, tuning=True, help=words, show_default=shown)
 
 
 def gate_m(shown: str | bool = True, tuning: str | bool = True, was: str = "") -> Any:
     """The largest distance of a match."""
-    words = "Largest distance in metres at which a person and a track match."
+    words = "Gate: largest distance in metres at which ground truth and a track match."
     ends: dict[str, Any] = {} if isinstance(tuning, str) else {"least": 0.001, "most": 1e6}  # text is several numbers
     return option("--gate-m", panel=SCORES, tuning=tuning, was=was, help=words, show_default=shown, **ends)
 
 
 def min_iou(was: str = "", was_if: tuple[str, str] | None = None) -> Any:
     """The least overlap of a match."""
-    words = "Least overlap (IoU) at which a person and a track match."
+    words = "Least overlap (IoU) at which ground truth and a track match."
     about: dict[str, Any] = {"was": was, "was_if": was_if, "least": 0.001, "most": 1}
     return option("--min-iou", panel=SCORES, tuning=True, help=words, show_default="0.5", **about)
 
@@ -175,7 +175,7 @@ Logs = Annotated[
 def register(
     app: typer.Typer, panel: str, name: str, command: Callable[..., None], words: str | None = None, reads: bool = False
 ) -> None:
-    """Add a command, below a heading of the help, whose options can also come from MCAPTRACK_NAME_OPTION and files.
+    """Add a command below a heading of the help. Its options can also be set by MCAPTRACK_NAME_OPTION and in files.
 
     One that ``reads`` changes no file, but the one that -o names.
     """
@@ -186,7 +186,7 @@ def register(
 
 
 class Talk:
-    """Words and progress for people. Progress only on a terminal; nothing but warnings if ``quiet``."""
+    """Prints notes and progress to stderr: progress on a terminal only; with ``quiet`` nothing but warnings."""
 
     def __init__(self, quiet: bool, verbose: bool = False) -> None:
         self.quiet, self.verbose = quiet, verbose
@@ -195,13 +195,13 @@ class Talk:
         self._shown = 0.0
 
     def say(self, words: str) -> None:
-        """A line on stderr."""
+        """Print a line to stderr."""
         if not self.quiet:
             self._stop()
             say(words)
 
     def detail(self, words: str) -> None:
-        """A line that only matters to some."""
+        """Print a line to stderr with --verbose."""
         if self.verbose:
             self.say(words)
 
@@ -295,7 +295,7 @@ def _printing_notes(talk: Talk) -> Iterator[None]:
 
 
 def one_line(command: Callable[P, None]) -> Callable[P, None]:
-    """An error that a user can mend becomes one line and exit code 1; warnings become lines and stand in the JSON."""
+    """Print errors that a user can fix as one line and exit with code 1; print warnings, and keep them for the JSON."""
 
     @wraps(command)
     def guarded(*args: P.args, **kwargs: P.kwargs) -> None:
@@ -322,7 +322,7 @@ def one_line(command: Callable[P, None]) -> Callable[P, None]:
 
 
 def _show_warning(notice: Notice) -> None:
-    """A warning on stderr, once."""
+    """Print a warning to stderr, once."""
     warned = _WARNED.get()
     notice = notice._replace(message=with_flags(notice.message))
     if notice not in warned:
@@ -332,7 +332,7 @@ def _show_warning(notice: Notice) -> None:
 
 @contextmanager
 def printed_to(output: Path | None, force: bool) -> Iterator[None]:
-    """What is printed to stdout goes to this file instead, if there is one."""
+    """Write to this file, if there is one, what is printed to stdout."""
     if output is None:
         yield
         return

@@ -42,9 +42,9 @@ def demo(
 ) -> None:
     """Draw a scene with known ground truth, run everything on it, and compare SORT with re-tracking.
 
-    The scene has what makes tracking fail: people who cross, who meet and part, who are hidden for a second, a tree
-    that sways, a camera that shakes a little. Writes a video, a log, tables and layouts. The scores of one scene are
-    one draw: the mean and the range over ten seeds of each scene stand below them.
+    The scene has what makes tracking fail: people who cross, meet and part, occlusion behind a kiosk, a tree that
+    sways, a camera that shakes a little. Writes a video, a log, tables and layouts. The scores of one scene are one
+    draw: the mean and the range over ten seeds of each scene are printed below them.
 
     Example: mcaptrack demo --scene crowd --seed 7 -o crowd
     """

@@ -70,7 +70,7 @@ _DEEPEST: Final = 30
 
 
 def _lineage(channels: list[dict[str, Any]], verbose: bool) -> Tree:
-    """What was made from what, as a tree whose roots are the channels that were recorded or ingested."""
+    """The lineage of channels as a tree; its roots are the channels that were recorded or ingested."""
     from rich.text import Text
     from rich.tree import Tree
 

@@ -70,7 +70,7 @@ def _help(stage: Stage) -> str:
 
 
 def _option(field: Field[Any], annotation: Any, of: str = "") -> inspect.Parameter:
-    """An option that is None unless it is given, and whose help shows what happens then.
+    """The option for a parameter: None unless it is given; its help shows the default.
 
     ``of`` names the one of several transforms that it belongs to, if it doesn't belong to all.
     """
@@ -116,7 +116,7 @@ def _parameter(name: str, annotation: Any, default: Any) -> inspect.Parameter:
 def _stage_command(stage: Stage, plugins: Mapping[str, type[Transform]] = MappingProxyType({})) -> Callable[..., None]:
     """The function behind a stage's command: its signature is made of what its transforms declare.
 
-    ``plugins`` are transforms of other packages whose options it has, too.
+    ``plugins`` are transforms of other packages; their options are added.
     """
     kinds = {**stage.built_in(), **plugins}
     own = {name: _options_of(kind) for name, kind in kinds.items()}

@@ -1,4 +1,4 @@
-"""``mcaptrack train``: learn a predictor from tracks, or from walks that are made up."""
+"""``mcaptrack train``: train a predictor on tracks or on synthetic walks."""
 
 from __future__ import annotations
 
@@ -271,7 +271,7 @@ def _windows(
 
     parts, words = [], []
     if SYNTHETIC in sources:
-        talk.say(f"making up {walks} walks ...")
+        talk.say(f"simulating {walks} walks ...")
         parts.append(synthetic(recipe, walks, recipe.seed))
         words.append(f"{walks} synthetic walks of mcaptrack {__version__}, seed {recipe.seed}")
     paths = common.expand([Path(source) for source in sources if source != SYNTHETIC])
