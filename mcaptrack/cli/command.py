@@ -85,6 +85,10 @@ class Group(TyperGroup):
         """Take what stands before the command; an unknown option is refused in one line."""
         if not args:
             return super().parse_args(ctx, args)  # which prints the help
+        from mcaptrack.cli.plugins import with_plugins
+
+        self._own = getattr(self, "_own", None) or dict(self.commands)
+        self.commands = with_plugins(self._own, args)
         with _usage_in_one_line():
             return super().parse_args(ctx, args)
 

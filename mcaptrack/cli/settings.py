@@ -111,9 +111,10 @@ class Setting:
     def check(self, value: Any, where: str) -> None:
         """Raise McaptrackError for a number out of range. ``where`` it was set, if not on the command line."""
         least, most = self.declared.least, self.declared.most
-        if self.kind in (int, float) and value is not None and not least <= value <= most:
-            words = limits(least, most) or "a number"
-            raise McaptrackError(f"{where or f'--{self.name}'} has to be {words}, not {value}")
+        for one in (value or ()) if self.many else (value,):
+            if self.kind in (int, float) and one is not None and not least <= one <= most:
+                words = limits(least, most) or "a number"
+                raise McaptrackError(f"{where or f'--{self.name}'} has to be {words}, not {one}")
 
     def may_tune(self, value: Any) -> bool:
         """Whether a file in the working folder may give this value."""

@@ -60,10 +60,11 @@ def add_stages(app: typer.Typer, panel: str) -> None:
     """A command for all transforms, and one for each, below a heading of the help."""
     common.register(app, panel, "run", common.one_line(run_all))
     for stage in STAGES.values():
-        common.register(app, panel, stage.name, common.one_line(_stage_command(stage)), _help(stage))
+        common.register(app, panel, stage.name, common.one_line(stage_command(stage)), stage_help(stage))
 
 
-def _help(stage: Stage) -> str:
+def stage_help(stage: Stage) -> str:
+    """What the help of a stage's command says."""
     where = f"From /camera/{stage.reads} to /camera/{stage.writes}. Inputs that are missing are made first."
     words = [inspect.cleandoc(one.__doc__ or "") for one in stage.built_in().values()]
     return "\n\n".join([*words, where, _EXAMPLES[stage.name]])
@@ -113,12 +114,12 @@ def _parameter(name: str, annotation: Any, default: Any) -> inspect.Parameter:
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
 
 
-def _stage_command(stage: Stage, plugins: Mapping[str, type[Transform]] = MappingProxyType({})) -> Callable[..., None]:
+def stage_command(stage: Stage, plugins: Mapping[str, type[Transform]] = MappingProxyType({})) -> Callable[..., None]:
     """The function behind a stage's command: its signature is made of what its transforms declare.
 
     ``plugins`` are transforms of other packages; their options are added.
     """
-    kinds = {**stage.built_in(), **plugins}
+    kinds = {**plugins, **stage.built_in()}
     own = {name: _options_of(kind) for name, kind in kinds.items()}
     parameters = [_parameter("logs", common.Logs, inspect.Parameter.empty)]
     if stage.kind:
@@ -142,11 +143,12 @@ def _stage_command(stage: Stage, plugins: Mapping[str, type[Transform]] = Mappin
     for name, found in own.items():
         for option in found:
             there.setdefault(option, []).append(name)
-    shared = len(stage.built_in())
+    built_in = set(stage.built_in())
     for option, those in there.items():
         name = those[0]
+        is_shared = built_in <= set(those)
         hint = get_type_hints(kinds[name])[option]
-        parameters.append(_option(own[name][option], hint, name if len(those) < shared or name in plugins else ""))
+        parameters.append(_option(own[name][option], hint, "" if is_shared else name))
     to = common.option("--to", panel=common.FILES, help="Write to this channel instead of the default one.")
     parameters += [
         _parameter("topic", Topic, None),
@@ -160,6 +162,11 @@ def _stage_command(stage: Stage, plugins: Mapping[str, type[Transform]] = Mappin
         _parameter("verbose", common.Verbose, False),
         _parameter("config", common.Config, None),
     ]
+
+    taken = [parameter.name for parameter in parameters]
+    if twice := {name for name in taken if taken.count(name) > 1 or name == "help"}:
+        words = f"{' and '.join(plugins)} can't have a parameter {' or '.join(sorted(twice))}"
+        raise McaptrackError(f"{words}: that is the name of an option of {stage.name}")
 
     def command(**given: Any) -> None:
         wanted = {option: given[option] for option in there if given[option] is not None}

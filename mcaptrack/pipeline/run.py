@@ -29,6 +29,7 @@ from mcaptrack.sources import foreign
 from mcaptrack.sources.cameras import camera_at
 from mcaptrack.sources.video import EncodedPicture, decode_gray
 from mcaptrack.transforms import FULL, STAGES, Sample, Transform
+from mcaptrack.transforms.guarded import guarded
 from mcaptrack.transforms.to_video_rate import to_video_rate, unchanged_tracks
 
 Progress = Callable[[str, int, int], None]
@@ -139,7 +140,10 @@ def _run_job(
     outputs: list[list[Frame]] = [[] for _ in transform.writes]
     try:
         with collected() as warnings:
-            for result in transform(given.stream):
+            entry = STAGES[job.stage].entry(type(transform))
+            is_own = STAGES[job.stage].is_built_in(type(transform))
+            results = transform(given.stream) if is_own else guarded(entry, transform, given.stream)
+            for result in results:
                 for frame, channel in zip(result, outputs, strict=True):
                     channel.append(frame)
             if not warnings:  # otherwise it is known why

@@ -1,0 +1,102 @@
+"""Options of detectors, trackers and so on of other packages: a command has them where one is chosen.
+
+Which are chosen is looked up before the command line is parsed: in its words, in the environment and in files. Nothing
+is imported but what is named there, and, where a file or the environment sets an option that a stage doesn't have by
+itself, what installed packages declare by entry points.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Final
+
+import typer
+from typer.main import get_command
+
+from mcaptrack.cli import common
+from mcaptrack.cli.config import ConfigFile, read_files
+from mcaptrack.cli.stages import stage_command, stage_help
+from mcaptrack.cli.text import say
+from mcaptrack.environment import PREFIX
+from mcaptrack.errors import McaptrackError
+from mcaptrack.registry import BUILT_IN, names
+from mcaptrack.transforms import STAGES, Stage, Transform
+
+_HELP: Final = ("--help", "-h")
+
+
+def with_plugins(commands: Mapping[str, Any], words: Sequence[str]) -> dict[str, Any]:
+    """The commands, those of stages with the options of what is chosen for them in this call.
+
+    Ends the command with exit code 1 if what its words name can't be had.
+    """
+    called = next((word for word in words if not word.startswith("-")), "")
+    if called not in commands:
+        return dict(commands)
+    files = [] if set(words) & set(_HELP) else _files(called, words)
+    found = dict(commands)
+    for stage in STAGES.values():
+        if stage.kind is None:
+            continue
+        try:
+            plugins = dict(_of_words(stage, words))
+        except McaptrackError as error:
+            say(f"mcaptrack: {error}")
+            raise typer.Exit(common.REFUSED) from None
+        for name in _of_settings(stage, files, commands[stage.name].settings):
+            try:
+                plugins.setdefault(name, stage.find(name).cls)
+            except McaptrackError:
+                continue  # said where it is used
+        if plugins:
+            found[stage.name] = _command(stage, plugins, commands[stage.name].rich_help_panel)
+    return found
+
+
+def _files(called: str, words: Sequence[str]) -> list[ConfigFile]:
+    given = [*_values(words, "config"), os.environ.get(f"{PREFIX}{called.upper()}_CONFIG", "")]
+    return read_files(Path(given[0]) if given[0] else None)
+
+
+def _values(words: Sequence[str], option: str) -> list[str]:
+    """What words of a command line give for an option."""
+    after = [value for word, value in pairwise(words) if word == f"--{option}"]
+    return after + [word.partition("=")[2] for word in words if word.startswith(f"--{option}=")]
+
+
+def _of_words(stage: Stage, words: Sequence[str]) -> Iterator[tuple[str, type[Transform]]]:
+    for option in filter(None, (stage.kind, stage.was)):
+        for name in _values(words, option):
+            if name not in BUILT_IN[stage.kind or ""]:
+                yield name, stage.find(name).cls
+
+
+def _of_settings(stage: Stage, files: Sequence[ConfigFile], known: Mapping[str, Any]) -> list[str]:
+    """The names that the environment and files give for a stage. A file in the working folder can't name a module."""
+    kind = stage.kind
+    assert kind is not None
+    found = [os.environ.get(f"{PREFIX}{command}_{kind}".upper(), "") for command in (stage.name, "run")]
+    options: set[str] = set()
+    for file in files:
+        for command in (stage.name, "run"):
+            table = file.tables.get(command)
+            name = table.get(kind) if isinstance(table, dict) else None
+            if isinstance(name, str) and (file.trusted or ":" not in name):
+                found.append(name)
+        table = file.tables.get(stage.name)
+        options |= {key.replace("_", "-") for key in table} if isinstance(table, dict) else set()
+    start = f"{PREFIX}{stage.name}_".upper()
+    options |= {name.removeprefix(start).lower().replace("_", "-") for name in os.environ if name.startswith(start)}
+    if options - set(known):
+        found += names(kind)
+    return [name for name in dict.fromkeys(found) if name and name not in BUILT_IN[kind]]
+
+
+def _command(stage: Stage, plugins: Mapping[str, type[Transform]], panel: str) -> Any:
+    """The command of a stage with options of plug-ins."""
+    app = typer.Typer(add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False)
+    common.register(app, panel, stage.name, common.one_line(stage_command(stage, plugins)), stage_help(stage))
+    return get_command(app)
