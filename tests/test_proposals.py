@@ -106,6 +106,14 @@ class Scene:
         Path("mcaptrack.toml").write_text("[track]\nmax-age-s = 7.0\n")
         return self.says("run", "LOG", "--no-tables")
 
+    def by_own_tracker(self) -> str:
+        """Tracks are those of a class in a file, and out of date."""
+        text = "from mcaptrack.transforms import Sort\n\n\nclass Own(Sort):\n    pass\n"
+        Path("own_tracker_of_a_scene.py").write_text(text)
+        self.says("track", "LOG", "--tracker", "own_tracker_of_a_scene:Own")
+        self.says("detect", "LOG", "--detector", "mog2")
+        return self.says("run", "LOG", "--no-tables")
+
     def bag(self) -> str:
         """The name is that of a recording of another kind."""
         self.path.unlink()
@@ -148,6 +156,7 @@ SCENES: dict[str, Callable[[Scene], str]] = {
     "pipeline/findings.py:warn_of_what_stands:ingest": Scene.side_view,
     "pipeline/findings.py:warn_of_what_stands:retrack": Scene.side_view,
     "pipeline/plan.py:_warn_of_settings:run": Scene.of_a_later_version,
+    "pipeline/plan.py:_refusal:run": Scene.by_own_tracker,
     "pipeline/plan.py:_not_made:*": Scene.elsewhere,
     "pipeline/write.py:find_views:run": lambda s: s.untracked().says("render", "LOG"),
     "viewing/report/contents.py:_score:ingest": lambda s: s.without("/camera/truth*").page(),

@@ -85,6 +85,10 @@ def _lineage(channels: list[dict[str, Any]], verbose: bool) -> Tree:
         parent, channel, depth = waiting.pop()
         label = Text(printable(channel["topic"]))
         label.append(f"  {printable(channel['transform'])}" if channel["transform"] else "", "dim")
+        for plugin in (channel["plugins"] or {}).values():
+            package = f"{plugin['distribution']} {plugin['version']}".strip()
+            words = f"  {plugin['name']}" + (f" ({package})" if package else "")
+            label.append(printable(words), "dim")
         label.append("  out of date" if channel["stale"] else "", "red")
         node = parent.add(label)
         if verbose and channel["parameters"]:

@@ -198,7 +198,7 @@ class _Planner:
         transform = wanted if self._anew or is_replaced else before
         if transform is None:
             if is_missing or source != had or isinstance(why_not, MissingPluginError):
-                raise McaptrackError(f"{self._opened.path}: {topic} can't be made from {source}: {why_not}")
+                raise McaptrackError(self._refusal(topic, source, why_not))
             why = "is out of date and" if is_due else "is not made again, it"
             warn(f"{topic} {why} stays as it is: {why_not}", "out-of-date" if is_due else "left-out")
             return False
@@ -228,6 +228,15 @@ class _Planner:
             return rebuild(STAGES[stage], made, self._defaults), None
         except McaptrackError as error:
             return None, error
+
+    def _refusal(self, topic: str, source: str, why_not: McaptrackError | None) -> str:
+        """Why a channel can't be made again, and what to do."""
+        words = f"{self._opened.path}: {topic} can't be made from {source}: {why_not}"
+        if not isinstance(why_not, MissingPluginError) or not why_not.options:
+            return words
+        return (
+            f"{words}, as in {command('run', self._opened.path, *why_not.options)}; another name replaces what it made"
+        )
 
     def _warn_of_settings(self, main: str, differing: str) -> None:
         """Say once for all outputs of a stage that they were made with other settings."""

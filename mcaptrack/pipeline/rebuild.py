@@ -21,7 +21,12 @@ from mcaptrack.transforms.protocol import member_type
 
 
 class MissingPluginError(McaptrackError):
-    """A class of another package that made a channel is not installed, or not named by the user."""
+    """A class of another package that made a channel is not installed, or not named by the user.
+
+    ``options`` are those that name it for ``run``; none if that is not enough.
+    """
+
+    options: tuple[str, ...] = ()
 
 
 def plugins_of(stage: Stage, transform: Transform) -> dict[str, Plugin]:
@@ -89,10 +94,11 @@ def _installed(kind: Any, plugin: Plugin) -> Entry:
     """The entry that a plug-in is, if it may be imported. Raises MissingPluginError."""
     words = _words(kind, plugin)
     if ":" in plugin.name:
-        raise MissingPluginError(
-            f"{words} made it, and a class that has no entry point is imported only if you name it: give "
-            f"--{kind} {plugin.name}, or another {kind} to replace it"
+        error = MissingPluginError(
+            f"{words} made it, and a class without an entry point is imported only if you name it"
         )
+        error.options = (f"--{kind}", plugin.name)
+        raise error
     if not is_installed(kind, plugin.name):
         package = f"{plugin.distribution} {plugin.version}".strip() or "the package that has it"
         raise MissingPluginError(

@@ -1,0 +1,337 @@
+"""A detector, a tracker and a predictor of another package: chosen by entry points, seen in the log, removed again."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from collections.abc import Iterator
+from importlib import invalidate_caches
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mcaptrack import log
+from mcaptrack.schema import SCHEMAS
+from mcaptrack.schema.provenance import Plugin, Provenance
+from tests.commands import called, done, made_log
+from tests.test_registry import package
+
+MODULE = """
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+import numpy as np
+
+from mcaptrack.schema import DETECTIONS, TRACKS, VIDEO
+from mcaptrack.transforms.protocol import option
+
+
+@dataclass(frozen=True, kw_only=True)
+class Corner:
+    "One box in every picture."
+    size_px: float = option(8.0, "how large the box is, in pixels", least=1.0)
+    reads: ClassVar = VIDEO
+    writes: ClassVar = {"": DETECTIONS}
+    latency_s: ClassVar = {"": 0.0}
+
+    def __call__(self, frames):
+        for frame in frames:
+            x = [20.0 + frame.index]
+            rows = DETECTIONS.rows(x_px=x, y_px=x, w_px=[self.size_px], h_px=[self.size_px], class_id=[1])
+            yield (frame._replace(rows=rows),)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Single:
+    "All boxes are one track."
+    track_id: int = option(7, "the id", least=0)
+    scales: tuple[float, ...] = option((1.0,), "factors for the width")
+    name: Literal["a", "b"] = option("a", "a name")
+    reads: ClassVar = DETECTIONS
+    writes: ClassVar = {"": TRACKS}
+    latency_s: ClassVar = {"": 0.0}
+
+    def __call__(self, frames):
+        for frame in frames:
+            first = frame.rows[:1]
+            boxes = {name: first[name] for name in ("x_px", "y_px", "h_px")} | {"w_px": first["w_px"] * self.scales[-1]}
+            count = len(first)
+            rows = TRACKS.rows(
+                track_id=[self.track_id] * count, observed=[True] * count, source_id=[-1] * count, **boxes
+            )
+            yield (frame._replace(rows=rows),)
+
+
+@dataclass(frozen=True)
+class Standing:
+    steps: int
+    step_s: float
+    past: int = 1
+
+    def predict(self, xy_m, valid):
+        mean = np.repeat(xy_m[:, -1:], self.steps, axis=1)
+        return mean, np.tile(np.eye(2), (len(xy_m), self.steps, 1, 1))
+"""
+ENTRIES = {
+    "detectors": {"corner": "own:Corner"},
+    "trackers": {"single": "own:Single"},
+    "predictors": {"standing": "own:Standing"},
+}
+ALL = ["--detector", "corner", "--tracker", "single", "--predictor", "standing"]
+
+
+@pytest.fixture(scope="module")
+def template(tmp_path_factory) -> Path:
+    return made_log(tmp_path_factory.mktemp("made"), 20)
+
+
+@pytest.fixture
+def place(template, tmp_path, monkeypatch) -> Iterator[Path]:
+    """The working folder, with a log; ``site`` in it stands for the installed packages."""
+    shutil.copy(template, tmp_path / "a.mcap")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
+    monkeypatch.syspath_prepend(str(tmp_path / "site"))
+    install()
+    yield tmp_path
+    sys.modules.pop("own", None)
+
+
+def install(version: str = "1.5", text: str = MODULE) -> None:
+    """Put the package there, or another version of it in its place."""
+    shutil.rmtree("site", ignore_errors=True)
+    Path("site").mkdir()
+    Path("site/own.py").write_text(text)
+    package(Path("site"), "own", version, "mcaptrack.detectors", {})
+    points = Path(f"site/own-{version}.dist-info/entry_points.txt")
+    lines = [
+        line
+        for kind, entries in ENTRIES.items()
+        for line in (f"[mcaptrack.{kind}]", *(f"{name} = {where}" for name, where in entries.items()))
+    ]
+    points.write_text("\n".join(lines) + "\n")
+    uncached()
+
+
+def uncached() -> None:
+    sys.modules.pop("own", None)
+    shutil.rmtree("site/__pycache__", ignore_errors=True)
+    invalidate_caches()
+
+
+def made(topic: str) -> Provenance:
+    with log.read(Path("a.mcap")) as opened:
+        found = Provenance.from_metadata(opened.channels[topic].metadata)
+    assert found is not None
+    return found
+
+
+def codes(*words: str) -> list[str]:
+    return [one["code"] for one in json.loads(done(*words, "--json", "-q").out)["warnings"]]
+
+
+def rows(topic: str) -> Any:
+    with log.read(Path("a.mcap")) as opened:
+        return opened.rows(topic, SCHEMAS[opened.channels[topic].schema_name]).rows
+
+
+def test_they_are_used_seen_made_again_and_refused_when_they_are_gone(place):
+    done("detect", "a.mcap", "--detector", "corner", "--size-px", "9", "-q")
+    done(
+        "track",
+        "a.mcap",
+        "--tracker",
+        "single",
+        "--track-id",
+        "5",
+        "--scales",
+        "2",
+        "--scales",
+        "3",
+        "--name",
+        "b",
+        "-q",
+    )
+    done("predict", "a.mcap", "--predictor", "standing", "-q")
+    assert made("/camera/detections").plugins == {"transform": Plugin("corner", "own:Corner", "own", "1.5")}
+    tracks = made("/camera/tracks")
+    assert tracks.plugins == {"transform": Plugin("single", "own:Single", "own", "1.5")}
+    assert tracks.parameters == {"tracker": "single", "track_id": 5, "scales": [2.0, 3.0], "name": "b"}
+    assert made("/camera/predictions").plugins == {"predictor": Plugin("standing", "own:Standing", "own", "1.5")}
+    assert set(rows("/camera/tracks")["track_id"]) == {5}
+    assert set(rows("/camera/tracks")["w_px"]) == {27.0}
+    assert rows("/camera/predictions")["cov_xx_m2"].tolist() == [1.0] * len(rows("/camera/predictions"))
+    said = done("info", "a.mcap").out
+    assert "/camera/tracks  track  single (own 1.5)" in said
+    (channel,) = [
+        one
+        for one in json.loads(done("info", "a.mcap", "--json").out)["results"][0]["channels"]
+        if one["topic"] == "/camera/tracks"
+    ]
+    assert channel["plugins"]["transform"] == {
+        "name": "single", "implementation": "own:Single", "distribution": "own", "version": "1.5"
+    }  # fmt: skip
+
+    before = {topic: made(topic).digest for topic in ("/camera/detections", "/camera/tracks", "/camera/predictions")}
+    assert "other-version" not in codes("run", "a.mcap", "--no-tables", "--force")
+    assert {topic: made(topic).digest for topic in before} == before  # the same classes and parameters
+    assert made("/camera/tracks") == tracks
+
+    install("2.0")
+    assert codes("run", "a.mcap", "--no-tables", "--force").count("other-version") == 3
+
+    shutil.rmtree("site")
+    uncached()
+    kept = Path("a.mcap").read_bytes()
+    refused = called("run", "a.mcap", "--no-tables", "--force")
+    assert refused.code == 1
+    assert refused.err == (
+        "mcaptrack: a.mcap: /camera/detections can't be made from /camera/video: detector corner (own 2.0) made it, which "
+        "is not installed; install own 2.0, or replace it with another --detector\n"
+    )
+    assert "tracker single (own 2.0)" in called("run", "a.mcap", "--no-tables", "--force", "--detector", "knn").err
+    assert Path("a.mcap").read_bytes() == kept
+    done("run", "a.mcap", "--no-tables")  # nothing is to be made again
+    done("run", "a.mcap", "--no-tables", "-q", "--detector", "knn", "--tracker", "sort", "--predictor", "cv")
+    assert made("/camera/tracks").parameters["tracker"] == "sort"
+    assert made("/camera/predictions").plugins == {}
+
+
+def test_an_entry_point_that_another_package_has_now_is_not_the_same(place):
+    done("track", "a.mcap", "--tracker", "single", "-q")
+    shutil.rmtree("site/own-1.5.dist-info")
+    package(Path("site"), "thief", "1.5", "mcaptrack.trackers", {"single": "own:Single"})
+    uncached()
+    refused = called("run", "a.mcap", "--no-tables", "--force")
+    assert refused.code == 1
+    assert "tracker single (own 1.5) made it; the tracker of that name is now that of thief" in refused.err
+
+
+def test_a_log_cannot_have_a_module_imported(place):
+    """Only the user can name a class that has no entry point."""
+    (place / "beside_the_log.py").write_text(MODULE)
+    done("track", "a.mcap", "--tracker", "beside_the_log:Single", "-q")
+    del sys.modules["beside_the_log"]
+    refused = called("run", "a.mcap", "--no-tables", "--force")
+    assert refused.code == 1
+    assert "imported only if you name it, as in `mcaptrack run a.mcap --tracker beside_the_log:Single`" in refused.err
+    assert "beside_the_log" not in sys.modules
+    done("run", "a.mcap", "--no-tables", "--force", "-q", "--tracker", "beside_the_log:Single")
+    assert made("/camera/tracks").parameters["tracker"] == "beside_the_log:Single"
+    del sys.modules["beside_the_log"]
+
+
+def test_files_and_environment_choose_them_and_set_their_options(place, monkeypatch):
+    (place / "mcaptrack.toml").write_text('[track]\ntracker = "single"\ntrack-id = 3\nscales = [2]\n')
+    done("track", "a.mcap", "-q")
+    assert made("/camera/tracks").parameters == {"tracker": "single", "track_id": 3, "scales": [2.0], "name": "a"}
+    done("track", "a.mcap", "-q", "--tracker", "sort")  # the options of the other one are left out
+    assert made("/camera/tracks").parameters["tracker"] == "sort"
+    done("info", "a.mcap", "-q")
+    (place / "mcaptrack.toml").write_text("[track]\ntrack-id = 4\n")
+    done("track", "a.mcap", "-q", "--tracker=single")
+    assert made("/camera/tracks").parameters["track_id"] == 4
+    monkeypatch.setenv("MCAPTRACK_TRACK_TRACKER", "single")
+    monkeypatch.setenv("MCAPTRACK_TRACK_TRACK_ID", "6")
+    done("run", "a.mcap", "-q", "--no-tables", "--force")
+    assert made("/camera/tracks").parameters["track_id"] == 6
+
+
+def test_a_file_in_the_working_folder_names_no_module(place):
+    (place / "mcaptrack.toml").write_text('[track]\ntracker = "own:Single"\n')
+    refused = called("track", "a.mcap")
+    assert (refused.code, refused.err.count("\n"), "own" in sys.modules) == (2, 1, False)
+    assert "may tune and nothing else; give --tracker" in refused.err
+    done("track", "a.mcap", "--config", "mcaptrack.toml", "-q")
+    assert made("/camera/tracks").parameters["tracker"] == "single"  # the entry point of the same class
+
+
+def test_the_help_lists_the_options_of_the_one_that_is_named(place, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "120")
+    assert "--track-id" not in called("track", "--help").out
+    words = called("track", "--tracker", "single", "--help").out
+    assert "Options of single alone" in words
+    assert "--track-id" in words
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "said"),
+    [
+        (["--tracker", "single", "--track-id", "-1"], 1, "--track-id has to be from 0 to 1000000, not -1"),
+        (["--tracker", "single", "--track-id", "x"], 2, "'x' is not a whole number"),
+        (["--tracker", "single", "--name", "c"], 2, "invalid value for '--name'"),
+        (["--tracker", "sort", "--track-id", "1"], 2, "no such option: --track-id"),
+        (["--tracker", "corner"], 1, "no tracker is called corner"),
+        (
+            ["--tracker", "own:Corner"],
+            1,
+            "tracker own:Corner (own 1.5) reads foxglove.CompressedVideo; a tracker reads",
+        ),
+        (
+            ["--tracker", "single", "--min-iou", "0.1"],
+            1,
+            "--min-iou is an option of sort and bytetrack and ocsort, not of",
+        ),
+    ],
+)
+def test_wrong_options_are_refused_in_one_line(place, words, code, said):
+    refused = called("track", "a.mcap", *words)
+    assert (refused.code, refused.err.count("\n")) == (code, 1)
+    assert said in refused.err
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("        for frame in frames:\n            first", "        raise StopIteration\n        for frame in frames:\n            first", "failed before the first frame: RuntimeError: generator raised StopIteration"),
+        ("count = len(first)", "count = 1 / 0", "failed at frame 0 (0 ns): ZeroDivisionError: division by zero (own.py, line"),
+        ("track_id=[self.track_id] * count, ", "", "ValueError: mcaptrack.Tracks needs the column track_id"),
+        ("yield (frame._replace(rows=rows),)\n\n\n@dataclass(frozen=True)", "yield frame._replace(rows=rows)\n\n\n@dataclass(frozen=True)", "gave a Frame at frame 0 (0 ns); it has to yield a tuple with a Frame for each of its outputs (1)"),
+        ("yield (frame._replace(rows=rows),)\n\n\n@dataclass(frozen=True)", "yield (frame,)\n\n\n@dataclass(frozen=True)", "gave rows at frame 0 (0 ns) that are wrong: mcaptrack.Tracks has the columns"),
+        ("yield (frame._replace(rows=rows),)\n\n\n@dataclass(frozen=True)", "yield (frame._replace(rows=rows, t_ns=10**9 - frame.t_ns),)\n\n\n@dataclass(frozen=True)", "), after one of 1000000000 ns"),
+        ("yield (frame._replace(rows=rows),)\n\n\n@dataclass(frozen=True)", "yield (frame._replace(rows=None),)\n\n\n@dataclass(frozen=True)", "that are a NoneType, no NumPy array"),
+        ("        for frame in frames:\n            first", "        return None\n\n    def other(self, frames):\n        for frame in frames:\n            first", "failed before the first frame: TypeError: 'NoneType' object is not iterable"),
+    ],
+    ids=["StopIteration", "raises", "no column", "no tuple", "other rows", "order", "no rows", "returns nothing"],
+)  # fmt: skip
+def test_a_tracker_that_goes_wrong_is_named_in_one_line(place, old, new, said):
+    assert old in MODULE
+    start = MODULE.index("class Single")
+    install(text=MODULE[:start] + MODULE[start:].replace(old, new, 1))
+    before = Path("a.mcap").read_bytes()
+    refused = called("track", "a.mcap", "--tracker", "single")
+    assert (refused.code, refused.err.count("\n")) == (1, 1), refused.err
+    assert "tracker single (own 1.5)" in refused.err
+    assert said in refused.err
+    assert Path("a.mcap").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("past: int = 1", "past: int = 0", "has steps=12, step_s=0.4, past=0; all have to be above 0"),
+        ("past: int = 1", "other: int = 1", "needs the numbers steps, step_s and past: AttributeError"),
+        ("past: int = 1", "past: int", "could not be made with steps, step_s: TypeError"),
+        ("def predict", "def forecast", "has no method predict"),
+        ("return mean,", "return mean / 0 * np.nan,", "gave numbers that are not finite"),
+        ("return mean,", "return mean[:, :1],", "gave mean and covariance of shape (1, 1, 2) and (1, 12, 2, 2)"),
+        ("np.eye(2), (len", "-np.eye(2), (len", "gave covariances that are not symmetric with variances above 0"),
+        (
+            "return mean,",
+            "raise KeyError('x')\n        return mean,",
+            "failed on 1 tracks: KeyError: 'x' (own.py, line",
+        ),
+    ],
+)
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+def test_a_predictor_that_goes_wrong_is_named_in_one_line(place, old, new, said):
+    done("detect", "a.mcap", "--detector", "corner", "-q")
+    done("track", "a.mcap", "--tracker", "single", "-q")
+    start = MODULE.index("class Standing")
+    install(text=MODULE[:start] + MODULE[start:].replace(old, new, 1))
+    refused = called("predict", "a.mcap", "--predictor", "standing", "-q")
+    assert (refused.code, refused.err.count("\n")) == (1, 1), refused.err
+    assert "predictor standing (own 1.5)" in refused.err
+    assert said in refused.err
