@@ -341,7 +341,7 @@ def test_results_of_a_class_that_only_the_log_names_are_not_made_again(path, sta
     assert first.plugins["transform"].implementation == first.parameters[kind] == name
     done("run", path, "--no-tables", "-q")  # what was made from it follows
     before = path.read_bytes()
-    refused = called("run", path, "--no-tables", "--force")
+    refused = call("run", path, "--no-tables", "--force")
     assert refused.code == 1
     assert f"{kind} {name}" in refused.err.splitlines()[-1]
     assert f"imported only if you name it, as in `mcaptrack run {path} --{kind} {name}`" in refused.err

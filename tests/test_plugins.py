@@ -15,8 +15,8 @@ import pytest
 from mcaptrack import log
 from mcaptrack.schema import SCHEMAS
 from mcaptrack.schema.provenance import Plugin, Provenance
-from tests.commands import called, done, made_log
-from tests.test_registry import package
+from tests.commands import call, done, made_log
+from tests.distributions import package
 
 MODULE = """
 from dataclasses import dataclass
@@ -185,13 +185,13 @@ def test_they_are_used_seen_made_again_and_refused_when_they_are_gone(place):
     shutil.rmtree("site")
     uncached()
     kept = Path("a.mcap").read_bytes()
-    refused = called("run", "a.mcap", "--no-tables", "--force")
+    refused = call("run", "a.mcap", "--no-tables", "--force")
     assert refused.code == 1
     assert refused.err == (
         "mcaptrack: a.mcap: /camera/detections can't be made from /camera/video: detector corner (own 2.0) made it, which "
         "is not installed; install own 2.0, or replace it with another --detector\n"
     )
-    assert "tracker single (own 2.0)" in called("run", "a.mcap", "--no-tables", "--force", "--detector", "knn").err
+    assert "tracker single (own 2.0)" in call("run", "a.mcap", "--no-tables", "--force", "--detector", "knn").err
     assert Path("a.mcap").read_bytes() == kept
     done("run", "a.mcap", "--no-tables")  # nothing is to be made again
     done("run", "a.mcap", "--no-tables", "-q", "--detector", "knn", "--tracker", "sort", "--predictor", "cv")
@@ -204,7 +204,7 @@ def test_an_entry_point_that_another_package_has_now_is_not_the_same(place):
     shutil.rmtree("site/own-1.5.dist-info")
     package(Path("site"), "thief", "1.5", "mcaptrack.trackers", {"single": "own:Single"})
     uncached()
-    refused = called("run", "a.mcap", "--no-tables", "--force")
+    refused = call("run", "a.mcap", "--no-tables", "--force")
     assert refused.code == 1
     assert "tracker single (own 1.5) made it; the tracker of that name is now that of thief" in refused.err
 
@@ -214,7 +214,7 @@ def test_a_log_cannot_have_a_module_imported(place):
     (place / "beside_the_log.py").write_text(MODULE)
     done("track", "a.mcap", "--tracker", "beside_the_log:Single", "-q")
     del sys.modules["beside_the_log"]
-    refused = called("run", "a.mcap", "--no-tables", "--force")
+    refused = call("run", "a.mcap", "--no-tables", "--force")
     assert refused.code == 1
     assert "imported only if you name it, as in `mcaptrack run a.mcap --tracker beside_the_log:Single`" in refused.err
     assert "beside_the_log" not in sys.modules
@@ -241,7 +241,7 @@ def test_files_and_environment_choose_them_and_set_their_options(place, monkeypa
 
 def test_a_file_in_the_working_folder_names_no_module(place):
     (place / "mcaptrack.toml").write_text('[track]\ntracker = "own:Single"\n')
-    refused = called("track", "a.mcap")
+    refused = call("track", "a.mcap")
     assert (refused.code, refused.err.count("\n"), "own" in sys.modules) == (2, 1, False)
     assert "may tune and nothing else; give --tracker" in refused.err
     done("track", "a.mcap", "--config", "mcaptrack.toml", "-q")
@@ -250,8 +250,8 @@ def test_a_file_in_the_working_folder_names_no_module(place):
 
 def test_the_help_lists_the_options_of_the_one_that_is_named(place, monkeypatch):
     monkeypatch.setenv("COLUMNS", "120")
-    assert "--track-id" not in called("track", "--help").out
-    words = called("track", "--tracker", "single", "--help").out
+    assert "--track-id" not in call("track", "--help").out
+    words = call("track", "--tracker", "single", "--help").out
     assert "Options of single alone" in words
     assert "--track-id" in words
 
@@ -277,7 +277,7 @@ def test_the_help_lists_the_options_of_the_one_that_is_named(place, monkeypatch)
     ],
 )
 def test_wrong_options_are_refused_in_one_line(place, words, code, said):
-    refused = called("track", "a.mcap", *words)
+    refused = call("track", "a.mcap", *words)
     assert (refused.code, refused.err.count("\n")) == (code, 1)
     assert said in refused.err
 
@@ -301,7 +301,7 @@ def test_a_tracker_that_goes_wrong_is_named_in_one_line(place, old, new, said):
     start = MODULE.index("class Single")
     install(text=MODULE[:start] + MODULE[start:].replace(old, new, 1))
     before = Path("a.mcap").read_bytes()
-    refused = called("track", "a.mcap", "--tracker", "single")
+    refused = call("track", "a.mcap", "--tracker", "single")
     assert (refused.code, refused.err.count("\n")) == (1, 1), refused.err
     assert "tracker single (own 1.5)" in refused.err
     assert said in refused.err
@@ -331,7 +331,7 @@ def test_a_predictor_that_goes_wrong_is_named_in_one_line(place, old, new, said)
     done("track", "a.mcap", "--tracker", "single", "-q")
     start = MODULE.index("class Standing")
     install(text=MODULE[:start] + MODULE[start:].replace(old, new, 1))
-    refused = called("predict", "a.mcap", "--predictor", "standing", "-q")
+    refused = call("predict", "a.mcap", "--predictor", "standing", "-q")
     assert (refused.code, refused.err.count("\n")) == (1, 1), refused.err
     assert "predictor standing (own 1.5)" in refused.err
     assert said in refused.err

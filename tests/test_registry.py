@@ -12,6 +12,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.predictors import NAMES
 from mcaptrack.registry import BUILT_IN, KINDS, entry_of, find, names
 from mcaptrack.transforms import STAGES, ByteTrack, Sort
+from tests.distributions import package
 
 PLUGIN = """
 from collections.abc import Iterable, Iterator
@@ -47,16 +48,6 @@ def installed(tmp_path, monkeypatch) -> Path:
     yield folder
     for name in [name for name in sys.modules if name.partition(".")[0] == "own_trackers"]:
         del sys.modules[name]
-
-
-def package(folder: Path, name: str, version: str, group: str, points: dict[str, str]) -> None:
-    """What pip leaves of a package that has entry points."""
-    info = folder / f"{name.replace('-', '_')}-{version}.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n")
-    lines = [f"{key} = {value}" for key, value in points.items()]
-    (info / "entry_points.txt").write_text("\n".join([f"[{group}]", *lines]) + "\n")
-    (info / "top_level.txt").write_text(name.replace("-", "_") + "\n")
 
 
 @pytest.mark.parametrize("kind", KINDS)
