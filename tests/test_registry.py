@@ -148,7 +148,7 @@ def test_what_cannot_be_found_is_said_in_one_line(installed, text, name, said):
         (PLUGIN.replace('{"": TRACKS}', "TRACKS"), "writes nothing"),
         (PLUGIN.replace("__call__", "call"), "can't be called with frames"),
         (PLUGIN.replace("gain: float", "gain: dict"), "Nearest.gain is a dict; a parameter is a float"),
-        (PLUGIN.replace("gain: float", "tracker: float"), "a parameter can't have the name of the option --tracker"),
+        (PLUGIN.replace("gain: float", "tracker: float"), "a parameter can't have the name of the option `tracker=`"),
         (
             PLUGIN.replace('gain: float = option(2.0, "how much", least=0.0)', "gain: float"),
             "Nearest.gain has no default",

@@ -34,6 +34,9 @@ class ChannelInfo:
         Number of messages.
     transform, input, version : str or None
         What made it, from which channel, and with which version of mcaptrack; None if it was recorded by others.
+    plugins : dict or None
+        Classes of other packages that made it, by the part that each is (transform, predictor): name, implementation,
+        distribution and version.
     references : dict or None
         Topics that it was compared with, with their digests.
     parameters : dict or None
@@ -54,6 +57,7 @@ class ChannelInfo:
     input: str | None
     version: str | None
     references: Mapping[str, str] | None
+    plugins: Mapping[str, Mapping[str, str]] | None
     parameters: Mapping[str, Any] | None
     stale: bool
 
@@ -162,6 +166,7 @@ def _channel(opened: logs.Log, part: logs.Log, channel: logs.Channel) -> Channel
         input=made.input or None if made else None,
         version=made.version if made else None,
         references=dict(made.references) if made else None,
+        plugins={part: plugin._asdict() for part, plugin in made.plugins.items()} if made else None,
         parameters=dict(made.parameters) if made else None,
         stale=not replaced and pipeline.is_stale(opened, channel.topic),
     )

@@ -234,9 +234,8 @@ class _Planner:
         words = f"{self._opened.path}: {topic} can't be made from {source}: {why_not}"
         if not isinstance(why_not, MissingPluginError) or not why_not.options:
             return words
-        return (
-            f"{words}, as in {command('run', self._opened.path, *why_not.options)}; another name replaces what it made"
-        )
+        again = call("run", self._opened.path, **why_not.options)
+        return f"{words}, as in {again}; another name replaces what it made"
 
     def _warn_of_settings(self, main: str, differing: str) -> None:
         """Say once for all outputs of a stage that they were made with other settings."""

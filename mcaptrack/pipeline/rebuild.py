@@ -23,10 +23,12 @@ from mcaptrack.transforms.protocol import member_type
 class MissingPluginError(McaptrackError):
     """A class of another package that made a channel is not installed, or not named by the user.
 
-    ``options`` are those that name it for ``run``; none if that is not enough.
+    ``options`` name it for ``run``; there are none if that is not enough.
     """
 
-    options: tuple[str, ...] = ()
+    def __init__(self, words: str, **options: str) -> None:
+        super().__init__(words)
+        self.options = options
 
 
 def plugins_of(stage: Stage, transform: Transform) -> dict[str, Plugin]:
@@ -94,21 +96,18 @@ def _installed(kind: Any, plugin: Plugin) -> Entry:
     """The entry that a plug-in is, if it may be imported. Raises MissingPluginError."""
     words = _words(kind, plugin)
     if ":" in plugin.name:
-        error = MissingPluginError(
-            f"{words} made it, and a class without an entry point is imported only if you name it"
-        )
-        error.options = (f"--{kind}", plugin.name)
-        raise error
+        why = "a class without an entry point is imported only if you name it"
+        raise MissingPluginError(f"{words} made it, and {why}", **{kind: plugin.name})
     if not is_installed(kind, plugin.name):
         package = f"{plugin.distribution} {plugin.version}".strip() or "the package that has it"
         raise MissingPluginError(
-            f"{words} made it, which is not installed; install {package}, or replace it with another --{kind}"
+            f"{words} made it, which is not installed; install {package}, or replace it with another `{kind}=`"
         )
     entry = find(kind, plugin.name)
     if entry.distribution != plugin.distribution:
         raise MissingPluginError(
             f"{words} made it; the {kind} of that name is now that of {entry.distribution or 'mcaptrack'}. Install "
-            f"{plugin.distribution}, or replace it with another --{kind}"
+            f"{plugin.distribution}, or replace it with another `{kind}=`"
         )
     _compare_versions(entry, plugin)
     return entry

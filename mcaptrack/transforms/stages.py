@@ -178,7 +178,7 @@ class Stage:
         if "__call__" not in dir(cls):
             raise McaptrackError(f"{entry} can't be called with frames; it needs a method __call__")
         if any(one.name == self.kind for one in fields(cls)):
-            raise McaptrackError(f"{entry}: a parameter can't have the name of the option --{self.kind}")
+            raise McaptrackError(f"{entry}: a parameter can't have the name of the option `{self.kind}=`")
         if problem := option_problem(cls):
             raise McaptrackError(f"{entry}: {problem}")
 
