@@ -245,8 +245,6 @@ class TestDocumentation:
 
     @pytest.mark.parametrize("name", FUNCTIONS)
     def test_examples_run(self, name, place):
-        if name == "query":
-            pytest.importorskip("duckdb", reason="queries need DuckDB")
         tests = doctest.DocTestFinder(recurse=False).find(getattr(mcaptrack, name), name, globs={})
         runner = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS)
         assert tests[0].examples
