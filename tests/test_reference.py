@@ -57,7 +57,7 @@ def test_every_file_of_the_conformance_suite_holds_what_is_written_beside_it(dat
         schemas = {int(f["id"]): f for f in _fields(said, "Schema")}
         channels = {int(f["id"]): f for f in _fields(said, "Channel")}
         with log.read(path) as opened:
-            index, buffer = opened.index, opened.buffer
+            index, buffer = opened.index, opened.snapshot.source
             (header,) = _fields(said, "Header")
             assert records.read_header(buffer, records.record_at(buffer, 8)) == (header["profile"], header["library"])
             assert {number: (f["name"], f["encoding"], _data(f["data"])) for number, f in schemas.items()} == {
