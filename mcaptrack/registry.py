@@ -63,7 +63,10 @@ BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(
             "lstm": "mcaptrack.predictors.built_in:lstm",
             "onnx": "mcaptrack.predictors.built_in:onnx",
         },
-        "retracker": {"prediction": "mcaptrack.transforms.retrack:Retrack"},
+        "retracker": {
+            "likelihood": "mcaptrack.transforms.retrack:Retrack",
+            "consistency": "mcaptrack.transforms.retrack:RetrackByConsistency",
+        },
         "fuser": {},
     }
 )

@@ -98,7 +98,7 @@ class TestTheUsualWay:
         (result,) = data["results"]
         channels = {channel["topic"]: channel for channel in result["channels"]}
         assert channels["/camera/retracks"]["input"] == "/camera/samples"
-        assert channels["/camera/retracks"]["parameters"]["distance"] == "likelihood"
+        assert channels["/camera/retracks"]["parameters"]["retracker"] == "likelihood"
         assert not any(channel["stale"] for channel in result["channels"])
         assert result["messages"] == sum(channel["messages"] for channel in result["channels"])
 
@@ -132,7 +132,7 @@ class TestTheUsualWay:
         (result,) = json.loads(printed("info", tmp_path / "p.mcap", "--json")[0])["results"]
         made = {channel["topic"]: channel["parameters"] for channel in result["channels"]}
         assert (made["/camera/retracks"]["distance"], made["/camera/retracks"]["sigma_m"]) == ("mean", 2.0)
-        assert made["/camera/retracks/online"]["distance"] == "likelihood"  # only the other output was made
+        assert made["/camera/retracks/online"]["retracker"] == "likelihood"  # only the other output was made
 
 
 class TestEvaluate:

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from mcaptrack.transforms import PROFILES, TRACKERS, TRANSFORMS
+from mcaptrack.transforms import PROFILES, TRACKERS, TRANSFORMS, RetrackByConsistency
 
 SORT: dict[str, Any] = {
     "max_age_s": 1.4,
@@ -26,6 +26,27 @@ SORT: dict[str, Any] = {
     "class_id": None,
     "mix_classes": False,
 }
+
+#: What both methods of re-tracking share.
+RETRACKING = {
+    "predictor": "kalman",
+    "horizon_s": 4.8,
+    "noise_m": None,
+    "speed_m_per_s": 1.75,
+    "drift_m_per_s": 0.12,
+    "drift_ratio": 0.08,
+    "same_id_bonus": 12.0,
+    "max_age_s": 2.0,
+    "min_history": 2,
+    "min_track_s": 2.0,
+    "link_s": 20.0,
+    "link_confidence": 0.5,
+    "resolve_swaps": True,
+    "track_confidence": 0.5,
+    "smooth": True,
+    "interpolated": False,
+    "side_view": False,
+}
 DEFAULTS: dict[str, dict[str, Any]] = {
     "detect": {"threshold": None, "history_s": 60.0, "max_pixels": 1_000_000, "stabilise": True},
     "track": SORT,
@@ -34,40 +55,27 @@ DEFAULTS: dict[str, dict[str, Any]] = {
     "ocsort": SORT | {"inertia": 0.2, "direction_frames": 3, "recover": True, "reupdate": True},
     "sample": {"rate_hz": 2.5, "max_hole_s": 2.0},
     "predict": {"predictor": "red", "horizon_s": 4.8, "min_history": 4},
-    "retrack": {
-        "predictor": "kalman",
-        "horizon_s": 4.8,
-        "distance": "likelihood",
+    "retrack": RETRACKING
+    | {
+        "merge_distance_m": 1.0,
+        "merge_timeout_s": 3.0,
+        "confirm_s": 1.2,
+        "coast_s": 1.2,
+    },
+    "consistency": RETRACKING
+    | {
+        "distance": "mean",
         "covariance": "predictor",
         "sigma_m": 1.0,
-        "noise_m": None,
-        "speed_m_per_s": 1.75,
-        "drift": 0.12,
-        "drift_share": 0.08,
         "max_distance": 3.0,
-        "certain_distance": 0.0,
-        "max_jump_m": 3.0,
-        "same_source": 12.0,
-        "max_age_s": 2.0,
-        "share_m": 1.0,
-        "share_s": 3.0,
-        "sure_s": 1.2,
-        "coast_s": 1.2,
+        "priority_distance": 0.0,
+        "gate_m": 3.0,
         "alpha": 1.0,
         "beta": 0.0,
         "birth": "raw",
-        "min_history": 2,
         "min_hits": 1,
-        "confirm": False,
-        "min_track_s": 2.0,
-        "link_s": 20.0,
-        "link_certainty": 0.5,
-        "part": True,
-        "min_certainty": 0.5,
-        "smooth": True,
+        "trim_ends": False,
         "backfill": "unclaimed",
-        "filled": False,
-        "side_view": False,
     },
 }
 #: Algorithm 1 as in the paper; numbers that the paper doesn't give are those of the authors' program.
@@ -76,27 +84,35 @@ PAPER = {
     "distance": "mean",
     "covariance": "paper",
     "noise_m": 0.5,
-    "max_jump_m": None,
-    "same_source": 0.0,
+    "gate_m": None,
+    "same_id_bonus": 0.0,
     "max_age_s": 3.2,
     "alpha": 0.5,
     "beta": 0.5,
     "min_history": 4,
     "min_hits": 2,
     "link_s": 0.0,
-    "part": False,
-    "min_certainty": 0.0,
+    "resolve_swaps": False,
+    "track_confidence": 0.0,
     "smooth": False,
-    "filled": True,
+    "interpolated": True,
 }
-AUTHORS = PAPER | {"distance": "max", "certain_distance": 0.15, "birth": "smoothed", "confirm": True, "backfill": "all"}
+AUTHORS = PAPER | {
+    "distance": "max",
+    "priority_distance": 0.15,
+    "birth": "smoothed",
+    "trim_ends": True,
+    "backfill": "all",
+}
 
 
 def options_of(transform: Any) -> dict[str, Any]:
     return {o.name: getattr(transform, o.name) for o in fields(transform) if not o.metadata.get("context")}
 
 
-@pytest.mark.parametrize(("name", "kind"), (dict(TRANSFORMS) | dict(TRACKERS)).items())
+@pytest.mark.parametrize(
+    ("name", "kind"), (dict(TRANSFORMS) | dict(TRACKERS) | {"consistency": RetrackByConsistency}).items()
+)
 def test_defaults(name, kind):
     assert options_of(kind()) == DEFAULTS[name]
 
@@ -104,7 +120,7 @@ def test_defaults(name, kind):
 def test_profiles_of_retracking():
     wanted = {"default": {}, "paper": PAPER, "authors": AUTHORS}
     assert {name: options_of(profile) for name, profile in PROFILES.items()} == {
-        name: DEFAULTS["retrack"] | changed for name, changed in wanted.items()
+        name: DEFAULTS["consistency" if changed else "retrack"] | changed for name, changed in wanted.items()
     }
 
 

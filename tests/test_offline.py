@@ -206,7 +206,7 @@ class TestOfTheWholeLog:
                 return {1: a, 2: b} if n < 22 else {name: a, 7: b}
             return {name: (0.5 * n, 0.0)}
 
-        for profile in (DEFAULT, replace(DEFAULT, part=False)):
+        for profile in (DEFAULT, replace(DEFAULT, resolve_swaps=False)):
             offline, online, _ = (list(part) for part in zip(*profile(walk(crowd, 45)), strict=True))
             for frames in (offline, online):
                 before, after = ({who: xy[1] > 0 for who, xy in places(frames[n]).items()} for n in (10, 40))
@@ -238,7 +238,7 @@ class TestOfTheWholeLog:
     @pytest.mark.parametrize(("spread_m", "found_m"), [(0.0, 0.03), (4.0, 0.8)])
     def test_the_noise_that_is_found_out_has_limits(self, spread_m, found_m):
         rng = np.random.default_rng(2)
-        run = LikelihoodPass(replace(DEFAULT, max_jump_m=None))
+        run = LikelihoodPass(DEFAULT)
         for frame in walk(lambda n: {k: tuple([0.0, 900.0 * k] + rng.normal(0, spread_m, 2)) for k in range(9)}, 250):
             run.step(frame)
         assert run.noise_m == pytest.approx(found_m)
@@ -263,7 +263,7 @@ class TestOfTheWholeLog:
                     name[one], name[other] = name[other], name[one]
             return {name[who]: at for who, at in people.items()}
 
-        frames = self.offline(crowd, 95, replace(DEFAULT, same_source=60.0, link_s=0.0))
+        frames = self.offline(crowd, 95, replace(DEFAULT, same_id_bonus=60.0, link_s=0.0))
         first, last = places(frames[5]), places(frames[90])
         assert len(first) == 4
         for one, at in first.items():

@@ -9,12 +9,13 @@ from typing import get_type_hints
 import numpy as np
 import pytest
 
-from mcaptrack.transforms import STAGES, TRACKERS, TRANSFORMS
+from mcaptrack.transforms import STAGES, TRACKERS, TRANSFORMS, RetrackByConsistency
 from mcaptrack.transforms.protocol import bare_type
+from mcaptrack.transforms.retrack import Retracking
 from tests.effects import Case, others, retrack, sort
 
 CASES = retrack.CASES | sort.CASES | others.CASES
-KINDS = dict(TRANSFORMS) | dict(TRACKERS)
+KINDS = dict(TRANSFORMS) | dict(TRACKERS) | {"consistency": RetrackByConsistency}
 BUILT_IN = {f"{stage} {name}": kind for stage, one in STAGES.items() for name, kind in one.built_in().items()}
 ORDER = ("least", "more", "most")
 
@@ -44,7 +45,8 @@ def test_detectors_differ_in_how_long_they_see_people_who_stop():
 
 def test_every_option_has_a_scene():
     options = {(kind, o.name) for kind, made in KINDS.items() for o in fields(made) if not o.metadata.get("context")}
-    assert set(CASES) == options
+    shared = {("consistency", o.name) for o in fields(Retracking)}  # their scenes are those of retrack
+    assert set(CASES) == options - shared
 
 
 #: Ranges that don't follow from what an option is.
@@ -53,14 +55,14 @@ RANGES = {
     "direction_frames": (2, 100),
     "history_s": (0.1, 1e6),
     "horizon_s": (0.1, 60.0),
-    "link_certainty": (0.01, 0.99),
+    "link_confidence": (0.01, 0.99),
     "max_pixels": (1000, 10**9),
     "min_history": (1, 100),
     "min_hits": (0, 1000),
     "rate_hz": (0.1, 1000.0),
     "sigma_m": (1e-6, 1e6),
 }
-SHARES = {"alpha", "beta", "min_iou", "low_min_iou", "min_certainty"}
+SHARES = {"alpha", "beta", "min_iou", "low_min_iou", "track_confidence"}
 ANY = {"min_score", "high_score", "new_score"}
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from mcaptrack.geometry.histories import Holt
 from mcaptrack.predictors import Forecast
-from mcaptrack.transforms import PROFILES
+from mcaptrack.transforms import PROFILES, RetrackByConsistency
 from mcaptrack.transforms.retrack.active_tracks import SmoothedHistory
 from mcaptrack.transforms.retrack.distances import (
     mahalanobis,
@@ -23,16 +23,15 @@ from tests.worlds import ids, places, tracks_at, walk
 
 PAPER, AUTHORS, DEFAULT = PROFILES["paper"], PROFILES["authors"], PROFILES["default"]
 #: The expected and the seen position compared, Algorithm 1 otherwise, and nothing done afterwards.
-NOW = replace(
-    DEFAULT,
+NOW = RetrackByConsistency(
     distance="now",
     noise_m=0.5,
-    same_source=1.0,
+    same_id_bonus=1.0,
     max_age_s=4.8,
     link_s=0.0,
-    part=False,
+    resolve_swaps=False,
     smooth=False,
-    min_certainty=0.0,
+    track_confidence=0.0,
 )
 every_profile = pytest.mark.parametrize("profile", PROFILES.values(), ids=PROFILES)
 
@@ -200,7 +199,7 @@ class TestBranches:
 
     def test_no_track_is_matched_further_than_it_can_have_jumped(self):
         frames = walk(lambda n: {7 if n < 10 else 8: (0.0, 0.0 if n < 10 else 4.0)} if not 10 <= n < 20 else {}, 32)
-        near, _, _ = run(replace(NOW, max_jump_m=None), frames)
+        near, _, _ = run(replace(NOW, gate_m=None), frames)
         far, _, _ = run(NOW, frames)
         assert len(paths(near)) == 1
         assert len(paths(far)) == 2
@@ -223,7 +222,7 @@ class TestBranches:
             sources = [dict(zip(ids(f), f.rows["source_id"].tolist(), strict=True)) for f in online[3:]]
             return sum(a != b for a, b in pairwise(sources))
 
-        assert switches(DEFAULT) < switches(replace(DEFAULT, same_source=0.0))
+        assert switches(DEFAULT) < switches(replace(DEFAULT, same_id_bonus=0.0))
 
     def test_certain_pairs_go_first(self):
         """Two tracks, one observation each; the sum is least crosswise, but one pair is certain."""
@@ -235,10 +234,10 @@ class TestBranches:
             "covariance": "paper",
             "min_history": 1,
             "max_distance": 3.0,
-            "same_source": 0.0,
+            "same_id_bonus": 0.0,
         }
-        plain = replace(NOW, **options, max_jump_m=None, noise_m=0.0, certain_distance=0.0)
-        sure = replace(plain, certain_distance=0.15)
+        plain = replace(NOW, **options, gate_m=None, noise_m=0.0, priority_distance=0.0)
+        sure = replace(plain, priority_distance=0.15)
         by = [
             {f.rows["source_id"][k]: f.rows["track_id"][k] for f in run(p, frames)[1][8:] for k in range(len(f.rows))}
             for p in (plain, sure)
@@ -389,7 +388,7 @@ def test_authors_keep_what_two_matches_in_a_row_confirm():
         return list(path)
 
     assert ticks(AUTHORS, 23) == list(range(10))
-    assert ticks(replace(AUTHORS, confirm=False), 23) == list(range(24))
+    assert ticks(replace(AUTHORS, trim_ends=False), 23) == list(range(24))
     assert ticks(AUTHORS, 24) == list(range(25))
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -10,16 +10,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mcaptrack.schema import Frame, Rows
-from mcaptrack.transforms import PROFILES, Retrack
+from mcaptrack.transforms import PROFILES, RetrackByConsistency
+from mcaptrack.transforms.retrack import Retracking
 from tests.worlds import noisy_tracks, ns, places, walk
 
 SEEDS = st.integers(0, 2**32 - 1)
 #: "now" looks at the forecast of the present, which the other readings of Algorithm 1 don't.
-METHODS = dict(PROFILES) | {"now": replace(PROFILES["default"], distance="now", noise_m=0.3)}
+METHODS = dict(PROFILES) | {"now": RetrackByConsistency(distance="now", noise_m=0.3)}
 every_method = pytest.mark.parametrize("method", METHODS.values(), ids=METHODS)
 
 
-def outputs(method: Retrack, frames: list[Frame]) -> list[Rows]:
+def outputs(method: Retracking, frames: list[Frame]) -> list[Rows]:
     """The rows of offline and online tracks and of forecasts."""
     return [np.concatenate([frame.rows for frame in part]) for part in zip(*method(frames), strict=True)]
 
@@ -48,7 +49,7 @@ def test_a_moved_and_turned_world_has_moved_and_turned_tracks(method, seed, angl
     rng = np.random.default_rng(seed)
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     shift = rng.uniform(-100, 100, 2)
-    method = replace(method, min_certainty=0.0)  # the extent of a path is measured along the axes
+    method = replace(method, track_confidence=0.0)  # the extent of a path is measured along the axes
     frames = noisy_tracks(rng, ticks=40, hidden=0.03)
     for found, wanted in zip(outputs(method, moved(frames, turn, shift)), outputs(method, frames), strict=True):
         x_m, y_m = (np.stack([wanted["x_m"], wanted["y_m"]], axis=-1) @ turn.T + shift).T
@@ -119,8 +120,8 @@ def standing(first: list[tuple[float, float]], then: list[tuple[float, float]], 
 
 
 TIES = {
-    # The corners of a square: who went to the left and who to the right can't be said.
-    "online": (standing([(1.3, 2.4), (1.3, 1.0)], [(2.0, 1.7), (0.6, 1.7)], range(12, 13), 30), {"max_jump_m": None}),
+    # The corners of a square: which track went left and which right is ambiguous.
+    "online": (standing([(1.3, 2.4), (1.3, 1.0)], [(2.0, 1.7), (0.6, 1.7)], range(12, 13), 30), {"gate_m": None}),
     "link": (
         standing([(1.3, 2.1), (1.3, 1.3)], [(1.7, 1.7), (0.9, 1.7)], range(20, 28), 60),
         {"max_age_s": 0.8, "link_s": 20.0},
@@ -133,7 +134,8 @@ TIES = {
 def test_last_digits_decide_nothing(method, tie):
     """Forecasts and sums differ in the last digits from machine to machine, and with how many are computed at once."""
     frames, options = TIES[tie]
-    method = replace(method, min_certainty=0.0, **options)
+    own = {option.name for option in fields(method)}
+    method = replace(method, track_confidence=0.0, **{name: v for name, v in options.items() if name in own})
     wanted = [sorted(places(frame).items()) for frame, _, _ in method(frames)]
     assert len({who for frame in wanted for who, _ in frame}) == 2  # the old ones went on
     for seed in range(6):

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.predictors import make
 from mcaptrack.schema import Frame
-from mcaptrack.transforms import PROFILES, Predict, Retrack
+from mcaptrack.transforms import PROFILES, Predict, Retrack, RetrackByConsistency
+from mcaptrack.transforms.retrack import Retracking
 from tests.references.algorithm1 import Algorithm1
 from tests.references.online import OnlineTracker
 from tests.references.retracking import Undecided, constant_velocity
@@ -20,7 +21,7 @@ from tests.worlds import crossing_tracks, noisy_tracks
 
 SEEDS = st.integers(0, 2**32 - 1)
 #: Nothing done afterwards but what both methods share: gaps are filled in, and what is short is left out.
-PLAIN = {"link_s": 0.0, "part": False, "smooth": False, "min_certainty": 0.0}
+PLAIN = {"link_s": 0.0, "resolve_swaps": False, "smooth": False, "track_confidence": 0.0}
 
 
 #: A plane that is a plain scale, so that what a box moves by is known: 20 px a metre.
@@ -47,7 +48,7 @@ def black_box(name: str, steps: int, step_s: float):
     return predict, predictor.past
 
 
-def compare(transform: Retrack, frames: list[Frame], reference, covariances: bool = True) -> None:
+def compare(transform: Retracking, frames: list[Frame], reference, covariances: bool = True) -> None:
     """Compare all three outputs, row by row."""
     samples, times = [rows_of(frame) for frame in frames], [frame.t_ns for frame in frames]
     try:
@@ -73,7 +74,7 @@ def compare(transform: Retrack, frames: list[Frame], reference, covariances: boo
                 np.testing.assert_allclose(found_cov, cov[:, [0, 0, 1], [0, 1, 1]], atol=1e-9)
 
 
-def algorithm_1(transform: Retrack) -> Algorithm1:
+def algorithm_1(transform: RetrackByConsistency) -> Algorithm1:
     predict, past = black_box(
         transform.predictor, round(transform.horizon_s * transform.rate_hz), 1 / transform.rate_hz
     )
@@ -94,9 +95,9 @@ NUMBERS = {
     "sigma_m": [0.3, 1.0],
     "noise_m": [None, 0.0, 0.5],
     "max_distance": [0.5, 1.5, 3.0],
-    "certain_distance": [0.0, 0.4],
-    "max_jump_m": [None, 0.5, 1.5],
-    "same_source": [0.0, 1.0, 12.0],
+    "priority_distance": [0.0, 0.4],
+    "gate_m": [None, 0.5, 1.5],
+    "same_id_bonus": [0.0, 1.0, 12.0],
     "max_age_s": [0.4, 1.2, 3.2],
     "alpha": [0.5, 0.8, 1.0],
     "beta": [0.0, 0.5],
@@ -110,8 +111,8 @@ CHOICES = {
     "covariance": ["paper", "predictor"],
     "birth": ["raw", "smoothed"],
     "backfill": ["none", "unclaimed", "all"],
-    "confirm": [False, True],
-    "filled": [False, True],
+    "trim_ends": [False, True],
+    "interpolated": [False, True],
     "predictor": ["cv", "holt-cv"],
 }
 
@@ -119,7 +120,7 @@ CHOICES = {
 @given(seed=SEEDS, chosen=st.fixed_dictionaries({name: st.sampled_from(v) for name, v in (NUMBERS | CHOICES).items()}))
 @settings(max_examples=45, phases=QUICK)
 def test_algorithm_1_with_random_options_equals_the_reference(seed, chosen):
-    transform = Retrack(**PLAIN, **chosen)
+    transform = RetrackByConsistency(**PLAIN, **chosen)
     frames = noisy_tracks(np.random.default_rng(seed), rate_hz=transform.rate_hz)
     compare(transform, frames, algorithm_1(transform))
 
@@ -129,17 +130,16 @@ LIKELIHOOD = {
     "horizon_s": [0.8, 4.8],
     "noise_m": [None, None, 0.1, 0.3],
     "speed_m_per_s": [0.5, 1.75],
-    "drift": [0.0, 0.12, 0.5],
-    "drift_share": [0.0, 0.08, 0.3],
-    "same_source": [0.0, 4.0, 12.0],
+    "drift_m_per_s": [0.0, 0.12, 0.5],
+    "drift_ratio": [0.0, 0.08, 0.3],
+    "same_id_bonus": [0.0, 4.0, 12.0],
     "max_age_s": [0.4, 1.2, 2.0],
-    "share_m": [0.0, 1.0, 2.0],
-    "share_s": [0.0, 0.8, 3.0],
-    "sure_s": [0.0, 0.4, 1.2],
+    "merge_distance_m": [0.0, 1.0, 2.0],
+    "merge_timeout_s": [0.0, 0.8, 3.0],
+    "confirm_s": [0.0, 0.4, 1.2],
     "coast_s": [0.0, 0.4, 1.2],
     "min_track_s": [0.0, 0.8, 2.0],
-    "filled": [False, True],
-    "backfill": ["unclaimed", "all"],
+    "interpolated": [False, True],
     "rate_hz": [2.5, 4.0],
     "predictor": ["kalman", "cv"],
 }
@@ -160,19 +160,18 @@ def test_the_likelihood_method_equals_the_reference(seed, chosen):
 
 #: What is done once the whole log is known.
 OFFLINE = {
-    "distance": ["likelihood", "likelihood", "mean"],
+    "kind": [Retrack, Retrack, RetrackByConsistency],
     "noise_m": [None, 0.1, 0.3],
     "speed_m_per_s": [0.8, 1.75],
-    "drift": [0.05, 0.12],
-    "drift_share": [0.0, 0.08],
-    "same_source": [0.0, 12.0, 25.0],
+    "drift_m_per_s": [0.05, 0.12],
+    "drift_ratio": [0.0, 0.08],
+    "same_id_bonus": [0.0, 12.0, 25.0],
     "link_s": [0.0, 4.0, 20.0],
-    "link_certainty": [0.2, 0.5, 0.9],
-    "part": [False, True],
+    "link_confidence": [0.2, 0.5, 0.9],
+    "resolve_swaps": [False, True],
     "smooth": [False, True],
-    "min_certainty": [0.0, 0.2, 0.5],
+    "track_confidence": [0.0, 0.2, 0.5],
     "min_track_s": [0.0, 2.0],
-    "backfill": ["unclaimed", "all"],
     "ground_planes": [(), PLANE],
 }
 
@@ -180,10 +179,11 @@ OFFLINE = {
 @given(seed=SEEDS, chosen=st.fixed_dictionaries({name: st.sampled_from(v) for name, v in OFFLINE.items()}))
 @settings(max_examples=22, phases=QUICK)
 def test_the_offline_part_equals_the_reference(seed, chosen):
-    transform = Retrack(predictor="cv", horizon_s=2.0, **chosen)
+    kind = chosen.pop("kind")
+    transform = kind(predictor="cv", horizon_s=2.0, **chosen)
     rng = np.random.default_rng(seed)
     frames = crossing_tracks(rng) if rng.random() < 0.5 else noisy_tracks(rng, ticks=70, hidden=0.02)
-    if chosen["distance"] == "mean":
+    if kind is RetrackByConsistency:
         reference = algorithm_1(transform)
     else:
         reference = OnlineTracker(transform, *black_box("cv", 5, 0.4))
@@ -195,7 +195,8 @@ WHETHER = {"side_view", "poor_scale"}
 
 
 def test_every_option_is_varied():
-    assert {option.name for option in fields(Retrack)} == {*NUMBERS, *CHOICES, *LIKELIHOOD, *OFFLINE} | WHETHER
+    varied = {*NUMBERS, *CHOICES, *LIKELIHOOD, *OFFLINE} - {"kind"} | WHETHER
+    assert {option.name for kind in (Retrack, RetrackByConsistency) for option in fields(kind)} == varied
 
 
 @given(seed=SEEDS)

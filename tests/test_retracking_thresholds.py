@@ -28,9 +28,9 @@ FEW = replace(
     predictor="cv",
     noise_m=0.2,
     link_s=0.0,
-    part=False,
+    resolve_swaps=False,
     smooth=False,
-    min_certainty=0.0,
+    track_confidence=0.0,
     min_track_s=0.0,
 )
 

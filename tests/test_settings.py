@@ -9,6 +9,7 @@ import difflib
 import os
 import re
 import shlex
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
@@ -356,7 +357,7 @@ class TestRenamed:
         wanted = self.params(command, beside, *words_for(setting, value))
         assert capsys.readouterr().err == ""
         line = " is called {} now; the old name goes with the next release\n"
-        assert self.params(command, beside, f"--{old}", str(value)) == wanted
+        assert self.params(command, beside, *words_for(replace(setting, name=old), value)) == wanted
         assert capsys.readouterr().err == f"--{old}" + line.format(f"--{setting.name}")
         variable = f"MCAPTRACK_{command}_{old}".upper().replace("-", "_")
         monkeypatch.setenv(variable, str(value))
@@ -372,14 +373,19 @@ class TestRenamed:
     def test_the_stronger_source_counts_whatever_the_name(self, command, setting, old, beside, folder, monkeypatch):
         variable = f"MCAPTRACK_{command}_{old}".upper().replace("-", "_")
         low, middle, high = ("a", "b", "c") if setting.kind is str else (0.25, 0.5, 0.75)
+        if setting.kind is bool:
+            low, middle, high = True, False, False
         monkeypatch.setenv(variable, str(low))
-        assert self.params(command, beside, f"--{setting.name}", str(middle))[setting.parameter] == middle
+        assert self.params(command, beside, *words_for(setting, middle))[setting.parameter] == middle
         put(folder / "mcaptrack.toml", f"[{command}]\n{setting.name} = {toml_value(high)}\n")
         assert self.params(command, beside)[setting.parameter] == low
 
     def test_both_names_at_once_are_refused(self, command, setting, old, beside):
         others = [word for name, value in beside.items() for word in (f"--{name}", value)]
-        words = refused(command, "x.mcap", *others, f"--{old}", "0.1", f"--{setting.name}", "0.2")
+        both = [
+            word for one in (replace(setting, name=old), setting) for word in words_for(one, another(setting, None))
+        ]
+        words = refused(command, "x.mcap", *others, *both)
         assert f"--{old} is the old name of --{setting.name}; give one of them" in words
 
     def test_the_help_knows_the_new_name_alone(self, command, setting, old, beside):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import fields, replace
+from functools import partial
 from typing import get_type_hints
 
 import numpy as np
@@ -15,7 +16,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import DETECTIONS, TRACKS, VIDEO
 from mcaptrack.testing import LAWS, sample_frames
-from mcaptrack.transforms import PROFILES, STAGES, TRACKERS, TRANSFORMS, Retrack, Transform
+from mcaptrack.transforms import PROFILES, STAGES, TRACKERS, TRANSFORMS, Retrack, RetrackByConsistency, Transform
 from mcaptrack.transforms.protocol import bare_type
 from tests.worlds import ids, walk
 
@@ -37,7 +38,7 @@ def variants() -> list[tuple[str, Transform]]:
     """Every transform with its defaults, and with what changes its course."""
     out: list[tuple[str, Transform]] = [(name, kind()) for name, kind in TRANSFORMS.items()]
     out += [("retrack", profile) for profile in PROFILES.values()]
-    out += [("retrack", Retrack(distance="first", min_history=1, backfill="none", max_age_s=1.0))]
+    out += [("retrack", RetrackByConsistency(distance="first", min_history=1, backfill="none", max_age_s=1.0))]
     out += [("predict", TRANSFORMS["predict"](predictor=name)) for name in ("cv", "holt-cv")]
     out += [("detect", kind(stabilise=False)) for kind in STAGES["detect"].built_in().values()]
     plane = {"ground_planes": ((0, PLANE),)}
@@ -98,7 +99,7 @@ def test_options_at_the_ends_of_their_ranges_run_without_warnings(name, data, se
     """Any options at the least or greatest value that they accept: rows conform to the schema, and no warnings."""
     kind = KINDS[name]
     base = data.draw(st.sampled_from(list(PROFILES.values()))) if name == "retrack" else kind()
-    ends = ends_of_ranges(kind)
+    ends = ends_of_ranges(type(base))
     chosen = data.draw(st.lists(st.sampled_from(sorted(ends)), unique=True))
     transform = replace(base, **{option: data.draw(st.sampled_from(ends[option])) for option in chosen})
     outputs = zip(*transform(INPUTS[INPUT_OF[name]](seed)), strict=True)
@@ -107,13 +108,13 @@ def test_options_at_the_ends_of_their_ranges_run_without_warnings(name, data, se
             schema.check(frame.rows)
 
 
-@pytest.mark.parametrize("distance", ["likelihood", "now"])
-def test_zero_noise_and_zero_speeds_drop_no_track(distance):
+@pytest.mark.parametrize("kind", [Retrack, partial(RetrackByConsistency, distance="now")], ids=["likelihood", "now"])
+def test_zero_noise_and_zero_speeds_drop_no_track(kind):
     """Taken literally, a noise of 0 m or speeds of 0 m/s would make covariances singular."""
     frames = walk(lambda n: {1: (0.5 * n, 0.0), 2: (10.0 - 0.5 * n, 0.5)}, 30)
-    for options in ({}, {"speed_m_per_s": 0.0, "drift": 0.0, "drift_share": 0.0}):
+    for options in ({}, {"speed_m_per_s": 0.0, "drift_m_per_s": 0.0, "drift_ratio": 0.0}):
         still = walk(lambda n: {1: (0.0, 0.0), 2: (10.0, 0.5)}, 30) if options else frames
-        outputs = [offline for offline, _, _ in Retrack(distance=distance, noise_m=0.0, link_s=4.0, **options)(still)]
+        outputs = [offline for offline, _, _ in kind(noise_m=0.0, link_s=4.0, **options)(still)]
         assert [ids(frame) for frame in outputs] == [[1, 2]] * 30
 
 

@@ -27,8 +27,8 @@ from mcaptrack.evaluation.aligned import make_matchup
 from mcaptrack.evaluation.metrics import combine, score, summary
 from mcaptrack.geometry.assignment import assign, solve
 from mcaptrack.schema import Frame
-from mcaptrack.transforms import PROFILES, Retrack, Sample
-from mcaptrack.transforms.retrack import false_tracks, linking
+from mcaptrack.transforms import PROFILES, Sample
+from mcaptrack.transforms.retrack import Retracking, false_tracks, linking
 from mcaptrack.transforms.retrack.likelihood import LikelihoodPass, motion_model
 from mcaptrack.transforms.retrack.motion_model import MotionModel, State, Trajectories, smooth, to_trajectories
 
@@ -39,15 +39,15 @@ SCENES = ("coupa_3", "gates_1", "hyang_5", "nexus_2", "bookstore_2", "deathCircl
 LIMIT_STEPS = 900
 
 DEFAULT = PROFILES["default"]
-CANDIDATES: dict[str, Retrack] = {
+CANDIDATES: dict[str, Retracking] = {
     **PROFILES,
-    **{f"same source {bonus:g}": replace(DEFAULT, same_source=bonus) for bonus in (0.0, 6.0, 18.0)},
+    **{f"same source {bonus:g}": replace(DEFAULT, same_id_bonus=bonus) for bonus in (0.0, 6.0, 18.0)},
     **{f"age {age:g} s": replace(DEFAULT, max_age_s=age) for age in (1.2, 3.2)},
     **{f"noise {noise:g} m": replace(DEFAULT, noise_m=noise) for noise in (0.1, 0.2, 0.3)},
-    **{f"drift {drift:g}": replace(DEFAULT, drift=drift) for drift in (0.1, 0.18)},
+    **{f"drift {drift:g}": replace(DEFAULT, drift_m_per_s=drift) for drift in (0.1, 0.18)},
     **{f"links within {most:g} s": replace(DEFAULT, link_s=most) for most in (0.0, 8.0, 14.0, 30.0)},
-    "swaps not resolved": replace(DEFAULT, part=False),
-    **{f"certainty {least:g}": replace(DEFAULT, min_certainty=least) for least in (0.0, 0.3, 0.7)},
+    "swaps not resolved": replace(DEFAULT, resolve_swaps=False),
+    **{f"certainty {least:g}": replace(DEFAULT, track_confidence=least) for least in (0.0, 0.3, 0.7)},
     "not smoothed": replace(DEFAULT, smooth=False),
 }
 

@@ -26,46 +26,47 @@ from mcaptrack.evaluation.metrics import summary
 from mcaptrack.evaluation.metrics.displacement import TAU_M2, Displacement
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame
-from mcaptrack.transforms import PROFILES, TRANSFORMS, Predict, Retrack, Sample
+from mcaptrack.transforms import PROFILES, TRANSFORMS, Predict, Sample
+from mcaptrack.transforms.retrack import Retracking
 
 RATE_HZ = 2.5
 COLOURS = ("#888888", "#c58b00", "#c0392b", "#8e44ad", "#1f6fb2", "#2e8b57")
 
 PAPER, AUTHORS, DEFAULT = PROFILES["paper"], PROFILES["authors"], PROFILES["default"]
 #: Nothing done after the fact.
-_PLAIN = {"link_s": 0.0, "part": False, "smooth": False, "min_certainty": 0.0}
+_PLAIN = {"link_s": 0.0, "resolve_swaps": False, "smooth": False, "track_confidence": 0.0}
 _NOW = replace(
     AUTHORS,
     distance="now",
-    certain_distance=0.0,
+    priority_distance=0.0,
     birth="raw",
-    filled=False,
+    interpolated=False,
     min_history=2,
     backfill="unclaimed",
-    confirm=False,
+    trim_ends=False,
 )
 #: The way from the paper to the default, one step a row; each row's options are those of `mcaptrack retrack`.
-ABLATION: dict[str, tuple[str, Retrack]] = {
+ABLATION: dict[str, tuple[str, Retracking]] = {
     "paper": ("--profile paper", PAPER),
     "authors": ("--profile authors", AUTHORS),
     "distance of current positions": (
-        "--profile authors --distance now --certain-distance 0 --birth raw --no-filled --min-history 2 "
-        "--backfill unclaimed --no-confirm",
+        "--profile authors --distance now --priority-distance 0 --birth raw --no-interpolated --min-history 2 "
+        "--backfill unclaimed --no-trim-ends",
         _NOW,
     ),
     "computed covariance": (
-        "... --covariance predictor --predictor kalman --max-jump-m 3 --alpha 1 --beta 0",
-        replace(_NOW, covariance="predictor", predictor="kalman", max_jump_m=3.0, alpha=1.0, beta=0.0),
+        "... --covariance predictor --predictor kalman --gate-m 3 --alpha 1 --beta 0",
+        replace(_NOW, covariance="predictor", predictor="kalman", gate_m=3.0, alpha=1.0, beta=0.0),
     ),
     "likelihood, estimated noise": (
-        "--link-s 0 --no-part --no-smooth --min-certainty 0",
+        "--link-s 0 --no-resolve-swaps --no-smooth --track-confidence 0",
         replace(DEFAULT, **_PLAIN),
     ),
     "+ false-track removal": (
-        "--link-s 0 --no-part --no-smooth",
-        replace(DEFAULT, **_PLAIN | {"min_certainty": 0.5}),
+        "--link-s 0 --no-resolve-swaps --no-smooth",
+        replace(DEFAULT, **_PLAIN | {"track_confidence": 0.5}),
     ),
-    "+ offline linking": ("--no-part --no-smooth", replace(DEFAULT, part=False, smooth=False)),
+    "+ offline linking": ("--no-resolve-swaps --no-smooth", replace(DEFAULT, resolve_swaps=False, smooth=False)),
     "+ identity swaps at encounters": ("--no-smooth", replace(DEFAULT, smooth=False)),
     "+ smoothing (the default)": ("", DEFAULT),
 }
@@ -136,7 +137,7 @@ def methods(predictor: str, profile: str) -> dict[str, Callable[[list[Frame]], C
         made = Predict(predictor=which)
         return lambda samples: Candidate(name, None, samples, [frame for (frame,) in made(samples)], name)
 
-    def retrack(name: str, options: Retrack, online: bool) -> Callable[[list[Frame]], Candidate]:
+    def retrack(name: str, options: Retracking, online: bool) -> Callable[[list[Frame]], Candidate]:
         def run(samples: list[Frame]) -> Candidate:
             offline, causal, forecasts = (list(part) for part in zip(*options(samples), strict=True))
             return Candidate(name, None, causal if online else offline, forecasts if online else None, name)
@@ -222,7 +223,7 @@ def ablate(members: list[tuple[str, list[Frame], list[Frame]]], target: Path, fo
     )
 
 
-def _offline(options: Retrack) -> Callable[[list[Frame]], Candidate]:
+def _offline(options: Retracking) -> Callable[[list[Frame]], Candidate]:
     return lambda samples: Candidate("tracks", None, [result[0] for result in options(samples)])
 
 

@@ -318,7 +318,7 @@ def retrack(
     log: PathLike,
     *,
     retracker: str | Transform | None = None,
-    profile: str = "default",
+    profile: str | None = None,
     mode: Mode = "both",
     topic: str | None = None,
     to: str | None = None,
@@ -337,10 +337,10 @@ def retrack(
     log : path
         The log.
     retracker : str or Transform, optional
-        "prediction" (the default), the name of an installed re-tracker, "module:Class", or a transform.
-    profile : {"default", "paper", "authors"}, default "default"
-        Values of all options of the default re-tracker: those of this project, those of the paper (Yu and Zhou, IROS
-        2021), or those of its authors' program.
+        "likelihood" (the default), "consistency", the name of an installed re-tracker, "module:Class", or a transform.
+    profile : {"default", "paper", "authors"}, optional
+        Values of all options, and the re-tracker that they are of: those of this project, those of the paper (Yu and
+        Zhou, IROS 2021), or those of its authors' program.
     mode : {"both", "offline", "online"}, default "both"
         Write tracks that use the whole log (offline), those that use the past alone (online), or both.
     topic : str, optional
@@ -381,10 +381,12 @@ def retrack(
     ('/camera/retracks', '/camera/retracks/online')
 
     """
-    if profile not in PROFILES:
+    if profile is not None and profile not in PROFILES:
         raise McaptrackError(f"there is no profile {profile}; there are {', '.join(PROFILES)}")
+    if profile is not None and retracker is not None:
+        raise McaptrackError(f"the profile {profile} names a retracker; give one of them")
     if retracker is None:
-        retracker = PROFILES[profile]
+        retracker = PROFILES[profile or "default"]
     return run_stage(
         "retrack",
         transform_of("retrack", retracker, options),

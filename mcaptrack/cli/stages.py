@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import math
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import MISSING, Field, fields, replace
 from pathlib import Path
@@ -15,6 +16,7 @@ import typer
 from mcaptrack.cli import common
 from mcaptrack.cli.command import is_on_command_line, settings_of
 from mcaptrack.cli.running import run_on_logs
+from mcaptrack.cli.text import say
 from mcaptrack.errors import McaptrackError
 from mcaptrack.registry import BUILT_IN, Kind, names
 from mcaptrack.transforms import STAGES, Stage, Transform
@@ -38,7 +40,9 @@ Topic = Annotated[
 _NAME: Final = r"[A-Za-z0-9_-]+"
 
 
-def chooser(kind: Kind, was: str = "", words: str = "The {kind} to use", panel: str = "") -> Any:
+def chooser(
+    kind: Kind, was: str = "", words: str = "The {kind} to use", panel: str = "", shown: str | bool = True
+) -> Any:
     """The option that names one of a kind in the registry."""
     there = ", ".join(BUILT_IN[kind])
     return common.option(
@@ -49,6 +53,7 @@ def chooser(kind: Kind, was: str = "", words: str = "The {kind} to use", panel: 
         metavar="NAME",
         help=f"{words.format(kind=kind)}: {there}, one of an installed package, or module:Class.",
         autocompletion=lambda: names(kind),
+        show_default=shown,
     )
 
 
@@ -66,7 +71,8 @@ def add_stages(app: typer.Typer, panel: str) -> None:
 def stage_help(stage: Stage) -> str:
     """What the help of a stage's command says."""
     where = f"From /camera/{stage.reads} to /camera/{stage.writes}. Inputs that are missing are made first."
-    words = [inspect.cleandoc(one.__doc__ or "") for one in stage.built_in().values()]
+    docs = [inspect.cleandoc(one.__doc__ or "") for one in stage.built_in().values()]
+    words = [re.split(r"\n\n\w+\n---", doc)[0] for doc in docs]  # without the sections on use from Python
     return "\n\n".join([*words, where, _EXAMPLES[stage.name]])
 
 
@@ -82,12 +88,13 @@ def _option(field: Field[Any], annotation: Any, of: str = "") -> inspect.Paramet
     words = about.get("help", "") or f"parameter {field.name} of {of}"
     info = common.option(
         switch,
-        panel=f"Options of {of} alone" if of else about.get("theme", ""),
+        panel=f"{about.get('theme') or 'Options'} ({of} alone)" if of else about.get("theme", ""),
         tuning=_NAME if about.get("kind") else bool(choices(kind)) or kind is not str,
         help=f"{words[:1].upper()}{words[1:]}.",
         least=about.get("least", -math.inf),
         most=about.get("most", math.inf),
         show_default=shown_default(default),
+        was=about.get("was", "").replace("_", "-"),
     )
     values: Any = list[kind] if is_tuple else kind  # type: ignore[valid-type]
     return _parameter(field.name, Annotated[values | None, info], None)
@@ -124,14 +131,19 @@ def stage_command(stage: Stage, plugins: Mapping[str, type[Transform]] = Mapping
     parameters = [_parameter("logs", common.Logs, inspect.Parameter.empty)]
     if stage.kind:
         usual = stage.entry(stage.default).name
-        parameters.append(_parameter(stage.kind, Annotated[str, chooser(stage.kind, stage.was)], usual))
+        which = chooser(stage.kind, stage.was, shown=usual if stage.profiles else True)
+        annotation = (
+            Annotated[str | None, which] if stage.profiles else Annotated[str, which]
+        )  # a profile names it, too
+        parameters.append(_parameter(stage.kind, annotation, None if stage.profiles else usual))
     if stage.profiles:
         words = common.option(
             "--profile",
             tuning=True,
             help="Values of all parameters: mcaptrack's own (default), the paper's, or those of its authors' program.",
+            show_default="default",
         )
-        parameters.append(_parameter("profile", Annotated[Literal[tuple(stage.profiles)], words], "default"))
+        parameters.append(_parameter("profile", Annotated[Literal[tuple(stage.profiles)] | None, words], None))
     if stage.modes:
         words = common.option(
             "--mode",
@@ -197,23 +209,42 @@ def _transform(
     ``there`` are the names of the transforms that have an option: one that is on the command line has to be of the
     chosen one. What is set in files or in the environment may be for when another one is chosen.
     """
-    name = given.get(stage.kind) if stage.kind else None
+    name = _chosen(stage, given, wanted)
     cls = stage.find(name).cls if name else stage.default
     own = _options_of(cls)
     for option in wanted:
         if option in there and option not in own and is_on_command_line(option):
             flag = "--" + option.replace("_", "-")
-            raise McaptrackError(f"{flag} is an option of {' and '.join(there[option])}, not of {name}")
+            chosen = name or stage.entry(cls).name
+            raise McaptrackError(f"{flag} is an option of {' and '.join(there[option])}, not of {chosen}")
     hints = get_type_hints(cls)
     values = {
         option: tuple(value) if member_type(hints[option])[1] else value
         for option, value in wanted.items()
         if option in own
     }
-    profile = stage.profiles.get(given.get("profile") or "default")
-    if profile is not None and type(profile) is cls:
-        return replace(profile, **values)
-    return stage.make(name or "", **values)
+    if profile := given.get("profile"):
+        return replace(stage.profiles[profile], **values)
+    return stage.make(name, **values)
+
+
+def _chosen(stage: Stage, given: Mapping[str, Any], wanted: Mapping[str, Any]) -> str:
+    """The name of the transform: as it is given, as the profile has it, or as an option implies it; "" if nothing does.
+
+    Raises McaptrackError if the profile is of another one.
+    """
+    name = (given.get(stage.kind) if stage.kind else "") or ""
+    if profile := given.get("profile"):
+        meant = stage.choice(stage.profiles[profile])
+        if name not in ("", meant):
+            raise McaptrackError(f"the profile {profile} is of the {stage.kind} {meant}, not of {name}")
+        return meant
+    for option, implied in stage.implied.items():
+        if not name and option in wanted:
+            if not given.get("quiet"):
+                say(f"{option} belongs to --{stage.kind} {implied}, which is taken; the next release needs it named")
+            return implied
+    return name
 
 
 def run_all(

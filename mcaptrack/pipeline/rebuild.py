@@ -50,13 +50,15 @@ def rebuild(stage: Stage, made: Provenance, known: Mapping[str, Transform]) -> T
     Raises MissingPluginError if a class of another package can't be had, and McaptrackError for parameters that there
     are no more.
     """
-    had = dict(made.parameters)
+    had = stage.upgrade(made.parameters)
     cls = _class_of(stage, made, had, known)
     if plugin := made.plugins.get("predictor"):
         named = {name for other in known.values() if isinstance(name := getattr(other, "predictor", None), str)}
         if plugin.name not in named:
             _installed("predictor", plugin)
     types = {f.name: f for f in fields(cls)}
+    renamed = {was: name for name, f in types.items() if (was := f.metadata.get("was"))}
+    had = {renamed.get(name, name): value for name, value in had.items()}
     strange = sorted(set(had) - set(types))
     if strange:
         raise McaptrackError(f"it was made with {', '.join(strange)}, which {cls.__name__} does not have")

@@ -12,7 +12,7 @@ from typing import Final
 from mcaptrack.transforms.detect import FrameDifferenceDetector, KnnDetector, Mog2Detector, MotionDetector
 from mcaptrack.transforms.predict import Predict
 from mcaptrack.transforms.protocol import Transform
-from mcaptrack.transforms.retrack import PROFILES, Retrack
+from mcaptrack.transforms.retrack import PROFILES, Retrack, RetrackByConsistency
 from mcaptrack.transforms.sample import Sample
 from mcaptrack.transforms.sort import ByteTrack, OcSort, Sort
 from mcaptrack.transforms.stages import FULL, STAGES, Stage
@@ -31,6 +31,7 @@ __all__ = [
     "OcSort",
     "Predict",
     "Retrack",
+    "RetrackByConsistency",
     "Sample",
     "Sort",
     "Stage",

@@ -57,6 +57,7 @@ def option(
     search: tuple[float, float] | None = None,
     kind: Kind | None = None,
     theme: str = "",
+    was: str = "",
 ) -> Any:
     """A parameter of a transform: its default, what it means, and its range.
 
@@ -65,11 +66,13 @@ def option(
 
     ``search`` is the part of the range that is worth a search (``mcaptrack tune``); None for what isn't tuned.
     ``kind`` says that a text is a name of that kind in ``mcaptrack.registry``. ``theme`` is a heading that parameters
-    share in the help of a command that has many.
+    share in the help of a command that has many. ``was`` is the name that it had before, which is accepted for one
+    release.
     """
     if most is None:
         most = math.inf if least == -math.inf else LARGEST
     about = {"help": help, "least": least, "most": most, "search": search, "kind": kind, "theme": theme}
+    about["was"] = was
     return field(default=default, metadata=about)
 
 

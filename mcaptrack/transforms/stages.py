@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import difflib
 import inspect
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
 from types import MappingProxyType
 from typing import Any, Final
@@ -18,7 +18,7 @@ from mcaptrack.registry import BUILT_IN, Entry, Kind, entry_of, failure, find
 from mcaptrack.transforms.detect import KnnDetector
 from mcaptrack.transforms.predict import Predict
 from mcaptrack.transforms.protocol import Transform, option_problem
-from mcaptrack.transforms.retrack import PROFILES, Retrack
+from mcaptrack.transforms.retrack import PROFILES, Retrack, upgrade_parameters
 from mcaptrack.transforms.sample import Sample
 from mcaptrack.transforms.sort import Sort
 
@@ -55,6 +55,10 @@ class Stage:
         Sets of parameters by name.
     modes : Mapping[str, tuple[str, ...]]
         Which of its outputs to write, by name.
+    implied : Mapping[str, str]
+        Options that choose a transform, by name, where none is named.
+    upgrade : Callable
+        Converts parameters of earlier versions to those of today.
 
     """
 
@@ -70,6 +74,8 @@ class Stage:
     at_video_rate: bool = False
     profiles: Mapping[str, Transform] = field(default_factory=dict)
     modes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    implied: Mapping[str, str] = field(default_factory=dict)
+    upgrade: Callable[[Mapping[str, Any]], dict[str, Any]] = dict
 
     def outputs(self, target: str) -> tuple[str, ...]:
         """The topics that the stage takes if it writes to ``target``."""
@@ -218,6 +224,8 @@ _STAGES: Final = (
         modes=MappingProxyType(
             {"both": ("", "online", "predictions"), "offline": ("",), "online": ("online", "predictions")}
         ),
+        implied=MappingProxyType({"distance": "consistency"}),
+        upgrade=upgrade_parameters,
     ),
 )
 #: All steps by name, in the order in which they run.

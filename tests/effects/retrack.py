@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
 
 from mcaptrack.schema import Frame
-from mcaptrack.transforms import PROFILES
+from mcaptrack.transforms import PROFILES, Retrack, RetrackByConsistency
 from tests.effects import (
     Case,
     Outputs,
@@ -27,7 +27,8 @@ CASES: dict[tuple[str, str], Case] = {}
 
 
 def case(option: str, *args: Any) -> None:
-    CASES["retrack", option] = Case(*args)
+    own = {f.name for f in fields(RetrackByConsistency)} - {f.name for f in fields(Retrack)}
+    CASES["consistency" if option in own else "retrack", option] = Case(*args)
 
 
 def online_rows(outputs: Outputs) -> int:
@@ -94,7 +95,7 @@ def off_the_path(outputs: Outputs) -> float:
 
 
 CIRCLES = turning(0.8, 15.0)
-LIKELY = replace(PROFILES["default"], link_s=0.0, part=False, smooth=False, min_certainty=0.0)
+LIKELY = replace(PROFILES["default"], link_s=0.0, resolve_swaps=False, smooth=False, track_confidence=0.0)
 PAPER = PROFILES["paper"]
 #: The paper's method with nothing that hides short tracks.
 BARE = replace(PAPER, min_hits=0, min_track_s=0.0)
@@ -151,33 +152,33 @@ case(
     {0.1: 0, 0.5: 0, 2.0: 1},
 )
 case(
-    "drift",
+    "drift_m_per_s",
     "a person goes round in circles, 15 degrees a tick",
-    replace(LIKELY, drift_share=0.0, smooth=True),
+    replace(LIKELY, drift_ratio=0.0, smooth=True),
     CIRCLES,
     off_the_path,
     {1.0: "least", 0.3: "more", 0.1: "most"},
 )
 case(
-    "drift_share",
+    "drift_ratio",
     "a person goes round in circles, 15 degrees a tick",
-    replace(LIKELY, drift=0.0, smooth=True),
+    replace(LIKELY, drift_m_per_s=0.0, smooth=True),
     CIRCLES,
     off_the_path,
     {0.5: "least", 0.05: "more"},
 )
 case("max_distance", "1 m aside after a step: 1 sigma", NOW, stands_then_jumps(1.0), people, {0.99: 2, 1.0: 1})
 case(
-    "certain_distance",
+    "priority_distance",
     """Tracks 1 and 2 stand at 0 and 1 m, then 3 stands at 0.1 m and 4 at -0.9 m. To 1 they are 0.1 and 0.9, to 2 0.9 and
     1.9 far: crosswise makes 1.8, straight 2.0; only a certain pair keeps 3 with 1.""",
-    replace(NOW, max_jump_m=None, max_distance=9.0),
+    replace(NOW, gate_m=None, max_distance=9.0),
     walk(lambda n: {1: (0.0, 0.0), 2: (1.0, 0.0)} if n < 10 else {3: (0.1, 0.0), 4: (-0.9, 0.0)}, 12),
     lambda outputs: next(int(r["track_id"]) for r in outputs[1][11].rows if r["source_id"] == 3),
     {0.0: 2, 0.2: 1},
 )
 case(
-    "max_jump_m",
+    "gate_m",
     "2 m aside after a step",
     replace(NOW, max_distance=9.0),
     stands_then_jumps(2.0),
@@ -185,7 +186,7 @@ case(
     {1.99: 2, 2.0: 1, None: 1},
 )
 case(
-    "same_source",
+    "same_id_bonus",
     "two stand 0.4 m apart and change places within a tick, each with its id",
     LIKELY,
     walk(lambda n: {1: (0.0, 0.0), 2: (0.4, 0.0)} if n < 10 else {1: (0.4, 0.0), 2: (0.0, 0.0)}, 30),
@@ -201,7 +202,7 @@ case(
     {0.8: 2, 2.0: 2, 2.4: 1, 2.8: 1},
 )
 case(
-    "share_m",
+    "merge_distance_m",
     "two are one detection for 2 s, 0.6 m beside where both are expected",
     LIKELY,
     one_box(range(15, 20)),
@@ -209,7 +210,7 @@ case(
     {0.0: 1, 0.5: 1, 0.7: 2},
 )
 case(
-    "share_s",
+    "merge_timeout_s",
     "two are one detection for 10 ticks, 4 s; lost, a track is shown for 1.2 s more",
     LIKELY,
     one_box(range(15, 25)),
@@ -217,7 +218,7 @@ case(
     {0.0: 1, 2.0: 1, 3.0: 2, 4.0: 2},
 )
 case(
-    "sure_s",
+    "confirm_s",
     "a person is seen from tick 0 on, every 0.4 s",
     LIKELY,
     line(0.5, 20, 20),
@@ -273,7 +274,7 @@ case(
     {0: 3, 1: 4, 3: 6},
 )
 case(
-    "confirm",
+    "trim_ends",
     "seen until tick 9, and for one match more, at tick 16; two in a row would have confirmed it",
     replace(PAPER, min_hits=2),
     walk(lambda n: {1: (0.5 * n, 0.0)} if n < 10 else {2: (0.5 * n, 0.0)} if 13 <= n < 17 else {}, 20),
@@ -305,7 +306,7 @@ case(
     {False: 2, True: 1},
 )
 case(
-    "link_certainty",
+    "link_confidence",
     "a person walks on behind a wall, 1 m aside",
     replace(LIKELY, link_s=20.0),
     hidden(range(20, 35), 60, aside_m=1.0),
@@ -313,9 +314,9 @@ case(
     {0.05: 1, 0.99: 2},
 )
 case(
-    "part",
+    "resolve_swaps",
     "two pass, unseen for a moment, the ids of the input change sides, and they are believed",
-    replace(LIKELY, same_source=60.0),
+    replace(LIKELY, same_id_bonus=60.0),
     walk(
         lambda n: {} if 29 <= n <= 31 else {1 + (n > 30): (0.4 * (n - 30), 0.0), 2 - (n > 30): (0.4 * (30 - n), 0.5)},
         61,
@@ -324,7 +325,7 @@ case(
     {False: False, True: True},
 )
 case(
-    "min_certainty",
+    "track_confidence",
     "a person walks for 24 s; something leaps about for 2.4 s",
     LIKELY,
     walk(lambda n: {1: (0.4 * n, 0.0)} | ({9: (*(noise(60, 0.5)[n] + [0, 20]),)} if 20 <= n < 27 else {}), 60),
@@ -348,9 +349,9 @@ case(
     {"none": 13, "unclaimed": 14, "all": 14},
 )
 case(
-    "filled",
+    "interpolated",
     "ten ticks, of which the tracker interpolated every other one",
-    replace(LIKELY, min_track_s=0.0, sure_s=0.0, coast_s=0.0),
+    replace(LIKELY, min_track_s=0.0, confirm_s=0.0, coast_s=0.0),
     [
         frame._replace(rows=tracks_at({7: (0.5 * n, 0.0)}, observed=n % 2 == 0))
         for n, frame in enumerate(line(0.5, 10, 10))

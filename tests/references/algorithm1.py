@@ -73,7 +73,7 @@ class Algorithm1:
         self.options, self.predict = options, predict
         self.length = max(past, options.min_history, 2)
         self.tracks: list[Track] = []
-        self.claims = Claims(asks=options.confirm)
+        self.claims = Claims(asks=options.trim_ends)
         self.born = 0
 
     def run(self, samples: list[list[Row]], times_ns: list[int]):
@@ -81,7 +81,7 @@ class Algorithm1:
         steps = steps_of(times_ns, o.rate_hz)
         online, predictions = [], []
         for step, rows in histories(samples, steps, self.length):
-            ready = [(r, run) for r, run in rows if len(run) >= o.min_history and (o.filled or r["observed"])]
+            ready = [(r, run) for r, run in rows if len(run) >= o.min_history and (o.interpolated or r["observed"])]
             observations = [(row, run, *self.predict(run)) for row, run in ready]
             pairs = self.match(step, observations)
             shown = self.update(step, pairs, observations) + self.start(step, pairs, observations)
@@ -100,11 +100,11 @@ class Algorithm1:
                 age = step - track.seen
                 distance = round(self.distance(track, age, run[-1], mean, cov), 6)
                 jump = hypot(*(track.mean[age - 1] - run[-1])) if age <= len(track.mean) else inf
-                near = distance <= o.max_distance and (o.max_jump_m is None or jump <= o.max_jump_m)
+                near = distance <= o.max_distance and (o.gate_m is None or jump <= o.gate_m)
                 cost = distance if near else None
-                if distance < o.certain_distance:
+                if distance < o.priority_distance:
                     cost = -100.0
-                same = o.same_source if row["track_id"] == track.source else 0.0
+                same = o.same_id_bonus if row["track_id"] == track.source else 0.0
                 value[-1].append(None if cost is None else same - cost)
         return best_assignment(value, most_pairs=True)
 

@@ -38,8 +38,8 @@ class Person:
     def here(self) -> np.ndarray:
         return self.mean[:, 0]
 
-    def predict(self, seconds: float, drift: float, drift_share: float) -> None:
-        power = (drift + drift_share * hypot(*self.mean[:, 1])) ** 2
+    def predict(self, seconds: float, drift: float, drift_ratio: float) -> None:
+        power = (drift + drift_ratio * hypot(*self.mean[:, 1])) ** 2
         move = np.array([[1, seconds], [0, 1]])
         noise = power * np.array([[seconds**3 / 3, seconds**2 / 2], [seconds**2 / 2, seconds]])
         self.mean, self.cov = self.mean @ move.T, move @ self.cov @ move.T + noise
@@ -58,7 +58,7 @@ class OnlineTracker:
         o = self.options = options
         self.predict, self.past = predict, past
         self.noise_m = 0.2 if o.noise_m is None else max(o.noise_m, LEAST)
-        self.confirm = max(1, round(o.sure_s * o.rate_hz) + 1)
+        self.confirm = max(1, round(o.confirm_s * o.rate_hz) + 1)
         self.max_age = max(1, round(o.max_age_s * o.rate_hz))
         self.people: list[Person] = []
         self.claims = Claims()
@@ -72,7 +72,7 @@ class OnlineTracker:
         places: dict[tuple[int, int], Point] = {}
         for at, (step, rows) in enumerate(zip(steps, samples, strict=True)):
             passed = step - steps[at - 1] if at else 1
-            seen = sorted((r for r in rows if r["observed"] or o.filled), key=lambda row: row["track_id"])
+            seen = sorted((r for r in rows if r["observed"] or o.interpolated), key=lambda row: row["track_id"])
             has = self.step(seen, passed)
             shown = []
             for person in self.people:
@@ -104,7 +104,7 @@ class OnlineTracker:
             person.missed += passed
         self.people = [p for p in self.people if p.missed <= (self.max_age if p.hits >= self.confirm else young)]
         for person in self.people:
-            person.predict(passed / o.rate_hz, o.drift, o.drift_share)
+            person.predict(passed / o.rate_hz, o.drift_m_per_s, o.drift_ratio)
         value = [[self.gain(person, row, rows) for row in rows] for person in self.people]
         pairs = best_assignment(value, most_pairs=False)
         has = {self.people[a].name: rows[b] for a, b in pairs}
@@ -114,7 +114,7 @@ class OnlineTracker:
             if person.name in has:
                 row = has[person.name]
                 host = person.name in hosts
-                person.correct(place(row), o.share_m / 2 if host else self._noise_before)
+                person.correct(place(row), o.merge_distance_m / 2 if host else self._noise_before)
                 person.hits, person.missed, person.merged = person.hits + 1, 0, 0
                 person.source = -1 if host else row["track_id"]
         for row in rows:
@@ -139,7 +139,7 @@ class OnlineTracker:
         gain = self.CAP - squared - 2 * log(variance)
         if person.source == row["track_id"]:
             others = [hypot(*(place(other) - place(row))) for other in rows if other is not row]
-            gain += o.same_source / 3 if any(apart < self.CROWD_M for apart in others) else o.same_source
+            gain += o.same_id_bonus / 3 if any(apart < self.CROWD_M for apart in others) else o.same_id_bonus
         if row["track_id"] not in self.known and person.missed == 1:
             gain -= self.FRESH
         gain = round(gain, 6)
@@ -150,16 +150,21 @@ class OnlineTracker:
         o, hosts = self.options, set()
         sure = [p for p in self.people if p.name in has and p.hits >= self.confirm]
         for person in self.people:
-            if person.name in has or person.hits < self.confirm or person.merged / o.rate_hz >= o.share_s or not sure:
+            if (
+                person.name in has
+                or person.hits < self.confirm
+                or person.merged / o.rate_hz >= o.merge_timeout_s
+                or not sure
+            ):
                 continue
             host = min(sure, key=lambda p: hypot(*(place(has[p.name]) - person.here)))
             at = place(has[host.name])
             middle = (host.here + person.here) / 2
-            if hypot(*(at - person.here)) < o.share_m and hypot(*(at - middle)) < hypot(*(at - host.here)):
+            if hypot(*(at - person.here)) < o.merge_distance_m and hypot(*(at - middle)) < hypot(*(at - host.here)):
                 hosts.add((host.name, person.name))
         for host, guest in hosts:
             person = next(p for p in self.people if p.name == guest)
-            person.correct(place(has[host]), o.share_m / 2)
+            person.correct(place(has[host]), o.merge_distance_m / 2)
             person.missed, person.merged = max(person.missed - passed, 1), person.merged + passed
         return {host for host, _ in hosts}
 

@@ -112,16 +112,16 @@ def filled(path: dict[int, Row], track: int) -> dict[int, Row]:
 def offline(claims: Claims, samples: list[list[Row]], steps: list[int], options, noise_m: float) -> list[list[Row]]:
     """The rows of each frame once the whole log is known."""
     o = options
-    motion = Motion(max(noise_m, LEAST), max(o.speed_m_per_s, LEAST), o.drift, o.drift_share, 1 / o.rate_hz)
+    motion = Motion(max(noise_m, LEAST), max(o.speed_m_per_s, LEAST), o.drift_m_per_s, o.drift_ratio, 1 / o.rate_hz)
     of = {(step, row["track_id"]): row for step, rows in zip(steps, samples, strict=True) for row in rows}
-    paths = claims.paths(of, o.backfill == "all")
+    paths = claims.paths(of, o.shares_samples)
     if o.link_s > 0:
-        name = linked(motion, places_of(paths), o.link_s, o.link_certainty)
+        name = linked(motion, places_of(paths), o.link_s, o.link_confidence)
         joined: dict[int, dict[int, Row]] = {}
         for track, path in paths.items():
             joined.setdefault(name[track], {}).update(path)
         paths = joined
-    for _ in range(3 if o.part else 0):
+    for _ in range(3 if o.resolve_swaps else 0):
         ids = {track: {step: row["track_id"] for step, row in path.items()} for track, path in paths.items()}
         owner = exchanged(motion, places_of(paths), ids)
         changed: dict[int, dict[int, Row]] = {}
@@ -137,7 +137,7 @@ def offline(claims: Claims, samples: list[list[Row]], steps: list[int], options,
         if o.smooth:
             for step, state in motion.smoothed(places_of(paths)[track]).items():
                 move_to(tracks[track][step], state.mean[:, 0], o.ground_planes)
-        if len(tracks[track]) < round(o.min_track_s * o.rate_hz) + 1 or sigmoid(odds[track]) < o.min_certainty:
+        if len(tracks[track]) < round(o.min_track_s * o.rate_hz) + 1 or sigmoid(odds[track]) < o.track_confidence:
             del tracks[track]
     return [[tracks[track][step] for track in sorted(tracks) if step in tracks[track]] for step in steps]
 

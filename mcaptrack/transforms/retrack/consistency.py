@@ -26,7 +26,7 @@ from mcaptrack.transforms.retrack.distances import metric_distances, position_di
 from mcaptrack.transforms.retrack.motion_model import DEFAULT_NOISE_M
 
 if TYPE_CHECKING:
-    from mcaptrack.transforms.retrack import Retrack
+    from mcaptrack.transforms.retrack.options import RetrackByConsistency
 
 #: Cost of a pair with priority: lower than any sum of other costs.
 _PRIORITY_COST: Final = -100.0
@@ -35,7 +35,7 @@ _PRIORITY_COST: Final = -100.0
 class ConsistencyPass:
     """Algorithm 1 over one log: ``step`` for each frame, then ``outputs``."""
 
-    def __init__(self, options: Retrack) -> None:
+    def __init__(self, options: RetrackByConsistency) -> None:
         horizon = max(1, round(options.horizon_s * options.rate_hz))
         self._options = options
         self._predictor: Predictor = make(options.predictor, horizon, 1 / options.rate_hz)
@@ -64,7 +64,7 @@ class ConsistencyPass:
         sources = frame.rows["track_id"]
         past, valid = self._histories.push(sources, np.stack([frame.rows["x_m"], frame.rows["y_m"]], axis=-1), passed)
         usable = valid[:, -self._options.min_history :].all(axis=1)
-        if not self._options.filled:
+        if not self._options.interpolated:
             usable &= frame.rows["observed"]
         row_at = np.flatnonzero(usable)
         past, valid = past[usable], valid[usable]
@@ -74,7 +74,7 @@ class ConsistencyPass:
         track, observation = self._match(step, past[:, -1], predictions, sources[row_at])
         self._update(step, track, past[observation, -1], sources[row_at[observation]])
         self.assignments.add(step, self._tracks.ids[track], sources[row_at[observation]])
-        if self._options.confirm:
+        if self._options.trim_ends:
             is_confirmed = self._tracks.hits[track] >= self._options.min_hits
             self.assignments.confirm(step, self._tracks.ids[track[is_confirmed]])
         new = np.setdiff1d(np.arange(len(row_at)), observation)
@@ -94,18 +94,17 @@ class ConsistencyPass:
         options, tracks = self._options, self._tracks
         age = step - tracks.last_step
         sigma_m = options.sigma_m if options.covariance == "paper" else None
-        kind = options.distance
-        if kind == "now" or kind == "likelihood":  # noqa: PLR1714 - so that mypy knows the others
+        if options.distance == "now":
             distance = position_distances(tracks.prediction, age, xy_m, self.noise_m, sigma_m)
         else:
-            distance = prediction_distances(tracks.prediction, age, predictions, kind, sigma_m)
+            distance = prediction_distances(tracks.prediction, age, predictions, options.distance, sigma_m)
         # The last digits of predictions depend on the size of the batch; assignments must not.
         distance = np.round(distance, 6)
         cost = np.where(distance <= options.max_distance, distance, np.inf)
-        if options.max_jump_m is not None:
-            cost = np.where(metric_distances(tracks.prediction, age, xy_m) <= options.max_jump_m, cost, np.inf)
-        cost = np.where(distance < options.certain_distance, _PRIORITY_COST, cost)
-        cost = cost - options.same_source * (tracks.source[:, None] == sources[None])
+        if options.gate_m is not None:
+            cost = np.where(metric_distances(tracks.prediction, age, xy_m) <= options.gate_m, cost, np.inf)
+        cost = np.where(distance < options.priority_distance, _PRIORITY_COST, cost)
+        cost = cost - options.same_id_bonus * (tracks.source[:, None] == sources[None])
         return assign(cost, np.finfo(float).max)
 
     def _update(self, step: int, track: Indices, xy_m: Floats, sources: Ints) -> None:
@@ -132,7 +131,7 @@ class ConsistencyPass:
         hits = np.zeros(count, np.int64)
         self._tracks = self._tracks + ActiveTracks(ids, np.full(count, step), hits, sources.copy(), history, prediction)
         self.assignments.add(step, ids, sources)
-        if self._options.confirm:
+        if self._options.trim_ends:
             self.assignments.confirm(step, ids)
         if self._options.backfill != "none":
             track, back = np.nonzero(valid[:, :-1][:, ::-1][:, : max(self._options.min_history, 4) - 1])

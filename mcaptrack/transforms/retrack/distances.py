@@ -12,7 +12,7 @@ import numpy as np
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.predictors import Forecast
 
-Distance = Literal["mean", "max", "first", "now", "likelihood"]
+Distance = Literal["mean", "max", "first", "now"]
 Covariance = Literal["paper", "predictor"]
 
 

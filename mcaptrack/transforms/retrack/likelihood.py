@@ -21,7 +21,7 @@ from mcaptrack.transforms.retrack.offline import move_rows
 from mcaptrack.transforms.retrack.online_tracker import Association, OnlineTracker, Step
 
 if TYPE_CHECKING:
-    from mcaptrack.transforms.retrack import Retrack
+    from mcaptrack.transforms.retrack.options import Retrack, Retracking
 
 #: Predictions that are made at once: more take memory, fewer take time.
 _BATCH: Final = 4096
@@ -34,15 +34,15 @@ class LikelihoodPass:
 
     def __init__(self, options: Retrack) -> None:
         rate, self._options = options.rate_hz, options
-        self._confirm_hits = round(options.sure_s * rate) + 1
+        self._confirm_hits = round(options.confirm_s * rate) + 1
         max_age = max(1, round(options.max_age_s * rate))
         self._tracker = OnlineTracker(
             model=motion_model(options, DEFAULT_NOISE_M if options.noise_m is None else options.noise_m),
             association=Association(
-                same_id=options.same_source,
-                same_id_crowded=options.same_source / 3,
-                merge_distance_m=options.share_m,
-                merge_timeout_s=options.share_s,
+                same_id=options.same_id_bonus,
+                same_id_crowded=options.same_id_bonus / 3,
+                merge_distance_m=options.merge_distance_m,
+                merge_timeout_s=options.merge_timeout_s,
             ),
             step_s=1 / rate,
             max_age=max_age,
@@ -69,7 +69,7 @@ class LikelihoodPass:
             passed = max(1, round((frame.t_ns - self._frames[-1].t_ns) * self._options.rate_hz / NS_PER_S))
         step = self.steps[-1] + passed if self.steps else 0
         rows = frame.rows
-        observed = np.flatnonzero(rows["observed"]) if not self._options.filled else np.arange(len(rows))
+        observed = np.flatnonzero(rows["observed"]) if not self._options.interpolated else np.arange(len(rows))
         observed = observed[np.argsort(rows["track_id"][observed], kind="stable")]
         xy_m = np.stack([rows["x_m"][observed], rows["y_m"][observed]], axis=-1)
         source = rows["track_id"][observed]
@@ -166,7 +166,7 @@ class LikelihoodPass:
         return Forecast(*(np.concatenate(members) for members in zip(*parts, strict=True)))
 
 
-def motion_model(options: Retrack, noise_m: float) -> MotionModel:
+def motion_model(options: Retracking, noise_m: float) -> MotionModel:
     """The motion model of the options, with this noise of measured positions."""
     noise_m, speed_m_per_s = max(noise_m, _MIN_SPREAD), max(options.speed_m_per_s, _MIN_SPREAD)
-    return MotionModel(noise_m, speed_m_per_s, options.drift, options.drift_share)
+    return MotionModel(noise_m, speed_m_per_s, options.drift_m_per_s, options.drift_ratio)

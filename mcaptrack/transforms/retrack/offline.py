@@ -23,14 +23,14 @@ from mcaptrack.transforms.retrack.linking import link_tracks
 from mcaptrack.transforms.retrack.motion_model import MotionModel, smooth, to_trajectories
 
 if TYPE_CHECKING:
-    from mcaptrack.transforms.retrack import Retrack
+    from mcaptrack.transforms.retrack.options import Retracking
 
 #: How often encounters are examined again after identities were swapped.
 _ROUNDS: Final = 3
 
 
 def offline_tracks(
-    options: Retrack,
+    options: Retracking,
     model: MotionModel,
     assignments: Assignments,
     sample_rows: Sequence[Rows],
@@ -40,18 +40,18 @@ def offline_tracks(
     """The rows of all tracks, ordered by step and id, and the step of each.
 
     ``sample_rows`` are the input rows of each of ``steps``. A sample that was assigned to two tracks goes to the one
-    that had it first; with ``backfill`` "all" both keep it, as in the authors' program.
+    that had it first, unless both keep it (``shares_samples``), as in the authors' program.
     """
     samples = TRACKS.joined(sample_rows)
     step, track, source, sample = assignments.of(samples, steps, [len(rows) for rows in sample_rows])
-    if options.backfill != "all":
+    if not options.shares_samples:
         _, kept = np.unique(sample, return_index=True)
         step, track, source, sample = step[kept], track[kept], source[kept], sample[kept]
     xy_m = np.stack([samples["x_m"][sample], samples["y_m"][sample]], axis=-1)
     step_s = 1 / options.rate_hz
     if options.link_s > 0 and len(track):
         track = _linked(options, model, step, track, xy_m, step_s)
-    if options.part and len(track):
+    if options.resolve_swaps and len(track):
         for _ in range(_ROUNDS):
             ids, row, trajectories = to_trajectories(step, track, xy_m, model.noise_m)
             owner, changed = resolve_swaps(model, trajectories, row, source, step_s)
@@ -61,13 +61,13 @@ def offline_tracks(
     order = np.lexsort((step, track))
     step, track, sample = step[order], track[order], sample[order]
     rows, row_step = _interpolated(samples, step, track, sample)
-    if len(rows) and (options.smooth or options.min_certainty > 0):
+    if len(rows) and (options.smooth or options.track_confidence > 0):
         ids, _, trajectories = to_trajectories(step, track, xy_m[order], model.noise_m)
         _, _, smoothed = smooth(model, trajectories, step_s)
         if options.smooth:  # rows and trajectories are both ordered by track, then by step
             when = np.array(times_ns, np.int64)[np.minimum(np.searchsorted(steps, row_step), len(times_ns) - 1)]
             rows = move_rows(rows, smoothed.mean[:, :2], options.ground_planes, when)
-        is_person = track_confidence(model, trajectories, smoothed, step_s) >= options.min_certainty
+        is_person = track_confidence(model, trajectories, smoothed, step_s) >= options.track_confidence
         kept_rows = is_person[np.searchsorted(ids, rows["track_id"])]
         rows, row_step = rows[kept_rows], row_step[kept_rows]
     min_rows = round(options.min_track_s * options.rate_hz) + 1
@@ -79,11 +79,11 @@ def offline_tracks(
     return rows[order], row_step[order]
 
 
-def _linked(options: Retrack, model: MotionModel, step: Ints, track: Ints, xy_m: Floats, step_s: float) -> Ints:
+def _linked(options: Retracking, model: MotionModel, step: Ints, track: Ints, xy_m: Floats, step_s: float) -> Ints:
     """The track of each assignment (C,) after linking tracks of the same person."""
     ids, _, trajectories = to_trajectories(step, track, xy_m, model.noise_m)
     forward, backward, _ = smooth(model, trajectories, step_s)
-    continued_by = link_tracks(model, trajectories, forward, backward, step_s, options.link_s, options.link_certainty)
+    continued_by = link_tracks(model, trajectories, forward, backward, step_s, options.link_s, options.link_confidence)
     root = np.arange(len(ids))
     order = np.argsort(trajectories.step[trajectories.first[:-1]], kind="stable")  # a continuation begins later
     for one in order[continued_by[order] >= 0].tolist():
