@@ -290,7 +290,7 @@ def test_boxes_of_others_that_can_not_be_read_leave_the_other_tables_as_they_are
         4,
     )
     (warning,) = data["warnings"]
-    assert (warning["code"], "no vision_msgs" in warning["message"]) == ("left-out", True)
+    assert (warning["code"], "not a vision_msgs" in warning["message"]) == ("left-out", True)
     assert "no boxes of /lidar/boxes are in the table" in warning["message"]
 
 

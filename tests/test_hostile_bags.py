@@ -324,7 +324,7 @@ def test_a_signal_ends_a_query(folder, monkeypatch, raised):
     old = signal.signal(signal.SIGUSR1, handler)
     looks = []
 
-    class Watched(bag_database.Database):
+    class Watched(bag_database.SqliteTables):
         @property
         def _most_steps(self) -> int:  # asked for at every look
             looks.append(len(looks))

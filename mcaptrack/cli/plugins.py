@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import pairwise
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any, Final
 
@@ -68,10 +68,12 @@ def _values(words: Sequence[str], option: str) -> list[str]:
 
 
 def _of_words(stage: Stage, words: Sequence[str]) -> Iterator[tuple[str, type[Transform]]]:
-    for option in filter(None, (stage.kind, stage.was)):
-        for name in _values(words, option):
-            if name not in BUILT_IN[stage.kind or ""]:
-                yield name, stage.find(name).cls
+    given = [values for option in filter(None, (stage.kind, stage.was)) if (values := _values(words, option))]
+    if len(given) > 1:
+        return  # both names of the option: refused where the command line is parsed
+    for name in chain.from_iterable(given):
+        if name not in BUILT_IN[stage.kind or ""]:
+            yield name, stage.find(name).cls
 
 
 def _of_settings(stage: Stage, files: Sequence[ConfigFile], known: Mapping[str, Any]) -> list[str]:

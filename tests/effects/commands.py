@@ -38,7 +38,7 @@ def stage(command: str, **others: str | tuple[str, str]) -> dict[str, Case]:
         camera="--camera other",
         output="-o b.mcap",
         sidecar="--sidecar",
-        force=(f"{base} -o clip.mp4", "--force"),
+        force=(f"{base} -o fresh.mcap", "--force"),
         **others,
     )
 
@@ -101,7 +101,7 @@ CASES: dict[str, dict[str, Case]] = {
         camera="--camera other",
         output="-o b.mcap",
         sidecar="--sidecar",
-        force=("events a.mcap -o clip.mp4", "--force"),
+        force=("events a.mcap -o fresh.mcap", "--force"),
     ),
     "evaluate": common(
         "evaluate a.mcap",
@@ -184,12 +184,12 @@ CASES: dict[str, dict[str, Case]] = {
         "report a.mcap", camera="--camera other", output="-o b.html", force=("report a.mcap -o clip.mp4", "--force")
     ),
     "check": common("check a.mcap", output="-o b.txt", force=("check a.mcap -o clip.mp4", "--force")),
-    "recover": common("recover a.mcap", output="-o b.mcap", force=("recover a.mcap -o clip.mp4", "--force")),
+    "recover": common("recover a.mcap", output="-o b.mcap", force=("recover a.mcap -o fresh.mcap", "--force")),
     "drop": common(
         "drop a.mcap /camera/retracks",
         output="-o b.mcap",
         in_place=("drop robot.mcap /a", "--in-place"),
-        force=("drop a.mcap /camera/retracks -o clip.mp4", "--force"),
+        force=("drop a.mcap /camera/retracks -o fresh.mcap", "--force"),
     ),
     "demo": common("demo", output="-o b", force=("demo -o taken", "--force"), scene="--scene crowd", seed="--seed 3"),
     "docs": common("docs", output="-o pages.txt", force=("docs -o clip.mp4", "--force")),
