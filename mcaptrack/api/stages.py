@@ -1,8 +1,4 @@
-"""Run one stage on a log: detect, track, sample, predict, retrack.
-
-Each function writes channels into the log (or into a copy, ``output``) and returns what came of it. Inputs that are
-missing are made first.
-"""
+"""Run one stage on a log: detect, track, sample, predict, retrack. Inputs that are missing are made first."""
 
 from __future__ import annotations
 
