@@ -76,6 +76,13 @@ def stage_help(stage: Stage) -> str:
     return "\n\n".join([*words, where, _EXAMPLES[stage.name]])
 
 
+def _panel(theme: str, of: str) -> str:
+    """The heading above an option in help: its theme, and which transform alone has it."""
+    if not of:
+        return theme
+    return f"{theme} ({of} alone)" if theme else f"Options of {of} alone"
+
+
 def _option(field: Field[Any], annotation: Any, of: str = "") -> inspect.Parameter:
     """The option for a parameter: None unless it is given; its help shows the default.
 
@@ -88,7 +95,7 @@ def _option(field: Field[Any], annotation: Any, of: str = "") -> inspect.Paramet
     words = about.get("help", "") or f"parameter {field.name} of {of}"
     info = common.option(
         switch,
-        panel=f"{about.get('theme') or 'Options'} ({of} alone)" if of else about.get("theme", ""),
+        panel=_panel(about.get("theme", ""), of),
         tuning=_NAME if about.get("kind") else bool(choices(kind)) or kind is not str,
         help=f"{words[:1].upper()}{words[1:]}.",
         least=about.get("least", -math.inf),
