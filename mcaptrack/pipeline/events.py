@@ -68,7 +68,7 @@ def outputs(topic: str) -> tuple[str, ...]:
 
 
 def make_events(opened: log.Log, prefix: str, made: Mapping[str, Made], watch: Watch) -> dict[str, Made]:
-    """The events of all channels that are watched and whose events are missing or out of date; so with forecasts.
+    """Events of all watched channels where they are missing or out of date, and errors of predictions likewise.
 
     ``made`` are channels that were just made. What can't be compared with the truth is left out, with a warning.
     Raises McaptrackError for topics that were asked for and hold no tracks.

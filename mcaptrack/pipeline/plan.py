@@ -92,11 +92,11 @@ def _stage_from(opened: log.Log, source: str) -> str:
 
 
 class _Planner:
-    """Collects the jobs that make channels stand and be up to date.
+    """Collects the jobs that make missing channels, and those that are out of date.
 
-    ``sources`` are inputs of stages and ``defaults`` transforms of stages, where they are not the usual ones. With
-    ``anew`` all stages run, whether or not their channels stand; those by whose options
-    (``chosen``) ``defaults`` take something else than before run, too.
+    ``sources`` gives inputs and ``defaults`` transforms of stages that differ from the usual ones. With ``anew`` all
+    stages run, also those that are up to date. A stage also runs if an option in ``chosen`` differs from the one that
+    its channel was made with.
     """
 
     def __init__(
@@ -160,7 +160,7 @@ class _Planner:
         return self._make_again(made, made.transform, topic)
 
     def _sibling(self, stage: str, topic: str) -> Provenance | None:
-        """How the other outputs of a stage were made whose output at ``topic`` is missing."""
+        """The provenance of the other outputs of a stage, if its output at ``topic`` is missing."""
         topics = STAGES[stage].outputs(_main(self._opened, stage, topic)) if stage else ()
         found = (
             Provenance.from_metadata(self._opened.channels[one].metadata)

@@ -151,7 +151,7 @@ class Shown(NamedTuple):
 
 
 def _shown(opened: log.Log, camera: Camera, made: Mapping[str, Made]) -> dict[str, Shown]:
-    """The channels whose views are to be made: what was made, and what was ingested since, or has none yet."""
+    """The channels that get views: those just made, those ingested since, and those without any."""
     shown = {
         topic: Shown(channel.schema, channel.frames, channel.provenance.digest, channel.provenance.transform)
         for topic, channel in made.items()

@@ -3,7 +3,7 @@
 A camera is a name (``/camera``) below which results are written. Which channels are its own does not follow from their
 names: each channel says what it was made from, and such a chain ends at something that was recorded or ingested.
 Channels whose chains end below the same name belong together, wherever a stage was told to write them. Boxes that a
-detector recorded, and labels, belong to the pictures beside them: those whose name shares the longest part with theirs.
+detector recorded, and labels, belong to the pictures beside them: the ones with the longest common part of the name.
 """
 
 from __future__ import annotations

@@ -18,6 +18,7 @@ from mcaptrack.geometry.arrays import Ints
 from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
 from mcaptrack.geometry.plane import Planes, plane_at
+from mcaptrack.geometry.ragged import ragged_range
 from mcaptrack.schema import TRACKS, Frame, Rows, Schema
 from mcaptrack.schema.framing import frame_times
 from mcaptrack.schema.resampling import resample
@@ -66,7 +67,7 @@ class Sample:
         return "no track is there at two ticks, or none stands on the ground plane"
 
     def _ticks(self, frame_ns: Ints, start: int) -> Ints:
-        """The ticks at which somebody looked: between frames that are no further apart than a hole may be.
+        """The ticks between consecutive frames that are at most ``max_hole_s`` apart.
 
         Tick k is at start + k / rate, to the nanosecond; a log that jumps over a year has no ticks in between.
         """
@@ -77,7 +78,7 @@ class Sample:
         low = np.maximum(np.ceil((frame_ns - start) / period - 0.5).astype(np.int64), 0)
         high = np.maximum(np.floor((ends - start) / period + 0.5).astype(np.int64), -1)
         count = np.maximum(high - low + 1, 0)  # a tick too many at either end goes below
-        ticks = np.arange(int(count.sum())) - np.repeat(np.cumsum(count) - count, count) + np.repeat(low, count)
+        ticks = ragged_range(low, count)
         tick_ns = start + np.rint(ticks * period).astype(np.int64)
         inside = (tick_ns >= np.repeat(frame_ns, count)) & (tick_ns <= np.repeat(ends, count))
         return np.unique(tick_ns[inside])

@@ -16,7 +16,7 @@ Method = Literal["knn", "mog2", "frame-difference"]
 THRESHOLDS: Final[dict[str, float]] = {"knn": 800.0, "mog2": 50.0, "frame-difference": 9.0}
 _FOREGROUND: Final = 255  # 127 is shadow
 _BLUR_PX: Final = 5
-# The pairs of pictures whose largest difference counts lie this far apart; there are three, one frame apart.
+# Each frame difference spans this long; there are three, one frame apart, and the largest of them counts.
 _SPAN_S: Final = 5 / 30
 _PAIRS: Final = 3
 

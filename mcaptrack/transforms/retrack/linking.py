@@ -18,7 +18,7 @@ from mcaptrack.geometry.assignment import assign_by_gain
 from mcaptrack.geometry.ragged import group_index, ragged_range, run_starts
 from mcaptrack.transforms.retrack.motion_model import MotionModel, State, Trajectories
 
-#: Nobody moves faster than this on average during a gap.
+#: Gate on the mean speed between the end of a tracklet and the beginning of the next.
 _MAX_SPEED_M_PER_S: Final = 2.5
 #: What a link is judged by, see ``features``.
 FEATURES: Final = ("miss", "misfit", "gap", "misfit or stay", "turn", "distance and speed", "misfit and speed")

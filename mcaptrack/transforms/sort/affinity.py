@@ -39,7 +39,7 @@ def by_overlap(boxes: Floats, expected: Floats, area: Floats, expected_area: Flo
 def by_distance(boxes: Floats, expected: Floats, gate: float, plane: GroundPlane | None) -> Pairs:
     """Pairs by the distance of centres in pixels or, given a plane, of where the boxes stand in metres.
 
-    Likeness is 1 at no distance and falls to 0 at the gate.
+    Likeness is 1 at no distance and falls to 0 at the gate; gating excludes pairs beyond it.
     """
     here, there = (_places(corners, plane) for corners in (boxes, expected))
     apart = np.hypot(here[0][:, None] - there[0][None, :], here[1][:, None] - there[1][None, :])

@@ -158,7 +158,7 @@ class Sort:
             life.next_id += len(born)
             found += len(born)
         table = tracks.table
-        if found == len(tracks):  # nobody is missed
+        if found == len(tracks):  # no missed detection
             return table[:SHARED_ROWS].compress(life.early | (table[STREAK] >= life.min_hits), axis=1)
         missed = table[MISSED]
         here = missed == 0
@@ -175,11 +175,11 @@ class Sort:
         """Move all tracks ``steps`` frames on."""
         tracks = life.tracks
         tracks.table[MISSED] += life.age
-        if steps > 1:  # a gap in the log: who would have been dropped in it is dropped
+        if steps > 1:  # a gap in the log: terminate tracks that would have been terminated in it
             tracks.keep(tracks.table[MISSED] <= life.max_age + life.frame_age)
         if life.clock.stretch != 1.0:
             kalman.stretch(tracks.state, life.clock.stretch)
-        for _ in range(steps):  # frames that nobody saw still move people
+        for _ in range(steps):  # predict through missing frames, too
             kalman.predict(tracks.state)
 
     def _likeness(self, moment: Moment, least: float) -> tuple[Pairs, float]:
@@ -232,7 +232,7 @@ class _Passed:
         self._highest = -np.inf
 
     def count(self, frames: Sequence[Frame], kept: int) -> None:
-        """Take notice of frames, of whose boxes so many passed."""
+        """Count frames, and how many of their detections passed the filters."""
         self._kept += kept
         for rows in (frame.rows for frame in frames if len(frame.rows) and not self._kept):
             self._seen += len(rows)
