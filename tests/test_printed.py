@@ -19,7 +19,12 @@ from tests.commands import GROUP, call, done
 from tests.logs import SOME, write_stock
 
 #: Commands whose output is what was asked for, and words after which each prints something.
-PRINTING = {"check": [], "evaluate": [], "info": [], "query": ["select topic, count(*) from tracks group by all"]}
+PRINTING = {
+    "check": [],
+    "evaluate": [],
+    "info": [],
+    "query": ["select topic, count(*) from tracks group by all order by all"],
+}
 
 
 def data(*words: object) -> list[dict[str, Any]]:
