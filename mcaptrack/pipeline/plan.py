@@ -179,9 +179,7 @@ class _Planner:
         return True
 
     def _make_again(self, made: Provenance, stage: str, topic: str) -> bool:
-        """Plan a channel that a stage made, or of whose outputs it is, if it is missing, out of date, or to come from
-        elsewhere now.
-        """
+        """Plan a channel that a stage makes, if the channel is missing, out of date, or gets another input now."""
         is_missing = topic not in self._opened.channels
         had = made.input or self.source_of(stage)
         source = self._sources.get(stage, had)
