@@ -6,8 +6,10 @@ import struct
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
+from mcap.writer import IndexType
 
 from mcaptrack import log
 from tests.logs import SOME, write_stock
@@ -177,11 +179,57 @@ def test_a_fault_is_found_where_it_is_and_nothing_else(records, at, kind, level,
     assert {f[0] for f in found} - others == {kind}
 
 
-def test_no_changed_byte_of_a_summary_goes_unnoticed(tmp_path):
-    """Every number of the summary is held against the data, also where its checksum was made anew.
+#: Options of the stock writer: logs with a summary, with one that has no checksum, and without one.
+SUMMARIES: dict[str, dict[str, Any]] = {
+    "summary": {},
+    "summary without checksum": {"enable_crcs": False},
+    "no summary": dict.fromkeys(("repeat_channels", "repeat_schemas", "use_statistics", "use_summary_offsets"), False)
+    | {"index_types": IndexType.NONE},
+}
+TAIL = len(record(0x02, bytes(20)) + MAGIC)
 
-    The length of the footer is not looked at: readers find the footer at its distance from the end.
-    """
+
+def findings(path: Path) -> list[tuple[str, int, str, str]]:
+    return [(found.kind, found.where, found.level, found.words) for found in log.check(path).findings]
+
+
+@pytest.mark.parametrize("options", SUMMARIES.values(), ids=SUMMARIES)
+def test_no_flipped_bit_of_the_footer_and_of_the_magic_behind_it_goes_unnoticed(options, tmp_path):
+    path = tmp_path / "a.mcap"
+    write_stock(path, SOME, chunk_size=60, **options)
+    whole, known = path.read_bytes(), findings(path)
+    unnoticed = []
+    for at in range(len(whole) - TAIL, len(whole)):
+        for bit in (0, at % 7 + 1):
+            changed = bytearray(whole)
+            changed[at] ^= 1 << bit
+            path.write_bytes(changed)
+            if findings(path) == known:
+                unnoticed.append((at - len(whole), bit))
+    assert unnoticed == []
+
+
+@pytest.mark.parametrize("length", [0, 19, 21, 2**63])
+@pytest.mark.parametrize("options", SUMMARIES.values(), ids=SUMMARIES)
+def test_a_footer_that_declares_another_length_is_an_error(options, length, tmp_path):
+    """The checksum covers the length, too, so it is computed again."""
+    path = tmp_path / "a.mcap"
+    write_stock(path, SOME, chunk_size=60, **options)
+    known = findings(path)
+    changed = bytearray(path.read_bytes())
+    footer = len(changed) - TAIL
+    start = int.from_bytes(changed[footer + 9 : footer + 17], "little") or footer
+    changed[footer + 1 : footer + 9] = length.to_bytes(8, "little")
+    if any(changed[footer + 25 : footer + 29]):
+        changed[footer + 25 : footer + 29] = zlib.crc32(changed[start : footer + 25]).to_bytes(4, "little")
+    path.write_bytes(changed)
+    words = f"the footer declares a length of {length} bytes; it has 20"
+    assert set(findings(path)) - set(known) == {("footer", footer, "error", words)}
+    assert not log.check(path).is_sound
+
+
+def test_no_changed_byte_of_a_summary_goes_unnoticed(tmp_path):
+    """Every number of the summary is compared with the data, also where its checksum was computed again."""
     path = tmp_path / "a.mcap"
     write_stock(path, SOME, chunk_size=60)
     assert log.check(path).findings == []
@@ -189,7 +237,7 @@ def test_no_changed_byte_of_a_summary_goes_unnoticed(tmp_path):
     footer = len(whole) - len(MAGIC) - 20
     start = int.from_bytes(whole[footer : footer + 8], "little")
     unnoticed = []
-    for at in (*range(start, footer - 8), *range(footer, footer + 16)):
+    for at in range(start, footer + 16):
         changed = bytearray(whole)
         changed[at] ^= 1
         changed[footer + 16 : footer + 20] = zlib.crc32(changed[start : footer + 16]).to_bytes(4, "little")

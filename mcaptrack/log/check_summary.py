@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from typing import Final, Literal, NamedTuple
 
 from mcaptrack.log.index import DATA_END_SIZE, FOOTER_SIZE, Index, add_summary_record, read_footer
-from mcaptrack.log.records import MAGIC, Bytes, Damaged, Opcode, Reader, walk
+from mcaptrack.log.records import FOOTER_BODY, MAGIC, Bytes, Damaged, Opcode, Reader, walk
 
 Level = Literal["error", "warning"]
 
@@ -80,9 +80,16 @@ class _Checker:
             return
         at, start, offsets_start, crc = footer
         behind = found.data_end + DATA_END_SIZE
+        length = Reader(buffer, at + 1, len(buffer)).number(8)
+        if length != FOOTER_BODY.size:  # readers that read the footer as a record take its length from here
+            self._find("footer", at, f"the footer declares a length of {length} bytes; it has {FOOTER_BODY.size}")
         if start == 0:
             words = "there is no summary: opening the log takes a scan"
             self._find("no-summary", at, words, "warning")
+            if offsets_start:
+                words = f"the footer places summary offsets at byte {offsets_start}, but there is no summary"
+                self._find("footer", at, words, "warning")
+            self._compare_checksum(at, crc)
             if behind != at and found.data_end:
                 self._find("footer", at, "there are records after the data section, and the footer names no summary")
             return
@@ -91,8 +98,7 @@ class _Checker:
                 "footer", at, f"the footer places the summary at byte {start}; the data section ends at {behind}"
             )
             return
-        if crc and zlib.crc32(buffer[start : len(buffer) - len(MAGIC) - 4]) != crc:
-            self._find("summary-checksum", start, "the checksum of the summary is wrong")
+        self._compare_checksum(start, crc)
         if not crc:
             self._find(
                 "no-summary-checksum", start, "the summary has no checksum, so damage is not detected", "warning"
@@ -114,6 +120,11 @@ class _Checker:
             self._compare_statistics(Reader(buffer, statistics.body, statistics.end), said, statistics.start)
         if offsets_start:
             self._compare_offsets(offsets_start, at, groups)
+
+    def _compare_checksum(self, start: int, crc: int) -> None:
+        """Compare the checksum, unless it is 0, with the bytes from ``start`` to the footer's own field of it."""
+        if crc and zlib.crc32(self._buffer[start : len(self._buffer) - len(MAGIC) - 4]) != crc:
+            self._find("summary-checksum", start, "the checksum of the summary is wrong")
 
     def _compare(self, said: Index, where: int) -> None:
         found = self._found

@@ -22,6 +22,7 @@ from mcaptrack.log.records import ChannelRecord, Damaged
 from mcaptrack.log.snapshot import open_snapshot
 from mcaptrack.log.writer import create
 from mcaptrack.schema import Frame, Schema
+from mcaptrack.schema.framing import split_rows
 
 T = TypeVar("T")
 
@@ -266,10 +267,7 @@ class Log:
     def frames(self, topic: str, schema: Schema) -> list[Frame]:
         """All rows of a channel, one frame for each message."""
         found = self.rows(topic, schema)
-        ends = np.cumsum(found.counts)
-        columns = (found.t_ns, found.sequence, ends - found.counts, ends)
-        spans = zip(*(column.tolist() for column in columns), strict=True)
-        return [Frame(t_ns, sequence, found.rows[start:end]) for t_ns, sequence, start, end in spans]
+        return split_rows(found.t_ns.tolist(), found.sequence.tolist(), found.rows, np.cumsum(found.counts))
 
     def times(self, topic: str) -> Ints:
         """The sorted times of a channel's messages, (M,) ns, without reading the messages."""

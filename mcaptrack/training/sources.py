@@ -19,6 +19,7 @@ from mcaptrack.geometry.arrays import Floats
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.plane import Planes
 from mcaptrack.schema import TRACKS, Frame
+from mcaptrack.schema.framing import join_frames
 from mcaptrack.sources.ingest import label_frames
 from mcaptrack.sources.ingest.labels.reading import read_labels
 from mcaptrack.training.recipe import Recipe
@@ -137,8 +138,8 @@ def _scene(name: str, frames: Iterable[Frame], step_s: float, planes: Planes) ->
         return Scene(name, np.empty((0, 0, 2)))
     start = sampled[0].t_ns
     step = [round((frame.t_ns - start) / (step_s * NS_PER_S)) for frame in sampled]
-    rows = np.concatenate([frame.rows for frame in sampled])
-    at = np.repeat(np.array(step, np.int64), [len(frame.rows) for frame in sampled])
+    joined = join_frames(TRACKS, sampled)
+    rows, at = joined.rows, np.array(step, np.int64)[joined.frame]
     observed = rows["observed"] & np.isfinite(rows["x_m"])
     ids, track = np.unique(rows["track_id"][observed], return_inverse=True)
     xy_m = np.full((len(ids), step[-1] + 1, 2), np.nan)
