@@ -11,7 +11,7 @@ import pytest
 
 from mcaptrack.transforms import STAGES, TRACKERS, TRANSFORMS, RetrackByConsistency
 from mcaptrack.transforms.protocol import bare_type
-from mcaptrack.transforms.retrack import Retracking
+from mcaptrack.transforms.retrack import RetrackOptions
 from tests.effects import Case, others, retrack, sort
 
 CASES = retrack.CASES | sort.CASES | others.CASES
@@ -45,7 +45,7 @@ def test_detectors_differ_in_how_long_they_see_people_who_stop():
 
 def test_every_option_has_a_scene():
     options = {(kind, o.name) for kind, made in KINDS.items() for o in fields(made) if not o.metadata.get("context")}
-    shared = {("consistency", o.name) for o in fields(Retracking)}  # their scenes are those of retrack
+    shared = {("consistency", o.name) for o in fields(RetrackOptions)}  # their scenes are those of retrack
     assert set(CASES) == options - shared
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack.geometry.arrays import Ints
-from mcaptrack.geometry.ragged import ragged_range, run_starts
+from mcaptrack.geometry.ragged import group_index, ragged_range, run_starts
 from mcaptrack.log.byte_source import ByteSource
 from mcaptrack.log.checksums import crc_of
 from mcaptrack.log.chunks import (
@@ -170,7 +170,7 @@ class Messages:
         if not any(len(batch.t_ns) for batch in batches):
             return
         t_ns = np.concatenate([batch.t_ns for batch in batches])
-        batch_of = np.repeat(np.arange(len(batches)), [len(batch.t_ns) for batch in batches])
+        batch_of = group_index([len(batch.t_ns) for batch in batches])
         in_order = batch_of[np.argsort(t_ns, kind="stable")]
         # Chunks rarely overlap: consecutive messages of one chunk are yielded together.
         starts = np.append(np.flatnonzero(run_starts(in_order)), len(in_order))

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from mcaptrack.geometry.arrays import Ints
 from mcaptrack.geometry.ragged import group_index, ragged_range, run_ends, run_starts
 from mcaptrack.schema import TRACKS, Frame, Rows
+from mcaptrack.schema.framing import join_frames
 
 #: The columns of a track that are interpolated.
 LINEAR: Final = ("x_px", "y_px", "w_px", "h_px", "x_m", "y_m", "score")
@@ -40,12 +41,10 @@ def resample(frames: Sequence[Frame], at_ns: Ints, max_gap_ns: int) -> tuple[Row
     at : (S,) of int64
         Index of the time of each row in ``at_ns``.
     """
-    frame_ns = np.array([frame.t_ns for frame in frames], np.int64)
-    usual_ns = float(np.median(np.diff(frame_ns))) if len(frames) > 1 else 0.0
-    rows = TRACKS.joined([frame.rows for frame in frames])
-    row_ns = np.repeat(frame_ns, [len(frame.rows) for frame in frames])
-    order = np.lexsort((row_ns, rows["track_id"]))
-    rows, row_ns = rows[order], row_ns[order]
+    joined = join_frames(TRACKS, frames)
+    usual_ns = float(np.median(np.diff(joined.t_ns))) if len(frames) > 1 else 0.0
+    order = np.lexsort((joined.row_ns, joined.rows["track_id"]))
+    rows, row_ns = joined.rows[order], joined.row_ns[order]
     has_next = ~run_ends(run_starts(rows["track_id"]))
     step_ns = np.append(np.diff(row_ns), 0)[: len(rows)]
     is_linked = has_next & (step_ns > 0) & (step_ns <= max_gap_ns)

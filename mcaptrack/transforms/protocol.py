@@ -29,10 +29,15 @@ from mcaptrack.registry import Kind
 from mcaptrack.schema import Frame, Schema
 
 
-class Transform(Protocol):
-    """See the module. ``writes`` maps the suffix of each output's topic to its schema; "" is the main output."""
+class WithOptions(Protocol):
+    """A dataclass of options: a transform, or what several transforms share."""
 
     __dataclass_fields__: ClassVar[dict[str, Any]]
+
+
+class Transform(WithOptions, Protocol):
+    """See the module. ``writes`` maps the suffix of each output's topic to its schema; "" is the main output."""
+
     reads: ClassVar[Schema]
     writes: ClassVar[Mapping[str, Schema]]
 
@@ -128,7 +133,7 @@ def _type_name(annotation: Any) -> str:
     return annotation.__name__ if isinstance(annotation, type) and not get_args(annotation) else str(annotation)
 
 
-def check_options(transform: Transform) -> None:
+def check_options(transform: WithOptions) -> None:
     """Refuse parameters that are out of range or of the wrong kind, by name and number. For ``__post_init__``.
 
     Raises McaptrackError; also for a class whose parameters are of types that no command line and no log can hold.

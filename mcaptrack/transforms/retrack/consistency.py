@@ -9,7 +9,7 @@ Letters: K tracks, N observations, L past positions, T predicted steps.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
@@ -24,9 +24,7 @@ from mcaptrack.transforms.retrack.active_tracks import ActiveTracks, SmoothedHis
 from mcaptrack.transforms.retrack.assignments import Assignments
 from mcaptrack.transforms.retrack.distances import metric_distances, position_distances, prediction_distances
 from mcaptrack.transforms.retrack.motion_model import DEFAULT_NOISE_M
-
-if TYPE_CHECKING:
-    from mcaptrack.transforms.retrack.options import RetrackByConsistency
+from mcaptrack.transforms.retrack.options import ConsistencyOptions
 
 #: Cost of a pair with priority: lower than any sum of other costs.
 _PRIORITY_COST: Final = -100.0
@@ -35,7 +33,7 @@ _PRIORITY_COST: Final = -100.0
 class ConsistencyPass:
     """Algorithm 1 over one log: ``step`` for each frame, then ``outputs``."""
 
-    def __init__(self, options: RetrackByConsistency) -> None:
+    def __init__(self, options: ConsistencyOptions) -> None:
         horizon = max(1, round(options.horizon_s * options.rate_hz))
         self._options = options
         self._predictor: Predictor = make(options.predictor, horizon, 1 / options.rate_hz)

@@ -5,7 +5,7 @@ Letters: R rows of online tracks, L past positions.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
@@ -19,9 +19,7 @@ from mcaptrack.transforms.retrack.assignments import Assignments
 from mcaptrack.transforms.retrack.motion_model import DEFAULT_NOISE_M, MotionModel
 from mcaptrack.transforms.retrack.offline import move_rows
 from mcaptrack.transforms.retrack.online_tracker import Association, OnlineTracker, Step
-
-if TYPE_CHECKING:
-    from mcaptrack.transforms.retrack.options import Retrack, Retracking
+from mcaptrack.transforms.retrack.options import LikelihoodOptions, RetrackOptions
 
 #: Predictions that are made at once: more take memory, fewer take time.
 _BATCH: Final = 4096
@@ -32,7 +30,7 @@ _MIN_SPREAD: Final = 1e-3
 class LikelihoodPass:
     """Online tracking over one log: ``step`` for each frame, then ``outputs``."""
 
-    def __init__(self, options: Retrack) -> None:
+    def __init__(self, options: LikelihoodOptions) -> None:
         rate, self._options = options.rate_hz, options
         self._confirm_hits = round(options.confirm_s * rate) + 1
         max_age = max(1, round(options.max_age_s * rate))
@@ -166,7 +164,7 @@ class LikelihoodPass:
         return Forecast(*(np.concatenate(members) for members in zip(*parts, strict=True)))
 
 
-def motion_model(options: Retracking, noise_m: float) -> MotionModel:
+def motion_model(options: RetrackOptions, noise_m: float) -> MotionModel:
     """The motion model of the options, with this noise of measured positions."""
     noise_m, speed_m_per_s = max(noise_m, _MIN_SPREAD), max(options.speed_m_per_s, _MIN_SPREAD)
     return MotionModel(noise_m, speed_m_per_s, options.drift_m_per_s, options.drift_ratio)

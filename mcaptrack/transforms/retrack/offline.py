@@ -6,7 +6,7 @@ Letters: C assignments (a track has a sample at a step), R rows, K tracks, N row
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
@@ -21,16 +21,14 @@ from mcaptrack.transforms.retrack.false_tracks import track_confidence
 from mcaptrack.transforms.retrack.identity_swaps import resolve_swaps
 from mcaptrack.transforms.retrack.linking import link_tracks
 from mcaptrack.transforms.retrack.motion_model import MotionModel, smooth, to_trajectories
-
-if TYPE_CHECKING:
-    from mcaptrack.transforms.retrack.options import Retracking
+from mcaptrack.transforms.retrack.options import RetrackOptions
 
 #: How often encounters are examined again after identities were swapped.
 _ROUNDS: Final = 3
 
 
 def offline_tracks(
-    options: Retracking,
+    options: RetrackOptions,
     model: MotionModel,
     assignments: Assignments,
     sample_rows: Sequence[Rows],
@@ -79,7 +77,7 @@ def offline_tracks(
     return rows[order], row_step[order]
 
 
-def _linked(options: Retracking, model: MotionModel, step: Ints, track: Ints, xy_m: Floats, step_s: float) -> Ints:
+def _linked(options: RetrackOptions, model: MotionModel, step: Ints, track: Ints, xy_m: Floats, step_s: float) -> Ints:
     """The track of each assignment (C,) after linking tracks of the same person."""
     ids, _, trajectories = to_trajectories(step, track, xy_m, model.noise_m)
     forward, backward, _ = smooth(model, trajectories, step_s)

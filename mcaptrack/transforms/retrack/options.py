@@ -1,25 +1,21 @@
-"""The transforms of re-tracking: what both methods share, the options of each, and named sets of options (profiles)."""
+"""The options of re-tracking: those that both methods share, and those of each.
+
+They are apart from ``methods``, which run the steps of re-tracking, because these steps read them.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any, ClassVar, Final, Literal, Protocol
-
-import numpy as np
+from typing import ClassVar, Final, Literal
 
 from mcaptrack.geometry.plane import Planes
 from mcaptrack.predictors import PredictorName
-from mcaptrack.schema import PREDICTIONS, TRACKS, Frame, Rows, Schema
+from mcaptrack.schema import PREDICTIONS, TRACKS, Frame, Schema
 from mcaptrack.transforms.durations import longest_track_s
-from mcaptrack.transforms.forecasts import Forecaster
 from mcaptrack.transforms.protocol import check_options, context, option
-from mcaptrack.transforms.retrack.assignments import Assignments
-from mcaptrack.transforms.retrack.consistency import ConsistencyPass
 from mcaptrack.transforms.retrack.distances import Covariance, Distance
-from mcaptrack.transforms.retrack.likelihood import LikelihoodPass, motion_model
-from mcaptrack.transforms.retrack.offline import offline_tracks
 
 # Headings of the options in the help.
 _ASSOCIATION: Final = "Association"
@@ -29,30 +25,9 @@ _LIFE: Final = "Begin and end of tracks"
 _OFFLINE: Final = "With the whole log known (offline)"
 
 
-class OnlinePass(Protocol):
-    """Online re-tracking of one log: ``step`` for each frame, then ``outputs``; and what it leaves for ``offline``."""
-
-    assignments: Assignments
-    samples: list[Rows]
-    steps: list[int]
-
-    @property
-    def noise_m(self) -> float:
-        """The noise of measured positions."""
-        ...
-
-    def step(self, frame: Frame) -> None:
-        """One step."""
-        ...
-
-    def outputs(self) -> list[tuple[Frame, Frame]]:
-        """For each step the online tracks and their predictions."""
-        ...
-
-
 @dataclass(frozen=True, kw_only=True)
-class Retracking:
-    """What the methods of re-tracking share: their input and outputs, and all that is done offline."""
+class RetrackOptions:
+    """What the methods of re-tracking share: input, outputs, and the options of all that is done offline."""
 
     predictor: PredictorName = option(
         "kalman",
@@ -173,28 +148,6 @@ class Retracking:
         """Whether a sample that was assigned to two tracks stays with both."""
         return False
 
-    def online_pass(self) -> OnlinePass:
-        """The method: online re-tracking of one log."""
-        raise NotImplementedError
-
-    def __call__(self, frames: Iterable[Frame]) -> Iterator[tuple[Frame, ...]]:
-        if self.holds_back:
-            forecaster = Forecaster(self.predictor, self.horizon_s, self.min_history, self.rate_hz)
-            for frame in frames:
-                online = frame._replace(rows=frame.rows[frame.rows["observed"]])
-                yield frame, online, frame._replace(rows=forecaster.predict(frame))
-            return
-        run = self.online_pass()
-        times_ns = []
-        for frame in frames:
-            run.step(frame)
-            times_ns.append(frame.t_ns)
-        model = motion_model(self, run.noise_m)
-        rows, step = offline_tracks(self, model, run.assignments, run.samples, run.steps, times_ns)
-        first, last = (np.searchsorted(step, run.steps, side) for side in ("left", "right"))
-        for (online, predictions), low, high in zip(run.outputs(), first.tolist(), last.tolist(), strict=True):
-            yield Frame(online.t_ns, online.index, rows[low:high]), online, predictions
-
     def why_nothing(self, given: Sequence[Frame], made: Sequence[Frame]) -> str:
         """Why no rows came of frames, for a warning."""
         longest_s = longest_track_s(given)
@@ -205,22 +158,8 @@ class Retracking:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Retrack(Retracking):
-    """Repair tracks: re-tracking by likelihood.
-
-    Reads samples; writes repaired tracks that use the whole log (offline), repaired tracks that use the past alone
-    (online), and predictions from the latter.
-
-    Examples
-    --------
-    A person walks on under another track id; re-tracking gives both tracks one id:
-
-    >>> def row(track_id, x_m):
-    ...     return TRACKS.rows(track_id=[track_id], x_m=[x_m], y_m=[0.0], observed=[True], source_id=[-1])
-    >>> frames = [Frame(t * 400_000_000, t, row(7 if t < 10 else 8, t / 2)) for t in range(20)]
-    >>> {id for offline, online, predictions in Retrack()(frames) for id in offline.rows["track_id"].tolist()}
-    {1}
-    """
+class LikelihoodOptions(RetrackOptions):
+    """The options of re-tracking by likelihood."""
 
     merge_distance_m: float = option(
         1.0,
@@ -251,20 +190,10 @@ class Retrack(Retracking):
         theme=_LIFE,
     )
 
-    def online_pass(self) -> OnlinePass:
-        return LikelihoodPass(self)
-
 
 @dataclass(frozen=True, kw_only=True)
-class RetrackByConsistency(Retracking):
-    """Repair tracks by prediction consistency: Algorithm 1 of the paper.
-
-    Tracks and observations are compared by their predictions. The profile "paper" has the values of the paper.
-
-    References
-    ----------
-    Yu and Zhou, "Towards Robust Human Trajectory Prediction in Raw Videos", IROS 2021.
-    """
+class ConsistencyOptions(RetrackOptions):
+    """The options of re-tracking by prediction consistency (Algorithm 1 of the paper)."""
 
     distance: Distance = option(
         "mean",
@@ -323,58 +252,3 @@ class RetrackByConsistency(Retracking):
     @property
     def shares_samples(self) -> bool:
         return self.backfill == "all"
-
-    def online_pass(self) -> OnlinePass:
-        return ConsistencyPass(self)
-
-
-_PAPER: Final = RetrackByConsistency(
-    predictor="cv",
-    distance="mean",
-    covariance="paper",
-    max_distance=3.0,
-    gate_m=None,
-    noise_m=0.5,
-    same_id_bonus=0.0,
-    max_age_s=3.2,
-    alpha=0.5,
-    beta=0.5,
-    min_history=4,
-    min_hits=2,
-    interpolated=True,
-    link_s=0.0,
-    resolve_swaps=False,
-    track_confidence=0.0,
-    smooth=False,
-)
-
-#: Values of all parameters by name. "paper" is Algorithm 1 with Eq. 1 to 3 to the letter; where the paper gives no
-#: number (sigma, d_min, t_max, the probation) it is that of the authors' program. "authors" is what their program does:
-#: the largest distance instead of the mean, near pairs first, tracks that start from the smoothed past, and assignments
-#: that two matches in a row confirm. "default" is this project's method.
-PROFILES: Final[Mapping[str, Retracking]] = MappingProxyType(
-    {
-        "default": Retrack(),
-        "paper": _PAPER,
-        "authors": replace(
-            _PAPER, distance="max", priority_distance=0.15, birth="smoothed", backfill="all", trim_ends=True
-        ),
-    }
-)
-
-
-def upgrade_parameters(had: Mapping[str, Any]) -> dict[str, Any]:
-    """Parameters of version 0.1, where ``distance`` chose the method and both had all options, as those of today."""
-    if "retracker" in had or "distance" not in had:
-        return dict(had)
-    is_likelihood = had["distance"] == "likelihood"
-    own, other = (RetrackByConsistency, Retrack)[::-1] if is_likelihood else (RetrackByConsistency, Retrack)
-    unused = _names(other) - _names(own)
-    return {name: value for name, value in had.items() if name not in unused} | {
-        "retracker": "likelihood" if is_likelihood else "consistency"
-    }
-
-
-def _names(cls: type[Retracking]) -> set[str]:
-    """The parameters of a method under the names that they had before."""
-    return {field.metadata.get("was") or field.name for field in fields(cls)}
