@@ -48,7 +48,17 @@ def footage(tmp_path_factory) -> demo.Footage:
 @pytest.fixture(scope="session")
 def _ingested(footage, tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("ingested") / "walk.mcap"
-    done("ingest", footage.video, "--ground-plane", footage.ground_plane, "--truth", footage.truth, "-o", path, "-q")
+    done(
+        "ingest",
+        footage.video,
+        "--ground-plane",
+        footage.ground_plane,
+        "--truth",
+        footage.ground_truth,
+        "-o",
+        path,
+        "-q",
+    )
     return path
 
 

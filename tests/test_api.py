@@ -183,7 +183,9 @@ def test_what_is_no_log_is_said_in_a_line(tmp_path):
 def test_the_document_runs_from_top_to_bottom(tmp_path, monkeypatch):
     footage, path = draw(small_scene(12.0), tmp_path / "mcaptrack-demo"), tmp_path / "log.mcap"
     ingest.ingest(
-        footage.video, path, ingest.IngestOptions(ground_plane=footage.ground_plane, labels={"truth": footage.truth})
+        footage.video,
+        path,
+        ingest.IngestOptions(ground_plane=footage.ground_plane, labels={"truth": footage.ground_truth}),
     )
     with log.read(path) as opened:
         pipeline.run(opened, "/camera", pipeline.plan_all(opened, "/camera"))

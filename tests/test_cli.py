@@ -210,10 +210,18 @@ class TestEvaluate:
         assert combined["/camera/samples"]["MOTA"] == pytest.approx(single["/camera/samples"]["MOTA"])
 
     def test_label_files_without_a_log(self, footage):
-        rows = json.loads(printed("evaluate", footage.truth, "--truth", footage.truth, "--json")[0])["results"]
+        rows = json.loads(printed("evaluate", footage.ground_truth, "--truth", footage.ground_truth, "--json")[0])[
+            "results"
+        ]
         assert [(row["similarity"], row["MOTA"], row["IDF1"]) for row in rows] == [("iou", 1.0, 1.0)]
         out, _ = printed(
-            "evaluate", footage.truth, "--truth", footage.truth, "--ground-plane", footage.ground_plane, "--json"
+            "evaluate",
+            footage.ground_truth,
+            "--truth",
+            footage.ground_truth,
+            "--ground-plane",
+            footage.ground_plane,
+            "--json",
         )
         assert [row["similarity"] for row in json.loads(out)["results"]] == ["iou", "metres", "metres", "metres"]
 

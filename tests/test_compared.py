@@ -25,7 +25,7 @@ def write(path: Path, *rows) -> Path:
 
 def scores(tracks: Path, truth: Path, **options) -> tuple[dict, list[str]]:
     both = compare_files(tracks, truth, **options)
-    outcome = evaluate([sequence_of_files("x", tracks, both.truth, both.tracks, 1)], EvaluateOptions(("iou",)))
+    outcome = evaluate([sequence_of_files("x", tracks, both.ground_truth, both.tracks, 1)], EvaluateOptions(("iou",)))
     return outcome.results[0].to_json(), both.notes + outcome.notes
 
 
@@ -272,7 +272,7 @@ def test_files_of_several_sequences_are_combined_and_one_file_stands_alone(tmp_p
     for name in ("north", "south"):
         tracks, truth = write(tmp_path / f"{name}.txt", *FOUND), write(tmp_path / f"{name}-gt.txt", *WALK)
         both = compare_files(tracks, truth)
-        made.append((name, tracks, both.truth, both.tracks))
+        made.append((name, tracks, both.ground_truth, both.tracks))
     together = evaluate([sequence_of_files(*one, 2) for one in made], EvaluateOptions(("iou",)))
     assert [(r.sequence, r.tracks) for r in together.results] == [
         ("north", "north.txt"),

@@ -36,7 +36,7 @@ from mcaptrack.sources.ingest.labels.reading import read_labels
 from mcaptrack.sources.ingest.labels.timeline import Timeline
 from mcaptrack.sources.video import H264Encoder
 from mcaptrack.sources.video.h264 import inspect
-from mcaptrack.tables.compared import compare_files, detections_and_truth
+from mcaptrack.tables.compared import compare_files, detections_and_ground_truth
 from tests.bags import camera_bag
 from tests.robots import FPS, PICTURES, ROBOT_NS, lines, robot_log
 from tests.worlds import ns, write_clip
@@ -276,12 +276,12 @@ def test_files_that_are_compared_or_tuned_have_the_same_frames(tmp_path, name, r
     if role == "tracks":
         both = compare_files(found, every, Fraction(FPS))
         assert {f.index: len(f.rows) for f in both.tracks if len(f.rows)} == wanted
-        assert {f.index: f.rows["x_px"].tolist() for f in both.truth} | {f.index: [f.index] for f in both.tracks} == {
-            f.index: [f.index] for f in both.truth
-        }
+        assert {f.index: f.rows["x_px"].tolist() for f in both.ground_truth} | {
+            f.index: [f.index] for f in both.tracks
+        } == {f.index: [f.index] for f in both.ground_truth}
     elif role == "detections":
-        tuned = detections_and_truth(found, every, Fraction(FPS), None, "foot")
-        assert [(f.t_ns, f.index) for f in tuned.truth] == [(t, k) for k, t in enumerate(CLIP_NS)]
+        tuned = detections_and_ground_truth(found, every, Fraction(FPS), None, "foot")
+        assert [(f.t_ns, f.index) for f in tuned.ground_truth] == [(t, k) for k, t in enumerate(CLIP_NS)]
         assert [(f.t_ns, f.index, len(f.rows)) for f in tuned.detections] == world.expected(CLIP_NS)
     else:
         frames = label_frames({"truth": found, "tracks": every}, Fraction(FPS), None, "foot")["truth"]

@@ -44,7 +44,7 @@ def footage(tmp_path_factory) -> demo.Footage:
 @pytest.fixture
 def fresh(footage, tmp_path) -> Path:
     """A log with a video, its ground plane and its truth."""
-    options = IngestOptions(ground_plane=footage.ground_plane, labels={"truth": footage.truth})
+    options = IngestOptions(ground_plane=footage.ground_plane, labels={"truth": footage.ground_truth})
     ingest(footage.video, tmp_path / "a.mcap", options)
     return tmp_path / "a.mcap"
 
@@ -53,7 +53,9 @@ def fresh(footage, tmp_path) -> Path:
 def finished(footage, tmp_path_factory) -> Path:
     """The same, with everything run on it. Not to be changed."""
     path = tmp_path_factory.mktemp("finished") / "a.mcap"
-    ingest(footage.video, path, IngestOptions(ground_plane=footage.ground_plane, labels={"truth": footage.truth}))
+    ingest(
+        footage.video, path, IngestOptions(ground_plane=footage.ground_plane, labels={"truth": footage.ground_truth})
+    )
     run_all(path)
     return path
 

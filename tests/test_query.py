@@ -81,7 +81,7 @@ def square(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("square")
     footage = demo.draw(demo_scene(), folder, video=False)
     options = IngestOptions(fps=demo_scene().fps, ground_plane=footage.ground_plane, role="truth")
-    ingest(footage.truth, folder / "labels.mcap", options)
+    ingest(footage.ground_truth, folder / "labels.mcap", options)
     with log.read(folder / "labels.mcap") as opened:
         frames = opened.frames("/camera/truth", TRACKS)
         made = Provenance.from_metadata(opened.channel("/camera/truth").metadata)

@@ -190,7 +190,7 @@ def test_a_log_without_views_says_what_makes_them(footage, tmp_path):
     printed("ingest", footage.video, "-o", path)
     code, _, err = call("render", path)
     assert (code, "has no views of /camera yet; `mcaptrack run" in err) == (1, True)
-    printed("ingest", footage.truth, "--as", "truth", "--fps", 10, "-o", tmp_path / "labels.mcap")
+    printed("ingest", footage.ground_truth, "--as", "truth", "--fps", 10, "-o", tmp_path / "labels.mcap")
     code, _, err = call("render", tmp_path / "labels.mcap")
     assert (code, "has no pictures of /camera to draw on" in err) == (1, True)
 

@@ -247,7 +247,18 @@ class TestAFinishedLog:
 
 def test_labels_without_pictures_have_scenes_too(footage, tmp_path):
     path = tmp_path / "labels.mcap"
-    printed("ingest", footage.truth, "--as", "tracks", "--fps", 10, "--ground-plane", footage.ground_plane, "-o", path)
+    printed(
+        "ingest",
+        footage.ground_truth,
+        "--as",
+        "tracks",
+        "--fps",
+        10,
+        "--ground-plane",
+        footage.ground_plane,
+        "-o",
+        path,
+    )
     printed("run", path)
     with log.read(path) as opened:
         for name in ("tracks", "predictions", "retracks/full"):

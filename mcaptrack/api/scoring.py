@@ -196,9 +196,9 @@ def _from_files(
     if words:
         notes.say(words)
     sequences = []
-    for name, path, truth in pairs:
-        both = compare_files(path, truth, fps, ground_plane, point, topics)
+    for name, path, labels in pairs:
+        both = compare_files(path, labels, fps, ground_plane, point, topics)
         for note in both.notes:
             notes.say(note)
-        sequences.append(sequence_of_files(name, path, both.truth, both.tracks, len(pairs)))
+        sequences.append(sequence_of_files(name, path, both.ground_truth, both.tracks, len(pairs)))
     return sequences

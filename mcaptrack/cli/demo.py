@@ -65,7 +65,7 @@ def demo(
         talk.say("drawing 40 seconds of people on a square ...")
         footage = drawing.draw(SCENES[scene](seed), output, talk.progress)
         talk.say("making a log, finding people, tracking, re-tracking, predicting ...")
-        options = IngestOptions(ground_plane=footage.ground_plane, labels={"truth": footage.truth})
+        options = IngestOptions(ground_plane=footage.ground_plane, labels={"truth": footage.ground_truth})
         ingest(footage.video, target, options, progress=talk.progress)
         with log.read(target) as opened:
             prefix = pipeline.find_camera(opened, None)

@@ -195,7 +195,7 @@ def _tasks_of_files(
 ) -> list[Task]:
     from mcaptrack.api.ingesting import parse_fps
     from mcaptrack.evaluation.tuning import Task
-    from mcaptrack.tables.compared import detections_and_truth, pair_files
+    from mcaptrack.tables.compared import detections_and_ground_truth, pair_files
 
     if stage != "track":
         raise McaptrackError(f"files of detections are for --stage track; to tune {stage} give logs")
@@ -203,9 +203,11 @@ def _tasks_of_files(
     if words:
         talk.say(words)
     tasks = []
-    for name, path, truth in pairs:
-        found = detections_and_truth(path, truth, parse_fps(given["fps"]), given["ground_plane"], given["point"])
-        tasks.append(Task(name, found.detections, found.truth, {"ground_planes": found.planes}))
+    for name, path, labels in pairs:
+        found = detections_and_ground_truth(
+            path, labels, parse_fps(given["fps"]), given["ground_plane"], given["point"]
+        )
+        tasks.append(Task(name, found.detections, found.ground_truth, {"ground_planes": found.planes}))
     return tasks
 
 

@@ -48,7 +48,7 @@ class Footage:
     """A synthetic scene on disk: the video, its ground truth boxes (MOTChallenge) and its ground plane (3x3)."""
 
     video: Path
-    truth: Path
+    ground_truth: Path
     ground_plane: Path
 
 
@@ -80,7 +80,7 @@ def draw(
             write_mp4(footage.video, images(), scene.fps)
         else:
             deque(images(), maxlen=0)
-        _write_text(footage.truth, "\n".join(lines) + "\n")
+        _write_text(footage.ground_truth, "\n".join(lines) + "\n")
         rows = np.array(scene.ground_plane().homography).reshape(3, 3).tolist()
         _write_text(footage.ground_plane, "\n".join(",".join(f"{value:.17g}" for value in row) for row in rows) + "\n")
     except OSError as error:

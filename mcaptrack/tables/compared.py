@@ -44,7 +44,7 @@ _EPS: Final = float(np.finfo(float).eps)
 class AlignedFiles:
     """Ground truth and tracks as frames at the same times, and notes for people."""
 
-    truth: list[Frame]
+    ground_truth: list[Frame]
     tracks: list[Frame]
     notes: list[str] = field(default_factory=list)
 
@@ -68,14 +68,14 @@ def pair_files(tracks: Sequence[Path], ground_truths: Sequence[Path]) -> tuple[l
         raise McaptrackError(
             f"{len(tracks)} files of tracks and {len(ground_truths)} of ground truth; give one of ground truth for each"
         )
-    track_names, truth_names = _names(tracks), _names(ground_truths)
+    track_names, ground_truth_names = _names(tracks), _names(ground_truths)
     if len(tracks) == 1:
         return [(tracks[0].stem, tracks[0], ground_truths[0])], ""
-    if set(track_names) == set(truth_names):
-        found = dict(zip(truth_names, ground_truths, strict=True))
+    if set(track_names) == set(ground_truth_names):
+        found = dict(zip(ground_truth_names, ground_truths, strict=True))
         return [(name, path, found[name]) for name, path in zip(track_names, tracks, strict=True)], ""
     pairs = list(zip(track_names, tracks, ground_truths, strict=True))
-    words = ", ".join(f"{path} with {truth}" for _, path, truth in pairs)
+    words = ", ".join(f"{path} with {other}" for _, path, other in pairs)
     return pairs, f"names of tracks and ground truth differ: taken in the order given, {words}"
 
 
@@ -90,7 +90,7 @@ def _names(paths: Sequence[Path]) -> list[str]:
 
 def compare_files(
     tracks: Path,
-    truth: Path,
+    ground_truth: Path,
     fps: Fraction | None = None,
     ground_plane: Path | None = None,
     point: Point = "foot",
@@ -98,14 +98,14 @@ def compare_files(
 ) -> AlignedFiles:
     """Tracks and ground truth as frames. Raises McaptrackError if they can't be read or compared."""
     both: dict[Role, tuple[Path, Labels]] = {
-        "truth": (truth, _read(truth, "truth", topics)),
+        "truth": (ground_truth, _read(ground_truth, "truth", topics)),
         "tracks": (tracks, _read(tracks, "tracks", topics)),
     }
     formats = [labels.format for _, labels in both.values()]
     if not all(name in _COUNTING for name in formats) and len(set(formats)) > 1:
         if "parquet" in formats:
-            raise McaptrackError(f"{tracks} and {truth} share no clock: one counts frames, the other does not")
-        frames = ingest.label_frames({"tracks": tracks, "truth": truth}, fps, ground_plane, point)
+            raise McaptrackError(f"{tracks} and {ground_truth} share no clock: one counts frames, the other does not")
+        frames = ingest.label_frames({"tracks": tracks, "truth": ground_truth}, fps, ground_plane, point)
         return AlignedFiles(frames["truth"], frames["tracks"])
     notes = [f"{path} also holds {labels.left_out}" for path, labels in both.values() if labels.left_out]
     if fps is not None:
@@ -118,21 +118,21 @@ class AlignedDetections:
     """Detections and ground truth as frames at the same times, and the ground plane, if there is one."""
 
     detections: list[Frame]
-    truth: list[Frame]
+    ground_truth: list[Frame]
     planes: tuple[tuple[int, GroundPlane], ...]
 
 
-def detections_and_truth(
-    detections: Path, truth: Path, fps: Fraction | None, ground_plane: Path | None, point: Point
+def detections_and_ground_truth(
+    detections: Path, ground_truth: Path, fps: Fraction | None, ground_plane: Path | None, point: Point
 ) -> AlignedDetections:
     """A file of detections and one of ground truth as frames, at the times that the frame rate gives.
 
     Raises McaptrackError if they can't be read, or if the frame rate is not known.
     """
     options = IngestOptions(fps=fps, ground_plane=ground_plane, point=point)
-    with _PairJob([("detections", detections), ("truth", truth)], options) as job:
+    with _PairJob([("detections", detections), ("truth", ground_truth)], options) as job:
         if any(labels.boxes_px is None for _, labels in job.labels.values()):
-            raise McaptrackError(f"{detections} and {truth} have to hold boxes in pixels, both")
+            raise McaptrackError(f"{detections} and {ground_truth} have to hold boxes in pixels, both")
         planes = ((0, job.ground),) if job.ground else ()
         return AlignedDetections(job.all_frames("detections"), job.all_frames("truth"), planes)
 
@@ -202,10 +202,10 @@ def _by_number(
     both: dict[Role, tuple[Path, Labels]], ground_plane: Path | None, point: Point, notes: list[str]
 ) -> AlignedFiles:
     """The frames with rows in either file, by their numbers, both counted from 0."""
-    truth, tracks = both["truth"][1], both["tracks"][1]
-    plane = _plane(ground_plane, point, truth, tracks)
+    ground_truth, tracks = both["truth"][1], both["tracks"][1]
+    plane = _plane(ground_plane, point, ground_truth, tracks)
     there = {role: labels.frame - labels.first_frame for role, (_, labels) in both.items()}
-    if truth.first_frame != tracks.first_frame and len(tracks.frame):
+    if ground_truth.first_frame != tracks.first_frame and len(tracks.frame):
         first = {role: f"{path} counts frames from {labels.first_frame}" for role, (path, labels) in both.items()}
         notes.append(f"{first['tracks']}, {first['truth']}: their first frames are taken as the same")
     if len(tracks.frame):
@@ -214,24 +214,24 @@ def _by_number(
         if b < c or d < a:
             words = [f"{both[role][0]} ({low} to {high})" for role, (low, high) in spans.items()]
             raise McaptrackError(f"the frames of {' and '.join(words)} never overlap, counted from 0")
-    step = max(truth.step, tracks.step) if len(tracks.frame) else truth.step
-    sparse = truth if truth.step >= tracks.step or not len(tracks.frame) else tracks
+    step = max(ground_truth.step, tracks.step) if len(tracks.frame) else ground_truth.step
+    sparse = ground_truth if ground_truth.step >= tracks.step or not len(tracks.frame) else tracks
     start = int(sparse.labelled[0] - sparse.first_frame) % step
     numbers = np.unique(np.concatenate([*there.values()]))  # frames without rows do not change any score
     numbers = numbers[numbers % step == start]
     frames = {role: _frames(labels, numbers, there[role], plane, role) for role, (_, labels) in both.items()}
-    if truth.ignored is not None and truth.boxes_px is not None:
-        frames["tracks"], gone = _without_ignored(frames["truth"], frames["tracks"], truth)
+    if ground_truth.ignored is not None and ground_truth.boxes_px is not None:
+        frames["tracks"], gone = _without_ignored(frames["truth"], frames["tracks"], ground_truth)
         if gone:
             notes.append(f"{gone} boxes of {both['tracks'][0]} match labels that don't count; they are ignored")
     return AlignedFiles(frames["truth"], frames["tracks"], notes)
 
 
-def _plane(path: Path | None, point: Point, truth: Labels, tracks: Labels) -> GroundPlane | None:
+def _plane(path: Path | None, point: Point, ground_truth: Labels, tracks: Labels) -> GroundPlane | None:
     if path is None:
         return None
     boxes = np.concatenate(
-        [np.zeros((1, 4)), *(part.boxes_px for part in (truth, tracks) if part.boxes_px is not None)]
+        [np.zeros((1, 4)), *(part.boxes_px for part in (ground_truth, tracks) if part.boxes_px is not None)]
     )
     width, height = (boxes[:, :2] + boxes[:, 2:]).max(axis=0)
     try:
@@ -249,7 +249,7 @@ def _frames(
     return split_rows(numbers * NS_PER_S, numbers, rows[kept], np.searchsorted(there[kept], numbers, "right"))
 
 
-def _without_ignored(truth: Sequence[Frame], tracks: Sequence[Frame], labels: Labels) -> tuple[list[Frame], int]:
+def _without_ignored(ground_truth: Sequence[Frame], tracks: Sequence[Frame], labels: Labels) -> tuple[list[Frame], int]:
     """Remove boxes that match labels which don't count, as MOTChallenge and KITTI do; returns their number, too."""
     assert labels.ignored is not None
     ignored = labels.ignored
@@ -257,7 +257,7 @@ def _without_ignored(truth: Sequence[Frame], tracks: Sequence[Frame], labels: La
     ignored = _rows(ignored, order)
     at = ignored.frame - labels.first_frame
     out, gone = [], 0
-    for true, found in zip(truth, tracks, strict=True):
+    for true, found in zip(ground_truth, tracks, strict=True):
         low, high = np.searchsorted(at, [true.index, true.index + 1])
         kept = ~_is_ignored(_boxes(true), _boxes(found), _rows(ignored, slice(low, high)), labels.format == "kitti")
         gone += int((~kept).sum())
