@@ -147,6 +147,20 @@ def test_files_and_folders_that_the_map_names_exist():
         assert (ROOT / name).exists() or (ROOT / "mcaptrack" / name).exists(), name
 
 
+def test_every_guarantee_of_the_map_names_test_files_that_exist():
+    listed = ARCHITECTURE.read_text().partition("## What holds for a log\n")[2].partition("\n## ")[0]
+    guarantees = re.split(r"^- ", listed, flags=re.M)[1:]
+    assert len(guarantees) > 10
+    for guarantee in guarantees:
+        files = re.findall(r"`(test_\w+)`", guarantee)
+        assert files, guarantee
+        assert all((ROOT / "tests" / f"{name}.py").exists() for name in files), guarantee
+
+
+def test_no_line_of_the_map_is_too_long():
+    assert max(map(len, ARCHITECTURE.read_text().splitlines())) <= 125
+
+
 def test_the_floors_on_the_map_are_those_that_are_held():
     contracts = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"]
     layers = {name.strip().rpartition(".")[2] for layer in contracts[0]["layers"] for name in layer.split("|")}

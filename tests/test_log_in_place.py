@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.log.checksums import crc_before
+from mcaptrack.log.writer import LogWriter
 from tests.interrupted import SCHEMA, contents
 
 
@@ -128,3 +129,34 @@ def test_damage_that_is_in_the_way_is_said_where_it_stands_and_nothing_changes(t
     ):
         add_results(path, 2)
     assert path.read_bytes() == bytes(whole)
+
+
+class FaultyDisk:
+    """Passes on what is written, but the first piece of at least 100 bytes has a flipped bit."""
+
+    def __init__(self, sink) -> None:
+        self.sink, self.has_failed = sink, False
+
+    def write(self, data: bytes) -> None:
+        if len(data) >= 100 and not self.has_failed:
+            self.has_failed = True
+            data = bytes(data[:50]) + bytes([data[50] ^ 1]) + bytes(data[51:])
+        self.sink.write(data)
+
+
+@pytest.mark.parametrize("way", ["create", "in place", "copy"])
+def test_bytes_that_are_read_back_otherwise_than_written_leave_the_log_as_it_was(way, tmp_path, monkeypatch):
+    path, copy = tmp_path / "a.mcap", tmp_path / "copy.mcap"
+    recorded(path)
+    before, init = path.read_bytes(), LogWriter.__init__
+    monkeypatch.setattr(LogWriter, "__init__", lambda self, sink, *rest: init(self, FaultyDisk(sink), *rest))
+    with pytest.raises(McaptrackError, match="read back of"):
+        if way == "create":
+            recorded(copy)
+        elif way == "in place":
+            add_results(path, 1)
+        else:
+            with log.read(path) as opened, log.extend(opened, copy) as writer:
+                writer.add_message(writer.add_channel("/new", SCHEMA, "json", {}, "media"), 1, 1, bytes(1000))
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
