@@ -1,4 +1,4 @@
-"""What all tests share."""
+"""Fixtures of all tests."""
 
 from __future__ import annotations
 
@@ -15,8 +15,7 @@ from mcaptrack.sources import demo
 from tests.commands import done
 from tests.worlds import small_scene
 
-# The same examples each time, so that a run says something about a change; `--hypothesis-profile search` looks for new
-# ones, and for many more.
+# The same examples each time, so that a failure comes from a change; `--hypothesis-profile search` tries many new ones.
 settings.register_profile("same", deadline=None, suppress_health_check=[HealthCheck.too_slow], derandomize=True)
 settings.register_profile("search", settings.get_profile("same"), derandomize=False, print_blob=True, max_examples=3000)
 settings.load_profile("same")
@@ -24,7 +23,7 @@ settings.load_profile("same")
 
 @pytest.fixture(scope="session", autouse=True)
 def no_settings(tmp_path_factory) -> Iterator[None]:
-    """Tests know nothing of the settings of whoever runs them."""
+    """Hide the settings of the user who runs the tests."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CONFIG_HOME", str(tmp_path_factory.mktemp("config")))
         yield
@@ -32,7 +31,7 @@ def no_settings(tmp_path_factory) -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def data() -> Path:
-    """Real data to compare with, if there is any: a folder named by MCAPTRACK_DATA."""
+    """The folder of reference data that MCAPTRACK_DATA names; tests are skipped without it."""
     folder = os.environ.get("MCAPTRACK_DATA", "")
     if not folder:
         pytest.skip("MCAPTRACK_DATA names no folder with reference data")
@@ -41,7 +40,7 @@ def data() -> Path:
 
 @pytest.fixture(scope="session")
 def footage(tmp_path_factory) -> demo.Footage:
-    """Three people on a small picture, with labels and the ground plane."""
+    """A video of three people, with labels and the ground plane."""
     return demo.draw(small_scene(), tmp_path_factory.mktemp("footage"))
 
 
@@ -72,7 +71,7 @@ def _finished(_ingested, tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def finished(_finished, tmp_path_factory) -> Path:
-    """A log with everything in it, and its companions. Not to be changed."""
+    """A log after all stages, with the files beside it. Not to be changed."""
     folder = tmp_path_factory.mktemp("finished")
     shutil.copytree(_finished.parent, folder, dirs_exist_ok=True)
     return folder / _finished.name
@@ -80,13 +79,13 @@ def finished(_finished, tmp_path_factory) -> Path:
 
 @pytest.fixture
 def fresh(_ingested, tmp_path) -> Path:
-    """A log of pictures, labels and the ground plane, before the first stage."""
+    """A log with pictures, labels and the ground plane, before the first stage."""
     return Path(shutil.copyfile(_ingested, tmp_path / "walk.mcap"))
 
 
 @pytest.fixture
 def never_waits() -> Iterator[None]:
-    """A test that waits for something that never comes fails after a minute."""
+    """Fail a test that waits for longer than a minute."""
 
     def late(*_: object) -> None:
         raise TimeoutError("it waits")

@@ -1,4 +1,4 @@
-"""What re-tracking does once the log is known: motion, links, meetings, doubt; each against its law or by hand."""
+"""Offline re-tracking: motion model, links, encounters and false tracks, each against a law or by hand."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ def one_path(xy: np.ndarray, start: int = 0) -> Trajectories:
 
 
 def joint(xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mean (n, 2) and variance (n,) of every true position given all seen ones, from one big Gaussian: no filter."""
+    """Mean (n, 2) and variance (n,) of every true position given all measured ones, from one joint Gaussian."""
     count = len(xy)
     move = np.array([[1, STEP_S], [0, 1]])
     noise = MODEL.drift_m_per_s**2 * np.array([[STEP_S**3 / 3, STEP_S**2 / 2], [STEP_S**2 / 2, STEP_S]])
     seen = np.flatnonzero(np.isfinite(xy[:, 0]))
-    # a flat prior of the first position, as a filter that starts on its measurement has it
+    # a flat prior of the first position, as in a filter that starts at its measurement
     cov = np.zeros((2 * count, 2 * count))
     cov[:2, :2] = np.diag([1e3, MODEL.speed_m_per_s**2])
     for k in range(1, count):
@@ -50,7 +50,7 @@ def joint(xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 class TestMotion:
-    def test_smoothing_is_the_mean_given_everything(self):
+    def test_smoothed_positions_are_the_mean_given_all_measurements(self):
         rng = np.random.default_rng(3)
         xy = np.cumsum(rng.normal(0.4, 0.1, (14, 2)), axis=0)
         xy[5:8] = np.nan
@@ -59,7 +59,7 @@ class TestMotion:
         np.testing.assert_allclose(smoothed.mean[:, :2], mean, atol=1e-3)
         np.testing.assert_allclose(smoothed.cov[:, 0], variance, rtol=0.01)
 
-    def test_tracks_beside_each_other_do_not_touch(self):
+    def test_tracks_are_smoothed_independently_of_each_other(self):
         rng = np.random.default_rng(4)
         parts = [rng.normal(0, 3, (n, 2)) for n in (9, 1, 4)]
         first = np.array([0, 9, 10, 14])
@@ -71,14 +71,14 @@ class TestMotion:
             for a, b in zip(whole, smooth(MODEL, one_path(part), STEP_S), strict=True):
                 np.testing.assert_allclose(a.mean[first[k] : first[k + 1]], b.mean, atol=1e-9)
 
-    def test_backwards_is_forwards_of_the_film_run_backwards(self):
+    def test_the_backward_filter_is_the_forward_filter_in_reversed_time(self):
         xy = np.cumsum(np.random.default_rng(5).normal(0.3, 0.2, (10, 2)), axis=0)
         _, backward, _ = smooth(MODEL, one_path(xy), STEP_S)
         forward, _, _ = smooth(MODEL, one_path(xy[::-1]), STEP_S)
         np.testing.assert_allclose(backward.mean[:, :2], forward.mean[::-1, :2])
         np.testing.assert_allclose(backward.mean[:, 2:], -forward.mean[::-1, 2:])
 
-    def test_prediction_in_two_steps_is_prediction_in_one(self):
+    def test_two_predictions_in_a_row_equal_one_over_the_whole_time(self):
         state = State(np.array([[1.0, 2, 0.5, -1]]), np.array([[0.1, 0.02, 0.3]]))
         one, two = MODEL.predict(state, 1.2), MODEL.predict(MODEL.predict(state, 0.4), 0.8)
         np.testing.assert_allclose(one.mean, two.mean)
@@ -87,8 +87,8 @@ class TestMotion:
 
 @given(seed=st.integers(0, 2**32 - 1))
 @settings(max_examples=40)
-def test_pairs_are_the_best_there_are(seed):
-    """Against all ways to pair up to four with up to four."""
+def test_the_assignment_is_optimal(seed):
+    """Compare with all assignments of up to four rows to up to four columns."""
     from itertools import permutations
 
     rng = np.random.default_rng(seed)
@@ -112,20 +112,20 @@ class TestLinks:
     def walking(self, x: float, y: float, steps: int = 12, speed: float = 0.5) -> np.ndarray:
         return np.stack([x + speed * np.arange(steps), np.full(steps, y)], axis=-1)
 
-    def test_who_walks_on_behind_a_wall_is_the_same(self):
+    def test_a_person_who_walks_on_behind_a_wall_is_linked(self):
         assert self.follows((0, self.walking(0, 0)), (22, self.walking(11, 0))) == [1, -1]
 
-    def test_who_stands_behind_a_wall_is_the_same(self):
+    def test_a_person_who_stands_behind_a_wall_is_linked(self):
         assert self.follows((0, self.walking(0, 0, speed=0)), (25, self.walking(0.1, 0, speed=0))) == [1, -1]
 
-    def test_who_would_have_to_turn_round_is_somebody_else(self):
+    def test_a_person_who_would_have_to_turn_round_is_not_linked(self):
         assert self.follows((0, self.walking(0, 0)), (16, self.walking(-6, 0, speed=-0.5))) == [-1, -1]
 
-    def test_nobody_is_linked_over_a_longer_time_than_that(self):
+    def test_no_link_is_longer_than_the_option_allows(self):
         assert self.follows((0, self.walking(0, 0)), (60, self.walking(30, 0))) == [-1, -1]
 
-    def test_two_and_two_go_together_as_fits_all_best(self):
-        """The nearer beginning of each end is the other's only one."""
+    def test_links_maximize_the_total_over_all_tracks(self):
+        """The nearest beginning for one end is the only possible one for the other."""
         people = [
             (0, self.walking(0, 0)),
             (0, self.walking(0, 1.2)),
@@ -135,9 +135,9 @@ class TestLinks:
         assert self.follows(*people) == [2, 3, -1, -1]
 
 
-class TestMeetings:
+class TestEncounters:
     def apart(self, exchanged: slice, noise: float, seed: int = 0) -> np.ndarray:
-        """Two pass each other 0.8 m apart; from then on, labels exchanged over some steps."""
+        """Two pass each other 0.8 m apart; their track ids are swapped over some steps."""
         steps = np.arange(40)
         off = np.stack([6 - 0.3 * steps, np.full(40, 0.8)], axis=-1) + np.random.default_rng(seed).normal(
             0, noise, (40, 2)
@@ -146,22 +146,22 @@ class TestMeetings:
         return off[None]
 
     @pytest.mark.parametrize("since", [5, 18, 22, 30])
-    def test_an_exchange_is_found_to_the_step(self, since):
+    def test_a_swap_is_found_at_its_exact_step(self, since):
         course, gain = find_swaps(self.apart(slice(since, None), 0.05), np.full((1, 40), 5.0), STEP_S, 0.05, 1.5)
         assert np.flatnonzero(course[0]).tolist() == list(range(since, 40))
         assert gain[0] > 3
 
-    def test_there_and_back_again(self):
+    def test_a_swap_and_its_reversal_are_found(self):
         course, _ = find_swaps(self.apart(slice(8, 15), 0.05), np.full((1, 40), 5.0), STEP_S, 0.05, 1.5)
         assert np.flatnonzero(course[0]).tolist() == list(range(8, 15))
 
-    def test_where_nothing_was_exchanged_nothing_is(self):
+    def test_without_a_swap_none_is_found(self):
         for seed in range(20):
             course, gain = find_swaps(self.apart(slice(0, 0), 0.1, seed), np.full((1, 40), 5.0), STEP_S, 0.1, 1.5)
             assert not course.any()
             assert gain[0] <= 0
 
-    def test_encounters_do_not_touch_and_holes_are_bridged(self):
+    def test_encounters_are_disjoint_and_span_gaps(self):
         one, two = self.apart(slice(20, None), 0.05), self.apart(slice(0, 0), 0.05, 1)
         one[0, 17:23] = np.nan
         course, _ = find_swaps(np.concatenate([one, two]), np.full((2, 40), 5.0), STEP_S, 0.05, 1.5)
@@ -170,18 +170,18 @@ class TestMeetings:
         assert not course[1].any()
 
 
-class TestOfTheWholeLog:
+class TestOffline:
     def offline(self, path, ticks=60, profile=DEFAULT):
         return [result[0] for result in profile(walk(path, ticks))]
 
-    def test_hidden_for_six_seconds_and_found_again(self):
+    def test_a_track_continues_after_an_occlusion_of_six_seconds(self):
         frames = self.offline(lambda n: {1 if n < 20 else 2: (0.5 * n, 0.0)} if not 20 <= n < 35 else {})
         assert {who for frame in frames for who in places(frame)} == {1}
         assert [len(frame.rows) for frame in frames] == [1] * 60
         assert not any(frame.rows["observed"].any() for frame in frames[20:35])
 
-    def test_labels_that_the_input_exchanges_where_two_pass_are_put_right(self):
-        """Ids of the input change sides as two pass 0.5 m from each other, unseen for a moment."""
+    def test_identity_switches_of_the_input_are_repaired_where_two_people_pass(self):
+        """The input ids are swapped as two pass 0.5 m from each other, occluded for a moment."""
 
         def crowd(n):
             a, b = (0.4 * n, 0.0), (24 - 0.4 * n, 0.5)
@@ -196,8 +196,8 @@ class TestOfTheWholeLog:
             assert abs(ends[0][who] - ends[1][who]) > 20
 
     @pytest.mark.parametrize("name", [1, 2, 3])
-    def test_two_who_cross_and_are_one_box_for_two_seconds_are_who_they_were(self, name):
-        """While they are one box it stands in the middle, under anybody's name, which one of them has afterwards too."""
+    def test_two_people_keep_their_ids_when_merged_for_two_seconds(self, name):
+        """The merged detection lies between them, under any id, which one of them keeps afterwards."""
 
         def crowd(n):
             side = 0.15 * (22 - n)
@@ -212,16 +212,16 @@ class TestOfTheWholeLog:
                 before, after = ({who: xy[1] > 0 for who, xy in places(frames[n]).items()} for n in (10, 40))
                 assert len(before) == 2
                 assert {who: not side for who, side in before.items()} == after
-                assert len(frames[22].rows) == 2  # both live while they are one box
+                assert len(frames[22].rows) == 2  # both are alive while merged
 
-    def test_smoothing_takes_noise_away(self):
+    def test_smoothing_reduces_noise(self):
         noise = np.random.default_rng(1).normal(0, 0.2, (60, 2))
         frames = self.offline(lambda n: {1: (0.5 * n + noise[n, 0], noise[n, 1])})
         off = np.array([np.subtract(places(f)[1], (0.5 * n, 0.0)) for n, f in enumerate(frames)])
         raw = np.sqrt((noise**2).sum(axis=1).mean())
         assert np.sqrt((off**2).sum(axis=1).mean()) < 0.7 * raw
 
-    def test_the_noise_is_found_out(self):
+    def test_the_noise_is_estimated(self):
         for noise_m in (0.05, 0.35):
             rng = np.random.default_rng(2)
             frames = walk(
@@ -236,15 +236,15 @@ class TestOfTheWholeLog:
             assert run.noise_m == pytest.approx(noise_m, rel=0.25)
 
     @pytest.mark.parametrize(("spread_m", "found_m"), [(0.0, 0.03), (4.0, 0.8)])
-    def test_the_noise_that_is_found_out_has_limits(self, spread_m, found_m):
+    def test_the_estimated_noise_has_limits(self, spread_m, found_m):
         rng = np.random.default_rng(2)
         run = LikelihoodPass(DEFAULT)
         for frame in walk(lambda n: {k: tuple([0.0, 900.0 * k] + rng.normal(0, spread_m, 2)) for k in range(9)}, 250):
             run.step(frame)
         assert run.noise_m == pytest.approx(found_m)
 
-    def test_an_id_that_is_handed_on_three_times_is_given_back(self):
-        """1 crosses 2, 2 crosses 3, 3 crosses 4, each time unseen for a moment, and the input's id 1 goes to the other.
+    def test_three_identity_switches_in_a_row_are_undone(self):
+        """1 crosses 2, 2 crosses 3, 3 crosses 4, each time occluded for a moment, and the input id 1 goes to the other.
 
         The same track is in all three encounters, so they are decided one after another.
         """
@@ -272,8 +272,8 @@ class TestOfTheWholeLog:
 
     @given(seed=st.integers(0, 2**32 - 1), cut=st.integers(5, 55))
     @settings(max_examples=15)
-    def test_what_is_foretold_knows_nothing_of_the_future(self, seed, cut):
-        """Truncate the log anywhere, or let anything at all come after: forecasts up to there stay to the bit."""
+    def test_predictions_do_not_depend_on_the_future(self, seed, cut):
+        """Truncate or replace the rest of the log: online tracks and predictions up to there stay the same to the bit."""
         rng = np.random.default_rng(seed)
         start, speed = rng.uniform(-8, 8, (6, 2)), rng.normal(0, 0.4, (6, 2))
         noise, there = rng.normal(0, 0.15, (60, 6, 2)), rng.random((60, 6)) > 0.25

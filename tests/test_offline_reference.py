@@ -103,7 +103,7 @@ def test_false_track_odds_equal_the_reference(seed):
 @given(seed=SEEDS)
 @settings(max_examples=40)
 def test_swaps_equal_the_reference(seed):
-    """Positions of one relative to the other, identities swapped now and then, any cost of a swap."""
+    """Relative positions of two people, with random swaps and random costs of a swap."""
     rng = np.random.default_rng(seed)
     _, motion = models(rng)
     count, steps = int(rng.integers(1, 4)), int(rng.integers(1, 40))
@@ -123,7 +123,7 @@ def test_swaps_equal_the_reference(seed):
 
 @given(seed=SEEDS)
 @settings(max_examples=40)
-def test_encounters_are_decided_as_in_the_reference(seed):
+def test_decisions_at_encounters_equal_the_reference(seed):
     """Pairs of people that cross, some with swapped identities, with input ids that follow the swap or not."""
     rng = np.random.default_rng(seed)
     model, motion = models(rng)

@@ -1,4 +1,4 @@
-"""Re-tracking: Eq. 1 to 3 and every branch of Algorithm 1 by hand, and the paper's four failures in worded scenes."""
+"""Re-tracking: Eq. 1 to 3 and every branch of Algorithm 1 by hand, and the paper's four failures as small scenes."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from mcaptrack.transforms.retrack.distances import (
 from tests.worlds import ids, places, tracks_at, walk
 
 PAPER, AUTHORS, DEFAULT = PROFILES["paper"], PROFILES["authors"], PROFILES["default"]
-#: The expected and the seen position compared, Algorithm 1 otherwise, and nothing done afterwards.
+#: Algorithm 1 with the distance between predicted and measured position, without the offline steps.
 NOW = RetrackByConsistency(
     distance="now",
     noise_m=0.5,
@@ -37,12 +37,12 @@ every_profile = pytest.mark.parametrize("profile", PROFILES.values(), ids=PROFIL
 
 
 def run(profile, frames):
-    """Offline, online and predicted frames."""
+    """Frames of offline tracks, online tracks and predictions."""
     return [list(part) for part in zip(*profile(frames), strict=True)]
 
 
 def paths(frames) -> dict[int, dict[int, tuple[float, float]]]:
-    """Each id's places by tick."""
+    """The positions of each id by tick."""
     out: dict[int, dict[int, tuple[float, float]]] = {}
     for tick, frame in enumerate(frames):
         for who, place in places(frame).items():
@@ -70,13 +70,13 @@ class TestDistance:
         off, cov = np.array([[3.0, 4.0], [1.0, 1.0]]), np.array([np.diag([9.0, 16.0]), [[2.0, 1.0], [1.0, 2.0]]])
         np.testing.assert_allclose(mahalanobis(off, cov), [np.sqrt(2), np.sqrt(2 / 3)])
 
-    def test_uncertainty_grows_as_the_paper_says(self):
+    def test_the_covariance_grows_as_in_the_paper(self):
         cov = paper_covariance(np.array([1, 4]), 3, 0.5)
         np.testing.assert_allclose(cov[:, :, 0, 0], [[0.25, 0.5, 0.75], [1.0, 1.25, 1.5]])
         np.testing.assert_allclose(cov[:, :, 0, 1], 0)
 
     def test_eq_2_by_hand(self):
-        """A track foretold one step ago at 0, 1, 2, ...; an observation foretells the same places 2 m further.
+        """A track predicted one step ago at 0, 1, 2, ...; an observation predicts the same positions 2 m further.
 
         Step j of the overlap (from 1): variances j + 1 and j, so the distance is 2 / sqrt(2 j + 1), for 11 steps.
         """
@@ -99,11 +99,11 @@ class TestDistance:
         assert distance[1] == pytest.approx(((9 + steps) / np.sqrt(9 + 2 * steps)).mean())
         assert distance[2] == np.inf
 
-    def test_learned_uncertainty_takes_the_place_of_the_papers(self):
+    def test_the_covariance_of_a_predictor_replaces_that_of_the_paper(self):
         tracks, seen = forecast(line(0, 0), variance=3.0), forecast(line(0, 0) + [2, 0], variance=1.0)
         assert prediction_distances(tracks, np.array([1]), seen, "mean", None)[0, 0] == pytest.approx(1.0)
 
-    def test_expected_and_seen_position_by_hand(self):
+    def test_the_distance_of_predicted_and_measured_position_by_hand(self):
         tracks = forecast(line(0, 1), line(0, 1), variance=0.75)
         xy = np.array([[3.0, 1.0]])
         distance = position_distances(tracks, np.array([3, 13]), xy, 0.5, None)
@@ -112,8 +112,8 @@ class TestDistance:
 
 
 class TestSmoothing:
-    def test_eq_3_through_a_hole_by_hand(self):
-        """Seen at 0 and 1; then a hole; then at 5, three steps on: displacements 1, 4/3, 4/3, 4/3."""
+    def test_eq_3_over_a_gap_by_hand(self):
+        """Observed at 0 and 1, and three steps later at 5: displacements 1, 4/3, 4/3, 4/3."""
         holt = Holt(0.5, 0.5)
         past = np.array([[[np.nan, np.nan], [0.0, 0], [1, 0]]])
         history = SmoothedHistory.of_observations(holt, past, np.isfinite(past[..., 0]))
@@ -128,7 +128,7 @@ class TestSmoothing:
         assert known.tolist() == [[True, True, True]]
         np.testing.assert_allclose(rebuilt[0, :, 0], [5 - smooth[-1] - smooth[-2], 5 - smooth[-1], 5])
 
-    def test_without_smoothing_the_past_is_as_it_was_seen(self):
+    def test_without_smoothing_the_past_is_as_it_was_observed(self):
         past = np.array([[[0.0, 1], [1, 1], [3, 0], [2, 5]]])
         history = SmoothedHistory.of_observations(Holt(1.0, 0.0), past, np.ones((1, 4), bool))
         np.testing.assert_allclose(history.positions()[0], past)
@@ -138,22 +138,22 @@ class TestBranches:
     """Lines 4 to 18 of Algorithm 1, one by one, on people who walk along the first axis."""
 
     @every_profile
-    def test_matched_one_who_walks_on_stays_one(self, profile):
+    def test_a_person_who_walks_on_is_one_track(self, profile):
         offline, online, _ = run(profile, walk(lambda n: {7: (0.5 * n, 0.0)}, 20))
         assert set(paths(offline)) == {1}
         assert set(paths(online)) == {1}
         assert along(paths(offline)[1], {tick: (0.5 * tick, 0.0) for tick in range(20)})
 
     @every_profile
-    def test_identity_is_dropped_a_new_id_on_the_same_path_is_the_same_person(self, profile):
+    def test_a_new_input_id_on_the_same_path_continues_the_track(self, profile):
         frames = walk(lambda n: {7 if n < 10 else 8: (0.5 * n, 0.0)}, 24)
         offline, _, _ = run(profile, frames)
         (who,) = paths(offline)
         assert along(paths(offline)[who], {tick: (0.5 * tick, 0.0) for tick in range(24)})
 
     @every_profile
-    def test_unmatched_track_ages_and_is_matched_again_within_its_age(self, profile):
-        """Hidden for five steps, back under another id; matched once that id has a past, and the hole is filled."""
+    def test_an_unmatched_track_coasts_and_is_matched_again_within_its_maximum_age(self, profile):
+        """Occluded for three steps, then under another id; matched once that id has a past. The gap is interpolated."""
         frames = walk(lambda n: {7 if n < 10 else 8: (0.5 * n, 0.0)} if not 10 <= n < 13 else {}, 26)
         offline, _, _ = run(profile, frames)
         (who,) = paths(offline)
@@ -162,7 +162,7 @@ class TestBranches:
         assert set(range(10, 13)) <= set(filled)
 
     @every_profile
-    def test_aged_out_is_somebody_else(self, profile):
+    def test_after_the_maximum_age_a_new_track_begins(self, profile):
         gone = range(10, 26)  # 6.4 s
         frames = walk(lambda n: {7 if n < 10 else 8: (0.5 * n, 0.0)} if n not in gone else {}, 40)
         offline, _, _ = run(replace(profile, link_s=0.0), frames)
@@ -170,14 +170,14 @@ class TestBranches:
         assert all(len(frame.rows) == 0 for frame in offline[10:26])
 
     @every_profile
-    def test_age_counts_seconds_not_frames_with_rows(self, profile):
-        """The same hole, but the log has no frames there at all."""
+    def test_the_age_is_in_seconds_and_does_not_count_frames(self, profile):
+        """The same gap, but the log has no frames there at all."""
         frames = [f for f in walk(lambda n: {7: (0.5 * n, 0.0)}, 40) if not 10 <= f.index < 26]
         offline, _, _ = run(replace(profile, link_s=0.0), frames)
         assert len(paths(offline)) == 2
 
     @every_profile
-    def test_unmatched_observation_starts_a_track(self, profile):
+    def test_an_unmatched_observation_starts_a_track(self, profile):
         frames = walk(lambda n: {7: (0.5 * n, 0.0)} | ({9: (0.0, 20.0 + 0.5 * n)} if n >= 6 else {}), 24)
         offline, _, predictions = run(profile, frames)
         assert len(paths(offline)) == 2
@@ -185,32 +185,32 @@ class TestBranches:
         assert {row["track_id"] for row in predictions[-1].rows} == {1, 2}
 
     @every_profile
-    def test_probation_what_never_lasts_is_never_reported(self, profile):
+    def test_tracks_shorter_than_the_probation_are_left_out(self, profile):
         frames = walk(lambda n: {7: (0.5 * n, 0.0)} | ({9: (0.0, 20.0)} if n in range(8, 12) else {}), 24)
         offline, _, _ = run(profile, frames)
         assert len(paths(offline)) == 1
 
-    def test_pairs_beyond_the_gate_are_no_pairs(self):
+    def test_pairs_outside_the_gate_are_not_matched(self):
         def jump(n):
             return {7: (0.5 * n, 0.0 if n < 10 else 40.0)}
 
         offline, _, _ = run(DEFAULT, walk(jump, 24))
         assert len(paths(offline)) == 2
 
-    def test_no_track_is_matched_further_than_it_can_have_jumped(self):
+    def test_the_gate_in_metres_limits_how_far_a_track_jumps(self):
         frames = walk(lambda n: {7 if n < 10 else 8: (0.0, 0.0 if n < 10 else 4.0)} if not 10 <= n < 20 else {}, 32)
         near, _, _ = run(replace(NOW, gate_m=None), frames)
         far, _, _ = run(NOW, frames)
         assert len(paths(near)) == 1
         assert len(paths(far)) == 2
 
-    def test_two_who_pass_keep_to_their_paths(self):
+    def test_two_people_who_pass_each_other_keep_their_ids(self):
         frames = walk(lambda n: {1: (0.5 * n, 0.0), 2: (10 - 0.5 * n, 0.6)}, 24)
         offline, _, _ = run(DEFAULT, frames)
         assert {round(path[23][1], 1): round(path[0][1], 1) for path in paths(offline).values()} == {0.0: 0.0, 0.6: 0.6}
 
-    def test_the_input_says_who_it_is_where_places_do_not(self):
-        """Two walk abreast, 0.3 m apart, in noise; ids of the input decide unless they are dropped."""
+    def test_input_ids_decide_where_positions_are_ambiguous(self):
+        """Two walk abreast, 0.3 m apart, in noise. Identity switches are fewer with the bonus for the same input id."""
         rng = np.random.default_rng(5)
         noise = rng.normal(0, 0.25, (60, 2))
 
@@ -224,8 +224,8 @@ class TestBranches:
 
         assert switches(DEFAULT) < switches(replace(DEFAULT, same_id_bonus=0.0))
 
-    def test_certain_pairs_go_first(self):
-        """Two tracks, one observation each; the sum is least crosswise, but one pair is certain."""
+    def test_near_pairs_are_matched_first(self):
+        """The total cost of two tracks and two observations is least crosswise, but one pair is near enough for priority."""
         frames = walk(lambda n: {1: (0.0, 0.0), 2: (1.0, 0.0)}, 8)
         late = walk(lambda n: {3: (0.05, 0.0), 4: (-1.0, 0.0)}, 8)
         frames += [f._replace(t_ns=f.t_ns + 8 * 400_000_000, index=8 + f.index) for f in late]
@@ -242,17 +242,17 @@ class TestBranches:
             {f.rows["source_id"][k]: f.rows["track_id"][k] for f in run(p, frames)[1][8:] for k in range(len(f.rows))}
             for p in (plain, sure)
         ]
-        assert by[1][3] == 1  # 0.05 m from where track 1 stands: certain
+        assert by[1][3] == 1  # 0.05 m from track 1: matched first
 
-    def test_an_observation_needs_a_past(self):
+    def test_an_observation_needs_a_history(self):
         frames = walk(lambda n: {1: (0.5 * n, 0.0)} if n < 3 else {}, 10)
         for profile, least in ((PAPER, 4), (NOW, 2)):
             assert profile.min_history == least
             _, online, _ = run(replace(profile, min_track_s=0.0), frames)
             assert any(len(frame.rows) for frame in online) == (least <= 3 and profile.min_hits <= 1)
 
-    def test_backfill_takes_what_nobody_holds_or_everything_or_nothing(self):
-        """Id 5 follows track 1 for a while and then jumps away: what it held before belongs to track 1."""
+    def test_backfill_takes_unclaimed_samples_or_all_or_none(self):
+        """Id 5 walks and then jumps away: its samples before the jump belong to track 1."""
 
         def path(n):
             return {5: (0.5 * n, 0.0) if n < 12 else (0.5 * n, 30.0)}
@@ -265,7 +265,7 @@ class TestBranches:
         assert rows["none"] < rows["unclaimed"] < rows["all"]
         assert rows["unclaimed"] <= 24
 
-    def test_birth_raw_or_smoothed_changes_the_first_forecast(self):
+    def test_birth_from_raw_or_smoothed_positions_changes_the_first_prediction(self):
         wild = [0.0, 1.0, 1.0, 3.0]
         frames = walk(lambda n: {1: (wild[min(n, 3)] + max(n - 3, 0), 0.0)}, 6)
         first = {}
@@ -281,14 +281,14 @@ class TestBranches:
         np.testing.assert_allclose(first["smoothed"], [3 + smooth, 3 + 2 * smooth])
 
     @every_profile
-    def test_online_and_predictions_say_the_same_people_at_the_same_time(self, profile):
+    def test_online_tracks_and_predictions_have_the_same_ids_and_times(self, profile):
         frames = walk(lambda n: {7: (0.5 * n, 0.0), 8: (0.0, 15.0 + n)} if n % 7 else {7: (0.5 * n, 0.0)}, 30)
         _, online, predictions = run(profile, frames)
         for now, then in zip(online, predictions, strict=True):
             assert now.t_ns == then.t_ns
             assert sorted(set(then.rows["track_id"].tolist())) == ids(now)
 
-    def test_online_rows_stand_where_they_were_seen(self):
+    def test_online_rows_are_at_the_measured_positions(self):
         frames = walk(lambda n: {7: (0.5 * n, np.sin(n))}, 20)
         _, online, _ = run(DEFAULT, frames)
         for tick, frame in enumerate(online[3:], start=3):
@@ -297,11 +297,11 @@ class TestBranches:
 
 
 class TestFailuresOfThePaper:
-    """Section IV-B: what tracking gets wrong, and what re-tracking makes of it."""
+    """Section IV-B of the paper: errors of tracking that re-tracking repairs."""
 
     @every_profile
     def test_missed_target(self, profile):
-        """One is swallowed by another's box for a second and comes back under a new id: one track, hole filled."""
+        """Merged into another detection for a second, then under a new id: one track, with the gap interpolated."""
 
         def crowd(n):
             people = {1: (0.5 * n, 0.0)}
@@ -318,7 +318,7 @@ class TestFailuresOfThePaper:
 
     @pytest.mark.parametrize("profile", [AUTHORS, DEFAULT], ids=["authors", "default"])
     def test_identity_switch_at_meet_and_separate(self, profile):
-        """Two cross; while they are one box it goes by the first's name, and after it the names are exchanged."""
+        """Two cross; their merged detection has the id of the first, and afterwards the ids are swapped."""
 
         def crowd(n):
             a, b = (0.6 * n, 0.45 * n), (0.6 * n, 10.8 - 0.45 * n)
@@ -326,7 +326,7 @@ class TestFailuresOfThePaper:
                 return {1: a, 2: b}
             if n < 14:
                 return {1: (0.6 * n, 5.4)}
-            return {1: b, 3: a}  # the tracker gives the first's name to the wrong one
+            return {1: b, 3: a}  # the tracker gives the first id to the wrong person
 
         offline, _, _ = run(profile, walk(crowd, 30))
         straight = 0
@@ -339,7 +339,7 @@ class TestFailuresOfThePaper:
 
     @every_profile
     def test_spurious_track(self, profile):
-        """A gust in a tree: for 2.4 s boxes leap about under one id. At most half of them are left, and of ours none."""
+        """A gust in a tree: for 2.4 s false detections jump about under one id. At most half remain; by likelihood none."""
         kept = 0
         for seed in range(20):
             leaps = np.random.default_rng(seed).uniform(-2.5, 2.5, (60, 2))
@@ -356,7 +356,7 @@ class TestFailuresOfThePaper:
         assert kept <= (0 if profile == DEFAULT else 0.5 * 20 * 6)
 
     def test_noisy_track(self):
-        """A shaking camera: forecasts of the re-tracked path jump less from step to step than those of the raw one."""
+        """A shaking camera: predictions from the re-tracked path jump less from step to step than those from the raw one."""
         rng = np.random.default_rng(4)
         noise = rng.normal(0, 0.25, (60, 2))
         frames = walk(lambda n: {1: (0.5 * n + noise[n, 0], noise[n, 1])}, 60)
@@ -372,10 +372,10 @@ class TestFailuresOfThePaper:
         assert drift(DEFAULT) < 0.8 * drift(raw)
 
 
-def test_authors_keep_what_two_matches_in_a_row_confirm():
-    """Seen at ticks 0 to 9, 13 to 16 and from 20 on: with four positions there is a forecast, so 16, 23, 24 match.
+def test_the_profile_authors_keeps_what_two_matches_in_a_row_confirm():
+    """Observed at ticks 0 to 9, 13 to 16 and from 20 on: four positions give a prediction, so 16, 23, 24 match.
 
-    What was matched once at the end of a track is left out; in the middle, once a later end is confirmed, it is kept.
+    A single match at the end of a track is left out; in the middle, before a confirmed end, it is kept.
     """
 
     def crowd(n, last):
@@ -392,7 +392,7 @@ def test_authors_keep_what_two_matches_in_a_row_confirm():
     assert ticks(AUTHORS, 24) == list(range(25))
 
 
-def test_the_log_without_people_gives_frames_without_rows():
+def test_a_log_without_people_gives_frames_without_rows():
     offline, online, predictions = run(DEFAULT, walk(lambda n: {}, 5))
     assert [len(f.rows) for f in (*offline, *online, *predictions)] == [0] * 15
     assert len(tracks_at({})) == 0

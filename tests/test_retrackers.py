@@ -85,7 +85,7 @@ def test_a_profile_names_its_method_and_distance_implies_it(walked):
 
 @pytest.mark.parametrize("profile", PROFILES)
 def test_logs_of_version_0_1_are_rebuilt_with_the_same_parameters(profile):
-    """There ``distance`` chose the method, all options stood with both, and some had other names."""
+    """There ``distance`` chose the method, both methods had all options, and some options had other names."""
     transform = PROFILES[profile]
     options = [f for kind in KINDS.values() for f in fields(kind) if not f.metadata.get("context")]
     had = {f.name: getattr(transform, f.name, f.default) for f in options}

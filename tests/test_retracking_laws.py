@@ -1,4 +1,4 @@
-"""Symmetries of re-tracking: where and when people walk, what ids are called, and who else is far away don't matter."""
+"""Symmetries of re-tracking: positions, times, ids and distant people don't change the tracks of a crowd."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from mcaptrack.transforms.retrack import Retracking
 from tests.worlds import noisy_tracks, ns, places, walk
 
 SEEDS = st.integers(0, 2**32 - 1)
-#: "now" looks at the forecast of the present, which the other readings of Algorithm 1 don't.
+#: "now" compares predictions of the current step, which the other distances of Algorithm 1 don't.
 METHODS = dict(PROFILES) | {"now": RetrackByConsistency(distance="now", noise_m=0.3)}
 every_method = pytest.mark.parametrize("method", METHODS.values(), ids=METHODS)
 
 
 def outputs(method: Retracking, frames: list[Frame]) -> list[Rows]:
-    """The rows of offline and online tracks and of forecasts."""
+    """The rows of offline tracks, online tracks and predictions."""
     return [np.concatenate([frame.rows for frame in part]) for part in zip(*method(frames), strict=True)]
 
 
 def same(found: Rows, wanted: Rows, **changed: np.ndarray) -> None:
-    """Equal rows, but for columns that are ``changed``; places to a micrometre."""
+    """Compare rows: equal but for the columns ``changed``, positions to a micrometre."""
     for name in found.dtype.names:
         values = changed.get(name, wanted[name])
         np.testing.assert_allclose(found[name], values, rtol=1e-6, atol=1e-6, err_msg=name)
@@ -45,7 +45,7 @@ def moved(frames: list[Frame], turn: np.ndarray, shift: np.ndarray) -> list[Fram
 @every_method
 @given(seed=SEEDS, angle=st.floats(0, 7))
 @settings(max_examples=2)
-def test_a_moved_and_turned_world_has_moved_and_turned_tracks(method, seed, angle):
+def test_tracks_move_and_turn_with_the_world(method, seed, angle):
     rng = np.random.default_rng(seed)
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     shift = rng.uniform(-100, 100, 2)
@@ -62,7 +62,7 @@ def test_a_moved_and_turned_world_has_moved_and_turned_tracks(method, seed, angl
 @every_method
 @given(seed=SEEDS)
 @settings(max_examples=2)
-def test_a_later_log_with_larger_ids_has_the_same_tracks(method, seed):
+def test_later_times_and_larger_ids_give_the_same_tracks(method, seed):
     frames = noisy_tracks(np.random.default_rng(seed), ticks=40, hidden=0.03)
     later = []
     for frame in frames:
@@ -77,15 +77,15 @@ def test_a_later_log_with_larger_ids_has_the_same_tracks(method, seed):
 
 
 def by_place(rows: Rows) -> Rows:
-    """The rows of a frame in an order that ids don't decide."""
+    """Sort the rows of a frame by position, so that their order doesn't depend on ids."""
     return rows[np.lexsort((rows["y_m"], rows["x_m"]))]
 
 
 @every_method
 @given(seed=SEEDS)
 @settings(max_examples=2)
-def test_crowds_that_are_far_apart_are_tracked_as_if_alone(method, seed):
-    """With a given noise; how many links are right is learned from the whole log, so nothing is linked here."""
+def test_crowds_far_apart_do_not_affect_each_other(method, seed):
+    """The noise is given and nothing is linked, because both are estimated from the whole log."""
     rng = np.random.default_rng(seed)
     method = replace(method, noise_m=0.15, link_s=0.0)
     one, two = noisy_tracks(rng, ticks=40), noisy_tracks(rng, ticks=40)
@@ -108,7 +108,7 @@ def test_crowds_that_are_far_apart_are_tracked_as_if_alone(method, seed):
 
 
 def standing(first: list[tuple[float, float]], then: list[tuple[float, float]], gap: range, ticks: int) -> list[Frame]:
-    """People stand, are not seen for a while, and then stand elsewhere under new ids."""
+    """People stand, are occluded for a while, and then stand elsewhere under new ids."""
 
     def path(tick: int):
         if tick in gap:
@@ -131,13 +131,13 @@ TIES = {
 
 @every_method
 @pytest.mark.parametrize("tie", TIES)
-def test_last_digits_decide_nothing(method, tie):
-    """Forecasts and sums differ in the last digits from machine to machine, and with how many are computed at once."""
+def test_the_last_digits_of_positions_change_no_assignment(method, tie):
+    """The last digits of predictions and sums differ between machines and with the size of the batch."""
     frames, options = TIES[tie]
     own = {option.name for option in fields(method)}
     method = replace(method, track_confidence=0.0, **{name: v for name, v in options.items() if name in own})
     wanted = [sorted(places(frame).items()) for frame, _, _ in method(frames)]
-    assert len({who for frame in wanted for who, _ in frame}) == 2  # the old ones went on
+    assert len({who for frame in wanted for who, _ in frame}) == 2  # both tracks continue
     for seed in range(6):
         rng = np.random.default_rng(seed)
         shaken = []

@@ -20,13 +20,13 @@ from tests.references.retracking import Undecided, constant_velocity
 from tests.worlds import crossing_tracks, noisy_tracks
 
 SEEDS = st.integers(0, 2**32 - 1)
-#: Nothing done afterwards but what both methods share: gaps are filled in, and what is short is left out.
+#: Offline, gaps are interpolated and short tracks are left out; nothing else.
 PLAIN = {"link_s": 0.0, "resolve_swaps": False, "smooth": False, "track_confidence": 0.0}
 
 
-#: A plane that is a plain scale, so that what a box moves by is known: 20 px a metre.
+#: A ground plane that only scales (20 px per metre), so that the movement of boxes is known.
 PLANE = ((0, GroundPlane((0.05, 0, 0, 0, 0.05, 0, 0, 0, 1), 640, 480)),)
-#: What fails is not made simpler: that takes minutes, and a seed says enough.
+#: Failures are not shrunk: that takes minutes, and the seed is enough.
 QUICK = [Phase.explicit, Phase.generate]
 
 
@@ -36,7 +36,7 @@ def rows_of(frame: Frame) -> list[dict[str, float]]:
 
 
 def black_box(name: str, steps: int, step_s: float):
-    """A predictor of the package for one track; where a position is not known stands None."""
+    """A predictor of the package for one track; positions that are not known are None."""
     predictor = make(name, steps, step_s)
 
     def predict(points):
@@ -89,7 +89,7 @@ def test_profile_paper_equals_algorithm_1(seed):
     compare(paper, noisy_tracks(np.random.default_rng(seed)), reference, covariances=False)
 
 
-#: What Algorithm 1 is asked for, beside the choices between names; of each a few values that change its course.
+#: Numeric options of Algorithm 1, with a few values each that change its results.
 NUMBERS = {
     "horizon_s": [0.8, 2.0, 4.8],
     "sigma_m": [0.3, 1.0],
@@ -125,7 +125,7 @@ def test_algorithm_1_with_random_options_equals_the_reference(seed, chosen):
     compare(transform, frames, algorithm_1(transform))
 
 
-#: What the likelihood method is asked for.
+#: Options of the method by likelihood, with the values to try.
 LIKELIHOOD = {
     "horizon_s": [0.8, 4.8],
     "noise_m": [None, None, 0.1, 0.3],
@@ -158,7 +158,7 @@ def test_the_likelihood_method_equals_the_reference(seed, chosen):
     compare(transform, make_frames(rng, rate_hz=transform.rate_hz), reference)
 
 
-#: What is done once the whole log is known.
+#: Options of the offline steps, with the values to try.
 OFFLINE = {
     "kind": [Retrack, Retrack, RetrackByConsistency],
     "noise_m": [None, 0.1, 0.3],
@@ -178,7 +178,7 @@ OFFLINE = {
 
 @given(seed=SEEDS, chosen=st.fixed_dictionaries({name: st.sampled_from(v) for name, v in OFFLINE.items()}))
 @settings(max_examples=22, phases=QUICK)
-def test_the_offline_part_equals_the_reference(seed, chosen):
+def test_the_offline_steps_equal_the_reference(seed, chosen):
     kind = chosen.pop("kind")
     transform = kind(predictor="cv", horizon_s=2.0, **chosen)
     rng = np.random.default_rng(seed)
@@ -190,7 +190,7 @@ def test_the_offline_part_equals_the_reference(seed, chosen):
     compare(transform, frames, reference)
 
 
-#: Whether anything is re-tracked at all.
+#: Options that decide whether anything is re-tracked at all.
 WHETHER = {"side_view", "poor_scale"}
 
 
@@ -201,7 +201,7 @@ def test_every_option_is_varied():
 
 @given(seed=SEEDS)
 @settings(max_examples=10, phases=QUICK)
-def test_tracks_that_are_passed_on_are_the_input_and_their_forecasts_those_of_predict(seed):
+def test_where_nothing_is_re_tracked_tracks_are_the_input_and_predictions_those_of_predict(seed):
     frames = noisy_tracks(np.random.default_rng(seed))
     options = {"predictor": "cv", "horizon_s": 2.0, "min_history": 3}
     passed_on, insisted, usual = (

@@ -1,6 +1,6 @@
-"""Decisions of re-tracking flip where they flip in the slow reference: at the same distance.
+"""Decisions of re-tracking flip at the same distance as in the slow reference.
 
-Random tracks seldom come near a threshold; here a scene is changed by halves until it is at one.
+Random tracks seldom come near a threshold; here bisection finds the scene that is at one.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ FEW = replace(
 
 
 def edge(decides: Callable[[float], bool], low: float, high: float) -> float:
-    """Where a decision that holds at ``low`` and not at ``high`` flips."""
+    """Bisect for the value at which a decision flips that holds at ``low`` and not at ``high``."""
     assert decides(low)
     assert not decides(high)
     for _ in range(16):
@@ -50,9 +50,9 @@ def compare(ours: Callable[[float], bool], reference: Callable[[float], bool], l
 
 
 def jump(to_m: float, name: int, gap: int, beside_m: float | None) -> list[Frame]:
-    """Person 7 stands at 0 m and, after a gap, at ``to_m`` under the id ``name``; 9 was there before, far away.
+    """Person 7 stands at 0 m and, after a gap, at ``to_m`` under the id ``name``; 9 stood far away before.
 
-    ``beside_m`` is where another person appears, from where 7 is then.
+    Another person appears ``beside_m`` away from 7 after the gap.
     """
 
     def path(tick: int):
@@ -79,7 +79,7 @@ def jump(to_m: float, name: int, gap: int, beside_m: float | None) -> list[Frame
         "known id in a crowd",
     ],
 )
-def test_how_far_a_track_follows_a_jump(name, gap, beside_m):
+def test_the_longest_jump_that_a_track_follows(name, gap, beside_m):
     def sources(rows) -> list[tuple[int, int]]:
         return [(int(row["track_id"]), int(row["source_id"])) for row in rows]
 
@@ -113,7 +113,7 @@ def line(first: int, steps: int, start: tuple[float, float], speed: tuple[float,
 
 @pytest.mark.parametrize(("others", "least"), [(0, 0.5), (4, 0.1), (4, 0.9)])
 @pytest.mark.parametrize(("speed", "gap"), [(0.0, 3), (0.0, 30), (1.2, 3), (1.2, 20)])
-def test_how_far_aside_a_track_is_linked(speed, gap, others, least):
+def test_the_largest_sideways_distance_of_a_link(speed, gap, others, least):
     def paths(aside_m: float) -> dict[int, Path]:
         out = {
             k: line(20 * (k % 2), 12, (300.0 * (k // 2) + 14.4 * (k % 2), 40.0), (1.8, 0.0)) for k in range(2 * others)
@@ -137,8 +137,8 @@ def test_how_far_aside_a_track_is_linked(speed, gap, others, least):
 
 
 @pytest.mark.parametrize("gap", [2, 6])
-def test_how_fast_a_runner_is_linked(gap):
-    """No link is longer than 1 m and 2.5 m a second of the gap, however well it fits."""
+def test_the_highest_speed_of_a_link(gap):
+    """No link is longer than 1 m plus 2.5 m for each second of the gap, however well it fits."""
 
     def paths(speed: float) -> dict[int, Path]:
         later = 20 + gap
@@ -152,8 +152,8 @@ def test_how_fast_a_runner_is_linked(gap):
     compare(ours, lambda speed: links(MOTION, paths(speed), 20.0, 0.05).get(1) == 2, 1.0, 9.0)
 
 
-def test_how_near_a_double_walks_beside_a_person():
-    """A short track beside a long one counts as its double up to 1.2 m."""
+def test_the_distance_within_which_a_track_is_a_duplicate():
+    """A short track beside a long one counts as its duplicate up to 1.2 m."""
 
     def odds(beside_m: float) -> tuple[float, float]:
         paths = {1: line(0, 40, (0.0, 0.0), (1.0, 0.0)), 2: line(12, 10, (4.8, beside_m), (1.0, 0.0))}
@@ -162,16 +162,16 @@ def test_how_near_a_double_walks_beside_a_person():
         return float(track_log_odds(MODEL, out, smoothed, 0.4)[1]), person_log_odds(MOTION, paths)[2]
 
     near, far = odds(1.1), odds(1.3)
-    assert far[0] - near[0] == pytest.approx(1.993)  # what walking beside a person counts for
+    assert far[0] - near[0] == pytest.approx(1.993)  # the log odds of a track beside a person
     assert near == pytest.approx(near[::-1])
     for side in (0, 1):
         compare(lambda more, s=side: odds(1.0 + more)[s] < sum(near + far) / 4, lambda more: more < 0.2, 0.0, 1.0)
 
 
 def crossing(beside_m: float, gap: int, shift: int, named: str) -> tuple[dict[int, Path], dict[int, dict[int, int]]]:
-    """Two people cross, and their labels are exchanged ``shift`` steps after they met, in a gap of the tracks.
+    """Two people cross, and their track ids are swapped ``shift`` steps after they met, in a gap of the tracks.
 
-    The ids of the input are exchanged with the labels, are the same all the time, or are new afterwards.
+    The input ids are swapped with the track ids, stay the same, or are new afterwards.
     """
     one, two = line(0, 51, (-10.0, 0.0), (1.0, 0.0)), line(0, 51, (10.0, beside_m), (-1.0, 0.0))
     when = 25 + shift
@@ -193,8 +193,8 @@ def ours_exchanged(paths: dict[int, Path], ids: dict[int, dict[int, int]]) -> bo
 
 @pytest.mark.parametrize("named", ["follow the people", "follow the labels", "are new"])
 @pytest.mark.parametrize("gap", [0, 4])
-def test_how_near_people_stand_until_exchanged_labels_are_not_noticed(named, gap):
-    """Two stand beside each other, and their labels are exchanged: the nearer they are, the less that shows."""
+def test_the_least_distance_at_which_swapped_ids_are_noticed(named, gap):
+    """Two stand beside each other, and their ids are swapped: the nearer they are, the smaller the evidence."""
 
     def beside(near: float):
         paths, ids = crossing(0.0, gap, 0, named)
@@ -206,7 +206,7 @@ def test_how_near_people_stand_until_exchanged_labels_are_not_noticed(named, gap
     compare(lambda near: ours_exchanged(*beside(near)), lambda near: bool(exchanged(MOTION, *beside(near))), 0.0, 1.49)
 
 
-def test_people_who_stay_further_apart_than_2_m_do_not_meet():
+def test_people_more_than_2_m_apart_have_no_encounter():
     for beside_m, met in ((1.99, True), (2.01, False)):
         paths, ids = crossing(beside_m, 0, 0, "are new")
         assert bool(exchanged(MOTION, paths, ids)) == met
@@ -228,8 +228,8 @@ def test_encounters_begin_and_end_as_in_the_reference():
         assert [(names[i], names[j], low, high) for i, j, low, high in found] == encounters(paths)
 
 
-def test_every_occlusion_is_timed_anew():
-    """Two walk abreast and are one detection twice, for 2.4 s each; a track outlives 3 s of that and coasts 1.2 s more."""
+def test_the_timeout_of_merged_detections_restarts_with_every_occlusion():
+    """Two walk abreast and are merged into one detection twice, for 2.4 s each; the timeout is 3 s, coasting 1.2 s."""
 
     def path(tick: int):
         if tick in range(15, 21) or tick in range(25, 31):
@@ -240,8 +240,8 @@ def test_every_occlusion_is_timed_anew():
     assert online[10:] == [2] * 24
 
 
-def test_an_exchange_at_the_last_step_of_both_is_undone():
-    """Two stand 1.5 m apart, and only their last positions are exchanged."""
+def test_a_swap_at_the_last_step_of_both_is_undone():
+    """Two stand 1.5 m apart, and only their last positions are swapped."""
     paths = {
         track: {step: (left if step < 39 else 1.5 - left, 0.0) for step in range(40)}
         for track, left in ((3, 0.0), (5, 1.5))
@@ -252,15 +252,13 @@ def test_an_exchange_at_the_last_step_of_both_is_undone():
     assert owner.tolist() == [0] * 39 + [1] + [1] * 39 + [0]
 
 
-def test_the_input_id_0_counts_as_any_other():
-    """How far apart two have to stand until exchanged positions are exchanged back, against ids that say otherwise."""
+def test_the_input_id_0_counts_like_any_other():
+    """The least distance at which a swap of positions is undone, although the input ids contradict it."""
 
-    def exchanged_back(near: float, first: int) -> bool:
+    def is_undone(near: float, first: int) -> bool:
         side = 1.5 - near
         paths = {t: {s: (a if s < 25 else side - a, 0.0) for s in range(50)} for t, a in ((3, 0.0), (5, side))}
         names = {s: 7 if s < 15 else first for s in range(50)}
         return ours_exchanged(paths, {3: names, 5: dict.fromkeys(range(50), 5)})
 
-    assert edge(lambda near: exchanged_back(near, 0), 0.0, 1.49) == edge(
-        lambda near: exchanged_back(near, 3), 0.0, 1.49
-    )
+    assert edge(lambda near: is_undone(near, 0), 0.0, 1.49) == edge(lambda near: is_undone(near, 3), 0.0, 1.49)

@@ -1,4 +1,4 @@
-"""Worded scenes, as rows and as footage, for tests."""
+"""Small scenes for tests, as rows and as videos."""
 
 from __future__ import annotations
 
@@ -51,12 +51,12 @@ def boxes_at(centres: Sequence[tuple[float, float]], size: tuple[float, float] =
 
 
 def detections(path: Callable[[int], Sequence[tuple[float, float]]], frames: int, fps: float = 10.0) -> list[Frame]:
-    """Frames of boxes whose centres ``path`` gives for every frame number."""
+    """Frames of boxes; ``path`` gives their centres for every frame number."""
     return [Frame(ns(number / fps), number, boxes_at(path(number))) for number in range(frames)]
 
 
 def tracks_at(people: Positions, observed: bool = True):
-    """Rows of tracks at places in metres, by id."""
+    """Rows of tracks at positions in metres, by id."""
     xy = np.array(list(people.values()), float).reshape(-1, 2)
     return TRACKS.rows(
         track_id=np.array(list(people), np.int64),
@@ -68,7 +68,7 @@ def tracks_at(people: Positions, observed: bool = True):
 
 
 def walk(path: Callable[[int], Positions], ticks: int, rate_hz: float = 2.5) -> list[Frame]:
-    """Frames of tracks on the clock of prediction: who is where at every tick."""
+    """Frames of tracks at a fixed rate; ``path`` gives the position of each id at every tick."""
     return [Frame(ns(tick / rate_hz), tick, tracks_at(path(tick))) for tick in range(ticks)]
 
 
@@ -77,12 +77,12 @@ def ids(frame: Frame) -> list[int]:
 
 
 def places(frame: Frame) -> dict[int, tuple[float, float]]:
-    """Who is where, rounded to a millimetre."""
+    """The position of each id, rounded to a millimetre."""
     return {int(row["track_id"]): (round(float(row["x_m"]), 3), round(float(row["y_m"]), 3)) for row in frame.rows}
 
 
 def small_scene(seconds: float = 6.0, **changes) -> SyntheticScene:
-    """Three people on a small picture, one of them behind something for a while."""
+    """Three people on a small picture, one of them occluded for a while."""
     people = (
         Pedestrian(1, ((0.0, -5.0, 9.0), (seconds, 4.0, 12.0)), (30, 30, 30)),
         Pedestrian(2, ((0.0, 5.0, 13.0), (seconds, -4.0, 10.0)), (120, 40, 20)),
@@ -103,7 +103,7 @@ def write_clip(
     options: Mapping[str, str] | None = None,
     times_ms: Sequence[int] | None = None,
 ) -> list[np.ndarray]:
-    """A clip made by FFmpeg: a bright quarter and a spot that wanders one pixel a frame. Returns the pictures."""
+    """Encode a clip with FFmpeg: a bright quarter and a spot that moves one pixel per frame. Returns the pictures."""
     width, height = size
     images = []
     with _own_priority(), av.open(str(path), "w") as container:
@@ -127,7 +127,7 @@ def write_clip(
 
 
 def tracked(rng: np.random.Generator, names: np.ndarray, seen: np.ndarray):
-    """Rows of tracks at places (N, 2) in metres, with boxes on a picture of 20 px a metre; some are interpolated."""
+    """Rows of tracks at positions (N, 2) in metres, with boxes at 20 px per metre; some are interpolated."""
     count = len(names)
     return TRACKS.rows(
         track_id=names.astype(np.int64),
@@ -146,10 +146,10 @@ def tracked(rng: np.random.Generator, names: np.ndarray, seen: np.ndarray):
 def noisy_tracks(
     rng: np.random.Generator, people: int = 4, ticks: int = 30, rate_hz: float = 2.5, hidden: float = 0.0
 ) -> list[Frame]:
-    """Tracks of random walkers: noise, misses, interpolated rows, new and exchanged ids, gaps of the log.
+    """Tracks of random walkers: noise, missed detections, interpolated rows, new and swapped ids, gaps of the log.
 
-    Two people near each other may be merged into one detection.
-    ``hidden`` is the probability at each tick that a person is hidden for a while, up to eight seconds.
+    Two people near each other may be merged into one detection. ``hidden`` is the probability at each tick that a person
+    is occluded, for up to eight seconds.
     """
     place, speed = rng.uniform(-4, 4, (people, 2)), rng.normal(0, 0.5, (people, 2)) * rng.integers(0, 2, (people, 1))
     names = rng.permutation(50)[:people]
@@ -182,7 +182,7 @@ def noisy_tracks(
 
 
 def crossing_tracks(rng: np.random.Generator, ticks: int = 50, rate_hz: float = 2.5) -> list[Frame]:
-    """Two pairs of people cross: when near, they are hidden, merged or seen; afterwards ids may be exchanged."""
+    """Two pairs of people cross: when near, they are occluded, merged or detected; afterwards ids may be swapped."""
     way = rng.uniform(0.15, 0.4, 2)
     beside = rng.uniform(0.1, 0.9, 2)
     middle = rng.integers(20, 30, 2)
@@ -209,7 +209,7 @@ def crossing_tracks(rng: np.random.Generator, ticks: int = 50, rate_hz: float = 
 
 
 def boxed(people):
-    """{id: (left, top)} with boxes of 10 x 20, and no metres."""
+    """Rows of tracks from {id: (left, top)}: boxes of 10 x 20 px, without positions in metres."""
     xy = np.array(list(people.values()), float).reshape(-1, 2)
     return TRACKS.rows(
         track_id=np.array(list(people), np.int64),

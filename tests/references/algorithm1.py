@@ -1,4 +1,4 @@
-"""Algorithm 1 of the paper (Yu and Zhou, IROS 2021) with Eq. 1 to 3: slow, one object a track, to compare with."""
+"""Algorithm 1 of the paper (Yu and Zhou, IROS 2021) with Eq. 1 to 3: a slow reference with one object per track."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tests.references.retracking import Claims, Point, Predict, Row, best_assign
 def histories(
     samples: list[list[Row]], steps: list[int], length: int
 ) -> Iterable[tuple[int, list[tuple[Row, list[Point]]]]]:
-    """For each step its rows, and of each the unbroken run of its id's positions up to now, ``length`` at most."""
+    """For each step its rows, each with the last positions of its id without a gap, ``length`` at most."""
     places: dict[tuple[int, int], Point] = {}
     for step, rows in zip(steps, samples, strict=True):
         for row in rows:
@@ -109,7 +109,7 @@ class Algorithm1:
         return best_assignment(value, most_pairs=True)
 
     def distance(self, track: Track, age: int, here: Point, mean: np.ndarray, cov: np.ndarray) -> float:
-        """Eq. 1 at each step that both predict, and Eq. 2 or another reading of it."""
+        """Eq. 1 at each step that both predict, and Eq. 2 or a variant of it."""
         o, horizon = self.options, len(mean)
 
         def spread(own: np.ndarray, ahead: int) -> np.ndarray:

@@ -1,7 +1,7 @@
-"""What re-tracking does once the whole log is known, once more, to compare with: slow, and nothing of the package.
+"""Offline re-tracking: a slow reference that uses nothing of the package.
 
-A path is a dictionary of positions by step. The numbers of the models stand here a second time: whoever changes them in
-the package says so here, too. Weights and biases are those that tools/choose_retrack.py printed.
+A path is a dictionary of positions by step. The constants of the models stand here a second time: change them here, too,
+when the package changes. Weights and biases are those that tools/choose_retrack.py printed.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ DRIFTS = (0.05, 0.15, 0.4)
 
 @dataclass(frozen=True)
 class Motion:
-    """How people move: noise of positions, spread of velocities, drift of velocities; and the seconds of a step."""
+    """The motion model: noise of positions, spread and drift of velocities, and the seconds of a step."""
 
     noise_m: float
     speed_m_per_s: float
@@ -39,7 +39,7 @@ class Motion:
         return State(mean, np.diag([self.noise_m**2, self.speed_m_per_s**2]))
 
     def ahead(self, state: State) -> tuple[State, np.ndarray]:
-        """A step on; also the matrix that takes states there."""
+        """Predict the next step; also returns the transition matrix."""
         t = self.step_s
         move = np.array([[1, t], [0, 1]])
         power = (self.drift + self.drift_share * hypot(*state.mean[:, 1])) ** 2
@@ -47,7 +47,7 @@ class Motion:
         return State(state.mean @ move.T, move @ state.cov @ move.T + noise), move
 
     def filtered(self, path: Path) -> dict[int, State]:
-        """The state at every step from the positions up to it."""
+        """The state at every step, from the positions up to this step."""
         out: dict[int, State] = {}
         for step in range(min(path), max(path) + 1):
             if not out:
@@ -62,12 +62,12 @@ class Motion:
         return out
 
     def backwards(self, path: Path) -> dict[int, State]:
-        """The state at every step from the positions from it on."""
+        """The state at every step, from the positions at this step and later."""
         turned = self.filtered({-step: at for step, at in path.items()})
         return {-step: State(state.mean * [1, -1], state.cov) for step, state in turned.items()}
 
     def smoothed(self, path: Path) -> dict[int, State]:
-        """The state at every step from all positions (Rauch, Tung, Striebel 1965)."""
+        """The state at every step, from all positions (Rauch, Tung, Striebel 1965)."""
         out = self.filtered(path)
         for step in range(max(path) - 1, min(path) - 1, -1):
             now, later = out[step], out[step + 1]
@@ -113,7 +113,7 @@ def link_features(motion: Motion, before: State, after: State, gap_s: float) -> 
 
 
 def links(motion: Motion, paths: dict[int, Path], max_gap_s: float, least: float) -> dict[int, int]:
-    """For a track the one that goes on from it."""
+    """For each linked track the track that continues it."""
     from scipy.optimize import linear_sum_assignment
 
     names = sorted(paths)
@@ -131,14 +131,14 @@ def links(motion: Motion, paths: dict[int, Path], max_gap_s: float, least: float
         (i, j): gains[i, j] + LINK_LEAST for i, j in zip(*linear_sum_assignment(-gains), strict=True) if gains[i, j]
     }
     shift = 0.0
-    for _ in range(1000):  # how many links are right in this log
+    for _ in range(1000):  # the share of right links in this log
         share = (sum(sigmoid(odds + shift) for odds in made.values()) + 0.3) / (len(made) + 3)
         shift = log(share / (1 - share)) - log(LINK_USUAL / (1 - LINK_USUAL))
     return {names[i]: names[j] for (i, j), odds in made.items() if sigmoid(odds + shift) > least}
 
 
 def linked(motion: Motion, paths: dict[int, Path], max_gap_s: float, least: float) -> dict[int, int]:
-    """The name of each track after the links: that of the first one."""
+    """The id of each track after linking: that of the first one in its chain."""
     name = {track: track for track in paths}
     follows = links(motion, paths, max_gap_s, least)
     for track in sorted(follows, key=lambda t: min(paths[t])):
@@ -146,12 +146,12 @@ def linked(motion: Motion, paths: dict[int, Path], max_gap_s: float, least: floa
     return name
 
 
-# Encounters: two people come near each other; were their labels exchanged?
+# Encounters: two people come near each other; were their track ids swapped?
 
 
 @dataclass
 class Survivor:
-    """One course of exchanges: a filter of the position of one from the other, as it would be without exchanges."""
+    """One hypothesis of swaps: a filter of the relative position of two people, as it would be without swaps."""
 
     mean: np.ndarray
     cov: np.ndarray
@@ -173,7 +173,7 @@ class Survivor:
 def course_of(
     apart: list[np.ndarray | None], cost: list[float], motion: Motion, drift: float
 ) -> tuple[list[bool], float, float]:
-    """The likeliest course of exchanges (Viterbi), how much likelier than none it is, and its log likelihood."""
+    """The likeliest hypothesis of swaps (Viterbi), its gain over no swap, and its log likelihood."""
     t, noise = motion.step_s, 2 * motion.noise_m**2
     move = np.array([[1, t], [0, 1]])
     wander = drift**2 * np.array([[t**3 / 3, t**2 / 2], [t**2 / 2, t]])
@@ -214,7 +214,7 @@ def course_of(
 
 
 def encounters(paths: dict[int, Path]) -> list[tuple[int, int, int, int]]:
-    """Two tracks that come near each other, and the steps from and to which they are looked at."""
+    """Pairs of tracks that come near each other, with the first and last step of the encounter."""
     out = []
     for a, b in combinations(sorted(paths), 2):
         one, other = paths[a], paths[b]
@@ -233,7 +233,7 @@ def encounters(paths: dict[int, Path]) -> list[tuple[int, int, int, int]]:
 
 
 def exchange_costs(a: dict[int, int], b: dict[int, int], low: int, high: int) -> list[float]:
-    """What an exchange costs at each step, by the ids that the input gives the two."""
+    """The cost of a swap at each step, by the input ids of the two tracks."""
     costs, last_a, last_b = [], None, None
     for step in range(low, high + 1):
         now_a, now_b = a.get(step), b.get(step)
@@ -245,7 +245,7 @@ def exchange_costs(a: dict[int, int], b: dict[int, int], low: int, high: int) ->
 
 
 def exchanged(motion: Motion, paths: dict[int, Path], ids: dict[int, dict[int, int]]) -> dict[int, dict[int, int]]:
-    """For tracks of encounters that were decided anew: the track that each step belongs to. {} if there is none."""
+    """For tracks with identity swaps: the track to which each step belongs. {} if there is none."""
     decided = []
     for a, b, low, high in encounters(paths):
         steps = range(low, high + 1)
@@ -289,7 +289,7 @@ def person_log_odds(motion: Motion, paths: dict[int, Path]) -> dict[int, float]:
 
 
 def beside(mine: dict[int, State], theirs: dict[int, State]) -> float:
-    """The share of a track's steps near another that began well before it and ended well after it."""
+    """The share of a track's steps beside another track that began well before it and ended well after it."""
     if not (min(theirs) + 3 < min(mine) and max(theirs) - 3 > max(mine)):
         return 0.0
     near = [s for s in mine if s in theirs and hypot(*(mine[s].mean[:, 0] - theirs[s].mean[:, 0])) < BESIDE_M]

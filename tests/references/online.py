@@ -1,4 +1,4 @@
-"""The likelihood method online: slow, one object a track with matrices, to compare with."""
+"""Online re-tracking by likelihood: a slow reference with one object per track."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tests.references.retracking import (
 
 @dataclass
 class Person:
-    """A Kalman filter along both axes, which share their covariance, and what is known of the identity."""
+    """A Kalman filter along both axes, which share their covariance, and the input ids of the track."""
 
     name: int
     mean: np.ndarray  # (2, 2): position and velocity along x, along y
@@ -97,7 +97,7 @@ class OnlineTracker:
         return self.predict([*past, (row["x_m"], row["y_m"])])
 
     def step(self, rows: list[Row], passed: int) -> dict[int, Row]:
-        """Go on; returns the row that each person has."""
+        """One step; returns the row that each person has."""
         o = self.options
         young = min(self.confirm, self.max_age)
         for person in self.people:
@@ -130,7 +130,7 @@ class OnlineTracker:
         return has
 
     def gain(self, person: Person, row: Row, rows: list[Row]) -> float | None:
-        """Twice the log likelihood of a pair against none."""
+        """Twice the log likelihood ratio of a pair to no pair."""
         o = self.options
         variance = person.cov[0, 0] + self.noise_m**2 + self.FLOOR_M**2
         squared = ((place(row) - person.here) ** 2).sum() / variance
@@ -146,7 +146,7 @@ class OnlineTracker:
         return gain if gain > 0 else None
 
     def merge(self, has: dict[int, Row], passed: int) -> set[int]:
-        """Lost tracks merged into one detection with another track are updated by it; returns those other tracks."""
+        """Update lost tracks by detections that they share with another track; returns those other tracks."""
         o, hosts = self.options, set()
         sure = [p for p in self.people if p.name in has and p.hits >= self.confirm]
         for person in self.people:
@@ -169,7 +169,7 @@ class OnlineTracker:
         return {host for host, _ in hosts}
 
     def learn(self, has: dict[int, Row], hosts: set[int], noise_m: float) -> None:
-        """The noise of positions grows where more than a tenth of them lie outside the 90 % circle, and shrinks."""
+        """Adapt the noise: it grows if more than a tenth of positions lie outside the 90 % circle, and shrinks otherwise."""
         self._noise_before = noise_m
         if self.options.noise_m is not None:
             return

@@ -1,4 +1,4 @@
-"""What both re-tracking references share: rows, claims, assignment, and the offline part put together."""
+"""Shared by both references of re-tracking: rows, claims, assignment, and the offline steps."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from tests.references.offline import Motion, exchanged, linked, person_log_odds,
 Point = tuple[float, float]
 Row = dict[str, float]
 Predict = Callable[[list[Point]], tuple[np.ndarray, np.ndarray]]
-#: Noise and speeds are never taken for less, m and m/s.
+#: The least noise (m) and speed (m/s).
 LEAST = 1e-3
 LINEAR = ("x_px", "y_px", "w_px", "h_px", "x_m", "y_m", "score")
 
 
 class Undecided(Exception):
-    """Two assignments are equally good: which one is taken is not defined."""
+    """Two assignments are equally good, so the result is not defined."""
 
 
 def constant_velocity(steps: int) -> Predict:
-    """The mean of the last three displacements goes on; unit covariance."""
+    """Continue by the mean of the last three displacements, with unit covariance."""
 
     def predict(points: list[Point]) -> tuple[np.ndarray, np.ndarray]:
         back = min(3, len(points) - 1)
@@ -35,7 +35,7 @@ def constant_velocity(steps: int) -> Predict:
 
 
 def best_assignment(value: list[list[float | None]], most_pairs: bool) -> list[tuple[int, int]]:
-    """The pairs (row, column) of the largest total value, None being no pair; by trying everything.
+    """The pairs (row, column) of the largest total value, by trying all; None is no pair.
 
     With ``most_pairs`` the number of pairs counts first. Raises Undecided on a tie.
     """
@@ -70,7 +70,7 @@ def steps_of(times_ns: list[int], rate_hz: float) -> list[int]:
 
 @dataclass
 class Claims:
-    """Which track has which sample, in the order in which it was decided."""
+    """The samples of tracks, in the order in which they were assigned."""
 
     made: list[tuple[int, int, int]] = field(default_factory=list)  # step, track, source
     confirmed: dict[int, int] = field(default_factory=dict)  # track -> last step
@@ -110,7 +110,7 @@ def filled(path: dict[int, Row], track: int) -> dict[int, Row]:
 
 
 def offline(claims: Claims, samples: list[list[Row]], steps: list[int], options, noise_m: float) -> list[list[Row]]:
-    """The rows of each frame once the whole log is known."""
+    """The rows of each frame by the offline steps."""
     o = options
     motion = Motion(max(noise_m, LEAST), max(o.speed_m_per_s, LEAST), o.drift_m_per_s, o.drift_ratio, 1 / o.rate_hz)
     of = {(step, row["track_id"]): row for step, rows in zip(steps, samples, strict=True) for row in rows}
@@ -147,7 +147,7 @@ def places_of(paths: dict[int, dict[int, Row]]) -> dict[int, dict[int, Point]]:
 
 
 def move_to(row: Row, to: np.ndarray, planes) -> None:
-    """Put a row at another place, and its box with it; planes are plain scales here."""
+    """Move a row and its box to another position; planes only scale here."""
     if planes:
         scale = planes[0][1].homography[0]
         row["x_px"] += (to[0] - row["x_m"]) / scale

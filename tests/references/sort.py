@@ -1,7 +1,7 @@
-"""SORT, ByteTrack and OC-SORT once more, to compare with: slow, one object a track, written from their papers.
+"""SORT, ByteTrack and OC-SORT: slow references with one object per track, written from the papers.
 
 Bewley et al., ICIP 2016 (section 3.2: state u, v, s, r and the rates of the first three; P0, Q and R as in its program),
-Zhang et al., ECCV 2022, and Cao et al., CVPR 2023. Which frame a picture is, ``FrameClock`` says here, too.
+Zhang et al., ECCV 2022, and Cao et al., CVPR 2023. ``FrameClock`` numbers the frames here, too.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class Filter:
         return cls(np.concatenate([box.measured(), np.zeros(3)]), P0.copy())
 
     def predict(self) -> None:
-        if self.mean[2] + self.mean[6] < 1e-9:  # an area that would vanish stops shrinking
+        if self.mean[2] + self.mean[6] < 1e-9:  # an area that would become negative stops shrinking
             self.mean[6] = 0
         self.mean, self.cov = MOVE @ self.mean, MOVE @ self.cov @ MOVE.T + Q
 
@@ -94,11 +94,11 @@ class Filter:
 class Track:
     name: int
     filter: Filter
-    box: Box  # the one seen last
-    frame: int  # the frame in which it was seen last
+    box: Box  # the last measurement
+    frame: int  # the frame of the last measurement
     missed: float = 0.0
     streak: float = 0.0
-    then: Filter | None = None  # the filter when it was seen last
+    then: Filter | None = None  # the filter at the last measurement
     centres: dict[int, tuple[float, float]] = field(default_factory=dict)
 
 
@@ -106,7 +106,7 @@ Likeness = dict[tuple[int, int], float]
 
 
 def paired(likeness: Likeness, least: float) -> list[tuple[int, int]]:
-    """The pairs of the largest total likeness, those too little alike let go; no weighing where nothing competes."""
+    """The pairs with the largest total similarity, without those below the least; pairs that don't compete are taken as they are."""
     close = [pair for pair, value in likeness.items() if value > least]
     if close and all(len({pair[side] for pair in close}) == len(close) for side in (0, 1)):
         return close
@@ -127,7 +127,7 @@ class ReferenceSort:
         self.first_ns = self.last_ns = 0
 
     def run(self, frames: list[tuple[int, list[Box]]]) -> list[list[tuple[int, Box, float]]]:
-        """For each frame, a time and its boxes, the tracks that are shown: name, box, score."""
+        """For each frame (a time and boxes), the tracks that are written: id, box, score."""
         return [self.step(t_ns, boxes) for t_ns, boxes in frames]
 
     def step(self, t_ns: int, boxes: list[Box]) -> list[tuple[int, Box, float]]:
@@ -173,7 +173,7 @@ class ReferenceSort:
         return out
 
     def alike(self, boxes: list[Box]) -> tuple[Likeness, float]:
-        """How alike boxes and tracks are, those that can be pairs at all, and the least that is enough."""
+        """The similarity of boxes and tracks, which pairs are possible, and the least similarity of a match."""
         o, out = self.options, {}
         for at, box in enumerate(boxes):
             for number, track in enumerate(self.tracks):
@@ -183,7 +183,7 @@ class ReferenceSort:
                 elif o.cost == "pixels":
                     value = 1 - hypot(*np.subtract(box.centre, expected.centre)) / o.max_distance_px
                 else:
-                    scale = o.ground_planes[0][1].homography[0]  # a plain scale; feet are at the lower edge
+                    scale = o.ground_planes[0][1].homography[0]  # the plane only scales; feet are at the lower edge
                     feet = [(one.centre[0] * scale, one.bottom * scale) for one in (box, expected)]
                     value = 1 - hypot(*np.subtract(*feet)) / o.max_distance_m
                 if value > 0 and self.same_class(box, track):
@@ -242,7 +242,7 @@ class ReferenceOcSort(ReferenceSort):
         return found + paired(again, o.min_iou)
 
     def momentum(self, box: Box, track: Track) -> float:
-        """0.5 straight on in the direction of the last frames, -0.5 straight back; times the score."""
+        """0.5 for the direction of the last frames, -0.5 for the opposite one; times the score."""
         oldest = [f for f in sorted(track.centres) if self.frame - f <= self.options.direction_frames]
         if not oldest:
             return 0.0
