@@ -46,9 +46,9 @@ _OWN: Final = "mcaptrack"
 BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(
     {
         "detector": {
-            "knn": "mcaptrack.transforms.detect:KnnDetector",
-            "mog2": "mcaptrack.transforms.detect:Mog2Detector",
-            "frame-difference": "mcaptrack.transforms.detect:FrameDifferenceDetector",
+            "knn": "mcaptrack.transforms.detect.background:KnnDetector",
+            "mog2": "mcaptrack.transforms.detect.background:Mog2Detector",
+            "frame-difference": "mcaptrack.transforms.detect.background:FrameDifferenceDetector",
         },
         "tracker": {
             "sort": "mcaptrack.transforms.sort:Sort",

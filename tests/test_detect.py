@@ -1,4 +1,4 @@
-"""The motion detector on scenes whose truth is known."""
+"""The motion detectors on drawn scenes with known boxes."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from mcaptrack.geometry.clocks import FrameClock
 from mcaptrack.schema import Frame
 from mcaptrack.sources.synthetic import SyntheticScene
 from mcaptrack.transforms import FrameDifferenceDetector, KnnDetector, Mog2Detector, MotionDetector
-from mcaptrack.transforms.detect import _PersonSize
+from mcaptrack.transforms.detect.background import _PersonHeight
 from mcaptrack.transforms.detect.foreground import FrameDifference
-from mcaptrack.transforms.detect.motion import CameraMotion
+from mcaptrack.transforms.detect.camera_motion import CameraMotion
 from tests.worlds import ns, small_scene
 
 
@@ -36,13 +36,13 @@ def found(detect: MotionDetector, scene: SyntheticScene, from_frame: int = 15) -
 
 
 @pytest.mark.parametrize("detector", [KnnDetector, Mog2Detector])
-def test_people_who_walk_are_found_and_little_else(detector):
+def test_walking_people_are_detected_with_few_false_positives(detector):
     recall, precision = found(detector(), small_scene())
     assert recall > 0.6
     assert precision > 0.6
 
 
-def test_a_shaking_camera_is_made_up_for():
+def test_the_motion_of_a_shaking_camera_is_compensated():
     shaken = small_scene(shake_px=2.5, contrast=6.0)
     _, unsteady = found(KnnDetector(stabilise=False), shaken)
     _, steadied = found(KnnDetector(stabilise=True), shaken)
@@ -51,7 +51,7 @@ def test_a_shaking_camera_is_made_up_for():
     assert steadied > still - 0.25
 
 
-def test_boxes_are_those_of_the_picture_as_it_is_though_the_camera_moved():
+def test_boxes_are_in_pixels_of_the_picture_before_registration():
     scene = small_scene(shake_px=3.0)
     frames, truth = footage(scene)
     off = []
@@ -63,22 +63,22 @@ def test_boxes_are_those_of_the_picture_as_it_is_though_the_camera_moved():
     assert np.std(off, axis=0).max() < 3.0
 
 
-def test_the_motion_of_the_camera_is_measured():
+def test_the_shift_of_the_camera_is_estimated():
     still = next(small_scene().shots()).image.mean(axis=2).astype(np.uint8)
     camera = CameraMotion()
-    camera.follow(still)
+    camera.estimate(still)
     moved = np.roll(still, (4, -6), axis=(0, 1))
-    matrix, _ = camera.follow(moved)
+    matrix, _ = camera.estimate(moved)
     np.testing.assert_allclose(matrix, [[1, 0, 6], [0, 1, -4]], atol=0.15)
-    assert np.array_equal(camera.follow(still)[0], [[1, 0, 0], [0, 1, 0]])
+    assert np.array_equal(camera.estimate(still)[0], [[1, 0, 0], [0, 1, 0]])
 
 
-def test_a_camera_that_looks_elsewhere_starts_anew():
+def test_another_view_becomes_the_reference_once():
     here, there = (next(small_scene(seed=seed).shots()).image.mean(axis=2).astype(np.uint8) for seed in (1, 99))
     there = np.random.default_rng(0).permutation(there.ravel()).reshape(there.shape)
     camera = CameraMotion()
-    assert camera.follow(here)[1]
-    fresh = [camera.follow(there)[1] for _ in range(20)]
+    assert camera.estimate(here)[1]
+    fresh = [camera.estimate(there)[1] for _ in range(20)]
     assert fresh.count(True) == 1
 
 
@@ -91,7 +91,7 @@ def test_large_pictures_are_halved_and_their_boxes_are_in_full_pixels():
         np.testing.assert_array_equal(2 * a, b)
 
 
-def test_a_lamp_that_goes_on_is_not_a_person():
+def test_a_change_of_light_gives_no_box_of_half_the_picture():
     frames, _ = footage(small_scene(3.0))
     lit = [
         f._replace(rows=np.clip(f.rows.astype(int) + 80 * (n > 20), 0, 255).astype(np.uint8))
@@ -101,7 +101,7 @@ def test_a_lamp_that_goes_on_is_not_a_person():
         assert (frame.rows["w_px"] * frame.rows["h_px"] < 0.5 * 320 * 180).all()
 
 
-def test_frame_difference_sees_what_moves_and_not_what_stands():
+def test_frame_difference_detects_moving_blocks_and_no_static_ones():
     floor = np.full((120, 160), 90, np.uint8)
     frames = []
     for number in range(30):
@@ -136,7 +136,7 @@ EMPTY = [blocks()] * 5
 
 
 @pytest.mark.parametrize("detector", [KnnDetector, Mog2Detector])
-def test_boxes_are_those_that_were_drawn_in_reading_order(detector):
+def test_boxes_equal_the_drawn_ones_sorted_from_top_to_bottom(detector):
     """Two people walk past each other, each a step further than they are wide; a third appears in the end."""
     drawn = [[(2 + 13 * n, 75, 12, 34), (146 - 11 * n, 20, 10, 30)] for n in range(10)]
     drawn[-1].append((75, 70, 11, 32))
@@ -147,8 +147,8 @@ def test_boxes_are_those_that_were_drawn_in_reading_order(detector):
 
 
 @pytest.mark.parametrize(("gap", "parts"), [(0, 1), (6, 1), (12, 2)])
-def test_parts_of_a_body_that_lie_above_each_other_are_one_person(gap, parts):
-    """People are 40 px tall here; parts up to a fifth of that apart are joined, above each other but not side by side."""
+def test_regions_above_each_other_are_joined_over_a_fifth_of_a_height(gap, parts):
+    """People are 40 px tall; regions up to 8 px apart are joined if they lie above each other, not side by side."""
     people = [[(20 + 3 * n, 60, 12, 40)] for n in range(12)]
     broken = [(60, 20, 12, 20), (60, 40 + gap, 12, 20)]
     beside = [(60, 20, 12, 40), (72 + max(gap, 1), 20, 12, 40)]
@@ -158,32 +158,32 @@ def test_parts_of_a_body_that_lie_above_each_other_are_one_person(gap, parts):
     assert len(across) == 2
 
 
-def test_what_is_too_small_to_be_a_person_is_left_out():
-    """The height of people is that of most of what moved so far: least is 3 % of its square, or 20 px."""
+def test_regions_below_the_minimum_area_are_left_out():
+    """The minimum is 3 % of the squared height of people so far, and at least 20 px."""
     people = [[(20 + 3 * n, 60, 12, 40)] for n in range(12)]
-    for size, seen in (((6, 8), False), ((7, 8), False), ((8, 9), True)):  # areas of outlines: 35, 42, 56; 48 is least
+    for size, seen in (((6, 8), False), ((7, 8), False), ((8, 9), True)):  # areas of outlines: 35, 42, 56; the minimum is 48
         *_, boxes = boxes_of([*EMPTY, *(blocks(*each) for each in people), blocks((100, 30, *size))])
         assert len(boxes) == seen
-    *_, first = boxes_of([*EMPTY, blocks((100, 30, 5, 6), (20, 30, 6, 6))])  # 20 and 25; nothing is known of people yet
+    *_, first = boxes_of([*EMPTY, blocks((100, 30, 5, 6), (20, 30, 6, 6))])  # areas 20 and 25; no person was measured yet
     assert len(first) == 2
     *_, first = boxes_of([*EMPTY, blocks((100, 30, 5, 5), (20, 30, 6, 6))])
     assert first == [[20.0, 30.0, 6.0, 6.0]]
 
 
 def test_the_height_of_people_is_the_median_height_weighted_by_area():
-    """Of blobs of at least 20 px of area that are less than half as high as the picture; 20 px until ten were seen."""
-    size = _PersonSize()
+    """Regions of at least 20 px of area count, if less than half as high as the picture; before ten of them it is 20."""
+    height = _PersonHeight()
     small, tall = blocks((10, 10, 10, 10), (40, 10, 10, 10)), blocks((10, 10, 12, 40))
     high, speck = blocks((100, 10, 20, 70)), blocks((100, 10, 5, 5))
     masks = [np.where(picture > 90, np.uint8(255), np.uint8(0)) for picture in (small, tall, high, speck)]
-    assert [size.measure(masks[k]) for k in (0, 0, 2, 3, 0, 0)] == [20.0] * 6
-    assert size.measure(masks[0]) == 10.0  # ten blobs of 100 px^2
-    assert size.measure(masks[1]) == 10.0  # 480 against 1000 px^2
-    assert size.measure(masks[1]) == 10.0  # 960
-    assert size.measure(masks[1]) == 40.0  # 1440
+    assert [height.update(masks[k]) for k in (0, 0, 2, 3, 0, 0)] == [20.0] * 6
+    assert height.update(masks[0]) == 10.0  # ten regions of 100 px^2
+    assert height.update(masks[1]) == 10.0  # 480 against 1000 px^2
+    assert height.update(masks[1]) == 10.0  # 960
+    assert height.update(masks[1]) == 40.0  # 1440
 
 
-def test_a_picture_of_which_more_than_half_differs_shows_no_people():
+def test_no_detections_where_more_than_half_of_the_picture_differs():
     for share, seen in ((0.45, 1), (0.55, 0)):
         *_, boxes = boxes_of([*EMPTY, blocks((0, 0, round(160 * share), 120))])
         assert len(boxes) == seen
@@ -216,7 +216,7 @@ class TestCameraMotion:
     @pytest.mark.parametrize(
         ("degrees", "scale", "shift"), [(2.0, 1.0, (0, 0)), (0.0, 1.03, (0, 0)), (1.0, 0.98, (3, -2))]
     )
-    def test_turns_scales_and_shifts_are_measured(self, degrees, scale, shift):
+    def test_rotation_scale_and_shift_are_estimated(self, degrees, scale, shift):
         import cv2
 
         still = self.textured()
@@ -225,29 +225,29 @@ class TestCameraMotion:
         matrix[:, 2] += shift
         image = cv2.warpAffine(still, matrix, still.shape[::-1], borderMode=cv2.BORDER_REPLICATE)
         camera = CameraMotion()
-        camera.follow(still)
-        found, is_new = camera.follow(image)
+        camera.estimate(still)
+        found, is_new = camera.estimate(image)
         assert not is_new
         corners = np.array([[0, 0, 1], [still.shape[1], 0, 1], [0, still.shape[0], 1], [*still.shape[::-1], 1]])
         back = np.column_stack([corners @ matrix.T, np.ones(4)]) @ found.T
         np.testing.assert_allclose(back, corners[:, :2], atol=0.5)
 
-    def test_a_new_view_is_taken_after_15_pictures_that_do_not_fit(self):
+    def test_the_reference_is_replaced_after_15_pictures_without_a_fit(self):
         camera = CameraMotion()
-        camera.follow(self.textured())
+        camera.estimate(self.textured())
         other = np.random.default_rng(0).integers(0, 255, (160, 240)).astype(np.uint8)
-        fresh = [camera.follow(other)[1] for _ in range(20)]
+        fresh = [camera.estimate(other)[1] for _ in range(20)]
         assert [n for n, is_new in enumerate(fresh, start=1) if is_new] == [16]
 
-    def test_a_fit_in_between_forgets_the_pictures_that_did_not(self):
+    def test_a_fit_resets_the_count_of_pictures_without_one(self):
         camera, still = CameraMotion(), self.textured()
         other = np.random.default_rng(0).integers(0, 255, (160, 240)).astype(np.uint8)
-        camera.follow(still)
+        camera.estimate(still)
         for picture in [other] * 10 + [still] + [other] * 15:
-            assert not camera.follow(picture)[1]
+            assert not camera.estimate(picture)[1]
 
-    def test_pictures_without_corners_are_still(self):
+    def test_pictures_without_corners_have_no_motion(self):
         camera = CameraMotion()
         for _ in range(30):
-            found, _ = camera.follow(np.full((60, 80), 90, np.uint8))
+            found, _ = camera.estimate(np.full((60, 80), 90, np.uint8))
             np.testing.assert_array_equal(found, [[1, 0, 0], [0, 1, 0]])

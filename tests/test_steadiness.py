@@ -1,4 +1,4 @@
-"""When a motion detector refuses, when it warns, and what it says: shares and times of pictures by what the camera did."""
+"""Motion of the camera: thresholds of warnings and of refusal, and the shares and times in their texts."""
 
 from __future__ import annotations
 
@@ -7,19 +7,19 @@ import pytest
 
 from mcaptrack import notices
 from mcaptrack.errors import McaptrackError
-from mcaptrack.transforms.detect.motion import CameraMotion
+from mcaptrack.transforms.detect.camera_motion import CameraMotion
 from mcaptrack.transforms.detect.steadiness import Steadiness
 from tests.worlds import ns
 
 
 def said(views: str, changes: tuple[int, ...] = (0,)) -> list[str]:
-    """What is warned of where a camera did this, ten pictures a second from 7 s on, a letter a picture."""
+    """The warnings for these views of the camera, one letter for each picture, ten pictures a second from 7 s on."""
     names = {"s": "steady", "f": "far", "m": "moving", "l": "lost"}
     steadiness = Steadiness()
     for number, letter in enumerate(views):
-        steadiness.see(ns(7 + number / 10), names[letter], number in changes)
+        steadiness.update(ns(7 + number / 10), names[letter], number in changes)
     with notices.collected() as found:
-        steadiness.judge()
+        steadiness.check()
     return [f"{notice.code}: {notice}" for notice in found]
 
 
@@ -28,7 +28,7 @@ def codes(*given) -> list[str]:
 
 
 @pytest.mark.parametrize("how", ["m", "f", "mf"])
-def test_a_camera_that_moves_in_one_picture_of_fifty_is_said_and_one_in_most_is_refused(how):
+def test_a_camera_that_moves_in_2_percent_of_the_pictures_is_a_warning_and_in_most_an_error(how):
     def views(count: int, of: int) -> str:
         return (how * of)[:count] + "s" * (of - count)
 
@@ -37,29 +37,29 @@ def test_a_camera_that_moves_in_one_picture_of_fifty_is_said_and_one_in_most_is_
     assert codes(views(50, 100)) == ["camera-moves"]
     with pytest.raises(McaptrackError, match=r"^the camera moves in 51% of the pictures;"):
         said(views(51, 100))
-    assert codes(views(14, 20)) == ["camera-moves"]  # too few pictures to be certain
+    assert codes(views(14, 20)) == ["camera-moves"]  # fewer than 15 pictures
     with pytest.raises(McaptrackError, match=r"^the camera moves in 75% of the pictures;"):
         said(views(15, 20))
 
 
-def test_a_view_that_is_lost_or_changes_is_said():
+def test_a_lost_or_changed_view_is_a_warning():
     assert codes("l" + 99 * "s") == []
     assert codes("ll" + 98 * "s") == ["view-lost"]
     assert codes(100 * "l") == ["view-lost"]
     assert codes(100 * "s", (0, 50)) == ["view-lost"]
-    assert codes(98 * "s" + "mm", (0, 50)) == ["camera-moves"]  # which says why it began anew
+    assert codes(98 * "s" + "mm", (0, 50)) == ["camera-moves"]  # which is the reason of the restart
     assert codes(99 * "s" + "m", (0, 50)) == ["view-lost"]
     assert codes(96 * "s" + "mmll") == ["camera-moves", "view-lost"]
     assert codes("") == []
 
 
-def test_shares_times_and_changes_are_said():
+def test_warnings_give_share_times_and_restarts():
     (words,) = said("ss" + "m" + 10 * "s" + "ff" + 85 * "s")
     assert words.startswith("camera-moves: the camera moves in 3% of the pictures, from 0.2 s to 1.4 s:")
     (words,) = said(20 * "s" + "lll" + 77 * "s")
     assert "in 3% of the pictures, from 2.0 s to 2.2 s: " in words
     (words,) = said(20 * "s" + "lll" + 77 * "s", (0, 30, 60))
-    assert "in 3% of the pictures, from 2.0 s to 2.2 s; the background began anew 2 times: " in words
+    assert "in 3% of the pictures, from 2.0 s to 2.2 s; the background model started again 2 times: " in words
 
 
 def textured(height: int = 160, width: int = 240, seed: int = 3) -> np.ndarray:
@@ -75,11 +75,11 @@ def shifted(wide: np.ndarray, by: float) -> np.ndarray:
     return np.ascontiguousarray(moved[:, :240])
 
 
-def test_a_camera_is_far_off_from_a_tenth_of_the_diagonal_on():
-    """A tenth of the diagonal of 240 x 160 pixels is 28.8 px; the camera turns slowly, so that it is followed."""
+def test_a_shift_of_more_than_a_tenth_of_the_diagonal_is_far():
+    """A tenth of the diagonal of 240 x 160 pixels is 28.8 px; the camera turns slowly, so that each picture fits."""
     wide, camera, views = textured(width=480), CameraMotion(), {}
     for by in range(33):
-        camera.follow(shifted(wide, by))
+        camera.estimate(shifted(wide, by))
         views[by] = camera.view
     assert {by: view for by, view in views.items() if abs(by - 28.8) > 0.5} == {
         by: "far" if by > 28.8 else "steady" for by in views if abs(by - 28.8) > 0.5
@@ -87,25 +87,25 @@ def test_a_camera_is_far_off_from_a_tenth_of_the_diagonal_on():
 
 
 @pytest.mark.parametrize(("by", "is_moved"), [(0.15, False), (0.6, True)])
-def test_less_than_a_third_of_a_pixel_is_no_motion(by, is_moved):
+def test_a_shift_below_a_third_of_a_pixel_is_no_motion(by, is_moved):
     wide, camera = textured(width=480), CameraMotion()
-    camera.follow(shifted(wide, 0))
-    found, _ = camera.follow(shifted(wide, by))
+    camera.estimate(shifted(wide, 0))
+    found, _ = camera.estimate(shifted(wide, by))
     assert (found[0, 2] != 0) == is_moved
     assert found[0, 2] == pytest.approx(by * is_moved, abs=0.15)
 
 
-def test_a_view_that_is_not_known_is_on_its_way_or_lost():
-    """All that is seen moves as one since the picture before, or nothing of it is seen again."""
+def test_a_picture_without_a_fit_is_moving_or_lost():
+    """Moving: all points share one shift since the picture before. Lost: none of them is found again."""
     wide, other = textured(width=480), textured(width=480, seed=4)
     camera = CameraMotion()
-    camera.follow(shifted(wide, 0))
+    camera.estimate(shifted(wide, 0))
     assert camera.view == "steady"
-    camera.follow(shifted(other, 0))
+    camera.estimate(shifted(other, 0))
     assert camera.view == "lost"
-    camera.follow(shifted(other, 0.2))  # a five-hundredth of the diagonal is 0.58 px
+    camera.estimate(shifted(other, 0.2))  # a five-hundredth of the diagonal is 0.58 px
     assert camera.view == "lost"
-    camera.follow(shifted(other, 3))
+    camera.estimate(shifted(other, 3))
     assert camera.view == "moving"
-    camera.follow(shifted(wide, 0))
+    camera.estimate(shifted(wide, 0))
     assert camera.view == "steady"

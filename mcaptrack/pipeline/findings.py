@@ -30,7 +30,7 @@ def warn_of_nothing(
     if transform.reads is not VIDEO and not any(len(frame.rows) for frame in given):
         warn(f"{source} holds nothing, so nothing was made of it", "nothing-found")
         return
-    reason = transform.why_nothing(given, made) if hasattr(transform, "why_nothing") else "the transform gave none"
+    reason = transform.why_empty(given, made) if hasattr(transform, "why_empty") else "the transform gave none"
     warn(f"no {STAGES[stage].rows} of {source}: {reason}", "nothing-found")
 
 

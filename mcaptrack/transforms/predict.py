@@ -48,7 +48,7 @@ class Predict:
         for frame in frames:
             yield (frame._replace(rows=forecaster.predict(frame)),)
 
-    def why_nothing(self, given: Sequence[Frame], made: Sequence[Frame]) -> str:
+    def why_empty(self, given: Sequence[Frame], made: Sequence[Frame]) -> str:
         """Why no rows came of frames, for a warning."""
         needed_s = (self.min_history - 1) / self.rate_hz
         return f"no track is without a gap for the {needed_s:.3g} s that a forecast needs (min_history)"

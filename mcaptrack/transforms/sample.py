@@ -62,7 +62,7 @@ class Sample:
         for index, t_ns, low, high in zip(*(a.tolist() for a in (shown, tick_ns, first, last)), strict=True):
             yield (Frame(t_ns, index, rows[low:high]),)
 
-    def why_nothing(self, given: Sequence[Frame], made: Sequence[Frame]) -> str:
+    def why_empty(self, given: Sequence[Frame], made: Sequence[Frame]) -> str:
         """Why no rows came of frames, for a warning."""
         return "no track is there at two ticks, or none stands on the ground plane"
 

@@ -148,7 +148,7 @@ class RetrackOptions:
         """Whether a sample that was assigned to two tracks stays with both."""
         return False
 
-    def why_nothing(self, given: Sequence[Frame], made: Sequence[Frame]) -> str:
+    def why_empty(self, given: Sequence[Frame], made: Sequence[Frame]) -> str:
         """Why no rows came of frames, for a warning."""
         longest_s = longest_track_s(given)
         if longest_s < self.min_track_s:

@@ -135,7 +135,7 @@ class Sort:
             yield from ((frame,) for frame in write(block, shown, shown_ends.tolist(), self.ground_planes))
         passed.warn()
 
-    def why_nothing(self, given: Sequence[Frame], made: Sequence[Frame]) -> str:
+    def why_empty(self, given: Sequence[Frame], made: Sequence[Frame]) -> str:
         """Why no rows came of frames, for a warning."""
         boxes = sum(len(frame.rows) for frame in given)
         return f"none of {boxes} boxes is followed for long enough (min_hits_s): too few pictures a second, perhaps"

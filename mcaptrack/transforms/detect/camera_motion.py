@@ -1,4 +1,4 @@
-"""How the camera moves against where it stood: a similarity from each picture to a reference picture."""
+"""Camera motion: a similarity transform from each picture to a reference picture."""
 
 from __future__ import annotations
 
@@ -14,29 +14,30 @@ Points = NDArray[np.float32]
 _FEATURES: Final = 200
 _FEATURE_DISTANCE_PX: Final = 10
 _RANSAC_PX: Final = 1.5
-#: A fit is believed if so many features, and this share of them, agree on it.
+#: A fit needs so many inliers, and this share of all features.
 _MIN_INLIERS: Final = 12
-_MIN_SHARE: Final = 0.4
-#: Below this the camera stands still: moving the picture would blur more than it would mend.
+_MIN_INLIER_RATIO: Final = 0.4
+#: Below this shift the camera stands still: resampling the picture would blur more than it corrects.
 _STILL_PX: Final = 0.3
-#: After so many pictures in a row without a believable fit the camera looks elsewhere.
-_PATIENCE: Final = 15
+#: After so many pictures in a row without a fit the next one becomes the reference.
+_MAX_MISSES: Final = 15
 
-#: A camera that looks further from where it looked first than this share of the picture's diagonal does more than
-#: shake: a quarter of the picture lies outside of what is known of the background.
+#: A shift from the reference of more than this share of the picture's diagonal is more than shaking: up to a quarter of
+#: the picture has no background model then.
 _FAR: Final = 0.1
 
-#: The same from one picture to the next: from so much on it is on its way; in a crowd the rest seems to creep.
+#: The same from one picture to the next: beyond it the camera is moving. In a crowd the fit drifts by less than this.
 _MOVING: Final = 0.002
 
-#: What is known of the camera at a picture: it looks where it looked; too far off; it is on its way; or nothing.
+#: The view at a picture: near the reference (steady); too far from it (far); the camera is moving (moving); no fit
+#: (lost).
 View = Literal["steady", "far", "moving", "lost"]
 
 IDENTITY: Final = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 
 
 class CameraMotion:
-    """Follows corner points of a reference picture by optical flow; people who move are outliers of the fit."""
+    """Registers pictures by optical flow of corner points; moving people are outliers of the fit."""
 
     def __init__(self) -> None:
         self.view: View = "steady"
@@ -46,10 +47,10 @@ class CameraMotion:
         self._last = IDENTITY
         self._misses = 0
 
-    def follow(self, image: Image) -> tuple[Floats, bool]:
-        """The similarity (2, 3) from pixels of ``image`` to those of the reference, and whether that is new.
+    def estimate(self, image: Image) -> tuple[Floats, bool]:
+        """The similarity (2, 3) from pixels of ``image`` to those of the reference, and whether the reference is new.
 
-        Afterwards ``view`` says what is known of the camera.
+        Sets ``view``.
         """
         before, self._before = self._before, image
         if self._reference is None or before is None:
@@ -62,7 +63,7 @@ class CameraMotion:
         if found is None:
             self.view = "moving" if _moves(before, image) else "lost"
             self._misses += 1
-            if self._misses > _PATIENCE:
+            if self._misses > _MAX_MISSES:
                 self._set_reference(image)
                 return IDENTITY, True
             return self._last, False
@@ -78,7 +79,7 @@ class CameraMotion:
 
 
 def _corners(image: Image) -> Points:
-    """Points (N, 1, 2) that can be found again."""
+    """Corner points (N, 1, 2), to be tracked by optical flow."""
     import cv2
 
     found = cv2.goodFeaturesToTrack(image, _FEATURES, 0.01, _FEATURE_DISTANCE_PX)
@@ -86,9 +87,9 @@ def _corners(image: Image) -> Points:
 
 
 def _fit(first: Image, second: Image, points: Points, guess: Floats) -> Floats | None:
-    """The similarity (2, 3) from pixels of the second picture to those of the first; None if there is none to believe.
+    """The similarity (2, 3) from pixels of the second picture to those of the first; None if too few points agree.
 
-    It follows from where ``points`` (N, 1, 2) of the first went, which is near ``guess`` (N, 2).
+    Optical flow finds ``points`` (N, 1, 2) of the first picture in the second, starting at ``guess`` (N, 2).
     """
     import cv2
 
@@ -103,15 +104,15 @@ def _fit(first: Image, second: Image, points: Points, guess: Floats) -> Floats |
     matrix, inliers = cv2.estimateAffinePartial2D(
         moved[ok], points[ok], method=cv2.RANSAC, ransacReprojThreshold=_RANSAC_PX
     )
-    if matrix is None or inliers.sum() < max(_MIN_INLIERS, _MIN_SHARE * len(points)):
+    if matrix is None or inliers.sum() < max(_MIN_INLIERS, _MIN_INLIER_RATIO * len(points)):
         return None
     return np.asarray(matrix, np.float64)
 
 
 def _moves(before: Image, image: Image) -> bool:
-    """Whether most of a picture moved as one since the picture before.
+    """Whether the camera moved since the picture before: most points share one shift.
 
-    Not so where something covers the view, where the light changes, and at a cut.
+    They don't where an object covers the view, where the light changes, and at a cut.
     """
     points = _corners(before)
     found = _fit(before, image, points, points[:, 0].astype(np.float64)) if len(points) else None
@@ -119,7 +120,7 @@ def _moves(before: Image, image: Image) -> bool:
 
 
 def _shift(matrix: Floats, image: Image) -> float:
-    """How far a similarity moves the corners of a picture at most, in pixels."""
+    """The largest shift of a corner of the picture by a similarity, in pixels."""
     height, width = image.shape
     corners = np.array([[0, 0, 1], [width, 0, 1], [0, height, 1], [width, height, 1]], float)
     shift = corners @ matrix.T - corners[:, :2]

@@ -1,0 +1,231 @@
+"""Motion detectors: pictures -> boxes around what differs from the background.
+
+Each picture is halved until it is small enough, registered to a reference picture, and compared with the background.
+The mask of differing pixels is cleaned, and its connected regions become boxes, in pixels of the picture before halving
+and registration.
+
+Letters: N boxes.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import ClassVar, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaptrack.geometry.arrays import Floats, Image
+from mcaptrack.geometry.clocks import FrameClock
+from mcaptrack.schema import DETECTIONS, VIDEO, Frame, Schema
+from mcaptrack.transforms.detect.camera_motion import IDENTITY, CameraMotion
+from mcaptrack.transforms.detect.foreground import Method, make_foreground_model
+from mcaptrack.transforms.detect.steadiness import Steadiness
+from mcaptrack.transforms.protocol import check_options, option
+
+# In units of the height of a person as measured in the picture: one body often gives several regions above each other,
+# which are joined over this distance; regions with a smaller area than this (times the height squared) are left out.
+_JOIN_HEIGHTS: Final = 0.2
+_MIN_AREA_HEIGHTS: Final = 0.03
+#: If a larger share of the picture than this differs, the light changed or the model is new: no detections.
+_MAX_FOREGROUND: Final = 0.5
+#: Smaller regions are noise, whatever the height of people.
+_MIN_AREA_PX: Final = 20.0
+#: The height of people until enough regions were measured.
+_INITIAL_HEIGHT_PX: Final = 20.0
+_MIN_REGIONS: Final = 10
+_PERSON_CLASS: Final = 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class MotionDetector:
+    """Base of the motion detectors, which differ in their foreground model (``method``)."""
+
+    threshold: float | None = option(
+        None, "difference from the background that counts as motion; each detector has its own default", least=0.0
+    )
+    history_s: float = option(60.0, "memory of the background model, in seconds", least=0.1)
+    max_pixels: int = option(
+        1_000_000, "pictures are halved until they have no more pixels than this", least=1_000, most=1_000_000_000
+    )
+    stabilise: bool = option(True, "compensate the motion of a shaking camera")
+
+    method: ClassVar[Method]
+    reads: ClassVar[Schema] = VIDEO
+    writes: ClassVar[Mapping[str, Schema]] = MappingProxyType({"": DETECTIONS})
+    latency_s: ClassVar[Mapping[str, float]] = MappingProxyType({"": 0.0})
+
+    def __post_init__(self) -> None:
+        check_options(self)
+
+    def __call__(self, frames: Iterable[Frame]) -> Iterator[tuple[Frame, ...]]:
+        clock, camera, height, steadiness = FrameClock(), CameraMotion(), _PersonHeight(), Steadiness()
+        foreground = make_foreground_model(self.method, self.threshold, self.history_s)
+        for frame in frames:
+            clock.tick(frame.t_ns)
+            image, halvings = _halve(frame.rows, self.max_pixels)
+            to_reference, is_new = camera.estimate(image) if self.stabilise else (IDENTITY, False)
+            steadiness.update(frame.t_ns, camera.view, is_new)
+            if is_new:  # another view has another background
+                foreground = make_foreground_model(self.method, self.threshold, self.history_s)
+            mask = _clear_border(foreground.mask(_warp(image, to_reference), clock), to_reference)
+            if np.count_nonzero(mask) > _MAX_FOREGROUND * mask.size:
+                mask = np.zeros_like(mask)
+            boxes = _find_boxes(mask, height.update(mask))
+            yield (Frame(frame.t_ns, frame.index, _boxes_to_rows(_unwarp_boxes(boxes, to_reference) * 2**halvings)),)
+        steadiness.check()
+
+    def why_empty(self, given: Sequence[Frame], made: Sequence[Frame]) -> str:
+        """Why there are no detections, for a warning."""
+        return f"no motion in its {len(made)} pictures exceeds the threshold"
+
+
+@dataclass(frozen=True, kw_only=True)
+class KnnDetector(MotionDetector):
+    """Detect what moves, by subtracting a background model (k nearest neighbours).
+
+    Reads video, writes detections: one box for each connected region that differs from the background.
+
+    Examples
+    --------
+    A bright square of 20 pixels moves over a dark picture, which was empty for a second:
+
+    >>> frames = [Frame(n * 40_000_000, n, np.full((80, 160), 30, np.uint8)) for n in range(40)]
+    >>> for frame in frames[25:]:
+    ...     frame.rows[30:50, 4 * frame.index - 80 : 4 * frame.index - 60] = 200
+    >>> *_, (last,) = KnnDetector()(frames)
+    >>> len(last.rows), float(last.rows["h_px"][0])
+    (1, 20.0)
+
+    References
+    ----------
+    Z. Zivkovic and F. van der Heijden, "Efficient adaptive density estimation per image pixel for the task of
+    background subtraction", Pattern Recognition Letters 27, 2006.
+    """
+
+    method: ClassVar[Method] = "knn"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mog2Detector(MotionDetector):
+    """With `--detector mog2` the background model is a mixture of Gaussians (Zivkovic, ICPR 2004).
+
+    References
+    ----------
+    Z. Zivkovic, "Improved adaptive Gaussian mixture model for background subtraction", ICPR 2004.
+    """
+
+    method: ClassVar[Method] = "mog2"
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameDifferenceDetector(MotionDetector):
+    """With `--detector frame-difference` pictures are compared with those just before them, as in the paper.
+
+    References
+    ----------
+    R. Yu and Z. Zhou, "Towards Robust Human Trajectory Prediction in Raw Videos", IROS 2021.
+    """
+
+    method: ClassVar[Method] = "frame-difference"
+
+
+def _halve(image: Image, max_pixels: int) -> tuple[Image, int]:
+    """The picture, halved until it has at most ``max_pixels``, and how often."""
+    import cv2
+
+    halvings = 0
+    while image.size > max_pixels and min(image.shape) >= 4:
+        height, width = image.shape
+        image = np.asarray(cv2.resize(image, (width // 2, height // 2), interpolation=cv2.INTER_AREA), np.uint8)
+        halvings += 1
+    return image, halvings
+
+
+def _warp(image: Image, to_reference: Floats) -> Image:
+    """The picture as the reference camera would see it."""
+    import cv2
+
+    if to_reference is IDENTITY:
+        return image
+    size = (image.shape[1], image.shape[0])
+    return np.asarray(cv2.warpAffine(image, to_reference, size, borderMode=cv2.BORDER_REPLICATE), np.uint8)
+
+
+def _clear_border(mask: Image, to_reference: Floats) -> Image:
+    """The mask without the border that a warped picture does not cover."""
+    if to_reference is IDENTITY:
+        return mask
+    height, width = mask.shape
+    corners = np.array([[0, 0, 1], [width, 0, 1], [0, height, 1], [width, height, 1]], float)
+    border = int(np.ceil(np.abs(corners @ to_reference.T - corners[:, :2]).max())) + 1
+    inner = np.zeros_like(mask)
+    inner[border:-border, border:-border] = mask[border:-border, border:-border]
+    return inner
+
+
+def _region_boxes(mask: Image, min_area_px: float) -> Floats:
+    """Boxes (N, 4) around connected regions of a mask."""
+    import cv2
+
+    contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+    found = [cv2.boundingRect(contour) for contour in contours if cv2.contourArea(contour) >= min_area_px]
+    return np.array(found, np.float64).reshape(-1, 4)
+
+
+class _PersonHeight:
+    """Estimates how tall people are in the picture: the median height of regions, weighted by their area.
+
+    Regions are measured before joining and filtering, which depend on the estimate: there is no feedback.
+    """
+
+    _memory = 2000
+
+    def __init__(self) -> None:
+        self._regions: deque[tuple[float, float]] = deque(maxlen=self._memory)  # height, area
+
+    def update(self, mask: Image) -> float:
+        """Take the regions of a mask; returns the estimate, in pixels."""
+        import cv2
+
+        closed = np.asarray(cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8)), np.uint8)
+        boxes = _region_boxes(closed, _MIN_AREA_PX)
+        boxes = boxes[boxes[:, 3] < mask.shape[0] / 2]
+        self._regions.extend(zip(boxes[:, 3].tolist(), (boxes[:, 2] * boxes[:, 3]).tolist(), strict=True))
+        if len(self._regions) < _MIN_REGIONS:
+            return _INITIAL_HEIGHT_PX
+        height, area = np.array(sorted(self._regions)).T
+        total = np.cumsum(area)
+        return float(height[np.searchsorted(total, total[-1] / 2)])
+
+
+def _find_boxes(mask: Image, person_px: float) -> Floats:
+    """Boxes (N, 4) of people of about this height in a mask."""
+    import cv2
+
+    tall = max(1, round(_JOIN_HEIGHTS * person_px) // 2 * 2 + 1)
+    closed = np.asarray(cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((tall, 1), np.uint8)), np.uint8)
+    return _region_boxes(closed, max(_MIN_AREA_PX, _MIN_AREA_HEIGHTS * person_px**2))
+
+
+def _unwarp_boxes(boxes: Floats, to_reference: Floats) -> Floats:
+    """Boxes (N, 4) of the reference picture in the picture itself. They stay upright, as rotations are small."""
+    if to_reference is IDENTITY:
+        return boxes
+    import cv2
+
+    to_image = np.asarray(cv2.invertAffineTransform(to_reference), np.float64)
+    scale = float(np.sqrt(np.abs(np.linalg.det(to_image[:, :2]))))
+    centres = (boxes[:, :2] + boxes[:, 2:] / 2) @ to_image[:, :2].T + to_image[:, 2]
+    size = boxes[:, 2:] * scale
+    return np.concatenate([centres - size / 2, size], axis=1)
+
+
+def _boxes_to_rows(boxes: Floats) -> NDArray[np.void]:
+    """Rows of boxes (N, 4), sorted from top to bottom, then from left to right."""
+    boxes = boxes[np.lexsort((boxes[:, 0], boxes[:, 1]))]
+    x, y, w, h = boxes.T
+    return DETECTIONS.rows(x_px=x, y_px=y, w_px=w, h_px=h, class_id=np.full(len(boxes), _PERSON_CLASS))
