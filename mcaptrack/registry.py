@@ -1,24 +1,22 @@
 """Find detectors, trackers, predictors, re-trackers and fusers by name: built-in ones and those of other packages.
 
-A name is one of three things, everywhere: on the command line, in files for ``--config``, and in Python.
+There are three kinds of names, on the command line, in files for ``--config`` and in Python:
 
-* A built-in name, as in ``find("tracker", "sort")``.
-* The name of an entry point. A package declares it in its ``pyproject.toml``, in the group of its kind
+* Built-in names, as in ``find("tracker", "sort")``.
+* Names of entry points. A package declares them in its ``pyproject.toml``, in the group of their kind
   (``mcaptrack.detectors``, ``.trackers``, ``.predictors``, ``.retrackers``, ``.fusers``)::
 
       [project.entry-points."mcaptrack.trackers"]
       nearest = "my_package.tracking:NearestTracker"
 
-* ``module:Class``, as in ``my_module:NearestTracker``. The module is imported as Python would import it in the working
-  folder, after all that is installed.
+* ``module:Class``, as in ``my_module:NearestTracker``. Installed modules are searched first, then the working folder.
 
-Built-in names come first: an entry point can't replace one. ``names`` imports nothing; ``find`` imports the module of
-the one that it finds and of no other. ``entry_of`` is the way back: what a class is called. An ``Entry`` has what the
-provenance of a channel keeps: name, module and class, and the name and version of the distribution (the installed
-package) that they come from.
+Entry points can't replace built-in names. ``names`` imports nothing; ``find`` imports the module of the entry that
+it finds. ``entry_of`` is the inverse: from a class to its entry. The provenance of a channel stores the fields of an
+``Entry``: name, module and class, and the name and version of the distribution (the installed package).
 
-What a class has to be stands in ``mcaptrack.transforms.protocol`` and ``mcaptrack.predictors.forecast``. To add a
-built-in one: a line in ``BUILT_IN``.
+Interfaces are defined in ``mcaptrack.transforms.protocol`` and ``mcaptrack.predictors.forecast``. To add a built-in
+entry: a line in ``BUILT_IN``.
 """
 
 from __future__ import annotations
@@ -42,7 +40,7 @@ Kind = Literal["detector", "tracker", "predictor", "retracker", "fuser"]
 KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
 _OWN: Final = "mcaptrack"
 
-#: Where the built-in ones are defined, by kind and name; the first of a kind is its default.
+#: Module and class of the built-in entries, by kind and name; the first of a kind is its default.
 BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(
     {
         "detector": {
@@ -74,21 +72,20 @@ BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(
 
 @dataclass(frozen=True)
 class Entry:
-    """What a name stands for.
+    """An entry of the registry.
 
     Attributes
     ----------
     name : str
-        The name it was found by: built-in, of an entry point, or ``module:Class``.
+        Its name: built-in, of an entry point, or ``module:Class``.
     kind : str
         One of ``KINDS``.
     cls : type
-        The class; of a predictor it may be a function that makes one.
+        The class; a predictor may be a function that returns one.
     module : str
         The module that defines the class.
     distribution, version : str
-        The installed package that the module comes from, and its version; "" where that is not known.
-
+        The installed package of the module, and its version; "" if unknown.
     """
 
     name: str
@@ -105,22 +102,22 @@ class Entry:
 
     @property
     def is_built_in(self) -> bool:
-        """Whether it comes with mcaptrack."""
+        """Whether it is part of mcaptrack."""
         return self.name in BUILT_IN.get(self.kind, ())
 
     def __str__(self) -> str:
-        """As messages name it: ``tracker nearest (my-package 1.0)``."""
+        """Its name in messages: ``tracker nearest (my-package 1.0)``."""
         package = f"{self.distribution} {self.version}".strip()
         return f"{self.kind} {self.name}" + (f" ({package})" if package and not self.is_built_in else "")
 
 
 def names(kind: Kind) -> tuple[str, ...]:
-    """All names of a kind: built-in ones, then those of installed packages. Imports nothing."""
+    """All names of a kind: built-in ones, then those of entry points. Imports nothing."""
     return (*BUILT_IN[kind], *sorted({point.name for point in _installed(kind)} - set(BUILT_IN[kind])))
 
 
 def find(kind: Kind, name: str) -> Entry:
-    """Find what a name stands for, and import it.
+    """Find an entry by its name, and import it.
 
     Parameters
     ----------
@@ -136,13 +133,12 @@ def find(kind: Kind, name: str) -> Entry:
     Raises
     ------
     McaptrackError
-        If there is none of that name, or several, or if it can't be imported.
+        If there is no such entry, if several packages have one, or if it can't be imported.
 
     Examples
     --------
     >>> find("tracker", "ocsort").implementation
     'mcaptrack.transforms.sort.ocsort:OcSort'
-
     """
     if name in BUILT_IN[kind]:
         found = _load(f"{kind} {name}", BUILT_IN[kind][name])
@@ -155,17 +151,17 @@ def find(kind: Kind, name: str) -> Entry:
     if not points:
         raise McaptrackError(_unknown(kind, name))
     if len(points) > 1:
-        theirs = " and ".join(sorted(f"{point.value} ({' '.join(_of_point(point))})" for point in points))
-        raise McaptrackError(f"several installed packages have a {kind} {name}: {theirs}; name one as module:Class")
+        values = " and ".join(sorted(f"{point.value} ({' '.join(_of_point(point))})" for point in points))
+        raise McaptrackError(f"several installed packages have a {kind} {name}: {values}; name one as module:Class")
     package = _of_point(points[0])
     found = _load(f"{kind} {name} ({' '.join(package)})", points[0].value)
     return Entry(name, kind, found, found.__module__, *package)
 
 
 def entry_of(kind: str, cls: type) -> Entry:
-    """The entry of a class: by its built-in name, by that of an entry point, or else as ``module:Class``.
+    """The entry of a class: built-in, of an entry point, or else ``module:Class``.
 
-    A class that inherits from a built-in one is not built in: it does something else.
+    A subclass of a built-in class is not built in.
     """
     built_in = BUILT_IN.get(kind, {})
     for name, where in built_in.items():
@@ -180,12 +176,12 @@ def entry_of(kind: str, cls: type) -> Entry:
 
 
 def is_installed(kind: Kind, name: str) -> bool:
-    """Whether a name is built in or an entry point's, so that it can be imported though only a log names it."""
+    """Whether a name is built in or of an entry point: only these are imported because a log names them."""
     return name in names(kind)
 
 
 def failure(entry: Entry, what: str, error: BaseException) -> McaptrackError:
-    """What the code of others raised, in one line that names it and the place in its files."""
+    """An exception of the code of another package, as one line with the entry and the place in its source."""
     frames = [frame for frame in extract_tb(error.__traceback__) if f"/{_OWN}/" not in Path(frame.filename).as_posix()]
     where = f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
     words = " ".join(f"{type(error).__name__}: {error}".split()).removesuffix(":")
@@ -193,7 +189,7 @@ def failure(entry: Entry, what: str, error: BaseException) -> McaptrackError:
 
 
 def distribution_of(module: str) -> tuple[str, str]:
-    """Name and version of the distribution that a module was installed with; "" and "" if that isn't known."""
+    """Name and version of the distribution of a module; "" and "" if unknown."""
     found = packages_distributions().get(module.partition(".")[0], [])
     return (found[0], _version_of(found[0])) if found else ("", "")
 
@@ -206,7 +202,7 @@ def _version_of(distribution: str) -> str:
 
 
 def _installed(kind: str) -> list[EntryPoint]:
-    """The entry points of a kind, each once."""
+    """The entry points of a kind, without duplicates."""
     return list({(p.name, p.value, *_of_point(p)): p for p in entry_points(group=f"{_OWN}.{kind}s")}.values())
 
 
@@ -217,19 +213,19 @@ def _of_point(point: EntryPoint) -> tuple[str, str]:
 def _is(point: EntryPoint, cls: type) -> bool:
     try:
         return point.load() is cls
-    except Exception:  # an entry point that can't be imported is not this class
+    except Exception:  # an entry point that can't be imported is another class
         return False
 
 
 def _load(what: str, reference: str) -> Any:
-    """Import what ``module:Class`` names. Raises McaptrackError, also for whatever its module raises."""
+    """Import ``module:Class``. Raises McaptrackError, also if its module raises any exception."""
     module, _, path = reference.partition(":")
     parts = path.split("[")[0].strip().split(".")
     if not all(part.isidentifier() for part in (*module.strip().split("."), *parts)):
         raise McaptrackError(f"{what}: {reference} is not of the form module:Class")
     try:
         found: Any = import_module(module.strip())
-    except (Exception, SystemExit) as error:  # the code of others may raise anything
+    except (Exception, SystemExit) as error:  # code of other packages may raise anything
         words = " ".join(f"{type(error).__name__}: {error}".split())
         raise McaptrackError(f"{what} can't be imported: {words}") from error
     for part in parts:
@@ -241,7 +237,7 @@ def _load(what: str, reference: str) -> Any:
 
 @contextmanager
 def _working_folder() -> Iterator[None]:
-    """Look for modules in the working folder, too, after all others."""
+    """Search modules in the working folder, too, after all others."""
     sys.path.append("")
     try:
         yield

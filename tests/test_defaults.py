@@ -53,7 +53,7 @@ DEFAULTS: dict[str, dict[str, Any]] = {
     "sort": SORT,
     "bytetrack": SORT | {"high_score": 0.5, "new_score": 0.6, "low_min_iou": 0.5},
     "ocsort": SORT | {"inertia": 0.2, "direction_frames": 3, "recover": True, "reupdate": True},
-    "sample": {"rate_hz": 2.5, "max_hole_s": 2.0},
+    "sample": {"rate_hz": 2.5, "max_gap_s": 2.0},
     "predict": {"predictor": "red", "horizon_s": 4.8, "min_history": 4},
     "retrack": RETRACKING
     | {

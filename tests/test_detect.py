@@ -12,8 +12,8 @@ from mcaptrack.schema import Frame
 from mcaptrack.sources.synthetic import SyntheticScene
 from mcaptrack.transforms import FrameDifferenceDetector, KnnDetector, Mog2Detector, MotionDetector
 from mcaptrack.transforms.detect.background import _PersonHeight
-from mcaptrack.transforms.detect.foreground import FrameDifference
 from mcaptrack.transforms.detect.camera_motion import CameraMotion
+from mcaptrack.transforms.detect.foreground import FrameDifference
 from tests.worlds import ns, small_scene
 
 
@@ -161,10 +161,16 @@ def test_regions_above_each_other_are_joined_over_a_fifth_of_a_height(gap, parts
 def test_regions_below_the_minimum_area_are_left_out():
     """The minimum is 3 % of the squared height of people so far, and at least 20 px."""
     people = [[(20 + 3 * n, 60, 12, 40)] for n in range(12)]
-    for size, seen in (((6, 8), False), ((7, 8), False), ((8, 9), True)):  # areas of outlines: 35, 42, 56; the minimum is 48
+    for size, seen in (
+        ((6, 8), False),
+        ((7, 8), False),
+        ((8, 9), True),
+    ):  # areas of outlines: 35, 42, 56; the minimum is 48
         *_, boxes = boxes_of([*EMPTY, *(blocks(*each) for each in people), blocks((100, 30, *size))])
         assert len(boxes) == seen
-    *_, first = boxes_of([*EMPTY, blocks((100, 30, 5, 6), (20, 30, 6, 6))])  # areas 20 and 25; no person was measured yet
+    *_, first = boxes_of(
+        [*EMPTY, blocks((100, 30, 5, 6), (20, 30, 6, 6))]
+    )  # areas 20 and 25; no person was measured yet
     assert len(first) == 2
     *_, first = boxes_of([*EMPTY, blocks((100, 30, 5, 5), (20, 30, 6, 6))])
     assert first == [[20.0, 30.0, 6.0, 6.0]]

@@ -341,7 +341,7 @@ class TestOnnx:
         with notices.collected() as said:
             make(name, 6, 0.4)
         assert [notice.code for notice in said] == ["extrapolated"]
-        assert "predicts 1.2 s ahead; what is asked for beyond, up to 2.4 s, is a straight line" in said[0].message
+        assert "predicts 1.2 s ahead; beyond it, up to 2.4 s, predictions are a straight line" in said[0].message
 
     @pytest.mark.parametrize(
         "cov", [[[1, 2], [2, 1]], [[0, 0], [0, 1]], [[-1, 0], [0, 1]], [[1, 0.5], [0.2, 1]], [[1, 0], [0, np.nan]]]

@@ -62,7 +62,7 @@ class TestSample:
         def path(n):
             return {} if 3 <= n <= 5 or (n > 10 and n < 18) else {1: (float(n), 0.0)}
 
-        out = {frame.t_ns: frame for frame in sampled(walk(path, 25), max_hole_s=2.0)}
+        out = {frame.t_ns: frame for frame in sampled(walk(path, 25), max_gap_s=2.0)}
         seen = {tick: out[ns(0.4 * tick)].rows for tick in range(25)}
         assert [seen[tick]["observed"].tolist() for tick in range(2, 7)] == [[True], [False], [False], [False], [True]]
         assert [seen[tick]["x_m"].tolist() for tick in (3, 4, 5)] == [[3.0], [4.0], [5.0]]

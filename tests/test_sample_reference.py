@@ -41,7 +41,7 @@ def slow_sample(frames: list[Frame], options: Sample) -> list[tuple[int, int, li
     for t, row in as_rows(frames):
         paths.setdefault(row["track_id"], []).append((t, row))
     out = []
-    for tick in ticks_of(frames, options.start_ns or times[0], options.rate_hz, options.max_hole_s):
+    for tick in ticks_of(frames, options.start_ns or times[0], options.rate_hz, options.max_gap_s):
         rows = []
         for who in sorted(paths):
             before = [(t, row) for t, row in paths[who] if t <= tick]
@@ -50,7 +50,7 @@ def slow_sample(frames: list[Frame], options: Sample) -> list[tuple[int, int, li
                 continue
             (low, one), made = before[-1], dict(before[-1][1])
             if low != tick:
-                if not after or after[0][0] - low > round(options.max_hole_s * 1e9):
+                if not after or after[0][0] - low > round(options.max_gap_s * 1e9):
                     continue
                 high, other = after[0]
                 for name in LINEAR:
@@ -75,7 +75,7 @@ def test_samples_equal_the_reference(seed, rate_hz, gap_s, late):
         frames = [frame._replace(t_ns=ns(round(frame.t_ns / 1e9 * 10) / 10)) for frame in frames]
         frames = [a for a, b in zip(frames, [*frames[1:], None], strict=True) if b is None or a.t_ns < b.t_ns]
     start_ns = None if late is None else max(frames[0].t_ns + ns(late), 1)
-    sample = Sample(rate_hz=rate_hz, max_hole_s=gap_s, start_ns=start_ns)
+    sample = Sample(rate_hz=rate_hz, max_gap_s=gap_s, start_ns=start_ns)
     wanted = slow_sample(frames, sample)
     found = [frame for (frame,) in sample(frames)]
     assert [(frame.t_ns, frame.index) for frame in found] == [(t, index) for t, index, _ in wanted]
@@ -90,7 +90,7 @@ def test_gaps_of_up_to_two_ticks_have_ticks_and_longer_ones_have_none():
     """No row is interpolated there (the gap limit is 0), but the ticks exist, as frames without rows."""
     for apart_s, ticks in ((0.8, [0.0, 0.4, 0.8]), (0.81, [0.0])):
         frames = [Frame(ns(k * apart_s), k, noisy_tracks(np.random.default_rng(0), ticks=1)[0].rows) for k in range(2)]
-        found = [frame for (frame,) in Sample(max_hole_s=0.0)(frames)]
+        found = [frame for (frame,) in Sample(max_gap_s=0.0)(frames)]
         assert [frame.t_ns for frame in found] == [ns(t) for t in ticks]
 
 

@@ -1,4 +1,4 @@
-"""SORT in worded scenes; and against the outputs of the original program."""
+"""The trackers on small scenes, and SORT against the output of the original program."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ FRAMES = {"max_age_frames": 2, "min_hits_frames": 2, "min_iou": 0.3}
 
 
 @pytest.mark.parametrize("kind", TRACKERS.values(), ids=TRACKERS)
-def test_tracks_that_are_empty_because_no_box_passes_are_said(kind):
+def test_filters_that_no_detection_passes_are_a_warning(kind):
     rows = boxes_at([(50, 50), (90, 50)], score=0.5)
     rows["class_id"] = [3, 1]
     frames = [Frame(ns(n / 10), n, rows if n % 2 else rows[:0]) for n in range(200)]
@@ -40,43 +40,43 @@ def run(frames, kind=Sort, **options):
     return [frame for (frame,) in kind(**(FRAMES | options))(frames)]
 
 
-def test_one_who_walks_keeps_one_id():
+def test_a_walking_person_keeps_one_id():
     out = run(detections(lambda n: [(50 + 3 * n, 50)], 30))
     assert {tuple(ids(frame)) for frame in out} == {(1,)}
 
 
-def test_two_side_by_side_keep_theirs():
+def test_two_people_side_by_side_keep_their_ids():
     out = run(detections(lambda n: [(50 + 3 * n, 50), (50 + 3 * n, 120)], 30))
     assert {tuple(ids(frame)) for frame in out} == {(1, 2)}
     assert all(frame.rows["y_px"][0] < frame.rows["y_px"][1] for frame in out)
 
 
-def test_one_who_comes_later_is_shown_after_enough_hits():
+def test_a_new_track_is_written_after_min_hits():
     out = run(detections(lambda n: [(50, 50)] + ([(200, 50)] if n >= 10 else []), 20))
     shown = [n for n, frame in enumerate(out) if 2 in ids(frame)]
-    assert shown == list(range(12, 20))  # born at 10, hit at 11 and 12
+    assert shown == list(range(12, 20))  # birth at 10, detected again at 11 and 12
 
 
-def test_one_who_is_missed_for_less_than_the_age_comes_back_as_the_same():
+def test_a_track_survives_missed_detections_up_to_its_maximum_age():
     out = run(detections(lambda n: [] if n in (10, 11) else [(50 + n, 50)], 20))
     assert [ids(frame) for frame in out[9:12]] == [[1], [], []]
-    assert [ids(frame) for frame in out[12:]] == [[], *[[1]] * 7]  # a streak begins anew
+    assert [ids(frame) for frame in out[12:]] == [[], *[[1]] * 7]  # the hit streak starts again
 
 
-def test_one_who_is_missed_for_longer_comes_back_as_another():
+def test_a_track_terminates_after_its_maximum_age():
     out = run(detections(lambda n: [] if 10 <= n <= 12 else [(50, 50)], 20))
     assert ids(out[9]) == [1]
     assert ids(out[19]) == [2]
 
 
-def test_a_box_that_jumps_is_somebody_else():
+def test_a_detection_beyond_the_gate_starts_another_track():
     out = run(detections(lambda n: [(50, 50) if n < 10 else (150, 50)], 20))
     assert ids(out[9]) == [1]
     assert ids(out[19]) == [2]
 
 
 def test_seconds_are_frames_of_the_actual_rate():
-    """The same walk at 10 and at 30 frames a second, hidden for 0.7 s."""
+    """The same walk at 10 and at 30 frames a second, occluded for 0.7 s."""
     for fps in (10, 30):
 
         def path(n, fps=fps):
@@ -87,15 +87,15 @@ def test_seconds_are_frames_of_the_actual_rate():
             assert ids(out[-1]) == [back], (fps, age)
 
 
-def test_frames_that_nobody_saw_still_move_people():
-    """A walker crosses a gap of half a second in the log; without counting its frames the boxes would not meet."""
+def test_tracks_are_predicted_through_missing_frames():
+    """A person walks through a gap of half a second in the log; a prediction of one frame would not overlap."""
     frames = detections(lambda n: [(50 + 6 * n, 50)], 40)
     gap = [frame for frame in frames if not 20 <= frame.index < 25]
     out = [f for (f,) in Sort(max_age_s=1.0, min_hits_s=0.1)(gap)]
     assert {tuple(ids(frame)) for frame in out} == {(1,)}
 
 
-def test_a_jitter_of_the_clock_changes_no_box():
+def test_jitter_of_timestamps_changes_no_box():
     rng = np.random.default_rng(3)
     frames = detections(lambda n: [(50 + 5 * n, 60 + 2 * n), (300 - 4 * n, 90)], 40)
     shaken = [frame._replace(t_ns=frame.t_ns + int(rng.integers(-20_000_000, 20_000_000))) for frame in frames]
@@ -103,7 +103,7 @@ def test_a_jitter_of_the_clock_changes_no_box():
         np.testing.assert_array_equal(a.rows["x_px"], b.rows["x_px"])
 
 
-def test_boxes_that_are_none_are_passed_over():
+def test_degenerate_boxes_are_ignored():
     rows = boxes_at([(50, 50), (90, 50), (130, 50)])
     rows["w_px"][1], rows["h_px"][2] = 0.0, -3.0
     out = run([Frame(ns(n / 10), n, rows) for n in range(6)])
@@ -111,7 +111,7 @@ def test_boxes_that_are_none_are_passed_over():
     assert np.isfinite(out[-1].rows["x_px"]).all()
 
 
-def test_scores_and_metres_go_along():
+def test_tracks_have_the_score_and_the_position_on_the_ground():
     plane = GroundPlane((0.1, 0, 0, 0, 0.1, 0, 0, 0, 1), 640, 480)
     frames = [Frame(ns(n / 10), n, boxes_at([(50, 50)], (20, 40), score=0.25)) for n in range(5)]
     (frame,) = list(Sort(ground_planes=((0, plane),))(frames))[-1]
@@ -121,8 +121,8 @@ def test_scores_and_metres_go_along():
     assert np.isnan(plain.rows["x_m"]).all()
 
 
-def test_a_jitter_of_the_clock_changes_no_age():
-    """Ages and streaks in seconds come out the same, to the frame, however the stamps tremble."""
+def test_jitter_of_timestamps_changes_no_age():
+    """Ages and hit streaks in seconds are rounded to the nearest frame."""
     rng = np.random.default_rng(4)
     frames = detections(lambda n: [] if 10 <= n < 19 else [(50, 60)], 40)
     for age in (0.8, 0.9, 1.0):
@@ -133,8 +133,8 @@ def test_a_jitter_of_the_clock_changes_no_age():
     assert wanted[-1] == [1]
 
 
-def test_ages_are_seconds_even_where_the_frame_rate_changes():
-    """Somebody is away for 0.9 s: at 10 frames a second, and after the rate has risen to 30."""
+def test_ages_are_in_seconds_where_the_frame_rate_changes():
+    """A person is missed for 0.9 s: at 10 frames a second, and after the rate has risen to 30."""
     times = [n / 10 for n in range(40)] + [4 + n / 30 for n in range(120)]
     away = [(2.0, 2.9), (6.0, 6.9)]
     frames = [
@@ -144,17 +144,17 @@ def test_ages_are_seconds_even_where_the_frame_rate_changes():
     assert ids([f for (f,) in Sort(max_age_s=0.6, min_hits_s=0.1)(frames)][-1]) == [3]
 
 
-def test_a_log_that_pauses_for_an_hour_does_not_go_on_with_who_was_there():
+def test_tracks_terminate_in_a_gap_of_an_hour():
     frames = detections(lambda n: [(50, 60)], 40)
     late = [f._replace(t_ns=f.t_ns + (ns(3600) if f.index >= 20 else 0)) for f in frames]
     out = [f for (f,) in Sort(max_age_s=1.0, min_hits_s=0.1)(late)]
     assert (ids(out[19]), ids(out[-1])) == ([1], [2])
 
 
-def test_small_and_fast_boxes_are_followed_by_distance():
-    """Boxes of 8 px that move by 12 px a frame never overlap; their centres are near enough."""
+def test_small_fast_boxes_are_associated_by_distance():
+    """Boxes of 8 px that move by 12 px a frame never overlap; their centres are within the gate."""
     frames = [Frame(ns(n / 10), n, boxes_at([(20 + 12 * n, 50), (20 + 12 * n, 130)], (8, 8))) for n in range(30)]
-    assert len({who for frame in run(frames) for who in ids(frame)}) > 2
+    assert len({track_id for frame in run(frames) for track_id in ids(frame)}) > 2
     out = run(frames, cost="pixels", max_distance_px=20.0)
     assert {tuple(ids(frame)) for frame in out} == {(1, 2)}
 
@@ -170,17 +170,17 @@ def test_distance_on_the_ground_is_not_distance_in_the_picture():
         run(frames, cost="metres")
 
 
-def test_gates_of_class_and_score():
+def test_filters_of_class_and_score():
     rows = boxes_at([(50, 50), (120, 50), (190, 50)])
     rows["score"], rows["class_id"] = [0.9, 0.3, np.nan], [1, 1, 2]
     frames = [Frame(ns(n / 10), n, rows) for n in range(6)]
     assert ids(run(frames)[-1]) == [1, 2, 3]
-    assert ids(run(frames, min_score=0.5)[-1]) == [1, 2]  # one without a score passes
+    assert ids(run(frames, min_score=0.5)[-1]) == [1, 2]  # a detection without a score passes
     assert ids(run(frames, class_id=2)[-1]) == [1]
     assert run(frames, class_id=2)[-1].rows["x_px"][0] == pytest.approx(180)
 
 
-def test_a_track_goes_on_with_boxes_of_its_class_only():
+def test_a_track_continues_with_detections_of_its_class_only():
     frames = detections(lambda n: [(50, 50)], 20)
     for frame in frames[10:]:
         frame.rows["class_id"] = 3
@@ -188,27 +188,27 @@ def test_a_track_goes_on_with_boxes_of_its_class_only():
     assert ids(run(frames, mix_classes=True)[-1]) == [1]
 
 
-def test_bytetrack_goes_on_with_doubtful_boxes_and_begins_nobody_with_them():
-    """One walks behind a hedge, where the detector doubts; something that is never sure stands beside."""
+def test_bytetrack_continues_tracks_with_low_scores_and_starts_none():
+    """A person scores low behind a hedge; a false positive beside scores low always."""
     frames = detections(lambda n: [(50 + 4 * n, 50), (300, 50)], 40)
     for frame in frames:
         frame.rows["score"] = [0.2 if 10 <= frame.index < 30 else 0.9, 0.3]
     out = run(frames, kind=ByteTrack)
     assert {tuple(ids(frame)) for frame in out} == {(1,)}
-    sure = run(frames, min_score=0.5)
-    assert ids(sure[-1]) == [2]
-    assert [ids(frame) for frame in sure[15:25]] == [[]] * 10
+    high = run(frames, min_score=0.5)
+    assert ids(high[-1]) == [2]
+    assert [ids(frame) for frame in high[15:25]] == [[]] * 10
 
 
-def test_bytetrack_gives_doubtful_boxes_to_who_was_just_there_only():
+def test_bytetrack_gives_low_scores_to_tracks_of_the_previous_frame_only():
     frames = detections(lambda n: [] if 10 <= n < 12 else [(50, 50)], 20)
     for frame in frames[12:]:
         frame.rows["score"] = 0.3
     assert [ids(frame) for frame in run(frames, kind=ByteTrack)[12:]] == [[]] * 8
 
 
-def test_ocsort_finds_one_who_stops_behind_something_where_he_was_seen_last():
-    """The filter walks on while nobody is seen; the observation doesn't."""
+def test_ocsort_recovers_a_person_who_stopped_while_occluded():
+    """The filter coasts on, away from the person; the last detection does not."""
 
     def path(n):
         return [] if 20 <= n < 32 else [(50 + 6 * min(n, 20), 50)]
@@ -219,8 +219,8 @@ def test_ocsort_finds_one_who_stops_behind_something_where_he_was_seen_last():
     assert ids(run(detections(path, 50), kind=OcSort, recover=False, **options)[-1]) == [2]
 
 
-def test_ocsort_forgets_what_the_filter_made_up():
-    """Found again, a track goes on as if it had been seen on the straight line all the while it was hidden."""
+def test_ocsort_recomputes_the_filter_over_the_gap():
+    """After the gap the track is as if it had been detected on the straight line throughout."""
 
     def path(n):
         return (50 + 3 * n, 100) if n <= 19 else (107 - (n - 19), 100 + 0.5 * (n - 19))
@@ -228,15 +228,14 @@ def test_ocsort_forgets_what_the_filter_made_up():
     options = {"max_age_frames": 30, "min_hits_frames": 0, "min_iou": 0.05, "kind": OcSort}
     seen = run(detections(lambda n: [path(n)], 34), **options)
     hidden = run(detections(lambda n: [] if 20 <= n < 29 else [path(n)], 34), **options)
-    dreamt = run(detections(lambda n: [] if 20 <= n < 29 else [path(n)], 34), reupdate=False, **options)
+    coasted = run(detections(lambda n: [] if 20 <= n < 29 else [path(n)], 34), reupdate=False, **options)
     for n in range(29, 34):
         for name in ("x_px", "y_px", "w_px", "h_px"):
             np.testing.assert_allclose(hidden[n].rows[name], seen[n].rows[name], atol=1e-9)
-    assert abs(dreamt[30].rows["x_px"] - seen[30].rows["x_px"]) > 0.01
+    assert abs(coasted[30].rows["x_px"] - seen[30].rows["x_px"]) > 0.01
 
 
-def test_with_nothing_that_tells_them_apart_the_trackers_agree():
-    """Sure boxes, nobody lost: the three are one."""
+def test_the_trackers_agree_without_low_scores_and_missed_detections():
     frames = detections(lambda n: [(50 + 3 * n, 50), (300 - 3 * n, 150)], 30)
     outs = [run(frames, kind=kind) for kind in TRACKERS.values()]
     for out in outs[1:]:

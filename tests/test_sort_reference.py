@@ -1,4 +1,4 @@
-"""The trackers against second, slow implementations, box by box, on random walkers."""
+"""The trackers against second, slow implementations, box by box, on random walks."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def walking(rng: np.random.Generator, count: int = 45) -> list[Frame]:
     """Boxes of people that cross, with missed detections, two classes, and irregular frame times; some shrink fast."""
     place, speed, size = rng.uniform(60, 160, (4, 2)), rng.normal(0, 5, (4, 2)), rng.uniform([15, 30], [25, 50], (4, 2))
     kind = rng.choice([1, 1, 1, 2], 4)
-    grows = rng.choice([1.0, 1.0, 0.7, 1.04], (4, 1))  # one who shrinks so fast is expected to vanish
+    grows = rng.choice([1.0, 1.0, 0.7, 1.04], (4, 1))  # at 0.7 the predicted area would become negative
     back, now, frames = np.zeros(4), 0.0, []
     period = 0.1
     for number in range(count):

@@ -1,9 +1,9 @@
-"""Predictors: recent positions in, distributions of future positions out, one batch at a time.
+"""Predictors: recent positions in, distributions of future positions out, in batches of tracks.
 
-A predictor is found by name (see ``mcaptrack.registry``): what is found is called with ``steps`` and ``step_s``, and
-with what other parameters it declares, and gives a ``forecast.Predictor``. One that takes a ``file`` is also found as
-``NAME:FILE``. A predictor whose steps are not those that were asked for, as a network's may be, is resampled
-(``own_clock.OnClock``). To add a built-in one: a function in ``built_in``, and a line in ``registry.BUILT_IN``.
+Predictors are found by name (see ``mcaptrack.registry``). An entry is a class or a function; it is called with
+``steps``, ``step_s`` and its own parameters, and returns a ``forecast.Predictor``. If it has a parameter ``file``, the
+name ``NAME:FILE`` gives it. A predictor with other steps than requested, such as a network, is resampled
+(``own_clock.OnClock``). To add a built-in predictor: a function in ``built_in``, and a line in ``registry.BUILT_IN``.
 """
 
 from __future__ import annotations
@@ -32,16 +32,16 @@ NAMES: Final = ("cv", "holt-cv", "kalman", "lstm", "red")
 def make(name: PredictorName, steps: int, step_s: float, **parameters: Any) -> Predictor:
     """Make a predictor for ``steps`` steps of ``step_s`` seconds.
 
-    A network that predicts less far than that is continued in a straight line, with a warning.
+    If a network predicts less far, its predictions are extrapolated at constant velocity, with a warning.
 
     Parameters
     ----------
     name : str
-        A built-in name, one of an entry point, or ``module:Class``; ``NAME:FILE`` where it takes a file.
+        Built-in name, name of an entry point, or ``module:Class``; ``NAME:FILE`` for one with a parameter ``file``.
     steps : int
-        How many future steps.
+        Number of future steps.
     step_s : float
-        How long a step is, in seconds; the past has the same steps.
+        Length of a step in seconds, in the past and in the future.
     **parameters
         Other parameters of the predictor.
 
@@ -52,8 +52,17 @@ def make(name: PredictorName, steps: int, step_s: float, **parameters: Any) -> P
     Raises
     ------
     McaptrackError
-        If there is none of that name, or if its file can't be read.
+        If there is no such predictor, or if its file can't be read.
 
+    Examples
+    --------
+    A track at 1 m/s, known for three steps of 0.4 s:
+
+    >>> import numpy as np
+    >>> predictor = make("cv", steps=2, step_s=0.4)
+    >>> forecast = predictor.predict(np.array([[[0.0, 0.0], [0.4, 0.0], [0.8, 0.0]]]), np.ones((1, 3), bool))
+    >>> forecast.mean[0, :, 0].round(3).tolist()
+    [1.2, 1.6]
     """
     entry, file = entry_of(name)
     inner = _made(entry, file, steps, step_s, parameters)
@@ -62,14 +71,14 @@ def make(name: PredictorName, steps: int, step_s: float, **parameters: Any) -> P
     ahead_s, own_s = steps * step_s, inner.steps * inner.step_s
     if ahead_s > own_s + inner.step_s / 2:
         warn(
-            f"{name} predicts {own_s:.3g} s ahead; what is asked for beyond, up to {ahead_s:.3g} s, is a straight line",
+            f"{name} predicts {own_s:.3g} s ahead; beyond it, up to {ahead_s:.3g} s, predictions are a straight line",
             "extrapolated",
         )
     return OnClock(inner, steps, step_s)
 
 
 def entry_of(name: PredictorName) -> tuple[Entry, Path | None]:
-    """What the registry has of a predictor's name, and the file that the name ends with, if it does.
+    """The entry of a predictor's name, and the file of ``NAME:FILE``, if there is one.
 
     Raises McaptrackError if there is no such predictor or file.
     """
@@ -90,19 +99,19 @@ def entry_of(name: PredictorName) -> tuple[Entry, Path | None]:
 
 
 def weights_sha256(name: PredictorName) -> str:
-    """The digest of the weights of that predictor; "" where nothing was learned. Raises McaptrackError as ``make``."""
+    """SHA-256 of the weights of a predictor; "" if it has none. Raises McaptrackError as ``make`` does."""
     entry, file = entry_of(name)
     if entry.is_built_in and _file_of(entry) is _NO_FILE:
         return ""
     return _made(entry, file, 1, 1.0, {}).weights_sha256 or ""
 
 
-#: What ``_file_of`` gives for a predictor that takes no file.
+#: Result of ``_file_of`` for a predictor without a parameter ``file``.
 _NO_FILE: Final = object()
 
 
 def _file_of(entry: Entry) -> Any:
-    """The default of a predictor's parameter ``file``: empty if it is required, ``_NO_FILE`` if there is none."""
+    """The default of a predictor's parameter ``file``: ``Parameter.empty`` if it has none, ``_NO_FILE`` without it."""
     try:
         parameters = inspect.signature(entry.cls).parameters
     except (TypeError, ValueError):

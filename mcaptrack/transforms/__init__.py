@@ -1,6 +1,7 @@
-"""Transforms: frames of one channel in, frames of others out. See ``protocol`` for what a transform is and its laws.
+"""Transforms: frames of one channel in, frames of other channels out.
 
-``stages`` says which steps there are and which transforms can do each; ``mcaptrack.registry`` finds transforms by name.
+``protocol`` has the interface of transforms and their laws, ``stages`` the stages of the pipeline and their transforms.
+``mcaptrack.registry`` finds transforms by name.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ __all__ = [
     "Transform",
 ]
 
-#: The default transform of each step.
+#: The default transform of each stage.
 TRANSFORMS: Final[Mapping[str, type[Transform]]] = MappingProxyType(
     {name: stage.default for name, stage in STAGES.items()}
 )

@@ -1,4 +1,4 @@
-"""How long tracks last."""
+"""Durations of tracks."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from mcaptrack.schema.framing import join_frames
 
 
 def longest_track_s(frames: Sequence[Frame]) -> float:
-    """The duration of the longest track of some frames, in seconds. They have at least one row."""
+    """The duration of the longest track in seconds; the frames have at least one row."""
     joined = join_frames(TRACKS, frames)
     order = np.lexsort((joined.row_ns, joined.rows["track_id"]))
     t_ns, starts = joined.row_ns[order], run_starts(joined.rows["track_id"][order])

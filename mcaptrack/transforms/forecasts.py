@@ -1,4 +1,4 @@
-"""Forecasts of people from their own past, frame by frame; what transforms that predict have in common."""
+"""Predictions of tracks, frame by frame; shared by the transforms that predict."""
 
 from __future__ import annotations
 
@@ -12,9 +12,18 @@ from mcaptrack.schema.predictions import forecast_to_rows
 
 
 class Forecaster:
-    """Remembers where people were, and predicts where those go who were seen often enough.
+    """Keeps the past positions of tracks, and predicts the tracks that have enough of them.
 
-    ``rate_hz`` is the clock of the frames; ``min_history`` past positions, with the present one, are needed.
+    Parameters
+    ----------
+    predictor : str
+        Name of the predictor (see ``mcaptrack.predictors``).
+    horizon_s : float
+        How far ahead to predict, in seconds.
+    min_history : int
+        Number of observed positions that a prediction needs, the current one included.
+    rate_hz : float
+        Rate of the frames.
     """
 
     def __init__(self, predictor: str, horizon_s: float, min_history: int, rate_hz: float) -> None:
@@ -31,7 +40,7 @@ class Forecaster:
         self._last_ns = frame.t_ns
         ids = frame.rows["track_id"]
         past, known = self._histories.push(ids, np.stack([frame.rows["x_m"], frame.rows["y_m"]], axis=-1), passed)
-        # A row inside a hole was filled in with what came after it; nothing may be predicted from there.
+        # An interpolated position depends on later ones: a prediction from it would not be causal.
         ready = known[:, -self._min_history :].all(axis=1) & frame.rows["observed"]
         forecast = self._predictor.predict(past[ready], known[ready])
         return forecast_to_rows(ids[ready], forecast, self._predictor.step_s)

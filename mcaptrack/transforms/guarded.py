@@ -1,4 +1,4 @@
-"""A transform of another package: whatever it does wrong becomes one line that names it."""
+"""Run a transform of another package: its errors become one line that names it, and its output is checked."""
 
 from __future__ import annotations
 
@@ -13,17 +13,31 @@ from mcaptrack.transforms.protocol import Transform
 
 
 def guarded(entry: Entry, transform: Transform, frames: Iterable[Frame]) -> Iterator[tuple[Frame, ...]]:
-    """The frames that a transform makes, which the registry has as ``entry``.
+    """Run a transform and check each of its outputs.
 
-    Raises McaptrackError, with the name of the transform and the frame it was at, if it raises anything, or if it gives
-    anything but a tuple of frames with the rows of its schemas, in order of time. What the frames themselves raise
-    passes as it is.
+    Parameters
+    ----------
+    entry : Entry
+        The transform in the registry, to name it in errors.
+    transform : Transform
+    frames : iterable of Frame
+        Its input.
+
+    Yields
+    ------
+    tuple of Frame
+
+    Raises
+    ------
+    McaptrackError
+        If the transform raises an exception, or yields anything but a tuple of frames with the rows of its schemas, in
+        order of time. The message names the transform and the frame. Exceptions of ``frames`` are passed on unchanged.
     """
     source = _Source(frames)
     try:
         made = iter(transform(source))
     except Exception as error:
-        raise source.blame(entry, error) from error
+        raise source.error_of(entry, error) from error
     last_ns: int | None = None
     while True:
         try:
@@ -31,13 +45,13 @@ def guarded(entry: Entry, transform: Transform, frames: Iterable[Frame]) -> Iter
         except StopIteration:
             return
         except Exception as error:
-            raise source.blame(entry, error) from error
+            raise source.error_of(entry, error) from error
         yield _checked(entry, transform, result, last_ns, source.where)
         last_ns = result[0].t_ns if result else last_ns
 
 
 class _Source:
-    """Frames, the last one that was taken, and what taking one raised."""
+    """The input of a transform: notes which frame was taken last, and which exception the input raised."""
 
     def __init__(self, frames: Iterable[Frame]) -> None:
         self._frames = iter(frames)
@@ -58,8 +72,8 @@ class _Source:
         self.where = f"at frame {frame.index} ({frame.t_ns} ns)"
         return frame
 
-    def blame(self, entry: Entry, error: Exception) -> Exception:
-        """The error as it is if the frames raised it, otherwise one that names the transform."""
+    def error_of(self, entry: Entry, error: Exception) -> Exception:
+        """An exception of the input as it is; one of the transform as an error that names the transform."""
         if error is self._error:
             return error
         if isinstance(error, McaptrackError):
@@ -68,9 +82,9 @@ class _Source:
 
 
 def _checked(entry: Entry, transform: Transform, result: object, last_ns: int | None, where: str) -> tuple[Frame, ...]:
-    """What a transform gave, if it is what it has to be."""
+    """The frames that a transform yielded. Raises McaptrackError if they are not as its schemas demand."""
     schemas = list(transform.writes.values())
-    # A Frame is a tuple, too: one that isn't in a tuple is a common mistake.
+    # A Frame is a tuple itself; to yield one without a tuple around it is a common mistake.
     frames = result if isinstance(result, tuple) and not isinstance(result, Frame) else None
     if frames is None or len(frames) != len(schemas) or not all(isinstance(one, Frame) for one in frames):
         gave = f"a {type(result).__name__}" if frames is None else f"a tuple of {len(frames)}"
@@ -78,7 +92,7 @@ def _checked(entry: Entry, transform: Transform, result: object, last_ns: int | 
         raise McaptrackError(f"{entry} gave {gave} {where}; it has to yield {wanted}")
     for frame, schema in zip(frames, schemas, strict=True):
         if not isinstance(frame.t_ns, int | np.integer) or not isinstance(frame.index, int | np.integer):
-            raise McaptrackError(f"{entry} gave a frame {where} whose t_ns and index are no whole numbers")
+            raise McaptrackError(f"{entry} gave a frame {where} with a t_ns or index that is no integer")
         if last_ns is not None and frame.t_ns < last_ns:
             raise McaptrackError(f"{entry} gave a frame of {frame.t_ns} ns {where}, after one of {last_ns} ns")
         if not isinstance(frame.rows, np.ndarray):

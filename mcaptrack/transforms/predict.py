@@ -1,7 +1,4 @@
-"""Tracks on a regular clock -> where everybody will be.
-
-Letters: N people at one time, T future steps.
-"""
+"""Predict future positions of tracks at a fixed rate, with a predictor of the registry."""
 
 from __future__ import annotations
 
@@ -21,6 +18,18 @@ class Predict:
     """Predict where tracked people go.
 
     Reads samples, writes predictions: one row per track and future step, for tracks with enough past positions.
+
+    Examples
+    --------
+    A person walks 1 m/s; the prediction at 2.5 samples per second continues at that speed:
+
+    >>> from mcaptrack.schema import TRACKS, Frame
+    >>> def row(x_m):
+    ...     return TRACKS.rows(track_id=[1], x_m=[x_m], y_m=[0.0], observed=[True], source_id=[-1])
+    >>> frames = [Frame(t * 400_000_000, t, row(0.4 * t)) for t in range(5)]
+    >>> *_, (last,) = Predict(predictor="cv", horizon_s=1.2)(frames)
+    >>> last.rows["x_m"].round(3).tolist()
+    [2.0, 2.4, 2.8]
     """
 
     predictor: PredictorName = option(
@@ -49,6 +58,6 @@ class Predict:
             yield (frame._replace(rows=forecaster.predict(frame)),)
 
     def why_empty(self, given: Sequence[Frame], made: Sequence[Frame]) -> str:
-        """Why no rows came of frames, for a warning."""
+        """Why there are no predictions, for a warning."""
         needed_s = (self.min_history - 1) / self.rate_hz
-        return f"no track is without a gap for the {needed_s:.3g} s that a forecast needs (min_history)"
+        return f"no track has the {needed_s:.3g} s without a gap that a prediction needs (min_history)"

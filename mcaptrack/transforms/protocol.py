@@ -1,17 +1,18 @@
-"""What a transform is.
+"""The interface of transforms, and their parameters.
 
 A transform is a frozen, keyword-only dataclass. Its fields are its parameters: each has a default, its unit at the end
-of its name and a help text; they are at once the options of its command and what its channels say of their making.
-Calling it with a stream of frames gives a stream of tuples of frames, one for each of its outputs.
+of its name and a help text. They become the options of its command, and are stored in the provenance of its channels.
+Calling it with an iterable of frames gives an iterator of tuples of frames, one frame for each of its outputs.
 
-Laws that hold for every transform, tested for all that are built in:
+All transforms obey these laws; ``mcaptrack.testing.check_transform`` tests them:
 
-* conforms: every output passes the gate of its schema;
-* keeps time: the times of an output never decrease;
-* causal: the run of a prefix is a prefix of the run, but for what lies within ``latency_s`` of the prefix's end;
-* pure: the same input gives the same output, and runs at the same time don't touch each other;
-* order-blind: shuffling the rows of a frame changes names (ids) at most;
-* unmoved by silence: frames without rows never stop a run.
+* Schema: the rows of every output have the columns of its schema, with valid values.
+* Time: the times of an output never decrease.
+* Causality: on a prefix of the input, outputs equal those on the whole input, except within ``latency_s`` of the end of
+  the prefix.
+* Purity: the same input gives the same output, also for two runs at the same time.
+* Order: another order of the rows of a frame changes nothing but track ids.
+* Empty frames: frames without rows are accepted anywhere.
 """
 
 from __future__ import annotations
@@ -36,7 +37,17 @@ class WithOptions(Protocol):
 
 
 class Transform(WithOptions, Protocol):
-    """See the module. ``writes`` maps the suffix of each output's topic to its schema; "" is the main output."""
+    """A transform of frames: see the module.
+
+    Attributes
+    ----------
+    reads : Schema
+        Schema of the input.
+    writes : Mapping[str, Schema]
+        Schema of each output by the suffix of its topic; "" is the main output.
+    latency_s : Mapping[str, float]
+        For each output, how far it depends on later input, in seconds: 0 if it is causal, infinity for the whole log.
+    """
 
     reads: ClassVar[Schema]
     writes: ClassVar[Mapping[str, Schema]]
@@ -45,11 +56,11 @@ class Transform(WithOptions, Protocol):
 
     @property
     def latency_s(self) -> Mapping[str, float]:
-        """How far each output looks ahead, in seconds: 0 for the past alone, infinity for the whole log."""
+        """How far each output depends on later input, in seconds."""
         ...
 
 
-#: The upper end of parameters that name no other: days as seconds, hundreds of kilometres as metres.
+#: The default upper end of parameters with a lower one: days in seconds, hundreds of kilometres in metres.
 LARGEST: Final = 1e6
 
 
@@ -64,15 +75,38 @@ def option(
     theme: str = "",
     was: str = "",
 ) -> Any:
-    """A parameter of a transform: its default, what it means, and its range.
+    """Declare a parameter of a transform, as a field of its dataclass.
 
-    What has a lower end has an upper one, too, ``LARGEST`` unless ``most`` says another: times in nanoseconds and
-    counts of steps stay in 64 bits then.
+    Parameters
+    ----------
+    default
+        Its default value.
+    help : str
+        What it means, in lower case and without a full stop.
+    least, most : float
+        The range of a number. With ``least`` alone, ``most`` is ``LARGEST``, so that times in nanoseconds and counts of
+        steps fit 64 bits.
+    search : tuple of float or None
+        The range that ``mcaptrack tune`` searches; None if the parameter is not tuned.
+    kind : str or None
+        The value is a name of this kind in ``mcaptrack.registry``.
+    theme : str
+        Heading in the help of the command, shared by related parameters.
+    was : str
+        Former name, which is accepted for one release.
 
-    ``search`` is the part of the range that is worth a search (``mcaptrack tune``); None for what isn't tuned.
-    ``kind`` says that a text is a name of that kind in ``mcaptrack.registry``. ``theme`` is a heading that parameters
-    share in the help of a command that has many. ``was`` is the name that it had before, which is accepted for one
-    release.
+    Returns
+    -------
+    dataclasses.Field
+
+    Examples
+    --------
+    >>> from dataclasses import dataclass
+    >>> @dataclass(frozen=True, kw_only=True)
+    ... class Example:
+    ...     max_age_s: float = option(1.4, "a track ends after this many seconds without a detection", least=0.0)
+    >>> Example().max_age_s
+    1.4
     """
     if most is None:
         most = math.inf if least == -math.inf else LARGEST
@@ -82,21 +116,31 @@ def option(
 
 
 def context(factory: Callable[[], Any]) -> Any:
-    """A parameter that the log gives and no command line: the ground plane, the start of the clock."""
+    """Declare a parameter that the log gives, not the user: the ground planes, or the time of the first frame.
+
+    Parameters
+    ----------
+    factory : callable
+        Returns its default value.
+
+    Returns
+    -------
+    dataclasses.Field
+    """
     return field(default_factory=factory, metadata={"context": True})
 
 
 def choices(annotation: Any) -> tuple[str, ...]:
-    """The names that a parameter with this annotation can take; () if it isn't a choice."""
+    """The names that a parameter with this annotation accepts; () unless it is a Literal."""
     return tuple(str(name) for name in get_args(annotation)) if get_origin(annotation) is Literal else ()
 
 
-#: What a parameter can be, and the values that it takes.
+#: Types of parameters, and the types of values that each accepts.
 _KINDS: Final[Mapping[type, tuple[type, ...]]] = {float: (int, float), int: (int,), bool: (bool,), str: (str,)}
 
 
 def bare_type(annotation: Any) -> Any:
-    """The type of a parameter without the "or None"."""
+    """The type of a parameter without ``| None``."""
     parts = [part for part in get_args(annotation) if part is not type(None)]
     return parts[0] if get_origin(annotation) in (UnionType, typing.Union) and len(parts) == 1 else annotation
 
@@ -111,7 +155,7 @@ def member_type(annotation: Any) -> tuple[Any, bool]:
 
 @cache
 def option_problem(cls: type[Any]) -> str:
-    """Why the parameters of a class can't be options, if they can't; "" if they can."""
+    """Why the fields of a class can't be options; "" if they can."""
     try:
         hints = get_type_hints(cls)
     except Exception as error:  # annotations are code
@@ -134,9 +178,12 @@ def _type_name(annotation: Any) -> str:
 
 
 def check_options(transform: WithOptions) -> None:
-    """Refuse parameters that are out of range or of the wrong kind, by name and number. For ``__post_init__``.
+    """Check the values of all parameters. To be called in ``__post_init__``.
 
-    Raises McaptrackError; also for a class whose parameters are of types that no command line and no log can hold.
+    Raises
+    ------
+    McaptrackError
+        If a value is out of range or of the wrong type, or if a field has a type that options can't have.
     """
     if problem := option_problem(type(transform)):
         raise McaptrackError(problem)
@@ -167,7 +214,7 @@ def _check_value(name: str, value: Any, kind: Any, about: Mapping[str, Any]) -> 
 
 
 def limits(least: float, most: float) -> str:
-    """A range in words, as in "from 0 to 1"; "" if it has no ends."""
+    """The text of a range, as in "from 0 to 1"; "" if it has no ends."""
     if most == math.inf:
         return "" if least == -math.inf else f"at least {_number(least)}"
     return f"at most {_number(most)}" if least == -math.inf else f"from {_number(least)} to {_number(most)}"

@@ -1,7 +1,6 @@
-"""Tracks at the video's rate -> tracks on the regular clock of prediction, in metres.
+"""Resample tracks: from the times of the video to a fixed rate, and from pixels to metres on the ground.
 
-The clock starts at the log's first frame and ticks at a fixed rate. After this stage nothing knows of pixels per metre
-or frames per second.
+Sample times start at the first frame of the log. Later stages depend neither on the frame rate nor on pixels.
 """
 
 from __future__ import annotations
@@ -30,10 +29,26 @@ class Sample:
     """Resample tracks to a fixed rate, in metres on the ground.
 
     Reads tracks, writes tracks: one row per person and sample time; ``observed`` is false where a gap was interpolated.
+
+    Examples
+    --------
+    A person walks 1 m/s at 10 frames a second; a gap of 1 s is interpolated:
+
+    >>> from mcaptrack.schema import TRACKS, Frame
+    >>> def row(t):
+    ...     return TRACKS.rows(track_id=[1], x_m=[t / 10], y_m=[0.0], observed=[True], source_id=[-1])
+    >>> frames = [Frame(t * 100_000_000, t, row(t) if not 5 < t < 15 else TRACKS.empty()) for t in range(21)]
+    >>> samples = [frame.rows for (frame,) in Sample(rate_hz=2.5)(frames)]
+    >>> [round(float(rows["x_m"][0]), 3) for rows in samples]
+    [0.0, 0.4, 0.8, 1.2, 1.6, 2.0]
+    >>> [bool(rows["observed"][0]) for rows in samples]
+    [True, True, False, False, True, True]
     """
 
     rate_hz: float = option(2.5, "samples per second", least=0.1, most=1000.0)
-    max_hole_s: float = option(2.0, "gaps in a track of up to this many seconds are interpolated", least=0.0)
+    max_gap_s: float = option(
+        2.0, "gaps in a track of up to this many seconds are interpolated", least=0.0, was="max_hole_s"
+    )
     start_ns: int | None = context(lambda: None)
     ground_planes: Planes = context(tuple)
 
@@ -45,39 +60,39 @@ class Sample:
 
     @property
     def latency_s(self) -> MappingProxyType[str, float]:
-        """A tick is certain once nothing can close a hole around it any more."""
-        return MappingProxyType({"": max(self.max_hole_s, 2 / self.rate_hz)})
+        """A sample is final once no later detection can close a gap around it."""
+        return MappingProxyType({"": max(self.max_gap_s, 2 / self.rate_hz)})
 
     def __call__(self, frames: Iterable[Frame]) -> Iterator[tuple[Frame, ...]]:
-        members = [frame._replace(rows=_in_metres(frame, self.ground_planes)) for frame in frames]
-        if not members:
+        in_metres = [frame._replace(rows=_in_metres(frame, self.ground_planes)) for frame in frames]
+        if not in_metres:
             return
-        frame_ns = frame_times(members)
-        indices = np.array([frame.index for frame in members])
+        frame_ns = frame_times(in_metres)
+        indices = np.array([frame.index for frame in in_metres])
         tick_ns = self._ticks(frame_ns, int(frame_ns[0]) if self.start_ns is None else self.start_ns)
-        rows, at = resample(members, tick_ns, seconds_to_ns(self.max_hole_s))
+        rows, at = resample(in_metres, tick_ns, seconds_to_ns(self.max_gap_s))
         rows["source_id"] = rows["track_id"]
-        shown = indices[np.searchsorted(frame_ns, tick_ns, "right") - 1]  # the picture on screen at each tick
+        picture = indices[np.searchsorted(frame_ns, tick_ns, "right") - 1]  # the last one at each sample time
         first, last = (np.searchsorted(at, np.arange(len(tick_ns)), side) for side in ("left", "right"))
-        for index, t_ns, low, high in zip(*(a.tolist() for a in (shown, tick_ns, first, last)), strict=True):
+        for index, t_ns, low, high in zip(*(a.tolist() for a in (picture, tick_ns, first, last)), strict=True):
             yield (Frame(t_ns, index, rows[low:high]),)
 
     def why_empty(self, given: Sequence[Frame], made: Sequence[Frame]) -> str:
-        """Why no rows came of frames, for a warning."""
-        return "no track is there at two ticks, or none stands on the ground plane"
+        """Why there are no samples, for a warning."""
+        return "no track lasts for two sample times, or none stands on the ground plane"
 
     def _ticks(self, frame_ns: Ints, start: int) -> Ints:
-        """The ticks between consecutive frames that are at most ``max_hole_s`` apart.
+        """Sample times between consecutive frames that are at most ``max_gap_s`` apart.
 
-        Tick k is at start + k / rate, to the nanosecond; a log that jumps over a year has no ticks in between.
+        Sample k is at start + k / rate, to the nanosecond. There are none in longer gaps, which may be years.
         """
         period = NS_PER_S / self.rate_hz
-        limit = max(seconds_to_ns(self.max_hole_s), round(2 * period))
+        limit = max(seconds_to_ns(self.max_gap_s), round(2 * period))
         ends = np.append(frame_ns[1:], frame_ns[-1])
         ends = np.where(ends - frame_ns <= limit, ends, frame_ns)
         low = np.maximum(np.ceil((frame_ns - start) / period - 0.5).astype(np.int64), 0)
         high = np.maximum(np.floor((ends - start) / period + 0.5).astype(np.int64), -1)
-        count = np.maximum(high - low + 1, 0)  # a tick too many at either end goes below
+        count = np.maximum(high - low + 1, 0)  # one too many at either end is removed below
         ticks = ragged_range(low, count)
         tick_ns = start + np.rint(ticks * period).astype(np.int64)
         inside = (tick_ns >= np.repeat(frame_ns, count)) & (tick_ns <= np.repeat(ends, count))
@@ -85,9 +100,9 @@ class Sample:
 
 
 def _in_metres(frame: Frame, planes: Planes) -> Rows:
-    """The rows with x_m, y_m filled in from the boxes where they are missing; rows off the ground plane left out.
+    """The rows with missing x_m, y_m computed from their boxes; rows above the horizon are left out.
 
-    Raises McaptrackError if there are boxes without metres and no plane to bring them there.
+    Raises McaptrackError if rows have no positions in metres and there is no ground plane.
     """
     rows = frame.rows
     missing = np.isnan(rows["x_m"])
@@ -95,7 +110,7 @@ def _in_metres(frame: Frame, planes: Planes) -> Rows:
         return rows
     plane = plane_at(planes, frame.t_ns)
     if plane is None:
-        raise McaptrackError("tracks are in pixels and there is no ground plane to bring them to metres")
+        raise McaptrackError("tracks are in pixels, and there is no ground plane to convert them to metres")
     rows = rows.copy()
     xy_m = plane.boxes_to_metres(columns_to_boxes(rows[missing]))
     rows["x_m"][missing], rows["y_m"][missing] = xy_m.T

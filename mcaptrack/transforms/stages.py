@@ -1,7 +1,7 @@
-"""The steps of the pipeline: which transforms can do each, and where it reads and writes below the name of a camera.
+"""The stages of the pipeline: the transforms of each, and the topics that it reads and writes.
 
-To add a step: its transform, and a ``Stage`` in ``STAGES``. To add another transform for a step that has a kind: a line
-in ``mcaptrack.registry.BUILT_IN``. Its options, its help, its provenance and the tests of the laws follow.
+To add a stage: its transform, and a ``Stage`` in ``STAGES``. To add a transform to a stage with a kind: a line in
+``mcaptrack.registry.BUILT_IN``. Options, help, provenance and the tests of the laws follow from these.
 """
 
 from __future__ import annotations
@@ -22,44 +22,44 @@ from mcaptrack.transforms.retrack import PROFILES, Retrack, upgrade_parameters
 from mcaptrack.transforms.sample import Sample
 from mcaptrack.transforms.sort import Sort
 
-#: Below the tracks of a stage that also writes them at the video's rate.
+#: Suffix of the topic of tracks at the video's rate (``Stage.at_video_rate``).
 FULL: Final = "/full"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Stage:
-    """A step of the pipeline.
+    """A stage of the pipeline.
 
     Attributes
     ----------
     name : str
-        Of the step and its command.
+        Name of the stage and of its command.
     default : type[Transform]
-        The transform that does it unless another is chosen.
+        Its default transform.
     reads, writes : str
         Topics below the name of a camera.
     rows : str
-        What its rows are, in words.
+        The noun for its rows, in the plural.
     kind : Kind or None
-        The kind in the registry whose entries can do it, which is also the name of the option that chooses; None if
-        there is one transform only.
+        The kind of its transforms in the registry, which is also the name of the option that chooses one; None if there
+        is one transform only.
     was : str
-        The name that this option had before.
+        The former name of this option.
     parameter : str
-        The parameter of its transform that chooses a part of it by name, as ``run`` may, too.
+        The parameter of its transform that names an entry of the registry, such as its predictor; ``run`` has an option
+        of the same name.
     needs_scale : bool
-        Whether it brings boxes to metres, so that a scale is guessed where no ground plane is given.
+        Whether it converts boxes to metres, so that a scale is estimated if no ground plane is given.
     at_video_rate : bool
         Whether its tracks are also written at the video's rate, below ``FULL``.
     profiles : Mapping[str, Transform]
-        Sets of parameters by name.
+        Values of all parameters by the name of the profile.
     modes : Mapping[str, tuple[str, ...]]
-        Which of its outputs to write, by name.
+        Outputs to write, by the name of the mode.
     implied : Mapping[str, str]
-        Options that choose a transform, by name, where none is named.
+        Options that belong to one transform and choose it, by its name, if none is named.
     upgrade : Callable
-        Converts parameters of earlier versions to those of today.
-
+        Converts parameters of earlier versions to current ones.
     """
 
     name: str
@@ -78,7 +78,7 @@ class Stage:
     upgrade: Callable[[Mapping[str, Any]], dict[str, Any]] = dict
 
     def outputs(self, target: str) -> tuple[str, ...]:
-        """The topics that the stage takes if it writes to ``target``."""
+        """The topics that the stage writes if its main output is ``target``."""
         topics = tuple(f"{target}/{suffix}".rstrip("/") for suffix in self.default.writes)
         return (*topics, target + FULL) if self.at_video_rate else topics
 
@@ -89,9 +89,9 @@ class Stage:
         return {name: find(self.kind, name).cls for name in BUILT_IN[self.kind]}
 
     def find(self, name: str) -> Entry:
-        """Find a transform by name (see ``mcaptrack.registry``).
+        """Find a transform of this stage by name (see ``mcaptrack.registry``).
 
-        Raises McaptrackError if there is none, or if it can't do this step.
+        Raises McaptrackError if there is none, or if it can't be a transform of this stage.
         """
         if self.kind is None:
             raise McaptrackError(f"{self.name} has one transform only, which can't be replaced by {name}")
@@ -101,28 +101,28 @@ class Stage:
         return entry
 
     def entry(self, cls: type[Transform]) -> Entry:
-        """What the registry has of a class of transforms for this step."""
+        """The entry of a class of transforms of this stage."""
         if self.kind is None and cls is self.default:
             return Entry(self.name, self.name, cls, cls.__module__, "", "")
         return entry_of(self.kind or self.name, cls)
 
     @property
     def option(self) -> str:
-        """The option that chooses what does this step; "" if there is no choice."""
+        """The option that chooses a transform or a part of it; "" if there is no choice."""
         return self.kind or self.parameter
 
     def choice(self, transform: Transform) -> str:
-        """The name that stands for what a transform does this step by; "" if there is no choice."""
+        """The value of ``option`` that a transform has; "" if there is no choice."""
         if self.parameter:
             return str(getattr(transform, self.parameter))
         return self.entry(type(transform)).name if self.kind else ""
 
     def is_built_in(self, cls: type[Transform]) -> bool:
-        """Whether a class is one of those that come with mcaptrack for this step."""
+        """Whether a class is a built-in transform of this stage."""
         return cls in self.built_in().values()
 
     def make(self, chosen: str = "", /, **parameters: Any) -> Transform:
-        """Make the transform of this step.
+        """Make a transform of this stage.
 
         Parameters
         ----------
@@ -144,7 +144,6 @@ class Stage:
         --------
         >>> STAGES["track"].make("bytetrack", max_age_s=2.0).max_age_s
         2.0
-
         """
         entry = self.find(chosen) if chosen else self.entry(self.default)
         known = [f.name for f in fields(entry.cls) if f.init]
@@ -164,7 +163,7 @@ class Stage:
         return made
 
     def _check(self, entry: Entry) -> None:
-        """Raise McaptrackError if a class of another package can't do this step."""
+        """Raise McaptrackError if a class of another package can't be a transform of this stage."""
         cls, wanted = entry.cls, self.default
         if not inspect.isclass(cls) or not is_dataclass(cls):
             raise McaptrackError(f"{entry} is no dataclass; the fields of a transform are its parameters")
@@ -228,5 +227,5 @@ _STAGES: Final = (
         upgrade=upgrade_parameters,
     ),
 )
-#: All steps by name, in the order in which they run.
+#: All stages by name, in the order in which they run.
 STAGES: Final[Mapping[str, Stage]] = MappingProxyType({stage.name: stage for stage in _STAGES})

@@ -123,7 +123,7 @@ CASES: dict[str, dict[str, Case]] = {
     "tune": common(
         "tune a.mcap --trials 2 --search min-iou",
         truth=("tune truth.txt --trials 1", "--truth truth.txt"),
-        stage="--stage sample --search max-hole-s",
+        stage="--stage sample --search max-gap-s",
         tracker="--tracker bytetrack",
         metric="--metric mota",
         trials="--trials 3",

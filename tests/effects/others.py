@@ -67,7 +67,7 @@ case(
 )
 case(
     "sample",
-    "max_hole_s",
+    "max_gap_s",
     "a person is seen until 0.5 s and from 2 s on: ticks at 0.8, 1.2 and 1.6 s are in the hole of 1.5 s",
     Sample(),
     tenths([n for n in range(31) if n <= 5 or n >= 20]),

@@ -1,7 +1,7 @@
-"""SORT, ByteTrack and OC-SORT: slow references with one object per track, written from the papers.
+"""Second implementations of SORT, ByteTrack and OC-SORT: slow, one object for each track, written from their papers.
 
 Bewley et al., ICIP 2016 (section 3.2: state u, v, s, r and the rates of the first three; P0, Q and R as in its program),
-Zhang et al., ECCV 2022, and Cao et al., CVPR 2023. ``FrameClock`` numbers the frames here, too.
+Zhang et al., ECCV 2022, and Cao et al., CVPR 2023. The numbers of frames come from ``FrameClock``, as in the package.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class Filter:
         return cls(np.concatenate([box.measured(), np.zeros(3)]), P0.copy())
 
     def predict(self) -> None:
-        if self.mean[2] + self.mean[6] < 1e-9:  # an area that would become negative stops shrinking
+        if self.mean[2] + self.mean[6] < 1e-9:  # an area that would vanish stops shrinking
             self.mean[6] = 0
         self.mean, self.cov = MOVE @ self.mean, MOVE @ self.cov @ MOVE.T + Q
 
@@ -92,42 +92,42 @@ class Filter:
 
 @dataclass
 class Track:
-    name: int
+    track_id: int
     filter: Filter
-    box: Box  # the last measurement
-    frame: int  # the frame of the last measurement
+    box: Box  # the last detection
+    frame: int  # its frame
     missed: float = 0.0
     streak: float = 0.0
-    then: Filter | None = None  # the filter at the last measurement
+    last_filter: Filter | None = None  # the filter after the last detection
     centres: dict[int, tuple[float, float]] = field(default_factory=dict)
 
 
-Likeness = dict[tuple[int, int], float]
+Similarities = dict[tuple[int, int], float]
 
 
-def paired(likeness: Likeness, least: float) -> list[tuple[int, int]]:
-    """The pairs with the largest total similarity, without those below the least; pairs that don't compete are taken as they are."""
-    close = [pair for pair, value in likeness.items() if value > least]
+def assign(similarity: Similarities, least: float) -> list[tuple[int, int]]:
+    """The pairs above the threshold if none compete; otherwise those of the largest total, then the threshold."""
+    close = [pair for pair, value in similarity.items() if value > least]
     if close and all(len({pair[side] for pair in close}) == len(close) for side in (0, 1)):
         return close
-    if not likeness:
+    if not similarity:
         return []
-    table = np.zeros([1 + max(pair[side] for pair in likeness) for side in (0, 1)])
-    for pair, value in likeness.items():
+    table = np.zeros([1 + max(pair[side] for pair in similarity) for side in (0, 1)])
+    for pair, value in similarity.items():
         table[pair] = value
     best = zip(*(side.tolist() for side in linear_sum_assignment(-table)), strict=True)
-    return [pair for pair in best if likeness.get(pair, 0.0) > 0 and likeness[pair] >= least]
+    return [pair for pair in best if similarity.get(pair, 0.0) > 0 and similarity[pair] >= least]
 
 
 class ReferenceSort:
     def __init__(self, options) -> None:
         self.options, self.clock = options, FrameClock()
         self.tracks: list[Track] = []
-        self.born = self.count = self.frame = 0
+        self.last_id = self.count = self.frame = 0
         self.first_ns = self.last_ns = 0
 
     def run(self, frames: list[tuple[int, list[Box]]]) -> list[list[tuple[int, Box, float]]]:
-        """For each frame (a time and boxes), the tracks that are written: id, box, score."""
+        """For each frame, a time and its boxes, the tracks that are written: id, box, score."""
         return [self.step(t_ns, boxes) for t_ns, boxes in frames]
 
     def step(self, t_ns: int, boxes: list[Box]) -> list[tuple[int, Box, float]]:
@@ -142,9 +142,9 @@ class ReferenceSort:
             self.aged, extra, oldest = steps, 1, o.max_age_frames
         if o.min_hits_frames is None:
             hit, hits = min(max(passed, 0), 2 * usual), o.min_hits_s * 1e9 - usual / 2
-            early = t_ns - self.first_ns < hits
+            is_starting = t_ns - self.first_ns < hits
         else:
-            hit, hits, early = 1, o.min_hits_frames, self.count <= o.min_hits_frames
+            hit, hits, is_starting = 1, o.min_hits_frames, self.count <= o.min_hits_frames
         for track in self.tracks:
             track.missed += self.aged
         if steps > 1:
@@ -158,33 +158,33 @@ class ReferenceSort:
         boxes = [b for b in boxes if o.class_id is None or b.class_id == o.class_id]
         pairs = self.pairs(boxes)
         for at, track in pairs:
-            self.seen(self.tracks[track], boxes[at], steps)
+            self.update(self.tracks[track], boxes[at], steps)
             self.tracks[track].streak += hit
         for track in self.tracks:
             track.streak = 0.0 if track.missed else track.streak
         for at, box in enumerate(boxes):
-            if at not in {pair[0] for pair in pairs} and self.may_begin(box):
-                self.born += 1
-                self.tracks.append(Track(self.born, Filter.start(box), box, self.frame))
-                self.remember(self.tracks[-1], box)
-        shown = [track for track in self.tracks if not track.missed and (early or track.streak >= hits)]
-        out = [(track.name, track.filter.box(), track.box.score) for track in shown]
+            if at not in {pair[0] for pair in pairs} and self.can_start(box):
+                self.last_id += 1
+                self.tracks.append(Track(self.last_id, Filter.start(box), box, self.frame))
+                self.store(self.tracks[-1], box)
+        written = [track for track in self.tracks if not track.missed and (is_starting or track.streak >= hits)]
+        out = [(track.track_id, track.filter.box(), track.box.score) for track in written]
         self.tracks = [track for track in self.tracks if track.missed <= oldest]
         return out
 
-    def alike(self, boxes: list[Box]) -> tuple[Likeness, float]:
-        """The similarity of boxes and tracks, which pairs are possible, and the least similarity of a match."""
+    def similarities(self, boxes: list[Box]) -> tuple[Similarities, float]:
+        """Similarities of boxes and tracks that pass the gate, and the least similarity of an assignment."""
         o, out = self.options, {}
         for at, box in enumerate(boxes):
             for number, track in enumerate(self.tracks):
-                expected = track.filter.box()
+                predicted = track.filter.box()
                 if o.cost == "iou":
-                    value = box.iou(expected)
+                    value = box.iou(predicted)
                 elif o.cost == "pixels":
-                    value = 1 - hypot(*np.subtract(box.centre, expected.centre)) / o.max_distance_px
+                    value = 1 - hypot(*np.subtract(box.centre, predicted.centre)) / o.max_distance_px
                 else:
-                    scale = o.ground_planes[0][1].homography[0]  # the plane only scales; feet are at the lower edge
-                    feet = [(one.centre[0] * scale, one.bottom * scale) for one in (box, expected)]
+                    scale = o.ground_planes[0][1].homography[0]  # a plain scale; feet are at the lower edge
+                    feet = [(one.centre[0] * scale, one.bottom * scale) for one in (box, predicted)]
                     value = 1 - hypot(*np.subtract(*feet)) / o.max_distance_m
                 if value > 0 and self.same_class(box, track):
                     out[at, number] = value
@@ -194,55 +194,56 @@ class ReferenceSort:
         return self.options.mix_classes or box.class_id == track.box.class_id
 
     def pairs(self, boxes: list[Box]) -> list[tuple[int, int]]:
-        return paired(*self.alike(boxes))
+        return assign(*self.similarities(boxes))
 
-    def may_begin(self, box: Box) -> bool:
+    def can_start(self, box: Box) -> bool:
         return True
 
-    def seen(self, track: Track, box: Box, steps: int) -> None:
+    def update(self, track: Track, box: Box, steps: int) -> None:
         track.filter.correct(box)
         track.missed = 0.0
-        self.remember(track, box)
+        self.store(track, box)
 
-    def remember(self, track: Track, box: Box) -> None:
-        track.box, track.frame, track.then = box, self.frame, track.filter.copy()
+    def store(self, track: Track, box: Box) -> None:
+        track.box, track.frame, track.last_filter = box, self.frame, track.filter.copy()
         track.centres[self.frame] = box.centre
 
 
 class ReferenceByteTrack(ReferenceSort):
     def pairs(self, boxes: list[Box]) -> list[tuple[int, int]]:
-        alike, least = self.alike(boxes)
+        similarities, least = self.similarities(boxes)
         low = {at for at, box in enumerate(boxes) if box.score < self.options.high_score}
-        first = paired({pair: value for pair, value in alike.items() if pair[0] not in low}, least)
+        first = assign({pair: value for pair, value in similarities.items() if pair[0] not in low}, least)
         taken = {track for _, track in first}
         left = {t for t, track in enumerate(self.tracks) if t not in taken and track.missed == self.aged}
-        rest = {(at, t): value for (at, t), value in alike.items() if at in low and t in left}
-        return first + paired(rest, self.options.low_min_iou if self.options.cost == "iou" else least)
+        rest = {(at, t): value for (at, t), value in similarities.items() if at in low and t in left}
+        return first + assign(rest, self.options.low_min_iou if self.options.cost == "iou" else least)
 
-    def may_begin(self, box: Box) -> bool:
+    def can_start(self, box: Box) -> bool:
         return not box.score < self.options.new_score
 
 
 class ReferenceOcSort(ReferenceSort):
     def pairs(self, boxes: list[Box]) -> list[tuple[int, int]]:
         o = self.options
-        alike, least = self.alike(boxes)
-        near = {pair: value for pair, value in alike.items() if value >= least}
+        similarities, least = self.similarities(boxes)
+        near = {pair: value for pair, value in similarities.items() if value >= least}
         if o.inertia > 0:
             near = {
-                (at, t): v + o.inertia * (0.5 + self.momentum(boxes[at], self.tracks[t])) for (at, t), v in near.items()
+                (at, t): v + o.inertia * (0.5 + self.direction(boxes[at], self.tracks[t]))
+                for (at, t), v in near.items()
             }
-        found = paired(near, 0.0)
+        found = assign(near, 0.0)
         if not o.recover:
             return found
         boxes_left = set(range(len(boxes))) - {at for at, _ in found}
         left = set(range(len(self.tracks))) - {track for _, track in found}
         again = {(at, t): boxes[at].iou(self.tracks[t].box) for at in boxes_left for t in left}
         again = {p: v for p, v in again.items() if v > 0 and self.same_class(boxes[p[0]], self.tracks[p[1]])}
-        return found + paired(again, o.min_iou)
+        return found + assign(again, o.min_iou)
 
-    def momentum(self, box: Box, track: Track) -> float:
-        """0.5 for the direction of the last frames, -0.5 for the opposite one; times the score."""
+    def direction(self, box: Box, track: Track) -> float:
+        """0.5 straight on in the direction of the last frames, -0.5 straight back; times the score."""
         oldest = [f for f in sorted(track.centres) if self.frame - f <= self.options.direction_frames]
         if not oldest:
             return 0.0
@@ -252,13 +253,13 @@ class ReferenceOcSort(ReferenceSort):
         angle = acos(min(max(float(was @ now) / length, -1), 1)) if length else pi / 2
         return (0.5 - angle / pi) * (1.0 if isnan(box.score) else min(max(box.score, 0), 1))
 
-    def seen(self, track: Track, box: Box, steps: int) -> None:
+    def update(self, track: Track, box: Box, steps: int) -> None:
         ago = self.frame - track.frame
         if self.options.reupdate and ago > steps:
-            again = track.then.copy()
+            again = track.last_filter.copy()
             for frame in range(1, ago + 1):
                 again.predict()
                 if frame < ago:
                     again.correct(track.box.towards(box, frame / ago))
             track.filter = again
-        super().seen(track, box, steps)
+        super().update(track, box, steps)

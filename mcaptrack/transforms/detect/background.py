@@ -93,6 +93,8 @@ class KnnDetector(MotionDetector):
     --------
     A bright square of 20 pixels moves over a dark picture, which was empty for a second:
 
+    >>> import numpy as np
+    >>> from mcaptrack.schema import Frame
     >>> frames = [Frame(n * 40_000_000, n, np.full((80, 160), 30, np.uint8)) for n in range(40)]
     >>> for frame in frames[25:]:
     ...     frame.rows[30:50, 4 * frame.index - 80 : 4 * frame.index - 60] = 200

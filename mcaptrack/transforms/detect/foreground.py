@@ -68,7 +68,9 @@ class FrameDifference:
         return np.where(np.asarray(largest) > self._threshold, np.uint8(255), np.uint8(0))
 
 
-def make_foreground_model(method: Method, threshold: float | None, history_s: float) -> BackgroundSubtractor | FrameDifference:
+def make_foreground_model(
+    method: Method, threshold: float | None, history_s: float
+) -> BackgroundSubtractor | FrameDifference:
     """The foreground model of a method, with the default threshold of the method if it is None."""
     limit = THRESHOLDS[method] if threshold is None else threshold
     return FrameDifference(limit) if method == "frame-difference" else BackgroundSubtractor(method, limit, history_s)

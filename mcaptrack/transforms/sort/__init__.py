@@ -1,7 +1,7 @@
-"""Detections -> tracks: SORT, and two trackers that grew out of it, all written from their papers.
+"""Detections -> tracks: SORT and two trackers derived from it, written from their papers.
 
-They share their parameters and the life of a track (``tracker``), the state of tracks (``tracks``) and what makes a box
-and a track alike (``affinity``); each adds how boxes and tracks are paired.
+They share their parameters and the lifecycle of tracks (``tracker``), the state of tracks (``state``) and the candidate
+pairs of detections and tracks (``association``). They differ in how they associate.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""ByteTrack (Zhang et al., ECCV 2022): boxes that a detector doubts go on with tracks, but begin none."""
+"""ByteTrack (Zhang et al., ECCV 2022): detections with a low score continue tracks, but start none."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ import numpy as np
 
 from mcaptrack.geometry.arrays import Bools, Indices
 from mcaptrack.transforms.protocol import option
-from mcaptrack.transforms.sort.affinity import pair
-from mcaptrack.transforms.sort.tracker import Moment, Sort
-from mcaptrack.transforms.sort.tracks import MISSED, Seen
+from mcaptrack.transforms.sort.association import associate
+from mcaptrack.transforms.sort.state import SINCE_UPDATE, Measurements
+from mcaptrack.transforms.sort.tracker import AssociationInput, Sort
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,6 +19,22 @@ class ByteTrack(Sort):
 
     Detections with a high score are matched with all tracks first, then those with a low score with the remaining
     tracks that were detected in the previous frame: people who are partly hidden score low, but stand where predicted.
+
+    Examples
+    --------
+    A detection with a low score continues a track, and starts none:
+
+    >>> from mcaptrack.schema import DETECTIONS, Frame
+    >>> def row(score):
+    ...     box = {"x_px": [100.0], "y_px": [50.0], "w_px": [40.0], "h_px": [120.0]}
+    ...     return DETECTIONS.rows(score=[score], class_id=[1], **box)
+    >>> frames = [Frame(t * 100_000_000, t, row(0.9 if 5 <= t < 10 else 0.3)) for t in range(15)]
+    >>> [len(tracks.rows) for (tracks,) in ByteTrack()(frames)]
+    [0, 0, 0, 0, 0, 0, 0, 0, 1, 1, 1, 1, 1, 1, 1]
+
+    References
+    ----------
+    Y. Zhang et al., "ByteTrack: Multi-Object Tracking by Associating Every Detection Box", ECCV 2022.
     """
 
     high_score: float = option(
@@ -33,19 +49,19 @@ class ByteTrack(Sort):
         search=(0.2, 0.8),
     )
 
-    def _pair(self, moment: Moment) -> tuple[Indices, Indices]:
-        pairs, least = self._likeness(moment, self.min_iou)
-        high = ~(moment.seen.score < self.high_score)
+    def _associate(self, step: AssociationInput) -> tuple[Indices, Indices]:
+        pairs, min_similarity = self._candidate_pairs(step, self.min_iou)
+        high = ~(step.detections.score < self.high_score)  # NaN is high
         if high.all():
-            return pair(pairs, least)
-        sure = high[pairs.box]
-        box, track = pair(pairs.where(sure), least)
-        left = moment.tracks.table[MISSED] == moment.age  # seen in the frame before
-        left[track] = False
-        rest = pairs.where(~sure & left[pairs.track])
-        low_box, low_track = pair(rest, self.low_min_iou if self.cost == "iou" else least)
-        return np.concatenate([box, low_box]), np.concatenate([track, low_track])
+            return associate(pairs, min_similarity)
+        is_high = high[pairs.detection]
+        detection, track = associate(pairs.select(is_high), min_similarity)
+        remaining = step.tracks.table[SINCE_UPDATE] == step.age  # detected in the previous frame
+        remaining[track] = False
+        low = pairs.select(~is_high & remaining[pairs.track])
+        low_detection, low_track = associate(low, self.low_min_iou if self.cost == "iou" else min_similarity)
+        return np.concatenate([detection, low_detection]), np.concatenate([track, low_track])
 
-    def _may_begin(self, seen: Seen) -> Bools:
-        begins: Bools = ~(seen.score < self.new_score)
-        return begins
+    def _can_start(self, detections: Measurements) -> Bools:
+        starts: Bools = ~(detections.score < self.new_score)
+        return starts

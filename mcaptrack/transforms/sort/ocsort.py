@@ -1,11 +1,11 @@
-"""OC-SORT (Cao et al., CVPR 2023): trust what was observed more than what the filter made of it.
+"""OC-SORT (Cao et al., CVPR 2023): observation-centric SORT, which trusts observations more than the filter.
 
-Three things beside SORT. Observation-centric momentum (OCM): pairs in which a track would go on in its direction
-are more alike. Recovery (OCR): tracks and boxes that are left over are paired once more, by where the tracks were seen
-last. Re-update (ORU): a track that is seen again after a while has its filter run anew along the straight line from
-where it was seen last, so that what it dreamt in between does no harm.
+It adds three things to SORT. Observation-centric momentum (OCM): pairs that keep the track's direction of motion are
+more similar. Observation-centric recovery (OCR): tracks and detections that remain are associated once more, by the
+last detections of the tracks. Observation-centric re-update (ORU): when a track is detected again after a gap, its
+filter is recomputed along the straight line from its last detection, which removes the errors of coasting.
 
-Letters: N boxes, K tracks, P pairs, T frames remembered.
+Letters: N detections, K tracks, P pairs.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ import numpy as np
 from mcaptrack.geometry import kalman
 from mcaptrack.geometry.arrays import Floats, Indices
 from mcaptrack.transforms.protocol import option
-from mcaptrack.transforms.sort.affinity import Pairs, by_overlap, pair
-from mcaptrack.transforms.sort.tracker import Moment, Sort
-from mcaptrack.transforms.sort.tracks import SHARED_ROWS, Seen, Tracks
+from mcaptrack.transforms.sort.association import CandidatePairs, associate, iou_pairs
+from mcaptrack.transforms.sort.state import SHARED_ROWS, Measurements, Tracks
+from mcaptrack.transforms.sort.tracker import AssociationInput, Sort
 
-# Rows below the shared ones: the corners of the box seen last; the filter's state then; how many frames ago that was;
-# and the centres seen in the last frames, oldest first, NaN where there was none.
-_LAST: Final = slice(SHARED_ROWS, SHARED_ROWS + 4)
-_THEN: Final = slice(_LAST.stop, _LAST.stop + kalman.STATE_ROWS)
-_AGO: Final = _THEN.stop
-_PATH: Final = _AGO + 1
+# Rows of the table below the shared ones: corners of the last detection; state of the filter after it; frames since
+# then; and centres of the detections in the last frames, oldest first, NaN where the track was missed.
+_LAST_BOX: Final = slice(SHARED_ROWS, SHARED_ROWS + 4)
+_LAST_STATE: Final = slice(_LAST_BOX.stop, _LAST_BOX.stop + kalman.STATE_ROWS)
+_FRAMES_SINCE: Final = _LAST_STATE.stop
+_CENTRES: Final = _FRAMES_SINCE + 1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,6 +36,22 @@ class OcSort(Sort):
 
     Matches that keep a track's direction of motion are preferred, lost tracks are matched once more by their last
     detection, and a track that is found again has its filter recomputed over the gap.
+
+    Examples
+    --------
+    A person walks, is missed for half a second, and keeps the track:
+
+    >>> from mcaptrack.schema import DETECTIONS, Frame
+    >>> def row(t):
+    ...     box = {"x_px": [100.0 + 3 * t], "y_px": [50.0], "w_px": [40.0], "h_px": [120.0]}
+    ...     return DETECTIONS.rows(class_id=[1], **box)
+    >>> frames = [Frame(t * 100_000_000, t, DETECTIONS.empty() if 10 <= t < 15 else row(t)) for t in range(20)]
+    >>> {id for (tracks,) in OcSort()(frames) for id in tracks.rows["track_id"].tolist()}
+    {1}
+
+    References
+    ----------
+    J. Cao et al., "Observation-Centric SORT: Rethinking SORT for Robust Multi-Object Tracking", CVPR 2023.
     """
 
     inertia: float = option(0.2, "weight of the direction of motion, beside overlap", least=0.0, search=(0.0, 0.6))
@@ -45,98 +61,102 @@ class OcSort(Sort):
     recover: bool = option(True, "match lost tracks once more by their last detection")
     reupdate: bool = option(True, "recompute the filter over the gap when a track is found again")
 
-    def _no_tracks(self) -> Tracks:
-        return Tracks(_PATH - SHARED_ROWS + 2 * (self.direction_frames + 1))
+    def _empty_tracks(self) -> Tracks:
+        return Tracks(_CENTRES - SHARED_ROWS + 2 * (self.direction_frames + 1))
 
-    def _pair(self, moment: Moment) -> tuple[Indices, Indices]:
-        table = moment.tracks.table
-        path = table[_PATH:]
-        for _ in range(min(moment.steps, self.direction_frames + 1)):
-            path[:-2] = path[2:].copy()
-            path[-2:] = np.nan
-        table[_AGO] += moment.steps
+    def _associate(self, step: AssociationInput) -> tuple[Indices, Indices]:
+        table = step.tracks.table
+        centres = table[_CENTRES:]
+        for _ in range(min(step.frames, self.direction_frames + 1)):
+            centres[:-2] = centres[2:].copy()
+            centres[-2:] = np.nan
+        table[_FRAMES_SINCE] += step.frames
 
-        pairs, least = self._likeness(moment, self.min_iou)
-        near = pairs.where(pairs.likeness >= least)
-        if self.inertia > 0 and len(near.box):
-            near = near._replace(likeness=near.likeness + self.inertia * (0.5 + self._momentum(moment, near)))
-        box, track = pair(near, 0.0)
-        if not self.recover or len(box) == min(len(moment.seen), len(moment.tracks)):
-            return box, track
-        rest = self._where_last_seen(moment, box, track)
-        more_box, more_track = pair(rest, self.min_iou)
-        return np.concatenate([box, more_box]), np.concatenate([track, more_track])
+        pairs, min_similarity = self._candidate_pairs(step, self.min_iou)
+        near = pairs.select(pairs.similarity >= min_similarity)
+        if self.inertia > 0 and len(near.detection):
+            bonus = self.inertia * (0.5 + self._direction_consistency(step, near))
+            near = near._replace(similarity=near.similarity + bonus)
+        detection, track = associate(near, 0.0)
+        if not self.recover or len(detection) == min(len(step.detections), len(step.tracks)):
+            return detection, track
+        remaining = self._recovery_pairs(step, detection, track)
+        recovered_detection, recovered_track = associate(remaining, self.min_iou)
+        return np.concatenate([detection, recovered_detection]), np.concatenate([track, recovered_track])
 
-    def _momentum(self, moment: Moment, pairs: Pairs) -> Floats:
-        """How well a pair (P,) goes on in the track's direction: 0.5 straight on, -0.5 straight back, 0 unknown.
+    def _direction_consistency(self, step: AssociationInput, pairs: CandidatePairs) -> Floats:
+        """How well pairs (P,) keep the track's direction: 0.5 straight on, -0.5 straight back, 0 unknown (OCM).
 
-        Weighted by the score of the box, as in the paper's program.
+        Weighted by the score of the detection, as in the paper's program.
         """
-        table, seen = moment.tracks.table, moment.seen
-        path, tracks = table[_PATH:].reshape(-1, 2, table.shape[1]), np.arange(table.shape[1])
-        there = np.isfinite(path[:, 0])
-        # The oldest and the newest place that is remembered: the same one has no direction, and neither has NaN.
-        before = path[there.argmax(axis=0), :, tracks].T
-        last = path[-1 - there[::-1].argmax(axis=0), :, tracks].T
-        was, now = (last - before)[:, pairs.track], seen.measured[:2, pairs.box] - before[:, pairs.track]
-        length = np.hypot(was[0], was[1]) * np.hypot(now[0], now[1])
-        known = length > 0  # False for NaN
-        cosine = (was * now).sum(axis=0) / np.where(known, length, 1.0)
-        angle = np.arccos(np.clip(np.where(known, cosine, 0.0), -1.0, 1.0))
-        score = seen.score[pairs.box]
+        table, detections = step.tracks.table, step.detections
+        centres, tracks = table[_CENTRES:].reshape(-1, 2, table.shape[1]), np.arange(table.shape[1])
+        known = np.isfinite(centres[:, 0])
+        # The oldest and the newest known centre: if they are the same or NaN, the direction is unknown.
+        oldest = centres[known.argmax(axis=0), :, tracks].T
+        newest = centres[-1 - known[::-1].argmax(axis=0), :, tracks].T
+        before = (newest - oldest)[:, pairs.track]
+        now = detections.measured[:2, pairs.detection] - oldest[:, pairs.track]
+        length = np.hypot(before[0], before[1]) * np.hypot(now[0], now[1])
+        has_direction = length > 0  # False for NaN
+        cosine = (before * now).sum(axis=0) / np.where(has_direction, length, 1.0)
+        angle = np.arccos(np.clip(np.where(has_direction, cosine, 0.0), -1.0, 1.0))
+        score = detections.score[pairs.detection]
         weight: Floats = (0.5 - angle / np.pi) * np.where(np.isnan(score), 1.0, np.clip(score, 0.0, 1.0))
         return weight
 
-    def _where_last_seen(self, moment: Moment, box: Indices, track: Indices) -> Pairs:
-        """The pairs of boxes and tracks that are left over, by the tracks' last boxes."""
-        box_left, track_left = np.ones(len(moment.seen), bool), np.ones(len(moment.tracks), bool)
-        box_left[box], track_left[track] = False, False
-        boxes, tracks = np.flatnonzero(box_left), np.flatnonzero(track_left)
-        last = moment.tracks.table[_LAST][:, tracks]
+    def _recovery_pairs(self, step: AssociationInput, detection: Indices, track: Indices) -> CandidatePairs:
+        """The pairs of detections and tracks that remain, by the last detections of the tracks (OCR)."""
+        detection_left, track_left = np.ones(len(step.detections), bool), np.ones(len(step.tracks), bool)
+        detection_left[detection], track_left[track] = False, False
+        detections, tracks = np.flatnonzero(detection_left), np.flatnonzero(track_left)
+        last = step.tracks.table[_LAST_BOX][:, tracks]
         area = (last[2] - last[0]) * (last[3] - last[1])
-        found = by_overlap(moment.seen.corners[:, boxes], last, moment.seen.measured[2, boxes], area)
-        pairs = Pairs(boxes[found.box], tracks[found.track], found.likeness, (len(box_left), len(track_left)))
-        return self._of_one_class(moment, pairs)
+        found = iou_pairs(step.detections.corners[:, detections], last, step.detections.measured[2, detections], area)
+        shape = (len(detection_left), len(track_left))
+        pairs = CandidatePairs(detections[found.detection], tracks[found.track], found.similarity, shape)
+        return self._of_same_class(step, pairs)
 
-    def _begin(self, tracks: Tracks, first_id: int, seen: Seen) -> None:
-        tracks.add(first_id, seen)
-        new = np.arange(len(tracks) - len(seen), len(tracks))
-        self._remember(tracks, new, seen)
+    def _initiate(self, tracks: Tracks, first_id: int, detections: Measurements) -> None:
+        tracks.initiate(first_id, detections)
+        new = np.arange(len(tracks) - len(detections), len(tracks))
+        self._store(tracks, new, detections)
 
-    def _see(self, tracks: Tracks, at: Indices, seen: Seen, hit: float, steps: int) -> None:
-        ago = tracks.table[_AGO, at]
-        lost = np.flatnonzero(ago > steps) if self.reupdate else at[:0]
+    def _update(self, tracks: Tracks, at: Indices, detections: Measurements, hit: float, frames: int) -> None:
+        frames_since = tracks.table[_FRAMES_SINCE, at]
+        lost = np.flatnonzero(frames_since > frames) if self.reupdate else at[:0]
         if len(lost):
-            tracks.state[:, at[lost]] = _run_anew(tracks.table[:, at[lost]], seen.corners[:, lost])
-        tracks.see(at, seen, hit)
-        self._remember(tracks, at, seen)
+            tracks.state[:, at[lost]] = _reupdate(tracks.table[:, at[lost]], detections.corners[:, lost])
+        tracks.update(at, detections, hit)
+        self._store(tracks, at, detections)
 
     @staticmethod
-    def _remember(tracks: Tracks, at: Indices, seen: Seen) -> None:
+    def _store(tracks: Tracks, at: Indices, detections: Measurements) -> None:
         table = tracks.table
-        table[_LAST, at] = seen.corners
-        table[_THEN, at] = table[: kalman.STATE_ROWS, at]
-        table[_AGO, at] = 0.0
-        table[-2:, at] = seen.measured[:2]
+        table[_LAST_BOX, at] = detections.corners
+        table[_LAST_STATE, at] = table[: kalman.STATE_ROWS, at]
+        table[_FRAMES_SINCE, at] = 0.0
+        table[-2:, at] = detections.measured[:2]
 
 
-def _run_anew(table: Floats, corners: Floats) -> Floats:
-    """The states (17, K) of tracks that are found again in boxes with these corners (4, K), just before they see them.
+def _reupdate(table: Floats, corners: Floats) -> Floats:
+    """The predicted states (17, K) of tracks that are detected again in boxes with these corners (4, K) (ORU).
 
-    From the state when they were seen last, along boxes on the straight line in between, all frames as if seen.
+    They start from the states after the last detections, and are corrected with virtual boxes on the straight line from
+    these to the new ones, in each frame of the gap.
     """
-    state, last, ago = table[_THEN].copy(), table[_LAST], table[_AGO].astype(int)
-    for frame in range(1, int(ago.max()) + 1):
-        going = ago >= frame
-        part = state[:, going]
+    state, last, frames_since = table[_LAST_STATE].copy(), table[_LAST_BOX], table[_FRAMES_SINCE].astype(int)
+    for frame in range(1, int(frames_since.max()) + 1):
+        running = frames_since >= frame
+        part = state[:, running]
         kalman.predict(part)
-        between = going & (ago > frame)
+        between = running & (frames_since > frame)
         if between.any():
-            share = frame / ago[between]
-            seen = last[:, between] + share * (corners[:, between] - last[:, between])
-            inner = between[going]
+            share = frame / frames_since[between]
+            virtual = last[:, between] + share * (corners[:, between] - last[:, between])
+            inner = between[running]
             corrected = part[:, inner]
-            kalman.correct(corrected, kalman.measure(np.concatenate([seen[:2], seen[2:] - seen[:2]])))
+            kalman.correct(corrected, kalman.measure(np.concatenate([virtual[:2], virtual[2:] - virtual[:2]])))
             part[:, inner] = corrected
-        state[:, going] = part
+        state[:, running] = part
     return state

@@ -1,9 +1,9 @@
-"""SORT (Bewley et al., ICIP 2016), and the life of a track that it shares with its descendants.
+"""SORT (Bewley et al., ICIP 2016), and the lifecycle of tracks, which the trackers derived from it share.
 
-A Kalman filter a track says where its box will be; boxes and tracks are paired by their likeness; a track is shown once
-it has been seen for long enough and dropped when it has been missed for too long.
+A Kalman filter for each track predicts its box; detections are assigned to tracks by similarity. A track is confirmed,
+and written, after ``min_hits`` of detections without a miss; it terminates after ``max_age`` without a detection.
 
-Letters: N boxes, K tracks.
+Letters: N detections, K tracks.
 """
 
 from __future__ import annotations
@@ -24,28 +24,49 @@ from mcaptrack.geometry.plane import GroundPlane, Planes, plane_at
 from mcaptrack.notices import warn
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame, Schema
 from mcaptrack.transforms.protocol import check_options, context, option
-from mcaptrack.transforms.sort.affinity import Cost, Pairs, by_distance, by_overlap, pair
-from mcaptrack.transforms.sort.tracks import CLASS, MISSED, SHARED_ROWS, STREAK, Seen, Tracks, look, write
+from mcaptrack.transforms.sort.association import CandidatePairs, Cost, associate, distance_pairs, iou_pairs
+from mcaptrack.transforms.sort.state import (
+    CLASS,
+    HIT_STREAK,
+    SHARED_ROWS,
+    SINCE_UPDATE,
+    Measurements,
+    Tracks,
+    frames_to_measurements,
+    tracks_to_frames,
+)
 
-#: How many frames are read and written at once.
-_BLOCK = 64
-#: So many classes are named.
-_NAMED = 20
+#: Number of frames that are converted at once.
+_BLOCK_FRAMES = 64
+#: Number of classes that a warning lists at most.
+_MAX_LISTED = 20
 
 
-class Moment(NamedTuple):
-    """A frame with its boxes and the tracks before they are paired.
+class AssociationInput(NamedTuple):
+    """The detections of a frame and the tracks, before association.
 
-    ``expected`` is where the filters expect the tracks' boxes, left, top, right, bottom (4, K); ``age`` by how much
-    tracks have aged since the frame before, ``steps`` how many frames ago that was; ``one_class`` says that boxes so
-    far are of one class only.
+    Attributes
+    ----------
+    detections : Measurements
+    tracks : Tracks
+        After the prediction of the filters.
+    predicted : (4, K) of float, in px
+        Predicted boxes of the tracks: left, top, right, bottom.
+    age : float
+        How much tracks aged since the previous frame, in the unit of ``SINCE_UPDATE``.
+    frames : int
+        Number of frames since the previous one: 1, or more where frames are missing.
+    plane : GroundPlane or None
+        For distances in metres.
+    one_class : bool
+        Whether all detections so far have the same class.
     """
 
-    seen: Seen
+    detections: Measurements
     tracks: Tracks
-    expected: Floats
+    predicted: Floats
     age: float
-    steps: int
+    frames: int
     plane: GroundPlane | None
     one_class: bool
 
@@ -62,13 +83,32 @@ class Sort:
 
     Reads detections, writes tracks: one row per frame for each person who is tracked and detected in it. SORT matches
     detections with the positions that Kalman filters predict for the tracks.
+
+    Examples
+    --------
+    A person walks through eight pictures, and is missed in one:
+
+    >>> from mcaptrack.schema import DETECTIONS, Frame
+    >>> def row(t):
+    ...     box = {"x_px": [100.0 + 3 * t], "y_px": [50.0], "w_px": [40.0], "h_px": [120.0]}
+    ...     return DETECTIONS.rows(class_id=[1], **box)
+    >>> frames = [Frame(t * 100_000_000, t, DETECTIONS.empty() if t == 4 else row(t)) for t in range(8)]
+    >>> [tracks.rows["track_id"].tolist() for (tracks,) in Sort(min_hits_s=0.0)(frames)]
+    [[1], [1], [1], [1], [], [1], [1], [1]]
+
+    References
+    ----------
+    A. Bewley et al., "Simple Online and Realtime Tracking", ICIP 2016.
     """
 
     max_age_s: float = option(
         1.4, "a track ends after this many seconds without a detection", least=0.0, search=(0.2, 4.0), theme=_LIFE
     )
     max_age_frames: int | None = option(
-        None, "a track ends after this many frames without a detection, instead of --max-age-s", least=0, theme=_LIFE
+        None,
+        "a track ends after this many frames without a detection, instead of --max-age-s",
+        least=0,
+        theme=_LIFE,
     )
     min_hits_s: float = option(
         0.3,
@@ -123,111 +163,112 @@ class Sort:
         check_options(self)
 
     def __call__(self, frames: Iterable[Frame]) -> Iterator[tuple[Frame, ...]]:
-        life, passed = _Life(self, self._no_tracks()), _Passed(self)
+        run, report = _Run(self, self._empty_tracks()), _FilterReport(self)
         coming = iter(frames)
-        while block := list(islice(coming, _BLOCK)):
-            columns, ends = look(block, self.min_score, self.class_id)
-            passed.count(block, int(ends[-1]))
-            life.notice_classes(columns[9])
+        while block := list(islice(coming, _BLOCK_FRAMES)):
+            columns, ends = frames_to_measurements(block, self.min_score, self.class_id)
+            report.count(block, int(ends[-1]))
+            run.note_classes(columns[9])
             spans = pairwise(ends.tolist())
-            parts = [self._step(life, f, Seen(columns[:, a:b])) for f, (a, b) in zip(block, spans, strict=True)]
-            shown, shown_ends = np.concatenate(parts, axis=1), np.cumsum([0, *(p.shape[1] for p in parts)])
-            yield from ((frame,) for frame in write(block, shown, shown_ends.tolist(), self.ground_planes))
-        passed.warn()
+            parts = [self._step(run, f, Measurements(columns[:, a:b])) for f, (a, b) in zip(block, spans, strict=True)]
+            written, written_ends = np.concatenate(parts, axis=1), np.cumsum([0, *(p.shape[1] for p in parts)])
+            made = tracks_to_frames(block, written, written_ends.tolist(), self.ground_planes)
+            yield from ((frame,) for frame in made)
+        report.warn()
 
     def why_empty(self, given: Sequence[Frame], made: Sequence[Frame]) -> str:
-        """Why no rows came of frames, for a warning."""
-        boxes = sum(len(frame.rows) for frame in given)
-        return f"none of {boxes} boxes is followed for long enough (min_hits_s): too few pictures a second, perhaps"
+        """Why there are no tracks, for a warning."""
+        count = sum(len(frame.rows) for frame in given)
+        return f"no track of {count} detections is confirmed (min_hits_s): too few pictures a second, perhaps"
 
-    def _step(self, life: _Life, frame: Frame, seen: Seen) -> Floats:
-        """Take one frame; returns the columns of the tracks that are shown in it."""
-        tracks, steps = life.tracks, life.tick(frame.t_ns)
-        self._age(life, steps)
+    def _step(self, run: _Run, frame: Frame, detections: Measurements) -> Floats:
+        """Take one frame; returns the columns of the tracks that are written in it."""
+        tracks, passed_frames = run.tracks, run.tick(frame.t_ns)
+        self._predict(run, passed_frames)
         plane = plane_at(self.ground_planes, frame.t_ns) if self.cost == "metres" else None
-        moment = Moment(seen, tracks, kalman.corners(tracks.state), life.age, steps, plane, life.one_class)
-        box, track = self._pair(moment)
-        if len(box):
-            self._see(tracks, track, seen.take(box), life.hit, steps)
-        found = len(box)
-        if found < len(seen):
-            new = self._may_begin(seen)
-            new[box] = False
-            born = seen.take(new.nonzero()[0])
-            self._begin(tracks, life.next_id, born)
-            life.next_id += len(born)
-            found += len(born)
+        predicted = kalman.corners(tracks.state)
+        step = AssociationInput(detections, tracks, predicted, run.age, passed_frames, plane, run.one_class)
+        matched, track = self._associate(step)
+        if len(matched):
+            self._update(tracks, track, detections.take(matched), run.hit, passed_frames)
+        detected = len(matched)
+        if detected < len(detections):
+            starts = self._can_start(detections)
+            starts[matched] = False
+            births = detections.take(starts.nonzero()[0])
+            self._initiate(tracks, run.next_id, births)
+            run.next_id += len(births)
+            detected += len(births)
         table = tracks.table
-        if found == len(tracks):  # no missed detection
-            return table[:SHARED_ROWS].compress(life.early | (table[STREAK] >= life.min_hits), axis=1)
-        missed = table[MISSED]
-        here = missed == 0
-        table[STREAK] *= here
-        if not life.early:
-            here &= table[STREAK] >= life.min_hits
-        shown: Floats = table[:SHARED_ROWS].compress(here, axis=1)
-        if missed.max() > life.max_age:
-            tracks.keep(missed <= life.max_age)
-        return shown
+        if detected == len(tracks):  # no missed detection
+            return table[:SHARED_ROWS].compress(run.is_starting | (table[HIT_STREAK] >= run.min_hits), axis=1)
+        since_update = table[SINCE_UPDATE]
+        is_written = since_update == 0
+        table[HIT_STREAK] *= is_written
+        if not run.is_starting:
+            is_written &= table[HIT_STREAK] >= run.min_hits
+        written: Floats = table[:SHARED_ROWS].compress(is_written, axis=1)
+        if since_update.max() > run.max_age:
+            tracks.keep(since_update <= run.max_age)
+        return written
 
     @staticmethod
-    def _age(life: _Life, steps: int) -> None:
-        """Move all tracks ``steps`` frames on."""
-        tracks = life.tracks
-        tracks.table[MISSED] += life.age
-        if steps > 1:  # a gap in the log: terminate tracks that would have been terminated in it
-            tracks.keep(tracks.table[MISSED] <= life.max_age + life.frame_age)
-        if life.clock.stretch != 1.0:
-            kalman.stretch(tracks.state, life.clock.stretch)
-        for _ in range(steps):  # predict through missing frames, too
+    def _predict(run: _Run, frames: int) -> None:
+        """Age and predict all tracks by a number of frames."""
+        tracks = run.tracks
+        tracks.table[SINCE_UPDATE] += run.age
+        if frames > 1:  # a gap in the log: terminate tracks that would have been terminated in it
+            tracks.keep(tracks.table[SINCE_UPDATE] <= run.max_age + run.frame_age)
+        if run.clock.stretch != 1.0:
+            kalman.stretch(tracks.state, run.clock.stretch)
+        for _ in range(frames):  # predict through missing frames, too
             kalman.predict(tracks.state)
 
-    def _likeness(self, moment: Moment, least: float) -> tuple[Pairs, float]:
-        """The pairs of a moment that are possible at all, and from which likeness on they may be paired."""
-        seen = moment.seen
+    def _candidate_pairs(self, step: AssociationInput, min_iou: float) -> tuple[CandidatePairs, float]:
+        """The pairs that pass the gate, and the least similarity of an assignment."""
+        boxes, predicted = step.detections.corners, step.predicted
         if self.cost == "iou":
-            pairs = by_overlap(seen.corners, moment.expected, seen.measured[2], moment.tracks.table[2])
-        elif self.cost == "pixels":
-            pairs, least = by_distance(seen.corners, moment.expected, self.max_distance_px, None), 0.0
-        elif moment.plane is None:
+            pairs = iou_pairs(boxes, predicted, step.detections.measured[2], step.tracks.table[2])
+            return self._of_same_class(step, pairs), min_iou
+        if self.cost == "metres" and step.plane is None:
             raise McaptrackError("cost metres needs a ground plane, and none is known")
-        else:
-            pairs, least = by_distance(seen.corners, moment.expected, self.max_distance_m, moment.plane), 0.0
-        return self._of_one_class(moment, pairs), least
+        gate = self.max_distance_px if self.cost == "pixels" else self.max_distance_m
+        return self._of_same_class(step, distance_pairs(boxes, predicted, gate, step.plane)), 0.0
 
-    def _of_one_class(self, moment: Moment, pairs: Pairs) -> Pairs:
-        """Without the pairs of a box and a track of different classes, unless these may mix."""
-        if self.mix_classes or moment.one_class or not len(pairs.box):
+    def _of_same_class(self, step: AssociationInput, pairs: CandidatePairs) -> CandidatePairs:
+        """The pairs of a detection and a track of the same class; all pairs with ``mix_classes``."""
+        if self.mix_classes or step.one_class or not len(pairs.detection):
             return pairs
-        same = moment.seen.class_id[pairs.box] == moment.tracks.table[CLASS, pairs.track]
-        return pairs if same.all() else pairs.where(same)
+        same = step.detections.class_id[pairs.detection] == step.tracks.table[CLASS, pairs.track]
+        return pairs if same.all() else pairs.select(same)
 
-    # What the descendants do otherwise.
+    # What derived trackers override.
 
-    def _no_tracks(self) -> Tracks:
+    def _empty_tracks(self) -> Tracks:
         return Tracks()
 
-    def _pair(self, moment: Moment) -> tuple[Indices, Indices]:
-        """Boxes and tracks that belong together."""
-        return pair(*self._likeness(moment, self.min_iou))
+    def _associate(self, step: AssociationInput) -> tuple[Indices, Indices]:
+        """Indices of detections and of the tracks that they are assigned to."""
+        return associate(*self._candidate_pairs(step, self.min_iou))
 
-    def _may_begin(self, seen: Seen) -> Bools:
-        """Which boxes may begin a track if they belong to none, as an array of its own."""
-        return np.ones(len(seen), bool)
+    def _can_start(self, detections: Measurements) -> Bools:
+        """Which detections may start a track if they are assigned to none. Returns a new array."""
+        return np.ones(len(detections), bool)
 
-    def _begin(self, tracks: Tracks, first_id: int, seen: Seen) -> None:
-        tracks.add(first_id, seen)
+    def _initiate(self, tracks: Tracks, first_id: int, detections: Measurements) -> None:
+        """Start a track at each of these detections."""
+        tracks.initiate(first_id, detections)
 
-    def _see(self, tracks: Tracks, at: Indices, seen: Seen, hit: float, steps: int) -> None:
-        """Track ``at[i]`` is seen in box i, ``steps`` frames after the frame before."""
-        tracks.see(at, seen, hit)
+    def _update(self, tracks: Tracks, at: Indices, detections: Measurements, hit: float, frames: int) -> None:
+        """Correct track ``at[i]`` with detection i, ``frames`` after the previous frame."""
+        tracks.update(at, detections, hit)
 
 
-class _Passed:
-    """Which boxes pass the class and the score that are asked for, to be said if there are none at all."""
+class _FilterReport:
+    """Counts the detections that pass the filters of class and score, and warns if none does."""
 
     def __init__(self, options: Sort) -> None:
-        self._options, self._seen, self._kept = options, 0, 0
+        self._options, self._count, self._kept = options, 0, 0
         self._classes: set[int] = set()
         self._highest = -np.inf
 
@@ -235,63 +276,64 @@ class _Passed:
         """Count frames, and how many of their detections passed the filters."""
         self._kept += kept
         for rows in (frame.rows for frame in frames if len(frame.rows) and not self._kept):
-            self._seen += len(rows)
+            self._count += len(rows)
             self._classes.update(rows["class_id"].tolist())
             self._highest = max(self._highest, float(np.nanmax(rows["score"], initial=-np.inf)))
 
     def warn(self) -> None:
-        """Warn of tracks that are empty because no box passed."""
+        """Warn if no detection passed."""
         wanted, least = self._options.class_id, self._options.min_score
-        if self._kept or not self._seen:
+        if self._kept or not self._count:
             return
         if wanted is not None and wanted not in self._classes:
-            there = ", ".join(map(str, sorted(self._classes)[:_NAMED]))
+            there = ", ".join(map(str, sorted(self._classes)[:_MAX_LISTED]))
             warn(f"no detection has class {wanted}, so there are no tracks; the classes are {there}", "left-out")
         elif least is not None and self._highest < least:
             words = f"the highest is {self._highest:g}"
             warn(f"no detection has a score of {least:g} or more, so there are no tracks; {words}", "left-out")
 
 
-class _Life:
-    """A run: its tracks and its clock, and what ages and streaks are at the frame that is being looked at.
+class _Run:
+    """The state of one run: its tracks, its clock, and the units of ages and hit streaks at the current frame.
 
-    They are nanoseconds, or frames where frames were asked for. ``age`` is by how much tracks age, ``frame_age`` by how
-    much in a usual frame; ``hit`` is what being seen adds to a streak; ``early`` says that no streak can be long yet.
+    Ages and streaks are in nanoseconds, or in frames with the options in frames. ``age`` is how much tracks age at this
+    frame, ``frame_age`` how much at a usual frame, ``hit`` how much a detection adds to a streak. ``is_starting`` is
+    true while the log is shorter than ``min_hits``: all detected tracks are written then.
     """
 
     def __init__(self, options: Sort, tracks: Tracks) -> None:
         self.tracks, self.clock, self.next_id = tracks, FrameClock(), 1
         self.age = self.frame_age = self.max_age = self.hit = self.min_hits = 0.0
-        self.early = True
+        self.is_starting = True
         self._options = options
         self._class_id: float | None = None
         self.one_class = True
         self._count = 0
 
-    def notice_classes(self, class_id: Floats) -> None:
-        """Take the classes of the boxes to come."""
+    def note_classes(self, class_id: Floats) -> None:
+        """Note the classes of the next detections."""
         if len(class_id) and self.one_class:
             self._class_id = class_id[0] if self._class_id is None else self._class_id
             self.one_class = bool((class_id == self._class_id).all())
 
     def tick(self, t_ns: int) -> int:
-        """Take the time of the next frame; returns how many frames on it is."""
+        """Take the time of the next frame; returns the number of frames since the previous one."""
         options = self._options
         if self._count == 0:
             self._first_ns = self._last_ns = t_ns
-        steps, passed_ns, usual_ns = self.clock.tick(t_ns), t_ns - self._last_ns, self.clock.interval_ns
+        frames, passed_ns, usual_ns = self.clock.tick(t_ns), t_ns - self._last_ns, self.clock.interval_ns
         self._count, self._last_ns = self._count + 1, t_ns
         if options.max_age_frames is not None:
-            self.age, self.frame_age, self.max_age = steps, 1, options.max_age_frames
+            self.age, self.frame_age, self.max_age = frames, 1, options.max_age_frames
         else:
-            # Where time stands still a miss is one all the same. To half a frame an age is what was asked for.
+            # At least 1: a miss counts even if two frames have one time. Limits are rounded to the nearest frame.
             self.age, self.frame_age = max(passed_ns, 1), usual_ns
             self.max_age = options.max_age_s * NS_PER_S + usual_ns / 2
         if options.min_hits_frames is not None:
             self.hit, self.min_hits = 1, options.min_hits_frames
-            self.early = self._count <= self.min_hits
+            self.is_starting = self._count <= self.min_hits
         else:
             self.hit = min(max(passed_ns, 0), 2 * usual_ns)
             self.min_hits = options.min_hits_s * NS_PER_S - usual_ns / 2
-            self.early = t_ns - self._first_ns < self.min_hits
-        return steps
+            self.is_starting = t_ns - self._first_ns < self.min_hits
+        return frames

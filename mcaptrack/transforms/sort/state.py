@@ -1,8 +1,8 @@
-"""What frames show, what is remembered of tracks, and how both become arrays and frames again.
+"""Detections and tracks as arrays: frames to measurements, the table of tracks, and tracks to frames.
 
-Frames are read and written several at a time: what a call of NumPy costs is then shared.
+Several frames are converted at once, because the overhead of NumPy calls is per call.
 
-Letters: N boxes in a frame, K tracks, F frames.
+Letters: N detections in a frame, K tracks, F frames.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ from mcaptrack.geometry.plane import Planes, plane_at
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame
 from mcaptrack.schema.framing import join_frames
 
-#: Rows of a table of tracks, below those of the filter: score and class of the last box; how long the track has been
-#: missed, 0 if it was just seen; how long it has been seen without a break; its name.
-SCORE, CLASS, MISSED, STREAK, ID = range(kalman.STATE_ROWS, kalman.STATE_ROWS + 5)
-#: How many rows every tracker's table has; a tracker may add its own below.
+#: Rows of the table of tracks, below those of the filter: score and class of the last detection; time since it (0 if it
+#: is in this frame); how long the track has been detected without a miss; track id. ``tracker`` says the unit of time.
+SCORE, CLASS, SINCE_UPDATE, HIT_STREAK, ID = range(kalman.STATE_ROWS, kalman.STATE_ROWS + 5)
+#: Number of rows that all trackers have; a tracker may add its own below.
 SHARED_ROWS: Final = ID + 1
-#: What can be a box: numbers whose areas and ratios are numbers.
-_LEAST_PX: Final = 1e-4
-_MOST_PX: Final = 1e12
+#: Limits of boxes, so that areas and aspect ratios are finite.
+_MIN_PX: Final = 1e-4
+_MAX_PX: Final = 1e12
 
 
 @dataclass(slots=True)
-class Seen:
-    """The boxes of a frame, a column each: left, top, right, bottom; what the filter measures; score and class."""
+class Measurements:
+    """Detections of a frame, one column each: left, top, right, bottom; the filter's measurement; score and class."""
 
     columns: Floats
 
@@ -48,12 +48,12 @@ class Seen:
 
     @property
     def measured(self) -> Floats:
-        """Centre, area and ratio (4, N)."""
+        """Measurements of the filter: centre, area and aspect ratio (4, N)."""
         return self.columns[4:8]
 
     @property
     def score(self) -> Floats:
-        """Scores (N,), NaN where there is none."""
+        """Scores (N,), NaN where the detector gives none."""
         row: Floats = self.columns[8]
         return row
 
@@ -63,21 +63,22 @@ class Seen:
         row: Floats = self.columns[9]
         return row
 
-    def take(self, at: Indices) -> Seen:
-        """The boxes ``at`` these places, in this order."""
-        return Seen(self.columns.take(at, axis=1))
+    def take(self, at: Indices) -> Measurements:
+        """The detections with these indices, in this order."""
+        return Measurements(self.columns.take(at, axis=1))
 
 
-def look(frames: Sequence[Frame], min_score: float | None, class_id: int | None) -> tuple[Floats, NDArray[np.int64]]:
-    """What F frames show: boxes that are neither empty nor beyond all measure, that score enough and are of the class.
+def frames_to_measurements(
+    frames: Sequence[Frame], min_score: float | None, class_id: int | None
+) -> tuple[Floats, NDArray[np.int64]]:
+    """The detections of F frames with at least this score, or none, and of this class; degenerate boxes are left out.
 
-    A box without a score passes. Returns the columns of ``Seen`` for all frames, and where those of each begin and end
-    (F + 1,).
+    Returns the columns of ``Measurements`` for all frames, and the ends of each frame's columns (F + 1,), from 0.
     """
     joined = join_frames(DETECTIONS, frames)
     rows, ends = joined.rows, joined.ends
     boxes = columns_to_boxes(rows)
-    kept = (boxes[:, 2:] > _LEAST_PX).all(axis=1) & (np.abs(boxes) < _MOST_PX).all(axis=1)
+    kept = (boxes[:, 2:] > _MIN_PX).all(axis=1) & (np.abs(boxes) < _MAX_PX).all(axis=1)
     if min_score is not None:
         kept &= ~(rows["score"] < min_score)
     if class_id is not None:
@@ -93,10 +94,10 @@ def look(frames: Sequence[Frame], min_score: float | None, class_id: int | None)
 
 
 class Tracks:
-    """K tracks, a column each of ``table``: the filter's state first, then the rows named above, then ``more``."""
+    """K tracks, one column of ``table`` each: the filter's state, the rows named above, then ``extra_rows``."""
 
-    def __init__(self, more: int = 0) -> None:
-        self.table: Floats = np.empty((SHARED_ROWS + more, 0))
+    def __init__(self, extra_rows: int = 0) -> None:
+        self.table: Floats = np.empty((SHARED_ROWS + extra_rows, 0))
 
     def __len__(self) -> int:
         return int(self.table.shape[1])
@@ -107,31 +108,31 @@ class Tracks:
         return self.table[: kalman.STATE_ROWS]
 
     def keep(self, kept: Bools) -> None:
-        """Forget all other tracks."""
+        """Terminate all other tracks."""
         self.table = self.table.compress(kept, axis=1)  # rows stay whole in memory, unlike with [:, kept]
 
-    def add(self, first_id: int, seen: Seen) -> None:
-        """Tracks that begin with these boxes, named ``first_id`` and on."""
-        new = np.empty((len(self.table), len(seen)))
-        kalman.start(new[: kalman.STATE_ROWS], seen.measured)
-        new[SCORE : CLASS + 1] = seen.columns[8:]
-        new[MISSED : STREAK + 1] = 0.0
-        new[ID] = range(first_id, first_id + len(seen))
+    def initiate(self, first_id: int, detections: Measurements) -> None:
+        """Start a track at each of these detections, with ids from ``first_id``."""
+        new = np.empty((len(self.table), len(detections)))
+        kalman.start(new[: kalman.STATE_ROWS], detections.measured)
+        new[SCORE : CLASS + 1] = detections.columns[8:]
+        new[SINCE_UPDATE : HIT_STREAK + 1] = 0.0
+        new[ID] = range(first_id, first_id + len(detections))
         new[SHARED_ROWS:] = np.nan
         self.table = np.concatenate([self.table, new], axis=1)
 
-    def see(self, at: Indices, seen: Seen, hit: float) -> None:
-        """Track ``at[i]`` is seen in box i (N,); its streak grows by ``hit``."""
+    def update(self, at: Indices, detections: Measurements, hit: float) -> None:
+        """Correct track ``at[i]`` with detection i (N,); its hit streak grows by ``hit``."""
         table = self.table.take(at, axis=1)
-        kalman.correct(table[: kalman.STATE_ROWS], seen.measured)
-        table[SCORE : CLASS + 1] = seen.columns[8:]
-        table[MISSED] = 0.0
-        table[STREAK] += hit
+        kalman.correct(table[: kalman.STATE_ROWS], detections.measured)
+        table[SCORE : CLASS + 1] = detections.columns[8:]
+        table[SINCE_UPDATE] = 0.0
+        table[HIT_STREAK] += hit
         self.table[:, at] = table
 
 
-def write(frames: Sequence[Frame], table: Floats, ends: Sequence[int], planes: Planes) -> list[Frame]:
-    """The columns of a table that are shown in F frames, ``ends`` (F + 1,) of each, as rows of these frames."""
+def tracks_to_frames(frames: Sequence[Frame], table: Floats, ends: Sequence[int], planes: Planes) -> list[Frame]:
+    """Rows of F frames from columns of a table, of which ``ends`` (F + 1,) are the ends of each frame's columns."""
     boxes = kalman.corners(table)
     boxes[2:] -= boxes[:2]
     rows = TRACKS.empty(table.shape[1])

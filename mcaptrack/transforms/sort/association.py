@@ -1,0 +1,74 @@
+"""Candidate pairs of detections and tracks, and their assignment. Letters: N detections, K tracks, P pairs."""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple, get_args
+
+import numpy as np
+
+from mcaptrack.geometry.arrays import Bools, Floats, Indices
+from mcaptrack.geometry.assignment import max_weight_matching, one_to_one
+from mcaptrack.geometry.boxes import overlapping
+from mcaptrack.geometry.plane import GroundPlane
+
+Cost = Literal["iou", "pixels", "metres"]
+COSTS: tuple[Cost, ...] = get_args(Cost)
+
+
+class CandidatePairs(NamedTuple):
+    """Pairs that pass the gate: detection (P,), track (P,), similarity (P,) in (0, 1]; ``shape`` is (N, K)."""
+
+    detection: Indices
+    track: Indices
+    similarity: Floats
+    shape: tuple[int, int]
+
+    def select(self, kept: Bools | Indices) -> CandidatePairs:
+        """Some of the pairs."""
+        return CandidatePairs(self.detection[kept], self.track[kept], self.similarity[kept], self.shape)
+
+
+def iou_pairs(boxes: Floats, predicted: Floats, area: Floats, predicted_area: Floats) -> CandidatePairs:
+    """Pairs of detected boxes (4, N) and predicted ones (4, K) that overlap; their similarity is IoU.
+
+    Boxes are left, top, right, bottom; areas are (N,) and (K,).
+    """
+    return CandidatePairs(*overlapping(boxes, predicted, area, predicted_area), (boxes.shape[1], predicted.shape[1]))
+
+
+def distance_pairs(boxes: Floats, predicted: Floats, gate: float, plane: GroundPlane | None) -> CandidatePairs:
+    """Pairs by the distance of centres in pixels or, given a plane, of positions on the ground in metres.
+
+    Similarity is 1 at distance 0 and falls to 0 at the gate; gating excludes pairs beyond it.
+    """
+    here, there = (_positions(corners, plane) for corners in (boxes, predicted))
+    distance = np.hypot(here[0][:, None] - there[0][None, :], here[1][:, None] - there[1][None, :])
+    detection, track = np.nonzero(distance < gate)  # NaN, above the horizon, is beyond every gate
+    return CandidatePairs(detection, track, 1 - distance[detection, track] / gate, (len(distance), distance.shape[1]))
+
+
+def _positions(corners: Floats, plane: GroundPlane | None) -> Floats:
+    if plane is None:
+        return (corners[:2] + corners[2:]) / 2
+    return plane.boxes_to_metres(np.concatenate([corners[:2], corners[2:] - corners[:2]]).T).T
+
+
+def associate(pairs: CandidatePairs, min_similarity: float) -> tuple[Indices, Indices]:
+    """Assign detections to tracks; returns the detections and the tracks of pairs of at least ``min_similarity``.
+
+    If no detection and no track is in two pairs, these are the assignment. Otherwise the assignment with the largest
+    total similarity is taken, and pairs below ``min_similarity`` are removed afterwards, as in the original program.
+    """
+    if not len(pairs.detection):
+        return pairs.detection, pairs.track
+    above = pairs.similarity > min_similarity
+    count = np.count_nonzero(above)
+    if count:
+        near = pairs if count == len(above) else pairs.select(above)
+        if one_to_one(near.detection, near.track):
+            return near.detection, near.track
+    (detection, track), similarity = max_weight_matching((pairs.detection, pairs.track), pairs.similarity, pairs.shape)
+    if count == len(above):
+        return detection, track
+    enough = similarity >= min_similarity
+    return detection[enough], track[enough]
