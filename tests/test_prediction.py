@@ -78,7 +78,7 @@ class TestSample:
         ]
         out = sampled([Frame(0, 0, rows), Frame(ns(0.4), 1, rows)], ground_planes=planes)
         assert [places(frame) for frame in out] == [{1: (1.2, 2.8)}, {1: (12.0, 28.0)}]
-        with pytest.raises(McaptrackError, match="tracks are in pixels and there is no ground plane"):
+        with pytest.raises(McaptrackError, match="tracks are in pixels, and there is no ground plane"):
             sampled([Frame(0, 0, rows)])
 
     def test_boxes_above_the_horizon_are_left_out(self):
