@@ -16,9 +16,10 @@ from typing import Any, Final
 
 import numpy as np
 
+from mcaptrack.geometry.arrays import Image
 from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
 from mcaptrack.schema import DETECTIONS, TRACKS, VIDEO, Frame, Schema
-from mcaptrack.transforms.protocol import Transform, check_options
+from mcaptrack.transforms.protocol import Colour, Transform, check_options, colour_of
 
 __all__ = ["LAWS", "LawError", "check_transform", "sample_frames"]
 
@@ -59,26 +60,29 @@ def check_transform(transform: Transform, frames: Sequence[Frame] | None = None,
     >>> check_transform(ByteTrack(max_age_s=1.0))
     """
     declares(transform, (), seed)
-    given = list(sample_frames(transform.reads, seed) if frames is None else frames)
+    sample = sample_frames(transform.reads, seed, colour=colour_of(transform)) if frames is None else frames
+    given = list(sample)
     if not given:
         raise LawError("there are no frames to check the transform with")
     for law in LAWS.values():
         law(transform, [frame._replace(rows=frame.rows.copy()) for frame in given], seed)
 
 
-def sample_frames(schema: Schema, seed: int = 0, step_s: float = 0.0) -> list[Frame]:
+def sample_frames(schema: Schema, seed: int = 0, step_s: float = 0.0, colour: Colour = "grey") -> list[Frame]:
     """Return frames to test transforms with.
 
     Parameters
     ----------
     schema : Schema
-        ``VIDEO`` gives pictures (H, W) of brightness on which a block moves; ``DETECTIONS`` gives boxes of people who
+        ``VIDEO`` gives pictures on which a block moves; ``DETECTIONS`` gives boxes of people who
         are missed now and then, and false positives, at uneven times; ``TRACKS`` gives tracks in pixels and metres with
         gaps, births, ends and changing ids.
     seed : int, default 0
         Random seed.
     step_s : float, optional
         Time between frames of tracks in seconds, by default 0.4.
+    colour : str, default "grey"
+        Pictures of brightness (H, W), or with "bgr" of blue, green and red (H, W, 3).
 
     Returns
     -------
@@ -94,7 +98,8 @@ def sample_frames(schema: Schema, seed: int = 0, step_s: float = 0.0) -> list[Fr
     """
     rng = np.random.default_rng(seed)
     if schema is VIDEO:
-        return _pictures(rng)
+        frames = _pictures(rng)
+        return frames if colour == "grey" else [frame._replace(rows=_tinted(frame.rows)) for frame in frames]
     if schema is DETECTIONS:
         return _detections(rng)
     if schema is TRACKS:
@@ -110,6 +115,11 @@ def _pictures(rng: np.random.Generator) -> list[Frame]:
         image[10:30, 4 * number : 4 * number + 8] = 230
         frames.append(Frame(seconds_to_ns(number / 10), number, image.astype(np.uint8)))
     return frames
+
+
+def _tinted(grey: Image) -> Image:
+    """A picture (H, W, 3) whose three channels differ, and whose green is that of ``grey`` (H, W)."""
+    return np.stack([grey // 2, grey, 255 - grey], axis=-1)
 
 
 def _detections(rng: np.random.Generator) -> list[Frame]:

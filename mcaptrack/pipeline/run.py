@@ -27,9 +27,10 @@ from mcaptrack.schema import DETECTIONS, GROUND_PLANE, TRACKS, VIDEO, Frame, Sch
 from mcaptrack.schema.provenance import CLOCK, Provenance
 from mcaptrack.sources import foreign
 from mcaptrack.sources.cameras import camera_at
-from mcaptrack.sources.video import EncodedPicture, decode_gray
+from mcaptrack.sources.video import EncodedPicture, decode_bgr, decode_gray
 from mcaptrack.transforms import FULL, STAGES, Sample, Transform
 from mcaptrack.transforms.guarded import guarded
+from mcaptrack.transforms.protocol import colour_of
 from mcaptrack.transforms.to_video_rate import to_video_rate, unchanged_tracks
 
 Progress = Callable[[str, int, int], None]
@@ -249,7 +250,7 @@ def _input(
     """What a job reads; ``stamps`` gets those of pictures."""
     if job.source not in made and job.transform.reads is VIDEO:
         seen = stamps.setdefault(job.source, [])
-        digest, pictures = _pictures(opened, opened.channel(job.source), seen, job.stage, progress)
+        digest, pictures = _pictures(opened, job, seen, progress)
         return _Input(pictures, [], digest, lambda: len(seen))
     if job.source in made:
         frames, said = made[job.source].frames, made[job.source].provenance.digest
@@ -271,12 +272,12 @@ def _counted(frames: Sequence[Frame], stage: str, progress: Progress) -> Iterato
 
 
 def _pictures(
-    opened: log.Log, channel: log.Channel, stamps: list[int], stage: str, progress: Progress
+    opened: log.Log, job: Job, stamps: list[int], progress: Progress
 ) -> tuple[Callable[[], str], Iterator[Frame]]:
-    """The brightness of a channel's pictures; ``stamps`` gets the stamp of each."""
+    """The pictures that a job reads, as its transform wants them; ``stamps`` gets the stamp of each."""
     import hashlib
 
-    total = hashlib.sha256()
+    total, channel = hashlib.sha256(), opened.channel(job.source)
 
     def encoded() -> Iterator[EncodedPicture]:
         stamps.clear()
@@ -285,9 +286,10 @@ def _pictures(
             stamps.append(picture.stamp_ns)
             where = f"{opened.path}: {channel.topic} at {message.t_ns} ns: frame {index}"
             yield EncodedPicture(message.t_ns, index, picture.format, picture.data, picture.layout, where)
-            progress(stage, index + 1, channel.messages)
+            progress(job.stage, index + 1, channel.messages)
 
-    return total.hexdigest, decode_gray(encoded())
+    decode = decode_bgr if colour_of(job.transform) == "bgr" else decode_gray
+    return total.hexdigest, decode(encoded())
 
 
 def input_of(

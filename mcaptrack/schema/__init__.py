@@ -51,7 +51,8 @@ class Frame(NamedTuple):
     index : int
         Frame number in the video (the sequence number of the message).
     rows : (N,) structured array
-        On the video channel the picture in gray, (height, width) uint8. A frame without rows is data, too: nothing was
+        On the video channel the picture: its brightness, (height, width) uint8, or blue, green and red,
+        (height, width, 3), for a transform that asks for colour. A frame without rows is data, too: nothing was
         detected.
     """
 
@@ -232,7 +233,8 @@ SCHEMAS: Final = {
         FORECAST_SCORES,
     )
 }
-#: Pictures instead of rows: a transform that reads this schema gets each frame in gray.
+#: Pictures instead of rows: a transform that reads this schema gets their brightness, or their colours if it asks for
+#: them.
 VIDEO: Final = Schema("foxglove.CompressedVideo")
 
 

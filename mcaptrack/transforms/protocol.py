@@ -4,6 +4,9 @@ A transform is a frozen, keyword-only dataclass. Its fields are its parameters: 
 of its name and a help text. They become the options of its command, and are stored in the provenance of its channels.
 Calling it with an iterable of frames gives an iterator of tuples of frames, one frame for each of its outputs.
 
+A transform that reads pictures (``reads = VIDEO``) gets their brightness, (height, width), unless its class attribute
+``colour`` is "bgr"; then it gets blue, green and red, (height, width, 3).
+
 All transforms obey these laws; ``mcaptrack.testing.check_transform`` tests them:
 
 * Schema: the rows of every output have the columns of its schema, with valid values.
@@ -58,6 +61,15 @@ class Transform(WithOptions, Protocol):
     def latency_s(self) -> Mapping[str, float]:
         """How far each output depends on later input, in seconds."""
         ...
+
+
+#: What a transform gets of pictures: brightness, (height, width), or blue, green and red, (height, width, 3).
+Colour = Literal["bgr", "grey"]
+
+
+def colour_of(transform: Any) -> Colour:
+    """What a transform (or its class) gets of pictures: brightness unless its ``colour`` says otherwise."""
+    return "bgr" if getattr(transform, "colour", "grey") == "bgr" else "grey"
 
 
 #: The default upper end of parameters with a lower one: days in seconds, hundreds of kilometres in metres.

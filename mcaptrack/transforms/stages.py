@@ -11,13 +11,13 @@ import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
 from types import MappingProxyType
-from typing import Any, Final
+from typing import Any, Final, get_args
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.registry import BUILT_IN, Entry, Kind, entry_of, failure, find
 from mcaptrack.transforms.detect import KnnDetector
 from mcaptrack.transforms.predict import Predict
-from mcaptrack.transforms.protocol import Transform, option_problem
+from mcaptrack.transforms.protocol import Colour, Transform, option_problem
 from mcaptrack.transforms.retrack import PROFILES, Retrack, upgrade_parameters
 from mcaptrack.transforms.sample import Sample
 from mcaptrack.transforms.sort import Sort
@@ -184,6 +184,8 @@ class Stage:
             raise McaptrackError(f"{entry} can't be called with frames; it needs a method __call__")
         if any(one.name == self.kind for one in fields(cls)):
             raise McaptrackError(f"{entry}: a parameter can't have the name of the option `{self.kind}=`")
+        if getattr(cls, "colour", "grey") not in get_args(Colour):
+            raise McaptrackError(f"{entry}: its class attribute colour is one of {', '.join(get_args(Colour))}")
         if problem := option_problem(cls):
             raise McaptrackError(f"{entry}: {problem}")
 

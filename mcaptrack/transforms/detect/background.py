@@ -24,7 +24,7 @@ from mcaptrack.schema import DETECTIONS, VIDEO, Frame, Schema
 from mcaptrack.transforms.detect.camera_motion import IDENTITY, CameraMotion
 from mcaptrack.transforms.detect.foreground import Method, make_foreground_model
 from mcaptrack.transforms.detect.steadiness import Steadiness
-from mcaptrack.transforms.protocol import check_options, option
+from mcaptrack.transforms.protocol import Colour, check_options, option
 
 # In units of the height of a person as measured in the picture: one body often gives several regions above each other,
 # which are joined over this distance; regions with a smaller area than this (times the height squared) are left out.
@@ -54,6 +54,7 @@ class MotionDetector:
     stabilise: bool = option(True, "compensate the motion of a shaking camera")
 
     method: ClassVar[Method]
+    colour: ClassVar[Colour] = "grey"
     reads: ClassVar[Schema] = VIDEO
     writes: ClassVar[Mapping[str, Schema]] = MappingProxyType({"": DETECTIONS})
     latency_s: ClassVar[Mapping[str, float]] = MappingProxyType({"": 0.0})
