@@ -6,14 +6,19 @@ SCHEMA_VERSION = 1
 
 _PARTS = {
     "contents": ["ChannelInfo", "LogInfo", "info"],
+    "demonstration": ["DemoResult", "demo"],
     "ingesting": ["IngestResult", "ingest"],
-    "outputs": ["ExportResult", "RenderResult", "ReportResult", "export", "query", "render", "report"],
+    "outputs": ["ExportResult", "RenderResult", "ReportResult", "export", "render", "report"],
+    "querying": ["ColumnInfo", "TableInfo", "TableList", "list_tables", "query"],
     "recording": ["FetchedMessage", "Recording", "open"],
     "rows": ["detections"],
     "running": ["RunResult"],
     "scoring": ["Scores", "evaluate"],
     "stages": ["detect", "predict", "retrack", "sample", "track"],
+    "training": ["TrainResult", "train"],
+    "tuning": ["TuneResult", "tune"],
     "upkeep": ["DropResult", "LogCheck", "LogRecovery", "check", "drop", "recover"],
+    "viewing": ["LogServer", "view"],
     "whole": ["events", "run"],
 }
 #: Where the names of the package are defined; each is imported when it is first used.

@@ -1,15 +1,21 @@
 from mcaptrack.api.contents import ChannelInfo as ChannelInfo
 from mcaptrack.api.contents import LogInfo as LogInfo
 from mcaptrack.api.contents import info as info
+from mcaptrack.api.demonstration import DemoResult as DemoResult
+from mcaptrack.api.demonstration import demo as demo
 from mcaptrack.api.ingesting import IngestResult as IngestResult
 from mcaptrack.api.ingesting import ingest as ingest
 from mcaptrack.api.outputs import ExportResult as ExportResult
 from mcaptrack.api.outputs import RenderResult as RenderResult
 from mcaptrack.api.outputs import ReportResult as ReportResult
 from mcaptrack.api.outputs import export as export
-from mcaptrack.api.outputs import query as query
 from mcaptrack.api.outputs import render as render
 from mcaptrack.api.outputs import report as report
+from mcaptrack.api.querying import ColumnInfo as ColumnInfo
+from mcaptrack.api.querying import TableInfo as TableInfo
+from mcaptrack.api.querying import TableList as TableList
+from mcaptrack.api.querying import list_tables as list_tables
+from mcaptrack.api.querying import query as query
 from mcaptrack.api.recording import FetchedMessage as FetchedMessage
 from mcaptrack.api.recording import Recording as Recording
 from mcaptrack.api.recording import open as open  # noqa: A004
@@ -22,12 +28,18 @@ from mcaptrack.api.stages import predict as predict
 from mcaptrack.api.stages import retrack as retrack
 from mcaptrack.api.stages import sample as sample
 from mcaptrack.api.stages import track as track
+from mcaptrack.api.training import TrainResult as TrainResult
+from mcaptrack.api.training import train as train
+from mcaptrack.api.tuning import TuneResult as TuneResult
+from mcaptrack.api.tuning import tune as tune
 from mcaptrack.api.upkeep import DropResult as DropResult
 from mcaptrack.api.upkeep import LogCheck as LogCheck
 from mcaptrack.api.upkeep import LogRecovery as LogRecovery
 from mcaptrack.api.upkeep import check as check
 from mcaptrack.api.upkeep import drop as drop
 from mcaptrack.api.upkeep import recover as recover
+from mcaptrack.api.viewing import LogServer as LogServer
+from mcaptrack.api.viewing import view as view
 from mcaptrack.api.whole import events as events
 from mcaptrack.api.whole import run as run
 from mcaptrack.errors import McaptrackError as McaptrackError
@@ -36,6 +48,8 @@ from mcaptrack.notices import Notice as Notice
 
 __all__ = [
     "ChannelInfo",
+    "ColumnInfo",
+    "DemoResult",
     "DropResult",
     "ExportResult",
     "FetchedMessage",
@@ -43,6 +57,7 @@ __all__ = [
     "LogCheck",
     "LogInfo",
     "LogRecovery",
+    "LogServer",
     "McaptrackError",
     "McaptrackWarning",
     "Notice",
@@ -51,7 +66,12 @@ __all__ = [
     "ReportResult",
     "RunResult",
     "Scores",
+    "TableInfo",
+    "TableList",
+    "TrainResult",
+    "TuneResult",
     "check",
+    "demo",
     "detect",
     "detections",
     "drop",
@@ -60,6 +80,7 @@ __all__ = [
     "export",
     "info",
     "ingest",
+    "list_tables",
     "open",
     "predict",
     "query",
@@ -70,6 +91,9 @@ __all__ = [
     "run",
     "sample",
     "track",
+    "train",
+    "tune",
+    "view",
 ]
 __version__: str
 SCHEMA_VERSION: int

@@ -137,10 +137,10 @@ SCENES: dict[str, Callable[[Scene], str]] = {
     "cli/train.py:_print:predict": lambda s: s.says(
         "train", "synthetic", "--walks", "1000", "--epochs", "1", "-o", "my net"
     ),
-    "cli/view.py:view:run": lambda s: s.untracked().says("view", "LOG"),
+    "cli/view.py:_print:run": lambda s: s.untracked().says("view", "LOG"),
     "evaluation/__init__.py:sequence_of_log:run": lambda s: s.untracked().says("evaluate", "LOG"),
     "evaluation/__init__.py:ground_truth_of_log:ingest": lambda s: s.without("/camera/truth*").says("evaluate", "LOG"),
-    "cli/view.py:view:recover": lambda s: s.half_written().says("view", "LOG"),
+    "api/viewing.py:view:recover": lambda s: s.half_written().says("view", "LOG"),
     "tables/compared.py:pair_files:ingest": lambda s: s.without("/camera/truth*").says(
         "evaluate", "LOG", "--truth", "truth.txt"
     ),
@@ -163,7 +163,7 @@ SCENES: dict[str, Callable[[Scene], str]] = {
     "viewing/report/summary.py:_without_ground_truth:run": lambda s: s.ingested("clip.mp4").page(),
     "viewing/report/sections.py:scores:run": lambda s: s.ingested("clip.mp4").page(),
     "viewing/report/sections.py:forecasts:predict": lambda s: s.without("*predictions*").page(),
-    "tables/sql.py:_answer:query": lambda s: s.says("query", "LOG", "show tables"),
+    "tables/sql.py:_answer:list_tables": lambda s: s.says("query", "LOG", "show tables"),
     "training/sources.py:_from_log:run": lambda s: s.ingested("clip.mp4").to_train_on(),
 }
 
@@ -247,6 +247,7 @@ def test_what_is_proposed_works(where, template, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(serving.Server, "serve_forever", lambda *_, **__: (_ for _ in ()).throw(KeyboardInterrupt))
     verb = where.rpartition(":")[2]
+    verb = {"list_tables": "query"}.get(verb, verb)
     said = SCENES[where](Scene(template, tmp_path))
     lines = re.findall(r"mcaptrack ((?:" + VERBS + r")\b[^`\n]*?)(?=`|\n|$|    )", said)
     lines = [line for line in lines if verb in ("*", line.split()[0])]

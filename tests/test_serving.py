@@ -27,6 +27,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 
+import mcaptrack
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.viewing.serving import Limits, Server, requested_range
@@ -500,10 +501,20 @@ def test_layout_files_are_served_as_they_were_edited(tmp_path):
         _, err = process.communicate(timeout=20)
         assert process.returncode == 128 + signal.SIGTERM
         assert err.splitlines() == [
-            f"warning: {unusable}",
             f"{edited} differs from the layout in the log; the file is served",
+            f"warning: {unusable}",
             "serving until Ctrl-C ...",
         ]
+
+
+def test_a_log_is_served_from_start_to_close(tmp_path):
+    path = extended(tmp_path / "a.mcap")
+    server = mcaptrack.view(path, layout="comparing").start()
+    assert ask(server.logs[0])[2] == path.read_bytes()
+    assert {name: ask(address)[2] for name, address in server.layouts.items()} == {"comparing": b'{"layout": 2}'}
+    server.close()
+    with pytest.raises(OSError, match="refused"):
+        ask(server.logs[0])
 
 
 def test_mistakes_are_said(tmp_path):

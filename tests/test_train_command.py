@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from mcaptrack import __version__
-from mcaptrack.training import sources
+from mcaptrack.api import training
 from mcaptrack.training.recipe import RECIPES
 from mcaptrack.training.sources import SourceOptions, read_scenes, split, windows_of
 from tests.commands import call, done
@@ -111,7 +111,7 @@ def test_synthetic_walks_and_files_are_other_scenes(folder, given, monkeypatch):
         assert (recipe.seed, walks, seed) == (5, 1234, 5)
         return windows(recipe, Path("b.txt"))
 
-    monkeypatch.setattr(sources, "synthetic", synthetic)
+    monkeypatch.setattr(training, "synthetic", synthetic)
     done("train", "synthetic", "--walks", 1234, "--seed", 5, "--validate", "b.txt", "-o", "one")
     done("train", "a.txt", "synthetic", "--walks", 1234, "--seed", 5, "--validate", "b.txt", "-o", "two")
     (recipe, made, *_, card, _, _, _, _, _), (_, both, *_, mixed, _, _, _, _, _) = given

@@ -156,7 +156,7 @@ def test_a_log_can_be_tuned_and_mistakes_are_said(tmp_path):
     assert "defaults" in out
     code, _, err = call("tune", log, "--search", "speed=1:2", folder=tmp_path)
     assert code == 1
-    assert "no parameter that can be searched; there are max-age-s" in err
+    assert "--search has speed, which can't be searched; there are max_age_s" in err
     code, _, err = call("tune", log, "--search", "min-iou=0.1:7", folder=tmp_path)
     assert code == 1
     assert "min_iou has to be from 0 to 1, not 7" in err

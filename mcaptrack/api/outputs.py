@@ -1,11 +1,11 @@
-"""Look at logs: what is in them, tables, reports, videos, and answers to queries."""
+"""Write tables, reports and videos of logs."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from mcaptrack import log as logs
 from mcaptrack import pipeline
@@ -29,9 +29,6 @@ from mcaptrack.tables.export import export as write_tables
 from mcaptrack.viewing import report as pages
 from mcaptrack.viewing.rendering import RenderOptions
 from mcaptrack.viewing.rendering import render as draw_video
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 
 @dataclass(frozen=True)
@@ -305,47 +302,3 @@ def render(
         views = pipeline.find_views(opened, prefix, names_of(topic))
         count = draw_video(opened, pictures, views, target, options, progress)
     return RenderResult(path, target, count, tuple(views), tuple(dict.fromkeys(warnings)))
-
-
-def query(
-    log: PathLike | Sequence[PathLike],
-    sql: str,
-    *,
-    files: Mapping[str, PathLike] | None = None,
-) -> pa.Table:
-    """Query the tables of logs in SQL. Needs DuckDB.
-
-    Parameters
-    ----------
-    log : path or sequence of paths
-        Logs, or folders of tables; the column ``recording`` tells several apart.
-    sql : str
-        The query.
-    files : mapping of str to path, optional
-        CSV, JSON or Parquet files as more tables, by name.
-
-    Returns
-    -------
-    pyarrow.Table
-        The answer; times are UTC.
-
-    Raises
-    ------
-    McaptrackError
-        If a log cannot be read, and for what DuckDB refuses.
-
-    Examples
-    --------
-    >>> import mcaptrack
-    >>> mcaptrack.query("log.mcap", "select count(*) > 0 as found from tracks").to_pydict()
-    {'found': [True]}
-
-    """
-    from mcaptrack.tables.sql import Database
-
-    named = {name: as_path(path) for name, path in (files or {}).items()}
-    with Database(paths_of(log), named) as database:
-        answer = database.ask(sql)
-        for note in database.notes:
-            detail(note)
-    return answer

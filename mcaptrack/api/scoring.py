@@ -5,12 +5,22 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from itertools import count
 from pathlib import Path
 from typing import Any, Final
 
 from mcaptrack import log as logs
 from mcaptrack import pipeline
-from mcaptrack.api.common import Notes, PathLike, detail, names_of, optional_path, paths_of
+from mcaptrack.api.common import (
+    Notes,
+    PathLike,
+    Progress,
+    detail,
+    names_of,
+    no_progress,
+    optional_path,
+    paths_of,
+)
 from mcaptrack.api.ingesting import parse_fps
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation import (
@@ -105,6 +115,7 @@ def evaluate(
     ground_plane: PathLike | None = None,
     point: Point = "foot",
     fps: float | str | Fraction | None = None,
+    progress: Progress = no_progress,
 ) -> Scores:
     """Score tracks and predictions against ground truth.
 
@@ -133,6 +144,8 @@ def evaluate(
         For files: which point of a box touches the ground.
     fps : float, str or Fraction, optional
         For files: frames per second.
+    progress : callable, optional
+        Called as ``progress(stage, done, total)``.
 
     Returns
     -------
@@ -162,7 +175,14 @@ def evaluate(
         else:
             plane = optional_path(ground_plane)
             sequences = _from_files(paths, paths_of(truth), parse_fps(fps), plane, point, topics, notes)
-        outcome = score_sequences(sequences, options, detail)
+        total, told = sum(len(sequence.candidates) for sequence in sequences), count()
+
+        def tell(candidate: str) -> None:
+            progress("evaluate", next(told), total)
+            detail(candidate)
+
+        outcome = score_sequences(sequences, options, tell)
+        progress("evaluate", total, total)
         for words in outcome.notes:
             warn(words, "not-compared")
     return Scores(tuple(outcome.results), tuple(notes), tuple(dict.fromkeys(warnings)))

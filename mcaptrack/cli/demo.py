@@ -11,10 +11,8 @@ from typing import Annotated, Final, Literal
 
 from mcaptrack.cli import common
 from mcaptrack.cli.text import show
-from mcaptrack.errors import McaptrackError
 
 _LICHTBLICK: Final = "lichtblick-suite.github.io/lichtblick"
-_GATE_M: Final = 1.0
 
 
 @common.one_line
@@ -48,40 +46,11 @@ def demo(
 
     Example: mcaptrack demo --scene crowd --seed 7 -o crowd
     """
-    from mcaptrack import log, pipeline
-    from mcaptrack.evaluation import EvaluateOptions, evaluate, sequence_of_log
-    from mcaptrack.files import publish_bytes
-    from mcaptrack.sources import demo as drawing
-    from mcaptrack.sources.ingest import IngestOptions, ingest
-    from mcaptrack.sources.synthetic import SCENES
-    from mcaptrack.tables.export import default_folder, export
+    import mcaptrack
 
-    if output.exists() and not output.is_dir():
-        raise McaptrackError(f"{output} is a file; the demonstration needs a folder")
-    target = output / "demo.mcap"
-    if target.exists() and not force:
-        raise McaptrackError(f"{target} exists; give another folder with -o, or --force to replace it")
     with common.Talk(quiet, verbose).open() as talk:
-        talk.say("drawing 40 seconds of people on a square ...")
-        footage = drawing.draw(SCENES[scene](seed), output, talk.progress)
-        talk.say("making a log, finding people, tracking, re-tracking, predicting ...")
-        options = IngestOptions(ground_plane=footage.ground_plane, labels={"truth": footage.ground_truth})
-        ingest(footage.video, target, options, progress=talk.progress)
-        with log.read(target) as opened:
-            prefix = pipeline.find_camera(opened, None)
-            jobs, watch = pipeline.plan_all(opened, prefix), pipeline.Watch()
-            report = pipeline.run(opened, prefix, jobs, progress=talk.progress, watch=watch)
-        layouts = [pipeline.layout_path(target, name) for name in report.layouts]
-        for path, content in zip(layouts, report.layouts.values(), strict=True):
-            publish_bytes(path, content)
-        with log.read(target) as opened:
-            export(opened, default_folder(target), talk.progress)
-            topics = [f"{prefix}/samples", f"{prefix}/retracks"]
-            outcome = evaluate(
-                [sequence_of_log(opened, prefix, topics)],
-                EvaluateOptions(similarities=("metres",), gates_m=(_GATE_M,)),
-            )
-    sort, retracked = (result.to_json() for result in outcome.results)
+        made = mcaptrack.demo(output, scene=scene, seed=seed, force=force, progress=talk.progress)
+    sort, retracked = made.scores.rows()
     if json:
         common.print_json({"scene": scene, "seed": seed, "results": [sort, retracked]})
         return
@@ -90,14 +59,14 @@ def demo(
         "",
         *_over_seeds(scene, seed),
         "",
-        f"video    {footage.video}",
-        f"log      {target}",
-        f"layouts  {'  '.join(str(path) for path in layouts)}",
-        f"tables   {default_folder(target)}",
+        f"video    {made.video}",
+        f"log      {made.log}",
+        f"layouts  {'  '.join(str(path) for path in made.layouts)}",
+        f"tables   {made.tables}",
         "",
         f"Open the log in Foxglove, or in Lichtblick (https://{_LICHTBLICK}): open local file, then import a layout.",
         "See more:",
-        *(f"  {line}" for line in _next_commands(target)),
+        *(f"  {line}" for line in _next_commands(made.log)),
     )
 
 
@@ -135,7 +104,7 @@ def _side_by_side(sort: dict[str, float], retracked: dict[str, float]) -> list[s
         "FN": "missed rows (hidden, merged)",
         "Frag": "fragments",
     }
-    lines = [f"{f'within {_GATE_M:g} m, 2.5 Hz':<36}{'SORT':>10}{'re-tracked':>14}"]
+    lines = [f"{'within 1 m, 2.5 Hz':<36}{'SORT':>10}{'re-tracked':>14}"]
     for name, meaning in words.items():
         values = [
             f"{100 * part[name]:.1f} %" if name in ("IDF1", "MOTA") else str(part[name]) for part in (sort, retracked)

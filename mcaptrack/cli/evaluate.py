@@ -96,7 +96,7 @@ def evaluate(
 
     limits = dict(_limit(text) for text in fail_under or ())
     gates = _gates(gate_m)
-    with common.Talk(quiet, verbose).open():
+    with common.Talk(quiet, verbose).open() as talk:
         paths, truths = common.expand(inputs), common.expand(truth) if truth else None
         scores = mcaptrack.evaluate(
             paths,
@@ -110,6 +110,7 @@ def evaluate(
             ground_plane=ground_plane,
             point=point,
             fps=fps,
+            progress=talk.progress,
         )
         if truths:
             warn_unused("files of tracks are of no camera", "camera")

@@ -14,6 +14,8 @@ from mcaptrack.errors import command
 RUNNING: Final[ContextVar[Any]] = ContextVar("running", default=None)
 
 _CALL: Final = re.compile(r"`mcaptrack\.(\w+)\(([^`]*)\)`")
+#: Functions that are a command with an option, by name.
+_WITH_OPTION: Final = {"list_tables": ("query", "--tables")}
 _PARAMETER: Final = re.compile(r"`([a-z]\w*)=([^`]*)`")
 
 
@@ -35,7 +37,8 @@ def _command(found: re.Match[str]) -> str:
     for parameter, value in options.items():
         flag = flag_of(parameter, value, name)
         words += [flag] if isinstance(value, bool) else [flag, str(value)]
-    return command(name, *words)
+    name, *more = _WITH_OPTION.get(name, (name,))
+    return command(name, *words, *more)
 
 
 def _option(found: re.Match[str]) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
@@ -16,7 +17,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.files import refuse_url
 
 if TYPE_CHECKING:
-    from mcaptrack.tables.sql import Database
+    from mcaptrack import TableList
 
 Form = Literal["table", "csv", "json", "jsonl", "parquet", "arrow"]
 _QUERY: Final = "Query and answer"
@@ -100,10 +101,6 @@ def query(
     paths, sql = _asked(words or [], file, tables)
     if tables:
         warn_unused("--tables lists what could be asked", "form", "rows")
-    if tables and not paths:
-        with common.printed_to(output, force):
-            _print_tables(None, json)
-        return
     paths = common.expand(paths)
     chosen = _form(form, output, json)
     if output is not None:
@@ -112,16 +109,15 @@ def query(
         refuse_overwrite(output, force)
         if any(is_same_file(output, path) for path in paths):
             raise McaptrackError(f"{output} is both input and output; give another name with -o")
-    from mcaptrack.tables.sql import Database
+    import mcaptrack
 
-    with common.Talk(quiet, verbose).open() as talk, Database(paths, _named(files or [])) as database:
+    with common.Talk(quiet, verbose).open() as talk:
         if tables:
+            listed = mcaptrack.list_tables(paths, files=_named(files or []))
             with common.printed_to(output, force):
-                _print_tables(database, json)
+                _print_tables(listed, json)
             return
-        answer = database.ask(sql)
-        for note in database.notes:
-            talk.detail(note)
+        answer = mcaptrack.query(paths, sql, files=_named(files or []))
         if chosen == "table":
             limit = rows if rows is not None else _SHOWN if sys.stdout.isatty() and output is None else 0
             with common.printed_to(output, force):
@@ -268,41 +264,25 @@ def _fitting(names: Sequence[str], rows: Sequence[Sequence[str | None]], width: 
     return len(names)
 
 
-def _print_tables(database: Database | None, json: bool) -> None:
-    from mcaptrack.tables import RECORDING, TABLES
-
-    listed: list[dict[str, Any]] = []
-    for table in TABLES.values():
-        columns = [*table.arrow, RECORDING.arrow]
-        listed.append(
-            {
-                "table": table.name,
-                "meaning": table.doc,
-                "columns": [
-                    {
-                        "name": field.name,
-                        "type": "text" if str(field.type).startswith(("dictionary", "string")) else str(field.type),
-                        "unit": field.metadata[b"unit"].decode(),
-                        "meaning": field.metadata[b"description"].decode(),
-                    }
-                    for field in columns
-                ],
-            }
-        )
-    found = {} if database is None else {"recordings": [*database.recordings], "channels": [*database.channels]}
+def _print_tables(listed: TableList, json: bool) -> None:
+    found = {"recordings": listed.recordings, "channels": listed.channels} if listed.recordings else {}
     if json:
-        common.print_json({"results": listed} | found)
+        results = [
+            {"table": table.name, "meaning": table.meaning, "columns": [asdict(column) for column in table.columns]}
+            for table in listed.tables
+        ]
+        common.print_json({"results": results} | {what: list(names) for what, names in found.items()})
         return
     from rich.table import Table
     from rich.text import Text
 
     out = console()
-    for one in listed:
-        out.print(Text(one["table"], "bold"))
-        out.print(Text(one["meaning"], "dim"))
+    for one in listed.tables:
+        out.print(Text(one.name, "bold"))
+        out.print(Text(one.meaning, "dim"))
         shown = Table(box=None, show_header=False, pad_edge=False, padding=(0, 2, 0, 0))
-        for column in one["columns"]:
-            shown.add_row(f"  {column['name']}", column["type"], column["unit"], column["meaning"])
+        for column in one.columns:
+            shown.add_row(f"  {column.name}", column.type, column.unit, column.meaning)
         out.print(shown)
         out.print()
     for what, names in found.items():

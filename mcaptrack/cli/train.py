@@ -9,13 +9,10 @@ import typer
 
 from mcaptrack.cli import common
 from mcaptrack.cli.text import console, show
-from mcaptrack.errors import McaptrackError, command
-from mcaptrack.files import refuse_url
+from mcaptrack.errors import command
 
 if TYPE_CHECKING:
-    from mcaptrack.training.loop import Trained
-    from mcaptrack.training.recipe import Recipe
-    from mcaptrack.training.windows import Windows
+    from mcaptrack import TrainResult
 
 _COLUMNS: Final = {
     "ADE_m": "ADE m",
@@ -28,7 +25,6 @@ _COLUMNS: Final = {
 }
 _TRAINING: Final = "Training"
 _WINDOWS: Final = "Training data"
-_LICENCE: Final = "that of the data it was trained on"
 
 
 @common.one_line
@@ -222,76 +218,43 @@ def train(
 
     Example: mcaptrack train synthetic -o trained
     """
-    from mcaptrack.training.recipe import RECIPES
+    import mcaptrack
+    from mcaptrack.training.sources import SYNTHETIC
 
-    for source in sources:
-        refuse_url(source)
-    given = {"epochs": epochs, "batch": batch, "rate": rate, "patience": patience, "seed": seed}
-    given |= {"consistency_weight": consistency_weight}
-    corrupted = {"noise_m": noise_m, "gaps": gaps, "scale": scale}
-    chosen = RECIPES[recipe].changed(given, corrupted)
-    if output.exists() and not output.is_dir():
-        raise McaptrackError(f"{output} is a file; training needs a folder")
-    weights = output / f"{chosen.network}.safetensors"
-    state = output / "state.safetensors"
-    if resume and not state.exists():
-        raise McaptrackError(f"there is no training to resume in {output}")
-    if not resume and not force and (weights.exists() or state.exists()):
-        raise McaptrackError(f"{output} holds a training; --resume goes on with it, --force replaces it")
-    from mcaptrack.training.loop import find_device
-    from mcaptrack.training.loop import train as fit
-
-    where = find_device(device)  # before anything takes long
+    paths = common.expand([Path(source) for source in sources if source != SYNTHETIC])
     with common.Talk(quiet, verbose).open() as talk:
-        options = _options(fps, ground_plane, point, topic)
-        training, validation, card = _windows(chosen, sources, validate or [], walks, options, talk)
-        talk.say(f"training on {len(training)} windows, validating on {len(validation)}")
-        output.mkdir(parents=True, exist_ok=True)
-        trained = fit(chosen, training, validation, output, card, where, threads, resume, talk.progress, talk.say)
+        trained = mcaptrack.train(
+            [*([SYNTHETIC] if SYNTHETIC in sources else []), *paths],
+            output,
+            recipe=recipe,
+            validate=common.expand(validate) if validate else None,
+            epochs=epochs,
+            batch=batch,
+            rate=rate,
+            noise_m=noise_m,
+            gaps=gaps,
+            scale=scale,
+            consistency_weight=consistency_weight,
+            patience=patience,
+            walks=walks,
+            seed=seed,
+            device=device,
+            threads=threads,
+            resume=resume,
+            topic=topic,
+            fps=fps,
+            ground_plane=ground_plane,
+            point=point,
+            force=force,
+            progress=talk.progress,
+        )
     if json:
         common.print_json(_as_json(trained))
-        return
-    _print(trained, chosen)
-
-
-def _options(fps: str | None, ground_plane: Path | None, point: Literal["center", "foot"], topic: str | None) -> Any:
-    from mcaptrack.api.ingesting import parse_fps
-    from mcaptrack.training.sources import SourceOptions
-
-    return SourceOptions(fps=parse_fps(fps), ground_plane=ground_plane, point=point, topic=topic)
-
-
-def _windows(
-    recipe: Recipe, sources: list[str], validate: list[Path], walks: int, options: Any, talk: common.Talk
-) -> tuple[Windows, Windows, dict[str, str]]:
-    """Windows to train and to validate on, and what the card says of them."""
-    from mcaptrack import __version__
-    from mcaptrack.training.sources import SYNTHETIC, read_scenes, split, synthetic, windows_of
-    from mcaptrack.training.windows import Windows
-
-    parts, words = [], []
-    if SYNTHETIC in sources:
-        talk.say(f"simulating {walks} walks ...")
-        parts.append(synthetic(recipe, walks, recipe.seed))
-        words.append(f"{walks} synthetic walks of mcaptrack {__version__}, seed {recipe.seed}")
-    paths = common.expand([Path(source) for source in sources if source != SYNTHETIC])
-    if paths:
-        scenes = read_scenes(paths, options, recipe.step_s)
-        first = 0 if not parts else int(parts[0].scene.max()) + 1
-        found = windows_of(scenes, recipe)
-        parts.append(Windows(found.past, found.known, found.future, found.scene + first))
-        words.append(f"{len(scenes)} scenes: {', '.join(scene.name for scene in scenes)[:500]}")
-    windows = Windows.join(parts)
-    if validate:
-        training = windows
-        validation = windows_of(read_scenes(common.expand(validate), options, recipe.step_s), recipe)
     else:
-        training, validation = split(windows, 0.1, recipe.seed)
-    licence = "Apache-2.0" if not paths else _LICENCE
-    return training, validation, {"data": "; ".join(words), "licence": licence, "made_by": f"mcaptrack {__version__}"}
+        _print(trained)
 
 
-def _as_json(trained: Trained) -> dict[str, Any]:
+def _as_json(trained: TrainResult) -> dict[str, Any]:
     return {
         "weights": str(trained.weights),
         "epochs": trained.epochs,
@@ -303,7 +266,7 @@ def _as_json(trained: Trained) -> dict[str, Any]:
     }
 
 
-def _print(trained: Trained, recipe: Recipe) -> None:
+def _print(trained: TrainResult) -> None:
     from rich.table import Table
 
     table = Table(box=None, pad_edge=False, header_style="bold")
@@ -319,5 +282,5 @@ def _print(trained: Trained, recipe: Recipe) -> None:
     console().print(table)
     minutes, seconds = divmod(round(trained.seconds), 60)
     show("", f"{trained.weights}: epoch {trained.kept_epoch} of {trained.epochs}, {minutes} min {seconds} s")
-    use = command("predict", "LOG", "--predictor", f"{recipe.network}:{trained.weights}")
+    use = command("predict", "LOG", "--predictor", trained.predictor)
     show(f"Use it:  {use.strip('`')}")

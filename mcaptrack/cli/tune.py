@@ -1,10 +1,9 @@
-"""``mcaptrack tune``: the parameters of a stage that score best against the truth, as a mcaptrack.toml."""
+"""``mcaptrack tune``: find the parameters of a stage that score best, and write them to mcaptrack.toml."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 import typer
 
@@ -15,10 +14,9 @@ from mcaptrack.cli.settings import old_names
 from mcaptrack.cli.stages import chooser
 from mcaptrack.cli.text import console, show
 from mcaptrack.errors import McaptrackError
-from mcaptrack.transforms import STAGES, Transform
 
 if TYPE_CHECKING:
-    from mcaptrack.evaluation.tuning import Range, Task, Trial
+    from mcaptrack import TuneResult
 
 _SEARCH: Final = "Search"
 _SHOWN: Final = ("IDF1", "MOTA", "HOTA", "IDSW", "FP", "FN")
@@ -110,137 +108,80 @@ def tune(
 
     Example: mcaptrack tune log.mcap --tracker ocsort --metric hota --trials 200
     """
-    from mcaptrack.evaluation import EvaluateOptions
-    from mcaptrack.evaluation.tuning import tune as run
-    from mcaptrack.evaluation.tuning import uses_optuna
+    import mcaptrack
 
-    has_trackers = STAGES[stage].kind == "tracker"
-    kind = STAGES[stage].find(tracker).cls if has_trackers else STAGES[stage].default
-    chosen = similarity or ("iou" if stage == "track" else "metres")
-    scoring = EvaluateOptions(similarities=(chosen,), gates_m=(gate_m,), min_iou=min_iou)
-    ranges = _ranges(kind, search or [])
-    which = tracker.replace(":", ".") if has_trackers else stage
-    trials_file = study or output.with_name(f"{output.stem}.{which}.trials.jsonl")
+    ranges = dict(map(_range, search or ()))
+    is_tracker = stage == "track"
+    which = tracker.replace(":", ".") if is_tracker else stage
+    by_overlap = similarity == "iou" or (similarity is None and is_tracker)
     with common.Talk(quiet, verbose).open() as talk:
         read_toml(output)  # a file that can't be edited is refused before the search
         if truth:
-            given = {"fps": fps, "ground_plane": ground_plane, "point": point}
-            tasks = _tasks_of_files(common.expand(inputs), common.expand(truth), stage, given, talk)
             warn_unused("files of detections are of no camera", "camera", "topic")
             if ground_plane is None:
                 warn_unused("there is no ground plane", "point")
         else:
-            tasks = _tasks_of_logs(common.expand(inputs), camera, topic, stage, kind)
             warn_unused("it is about label files; logs have theirs inside", "ground_plane", "point", "fps")
-        if not has_trackers:
+        if not is_tracker:
             warn_unused(f"{stage} has no trackers", "tracker")
-        warn_unused(*(("overlap is compared", "gate_m") if chosen == "iou" else ("distance is compared", "min_iou")))
-        if force:
-            trials_file.unlink(missing_ok=True)
-        how = "Optuna" if uses_optuna() else "chance; with `pip install mcaptrack[tune]` they learn from each other"
-        talk.say(f"{stage}: {len(ranges)} parameters, {len(tasks)} sequences, trials by {how}")
-
-        def told(trial: Trial, best: Trial, total: int) -> None:
-            talk.progress("tune", trial.number + 1, total)
-            if trial is best:
-                talk.detail(f"trial {trial.number}: {metric} {trial.scores[metric]:.4f} {_words(trial.parameters)}")
-
-        first, best = run(
-            kind(), tasks, ranges, scoring, metric=metric, trials=trials, seed=seed, study=trials_file, on_trial=told
+        warn_unused(*(("overlap is compared", "gate_m") if by_overlap else ("distance is compared", "min_iou")))
+        done = mcaptrack.tune(
+            common.expand(inputs),
+            truth=common.expand(truth) if truth else None,
+            stage=stage,
+            tracker=tracker if is_tracker else None,
+            metric=metric,
+            trials=trials,
+            search=ranges,
+            seed=seed,
+            study=study or output.with_name(f"{output.stem}.{which}.trials.jsonl"),
+            similarity=similarity,
+            gate_m=gate_m,
+            min_iou=min_iou,
+            fps=fps,
+            ground_plane=ground_plane,
+            point=point,
+            topic=topic,
+            camera=camera,
+            force=force,
+            progress=talk.progress,
         )
-        settings = ({"tracker": tracker} if has_trackers else {}) | dict(best.parameters)
-        if best is first:
-            talk.say(f"nothing that was tried beats the defaults ({metric} {first.scores[metric]:.4f}); {output} stays")
+        score, before = done.scores[metric], done.default_scores[metric]
+        if done.best == 0:
+            talk.say(f"nothing that was tried beats the defaults ({metric} {before:.4f}); {output} stays")
         else:
-            named = {name.replace("_", "-"): value for name, value in settings.items()}
+            named = {name.replace("_", "-"): value for name, value in done.settings.items()}
             write_settings(output, stage, named, old_names(stage))
-            talk.say(f"{output}: {metric} {first.scores[metric]:.4f} with the defaults, {best.scores[metric]:.4f} now")
+            talk.say(f"{output}: {metric} {before:.4f} with the defaults, {score:.4f} now")
     if json:
-        row = {"stage": stage, "metric": metric, "settings": settings, "trials": trials, "best": best.number}
-        common.print_json({"results": [row | {"scores": dict(best.scores), "default_scores": dict(first.scores)}]})
+        row = {"stage": stage, "metric": metric, "settings": done.settings, "trials": done.trials, "best": done.best}
+        common.print_json({"results": [row | {"scores": done.scores, "default_scores": done.default_scores}]})
     else:
-        _print(first, best, settings)
+        _print(done)
 
 
-def _ranges(kind: type[Transform], wanted: Sequence[str]) -> dict[str, Range]:
-    """The ranges to search in: those that are asked for, or all that are declared."""
-    from mcaptrack.evaluation.tuning import Range, declared_ranges
-
-    declared = declared_ranges(kind)
-    if not wanted:
-        return declared
-    out = {}
-    for text in wanted:
-        name, _, span = text.partition("=")
-        name = name.strip().lstrip("-").replace("-", "_")
-        if name not in declared:
-            known = ", ".join(one.replace("_", "-") for one in declared) or "none"
-            raise McaptrackError(f"--search {text}: no parameter that can be searched; there are {known}")
-        out[name] = declared[name]
-        if span:
-            try:
-                low, high = (float(part) for part in span.split(":"))
-            except ValueError:
-                low, high = 1.0, 0.0
-            if not low <= high:
-                raise McaptrackError(f"--search needs a range like {name.replace('_', '-')}=0.1:0.5, not {text}")
-            kind(**{name: int(low) if declared[name].whole else low})  # both ends have to be allowed
-            kind(**{name: int(high) if declared[name].whole else high})
-            out[name] = Range(low, high, declared[name].whole)
-    return out
+def _range(text: str) -> tuple[str, tuple[float, float] | None]:
+    """Return a parameter to search and its range, from text such as min-iou=0.1:0.5, or min-iou for None."""
+    name, equals, span = text.partition("=")
+    name = name.strip().lstrip("-")
+    if not equals:
+        return name.replace("-", "_"), None
+    try:
+        low, high = (float(part) for part in span.split(":"))
+    except ValueError:
+        raise McaptrackError(f"--search needs a range like {name}=0.1:0.5, not {text}") from None
+    return name.replace("-", "_"), (low, high)
 
 
-def _tasks_of_files(
-    paths: Sequence[Path], truths: Sequence[Path], stage: str, given: dict[str, Any], talk: common.Talk
-) -> list[Task]:
-    from mcaptrack.api.ingesting import parse_fps
-    from mcaptrack.evaluation.tuning import Task
-    from mcaptrack.tables.compared import detections_and_ground_truth, pair_files
-
-    if stage != "track":
-        raise McaptrackError(f"files of detections are for --stage track; to tune {stage} give logs")
-    pairs, words = pair_files(paths, truths)
-    if words:
-        talk.say(words)
-    tasks = []
-    for name, path, labels in pairs:
-        found = detections_and_ground_truth(
-            path, labels, parse_fps(given["fps"]), given["ground_plane"], given["point"]
-        )
-        tasks.append(Task(name, found.detections, found.ground_truth, {"ground_planes": found.planes}))
-    return tasks
-
-
-def _tasks_of_logs(
-    paths: Sequence[Path], camera: str | None, topic: str | None, stage: str, kind: type[Transform]
-) -> list[Task]:
-    from mcaptrack import log, pipeline
-    from mcaptrack.evaluation import ground_truth_of_log
-    from mcaptrack.evaluation.tuning import Task
-
-    tasks = []
-    for path in paths:
-        with log.read(path) as opened:
-            prefix = pipeline.find_camera(opened, camera, topic)
-            truth = ground_truth_of_log(opened, prefix)
-            frames, context = pipeline.input_of(opened, prefix, stage, kind(), topic)
-            tasks.append(Task(path.stem, frames, truth, context))
-    return tasks
-
-
-def _words(parameters: Any) -> str:
-    return " ".join(f"{name.replace('_', '-')}={value}" for name, value in parameters.items())
-
-
-def _print(first: Trial, best: Trial, settings: dict[str, Any]) -> None:
+def _print(done: TuneResult) -> None:
     from rich.table import Table
 
     table = Table(box=None, pad_edge=False, header_style="bold")
     table.add_column("")
     for name in _SHOWN:
         table.add_column(name, justify="right")
-    for words, trial in (("defaults", first), ("best", best)):
-        values = [trial.scores[name] for name in _SHOWN]
+    for words, scores in (("defaults", done.default_scores), ("best", done.scores)):
+        values = [scores[name] for name in _SHOWN]
         table.add_row(words, *(f"{100 * v:.1f}" if isinstance(v, float) else str(v) for v in values))
     console().print(table)
-    show("", *(f"{name.replace('_', '-')} = {value}" for name, value in settings.items()))
+    show("", *(f"{name.replace('_', '-')} = {value}" for name, value in done.settings.items()))

@@ -173,9 +173,7 @@ class Database:
     def _answer(self, query: str) -> Any:
         """The answer of the last statement that gives one, Arrow or None."""
         if re.match(r"\s*show\s+(all\s+)?tables\b", query, re.IGNORECASE):
-            raise McaptrackError(
-                f"tables come in when a query names them; {call('query', 'LOG', tables=True)} lists them"
-            )
+            raise McaptrackError(f"tables come in when a query names them; {call('list_tables', 'LOG')} lists them")
         statements = self._connection.extract_statements(query)
         _refuse_writing([statement.type.name for statement in statements])
         answer = None

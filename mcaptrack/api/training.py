@@ -1,0 +1,227 @@
+"""Train a predictor on tracks, or on synthetic walks."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import Final, Literal
+
+from mcaptrack import __version__
+from mcaptrack.api.common import Notes, PathLike, Progress, as_path, no_progress, optional_path, paths_of
+from mcaptrack.api.ingesting import parse_fps
+from mcaptrack.errors import McaptrackError
+from mcaptrack.geometry.plane import Point
+from mcaptrack.notices import Notice, collected
+from mcaptrack.training.recipe import RECIPES, Recipe
+from mcaptrack.training.sources import SYNTHETIC, SourceOptions, read_scenes, split, synthetic, windows_of
+from mcaptrack.training.windows import Windows
+
+Device = Literal["auto", "cpu", "cuda", "mps"]
+RecipeName = Literal["red", "paper"]
+#: The licence of weights that were trained on files.
+_LICENCE: Final = "that of the data it was trained on"
+_VALIDATION_SHARE: Final = 0.1
+
+
+@dataclass(frozen=True)
+class TrainResult:
+    """A trained predictor.
+
+    Attributes
+    ----------
+    weights : pathlib.Path
+        The file of weights, with a model card in its header.
+    predictor : str
+        The name that ``predict`` and ``run`` take: "red:" or "lstm:" and the file.
+    epochs, kept_epoch : int
+        Number of epochs, and the one that the weights are of.
+    windows, validation_windows : int
+        Number of windows to train and to validate on.
+    scores : dict of str to dict of str to dict of str to float
+        Scores on the validation windows: as they are ("clean") and with 0.2 m of noise ("noisy"), by predictor.
+    seconds : float
+        How long the epochs took.
+    notes : tuple of str
+        What was done, such as why the training stopped early.
+    warnings : tuple of mcaptrack.Notice
+        What was assumed, left out or looks odd.
+
+    """
+
+    weights: Path
+    predictor: str
+    epochs: int
+    kept_epoch: int
+    windows: int
+    validation_windows: int
+    scores: Mapping[str, Mapping[str, Mapping[str, float]]]
+    seconds: float
+    notes: tuple[str, ...]
+    warnings: tuple[Notice, ...]
+
+
+def train(
+    sources: PathLike | Sequence[PathLike],
+    output: PathLike = "trained",
+    *,
+    recipe: RecipeName = "red",
+    validate: PathLike | Sequence[PathLike] | None = None,
+    epochs: int | None = None,
+    batch: int | None = None,
+    rate: float | None = None,
+    noise_m: float | None = None,
+    gaps: float | None = None,
+    scale: float | None = None,
+    consistency_weight: float = 0.0,
+    patience: int = 0,
+    walks: int = 60_000,
+    seed: int = 1,
+    device: Device = "auto",
+    threads: int = 1,
+    resume: bool = False,
+    topic: str | None = None,
+    fps: float | str | Fraction | None = None,
+    ground_plane: PathLike | None = None,
+    point: Point = "foot",
+    force: bool = False,
+    progress: Progress = no_progress,
+) -> TrainResult:
+    """Train a predictor on tracks of people, or on synthetic walks. Needs torch.
+
+    Writes weights, a log of the epochs and a state to resume from into a folder.
+
+    Parameters
+    ----------
+    sources : path or sequence of paths
+        Label files, Parquet tables, logs, folders of these, or "synthetic".
+    output : path, default "trained"
+        Folder for the weights, the log of epochs and the state.
+    recipe : {"red", "paper"}, default "red"
+        Network and training: those of this project, or those of the paper (Yu and Zhou, IROS 2021).
+    validate : path or sequence of paths, optional
+        Sources to validate on; by default a tenth of the windows, whole scenes apart.
+    epochs : int, optional
+        Number of passes over the windows: by default 20, "paper" 50.
+    batch : int, optional
+        Number of windows per step: by default 256, "paper" 60.
+    rate : float, optional
+        Learning rate: by default 0.003, "paper" 0.0001.
+    noise_m : float, optional
+        Largest noise added to past positions, in metres: by default 0.4, "paper" 0.
+    gaps : float, optional
+        Share of past positions that are removed: by default 0.3, "paper" 0.
+    scale : float, optional
+        Largest scaling of positions, as a natural logarithm: by default 0.15, "paper" 0.
+    consistency_weight : float, default 0
+        Weight of the difference between predictions of successive steps in the loss.
+    patience : int, default 0
+        Stop after this many epochs without improvement; 0 for never.
+    walks : int, default 60000
+        Number of walks that "synthetic" makes.
+    seed : int, default 1
+        Random seed.
+    device : {"auto", "cpu", "cuda", "mps"}, default "auto"
+        Device to compute on; "auto" is the fastest one available.
+    threads : int, default 1
+        Threads of the processor to use.
+    resume : bool, default False
+        Continue the training in the folder.
+    topic : str, optional
+        Read this channel of logs and tables; by default the ground truth, or the best tracks.
+    fps : float, str or Fraction, optional
+        For label files: frames per second.
+    ground_plane : path, optional
+        For label files: 3x3 homography from pixels to metres on the ground.
+    point : {"foot", "center"}, default "foot"
+        For label files: which point of a box touches the ground.
+    force : bool, default False
+        Replace the training in the folder.
+    progress : callable, optional
+        Called as ``progress(stage, done, total)``.
+
+    Returns
+    -------
+    TrainResult
+        The weights and their scores beside those of constant velocity and of a Kalman filter.
+
+    Raises
+    ------
+    McaptrackError
+        If torch or the device is missing, if a source cannot be read or has no windows, or if the folder holds a
+        training.
+
+    Examples
+    --------
+    >>> import mcaptrack
+    >>> result = mcaptrack.train("synthetic", "network", walks=1000, epochs=1, device="cpu")
+    >>> mcaptrack.predict("log.mcap", predictor=result.predictor, output="predictions.mcap").stages
+    ('predict',)
+
+    """
+    hyperparameters = {"epochs": epochs, "batch": batch, "rate": rate, "patience": patience, "seed": seed}
+    hyperparameters["consistency_weight"] = consistency_weight
+    chosen = RECIPES[recipe].changed(hyperparameters, {"noise_m": noise_m, "gaps": gaps, "scale": scale})
+    folder, notes = as_path(output), Notes()
+    _refuse_folder(folder, chosen, resume=resume, force=force)
+    from mcaptrack.training.loop import find_device
+    from mcaptrack.training.loop import train as fit
+
+    where = find_device(device)  # before anything takes long
+    options = SourceOptions(fps=parse_fps(fps), ground_plane=optional_path(ground_plane), point=point, topic=topic)
+    with collected() as warnings:
+        training, card = _windows(chosen, sources, walks, options, notes)
+        if validate:
+            validation = windows_of(read_scenes(paths_of(validate), options, chosen.step_s), chosen)
+        else:
+            training, validation = split(training, _VALIDATION_SHARE, chosen.seed)
+        notes.say(f"training on {len(training)} windows, validating on {len(validation)}")
+        folder.mkdir(parents=True, exist_ok=True)
+        made = fit(chosen, training, validation, folder, card, where, threads, resume, progress, notes.say)
+    return TrainResult(
+        weights=made.weights,
+        predictor=f"{chosen.network}:{made.weights}",
+        epochs=made.epochs,
+        kept_epoch=made.kept_epoch,
+        windows=made.windows,
+        validation_windows=made.validation_windows,
+        scores=made.scores,
+        seconds=made.seconds,
+        notes=tuple(notes),
+        warnings=tuple(dict.fromkeys(warnings)),
+    )
+
+
+def _refuse_folder(folder: Path, recipe: Recipe, *, resume: bool, force: bool) -> None:
+    """Raise McaptrackError if the folder can't take the training, or has none to resume."""
+    if folder.exists() and not folder.is_dir():
+        raise McaptrackError(f"{folder} is a file; training needs a folder")
+    state = folder / "state.safetensors"
+    if resume and not state.exists():
+        raise McaptrackError(f"there is no training to resume in {folder}")
+    if not resume and not force and (state.exists() or (folder / f"{recipe.network}.safetensors").exists()):
+        raise McaptrackError(f"{folder} holds a training; `resume=True` goes on with it, `force=True` replaces it")
+
+
+def _windows(
+    recipe: Recipe, sources: PathLike | Sequence[PathLike], walks: int, options: SourceOptions, notes: Notes
+) -> tuple[Windows, dict[str, str]]:
+    """Return the windows of all sources, and what the model card says of them."""
+    given = [sources] if isinstance(sources, str | os.PathLike) else list(sources)
+    paths = paths_of([source for source in given if source != SYNTHETIC])
+    parts, words = [], []
+    if len(paths) < len(given):
+        notes.say(f"simulating {walks} walks ...")
+        parts.append(synthetic(recipe, walks, recipe.seed))
+        words.append(f"{walks} synthetic walks of mcaptrack {__version__}, seed {recipe.seed}")
+    if paths:
+        scenes = read_scenes(paths, options, recipe.step_s)
+        first = 0 if not parts else int(parts[0].scene.max()) + 1
+        found = windows_of(scenes, recipe)
+        parts.append(Windows(found.past, found.known, found.future, found.scene + first))
+        words.append(f"{len(scenes)} scenes: {', '.join(scene.name for scene in scenes)[:500]}")
+    licence = _LICENCE if paths else "Apache-2.0"
+    card = {"data": "; ".join(words), "licence": licence, "made_by": f"mcaptrack {__version__}"}
+    return Windows.join(parts), card
