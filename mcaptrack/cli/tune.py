@@ -116,15 +116,6 @@ def tune(
     by_overlap = similarity == "iou" or (similarity is None and is_tracker)
     with common.Talk(quiet, verbose).open() as talk:
         read_toml(output)  # a file that can't be edited is refused before the search
-        if truth:
-            warn_unused("files of detections are of no camera", "camera", "topic")
-            if ground_plane is None:
-                warn_unused("there is no ground plane", "point")
-        else:
-            warn_unused("it is about label files; logs have theirs inside", "ground_plane", "point", "fps")
-        if not is_tracker:
-            warn_unused(f"{stage} has no trackers", "tracker")
-        warn_unused(*(("overlap is compared", "gate_m") if by_overlap else ("distance is compared", "min_iou")))
         done = mcaptrack.tune(
             common.expand(inputs),
             truth=common.expand(truth) if truth else None,
@@ -146,6 +137,15 @@ def tune(
             force=force,
             progress=talk.progress,
         )
+        if truth:
+            warn_unused("files of detections are of no camera", "camera", "topic")
+            if ground_plane is None:
+                warn_unused("there is no ground plane", "point")
+        else:
+            warn_unused("it is about label files; logs have theirs inside", "ground_plane", "point", "fps")
+        if not is_tracker:
+            warn_unused(f"{stage} has no trackers", "tracker")
+        warn_unused(*(("overlap is compared", "gate_m") if by_overlap else ("distance is compared", "min_iou")))
         score, before = done.scores[metric], done.default_scores[metric]
         if done.best == 0:
             talk.say(f"nothing that was tried beats the defaults ({metric} {before:.4f}); {output} stays")
