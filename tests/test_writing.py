@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
-from types import ModuleType
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
@@ -23,9 +24,26 @@ class Detections:
     """What supervision.Detections has, as far as it is read."""
 
     xyxy: np.ndarray
+    mask: np.ndarray | None = None
     confidence: np.ndarray | None = None
     class_id: np.ndarray | None = None
     tracker_id: np.ndarray | None = None
+    data: dict[str, object] = field(default_factory=dict)
+
+    def __iter__(self) -> Iterator[tuple]:
+        """Yield what the real one does: box, mask, confidence, class, tracker id and data of each."""
+        columns = (self.mask, self.confidence, self.class_id, self.tracker_id)
+        for n, box in enumerate(self.xyxy):
+            rest = [None if column is None else column[n] for column in columns]
+            yield box, *rest, {name: values[n] for name, values in self.data.items()}
+
+    def __len__(self) -> int:
+        return len(self.xyxy)
+
+    @classmethod
+    def empty(cls) -> Detections:
+        """Return what a model gives for a picture without objects."""
+        return cls(np.empty((0, 4), np.float32), confidence=np.empty(0, np.float32), class_id=np.empty(0, int))
 
 
 @pytest.fixture(params=["stand-in", "real"])
@@ -37,6 +55,10 @@ def made(request, monkeypatch) -> type:
     module.Detections = Detections
     monkeypatch.setitem(sys.modules, "supervision", module)
     return Detections
+
+
+BOXES = np.array([[10.0, 20, 30, 60], [50, 20, 80, 60]], np.float32)
+SCORES = np.array([0.5, 0.75], np.float32)
 
 
 def walk(frames: int = 30) -> list[mcaptrack.Notice]:
@@ -69,6 +91,27 @@ class TestDetections:
         found = made(np.array([[10.0, 20, 30, 60]]), confidence=np.array([0.5]), class_id=np.array([3]))
         (row,) = mcaptrack.detections(found, t_ns=5).rows
         assert (row["w_px"], row["h_px"], row["score"], row["class_id"]) == (20, 40, 0.5, 3)
+        assert len(mcaptrack.detections(made.empty()).rows) == 0
+        (bare, _) = mcaptrack.detections(made(BOXES)).rows
+        assert (np.isnan(bare["score"]), bare["class_id"]) == (True, 0)
+
+    def test_names_of_classes_say_what_is_a_person(self, made):
+        """A model of COCO has a person as class 0 and a bicycle as class 1."""
+        names = np.array(["person", "bicycle"])
+        found = made(BOXES, class_id=np.array([0, 1]), data={"class_name": names})
+        with pytest.warns(mcaptrack.McaptrackWarning, match="in class_id 1 is a person, other numbers are 2 higher"):
+            assert mcaptrack.detections(found).rows["class_id"].tolist() == [1, 3]
+        found = made(BOXES[:1], class_id=np.array([0]), data={"class_name": names[:1]})
+        assert mcaptrack.detections(found).rows["class_id"].tolist() == [1]
+
+    def test_masks_are_left_out_and_said(self, made):
+        found = made(BOXES, mask=np.zeros((2, 8, 8), bool))
+        with pytest.warns(mcaptrack.McaptrackWarning, match="masks of supervision.Detections are left out"):
+            assert len(mcaptrack.detections(found).rows) == 2
+
+    def test_boxes_of_another_package_are_refused(self):
+        with pytest.raises(McaptrackError, match="SimpleNamespace has no confidence, unlike"):
+            mcaptrack.detections(SimpleNamespace(xyxy=BOXES, conf=SCORES))
 
     @pytest.mark.parametrize(
         ("given", "words"),
@@ -114,15 +157,40 @@ class TestWriting:
         assert len(payloads) == 1
 
     def test_supervision_goes_in_and_comes_out(self, tmp_path, made):
+        tracked = made(BOXES, confidence=SCORES, tracker_id=np.array([7, 9]))
+        given = {0: tracked, SECOND: made.empty(), 2 * SECOND: tracked}
         with mcaptrack.open(tmp_path / "a.mcap", create=True) as opened:
-            boxes = np.array([[10.0, 20, 30, 60], [50, 20, 80, 60]], np.float32)
-            tracked = made(boxes, confidence=np.array([0.5, 0.75], np.float32), tracker_id=np.array([7, 9]))
-            opened.write("tracks", {n * SECOND: tracked for n in range(3)})
-            out = list(opened.supervision("tracks"))
-        assert [t_ns for t_ns, _ in out] == [0, SECOND, 2 * SECOND]
-        for _, found in out:
-            np.testing.assert_array_equal(found.xyxy, boxes)
-            assert (found.tracker_id.tolist(), found.confidence.tolist()) == ([7, 9], [0.5, 0.75])
+            for topic in ("tracks", "/camera/mine"):  # the name of the first says what it holds
+                assert opened.write(topic, given) == 3
+                out = dict(opened.supervision(topic))
+                assert list(out) == list(given)
+                assert [len(found) for found in out.values()] == [2, 0, 2]
+                for t_ns in (0, 2 * SECOND):
+                    np.testing.assert_array_equal(out[t_ns].xyxy, BOXES)
+                    assert (out[t_ns].tracker_id.tolist(), out[t_ns].confidence.tolist()) == ([7, 9], [0.5, 0.75])
+            opened.write("detections", {0: made(BOXES, class_id=np.array([1, 3])), SECOND: made.empty()})
+            ((_, first), (_, second)) = opened.supervision("detections")
+            assert (first.class_id.tolist(), len(second)) == ([1, 3], 0)
+            assert np.isnan(first.confidence).all()
+            if hasattr(made, "merge"):
+                assert len(made.merge([found for _, found in opened.supervision("tracks")])) == 4
+
+    def test_tracks_that_are_not_confirmed_yet_are_left_out_and_said(self, tmp_path, made):
+        with mcaptrack.open(tmp_path / "a.mcap", create=True) as opened:
+            with pytest.warns(mcaptrack.McaptrackWarning, match="boxes without a tracker id"):
+                opened.write("tracks", {0: made(BOXES, tracker_id=np.array([-1, 4]))})
+            assert opened.array("tracks")["track_id"].tolist() == [4]
+
+    def test_supervision_without_a_time_or_an_id_is_refused_in_a_line(self, tmp_path, made):
+        with mcaptrack.open(tmp_path / "a.mcap", create=True) as opened:
+            for rows, words in (
+                (made(BOXES), "have no time; give them by time"),
+                ([made(BOXES)], "each frame is a Frame, or a time in nanoseconds with"),
+                ({5: made(BOXES)}, "the detections at 5 ns have no tracker ids"),
+            ):
+                with pytest.raises(McaptrackError, match=words) as refused:
+                    opened.write("tracks", rows)
+                assert "\n" not in str(refused.value)
 
     def test_what_is_there_stays_unless_it_is_to_be_replaced(self, tmp_path):
         path = tmp_path / "a.mcap"

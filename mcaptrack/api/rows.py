@@ -13,11 +13,16 @@ from numpy.typing import ArrayLike
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Floats
+from mcaptrack.notices import warn
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame, Rows, Schema
+from mcaptrack.sources.foreign.boxes import PEOPLE, PERSON
 
 BoxFormat = Literal["xyxy", "xywh"]
 #: The frame number of a frame that was not numbered; ``Recording.write`` gives it one.
 UNNUMBERED: Final = -1
+_SUPERVISION: Final = ("confidence", "class_id", "tracker_id", "mask", "data")
+#: What is added to the classes of a detector that names them, so that none of them is 0 (unknown) or 1 (person).
+_OTHERS: Final = 2
 #: Columns of tables and arrays that are not part of rows.
 _BESIDE: Final = ("t", "t_ns", "frame", "index", "row", "topic", "recording", "class")
 
@@ -36,7 +41,9 @@ def detections(
     Parameters
     ----------
     boxes : array_like, shape (N, 4), or supervision.Detections
-        Boxes in pixels; (0, 4) for a picture without detections.
+        Boxes in pixels; (0, 4) for a picture without detections. Of ``supervision.Detections``, boxes, confidence and
+        classes are taken; where ``data["class_name"]`` names the classes, persons become class 1, and the numbers of
+        other classes are raised by 2.
     scores : array_like, shape (N,), optional
         Confidence of each box, from 0 to 1.
     classes : array_like, shape (N,), optional
@@ -66,7 +73,7 @@ def detections(
     >>> frame.rows["w_px"].tolist(), frame.rows["h_px"].tolist()
     ([20.0], [40.0])
     """
-    if hasattr(boxes, "xyxy"):
+    if is_supervision(boxes):
         if scores is not None or classes is not None or box_format not in (None, "xyxy"):
             raise McaptrackError("supervision.Detections bring scores, classes and the format of their boxes along")
         return frame_of_supervision(boxes, t_ns, index, DETECTIONS)
@@ -80,23 +87,62 @@ def detections(
     return Frame(int(t_ns), index, _rows(DETECTIONS, columns, t_ns))
 
 
+def is_supervision(given: Any) -> bool:
+    """Whether an object is a ``supervision.Detections``, by its attributes: the package need not be installed.
+
+    Raises McaptrackError for boxes of another package that look alike.
+    """
+    if not hasattr(given, "xyxy"):
+        return False
+    lacks = [name for name in _SUPERVISION if not hasattr(given, name)]
+    if lacks:
+        kind = f"{type(given).__module__}.{type(given).__qualname__}"
+        raise McaptrackError(f"{kind} has no {lacks[0]}, unlike supervision.Detections; give its boxes as an array")
+    return True
+
+
 def frame_of_supervision(found: Any, t_ns: int, index: int = UNNUMBERED, schema: Schema | None = None) -> Frame:
-    """Return ``supervision.Detections`` as a frame: of tracks where they have tracker ids, otherwise of detections."""
+    """Return ``supervision.Detections`` as a frame: of tracks where they have tracker ids, otherwise of detections.
+
+    Trackers give -1 to boxes of tracks that are not confirmed yet: a frame of tracks leaves these out. A frame without
+    boxes needs no tracker ids.
+    """
     xywh = _boxes(found.xyxy, "xyxy")
-    ids = getattr(found, "tracker_id", None)
+    ids = None if found.tracker_id is None else np.asarray(found.tracker_id, np.int64)
     schema = schema or (DETECTIONS if ids is None else TRACKS)
     columns: dict[str, Any] = dict(zip(("x_px", "y_px", "w_px", "h_px"), xywh.T, strict=True))
-    if getattr(found, "confidence", None) is not None:
+    if found.confidence is not None:
         columns["score"] = np.asarray(found.confidence, np.float64)
+    if found.mask is not None and len(xywh):
+        warn("rows hold boxes: masks of supervision.Detections are left out", "left-out")
     if schema is DETECTIONS:
-        classes = getattr(found, "class_id", None)
-        columns["class_id"] = np.zeros(len(xywh), np.uint32) if classes is None else np.asarray(classes)
-    else:
-        if ids is None:
-            raise McaptrackError(f"the detections at {t_ns} ns have no tracker ids; tracks need them")
-        columns["track_id"] = np.asarray(ids, np.int64)
-        columns |= {"observed": np.ones(len(xywh), bool), "source_id": np.full(len(xywh), -1)}
-    return Frame(int(t_ns), index, _rows(schema, columns, t_ns))
+        columns["class_id"] = _classes_of(found)
+        return Frame(int(t_ns), index, _rows(DETECTIONS, columns, t_ns))
+    if ids is None and len(xywh):
+        raise McaptrackError(f"the detections at {t_ns} ns have no tracker ids; tracks need them")
+    columns["track_id"] = np.empty(0, np.int64) if ids is None else ids
+    columns |= {"observed": np.ones(len(xywh), bool), "source_id": np.full(len(xywh), -1)}
+    rows = _rows(TRACKS, columns, t_ns)
+    if (rows["track_id"] < 0).any():
+        warn("boxes without a tracker id (-1: the track is not confirmed yet) are left out", "left-out")
+    return Frame(int(t_ns), index, rows[rows["track_id"] >= 0])
+
+
+def _classes_of(found: Any) -> Any:
+    """Return class ids (N,) as the schema of detections has them: 0 unknown, 1 a person.
+
+    Detectors count from 0 or from 1, and person may be any number, so names decide where there are some.
+    """
+    count, names = len(found.xyxy), found.data.get("class_name")
+    ids = np.zeros(count, np.uint32) if found.class_id is None else np.asarray(found.class_id)
+    if names is None or not count:
+        return ids
+    is_person = np.array([str(name).lower() in PEOPLE for name in names])
+    if not is_person.all() and found.class_id is not None:
+        raised = f"other numbers are {_OTHERS} higher than the detector's"
+        warn(f"supervision.Detections name their classes: in class_id 1 is a person, {raised}", "classes")
+        ids = ids + _OTHERS
+    return np.where(is_person, PERSON, ids)
 
 
 def frames_of(rows: Any, schema: Schema | None) -> tuple[Schema, list[Frame]]:
@@ -111,15 +157,20 @@ def frames_of(rows: Any, schema: Schema | None) -> tuple[Schema, list[Frame]]:
         if rows.dtype.names is None:
             raise McaptrackError("an array without named columns is no table; make frames with `mcaptrack.detections`")
         return _of_columns({name: rows[name] for name in rows.dtype.names}, schema)
+    if is_supervision(rows):
+        raise McaptrackError(
+            "supervision.Detections have no time; give them by time in nanoseconds: {t_ns: detections}"
+        )
     if not isinstance(rows, Iterable):
         raise McaptrackError(f"rows are frames, an array, a table or supervision.Detections, not {type(rows).__name__}")
     frames = [_frame(one, schema) for one in (rows.items() if hasattr(rows, "items") else rows)]
     if schema is None:
-        found = {frame.rows.dtype.names for frame in frames}
+        found = {frame.rows.dtype.names for frame in [frame for frame in frames if len(frame.rows)] or frames}
         fitting = [one for one in (DETECTIONS, TRACKS) if found == {one.dtype.names}]
         if not fitting:
             raise McaptrackError("it is not clear whether these are detections or tracks; all frames have to be of one")
         schema = fitting[0]
+        frames = [frame if len(frame.rows) else frame._replace(rows=schema.empty()) for frame in frames]
     for frame in frames:
         _check(schema, frame.rows, frame.t_ns)
     return schema, sorted(frames, key=lambda frame: frame.t_ns)
@@ -128,10 +179,10 @@ def frames_of(rows: Any, schema: Schema | None) -> tuple[Schema, list[Frame]]:
 def _frame(one: Any, schema: Schema | None) -> Frame:
     if isinstance(one, Frame):
         return one
-    if isinstance(one, Sequence) and len(one) == 2 and hasattr(one[1], "xyxy"):
+    if isinstance(one, Sequence) and len(one) == 2 and is_supervision(one[1]):
         return frame_of_supervision(one[1], int(one[0]), schema=schema)
     raise McaptrackError(
-        f"each frame is a Frame, or a time in nanoseconds with supervision.Detections, not {one!r:.80}"
+        f"each frame is a Frame, or a time in nanoseconds with supervision.Detections, not {type(one).__name__}"
     )
 
 
@@ -207,9 +258,8 @@ def supervision_of(frames: Iterable[Frame]) -> Iterator[tuple[int, Any]]:
         raise McaptrackError("supervision is not installed; install it with: pip install supervision") from None
     for frame in frames:
         rows = frame.rows[np.isfinite(frame.rows["x_px"])]
+        # With NaN for missing scores: supervision merges frames only if all have a confidence, or none.
         columns: dict[str, Any] = {"confidence": rows["score"].astype(np.float32)}
-        if np.isnan(columns["confidence"]).any():
-            columns = {}
         for name, column in (("tracker_id", "track_id"), ("class_id", "class_id")):
             if column in (rows.dtype.names or ()):
                 columns[name] = rows[column].astype(int)

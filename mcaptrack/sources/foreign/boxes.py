@@ -20,8 +20,9 @@ from mcaptrack.sources.foreign.decoding import MessageType, decoder_with_errors,
 #: Schemas of boxes of other software.
 DETECTIONS_READ: Final = ("vision_msgs/Detection2DArray",)
 
-_UNKNOWN, _PERSON = 0, 1
-_PEOPLE: Final = ("person", "pedestrian", "human")
+_UNKNOWN, PERSON = 0, 1
+#: Class names of people.
+PEOPLE: Final = ("person", "pedestrian", "human")
 _NUMBER: Final = re.compile(r"[0-9]{1,10}")
 _NAME: Final = re.compile(r"[^\W\d_]")
 #: The maximum number of class names of a channel; ids from ``_FIRST_NAME`` on are placeholders until all names are
@@ -40,12 +41,12 @@ class Classes:
 
     def __init__(self) -> None:
         self._names: dict[str, int] = {}
-        self._largest = _PERSON
+        self._largest = PERSON
 
     def class_id(self, said: str) -> int:
         """The id of a class; for a name a placeholder, which ``numbers`` maps to the final id."""
-        if said.lower() in _PEOPLE:
-            return _PERSON
+        if said.lower() in PEOPLE:
+            return PERSON
         if _NUMBER.fullmatch(said):
             number = int(said) if int(said) < _FIRST_NAME else _UNKNOWN
             self._largest = max(self._largest, number)
