@@ -1,4 +1,4 @@
-"""Find people in a video or a log, track them, repair the tracks, predict where they go, and write it all back."""
+"""Detect and track people in a video or a log, repair the tracks, predict where people go, and write the results."""
 
 __version__ = "0.2.0"
 #: Version of the shape of everything that is printed, or put into a page, as JSON.
@@ -7,10 +7,11 @@ SCHEMA_VERSION = 1
 _PARTS = {
     "contents": ["ChannelInfo", "LogInfo", "info"],
     "demonstration": ["DemoResult", "demo"],
+    "fetching": ["FetchedMessage"],
     "ingesting": ["IngestResult", "ingest"],
     "outputs": ["ExportResult", "RenderResult", "ReportResult", "export", "render", "report"],
     "querying": ["ColumnInfo", "TableInfo", "TableList", "list_tables", "query"],
-    "recording": ["FetchedMessage", "Recording", "open"],
+    "recording": ["Recording", "open"],
     "rows": ["detections"],
     "running": ["RunResult"],
     "scoring": ["Scores", "evaluate"],

@@ -3,6 +3,7 @@ from mcaptrack.api.contents import LogInfo as LogInfo
 from mcaptrack.api.contents import info as info
 from mcaptrack.api.demonstration import DemoResult as DemoResult
 from mcaptrack.api.demonstration import demo as demo
+from mcaptrack.api.fetching import FetchedMessage as FetchedMessage
 from mcaptrack.api.ingesting import IngestResult as IngestResult
 from mcaptrack.api.ingesting import ingest as ingest
 from mcaptrack.api.outputs import ExportResult as ExportResult
@@ -16,7 +17,6 @@ from mcaptrack.api.querying import TableInfo as TableInfo
 from mcaptrack.api.querying import TableList as TableList
 from mcaptrack.api.querying import list_tables as list_tables
 from mcaptrack.api.querying import query as query
-from mcaptrack.api.recording import FetchedMessage as FetchedMessage
 from mcaptrack.api.recording import Recording as Recording
 from mcaptrack.api.recording import open as open  # noqa: A004
 from mcaptrack.api.rows import detections as detections

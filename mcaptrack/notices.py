@@ -49,11 +49,22 @@ def known_code(text: str) -> Code:
 
 
 class McaptrackWarning(UserWarning):
-    """A warning without a listener."""
+    """A warning as Python shows it: something was assumed, left out or looks odd."""
 
 
 class Notice(NamedTuple):
-    """A warning: one line of text, a code for programs, and the log that it is about, if any."""
+    """A warning.
+
+    Attributes
+    ----------
+    message : str
+        One line: what was assumed, left out or looks odd.
+    code : str
+        Its kind, for programs, such as "clock"; docs/warnings.md lists them.
+    log : str or None
+        The log that it is about, if any.
+
+    """
 
     message: str
     code: Code = "other"

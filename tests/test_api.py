@@ -166,11 +166,11 @@ def test_pointers_into_a_log_that_has_changed_are_told(tmp_path):
             {"topic": "/x"},
             {"message_offset": -9},
         ):
-            with pytest.raises(McaptrackError, match="no such message stands there"):
+            with pytest.raises(McaptrackError, match="no such message at this place"):
                 opened.fetch(opened.table("frames").to_pylist()[0] | wrong)
-        with pytest.raises(McaptrackError, match="not of this log"):
+        with pytest.raises(McaptrackError, match="not part of this log"):
             opened.fetch(rows[0] | {"file": "b.mcap"})
-        with pytest.raises(McaptrackError, match="points to no message"):
+        with pytest.raises(McaptrackError, match="does not say where its message is"):
             opened.fetch({"t_ns": 5})
 
 

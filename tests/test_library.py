@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import dataclasses
 import doctest
 import importlib
 import inspect
@@ -30,6 +31,17 @@ from tests.worlds import small_scene
 
 PACKAGE = Path(mcaptrack.__file__).parent
 FUNCTIONS = [name for name in mcaptrack.__all__ if inspect.isfunction(getattr(mcaptrack, name))]
+CLASSES = [name for name in mcaptrack.__all__ if inspect.isclass(getattr(mcaptrack, name))]
+#: The public methods that classes of the package define, by name.
+METHODS = {
+    f"{name}.{method}": value
+    for name in CLASSES
+    for method, value in vars(getattr(mcaptrack, name)).items()
+    if inspect.isfunction(value) and not method.startswith("_")
+}
+SECTIONS = ["Parameters", "Returns", "Raises", "Examples"]
+#: Optional packages that examples need.
+NEEDS = {"train": "torch", "query": "duckdb", "list_tables": "duckdb", "Recording.supervision": "supervision"}
 #: How a command reads and prints: options that every command may have, and no work of the library.
 OF_ALL_COMMANDS = {"json", "quiet", "verbose", "config", "help"}
 #: Options that their functions lack, and what Python has instead.
@@ -63,6 +75,14 @@ ONLY_PARAMETERS = {
 }
 #: Defaults that a command line writes in another way.
 OTHER_DEFAULTS = {("evaluate", "gate_m")}
+
+
+def sections_of(function) -> tuple[list[str], list[str]]:
+    """The sections of a docstring, and the parameters that it names."""
+    text = inspect.getdoc(function)
+    block = re.findall(r"^Parameters\n-+\n(.*?)\n\n[A-Z]", text, re.M | re.S)
+    named = [one for line in re.findall(r"^(\S.*?)(?: : .*)?$", "".join(block), re.M) for one in line.split(", ")]
+    return re.findall(r"^(\w+)\n-+$", text, re.M), [one.lstrip("*") for one in named]
 
 
 @pytest.fixture(scope="module")
@@ -295,26 +315,59 @@ class TestDocumentation:
                 for alias in node.names:
                     assert getattr(importlib.import_module(node.module), alias.name) is getattr(mcaptrack, alias.name)
 
-    @pytest.mark.parametrize("name", FUNCTIONS)
-    def test_functions_are_documented_as_numpydoc_has_it(self, name):
-        function = getattr(mcaptrack, name)
-        text = inspect.getdoc(function)
-        sections = re.findall(r"^(\w+)\n-+$", text, re.M)
-        assert sections == ["Parameters", "Returns", "Raises", "Examples"]
-        (block,) = re.findall(r"^Parameters\n-+\n(.*?)\n\nReturns", text, re.M | re.S)
-        named = [one for line in re.findall(r"^(\S.*?)(?: : .*)?$", block, re.M) for one in line.split(", ")]
-        assert [one.lstrip("*") for one in named] == list(inspect.signature(function).parameters)
+    @pytest.mark.parametrize("name", sorted(METHODS))
+    def test_methods_are_documented_as_numpydoc_has_it(self, name):
+        method = METHODS[name]
+        sections, named = sections_of(method)
+        signature = inspect.signature(method)
+        parameters = [one for one in signature.parameters if one != "self"]
+        needed = {
+            "Parameters": bool(parameters),
+            "Returns": signature.return_annotation != "None",
+            "Raises": "raise McaptrackError" in inspect.getsource(method),
+        }
+        assert {one for one, is_needed in needed.items() if is_needed} <= set(sections)
+        assert named == parameters
+        assert sections == [one for one in SECTIONS if one in sections]
+        if parameters or needed["Returns"]:
+            assert sections[-1] == "Examples"
+
+    @pytest.mark.parametrize("name", CLASSES)
+    def test_classes_say_what_their_attributes_are(self, name):
+        cls = getattr(mcaptrack, name)
+        text = inspect.getdoc(cls)
+        assert text
+        assert not text.startswith(f"{name}(")  # which a dataclass writes itself
+        fields = (
+            [f.name for f in dataclasses.fields(cls)]
+            if dataclasses.is_dataclass(cls)
+            else [*getattr(cls, "_fields", [])]
+        )
+        (block,) = re.findall(r"^Attributes\n-+\n(.*?)(?:\n\n|\Z)", text, re.M | re.S) or [""]
+        named = [one for line in re.findall(r"^(\S.*?) : .*$", block, re.M) for one in line.split(", ")]
+        if fields:
+            assert sorted(named) == sorted(fields)
+        for attribute, value in vars(cls).items():
+            if isinstance(value, property) and not attribute.startswith("_"):
+                assert inspect.getdoc(value), attribute
 
     @pytest.mark.parametrize("name", FUNCTIONS)
+    def test_functions_are_documented_as_numpydoc_has_it(self, name):
+        sections, named = sections_of(getattr(mcaptrack, name))
+        assert sections == SECTIONS
+        assert named == list(inspect.signature(getattr(mcaptrack, name)).parameters)
+
+    @pytest.mark.parametrize("name", [*FUNCTIONS, *CLASSES, *sorted(METHODS)])
     def test_examples_run(self, name, place, monkeypatch):
-        if name == "train":
-            pytest.importorskip("torch", reason="training needs torch")
-        if name in ("query", "list_tables"):
-            pytest.importorskip("duckdb", reason="SQL needs DuckDB")
+        documented = METHODS.get(name) or getattr(mcaptrack, name)
+        tests = doctest.DocTestFinder(recurse=False).find(documented, name, globs={})
+        if not tests or not tests[0].examples:
+            assert name not in FUNCTIONS
+            return
+        if name in NEEDS:
+            pytest.importorskip(NEEDS[name], reason=f"{name} needs {NEEDS[name]}")
         monkeypatch.setitem(synthetic.SCENES, "crowd", lambda seed: small_scene(3.0, seed=seed))  # a short one
-        tests = doctest.DocTestFinder(recurse=False).find(getattr(mcaptrack, name), name, globs={})
         runner = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS)
-        assert tests[0].examples
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", mcaptrack.McaptrackWarning)
             assert all(runner.run(test).failed == 0 for test in tests)

@@ -98,7 +98,20 @@ class LogInfo:
     warnings: tuple[Notice, ...]
 
     def to_json(self) -> dict[str, Any]:
-        """Return it as JSON has it, without the warnings."""
+        """Return all but the warnings as values of JSON.
+
+        Returns
+        -------
+        dict
+            What ``mcaptrack info --json`` prints for a log.
+
+        Examples
+        --------
+        >>> import mcaptrack
+        >>> mcaptrack.info("log.mcap").to_json()["log"]
+        'log.mcap'
+
+        """
         results = str(self.results) if self.results else None
         out = asdict(self) | {"log": str(self.log), "results": results, "attachments": list(self.attachments)}
         del out["warnings"]

@@ -1,4 +1,4 @@
-"""A log in Python: tables for Arrow, arrays for NumPy, pictures, and any message by where it stands.
+"""Read a log: tables for Arrow, arrays for NumPy, pictures, and any message by its place in the file; write own rows.
 
     import mcaptrack
 
@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from mcaptrack import log as logs
 from mcaptrack import tables
 from mcaptrack.api.common import as_path, log_output
+from mcaptrack.api.fetching import FetchedMessage, fetch_message
 from mcaptrack.api.rows import supervision_of
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import refuse_overwrite
@@ -35,27 +36,24 @@ from mcaptrack.tables import export
 if TYPE_CHECKING:
     import pyarrow as pa
 
-__all__ = ["FetchedMessage", "Recording", "open"]
+__all__ = ["Recording", "open"]
 
 Colour = Literal["bgr", "rgb", "grey"]
-_NEEDED: Final = ("chunk_offset", "message_offset")
-
-
-class FetchedMessage(NamedTuple):
-    """A message of a log: its channel, times in nanoseconds, and its bytes as they were recorded."""
-
-    topic: str
-    t_ns: int
-    publish_ns: int
-    sequence: int
-    payload: bytes
 
 
 class Recording:
-    """A log, open for reading; made by ``mcaptrack.open``. A context manager.
+    """A log, open for reading and writing; made by ``mcaptrack.open``. A context manager.
 
-    What it gives stays valid when it is closed. Every method raises McaptrackError, in one line, for what isn't there
-    and for what is damaged.
+    Tables, arrays and pictures stay valid when it is closed. All methods raise McaptrackError, in one line, for what
+    does not exist and for damage.
+
+    Examples
+    --------
+    >>> import mcaptrack
+    >>> with mcaptrack.open("log.mcap") as log:
+    ...     log.topics[0], log.tables[:3]
+    ('/camera/detections', ('frames', 'detections', 'tracks'))
+
     """
 
     def __init__(self, path: Path) -> None:
@@ -75,7 +73,7 @@ class Recording:
         return f"mcaptrack.open({str(self.path)!r})"
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close the file."""
         self._log.__exit__()
 
     @property
@@ -85,24 +83,46 @@ class Recording:
 
     @property
     def name(self) -> str:
-        """What the log is called in the column ``recording`` of all tables."""
+        """The name of the log in the column ``recording`` of all tables."""
         return self._contents.recording
 
     @property
     def tables(self) -> tuple[str, ...]:
-        """The names of all tables; every log has all of them, some without rows."""
+        """The names of all tables. Every log has all of them; some may have no rows."""
         return tuple(tables.TABLES)
 
     @property
     def topics(self) -> tuple[str, ...]:
-        """The channels, in order."""
+        """The topics of all channels, in alphabetical order."""
         return tuple(sorted(self._log.channels))
 
     def table(self, name: str, topic: str | None = None) -> pa.Table:
-        """A table as Arrow: what reading the folder of ``mcaptrack export`` gives, ``recording`` included.
+        """Return a table as Arrow: the same as in the files that ``export`` writes, with the column ``recording``.
 
-        ``name`` is one of ``tables``, or the topic of any other channel, whose messages are flattened. With ``topic``
-        only the rows of that channel.
+        Parameters
+        ----------
+        name : str
+            One of ``tables``; or the topic of any other channel, for a table of its flattened messages.
+        topic : str, optional
+            Return the rows of this channel only.
+
+        Returns
+        -------
+        pyarrow.Table
+            One row for each object and frame. Units and meanings of columns stand in the metadata of its schema.
+
+        Raises
+        ------
+        McaptrackError
+            If there is no such table or channel, or if the rows of the table are not by channel.
+
+        Examples
+        --------
+        >>> import mcaptrack
+        >>> with mcaptrack.open("log.mcap") as log:
+        ...     log.table("tracks", "/camera/tracks").column_names[:4]
+        ['topic', 'frame', 't', 't_ns']
+
         """
         if name in tables.TABLES:
             made = self._contents.table(name)
@@ -120,19 +140,70 @@ class Recording:
         return tables.with_recording(made, self.name)
 
     def array(self, name: str, topic: str | None = None) -> NDArray[Any]:
-        """The same as a structured array (N,): times as datetime64[ns], missing numbers as NaN.
+        """Return a table as a structured NumPy array.
 
-        Whole numbers of which some are missing become float64.
+        Parameters
+        ----------
+        name : str
+            One of ``tables``; or the topic of any other channel.
+        topic : str, optional
+            Return the rows of this channel only.
+
+        Returns
+        -------
+        numpy.ndarray, shape (N,)
+            The rows: times as datetime64[ns], missing numbers as NaN. A column of whole numbers of which some are
+            missing becomes float64.
+
+        Raises
+        ------
+        McaptrackError
+            If there is no such table or channel, or if the rows of the table are not by channel.
+
+        Examples
+        --------
+        >>> import mcaptrack
+        >>> with mcaptrack.open("log.mcap") as log:
+        ...     rows = log.array("tracks", "/camera/tracks")
+        >>> rows["t"].dtype, rows["x_px"].shape == rows.shape
+        (dtype('<M8[ns]'), True)
+
         """
         return tables.table_to_array(self.table(name, topic))
 
     def frames(
         self, topic: str = "video", times: Sequence[int] | None = None, colour: Colour = "bgr"
     ) -> Iterator[Frame]:
-        """The pictures of a channel, decoded, by time: ``rows`` is (H, W, 3) uint8, or (H, W) for "grey".
+        """Decode the pictures of a channel, in the order of time.
 
-        ``topic`` may be the end of one: "video" for /camera/video. With ``times``, in nanoseconds, the picture that is
-        shown at each: the last one that is not later. They come by time, each as often as it is asked for.
+        Parameters
+        ----------
+        topic : str, default "video"
+            The channel, or the end of its topic: "video" for /camera/video.
+        times : sequence of int, optional
+            Times in nanoseconds: decode the picture that is shown at each, the last one that is not later. By default
+            all pictures.
+        colour : {"bgr", "rgb", "grey"}, default "bgr"
+            Order of the colours.
+
+        Returns
+        -------
+        iterator of mcaptrack.schema.Frame
+            ``t_ns``, ``index``, and ``rows``: the picture, (H, W, 3) uint8, or (H, W) for "grey".
+
+        Raises
+        ------
+        McaptrackError
+            If there is no such channel of pictures, if a picture is damaged, or for a time before the first picture.
+
+        Examples
+        --------
+        >>> import mcaptrack
+        >>> with mcaptrack.open("log.mcap") as log:
+        ...     picture = next(log.frames("video", colour="grey"))
+        >>> picture.index, picture.rows.shape
+        (0, (48, 64))
+
         """
         channel = self._pictures(topic)
         wanted = None if times is None else self._shown(channel, times)
@@ -140,47 +211,62 @@ class Recording:
         return frames if wanted is None else (frame for frame in frames for _ in range(wanted[frame.index]))
 
     def fetch(self, row: Mapping[str, Any]) -> FetchedMessage:
-        """The message that a row of ``frames`` points to, or of any table with its columns; one chunk is read.
+        """Read one message by its place in the file, without a scan.
 
-        ``file``, ``topic`` and ``t_ns`` are held against what is found, as far as the row has them: a log that was
-        changed since its tables were exported is told.
+        Parameters
+        ----------
+        row : mapping of str to value
+            A row of the table ``frames``, or any other with its columns ``chunk_offset`` and ``message_offset``;
+            ``file``, ``topic`` and ``t_ns`` are compared with the message, if the row has them.
+
+        Returns
+        -------
+        FetchedMessage
+            The message.
+
+        Raises
+        ------
+        McaptrackError
+            If there is no such message at this place, because the log was changed since its tables were exported.
+
+        Examples
+        --------
+        >>> import mcaptrack
+        >>> with mcaptrack.open("log.mcap") as log:
+        ...     row = log.table("frames", "/camera/video").slice(0, 1).to_pylist()[0]
+        ...     log.fetch(row).topic
+        '/camera/video'
+
         """
-        missing = [name for name in _NEEDED if name not in row]
-        if missing:
-            raise McaptrackError(f"a row without {', '.join(missing)} points to no message; rows of `frames` do")
-        chunk, offset = (_whole(row[name]) for name in _NEEDED)
-        file = row.get("file")
-        part = next((part for part in self._log.parts if file in (None, part.path.name)), None)
-        if part is None or offset is None:
-            raise McaptrackError(f"{self.path}: the row is of {file}, at byte {offset}, which is not of this log")
-        old = f"{part.path}: no such message stands there; export its tables again"
-        try:
-            topic, message = part.message_at(chunk, offset)
-        except McaptrackError as error:
-            raise McaptrackError(f"{old} ({error})") from None
-        said = (row.get("topic", topic), _whole(row.get("t_ns", message.t_ns)))
-        if said != (topic, message.t_ns):
-            raise McaptrackError(old)
-        return FetchedMessage(topic, message.t_ns, message.publish_ns, message.sequence, message.payload)
+        return fetch_message(self._log, row)
 
     def supervision(self, topic: str) -> Iterator[tuple[int, Any]]:
-        """Yield detections or tracks as ``supervision.Detections``, frame by frame.
+        """Return detections or tracks as ``supervision.Detections``, frame by frame.
 
         Parameters
         ----------
         topic : str
             The channel, or the end of its topic: "tracks" for /camera/tracks.
 
-        Yields
-        ------
-        tuple of int and supervision.Detections
+        Returns
+        -------
+        iterator of (int, supervision.Detections)
             Time in nanoseconds, and the boxes in pixels, with ``tracker_id`` for tracks and ``class_id`` for
-            detections. Rows without a box are left out.
+            detections; ``confidence`` is NaN where there is none. Rows without a box are left out.
 
         Raises
         ------
         McaptrackError
             If the channel has neither detections nor tracks, or if supervision is not installed.
+
+        Examples
+        --------
+        >>> import mcaptrack
+        >>> with mcaptrack.open("log.mcap") as log:
+        ...     t_ns, boxes = next(log.supervision("detections"))
+        >>> boxes.xyxy.shape[1]
+        4
+
         """
         there = {c.topic: SCHEMAS.get(c.schema_name) for c in self._log.channels.values()}
         boxes = {name: schema for name, schema in there.items() if schema in (DETECTIONS, TRACKS)}
@@ -228,6 +314,7 @@ class Recording:
         ...     frames = [mcaptrack.detections([[9, 20, 17, 28]], t_ns=0, box_format="xyxy")]
         ...     log.write("/mine/detections", frames)
         1
+
         """
         from mcaptrack.api.writing import write_rows
 
@@ -247,7 +334,7 @@ class Recording:
         return found[0]
 
     def _shown(self, topic: str, times: Sequence[int]) -> dict[int, int]:
-        """The numbers of the pictures that are shown at these times, and how often each is asked for."""
+        """Return the numbers of the pictures that are shown at these times, and how often each is asked for."""
         at = np.searchsorted(self._log.times(topic), np.asarray(times, np.int64), "right") - 1
         if len(at) and at.min() < 0:
             first = int(np.asarray(times)[at.argmin()])
@@ -260,11 +347,6 @@ class Recording:
         found = Pictures(self._log, topic)
         for frame in found.frames(range(len(found.t_ns)) if wanted is None else wanted, pixels):
             yield frame._replace(rows=frame.rows[..., ::-1]) if colour == "rgb" else frame
-
-
-def _whole(value: Any) -> int | None:
-    """A whole number as tables have it: pandas makes floats of columns in which some are missing."""
-    return None if value is None or value != value else int(value)  # noqa: PLR0124  # NaN is not itself
 
 
 def open(path: str | Path, *, create: bool = False) -> Recording:  # noqa: A001  # mcaptrack.open is its name

@@ -66,14 +66,53 @@ class Scores:
     warnings: tuple[Notice, ...]
 
     def rows(self) -> list[dict[str, Any]]:
-        """Return the results as dictionaries, for a ``pandas.DataFrame``: shares from 0 to 1, lengths in metres."""
+        """Return the results as dictionaries, for a ``pandas.DataFrame``.
+
+        Returns
+        -------
+        list of dict
+            One for each result: scores as shares from 0 to 1, counts, lengths in metres.
+
+        Examples
+        --------
+        >>> import mcaptrack
+        >>> mcaptrack.evaluate("log.mcap", gate_m=1.0).rows()[0]["sequence"]
+        'log'
+
+        """
         return [result.to_json() for result in self.results]
 
     def score(self, name: str, tracks: str = "", similarity: str = "", gate: float | None = None) -> float:
-        """Return one score, such as "IDF1", of the only result that fits the rest.
+        """Return one score, of the only result that fits.
 
-        ``tracks`` is a topic or the end of one ("retracks"). Of several sequences, all together count. Raises
-        McaptrackError if no result fits, or several.
+        Parameters
+        ----------
+        name : str
+            The score, such as "IDF1".
+        tracks : str, optional
+            Topic of the tracks, or its end: "retracks" for /camera/retracks.
+        similarity : {"iou", "metres"}, optional
+            How ground truth and tracks were matched.
+        gate : float, optional
+            Largest distance of a match in metres, or least overlap.
+
+        Returns
+        -------
+        float
+            The score; with several sequences that of all together.
+
+        Raises
+        ------
+        McaptrackError
+            If no result fits, or more than one.
+
+        Examples
+        --------
+        >>> import mcaptrack
+        >>> scores = mcaptrack.evaluate("log.mcap", gate_m=1.0)
+        >>> 0.5 < scores.score("IDF1", "retracks", "metres") <= 1.0
+        True
+
         """
         rows = [
             row for row in self.final() if row["tracks"].endswith(tracks) and row["similarity"].startswith(similarity)
@@ -87,12 +126,44 @@ class Scores:
         return float(rows[0][name])
 
     def final(self) -> list[dict[str, Any]]:
-        """Return the rows of all sequences together; those of the only sequence, if there is one."""
+        """Return the rows of all sequences together.
+
+        Returns
+        -------
+        list of dict
+            Of ``rows``, those of all sequences together, or of the only sequence.
+
+        Examples
+        --------
+        >>> import mcaptrack
+        >>> scores = mcaptrack.evaluate("log.mcap", gate_m=1.0)
+        >>> scores.final() == scores.rows()
+        True
+
+        """
         rows = self.rows()
         return [row for row in rows if row["sequence"] == COMBINED] or rows
 
     def below(self, limits: Mapping[str, float]) -> list[str]:
-        """Return a line for each final score that is below its limit, such as ``{"IDF1": 0.7}``."""
+        """Return the scores that are below a limit.
+
+        Parameters
+        ----------
+        limits : mapping of str to float
+            Least scores by name.
+
+        Returns
+        -------
+        list of str
+            A line for each score of ``final`` that is lower.
+
+        Examples
+        --------
+        >>> import mcaptrack
+        >>> mcaptrack.evaluate("log.mcap").below({"IDF1": 0.0})
+        []
+
+        """
         return [
             f"{row['sequence']} {row['tracks']} {row['similarity']} {row['gate']:g}: "
             f"{name} {row[name]:.4f} is under {least:g}"

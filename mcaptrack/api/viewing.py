@@ -73,7 +73,20 @@ class LogServer:
         self.close()
 
     def start(self) -> Self:
-        """Serve the log from another thread until ``close``; returns the server itself."""
+        """Serve the log from another thread until ``close``.
+
+        Returns
+        -------
+        LogServer
+            The server itself.
+
+        Examples
+        --------
+        >>> import mcaptrack
+        >>> server = mcaptrack.view("log.mcap").start()
+        >>> server.close()
+
+        """
         self._thread = threading.Thread(target=self.serve_forever, daemon=True)
         self._thread.start()
         return self
