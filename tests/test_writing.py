@@ -13,8 +13,9 @@ import pytest
 import mcaptrack
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
-from mcaptrack.schema import DETECTIONS
+from mcaptrack.schema import DETECTIONS, Frame
 from mcaptrack.schema.provenance import Provenance
+from tests.worlds import write_clip
 
 SECOND = 10**9
 
@@ -61,7 +62,7 @@ BOXES = np.array([[10.0, 20, 30, 60], [50, 20, 80, 60]], np.float32)
 SCORES = np.array([0.5, 0.75], np.float32)
 
 
-def walk(frames: int = 30) -> list[mcaptrack.Notice]:
+def walk(frames: int = 30) -> list[Frame]:
     """Two boxes that move apart, 10 pictures a second."""
     return [
         mcaptrack.detections(
@@ -73,6 +74,16 @@ def walk(frames: int = 30) -> list[mcaptrack.Notice]:
         )
         for n in range(frames)
     ]
+
+
+def table(**columns: object) -> np.ndarray:
+    """Two boxes, at 0 and at 5 ns, with other columns, or other values."""
+    usual = {"t_ns": [0, 5], "x_px": [1.0, 2.0], "y_px": [1.0, 2.0], "w_px": [4.0, 4.0], "h_px": [8.0, 8.0]}
+    arrays = {name: np.array(values) for name, values in (usual | columns).items()}
+    out = np.empty(2, [(name, values.dtype) for name, values in arrays.items()])
+    for name, values in arrays.items():
+        out[name] = values
+    return out
 
 
 class TestDetections:
@@ -119,13 +130,36 @@ class TestDetections:
             ({"boxes": [[1, 2, 3, 4]]}, "say what the columns of boxes are"),
             ({"boxes": [1, 2, 3, 4], "box_format": "xyxy"}, r"shape \(N, 4\), not \(4,\)"),
             ({"boxes": [[30, 2, 3, 4]], "box_format": "xyxy"}, "box 0 has a negative size"),
-            ({"boxes": [[1, 2, np.nan, 4]], "box_format": "xywh", "t_ns": 9}, "rows at 9 ns: .*w_px is required"),
-            ({"boxes": [[1, 2, 3, 4]], "scores": [1, 2], "box_format": "xywh"}, "columns of one length"),
+            (
+                {"boxes": [[1, 2, np.nan, 4]], "box_format": "xywh", "t_ns": 9},
+                "box 0 has numbers that are missing or infinite",
+            ),
+            (
+                {"boxes": [[1, 2, 3, 4]], "scores": [1, 2], "box_format": "xywh"},
+                r"1 boxes need score of shape \(1,\), not \(2,\)",
+            ),
+            ({"boxes": [[1, 2, np.inf, 4]], "box_format": "xyxy"}, "box 0 has numbers that are missing or infinite"),
+            ({"boxes": [[1, 2, 3, 4], [1, 2, 3]], "box_format": "xyxy"}, r"boxes are numbers of shape \(N, 4\): "),
+            ({"boxes": ["abcd"], "box_format": "xyxy"}, "could not convert string to float"),
+            ({"boxes": [[1, 2, 3, 4]], "scores": ["high"], "box_format": "xywh"}, "score needs numbers"),
+            ({"boxes": [[1, 2, 3, 4]], "classes": ["person"], "box_format": "xywh"}, "class_id needs whole numbers"),
+            ({"boxes": [[1, 2, 3, 4]], "classes": [1.5], "box_format": "xywh"}, "class_id needs whole numbers"),
+            ({"boxes": [], "t_ns": 1.5, "box_format": "xyxy"}, r"`t_ns=` needs whole nanoseconds.* not 1.5 \(float\)"),
+            ({"boxes": [], "t_ns": "2026-05-01", "box_format": "xyxy"}, "`t_ns=` needs whole nanoseconds"),
+            ({"boxes": [], "t_ns": -1, "box_format": "xyxy"}, "from 0 to 9223372036854775807, not -1"),
+            ({"boxes": [], "t_ns": 2**63, "box_format": "xyxy"}, "from 0 to 9223372036854775807"),
+            ({"boxes": [], "index": 2**32, "box_format": "xyxy"}, "`index=` needs the number of a picture, from 0"),
+            ({"boxes": [], "index": "x", "box_format": "xyxy"}, "`index=` needs the whole number of a picture"),
         ],
     )
-    def test_what_does_not_fit_is_refused(self, given, words):
+    def test_what_does_not_fit_is_refused_in_a_line(self, given, words):
         with pytest.raises(McaptrackError, match=words):
             mcaptrack.detections(**given)
+
+    def test_times_of_numpy_and_classes_as_floats_are_taken(self):
+        time = np.datetime64(1_700_000_000_000_000_001, "ns")
+        frame = mcaptrack.detections(np.ones((1, 4), np.float16), None, np.ones(1, np.float32), time, box_format="xywh")
+        assert (frame.t_ns, frame.rows["class_id"].tolist()) == (1_700_000_000_000_000_001, [1])
 
 
 class TestWriting:
@@ -185,7 +219,7 @@ class TestWriting:
         with mcaptrack.open(tmp_path / "a.mcap", create=True) as opened:
             for rows, words in (
                 (made(BOXES), "have no time; give them by time"),
-                ([made(BOXES)], "each frame is a Frame, or a time in nanoseconds with"),
+                ([made(BOXES)], "or a time in nanoseconds with supervision.Detections, not Detections"),
                 ({5: made(BOXES)}, "the detections at 5 ns have no tracker ids"),
             ):
                 with pytest.raises(McaptrackError, match=words) as refused:
@@ -208,12 +242,47 @@ class TestWriting:
     @pytest.mark.parametrize(
         ("topic", "rows", "words"),
         [
-            ("/camera/detections", [1, 2], "each frame is a Frame"),
-            ("/camera/detections", np.zeros((3, 4)), "an array without named columns"),
+            ("/camera/detections", [1, 2], "each frame is one of `mcaptrack.detections`, .* not 1 .int."),
+            ("/camera/detections", {"t_ns": [0]}, "not a mapping of columns; columns are given as"),
+            ("/camera/detections", np.zeros((3, 4)), r"an array \(3, 4\) of float64 is no table"),
             ("/camera/detections", np.zeros(2, [("x_px", float)]), "no column t_ns"),
             ("/camera/detections", np.zeros(2, [("t_ns", int), ("left", float)]), "has no column left; it has"),
-            ("/camera/detections", 5, "not int"),
+            ("/camera/detections", 5, "not 5 .int."),
             ("/camera/", [], "is no topic"),
+            ("/camera//detections", [], "is no topic"),
+            ("/camera/\n/detections", [], "is no topic"),
+            (5, [], "a topic is text"),
+            ("/" + "x" * 2000, [], "is longer than 1024 bytes"),
+            ("/camera/video", walk(2), "/camera/video is a name of what stages make or of pictures"),
+            ("/camera/ground_plane", walk(2), "is a name of what stages make"),
+            ("/camera/retracks/online", [], "is a name of what stages make"),
+            ("/camera/tracks/view/image", walk(2), "is a name of what stages make"),
+            ("/camera/tracks/events", walk(2), "is a name of what stages make"),
+            ("/camera/detections", [*walk(2), *walk(1)], "two frames are at 0 ns; each picture has a time of its own"),
+            ("/camera/detections", [walk(1)[0]._replace(t_ns=0.5)], "needs whole nanoseconds"),
+            ("/camera/detections", [walk(1)[0]._replace(rows=None)], "rows of a frame are a structured array"),
+            ("/camera/detections", table(t_ns=[0.0, 0.1]), "t_ns needs whole nanoseconds.* not float64"),
+            ("/camera/detections", table(t_ns=[-1, 5]), "it has -1 to 5"),
+            ("/camera/detections", table(frame=[-2, 5]), "the column frame holds numbers of pictures"),
+            (
+                "/camera/detections",
+                table(x_px=[0, np.inf]),
+                "row 0 of the frame at 5 ns has an infinite number: x_px inf",
+            ),
+            ("/camera/detections", table(h_px=[1, -1]), "row 0 of the frame at 5 ns has a box of negative size"),
+            ("/camera/detections", table(topic=["/a", "/b"]), "rows of 2 topics: /a, /b; .* select one topic"),
+            ("/camera/detections", table(recording=["a", "b"]), "rows of 2 recordings"),
+            ("/camera/detections", table()["x_px"], "an array .* is no table"),
+            ("/camera/detections", table().reshape(1, 2), "an array .* is no table"),
+            ("/camera/tracks", table(t_ns=[5, 5], track_id=[1, 1]), "row 1 of .* has a track_id that another row"),
+            ("/camera/tracks", table(track_id=[1, -1]), "row 0 of the frame at 5 ns has a negative track_id"),
+            ("/camera/tracks", table(track_id=[1, 2], x_m=[1, 2]), "a part of a box or of a position"),
+            ("/camera/tracks", table(track_id=[1, 2], w_px=[1, np.nan]), "a part of a box or of a position"),
+            (
+                "/camera/tracks",
+                np.array([(0, 1)], [("t_ns", int), ("track_id", int)]),
+                "has neither a box nor a position",
+            ),
             ("/camera/other", [], "whether these are detections or tracks"),
         ],
     )
@@ -224,3 +293,65 @@ class TestWriting:
             with pytest.raises(McaptrackError, match=words):
                 opened.write(topic, rows)
         assert path.read_bytes() == before
+
+    @pytest.mark.parametrize("library", ["pandas", "polars", "pyarrow", "duckdb"])
+    def test_tables_of_any_library_give_the_same_rows(self, tmp_path, library):
+        rows = table(t_ns=[7, 5], score=[np.nan, 0.5])
+        columns = {name: rows[name] for name in rows.dtype.names}
+        module = pytest.importorskip(library)
+        if library == "pandas":
+            given = module.DataFrame(columns, index=["b", "a"])  # an index that is no column
+        elif library == "polars":
+            given = module.DataFrame(columns)
+        else:
+            given = pytest.importorskip("pyarrow").table(columns)
+        if library == "duckdb":
+            given = module.sql("select t_ns, x_px, y_px, w_px, h_px, score from given")
+        with mcaptrack.open(tmp_path / "a.mcap", create=True) as opened:
+            assert opened.write("/own/detections", given) == 2
+            found = opened.array("detections", "/own/detections")
+        assert [tuple(found[name]) for name in ("t_ns", "x_px", "score")][:2] == [(5, 7), (2.0, 1.0)]
+        np.testing.assert_array_equal(found["score"], [0.5, np.nan])
+
+    def test_timestamps_are_times_and_frames_of_one_time_are_told_by_their_number(self, tmp_path):
+        rows = table(t_ns=np.array([1, 1], "datetime64[us]"), frame=[4, 3])
+        with mcaptrack.open(tmp_path / "a.mcap", create=True) as opened:
+            assert opened.write("/own/detections", rows) == 2
+            found = opened.array("detections", "/own/detections")
+        assert [found[name].tolist() for name in ("t_ns", "frame", "x_px")] == [[1000, 1000], [3, 4], [2.0, 1.0]]
+
+    def test_what_is_out_of_date_then_is_said(self, tmp_path):
+        path = tmp_path / "a.mcap"
+        with mcaptrack.open(path, create=True) as opened:
+            opened.write("/camera/detections", walk())
+        mcaptrack.track(path)
+        with (
+            mcaptrack.open(path) as opened,
+            pytest.warns(mcaptrack.McaptrackWarning, match="/camera/tracks was made from what has just been replaced"),
+        ):
+            opened.write("/camera/detections", walk(20), replace=True)
+        assert "/camera/tracks" in [one.topic for one in mcaptrack.info(path).channels if one.stale]
+
+    def test_a_channel_is_only_replaced_by_one_of_its_kind(self, tmp_path):
+        path = tmp_path / "a.mcap"
+        write_clip(tmp_path / "clip.mp4", frames=10)
+        mcaptrack.ingest(tmp_path / "clip.mp4", path)
+        with mcaptrack.open(path) as opened:
+            opened.write("/own/things", walk())
+            before = path.read_bytes()
+            with pytest.raises(
+                McaptrackError, match=r"which holds mcaptrack.Detections and is not replaced by mcaptra"
+            ):
+                opened.write("/own/things", table(track_id=[1, 2]), replace=True)
+            for topic in opened.topics:
+                if topic != "/own/things":
+                    with pytest.raises(McaptrackError):
+                        opened.write(topic, walk(), replace=True)
+        assert path.read_bytes() == before
+
+    def test_scores_beyond_one_are_said(self, tmp_path):
+        with (
+            mcaptrack.open(tmp_path / "a.mcap", create=True) as opened,
+            pytest.warns(mcaptrack.McaptrackWarning, match="scores are from 2 to 95; trackers"),
+        ):
+            opened.write("/own/detections", table(score=[2.0, 95.0]))

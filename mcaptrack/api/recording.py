@@ -24,7 +24,7 @@ from mcaptrack import log as logs
 from mcaptrack import tables
 from mcaptrack.api.common import as_path, log_output
 from mcaptrack.api.fetching import FetchedMessage, fetch_message
-from mcaptrack.api.rows import supervision_of
+from mcaptrack.api.supervision import supervision_of
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import refuse_overwrite
 from mcaptrack.schema import DETECTIONS, SCHEMAS, TRACKS, Frame
@@ -288,11 +288,13 @@ class Recording:
         topic : str
             The channel, such as "/camera/detections", or its name below the only camera, "detections". Channels named
             detections hold detections; those named tracks or truth hold tracks.
-        rows : iterable of Frame, structured array, pyarrow.Table, or mapping
-            Frames as ``mcaptrack.detections`` makes them; or an array or table with a column ``t_ns`` and those of the
-            rows; or ``supervision.Detections`` by time in nanoseconds, as a mapping or as pairs.
+        rows : iterable of Frame, structured array, table, or mapping
+            Frames as ``mcaptrack.detections`` makes them; or an array, or a table of pandas, Polars, Arrow or DuckDB,
+            with a column ``t_ns`` and those of the rows; or ``supervision.Detections`` by time in nanoseconds, as a
+            mapping or as pairs. A table has no frames without rows.
         replace : bool, default False
-            Replace the channel if it exists. Channels that others recorded are never replaced.
+            Replace the channel if it exists and holds the same kind of rows. Channels that others recorded are never
+            replaced.
         sidecar : bool, optional
             Write into LOG.results.mcap beside the log (True) or into the log (False). By default beside recordings
             that ROS tools read, otherwise into the log.

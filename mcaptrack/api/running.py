@@ -123,8 +123,7 @@ def work(where: Where, plan: Plan, watch: Watch | None, progress: Progress, tabl
         for layout, content in zip(layouts, report.layouts.values(), strict=True):
             publish_bytes(layout, content)
         for topic in report.stale:
-            again = call("run", target)
-            warn(f"{topic} was made from what has just been replaced; {again} brings it up to date", "out-of-date")
+            warn_stale(topic, target)
         rows = _export(target, where.force, progress) if tables else {}
         summary = None
         if tables is not None:
@@ -147,6 +146,12 @@ def work(where: Where, plan: Plan, watch: Watch | None, progress: Progress, tabl
         notes=tuple(notes),
         seconds=round(monotonic() - began, 3),
     )
+
+
+def warn_stale(topic: str, log: Path) -> None:
+    """Warn of a channel that is out of date now."""
+    again = call("run", log)
+    warn(f"{topic} was made from what has just been replaced; {again} brings it up to date", "out-of-date")
 
 
 def _export(target: Path, force: bool, progress: Progress) -> dict[str, int]:

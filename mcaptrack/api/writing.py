@@ -10,18 +10,26 @@ import numpy as np
 
 from mcaptrack import log as logs
 from mcaptrack import pipeline
+from mcaptrack.api.columns import UNNUMBERED
 from mcaptrack.api.common import warnings_about
-from mcaptrack.api.rows import UNNUMBERED, frames_of
+from mcaptrack.api.rows import frames_of
+from mcaptrack.api.running import warn_stale
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import publish_bytes
 from mcaptrack.geometry.plane import Planes, plane_at
 from mcaptrack.pipeline.write import Made, write
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame, Schema
 from mcaptrack.schema.provenance import INGEST, Provenance
+from mcaptrack.sources.cameras import USUAL
 from mcaptrack.sources.ingest.sidecar import SidecarChoice
 
 #: What channels usually hold, by the end of their topic.
 _HOLDS: Final[Mapping[str, Schema]] = {"detections": DETECTIONS, "tracks": TRACKS, "truth": TRACKS}
+#: The ends of names of channels that stand beside others.
+_BESIDE: Final = ("events", "counts", "errors", "scores", "view")
+_SUCH: Final = "/own/detections or /own/tracks"
+#: The longest topic in bytes.
+_LONGEST: Final = 1024
 
 
 def write_rows(path: Path, topic: str, rows: Any, *, replace: bool, sidecar: bool | None) -> int:
@@ -29,23 +37,51 @@ def write_rows(path: Path, topic: str, rows: Any, *, replace: bool, sidecar: boo
     place = SidecarChoice(sidecar)
     with warnings_about(path), logs.read(path, sidecar=place) as opened:
         opened.lock()
-        prefix = pipeline.find_camera(opened, None, None) if "/" not in topic else ""
-        name = f"{prefix}/{topic}" if prefix else topic
-        if not name.startswith("/") or name.endswith("/"):
-            raise McaptrackError(f"{topic} is no topic; give one such as detections or /camera/detections")
-        prefix = prefix or name.rpartition("/")[0]
-        schema, frames = frames_of(rows, _HOLDS.get(name.rpartition("/")[2]))
-        if name in opened.channels and not replace:
-            raise McaptrackError(f"{path} has {name} already; `replace=True` replaces it")
+        name = _topic(opened, topic)
+        prefix, _, last = name.rpartition("/")
+        schema, frames = frames_of(rows, _HOLDS.get(last))
+        _refuse_to_replace(opened, name, schema, replace)
         planes = pipeline.read_planes(opened, prefix) or ()
         frames = _numbered(
             opened, prefix, [_in_metres(frame, planes) if schema is TRACKS else frame for frame in frames]
         )
         made = Made.of(schema, frames, Provenance(INGEST, {"written_with": "mcaptrack.open"}))
         layouts = write(opened, prefix, {name: made}, planes, {}, None)
+        stale = pipeline.outdated_by(opened, {name: made.provenance.digest})
         for layout, content in layouts.items():
             publish_bytes(pipeline.layout_path(path, layout), content)
+        for topic_of_stage in stale:
+            warn_stale(topic_of_stage, path)
     return len(frames)
+
+
+def _topic(opened: logs.Log, topic: str) -> str:
+    """The topic of a channel to write: as it is given, or below the only camera."""
+    if not isinstance(topic, str):
+        raise McaptrackError(f"a topic is text such as detections or /camera/detections, not {topic!r:.40}")
+    name = topic if "/" in topic else f"{pipeline.find_camera(opened, None, None)}/{topic}"
+    if not topic or not name.startswith("/") or not all(name[1:].split("/")) or not name.isprintable():
+        raise McaptrackError(f"{topic!r:.80} is no topic; give one such as detections or /camera/detections")
+    if len(name.encode()) > _LONGEST:
+        raise McaptrackError(f"{topic:.80}... is longer than {_LONGEST} bytes; give the channel a shorter topic")
+    taken = [*(usual for usual in USUAL if usual not in _HOLDS), *_BESIDE]
+    if "/view/" in name or name.endswith(tuple(f"/{end}" for end in taken)):
+        raise McaptrackError(f"{name} is a name of what stages make or of pictures; write to another, such as {_SUCH}")
+    return name
+
+
+def _refuse_to_replace(opened: logs.Log, name: str, schema: Schema, replace: bool) -> None:
+    """Raise McaptrackError if there is a channel of this name that has to stay."""
+    there = opened.channels.get(name)
+    if there is None:
+        return
+    if there.schema_name != schema.name:
+        raise McaptrackError(
+            f"{opened.path} has {name}, which holds {there.schema_name or 'no schema'} and is not replaced by "
+            f"{schema.name}; write to another channel, such as {_SUCH}"
+        )
+    if not replace:
+        raise McaptrackError(f"{opened.path} has {name} already; `replace=True` replaces it")
 
 
 def _numbered(opened: logs.Log, prefix: str, frames: Sequence[Frame]) -> list[Frame]:

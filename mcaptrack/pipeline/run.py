@@ -113,13 +113,19 @@ def _run(
         report.layouts = write(opened, prefix, made, planes or (), stamps, output)
     how = {topic: channel.provenance for topic, channel in made.items()}
     warn_of_what_stands(opened, prefix, how, planes or (), is_all=watch is not None or not jobs)
-    digests = {topic: channel.provenance.digest for topic, channel in made.items()}
+    report.stale = outdated_by(opened, {topic: channel.provenance.digest for topic, channel in made.items()})
+    return report
+
+
+def outdated_by(opened: log.Log, digests: Mapping[str, str]) -> list[str]:
+    """The other channels that a stage made from, or compared with, these topics when they had other digests."""
+    found = []
     for topic, there in sorted(opened.channels.items()):
         known = Provenance.from_metadata(there.metadata)
-        if topic not in made and known and known.transform in {*STAGES, EVENTS_STAGE}:
+        if topic not in digests and known and known.transform in {*STAGES, EVENTS_STAGE}:
             is_late = any(digests.get(name, then) != then for name, then in known.made_from().items())
-            report.stale += [topic] if is_late else []
-    return report
+            found += [topic] if is_late else []
+    return found
 
 
 class _Input(NamedTuple):

@@ -12,6 +12,7 @@ read_tracks(path), read_columns(...) files -> arrays and frames, also of files f
 from mcaptrack.tables.build import (
     Part,
     Pointers,
+    columns_of,
     frames_table,
     frames_to_part,
     records_table,
@@ -42,6 +43,7 @@ __all__ = [
     "Pointers",
     "Table",
     "cells",
+    "columns_of",
     "file_metadata",
     "frames_table",
     "frames_to_part",

@@ -11,6 +11,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.ragged import group_index
 from mcaptrack.schema import Frame, Rows, Schema
@@ -253,6 +254,26 @@ def table_to_array(table: Any) -> NDArray[Any]:
     for name, values in arrays.items():
         out[name] = values
     return out
+
+
+def columns_of(rows: Any) -> dict[str, NDArray[Any]]:
+    """The columns (N,) of a table of any library that speaks Arrow: pyarrow, pandas, Polars, DuckDB.
+
+    Raises McaptrackError for what Arrow cannot hold.
+    """
+    import pyarrow as pa
+
+    try:
+        table = pa.table(rows)
+    except (pa.ArrowException, TypeError, ValueError) as error:
+        raise McaptrackError(f"the table cannot be read as Arrow: {' '.join(str(error).split())}") from None
+    if len(set(table.column_names)) < len(table.column_names):
+        raise McaptrackError(f"the table has columns of the same name: {', '.join(table.column_names)}")
+    is_decimal = {field.name: pa.types.is_decimal(field.type) for field in table.schema}
+    return {
+        name: (column.cast(pa.float64()) if is_decimal[name] else column).to_numpy()
+        for name, column in zip(table.column_names, table.columns, strict=True)
+    }
 
 
 def table_to_frames(schema: Schema, rows: Any, frames: Any, topic: str) -> list[Frame]:

@@ -1,0 +1,207 @@
+"""Columns of a user as frames of rows: what is a time, a frame number, a box, a position, and what is none.
+
+Letters: N rows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from operator import index as as_index
+from typing import Any, Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaptrack.errors import McaptrackError
+from mcaptrack.geometry.arrays import Floats, Ints
+from mcaptrack.geometry.clocks import LAST_NS
+from mcaptrack.notices import warn
+from mcaptrack.schema import DETECTIONS, TRACKS, Frame, Rows, Schema
+
+BoxFormat = Literal["xyxy", "xywh"]
+#: The frame number of a frame that was not numbered; ``Recording.write`` gives it one.
+UNNUMBERED: Final = -1
+#: The largest frame number of a message.
+_LAST_INDEX: Final = 2**32 - 1
+#: Columns of tables and arrays that are not part of rows. pandas names an index that has no name so.
+_BESIDE: Final = ("t", "t_ns", "frame", "index", "row", "topic", "recording", "__index_level_0__")
+_BOX: Final = ("x_px", "y_px", "w_px", "h_px")
+_PLACE: Final = ("x_m", "y_m")
+_IN_NS: Final = "whole nanoseconds, such as `round(seconds * 1e9)`"
+
+
+def frame_of(schema: Schema, boxes: Floats, given: Mapping[str, Any], t_ns: int | np.datetime64, index: int) -> Frame:
+    """A frame of boxes (N, 4), with other columns as far as they are given."""
+    columns: dict[str, Any] = dict(zip(_BOX, boxes.T, strict=True))
+    for name, values in given.items():
+        if values is None:
+            continue
+        try:
+            array = np.asarray(values, np.float64 if name == "score" else None)
+        except (TypeError, ValueError) as error:
+            raise McaptrackError(f"{name} needs numbers of shape (N,): {_line(error)}") from None
+        if array.shape != (len(boxes),):
+            raise McaptrackError(f"{len(boxes)} boxes need {name} of shape ({len(boxes)},), not {array.shape}")
+        columns[name] = array
+    time, number = time_of(t_ns), number_of(index)
+    rows = _rows(schema, columns, len(boxes), f"the frame at {time} ns")
+    return Frame(time, number, rows)
+
+
+def frames_of_columns(columns: dict[str, Any], schema: Schema | None) -> tuple[Schema, list[Frame]]:
+    """Frames of a table: rows of the same ``t_ns`` and ``frame`` are a frame."""
+    if "t_ns" not in columns:
+        raise McaptrackError(f"the table has no column t_ns (times in nanoseconds); it has {', '.join(columns)}")
+    schema = schema or (TRACKS if "track_id" in columns else DETECTIONS)
+    known = {column.name for column in schema.columns}
+    strange = sorted(set(columns) - known - set(_BESIDE))
+    if strange:
+        raise McaptrackError(f"{schema.name} has no column {', '.join(strange)}; it has {', '.join(sorted(known))}")
+    for name in ("topic", "recording"):
+        different = sorted({str(value) for value in columns.get(name, ())})
+        if len(different) > 1:
+            raise McaptrackError(
+                f"the table has rows of {len(different)} {name}s: {', '.join(different)}; their ids and times do not "
+                f"go together: select one {name}"
+            )
+    t_ns = _times(columns["t_ns"])
+    rows = _rows(schema, {name: values for name, values in columns.items() if name in known}, len(t_ns), "the table")
+    numbers = _numbers(columns["frame"]) if "frame" in columns else np.full(len(t_ns), UNNUMBERED)
+    order = np.lexsort((numbers, t_ns))
+    begins = np.flatnonzero((np.diff(t_ns[order]) != 0) | (np.diff(numbers[order]) != 0)) + 1
+    parts = np.split(order, begins) if len(order) else []
+    return schema, [Frame(int(t_ns[part[0]]), int(numbers[part[0]]), rows[part]) for part in parts]
+
+
+def _rows(schema: Schema, given: Mapping[str, Any], count: int, where: str) -> Rows:
+    """Rows of columns; those that have usual values may be left out."""
+    columns = {name: _whole(values) if schema.dtype[name].kind in "iu" else values for name, values in given.items()}
+    if schema is TRACKS:
+        columns.setdefault("observed", np.ones(count, bool))
+        columns.setdefault("source_id", np.full(count, -1))
+    else:
+        columns.setdefault("class_id", np.zeros(count, np.uint32))
+    try:
+        return schema.rows(**columns)
+    except ValueError as error:
+        raise McaptrackError(f"{where}: {error}") from None
+
+
+def check_frames(schema: Schema, frames: Sequence[Frame]) -> None:
+    """Raise McaptrackError, for the first such row, if boxes or positions are no boxes or positions."""
+    rows = schema.joined([frame.rows for frame in frames])
+    of = np.repeat(np.arange(len(frames)), [len(frame.rows) for frame in frames])
+
+    def refuse(wrong: NDArray[np.bool_], words: str) -> None:
+        if wrong.any():
+            at = int(wrong.argmax())
+            number = at - int(np.searchsorted(of, of[at]))
+            values = ", ".join(f"{name} {rows[name][at]}" for name in rows.dtype.names or ())
+            raise McaptrackError(f"row {number} of the frame at {frames[of[at]].t_ns} ns {words}: {values}")
+
+    names = [name for name in (*_BOX, *_PLACE, "score") if name in (rows.dtype.names or ())]
+    refuse(np.any([np.isinf(rows[name]) for name in names], axis=0), "has an infinite number")
+    refuse((rows["w_px"] < 0) | (rows["h_px"] < 0), "has a box of negative size")
+    if schema is TRACKS:
+        box, place = (np.sum([np.isfinite(rows[name]) for name in some], axis=0) for some in (_BOX, _PLACE))
+        refuse((box % 4 > 0) | (place % 2 > 0), "has a part of a box or of a position")
+        refuse((box == 0) & (place == 0), "has neither a box nor a position")
+        refuse(rows["track_id"] < 0, "has a negative track_id")
+        order = np.lexsort((rows["track_id"], of))
+        again = np.zeros(len(rows), bool)
+        again[order[1:]] = (np.diff(of[order]) == 0) & (np.diff(rows["track_id"][order]) == 0)
+        refuse(again, "has a track_id that another row of this frame has")
+    odd = (rows["score"] < 0) | (rows["score"] > 1)
+    if odd.any():
+        low, high = np.nanmin(rows["score"]), np.nanmax(rows["score"])
+        warn(f"scores are from {low:g} to {high:g}; trackers that use them need scores from 0 to 1")
+
+
+def time_of(t_ns: Any) -> int:
+    """A time in whole nanoseconds. Raises McaptrackError for anything else, such as seconds."""
+    found = t_ns.astype("datetime64[ns]").astype(np.int64) if isinstance(t_ns, np.datetime64) else t_ns
+    try:
+        whole = as_index(found)
+    except TypeError:
+        raise McaptrackError(f"`t_ns=` needs {_IN_NS}, not {kind_of(t_ns)}") from None
+    if not 0 <= whole <= LAST_NS:
+        raise McaptrackError(f"`t_ns=` needs nanoseconds since 1970 from 0 to {LAST_NS}, not {whole}")
+    return whole
+
+
+def _times(values: Any) -> Ints:
+    """The times (N,) of a table in nanoseconds; also from timestamps."""
+    array = np.asarray(values)
+    if array.dtype.kind == "M":
+        array = array.astype("datetime64[ns]").astype(np.int64)
+    if array.dtype.kind not in "iu" and len(array):
+        raise McaptrackError(f"the column t_ns needs {_IN_NS}, in each row, not {array.dtype}")
+    if len(array) and not 0 <= int(array.min()) <= int(array.max()) <= LAST_NS:
+        raise McaptrackError(
+            f"the column t_ns holds nanoseconds since 1970 from 0 to {LAST_NS}; it has {array.min()} to {array.max()}"
+        )
+    return array.astype(np.int64)
+
+
+def number_of(index: Any) -> int:
+    """A frame number. Raises McaptrackError for anything else."""
+    try:
+        whole = as_index(index)
+    except TypeError:
+        raise McaptrackError(f"`index=` needs the whole number of a picture, not {kind_of(index)}") from None
+    if not UNNUMBERED <= whole <= _LAST_INDEX:
+        raise McaptrackError(f"`index=` needs the number of a picture, from 0 to {_LAST_INDEX}, not {whole}")
+    return whole
+
+
+def _numbers(values: Any) -> Ints:
+    """The frame numbers (N,) of a table; UNNUMBERED where one is missing."""
+    array = np.asarray(values)
+    array = _whole(np.where(np.isnan(array), UNNUMBERED, array)) if array.dtype.kind == "f" else array
+    if len(array) and (array.dtype.kind not in "iu" or array.min() < UNNUMBERED or array.max() > _LAST_INDEX):
+        raise McaptrackError(f"the column frame holds numbers of pictures, from 0 to {_LAST_INDEX}")
+    return array.astype(np.int64)
+
+
+def _whole(values: Any) -> Any:
+    """Whole numbers of a column; many libraries give them as floating-point numbers."""
+    array = np.asarray(values)
+    if array.dtype.kind == "f" and (np.abs(array) < 2**53).all() and (array == np.round(array)).all():
+        return array.astype(np.int64)
+    return array.astype(np.int64) if array.size == 0 else array
+
+
+def boxes_of(boxes: Any, box_format: BoxFormat) -> Floats:
+    """Boxes (N, 4) as left, top, width, height."""
+    try:
+        array = np.asarray(boxes, np.float64)
+    except (TypeError, ValueError) as error:
+        raise McaptrackError(f"boxes are numbers of shape (N, 4): {_line(error)}") from None
+    array = array.reshape(0, 4) if array.shape in ((0,), (0, 0)) else array
+    if array.ndim != 2 or array.shape[1] != 4:
+        raise McaptrackError(f"boxes are an array of shape (N, 4), not {array.shape}")
+    wrong = ~np.isfinite(array).all(axis=1)
+    if wrong.any():
+        raise McaptrackError(
+            f"box {wrong.argmax()} has numbers that are missing or infinite: {array[wrong][0].tolist()}"
+        )
+    xywh: Floats = (
+        np.concatenate([array[:, :2], array[:, 2:] - array[:, :2]], axis=1) if box_format == "xyxy" else array
+    )
+    wrong = (xywh[:, 2:] < 0).any(axis=1)
+    if wrong.any():
+        raise McaptrackError(
+            f"box {wrong.argmax()} has a negative size: {array[wrong][0].tolist()} read as {box_format}"
+        )
+    return xywh
+
+
+def kind_of(value: Any) -> str:
+    """A value for a message, in a line: itself if it is short, and its type."""
+    text = repr(value)
+    name = type(value).__name__
+    return f"{text} ({name})" if len(text) <= 40 and text.isprintable() else name
+
+
+def _line(error: Exception) -> str:
+    return " ".join(str(error).split())

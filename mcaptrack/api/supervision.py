@@ -1,0 +1,98 @@
+"""``supervision.Detections`` as frames of rows, and back; the package need not be installed to write them.
+
+Letters: N objects in one frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import Any, Final
+
+import numpy as np
+
+from mcaptrack.api.columns import UNNUMBERED, boxes_of, frame_of
+from mcaptrack.errors import McaptrackError
+from mcaptrack.notices import warn
+from mcaptrack.schema import DETECTIONS, TRACKS, Frame, Schema
+from mcaptrack.sources.foreign.boxes import PEOPLE, PERSON
+
+_SUPERVISION: Final = ("confidence", "class_id", "tracker_id", "mask", "data")
+#: What is added to the classes of a detector that names them, so that none of them is 0 (unknown) or 1 (person).
+_OTHERS: Final = 2
+
+
+def is_supervision(given: Any) -> bool:
+    """Whether an object is a ``supervision.Detections``, by its attributes: the package need not be installed.
+
+    Raises McaptrackError for boxes of another package that look alike.
+    """
+    if not hasattr(given, "xyxy"):
+        return False
+    lacks = [name for name in _SUPERVISION if not hasattr(given, name)]
+    if lacks:
+        kind = f"{type(given).__module__}.{type(given).__qualname__}"
+        raise McaptrackError(f"{kind} has no {lacks[0]}, unlike supervision.Detections; give its boxes as an array")
+    return True
+
+
+def frame_of_supervision(
+    found: Any, t_ns: int | np.datetime64, index: int = UNNUMBERED, schema: Schema | None = None
+) -> Frame:
+    """Return ``supervision.Detections`` as a frame: of tracks where they have tracker ids, otherwise of detections.
+
+    Trackers give -1 to boxes of tracks that are not confirmed yet: a frame of tracks leaves these out. A frame without
+    boxes needs no tracker ids.
+    """
+    boxes = boxes_of(found.xyxy, "xyxy")
+    ids = None if found.tracker_id is None else np.asarray(found.tracker_id, np.int64)
+    schema = schema or (DETECTIONS if ids is None else TRACKS)
+    if found.mask is not None and len(boxes):
+        warn("rows hold boxes: masks of supervision.Detections are left out", "left-out")
+    if schema is DETECTIONS:
+        columns = {"score": found.confidence, "class_id": _classes_of(found)}
+        return frame_of(DETECTIONS, boxes, columns, t_ns, index)
+    if ids is None and len(boxes):
+        raise McaptrackError(f"the detections at {t_ns} ns have no tracker ids; tracks need them")
+    ids = np.empty(0, np.int64) if ids is None else ids
+    frame = frame_of(TRACKS, boxes, {"score": found.confidence, "track_id": ids}, t_ns, index)
+    if (ids < 0).any():
+        warn("boxes without a tracker id (-1: the track is not confirmed yet) are left out", "left-out")
+    return frame._replace(rows=frame.rows[ids >= 0])
+
+
+def _classes_of(found: Any) -> Any:
+    """Return class ids (N,) as the schema of detections has them: 0 unknown, 1 a person.
+
+    Detectors count from 0 or from 1, and person may be any number, so names decide where there are some.
+    """
+    count, names = len(found.xyxy), found.data.get("class_name")
+    ids = np.zeros(count, np.uint32) if found.class_id is None else np.asarray(found.class_id)
+    if names is None or not count:
+        return ids
+    is_person = np.array([str(name).lower() in PEOPLE for name in names])
+    if not is_person.all() and found.class_id is not None:
+        raised = f"other numbers are {_OTHERS} higher than the detector's"
+        warn(f"supervision.Detections name their classes: in class_id 1 is a person, {raised}", "classes")
+        ids = ids + _OTHERS
+    return np.where(is_person, PERSON, ids)
+
+
+def supervision_of(frames: Iterable[Frame]) -> Iterator[tuple[int, Any]]:
+    """Yield the time in nanoseconds and the ``supervision.Detections`` of each frame of detections or tracks.
+
+    Rows without a box are left out. Raises McaptrackError if supervision is not installed.
+    """
+    try:
+        from supervision import Detections
+    except ImportError:
+        raise McaptrackError("supervision is not installed; install it with: pip install supervision") from None
+    for frame in frames:
+        rows = frame.rows[np.isfinite(frame.rows["x_px"])]
+        # With NaN for missing scores: supervision merges frames only if all have a confidence, or none.
+        columns: dict[str, Any] = {"confidence": rows["score"].astype(np.float32)}
+        for name, column in (("tracker_id", "track_id"), ("class_id", "class_id")):
+            if column in (rows.dtype.names or ()):
+                columns[name] = rows[column].astype(int)
+        left, top = rows["x_px"], rows["y_px"]
+        xyxy = np.stack([left, top, left + rows["w_px"], top + rows["h_px"]], axis=-1).astype(np.float32)
+        yield frame.t_ns, Detections(xyxy=xyxy, **columns)
