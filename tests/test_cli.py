@@ -268,7 +268,7 @@ class TestConfig:
         [
             ("[trak]\nmin-iou = 0.4\n", "there is no command trak; did you mean track?"),
             ("[track]\nmin-iuo = 0.4\n", "track has no option min-iuo; did you mean min-iou?"),
-            ("[track\n", "is no TOML"),
+            ("[track\n", "is not valid TOML"),
             ("track = 1\n", "track is a command; write its options below [track]"),
         ],
     )

@@ -298,13 +298,13 @@ class TestFiles:
         path = folder / "mcaptrack.toml"
         words = ["track", "x.mcap", *(["--config", "mcaptrack.toml"] if named else [])]
         os.mkfifo(path)
-        assert "is no regular file" in refused(*words)
+        assert "is not a regular file" in refused(*words)
         path.unlink()
         path.mkdir()
-        assert "is no regular file" in refused(*words)
+        assert "is not a regular file" in refused(*words)
         path.rmdir()
         path.symlink_to("/dev/zero")
-        assert "is no regular file" in refused(*words)
+        assert "is not a regular file" in refused(*words)
         path.unlink()
         path.symlink_to(path)
         assert "can't be read" in refused(*words)

@@ -179,7 +179,7 @@ def test_settings_go_into_a_file_that_exists_and_a_file_that_cannot_be_edited_is
     (tmp_path / "other.toml").write_text("[track\n")
     code, _, err = call(*words, "-o", "other.toml", folder=tmp_path)
     assert code == 1
-    assert err.startswith("mcaptrack: other.toml is no TOML: ")
+    assert err.startswith("mcaptrack: other.toml is not valid TOML: ")
     assert not (tmp_path / "other.sort.trials.jsonl").exists()
 
 

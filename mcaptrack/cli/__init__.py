@@ -1,6 +1,6 @@
-"""The command line: each command parses, calls the library, and prints. ``mcaptrack --help`` lists them.
+"""The command line. Each command parses its options, calls the function of the library of the same name, and prints.
 
-The command itself is ``mcaptrack.__main__``, which loads this.
+``mcaptrack.__main__`` is the program, and loads this package.
 """
 
 from __future__ import annotations

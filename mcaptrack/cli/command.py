@@ -1,4 +1,4 @@
-"""Typer commands with options that can also be set in the environment and in files, and that may have old names."""
+"""Typer commands. Their options can also be set in the environment and in files, and may have old names."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from mcaptrack.cli.settings import Given, Setting, declared_settings, found_of, 
 from mcaptrack.cli.text import refuse_usage, say
 from mcaptrack.notices import warn
 
-#: Headings of options that stand last in the help: what is read and written, and what every command has.
+#: The last headings of options in the help.
 LAST_PANELS: Final = ("Input and output", "Options of all commands")
 
 
-#: What Typer raises for a command line that it does not understand.
+#: The exception of Typer for a command line that it can't parse.
 _UsageError: Final[Any] = typer.BadParameter.__bases__[0]
 
 
-#: What a value is not, by pydantic's name of the fault.
+#: What a value should be, by pydantic's name of the error.
 _NOT: Final = {
     "float_parsing": "a number",
     "int_parsing": "a whole number",
@@ -37,7 +37,7 @@ _NOT: Final = {
 
 @contextmanager
 def _usage_in_one_line(command: str = "") -> Iterator[None]:
-    """Refuse a wrong command line in one line, without Typer's box."""
+    """Refuse a wrong command line with one line of text instead of Typer's box."""
     try:
         yield
     except _UsageError as error:
@@ -51,7 +51,7 @@ def _usage_in_one_line(command: str = "") -> Iterator[None]:
 
 
 def _message(error: Any) -> str:
-    """What Typer says of a value, or what was given and what it should be where that is left to pydantic."""
+    """Return the message of an error; for errors of pydantic a shorter one."""
     for found in error.__cause__.errors() if hasattr(error.__cause__, "errors") else ():
         if found["type"] in _NOT:
             return f"{found['input']!r} is not {_NOT[found['type']]}"
@@ -59,7 +59,7 @@ def _message(error: Any) -> str:
 
 
 def _unknown_option(error: Any) -> str:
-    """An option that the command doesn't have: the commands that have it, and those of this command that are alike."""
+    """Return the message about an unknown option: which commands have it, and which options have similar names."""
     name, context = error.option_name, error.ctx
     words = f"no such option: {name}"
     if context is None or context.parent is None:
@@ -79,10 +79,10 @@ def _options_of(command: Any) -> list[str]:
 
 
 class Group(TyperGroup):
-    """The command of commands."""
+    """The group of all commands."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Take what stands before the command; an unknown option is refused in one line."""
+        """Parse the options before the command; refuse an unknown one in one line."""
         if not args:
             return super().parse_args(ctx, args)  # which prints the help
         from mcaptrack.cli.plugins import with_plugins
@@ -93,15 +93,15 @@ class Group(TyperGroup):
             return super().parse_args(ctx, args)
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """Find the command; one that isn't there is refused in one line."""
+        """Find the command; refuse an unknown one in one line."""
         with _usage_in_one_line():
             return super().resolve_command(ctx, args)
 
 
 class Command(TyperCommand):
-    """See the module. ``settings`` are its options by name, also under the names that they had before.
+    """A command. ``settings`` has its options by name, and those that were renamed also by their old names.
 
-    A command that ``reads`` changes no file, but the one that -o names.
+    A command that ``reads`` changes no file except the one that -o names.
     """
 
     reads: ClassVar = False
@@ -125,14 +125,14 @@ class Command(TyperCommand):
         config.envvar = now["config"].variable  # the others are read with the files, once this is known
 
     def get_help_option(self, ctx: Any) -> Any:
-        """``--help`` stands with the options that all commands have."""
+        """Put ``--help`` below the heading of the options that all commands have."""
         option = super().get_help_option(ctx)
         if option is not None:
             option.rich_help_panel = LAST_PANELS[-1]
         return option
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Take what was given under an old name for the new one."""
+        """Parse the command line, and move values of old names of options to the new ones."""
         with _usage_in_one_line(self.name or ""):
             left = super().parse_args(ctx, args)
         if not ctx.resilient_parsing:
@@ -141,7 +141,10 @@ class Command(TyperCommand):
         return left
 
     def rename(self, values: dict[str, Any], rank_of: Callable[[str], tuple[int, str]], quiet: Any = False) -> None:
-        """Put what stands under old names in ``values`` under the new ones, unless that was given in a stronger way."""
+        """Move values from old names to new ones, unless a stronger source has set the new one.
+
+        ``rank_of`` returns how strong the source of a value is (0 is the strongest) and its description.
+        """
         for old, targets in self._renamed.items():
             value = values.pop(_python_name(old), None)
             rank, where = rank_of(_python_name(old))
@@ -159,13 +162,13 @@ class Command(TyperCommand):
                 say(words)
 
     def invoke(self, ctx: Any) -> Any:
-        """Run it; with --verbose say first which options are not as usual, and where each was set."""
+        """Run the command; with --verbose first list the options that differ from the defaults, and their sources."""
         RUNNING.set(ctx)
         if ctx.params.get("verbose") and not ctx.params.get("quiet"):
-            say(self._said(ctx))
+            say(self._options_in_use(ctx))
         return super().invoke(ctx)
 
-    def _said(self, ctx: Any) -> str:
+    def _options_in_use(self, ctx: Any) -> str:
         found = found_of(self.name or "")
         parts = []
         for setting in self.settings.values():
@@ -178,7 +181,7 @@ class Command(TyperCommand):
 
 
 class Reading(Command):
-    """A command that changes nothing."""
+    """A command that changes no file except the one that -o names."""
 
     reads: ClassVar = True
 
@@ -187,7 +190,7 @@ _DEFAULT: Final = 3
 
 
 def _rank(ctx: Any, parameter: str, found: Mapping[str, tuple[Setting, Given]]) -> tuple[int, str]:
-    """How strong the source of a value is, 0 the strongest, and where it is, unless on the command line."""
+    """Return the rank of the source of a value (0, the command line, is the strongest), and its description."""
     source = ctx.get_parameter_source(parameter)
     if source is None or source.name == "DEFAULT":
         return _DEFAULT, ""
@@ -201,13 +204,13 @@ def _python_name(name: str) -> str:
 
 
 def _place(parameter: Any) -> int:
-    """Where a parameter stands in the help, among others in the order in which they are declared."""
+    """Return the sort key of an option in the help: the common headings are last."""
     panel = getattr(parameter, "rich_help_panel", None)
     return 1 + LAST_PANELS.index(panel) if panel in LAST_PANELS else 0
 
 
 def _hidden(parameter: Any, old: str) -> Any:
-    """The same option under the name that it had before."""
+    """Return a hidden copy of an option with its old name."""
     hidden = copy.copy(parameter)
     hidden.name = _python_name(old)
     hidden.opts = [f"--{old}"]
@@ -217,13 +220,16 @@ def _hidden(parameter: Any, old: str) -> Any:
 
 
 def _now(targets: list[Setting], values: Mapping[str, Any]) -> Setting:
-    """Which of the options that had one name before is meant."""
+    """Return the option that an old name stands for, where several options had it."""
     fitting = [s for s in targets if s.declared.was_if and values.get(s.declared.was_if[0]) == s.declared.was_if[1]]
     return fitting[0] if fitting else next(s for s in targets if not s.declared.was_if)
 
 
 def read_config(context: typer.Context, path: Path | None) -> Path | None:
-    """Take what environment and files say for this command's options. The callback of ``--config``, the first."""
+    """Use the values of environment and files as defaults of this command's options.
+
+    This is the callback of ``--config``, which Typer parses first.
+    """
     if context.resilient_parsing or context.parent is None:
         return path
     group: Any = context.parent.command
@@ -234,9 +240,9 @@ def read_config(context: typer.Context, path: Path | None) -> Path | None:
 
 
 def converted(context: Any, command: str) -> dict[str, Any]:
-    """What environment and files say of a command's options, by parameter, as the option takes it.
+    """Return the values that environment and files set for a command, by parameter, converted by Typer.
 
-    A value that the option doesn't take ends the command with exit code 2.
+    A value that the option refuses ends the command with exit code 2.
     """
     parameters = {parameter.name: parameter for parameter in context.parent.command.commands[command].params}
     out = {}
@@ -249,7 +255,7 @@ def converted(context: Any, command: str) -> dict[str, Any]:
 
 
 def settings_of(command: str) -> dict[str, Any]:
-    """What environment and files say of another command's options, by parameter: for what the running one makes."""
+    """Return the values that environment and files set for another command (a stage that the running one runs)."""
     context: Any = RUNNING.get()
     values, found = converted(context, command), found_of(command)
     other: Command = context.parent.command.commands[command]
@@ -261,9 +267,9 @@ def settings_of(command: str) -> dict[str, Any]:
 
 
 def check_ranges(values: Mapping[str, Any]) -> None:
-    """Raise McaptrackError for a number out of range among the values of the running command's options, if one runs."""
+    """Raise McaptrackError for an option of the running command with a number out of range."""
     context: Any = RUNNING.get()
-    if context is None:  # its function was called, without a command line
+    if context is None:  # the function was called without a command line
         return
     found = found_of(context.info_name)
     for setting in context.command.settings.values():
@@ -277,7 +283,7 @@ def is_on_command_line(parameter: str) -> bool:
 
 
 def warn_unused(reason: str, *parameters: str) -> None:
-    """Warn of options on the command line that change nothing here, and say why."""
+    """Warn of options on the command line that have no effect in this call; ``reason`` says why."""
     command: Any = RUNNING.get().command
     for setting in command.settings.values():
         if setting.parameter in parameters and is_on_command_line(setting.parameter):

@@ -1,4 +1,4 @@
-"""What all commands share: options, notes and progress on stderr, JSON on stdout, errors in one line."""
+"""Shared parts of all commands: options, notes and progress on stderr, JSON on stdout, errors in one line."""
 
 from __future__ import annotations
 
@@ -42,17 +42,17 @@ class Failed(NamedTuple):
 
 @dataclass
 class _Batch:
-    """How many inputs the running command has tried, and which of them could not be processed."""
+    """The number of inputs that the running command has tried, and those that failed."""
 
     tried: int = 0
     failed: list[Failed] = field(default_factory=list)
 
 
-#: What the running command has warned of, and its inputs.
+#: The warnings of the running command, and its inputs.
 _WARNED: Final[ContextVar[list[Notice]]] = ContextVar("warned")
 _BATCH: Final[ContextVar[_Batch]] = ContextVar("batch")
-#: Headings of options in the help: what is read and written, what every command has, label files, and how tracks are
-#: compared with the truth.
+#: Headings of options in the help: input and output, options of all commands, label files, and how tracks are matched
+#: with ground truth.
 FILES, COMMON = LAST_PANELS
 LABELS: Final = "Label files"
 SCORES: Final = "Scores"
@@ -70,9 +70,10 @@ def option(
     most: float = math.inf,
     **given: Any,
 ) -> Any:
-    """A Typer option, below the heading ``panel`` of the help, which names the range; for the others see ``Declared``.
+    """Return a Typer option below the heading ``panel``; ``Declared`` explains the other parameters.
 
-    The options of ``COMMON`` and of ``FILES`` show no defaults; that all can come from the environment goes unsaid.
+    The help names the range. Options of ``COMMON`` and of ``FILES`` show no defaults, and none shows its environment
+    variable.
     """
     if words := limits(least, most):
         given["help"] += f" {words[0].upper()}{words[1:]}."
@@ -86,7 +87,7 @@ def option(
 
 
 def output(shown: str | bool = False) -> Any:
-    """Where to write; ``shown`` says where it goes unless this is given."""
+    """Return the option --output; ``shown`` is its default in the help."""
     words = "Write to this file; the input stays unchanged."
     return option("--output", "-o", panel=FILES, help=words, show_default=shown)
 
@@ -148,20 +149,20 @@ LabelFps = Annotated[
 
 
 def similarity(shown: str) -> Any:
-    """The option for how ground truth and tracks are matched; ``shown`` says what happens unless it is given."""
+    """Return the option --similarity; ``shown`` is its default in the help."""
     words = "How ground truth and tracks are matched: by overlap of boxes (iou) or distance on the ground (metres)."
     return option("--similarity", panel=SCORES, tuning=True, help=words, show_default=shown)
 
 
 def gate_m(shown: str | bool = True, tuning: str | bool = True, was: str = "") -> Any:
-    """The largest distance of a match."""
+    """Return the option --gate-m."""
     words = "Gate: largest distance in metres at which ground truth and a track match."
     ends: dict[str, Any] = {} if isinstance(tuning, str) else {"least": 0.001, "most": 1e6}  # text is several numbers
     return option("--gate-m", panel=SCORES, tuning=tuning, was=was, help=words, show_default=shown, **ends)
 
 
 def min_iou(was: str = "", was_if: tuple[str, str] | None = None) -> Any:
-    """The least overlap of a match."""
+    """Return the option --min-iou."""
     words = "Least overlap (IoU) at which ground truth and a track match."
     about: dict[str, Any] = {"was": was, "was_if": was_if, "least": 0.001, "most": 1}
     return option("--min-iou", panel=SCORES, tuning=True, help=words, show_default="0.5", **about)
@@ -175,9 +176,9 @@ Logs = Annotated[
 def register(
     app: typer.Typer, panel: str, name: str, command: Callable[..., None], words: str | None = None, reads: bool = False
 ) -> None:
-    """Add a command below a heading of the help. Its options can also be set by MCAPTRACK_NAME_OPTION and in files.
+    """Add a command below the heading ``panel`` of the help; ``words`` are its help, by default its docstring.
 
-    One that ``reads`` changes no file, but the one that -o names.
+    A command that ``reads`` changes no file except the one that -o names.
     """
     settings = {"help_option_names": ["--help", "-h"]}
     app.command(name, cls=Reading if reads else Command, help=words, context_settings=settings, rich_help_panel=panel)(
@@ -186,7 +187,7 @@ def register(
 
 
 class Talk:
-    """Prints notes and progress to stderr: progress on a terminal only; with ``quiet`` nothing but warnings."""
+    """Prints notes and progress to stderr: progress on a terminal only; with ``quiet`` only warnings."""
 
     def __init__(self, quiet: bool, verbose: bool = False) -> None:
         self.quiet, self.verbose = quiet, verbose
@@ -206,7 +207,7 @@ class Talk:
             self.say(words)
 
     def warn(self, words: str, code: Code = "other") -> None:
-        """A line that is never hidden and stands in the command's JSON; see ``mcaptrack.notices``."""
+        """Print a warning, also with ``quiet``, and add it to the JSON; see ``mcaptrack.notices``."""
         notices.warn(words, code)
 
     @contextmanager
@@ -233,7 +234,7 @@ class Talk:
         _show_warning(notice)
 
     def progress(self, stage: str, done: float, total: float | None) -> None:
-        """Show how far a stage is."""
+        """Show the progress of a stage."""
         if total is None or self.quiet or not sys.stderr.isatty():
             return
         now = monotonic()
@@ -261,7 +262,7 @@ class Talk:
 
     @contextmanager
     def open(self) -> Iterator[Talk]:
-        """Print warnings and notes of the library; leave the terminal as it was."""
+        """Print warnings and notes of the library within this block, and restore the terminal after it."""
         with notices.listening(self._hear), _printing_notes(self):
             try:
                 yield self
@@ -270,7 +271,7 @@ class Talk:
 
 
 class _Printer(logging.Handler):
-    """Prints what the library logs: what is routine, and with --verbose details."""
+    """Prints the notes that the library logs, and with --verbose its details."""
 
     def __init__(self, talk: Talk) -> None:
         super().__init__()
@@ -295,7 +296,7 @@ def _printing_notes(talk: Talk) -> Iterator[None]:
 
 
 def one_line(command: Callable[P, None]) -> Callable[P, None]:
-    """Print errors that a user can fix as one line and exit with code 1; print warnings, and keep them for the JSON."""
+    """Wrap a command: print a McaptrackError as one line, exit with 1; print warnings, and keep them for the JSON."""
 
     @wraps(command)
     def guarded(*args: P.args, **kwargs: P.kwargs) -> None:
@@ -322,7 +323,7 @@ def one_line(command: Callable[P, None]) -> Callable[P, None]:
 
 
 def _show_warning(notice: Notice) -> None:
-    """Print a warning to stderr, once."""
+    """Print a warning to stderr, unless it was printed before."""
     warned = _WARNED.get()
     notice = notice._replace(message=with_flags(notice.message))
     if notice not in warned:
@@ -332,7 +333,7 @@ def _show_warning(notice: Notice) -> None:
 
 @contextmanager
 def printed_to(output: Path | None, force: bool) -> Iterator[None]:
-    """Write to this file, if there is one, what is printed to stdout."""
+    """Write to ``output``, if it is given, what the block prints to stdout."""
     if output is None:
         yield
         return
@@ -343,21 +344,23 @@ def printed_to(output: Path | None, force: bool) -> Iterator[None]:
 
 
 def print_json(data: dict[str, Any]) -> None:
-    """One object on stdout, with the version of its shape, the inputs that failed and all warnings; there at once, also
-    for a program that goes on.
+    """Print a JSON object to stdout, with the version of the schema, the inputs that failed and all warnings.
+
+    The output is flushed, so that other programs get it while this one continues, as ``view`` does.
     """
-    said = {
+    added = {
         "failed": [one._asdict() for one in _BATCH.get().failed],
         "warnings": [one._asdict() for one in _WARNED.get()],
     }
-    whole = {"schema_version": SCHEMA_VERSION} | data | said
+    whole = {"schema_version": SCHEMA_VERSION} | data | added
     print(json.dumps(whole, indent=2, allow_nan=False), flush=True)
 
 
 def expand(paths: Sequence[Path], *, each: bool = False) -> list[Path]:
-    """Paths and patterns as paths; the results of a log that is among them are part of it unless ``each`` is a file.
+    """Return paths, with patterns replaced by the files that match.
 
-    Raises McaptrackError for a pattern that matches nothing.
+    LOG.results.mcap is left out if LOG is among the paths, because it is a part of LOG; with ``each`` it is kept.
+    Raises McaptrackError for a pattern that matches no file.
     """
     from mcaptrack.files import follow_links
     from mcaptrack.log import results_path
@@ -377,7 +380,7 @@ def expand(paths: Sequence[Path], *, each: bool = False) -> list[Path]:
 
 
 def only_one_output(paths: Sequence[Path], output: Path | None) -> None:
-    """Raises McaptrackError if several inputs would go to one output."""
+    """Raise McaptrackError if several inputs would be written to one output."""
     if output is not None and len(paths) > 1:
         raise McaptrackError(
             f"{len(paths)} inputs can't all be written to {output}; give one input, or no name for the output"

@@ -1,7 +1,7 @@
-"""mcaptrack.toml: options in a file, a table a command. Which files are read, and how far each is trusted.
+"""Read and edit mcaptrack.toml, which sets options in one table for each command.
 
-A file that ``--config`` names, and one in the user's config folder, may set every option. One in the working folder may
-have come along with other people's data: it may tune, and nothing else.
+A file that ``--config`` names and the file in the user's config folder may set all options. A file in the working
+folder may set tuning options only, because it may have come with other people's data.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _BARE_NEWLINE: Final = re.compile(r"(?<!\r)\n")
 
 
 class ConfigFile(NamedTuple):
-    """The tables of one file. Only a ``trusted`` one may set options that don't tune."""
+    """The tables of one file. Only a ``trusted`` file may set options other than tuning ones."""
 
     path: Path
     tables: dict[str, Any]
@@ -36,12 +36,12 @@ class ConfigFile(NamedTuple):
 
 
 def user_file() -> Path:
-    """The file in the user's config folder: ~/.config/mcaptrack/mcaptrack.toml on Linux."""
+    """Return the file in the user's config folder: ~/.config/mcaptrack/mcaptrack.toml on Linux."""
     return Path(typer.get_app_dir("mcaptrack")) / NAME
 
 
 def read_files(named: Path | None) -> list[ConfigFile]:
-    """The files that apply, the strongest first: the one that is named, or those of the working folder and the user.
+    """Return the files to use, the strongest first: ``named``, or those of the working folder and of the user.
 
     A file that can't be read ends the command with exit code 2.
     """
@@ -65,7 +65,7 @@ def _is_same(one: Path, other: Path) -> bool:
 
 
 def _read(path: Path) -> dict[str, Any] | None:
-    """The tables of a file; None if there is none."""
+    """Return the tables of a file; None if it does not exist."""
     try:
         content = read_toml(path)
     except McaptrackError as error:
@@ -81,9 +81,10 @@ class Toml(NamedTuple):
 
 
 def read_toml(path: Path) -> Toml | None:
-    """Read a file of options; None if there is none. Opening a FIFO must not wait for a writer.
+    """Read a file of options; returns None if it does not exist.
 
-    Raises McaptrackError for whatever is no regular file of TOML of at most ``MAX_BYTES``.
+    Raises McaptrackError if it is not a regular file of TOML of at most ``MAX_BYTES``. It is opened without blocking,
+    because opening a FIFO would wait for a writer.
     """
     try:
         handle = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))
@@ -94,7 +95,7 @@ def read_toml(path: Path) -> Toml | None:
     try:
         about = os.fstat(handle)
         if not stat.S_ISREG(about.st_mode):
-            raise McaptrackError(f"{path} is no regular file; options are read from a file of TOML")
+            raise McaptrackError(f"{path} is not a regular file; options are read from a TOML file")
         with open(handle, "rb", closefd=False) as stream:
             data = stream.read(MAX_BYTES + 1)
     except OSError as error:
@@ -107,16 +108,16 @@ def read_toml(path: Path) -> Toml | None:
         text = data.decode("utf-8")
         return Toml(text, tomllib.loads(text.removeprefix(_BOM)))
     except RecursionError:
-        raise McaptrackError(f"{path} is no TOML that can be read: it is nested too deeply") from None
+        raise McaptrackError(f"{path} is not valid TOML: it is nested too deeply") from None
     except ValueError as error:
-        raise McaptrackError(f"{path} is no TOML: {error}") from None
+        raise McaptrackError(f"{path} is not valid TOML: {error}") from None
 
 
 def write_settings(path: Path, command: str, settings: Mapping[str, Any], was: Mapping[str, str]) -> None:
-    """Put settings of a command into a file of options, by their names, as in ``{"max-age-s": 2.0}``.
+    """Write settings of a command, such as ``{"max-age-s": 2.0}``, into a file of options.
 
-    Everything else in the file stays as it is, comments and line endings included. ``was`` has the names that settings
-    had before. Raises McaptrackError for a file that holds something else.
+    The rest of the file stays as it is, with comments and line endings. ``was`` maps names of settings to their old
+    names, which are removed. Raises McaptrackError for a file that can't be read or edited.
     """
     old = read_toml(path)
     text = edited(path, old.text if old else "", command, settings, was)
@@ -124,7 +125,7 @@ def write_settings(path: Path, command: str, settings: Mapping[str, Any], was: M
 
 
 def edited(path: Path, text: str, command: str, settings: Mapping[str, Any], was: Mapping[str, str]) -> str:
-    """Edit the text of ``path``, see ``write_settings``."""
+    """Return the edited text of ``path``; see ``write_settings``."""
     import tomlkit
     from tomlkit.exceptions import TOMLKitError
 
@@ -152,6 +153,6 @@ def edited(path: Path, text: str, command: str, settings: Mapping[str, Any], was
         same = tomllib.loads(new) == {**tables, command: wanted}
     except (TOMLKitError, ValueError):
         same = False
-    if not same:  # nothing may be lost by an editor that misses something
+    if not same:  # refuse rather than lose a part of the file
         raise McaptrackError(f"{path} is written in a way that can't be edited; write to another file with -o")
     return bom + new

@@ -1,4 +1,4 @@
-"""``mcaptrack demo``: everything, on a scene that is drawn for it."""
+"""``mcaptrack demo``: run everything on a synthetic scene."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _LICHTBLICK: Final = "lichtblick-suite.github.io/lichtblick"
 @common.one_line
 def demo(
     output: Annotated[
-        Path, common.option("--output", "-o", panel=common.FILES, help="Folder for what it makes.", show_default=True)
+        Path, common.option("--output", "-o", panel=common.FILES, help="Folder for all files.", show_default=True)
     ] = Path("mcaptrack-demo"),
     scene: Annotated[
         Literal["square", "walkers", "crowd", "side-by-side", "standing"],
@@ -41,8 +41,8 @@ def demo(
     """Draw a scene with known ground truth, run everything on it, and compare SORT with re-tracking.
 
     The scene has what makes tracking fail: people who cross, meet and part, occlusion behind a kiosk, a tree that
-    sways, a camera that shakes a little. Writes a video, a log, tables and layouts. The scores of one scene are one
-    draw: the mean and the range over ten seeds of each scene are printed below them.
+    sways, a camera that shakes a little. Writes a video, a log, tables and layouts. Scores of one seed are a random
+    sample, so the mean and the range over ten seeds of each scene are printed, too.
 
     Example: mcaptrack demo --scene crowd --seed 7 -o crowd
     """
@@ -71,7 +71,7 @@ def demo(
 
 
 def _next_commands(target: Path) -> list[str]:
-    """Command lines that can be given where this one was."""
+    """Return commands to try next, as they can be typed in the working folder."""
     command, log = _how_called(), quote(str(target))
     lines = [f"{command} {name} {log}" for name in ("info", "evaluate", "report")]
     if find_spec("duckdb") is None:
@@ -80,7 +80,7 @@ def _next_commands(target: Path) -> list[str]:
 
 
 def _how_called() -> str:
-    """What a shell finds the running program by: its name, otherwise its path."""
+    """Return how a shell finds the running program: by its name, otherwise by its path."""
     program = Path(sys.argv[0])
     found = which(program.name)
     if program.name.endswith(".py") or not program.is_file():  # python -m mcaptrack
@@ -89,13 +89,13 @@ def _how_called() -> str:
 
 
 def _from_here(path: Path) -> str:
-    """A path as it is written in the working folder."""
+    """Return a path relative to the working folder, quoted for a shell."""
     path = Path.cwd() / path
     return quote(str(path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path))
 
 
 def _side_by_side(sort: dict[str, float], retracked: dict[str, float]) -> list[str]:
-    """SORT and re-tracking beside each other, within 1 m on the clock of prediction."""
+    """Return the scores of SORT and of re-tracking side by side."""
     words = {
         "IDF1": "identity kept (IDF1)",
         "MOTA": "accuracy (MOTA)",
@@ -114,11 +114,11 @@ def _side_by_side(sort: dict[str, float], retracked: dict[str, float]) -> list[s
 
 
 def _over_seeds(scene: str, seed: int) -> list[str]:
-    """Mean and range over all seeds of all scenes."""
+    """Return the mean and range of IDF1 over all seeds, for each scene."""
     from mcaptrack.sources.demo import mean_and_range, read_scores
 
     scores = read_scores()
-    lines = [f"This is scene {scene}, seed {seed}: one draw. IDF1 over {len(scores['seeds'])} seeds, mean and range:"]
+    lines = [f"This is scene {scene}, seed {seed}: one sample. IDF1 over {len(scores['seeds'])} seeds, mean and range:"]
     for name, values in scores["scenes"].items():
         sort, retracked = (mean_and_range(values[mode]["IDF1"], 100) for mode in ("SORT", "re-tracked"))
         lines.append(f"{name:<16}{sort:>24}{retracked:>24}")

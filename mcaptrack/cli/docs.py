@@ -1,4 +1,4 @@
-"""``mcaptrack docs``: the documentation that is installed with the package."""
+"""``mcaptrack docs``: show the documentation that is installed with the package."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def docs(
 ) -> None:
     """List the pages of the documentation, or print one.
 
-    The pages are part of the installation and fit its version. In a pipe or a file they are Markdown as it was written.
+    The pages are installed with mcaptrack and describe its version. A pipe or a file gets their Markdown.
 
     Example: mcaptrack docs
 
@@ -63,7 +63,7 @@ def docs(
 
 
 def documentation() -> dict[str, Path]:
-    """The pages by name: inside the installed package, or beside it in a checkout."""
+    """Return the pages by name: those in the installed package, or those beside it in a checkout."""
     package = Path(__file__).resolve().parent.parent
     inside = package / "docs"
     beside = [path for path in package.parent.glob("*.md") if path.stem in ("README", "CHANGELOG")]
@@ -74,6 +74,6 @@ def documentation() -> dict[str, Path]:
 
 
 def _title(path: Path) -> str:
-    """The first heading of a page."""
+    """Return the first heading of a page."""
     lines = path.read_text(encoding="utf-8").splitlines()
     return next((line.lstrip("# ") for line in lines if line.startswith("# ")), path.stem)

@@ -1,4 +1,4 @@
-"""``mcaptrack evaluate``: tracks and forecasts against the truth, as a table, JSON or CSV."""
+"""``mcaptrack evaluate``: score tracks and predictions against ground truth; print a table, JSON or CSV."""
 
 from __future__ import annotations
 
@@ -163,7 +163,7 @@ def _limit(text: str) -> tuple[str, float]:
 
 
 def print_results(scores: Scores) -> None:
-    """The scores as a table on stdout, and the forecasts below it."""
+    """Print the scores as a table, and those of predictions below it."""
     from rich.table import Table
 
     out = console()

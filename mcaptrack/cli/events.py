@@ -1,4 +1,4 @@
-"""``mcaptrack events``: what happened to the identities of tracks, and how far off forecasts were."""
+"""``mcaptrack events``: write events of tracks and errors of predictions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``mcaptrack check``, ``recover`` and ``drop``: is a log sound, what of it can be saved, what is left out of it."""
+"""``mcaptrack check``, ``recover`` and ``drop``: check logs, save damaged ones, and remove channels."""
 
 from __future__ import annotations
 
@@ -45,15 +45,15 @@ def check(
                 checked += mcaptrack.check(path, progress=talk.progress).files[:1]
     with common.printed_to(output, force):
         if json:
-            common.print_json({"results": [_checked_as_data(one) for one in checked]})
+            common.print_json({"results": [_as_json(one) for one in checked]})
         else:
             for one in checked:
-                _print_checked(one, quiet)
+                _print_check(one, quiet)
     if not all(one.is_sound for one in checked):
         raise typer.Exit(common.REFUSED)
 
 
-def _checked_as_data(checked: CheckResult) -> dict[str, object]:
+def _as_json(checked: CheckResult) -> dict[str, object]:
     return {
         "log": str(checked.path),
         "sound": checked.is_sound,
@@ -66,7 +66,7 @@ def _checked_as_data(checked: CheckResult) -> dict[str, object]:
     }
 
 
-def _print_checked(checked: CheckResult, quiet: bool) -> None:
+def _print_check(checked: CheckResult, quiet: bool) -> None:
     from rich.table import Table
     from rich.text import Text
 

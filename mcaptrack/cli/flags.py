@@ -1,4 +1,4 @@
-"""Messages of the library in the words of the command line: parameters become options, calls become commands."""
+"""Translate messages of the library for the command line: parameters become options, calls become commands."""
 
 from __future__ import annotations
 

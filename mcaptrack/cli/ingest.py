@@ -1,4 +1,4 @@
-"""``mcaptrack ingest``: whatever exists becomes a log."""
+"""``mcaptrack ingest``: make logs of videos, images, recordings and label files."""
 
 from __future__ import annotations
 
@@ -196,13 +196,13 @@ def ingest(
                     talk.detail(words)
                 talk.say(f"{done.log}: " + ", ".join(f"{topic} {count}" for topic, count in done.messages.items()))
     if json:
-        common.print_json({"results": [_as_data(done) for done in results]})
+        common.print_json({"results": [_as_json(done) for done in results]})
     if any(done.lost for done in results):
         raise typer.Exit(common.LOST)
 
 
-def _as_data(done: IngestResult) -> dict[str, Any]:
-    """What came of an input, for programs."""
+def _as_json(done: IngestResult) -> dict[str, Any]:
+    """Return the result for one input as values of JSON."""
     return {
         "log": str(done.log),
         "messages": done.messages,
@@ -212,7 +212,7 @@ def _as_data(done: IngestResult) -> dict[str, Any]:
 
 
 def _warn_unused(done: IngestResult, ground_plane: Path | None) -> None:
-    """Say which options are about what wasn't there."""
+    """Warn of options for parts that the input doesn't have."""
     if not done.has_labels:
         warn_unused("there is no label file", "label_format")
     if ground_plane is None:

@@ -1,4 +1,4 @@
-"""Paths that a command is given: what no file can be is refused before anything is opened."""
+"""Refuse paths that are not files (URLs, pipes, devices) before a command opens anything."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from mcaptrack.files import refuse_special, refuse_url
 
 
 def check_paths(values: Iterable[Any]) -> None:
-    """Raise McaptrackError for a path among the values of a command's options that is a URL, a pipe or a device."""
+    """Raise McaptrackError if a path among the values of a command's options is a URL, a pipe or a device."""
     for value in values:
         for path in value if isinstance(value, list | tuple) else [value]:
             if isinstance(path, Path):

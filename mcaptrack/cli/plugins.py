@@ -1,8 +1,8 @@
-"""Options of detectors, trackers and so on of other packages: a command has them where one is chosen.
+"""Add the options of plug-ins (detectors, trackers and so on of other packages) to the command that uses them.
 
-Which are chosen is looked up before the command line is parsed: in its words, in the environment and in files. Nothing
-is imported but what is named there, and, where a file or the environment sets an option that a stage doesn't have by
-itself, what installed packages declare by entry points.
+The command line, the environment and files are searched for names of plug-ins before the command line is parsed. Only
+plug-ins that are named there are imported; and, if a file or the environment sets an option that no built-in transform
+has, all that installed packages declare as entry points.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ _HELP: Final = ("--help", "-h")
 
 
 def with_plugins(commands: Mapping[str, Any], words: Sequence[str]) -> dict[str, Any]:
-    """The commands, those of stages with the options of what is chosen for them in this call.
+    """Return the commands; those of stages have the options of the plug-ins that this call chooses for them.
 
-    Ends the command with exit code 1 if what its words name can't be had.
+    A plug-in on the command line that can't be loaded ends the command with exit code 1.
     """
     called = next((word for word in words if not word.startswith("-")), "")
     if called not in commands:
@@ -50,7 +50,7 @@ def with_plugins(commands: Mapping[str, Any], words: Sequence[str]) -> dict[str,
             try:
                 plugins.setdefault(name, stage.find(name).cls)
             except McaptrackError:
-                continue  # said where it is used
+                continue  # the stage that uses it reports the error
         if plugins:
             found[stage.name] = _command(stage, plugins, commands[stage.name].rich_help_panel)
     return found
@@ -62,7 +62,7 @@ def _files(called: str, words: Sequence[str]) -> list[ConfigFile]:
 
 
 def _values(words: Sequence[str], option: str) -> list[str]:
-    """What words of a command line give for an option."""
+    """Return the values of an option among the words of a command line."""
     after = [value for word, value in pairwise(words) if word == f"--{option}"]
     return after + [word.partition("=")[2] for word in words if word.startswith(f"--{option}=")]
 
@@ -70,14 +70,17 @@ def _values(words: Sequence[str], option: str) -> list[str]:
 def _of_words(stage: Stage, words: Sequence[str]) -> Iterator[tuple[str, type[Transform]]]:
     given = [values for option in filter(None, (stage.kind, stage.was)) if (values := _values(words, option))]
     if len(given) > 1:
-        return  # both names of the option: refused where the command line is parsed
+        return  # both the old and the new name: the parser refuses that
     for name in chain.from_iterable(given):
         if name not in BUILT_IN[stage.kind or ""]:
             yield name, stage.find(name).cls
 
 
 def _of_settings(stage: Stage, files: Sequence[ConfigFile], known: Mapping[str, Any]) -> list[str]:
-    """The names that the environment and files give for a stage. A file in the working folder can't name a module."""
+    """Return the plug-ins that environment and files name for a stage.
+
+    A file in the working folder can't name modules.
+    """
     kind = stage.kind
     assert kind is not None
     found = [os.environ.get(f"{PREFIX}{command}_{kind}".upper(), "") for command in (stage.name, "run")]
@@ -98,7 +101,7 @@ def _of_settings(stage: Stage, files: Sequence[ConfigFile], known: Mapping[str, 
 
 
 def _command(stage: Stage, plugins: Mapping[str, type[Transform]], panel: str) -> Any:
-    """The command of a stage with options of plug-ins."""
+    """Return the command of a stage with the options of plug-ins."""
     app = typer.Typer(add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False)
     common.register(app, panel, stage.name, common.one_line(stage_command(stage, plugins)), stage_help(stage))
     return get_command(app)

@@ -1,4 +1,4 @@
-"""``mcaptrack query``: SQL on the tables of logs."""
+"""``mcaptrack query``: query the tables of logs in SQL."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ if TYPE_CHECKING:
 
 Form = Literal["table", "csv", "json", "jsonl", "parquet", "arrow"]
 _QUERY: Final = "Query and answer"
-#: Rows that a terminal is shown unless more are asked for.
+#: Number of rows that a terminal shows by default.
 _SHOWN: Final = 60
-#: Characters of a cell in a table, on a terminal and elsewhere.
+#: Most characters of a cell in a table: on a terminal, and elsewhere.
 _WIDEST: Final = 60
 _WIDEST_UNBROKEN: Final = 1000
-#: The columns of a query's plan, a drawing of many lines.
+#: The columns of the answer of EXPLAIN: a drawing of many lines.
 _PLAN: Final = ["explain_key", "explain_value"]
 _KEYWORDS: Final = ("select", "from", "with", "describe", "summarize", "explain", "pivot", "show", "values")
 
@@ -37,14 +37,18 @@ def query(
         list[str] | None,
         typer.Argument(
             metavar="LOG... QUERY",
-            help="Logs, patterns or folders of tables, then the query in quotes; - takes it from standard input.",
+            help="Logs, patterns or folders of tables, then the query in quotes; - reads it from standard input.",
             show_default=False,
         ),
     ] = None,
     file: Annotated[
         Path | None,
         common.option(
-            "--file", "-f", panel=_QUERY, help="Take the query from this file; all words are logs.", show_default=False
+            "--file",
+            "-f",
+            panel=_QUERY,
+            help="Read the query from this file; all arguments are logs.",
+            show_default=False,
         ),
     ] = None,
     form: Annotated[
@@ -87,12 +91,12 @@ def query(
     verbose: common.Verbose = False,
     config: common.Config = None,
 ) -> None:
-    """Query a log in SQL: where people were, how fast, how long, and how well they were tracked.
+    """Query the tables of logs in SQL: where people were, how fast, for how long, and how well they were tracked.
 
-    The tables are those of `mcaptrack export` (`mcaptrack docs tables`); `recording` tells several logs apart. They are
-    read from the files beside the log where those are up to date, otherwise from the log. Any other channel is a table
-    under its name in double quotes. Queries read nothing else and change nothing. Needs DuckDB (`pip install duckdb`).
-    `mcaptrack docs sql` answers what people ask.
+    The tables are those of `mcaptrack export` (`mcaptrack docs tables`); the column `recording` names the log. They are
+    read from the files beside the log if those are up to date, otherwise from the log. Each other channel is a table
+    under its topic in double quotes. Queries read nothing else and change nothing. Needs DuckDB (`pip install duckdb`).
+    `mcaptrack docs sql` has examples.
 
     Example: mcaptrack query log.mcap "select topic, count(distinct track_id) from tracks group by topic"
 
@@ -129,22 +133,20 @@ def query(
 
 
 def _asked(words: Sequence[str], file: Path | None, tables: bool) -> tuple[list[Path], str]:
-    """The logs and the query among the words of the command."""
+    """Return the logs and the query that the words of the command line give."""
     from_file = file is not None or tables
     names = list(words) if from_file else list(words[:-1])
     for word in words:
         refuse_url(word)
     stray = next((name for name in names if name.lower() in _KEYWORDS and not Path(name).exists()), None)
     if stray is not None:
-        raise McaptrackError(f'{stray} is no log; the query is one word, in quotes: "{stray} ..."')
+        raise McaptrackError(f'{stray} is not a log; the query is one argument, in quotes: "{stray} ..."')
     if tables:
         if file is not None:
             raise McaptrackError("--tables needs no query; leave -f out")
         return [Path(name) for name in names], ""
     if not words or (not from_file and _is_there(words[-1])):
-        raise McaptrackError(
-            "there is no query; give it as the last word, in quotes, or with -f FILE (--tables: what there is)"
-        )
+        raise McaptrackError("there is no query; give it last, in quotes, or with -f FILE (--tables lists the tables)")
     if not names:
         raise McaptrackError("there is no log; give logs or folders of tables before the query")
     if file is None and words[-1] != "-":
@@ -157,7 +159,7 @@ def _asked(words: Sequence[str], file: Path | None, tables: bool) -> tuple[list[
         except OSError as error:
             raise McaptrackError(f"{file} can't be read: {error.strerror or error}") from None
         except UnicodeDecodeError:
-            raise McaptrackError(f"{file} is no text in UTF-8") from None
+            raise McaptrackError(f"{file} is not text in UTF-8") from None
     if not sql.strip(" \t\r\n;"):
         raise McaptrackError("the query is empty")
     return [Path(name) for name in names], sql
@@ -171,14 +173,14 @@ def _is_there(word: str) -> bool:
 
 
 def _form(form: Form | None, output: Path | None, json: bool) -> Form:
-    """What the answer is written as: as is said, as the file's name ends, or for people."""
+    """Return the format of the answer: as the options say, as the name of the file ends, or a table."""
     if json and form not in (None, "json"):
-        raise McaptrackError(f"--json and --format {form} can't both be; leave one out")
+        raise McaptrackError(f"--json and --format {form} are two formats; give one")
     end = output.suffix.removeprefix(".").lower() if output is not None else ""
     known: dict[str, Form] = {name: name for name in ("csv", "json", "jsonl", "parquet", "arrow")}
     chosen: Form = "json" if json else form or known.get(end, "table")
     if chosen in ("parquet", "arrow") and output is None:
-        raise McaptrackError(f"--format {chosen} is no text; give a file with -o")
+        raise McaptrackError(f"--format {chosen} is not text; name a file with -o")
     return chosen
 
 
@@ -211,7 +213,7 @@ def _write(answer: Any, form: Form, output: Path | None, json: bool) -> None:
 
 
 def _print_answer(answer: Any, limit: int) -> str:
-    """Print rows for people, as many columns as fit; returns what is to be said of those that aren't shown."""
+    """Print an answer as a table with the columns that fit; returns a note on what is not shown, or ""."""
     from rich import box
     from rich.table import Table
     from rich.text import Text
@@ -236,18 +238,18 @@ def _print_answer(answer: Any, limit: int) -> str:
     for row in rows:
         table.add_row(*(Text("null", "dim") if word is None else word for word in row[:fitting]))
     out.print(table)
-    said = (
+    notes = (
         [f"{were_cut} long value{'s are' if were_cut > 1 else ' is'} cut; --format json or csv has all of it"]
         if were_cut
         else []
     )
     if shown < answer.num_rows:
-        said.append(f"the first {shown} of {answer.num_rows} rows; --rows 0 shows all")
+        notes.append(f"the first {shown} of {answer.num_rows} rows; --rows 0 shows all")
     elif answer.num_rows == 0:
-        said.append("no rows")
+        notes.append("no rows")
     if fitting < len(names):
-        said.append(f"{fitting} of {len(names)} columns fit; without: {', '.join(names[fitting:])}")
-    return "; ".join(said)
+        notes.append(f"{fitting} of {len(names)} columns fit; without: {', '.join(names[fitting:])}")
+    return "; ".join(notes)
 
 
 def _cut(word: str, widest: int) -> str:
@@ -255,7 +257,7 @@ def _cut(word: str, widest: int) -> str:
 
 
 def _fitting(names: Sequence[str], rows: Sequence[Sequence[str | None]], width: int) -> int:
-    """How many columns stand beside each other, at least one."""
+    """Return the number of columns that fit into ``width`` characters, at least one."""
     used = 0
     for at, name in enumerate(names):
         used += max([len(name), *(len(row[at] or "null") for row in rows)]) + 2

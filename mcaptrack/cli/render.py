@@ -1,4 +1,4 @@
-"""``mcaptrack render``: the annotated video."""
+"""``mcaptrack render``: draw the annotated video."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def render(
 ) -> None:
     """Draw boxes, trails and predictions on the video of a log: LOG.mp4, or a GIF.
 
-    They are those of the views that Foxglove and Lichtblick show, in the same colours.
+    Draws the views that Foxglove and Lichtblick show, in the same colours.
 
     Example: mcaptrack render log.mcap -o walk.gif --width 480 --start-s 2 --end-s 8
     """

@@ -1,4 +1,4 @@
-"""``mcaptrack report``: one page about logs, for people."""
+"""``mcaptrack report``: write one HTML page about logs."""
 
 from __future__ import annotations
 
@@ -14,7 +14,11 @@ def report(
     output: Annotated[
         Path | None,
         common.option(
-            "--output", "-o", panel=common.FILES, help="The page.", show_default="LOG.report.html beside the log"
+            "--output",
+            "-o",
+            panel=common.FILES,
+            help="Write the page to this file.",
+            show_default="LOG.report.html beside the log",
         ),
     ] = None,
     camera: common.Camera = None,
@@ -26,9 +30,9 @@ def report(
 ) -> None:
     """Write one page about a log, or several: scores, forecasts, tracks over the scene, identity switches, lineage.
 
-    The page needs no network and runs nothing; its numbers are inside it as JSON, and --json prints them too. Scores
-    are those of `mcaptrack evaluate`; without ground truth in the log the page has none. Reads logs only: stages that
-    are missing in one, `mcaptrack run` makes.
+    The page needs no network and has no scripts; it contains its numbers as JSON, which --json prints. Scores are those
+    of `mcaptrack evaluate`; without ground truth in the log there are none. Only reads logs; `mcaptrack run` runs
+    stages that are missing.
 
     Example: mcaptrack report log.mcap -o report.html
 

@@ -1,4 +1,4 @@
-"""Run stages on logs, and print what came of it."""
+"""Run stages on logs, and print the results."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ if TYPE_CHECKING:
     from mcaptrack import RunResult
     from mcaptrack.pipeline import Summary
 
-#: Runs stages on a log, with these keywords: output, sidecar, force, camera, progress.
+#: Runs stages on a log; takes the keywords output, sidecar, force, camera and progress.
 Run = Callable[..., "RunResult"]
 
 _UP_TO_DATE = "nothing to do, everything is up to date"
 
 
 def run_on_logs(given: Mapping[str, Any], run: Run, *, shows_events: bool = False) -> None:
-    """Run on every log, and print what came of it."""
+    """Run stages on each log, and print the results."""
     paths = common.expand(given["logs"])
     common.only_one_output(paths, given["output"])
     results = []
@@ -30,14 +30,14 @@ def run_on_logs(given: Mapping[str, Any], run: Run, *, shows_events: bool = Fals
             with talk.attempt(path, paths), notices.about(given["output"] or path):
                 names = ("camera", "output", "sidecar", "force")
                 result = run(path, **{name: given[name] for name in names}, progress=talk.progress)
-                results.append(_data(result))
+                results.append(_as_json(result))
                 _print(result, shows_events, talk)
     if given["json"]:
         common.print_json({"results": results})
 
 
-def _data(result: RunResult) -> dict[str, Any]:
-    """What came of one log, for programs."""
+def _as_json(result: RunResult) -> dict[str, Any]:
+    """Return the result of one log as values of JSON."""
     data: dict[str, Any] = {
         "log": str(result.log),
         "stages": list(result.stages),
@@ -54,7 +54,7 @@ def _data(result: RunResult) -> dict[str, Any]:
 
 
 def _next(result: RunResult) -> list[str]:
-    """Commands that can be given next."""
+    """Return commands to run next."""
     if result.summary is None:
         steps = ["view"] if result.stages == ("events",) else ["run"]
     elif not result.summary.tracks:
@@ -84,7 +84,7 @@ def _print(result: RunResult, shows_events: bool, talk: common.Talk) -> None:
 
 
 def _lines_of_run(result: RunResult) -> Iterator[tuple[str, str]]:
-    """What a log holds, a line a thing: its name, and the words."""
+    """Yield a line for each part of the result of ``run``: its name and its text."""
     if result.summary is not None:
         yield from _lines_of_summary(result.summary)
     codes = [notice.code for notice in result.warnings]
@@ -93,14 +93,14 @@ def _lines_of_run(result: RunResult) -> Iterator[tuple[str, str]]:
 
 
 def _lines_of_summary(summary: Summary) -> Iterator[tuple[str, str]]:
-    """What a log holds, a line a thing."""
+    """Yield a line for each part of a summary: its name and its text."""
     if summary.boxes is not None:
         where = "" if summary.pictures is None else f" in {summary.pictures:,} pictures"
         yield "boxes", f"{summary.boxes:,}{where}"
     if summary.tracks is not None:
         yield "tracks", f"{summary.tracks:,}"
     if summary.repair is not None:
-        done = (("joined", "gaps closed"), ("parted", "taken apart"), ("left_out", "left out"))
+        done = (("joined", "gaps closed"), ("parted", "split"), ("left_out", "left out"))
         words = ", ".join(f"{getattr(summary.repair, name):,} {word}" for name, word in done)
         count = summary.repair.tracks
         yield "re-tracked", f"{count:,} {'track' if count == 1 else 'tracks'}: {words}"
@@ -116,7 +116,7 @@ def _lines_of_summary(summary: Summary) -> Iterator[tuple[str, str]]:
 
 
 def _lines_of_stage(result: RunResult) -> Iterator[tuple[str, str]]:
-    """What stages made, a line a channel."""
+    """Yield a line for each channel that was written: its topic and its size."""
     for topic, rows in result.rows.items():
         tracks = f"{result.tracks[topic]:,} tracks, " if topic in result.tracks else ""
         yield topic, f"{tracks}{rows:,} rows in {result.frames[topic]:,} frames"

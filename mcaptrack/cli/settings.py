@@ -1,7 +1,7 @@
-"""Options that come from the environment and from files: what may be set there, what is set, and where.
+"""Read options from the environment and from files, and check them.
 
-The order is: command line, environment, the file that ``--config`` names (otherwise that of the working folder, then
-that of the user), default.
+The order is: command line, environment, file, default. The file is the one that ``--config`` names, otherwise that of
+the working folder and then that of the user.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from mcaptrack.environment import PREFIX, VARIABLES
 from mcaptrack.errors import McaptrackError
 from mcaptrack.transforms.protocol import limits
 
-#: Options that belong to one call, not to a file or to another command.
+#: Options that only the command line can set.
 CALL_ONLY: Final = ("config", "help")
 _YES: Final = ("1", "true", "yes", "on")
 _NO: Final = ("0", "false", "no", "off")
@@ -34,12 +34,19 @@ _LARGEST: Final = 2**63
 
 @dataclass(frozen=True)
 class Declared:
-    """What an option says of itself beyond what Typer knows.
+    """Properties of an option that Typer doesn't have.
 
-    ``tuning`` says that a file in the working folder may set it: numbers, choices and switches that change how results
-    are computed. For text it is a pattern that the whole value has to match, because text could name a file. ``was`` is
-    the name it had before, without dashes; where several options had it, ``was_if`` are another option and its value
-    that make it this one. Numbers are refused below ``least`` and above ``most``.
+    Attributes
+    ----------
+    tuning : bool or str
+        Whether a file in the working folder may set it: numbers, choices and switches that change how results are
+        computed. For text, a pattern that the whole value has to match, because text could be a path.
+    was : str
+        The old name, without dashes.
+    was_if : (str, str) or None
+        If several options had this old name: another option and its value, for which the old name means this option.
+    least, most : float
+        The range of numbers.
     """
 
     tuning: bool | str = False
@@ -50,7 +57,7 @@ class Declared:
 
 
 class Given(NamedTuple):
-    """A value that was given outside of the command line; ``rank`` is 1 for the environment, 2 for files."""
+    """A value from the environment (``rank`` 1) or from a file (``rank`` 2), and where it was set."""
 
     value: Any
     where: str
@@ -59,7 +66,7 @@ class Given(NamedTuple):
 
 @dataclass(frozen=True)
 class Setting:
-    """An option of a command: its names on the command line (``name``) and in Python, and the kind of its values."""
+    """An option of a command: its ``name`` on the command line, its ``parameter`` in Python, and its type."""
 
     command: str
     name: str
@@ -70,11 +77,11 @@ class Setting:
 
     @property
     def variable(self) -> str:
-        """The environment variable."""
+        """Name of the environment variable."""
         return f"{PREFIX}{self.command}_{self.name}".upper().replace("-", "_")
 
     def from_text(self, text: str) -> Any:
-        """The value of an environment variable. Raises ValueError with what is wrong."""
+        """Convert the text of an environment variable. Raises ValueError for a value of the wrong type."""
         if self.many:
             return shlex.split(text)
         if self.kind is not bool:
@@ -85,7 +92,7 @@ class Setting:
         return word in _YES
 
     def from_toml(self, value: Any) -> Any:
-        """A value of a file. Raises ValueError with what is wrong."""
+        """Check a value from a file. Raises ValueError for a value of the wrong type."""
         if self.many:
             return [self._one(member) for member in (value if isinstance(value, list) else [value])]
         return self._one(value)
@@ -93,7 +100,7 @@ class Setting:
     def _one(self, value: Any) -> Any:
         is_number = isinstance(value, int | float) and not isinstance(value, bool)
         if isinstance(value, int) and abs(value) >= _LARGEST:
-            raise ValueError("is larger than any number that TOML has")
+            raise ValueError("is too large a number for TOML")
         if self.kind is bool:
             fits, wanted = isinstance(value, bool), "true or false"
         elif self.kind is int:
@@ -109,7 +116,7 @@ class Setting:
         return value
 
     def check(self, value: Any, where: str) -> None:
-        """Raise McaptrackError for a number out of range. ``where`` it was set, if not on the command line."""
+        """Raise McaptrackError for a number out of range. ``where`` is what set it; "" is the command line."""
         least, most = self.declared.least, self.declared.most
         for one in (value or ()) if self.many else (value,):
             if self.kind in (int, float) and one is not None and not least <= one <= most:
@@ -117,7 +124,7 @@ class Setting:
                 raise McaptrackError(f"{where or f'--{self.name}'} has to be {words}, not {one}")
 
     def may_tune(self, value: Any) -> bool:
-        """Whether a file in the working folder may give this value."""
+        """Whether a file in the working folder may set this value."""
         pattern = self.declared.tuning
         if not isinstance(pattern, str):
             return pattern
@@ -125,13 +132,13 @@ class Setting:
         return all(re.fullmatch(pattern, str(member)) is not None for member in members)
 
 
-#: For each command its options by name, those that were renamed under their old names, too.
+#: Options by command and name; renamed options also by their old names.
 Settings = Mapping[str, Mapping[str, Setting]]
 _KNOWN: Final[ContextVar[tuple[Settings, dict[str, dict[str, Given]]]]] = ContextVar("known")
 
 
 def declared_settings(command: str, function: Any, parameters: Iterable[Any]) -> dict[str, Setting]:
-    """The options of a command, by name, from what its function declares. ``parameters`` are Typer's."""
+    """Return the options of a command by name. ``parameters`` are Typer's; ``function`` has their annotations."""
     hints = get_type_hints(inspect.unwrap(function), include_extras=True)
     out = {}
     for parameter in parameters:
@@ -149,9 +156,9 @@ def declared_settings(command: str, function: Any, parameters: Iterable[Any]) ->
 
 
 def gather(settings: Settings, config: Path | None) -> dict[str, dict[str, Given]]:
-    """What environment and files say, by command and option, the strongest of each.
+    """Return the values that environment and files set, by command and option; the strongest source wins.
 
-    An unknown name, a value of the wrong kind, and what a file may not set end the command with exit code 2.
+    An unknown name, a value of the wrong type, and an option that a file may not set end the command with exit code 2.
     """
     found: dict[str, dict[str, Given]] = {command: {} for command in settings}
     for command, setting, given in _from_environment(settings):
@@ -205,13 +212,13 @@ def _from_file(settings: Settings, file: ConfigFile) -> Iterable[tuple[str, Sett
 
 
 def found_of(command: str) -> dict[str, tuple[Setting, Given]]:
-    """What environment and files say of a command, by parameter; for the command that runs, and for its helpers."""
+    """Return the options of a command that environment and files set, with their values, by parameter."""
     settings, found = _KNOWN.get()
     return {settings[command][name].parameter: (settings[command][name], one) for name, one in found[command].items()}
 
 
 def old_names(command: str) -> dict[str, str]:
-    """The names that options of a command had before, by their names today."""
+    """Return the old names of a command's options, by their new names."""
     settings, _ = _KNOWN.get()
     return {one.name: one.declared.was for one in settings[command].values() if one.declared.was not in ("", one.name)}
 

@@ -1,4 +1,4 @@
-"""``mcaptrack info`` and ``mcaptrack export``: what is in a log, and the same as tables."""
+"""``mcaptrack info`` and ``mcaptrack export``: show the channels of a log, and write them as tables."""
 
 from __future__ import annotations
 
@@ -65,12 +65,12 @@ def _print(data: dict[str, Any], verbose: bool) -> None:
     out.print(_lineage([*reversed(shown.values())], verbose))
 
 
-#: The lineage is drawn no deeper: what comes after that stands beside what it was made from.
+#: Deepest level of the drawn lineage. Channels below it are drawn at this level, beside their input.
 _DEEPEST: Final = 30
 
 
 def _lineage(channels: list[dict[str, Any]], verbose: bool) -> Tree:
-    """The lineage of channels as a tree; its roots are the channels that were recorded or ingested."""
+    """Return the lineage of channels as a tree; its roots are channels that were recorded or ingested."""
     from rich.text import Text
     from rich.tree import Tree
 

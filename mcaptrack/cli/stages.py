@@ -1,4 +1,4 @@
-"""One command for each transform, made from its parameters; and ``run``."""
+"""Make the commands of the stages from the parameters of their transforms; and ``run``."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from mcaptrack.transforms.protocol import choices, member_type
 if TYPE_CHECKING:
     from mcaptrack import RunResult
 
-#: An example for the help of each command.
+#: Examples for the help, by command.
 _EXAMPLES: Final = {
     "detect": "Example: mcaptrack detect log.mcap --detector mog2",
     "track": "Example: mcaptrack track log.mcap --tracker bytetrack",
@@ -36,14 +36,14 @@ _EXAMPLES: Final = {
 Topic = Annotated[
     str | None, common.option("--topic", panel=common.FILES, help="Read this channel instead of the default one.")
 ]
-#: Names that files in the working folder may give: they are built in, or installed. ``module:Class`` is neither.
+#: Names that files in the working folder may give: built-in or installed ones, but not ``module:Class``.
 _NAME: Final = r"[A-Za-z0-9_-]+"
 
 
 def chooser(
     kind: Kind, was: str = "", words: str = "The {kind} to use", panel: str = "", shown: str | bool = True
 ) -> Any:
-    """The option that names one of a kind in the registry."""
+    """Return the option that chooses a detector, tracker or so on of the registry by name."""
     there = ", ".join(BUILT_IN[kind])
     return common.option(
         f"--{kind}",
@@ -62,14 +62,14 @@ _AGAIN: Final = "Use this {kind}, also where another one was used before"
 
 
 def add_stages(app: typer.Typer, panel: str) -> None:
-    """A command for all transforms, and one for each, below a heading of the help."""
+    """Add ``run`` and a command for each stage below the heading ``panel`` of the help."""
     common.register(app, panel, "run", common.one_line(run_all))
     for stage in STAGES.values():
         common.register(app, panel, stage.name, common.one_line(stage_command(stage)), stage_help(stage))
 
 
 def stage_help(stage: Stage) -> str:
-    """What the help of a stage's command says."""
+    """Return the help of the command of a stage."""
     where = f"From /camera/{stage.reads} to /camera/{stage.writes}. Inputs that are missing are made first."
     docs = [inspect.cleandoc(one.__doc__ or "") for one in stage.built_in().values()]
     words = [re.split(r"\n\n\w+\n---", doc)[0] for doc in docs]  # without the sections on use from Python
@@ -77,16 +77,16 @@ def stage_help(stage: Stage) -> str:
 
 
 def _panel(theme: str, of: str) -> str:
-    """The heading above an option in help: its theme, and which transform alone has it."""
+    """Return the heading of an option in the help: its theme, and the only transform that has it, if there is one."""
     if not of:
         return theme
     return f"{theme} ({of} alone)" if theme else f"Options of {of} alone"
 
 
 def _option(field: Field[Any], annotation: Any, of: str = "") -> inspect.Parameter:
-    """The option for a parameter: None unless it is given; its help shows the default.
+    """Return the option for a parameter. Its value is None unless it is set; its help shows the default.
 
-    ``of`` names the one of several transforms that it belongs to, if it doesn't belong to all.
+    ``of`` is the name of the only transform that has the parameter; "" if all have it.
     """
     (kind, is_tuple), about = member_type(annotation), field.metadata
     flag = "--" + field.name.replace("_", "-")
@@ -108,19 +108,19 @@ def _option(field: Field[Any], annotation: Any, of: str = "") -> inspect.Paramet
 
 
 def default_of(field: Field[Any]) -> Any:
-    """What a field is unless it is given."""
+    """Return the default of a field."""
     return field.default_factory() if field.default_factory is not MISSING else field.default
 
 
 def shown_default(default: Any) -> str:
-    """A default in words."""
+    """Return a default as text for the help."""
     if isinstance(default, tuple):
         return " ".join(map(str, default)) or "none"
     return "none" if default is None else str(default).lower() if isinstance(default, bool) else f"{default}"
 
 
 def _options_of(kind: type[Transform]) -> dict[str, Field[Any]]:
-    """The parameters of a transform that are options, by name."""
+    """Return the parameters of a transform that are options, by name."""
     return {f.name: f for f in fields(kind) if not f.metadata.get("context")}
 
 
@@ -129,9 +129,9 @@ def _parameter(name: str, annotation: Any, default: Any) -> inspect.Parameter:
 
 
 def stage_command(stage: Stage, plugins: Mapping[str, type[Transform]] = MappingProxyType({})) -> Callable[..., None]:
-    """The function behind a stage's command: its signature is made of what its transforms declare.
+    """Return the function of a stage's command, with a signature that is made of the parameters of its transforms.
 
-    ``plugins`` are transforms of other packages; their options are added.
+    The options of ``plugins``, transforms of other packages, are added.
     """
     kinds = {**plugins, **stage.built_in()}
     own = {name: _options_of(kind) for name, kind in kinds.items()}
@@ -211,10 +211,11 @@ def _transform(
     wanted: Mapping[str, Any],
     there: Mapping[str, list[str]] = MappingProxyType({}),
 ) -> Transform:
-    """The transform that is chosen, with the parameters that it has of those that are wanted.
+    """Return the chosen transform with those of the wanted parameters that it has.
 
-    ``there`` are the names of the transforms that have an option: one that is on the command line has to be of the
-    chosen one. What is set in files or in the environment may be for when another one is chosen.
+    ``there`` has the names of the transforms that have an option. An option on the command line that the chosen
+    transform lacks is refused; one from a file or the environment is ignored, since it may be meant for another
+    transform.
     """
     name = _chosen(stage, given, wanted)
     cls = stage.find(name).cls if name else stage.default
@@ -236,9 +237,9 @@ def _transform(
 
 
 def _chosen(stage: Stage, given: Mapping[str, Any], wanted: Mapping[str, Any]) -> str:
-    """The name of the transform: as it is given, as the profile has it, or as an option implies it; "" if nothing does.
+    """Return the name of the chosen transform: from its option, the profile, or an option that implies it; else "".
 
-    Raises McaptrackError if the profile is of another one.
+    Raises McaptrackError if the profile is of another transform.
     """
     name = (given.get(stage.kind) if stage.kind else "") or ""
     if profile := given.get("profile"):
@@ -249,7 +250,7 @@ def _chosen(stage: Stage, given: Mapping[str, Any], wanted: Mapping[str, Any]) -
     for option, implied in stage.implied.items():
         if not name and option in wanted:
             if not given.get("quiet"):
-                say(f"{option} belongs to --{stage.kind} {implied}, which is taken; the next release needs it named")
+                say(f"{option} belongs to --{stage.kind} {implied}, which is used; the next release requires that")
             return implied
     return name
 
@@ -287,10 +288,10 @@ def run_all(
     """Run all stages that are missing or out of date, then events, views and tables.
 
     From /camera/video (or the detections, tracks or samples that the log has) to /camera/predictions and
-    /camera/retracks; then events (see `mcaptrack events`), views, and Parquet tables beside the log. --topic begins
-    with the pictures, or the boxes, of that channel. Stages that are up to date are left alone, those that are out of
-    date are made again with the parameters they had. --force makes all again, with the parameters that environment and
-    config files set now, and otherwise those they had.
+    /camera/retracks; then events (see `mcaptrack events`), views, and Parquet tables beside the log. --topic starts
+    with the pictures, or the boxes, of that channel. Channels that are up to date are kept; those that are out of date
+    are made again with the parameters they had. --force makes all again, with the parameters that environment and
+    config files set now, otherwise with those they had.
 
     Example: mcaptrack run log.mcap
     """
@@ -316,9 +317,9 @@ def run_all(
 
 
 def _configured(chosen: Mapping[str, str] = MappingProxyType({})) -> dict[str, Transform]:
-    """The stages as environment and files want them, for a command that makes them on its way; others aren't listed.
+    """Return the transforms that environment and files configure, by stage, for a command that runs several stages.
 
-    ``chosen`` are names by kind that the command line gives.
+    ``chosen`` has names from the command line by kind.
     """
     out: dict[str, Transform] = {}
     for stage in STAGES.values():

@@ -1,6 +1,7 @@
-"""All that commands print for people goes through here: names from files may hold anything.
+"""Print text safely: names from files may contain control characters.
 
-Nothing else in the command line writes to a terminal, but data for programs (JSON, CSV) and Typer's help.
+All text that commands print for people goes through this module; only data for programs (JSON, CSV) and Typer's help
+don't.
 """
 
 from __future__ import annotations
@@ -16,15 +17,15 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 WRONG_USAGE: Final = 2
-#: Wider than any line: a file or a pipe has no width to keep to, and a line that isn't broken can be searched.
+#: Width of output that is not a terminal: lines are not broken, so that they can be searched.
 _UNBROKEN: Final = 100_000
 
 
 def printable(text: str) -> str:
-    r"""``text`` on one line, with control characters, line ends and bidirectional marks as escapes: ``\n``, ``\x1b``.
+    r"""Return text with characters that are not printable as escapes: ``\n``, ``\x1b``.
 
-    What a terminal would act on, and what could pass for another line, is everything that Unicode doesn't call
-    printable, lone surrogates (bytes of a file name that are not UTF-8) among it.
+    These are control characters, line ends, bidirectional marks, and lone surrogates (bytes of a file name that are not
+    UTF-8). A terminal would act on them, or show them as another line.
     """
     if text.isprintable():
         return text
@@ -32,25 +33,25 @@ def printable(text: str) -> str:
 
 
 def show(*lines: str) -> None:
-    """Lines on stdout: what was asked for."""
+    """Print lines to stdout: the answer of a command."""
     print("\n".join(map(printable, lines)), flush=True)
 
 
 def say(line: str) -> None:
-    """Print a line to stderr: what is done, and what is odd about it."""
+    """Print a line to stderr: a note, a warning or an error."""
     print(printable(with_flags(line)), file=sys.stderr)
 
 
 def refuse_usage(line: str) -> NoReturn:
-    """End the command because of how it was called or configured: one line on stderr, exit code 2."""
+    """End the command with one line on stderr and exit code 2: it was called or configured wrongly."""
     say(f"mcaptrack: {line}")
     raise typer.Exit(WRONG_USAGE)
 
 
 def console() -> Console:
-    """A console for tables and trees on stdout: text in them is taken as it is, and each piece of it printable.
+    """Return a console for tables and trees on stdout, without markup, that makes text printable.
 
-    Text that is given as ``rich.text.Text`` has to be printable already.
+    Only ``rich.text.Text`` has to be printable already.
     """
     from rich.console import Console
 

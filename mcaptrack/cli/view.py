@@ -1,4 +1,4 @@
-"""``mcaptrack view``: logs for viewers in a browser."""
+"""``mcaptrack view``: serve a log to viewers in a browser."""
 
 from __future__ import annotations
 
@@ -29,16 +29,16 @@ def view(
     ] = 0,
     lichtblick: Annotated[
         str,
-        common.option("--lichtblick", panel=_VIEWER, help="Where Lichtblick is, if you have it installed yourself."),
+        common.option("--lichtblick", panel=_VIEWER, help="Address of Lichtblick, if you have installed it yourself."),
     ] = LICHTBLICK,
     layout: Annotated[
         str | None,
         common.option(
             "--layout",
             panel=_VIEWER,
-            help="The layout to print a link for.",
+            help="Print a link for this layout only.",
             metavar="NAME",
-            show_default="all there are",
+            show_default="all",
         ),
     ] = None,
     browser: Annotated[
@@ -51,9 +51,9 @@ def view(
 ) -> None:
     """Serve a log to this machine's browser, and print links that open it in Lichtblick and Foxglove.
 
-    With the log go its layouts (tracking, comparing, predictions), which Lichtblick takes by itself and Foxglove
-    imports (Layouts, Import from file). Layout files beside the log are served as they are, also while they are edited.
-    Only these files are served, only to this machine, until Ctrl-C.
+    Also serves its layouts (tracking, comparing, predictions): the links open Lichtblick with one; in Foxglove import
+    the file (Layouts, Import from file). Layout files beside the log are served as they are, also while they are
+    edited. Only these files are served, only to this machine, until Ctrl-C.
 
     Example: mcaptrack view log.mcap
     """
