@@ -117,6 +117,9 @@ def test_exported_tables_are_scored(tmp_path):
     with pytest.raises(McaptrackError, match=r"holds /camera/samples, /camera/tracks; choose one with `topic=`"):
         scores(path, gt)
     assert scores(path, gt, topics=("/camera/tracks",))[0]["MOTA"] == 1.0
+    (tmp_path / "points.txt").write_text("0 7 1.5 2.5\n12 7 1.6 2.5\n24 7 1.7 2.5\n")
+    with pytest.raises(McaptrackError, match="share no clock: one counts frames, the other does not"):
+        scores(path, tmp_path / "points.txt", topics=("/camera/tracks",))
     (tmp_path / "no.parquet").write_bytes(b"PAR1 but not really")
     with pytest.raises(McaptrackError, match="is no Parquet file"):
         scores(tmp_path / "no.parquet", gt)

@@ -7,11 +7,13 @@ says that 0.08 is right and 0.1 is not. Measure again before changing one here.
 from __future__ import annotations
 
 from dataclasses import fields
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from mcaptrack.transforms import PROFILES, TRACKERS, TRANSFORMS, RetrackByConsistency
+from tests.commands import GROUP
 
 SORT: dict[str, Any] = {
     "max_age_s": 1.4,
@@ -126,3 +128,47 @@ def test_profiles_of_retracking():
 
 def test_the_clock_of_prediction_ticks_at_2_5_hz():
     assert TRANSFORMS["retrack"]().rate_hz == TRANSFORMS["predict"]().rate_hz == TRANSFORMS["sample"]().rate_hz == 2.5
+
+
+#: Defaults of commands that no transform declares; those of all other options are None, or False.
+COMMANDS: dict[str, dict[str, Any]] = {
+    "demo": {"scene": "square", "seed": 2, "output": Path("mcaptrack-demo")},
+    "detect": {"detector": "knn"},
+    "evaluate": {"gate_m": "0.5,1,2", "min_iou": 0.5, "rules": "trackeval", "point": "foot"},
+    "export": {"form": "parquet"},
+    "ingest": {"image_format": "auto", "point": "foot", "label_format": "auto", "camera": "camera"},
+    "render": {"start_s": 0.0},
+    "retrack": {"mode": "both"},
+    "run": {"events": True, "tables": True},
+    "track": {"tracker": "sort"},
+    "train": {
+        "recipe": "red",
+        "consistency_weight": 0.0,
+        "patience": 0,
+        "walks": 60000,
+        "seed": 1,
+        "device": "auto",
+        "threads": 1,
+        "point": "foot",
+        "output": Path("trained"),
+    },
+    "tune": {
+        "stage": "track",
+        "tracker": "sort",
+        "metric": "IDF1",
+        "trials": 100,
+        "seed": 0,
+        "gate_m": 1.0,
+        "min_iou": 0.5,
+        "point": "foot",
+        "output": Path("mcaptrack.toml"),
+    },
+    "view": {"port": 0, "lichtblick": "https://lichtblick-suite.github.io/lichtblick/"},
+}
+
+
+@pytest.mark.parametrize("command", sorted(GROUP.commands))
+def test_defaults_of_commands(command):
+    given = {one.name: one.default for one in GROUP.commands[command].params if not one.hidden}
+    said = {name: value for name, value in given.items() if value is not None and value is not False}
+    assert said == COMMANDS.get(command, {})

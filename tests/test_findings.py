@@ -19,7 +19,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.pipeline import findings
 from mcaptrack.schema import DETECTIONS, TRACKS, VIDEO, Frame, Schema
 from mcaptrack.schema.provenance import Provenance
-from mcaptrack.transforms import KnnDetector
+from mcaptrack.transforms import TRANSFORMS, KnnDetector
 from mcaptrack.transforms.protocol import option
 from tests.commands import call, done, made_log
 from tests.worlds import boxes_at, ns, tracks_at, walk
@@ -166,6 +166,30 @@ def test_little_memory_is_said(path, monkeypatch):
     monkeypatch.setattr(findings, "free_memory", lambda: 1_000_000)
     said = json.loads(done("track", path, "--json", "-q").out)["warnings"]
     assert [one["code"] for one in said] == ["memory"]
+
+
+def test_memory_is_little_where_less_is_free_than_pictures_and_boxes_take(monkeypatch):
+    """100 MB, 3 kB for each picture and 1.6 kB for each box, as measured."""
+    needed = 100_000_000 + 1_000 * 3_000 + 20_000 * 1_600
+    for free, is_little in ((needed, False), (needed - 1, True), (None, False)):
+        monkeypatch.setattr(findings, "free_memory", lambda free=free: free)
+        with notices.listening(lambda _: None), notices.collected() as said:
+            findings.warn_of_memory(1_000, 20_000)
+        assert [one.code for one in said] == ["memory"] * is_little
+
+
+def test_nothing_is_made_of_nothing_and_otherwise_the_transform_gives_the_reason():
+    none, some = Frame(ns(0), 0, TRACKS.empty()), Frame(ns(1), 1, TRACKS.empty(1))
+    for given, words in (
+        ([none, none], "/camera/tracks holds nothing, so nothing was made of it"),
+        ([none, some], "no samples of /camera/tracks: "),
+    ):
+        with notices.listening(lambda _: None), notices.collected() as said:
+            findings.warn_of_nothing("sample", "/camera/tracks", TRANSFORMS["sample"](), given, [none])
+        assert [one.message.startswith(words) for one in said] == [True]
+    with notices.listening(lambda _: None), notices.collected() as said:
+        findings.warn_of_nothing("sample", "/camera/tracks", TRANSFORMS["sample"](), [none, some], [none, some])
+    assert said == []
 
 
 # Without a ground plane

@@ -243,6 +243,16 @@ def test_a_view_that_calls_itself_a_table_is_not_read(commands, folder):
     refused(commands, folder / "a.db3", "messages")
 
 
+def test_a_database_is_read_with_the_guards_of_sqlite(folder, monkeypatch):
+    """Functions in its schema are not trusted, cells are checked, and nothing is mapped into memory."""
+    database(folder / "a.db3", 3, [], TOPICS)
+    monkeypatch.setattr(bag_database.SqliteTables, "_restrict_to_tables", lambda _: None)
+    opened = bag_database.SqliteTables(folder / "a.db3", ["topics"])
+    for name, wanted in (("trusted_schema", [(0,)]), ("cell_size_check", [(1,)]), ("mmap_size", [(0,)])):
+        assert list(opened._query(f"PRAGMA {name}")) == wanted
+    opened.close()
+
+
 def test_one_of_two_tables_is_no_bag(commands, folder):
     for gone in ("topics", "messages"):
         database(folder / "a.db3", 3, [], TOPICS)

@@ -44,7 +44,10 @@ class TestLabels:
         truth = read_labels(path, role="truth")
         assert list(zip(truth.frame.tolist(), truth.id.tolist(), strict=True)) == [(1, 1), (2, 1)]
         assert truth.left_out == "2 boxes that don't count (score 0 or a class but 1)"
-        assert len(read_labels(path, role="tracks").frame) == 4
+        tracks = read_labels(path, role="tracks")
+        assert len(tracks.frame) == 4
+        assert tracks.left_out == "the classes of 1 boxes that aren't people (column 8)"
+        assert read_labels(write(tmp_path / "a.txt", MOT15), role="tracks").left_out == ""
 
     def test_a_frame_0_says_that_frames_count_from_0(self, tmp_path):
         assert read_labels(write(tmp_path / "a.txt", "0,1,1,1,2,2\n5,1,1,1,2,2\n")).first_frame == 0
@@ -290,6 +293,17 @@ class TestIngest:
     def test_labels_alone_need_a_clock(self, tmp_path):
         with pytest.raises(McaptrackError, match="has no clock of its own; give the frames per second with `fps=`"):
             ingest(write(tmp_path / "a.txt", MOT15), tmp_path / "a.mcap", options())
+
+    def test_labels_that_count_from_elsewhere_are_assumed_to_begin_together_and_that_is_said(self, tmp_path, clip):
+        both = {
+            "truth": write(tmp_path / "gt.txt", "0,1,1,1,2,2\n1,1,1,1,2,2\n"),
+            "detections": write(tmp_path / "found.txt", "1,1,1,1,2,2\n2,1,1,1,2,2\n"),
+        }
+        said = [notice.message for notice in ingest(clip, tmp_path / "a.mcap", options(labels=both)).warnings]
+        first, other = (f"frame {k} of {path}" for k, path in enumerate(both.values()))
+        assert f"{first} and {other} are assumed to be the same picture; `first_frame=` sets the number" in said
+        given = ingest(clip, tmp_path / "b.mcap", options(labels=both, first_frame=0))
+        assert not [notice for notice in given.warnings if "same picture" in notice.message]
 
     def test_input_and_output_are_not_one(self, clip):
         with pytest.raises(McaptrackError, match="is both input and output"):

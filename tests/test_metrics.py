@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -355,6 +356,14 @@ class TestDisplacement:
         found = displacement(truth, positions(straight(7, range(3))), made).summary()
         assert found["ADE_m"] is None
         assert found["recall"] is None
+
+    def test_a_mean_with_a_value_that_is_not_finite_is_none(self):
+        truth, made = positions(straight(1, range(10))), forecasts(predicted(4, 5, [(5.0, 0), (6.0, 0), (7.0, 2)]))
+        good = displacement(truth, positions(straight(5, range(10))), made)
+        for worse in (np.nan, np.inf):
+            found = combine_displacements([good, replace(good, fde_m=np.array([worse]))]).summary()
+            assert found["FDE_m"] is None
+            assert found["ADE_m"] == pytest.approx(2 / 3)
 
     def test_pairs_of_several_sequences_are_pooled(self):
         truth, tracks = positions(straight(1, range(10))), positions(straight(5, range(10)))

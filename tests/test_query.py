@@ -23,6 +23,7 @@ from typer.testing import CliRunner
 
 from mcaptrack import log, tables
 from mcaptrack.cli import app
+from mcaptrack.cli.query import _fitting
 from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import EVENTS, PREDICTIONS, TRACKS, Frame
 from mcaptrack.schema.provenance import Provenance
@@ -655,6 +656,8 @@ def test_answers_for_people(known):
     shown = run(known, query, "--rows", "1")
     assert len(shown.stdout.splitlines()) == 3
     assert "the first 1 of 3 rows" in shown.stderr
+    for all_rows in ([], ["--rows", "3"], ["--rows", "0"]):
+        assert "rows" not in run(known, query, *all_rows).stderr
     assert "no rows" in run(known, "select 1 where false").stderr
 
 
@@ -704,3 +707,10 @@ def test_a_table_is_no_wider_than_the_terminal(known, monkeypatch):
         text = re.sub(r"\x1b\[[0-9;]*m", "", screen.getvalue())
         assert "…" in text
         assert max(map(len, text.splitlines())) <= 80
+
+
+def test_as_many_columns_are_shown_as_fit():
+    """A column takes its widest cell and two spaces; null takes four letters; the first is always shown."""
+    names, rows = ["id", "name", "x"], [["1", "lamp", None], ["22", None, "0.5"]]
+    for width, fitting in ((0, 1), (9, 1), (10, 2), (15, 2), (16, 3)):
+        assert _fitting(names, rows, width) == fitting

@@ -59,11 +59,11 @@ class LinesRun:
             os.environ[CONTEXT] = before
             self._coverage.switch_context(before)
 
-    @pytest.hookimpl(wrapper=True)
-    def pytest_collection(self) -> Any:
+    @pytest.hookimpl(tryfirst=True)
+    def pytest_load_initial_conftests(self) -> None:
+        """Start before conftest.py, because what it imports runs code of the package, too."""
         self._coverage.start()
         self._coverage.switch_context(os.environ[CONTEXT])
-        return (yield)
 
     @pytest.hookimpl(wrapper=True)
     def pytest_fixture_setup(self, fixturedef: Any) -> Any:
