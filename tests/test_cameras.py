@@ -93,7 +93,7 @@ def test_what_a_stage_writes_belongs_to_the_camera_that_it_comes_from(path, stag
         if TRANSFORMS[again].reads is TRANSFORMS[stage].writes[""] and stage != "retrack":
             done(again, path, "--topic", target, "-q")
             with log.read(path) as opened:
-                made = Provenance.from_metadata(opened.channel(f"/camera/{STAGES[again].writes}").metadata)
+                made = Provenance.from_metadata(opened.channel(f"/camera/{STAGES[again].output_topic}").metadata)
                 assert made is not None
                 assert made.input == target
 
@@ -151,8 +151,8 @@ def test_a_stage_does_not_replace_what_its_input_was_made_from(path):
 @pytest.mark.parametrize("stage", STAGES)
 def test_no_stage_replaces_what_it_did_not_make(path, stage):
     before = path.read_bytes()
-    for name in {"video", "truth", "ground_plane", *(stage.writes for stage in STAGES.values())} - {
-        STAGES[stage].writes
+    for name in {"video", "truth", "ground_plane", *(stage.output_topic for stage in STAGES.values())} - {
+        STAGES[stage].output_topic
     }:
         outcome = call(stage, path, "--to", f"/camera/{name}")
         assert (outcome.code, "another --to" in outcome.err) == (1, True), outcome.err

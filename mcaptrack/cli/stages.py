@@ -70,7 +70,7 @@ def add_stages(app: typer.Typer, panel: str) -> None:
 
 def stage_help(stage: Stage) -> str:
     """Return the help of the command of a stage."""
-    where = f"From /camera/{stage.reads} to /camera/{stage.writes}. Inputs that are missing are made first."
+    where = f"From /camera/{stage.input_topic} to /camera/{stage.output_topic}. Inputs that are missing are made first."
     docs = [inspect.cleandoc(one.__doc__ or "") for one in stage.built_in().values()]
     words = [re.split(r"\n\n\w+\n---", doc)[0] for doc in docs]  # without the sections on use from Python
     return "\n\n".join([*words, where, _EXAMPLES[stage.name]])

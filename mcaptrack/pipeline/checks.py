@@ -75,7 +75,7 @@ def _lacks(opened: log.Log, prefix: str, job: Job) -> str:
     """What is missing for a job, what there is, and what to do."""
     there = [topic for topic in sorted(opened.channels) if "/view/" not in topic]
     has, hint = f"it has {', '.join(there) or 'none'}", f"{call('info', opened.path)} shows more"
-    if job.transform.reads is VIDEO and job.source == f"{prefix}/{STAGES[job.stage].reads}":
+    if job.transform.reads is VIDEO and job.source == f"{prefix}/{STAGES[job.stage].input_topic}":
         pictures = [topic for topic in there if foreign.holds_pictures(opened.channels[topic])]
         if pictures:
             has, hint = f"it has pictures in {', '.join(pictures)}", "choose one with `topic=`"

@@ -46,7 +46,7 @@ def plan_stage(
     from, or if the stage would replace what it did not make.
     """
     planner = _Planner(opened, prefix, defaults=defaults)
-    usual = f"{prefix}/{STAGES[stage].writes}"
+    usual = f"{prefix}/{STAGES[stage].output_topic}"
     source = source or planner.source_of(stage)
     planner.ensure(source)
     planner.jobs.append(Job(stage, transform, source, target or usual, keep))
@@ -70,10 +70,10 @@ def plan_all(
     Raises McaptrackError as ``plan_stage`` does, and if what made a channel is not installed.
     """
     planner = _Planner(opened, prefix, {_stage_from(opened, source): source} if source else {}, defaults, anew, chosen)
-    read = {stage.reads for stage in STAGES.values()}
+    read = {stage.input_topic for stage in STAGES.values()}
     for stage in STAGES.values():
-        if stage.writes not in read:
-            planner.ensure(f"{prefix}/{stage.writes}")
+        if stage.output_topic not in read:
+            planner.ensure(f"{prefix}/{stage.output_topic}")
     for topic in sorted(camera_at(opened, prefix).topics):  # also what was written elsewhere
         planner.ensure(topic)
     return planner.checked(say)
@@ -124,7 +124,7 @@ class _Planner:
 
     def source_of(self, stage: str) -> str:
         """The topic that a stage reads, unless it was made from another one before."""
-        usual = f"{self._prefix}/{STAGES[stage].reads}"
+        usual = f"{self._prefix}/{STAGES[stage].input_topic}"
         if stage in self._sources or usual in self._opened.channels:
             return self._sources.get(stage, usual)
         camera = camera_at(self._opened, self._prefix)
@@ -186,7 +186,9 @@ class _Planner:
         is_due = self.ensure(source) or is_missing or is_stale(self._opened, topic) or source != had
         before, why_not = self._before(stage, made)
         main = _main(self._opened, stage, topic)
-        is_usual = main == f"{self._prefix}/{STAGES[stage].writes}"  # what stands elsewhere was asked for as it is
+        is_usual = (
+            main == f"{self._prefix}/{STAGES[stage].output_topic}"
+        )  # what stands elsewhere was asked for as it is
         wanted = self._defaults.get(stage, before) if is_usual else before
         is_replaced = is_usual and self._is_replaced(STAGES[stage], before, wanted)
         if wanted and not is_replaced and not self._anew:

@@ -93,7 +93,7 @@ def _run(
         given = _input(opened, job, made, stamps, progress)
         # A guessed scale is guessed anew from new detections; a given one stands.
         stage, has_boxes = STAGES[job.stage], job.transform.reads is DETECTIONS
-        is_due = has_boxes and job.target == f"{prefix}/{stage.writes}" and is_assumed(planes)
+        is_due = has_boxes and job.target == f"{prefix}/{stage.output_topic}" and is_assumed(planes)
         if is_due or (planes is None and stage.needs_scale):
             planes, channel = guess_plane(given.frames, job.source, given.digest())
             made |= {camera_at(opened, prefix).ground_plane: Made.of(GROUND_PLANE, *channel)} if channel else {}
@@ -229,7 +229,7 @@ def _in_context(opened: log.Log, prefix: str, job: Job, frames: Sequence[Frame],
         steps = np.diff([frame.t_ns for frame in frames])
         if (steps > 0).any():  # frames may share a time
             known["rate_hz"] = round(NS_PER_S / float(np.median(steps[steps > 0])), 6)
-            usual = f"{prefix}/{STAGES[job.stage].reads}"
+            usual = f"{prefix}/{STAGES[job.stage].input_topic}"
             if job.source != usual and known["rate_hz"] > 2 * Sample().rate_hz:
                 warn(
                     f"{job.source} has {known['rate_hz']:g} frames a second, and {job.stage} takes steps at that rate; "
@@ -305,8 +305,8 @@ def input_of(
 
     Raises McaptrackError if the input isn't there.
     """
-    topic = source or f"{prefix}/{STAGES[stage].reads}"
-    job = Job(stage, transform, topic, f"{prefix}/{STAGES[stage].writes}")
+    topic = source or f"{prefix}/{STAGES[stage].input_topic}"
+    job = Job(stage, transform, topic, f"{prefix}/{STAGES[stage].output_topic}")
     check_inputs(opened, prefix, [job])
     frames = _frames(opened, topic, transform.reads)
     known = _in_context(opened, prefix, job, frames, read_planes(opened, prefix) or ())

@@ -65,7 +65,7 @@ def summarise(opened: log.Log, prefix: str) -> Summary:
     Warns where re-tracking lost more than it mended.
     """
     camera = camera_at(opened, prefix)
-    boxes, tracks, samples, predictions, retracks = (f"{prefix}/{stage.writes}" for stage in STAGES.values())
+    boxes, tracks, samples, predictions, retracks = (f"{prefix}/{stage.output_topic}" for stage in STAGES.values())
     tracked, repaired = _rows(opened, tracks, TRACKS), _rows(opened, retracks, TRACKS)
     forecasts = _rows(opened, f"{retracks}/predictions", PREDICTIONS)
     forecasts = _rows(opened, predictions, PREDICTIONS) if forecasts is None else forecasts

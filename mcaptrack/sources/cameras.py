@@ -27,7 +27,7 @@ DEFAULT_CAMERA: Final = "camera"
 VIDEO, TRUTH, GROUND_PLANE = "video", "truth", "ground_plane"
 #: What stands below the name of a camera, and the stage that makes it; "" where it comes in.
 USUAL: Final[Mapping[str, str]] = {VIDEO: "", TRUTH: "", GROUND_PLANE: ""} | {
-    topic: stage.name for stage in STAGES.values() for topic in stage.outputs(stage.writes)
+    topic: stage.name for stage in STAGES.values() for topic in stage.outputs(stage.output_topic)
 }
 
 
@@ -190,7 +190,7 @@ class _Channels:
     def _usual_pictures(self, names: list[str]) -> str | None:
         """The video, or what detections were made from."""
         topics = [f"{name}/{VIDEO}" for name in names]
-        topics += [made.input for name in names if (made := self._made.get(f"{name}/{STAGES['detect'].writes}"))]
+        topics += [made.input for name in names if (made := self._made.get(f"{name}/{STAGES['detect'].output_topic}"))]
         there = [self._opened.channels[topic] for topic in topics if topic in self._opened.channels]
         return next((channel.topic for channel in there if foreign.holds_pictures(channel)), None)
 

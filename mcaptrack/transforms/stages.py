@@ -36,8 +36,8 @@ class Stage:
         Name of the stage and of its command.
     default : type[Transform]
         Its default transform.
-    reads, writes : str
-        Topics below the name of a camera.
+    input_topic, output_topic : str
+        Topics below the name of a camera, as in ``tracks``: what it reads, and its main output.
     rows : str
         The noun for its rows, in the plural.
     kind : Kind or None
@@ -64,8 +64,8 @@ class Stage:
 
     name: str
     default: type[Transform]
-    reads: str
-    writes: str
+    input_topic: str
+    output_topic: str
     rows: str
     kind: Kind | None = None
     was: str = ""
@@ -196,29 +196,36 @@ _STAGES: Final = (
         default=KnnDetector,
         kind="detector",
         was="method",
-        reads="video",
-        writes="detections",
+        input_topic="video",
+        output_topic="detections",
         rows="boxes",
     ),
     Stage(
         name="track",
         default=Sort,
         kind="tracker",
-        reads="detections",
-        writes="tracks",
+        input_topic="detections",
+        output_topic="tracks",
         rows="tracks",
         needs_scale=True,
     ),
-    Stage(name="sample", default=Sample, reads="tracks", writes="samples", rows="samples", needs_scale=True),
     Stage(
-        name="predict", default=Predict, reads="samples", writes="predictions", rows="forecasts", parameter="predictor"
+        name="sample", default=Sample, input_topic="tracks", output_topic="samples", rows="samples", needs_scale=True
+    ),
+    Stage(
+        name="predict",
+        default=Predict,
+        input_topic="samples",
+        output_topic="predictions",
+        rows="forecasts",
+        parameter="predictor",
     ),
     Stage(
         name="retrack",
         default=Retrack,
         kind="retracker",
-        reads="samples",
-        writes="retracks",
+        input_topic="samples",
+        output_topic="retracks",
         rows="re-tracked tracks",
         at_video_rate=True,
         profiles=PROFILES,
