@@ -1,10 +1,12 @@
-"""One name, one thing: no two public classes of the package have the same name."""
+"""Names in the source: each public class has its own; no stage is special-cased by name."""
 
 from __future__ import annotations
 
 import ast
 from collections import defaultdict
 from pathlib import Path
+
+from mcaptrack.transforms import STAGES
 
 PACKAGE = Path(__file__).parent.parent / "mcaptrack"
 
@@ -23,3 +25,30 @@ def test_no_two_public_classes_have_the_same_name():
     found = public_classes()
     assert len(found) > 100
     assert {name: places for name, places in found.items() if len(places) > 1} == {}
+
+
+def compared_names(tree: ast.AST) -> list[tuple[int, str]]:
+    """Lines and texts that a comparison or a ``match`` tests for, also as members of a collection."""
+    tested = [
+        part for node in ast.walk(tree) if isinstance(node, ast.Compare) for part in (node.left, *node.comparators)
+    ]
+    tested += [node.value for node in ast.walk(tree) if isinstance(node, ast.MatchValue)]
+    members = [each for part in tested for each in (part.elts if hasattr(part, "elts") else [part])]
+    return [(one.lineno, one.value) for one in members if isinstance(one, ast.Constant) and isinstance(one.value, str)]
+
+
+def test_no_stage_is_special_cased_by_name_outside_of_transforms():
+    """What sets a stage apart is declared: by its attributes, and by the schemas of its transform."""
+    found = [
+        f"{path.relative_to(PACKAGE)}:{line}: {name}"
+        for path in sorted(PACKAGE.rglob("*.py"))
+        if path.relative_to(PACKAGE).parts[0] != "transforms"
+        for line, name in compared_names(ast.parse(path.read_text()))
+        if name in STAGES
+    ]
+    assert found == []
+
+
+def test_comparisons_of_every_form_are_found():
+    source = 'a == "1"\n"2" != a\na in ("3", "4")\nmatch a:\n    case "5" | "6":\n        pass\nfunction("7", a == b)'
+    assert {name for _, name in compared_names(ast.parse(source))} == {"1", "2", "3", "4", "5", "6"}

@@ -38,8 +38,8 @@ def track_rows(people, observed=True):
     )
 
 
-def view(topic, schema, frames, picture_ns, planes, stamp_ns=None, made_by=""):
-    drawing = Drawing(topic, schema, frames, planes, made_by)
+def view(topic, schema, frames, picture_ns, planes, stamp_ns=None, is_retracked=False):
+    drawing = Drawing(topic, schema, frames, planes, is_retracked)
     return drawing.on_pictures(picture_ns, picture_ns if stamp_ns is None else stamp_ns)
 
 
@@ -84,6 +84,16 @@ def test_every_picture_has_a_message_with_its_time_and_never_an_empty_one(channe
     empty = [message for message in found if not drawn(message)]
     assert empty
     assert all(line.type == 1 and len(line.points) == 1 for message in empty for line in message.points)
+
+
+def test_repaired_tracks_have_one_style_under_any_topic():
+    _, schema, frames = CHANNELS["retracks"]
+
+    def thickness(topic: str, **options) -> set[float]:
+        return {line.thickness for message in messages(topic, schema, frames, **options) for line in drawn(message)}
+
+    assert thickness("/c/other", is_retracked=True) == thickness("/c/retracks") != thickness("/c/other")
+    assert thickness("/c/other") == thickness("/c/tracks")
 
 
 def test_boxes_stand_where_the_rows_say():

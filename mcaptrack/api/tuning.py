@@ -20,8 +20,9 @@ from mcaptrack.evaluation.aligned import Similarity
 from mcaptrack.evaluation.tuning import Metric, Range, Task, Trial, declared_ranges, uses_optuna
 from mcaptrack.geometry.plane import Point
 from mcaptrack.notices import Notice, collected
+from mcaptrack.schema import DETECTIONS
 from mcaptrack.tables.compared import detections_and_ground_truth, pair_files
-from mcaptrack.transforms import Transform
+from mcaptrack.transforms import STAGES, Transform
 
 TunedStage = Literal["track", "sample", "retrack"]
 #: Parameters to search: their names; or ranges by name, None for the range that the stage declares.
@@ -156,17 +157,18 @@ def tune(
     ('track',)
 
     """
-    if tracker is not None and stage != "track":
+    has_tracker = STAGES[stage].default.reads is DETECTIONS
+    if tracker is not None and not has_tracker:
         raise McaptrackError(f"the stage {stage} has no tracker; leave `tracker=` out")
     base = transform_of(stage, tracker, {})
     ranges = _ranges(type(base), search)
-    chosen: Similarity = similarity or ("iou" if stage == "track" else "metres")
+    chosen: Similarity = similarity or ("iou" if has_tracker else "metres")
     scoring = EvaluateOptions(similarities=(chosen,), gates_m=(gate_m,), min_iou=min_iou)
     notes, trials_file = Notes(), optional_path(study)
     with collected() as warnings:
         if truth is None:
             tasks = _tasks_of_logs(paths_of(inputs), camera, topic, stage, base)
-        elif stage != "track":
+        elif not has_tracker:
             raise McaptrackError(f"files of detections are for `stage='track'`; to tune {stage} give logs")
         else:
             pairs, words = pair_files(paths_of(inputs), paths_of(truth))
@@ -187,7 +189,7 @@ def tune(
         first, best = searching.tune(
             base, tasks, ranges, scoring, metric=metric, trials=trials, seed=seed, study=trials_file, on_trial=tell
         )
-    settings = ({"tracker": tracker or "sort"} if stage == "track" else {}) | dict(best.parameters)
+    settings = ({"tracker": tracker or "sort"} if has_tracker else {}) | dict(best.parameters)
     return TuneResult(
         stage=stage,
         metric=metric,

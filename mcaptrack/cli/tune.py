@@ -14,6 +14,8 @@ from mcaptrack.cli.settings import old_names
 from mcaptrack.cli.stages import chooser
 from mcaptrack.cli.text import console, show
 from mcaptrack.errors import McaptrackError
+from mcaptrack.schema import DETECTIONS
+from mcaptrack.transforms import STAGES
 
 if TYPE_CHECKING:
     from mcaptrack import TuneResult
@@ -111,7 +113,7 @@ def tune(
     import mcaptrack
 
     ranges = dict(map(_range, search or ()))
-    is_tracker = stage == "track"
+    is_tracker = STAGES[stage].default.reads is DETECTIONS
     which = tracker.replace(":", ".") if is_tracker else stage
     by_overlap = similarity == "iou" or (similarity is None and is_tracker)
     with common.Talk(quiet, verbose).open() as talk:

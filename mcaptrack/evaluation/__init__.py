@@ -31,6 +31,7 @@ from mcaptrack.evaluation.metrics.displacement import Displacement, combine_disp
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.cameras import camera_at
+from mcaptrack.transforms import STAGES
 
 COMBINED: Final = "COMBINED"
 DEFAULT_GATES_M: Final = (0.5, 1.0, 2.0)
@@ -141,7 +142,7 @@ def sequence_of_log(opened: log.Log, prefix: str, topics: Sequence[str]) -> Eval
     for topic in chosen:
         made = Provenance.from_metadata(opened.channel(topic).metadata)
         mode = None
-        if made and made.transform == "retrack":
+        if made and made.transform in STAGES and STAGES[made.transform].repairs_tracks:
             mode = "online" if topic.endswith("/online") else "offline"
         name = forecasts_of.get(topic, "")
         forecasts = opened.frames(name, PREDICTIONS) if name in opened.channels else None

@@ -65,7 +65,8 @@ def summarise(opened: log.Log, prefix: str) -> Summary:
     Warns where re-tracking lost more than it mended.
     """
     camera = camera_at(opened, prefix)
-    boxes, tracks, samples, predictions, retracks = (f"{prefix}/{stage.output_topic}" for stage in STAGES.values())
+    names = ("detect", "track", "sample", "predict", "retrack")
+    boxes, tracks, samples, predictions, retracks = (f"{prefix}/{STAGES[name].output_topic}" for name in names)
     tracked, repaired = _rows(opened, tracks, TRACKS), _rows(opened, retracks, TRACKS)
     forecasts = _rows(opened, f"{retracks}/predictions", PREDICTIONS)
     forecasts = _rows(opened, predictions, PREDICTIONS) if forecasts is None else forecasts

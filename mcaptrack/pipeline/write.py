@@ -25,7 +25,7 @@ from mcaptrack.schema.framing import frame_times
 from mcaptrack.schema.provenance import INGEST, VIEW, Provenance, digest
 from mcaptrack.sources import foreign
 from mcaptrack.sources.cameras import VIDEO, Camera, camera_at
-from mcaptrack.transforms import FULL
+from mcaptrack.transforms import FULL, STAGES
 
 #: Log time, number of the channel, sequence and payload of a message.
 Numbered = tuple[int, int, int, bytes]
@@ -199,7 +199,8 @@ class _Drawn:
                 yield View(topic + views.SCENE_SUFFIX, foxglove.SCENE, made_from, group, outline)
             if channel.schema not in views.DRAWN or topic.endswith(_NOT_SHOWN) or topic + FULL in shown:
                 continue  # others show the same at more times
-            drawing = views.Drawing(topic, channel.schema, channel.frames, self._planes, channel.made_by)
+            is_retracked = channel.made_by in STAGES and STAGES[channel.made_by].repairs_tracks
+            drawing = views.Drawing(topic, channel.schema, channel.frames, self._planes, is_retracked)
             if len(self._picture_ns):
                 drawn = drawing.on_pictures(self._picture_ns, self._stamp_ns)
                 yield View(topic + views.SUFFIX, foxglove.ANNOTATIONS, made_from, group, drawn)

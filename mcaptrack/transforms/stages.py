@@ -50,6 +50,8 @@ class Stage:
         of the same name.
     needs_scale : bool
         Whether it converts boxes to metres, so that a scale is estimated if no ground plane is given.
+    repairs_tracks : bool
+        Whether its tracks are repaired ones, which are scored and drawn as such.
     at_video_rate : bool
         Whether its tracks are also written at the video's rate, below ``FULL``.
     profiles : Mapping[str, Transform]
@@ -71,6 +73,7 @@ class Stage:
     was: str = ""
     parameter: str = ""
     needs_scale: bool = False
+    repairs_tracks: bool = False
     at_video_rate: bool = False
     profiles: Mapping[str, Transform] = field(default_factory=dict)
     modes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
@@ -227,6 +230,7 @@ _STAGES: Final = (
         input_topic="samples",
         output_topic="retracks",
         rows="re-tracked tracks",
+        repairs_tracks=True,
         at_video_rate=True,
         profiles=PROFILES,
         modes=MappingProxyType(

@@ -30,11 +30,16 @@ DRAWN: Final = (DETECTIONS, TRACKS, PREDICTIONS)
 
 
 class Drawing:
-    """A channel to draw; ``made_by`` is the stage that made it. Predictions need ``planes`` to be drawn on pictures."""
+    """A channel to draw.
 
-    def __init__(self, topic: str, schema: Schema, frames: Sequence[Frame], planes: Planes, made_by: str = "") -> None:
+    ``is_retracked`` says that its tracks are repaired. Predictions need ``planes`` to be drawn on pictures.
+    """
+
+    def __init__(
+        self, topic: str, schema: Schema, frames: Sequence[Frame], planes: Planes, is_retracked: bool = False
+    ) -> None:
         self._schema, self._frames, self._planes = schema, frames, planes
-        self._style = style_of(topic, made_by)
+        self._style = style_of(topic, is_retracked)
         self._known: tuple[Ints, People] | None = None
 
     def on_pictures(self, picture_ns: Ints, stamp_ns: Ints) -> View:

@@ -38,11 +38,11 @@ GROUND_TRUTH: Final = TrackStyle(1.0, False, 0.0, True, "beside", PersonMarker(0
 OBSERVED, INTERPOLATED = 1.0, 0.375
 
 
-def style_of(topic: str, made_by: str = "") -> TrackStyle:
-    """The style of a channel of tracks, by its name and by the stage that made it."""
+def style_of(topic: str, is_retracked: bool = False) -> TrackStyle:
+    """The style of a channel of tracks, by its topic and by whether a stage made it that repairs tracks."""
     if topic.endswith("/truth"):
         return GROUND_TRUTH
-    return RETRACKED if made_by == "retrack" or "/retracks" in topic else TRACKED
+    return RETRACKED if is_retracked or "/retracks" in topic else TRACKED
 
 
 def line_unit(frames: Sequence[Frame], planes: Planes) -> float:

@@ -16,10 +16,11 @@ from mcaptrack.evaluation.aligned import has_positions, resample_frames
 from mcaptrack.evaluation.events import EventOptions, MatchRule, find_events
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.plane import Planes, plane_at
-from mcaptrack.schema import EVENTS, TRACKS, Frame
+from mcaptrack.schema import DETECTIONS, EVENTS, TRACKS, Frame
 from mcaptrack.schema.framing import frame_times
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.pictures import Pictures
+from mcaptrack.transforms import STAGES
 from mcaptrack.viewing.report import statistics
 from mcaptrack.viewing.report.formatting import plain
 from mcaptrack.viewing.report.identity_events import (
@@ -39,7 +40,9 @@ ROLES: Final = {
     "retracks": "offline",
     "truth": "truth",
 }
+#: How trackers are called; channels of earlier versions that name none were made by the first.
 _TRACKERS: Final = {"sort": "SORT", "bytetrack": "ByteTrack", "ocsort": "OC-SORT"}
+_FIRST_TRACKER: Final = next(iter(_TRACKERS))
 #: The roles for which events are shown.
 _WITH_EVENTS: Final = ("tracks", "offline")
 #: The number of events with thumbnails.
@@ -124,8 +127,10 @@ def _read(opened: log.Log, out: LogReport) -> None:
     camera = pipeline.camera_at(opened, out.prefix)
     channel = opened.channels.get(f"{out.prefix}/tracks")
     made = Provenance.from_metadata(channel.metadata) if channel else None
-    by = _TRACKERS.get(str(made.parameters.get("tracker", "sort")), "tracker") if made else "tracker"
-    tracker = by if made and made.transform == "track" else "tracks as given"
+    stage = STAGES.get(made.transform) if made else None
+    tracker = "tracks as given"
+    if made and stage and stage.default.reads is DETECTIONS:
+        tracker = _TRACKERS.get(str(made.parameters.get(stage.option, _FIRST_TRACKER)), "tracker")
     names = {
         "tracks": tracker,
         "samples": f"{tracker}, sampled",

@@ -13,12 +13,14 @@ from numpy.typing import NDArray
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.clocks import parse_fps
+from mcaptrack.schema import VIDEO
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources import foreign
 from mcaptrack.sources.foreign.flatten import message_type_of
 from mcaptrack.sources.ingest.labels.formats import Role
 from mcaptrack.sources.ingest.labels.timeline import Timeline
 from mcaptrack.sources.video import EncodedPicture, decode_gray, is_video_codec, read_head
+from mcaptrack.transforms import STAGES
 
 #: The default camera name.
 DEFAULT: Final = "camera"
@@ -122,7 +124,9 @@ def detections_topic(opened: log.Log, prefix: str) -> str:
     """The topic of detections made from pictures that were dropped since; "" if there is none."""
     channel = opened.channels.get(f"{prefix}/detections")
     made = Provenance.from_metadata(channel.metadata) if channel else None
-    return channel.topic if channel and channel.messages and made and made.transform == "detect" else ""
+    stage = STAGES.get(made.transform) if made else None
+    is_of_pictures = stage is not None and stage.default.reads is VIDEO
+    return channel.topic if channel and channel.messages and is_of_pictures else ""
 
 
 def _may_be_video(opened: log.Log, topic: str) -> bool:
