@@ -170,7 +170,7 @@ class TestIngest:
         out = tmp_path / "a.mcap"
         report = ingest(clip, out, options(labels={"truth": truth}))
         assert report.messages["/camera/truth"] == 2  # frames 0 and 12 of 20
-        assert report.said == [f"{truth} has labels every 12 frames, from 0 on; the frames in between are left out"]
+        assert report.remarks == [f"{truth} has labels every 12 frames, from 0 on; the frames in between are left out"]
 
     def test_labels_alone_keep_their_own_clock(self, tmp_path):
         out = tmp_path / "a.mcap"
@@ -199,11 +199,11 @@ class TestIngest:
         out = tmp_path / "a.mcap"
         found = write(tmp_path / "t.txt", "3,4,1,1,2,2\n4,4,1,1,2,2\n7,4,1,1,2,2\n")
         report = ingest(found, out, options(fps=Fraction(10), frames=9))
-        assert report.said == [f"{found}: 9 frames (by `frames=`) from 1 on, 10 a second (by `fps=`)"]
+        assert report.remarks == [f"{found}: 9 frames (by `frames=`) from 1 on, 10 a second (by `fps=`)"]
         with log.read(out) as opened:
             assert [len(f.rows) for f in opened.frames("/camera/tracks", TRACKS)] == [0, 0, 1, 1, 0, 0, 1, 0, 0]
         report = ingest(found, out, options(fps=Fraction(10)))
-        assert report.said == [f"{found}: 7 frames (by the last label) from 1 on, 10 a second (by `fps=`)"]
+        assert report.remarks == [f"{found}: 7 frames (by the last label) from 1 on, 10 a second (by `fps=`)"]
         with log.read(out) as opened:
             assert [len(f.rows) for f in opened.frames("/camera/tracks", TRACKS)] == [0, 0, 1, 1, 0, 0, 1]
 
@@ -222,7 +222,7 @@ class TestIngest:
         out = tmp_path / "a.mcap"
         found = write(tmp_path / "gt" / "gt.txt", MOT15)
         report = ingest(found, out, options(role="truth"))
-        assert report.said == [f"{found}: 4 frames (by seqinfo.ini) from 1 on, 14 a second (by seqinfo.ini)"]
+        assert report.remarks == [f"{found}: 4 frames (by seqinfo.ini) from 1 on, 14 a second (by seqinfo.ini)"]
         with log.read(out) as opened:
             frames = opened.frames("/camera/truth", TRACKS)
             assert [(f.t_ns, ids(f)) for f in frames] == [

@@ -78,9 +78,9 @@ def test_another_client_sees_every_picture_of_the_clip_in_a_message_of_its_own(t
     report = ingest(path, output, IngestOptions(image_format=image_format, start_ns=7))
     assert report.lost == []
     if codec in ("vp9", "av1"):
-        assert "which Foxglove plays and Lichtblick does not (`image_format='h264'` is for both)" in report.said[0]
+        assert "which Foxglove plays and Lichtblick does not (`image_format='h264'` is for both)" in report.remarks[0]
     else:
-        assert report.said == []
+        assert report.remarks == []
     images, packets = by_ffmpeg(path)
     messages = by_the_stock_library(output)
     assert {video.format for _, video in messages} == {codec}
@@ -182,7 +182,7 @@ def test_what_viewers_would_show_wrongly_is_encoded_again_and_shows_what_players
     path, output = make(tmp_path), tmp_path / "a.mcap"
     fps = Fraction(10) if path.suffix == ".h264" else None
     report = ingest(path, output, IngestOptions(fps=fps))
-    assert words in report.said[0]
+    assert words in report.remarks[0]
     images, _ = by_ffmpeg(path)
     messages = by_the_stock_library(output)
     assert len(messages) == len(images) == (count or len(images))
@@ -219,7 +219,7 @@ def test_a_stream_without_times_needs_a_rate_and_is_passed_on_with_one(tmp_path)
     ):
         ingest(path, tmp_path / "a.mcap", IngestOptions())
     report = ingest(path, tmp_path / "a.mcap", IngestOptions(fps=Fraction(10)))
-    assert report.said == []
+    assert report.remarks == []
     assert len(by_the_stock_library(tmp_path / "a.mcap")) == 20
 
 
@@ -230,7 +230,7 @@ def test_parameter_sets_that_stand_at_the_beginning_alone_are_put_before_every_k
     assert len(kept) < len(units)
     (tmp_path / "a.h264").write_bytes(b"\x00\x00\x01".join(kept))
     report = ingest(tmp_path / "a.h264", tmp_path / "a.mcap", IngestOptions(fps=Fraction(10)))
-    assert report.said == []
+    assert report.remarks == []
     images, _ = by_ffmpeg(path)
     messages = by_the_stock_library(tmp_path / "a.mcap")
     for number in (0, 10):
@@ -411,12 +411,12 @@ def several(path, cover=False):
 
 def test_of_several_videos_the_first_is_taken_and_that_is_said(tmp_path):
     report = ingest(several(tmp_path / "a.mkv"), tmp_path / "a.mcap", IngestOptions())
-    assert (report.messages, "holds 2 videos; the first is taken" in report.said[0]) == ({"/camera/video": 12}, True)
+    assert (report.messages, "holds 2 videos; the first is taken" in report.remarks[0]) == ({"/camera/video": 12}, True)
 
 
 def test_a_cover_picture_is_no_video(tmp_path):
     report = ingest(several(tmp_path / "a.mp4", cover=True), tmp_path / "a.mcap", IngestOptions())
-    assert (report.messages, report.said) == ({"/camera/video": 9}, [])
+    assert (report.messages, report.remarks) == ({"/camera/video": 9}, [])
 
 
 def test_vp9_headers_by_hand():

@@ -320,7 +320,7 @@ def test_colours_are_those_of_viewers(finished):
     assert {one["class"] for one in reader.of("path")} <= {"halo", *(f"c{k}" for k in range(COLOURS))}
 
 
-# What can't be said
+# Statistics that are not known
 
 
 def test_an_empty_log_says_so_in_every_section(tmp_path):
@@ -348,7 +348,7 @@ def test_without_metres_it_says_that_speeds_are_not_known(tmp_path):
     frames = [Frame(ns(t / 10), t, boxes({1: (40 + t, 60)})) for t in range(30)]
     _, numbers, reader = report_on(write(tmp_path / "pixels.mcap", {"/camera/tracks": frames}))
     words = "".join(reader.text)
-    assert "Speeds can't be said" in words
+    assert "Speeds are not known" in words
     assert "Tracks can't be drawn" in words
     assert numbers["logs"][0]["speed_m_per_s"] is None
     assert numbers["logs"][0]["dwell_s"]["series"][0]["median"] == pytest.approx(3.0)

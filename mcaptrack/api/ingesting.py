@@ -173,13 +173,13 @@ def ingest(
                 report = make_log(path, target, options, into=opened, force=force, progress=progress)
                 written_to = opened.parts[-1].path
             if place.why:
-                report.said.append(place.words(written_to))
+                report.remarks.append(place.words(written_to))
         for lost in report.lost:
             warn(f"lost: {lost}", "lost")
     return IngestResult(
         log=target,
         messages=report.messages,
-        notes=tuple(report.said),
+        notes=tuple(report.remarks),
         details=tuple(report.notes),
         lost=tuple(report.lost),
         warnings=tuple(dict.fromkeys(warnings)),

@@ -42,7 +42,7 @@ FORECASTS: Final = tuple(FORECAST_INPUTS)
 
 @dataclass(frozen=True)
 class EvaluateOptions:
-    """What to compare and how.
+    """The options of a comparison.
 
     Parameters
     ----------

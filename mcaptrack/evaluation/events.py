@@ -1,7 +1,7 @@
 """Events in the life of tracks, and counts for each frame: rows of Events and of Counts.
 
-Births, ends and repairs by re-tracking follow from the tracks alone. Misses, false tracks and identity switches follow
-from the same matches with the ground truth that the scores count; their sums are the counts of CLEAR.
+Births, terminations and repairs by re-tracking follow from the tracks alone. Misses, false tracks and identity switches
+follow from the same matches with the ground truth that the scores count; their sums are the counts of CLEAR.
 
 Letters: F frames of the tracks or of the ground truth, N rows, R events, P matches.
 """
@@ -47,7 +47,7 @@ from mcaptrack.schema.framing import frame_times, join_frames, split_rows
 
 @dataclass(frozen=True)
 class EventOptions:
-    """How tracks are matched with people. ``similarity`` None: the default for the tracks (see `default_rule`).
+    """Options of matching tracks with people. ``similarity`` None: the default for the tracks (see `default_rule`).
 
     ``gate_m`` is the largest distance for "metres", ``min_iou`` the least overlap for "iou"; None: the default.
     """
@@ -83,7 +83,7 @@ class TrackEvents(NamedTuple):
     frame_interval_s: float
 
     def parameters(self, options: EventOptions) -> dict[str, Any]:
-        """Options and rule, as they stand in the provenance."""
+        """Options and rule, as in the provenance."""
         return {"asked": asdict(options)} | (self.rule._asdict() if self.rule else {"similarity": None, "gate": None})
 
 

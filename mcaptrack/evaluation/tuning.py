@@ -146,7 +146,7 @@ def trial_scores(transform: Transform, tasks: Sequence[Task], scoring: EvaluateO
 def _about(
     base: Transform, tasks: Sequence[Task], ranges: Mapping[str, Range], scoring: EvaluateOptions
 ) -> dict[str, Any]:
-    """What identifies a study; trials of another study can't be continued."""
+    """The identity of a study; trials of another study can't be continued."""
     digest = hashlib.sha256()
     for task in tasks:
         for part in (task.frames, task.ground_truth):

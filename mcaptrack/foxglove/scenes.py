@@ -29,7 +29,7 @@ _UPRIGHT: Final = {"w": 1.0}
 
 
 class PersonMarker(NamedTuple):
-    """How a person is drawn: a cylinder with its width and height, the height of the number above the ground, and the
+    """The drawing of a person: a cylinder with its width and height, the height of the number above the ground, and the
     thickness of the trail, which is drawn whole or in pieces.
     """
 

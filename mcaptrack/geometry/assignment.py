@@ -37,8 +37,8 @@ def _solver() -> Callable[[Floats], Pairs]:
 def assign(cost: Floats, gate: float) -> Pairs:
     """The largest set of pairs with a cost (M, N) of at most ``gate``, and of those sets the one with the lowest cost.
 
-    Pairs beyond the gate are excluded before solving, so a far pair can't take the place of a near one. NaN is beyond
-    every gate.
+    Gating: pairs beyond the gate are excluded before solving, so a far pair can't take the place of a near one. NaN is
+    beyond every gate.
     """
     allowed = cost <= gate
     rows_with, columns_with = allowed.any(axis=1), allowed.any(axis=0)

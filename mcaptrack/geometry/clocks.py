@@ -103,5 +103,5 @@ class FrameClock:
             self._anchor_ns = usual
 
     def frames(self, seconds: float) -> int:
-        """How many frames a time span lasts, at least 1; 1 while the usual interval isn't known."""
+        """The number of frames in a time span, at least 1; 1 while the usual interval isn't known."""
         return max(1, round(seconds_to_ns(seconds) / self.interval_ns)) if self.interval_ns else 1

@@ -40,7 +40,7 @@ def ragged_range(starts: ArrayLike, counts: ArrayLike, step: int = 1) -> Ints:
     starts : (G,) of int, or one int for all groups
         First number of each group.
     counts : (G,) of int
-        How many numbers each group has, 0 or more.
+        The size of each group, 0 or more.
     step : int
         Difference between consecutive numbers of a group.
 
@@ -63,7 +63,7 @@ def ragged_range(starts: ArrayLike, counts: ArrayLike, step: int = 1) -> Ints:
 
 
 def run_starts(*keys: NDArray[Any], times: Ints | None = None, max_gap: int = 0) -> Bools:
-    """Where a run of equal keys begins: at the first member, and where a key differs from that of the member before.
+    """Mask the members where a run of equal keys begins: the first, and those with another key than the one before.
 
     Parameters
     ----------
@@ -97,7 +97,7 @@ def run_starts(*keys: NDArray[Any], times: Ints | None = None, max_gap: int = 0)
 
 
 def run_ends(starts: Bools) -> Bools:
-    """Where runs end, given where they begin (see ``run_starts``).
+    """Mask the members where runs end, given where they begin (see ``run_starts``).
 
     Parameters
     ----------

@@ -107,17 +107,17 @@ class _Checker:
             self._find("footer", at, f"the footer places the summary offsets at byte {offsets_start}")
             offsets_start = 0
         groups: dict[int, tuple[int, int, int]] = {}  # start, end and total size of the records of a type
-        said, statistics = Index(), None
+        summary, statistics = Index(), None
         for record in walk(buffer, start, offsets_start or at):
             low, _, kinds = groups.get(record.opcode, (record.start, 0, 0))
             groups[record.opcode] = (low, record.end, kinds + record.end - record.start)
             statistics = record if record.opcode == Opcode.STATISTICS else statistics
-            add_summary_record(said, buffer, record)
-        self._compare(said, start)
+            add_summary_record(summary, buffer, record)
+        self._compare(summary, start)
         if statistics is None:
             self._find("no-statistics", start, "there are no statistics: counting takes a scan", "warning")
         else:
-            self._compare_statistics(Reader(buffer, statistics.body, statistics.end), said, statistics.start)
+            self._compare_statistics(Reader(buffer, statistics.body, statistics.end), summary, statistics.start)
         if offsets_start:
             self._compare_offsets(offsets_start, at, groups)
 
@@ -126,11 +126,11 @@ class _Checker:
         if crc and zlib.crc32(self._buffer[start : len(self._buffer) - len(MAGIC) - 4]) != crc:
             self._find("summary-checksum", start, "the checksum of the summary is wrong")
 
-    def _compare(self, said: Index, where: int) -> None:
+    def _compare(self, summary: Index, where: int) -> None:
         found = self._found
         for name, theirs, ours in (
-            ("schema", said.schemas, found.schemas),
-            ("channel", said.channels, found.channels),
+            ("schema", summary.schemas, found.schemas),
+            ("channel", summary.channels, found.channels),
         ):
             for number, record in theirs.items():
                 if ours.get(number, record) != record:
@@ -143,23 +143,23 @@ class _Checker:
             if missing and theirs:
                 words = f"{name} {min(missing)} is missing in the summary"
                 self._find(f"summary-no-{name}", where, words, "error" if name == "channel" else "warning")
-        self._compare_chunks(said, where)
+        self._compare_chunks(summary, where)
         for name, listed, there in (
-            ("attachment", said.attachments, found.attachments),
-            ("metadata", said.metadata, found.metadata),
+            ("attachment", summary.attachments, found.attachments),
+            ("metadata", summary.metadata, found.metadata),
         ):
             if listed and sorted(part.entry for part in listed) != sorted(part.entry for part in there):
                 self._find(f"{name}-index", where, f"the {name} index differs from the {name} records in the log")
             if there and not listed:
                 self._find(f"no-{name}-index", where, f"the summary does not list {len(there)} {name}", "warning")
 
-    def _compare_chunks(self, said: Index, where: int) -> None:
+    def _compare_chunks(self, summary: Index, where: int) -> None:
         ours = {chunk.offset: chunk for chunk in self._found.chunks}
-        if ours and not said.chunks:
+        if ours and not summary.chunks:
             words = "the summary lists no chunks: finding a message takes a scan"
             self._find("no-chunk-index", where, words, "warning")
             return
-        for chunk in said.chunks:
+        for chunk in summary.chunks:
             known = ours.pop(chunk.offset, None)
             if known is None:
                 self._find(
@@ -174,16 +174,16 @@ class _Checker:
         if ours:
             self._find("chunk-not-listed", min(ours), "a chunk that the summary does not list", times=len(ours))
 
-    def _compare_statistics(self, reader: Reader, said: Index, where: int) -> None:
+    def _compare_statistics(self, reader: Reader, summary: Index, where: int) -> None:
         found = self._found
         loose = [sum(found.counts.values()), len(found.schemas), len(found.channels), len(found.attachments)]
         there = [*loose, len(found.metadata), len(found.chunks), found.start_ns, found.end_ns]
         for (name, size), number in zip(_STATISTICS.items(), there, strict=True):
             value = reader.number(size)
-            only_described = name in ("schemas", "channels") and value == len(getattr(said, name))
+            only_described = name in ("schemas", "channels") and value == len(getattr(summary, name))
             if value != number and not only_described:
                 self._find("statistics", where, f"the statistics say {value} for {name}; it is {number}")
-        if {n: count for n, count in said.counts.items() if count} != found.counts:
+        if {n: count for n, count in summary.counts.items() if count} != found.counts:
             self._find("statistics-counts", where, "the statistics have a wrong number of messages for a channel")
 
     def _compare_offsets(self, start: int, end: int, groups: Mapping[int, tuple[int, int, int]]) -> None:

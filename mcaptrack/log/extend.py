@@ -135,7 +135,7 @@ def _compare(source: ByteSource, copy: Path, end: int) -> None:
 
 @dataclass
 class _Rewrite:
-    """What is dropped from a log, and the offset of the first record that is rewritten (``cut``).
+    """The parts to drop from a log, and the offset of the first record that is rewritten (``cut``).
 
     ``open_all``: any chunk may describe a dropped channel, so all chunks have to be opened.
     """

@@ -22,7 +22,7 @@ from mcaptrack.log.byte_source import OpenFile
 from mcaptrack.log.journal import Journal, UnusableJournal, journal_of
 from mcaptrack.log.records import Damaged
 
-#: How many bytes are written at once.
+#: The number of bytes that are written at once.
 _PIECE: Final = 4 * 2**20
 _BLOCK: Final = 2**20
 

@@ -178,7 +178,7 @@ def read_intact_summary(buffer: Bytes, start: int) -> Index | None:
 def _is_consistent(index: Index, statistics: Reader) -> bool:
     """Whether the summary describes all channels and lists all messages, and no chunks overlap."""
     statistics.skip(8)
-    said = [statistics.number(size) for size in (2, 4, 4, 4, 4)]
+    declared = [statistics.number(size) for size in (2, 4, 4, 4, 4)]
     found = [len(part) for part in (index.schemas, index.channels, index.attachments, index.metadata, index.chunks)]
     known = {channel for chunk in index.chunks for channel in chunk.message_index_offsets}
     schemas = {0, *index.schemas}
@@ -190,7 +190,7 @@ def _is_consistent(index: Index, statistics: Reader) -> bool:
     ends = [len(MAGIC), *(chunk.offset + chunk.length for chunk in index.chunks)]
     starts = [*(chunk.offset for chunk in index.chunks), index.data_end]
     apart = all(end <= start for end, start in zip(ends, starts, strict=True))
-    return said == found and described and indexed and apart
+    return declared == found and described and indexed and apart
 
 
 def add_summary_record(index: Index, buffer: Bytes, record: Record) -> None:

@@ -106,7 +106,7 @@ class Journal:
         return ByteSource(self.pieces()[1:])
 
     def state(self) -> State:
-        """What the log holds now. Raises UnusableJournal if the change can't have left that."""
+        """The current content of the log. Raises UnusableJournal if the change can't have left that."""
         try:
             fcntl.flock(self.file.handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
             fcntl.flock(self.file.handle, fcntl.LOCK_UN)

@@ -12,7 +12,7 @@ from mcaptrack.log.journal import Journal, UnusableJournal, find, journal_of, lo
 
 
 class JournalFinding(NamedTuple):
-    """What lies at LOG.journal: a message about it, and ``journal`` if the log must be read through it."""
+    """A file at LOG.journal: a message about it, and ``journal`` if the log must be read through it."""
 
     message: str
     journal: Journal | None = None

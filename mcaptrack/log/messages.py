@@ -254,9 +254,9 @@ class Messages:
         loose = self.index.loose.get(channel_id, np.empty((0, 2), "<u8"))
         found += _pieces(channel_id, None, loose, span)
         listed += len(loose)
-        said = self.index.counts.get(channel_id, 0)
-        if first is None and last is None and listed != said:
-            raise Damaged(f"its indexes list {listed} messages of channel {channel_id}, and there are {said}")
+        declared = self.index.counts.get(channel_id, 0)
+        if first is None and last is None and listed != declared:
+            raise Damaged(f"its indexes list {listed} messages of channel {channel_id}, and there are {declared}")
         return found
 
     def _content(self, chunk: ChunkIndexRecord) -> Bytes:

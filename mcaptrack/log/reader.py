@@ -177,7 +177,7 @@ class Log:
         return [channel.id for channel in those]
 
     def _layout(self, channel: Channel) -> tuple[str, ...]:
-        """What determines how a channel's messages are decoded, without comments and white space of ROS definitions."""
+        """A key of the layout of a channel's messages, without comments and white space of ROS definitions."""
         schema = self.index.schemas.get(self.index.channels[channel.id].schema_id)
         if schema is None:
             return (channel.message_encoding,)

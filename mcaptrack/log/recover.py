@@ -238,8 +238,8 @@ class _Recovery:
             # Its offsets may be wrong, but its counts are right.
             self._summary_index = read_intact_summary(buffer, record.end) or self._summary_index
             self._is_done = record.end == len(buffer) or buffer[record.end] not in _NOT_BEHIND
-        said = Reader(buffer, record.body, record.end).number(4)
-        if self._is_done and said and not self._report.lost and said != self._checksum.up_to(record.start):
+        declared = Reader(buffer, record.body, record.end).number(4)
+        if self._is_done and declared and not self._report.lost and declared != self._checksum.up_to(record.start):
             self._report.lost.append(
                 f"byte {record.start}: the checksum of the data section is wrong; chunks with their own checksums "
                 "are intact, other records may not be"

@@ -20,7 +20,7 @@ from mcaptrack.log.records import Damaged
 
 T = TypeVar("T")
 
-#: How long to wait for another process that is changing the file, and the pause between two attempts.
+#: The time to wait for another process that is changing the file, and the pause between two attempts.
 _WAIT_S: Final = 1.0
 _PAUSE_S: Final = 0.02
 

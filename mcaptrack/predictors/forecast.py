@@ -61,7 +61,7 @@ class Predictor(Protocol):
         xy_m : (B, L, 2) of float, in m
             Past positions, the current one last; L may be longer or shorter than ``past``. Unknown ones may be NaN.
         valid : (B, L) of bool
-            Which positions are known; the last one always is.
+            Mask of the known positions; the last one is always known.
 
         Returns
         -------

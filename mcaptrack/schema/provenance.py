@@ -34,7 +34,7 @@ class Plugin(NamedTuple):
 
 @dataclass(frozen=True)
 class Provenance:
-    """How a channel was made. ``digest`` is of its own messages, ``input_digest`` of the messages of its input.
+    """The making of a channel. ``digest`` is of its own messages, ``input_digest`` of the messages of its input.
 
     ``references`` are the topics that the input was compared with, and their digests; empty for missing topics.
     ``plugins`` are the classes of other packages that were used: the ``transform`` itself if it is not built in, and
@@ -105,7 +105,7 @@ def _is_warning(value: object) -> bool:
 
 
 def _plugins(values: dict[str, str]) -> dict[str, Plugin]:
-    """What metadata say of classes of other packages; takes it out of ``values``.
+    """Take the classes of other packages out of the metadata ``values``.
 
     Version 0.1 had ``implementation`` ("module:Class") and ``distribution`` ("name 1.2").
     """

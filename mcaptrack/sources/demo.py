@@ -69,8 +69,8 @@ def draw(
 
     def images() -> Iterator[Image]:
         for number, shot in enumerate(scene.shots(video), start=1):
-            for who, box in zip(shot.ids, shot.boxes.tolist(), strict=True):
-                lines.append(",".join([str(number), str(who), *(f"{value:.2f}" for value in box), "1,1,1"]))
+            for track_id, box in zip(shot.ids, shot.boxes.tolist(), strict=True):
+                lines.append(",".join([str(number), str(track_id), *(f"{value:.2f}" for value in box), "1,1,1"]))
             progress("draw", number, total)
             yield shot.image
 

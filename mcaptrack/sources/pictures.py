@@ -27,7 +27,7 @@ _STEP, _FURTHER, _MOST = 8, 4, 512
 #: Wanted pictures at most this far apart are decoded in one run.
 _NEAR: Final = 64
 _BLOCK: Final = 128
-#: How many earlier groups of pictures are tried for a picture that decoding from its own key picture doesn't show.
+#: The number of earlier groups of pictures to try for a picture that decoding from its own key picture doesn't show.
 _BACK: Final = 2
 
 
@@ -82,7 +82,7 @@ class Pictures:
             wanted = wanted[len(fed) :]
 
     def _entry(self, number: int) -> int | None:
-        """Where to begin decoding for a picture: at the last key picture before it, or at its parameter sets.
+        """The message to begin decoding at for a picture: the last key picture before it, or its parameter sets.
 
         None if there is none.
         """

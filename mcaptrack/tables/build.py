@@ -155,17 +155,17 @@ def _summary(part: Part) -> dict[str, NDArray[Any]]:
     rows = part.rows[order]
     message = group_index(part.counts)[order]
     t_ns, frame = part.t_ns[message], part.frame[message]
-    who, first, count = np.unique(rows["track_id"], return_index=True, return_counts=True)
+    ids, first, count = np.unique(rows["track_id"], return_index=True, return_counts=True)
     last = first + count - 1
-    out: dict[str, NDArray[Any]] = {"track_id": who, "rows": count}
+    out: dict[str, NDArray[Any]] = {"track_id": ids, "rows": count}
     for name, at in (("first", first), ("last", last)):
         out |= {f"{name}_t_ns": t_ns[at], f"{name}_t": t_ns[at], f"{name}_frame": frame[at]}
     out["duration_s"] = (t_ns[last] - t_ns[first]) / 1e9
     track = group_index(count)
-    share = np.bincount(track, rows["observed"], len(who))
+    share = np.bincount(track, rows["observed"], len(ids))
     out["observed_share"] = share / np.maximum(count, 1)
     place = np.stack([rows["x_m"], rows["y_m"]], axis=-1)
-    out |= _motion(place, t_ns, track, len(who))
+    out |= _motion(place, t_ns, track, len(ids))
     for unit in ("m", "px"):
         ends = _ends(np.isfinite(rows[f"x_{unit}"]) & np.isfinite(rows[f"y_{unit}"]), first, last)
         for name, at in zip(("first", "last"), ends, strict=True):

@@ -181,15 +181,15 @@ def _read_parquet(path: Path, role: Role, topics: Sequence[str]) -> Labels:
             + ("choose one with `topic=`" if wanted else f"none of them is {role}")
         )
     mine = table["topic"] == wanted[0]
-    frame, who = table["frame"][mine], table["track_id"][mine]
+    frame, track_id = table["frame"][mine], table["track_id"][mine]
     boxes = np.stack([table[name][mine] for name in columns[3:7]], axis=-1)
     xy_m = np.stack([table["x_m"][mine], table["y_m"][mine]], axis=-1)
-    order = np.lexsort((who, frame))
+    order = np.lexsort((track_id, frame))
     return Labels(
         "parquet",  # type: ignore[arg-type]
         0,
         frame[order],
-        who[order],
+        track_id[order],
         boxes[order],
         xy_m[order],
         table["score"][mine][order],

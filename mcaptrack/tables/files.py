@@ -152,8 +152,8 @@ def verify(path: Path, form: Format = "parquet") -> int:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    said = (file_metadata(path, form) or {}).get("digest")
-    if said is None:
+    stored = (file_metadata(path, form) or {}).get("digest")
+    if stored is None:
         raise McaptrackError(f"{path} is no exported table: it has no digest")
     rows = [0]
 
@@ -173,7 +173,7 @@ def verify(path: Path, form: Format = "parquet") -> int:
             found = digest(table.schema, counted(_pieces(table)))
     except (OSError, pa.ArrowException) as error:
         raise McaptrackError(f"{path} can't be read back: {str(error).splitlines()[0]}") from None
-    if found != said:
+    if found != stored:
         raise McaptrackError(f"{path} does not hold what was written to it; export it again")
     return rows[0]
 

@@ -68,7 +68,7 @@ def read_tracks(path: Path) -> dict[str, list[Frame]]:
     if table.num_rows == 0:
         raise McaptrackError(f"{path} has no rows")
     count = table.num_rows
-    t_ns, who = (np.asarray(table.column(name).to_numpy()).astype(np.int64) for name in _OF_TRACKS[:2])
+    t_ns, track_id = (np.asarray(table.column(name).to_numpy()).astype(np.int64) for name in _OF_TRACKS[:2])
     x_m, y_m = (np.asarray(table.column(name).to_numpy(), np.float64) for name in _OF_TRACKS[2:])
     topic = np.array(table.column("topic").to_pylist()) if "topic" in names else np.full(count, "")
     observed = table.column("observed").to_numpy().astype(bool) if "observed" in names else np.ones(count, bool)
@@ -76,8 +76,8 @@ def read_tracks(path: Path) -> dict[str, list[Frame]]:
     out = {}
     for name in np.unique(topic).tolist():
         mine = np.flatnonzero((topic == name) & np.isfinite(x_m) & np.isfinite(y_m))
-        mine = mine[np.lexsort((who[mine], t_ns[mine]))]
-        given = {"track_id": who, "x_m": x_m, "y_m": y_m, "observed": observed, "source_id": np.full(count, -1)}
+        mine = mine[np.lexsort((track_id[mine], t_ns[mine]))]
+        given = {"track_id": track_id, "x_m": x_m, "y_m": y_m, "observed": observed, "source_id": np.full(count, -1)}
         given |= dict.fromkeys(("x_px", "y_px", "w_px", "h_px", "score"), nowhere)
         rows = TRACKS.rows(**{column: values[mine] for column, values in given.items()})
         times, first = np.unique(t_ns[mine], return_index=True)

@@ -79,9 +79,9 @@ def train(
     training, validation : Windows
         Windows to train and to validate on.
     folder : Path
-        Where to write.
+        The folder to write to.
     source : dict of str to str
-        Where the windows come from, for the model card.
+        The source of the windows, for the model card.
     device : str
         ``auto``, ``cpu``, ``cuda`` or ``mps``.
     threads : int or None
@@ -344,7 +344,7 @@ class _Run:
             }
 
     def _fingerprint(self) -> str:
-        """What has to be equal for a training to be resumed: recipe (but for its length), windows, device."""
+        """The key of a training, equal when it is resumed: recipe (but for its length), windows, device."""
         import hashlib
 
         total = hashlib.sha256(self._training.past.tobytes() + self._training.future.tobytes()).hexdigest()

@@ -20,7 +20,7 @@ class Recipe:
     Attributes
     ----------
     network : {"red", "lstm"}
-        Which network.
+        The network.
     past, steps : int
         Number of past positions and of predicted steps.
     step_s : float
@@ -50,7 +50,7 @@ class Recipe:
     patience : int
         Stop after so many epochs without improvement; 0 for never.
     kept : {"best", "last"}
-        Which weights are kept: those of the best or of the last epoch.
+        The weights to keep: those of the best or of the last epoch.
     seed : int
         Random seed.
     """

@@ -47,7 +47,7 @@ class Scene:
 
 @dataclass(frozen=True, kw_only=True)
 class SourceOptions:
-    """How to read sources that don't specify it: frames per second, ground plane, channel of a log."""
+    """Options of sources that don't specify them: frames per second, ground plane, channel of a log."""
 
     fps: Fraction | None = None
     ground_plane: Path | None = None

@@ -31,7 +31,7 @@ _GIF_FPS: Final = 10.0
 
 @dataclass(frozen=True, kw_only=True)
 class RenderOptions:
-    """What to render: the width in pixels (None: that of the pictures), the highest frame rate, and the period.
+    """Options of a video: the width in pixels (None: that of the pictures), the highest frame rate, and the period.
 
     Seconds count from the first picture.
     """

@@ -268,7 +268,7 @@ def _assigned(past_true: Floats, past: Floats, true_step: Ints, step: Ints, step
 def _best(cost: Floats, row: Ints, column: Ints, which: Ints, down: Ints, across: Ints) -> Ints:
     """Choose pairs of least total cost at each time, as many as the smaller side has.
 
-    Where the nearest partners of the smaller side are all different, they are the solution; the solver runs for the
+    If the nearest partners of the smaller side are all different, they are the solution; the solver runs for the
     rest.
     """
     is_by_row = (down <= across)[which]

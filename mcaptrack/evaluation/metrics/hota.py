@@ -60,7 +60,7 @@ def hota(matchup: Matchup) -> dict[str, NDArray[np.float64]]:
         return solve(-(alignment[persons[:, None], tracks] * matchup.similarity[number]))
 
     found = matchup.assigned(pairs, solve_frame)
-    # How many thresholds each match passes; from that, the matches that pass each threshold.
+    # The number of thresholds that each match passes; from that, the matches that pass each threshold.
     passed = np.searchsorted(ALPHAS - _EPS, found.similarity, "right")
     levels = len(ALPHAS) + 1
     tp = _at_least(np.bincount(passed, minlength=levels))

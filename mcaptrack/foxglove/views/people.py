@@ -96,7 +96,7 @@ def people_at(frames: Sequence[Frame], at_ns: Ints, planes: Planes) -> People:
 def trails(people: People, known: NDArray[np.bool_], at_ns: Ints) -> Trails:
     """The trails of people with a ``known`` position (S,); trails do not pass unknown positions.
 
-    Their points are at the ticks of a slow clock, the same ones in picture after picture: so trails stand still, and a
+    Their points are at the ticks of a slow clock, the same ones in picture after picture: so trails don't move, and a
     compressed log hardly grows by them.
     """
     t_ns = at_ns[people.frame]

@@ -16,7 +16,7 @@ _WIDTH_PX: Final = 800
 
 
 class TrackStyle(NamedTuple):
-    """How the people of a channel are drawn.
+    """The style of the people of a channel.
 
     ``name_at`` is the position of the number at a box, different for each style, so that numbers don't overlap.
     ``dash`` is the drawn share of each piece of a trail on pictures; 0 for no trail.

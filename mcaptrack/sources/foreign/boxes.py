@@ -43,17 +43,17 @@ class Classes:
         self._names: dict[str, int] = {}
         self._largest = PERSON
 
-    def class_id(self, said: str) -> int:
+    def class_id(self, name: str) -> int:
         """The id of a class; for a name a placeholder, which ``numbers`` maps to the final id."""
-        if said.lower() in PEOPLE:
+        if name.lower() in PEOPLE:
             return PERSON
-        if _NUMBER.fullmatch(said):
-            number = int(said) if int(said) < _FIRST_NAME else _UNKNOWN
+        if _NUMBER.fullmatch(name):
+            number = int(name) if int(name) < _FIRST_NAME else _UNKNOWN
             self._largest = max(self._largest, number)
             return number
-        if not _NAME.search(said) or (said not in self._names and len(self._names) == _MAX_NAMES):
+        if not _NAME.search(name) or (name not in self._names and len(self._names) == _MAX_NAMES):
             return _UNKNOWN
-        return self._names.setdefault(said, _FIRST_NAME + len(self._names))
+        return self._names.setdefault(name, _FIRST_NAME + len(self._names))
 
     def numbers(self) -> dict[int, int]:
         """The final id of each class name, by the placeholder from ``class_id``."""

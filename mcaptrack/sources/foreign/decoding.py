@@ -1,4 +1,4 @@
-"""Decode payloads to messages whose fields are attributes, in all supported encodings.
+"""Decode payloads to messages with their fields as attributes, in all supported encodings.
 
 Protobuf is decoded with the classes of the Foxglove schemas, JSON directly, ROS 1 and ROS 2 messages (by rosbags) with
 the definition in the log, so that modified versions of a message are read, too.

@@ -39,7 +39,7 @@ _BLOCK: Final = 4096
 
 @dataclass(frozen=True, kw_only=True)
 class IngestOptions:
-    """How to make a log. ``labels`` are label files by role; ``role`` is that of an input which is a label file itself.
+    """Options of making a log. ``labels`` are label files by role; ``role`` is that of an input that is a label file.
 
     ``fps``, ``image_format``, ``quality`` and ``keyframe_interval_s`` are as in ``video.VideoOptions``. ``first_frame``
     is the number that label files give the first picture, if it isn't that of their format; ``frames`` is the number of
@@ -62,7 +62,7 @@ class IngestOptions:
 
     @property
     def video_options(self) -> VideoOptions:
-        """How pictures are stored. Raises McaptrackError for options that contradict each other."""
+        """Options of storing pictures. Raises McaptrackError for options that contradict each other."""
         return VideoOptions(
             image_format=self.image_format,
             quality=self.quality,
@@ -82,14 +82,14 @@ class IngestOptions:
 
 @dataclass
 class IngestReport:
-    """The result of ``ingest``: messages by topic, remarks (``said``), details (``notes``), and what was lost.
+    """The result of ``ingest``: messages by topic, ``remarks``, details (``notes``), and what was lost.
 
     ``warnings`` report what was assumed, left out or looks unusual. ``has_labels``: there were label files.
     ``uses_camera``: topics below the camera's name were written.
     """
 
     messages: dict[str, int] = field(default_factory=dict)
-    said: list[str] = field(default_factory=list)
+    remarks: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     lost: list[str] = field(default_factory=list)
     warnings: list[Notice] = field(default_factory=list)
@@ -145,13 +145,13 @@ class IngestJob:
                 warn(f"{path} also holds {labels.left_out}; left out of {role}", "left-out")
             if labels.step > 1:
                 words = f"{path} has labels every {labels.step} frames, from {labels.labelled[0]} on"
-                self.report.said.append(f"{words}; the frames in between are left out")
+                self.report.remarks.append(f"{words}; the frames in between are left out")
             if role == "detections" and len(set(labels.class_id.tolist())) > 1:
                 ids, counts = np.unique(labels.class_id, return_counts=True)
                 names = [f" {labels.classes[number]}" if number in labels.classes else "" for number in ids.tolist()]
                 found = zip(ids.tolist(), names, counts.tolist(), strict=True)
                 words = ", ".join(f"{number}{name} ({count})" for number, name, count in found)
-                self.report.said.append(f"{path} has several classes; class_id is {words}")
+                self.report.remarks.append(f"{path} has several classes; class_id is {words}")
 
     def __enter__(self) -> Self:
         return self

@@ -155,8 +155,8 @@ class LabelJob(IngestJob):
         if self.there:
             self._check_existing(self.there, existing, fps)
             if self.options.start_ns is None:
-                said = self.there.metadata(CLOCK) or {}
-                self._start_ns = parse_ns(said.get("start_ns", "")) or 0
+                found = self.there.metadata(CLOCK) or {}
+                self._start_ns = parse_ns(found.get("start_ns", "")) or 0
         count, counted_by = self._count(known, existing)
         timeline = Timeline.spaced(count, fps, self._start_ns, f"the frames that {counted_by} counts")
         if self.there and any(part.index.counts for part in self.there.parts):
@@ -177,7 +177,7 @@ class LabelJob(IngestJob):
         if is_assumed:
             warn(f"{words}; `fps=` sets another rate", "clock")
         elif words:
-            self.report.said.append(words)
+            self.report.remarks.append(words)
 
     def _check_existing(self, there: log.Log, existing: Mapping[str, ExistingLabels], fps: Fraction) -> None:
         """Check that the labels of one camera have one frame rate."""
@@ -192,9 +192,9 @@ class LabelJob(IngestJob):
         """The number of frames, and the source of this number."""
         if self.options.frames is not None:
             return self.options.frames, "`frames=`"
-        said = {one.frames: one.of for one in known if one.frames}
-        if said:
-            return max(said), said[max(said)]
+        found = {one.frames: one.of for one in known if one.frames}
+        if found:
+            return max(found), found[max(found)]
         counts = [count_frames(path, labels) for path, labels in self.labels.values()]
         return max(*counts, *(label.frames for label in existing.values()), 1), "the last label"
 

@@ -206,13 +206,13 @@ class RecordingJob(IngestJob):
 
     def _compare(self) -> None:
         """Compare the messages read with the counts that the recording declares."""
-        for connection, said in (self._recorded.declared_counts or {}).items():
+        for connection, declared in (self._recorded.declared_counts or {}).items():
             count = self._written[self._channels[connection]]
-            if count < said and self.report.lost:
-                self.report.lost.append(f"{connection.topic}: {said - count} of {said} messages")
-            elif count != said:
+            if count < declared and self.report.lost:
+                self.report.lost.append(f"{connection.topic}: {declared - count} of {declared} messages")
+            elif count != declared:
                 raise McaptrackError(
-                    f"{self.source} does not add up: its index counts {said} messages of {connection.topic}, "
+                    f"{self.source} does not add up: its index counts {declared} messages of {connection.topic}, "
                     f"and {count} are there"
                 )
 

@@ -69,7 +69,7 @@ class SidecarChoice:
 
 
 def recording_of(opened: log.Log) -> str:
-    """How ROS tools see a log: "a ROS 2 recording"; "" if they don't read it."""
+    """The name of a log for ROS tools: "a ROS 2 recording"; "" if they don't read it."""
     for path in (opened.path, opened.real_path):
         metadata = path.with_name(METADATA)
         if _is_named(metadata, path.name):

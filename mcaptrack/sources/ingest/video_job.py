@@ -64,10 +64,10 @@ class VideoJob(IngestJob):
         if video.why_transcode:
             words |= {"encoded_again_because": video.why_transcode}
             words |= {"crf": keep.crf, "keyframe_interval_s": keep.key_every_s}
-            self.report.said.append(f"{video.path} is encoded again, as H.264: {video.why_transcode}")
+            self.report.remarks.append(f"{video.path} is encoded again, as H.264: {video.why_transcode}")
         elif video.format in _FOXGLOVE_ALONE:
             kept = f"{video.path} is kept as {_FOXGLOVE_ALONE[video.format]}, which Foxglove plays"
-            self.report.said.append(f"{kept} and Lichtblick does not (`image_format='h264'` is for both)")
+            self.report.remarks.append(f"{kept} and Lichtblick does not (`image_format='h264'` is for both)")
         elif video.format == "jpeg":
             words["quality"] = keep.jpeg_quality
         channel = writer.add_channel(
@@ -89,7 +89,7 @@ class VideoJob(IngestJob):
         if not times:
             raise McaptrackError(f"{video.path} is a video without frames")
         self.report.messages[self.pictures] = len(times)
-        self.report.said += video.notes
+        self.report.remarks += video.notes
         self.report.lost += video.lost
         of = f"the pictures of {video.path}"
         timeline = Timeline(np.array(numbers), np.array(times), of, not video.lost, video.every)

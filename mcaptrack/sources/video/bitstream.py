@@ -29,7 +29,7 @@ class AccessUnit(NamedTuple):
 
 
 class PictureHead(NamedTuple):
-    """What the first bytes of a message tell.
+    """The information in the first bytes of a message.
 
     Whether it has a picture, whether decoding can begin with it, given the parameter sets, and whether it has these.
     """

@@ -10,7 +10,7 @@ from mcaptrack.sources.video.bitstream import AccessUnit, PictureHead
 
 
 class Codec(NamedTuple):
-    """How the bytes of one codec are handled. ``name`` and ``decoder`` are FFmpeg's names of the codec and its decoder.
+    """The functions for the bytes of a codec. ``name`` and ``decoder`` are FFmpeg's names of it and of its decoder.
 
     ``annex_b`` is FFmpeg's bitstream filter from packets of a container to messages, "" where they are the same.
     ``read_head`` reads only the first bytes of a message.

@@ -46,7 +46,7 @@ _IN_MESSAGES: Final = {"x264-params": _X264["x264-params"] + ":repeat-headers=1:
 
 @dataclass(frozen=True, kw_only=True)
 class VideoOptions:
-    """How the pictures of a video are stored in a log.
+    """Options of storing the pictures of a video in a log.
 
     Parameters
     ----------

@@ -46,7 +46,7 @@ class Buffer(Protocol):
         """Some of the bytes."""
 
     def __len__(self) -> int:
-        """How many there are."""
+        """The number of bytes."""
 
 
 def max_pixels() -> int:

@@ -207,9 +207,9 @@ def _make_even(video: Video) -> None:
 
 def _length_s(opened: Any, stream: Any) -> Fraction | None:
     """The duration of the video stream that the container declares; None if it only declares that of all streams."""
-    said = re.fullmatch(r"(\d+):(\d\d):(\d\d(?:\.\d+)?)", stream.metadata.get("DURATION", ""))
-    if said:
-        return int(said[1]) * 3600 + int(said[2]) * 60 + Fraction(said[3])
+    declared = re.fullmatch(r"(\d+):(\d\d):(\d\d(?:\.\d+)?)", stream.metadata.get("DURATION", ""))
+    if declared:
+        return int(declared[1]) * 3600 + int(declared[2]) * 60 + Fraction(declared[3])
     return Fraction(opened.duration, 1_000_000) if opened.duration and len(opened.streams) == 1 else None
 
 

@@ -16,10 +16,10 @@ def inspect(data: bytes) -> AccessUnit:
     """Parse a packet: one frame, or a superframe of which one frame is shown."""
     pictures, is_key, size = 0, False, None
     for number, (start, end) in enumerate(_frames(data)):
-        shown, key, said = _header(data[start : min(end, start + _HEAD)])
+        shown, key, declared = _header(data[start : min(end, start + _HEAD)])
         pictures += shown
         is_key |= key and number == 0
-        size = said or size
+        size = declared or size
     return AccessUnit(pictures, is_key, size=size)
 
 

@@ -55,9 +55,9 @@ def current_file(contents: LogTables, folder: Path, name: str) -> Path | None:
     """The Parquet file of a table in a folder, if it is up to date."""
     path = folder.joinpath(name, f"recording={contents.recording}", "part-0.parquet")
     known = tables.file_metadata(path, "parquet") or {}
-    said = (known.get("recording"), known.get("table_version"), known.get("source"))
+    stored = (known.get("recording"), known.get("table_version"), known.get("source"))
     now = (file_name(contents.opened.path), tables.TABLE_VERSION)
-    return path if said[:2] == now and said[2] == contents.source(name) else None
+    return path if stored[:2] == now and stored[2] == contents.source(name) else None
 
 
 def export(

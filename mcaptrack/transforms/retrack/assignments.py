@@ -1,4 +1,4 @@
-"""Which sample was assigned to which track, collected while tracks run online. Letters: C assignments."""
+"""Assignments of samples to tracks, collected while tracks run online. Letters: C assignments."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from mcaptrack.schema import Rows
 
 @dataclass
 class Assignments:
-    """Which sample each track was assigned at which step. Samples are named by step and input id."""
+    """Assignments: each has a step, a track and a sample. Samples are named by step and input id."""
 
     _steps: list[Ints] = field(default_factory=list)
     _tracks: list[Ints] = field(default_factory=list)
@@ -42,7 +42,7 @@ class Assignments:
         return step[kept], track[kept], source[kept], row[kept]
 
     def _is_confirmed(self, step: Ints, track: Ints) -> Bools:
-        """Which assignments (C,) are not later than the last time that their track was confirmed."""
+        """Mask the assignments (C,) that are not later than the last confirmation of their track."""
         if not self._confirmed:
             return np.ones(len(step), bool)
         until = np.full(int(track.max(initial=0)) + 1, np.iinfo(np.int64).min)

@@ -88,7 +88,7 @@ class ConsistencyPass:
         return self._outputs
 
     def _match(self, step: int, xy_m: Floats, predictions: Forecast, sources: Ints) -> tuple[Indices, Indices]:
-        """Pairs of tracks and observations (line 4 of Algorithm 1)."""
+        """Data association: pairs of tracks and observations within the gates (line 4 of Algorithm 1)."""
         options, tracks = self._options, self._tracks
         age = step - tracks.last_step
         sigma_m = options.sigma_m if options.covariance == "paper" else None
@@ -106,7 +106,7 @@ class ConsistencyPass:
         return assign(cost, np.finfo(float).max)
 
     def _update(self, step: int, track: Indices, xy_m: Floats, sources: Ints) -> None:
-        """Lines 5 to 12: matched tracks are smoothed and predict again; the others age."""
+        """Lines 5 to 12: matched tracks are smoothed and predict again; the others age (coasting)."""
         tracks = self._tracks
         history = tracks[track].history
         history.append(self._holt, xy_m, step - tracks.last_step[track])
@@ -120,7 +120,7 @@ class ConsistencyPass:
         tracks.last_step[track], tracks.source[track] = step, sources
 
     def _start(self, step: int, past: Floats, valid: Bools, raw: Forecast, sources: Ints) -> None:
-        """Lines 13 to 15: unmatched observations start tracks, with their own (``raw``) or smoothed predictions."""
+        """Birth (lines 13 to 15): unmatched observations start tracks, with ``raw`` or smoothed predictions."""
         count = len(past)
         ids = np.arange(self._next_id, self._next_id + count)
         self._next_id += count

@@ -61,7 +61,7 @@ def prediction_distances(
 
 
 def expected_positions(tracks: Forecast, age: Ints) -> Floats:
-    """Where K tracks are expected ``age`` (K,) steps after their last prediction: (K, 2), NaN beyond its horizon."""
+    """The expected positions (K, 2) of tracks ``age`` (K,) steps after their prediction; NaN beyond its horizon."""
     horizon = tracks.mean.shape[1]
     now = tracks.mean[np.arange(len(age)), np.minimum(age, horizon) - 1]
     return np.where((age <= horizon)[:, None], now, np.nan)

@@ -36,7 +36,7 @@ def track_log_odds(model: MotionModel, trajectories: Trajectories, smoothed: Sta
 
 
 def features(model: MotionModel, trajectories: Trajectories, smoothed: State, step_s: float) -> Floats:
-    """What distinguishes people from false tracks, (K, F): see ``FEATURES``."""
+    """The features that distinguish people from false tracks, (K, F): see ``FEATURES``."""
     first, last = trajectories.first[:-1], trajectories.first[1:] - 1
     length = last - first + 1
     observed = np.isfinite(trajectories.xy_m[:, 0])

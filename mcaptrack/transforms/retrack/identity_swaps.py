@@ -19,7 +19,7 @@ from mcaptrack.geometry.neighbours import near_pairs
 from mcaptrack.geometry.ragged import group_index, run_ends, run_starts
 from mcaptrack.transforms.retrack.motion_model import MotionModel, Trajectories
 
-#: How much a relative velocity drifts within a second, in m/s: the most likely of these is taken for each encounter.
+#: Drifts of a relative velocity within a second, in m/s: the most likely of these is taken for each encounter.
 DRIFTS_M_PER_S: Final = (0.05, 0.15, 0.4)
 #: Two tracks nearer than this meet; an encounter lasts so many steps longer at both ends.
 _NEAR_M: Final = 2.0
@@ -28,7 +28,7 @@ _MARGIN: Final = 10
 #: there (and less for each that takes over the input id of the other).
 _SWAP_COST: Final = 5.0
 _SAME_ID_COST: Final = 2.0
-#: How much more likely (as a log likelihood) swaps have to be than none.
+#: The least gain in log likelihood of swaps over none.
 _MIN_GAIN: Final = 3.0
 
 
@@ -96,7 +96,7 @@ def find_encounters(trajectories: Trajectories) -> tuple[Ints, Ints, Ints, Ints]
 
 
 def _continuity(id_i: Ints, id_j: Ints) -> Floats:
-    """How many of two tracks (C, T) keep the input id they had before, minus how many take over that of the other."""
+    """The number of tracks (C, T) of an encounter that keep their input id, minus those that take over the other's."""
 
     def before(ids: Ints) -> Ints:
         at = np.maximum.accumulate(np.where(ids >= 0, np.arange(ids.shape[1]), 0), axis=1)

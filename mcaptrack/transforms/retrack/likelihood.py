@@ -61,7 +61,7 @@ class LikelihoodPass:
         return self._tracker.model.noise_m
 
     def step(self, frame: Frame) -> None:
-        """One step: associate, update, start and terminate tracks."""
+        """One step: association, update, birth and termination of tracks."""
         passed = 1
         if self._frames:
             passed = max(1, round((frame.t_ns - self._frames[-1].t_ns) * self._options.rate_hz / NS_PER_S))

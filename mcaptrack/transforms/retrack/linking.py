@@ -20,7 +20,7 @@ from mcaptrack.transforms.retrack.motion_model import MotionModel, State, Trajec
 
 #: Gate on the mean speed between the end of a tracklet and the beginning of the next.
 _MAX_SPEED_M_PER_S: Final = 2.5
-#: What a link is judged by, see ``features``.
+#: The features of a link, see ``features``.
 FEATURES: Final = ("miss", "misfit", "gap", "misfit or stay", "turn", "distance and speed", "misfit and speed")
 #: Weight of each feature as a log odds ratio; and the log odds without any, in logs where a share of
 #: ``_PRIOR`` of the best links is right (tools/choose_retrack.py).
@@ -84,7 +84,7 @@ def candidates(
 
 
 def _prior_shift(log_odds: Floats) -> float:
-    """What to add to the log odds of links (E,) because another share of them is right in this log than usual."""
+    """The shift of the log odds of links (E,), because another share of them is right in this log than usual."""
     shift = 0.0
     for _ in range(100):
         right = (1 / (1 + np.exp(-(log_odds + shift)))).sum()
@@ -108,7 +108,7 @@ def _components(i: Ints, j: Ints, count: int) -> list[Ints]:
 
 
 def features(model: MotionModel, before: State, after: State, gap_s: Floats) -> Floats:
-    """What distinguishes right links from wrong ones, (E, F): see ``FEATURES``.
+    """The features that distinguish right links from wrong ones, (E, F): see ``FEATURES``.
 
     ``before`` are the states at the beginning of each gap, filtered forward; ``after`` those at its end, filtered
     backward. The miss is the distance from one side to where the other, extrapolated at its own velocity, expects it

@@ -1,4 +1,4 @@
-"""How people move: constant velocity with random drift, measured with noise. Kalman filters for many tracks at once.
+"""The motion of people: constant velocity with drift, measured with noise. Kalman filters for many tracks at once.
 
 Both axes have the same covariance, so three numbers of it are enough for each track: the variance of the position, the
 covariance of position and velocity, and the variance of the velocity.

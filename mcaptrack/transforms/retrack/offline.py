@@ -23,7 +23,7 @@ from mcaptrack.transforms.retrack.linking import link_tracks
 from mcaptrack.transforms.retrack.motion_model import MotionModel, smooth, to_trajectories
 from mcaptrack.transforms.retrack.options import RetrackOptions
 
-#: How often encounters are examined again after identities were swapped.
+#: The number of times that encounters are examined again after identities were swapped.
 _ROUNDS: Final = 3
 
 

@@ -1,8 +1,9 @@
 """Online tracking by likelihood: data association step by step, from the past alone.
 
 Every track is a Kalman filter. An observation is assigned to the track that makes it likely, and the input's track ids
-count as evidence: much where a person walks alone, little in a crowd, where trackers confuse people. Tracks that are
-occluded stay alive while they are merged into one detection with another track.
+count as evidence: much where a person walks alone, little in a crowd, where trackers confuse people. A track without
+an observation is coasting: its filter predicts on until the track terminates. Tracks that are occluded stay alive while
+they are merged into one detection with another track.
 
 Letters: K tracks, N observations of one step.
 """
@@ -27,7 +28,7 @@ _MIN_RATE: Final = 0.01
 
 @dataclass(frozen=True, kw_only=True)
 class Association:
-    """What counts for and against pairs of tracks and observations, in squared standard deviations.
+    """The evidence for and against pairs of tracks and observations, in squared standard deviations.
 
     That is twice a log likelihood ratio. ``same_id`` and ``same_id_crowded`` count for a pair if the observation has
     the input id that the track had last: alone, and with another observation within ``crowd_m``. ``new_id`` counts
@@ -164,7 +165,7 @@ class OnlineTracker:
             self.model = replace(self.model, noise_m=float(np.clip(np.exp(log_noise), *NOISE_M)))
 
     def _gain(self, xy_m: Floats, source: Ints) -> Floats:
-        """What matching each pair gains (K, N); negative beyond the gate."""
+        """The gain of matching each pair (K, N); negative beyond the gate."""
         association = self.association
         if len(self.ids) == 0 or len(xy_m) == 0:
             return np.empty((len(self.ids), len(xy_m)))
@@ -186,7 +187,7 @@ class OnlineTracker:
         return np.where(squared <= association.gate, np.round(gain, 6), -1.0)
 
     def _start(self, xy_m: Floats, source: Ints) -> None:
-        """Start a track for each observation that was not matched."""
+        """Birth: start a track for each observation that was not matched."""
         count = len(xy_m)
         self.ids = np.concatenate([self.ids, np.arange(self.next_id, self.next_id + count)])
         self.next_id += count

@@ -27,7 +27,7 @@ _OFFLINE: Final = "With the whole log known (offline)"
 
 @dataclass(frozen=True, kw_only=True)
 class RetrackOptions:
-    """What the methods of re-tracking share: input, outputs, and the options of all that is done offline."""
+    """The options that the methods of re-tracking share: input, outputs, and all that is done offline."""
 
     predictor: PredictorName = option(
         "kalman",

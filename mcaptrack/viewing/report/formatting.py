@@ -28,7 +28,7 @@ def percent(value: float | None, digits: int = 1) -> str:
 
 
 def times(count: int) -> str:
-    """How often: once, twice, 3 times."""
+    """A number of times: once, twice, 3 times."""
     return {1: "once", 2: "twice"}.get(count, f"{number(count)} times")
 
 

@@ -75,7 +75,7 @@ class ChannelEvents:
     span_s: float
 
     def to_json(self) -> dict[str, Any]:
-        """The events as they stand in the report's data."""
+        """The events as JSON, for the report's data."""
         return {
             "topic": self.topic,
             "similarity": self.rule[0] if self.rule else None,

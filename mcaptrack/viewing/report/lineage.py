@@ -1,4 +1,4 @@
-"""How a log was made: the file itself, and the provenance of its channels."""
+"""The file itself, and the provenance of its channels."""
 
 from __future__ import annotations
 

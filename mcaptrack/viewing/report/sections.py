@@ -103,7 +103,7 @@ def forecasts(report: LogReport) -> dict[str, Any]:
     ]
     if with_covariance:
         return {"figures": [*figures, _calibration(with_covariance)], "missing": []}
-    why = "How well the ellipses are calibrated can't be said: the forecasts have no covariance."
+    why = "The calibration of the ellipses is not known: the forecasts have no covariance."
     return {"figures": figures, "missing": [why]}
 
 
@@ -169,7 +169,7 @@ def motion(report: LogReport) -> dict[str, Any]:
         note += " Metres are guessed from the size of people: the ground was not measured." if report.is_assumed else ""
         figures.append(_histogram(report, speeds, "Speed.", "speed, m/s", note, "m/s", "step", 2))
     elif report.track_sets:
-        missing.append("Speeds can't be said: positions on the ground are not known without a ground plane.")
+        missing.append("Speeds are not known: without a ground plane there are no positions on the ground.")
     if durations:
         note = "From the first row of a track to its last."
         figures.append(_histogram(report, durations, "Duration.", "duration of a track, s", note, "s", "track", 1))

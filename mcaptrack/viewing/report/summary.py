@@ -104,7 +104,7 @@ def _without_ground_truth(reports: Sequence[LogReport]) -> str:
             f"{counted(joined, 'gap or mix-up', 'gaps and mix-ups')} {'was' if joined == 1 else 'were'} repaired by "
             "joining"
         )
-    return f"{text}. How right they are can't be said without ground truth."
+    return f"{text}. Their accuracy is not known without ground truth."
 
 
 def _tiles(found: BeforeAfter) -> list[dict[str, str]]:

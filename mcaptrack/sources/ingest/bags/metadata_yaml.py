@@ -46,11 +46,11 @@ def read_metadata(path: Path) -> tuple[Bag, list[str]]:
     """Read a metadata.yaml; returns it and the files that it names. Raises McaptrackError if it is invalid."""
     text = _start(path)
     try:
-        said = Fields(plain_yaml.load(text), "it").map(_ROOT)
-        mode, compression = said.text("compression_mode", ""), said.text("compression_format", "")
-        topics = [_topic(Fields(entry, "a topic")) for entry in said.values("topics_with_message_count")]
-        names = [_name(entry) for entry in said.values("relative_file_paths")]
-        bag = Bag(text, said.text("ros_distro", ""), mode.lower() == "message", topics)
+        fields = Fields(plain_yaml.load(text), "it").map(_ROOT)
+        mode, compression = fields.text("compression_mode", ""), fields.text("compression_format", "")
+        topics = [_topic(Fields(entry, "a topic")) for entry in fields.values("topics_with_message_count")]
+        names = [_name(entry) for entry in fields.values("relative_file_paths")]
+        bag = Bag(text, fields.text("ros_distro", ""), mode.lower() == "message", topics)
     except UnsupportedYamlError as error:
         raise McaptrackError(f"{path} is not the metadata of a rosbag2 bag ({str(error)[:200]})") from None
     twice = next((name for name, times in Counter(names).items() if times > 1), "")

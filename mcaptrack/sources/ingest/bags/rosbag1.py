@@ -259,14 +259,14 @@ def _op(fields: Fields) -> int:
     return value[0]
 
 
-def _connection(fields: Fields, said: Mapping[bytes, bytes]) -> Connection:
-    """Parse a connection: ``fields`` is the header of the record, ``said`` the connection header of the publisher."""
+def _connection(fields: Fields, published: Mapping[bytes, bytes]) -> Connection:
+    """Parse a connection: ``fields`` is the header of the record, ``published`` that of the publisher."""
     topic = _text(fields.get(b"topic", b""))
-    if not topic or not said.get(b"type"):
+    if not topic or not published.get(b"type"):
         raise _InvalidRecord("a connection has no topic or no type")
-    schema = (_text(said.get(b"type", b"")), "ros1msg", _text(said.get(b"message_definition", b"")).encode())
+    schema = (_text(published.get(b"type", b"")), "ros1msg", _text(published.get(b"message_definition", b"")).encode())
     metadata = {
-        _text(name): _text(value) for name, value in said.items() if name not in (b"type", b"message_definition")
+        _text(name): _text(value) for name, value in published.items() if name not in (b"type", b"message_definition")
     }
     if "latching" in metadata:  # as the ros1 profile of the MCAP registry has it
         metadata["latching"] = "true" if metadata["latching"].strip() == "1" else "false"

@@ -227,10 +227,10 @@ class Databases(_Files):
         described: dict[int, Connection] = {}
         for key, *words in database.rows("topics", ["id", "name", "type", "serialization_format", *optional]):
             topic, kind, encoding, *more = map(_text, words)
-            said = dict(zip(optional, more, strict=True))
-            digest = said.get("type_description_hash", "")
+            given = dict(zip(optional, more, strict=True))
+            digest = given.get("type_description_hash", "")
             schema, defined_digest = definitions.get(kind) or (self._schema(kind, digest), "")
-            qos = said.get("offered_qos_profiles", "")
+            qos = given.get("offered_qos_profiles", "")
             metadata = {"offered_qos_profiles": qos, "topic_type_hash": digest or defined_digest}
             described[key] = Connection(topic, schema, encoding, metadata)
         counts = self._count(database, described)
@@ -270,8 +270,8 @@ class Databases(_Files):
         wanted += ["type_description_hash"] * ("type_description_hash" in has)
         rows = [[*map(_text, row), ""] for row in database.rows("message_definitions", wanted)]
         return {
-            kind: ((kind, encoding, text.encode()), said)
-            for kind, encoding, text, said, *_ in rows
+            kind: ((kind, encoding, text.encode()), given)
+            for kind, encoding, text, given, *_ in rows
             if encoding in ("ros2msg", "ros2idl") and (text or kind.endswith("/Empty"))
         }
 

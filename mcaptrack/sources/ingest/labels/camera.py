@@ -106,8 +106,8 @@ def timeline_of(opened: log.Log, topic: str) -> Timeline:
     index, every, of = np.arange(len(t_ns)), 1, f"the pictures of {topic}"
     made = Provenance.from_metadata(opened.channel(topic).metadata)
     if made:
-        said = made.parameters.get("every")
-        every = said if isinstance(said, int) and said > 0 else 1
+        given = made.parameters.get("every")
+        every = given if isinstance(given, int) and given > 0 else 1
         last = max(message.sequence for message in opened.messages(topic, int(t_ns[-1])))
         if last + 1 != len(t_ns):  # some pictures could not be read; the others keep their numbers
             index = np.array([message.sequence for message in opened.messages(topic)], np.int64)
@@ -156,8 +156,8 @@ def labels_of(opened: log.Log, prefix: str) -> dict[str, ExistingLabels]:
         made = Provenance.from_metadata(channel.metadata) if channel else None
         if channel and channel.messages and made and made.transform == "ingest":
             t_ns = opened.times(channel.topic)
-            said = made.parameters.get("fps")
-            fps = parse_fps(said) if isinstance(said, str) else None
+            given = made.parameters.get("fps")
+            fps = parse_fps(given) if isinstance(given, str) else None
             frames = 1 + max(message.sequence for message in opened.messages(channel.topic, int(t_ns[-1])))
             out[channel.topic] = ExistingLabels(t_ns, frames, fps)
     return out

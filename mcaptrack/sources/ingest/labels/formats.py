@@ -132,7 +132,7 @@ class _ClassNames:
         return self._numbers.setdefault(name, len(self._numbers))
 
     def are(self, numbers: Floats, name: str) -> Bools:
-        """Which entries of a column have this name (lower case)."""
+        """Mask the entries of a column that have this name (lower case)."""
         same = np.array([other.lower() == name for other in self._numbers], bool)
         return np.asarray(same[numbers.astype(int)], bool)
 
@@ -194,7 +194,7 @@ def read_mot(path: Path, lines: Lines, role: Role) -> Labels:
         return [*map(float, parts[:6]), *map(float, more), *[np.nan] * (2 - len(more))]
 
     table = NumberTable(path, lines, "MOTChallenge (frame, id, left, top, width, height, score, ...)", 8, parse)
-    frame, who = _frame(table, 0), table.whole(1, "the id", NO_ID)
+    frame, track_id = _frame(table, 0), table.whole(1, "the id", NO_ID)
     boxes, score, kind = _boxes(table, slice(2, 6)), _score(table, 6), table.values[:, 7]
     named = np.isfinite(kind)
     kept = np.ones(len(frame), bool)
@@ -224,7 +224,7 @@ def read_mot(path: Path, lines: Lines, role: Role) -> Labels:
         "mot",
         0 if (frame == 0).any() else 1,  # some programs number frames from 0 in this format, too
         frame[kept],
-        who[kept],
+        track_id[kept],
         boxes[kept],
         None,
         score[kept] if role != "truth" else np.full(int(kept.sum()), np.nan),
@@ -246,7 +246,7 @@ def read_kitti(path: Path, lines: Lines, role: Role) -> Labels:
 
     columns = "frame id type truncated occluded alpha left top right bottom height width length x y z rotation score"
     table = NumberTable(path, lines, f"KITTI tracking ({columns})", 10, parse)
-    frame, who = _frame(table, 0), table.whole(1, "the id", NO_ID)
+    frame, track_id = _frame(table, 0), table.whole(1, "the id", NO_ID)
     boxes, score, kind = _boxes(table, slice(4, 8), corners=True), _score(table, 8), table.values[:, 9]
     truncated, occluded = table.values[:, 2], table.values[:, 3]
     people, region = names.are(kind, "pedestrian"), names.are(kind, _KITTI_REGION)
@@ -270,7 +270,7 @@ def read_kitti(path: Path, lines: Lines, role: Role) -> Labels:
         "kitti",
         0,
         frame[kept],
-        who[kept],
+        track_id[kept],
         boxes[kept],
         None,
         score[kept],
@@ -292,7 +292,7 @@ def read_sdd(path: Path, lines: Lines, role: Role) -> Labels:
 
     columns = 'id xmin ymin xmax ymax frame lost occluded generated "label"'
     table = NumberTable(path, lines, f"Stanford Drone annotations ({columns})", 10, parse)
-    frame, who = _frame(table, 5), table.whole(0, "the id", 0)
+    frame, track_id = _frame(table, 5), table.whole(0, "the id", 0)
     boxes, kind = _boxes(table, slice(1, 5), corners=True), table.values[:, 9]
     lost = table.values[:, 6] != 0
     other = ~names.are(kind, "pedestrian") & (role != "detections")
@@ -307,7 +307,7 @@ def read_sdd(path: Path, lines: Lines, role: Role) -> Labels:
         "sdd",
         0,
         frame[kept],
-        who[kept],
+        track_id[kept],
         boxes[kept],
         None,
         np.full(int(kept.sum()), np.nan),
@@ -334,9 +334,9 @@ def _positions(path: Path, lines: Lines, name: Format, what: str, columns: int, 
         return [float(part) for part in parts]
 
     table = NumberTable(path, lines, what, columns, parse)
-    frame, who = _frame(table, 0), table.whole(1, "the id", 0)
+    frame, track_id = _frame(table, 0), table.whole(1, "the id", 0)
     xy_m, none = table.within(place, "a position", _MAX_PLACE), np.full(len(frame), np.nan)
-    return Labels(name, 0, frame, who, None, xy_m, none, np.unique(frame), _all_persons(len(frame)))
+    return Labels(name, 0, frame, track_id, None, xy_m, none, np.unique(frame), _all_persons(len(frame)))
 
 
 READERS: Final[Mapping[str, Callable[[Path, Lines, Role], Labels]]] = {

@@ -109,11 +109,11 @@ def _guess(path: Path, number: int, line: str) -> Format:
 def _refuse_repeated_ids(path: Path, labels: Labels) -> None:
     """Raise McaptrackError if an id appears twice in a frame."""
     order = np.lexsort((labels.id, labels.frame))
-    frame, who = labels.frame[order], labels.id[order]
-    repeats = np.flatnonzero((frame[1:] == frame[:-1]) & (who[1:] == who[:-1]))
+    frame, track_id = labels.frame[order], labels.id[order]
+    repeats = np.flatnonzero((frame[1:] == frame[:-1]) & (track_id[1:] == track_id[:-1]))
     if len(repeats):
         at = repeats[0]
-        raise McaptrackError(f"{path}: id {who[at]} appears twice in frame {frame[at]}")
+        raise McaptrackError(f"{path}: id {track_id[at]} appears twice in frame {frame[at]}")
 
 
 def read_homography(path: Path) -> tuple[float, ...]:
