@@ -33,7 +33,7 @@ def test_importing_is_light():
         mcaptrack.nonsense  # noqa: B018
 
 
-def test_tables_carry_the_name_of_the_log_as_reading_the_folder_does(tmp_path):
+def test_tables_have_the_name_of_the_log_as_exported_ones_do(tmp_path):
     with mcaptrack.open(str(some_log(tmp_path / "a.mcap"))) as opened:
         assert opened.tables == tuple(tables.TABLES)
         for name in opened.tables:
@@ -86,7 +86,7 @@ def test_pictures_are_decoded_with_their_times(tmp_path):
         assert grey.rows.shape == frames[0].rows.shape[:2]
 
 
-def test_pictures_at_times_are_those_shown_then(tmp_path):
+def test_pictures_at_given_times_are_those_shown_at_these_times(tmp_path):
     path, _ = clip_log(tmp_path)
     with mcaptrack.open(path) as opened:
         all_frames = list(opened.frames())
@@ -96,16 +96,16 @@ def test_pictures_at_times_are_those_shown_then(tmp_path):
         for frame in found:
             assert (frame.rows == all_frames[frame.index].rows).all()
         assert list(opened.frames(times=[])) == []
-        with pytest.raises(McaptrackError, match="has no picture at -5 ns yet"):
+        with pytest.raises(McaptrackError, match="has no picture at -5 ns"):
             opened.frames(times=[-5])
 
 
-def test_a_channel_without_pictures_is_said(tmp_path):
+def test_a_channel_without_pictures_is_refused(tmp_path):
     with mcaptrack.open(some_log(tmp_path / "a.mcap")) as opened, pytest.raises(McaptrackError, match="no pictures"):
         opened.frames("video")
 
 
-def test_every_message_is_fetched_from_where_the_table_says(tmp_path):
+def test_every_message_is_fetched_by_its_row_of_frames(tmp_path):
     path, _ = clip_log(tmp_path)
     with mcaptrack.open(path) as opened, log.read(path) as raw:
         pointers = opened.table("frames")
@@ -119,7 +119,7 @@ def test_every_message_is_fetched_from_where_the_table_says(tmp_path):
         assert opened.fetch(first).t_ns == first["t_ns"]
 
 
-def test_messages_outside_of_chunks_and_from_results_are_fetched_too(tmp_path):
+def test_messages_outside_chunks_and_in_results_are_fetched(tmp_path):
     from mcap.writer import Writer
 
     path = tmp_path / "loose.mcap"
@@ -144,7 +144,7 @@ def test_messages_outside_of_chunks_and_from_results_are_fetched_too(tmp_path):
         ]
 
 
-def test_pointers_into_a_log_that_has_changed_are_told(tmp_path):
+def test_rows_of_a_log_that_has_changed_are_refused(tmp_path):
     path = some_log(tmp_path / "a.mcap")
     with mcaptrack.open(path) as opened:
         rows = opened.table("frames").to_pylist()
@@ -174,7 +174,7 @@ def test_pointers_into_a_log_that_has_changed_are_told(tmp_path):
             opened.fetch({"t_ns": 5})
 
 
-def test_what_is_no_log_is_said_in_a_line(tmp_path):
+def test_a_file_that_is_not_a_log_is_refused_in_one_line(tmp_path):
     (tmp_path / "a.mcap").write_bytes(b"no log")
     with pytest.raises(mcaptrack.McaptrackError, match="can't be read as an MCAP file"):
         mcaptrack.open(tmp_path / "a.mcap")

@@ -49,7 +49,7 @@ def inputs(command: str, *names: str) -> list[str]:
 
 
 @pytest.mark.parametrize("command", sorted(SEVERAL - COMBINING))
-def test_a_broken_input_stops_no_other(command, folder):
+def test_a_broken_input_does_not_stop_the_others(command, folder):
     bad = ["missing.mcap"] if command == "check" else ["broken.mcap", "missing.mcap"]  # check tells what is broken
     *bad, good = inputs(command, *bad, "a.mcap")
     outcome = call(command, *bad, good, "--json")
@@ -65,7 +65,7 @@ def test_a_broken_input_stops_no_other(command, folder):
 
 
 @pytest.mark.parametrize("command", sorted(SEVERAL - COMBINING))
-def test_a_single_input_that_is_missing_is_one_line(command, folder):
+def test_a_missing_input_is_one_line(command, folder):
     outcome = call(command, "missing.mcap", "--json")
     assert (outcome.code, outcome.out) == (1, "")
     assert outcome.err.count("\n") == 1
@@ -73,7 +73,7 @@ def test_a_single_input_that_is_missing_is_one_line(command, folder):
 
 
 @pytest.mark.parametrize("command", sorted(COMBINING - {"train"}))  # which needs torch
-def test_what_is_made_of_all_inputs_is_not_made_of_some(command, folder):
+def test_a_command_that_combines_inputs_needs_all_of_them(command, folder):
     more = [] if command == "tune" else ["--json"]
     before = sorted(folder.rglob("*"))
     outcome = call(command, "a.mcap", "broken.mcap", *WORDS.get(command, []), "-o", "out.html", *more)
@@ -82,7 +82,7 @@ def test_what_is_made_of_all_inputs_is_not_made_of_some(command, folder):
     assert sorted(folder.rglob("*")) == before
 
 
-def test_what_all_can_not_be_written_to_is_refused_before_anything_is_done(folder):
+def test_one_output_for_several_inputs_is_refused_at_once(folder):
     before = {path: path.read_bytes() for path in folder.iterdir()}
     assert call("run", "a.mcap", "z.mcap", "-o", "b.mcap").code == 1
     assert {path: path.read_bytes() for path in folder.iterdir()} == before

@@ -41,8 +41,8 @@ class TestHelp:
         assert printed("--version")[0].strip() == f"mcaptrack {__version__}"
 
 
-class TestTheUsualWay:
-    def test_a_finished_log_has_its_companions(self, finished):
+class TestCommands:
+    def test_run_writes_layouts_and_tables_beside_the_log(self, finished):
         names = sorted(path.name for path in finished.parent.iterdir())
         assert names == [f"walk{end}" for end in (*LAYOUTS, ".mcap", ".predictions.layout.json", ".tables")]
         layout = json.loads((finished.parent / "walk.layout.json").read_text())
@@ -51,7 +51,7 @@ class TestTheUsualWay:
         assert shown["/camera/tracks/view/image"] == {"visible": False}
         assert shown["/camera/detections/view/image"] == {"visible": False}
 
-    def test_running_again_has_nothing_to_do(self, finished):
+    def test_a_second_run_changes_nothing(self, finished):
         before = finished.read_bytes()
         _, err = printed("run", finished)
         assert "nothing to do, everything is up to date" in err
@@ -67,15 +67,15 @@ class TestTheUsualWay:
         assert code == 1
         assert err == "mcaptrack: --new-score is an option of bytetrack, not of ocsort\n"
 
-    def test_a_stage_says_what_it_has_to_make_first(self, fresh):
+    def test_a_stage_runs_missing_inputs_and_says_so(self, fresh):
         _, err = printed("track", fresh)
         assert "/camera/detections is missing: running detect" in err
         assert f"{fresh}: detect, track" in err
 
-    def test_quiet_is_quiet(self, fresh):
+    def test_quiet_prints_nothing(self, fresh):
         assert printed("track", fresh, "-q") == ("", "")
 
-    def test_no_progress_goes_to_a_pipe(self, fresh):
+    def test_progress_is_not_written_to_a_pipe(self, fresh):
         _, err = printed("detect", fresh)
         assert "\x1b" not in err
         assert "\r" not in err
@@ -92,7 +92,7 @@ class TestTheUsualWay:
             "/camera/samples",
         ]
 
-    def test_info_as_data(self, finished):
+    def test_info_as_json(self, finished):
         data = json.loads(printed("info", finished, "--json")[0])
         assert data["schema_version"] == 1
         (result,) = data["results"]
@@ -117,13 +117,13 @@ class TestTheUsualWay:
         assert code == 1
         assert "2 inputs can't all be written to" in err
 
-    def test_stages_as_data(self, fresh):
+    def test_stages_as_json(self, fresh):
         out, _ = printed("track", fresh, "--json", "-q")
         (result,) = json.loads(out)["results"]
         assert result["stages"] == ["detect", "track"]
         assert result["frames"]["/camera/tracks"] == 60
 
-    def test_another_file_and_a_profile_and_a_mode(self, finished, tmp_path):
+    def test_output_profile_and_mode_of_retrack(self, finished, tmp_path):
         before = finished.read_bytes()
         printed(
             "retrack", finished, "--profile", "paper", "--sigma-m", "2", "--mode", "offline", "-o", tmp_path / "p.mcap"
@@ -136,12 +136,12 @@ class TestTheUsualWay:
 
 
 class TestEvaluate:
-    def test_a_table_for_people(self, finished):
+    def test_scores_as_a_table(self, finished):
         out, _ = printed("evaluate", finished)
         for words in ("IDF1", "IoU 0.5", "0.5 m", "2 m", "/camera/retracks/online", "forecasts of", "ADE m"):
             assert words in out
 
-    def test_data_for_programs(self, finished):
+    def test_scores_as_json(self, finished):
         rows = json.loads(printed("evaluate", finished, "--json")[0])["results"]
         keys = {
             "sequence",
@@ -192,7 +192,7 @@ class TestEvaluate:
         }
         assert wanted <= set(displaced[0]["displacement"])
 
-    def test_rows_for_a_spreadsheet(self, finished):
+    def test_scores_as_csv(self, finished):
         out, _ = printed("evaluate", finished, "--csv", "--similarity", "iou", "--topic", "/camera/tracks")
         (row,) = csv.DictReader(io.StringIO(out))
         assert (row["tracks"], row["similarity"]) == ("/camera/tracks", "iou")
@@ -209,7 +209,7 @@ class TestEvaluate:
         assert combined["/camera/samples"]["FN"] == 2 * single["/camera/samples"]["FN"]
         assert combined["/camera/samples"]["MOTA"] == pytest.approx(single["/camera/samples"]["MOTA"])
 
-    def test_label_files_without_a_log(self, footage):
+    def test_tracks_in_files_are_scored_without_a_log(self, footage):
         rows = json.loads(printed("evaluate", footage.ground_truth, "--truth", footage.ground_truth, "--json")[0])[
             "results"
         ]
@@ -225,14 +225,14 @@ class TestEvaluate:
         )
         assert [row["similarity"] for row in json.loads(out)["results"]] == ["iou", "metres", "metres", "metres"]
 
-    def test_results_can_go_to_a_file(self, finished, tmp_path):
+    def test_scores_are_written_to_a_file(self, finished, tmp_path):
         out, _ = printed("evaluate", finished, "--json", "-o", tmp_path / "scores.json")
         assert out == ""
         assert json.loads((tmp_path / "scores.json").read_text())["results"]
         code, _, err = call("info", finished, "-o", tmp_path / "scores.json")
         assert (code, "scores.json exists" in err) == (1, True)
 
-    def test_a_gate_that_is_missed_is_exit_4(self, finished):
+    def test_a_score_below_its_limit_exits_with_4(self, finished):
         code, _, err = call(
             "evaluate", finished, "--fail-under", "idf1=0.999", "--similarity", "metres", "--gate-m", "1", "-q"
         )
@@ -243,7 +243,7 @@ class TestEvaluate:
 
 
 class TestConfig:
-    def test_options_come_from_the_file_and_the_command_line_comes_first(self, fresh, tmp_path):
+    def test_the_command_line_overrides_options_of_the_file(self, fresh, tmp_path):
         (tmp_path / "mcaptrack.toml").write_text(
             '[track]\nmax-age-s = 2.5\nmin_iou = 0.4\n[detect]\ndetector = "mog2"\n'
         )
@@ -272,7 +272,7 @@ class TestConfig:
             ("track = 1\n", "track is a command; write its options below [track]"),
         ],
     )
-    def test_mistakes_in_the_file_are_named(self, tmp_path, text, words):
+    def test_errors_in_the_file_are_named(self, tmp_path, text, words):
         (tmp_path / "mcaptrack.toml").write_text(text)
         code, _, err = call("track", "x.mcap", folder=tmp_path)
         assert code == 2
@@ -291,7 +291,7 @@ def place(tmp_path_factory) -> Path:
     return folder
 
 
-class TestMistakes:
+class TestErrors:
     """One line, exit 1, nothing written, nothing lost."""
 
     CASES = {
@@ -347,7 +347,7 @@ class TestMistakes:
     }
 
     @pytest.mark.parametrize(("words", "said"), CASES.values(), ids=CASES)
-    def test_it_is_said_in_a_line(self, place, words, said):
+    def test_an_error_is_one_line(self, place, words, said):
         before = {path: path.read_bytes() for path in place.rglob("*") if path.is_file()}
         code, out, err = call(*words, folder=place)
         assert code == 1
@@ -357,7 +357,7 @@ class TestMistakes:
         assert out == ""
         assert {path: path.read_bytes() for path in place.rglob("*") if path.is_file()} == before
 
-    def test_wrong_words_are_exit_2(self, place):
+    def test_wrong_usage_exits_with_2(self, place):
         for words in (
             ["track"],
             ["track", "a.mcap", "--min-iou", "much"],
@@ -377,12 +377,12 @@ class TestMistakes:
             (["--max-age-frames", "2.5"], "invalid value for '--max-age-frames': '2.5' is not a whole number; `"),
         ],
     )
-    def test_wrong_options_are_said_with_what_is_meant(self, place, words, said):
+    def test_a_wrong_option_is_refused_with_the_nearest_one(self, place, words, said):
         code, out, err = call("track", "a.mcap", *words, folder=place)
         assert (code, out) == (2, "")
         assert err == f"mcaptrack: {said}mcaptrack track --help` lists the options\n"
 
-    def test_stages_that_cannot_run_are_not_announced(self, place):
+    def test_a_stage_that_cannot_run_is_not_announced(self, place):
         printed("ingest", "good.txt", "--as", "truth", "--fps", "10", "-o", place / "labels.mcap", folder=place)
         code, _, err = call("run", "labels.mcap", folder=place)
         (place / "labels.mcap").unlink()
@@ -390,12 +390,12 @@ class TestMistakes:
         assert err.count("\n") == 1
         assert "add pictures with `mcaptrack ingest VIDEO --into labels.mcap`" in err
 
-    def test_names_that_would_steer_the_terminal_are_made_harmless(self, place):
+    def test_control_characters_in_names_are_escaped(self, place):
         code, _, err = call("info", "\x1b[2Jevil.mcap", folder=place)
         assert code == 1
         assert "\x1b" not in err
 
-    def test_what_was_lost_is_exit_3(self, tmp_path):
+    def test_lost_data_exits_with_3(self, tmp_path):
         write_clip(tmp_path / "a.avi", frames=30, codec="mjpeg", pixels="yuvj420p", size=(320, 240))
         raw = (tmp_path / "a.avi").read_bytes()
         (tmp_path / "a.avi").write_bytes(raw[: len(raw) * 2 // 3])
@@ -404,14 +404,14 @@ class TestMistakes:
         assert "lost: a.avi claims 30 frames" in err
         assert (tmp_path / "a.mcap").is_file()
 
-    def test_whoever_stops_reading_gets_no_traceback(self, finished):
+    def test_a_closed_pipe_gives_no_traceback(self, finished):
         command = f"{sys.executable} -m mcaptrack evaluate {finished} --json | head -1"
         piped = subprocess.run(["bash", "-c", command], capture_output=True, text=True, check=False)
         assert "Traceback" not in piped.stderr
 
 
 @pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM], ids=["Ctrl-C", "kill"])
-def test_an_interruption_at_any_moment_leaves_the_old_log_or_the_new_one(fresh, finished, sent):
+def test_an_interrupted_command_leaves_the_old_log_or_the_new_one(fresh, finished, sent):
     before, after = fresh.read_bytes(), finished.read_bytes()
     started = time.monotonic()
     printed("run", fresh, "--no-tables", "-q")
@@ -432,7 +432,7 @@ def test_an_interruption_at_any_moment_leaves_the_old_log_or_the_new_one(fresh, 
 
 
 @pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM], ids=["Ctrl-C", "kill"])
-def test_an_interruption_is_not_lost_where_python_raises_nothing(sent):
+def test_an_interruption_ends_the_command_where_python_ignores_exceptions(sent):
     """The signal comes while the collector calls back, whose exceptions Python ignores."""
     code = (
         "import os, sys, time, types, weakref\n"
@@ -451,7 +451,7 @@ def test_an_interruption_is_not_lost_where_python_raises_nothing(sent):
 
 
 @pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM], ids=["Ctrl-C", "kill"])
-def test_an_interruption_that_a_library_turns_into_its_own_error_is_still_one(sent):
+def test_an_interruption_that_a_library_replaces_by_its_own_error_counts(sent):
     """As extension modules do when the signal comes while they are imported."""
     code = (
         "import os, sys, time, types\n"
@@ -519,7 +519,7 @@ def test_the_demonstration_proposes_commands_as_the_shell_finds_them(tmp_path, m
     assert _next_commands(Path("a.mcap"))[0] == f"{tmp_path}/.venv/bin/mcaptrack info a.mcap"
 
 
-def test_a_log_is_checked_and_what_is_wrong_stands_in_a_table(finished, tmp_path):
+def test_check_lists_findings_in_a_table(finished, tmp_path):
     out, err = printed("check", finished)
     assert out.startswith(f"{finished}: sound; ")
     assert "error" not in out + err
@@ -536,7 +536,7 @@ def test_a_log_is_checked_and_what_is_wrong_stands_in_a_table(finished, tmp_path
     assert {"level", "kind", "byte", "times", "words"} == set(result["findings"][0])
 
 
-def test_what_is_whole_is_recovered_and_what_is_lost_makes_the_exit_code_three(finished, tmp_path):
+def test_recover_saves_intact_chunks_and_exits_with_3_after_losses(finished, tmp_path):
     damaged = tmp_path / "bad.mcap"
     whole = finished.read_bytes()
     damaged.write_bytes(whole[: len(whole) * 2 // 3])
@@ -560,7 +560,7 @@ def test_what_is_whole_is_recovered_and_what_is_lost_makes_the_exit_code_three(f
     assert "nothing was lost" in err
 
 
-def test_events_follow_a_run_unless_they_are_not_wanted(fresh, finished):
+def test_run_writes_events_unless_told_not_to(fresh, finished):
     """A log with pictures: events and counts add up to what evaluate prints, by overlap."""
     scores = json.loads(printed("evaluate", finished, "--json", "--similarity", "iou", "--topic", "/camera/tracks")[0])
     (score,) = scores["results"]
@@ -578,7 +578,7 @@ def test_events_follow_a_run_unless_they_are_not_wanted(fresh, finished):
     assert result["events"]["/camera/tracks"]["birth"] == counts["born"][-1]
 
 
-def test_channels_are_dropped_with_their_views_and_nothing_else(finished, tmp_path):
+def test_drop_removes_a_channel_and_its_views_only(finished, tmp_path):
     before = json.loads(printed("info", finished, "--json")[0])["results"][0]["channels"]
     out, _ = printed("drop", finished, "/camera/retracks*", "/camera/video", "-o", tmp_path / "small.mcap", "--json")
     (result,) = json.loads(out)["results"]

@@ -128,7 +128,7 @@ KNOWN: dict[str, Seen] = {}
 
 
 @pytest.mark.parametrize(("command", "option"), [(name, option) for name, known in CASES.items() for option in known])
-def test_an_option_is_seen(command, option, see):
+def test_an_option_has_an_effect(command, option, see):
     case = CASES[command][option]
     if case.base not in KNOWN:
         KNOWN[case.base] = see(case.base)
@@ -166,7 +166,7 @@ ALSO = {
 
 
 @pytest.mark.parametrize(("command", "base"), [(name, base) for name, bases in ALSO.items() for base in bases])
-def test_an_option_that_does_nothing_is_said(command, base, see):
+def test_an_option_without_effect_is_a_warning(command, base, see):
     before, silent = see(base), []
     assert before.code == 0, before.err
     for option, case in CASES[command].items():

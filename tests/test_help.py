@@ -30,7 +30,7 @@ def shown(command: str) -> list[Any]:
 
 
 class TestHelp:
-    def test_commands_stand_under_a_few_headings(self):
+    def test_commands_are_grouped_below_a_few_headings(self):
         panels = Counter(command.rich_help_panel for command in COMMANDS.values())
         assert 3 <= len(panels) <= 6
         assert None not in panels
@@ -42,13 +42,13 @@ class TestHelp:
 
     @EVERY_COMMAND
     @pytest.mark.parametrize("width", ["80", "120"])
-    def test_names_of_options_are_whole_at_every_width(self, command, width, monkeypatch):
+    def test_names_of_options_are_not_cut_at_any_width(self, command, width, monkeypatch):
         monkeypatch.setenv("COLUMNS", width)
         words = set(call(command, "--help").out.split())
         assert {name for option in shown(command) for name in (*option.opts, *option.secondary_opts)} <= words
 
     @EVERY_COMMAND
-    def test_examples_are_commands_that_can_be_given(self, command):
+    def test_examples_are_valid_commands(self, command):
         examples = re.findall(r"^Example: mcaptrack (.+)$", COMMANDS[command].help, re.MULTILINE)
         assert examples
         for example in examples:
@@ -57,7 +57,7 @@ class TestHelp:
             COMMANDS[name].make_parser(COMMANDS[name].context_class(COMMANDS[name])).parse_args(words)
 
     @EVERY_COMMAND
-    def test_what_can_be_written_over_has_to_be_forced(self, command):
+    def test_commands_with_an_output_have_force(self, command):
         names = {name for option in shown(command) for name in option.opts}
         assert "--force" in names or "--output" not in names
 
@@ -69,13 +69,13 @@ class TestHelp:
             assert f"[default: ({default})]" in words
 
     @EVERY_COMMAND
-    def test_options_stand_under_headings_that_can_be_taken_in(self, command):
+    def test_options_are_grouped_below_headings(self, command):
         panels = [option.rich_help_panel for option in shown(command)]
         assert max(Counter(panels).values()) <= 9
         order = [LAST_PANELS.index(panel) + 1 if panel in LAST_PANELS else 0 for panel in panels]
         assert order == sorted(order)
 
-    def test_what_every_command_has_is_the_same_everywhere(self):
+    def test_common_options_are_the_same_in_all_commands(self):
         def common(command: str) -> list[tuple[list[str], str]]:
             return [(one.opts, one.help) for one in shown(command) if one.rich_help_panel == LAST_PANELS[-1]]
 
@@ -88,7 +88,7 @@ class TestHelp:
             ["--config"],
         ]
 
-    def test_short_names_mean_one_thing(self):
+    def test_a_short_name_means_the_same_in_all_commands(self):
         for command in COMMANDS:
             short = {name: one.name for one in shown(command) for name in one.opts if re.fullmatch("-[a-z]", name)}
             usual = {"-o": "output", "-q": "quiet", "-v": "verbose", "-f": "file"}
@@ -96,7 +96,7 @@ class TestHelp:
             assert ("-o" in short) == any(one.name == "output" for one in shown(command))
 
     @EVERY_COMMAND
-    def test_every_option_is_told_in_a_sentence_of_its_own(self, command):
+    def test_the_help_of_every_option_is_a_sentence(self, command):
         sentences = Counter(option.help for option in shown(command))
         assert sentences.most_common(1)[0][1] == 1
         for option in shown(command):
@@ -108,12 +108,12 @@ class TestHelp:
         assert len(COMMANDS[command].help) > 40
 
     @EVERY_COMMAND
-    def test_units_in_names_are_said_in_words(self, command):
+    def test_the_help_spells_out_units_in_names(self, command):
         for option in shown(command):
             unit = max(option.opts, key=len).rpartition("-")[2]
             assert UNITS.get(unit, "") in option.help.lower(), option.name
 
-    def test_what_means_the_same_has_the_same_name_everywhere(self):
+    def test_options_of_the_same_meaning_have_the_same_name(self):
         names = defaultdict(set)
         for command in COMMANDS:
             for option in shown(command):
@@ -132,13 +132,13 @@ class TestWrongUsage:
         return err
 
     @EVERY_COMMAND
-    def test_an_option_that_is_not_there(self, command):
+    def test_an_unknown_option_is_refused(self, command):
         words = self.refused(command, "a", "--verbos")
         assert "--verbose" in words
         assert f"`mcaptrack {command} --help`" in words
 
     @EVERY_COMMAND
-    def test_a_value_of_another_kind_and_a_value_that_is_missing(self, command):
+    def test_a_wrong_and_a_missing_value_are_refused(self, command):
         for setting in COMMANDS[command].settings.values():
             if setting.kind in (int, float):
                 assert f"--{setting.name}" in self.refused(command, "a", f"--{setting.name}", "two")
@@ -146,12 +146,12 @@ class TestWrongUsage:
                 assert f"--{setting.name}" in self.refused(command, "a", f"--{setting.name}")
 
     @EVERY_COMMAND
-    def test_an_argument_that_is_missing(self, command):
+    def test_a_missing_argument_is_refused(self, command):
         needed = [one for one in COMMANDS[command].params if one.param_type_name == "argument" and one.required]
         if needed:
             assert str(needed[0].metavar) in self.refused(command)
 
-    def test_a_command_or_an_option_before_it_that_is_not_there(self):
+    def test_an_unknown_command_and_an_unknown_option_before_it_are_refused(self):
         assert "'evaluate'? `mcaptrack --help` lists" in self.refused("evaluat", "a.mcap")
         assert "--versio" in self.refused("--versio")
 
@@ -202,13 +202,13 @@ class TestPage:
     def test_the_page_lists_all_parameters_of_stages_and_all_numbers(self, tool):
         assert tool.with_options(PAGE) == PAGE, "run tools/options_doc.py"
 
-    def test_the_page_lists_the_variables_that_are_no_options(self):
+    def test_the_page_lists_environment_variables_that_are_not_options(self):
         listed = re.findall(r"^\| `(MCAPTRACK_\w+)` \| (.+) \|$", PAGE, re.MULTILINE)
         assert dict(listed) == dict(environment.VARIABLES)
 
     @pytest.mark.parametrize("way", ["command line", "environment", "file"])
     @pytest.mark.parametrize("case", BOUNDED, ids=lambda case: "-".join([case.command, *case.chosen[1:], case.name]))
-    def test_a_bound_is_taken_and_what_lies_beyond_is_not(self, case, way, tmp_path, monkeypatch):
+    def test_a_number_at_the_bound_is_accepted_and_one_beyond_it_refused(self, case, way, tmp_path, monkeypatch):
         monkeypatch.chdir(tmp_path)
         for bound, sign in ((case.least, -1), (case.most, 1)):
             if math.isinf(bound):
@@ -234,7 +234,7 @@ class TestPage:
                 assert err.count("\n") == 1
 
     @EVERY_COMMAND
-    def test_what_is_no_number_is_taken_for_none(self, command):
+    def test_nan_is_refused(self, command):
         for setting in COMMANDS[command].settings.values():
             if setting.kind is float and not setting.parameter.startswith("old_"):
                 chosen = next((case.chosen for case in BOUNDED if case[::2][:2] == (command, setting.name)), ())
@@ -242,7 +242,7 @@ class TestPage:
                 _, _, err = call(*words)
                 assert err.startswith(f"mcaptrack: --{setting.name} has to be "), err
 
-    def test_numbers_of_all_commands_have_two_ends(self):
+    def test_all_numbers_have_a_lower_and_an_upper_bound(self):
         bounded = {(one.command, one.name) for one in BOUNDED if math.isfinite(one.least) and math.isfinite(one.most)}
         numbers = {
             (command, setting.name)

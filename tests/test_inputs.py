@@ -46,7 +46,7 @@ def words_with(name: str, parameter: Any, value: str) -> list[str]:
 
 @pytest.mark.parametrize(("name", "parameter"), PATHS, ids=[f"{name} {p.name}" for name, p in PATHS])
 @pytest.mark.parametrize("url", ["s3://bucket/a.mcap", "https://example.org/a/b?c=d", "gs://b/*.mcap"])
-def test_a_url_is_named_as_one(tmp_path, monkeypatch, name, parameter, url):
+def test_a_url_is_refused_as_a_url(tmp_path, monkeypatch, name, parameter, url):
     monkeypatch.chdir(tmp_path)
     Path("a.txt").write_text("1,1,1,1,2,2\n")
     result = CliRunner().invoke(app, words_with(name, parameter, url))
@@ -58,12 +58,12 @@ def test_a_url_is_named_as_one(tmp_path, monkeypatch, name, parameter, url):
     assert os.listdir() == ["a.txt"]
 
 
-def test_the_paths_of_all_commands_are_tried():
+def test_paths_of_all_commands_have_a_test():
     assert {name for name, _ in PATHS} == set(COMMANDS)
 
 
 @pytest.mark.parametrize("name", ["a.mcap", "C:/a", "12:30.mp4", "a b://c", "://x", "/s3:/x"])
-def test_a_path_is_no_url(name):
+def test_a_path_is_not_taken_for_a_url(name):
     refuse_url(name)
 
 
@@ -89,7 +89,7 @@ PIPES = [
 ]
 
 
-def test_a_pipe_is_no_file(tmp_path):
+def test_a_pipe_is_refused(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "a.txt").write_text("1,1,1,1,2,2\n")
     known = {(name, parameter.name): parameter for name, parameter in PATHS}

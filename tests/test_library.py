@@ -124,11 +124,11 @@ class TestTheSameAsTheCommandLine:
         again = mcaptrack.run("b.mcap")
         assert (again.stages, again.written_to) == ((), None)
 
-    def test_scores_are_those_that_the_command_prints(self, place):
+    def test_evaluate_returns_the_scores_that_the_command_prints(self, place):
         said = json.loads(done("evaluate", "log.mcap", "--json").out)["results"]
         assert json.loads(json.dumps(mcaptrack.evaluate("log.mcap").rows())) == said
 
-    def test_info_is_what_the_command_prints(self, place):
+    def test_info_returns_what_the_command_prints(self, place):
         said = json.loads(done("info", "log.mcap", "--json").out)["results"]
         assert [mcaptrack.info("log.mcap").to_json()] == said
 
@@ -158,7 +158,7 @@ class TestTheSameAsTheCommandLine:
 
 
 class TestResults:
-    def test_nothing_is_printed_and_progress_is_told(self, place, capfd):
+    def test_nothing_is_printed_and_progress_is_called(self, place, capfd):
         told = []
         result = mcaptrack.track("log.mcap", tracker="ocsort", output="b.mcap", progress=lambda *now: told.append(now))
         assert told[-1] == ("track", 30, 30)
@@ -195,7 +195,7 @@ class TestResults:
         with pytest.raises(McaptrackError, match="2 results fit retracks"):
             scores.score("IDF1", "retracks")
 
-    def test_what_is_below_a_limit_is_told(self, place):
+    def test_scores_below_a_limit_are_listed(self, place):
         scores = mcaptrack.evaluate("log.mcap", similarity="metres", gate_m=1.0)
         assert scores.below({"IDF1": 0.0}) == []
         assert len(scores.below({"IDF1": 1.1})) == len(scores.rows())
@@ -212,9 +212,9 @@ class TestRefused:
             "a tracker that is not there": (lambda: mcaptrack.track("log.mcap", tracker="dart"), "dart"),
             "a name that is no log's": (
                 lambda: mcaptrack.ingest("video.mp4", "out.mp4"),
-                "out.mp4 is no name for a log: logs are MCAP files; give a name that ends with .mcap",
+                "out.mp4 is not a name for a log: logs are MCAP files; give a name that ends with .mcap",
             ),
-            "standard output": (lambda: mcaptrack.ingest("video.mp4", "-"), "- is not a file here"),
+            "standard output": (lambda: mcaptrack.ingest("video.mp4", "-"), "- is not a file: pipes"),
             "two places": (
                 lambda: mcaptrack.track("log.mcap", output="b.mcap", sidecar=True),
                 "`sidecar=True` and `output=` are two places",
@@ -236,7 +236,7 @@ class TestRefused:
             "frames per second": (lambda: mcaptrack.ingest("video.mp4", "b.mcap", fps=0), "`fps=` needs a number"),
         }.values(),
     )
-    def test_in_one_line_that_names_parameters(self, place, work, words):
+    def test_errors_are_one_line_that_names_parameters(self, place, work, words):
         before = {path: path.read_bytes() for path in place.iterdir() if path.is_file()}
         with pytest.raises(McaptrackError) as refused:
             work()
@@ -245,14 +245,14 @@ class TestRefused:
         assert {path: path.read_bytes() for path in place.iterdir() if path.is_file()} == before
 
     @pytest.mark.parametrize("words", ["ingest video.mp4 -o out.mp4", "ingest video.mp4 -o -", "track log.mcap -o -"])
-    def test_the_command_line_refuses_names_that_are_no_logs(self, place, words):
+    def test_the_command_line_refuses_outputs_that_are_not_mcap(self, place, words):
         outcome = call(*words.split())
         assert (outcome.code, outcome.err.count("\n")) == (1, 1)
         assert not Path("-").exists()
         assert not Path("out.mp4").exists()
 
 
-class TestWordsOfTheCommandLine:
+class TestMessagesOfTheCommandLine:
     """The library names parameters and functions; the command line shows options and commands."""
 
     def test_parameters_become_options(self):
@@ -275,7 +275,7 @@ class TestWordsOfTheCommandLine:
             path = f"./{name}" if name.startswith("-") else name
             assert shlex.split(line[1:-1]) == ["mcaptrack", "run", path, "--topic", "/a b", "--force"]
 
-    def test_a_call_can_be_given_as_it_stands(self, place):
+    def test_a_proposed_call_is_valid_python(self, place):
         shutil.copy("log.mcap", "it's`.mcap")
         names = {"mcaptrack": mcaptrack}
         assert eval(proposed("info", Path("it's`.mcap")).strip("`"), names).messages > 0
@@ -333,7 +333,7 @@ class TestDocumentation:
             assert sections[-1] == "Examples"
 
     @pytest.mark.parametrize("name", CLASSES)
-    def test_classes_say_what_their_attributes_are(self, name):
+    def test_classes_document_their_attributes(self, name):
         cls = getattr(mcaptrack, name)
         text = inspect.getdoc(cls)
         assert text
@@ -373,16 +373,16 @@ class TestDocumentation:
             assert all(runner.run(test).failed == 0 for test in tests)
 
 
-class TestSurprises:
+class TestNothingIsSilent:
     """What was once done without a word is refused or said."""
 
-    def test_a_camera_that_is_not_there_is_refused(self, place):
+    def test_an_unknown_camera_is_refused(self, place):
         before = Path("log.mcap").read_bytes()
         outcome = call("run", "log.mcap", "--camera", "camra")
         assert (outcome.code, outcome.err) == (1, "mcaptrack: log.mcap has no camera camra; it has camera\n")
         assert Path("log.mcap").read_bytes() == before
 
-    def test_predictions_at_the_rate_of_the_video_are_said(self, place):
+    def test_predictions_at_the_rate_of_the_video_are_a_warning(self, place):
         said = mcaptrack.predict("log.mcap", topic="/camera/tracks", to="/camera/p").warnings
         assert [(one.code, one.message.partition(",")[0]) for one in said] == [
             ("clock", "/camera/tracks has 10 frames a second")

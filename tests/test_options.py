@@ -123,7 +123,7 @@ def test_every_parameter_of_a_stage_arrives_in_the_provenance(stage, way, folder
 
 
 @pytest.mark.parametrize("stage", STAGES, ids=lambda stage: "-".join([stage.command, *dict(stage.chosen).values()]))
-def test_the_default_can_be_said_and_changes_nothing(stage, folder):
+def test_giving_the_default_changes_nothing(stage, folder):
     """Also ``--smooth`` where it is on and ``--no-confirm`` where it is off."""
     values = {name: value for name, value in stage.parameters().items() if value is not None}
     code, _, err = call(stage.command, "a.mcap", "-o", "b.mcap", *flags(dict(stage.chosen) | values))
@@ -152,7 +152,7 @@ def test_parameters_reach_the_stages_that_run_makes(stage, way, folder, monkeypa
     assert "other-settings" not in [one["code"] for one in after]
 
 
-def test_everything_made_again_is_what_was_there(folder):
+def test_a_forced_run_makes_the_same_channels(folder):
     """With the parameters that each channel had, also where they are not the defaults."""
     done("track", "a.mcap", "--tracker", "ocsort", "--max-age-s", 3)
     done("events", "a.mcap", "--similarity", "metres", "--gate-m", 0.5)

@@ -71,7 +71,7 @@ class TestEvaluate:
         "in 95 %": "coverage_95",
     }
 
-    def test_scores_stand_in_the_table_group_by_group(self, scored):
+    def test_the_table_groups_scores_by_similarity_and_gate(self, scored):
         first, results, text, _ = scored
         (head, rows), *_ = tables(text)
         assert head == [*first, *self.HEAD]
@@ -90,7 +90,7 @@ class TestEvaluate:
         assert rows == wanted
         assert len({row[0] for row in wanted if row}) > 1
 
-    def test_forecasts_stand_in_a_table_of_their_own_once_for_each_channel(self, scored):
+    def test_predictions_have_a_table_with_a_row_for_each_channel(self, scored):
         first, results, text, _ = scored
         _, (head, rows) = tables(text)
         assert head == [*first, "forecasts of", *self.FORECASTS]
@@ -105,19 +105,19 @@ class TestEvaluate:
         ]
         assert rows
 
-    def test_numbers_end_below_each_other(self, scored):
+    def test_numbers_are_aligned_right(self, scored):
         _, _, text, _ = scored
         for part in re.split(r"\n\n(?=\S+(?: \S+)*  +\S)", text.rstrip("\n")):
             lines = [line.rstrip() for line in part.split("\n") if line.strip()]
             assert len({len(line) for line in lines}) == 1
 
-    def test_rows_for_spreadsheets_have_all_but_what_is_no_number(self, scored):
+    def test_csv_has_the_values_of_the_json(self, scored):
         _, results, _, text = scored
         rows = list(csv.DictReader(io.StringIO(text)))
         plain = [{key: value for key, value in one.items() if key != "displacement"} for one in results]
         assert rows == [{key: "" if value is None else str(value) for key, value in one.items()} for one in plain]
 
-    def test_a_score_at_the_limit_is_not_under_it(self, finished):
+    def test_a_score_at_the_limit_passes(self, finished):
         asked = ["evaluate", finished, "--similarity", "iou", "--topic", "/camera/tracks"]
         (one,) = data(*asked)
         assert 0.05 < one["MOTA"] < 1
@@ -128,7 +128,7 @@ class TestEvaluate:
             f"walk /camera/tracks iou 0.5: MOTA {one['MOTA']:.4f} is under {one['MOTA'] + 1e-4:g}"
         ]
 
-    def test_of_several_logs_all_together_have_to_reach_the_limit(self, twice):
+    def test_the_limit_is_for_several_logs_together(self, twice):
         asked = ["evaluate", *twice, "--similarity", "metres", "--gate-m", "1"]
         missed = call(*asked, "--fail-under", "idf1=1.5")
         together = [one for one in data(*asked) if one["sequence"] == "COMBINED"]
@@ -151,7 +151,7 @@ class TestInfo:
             assert rest[len(channels)] == "lineage"
             assert len({len(line) for line in [head, *rest[: len(channels)]]}) == 1  # numbers end below each other
 
-    def test_what_it_says_is_what_the_log_holds(self, twice):
+    def test_info_agrees_with_the_log(self, twice):
         for path in twice:
             (one,) = data("info", path)
             with log.read(path) as opened:
@@ -168,7 +168,7 @@ class TestInfo:
             recorded = [c for c in one["channels"] if c["transform"] is None]
             assert all(c["input"] is c["version"] is c["parameters"] is c["references"] is None for c in recorded)
 
-    def test_each_channel_hangs_once_below_what_it_was_made_from(self, twice):
+    def test_each_channel_is_once_in_the_tree_below_its_input(self, twice):
         for path in twice:
             (one,) = data("info", path)
             channels = {c["topic"]: c for c in one["channels"]}
@@ -192,7 +192,7 @@ class TestInfo:
             assert sorted(seen) == sorted(topic for topic, c in channels.items() if c["transform"] != "view")
             assert any(channels[topic]["stale"] for topic in seen) == (path == twice[1])
 
-    def test_the_parameters_are_only_shown_to_who_asks(self, finished):
+    def test_parameters_are_shown_with_verbose_only(self, finished):
         brief, full = (done("info", finished, *more).out.splitlines() for more in ([], ["-v"]))
         assert [line for line in full if "=" not in line] == brief
         assert len(full) > len(brief)
@@ -218,7 +218,7 @@ class TestChecked:
         path.write_bytes(raw)
         return path
 
-    def test_what_is_wrong_stands_in_a_table(self, finished, bad, odd):
+    def test_findings_are_listed_in_a_table(self, finished, bad, odd):
         for logs in ([finished, bad], [bad, odd, finished]):
             outcome = call("check", *logs)
             results = json.loads(call("check", *logs, "--json").out)["results"]
@@ -237,14 +237,14 @@ class TestChecked:
             assert not lines
         assert {f["level"] for one in results for f in one["findings"]} == {"error", "warning"}
 
-    def test_quietly_only_errors_are_said(self, finished, odd):
+    def test_quiet_prints_errors_only(self, finished, odd):
         assert done("check", finished, "-q").out == ""
         (one,) = json.loads(call("check", odd, "--json").out)["results"]
         lines = call("check", odd, "-q").out.splitlines()
         errors = [f for f in one["findings"] if f["level"] == "error"]
         assert len(lines) == 1 + len(errors) < 1 + len(one["findings"])
 
-    def test_what_was_saved_and_lost_is_said_as_it_stands_in_the_data(self, bad, tmp_path):
+    def test_text_and_json_agree_on_what_was_saved_and_lost(self, bad, tmp_path):
         outcome = call("recover", bad, "-o", tmp_path / "b.mcap")
         (one,) = json.loads(call("recover", bad, "-o", tmp_path / "c.mcap", "--json", "-q").out)["results"]
         assert outcome.code == 3
@@ -257,7 +257,7 @@ class TestChecked:
         with log.read(tmp_path / "c.mcap") as opened:
             assert sum(channel.messages for channel in opened.channels.values()) == one["messages"] > 0
 
-    def test_of_many_losses_twenty_are_said(self, finished, tmp_path, monkeypatch):
+    def test_the_first_twenty_losses_are_printed(self, finished, tmp_path, monkeypatch):
         from mcaptrack.log import recover as real
 
         lost = [f"thing {number}" for number in range(22)]
@@ -268,7 +268,7 @@ class TestChecked:
             wanted = [f"lost: thing {number}" for number in range(said)]
             assert lines == wanted + (["lost: 2 more; -v shows them"] if said < count else [])
 
-    def test_what_is_dropped_is_counted(self, finished, tmp_path):
+    def test_drop_counts_messages_and_bytes(self, finished, tmp_path):
         with log.read(finished) as opened:
             gone = {t: c.messages for t, c in opened.channels.items() if t.startswith("/camera/retracks/online")}
         target = tmp_path / "b.mcap"
@@ -283,7 +283,7 @@ class TestChecked:
 
 
 class TestRun:
-    def test_what_a_stage_made_is_said_channel_by_channel(self, fresh):
+    def test_a_stage_prints_a_line_for_each_channel(self, fresh):
         copy = fresh.with_name("copy.mcap")
         shutil.copyfile(fresh, copy)
         (one,) = data("track", fresh, "-q")
@@ -305,7 +305,7 @@ class TestRun:
         assert (one["log"], one["written_to"]) == (str(fresh), str(fresh))
         assert len({line.index(line.split()[1]) for line in lines if line.startswith("  ")}) == 1
 
-    def test_the_summary_of_a_run_says_what_the_log_holds(self, finished, tmp_path):
+    def test_the_summary_of_a_run_agrees_with_the_log(self, finished, tmp_path):
         path = tmp_path / "walk.mcap"
         shutil.copyfile(finished, path)
         (one,) = data("run", path, "-q")
@@ -321,7 +321,7 @@ class TestRun:
         for key, value in found["repair"].items():
             assert re.search(rf"(?<![\d,]){value:,}(?![\d,])", stated["re-tracked"]), key
 
-    def test_happenings_are_counted_kind_by_kind(self, finished, tmp_path):
+    def test_events_are_counted_by_kind(self, finished, tmp_path):
         path = tmp_path / "walk.mcap"
         shutil.copyfile(finished, path)
         outcome = done("events", path)
@@ -344,7 +344,7 @@ class TestRun:
         assert (one["written"], one["log"], one["folder"]) == ([], str(finished), str(folder))
 
 
-def test_the_search_for_settings_says_what_it_found(finished, tmp_path):
+def test_tune_prints_scores_and_settings(finished, tmp_path):
     words = [
         "tune",
         finished,
@@ -372,7 +372,7 @@ def test_the_search_for_settings_says_what_it_found(finished, tmp_path):
 
 
 @pytest.mark.parametrize("command", sorted(PRINTING))
-def test_a_file_gets_what_is_printed_otherwise(command, finished, tmp_path):
+def test_output_writes_what_would_be_printed(command, finished, tmp_path):
     for more in ([], ["--json"]):
         words = [command, finished, *PRINTING[command], *more]
         printed = done(*words)
@@ -389,7 +389,7 @@ def test_a_file_gets_what_is_printed_otherwise(command, finished, tmp_path):
 
 
 @pytest.mark.parametrize("command", sorted(GROUP.commands))
-def test_nothing_is_forced_hushed_or_printed_as_data_unless_asked_for(command):
+def test_switches_are_off_by_default(command):
     flags = {p.name: p.default for p in GROUP.commands[command].params if p.param_type_name == "option" and p.is_flag}
     off = {"force", "json", "quiet", "verbose", "csv", "gif", "tables", "blobs", "in_place", "open_"} & flags.keys()
     assert {name: flags[name] for name in off} == dict.fromkeys(off, False) | (
@@ -416,7 +416,7 @@ def test_nothing_is_forced_hushed_or_printed_as_data_unless_asked_for(command):
         ("noon", None),
     ],
 )
-def test_a_log_starts_when_it_is_told_to(text, wanted, tmp_path, monkeypatch):
+def test_start_time_sets_the_first_timestamp(text, wanted, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "clip.txt").write_text("1,1,1,1,2,2\n3,1,1,1,2,2\n")
     outcome = call("ingest", "clip.txt", "--fps", "10", f"--start-time={text}")
@@ -437,7 +437,7 @@ class Terminal(io.StringIO):
         return True
 
 
-def test_progress_is_shown_on_a_terminal_and_nowhere_else(monkeypatch):
+def test_progress_is_shown_on_a_terminal_only(monkeypatch):
     from mcaptrack.cli.common import Talk
 
     now = iter(0.06 * n for n in range(1000))

@@ -241,7 +241,7 @@ def words_of(line: str) -> list[str]:
 
 
 @pytest.mark.parametrize("where", SCENES)
-def test_what_is_proposed_works(where, template, tmp_path, monkeypatch):
+def test_a_proposed_command_works(where, template, tmp_path, monkeypatch):
     if where.startswith("cli/train"):
         pytest.importorskip("torch", reason="training needs torch")
     monkeypatch.chdir(tmp_path)
@@ -270,7 +270,7 @@ def test_what_is_proposed_works(where, template, tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     "name", ["a.mcap", "a b.mcap", "it's.mcap", "-o.mcap", "$(rm -r).mcap", 'say "a".mcap', "line\nend\t.mcap", "naïve.mcap", "a*?[b].mcap", "back\\slash.mcap", "~.mcap", "#.mcap", "--help"]
 )  # fmt: skip
-def test_a_shell_reads_what_was_meant(name):
+def test_a_shell_parses_a_proposed_command_as_intended(name):
     line = command("run", Path(name), "--topic", "/a b")
     assert (line[0], line[-1], "\n" in line) == ("`", "`", False)
     assert words_of(line.strip("`")) == [

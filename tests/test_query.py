@@ -95,7 +95,7 @@ def square(tmp_path_factory) -> Path:
 
 
 @pytest.mark.parametrize(("query", "answer"), SURE, ids=[f"query{n}" for n in range(len(SURE))])
-def test_the_queries_of_the_page_give_its_answers(square, query, answer):
+def test_queries_of_the_page_give_its_answers(square, query, answer):
     with Database([square / "demo.mcap"]) as database:
         agree(rows_of(database.ask(query)), parsed(answer))
 
@@ -128,7 +128,7 @@ def answer_to(*words):
     return parsed(found)[1]
 
 
-def test_the_answers_of_the_page_are_true():
+def test_answers_of_the_page_are_correct():
     walkers = {walker.id: walker for walker in demo_scene().people}
     for who, x_m, y_m in answer_to("t_ns = 10_000_000_000"):
         assert walkers[who].at(10.0) == pytest.approx((x_m, y_m), abs=0.35), who
@@ -227,7 +227,7 @@ def known(tmp_path_factory) -> Path:
 
 
 @pytest.mark.parametrize("part", KNOWN)
-def test_the_examples_of_the_page_are_right_where_the_answer_is_known(known, part):
+def test_examples_of_the_page_give_known_answers(known, part):
     (query,) = (query for query in EXAMPLES if part in query)
     with Database([known]) as database:
         found = [row for row in rows_of(database.ask(query))[1] if "/camera/retracks/full" not in row]
@@ -236,12 +236,12 @@ def test_the_examples_of_the_page_are_right_where_the_answer_is_known(known, par
         assert one == pytest.approx(other)
 
 
-def test_every_example_of_the_page_is_tried():
+def test_every_example_of_the_page_has_a_test():
     assert all(sum(part in query for part in KNOWN) == 1 for query in EXAMPLES)
     assert len(EXAMPLES) == len(KNOWN)
 
 
-def test_two_runs_beside_each_other(tmp_path):
+def test_two_runs_are_compared(tmp_path):
     (query,) = re.findall(r"```sql\n([^`]*from metrics before join[^`]*)```", PAGE)
     known_log(tmp_path / "before.mcap")
     known_log(tmp_path / "after.mcap", tracked=(7,))
@@ -253,7 +253,7 @@ def test_two_runs_beside_each_other(tmp_path):
 
 
 @pytest.mark.parametrize("library", ["polars", "pandas"])
-def test_the_same_in_other_libraries(square, monkeypatch, library):
+def test_other_libraries_give_the_same_answers(square, monkeypatch, library):
     (block,) = re.findall(rf"```python\n(import {library} as .*?)```", PAGE, re.S)
     monkeypatch.chdir(square)
     names = {}
@@ -280,7 +280,7 @@ def test_the_commands_of_the_page_have_options_that_exist():
 # Where tables come from
 
 
-def test_only_what_a_query_names_is_read(known, tmp_path):
+def test_a_query_reads_only_the_tables_it_names(known, tmp_path):
     content = bytearray(known.read_bytes())
     with log.read(known) as opened:
         number = opened.channel("/camera/predictions").id
@@ -294,7 +294,7 @@ def test_only_what_a_query_names_is_read(known, tmp_path):
     assert re.search(r"damaged\.mcap.*damaged.*recover", refusal(damaged, "select count(*) from predictions"))
 
 
-def test_tables_beside_a_log_are_read_while_they_are_up_to_date(tmp_path):
+def test_exported_tables_are_read_while_they_are_up_to_date(tmp_path):
     path = known_log(tmp_path / "a.mcap")
     query = "select count(*) as n from tracks where topic = '/camera/samples'"
     with Database([path]) as database:
@@ -335,7 +335,7 @@ def test_files_and_logs_give_the_same_tables(known, tmp_path):
         ), name
 
 
-def test_logs_of_one_name_are_told_apart_by_their_folders(tmp_path):
+def test_folders_distinguish_logs_of_the_same_name(tmp_path):
     paths = [
         known_log(folder / "walk.mcap") for folder in (tmp_path / "monday", tmp_path / "tuesday") if not folder.mkdir()
     ]
@@ -348,7 +348,7 @@ def test_logs_of_one_name_are_told_apart_by_their_folders(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["a'b", 'a"b; drop table tracks', "ä $x {0}", "%s? :1", "--x"])
-def test_names_of_logs_and_channels_are_no_sql(tmp_path, name):
+def test_names_of_logs_and_channels_are_not_parsed_as_sql(tmp_path, name):
     path = known_log(tmp_path / f"{name}.mcap")
     topic = f"/{name}"
     with log.read(path) as opened, log.extend(opened) as writer:
@@ -419,7 +419,7 @@ def test_old_tables_have_new_columns_as_null(square, tmp_path):
         "select * from environ",
     ],
 )
-def test_queries_reach_nothing_but_the_logs(known, tmp_path, monkeypatch, query):
+def test_queries_read_only_the_logs(known, tmp_path, monkeypatch, query):
     monkeypatch.chdir(tmp_path)
     environ = duckdb.sql("select 'hush' as a").to_arrow_table()  # a name that Python knows  # noqa: F841
     Path("secret.csv").write_text("a\nhush\n")
@@ -433,7 +433,7 @@ def test_queries_reach_nothing_but_the_logs(known, tmp_path, monkeypatch, query)
     assert sorted(tmp_path.rglob("*")) == there
 
 
-def test_what_is_made_within_a_query_is_gone_after_it(known):
+def test_tables_made_by_a_query_are_temporary(known):
     with Database([known]) as database:
         query = "create macro twice(a) as 2 * a; create view two as select twice(21) as n; from two"
         assert rows_of(database.ask(query)) == (["n"], [[42]])
@@ -441,7 +441,7 @@ def test_what_is_made_within_a_query_is_gone_after_it(known):
         database.ask("from two")
 
 
-def test_statements_of_all_kinds_bring_tables_in(known):
+def test_all_kinds_of_statements_load_tables(known):
     with Database([known]) as database:
         found = database.ask("pivot Tracks on topic using count(*) group by observed")
         assert found.column("/camera/truth").to_pylist() in ([22, None], [None, 22], [22, 0], [0, 22])
@@ -458,7 +458,7 @@ def test_statements_of_all_kinds_bring_tables_in(known):
         )
 
 
-def test_a_file_is_a_table_where_it_is_given(known, tmp_path):
+def test_a_given_file_is_a_table(known, tmp_path):
     (tmp_path / "zones.csv").write_text("zone,low_m,high_m\nleft,-1,2\nright,2.1,9\n")
     query = (
         "select zone, count(*) as n from tracks join zones on x_m between low_m and high_m "
@@ -472,7 +472,7 @@ def test_a_file_is_a_table_where_it_is_given(known, tmp_path):
     assert "end with" in refusal(known, query, "--with", f"zones={known}")
 
 
-def test_ctrl_c_ends_a_query_and_leaves_the_database(known):
+def test_ctrl_c_ends_a_query_and_the_database_stays_usable(known):
     program = (
         "import os, signal, sys, threading\n"
         "from pathlib import Path\n"
@@ -511,20 +511,20 @@ def test_ctrl_c_ends_a_query_and_leaves_the_database(known):
         (["show tables"], "--tables"),
     ],
 )
-def test_mistakes_are_said_in_one_line(known, words, said):
+def test_errors_are_one_line(known, words, said):
     line = refusal(known, *words)
     assert re.search(said, line)
     assert "LINE" not in line
 
 
 @pytest.mark.skipif(int(duckdb.__version__[0]) < 2, reason="DuckDB 1 cuts times to microseconds")
-def test_what_takes_no_nanoseconds_is_told_with_what_it_takes(known):
+def test_functions_that_lack_nanoseconds_are_named_with_the_remedy(known):
     query = "select date_trunc('minute', t) from tracks limit 1"
     assert "t::timestamptz" in refusal(known, query)
     assert run(known, query.replace("t)", "t::timestamptz)")).exit_code == 0
 
 
-def test_logs_that_are_none_are_said(tmp_path):
+def test_a_file_that_is_not_a_log_is_refused(tmp_path):
     (tmp_path / "empty.mcap").touch()
     assert "it is empty" in refusal(tmp_path / "empty.mcap", "select 1")
     assert "can't be opened" in refusal(tmp_path / "none.mcap", "select 1")
@@ -533,7 +533,7 @@ def test_logs_that_are_none_are_said(tmp_path):
     assert "no file matches" in refusal(tmp_path / "x*.mcap", "select 1")
 
 
-def test_a_damaged_table_is_said(square, tmp_path):
+def test_a_damaged_table_is_refused(square, tmp_path):
     damaged = tmp_path / "tracks/recording=a/part-0.parquet"
     damaged.parent.mkdir(parents=True)
     source = square / "demo.tables/tracks/recording=demo/part-0.parquet"
@@ -547,7 +547,7 @@ def test_a_damaged_table_is_said(square, tmp_path):
     assert "can't be read as Parquet" in refusal(tmp_path, "select sum(x_m) from tracks")
 
 
-def test_duckdb_that_is_missing_is_named_with_the_command_that_mends_it(known, monkeypatch):
+def test_missing_duckdb_is_named_with_the_command_that_installs_it(known, monkeypatch):
     monkeypatch.setitem(sys.modules, "duckdb", None)
     assert re.search(r'pip install "mcaptrack\[sql\]"', refusal(known, "select 1"))
 
@@ -604,7 +604,7 @@ def test_answers_are_exact_in_every_form(known, tmp_path):
         max_size=20,
     )
 )
-def test_numbers_and_words_come_back_from_json_as_they_were(rows):
+def test_json_round_trips_numbers_and_text(rows):
     columns = [list(column) for column in zip(*rows, strict=True)] or [[], [], []]
     try:
         table = pa.table(
@@ -620,7 +620,7 @@ def test_numbers_and_words_come_back_from_json_as_they_were(rows):
     assert [tuple(row.values()) for row in json.loads(text)] == rows
 
 
-def test_an_answer_goes_to_a_file_that_nothing_is_lost_of(known, tmp_path):
+def test_an_answer_is_written_to_a_file_without_loss(known, tmp_path):
     target = tmp_path / "a.csv"
     assert run(known, "select 1 as a", "-o", target).exit_code == 0
     assert target.read_text() == '"a"\n1\n'
@@ -635,7 +635,7 @@ def test_an_answer_goes_to_a_file_that_nothing_is_lost_of(known, tmp_path):
     assert "both input and output" in refusal(copy, "select 1", "-o", copy, "--force")
 
 
-def test_a_query_comes_from_a_file_or_from_standard_input(known, tmp_path):
+def test_a_query_is_read_from_a_file_or_from_standard_input(known, tmp_path):
     (tmp_path / "q.sql").write_text(
         "\ufeff-- how many\nselect count(*) as n from tracks where topic = '/camera/truth';\n"
     )
@@ -646,7 +646,7 @@ def test_a_query_comes_from_a_file_or_from_standard_input(known, tmp_path):
     assert run(known, "-f", "-", "--format", "csv", input=text).stdout == wanted
 
 
-def test_answers_for_people(known):
+def test_answers_as_a_table(known):
     query = "select track_id, x_m / 3 as third, null as nothing, '\x1b[31mred' as word from tracks where topic = '/camera/samples' order by row limit 3"
     outcome = run(known, query)
     lines = outcome.stdout.splitlines()
@@ -686,7 +686,7 @@ class Terminal(io.StringIO):
 LONG = "select range(5000) as many, repeat('x', 5000) as words, {'a': range(5000)} as nested, 1 as one"
 
 
-def test_long_values_are_cut_in_tables_and_nowhere_else(known):
+def test_long_values_are_cut_in_tables_only(known):
     shown = run(known, LONG)
     assert max(map(len, shown.stdout.splitlines())) < 4000
     assert "3 long values are cut; --format json or csv has all of it" in shown.stderr

@@ -40,7 +40,7 @@ def out(tmp_path, monkeypatch) -> Path:
     return tmp_path
 
 
-def test_every_command_is_tried():
+def test_every_command_has_a_case():
     assert READING.keys() | OTHERS == set(GROUP.commands)
 
 
@@ -68,13 +68,13 @@ def test_a_half_written_log_stays_as_it_is_and_is_read_as_it_was(command, half, 
 
 
 @pytest.mark.parametrize("command", ["info", "evaluate", "query"])
-def test_it_stands_in_the_warnings_for_programs(command, half, out):
+def test_the_journal_is_among_the_json_warnings(command, half, out):
     outcome = done(command, *READING[command](half, out), "--json", "-q")
     warnings = json.loads(outcome.out)["warnings"]
     assert [warning["code"] for warning in warnings if "left half written" in warning["message"]] == ["journal"]
 
 
-def test_the_next_command_that_writes_puts_it_back_and_says_so(half, whole, tmp_path):
+def test_the_next_command_that_writes_restores_the_log_with_a_warning(half, whole, tmp_path):
     path = tmp_path / "a.mcap"
     shutil.copy(whole, path)
     interrupt(path)
@@ -96,7 +96,7 @@ BESIDE: dict[str, Callable[[Path], object]] = {
 
 @pytest.mark.parametrize("thing", BESIDE)
 @pytest.mark.parametrize("command", sorted(READING))
-def test_what_lies_where_the_journal_goes_harms_and_stops_nothing(command, thing, whole, out):
+def test_anything_at_the_path_of_the_journal_is_harmless(command, thing, whole, out):
     folder = out / "logs"
     folder.mkdir()
     path = folder / "a.mcap"
@@ -110,7 +110,7 @@ def test_what_lies_where_the_journal_goes_harms_and_stops_nothing(command, thing
 
 
 @pytest.mark.parametrize("command", sorted(READING))
-def test_what_is_no_file_is_refused_in_a_line(command, out):
+def test_a_path_that_is_not_a_file_is_refused_in_one_line(command, out):
     """As the log, and as the results beside one."""
     folder = out / "logs"
     folder.mkdir()

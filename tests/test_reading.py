@@ -117,7 +117,7 @@ def _interrupted(*_: object, **__: object) -> None:
 @pytest.mark.usefixtures("no_hanging")
 @pytest.mark.parametrize("beside", SURROUNDINGS, ids=lambda one: one.__name__)
 @pytest.mark.parametrize("command", sorted(set(GROUP.commands) - {"demo", "train"}))  # train needs torch
-def test_what_is_read_stays_as_it_is(
+def test_commands_that_read_change_nothing(
     command: str, beside: Callable[[Path], None], template: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(Server, "serve_forever", _interrupted)

@@ -101,7 +101,7 @@ def test_the_stock_reader_reads_the_log_in_ranges(server, path):
 
 
 @given(st.data())
-def test_a_range_is_that_part_of_the_file(server, path, data):
+def test_a_range_returns_that_part_of_the_file(server, path, data):
     whole = path.read_bytes()
     first = data.draw(st.none() | st.integers(0, len(whole) + 10))
     last = data.draw(st.integers(0 if first is None else first, len(whole) + 10) | st.none())
@@ -161,12 +161,12 @@ RANGES = {
 
 
 @pytest.mark.parametrize(("text", "wanted"), RANGES.items(), ids=[text[:12] for text in RANGES])
-def test_a_range_is_what_the_standard_says(text, wanted):
+def test_ranges_follow_the_standard(text, wanted):
     span, status = requested_range([text], N)
     assert (status, span) == wanted
 
 
-def test_two_range_fields_are_none():
+def test_two_range_fields_are_ignored():
     assert requested_range(["bytes=0-1", "bytes=2-3"], N) == (range(N), WHOLE)
 
 
@@ -269,7 +269,7 @@ def test_a_request_that_never_ends_is_closed_also_if_it_goes_on_byte_by_byte(pat
         assert ask(server.address(path.name))[0] == 200
 
 
-def test_a_viewer_that_does_not_read_is_let_go(tmp_path):
+def test_a_viewer_that_does_not_read_is_disconnected(tmp_path):
     large = tmp_path / "large"
     with large.open("wb") as stream:
         stream.truncate(2**28)
@@ -296,7 +296,7 @@ def connections(server: Server) -> int:
     return len(server._idle_since)
 
 
-def test_connections_that_wait_make_room_for_those_that_ask(path):
+def test_idle_connections_are_closed_for_new_ones(path):
     """Of 300 idle connections only so many as the limit stay, and a viewer is answered."""
     with serving({path.name: path}, connections=8) as server:
         idle = [connect(server) for _ in range(300)]
@@ -309,7 +309,7 @@ def test_connections_that_wait_make_room_for_those_that_ask(path):
             connection.close()
 
 
-def test_no_more_are_answered_at_once_than_the_limit(tmp_path):
+def test_the_number_of_connections_is_limited(tmp_path):
     large = tmp_path / "large"
     with large.open("wb") as stream:
         stream.truncate(2**28)
@@ -359,7 +359,7 @@ def test_malformed_fields_make_a_bad_request(server, fields):
         assert answer.startswith(b"HTTP/1.1 400 "), head
 
 
-def test_viewers_that_hang_up_are_let_go_without_a_word(path, capfd):
+def test_viewers_that_disconnect_cause_no_output(path, capfd):
     with serving({path.name: path}) as server:
         for begun in (b"", b"GET / HT", b"GET / HTTP/1.1\r\nHost: local"):
             hasty = connect(server)
@@ -396,7 +396,7 @@ HOSTS = {
 
 
 @pytest.mark.parametrize(("host", "wanted"), HOSTS.items())
-def test_the_host_of_a_request_is_this_machine_or_it_is_refused(server, host, wanted):
+def test_requests_for_other_hosts_are_refused(server, host, wanted):
     path = urlsplit(server.address("layout.json")).path
     for request in (
         f"GET {path} HTTP/1.1\r\nHost: {host}\r\n\r\n",
@@ -408,7 +408,7 @@ def test_the_host_of_a_request_is_this_machine_or_it_is_refused(server, host, wa
     assert doubled.startswith(b"HTTP/1.1 400 ")
 
 
-def test_what_is_no_file_any_more_is_not_found_and_nothing_waits_for_it(tmp_path):
+def test_a_path_that_is_not_a_regular_file_is_not_found(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     with serving({"pipe": tmp_path / "pipe", "folder": tmp_path, "none": tmp_path / "none"}) as server:
         for name in ("pipe", "folder", "none"):
@@ -422,7 +422,7 @@ def test_a_name_in_any_encoding_is_found(tmp_path):
         assert ask(server.address(name))[2] == b"here"
 
 
-def test_a_port_that_is_taken_is_said(server):
+def test_a_port_in_use_is_refused(server):
     with pytest.raises(McaptrackError, match=rf"port {server.server_port} of this machine can't be used: .*; choose"):
         Server({}, server.server_port)
     with pytest.raises(McaptrackError, match="port 99999"):
@@ -455,7 +455,7 @@ def viewing(path: Path, *more: str) -> Iterator[tuple[subprocess.Popen[str], dic
             process.kill()
 
 
-def test_the_command_prints_links_that_lead_to_the_log_and_its_layouts_until_it_is_stopped(tmp_path):
+def test_view_prints_working_links_and_serves_until_ctrl_c(tmp_path):
     path = extended(tmp_path / "a.mcap")
     with viewing(path, "--lichtblick", "http://localhost:8080/") as (process, said):
         link = urlsplit(said["links"]["Lichtblick"])
@@ -517,7 +517,7 @@ def test_a_log_is_served_from_start_to_close(tmp_path):
         ask(server.logs[0])
 
 
-def test_mistakes_are_said(tmp_path):
+def test_errors_are_one_line(tmp_path):
     code, _, err = call("view", "none.mcap")
     assert (code, "can't be opened: No such file" in err) == (1, True)
     path = tmp_path / "a.mcap"
@@ -606,7 +606,7 @@ class TestMutants:
             data[at : at + rng.choice([0, 1, 7])] = rng.randbytes(rng.choice([0, 1, 3]))
         return bytes(data[: rng.randrange(len(data))] if rng.random() < 0.1 else data)
 
-    def test_none_of_them_gets_a_traceback_or_what_it_did_not_name_or_waits(self, path, capfd):
+    def test_mutated_requests_get_no_traceback_no_other_file_and_an_answer_in_time(self, path, capfd):
         secret = path.read_bytes()
         statuses: Counter[int] = Counter()
         with serving({path.name: path}) as server:

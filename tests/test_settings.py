@@ -97,7 +97,7 @@ def put(path: Path, text: str) -> Path:
 
 
 @EVERY_COMMAND
-def test_an_option_has_one_value_whichever_way_it_is_given(command, folder, monkeypatch):
+def test_an_option_has_the_same_value_from_every_source(command, folder, monkeypatch):
     usual = parsed(command)
     for setting in options_of(command):
         value = another(setting, usual[setting.parameter])
@@ -122,7 +122,7 @@ def test_an_option_has_one_value_whichever_way_it_is_given(command, folder, monk
 
 
 @EVERY_COMMAND
-def test_a_switch_can_be_turned_on_and_off_in_the_environment(command, monkeypatch):
+def test_the_environment_turns_switches_on_and_off(command, monkeypatch):
     for setting in options_of(command):
         for word, value in (("1", True), ("TRUE", True), ("yes", True), ("on", True), ("0", False), ("off", False)):
             if setting.kind is bool:
@@ -131,7 +131,7 @@ def test_a_switch_can_be_turned_on_and_off_in_the_environment(command, monkeypat
                 monkeypatch.delenv(setting.variable)
 
 
-def test_the_nearest_source_counts(folder, monkeypatch):
+def test_the_strongest_source_wins(folder, monkeypatch):
     def value(*words: str) -> Any:
         return parsed("track", *words)["max_age_s"]
 
@@ -163,7 +163,7 @@ def refused(*words: str) -> str:
 
 class TestUnknownNames:
     @EVERY_COMMAND
-    def test_the_nearest_name_is_said_in_whichever_way_it_was_given(self, command, folder, monkeypatch):
+    def test_an_unknown_name_from_any_source_is_refused_with_the_nearest_one(self, command, folder, monkeypatch):
         known = [setting.name for setting in options_of(command)]
         for name in known:
             wrong = name[:-1] if name[:-1] not in known and len(name) > 3 else name + "x"
@@ -182,11 +182,11 @@ class TestUnknownNames:
             assert f"the environment variable {variable} names no option; did you mean " in refused("info", "x.mcap")
             monkeypatch.delenv(variable)
 
-    def test_a_variable_that_lacks_its_unit(self, monkeypatch):
+    def test_a_variable_without_its_unit_is_refused(self, monkeypatch):
         monkeypatch.setenv("MCAPTRACK_TRACK_MAX_AGE", "2")
         assert refused("run", "x.mcap").endswith("; did you mean MCAPTRACK_TRACK_MAX_AGE_S?\n")
 
-    def test_variables_that_are_no_options_stand_in_one_list(self, monkeypatch):
+    def test_variables_that_are_not_options_are_in_one_list(self, monkeypatch):
         for name in environment.VARIABLES:
             monkeypatch.setenv(name, "1")
         assert call("info", "x.mcap").code == 1
@@ -195,7 +195,7 @@ class TestUnknownNames:
             if path.name not in ("environment.py", "settings.py", "plugins.py"):
                 assert not re.search(r"environ\b|getenv", path.read_text()), path
 
-    def test_a_limit_that_is_no_number_is_refused(self, tmp_path, monkeypatch):
+    def test_a_limit_that_is_not_a_number_is_refused(self, tmp_path, monkeypatch):
         from tests.logs import SOME, write_log
 
         write_log(tmp_path / "a.mcap", SOME)
@@ -224,7 +224,7 @@ class TestTrust:
     """A file in the working folder may tune, and nothing else."""
 
     @EVERY_COMMAND
-    def test_what_does_not_tune_is_refused_with_the_ways_to_say_it(self, command, folder):
+    def test_an_option_that_does_not_tune_is_refused_with_other_ways_to_set_it(self, command, folder):
         usual = parsed(command)
         for setting in options_of(command):
             if setting.declared.tuning is not False:
@@ -237,7 +237,7 @@ class TestTrust:
             assert [*folder.iterdir()] == [path]
 
     @EVERY_COMMAND
-    def test_what_tunes_is_a_number_a_switch_a_choice_or_a_text_that_names_no_file(self, command, folder):
+    def test_tuning_options_are_numbers_switches_choices_or_text_that_is_no_path(self, command, folder):
         for setting in options_of(command):
             if setting.declared.tuning is False:
                 continue
@@ -249,12 +249,12 @@ class TestTrust:
                     put(folder / "mcaptrack.toml", table_for(setting, value))
                     assert f"[{command}] {setting.name}" in refused(command, *ARGUMENTS.get(command, ["x.mcap"]))
 
-    def test_the_file_of_the_config_folder_may_lie_in_the_working_folder(self, monkeypatch):
+    def test_the_working_folder_may_be_the_config_folder(self, monkeypatch):
         path = put(user_file(), '[info]\noutput = "a.txt"\n')
         monkeypatch.chdir(path.parent)
         assert parsed("info")["output"] == "a.txt"
 
-    def test_a_link_gives_no_trust(self, folder):
+    def test_a_link_to_a_file_is_not_trusted(self, folder):
         other = put(folder.parent / "other.toml", '[info]\noutput = "a.txt"\n')
         (folder / "mcaptrack.toml").symlink_to(other)
         assert "may tune and nothing else" in refused("info", "x.mcap")
@@ -280,7 +280,7 @@ class TestFiles:
 
     @pytest.mark.parametrize("place", ["working folder", "config folder", "--config"])
     @pytest.mark.parametrize("data", CASES.values(), ids=CASES)
-    def test_a_file_that_cannot_be_taken(self, data, place, folder):
+    def test_a_file_that_is_not_toml_is_refused(self, data, place, folder):
         path = {"working folder": folder / "mcaptrack.toml", "config folder": user_file()}.get(place, folder / "a.toml")
         put(path, "").write_bytes(data)
         words = refused("track", "x.mcap", *(["--config", str(path)] if place == "--config" else []))
@@ -294,7 +294,7 @@ class TestFiles:
         assert f"has {2**33} bytes; a file of options has at most {MAX_BYTES}" in refused("track", "x.mcap")
 
     @pytest.mark.parametrize("named", [False, True])
-    def test_what_is_no_file(self, named, folder):
+    def test_a_path_that_is_not_a_regular_file_is_refused(self, named, folder):
         path = folder / "mcaptrack.toml"
         words = ["track", "x.mcap", *(["--config", "mcaptrack.toml"] if named else [])]
         os.mkfifo(path)
@@ -309,15 +309,15 @@ class TestFiles:
         path.symlink_to(path)
         assert "can't be read" in refused(*words)
 
-    def test_a_mark_of_byte_order_does_no_harm(self, folder):
+    def test_a_byte_order_mark_is_ignored(self, folder):
         (folder / "mcaptrack.toml").write_bytes(b"\xef\xbb\xbf[track]\nmax-age-s = 2")
         assert parsed("track")["max_age_s"] == 2
 
-    def test_a_file_that_is_named_has_to_be_there(self):
+    def test_a_named_file_has_to_exist(self):
         assert "there is no such file" in refused("track", "x.mcap", "--config", "none.toml")
 
     @EVERY_COMMAND
-    def test_a_value_of_another_kind_is_refused(self, command, folder):
+    def test_a_value_of_the_wrong_type_is_refused(self, command, folder):
         for setting in options_of(command):
             wrong = {bool: ['"no"', "1"], int: ['"1"', "1.5", "true"], float: ['"1"', "true", "1979-05-27"]}
             wrong |= {Path: ["1", "true", "{a = 1}"], str: ["true", "[[1]]", "1979-05-27"]}
@@ -327,7 +327,7 @@ class TestFiles:
                 assert f"[{command}] {setting.name} needs " in words
 
     @EVERY_COMMAND
-    def test_a_variable_of_another_kind_is_refused(self, command, monkeypatch):
+    def test_a_variable_of_the_wrong_type_is_refused(self, command, monkeypatch):
         for setting in options_of(command):
             is_choice = get_origin(setting.kind) is Literal
             if setting.kind in (bool, int, float) or is_choice:
@@ -370,7 +370,7 @@ class TestRenamed:
         assert self.params(command, beside, "-q") == wanted | {"quiet": True}
         assert capsys.readouterr().err == ""
 
-    def test_the_stronger_source_counts_whatever_the_name(self, command, setting, old, beside, folder, monkeypatch):
+    def test_the_stronger_source_wins_under_either_name(self, command, setting, old, beside, folder, monkeypatch):
         variable = f"MCAPTRACK_{command}_{old}".upper().replace("-", "_")
         low, middle, high = ("a", "b", "c") if setting.kind is str else (0.25, 0.5, 0.75)
         if setting.kind is bool:
@@ -388,7 +388,7 @@ class TestRenamed:
         words = refused(command, "x.mcap", *others, *both)
         assert f"--{old} is the old name of --{setting.name}; give one of them" in words
 
-    def test_the_help_knows_the_new_name_alone(self, command, setting, old, beside):
+    def test_the_help_shows_the_new_name_only(self, command, setting, old, beside):
         words = call(command, "--help").out
         assert f"--{setting.name} " in words
         assert not re.search(rf"--{old}\b(?!-)", words)

@@ -82,7 +82,7 @@ def write(text: str) -> str:
 
 @given(document=documents(), bom=st.booleans())
 @settings(max_examples=100)
-def test_after_writing_the_value_is_there_and_all_else_is_as_it_was(document, bom):
+def test_writing_sets_the_value_and_changes_nothing_else(document, bom):
     text, stay = document
     written = write(BOM * bom + text)
     assert written.startswith(BOM) == bom
@@ -120,17 +120,17 @@ def test_after_writing_the_value_is_there_and_all_else_is_as_it_was(document, bo
     ],
     ids=["empty", "spaced", "dotted", "inline"],
 )
-def test_the_command_stays_in_the_form_it_has(text, form):
+def test_a_table_keeps_its_form(text, form):
     assert re.fullmatch(form, write(text))
 
 
-def test_a_file_that_is_not_there_is_made(tmp_path):
+def test_a_missing_file_is_created(tmp_path):
     write_settings(tmp_path / "new.toml", "track", {"min-iou": 0.3}, {})
     assert (tmp_path / "new.toml").read_text() == "[track]\nmin-iou = 0.3\n"
 
 
 @pytest.mark.parametrize("text", ["track = 3\n", "[[track]]\nmax-age-s = 1\n", "[track\n", "\0", "\xff"])
-def test_a_file_that_is_no_file_of_options_is_refused_and_stays(tmp_path, text):
+def test_a_file_of_something_else_is_refused_and_stays(tmp_path, text):
     path = tmp_path / "a.toml"
     path.write_bytes(text.encode("latin-1"))
     with pytest.raises(McaptrackError, match=r"a\.toml"):

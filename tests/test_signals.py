@@ -52,7 +52,7 @@ def folder(tmp_path_factory) -> Path:
 
 
 @pytest.mark.parametrize("number", range(len(MOMENTS)), ids=[" ".join(moment) for moment in MOMENTS])
-def test_a_signal_ends_a_command_and_leaves_what_was_there(number, commands, folder):
+def test_a_signal_ends_a_command_and_leaves_the_files_unchanged(number, commands, folder):
     command, deed = MOMENTS[number]
     if command == "train" and not find_spec("torch"):
         pytest.skip("train needs torch")

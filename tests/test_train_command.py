@@ -80,7 +80,7 @@ def windows(recipe, *paths: Path):
     return windows_of(read_scenes(paths, SourceOptions(), recipe.step_s), recipe)
 
 
-def test_without_options_a_tenth_is_kept_for_validation(folder, given):
+def test_by_default_a_tenth_is_kept_for_validation(folder, given):
     outcome = done("train", "a.txt", "b.txt")
     ((recipe, training, validation, output, card, device, threads, resume, _, _),) = given
     assert recipe == RECIPES["red"]
@@ -145,7 +145,7 @@ def test_options_change_the_recipe(folder, given, words, changed, corrupted):
 
 
 @pytest.mark.parametrize("there", ["red.safetensors", "state.safetensors"])
-def test_a_training_is_only_replaced_or_gone_on_with_if_asked_for(folder, given, there):
+def test_a_training_is_replaced_or_resumed_only_on_request(folder, given, there):
     (folder / "trained").mkdir()
     (folder / "trained" / there).write_text("")
     refused = call("train", "a.txt", "b.txt")
@@ -159,7 +159,7 @@ def test_a_training_is_only_replaced_or_gone_on_with_if_asked_for(folder, given,
     assert [words[7] for words in given[1:]] == ([True] if there == "state.safetensors" else [])
 
 
-def test_weights_of_another_network_are_in_nobodys_way(folder, given):
+def test_weights_of_another_network_do_not_prevent_a_training(folder, given):
     (folder / "trained").mkdir()
     (folder / "trained" / "lstm.safetensors").write_text("")
     done("train", "a.txt", "b.txt")
@@ -167,7 +167,7 @@ def test_weights_of_another_network_are_in_nobodys_way(folder, given):
     assert len(given) == 1
 
 
-def test_what_came_of_it_is_printed_and_stands_in_the_data(folder, given):
+def test_text_and_json_have_the_scores(folder, given):
     lines = done("train", "a.txt", "b.txt").out.splitlines()
     names = list(SCORES["clean"]["red"])
     head = ["validation windows", "predictor", "ADE m", "FDE m", "ADE m²", "NLL", "in 50 %", "in 90 %", "in 95 %"]

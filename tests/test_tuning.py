@@ -47,7 +47,7 @@ def test_every_tracker_declares_ranges_that_it_accepts():
     assert "high_score" in declared_ranges(TRACKERS["bytetrack"])
 
 
-def test_the_search_finds_the_age_that_keeps_an_identity(chance):
+def test_a_search_finds_the_age_that_keeps_an_identity(chance):
     first, best = tune(Sort(), [scene()], {"max_age_s": Range(0.1, 6.0, False)}, IOU, trials=25)
     assert first.number == 0
     assert first.parameters == {}
@@ -55,13 +55,13 @@ def test_the_search_finds_the_age_that_keeps_an_identity(chance):
     assert best.scores["IDF1"] > first.scores["IDF1"] + 0.2
 
 
-def test_optuna_finds_it_too():
+def test_a_search_with_optuna_finds_the_age_that_keeps_an_identity():
     _, best = tune(Sort(), [scene()], {"max_age_s": Range(0.1, 6.0, False)}, IOU, trials=25)
     assert best.parameters["max_age_s"] > 2.4
 
 
 @pytest.mark.parametrize("with_optuna", [False, True])
-def test_an_ended_search_continues(with_optuna, tmp_path, monkeypatch):
+def test_an_interrupted_search_continues(with_optuna, tmp_path, monkeypatch):
     if not with_optuna:
         monkeypatch.setitem(sys.modules, "optuna", None)
     path, ranges, task = tmp_path / "study.jsonl", {"max_age_s": Range(0.1, 6.0, False)}, scene()
@@ -90,7 +90,7 @@ def test_a_study_of_another_search_is_refused(chance, tmp_path):
         tune(Sort(), [scene()], {}, IOU)
 
 
-def test_tried_parameters_are_written_exactly(chance):
+def test_the_study_has_the_exact_parameters_that_were_tried(chance):
     seen = []
 
     @dataclass(frozen=True, kw_only=True)
@@ -104,7 +104,7 @@ def test_tried_parameters_are_written_exactly(chance):
     assert (best.parameters.get("max_age_s", 1.4), best.parameters.get("min_iou", 0.2)) in seen
 
 
-def test_draws_keep_to_their_ranges():
+def test_drawn_values_are_within_their_ranges():
     rng = np.random.default_rng(0)
     assert {Range(1, 3, True).draw(rng) for _ in range(100)} == {1, 2, 3}
     assert all(0.2 <= Range(0.2, 0.4, False).draw(rng) <= 0.4 for _ in range(100))
@@ -125,7 +125,7 @@ def write_files(folder):
     )
 
 
-def test_at_the_command_line_from_files_to_settings_that_commands_read(tmp_path):
+def test_tune_writes_settings_that_other_commands_read(tmp_path):
     write_files(tmp_path)
     words = ("tune", "det.txt", "--truth", "gt.txt", "--fps", 10, "--trials", 12, "--search", "max-age-s=0.1:6")
     out, err = printed(*words, "--json", folder=tmp_path)
@@ -144,7 +144,7 @@ def test_at_the_command_line_from_files_to_settings_that_commands_read(tmp_path)
     assert made["/camera/tracks"]["max_age_s"] == settings["max-age-s"]
 
 
-def test_a_log_can_be_tuned_and_mistakes_are_said(tmp_path):
+def test_a_log_is_tuned_and_errors_are_one_line(tmp_path):
     write_files(tmp_path)
     log = tmp_path / "a.mcap"
     printed("ingest", tmp_path / "det.txt", "--as", "detections", "--fps", 10, "-o", log)
@@ -162,7 +162,7 @@ def test_a_log_can_be_tuned_and_mistakes_are_said(tmp_path):
     assert "min_iou has to be from 0 to 1, not 7" in err
 
 
-def test_settings_go_into_a_file_that_exists_and_a_file_that_cannot_be_edited_is_refused_before_the_search(tmp_path):
+def test_settings_are_added_to_a_file_that_exists_unless_it_cannot_be_edited(tmp_path):
     write_files(tmp_path)
     words = ("tune", "det.txt", "--truth", "gt.txt", "--fps", 10, "--trials", 12, "--search", "max-age-s=0.1:6", "-q")
     settings = tmp_path / "mcaptrack.toml"
@@ -183,7 +183,7 @@ def test_settings_go_into_a_file_that_exists_and_a_file_that_cannot_be_edited_is
     assert not (tmp_path / "other.sort.trials.jsonl").exists()
 
 
-def test_empty_tracks_are_a_score_too(chance):
+def test_parameters_without_any_track_score_zero(chance):
     """Parameters without any track get a score of zero, and do not end the search."""
     task = scene()
     empty = Task("x", [f._replace(rows=f.rows[:0]) for f in task.frames], task.ground_truth, {})

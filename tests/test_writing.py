@@ -106,7 +106,7 @@ class TestDetections:
         (bare, _) = mcaptrack.detections(made(BOXES)).rows
         assert (np.isnan(bare["score"]), bare["class_id"]) == (True, 0)
 
-    def test_names_of_classes_say_what_is_a_person(self, made):
+    def test_class_names_decide_which_class_is_a_person(self, made):
         """A model of COCO has a person as class 0 and a bicycle as class 1."""
         names = np.array(["person", "bicycle"])
         found = made(BOXES, class_id=np.array([0, 1]), data={"class_name": names})
@@ -115,7 +115,7 @@ class TestDetections:
         found = made(BOXES[:1], class_id=np.array([0]), data={"class_name": names[:1]})
         assert mcaptrack.detections(found).rows["class_id"].tolist() == [1]
 
-    def test_masks_are_left_out_and_said(self, made):
+    def test_masks_are_left_out_with_a_warning(self, made):
         found = made(BOXES, mask=np.zeros((2, 8, 8), bool))
         with pytest.warns(mcaptrack.McaptrackWarning, match="masks of supervision.Detections are left out"):
             assert len(mcaptrack.detections(found).rows) == 2
@@ -190,7 +190,7 @@ class TestWriting:
                 payloads.add(Provenance.from_metadata(opened.channel("/camera/detections").metadata).digest)
         assert len(payloads) == 1
 
-    def test_supervision_goes_in_and_comes_out(self, tmp_path, made):
+    def test_supervision_detections_round_trip(self, tmp_path, made):
         tracked = made(BOXES, confidence=SCORES, tracker_id=np.array([7, 9]))
         given = {0: tracked, SECOND: made.empty(), 2 * SECOND: tracked}
         with mcaptrack.open(tmp_path / "a.mcap", create=True) as opened:
@@ -209,7 +209,7 @@ class TestWriting:
             if hasattr(made, "merge"):
                 assert len(made.merge([found for _, found in opened.supervision("tracks")])) == 4
 
-    def test_tracks_that_are_not_confirmed_yet_are_left_out_and_said(self, tmp_path, made):
+    def test_unconfirmed_tracks_are_left_out_with_a_warning(self, tmp_path, made):
         with mcaptrack.open(tmp_path / "a.mcap", create=True) as opened:
             with pytest.warns(mcaptrack.McaptrackWarning, match="boxes without a tracker id"):
                 opened.write("tracks", {0: made(BOXES, tracker_id=np.array([-1, 4]))})
@@ -327,7 +327,9 @@ class TestWriting:
         mcaptrack.track(path)
         with (
             mcaptrack.open(path) as opened,
-            pytest.warns(mcaptrack.McaptrackWarning, match="/camera/tracks was made from what has just been replaced"),
+            pytest.warns(
+                mcaptrack.McaptrackWarning, match="/camera/tracks is out of date, because its input was replaced"
+            ),
         ):
             opened.write("/camera/detections", walk(20), replace=True)
         assert "/camera/tracks" in [one.topic for one in mcaptrack.info(path).channels if one.stale]

@@ -1,4 +1,4 @@
-"""What all functions of the library share: paths, progress, warnings and notes."""
+"""Shared parts of all functions of the library: paths, progress, warnings and notes."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from mcaptrack.files import is_same_file, refuse_special, refuse_url
 from mcaptrack.notices import Notice
 
 PathLike = str | os.PathLike[str]
-#: Called with the name of a stage, how much of it is done, and how much there is (None where that is not known).
+#: Called with the name of a stage, the amount that is done, and the total (None if it is not known).
 Progress = Callable[[str, float, float | None], None]
 
 #: Where routine notes go ("/camera/tracks is missing: running track"): INFO, and DEBUG for details.
@@ -23,7 +23,7 @@ _LOGGER: Final = logging.getLogger("mcaptrack")
 
 
 def no_progress(stage: str, done: float, total: float | None) -> None:
-    """Show nothing."""
+    """Ignore the progress."""
 
 
 def as_path(path: PathLike) -> Path:
@@ -32,7 +32,7 @@ def as_path(path: PathLike) -> Path:
     refuse_url(found)
     refuse_special(found)
     if str(path) == "-":
-        raise McaptrackError("- is not a file here: nothing is read from or written to a pipe; give the name of a file")
+        raise McaptrackError("- is not a file: pipes are neither read nor written; give the name of a file")
     return found
 
 
@@ -54,32 +54,32 @@ def names_of(names: str | Sequence[str] | None) -> tuple[str, ...]:
 def log_output(path: PathLike, source: Path) -> Path:
     """Return the path of a log to write, made from ``source``.
 
-    Raises McaptrackError for a name that does not end with .mcap. That ``source`` is no output is for others to say.
+    Raises McaptrackError for a name that does not end with .mcap. Callers check whether it is ``source`` itself.
     """
     found = as_path(path)
     if found.is_dir():
         raise McaptrackError(f"{found} is a folder; give the name of a file")
     if found.suffix.lower() != ".mcap" and not is_same_file(found, source):
-        raise McaptrackError(f"{found} is no name for a log: logs are MCAP files; give a name that ends with .mcap")
+        raise McaptrackError(f"{found} is not a name for a log: logs are MCAP files; give a name that ends with .mcap")
     return found
 
 
 @contextmanager
 def warnings_about(log: object) -> Iterator[list[Notice]]:
-    """Collect the warnings inside, which are about ``log``; each of them is also passed on."""
+    """Collect the warnings of this block, about ``log``; they are also passed on."""
     with notices.about(log), notices.collected() as warnings:
         yield warnings
 
 
 class Notes(list[str]):
-    """Routine notes of one call: kept for its result, and logged as they come."""
+    """Routine notes of one call, kept for its result and logged at once."""
 
     def say(self, note: str) -> None:
-        """Take a note."""
+        """Keep a note, and log it."""
         self.append(note)
         _LOGGER.info(note)
 
 
 def detail(note: str) -> None:
-    """Log a note that matters to few people."""
+    """Log a detail."""
     _LOGGER.debug(note)

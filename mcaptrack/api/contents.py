@@ -1,4 +1,4 @@
-"""What is in a log: its channels, and what was made from what."""
+"""List the channels of a log, and how they were made."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Make a log of what exists: videos, folders of images, recordings, label files."""
+"""Make logs of videos, folders of images, recordings and label files."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _EPOCH: Final = dt.datetime(1970, 1, 1, tzinfo=dt.UTC)
 
 @dataclass(frozen=True)
 class IngestResult:
-    """What became of an input.
+    """The result of ingesting one input.
 
     Attributes
     ----------
@@ -34,7 +34,7 @@ class IngestResult:
     messages : dict of str to int
         Number of messages that were written, by topic.
     notes, details : tuple of str
-        What was done with the input, such as why a video was encoded again; details matter to few.
+        What was done with the input, such as why a video was encoded again; ``details`` are less important.
     lost : tuple of str
         What could not be read, such as damaged pictures.
     warnings : tuple of mcaptrack.Notice
@@ -144,7 +144,7 @@ def ingest(
     if into is not None and output is not None:
         raise McaptrackError("`into=` adds to a log in place; it does not go with `output=`")
     if into is None and sidecar is not None:
-        raise McaptrackError(f"`sidecar={sidecar}` is about a log that is added to; name it with `into=`")
+        raise McaptrackError(f"`sidecar={sidecar}` needs a log to add to; name it with `into=`")
     path, labels = as_path(source), {"detections": detections, "tracks": tracks, "truth": truth}
     options = IngestOptions(
         camera=camera,
@@ -189,7 +189,7 @@ def ingest(
 
 
 def default_log(source: Path) -> Path:
-    """Return the name of the log that is made of an input: in the working folder."""
+    """Return the default path of the log of an input: in the working folder."""
     return Path((source.name if source.is_dir() else source.stem) + ".mcap")
 
 

@@ -106,7 +106,7 @@ def export(
     if folder.exists() and not folder.is_dir():
         raise McaptrackError(f"{folder} is a file; tables go to a folder")
     if blobs and not topic:
-        raise McaptrackError("`blobs=True` is about the fields of a channel; name it with `topic=`")
+        raise McaptrackError("`blobs=True` needs a channel to write; name it with `topic=`")
     with warnings_about(path) as warnings:
         with logs.read(path) as opened:
             done = write_tables(opened, folder, progress, form=form, topics=names_of(topic), blobs=blobs, force=force)

@@ -135,7 +135,7 @@ class Recording:
         if topic is not None:
             self._log.channel(topic)
             if "topic" not in made.schema.names:
-                raise McaptrackError(f"the table {name} is not by channel")
+                raise McaptrackError(f"the rows of the table {name} are not by channel; leave `topic=` out")
             made = tables.rows_of_topic(made, topic)
         return tables.with_recording(made, self.name)
 
@@ -340,7 +340,7 @@ class Recording:
         at = np.searchsorted(self._log.times(topic), np.asarray(times, np.int64), "right") - 1
         if len(at) and at.min() < 0:
             first = int(np.asarray(times)[at.argmin()])
-            raise McaptrackError(f"{self.path}: {topic} has no picture at {first} ns yet; it begins later")
+            raise McaptrackError(f"{self.path}: {topic} has no picture at {first} ns; its first picture is later")
         numbers, counts = np.unique(at, return_counts=True)
         return dict(zip(numbers.tolist(), counts.tolist(), strict=True))
 

@@ -78,7 +78,7 @@ def detections(
     """
     if is_supervision(boxes):
         if scores is not None or classes is not None or box_format not in (None, "xyxy"):
-            raise McaptrackError("supervision.Detections bring scores, classes and the format of their boxes along")
+            raise McaptrackError("supervision.Detections have scores, classes and a box format; give no others")
         return frame_of_supervision(boxes, t_ns, index, DETECTIONS)
     if box_format not in ("xyxy", "xywh"):
         raise McaptrackError("say what the columns of boxes are with `box_format='xyxy'` or `box_format='xywh'`")

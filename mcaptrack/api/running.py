@@ -1,4 +1,4 @@
-"""Running stages on one log: what comes of it, and how results get into the log."""
+"""Run stages on one log, and write their results into it."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ Mode = Literal["both", "offline", "online"]
 
 @dataclass(frozen=True)
 class RunResult:
-    """What stages made of a log.
+    """The result of running stages on a log.
 
     Attributes
     ----------
@@ -82,13 +82,13 @@ class RunResult:
         return tuple(self.frames)
 
 
-#: Plans what to run on an open log: from the prefix of its camera, and with what takes notes.
+#: Plans the jobs for a log; takes the open log, the prefix of its camera, and a function that takes notes.
 Plan = Callable[[logs.Log, str, Callable[[str], None]], list[Job]]
 
 
 @dataclass(frozen=True)
 class Where:
-    """Which log and camera, and where results go."""
+    """The log and camera to run on, and the place for results."""
 
     log: PathLike
     camera: str | None
@@ -114,7 +114,7 @@ def work(where: Where, plan: Plan, watch: Watch | None, progress: Progress, tabl
         place = SidecarChoice(where.sidecar)
         with logs.read(path, sidecar=None if output else place) as opened:
             if output is None:
-                opened.lock()  # a second writer is turned away before it computes anything
+                opened.lock()  # a second process is refused before it computes anything
             topics = watch.topics if watch else ()
             prefix = pipeline.find_camera(opened, where.camera, where.topic or next(iter(topics), None))
             report = pipeline.run(opened, prefix, plan(opened, prefix, notes.say), output, progress, watch)
@@ -151,11 +151,11 @@ def work(where: Where, plan: Plan, watch: Watch | None, progress: Progress, tabl
 def warn_stale(topic: str, log: Path) -> None:
     """Warn of a channel that is out of date now."""
     again = call("run", log)
-    warn(f"{topic} was made from what has just been replaced; {again} brings it up to date", "out-of-date")
+    warn(f"{topic} is out of date, because its input was replaced; {again} brings it up to date", "out-of-date")
 
 
 def _export(target: Path, force: bool, progress: Progress) -> dict[str, int]:
-    """Write the tables beside a log; how many rows each has."""
+    """Write the tables beside a log; returns their numbers of rows."""
     with logs.read(target) as opened:
         exported = export(opened, default_folder(target), progress, force=force)
     for words in exported.notes:
@@ -177,7 +177,7 @@ def transform_of(stage: str, chosen: str | Transform | None, options: Mapping[st
 
 
 def _with_options(base: Transform, options: Mapping[str, Option]) -> Transform:
-    """Return a transform with other values of some options. Raises McaptrackError for one that it does not have."""
+    """Return a transform with other values of some options. Raises McaptrackError for an unknown option."""
     known = [f.name for f in fields(base) if not f.metadata.get("context")]
     for name in options:
         if name not in known:
@@ -204,7 +204,7 @@ def run_stage(
     mode: Mode | None = None,
     progress: Progress = no_progress,
 ) -> RunResult:
-    """Run one stage with a transform; ``detect``, ``track`` and the others are this with a transform of theirs."""
+    """Run one stage with a transform; ``detect``, ``track`` and the others call this with their transform."""
     modes = STAGES[stage].modes
     keep = modes[mode or "both"] if modes else None
 

@@ -38,7 +38,7 @@ from mcaptrack.geometry.plane import Point
 from mcaptrack.notices import Notice, collected, warn
 from mcaptrack.tables.compared import compare_files, pair_files
 
-#: Files that are tracks, not logs, by the end of their name; those that hold several channels.
+#: Ends of names of files of tracks: of tables, which hold several channels, and of all.
 _TABLES: Final = (".parquet", ".pq")
 _FILES: Final = (".txt", ".csv", *_TABLES)
 #: The scores that a limit can be set for.
@@ -268,7 +268,7 @@ def _from_logs(paths: Sequence[Path], camera: str | None, topics: tuple[str, ...
     sequences = []
     for path in paths:
         if path.suffix.lower() in _FILES:
-            raise McaptrackError(f"{path} is no log; to score a file of tracks give the ground truth with `truth=`")
+            raise McaptrackError(f"{path} is not a log; to score a file of tracks give the ground truth with `truth=`")
         with logs.read(path) as opened:
             sequences.append(sequence_of_log(opened, pipeline.find_camera(opened, camera), topics))
     return sequences

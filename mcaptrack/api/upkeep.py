@@ -259,7 +259,7 @@ def drop(
 
 
 def _chosen(opened: logs.Log, patterns: Sequence[str]) -> set[str]:
-    """The topics that fit any of the patterns, with the channels that only describe them.
+    """Return the topics that fit any of the patterns, with the channels that only describe them.
 
     Raises McaptrackError for a pattern that fits none.
     """

@@ -1,4 +1,4 @@
-"""Run all stages on a log, and write what happened to tracks."""
+"""Run all stages on a log, and write events of tracks."""
 
 from __future__ import annotations
 
