@@ -1,4 +1,4 @@
-"""A log in Python: tables, arrays, pictures, and messages by where they stand."""
+"""A log in Python: tables, arrays, pictures, and messages by their place in the file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Several inputs on one command line: one that can't be processed is said, counted and listed, and the others are done."""
+"""Several inputs of one command: an input that fails is reported and listed, and the others are processed."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def template(tmp_path_factory) -> Path:
 
 @pytest.fixture
 def folder(template, tmp_path, monkeypatch) -> Path:
-    """Two logs, a file that is no log, and the folder as the working folder."""
+    """A working folder with two logs and a file that is not a log."""
     for name in ("a.mcap", "z.mcap"):
         shutil.copy(template / "a.mcap", tmp_path / name)
     (tmp_path / "broken.mcap").write_bytes(b"no log at all")
@@ -38,7 +38,7 @@ def folder(template, tmp_path, monkeypatch) -> Path:
 
 
 def inputs(command: str, *names: str) -> list[str]:
-    """What a command is given so that it processes these; ingest would write over its own input otherwise."""
+    """Return the arguments of a command that processes these inputs; ingest must not overwrite its own input."""
     if command == "ingest":
         Path("in").mkdir(exist_ok=True)
         for name in names:

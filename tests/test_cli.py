@@ -1,4 +1,4 @@
-"""The command line as a person and as a program use it."""
+"""The command line: text, JSON, exit codes and errors of all commands."""
 
 from __future__ import annotations
 
@@ -292,7 +292,7 @@ def place(tmp_path_factory) -> Path:
 
 
 class TestErrors:
-    """One line, exit 1, nothing written, nothing lost."""
+    """An error is one line and exit code 1, and changes no file."""
 
     CASES = {
         "no such file": (["ingest", "nothing.mp4"], "nothing.mp4 does not exist"),
@@ -433,7 +433,7 @@ def test_an_interrupted_command_leaves_the_old_log_or_the_new_one(fresh, finishe
 
 @pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM], ids=["Ctrl-C", "kill"])
 def test_an_interruption_ends_the_command_where_python_ignores_exceptions(sent):
-    """The signal comes while the collector calls back, whose exceptions Python ignores."""
+    """The signal arrives in a callback of the garbage collector, where Python ignores exceptions."""
     code = (
         "import os, sys, time, types, weakref\n"
         "def app():\n"
@@ -452,7 +452,7 @@ def test_an_interruption_ends_the_command_where_python_ignores_exceptions(sent):
 
 @pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM], ids=["Ctrl-C", "kill"])
 def test_an_interruption_that_a_library_replaces_by_its_own_error_counts(sent):
-    """As extension modules do when the signal comes while they are imported."""
+    """Extension modules do that when the signal arrives while they are imported."""
     code = (
         "import os, sys, time, types\n"
         "def app():\n"
@@ -466,7 +466,7 @@ def test_an_interruption_that_a_library_replaces_by_its_own_error_counts(sent):
 
 
 def test_the_demonstration(tmp_path, monkeypatch):
-    """Everything on a scene that it draws itself; a short one here."""
+    """The test replaces the scene by a short one."""
     monkeypatch.setitem(synthetic.SCENES, "square", lambda seed: small_scene(seed=seed))
     monkeypatch.setattr(sys, "argv", ["mcaptrack", "demo"])
     folder = tmp_path / "d"
@@ -561,7 +561,7 @@ def test_recover_saves_intact_chunks_and_exits_with_3_after_losses(finished, tmp
 
 
 def test_run_writes_events_unless_told_not_to(fresh, finished):
-    """A log with pictures: events and counts add up to what evaluate prints, by overlap."""
+    """Sums of events and of counts are the numbers that evaluate prints, matched by overlap."""
     scores = json.loads(printed("evaluate", finished, "--json", "--similarity", "iou", "--topic", "/camera/tracks")[0])
     (score,) = scores["results"]
     with log.read(finished) as opened:

@@ -1,4 +1,4 @@
-"""Every option does something: a command line with it ends otherwise than without it.
+"""Every option has an effect: a command with it has another outcome than without it.
 
 What is seen is everything that a command leaves: exit code, stdout, stderr, and all files of its folder. That an option
 means the same whichever way it is given is tested in ``test_settings``, what parameters of transforms do in
@@ -31,7 +31,7 @@ from tests.worlds import small_scene
 
 
 class Seen(NamedTuple):
-    """All that came of a command."""
+    """The outcome of a command."""
 
     code: int
     out: str
@@ -40,7 +40,7 @@ class Seen(NamedTuple):
 
 
 def parameters(command: str) -> set[str]:
-    """The options of a stage that its transforms declare."""
+    """Return the options of a stage that its transforms declare."""
     if command not in STAGES:
         return set()
     declared = [
@@ -62,7 +62,7 @@ def test_every_option_has_a_case():
 
 @pytest.fixture(scope="module")
 def template(tmp_path_factory) -> Path:
-    """A folder with what commands are tried on. Not to be changed."""
+    """A folder with inputs of all commands. Tests must not change it."""
     folder = tmp_path_factory.mktemp("template")
     made_log(folder)
     done("ingest", folder / "clip.mp4", "--truth", folder / "truth.txt", "-o", folder / "fresh.mcap")
@@ -85,7 +85,7 @@ def template(tmp_path_factory) -> Path:
 
 
 def _add_channels_of_others(path: Path) -> None:
-    """What a robot recorded beside the camera: messages with bytes in them, and boxes."""
+    """Write a recording of a robot: messages with bytes in them, and detections."""
     with log.read(path) as opened, log.extend(opened) as writer:
         channel = writer.add_channel("/others", ("", "", b""), "json", {})
         writer.add_message(channel, 1, 1, b'{"a": 1}')

@@ -1,4 +1,4 @@
-"""The help and docs/options.md say what there is, in an order that people find their way in, and it is so."""
+"""The help and docs/options.md list all options, in order, with correct names, defaults and ranges."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ EVERY_COMMAND = pytest.mark.parametrize("command", sorted(COMMANDS))
 
 
 def shown(command: str) -> list[Any]:
-    """The options that the help of a command lists, but ``--help``."""
+    """Return the options in the help of a command, except ``--help``."""
     return [one for one in COMMANDS[command].params if one.param_type_name == "option" and not one.hidden]
 
 
@@ -122,7 +122,7 @@ class TestHelp:
 
 
 class TestWrongUsage:
-    """A command line that can't be understood is refused in one line, which names what it might be."""
+    """A wrong command line is refused in one line, with the nearest name."""
 
     @staticmethod
     def refused(*words: str) -> str:
@@ -157,7 +157,7 @@ class TestWrongUsage:
 
 
 class Bounded(NamedTuple):
-    """An option with a bound, as the page lists it."""
+    """An option with a range, as docs/options.md lists it."""
 
     command: str
     chosen: tuple[str, ...]
@@ -168,7 +168,7 @@ class Bounded(NamedTuple):
 
 
 def documented() -> list[Bounded]:
-    """The options that the page gives a range."""
+    """Return the options for which docs/options.md has a range."""
     out, chosen = [], ("", ())
     for line in PAGE.splitlines():
         if head := re.fullmatch(r"### (\w+)(?:, with `--(\w+) (\w+)` alone)?", line):

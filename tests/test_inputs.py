@@ -1,4 +1,4 @@
-"""What no file can be is refused by name, by every command and every option that takes a path."""
+"""URLs, pipes and devices are refused by every argument and option that takes a path."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ STAGES = TRANSFORMS
 
 
 def takes_paths(command: str) -> list[Any]:
-    """The parameters of a command whose values are paths, by the types that it declares; config is read before."""
+    """Return the parameters of a command that have type Path, except config, which is read earlier."""
     callback = inspect.unwrap(next(c.callback for c in app.registered_commands if c.name == command))
     hints = getattr(callback, "__annotations__", {}) if command in STAGES else get_type_hints(callback)
     paths = {name for name, hint in hints.items() if "Path" in str(hint)} - {"config"}
@@ -35,7 +35,7 @@ PATHS = [(name, parameter) for name in COMMANDS for parameter in takes_paths(nam
 
 
 def words_with(name: str, parameter: Any, value: str) -> list[str]:
-    """A command with a value for one parameter, and others for all that it needs."""
+    """Return a command line with a value for one parameter, and with all required arguments."""
     words = [name]
     for other in COMMANDS[name].params:
         if other.param_type_name == "argument":

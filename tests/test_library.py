@@ -1,4 +1,4 @@
-"""What the command line does, as functions: the same results, results to look at, and nothing printed."""
+"""The functions of the library do what the commands do; they return results, print nothing, and are documented."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def sections_of(function) -> tuple[list[str], list[str]]:
 
 @pytest.fixture(scope="module")
 def template(tmp_path_factory) -> Path:
-    """A folder with a log that has all results, and what it was made from. Not to be changed."""
+    """A folder with a log that has all results, its video and its labels. Tests must not change it."""
     folder = made_log(tmp_path_factory.mktemp("made")).parent
     (folder / "a.mcap").rename(folder / "log.mcap")
     shutil.copy(folder / "clip.mp4", folder / "video.mp4")
@@ -281,7 +281,7 @@ class TestMessagesOfTheCommandLine:
         assert eval(proposed("info", Path("it's`.mcap")).strip("`"), names).messages > 0
 
     def test_the_library_names_no_option_of_the_command_line(self):
-        """Texts outside the command line that are no documentation, no help, and no page."""
+        """Checks all texts outside the command line except documentation, help and pages."""
         found = []
         for path in PACKAGE.rglob("*.py"):
             if {"cli", "viewing"} & set(path.relative_to(PACKAGE).parts):
@@ -374,7 +374,7 @@ class TestDocumentation:
 
 
 class TestNothingIsSilent:
-    """What was once done without a word is refused or said."""
+    """Nothing that changes results happens silently."""
 
     def test_an_unknown_camera_is_refused(self, place):
         before = Path("log.mcap").read_bytes()

@@ -1,4 +1,4 @@
-"""Options do what they say, however they are given: on the command line, in the environment, in a file.
+"""Parameters of stages arrive from the command line, the environment and files.
 
 The tests follow from what the code declares, so that an option that is added is tested, too.
 """
@@ -38,7 +38,7 @@ def folder(finished, tmp_path, monkeypatch) -> Path:
 
 @dataclass(frozen=True)
 class Stage:
-    """A command made of a transform, and what chooses that transform: ``chosen`` are options of the command."""
+    """The command of a stage with one of its transforms, which the options ``chosen`` select."""
 
     command: str
     transform: Any
@@ -46,12 +46,12 @@ class Stage:
     chosen: tuple[tuple[str, str], ...] = ()
 
     def parameters(self) -> dict[str, Any]:
-        """The parameters that are options, with their defaults."""
+        """Return the parameters that are options, with their defaults."""
         options = [field.name for field in fields(self.transform) if not field.metadata.get("context")]
         return {name: getattr(self.transform, name) for name in options}
 
     def others(self) -> dict[str, Any]:
-        """For each parameter a value that isn't the default."""
+        """Return a value other than the default for each parameter."""
         hints = get_type_hints(type(self.transform))
         out = {}
         for field in fields(self.transform):
@@ -60,7 +60,7 @@ class Stage:
         return out
 
     def made(self, path: Path) -> dict[str, Any]:
-        """The parameters that the channel of this stage says it was made with."""
+        """Return the parameters in the provenance of the channel of this stage."""
         with log.read(path) as opened:
             said = Provenance.from_metadata(opened.channel(self.target).metadata)
         assert said is not None
@@ -68,7 +68,7 @@ class Stage:
 
 
 def _other(default: Any, kind: Any, declared: Any) -> Any:
-    """A value of a parameter that differs from its default, and is allowed."""
+    """Return an allowed value of a parameter that differs from its default."""
     if kind is bool:
         return not default
     if names := choices(kind):
@@ -90,7 +90,7 @@ STAGES = [
 
 
 def flags(values: dict[str, Any]) -> list[str]:
-    """Values as options of a command line."""
+    """Write values as options of a command line."""
     out = []
     for name, value in values.items():
         flag = name.replace("_", "-")
@@ -99,7 +99,7 @@ def flags(values: dict[str, Any]) -> list[str]:
 
 
 def toml(command: str, values: dict[str, Any]) -> str:
-    """Values as a table of a mcaptrack.toml."""
+    """Write values as a table of mcaptrack.toml."""
     lines = [f"{name.replace('_', '-')} = {toml_value(value)}" for name, value in values.items()]
     return "\n".join([f"[{command}]", *lines]) + "\n"
 
@@ -134,7 +134,7 @@ def test_giving_the_default_changes_nothing(stage, folder):
 @pytest.mark.parametrize("stage", STAGES, ids=lambda stage: "-".join([stage.command, *dict(stage.chosen).values()]))
 @pytest.mark.parametrize("way", ["environment", "file"])
 def test_parameters_reach_the_stages_that_run_makes(stage, way, folder, monkeypatch):
-    """By ``run --force`` where the channel stands, and it is said where it doesn't come to that."""
+    """``run --force`` applies them where the channel exists; without it a warning says that they are not applied."""
     values = stage.others() | dict(stage.chosen)
     if way == "environment":
         for name, value in values.items():
@@ -153,7 +153,7 @@ def test_parameters_reach_the_stages_that_run_makes(stage, way, folder, monkeypa
 
 
 def test_a_forced_run_makes_the_same_channels(folder):
-    """With the parameters that each channel had, also where they are not the defaults."""
+    """``run --force`` keeps the parameters of each channel, also those that are not the defaults."""
     done("track", "a.mcap", "--tracker", "ocsort", "--max-age-s", 3)
     done("events", "a.mcap", "--similarity", "metres", "--gate-m", 0.5)
     done("run", "a.mcap")
@@ -169,7 +169,7 @@ def test_a_forced_run_makes_the_same_channels(folder):
 
 
 def _content(path: Path) -> dict[str, tuple[dict[str, str], list[tuple[int, bytes]]]]:
-    """What every channel says of itself and holds, but for the one that all views share: it names one of them."""
+    """Return the metadata and messages of all channels except the one that all views share, which names one of them."""
     with log.read(path) as opened:
         return {
             topic: (dict(channel.metadata), [(m.t_ns, m.payload) for m in opened.messages(topic)])

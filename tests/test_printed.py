@@ -1,4 +1,4 @@
-"""What commands print for people says what they print for programs, number by number, and files hold what is printed."""
+"""Text and JSON of commands have the same numbers, and -o writes what would be printed."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from mcaptrack import log
 from tests.commands import GROUP, call, done
 from tests.logs import SOME, write_stock
 
-#: Commands whose output is what was asked for, and words after which each prints something.
+#: Commands with --output for what they print, and arguments for each.
 PRINTING = {
     "check": [],
     "evaluate": [],
@@ -28,12 +28,12 @@ PRINTING = {
 
 
 def data(*words: object) -> list[dict[str, Any]]:
-    """The results of a command that has to succeed."""
+    """Run a command that has to succeed, and return its results."""
     return json.loads(done(*words, "--json").out)["results"]
 
 
 def tables(text: str) -> list[tuple[list[str], list[list[str]]]]:
-    """The tables of a text: of each its head and its rows, cell by cell; a row without cells is an empty line."""
+    """Parse the tables in a text: head and rows of each as lists of cells; an empty line is a row without cells."""
     found = []
     for part in re.split(r"\n\n(?=\S+(?: \S+)*  +\S)", text.rstrip("\n")):
         head, *rows = ([cell for cell in re.split(r"  +", line.strip()) if cell] for line in part.split("\n"))
@@ -43,7 +43,7 @@ def tables(text: str) -> list[tuple[list[str], list[list[str]]]]:
 
 @pytest.fixture(scope="module")
 def twice(finished, tmp_path_factory) -> tuple[Path, Path]:
-    """A log with everything in it, and a copy without some of it, in which detections are newer than tracks."""
+    """A log with all channels, and a copy without some, in which detections are newer than tracks."""
     less = tmp_path_factory.mktemp("twice") / "less.mcap"
     done("drop", finished, "/camera/retracks/predictions", "-o", less, "-q")
     done("detect", less, "--threshold", "30", "-q")
@@ -431,7 +431,7 @@ def test_start_time_sets_the_first_timestamp(text, wanted, tmp_path, monkeypatch
 
 
 class Terminal(io.StringIO):
-    """Text that goes to a terminal."""
+    """A stream that is a terminal."""
 
     def isatty(self) -> bool:
         return True

@@ -1,4 +1,4 @@
-"""Every message that proposes a command proposes one that works, whatever the file is called."""
+"""Every command that a message proposes works, for any name of a file."""
 
 from __future__ import annotations
 
@@ -25,19 +25,19 @@ from tests.interrupted import interrupt
 from tests.robots import write_log
 
 PACKAGE = Path(mcaptrack.__file__).parent
-#: A name that a shell, an option parser and a reader of messages can all stumble over.
+#: A name that is difficult for a shell, an option parser and a parser of messages.
 NAME = "-a  b'c$(x)`.mcap".replace("`", "")
 VERBS = "|".join(GROUP.commands)
 
 
 @pytest.fixture(scope="module")
 def template(tmp_path_factory) -> Path:
-    """A small log with everything in it, beside what it was made from. Not to be changed."""
+    """A small log with all channels, beside its video and labels. Tests must not change it."""
     return made_log(tmp_path_factory.mktemp("made"))
 
 
 class Scene:
-    """A folder with a log of an odd name, and what it was made from."""
+    """A folder with a log that has an odd name, its video and its labels."""
 
     def __init__(self, template: Path, folder: Path) -> None:
         for name in ("clip.mp4", "truth.txt", "plane.txt"):
@@ -47,29 +47,29 @@ class Scene:
         self.path = Path(NAME)
 
     def says(self, *words: str) -> str:
-        """What a command on the log prints, its name in the place of LOG."""
+        """Run a command on the log (LOG), and return what it prints."""
         given = [f"./{NAME}" if word == "LOG" else word for word in words]
         outcome = call(*given)
         return outcome.err + outcome.out
 
     def without(self, *topics: str) -> Scene:
-        """The log without some channels."""
+        """Remove channels from the log."""
         done("drop", f"./{NAME}", *topics, "-o", "left.mcap")
         Path("left.mcap").replace(NAME)
         return self
 
     def ingested(self, *words: str) -> Scene:
-        """The log made anew."""
+        """Make the log again."""
         done("ingest", *words, "-o", f"./{NAME}", "--force")
         return self
 
     def page(self) -> str:
-        """What a report says."""
+        """Return the text of a report."""
         done("report", f"./{NAME}", "-o", "page.html")
         return html.unescape(re.sub(r"<[^>]*>", "", re.sub(r"</?code>", "`", Path("page.html").read_text())))
 
     def damaged(self) -> str:
-        """A byte of each chunk but the last is another."""
+        """Change a byte of each chunk except the last."""
         data = bytearray(self.path.read_bytes())
         with log.read(self.path) as opened:
             places = [chunk.offset + 200 for chunk in opened.index.chunks[:-1]]
@@ -79,12 +79,12 @@ class Scene:
         return self.says("export", "LOG", "-o", "tables")
 
     def half_written(self) -> Scene:
-        """A change of the log was cut off."""
+        """Interrupt a change of the log."""
         interrupt(self.path.resolve())
         return self
 
     def late(self) -> str:
-        """Messages at times that nothing computes with."""
+        """Add messages with times out of range."""
         channel = (TRACKS.name, "protobuf", TRACKS.descriptor)
         with log.read(self.path) as opened, log.extend(opened) as writer:
             number = writer.add_channel("/camera/late", channel, "protobuf", {})
@@ -92,12 +92,12 @@ class Scene:
         return self.says("sample", "LOG", "--topic", "/camera/late", "--to", "/camera/later")
 
     def elsewhere(self) -> str:
-        """Boxes of others at the place where a stage would write."""
+        """Add detections of other software to the channel where a stage would write."""
         write_log(self.path, "/eye/image", boxes="/eye/detections")
         return self.says("run", "LOG", "--topic", "/eye/image")
 
     def side_view(self) -> str:
-        """People at one distance, seen from their height, without a ground plane."""
+        """Detect people at one distance, seen from their height, without a ground plane."""
         rows = [f"{n},-1,{n * 2},{20 + k % 2},20,60,1,-1,-1,-1" for n in range(1, 60) for k in (0, 1)]
         Path("boxes.txt").write_text("\n".join(rows))
         return self.ingested("boxes.txt", "--as", "detections", "--fps", "10").says("run", "LOG", "--no-tables")
@@ -107,7 +107,7 @@ class Scene:
         return self.says("run", "LOG", "--no-tables")
 
     def by_own_tracker(self) -> str:
-        """Tracks are those of a class in a file, and out of date."""
+        """Track with a class in a file, and make the tracks out of date."""
         text = "from mcaptrack.transforms import Sort\n\n\nclass Own(Sort):\n    pass\n"
         Path("own_tracker_of_a_scene.py").write_text(text)
         self.says("track", "LOG", "--tracker", "own_tracker_of_a_scene:Own")
@@ -115,7 +115,7 @@ class Scene:
         return self.says("run", "LOG", "--no-tables")
 
     def bag(self) -> str:
-        """The name is that of a recording of another kind."""
+        """Replace the log by a recording of another kind."""
         self.path.unlink()
         bag1(self.path, 3, 10)
         return self.says("info", "LOG")
@@ -169,7 +169,7 @@ SCENES: dict[str, Callable[[Scene], str]] = {
 
 
 def functions(tree: ast.AST) -> Iterator[tuple[str, ast.AST]]:
-    """Every node of a module with the name of the innermost function around it."""
+    """Yield every node of a module with the name of the innermost function around it."""
 
     def within(node: ast.AST, name: str) -> Iterator[tuple[str, ast.AST]]:
         name = node.name if isinstance(node, ast.FunctionDef) else name
@@ -185,7 +185,7 @@ def names_of(node: ast.ImportFrom) -> set[str]:
 
 
 def proposals() -> set[str]:
-    """Where the package proposes commands: module, function and verb."""
+    """Return the places where the package proposes commands: module, function and command."""
     out = set()
     for path in PACKAGE.rglob("*.py"):
         if path == PACKAGE / "cli" / "flags.py":
@@ -211,7 +211,7 @@ def test_every_proposal_has_a_scene():
 
 
 def test_commands_are_proposed_in_one_way():
-    """Texts that are no documentation name no command but through ``errors.command``."""
+    """Texts other than documentation name commands through ``errors.command`` only."""
     found = []
     for path in PACKAGE.rglob("*.py"):
         tree = ast.parse(path.read_text(encoding="utf-8"))
@@ -235,7 +235,7 @@ def test_commands_are_proposed_in_one_way():
 
 
 def words_of(line: str) -> list[str]:
-    """The words of a command as a shell sees them."""
+    """Return the words of a command as a shell parses them."""
     shown = subprocess.run(["bash", "-c", f"printf '%s\\0' {line}"], capture_output=True, check=True).stdout
     return shown.decode().split("\0")[:-1]
 

@@ -1,4 +1,4 @@
-"""Questions in SQL: answered from logs and from tables alike, and nothing but answered."""
+"""Queries in SQL: the same answers from logs and from exported tables, without access to anything else."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ BEGIN = next(answer for query, answer in SURE if "begin" in query)
 
 
 def parsed(answer):
-    """A table of the page: names and rows."""
+    """Return the names and rows of a table in docs/sql.md."""
     head, _, *lines = ([cell.strip() for cell in line.strip(" |").split(" | ")] for line in answer.splitlines())
     return head, [[word(cell) for cell in line] for line in lines]
 
@@ -78,7 +78,7 @@ def refusal(*words):
 
 @pytest.fixture(scope="module")
 def square(tmp_path_factory) -> Path:
-    """The folder of the demonstration as far as no tracker has a hand in it: its truth, as log and as tables."""
+    """A folder with the ground truth of the demonstration, as a log and as tables; independent of trackers."""
     folder = tmp_path_factory.mktemp("square")
     footage = demo.draw(demo_scene(), folder, video=False)
     options = IngestOptions(fps=demo_scene().fps, ground_plane=footage.ground_plane, role="truth")
@@ -123,7 +123,7 @@ def test_the_prelude_names_all_tables():
 
 
 def answer_to(*words):
-    """What the page answers to the one query that holds all these words."""
+    """Return the answer in docs/sql.md of the only query that contains all these words."""
     (found,) = (answer for query, answer in SURE if all(one in query for one in words))
     return parsed(found)[1]
 
@@ -150,7 +150,7 @@ def test_answers_of_the_page_are_correct():
         assert begin == sum(from_s <= walker.route[0][0] < from_s + 10 for walker in walkers.values())
 
 
-# Examples: a log whose answers are known
+# Examples: a log with known answers
 
 
 def write_log(path, channels):
@@ -177,7 +177,7 @@ def happened(rows):
 
 
 def known_log(path, tracked=(7, 8)):
-    """Person 1 walks along the first axis, person 2 stands; track 8 stands half a metre beside them."""
+    """A log in which person 1 walks along the first axis and person 2 stands, with track 8 half a metre away."""
     ticks = range(11)
     people = [Frame(ns(0.4 * n), n, tracks_at({1: (0.4 * n, 0.0), 2: (0.0, 10.0)})) for n in ticks]
     tracks = {7: lambda n: (0.4 * n, 0.0), 8: lambda n: (0.0, 10.5)}

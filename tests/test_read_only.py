@@ -1,4 +1,4 @@
-"""Commands that read change nothing: no byte, no time, no name, whatever lies beside the log."""
+"""Commands that read change nothing, also for a log that was left half written."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def whole(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def half(whole, tmp_path_factory) -> Path:
-    """A log that was left half written. Nothing here changes it, or every test after that fails."""
+    """A log that was left half written. Tests must not change it."""
     path = tmp_path_factory.mktemp("half") / "a.mcap"
     shutil.copy(whole, path)
     interrupt(path)
@@ -111,7 +111,7 @@ def test_anything_at_the_path_of_the_journal_is_harmless(command, thing, whole, 
 
 @pytest.mark.parametrize("command", sorted(READING))
 def test_a_path_that_is_not_a_file_is_refused_in_one_line(command, out):
-    """As the log, and as the results beside one."""
+    """For the log, and for the results beside a log."""
     folder = out / "logs"
     folder.mkdir()
     os.mkfifo(folder / "pipe.mcap")

@@ -1,4 +1,4 @@
-"""Commands that read change nothing, whatever lies beside the log: no byte, no time, no name in its folder.
+"""Commands that read change nothing in the folder of the log: no byte, no timestamp, no name.
 
 Which commands read, they declare themselves; all others leave everything as it is where ``-o`` names another place.
 """
@@ -30,7 +30,7 @@ _HANGS_S = 60
 
 
 def line_of(command: str) -> str:
-    """A command line that changes nothing in the folder, if it does as it says."""
+    """Return a command line that should change nothing in the folder."""
     base = LINES.get(command) or CASES[command]["json"].base
     name = {"train": "b", "export": "b", "report": "b.html", "render": "b.mp4", "tune": "b.toml"}
     output = f" -o {{elsewhere}}/{name.get(command, 'b.mcap')}"
@@ -38,7 +38,7 @@ def line_of(command: str) -> str:
 
 
 class Seen(tuple[object, ...]):
-    """All that there is to see of a file, but when it was read last."""
+    """The content and attributes of a file, except its time of access."""
 
     __slots__ = ()
 
@@ -55,13 +55,13 @@ class Seen(tuple[object, ...]):
 
 
 def seen(folder: Path) -> dict[str, Seen]:
-    """Everything in a folder, and the folder."""
+    """Return the attributes of a folder and of everything in it."""
     return {str(path.relative_to(folder)): Seen.of(path) for path in (folder, *sorted(folder.rglob("*")))}
 
 
 @pytest.fixture(scope="module")
 def template(tmp_path_factory) -> Path:
-    """A folder with what commands read. Not to be changed."""
+    """A folder with inputs of all commands. Tests must not change it."""
     folder = tmp_path_factory.mktemp("reading")
     made_log(folder)
     done("ingest", folder / "clip.mp4", "--truth", folder / "truth.txt", "-o", folder / "fresh.mcap")
@@ -98,7 +98,7 @@ SURROUNDINGS = [nothing, noise, emptiness]
 
 @pytest.fixture
 def no_hanging() -> Iterator[None]:
-    """A command that waits for what never comes fails, instead of the whole run."""
+    """Fail the test, not the whole run, if a command waits forever."""
 
     def hangs(*_: object) -> None:
         raise TimeoutError(f"it takes longer than {_HANGS_S} s")

@@ -1,4 +1,4 @@
-"""Logs served to a viewer in a browser: the requested bytes, only of these files, only on this machine."""
+"""Logs are served to viewers in a browser: the requested bytes of these files only, on this machine only."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def ask(address: str, method: str = "GET", **headers: str) -> tuple[int, dict[st
 
 
 class OverHttp(io.RawIOBase):
-    """What a viewer does: a file that is read in ranges."""
+    """A file that is read in ranges over HTTP, as viewers do."""
 
     def __init__(self, address: str) -> None:
         self._address, self._at = address, 0
@@ -217,7 +217,7 @@ def test_only_the_given_files_are_served_and_only_to_this_machine(server, path):
 
 @contextmanager
 def serving(files: Mapping[str, Path | bytes], **limits: float) -> Iterator[Server]:
-    """A server of its own, with limits that tests reach."""
+    """Start a server with limits that tests can reach."""
     with Server(files, limits=Limits(**limits)) as server:
         thread = threading.Thread(target=server.serve_forever, args=(0.02,))
         thread.start()
@@ -233,7 +233,7 @@ def connect(server: Server) -> socket.socket:
 
 
 def rest(connection: socket.socket) -> bytes:
-    """Everything until the other side closes; a TimeoutError if it never does."""
+    """Read everything until the other side closes. Raises TimeoutError if it doesn't."""
     data = b""
     with suppress(ConnectionResetError):
         while block := connection.recv(2**20):
@@ -242,7 +242,7 @@ def rest(connection: socket.socket) -> bytes:
 
 
 def drips(connection: socket.socket) -> bytes | None:
-    """One byte more; what comes back: b"" if the other side has closed, None if nothing."""
+    """Send one more byte, and return the answer: b"" if the other side has closed, None if there is none."""
     try:
         connection.sendall(b"a")
         return connection.recv(1)
@@ -297,7 +297,7 @@ def connections(server: Server) -> int:
 
 
 def test_idle_connections_are_closed_for_new_ones(path):
-    """Of 300 idle connections only so many as the limit stay, and a viewer is answered."""
+    """Of 300 idle connections as many as the limit allows stay open, and a viewer gets its answer."""
     with serving({path.name: path}, connections=8) as server:
         idle = [connect(server) for _ in range(300)]
         assert ask(server.address(path.name))[2] == path.read_bytes()
@@ -329,7 +329,7 @@ def test_the_number_of_connections_is_limited(tmp_path):
 
 
 def exchange(server: Server, data: bytes) -> bytes:
-    """What comes back for these bytes until the connection ends."""
+    """Send bytes, and return everything until the connection ends."""
     with connect(server) as connection:
         with suppress(OSError):  # it may be answered and closed before all is sent
             connection.sendall(data)
@@ -440,7 +440,7 @@ def extended(path: Path) -> Path:
 
 @contextmanager
 def viewing(path: Path, *more: str) -> Iterator[tuple[subprocess.Popen[str], dict[str, Any]]]:
-    """The command, once it serves, and the data it printed."""
+    """Start the command, wait until it serves, and yield it with the JSON it printed."""
     command = [sys.executable, "-m", "mcaptrack", "view", path, "--json", *more]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     usual = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
@@ -529,7 +529,7 @@ def test_errors_are_one_line(tmp_path):
 
 
 class TestMutants:
-    """Requests as a grammar makes them, with a few faults in each, from a seed."""
+    """Requests from a grammar, with a few random faults in each."""
 
     NUMBERS = ("0", "1", "-1", "9" * 5000, "0x10", "1e9", "", " ", "\u0663", "\x00", "18446744073709551616")
     TEXTS = (

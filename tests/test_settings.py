@@ -1,4 +1,4 @@
-"""Where options come from: the command line, the environment, files; which of them counts, and which is trusted.
+"""Options from the command line, the environment and files: which source wins, and which is trusted.
 
 Every law is tried on all options of all commands, as the commands declare them.
 """
@@ -28,7 +28,7 @@ EVERY_COMMAND = pytest.mark.parametrize("command", sorted(COMMANDS))
 
 @pytest.fixture(autouse=True)
 def folder(tmp_path, monkeypatch) -> Path:
-    """The working folder; the user's config folder is another one."""
+    """The working folder, which is not the user's config folder."""
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
     (tmp_path / "work").mkdir()
     monkeypatch.chdir(tmp_path / "work")
@@ -36,13 +36,13 @@ def folder(tmp_path, monkeypatch) -> Path:
 
 
 def options_of(command: str) -> list[Setting]:
-    """The options of a command that are not renamed ones under their old names."""
+    """Return the options of a command without old names."""
     now = COMMANDS[command].settings.values()
     return [setting for setting in now if setting.name not in CALL_ONLY and not setting.parameter.startswith("old_")]
 
 
 def parsed(command: str, *words: str) -> dict[str, Any]:
-    """What a command is called with, paths as text."""
+    """Return the values that a command gets, with paths as text."""
     group = GROUP.make_context("mcaptrack", [command])
     given = [*words, *ARGUMENTS.get(command, ["x.mcap"])]
     return {
@@ -52,14 +52,14 @@ def parsed(command: str, *words: str) -> dict[str, Any]:
 
 
 def as_text(value: Any) -> Any:
-    """Paths as text, also within lists."""
+    """Return a value with paths as text, also in lists."""
     if isinstance(value, list | tuple):
         return [as_text(member) for member in value]
     return str(value) if isinstance(value, Path) else value
 
 
 def another(setting: Setting, default: Any) -> Any:
-    """A value that isn't the default, as the command gets it."""
+    """Return a value that isn't the default, as the command gets it."""
     if setting.kind is bool:
         return not default
     if get_origin(setting.kind) is Literal:
@@ -73,19 +73,19 @@ def another(setting: Setting, default: Any) -> Any:
 
 
 def words_for(setting: Setting, value: Any) -> list[str]:
-    """A value on the command line."""
+    """Write a value for the command line."""
     if setting.kind is bool:
         return [f"--{setting.name}" if value else f"--no-{setting.name}"]
     return [word for one in (value if setting.many else [value]) for word in (f"--{setting.name}", str(one))]
 
 
 def text_for(setting: Setting, value: Any) -> str:
-    """A value in the environment."""
+    """Write a value for the environment."""
     return shlex.join(map(str, value)) if setting.many else str(value).lower() if setting.kind is bool else str(value)
 
 
 def table_for(setting: Setting, value: Any) -> str:
-    """A value in a file."""
+    """Write a value for a file."""
     word = f"[{', '.join(map(toml_value, value))}]" if setting.many else toml_value(value)
     return f"[{setting.command}]\n{setting.name} = {word}\n"
 
@@ -153,7 +153,7 @@ def test_the_strongest_source_wins(folder, monkeypatch):
 
 
 def refused(*words: str) -> str:
-    """The one line of a command that is refused because of its options, before it does anything."""
+    """Run a command that has to refuse its options with exit code 2, and return its one line of error."""
     outcome = call(*words)
     assert (outcome.code, outcome.out) == (2, ""), outcome
     assert outcome.err.startswith("mcaptrack: ")
@@ -206,7 +206,7 @@ class TestUnknownNames:
             assert "MCAPTRACK_MAX_CHUNK_MIB needs a whole number" in outcome.out + outcome.err
 
 
-#: What a text of the working folder's file must never be: a file, an address, a module, a command.
+#: Text that a file of the working folder must not set: paths, addresses, modules, commands.
 HOSTILE = (
     "red:weights.safetensors",
     "onnx:a.onnx",
@@ -221,7 +221,7 @@ HOSTILE = (
 
 
 class TestTrust:
-    """A file in the working folder may tune, and nothing else."""
+    """A file in the working folder may set tuning options only."""
 
     @EVERY_COMMAND
     def test_an_option_that_does_not_tune_is_refused_with_other_ways_to_set_it(self, command, folder):
@@ -261,7 +261,7 @@ class TestTrust:
 
 
 class TestFiles:
-    """A file that is none, or that is made to do harm, is one line."""
+    """A file that is missing, damaged or hostile is refused in one line."""
 
     CASES = {
         "nested deeply": b"[track]\nmax-age-s = " + b"[" * 5000 + b"]" * 5000,
@@ -346,7 +346,7 @@ RENAMED = [
 
 @pytest.mark.parametrize(("command", "setting", "old", "beside"), RENAMED, ids=lambda part: getattr(part, "name", None))
 class TestRenamed:
-    """An option is taken under its old name, in every way, and a line says the new one."""
+    """An old name works from every source, and a note gives the new one."""
 
     def params(self, command: str, beside: dict[str, str], *words: str) -> dict[str, Any]:
         others = [word for name, value in beside.items() for word in (f"--{name}", value)]

@@ -1,4 +1,4 @@
-"""Settings that are written into mcaptrack.toml: the value is there, and nothing else changes."""
+"""Writing settings into mcaptrack.toml changes these settings only."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def plain(key: str) -> str:
 
 @st.composite
 def documents(draw) -> tuple[str, list[str]]:
-    """A file of options, and its lines that have to stay: [track] written in one of the ways that TOML has."""
+    """Draw a file of options, with [track] in one of the forms of TOML, and the lines of it that have to stay."""
     parts = draw(st.permutations([*draw(st.sets(st.sampled_from(CHANGED))), *draw(st.sets(st.sampled_from(KEPT)))]))
     parts = list({plain(key): (key, text) for key, text in parts}.values())
     style = draw(st.sampled_from(["header", "dotted", "inline", "none"]))

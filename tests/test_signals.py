@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM end every command soon, as such, and leave the files as they were."""
+"""Ctrl-C and SIGTERM end every command soon, with the exit code of the signal, and leave the files unchanged."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def commands():
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory) -> Path:
-    """A folder with what commands are ended on. None of them changes it, or all tests after that fail."""
+    """A folder with inputs of all commands. An interrupted command must not change it."""
     folder = tmp_path_factory.mktemp("ended")
     made_log(folder)
     done("ingest", folder / "clip.mp4", "--truth", folder / "truth.txt", "-o", folder / "fresh.mcap")

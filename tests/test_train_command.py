@@ -1,4 +1,4 @@
-"""What `train` hands to the training and prints of it; the training itself, which needs torch, is a stand-in."""
+"""What `train` passes to the training and prints of it; the training, which needs torch, is replaced by a stand-in."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ SCORES = {
 
 
 def written(path: Path, people: int, start: float) -> Path:
-    """A file of labels in metres, in which people walk straight on."""
+    """Write a file of labels in metres, in which people walk straight."""
     rows = [f"{12 * n} {who} {start + 0.4 * n} {2.0 * who}" for n in range(26) for who in range(people)]
     path.write_text("\n".join(rows))
     return path
@@ -41,7 +41,7 @@ def written(path: Path, people: int, start: float) -> Path:
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch) -> Path:
-    """A working folder with labels, and a training that notes what it is given."""
+    """A working folder with label files."""
     monkeypatch.chdir(tmp_path)
     written(tmp_path / "a.txt", 3, 0.0)
     written(tmp_path / "b.txt", 2, 50.0)
@@ -50,7 +50,7 @@ def folder(tmp_path, monkeypatch) -> Path:
 
 @pytest.fixture
 def given(monkeypatch) -> list[tuple]:
-    """What the training was given; it says that it has begun, and how far it is."""
+    """The arguments of each call of the training, which is replaced by a stand-in."""
     calls: list[tuple] = []
 
     def train(*words):

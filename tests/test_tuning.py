@@ -1,4 +1,4 @@
-"""The search for settings that score best."""
+"""Tuning: the search for parameters that score best."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ IOU = EvaluateOptions(similarities=("iou",))
 
 
 def scene() -> Task:
-    """A person is hidden for 2.5 s: tracks that live longer than that keep the identity."""
+    """A person is occluded for 2.5 s: tracks with a larger maximum age keep the identity."""
     path = [(50 + 0.5 * n, 50) for n in range(80)]
     found = detections(lambda n: [] if 30 <= n < 55 else [path[n]], 80)
     truth = [Frame(ns(n / 10), n, boxed({1: (x - 5, y - 10)})) for n, (x, y) in enumerate(path)]
@@ -33,7 +33,7 @@ def scene() -> Task:
 
 @pytest.fixture
 def chance(monkeypatch):
-    """Without Optuna, whether or not it is installed."""
+    """Search without Optuna, also where it is installed."""
     monkeypatch.setitem(sys.modules, "optuna", None)
 
 

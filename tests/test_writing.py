@@ -1,4 +1,4 @@
-"""Own rows in a log: arrays, tables and supervision.Detections become channels that stages go on from."""
+"""Rows of a user (arrays, tables, supervision.Detections) become channels that stages take as input."""
 
 from __future__ import annotations
 

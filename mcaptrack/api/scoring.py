@@ -53,7 +53,7 @@ class Scores:
     ----------
     results : tuple of mcaptrack.evaluation.EvaluationRow
         One for each sequence, channel of tracks, similarity and gate; with several sequences also one for all of them
-        together, whose ``sequence`` is "COMBINED".
+        together, with the ``sequence`` "COMBINED".
     notes : tuple of str
         How files were paired and read.
     warnings : tuple of mcaptrack.Notice
