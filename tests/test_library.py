@@ -11,6 +11,7 @@ import json
 import logging
 import re
 import shutil
+import typing
 import warnings
 from pathlib import Path
 
@@ -243,6 +244,20 @@ class TestRefused:
         assert words in str(refused.value)
         assert "\n" not in str(refused.value)
         assert {path: path.read_bytes() for path in place.iterdir() if path.is_file()} == before
+
+    @pytest.mark.parametrize("name", FUNCTIONS)
+    def test_text_that_is_not_a_choice_is_refused(self, name, place):
+        function = getattr(mcaptrack, name)
+        hints = {} if name == "query" else typing.get_type_hints(function)
+        for parameter, hint in hints.items():
+            kinds = [hint, *typing.get_args(hint)]
+            if any(typing.get_origin(kind) is typing.Literal for kind in kinds) and str not in kinds:
+                required = [
+                    one.name for one in inspect.signature(function).parameters.values() if one.default is one.empty
+                ]
+                values = {"boxes": [[1, 2, 3, 4]]} if name == "detections" else dict.fromkeys(required[:1], "log.mcap")
+                with pytest.raises(McaptrackError, match=f"`{parameter}=` can't be 'nonsense'; "):
+                    function(**values, **{parameter: "nonsense"})
 
     @pytest.mark.parametrize("words", ["ingest video.mp4 -o out.mp4", "ingest video.mp4 -o -", "track log.mcap -o -"])
     def test_the_command_line_refuses_outputs_that_are_not_mcap(self, place, words):

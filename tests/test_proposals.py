@@ -133,7 +133,7 @@ class Scene:
 SCENES: dict[str, Callable[[Scene], str]] = {
     "api/outputs.py:render:info": lambda s: s.without("/camera/video").says("render", "LOG"),
     "cli/running.py:_next:*": lambda s: s.says("run", "LOG", "--no-tables"),
-    "api/running.py:work:run": lambda s: s.says("detect", "LOG", "--detector", "mog2"),
+    "api/running.py:warn_stale:run": lambda s: s.says("detect", "LOG", "--detector", "mog2"),
     "cli/train.py:_print:predict": lambda s: s.says(
         "train", "synthetic", "--walks", "1000", "--epochs", "1", "-o", "my net"
     ),

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal
 
-from mcaptrack.api.common import Notes, PathLike, Progress, as_path, no_progress
+from mcaptrack.api.common import Notes, PathLike, Progress, as_path, checked, no_progress
 from mcaptrack.api.ingesting import ingest
 from mcaptrack.api.scoring import Scores, evaluate
 from mcaptrack.api.whole import run
@@ -53,6 +53,7 @@ class DemoResult:
     warnings: tuple[Notice, ...]
 
 
+@checked
 def demo(
     output: PathLike = "mcaptrack-demo",
     *,

@@ -10,7 +10,16 @@ from pathlib import Path
 from typing import Final
 
 from mcaptrack import log as logs
-from mcaptrack.api.common import PathLike, Progress, as_path, log_output, no_progress, optional_path, warnings_about
+from mcaptrack.api.common import (
+    PathLike,
+    Progress,
+    as_path,
+    checked,
+    log_output,
+    no_progress,
+    optional_path,
+    warnings_about,
+)
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import is_same_file, refuse_overwrite
 from mcaptrack.geometry import clocks
@@ -56,6 +65,7 @@ class IngestResult:
     uses_camera: bool
 
 
+@checked
 def ingest(
     source: PathLike,
     output: PathLike | None = None,

@@ -13,6 +13,7 @@ from mcaptrack.api.common import (
     PathLike,
     Progress,
     as_path,
+    checked,
     detail,
     names_of,
     no_progress,
@@ -55,6 +56,7 @@ class ExportResult:
     warnings: tuple[Notice, ...]
 
 
+@checked
 def export(
     log: PathLike,
     output: PathLike | None = None,

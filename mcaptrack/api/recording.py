@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from mcaptrack import log as logs
 from mcaptrack import tables
-from mcaptrack.api.common import as_path, log_output
+from mcaptrack.api.common import as_path, checked, log_output
 from mcaptrack.api.fetching import FetchedMessage, fetch_message
 from mcaptrack.api.supervision import supervision_of
 from mcaptrack.errors import McaptrackError
@@ -171,6 +171,7 @@ class Recording:
         """
         return tables.table_to_array(self.table(name, topic))
 
+    @checked
     def frames(
         self, topic: str = "video", times: Sequence[int] | None = None, colour: Colour = "bgr"
     ) -> Iterator[Frame]:

@@ -24,11 +24,13 @@ from mcaptrack.api.columns import (
     number_of,
     time_of,
 )
+from mcaptrack.api.common import checked
 from mcaptrack.api.supervision import frame_of_supervision, is_supervision
 from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame, Schema
 
 
+@checked
 def detections(
     boxes: Any,
     scores: ArrayLike | None = None,

@@ -15,6 +15,7 @@ from mcaptrack.api.common import (
     Notes,
     PathLike,
     Progress,
+    checked,
     detail,
     names_of,
     no_progress,
@@ -173,6 +174,7 @@ class Scores:
         ]
 
 
+@checked
 def evaluate(
     tracks: PathLike | Sequence[PathLike],
     *,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from mcaptrack.api.common import PathLike, Progress, no_progress
+from mcaptrack.api.common import PathLike, Progress, checked, no_progress
 from mcaptrack.api.running import Mode, Option, RunResult, run_stage, transform_of
 from mcaptrack.errors import McaptrackError
 from mcaptrack.transforms import PROFILES, Transform
@@ -310,6 +310,7 @@ def predict(
     )
 
 
+@checked
 def retrack(
     log: PathLike,
     *,

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Final, Literal
 
 from mcaptrack import __version__
-from mcaptrack.api.common import Notes, PathLike, Progress, as_path, no_progress, optional_path, paths_of
+from mcaptrack.api.common import Notes, PathLike, Progress, as_path, checked, no_progress, optional_path, paths_of
 from mcaptrack.api.ingesting import parse_fps
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.plane import Point
@@ -63,6 +63,7 @@ class TrainResult:
     warnings: tuple[Notice, ...]
 
 
+@checked
 def train(
     sources: PathLike | Sequence[PathLike],
     output: PathLike = "trained",

@@ -10,7 +10,7 @@ from typing import Final, Literal
 
 from mcaptrack import log as logs
 from mcaptrack import pipeline
-from mcaptrack.api.common import Notes, PathLike, Progress, detail, no_progress, optional_path, paths_of
+from mcaptrack.api.common import Notes, PathLike, Progress, checked, detail, no_progress, optional_path, paths_of
 from mcaptrack.api.ingesting import parse_fps
 from mcaptrack.api.running import Option, transform_of
 from mcaptrack.errors import McaptrackError
@@ -68,6 +68,7 @@ class TuneResult:
     warnings: tuple[Notice, ...]
 
 
+@checked
 def tune(
     inputs: PathLike | Sequence[PathLike],
     *,

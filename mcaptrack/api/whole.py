@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 from mcaptrack import log as logs
 from mcaptrack import pipeline
-from mcaptrack.api.common import PathLike, Progress, names_of, no_progress
+from mcaptrack.api.common import PathLike, Progress, checked, names_of, no_progress
 from mcaptrack.api.running import RunResult, Where, transform_of, work
 from mcaptrack.evaluation.aligned import Similarity
 from mcaptrack.evaluation.events import EventOptions
@@ -95,6 +95,7 @@ def run(
     return work(Where(log, camera, topic, output, sidecar, force), plan, watch, progress, tables)
 
 
+@checked
 def events(
     log: PathLike,
     *,
