@@ -124,6 +124,21 @@ class TestRos1:
         assert report.lost == []
         assert "was never closed" in report.notes[0]
 
+    def test_a_record_is_cut_off_at_any_byte_of_its_head(self, tmp_path):
+        """A bag without an index ends in one to eight bytes of a record: all before it is read, and that is said."""
+        said = bag1(tmp_path / "a.bag", 4, 100)
+        data = bytearray((tmp_path / "a.bag").read_bytes())
+        index = data.index(b"index_pos=") + 10
+        at = struct.unpack("<Q", data[index : index + 8])[0]
+        data[index : index + 8] = bytes(8)
+        for more in range(1, 9):
+            (tmp_path / "b.bag").write_bytes(data[: at + more])
+            report = make(tmp_path / "b.bag", tmp_path / f"{more}.mcap")
+            assert recorded(tmp_path / f"{more}.mcap") == sorted(said)
+            (lost,) = report.lost
+            assert f"byte {at} and what follows: a record is cut off" in lost
+            assert lost.endswith("invalid") == (more >= 4)  # from then on there is a size
+
     def test_of_a_damaged_chunk_the_others_are_read(self, tmp_path):
         said = bag1(tmp_path / "a.bag", 60, 20_000, "BZ2")
         data = bytearray((tmp_path / "a.bag").read_bytes())

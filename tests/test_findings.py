@@ -17,6 +17,7 @@ import pytest
 from mcaptrack import log, notices, pipeline
 from mcaptrack.errors import McaptrackError
 from mcaptrack.pipeline import findings
+from mcaptrack.pipeline.planes import guess_plane
 from mcaptrack.schema import DETECTIONS, TRACKS, VIDEO, Frame, Schema
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.transforms import TRANSFORMS, KnnDetector
@@ -193,6 +194,20 @@ def test_nothing_is_made_of_nothing_and_otherwise_the_transform_gives_the_reason
 
 
 # Without a ground plane
+
+
+def test_a_guessed_plane_is_as_large_as_all_boxes_and_begins_with_the_first_frame():
+    boxes = {"x_px": [10.0, 300.0], "y_px": [20.0, 5.0], "w_px": [20.0, 40.4], "h_px": [34.0, 34.0]}
+    rows = DETECTIONS.rows(**boxes, score=[1.0, 1.0], class_id=[1, 1])
+    frames = [Frame(ns(3), 0, DETECTIONS.empty()), Frame(ns(4), 1, rows)]
+    planes, made = guess_plane(frames, "/camera/detections", "")
+    assert planes is not None
+    assert made is not None
+    (((start, plane),), ((frame,), _)) = planes, made
+    assert (start, frame.t_ns) == (ns(3), ns(3))
+    assert (plane.width_px, plane.height_px, plane.assumed) == (340, 54, True)
+    assert plane.homography[0] == pytest.approx(1.7 / 34)  # people are 1.7 m high
+    assert guess_plane(frames[:1], "/camera/detections", "") == (None, None)
 
 
 def ingested(path: Path, rows: Iterable[str], *words: object) -> Path:

@@ -8,7 +8,7 @@ import re
 import shlex
 import shutil
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from pathlib import Path
 from typing import get_args
@@ -443,6 +443,15 @@ class TestTimeline:
         made = Timeline.spaced(count, fps, start, "frames")
         assert made.t_ns.tolist() == [start + round(Fraction(k) / fps * 10**9) for k in range(count)]
         assert made.fits(fps)
+
+    @pytest.mark.parametrize("which", [0, 3, 9])
+    def test_pictures_match_a_rate_within_half_a_frame(self, which):
+        """At 4 a second half a frame is 125 ms, to either side; the first picture is what the others are counted from."""
+        made = Timeline.spaced(10, Fraction(4), 10**9, "frames")
+        for off_ms, fits in ((125, True), (-125, True), (126, False), (-126, False)):
+            t_ns = made.t_ns.copy()
+            t_ns[which] += off_ms * 10**6
+            assert replace(made, t_ns=t_ns).fits(Fraction(4)) is fits
 
     def test_times_end_in_2262(self):
         with pytest.raises(McaptrackError, match="times reach to the year 2262"):

@@ -236,6 +236,11 @@ class TestPredictors:
         variance = linear_variance(np.ones((1, 1)), np.array([0.0]), np.array([1.0]))
         assert variance[0] == pytest.approx(POSITION_NOISE_M**2 + SPEED_M_PER_S**2 + DRIFT_M2_PER_S3 / 3)
 
+    def test_variance_depends_on_no_clock(self):
+        weights, times, ahead = np.array([[-1.0, 0.5, 1.5], [-2.0, 1.0, 2.0]]), np.array([0.0, 0.4, 0.8]), [0.4, 0.8]
+        here, later = (linear_variance(weights, start + times, np.array(ahead)) for start in (0.0, 100.0))
+        np.testing.assert_allclose(here, later, rtol=1e-9)
+
 
 class TestPredict:
     def run(self, frames, **options):

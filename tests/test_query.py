@@ -503,7 +503,7 @@ def test_ctrl_c_ends_a_query_and_the_database_stays_usable(known):
         (["select 1\n\nform tracks where\n"], "in line 3"),
         (["  ;"], "empty"),
         (["create view a as select 1"], "needs a SELECT"),
-        (["select", "x_m", "from", "tracks"], "select is no log.*in quotes"),
+        (["select", "x_m", "from", "tracks"], "select is not a log.*in quotes"),
         ([], "no query.*--tables"),
         (["select 1", "--format", "parquet"], "-o"),
         (["select 1", "-f", "none.sql"], "."),

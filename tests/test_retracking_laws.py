@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import Frame, Rows
 from mcaptrack.transforms import PROFILES, RetrackByConsistency
 from mcaptrack.transforms.retrack import Retracking
@@ -147,3 +148,27 @@ def test_the_last_digits_of_positions_change_no_assignment(method, tie):
             rows["y_m"] += rng.uniform(-1e-12, 1e-12, len(rows))
             shaken.append(frame._replace(rows=rows))
         assert [sorted(places(frame).items()) for frame, _, _ in method(shaken)] == wanted
+
+
+@every_method
+def test_boxes_move_by_the_plane_of_their_time(method):
+    """Where the ground plane changes, rows before are as with the first plane alone, rows after as with the second."""
+    frames = noisy_tracks(np.random.default_rng(3), ticks=40, hidden=0.03)
+    change = frames[20].t_ns
+    first, second = (GroundPlane((scale, 0, 0, 0, scale, 0, 0, 0, 1), 640, 480) for scale in (0.05, 0.02))
+    method = replace(method, smooth=True, track_confidence=0.0)
+    before, after, both = (
+        list(replace(method, ground_planes=planes)(frames))
+        for planes in (((0, first),), ((0, second),), ((0, first), (change, second)))
+    )
+    assert any((a.rows["x_px"] != b.rows["x_px"]).any() for (a, *_), (b, *_) in zip(before, after, strict=True))
+    for frame, earlier, later, found in zip(frames, before, after, both, strict=True):
+        for one, wanted in zip(found, later if frame.t_ns >= change else earlier, strict=True):
+            np.testing.assert_array_equal(one.rows, wanted.rows)
+
+
+def test_noise_and_speed_are_never_taken_for_less_than_a_millimetre():
+    frames = noisy_tracks(np.random.default_rng(4), ticks=40)
+    none, least = (replace(PROFILES["default"], noise_m=least, speed_m_per_s=least) for least in (0.0, 1e-3))
+    for found, wanted in zip(outputs(none, frames), outputs(least, frames), strict=True):
+        np.testing.assert_array_equal(found, wanted)

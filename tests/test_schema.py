@@ -81,9 +81,17 @@ def test_we_read_what_the_protobuf_runtime_writes(data):
 def test_a_channel_is_its_messages_laid_end_to_end(data):
     schema = data.draw(ALL)
     parts = [schema.rows(**data.draw(columns(schema))) for _ in range(data.draw(st.integers(0, 4)))]
-    rows, counts = schema.codec.decode_all([schema.codec.encode(part) for part in parts])
+    payloads = [schema.codec.encode(part) for part in parts]
+    rows, counts = schema.codec.decode_all(payloads)
     assert counts.tolist() == [len(part) for part in parts]
     assert same(rows, np.concatenate([schema.empty(), *parts]))
+    between = b"--".join([b"", *payloads, b""])  # as in a chunk, with other records between them
+    end = np.cumsum([2 + len(payload) for payload in payloads], dtype=np.int64)
+    start = end - np.array([len(payload) for payload in payloads], np.int64)
+    decoded = schema.codec.decode_at(np.frombuffer(between, np.uint8), start, end)
+    assert decoded is not None
+    assert same(decoded[0], rows)
+    assert decoded[1].tolist() == counts.tolist()
 
 
 def test_a_writer_that_leaves_defaults_out_is_read_between_others():
