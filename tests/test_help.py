@@ -15,6 +15,7 @@ import pytest
 
 from mcaptrack import environment
 from mcaptrack.cli.command import LAST_PANELS
+from mcaptrack.cli.stages import shown_default
 from tests.commands import GROUP, call
 
 ROOT = Path(__file__).parent.parent
@@ -119,6 +120,23 @@ class TestHelp:
             for option in shown(command):
                 names[option.help].add(max(option.opts, key=len))
         assert {words: found for words, found in names.items() if len(found) > 1} == {}
+
+
+@pytest.mark.parametrize(
+    ("default", "words"),
+    [
+        ((1.0, 2.5), "1.0 2.5"),
+        ((), "none"),
+        (None, "none"),
+        (True, "true"),
+        (False, "false"),
+        (0.5, "0.5"),
+        (0, "0"),
+        ("iou", "iou"),
+    ],
+)
+def test_a_default_in_words(default, words):
+    assert shown_default(default) == words
 
 
 class TestWrongUsage:

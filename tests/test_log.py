@@ -16,6 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
+from mcap.writer import Writer
 from mcap_protobuf.decoder import DecoderFactory
 
 from mcaptrack import log
@@ -100,6 +101,22 @@ def test_results_are_replaced_without_opening_what_they_stand_beside(tmp_path):
         size.append(path.stat().st_size)
         assert our_messages(path)["result"] == [(round_number, 0, b"the same every time")]
     assert max(size) - min(size) < 16
+
+
+@pytest.mark.parametrize("options", STOCK_OPTIONS.values(), ids=STOCK_OPTIONS)
+def test_a_channel_without_messages_is_empty_also_where_no_statistics_count_it(tmp_path, options):
+    path = tmp_path / "theirs.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream, **options)
+        writer.start()
+        schema = writer.register_schema("text", "jsonschema", b"{}")
+        some, _ = (writer.register_channel(topic, "json", schema) for topic in ("some", "none"))
+        writer.add_message(some, 1, b"{}", 1)
+        writer.finish()
+    with log.read(path) as opened:
+        assert opened.channel("none").messages == 0
+        assert list(opened.messages("none")) == []
+        assert len(list(opened.messages("some"))) == 1
 
 
 def test_a_topic_can_be_taken_once(tmp_path):
