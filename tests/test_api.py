@@ -6,6 +6,7 @@ import json
 import re
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -100,6 +101,59 @@ def test_pictures_at_given_times_are_those_shown_at_these_times(tmp_path):
             opened.frames(times=[-5])
 
 
+@pytest.mark.parametrize("times", [[0.5], ["a"], [[0, 1]], 5, [np.nan], [2**64]])
+def test_times_of_pictures_are_whole_nanoseconds(tmp_path, times):
+    path, _ = clip_log(tmp_path)
+    with mcaptrack.open(path) as opened:
+        with pytest.raises(McaptrackError, match=r"`times=` needs .*nanoseconds"):
+            opened.frames(times=times)
+        with pytest.raises(McaptrackError, match="`colour=` can't be 'gray'; did you mean grey"):
+            opened.frames(colour="gray")
+        assert [frame.index for frame in opened.frames(times=np.array([0, 10], "datetime64[s]"))] == [0, 29]
+
+
+def test_a_log_that_was_closed_says_so(tmp_path):
+    path, _ = clip_log(tmp_path)
+    opened = mcaptrack.open(path)
+    row = opened.table("frames").to_pylist()[0]
+    late = opened.frames("video")
+    before = path.read_bytes()
+    opened.close()
+    for work in (
+        lambda: opened.table("frames"),
+        lambda: opened.array("/camera/video"),
+        lambda: opened.frames("video"),
+        lambda: opened.fetch(row),
+        lambda: opened.supervision("tracks"),
+        lambda: opened.write("/own/tracks", []),
+    ):
+        with pytest.raises(McaptrackError, match=r"clip.mcap is closed; `mcaptrack.open\('.*'\)` opens it again"):
+            work()
+    with pytest.raises(McaptrackError, match="is closed"):
+        next(late)
+    assert (opened.topics, opened.path, path.read_bytes()) == (("/camera/video",), path, before)
+    opened.close()
+
+
+def test_a_log_stays_the_same_one_wherever_the_working_folder_moves(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    some_log(tmp_path / "a.mcap")
+    (tmp_path / "below").mkdir()
+    other = some_log(tmp_path / "below" / "a.mcap").read_bytes()
+    with mcaptrack.open("a.mcap") as opened:
+        monkeypatch.chdir("below")
+        opened.write("/own/tracks", [])
+        assert "/own/tracks" in opened.topics
+    assert "/own/tracks" in {one.topic for one in mcaptrack.info(tmp_path / "a.mcap").channels}
+    assert (tmp_path / "below" / "a.mcap").read_bytes() == other
+
+
+def test_threads_may_share_a_log(tmp_path):
+    with mcaptrack.open(some_log(tmp_path / "a.mcap")) as opened, ThreadPoolExecutor(8) as pool:
+        found = list(pool.map(lambda name: opened.table(name).num_rows, [*opened.tables] * 3))
+        assert found == [opened.table(name).num_rows for name in opened.tables] * 3
+
+
 def test_a_channel_without_pictures_is_refused(tmp_path):
     with mcaptrack.open(some_log(tmp_path / "a.mcap")) as opened, pytest.raises(McaptrackError, match="no pictures"):
         opened.frames("video")
@@ -117,6 +171,7 @@ def test_every_message_is_fetched_by_its_row_of_frames(tmp_path):
             assert found == (row["topic"], message.t_ns, message.publish_ns, message.sequence, message.payload)
         first = pointers.to_pandas().iloc[0]  # a row of pandas, as numbers of its own
         assert opened.fetch(first).t_ns == first["t_ns"]
+        assert opened.fetch(opened.array("frames")[0]).t_ns == first["t_ns"]  # a row of an array
 
 
 def test_messages_outside_chunks_and_in_results_are_fetched(tmp_path):

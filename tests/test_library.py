@@ -9,11 +9,13 @@ import importlib
 import inspect
 import json
 import logging
+import math
 import re
 import shutil
 import typing
 import warnings
 from pathlib import Path
+from typing import Literal, get_args, get_origin
 
 import numpy as np
 import pytest
@@ -193,7 +195,7 @@ class TestResults:
         scores = mcaptrack.evaluate("log.mcap", gate_m=1.0)
         (row,) = [r for r in scores.rows() if (r["tracks"], r["similarity"]) == ("/camera/retracks", "metres")]
         assert scores.score("IDF1", "retracks", "metres") == row["IDF1"]
-        with pytest.raises(McaptrackError, match="2 results fit retracks"):
+        with pytest.raises(McaptrackError, match="2 results fit `tracks='retracks'`"):
             scores.score("IDF1", "retracks")
 
     def test_scores_below_a_limit_are_listed(self, place):
@@ -235,6 +237,49 @@ class TestRefused:
             "a URL": (lambda: mcaptrack.info("s3://bucket/a.mcap"), "s3://bucket/a.mcap is a URL"),
             "what exists": (lambda: mcaptrack.recover("log.mcap", "log.mcap"), "both input and output"),
             "frames per second": (lambda: mcaptrack.ingest("video.mp4", "b.mcap", fps=0), "`fps=` needs a number"),
+            "a class": (
+                lambda: mcaptrack.track("log.mcap", tracker=ByteTrack),
+                "ByteTrack is a class; give an object of",
+            ),
+            "no transform": (lambda: mcaptrack.track("log.mcap", tracker=5), "5 is no transform"),
+            "no transform of a stage": (
+                lambda: mcaptrack.run("log.mcap", stages={"track": object()}),
+                "is no transform: it is no dataclass",
+            ),
+            "no stage": (
+                lambda: mcaptrack.run("log.mcap", stages={"trak": "sort"}),
+                "there is no stage trak; `stages=",
+            ),
+            "no channels": (lambda: mcaptrack.drop("log.mcap", []), "name the channels to remove with `topics=`"),
+            "no logs": (lambda: mcaptrack.report([], "a.html"), "there is no log to report on"),
+            "a folder to check": (lambda: mcaptrack.check(""), ". is a folder, not an MCAP file"),
+            "a folder to export": (lambda: mcaptrack.export("."), ". is a folder, not an MCAP file"),
+            "a folder to render": (lambda: mcaptrack.render("."), ". is a folder, not an MCAP file"),
+            "a folder to recover": (lambda: mcaptrack.recover("."), ". is a folder, not an MCAP file"),
+            "a folder to report on": (lambda: mcaptrack.report("."), ". is a folder, not an MCAP file"),
+            "no progress": (
+                lambda: mcaptrack.track("log.mcap", progress=None),
+                "`progress=` is called as progress(stage",
+            ),
+            "no gates": (lambda: mcaptrack.evaluate("log.mcap", gate_m=()), "`gate_m=` needs at least one number"),
+            "a wrong gate": (lambda: mcaptrack.evaluate("log.mcap", gate_m=(1, -1)), "from 0.001 to 1000000, not -1"),
+            "a score of several": (
+                lambda: mcaptrack.evaluate("log.mcap").score("IDF1", "retracks"),
+                "4 results fit `tracks='retracks'`, `similarity=''` and `gate=None`; choose one of: /camera/retracks ",
+            ),
+            "a score of none": (
+                lambda: mcaptrack.evaluate("log.mcap").score("IDF1", "retracks", "meters"),
+                "no results fit `tracks='retracks'`, `similarity='meters'`",
+            ),
+            "no score": (
+                lambda: mcaptrack.evaluate("log.mcap").score("sequence", "retracks", "metres", 1.0),
+                "there is no score sequence; there are MOTA",
+            ),
+            "no limit": (
+                lambda: mcaptrack.evaluate("log.mcap").below({"idf1": 1}),
+                "there is no score idf1; there are",
+            ),
+            "what is there": (lambda: mcaptrack.open("log.mcap", create=True), "open it without `create=True`"),
         }.values(),
     )
     def test_errors_are_one_line_that_names_parameters(self, place, work, words):
@@ -267,7 +312,47 @@ class TestRefused:
         assert not Path("out.mp4").exists()
 
 
-class TestMessagesOfTheCommandLine:
+class TestChecked:
+    """Choices and ranges that the command line has hold for calls, before anything is read."""
+
+    @staticmethod
+    def words(name: str, parameter: str, value: object) -> str:
+        with pytest.raises(McaptrackError) as refused:
+            getattr(mcaptrack, name)("nowhere.mcap", **{parameter: value})
+        return str(refused.value)
+
+    @pytest.mark.parametrize("name", [name for name in FUNCTIONS if name in GROUP.commands])
+    def test_ranges_are_those_of_the_command_line(self, name):
+        known = inspect.signature(getattr(mcaptrack, name)).parameters
+        for setting in GROUP.commands[name].settings.values():
+            least, most = setting.declared.least, setting.declared.most
+            if setting.parameter not in known or not (math.isfinite(least) or math.isfinite(most)):
+                continue
+            beyond = [least - 1, most + 1] + ([math.nan] if setting.kind is float else [least + 0.5])
+            for value in beyond:
+                assert self.words(name, setting.parameter, value).startswith(f"`{setting.parameter}=` is a")
+            for value in (least, most) if name != "demo" else ():  # demo needs no log
+                assert f"`{setting.parameter}=` is a" not in self.words(name, setting.parameter, setting.kind(value))
+
+    @pytest.mark.parametrize("name", [name for name in FUNCTIONS if name in GROUP.commands])
+    def test_choices_are_those_of_the_command_line(self, name):
+        known = inspect.signature(getattr(mcaptrack, name)).parameters
+        for setting in GROUP.commands[name].settings.values():
+            choices = get_args(setting.kind) if get_origin(setting.kind) is Literal else ()
+            if choices and setting.parameter in known:
+                said = self.words(name, setting.parameter, "nonsense")
+                assert "nonsense" in said
+                assert all(choice in said for choice in choices)
+
+    def test_what_numpy_computes_is_a_number(self, place):
+        gates = mcaptrack.evaluate("log.mcap", similarity="metres", gate_m=np.array([1.0, 2.0])).rows()
+        assert {row["gate"] for row in gates} == {1.0, 2.0}
+        mcaptrack.track("log.mcap", max_age_s=np.float32(0.5), output="a.mcap")
+        mcaptrack.track("log.mcap", max_age_s=0.5, output="b.mcap", stages={"detect": "mog2"})
+        assert Path("a.mcap").read_bytes() == Path("b.mcap").read_bytes()
+
+
+class TestWordsOfTheCommandLine:
     """The library names parameters and functions; the command line shows options and commands."""
 
     def test_parameters_become_options(self):

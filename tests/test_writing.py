@@ -261,8 +261,8 @@ class TestWriting:
             ("/camera/detections", [*walk(2), *walk(1)], "two frames are at 0 ns; each picture has a time of its own"),
             ("/camera/detections", [walk(1)[0]._replace(t_ns=0.5)], "needs whole nanoseconds"),
             ("/camera/detections", [walk(1)[0]._replace(rows=None)], "rows of a frame are a structured array"),
-            ("/camera/detections", table(t_ns=[0.0, 0.1]), "t_ns needs whole nanoseconds.* not float64"),
-            ("/camera/detections", table(t_ns=[-1, 5]), "it has -1 to 5"),
+            ("/camera/detections", table(t_ns=[0.0, 0.1]), "the column t_ns needs whole nanoseconds.* not float64"),
+            ("/camera/detections", table(t_ns=[-1, 5]), "from 0 to .*, not -1"),
             ("/camera/detections", table(frame=[-2, 5]), "the column frame holds numbers of pictures"),
             (
                 "/camera/detections",

@@ -64,7 +64,9 @@ def frames_of_columns(columns: dict[str, Any], schema: Schema | None) -> tuple[S
                 f"the table has rows of {len(different)} {name}s: {', '.join(different)}; their ids and times do not "
                 f"go together: select one {name}"
             )
-    t_ns = _times(columns["t_ns"])
+    t_ns = times_of(columns["t_ns"], "the column t_ns")
+    if len(t_ns):
+        time_of(t_ns.min())
     rows = _rows(schema, {name: values for name, values in columns.items() if name in known}, len(t_ns), "the table")
     numbers = _numbers(columns["frame"]) if "frame" in columns else np.full(len(t_ns), UNNUMBERED)
     order = np.lexsort((numbers, t_ns))
@@ -129,17 +131,15 @@ def time_of(t_ns: Any) -> int:
     return whole
 
 
-def _times(values: Any) -> Ints:
-    """The times (N,) of a table in nanoseconds; also from timestamps."""
+def times_of(values: Any, name: str) -> Ints:
+    """Times (N,) in nanoseconds; also from timestamps. Raises McaptrackError, with their name, for anything else."""
     array = np.asarray(values)
     if array.dtype.kind == "M":
         array = array.astype("datetime64[ns]").astype(np.int64)
-    if array.dtype.kind not in "iu" and len(array):
-        raise McaptrackError(f"the column t_ns needs {_IN_NS}, in each row, not {array.dtype}")
-    if len(array) and not 0 <= int(array.min()) <= int(array.max()) <= LAST_NS:
-        raise McaptrackError(
-            f"the column t_ns holds nanoseconds since 1970 from 0 to {LAST_NS}; it has {array.min()} to {array.max()}"
-        )
+    if array.ndim != 1 or (array.dtype.kind not in "iu" and len(array)):
+        raise McaptrackError(f"{name} needs {_IN_NS}, in an array (N,), not {array.dtype} of shape {array.shape}")
+    if len(array) and not -LAST_NS <= int(array.min()) <= int(array.max()) <= LAST_NS:
+        raise McaptrackError(f"{name} needs nanoseconds up to {LAST_NS}; there are {array.min()} to {array.max()}")
     return array.astype(np.int64)
 
 

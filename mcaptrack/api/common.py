@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-import inspect
 import logging
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from difflib import get_close_matches
-from functools import wraps
 from pathlib import Path
-from typing import Final, Literal, ParamSpec, TypeVar, get_args, get_origin, get_type_hints
+from typing import Final
 
 from mcaptrack import notices
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import is_same_file, refuse_special, refuse_url
 from mcaptrack.notices import Notice
 
-P = ParamSpec("P")
-R = TypeVar("R")
 PathLike = str | os.PathLike[str]
 #: Called with the name of a stage, the amount that is done, and the total (None if it is not known).
 Progress = Callable[[str, float, float | None], None]
@@ -46,9 +41,19 @@ def optional_path(path: PathLike | None) -> Path | None:
     return None if path is None else as_path(path)
 
 
+def log_path(path: PathLike) -> Path:
+    """Return the path of a log that stands. Raises McaptrackError as ``as_path``, and for a folder."""
+    found = as_path(path)
+    if found.is_dir():
+        raise McaptrackError(f"{found} is a folder, not an MCAP file; give the log in it")
+    return found
+
+
 def paths_of(paths: PathLike | Sequence[PathLike]) -> list[Path]:
     """Return one path, or several, as a list."""
-    return [as_path(path) for path in ([paths] if isinstance(paths, str | os.PathLike) else paths)]
+    if isinstance(paths, Iterable) and not isinstance(paths, str | bytes | os.PathLike):
+        return [as_path(path) for path in paths]
+    return [as_path(paths)]
 
 
 def names_of(names: str | Sequence[str] | None) -> tuple[str, ...]:
@@ -67,37 +72,6 @@ def log_output(path: PathLike, source: Path) -> Path:
     if found.suffix.lower() != ".mcap" and not is_same_file(found, source):
         raise McaptrackError(f"{found} is not a name for a log: logs are MCAP files; give a name that ends with .mcap")
     return found
-
-
-def checked(function: Callable[P, R]) -> Callable[P, R]:
-    """Wrap a function: raise McaptrackError for text that its type hints (``Literal``) do not list."""
-    choices: dict[str, tuple[object, ...]] = {}
-
-    @wraps(function)
-    def wrapper(*values: P.args, **named: P.kwargs) -> R:
-        if not choices:
-            choices.update(_choices_of(function))
-        given = inspect.signature(function).bind(*values, **named).arguments
-        for name, known in choices.items():
-            value = given.get(name)
-            if isinstance(value, str) and value not in known:
-                close = get_close_matches(value, map(str, known), 1)
-                meant = f"did you mean {close[0]}? " if close else ""
-                raise McaptrackError(f"`{name}=` can't be {value!r}; {meant}there are {', '.join(map(str, known))}")
-        return function(*values, **named)
-
-    return wrapper
-
-
-def _choices_of(function: Callable[..., object]) -> dict[str, tuple[object, ...]]:
-    """Return the values of each parameter that is a ``Literal``, or a ``Literal`` or None."""
-    out = {}
-    for name, hint in get_type_hints(function).items():
-        kinds = [hint] if get_origin(hint) is Literal else get_args(hint)
-        literals = [kind for kind in kinds if get_origin(kind) is Literal]
-        if literals and str not in kinds and name != "return":
-            out[name] = tuple(value for kind in literals for value in get_args(kind))
-    return out
 
 
 @contextmanager

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal
 
-from mcaptrack.api.common import Notes, PathLike, Progress, as_path, checked, no_progress
+from mcaptrack.api.checked import checked
+from mcaptrack.api.common import Notes, PathLike, Progress, as_path, no_progress
 from mcaptrack.api.ingesting import ingest
 from mcaptrack.api.scoring import Scores, evaluate
 from mcaptrack.api.whole import run
@@ -53,7 +54,7 @@ class DemoResult:
     warnings: tuple[Notice, ...]
 
 
-@checked
+@checked(seed=(0, 2**31 - 1))
 def demo(
     output: PathLike = "mcaptrack-demo",
     *,

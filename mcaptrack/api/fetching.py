@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Final, NamedTuple
 
+import numpy as np
+
 from mcaptrack.errors import McaptrackError
 from mcaptrack.log import Log
 
@@ -36,6 +38,8 @@ class FetchedMessage(NamedTuple):
 
 def fetch_message(log: Log, row: Mapping[str, Any]) -> FetchedMessage:
     """Read the message that a row points to; see ``Recording.fetch``."""
+    if isinstance(row, np.void):
+        row = {name: row[name] for name in row.dtype.names or ()}
     missing = [name for name in _NEEDED if name not in row]
     if missing:
         raise McaptrackError(f"a row without {', '.join(missing)} does not say where its message is; rows of frames do")

@@ -10,16 +10,8 @@ from pathlib import Path
 from typing import Final
 
 from mcaptrack import log as logs
-from mcaptrack.api.common import (
-    PathLike,
-    Progress,
-    as_path,
-    checked,
-    log_output,
-    no_progress,
-    optional_path,
-    warnings_about,
-)
+from mcaptrack.api.checked import checked
+from mcaptrack.api.common import PathLike, Progress, as_path, log_output, no_progress, optional_path, warnings_about
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import is_same_file, refuse_overwrite
 from mcaptrack.geometry import clocks
@@ -65,7 +57,7 @@ class IngestResult:
     uses_camera: bool
 
 
-@checked
+@checked(quality=(1, 100), keyframe_interval_s=(0.01, 60), first_frame=(0, 10**12), frames=(1, 10_000_000))
 def ingest(
     source: PathLike,
     output: PathLike | None = None,

@@ -9,12 +9,12 @@ from typing import Any
 
 from mcaptrack import log as logs
 from mcaptrack import pipeline
+from mcaptrack.api.checked import checked
 from mcaptrack.api.common import (
     PathLike,
     Progress,
-    as_path,
-    checked,
     detail,
+    log_path,
     names_of,
     no_progress,
     optional_path,
@@ -56,7 +56,7 @@ class ExportResult:
     warnings: tuple[Notice, ...]
 
 
-@checked
+@checked()
 def export(
     log: PathLike,
     output: PathLike | None = None,
@@ -103,7 +103,7 @@ def export(
     True
 
     """
-    path = as_path(log)
+    path = log_path(log)
     folder = optional_path(output) or default_folder(path)
     if folder.exists() and not folder.is_dir():
         raise McaptrackError(f"{folder} is a file; tables go to a folder")
@@ -151,6 +151,7 @@ class ReportResult:
     warnings: tuple[Notice, ...]
 
 
+@checked()
 def report(
     log: PathLike | Sequence[PathLike],
     output: PathLike | None = None,
@@ -191,7 +192,9 @@ def report(
     'page.html'
 
     """
-    paths = paths_of(log)
+    paths = [log_path(path) for path in paths_of(log)]
+    if not paths:
+        raise McaptrackError("there is no log to report on; give one, or several")
     if output is None and len(paths) != 1:
         raise McaptrackError(f"{len(paths)} logs become one page; name it with `output=`")
     target = optional_path(output) or paths[0].with_suffix(".report.html")
@@ -235,6 +238,7 @@ class RenderResult:
     warnings: tuple[Notice, ...]
 
 
+@checked(width=(16, 16384), max_fps=(0.01, 1000), start_s=(0, 1e9), end_s=(0, 1e9))
 def render(
     log: PathLike,
     output: PathLike | None = None,
@@ -291,7 +295,7 @@ def render(
     True
 
     """
-    path = as_path(log)
+    path = log_path(log)
     target = optional_path(output) or path.with_suffix(".gif" if gif else ".mp4")
     refuse_overwrite(target, force)
     options = RenderOptions(width_px=width, max_fps=max_fps, start_s=start_s, end_s=end_s)

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from threading import RLock
 from typing import TYPE_CHECKING, Any, Literal, Self
 
 import numpy as np
@@ -22,10 +23,12 @@ from numpy.typing import NDArray
 
 from mcaptrack import log as logs
 from mcaptrack import tables
-from mcaptrack.api.common import as_path, checked, log_output
+from mcaptrack.api.checked import checked
+from mcaptrack.api.columns import times_of
+from mcaptrack.api.common import as_path, log_output
 from mcaptrack.api.fetching import FetchedMessage, fetch_message
 from mcaptrack.api.supervision import supervision_of
-from mcaptrack.errors import McaptrackError
+from mcaptrack.errors import McaptrackError, call
 from mcaptrack.files import refuse_overwrite
 from mcaptrack.schema import DETECTIONS, SCHEMAS, TRACKS, Frame
 from mcaptrack.sources import foreign
@@ -57,11 +60,20 @@ class Recording:
     """
 
     def __init__(self, path: Path) -> None:
+        self._place = path.absolute()  # where the log is, wherever the working folder moves
+        self._reading = RLock()  # tables are kept once they were made, and several threads may ask for them
         self._open(path)
 
     def _open(self, path: Path) -> None:
-        self._log = logs.read(path)
-        self._contents = export.LogTables(self._log)
+        self._there = logs.read(path)
+        self._contents = export.LogTables(self._there)
+        self._is_open = True
+
+    @property
+    def _log(self) -> logs.Log:
+        if not self._is_open:
+            raise McaptrackError(f"{self.path} is closed; {call('open', self.path)} opens it again")
+        return self._there
 
     def __enter__(self) -> Self:
         return self
@@ -74,12 +86,13 @@ class Recording:
 
     def close(self) -> None:
         """Close the file."""
-        self._log.__exit__()
+        self._is_open = False
+        self._there.__exit__()
 
     @property
     def path(self) -> Path:
         """The file of the log."""
-        return self._log.path
+        return self._there.path
 
     @property
     def name(self) -> str:
@@ -94,7 +107,7 @@ class Recording:
     @property
     def topics(self) -> tuple[str, ...]:
         """The topics of all channels, in alphabetical order."""
-        return tuple(sorted(self._log.channels))
+        return tuple(sorted(self._there.channels))
 
     def table(self, name: str, topic: str | None = None) -> pa.Table:
         """Return a table as Arrow: the same as in the files that ``export`` writes, with the column ``recording``.
@@ -124,14 +137,16 @@ class Recording:
         ['topic', 'frame', 't', 't_ns']
 
         """
-        if name in tables.TABLES:
-            made = self._contents.table(name)
-        elif self._log.channels.get(name) is not None:
-            made = self._contents.messages(name)[0]
-        else:
-            raise McaptrackError(
-                f"{self.path} has no table {name}; there are {', '.join(self.tables)}, and its channels"
-            )
+        with self._reading:
+            channels = self._log.channels
+            if str(name) in tables.TABLES:
+                made = self._contents.table(name)
+            elif str(name) in channels:
+                made = self._contents.messages(name)[0]
+            else:
+                raise McaptrackError(
+                    f"{self.path} has no table {name}; there are {', '.join(self.tables)}, and its channels"
+                )
         if topic is not None:
             self._log.channel(topic)
             if "topic" not in made.schema.names:
@@ -171,9 +186,9 @@ class Recording:
         """
         return tables.table_to_array(self.table(name, topic))
 
-    @checked
+    @checked()
     def frames(
-        self, topic: str = "video", times: Sequence[int] | None = None, colour: Colour = "bgr"
+        self, topic: str = "video", times: Sequence[int] | NDArray[Any] | None = None, colour: Colour = "bgr"
     ) -> Iterator[Frame]:
         """Decode the pictures of a channel, in the order of time.
 
@@ -181,9 +196,9 @@ class Recording:
         ----------
         topic : str, default "video"
             The channel, or the end of its topic: "video" for /camera/video.
-        times : sequence of int, optional
-            Times in nanoseconds: decode the picture that is shown at each, the last one that is not later. By default
-            all pictures.
+        times : sequence of int or array of datetime64, optional
+            Times in whole nanoseconds: decode the picture that is shown at each, the last one that is not later. By
+            default all pictures.
         colour : {"bgr", "rgb", "grey"}, default "bgr"
             Order of the colours.
 
@@ -321,10 +336,12 @@ class Recording:
         """
         from mcaptrack.api.writing import write_rows
 
-        path = self.path
-        count = write_rows(path, topic, rows, replace=replace, sidecar=sidecar)
-        self.close()
-        self._open(path)
+        path = self._log.path
+        path = path if path.absolute() == self._place else self._place
+        with self._reading:
+            count = write_rows(path, topic, rows, replace=replace, sidecar=sidecar)
+            self.close()
+            self._open(path)
         return count
 
     def _pictures(self, topic: str) -> str:
@@ -336,11 +353,12 @@ class Recording:
             raise McaptrackError(f"{self.path} has {len(found) or 'no'} channels {topic} with pictures; it has {has}")
         return found[0]
 
-    def _shown(self, topic: str, times: Sequence[int]) -> dict[int, int]:
-        """Return the numbers of the pictures that are shown at these times, and how often each is asked for."""
-        at = np.searchsorted(self._log.times(topic), np.asarray(times, np.int64), "right") - 1
+    def _shown(self, topic: str, times: Sequence[int] | NDArray[Any]) -> dict[int, int]:
+        """The numbers of the pictures that are shown at these times, and how often each is asked for."""
+        wanted = times_of(times, "`times=`")
+        at = np.searchsorted(self._log.times(topic), wanted, "right") - 1
         if len(at) and at.min() < 0:
-            first = int(np.asarray(times)[at.argmin()])
+            first = int(wanted[at.argmin()])
             raise McaptrackError(f"{self.path}: {topic} has no picture at {first} ns; its first picture is later")
         numbers, counts = np.unique(at, return_counts=True)
         return dict(zip(numbers.tolist(), counts.tolist(), strict=True))
@@ -381,6 +399,8 @@ def open(path: str | Path, *, create: bool = False) -> Recording:  # noqa: A001 
     """
     if create:
         made = log_output(path, Path(path))
+        if made.exists():
+            raise McaptrackError(f"{made} exists; open it without `create=True`, or give a new log another name")
         refuse_overwrite(made, force=False)
         with logs.create(made):
             pass

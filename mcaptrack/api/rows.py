@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mcaptrack import tables
+from mcaptrack.api.checked import checked
 from mcaptrack.api.columns import (
     UNNUMBERED,
     BoxFormat,
@@ -24,13 +25,12 @@ from mcaptrack.api.columns import (
     number_of,
     time_of,
 )
-from mcaptrack.api.common import checked
 from mcaptrack.api.supervision import frame_of_supervision, is_supervision
 from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame, Schema
 
 
-@checked
+@checked()
 def detections(
     boxes: Any,
     scores: ArrayLike | None = None,

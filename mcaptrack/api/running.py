@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from difflib import get_close_matches
 from pathlib import Path
 from time import monotonic
 from typing import Literal
+
+import numpy as np
 
 from mcaptrack import log as logs
 from mcaptrack import pipeline
@@ -166,8 +168,9 @@ def _export(target: Path, force: bool, progress: Progress) -> dict[str, int]:
 def transform_of(stage: str, chosen: str | Transform | None, options: Mapping[str, Option]) -> Transform:
     """Return the transform of a stage: the one of this name, or this one; with these options.
 
-    Raises McaptrackError for a name or an option that does not exist.
+    Raises McaptrackError for a name or an option that does not exist, and for what is no transform.
     """
+    options = {name: value.item() if isinstance(value, np.generic) else value for name, value in options.items()}
     if chosen is None or isinstance(chosen, str):
         step = STAGES[stage]
         if chosen and step.parameter:
@@ -176,8 +179,22 @@ def transform_of(stage: str, chosen: str | Transform | None, options: Mapping[st
     return _with_options(chosen, options)
 
 
+def transforms_of(stages: Mapping[str, str | Transform] | None) -> dict[str, Transform]:
+    """Return transforms by stage. Raises McaptrackError as ``transform_of``, and for a stage that does not exist."""
+    for stage in stages or {}:
+        if stage not in STAGES:
+            raise McaptrackError(f"there is no stage {stage}; `stages=` has transforms of {', '.join(STAGES)}")
+    return {stage: transform_of(stage, chosen, {}) for stage, chosen in (stages or {}).items()}
+
+
 def _with_options(base: Transform, options: Mapping[str, Option]) -> Transform:
     """Return a transform with other values of some options. Raises McaptrackError for an unknown option."""
+    if isinstance(base, type):
+        raise McaptrackError(f"{base.__name__} is a class; give an object of it: {base.__name__}()")
+    if not is_dataclass(base):
+        raise McaptrackError(
+            f"{base!r:.80} is no transform: it is no dataclass; give a name, or an object of a transform"
+        )
     known = [f.name for f in fields(base) if not f.metadata.get("context")]
     for name in options:
         if name not in known:
@@ -200,15 +217,16 @@ def run_stage(
     output: PathLike | None = None,
     sidecar: bool | None = None,
     force: bool = False,
-    stages: Mapping[str, Transform] | None = None,
+    stages: Mapping[str, str | Transform] | None = None,
     mode: Mode | None = None,
     progress: Progress = no_progress,
 ) -> RunResult:
     """Run one stage with a transform; ``detect``, ``track`` and the others call this with their transform."""
     modes = STAGES[stage].modes
     keep = modes[mode or "both"] if modes else None
+    before = transforms_of(stages)
 
     def plan(opened: logs.Log, prefix: str, say: Callable[[str], None]) -> list[Job]:
-        return pipeline.plan_stage(opened, prefix, stage, transform, topic, to, keep, say, stages or {})
+        return pipeline.plan_stage(opened, prefix, stage, transform, topic, to, keep, say, before)
 
     return work(Where(log, camera, topic, output, sidecar, force), plan, None, progress, None)

@@ -9,13 +9,15 @@ from itertools import count
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
+
 from mcaptrack import log as logs
 from mcaptrack import pipeline
+from mcaptrack.api.checked import checked
 from mcaptrack.api.common import (
     Notes,
     PathLike,
     Progress,
-    checked,
     detail,
     names_of,
     no_progress,
@@ -35,6 +37,7 @@ from mcaptrack.evaluation import (
 from mcaptrack.evaluation import evaluate as score_sequences
 from mcaptrack.evaluation.aligned import Similarity
 from mcaptrack.evaluation.metrics import Rules
+from mcaptrack.geometry.arrays import Floats
 from mcaptrack.geometry.plane import Point
 from mcaptrack.notices import Notice, collected, warn
 from mcaptrack.tables.compared import compare_files, pair_files
@@ -46,7 +49,7 @@ _FILES: Final = (".txt", ".csv", *_TABLES)
 LIMITS: Final = ("MOTA", "IDF1", "IDP", "IDR", "HOTA", "DetA", "AssA", "LocA")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Scores:
     """Scores of tracks and predictions against ground truth.
 
@@ -121,9 +124,13 @@ class Scores:
         rows = [row for row in rows if gate in (None, row["gate"])]
         whole = [row for row in rows if row["tracks"] == tracks or row["tracks"].endswith(f"/{tracks}")]
         rows = whole or rows
-        if len(rows) != 1 or name not in rows[0]:
-            there = ", ".join(f"{row['tracks']} {row['similarity']} {row['gate']:g}" for row in self.final())
-            raise McaptrackError(f"{len(rows)} results fit {tracks} {similarity} {gate} {name}; there are {there}")
+        if len(rows) != 1:
+            there = ", ".join(f"{row['tracks']} {row['similarity']} {row['gate']:g}" for row in rows or self.final())
+            raise McaptrackError(
+                f"{len(rows) or 'no'} results fit `tracks={tracks!r}`, `similarity={similarity!r}` and `gate={gate}`; "
+                f"choose one of: {there}"
+            )
+        _check_name(name, rows[0])
         return float(rows[0][name])
 
     def final(self) -> list[dict[str, Any]]:
@@ -165,6 +172,8 @@ class Scores:
         []
 
         """
+        for name in limits:
+            _check_name(name, *self.final()[:1])
         return [
             f"{row['sequence']} {row['tracks']} {row['similarity']} {row['gate']:g}: "
             f"{name} {row[name]:.4f} is under {least:g}"
@@ -174,13 +183,13 @@ class Scores:
         ]
 
 
-@checked
+@checked(gate_m=(0.001, 1e6), min_iou=(0.001, 1))
 def evaluate(
     tracks: PathLike | Sequence[PathLike],
     *,
     truth: PathLike | Sequence[PathLike] | None = None,
     similarity: Similarity | None = None,
-    gate_m: float | Sequence[float] = (0.5, 1.0, 2.0),
+    gate_m: float | Sequence[float] | Floats = (0.5, 1.0, 2.0),
     min_iou: float = 0.5,
     rules: Rules = "trackeval",
     topic: str | Sequence[str] | None = None,
@@ -202,7 +211,7 @@ def evaluate(
     similarity : {"iou", "metres"}, optional
         Match by overlap of boxes or by distance on the ground; by default both, as far as there are boxes and metres.
     gate_m : float or sequence of float, default (0.5, 1, 2)
-        Largest distance of a match in metres; scores are given for each.
+        Largest distance of a match in metres, from 0.001; scores are given for each.
     min_iou : float, default 0.5
         Least overlap (IoU) of a match.
     rules : {"trackeval", "motmetrics"}, default "trackeval"
@@ -239,7 +248,7 @@ def evaluate(
 
     """
     topics, notes = names_of(topic), Notes()
-    gates = tuple(map(float, gate_m)) if isinstance(gate_m, Sequence) else (float(gate_m),)
+    gates = tuple(np.asarray(gate_m, float).reshape(-1).tolist())
     options = EvaluateOptions((similarity,) if similarity else (), gates, min_iou, rules, topics)
     paths = paths_of(tracks)
     with collected() as warnings:
@@ -259,6 +268,13 @@ def evaluate(
         for words in outcome.notes:
             warn(words, "not-compared")
     return Scores(tuple(outcome.results), tuple(notes), tuple(dict.fromkeys(warnings)))
+
+
+def _check_name(name: str, row: Mapping[str, Any]) -> None:
+    """Raise McaptrackError if a row has no score of this name."""
+    scores = [key for key, value in row.items() if isinstance(value, int | float) and key != "gate"]
+    if name not in scores:
+        raise McaptrackError(f"there is no score {name}; there are {', '.join(scores)}")
 
 
 def holds_tables(path: Path) -> bool:

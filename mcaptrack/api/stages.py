@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from mcaptrack.api.common import PathLike, Progress, checked, no_progress
+from mcaptrack.api.checked import checked
+from mcaptrack.api.common import PathLike, Progress, no_progress
 from mcaptrack.api.running import Mode, Option, RunResult, run_stage, transform_of
 from mcaptrack.errors import McaptrackError
 from mcaptrack.transforms import PROFILES, Transform
 
 
+@checked()
 def detect(
     log: PathLike,
     *,
@@ -20,7 +22,7 @@ def detect(
     output: PathLike | None = None,
     sidecar: bool | None = None,
     force: bool = False,
-    stages: Mapping[str, Transform] | None = None,
+    stages: Mapping[str, str | Transform] | None = None,
     progress: Progress = no_progress,
     **options: Option,
 ) -> RunResult:
@@ -46,8 +48,8 @@ def detect(
         ROS tools read, otherwise into the log.
     force : bool, default False
         Overwrite ``output`` if it exists.
-    stages : mapping of str to Transform, optional
-        Transforms by stage, for channels that are missing and have to be made first.
+    stages : mapping of str to str or Transform, optional
+        Transforms, or their names, by stage, for channels that are missing and have to be made first.
     progress : callable, optional
         Called as ``progress(stage, done, total)``.
     **options
@@ -85,6 +87,7 @@ def detect(
     )
 
 
+@checked()
 def track(
     log: PathLike,
     *,
@@ -95,7 +98,7 @@ def track(
     output: PathLike | None = None,
     sidecar: bool | None = None,
     force: bool = False,
-    stages: Mapping[str, Transform] | None = None,
+    stages: Mapping[str, str | Transform] | None = None,
     progress: Progress = no_progress,
     **options: Option,
 ) -> RunResult:
@@ -121,8 +124,8 @@ def track(
         ROS tools read, otherwise into the log.
     force : bool, default False
         Overwrite ``output`` if it exists.
-    stages : mapping of str to Transform, optional
-        Transforms by stage, for channels that are missing and have to be made first.
+    stages : mapping of str to str or Transform, optional
+        Transforms, or their names, by stage, for channels that are missing and have to be made first.
     progress : callable, optional
         Called as ``progress(stage, done, total)``.
     **options
@@ -161,6 +164,7 @@ def track(
     )
 
 
+@checked()
 def sample(
     log: PathLike,
     *,
@@ -171,7 +175,7 @@ def sample(
     output: PathLike | None = None,
     sidecar: bool | None = None,
     force: bool = False,
-    stages: Mapping[str, Transform] | None = None,
+    stages: Mapping[str, str | Transform] | None = None,
     progress: Progress = no_progress,
     **options: Option,
 ) -> RunResult:
@@ -196,8 +200,8 @@ def sample(
         ROS tools read, otherwise into the log.
     force : bool, default False
         Overwrite ``output`` if it exists.
-    stages : mapping of str to Transform, optional
-        Transforms by stage, for channels that are missing and have to be made first.
+    stages : mapping of str to str or Transform, optional
+        Transforms, or their names, by stage, for channels that are missing and have to be made first.
     progress : callable, optional
         Called as ``progress(stage, done, total)``.
     **options
@@ -235,6 +239,7 @@ def sample(
     )
 
 
+@checked()
 def predict(
     log: PathLike,
     *,
@@ -245,7 +250,7 @@ def predict(
     output: PathLike | None = None,
     sidecar: bool | None = None,
     force: bool = False,
-    stages: Mapping[str, Transform] | None = None,
+    stages: Mapping[str, str | Transform] | None = None,
     progress: Progress = no_progress,
     **options: Option,
 ) -> RunResult:
@@ -271,8 +276,8 @@ def predict(
         ROS tools read, otherwise into the log.
     force : bool, default False
         Overwrite ``output`` if it exists.
-    stages : mapping of str to Transform, optional
-        Transforms by stage, for channels that are missing and have to be made first.
+    stages : mapping of str to str or Transform, optional
+        Transforms, or their names, by stage, for channels that are missing and have to be made first.
     progress : callable, optional
         Called as ``progress(stage, done, total)``.
     **options
@@ -310,7 +315,7 @@ def predict(
     )
 
 
-@checked
+@checked()
 def retrack(
     log: PathLike,
     *,
@@ -323,7 +328,7 @@ def retrack(
     output: PathLike | None = None,
     sidecar: bool | None = None,
     force: bool = False,
-    stages: Mapping[str, Transform] | None = None,
+    stages: Mapping[str, str | Transform] | None = None,
     progress: Progress = no_progress,
     **options: Option,
 ) -> RunResult:
@@ -353,8 +358,8 @@ def retrack(
         ROS tools read, otherwise into the log.
     force : bool, default False
         Overwrite ``output`` if it exists.
-    stages : mapping of str to Transform, optional
-        Transforms by stage, for channels that are missing and have to be made first.
+    stages : mapping of str to str or Transform, optional
+        Transforms, or their names, by stage, for channels that are missing and have to be made first.
     progress : callable, optional
         Called as ``progress(stage, done, total)``.
     **options

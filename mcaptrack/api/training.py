@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Final, Literal
 
 from mcaptrack import __version__
-from mcaptrack.api.common import Notes, PathLike, Progress, as_path, checked, no_progress, optional_path, paths_of
+from mcaptrack.api.checked import checked
+from mcaptrack.api.common import Notes, PathLike, Progress, as_path, no_progress, optional_path, paths_of
 from mcaptrack.api.ingesting import parse_fps
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.plane import Point
@@ -63,7 +64,19 @@ class TrainResult:
     warnings: tuple[Notice, ...]
 
 
-@checked
+@checked(
+    epochs=(1, 1_000_000),
+    batch=(1, 1_000_000),
+    rate=(1e-9, 1),
+    noise_m=(0, 10),
+    gaps=(0, 0.9),
+    scale=(0, 1),
+    consistency_weight=(0, 1e6),
+    patience=(0, 1_000_000),
+    walks=(1000, 100_000_000),
+    seed=(0, 2**31 - 1),
+    threads=(1, 1024),
+)
 def train(
     sources: PathLike | Sequence[PathLike],
     output: PathLike = "trained",

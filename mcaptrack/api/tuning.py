@@ -10,7 +10,8 @@ from typing import Final, Literal
 
 from mcaptrack import log as logs
 from mcaptrack import pipeline
-from mcaptrack.api.common import Notes, PathLike, Progress, checked, detail, no_progress, optional_path, paths_of
+from mcaptrack.api.checked import checked
+from mcaptrack.api.common import Notes, PathLike, Progress, detail, no_progress, optional_path, paths_of
 from mcaptrack.api.ingesting import parse_fps
 from mcaptrack.api.running import Option, transform_of
 from mcaptrack.errors import McaptrackError
@@ -68,7 +69,7 @@ class TuneResult:
     warnings: tuple[Notice, ...]
 
 
-@checked
+@checked(trials=(1, 1_000_000), seed=(0, 2**31 - 1), gate_m=(0.001, 1e6), min_iou=(0.001, 1))
 def tune(
     inputs: PathLike | Sequence[PathLike],
     *,

@@ -8,7 +8,8 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 
 from mcaptrack import log as logs
-from mcaptrack.api.common import PathLike, Progress, as_path, log_output, names_of, no_progress, warnings_about
+from mcaptrack.api.checked import checked
+from mcaptrack.api.common import PathLike, Progress, log_output, log_path, names_of, no_progress, warnings_about
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import is_same_file, refuse_overwrite
 from mcaptrack.log import CheckResult, Finding
@@ -48,6 +49,7 @@ class LogCheck:
         return tuple(found for file in self.files for found in file.findings)
 
 
+@checked()
 def check(log: PathLike, *, progress: Progress = no_progress) -> LogCheck:
     """Check every byte of a log: structure, checksums, indexes, statistics, order of messages.
 
@@ -75,7 +77,7 @@ def check(log: PathLike, *, progress: Progress = no_progress) -> LogCheck:
     True
 
     """
-    path = as_path(log)
+    path = log_path(log)
     with warnings_about(path) as warnings:
         files = tuple(logs.check(part, progress) for part in files_of(path))
     return LogCheck(path, files, tuple(dict.fromkeys(warnings)))
@@ -112,6 +114,7 @@ class LogRecovery:
     warnings: tuple[Notice, ...]
 
 
+@checked()
 def recover(
     log: PathLike, output: PathLike | None = None, *, force: bool = False, progress: Progress = no_progress
 ) -> LogRecovery:
@@ -145,7 +148,7 @@ def recover(
     ()
 
     """
-    path = as_path(log)
+    path = log_path(log)
     target = path.with_suffix(".recovered.mcap") if output is None else log_output(output, path)
     if is_same_file(target, path):
         raise McaptrackError(f"{path} is both input and output; give another name with `output=`")
@@ -224,7 +227,9 @@ def drop(
     ('/camera/video',)
 
     """
-    path = as_path(log)
+    path = log_path(log)
+    if not names_of(topics):
+        raise McaptrackError("name the channels to remove with `topics=`")
     copy = None if output is None else log_output(output, path)
     if copy is not None:
         refuse_overwrite(copy, force)

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Self
 
 from mcaptrack import log as logs
+from mcaptrack.api.checked import checked
 from mcaptrack.api.common import Notes, PathLike, as_path
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.notices import Notice, collected, warn
@@ -104,6 +105,7 @@ class LogServer:
         self._server.server_close()
 
 
+@checked(port=(0, 65535))
 def view(
     log: PathLike,
     *,

@@ -6,14 +6,16 @@ from collections.abc import Callable, Mapping, Sequence
 
 from mcaptrack import log as logs
 from mcaptrack import pipeline
-from mcaptrack.api.common import PathLike, Progress, checked, names_of, no_progress
-from mcaptrack.api.running import RunResult, Where, transform_of, work
+from mcaptrack.api.checked import checked
+from mcaptrack.api.common import PathLike, Progress, names_of, no_progress
+from mcaptrack.api.running import RunResult, Where, transform_of, transforms_of, work
 from mcaptrack.evaluation.aligned import Similarity
 from mcaptrack.evaluation.events import EventOptions
 from mcaptrack.pipeline import Job, Watch
 from mcaptrack.transforms import STAGES, Transform
 
 
+@checked()
 def run(
     log: PathLike,
     *,
@@ -28,7 +30,7 @@ def run(
     tracker: str | Transform | None = None,
     retracker: str | Transform | None = None,
     predictor: str | Transform | None = None,
-    stages: Mapping[str, Transform] | None = None,
+    stages: Mapping[str, str | Transform] | None = None,
     progress: Progress = no_progress,
 ) -> RunResult:
     """Run all stages that are missing or out of date, then write events, views, layouts and tables.
@@ -58,8 +60,8 @@ def run(
     detector, tracker, retracker, predictor : str or Transform, optional
         Use this one, also where another one was used before: a built-in name, the name of an installed one,
         "module:Class", or a transform.
-    stages : mapping of str to Transform, optional
-        Transforms by stage, for channels that are missing; with ``force`` also for those that exist.
+    stages : mapping of str to str or Transform, optional
+        Transforms, or their names, by stage, for channels that are missing; with ``force`` also for those that exist.
     progress : callable, optional
         Called as ``progress(stage, done, total)``.
 
@@ -84,7 +86,7 @@ def run(
     """
     named = {"detector": detector, "tracker": tracker, "retracker": retracker, "predictor": predictor}
     chosen = {kind: one for kind, one in named.items() if one is not None}
-    transforms = dict(stages or {})
+    transforms = transforms_of(stages)
     transforms |= {s.name: transform_of(s.name, chosen[s.option], {}) for s in STAGES.values() if s.option in chosen}
 
     def plan(opened: logs.Log, prefix: str, say: Callable[[str], None]) -> list[Job]:
@@ -95,7 +97,7 @@ def run(
     return work(Where(log, camera, topic, output, sidecar, force), plan, watch, progress, tables)
 
 
-@checked
+@checked(gate_m=(0.001, 1e6), min_iou=(0.001, 1))
 def events(
     log: PathLike,
     *,

@@ -90,7 +90,7 @@ class OpenFile:
     def read(self, at: int, size: int) -> bytes:
         """``size`` bytes from offset ``at``. Raises Damaged if the file has become shorter or can't be read."""
         if not self.close.alive:
-            raise ValueError("the file is closed")
+            raise McaptrackError("the log is closed; what is read bit by bit, such as pictures, needs it open")
         return read_exactly(self.handle, at, size)
 
 

@@ -1,0 +1,91 @@
+"""What functions are given is checked when they are called: choices, ranges of numbers, progress.
+
+The command line checks its options itself, by the same ranges. Without these checks ``form="parqet"`` would be an error
+of the program, or change nothing.
+"""
+
+from __future__ import annotations
+
+import inspect
+import types
+from collections.abc import Callable, Iterable
+from difflib import get_close_matches
+from functools import cache, wraps
+from numbers import Integral, Real
+from typing import Any, Literal, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
+
+from mcaptrack.errors import McaptrackError
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+def checked(**ranges: tuple[float, float]) -> Callable[[Callable[P, T]], Callable[P, T]]:
+    """Check parameters before a function runs: those of a ``Literal``, those with a range here, and ``progress``.
+
+    Parameters
+    ----------
+    **ranges : tuple of two float
+        Smallest and largest value of a parameter that is a number, or several.
+
+    Returns
+    -------
+    callable
+        A decorator. The function raises McaptrackError, and does nothing, if a value is none of the choices or out of
+        its range.
+
+    """
+
+    def decorate(function: Callable[P, T]) -> Callable[P, T]:
+        signature = inspect.signature(function)
+
+        @wraps(function)
+        def call(*args: P.args, **kwargs: P.kwargs) -> T:
+            for name, value in signature.bind(*args, **kwargs).arguments.items():
+                if value is signature.parameters[name].default:
+                    continue
+                kinds = _kinds(function).get(name, ())
+                choices = [choice for kind in kinds if get_origin(kind) is Literal for choice in get_args(kind)]
+                if choices:
+                    _check_choice(name, value, choices)
+                if name in ranges:
+                    _check_range(name, value, ranges[name], is_whole=float not in kinds)
+                if name == "progress" and not callable(value):
+                    raise McaptrackError(
+                        f"`progress=` is called as progress(stage, done, total), which {value!r:.40} is not"
+                    )
+            return function(*args, **kwargs)
+
+        return call
+
+    return decorate
+
+
+@cache
+def _kinds(function: Callable[..., object]) -> dict[str, tuple[Any, ...]]:
+    """The types that each parameter may have. That of the result is left out: it may be known to type checkers only."""
+    hints = {name: hint for name, hint in function.__annotations__.items() if name != "return"}
+    known = get_type_hints(types.SimpleNamespace(__annotations__=hints), function.__globals__)
+    return {
+        name: get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,)
+        for name, hint in known.items()
+    }
+
+
+def _check_choice(name: str, value: object, choices: list[Any]) -> None:
+    if not isinstance(value, str) or value not in choices:
+        close = get_close_matches(str(value), map(str, choices), 1)
+        meant = f"did you mean {close[0]}? " if close else ""
+        raise McaptrackError(f"`{name}=` can't be {value!r:.40}; {meant}there are {', '.join(map(str, choices))}")
+
+
+def _check_range(name: str, value: Any, ends: tuple[float, float], *, is_whole: bool) -> None:
+    kind: Any = Integral if is_whole else Real
+    least, most = ends
+    values = list(value) if isinstance(value, Iterable) and not isinstance(value, str | bytes) else [value]
+    for one in values:
+        if not isinstance(one, kind) or isinstance(one, bool) or not least <= one <= most:
+            words = "a whole number" if is_whole else "a number"
+            raise McaptrackError(f"`{name}=` is {words} from {least:.12g} to {most:.12g}, not {one!r:.40}")
+    if not values:
+        raise McaptrackError(f"`{name}=` needs at least one number")
