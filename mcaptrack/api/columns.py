@@ -31,7 +31,7 @@ _IN_NS: Final = "whole nanoseconds, such as `round(seconds * 1e9)`"
 
 
 def frame_of(schema: Schema, boxes: Floats, given: Mapping[str, Any], t_ns: int | np.datetime64, index: int) -> Frame:
-    """A frame of boxes (N, 4), with other columns as far as they are given."""
+    """Return a frame of boxes (N, 4), with the other columns that are given."""
     columns: dict[str, Any] = dict(zip(_BOX, boxes.T, strict=True))
     for name, values in given.items():
         if values is None:
@@ -120,7 +120,7 @@ def check_frames(schema: Schema, frames: Sequence[Frame]) -> None:
 
 
 def time_of(t_ns: Any) -> int:
-    """A time in whole nanoseconds. Raises McaptrackError for anything else, such as seconds."""
+    """Return a time in whole nanoseconds. Raises McaptrackError for anything else, such as seconds."""
     found = t_ns.astype("datetime64[ns]").astype(np.int64) if isinstance(t_ns, np.datetime64) else t_ns
     try:
         whole = as_index(found)
@@ -132,7 +132,7 @@ def time_of(t_ns: Any) -> int:
 
 
 def times_of(values: Any, name: str) -> Ints:
-    """Times (N,) in nanoseconds; also from timestamps. Raises McaptrackError, with their name, for anything else."""
+    """Return times (N,) in nanoseconds, also from timestamps. Raises McaptrackError with ``name`` for anything else."""
     array = np.asarray(values)
     if array.dtype.kind == "M":
         array = array.astype("datetime64[ns]").astype(np.int64)
@@ -144,7 +144,7 @@ def times_of(values: Any, name: str) -> Ints:
 
 
 def number_of(index: Any) -> int:
-    """A frame number. Raises McaptrackError for anything else."""
+    """Return a frame number. Raises McaptrackError for anything else."""
     try:
         whole = as_index(index)
     except TypeError:
@@ -155,7 +155,7 @@ def number_of(index: Any) -> int:
 
 
 def _numbers(values: Any) -> Ints:
-    """The frame numbers (N,) of a table; UNNUMBERED where one is missing."""
+    """Return the frame numbers (N,) of a table; UNNUMBERED where one is missing."""
     array = np.asarray(values)
     array = _whole(np.where(np.isnan(array), UNNUMBERED, array)) if array.dtype.kind == "f" else array
     if len(array) and (array.dtype.kind not in "iu" or array.min() < UNNUMBERED or array.max() > _LAST_INDEX):
@@ -197,7 +197,7 @@ def boxes_of(boxes: Any, box_format: BoxFormat) -> Floats:
 
 
 def kind_of(value: Any) -> str:
-    """A value for a message, in a line: itself if it is short, and its type."""
+    """Describe a value in one line: its type, and the value if it is short."""
     text = repr(value)
     name = type(value).__name__
     return f"{text} ({name})" if len(text) <= 40 and text.isprintable() else name

@@ -64,7 +64,7 @@ class ChannelInfo:
 
 @dataclass(frozen=True)
 class LogInfo:
-    """What is in a log.
+    """The contents of a log.
 
     Attributes
     ----------

@@ -34,7 +34,7 @@ _BY_CHANCE: Final = "random numbers; with `pip install mcaptrack[tune]` they lea
 
 @dataclass(frozen=True)
 class TuneResult:
-    """What a search of parameters found.
+    """The result of a search of parameters.
 
     Attributes
     ----------
@@ -42,6 +42,8 @@ class TuneResult:
         The stage that was tuned.
     metric : str
         The score that was maximised.
+    similarity : {"iou", "metres"}
+        How ground truth and tracks were matched.
     settings : dict of str to float, int, str or Transform
         The best parameters, with the tracker they belong to; the function of the stage takes them as they are:
         ``mcaptrack.track("log.mcap", **result.settings)``.
@@ -60,6 +62,7 @@ class TuneResult:
 
     stage: TunedStage
     metric: Metric
+    similarity: Similarity
     settings: Mapping[str, Option | Transform]
     scores: Mapping[str, float]
     default_scores: Mapping[str, float]
@@ -195,6 +198,7 @@ def tune(
     return TuneResult(
         stage=stage,
         metric=metric,
+        similarity=chosen,
         settings=settings,
         scores=dict(best.scores),
         default_scores=dict(first.scores),

@@ -20,7 +20,7 @@ from mcaptrack.sources.ingest.sidecar import recording_of
 
 @dataclass(frozen=True)
 class LogCheck:
-    """What was found in a log.
+    """The findings in a log.
 
     Attributes
     ----------
@@ -91,7 +91,7 @@ def files_of(log: Path) -> list[Path]:
 
 @dataclass(frozen=True)
 class LogRecovery:
-    """What was saved of a damaged log.
+    """The result of saving a damaged log.
 
     Attributes
     ----------
@@ -160,7 +160,7 @@ def recover(
 
 @dataclass(frozen=True)
 class DropResult:
-    """What was removed from a log.
+    """The channels that were removed from a log.
 
     Attributes
     ----------

@@ -56,7 +56,7 @@ def write_rows(path: Path, topic: str, rows: Any, *, replace: bool, sidecar: boo
 
 
 def _topic(opened: logs.Log, topic: str) -> str:
-    """The topic of a channel to write: as it is given, or below the only camera."""
+    """Return the topic of a channel to write: as it is given, or below the only camera."""
     if not isinstance(topic, str):
         raise McaptrackError(f"a topic is text such as detections or /camera/detections, not {topic!r:.40}")
     name = topic if "/" in topic else f"{pipeline.find_camera(opened, None, None)}/{topic}"

@@ -44,14 +44,14 @@ def chooser(
     kind: Kind, was: str = "", words: str = "The {kind} to use", panel: str = "", shown: str | bool = True
 ) -> Any:
     """Return the option that chooses a detector, tracker or so on of the registry by name."""
-    there = ", ".join(BUILT_IN[kind])
+    built_in = ", ".join(BUILT_IN[kind])
     return common.option(
         f"--{kind}",
         tuning=_NAME,
         was=was,
         panel=panel,
         metavar="NAME",
-        help=f"{words.format(kind=kind)}: {there}, one of an installed package, or module:Class.",
+        help=f"{words.format(kind=kind)}: {built_in}, one of an installed package, or module:Class.",
         autocompletion=lambda: names(kind),
         show_default=shown,
     )
@@ -139,9 +139,8 @@ def stage_command(stage: Stage, plugins: Mapping[str, type[Transform]] = Mapping
     if stage.kind:
         usual = stage.entry(stage.default).name
         which = chooser(stage.kind, stage.was, shown=usual if stage.profiles else True)
-        annotation = (
-            Annotated[str | None, which] if stage.profiles else Annotated[str, which]
-        )  # a profile names it, too
+        # None where a profile may choose the transform.
+        annotation = Annotated[str | None, which] if stage.profiles else Annotated[str, which]
         parameters.append(_parameter(stage.kind, annotation, None if stage.profiles else usual))
     if stage.profiles:
         words = common.option(
@@ -158,14 +157,14 @@ def stage_command(stage: Stage, plugins: Mapping[str, type[Transform]] = Mapping
             help="Write tracks that use the whole log (offline), the past alone (online), or both.",
         )
         parameters.append(_parameter("mode", Annotated[Literal[tuple(stage.modes)], words], "both"))
-    there: dict[str, list[str]] = {}
+    owners: dict[str, list[str]] = {}
     for name, found in own.items():
         for option in found:
-            there.setdefault(option, []).append(name)
+            owners.setdefault(option, []).append(name)
     built_in = set(stage.built_in())
-    for option, those in there.items():
-        name = those[0]
-        is_shared = built_in <= set(those)
+    for option, having in owners.items():
+        name = having[0]
+        is_shared = built_in <= set(having)
         hint = get_type_hints(kinds[name])[option]
         parameters.append(_option(own[name][option], hint, "" if is_shared else name))
     to = common.option("--to", panel=common.FILES, help="Write to this channel instead of the default one.")
@@ -188,8 +187,8 @@ def stage_command(stage: Stage, plugins: Mapping[str, type[Transform]] = Mapping
         raise McaptrackError(f"{words}: that is the name of an option of {stage.name}")
 
     def command(**given: Any) -> None:
-        wanted = {option: given[option] for option in there if given[option] is not None}
-        transform = _transform(stage, given, wanted, there)
+        wanted = {option: given[option] for option in owners if given[option] is not None}
+        transform = _transform(stage, given, wanted, owners)
 
         def run(path: Path, **where: Any) -> RunResult:
             from mcaptrack.api.running import run_stage
@@ -209,11 +208,11 @@ def _transform(
     stage: Stage,
     given: Mapping[str, Any],
     wanted: Mapping[str, Any],
-    there: Mapping[str, list[str]] = MappingProxyType({}),
+    owners: Mapping[str, list[str]] = MappingProxyType({}),
 ) -> Transform:
     """Return the chosen transform with those of the wanted parameters that it has.
 
-    ``there`` has the names of the transforms that have an option. An option on the command line that the chosen
+    ``owners`` has the names of the transforms that have an option. An option on the command line that the chosen
     transform lacks is refused; one from a file or the environment is ignored, since it may be meant for another
     transform.
     """
@@ -221,10 +220,10 @@ def _transform(
     cls = stage.find(name).cls if name else stage.default
     own = _options_of(cls)
     for option in wanted:
-        if option in there and option not in own and is_on_command_line(option):
+        if option in owners and option not in own and is_on_command_line(option):
             flag = "--" + option.replace("_", "-")
             chosen = name or stage.entry(cls).name
-            raise McaptrackError(f"{flag} is an option of {' and '.join(there[option])}, not of {chosen}")
+            raise McaptrackError(f"{flag} is an option of {' and '.join(owners[option])}, not of {chosen}")
     hints = get_type_hints(cls)
     values = {
         option: tuple(value) if member_type(hints[option])[1] else value

@@ -115,7 +115,6 @@ def tune(
     ranges = dict(map(_range, search or ()))
     is_tracker = STAGES[stage].default.reads is DETECTIONS
     which = tracker.replace(":", ".") if is_tracker else stage
-    by_overlap = similarity == "iou" or (similarity is None and is_tracker)
     with common.Talk(quiet, verbose).open() as talk:
         read_toml(output)  # a file that can't be edited is refused before the search
         done = mcaptrack.tune(
@@ -147,6 +146,7 @@ def tune(
             warn_unused("it is about label files; logs have theirs inside", "ground_plane", "point", "fps")
         if not is_tracker:
             warn_unused(f"{stage} has no trackers", "tracker")
+        by_overlap = done.similarity == "iou"
         warn_unused(*(("overlap is compared", "gate_m") if by_overlap else ("distance is compared", "min_iou")))
         score, before = done.scores[metric], done.default_scores[metric]
         if done.best == 0:
