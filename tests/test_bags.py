@@ -24,6 +24,8 @@ from mcaptrack.schema import GROUND_PLANE, TRACKS
 from mcaptrack.schema.ground_plane import rows_to_plane
 from mcaptrack.sources.ingest import IngestOptions, ingest
 from tests.bags import MOT, ROS1, ROS2, STRING1, T0, bag1, bag2, camera_bag, database
+from tests.commands import call
+from tests.worlds import write_clip
 
 
 def recorded(path: Path) -> list[tuple[str, int, int, bytes]]:
@@ -138,6 +140,10 @@ class TestRos1:
             (lost,) = report.lost
             assert f"byte {at} and what follows: a record is cut off" in lost
             assert lost.endswith("invalid") == (more >= 4)  # from then on there is a size
+        head = struct.unpack("<I", data[at : at + 4])[0]
+        (tmp_path / "b.bag").write_bytes(data[: at + 8 + head + 3])  # all of the head, and three bytes of the data
+        (lost,) = make(tmp_path / "b.bag", tmp_path / "c.mcap").lost
+        assert lost.endswith(f"byte {at} and what follows: a record is cut off")
 
     def test_of_a_damaged_chunk_the_others_are_read(self, tmp_path):
         said = bag1(tmp_path / "a.bag", 60, 20_000, "BZ2")
@@ -496,6 +502,18 @@ def test_what_makes_no_sense_for_a_log_is_refused_in_a_line(tmp_path, option, va
     assert f"leave {option} out" in result.stderr
     assert result.stderr.count("\n") == 1
     assert not (tmp_path / "a.mcap").exists()
+
+
+def test_a_camera_is_named_where_something_is_written_below_it(tmp_path):
+    """The channels of a recording keep their names; those of a video stand below it."""
+    bag1(tmp_path / "a.bag", 2, 100)
+    write_clip(tmp_path / "a.mp4", 2)
+    for name, is_used in (("a.bag", False), ("a.mp4", True)):
+        made = call("ingest", tmp_path / name, "--camera", "gate", "-o", tmp_path / "out.mcap", "--force")
+        assert made.code == 0, made.err
+        assert ("--camera changes nothing here: the channels of a recording keep their names" in made.err) != is_used
+        with log.read(tmp_path / "out.mcap") as opened:
+            assert any(topic.startswith("/gate/") for topic in opened.channels) == is_used
 
 
 def test_a_cut_bag_exits_with_3(tmp_path):
