@@ -117,6 +117,12 @@ def test_exported_tables_are_scored(tmp_path):
     with pytest.raises(McaptrackError, match=r"holds /camera/samples, /camera/tracks; choose one with `topic=`"):
         scores(path, gt)
     assert scores(path, gt, topics=("/camera/tracks",))[0]["MOTA"] == 1.0
+    alone = tmp_path / "alone.parquet"  # ground truth may have any name where it is all there is
+    tables.write(alone, tables.rows_table(TRACKS, {"/lidar/people": truth}), {})
+    assert scores(path, alone, topics=("/camera/tracks",))[0]["MOTA"] == 1.0
+    tables.write(alone, tables.rows_table(TRACKS, {"/lidar/people": truth, "/lidar/dogs": truth}), {})
+    with pytest.raises(McaptrackError, match="holds /lidar/dogs, /lidar/people; none of them is truth"):
+        scores(path, alone, topics=("/camera/tracks",))
     (tmp_path / "points.txt").write_text("0 7 1.5 2.5\n12 7 1.6 2.5\n24 7 1.7 2.5\n")
     with pytest.raises(McaptrackError, match="share no clock: one counts frames, the other does not"):
         scores(path, tmp_path / "points.txt", topics=("/camera/tracks",))

@@ -672,6 +672,7 @@ def test_the_tables_are_listed_with_columns_units_and_meanings(known):
             assert field.name in words
     (tracks,) = (table for table in listed["results"] if table["table"] == "tracks")
     column = next(column for column in tracks["columns"] if column["name"] == "x_m")
+    assert re.search(r"^  x_m +\w+ +m +position on the ground plane, first axis *$", words, re.MULTILINE)
     assert "timestamp[ns, tz=UTC]" in words
     assert (column["unit"], column["meaning"]) == ("m", "position on the ground plane, first axis")
 
