@@ -473,6 +473,8 @@ def test_the_demonstration(tmp_path, monkeypatch):
     shown, _ = printed("demo", "-o", folder)
     for words in ("SORT", "re-tracked", "identity switches", "demo.mcap", "Lichtblick"):
         assert words in shown
+    made = ("video", "log", "layouts", "tables")
+    assert [line.split()[0] for line in shown.splitlines() if line.split()[:1] and line.split()[0] in made] == [*made]
     assert sorted(path.name for path in folder.iterdir()) == [
         *(f"demo{end}" for end in (*LAYOUTS, ".mcap", ".mp4", ".predictions.layout.json", ".tables")),
         "ground_plane.txt",
