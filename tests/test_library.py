@@ -204,6 +204,47 @@ class TestResults:
         assert len(scores.below({"IDF1": 1.1})) == len(scores.rows())
 
 
+class TestUnused:
+    """Parameters without an effect are warnings of the result, in the sentence that the command prints."""
+
+    @pytest.mark.parametrize(
+        ("name", "values", "parameter"),
+        [
+            ("evaluate", {"tracks": "log.mcap", "fps": 25}, "fps"),
+            ("evaluate", {"tracks": "log.mcap", "point": "center"}, "point"),
+            ("evaluate", {"tracks": "log.mcap", "ground_plane": "plane.txt"}, "ground_plane"),
+            ("evaluate", {"tracks": "log.mcap", "similarity": "iou", "gate_m": 3}, "gate_m"),
+            ("evaluate", {"tracks": "log.mcap", "similarity": "metres", "min_iou": 0.3}, "min_iou"),
+            ("evaluate", {"tracks": "truth.txt", "truth": "truth.txt", "camera": "x"}, "camera"),
+            ("evaluate", {"tracks": "truth.txt", "truth": "truth.txt", "topic": "/x"}, "topic"),
+            ("evaluate", {"tracks": "truth.txt", "truth": "truth.txt", "point": "center"}, "point"),
+            ("events", {"log": "log.mcap", "similarity": "iou", "gate_m": 3.0}, "gate_m"),
+            ("events", {"log": "log.mcap", "similarity": "metres", "min_iou": 0.3}, "min_iou"),
+            ("ingest", {"source": "video.mp4", "output": "a.mcap", "label_format": "mot"}, "label_format"),
+            ("ingest", {"source": "video.mp4", "output": "a.mcap", "point": "center"}, "point"),
+            ("ingest", {"source": "log.mcap", "output": "a.mcap", "camera": "x"}, "camera"),
+            ("render", {"log": "log.mcap", "output": "a.gif", "gif": True, "end_s": 0.2}, "gif"),
+        ],
+    )
+    def test_they_are_in_the_result_and_on_stderr(self, place, name, values, parameter):
+        warned = [one for one in getattr(mcaptrack, name)(**values).warnings if one.code == "option-not-used"]
+        assert [one.message.partition(":")[0] for one in warned] == [f"`{parameter}=` changes nothing here"]
+        first, *others = values
+        words = [name, str(values[first])]
+        for other in others:
+            words += [flag_of(name, other)] + ([] if values[other] is True else [str(values[other])])
+        err = call(*words, "--force").err
+        assert (
+            f"warning: {flag_of(name, parameter)} changes nothing here: {warned[0].message.partition(': ')[2]}" in err
+        )
+
+
+def flag_of(name: str, parameter: str) -> str:
+    """The option of a command for a parameter of its function."""
+    (found,) = (one for one in GROUP.commands[name].params if one.name == parameter)
+    return max(found.opts, key=len)
+
+
 class TestRefused:
     @pytest.mark.parametrize(
         ("work", "words"),

@@ -269,6 +269,7 @@ class TestWriting:
                 table(x_px=[0, np.inf]),
                 "row 0 of the frame at 5 ns has an infinite number: x_px inf",
             ),
+            ("/camera/detections", table(w_px=[1, -1]), "row 0 of the frame at 5 ns has a box of negative size"),
             ("/camera/detections", table(h_px=[1, -1]), "row 0 of the frame at 5 ns has a box of negative size"),
             ("/camera/detections", table(topic=["/a", "/b"]), "rows of 2 topics: /a, /b; .* select one topic"),
             ("/camera/detections", table(recording=["a", "b"]), "rows of 2 recordings"),
@@ -306,7 +307,7 @@ class TestWriting:
         else:
             given = pytest.importorskip("pyarrow").table(columns)
         if library == "duckdb":
-            given = module.sql("select t_ns, x_px, y_px, w_px, h_px, score from given")
+            given = module.sql("select t_ns, x_px, y_px, w_px, h_px::decimal(9, 2) as h_px, score from given")
         with mcaptrack.open(tmp_path / "a.mcap", create=True) as opened:
             assert opened.write("/own/detections", given) == 2
             found = opened.array("detections", "/own/detections")
@@ -350,6 +351,47 @@ class TestWriting:
                     with pytest.raises(McaptrackError):
                         opened.write(topic, walk(), replace=True)
         assert path.read_bytes() == before
+
+    def test_rows_get_the_pictures_that_are_shown_then_and_places_on_the_ground(self, tmp_path):
+        path, plane = tmp_path / "a.mcap", tmp_path / "plane.txt"
+        write_clip(tmp_path / "clip.mp4", frames=10)
+        plane.write_text("0.1 0 0\n0 0.1 0\n0 0 1")
+        mcaptrack.ingest(tmp_path / "clip.mp4", path, ground_plane=plane, start_time=1)
+        with mcaptrack.open(path) as opened:
+            t_ns = [picture.t_ns for picture in opened.frames()]
+            times = [0, t_ns[0], t_ns[3] - 1, t_ns[3], t_ns[9] + SECOND]
+            frames = [mcaptrack.detections([], t_ns=t, box_format="xyxy") for t in times]
+            opened.write("/camera/detections", frames)
+            assert [frame.index for frame in opened._log.frames("/camera/detections", DETECTIONS)] == [0, 0, 2, 3, 9]
+            opened.write("tracks", table(track_id=[4, 4], x_m=[np.nan, 7.0], y_m=[np.nan, 8.0], frame=[2, np.nan]))
+            rows = opened.array("tracks", "/camera/tracks")
+        assert (tmp_path / "a.layout.json").exists()
+        # The middle of the lower edge of (1, 1, 4, 8) is (3, 9) px.
+        np.testing.assert_allclose([rows["x_m"], rows["y_m"]], [[0.3, 7.0], [0.9, 8.0]])
+        assert (rows["observed"].tolist(), rows["source_id"].tolist()) == ([True, True], [-1, -1])
+        assert rows["frame"].tolist() == [2, 0]
+
+    def test_frames_without_a_number_are_counted_where_there_are_no_pictures(self, tmp_path):
+        with mcaptrack.open(tmp_path / "a.mcap", create=True) as opened:
+            opened.write("/own/detections", table(frame=[5, np.nan]))
+            assert opened.array("detections")["frame"].tolist() == [5, 1]
+
+    def test_rows_go_beside_the_log_where_that_is_asked_for(self, tmp_path):
+        path = tmp_path / "a.mcap"
+        with mcaptrack.open(path, create=True) as opened:
+            before = path.read_bytes()
+            assert opened.write("/own/detections", table(), sidecar=True) == 2
+            assert len(opened.array("detections")) == 2
+        assert path.read_bytes() == before
+        assert (tmp_path / "a.results.mcap").exists()
+
+    def test_tracks_without_boxes_have_none_in_supervision(self, tmp_path, made):
+        names = ("t_ns", "track_id", "x_m", "y_m")
+        rows = np.array([(0, 1, 2.0, 3.0)], [(name, float if name.endswith("m") else int) for name in names])
+        with mcaptrack.open(tmp_path / "a.mcap", create=True) as opened:
+            opened.write("/own/tracks", rows)
+            ((t_ns, found),) = opened.supervision("/own/tracks")
+        assert (t_ns, len(found.xyxy)) == (0, 0)
 
     def test_scores_beyond_one_are_said(self, tmp_path):
         with (

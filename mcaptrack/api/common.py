@@ -81,6 +81,13 @@ def warnings_about(log: object) -> Iterator[list[Notice]]:
         yield warnings
 
 
+def warn_unused(reason: str, **given: bool) -> None:
+    """Warn of parameters that have no effect in this call, as far as they were given; ``reason`` says why."""
+    for name, is_given in given.items():
+        if is_given:
+            notices.warn(f"`{name}=` changes nothing here: {reason}", "option-not-used")
+
+
 class Notes(list[str]):
     """Routine notes of one call, kept for its result and logged at once."""
 

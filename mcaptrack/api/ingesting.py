@@ -11,7 +11,16 @@ from typing import Final
 
 from mcaptrack import log as logs
 from mcaptrack.api.checked import checked
-from mcaptrack.api.common import PathLike, Progress, as_path, log_output, no_progress, optional_path, warnings_about
+from mcaptrack.api.common import (
+    PathLike,
+    Progress,
+    as_path,
+    log_output,
+    no_progress,
+    optional_path,
+    warn_unused,
+    warnings_about,
+)
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import is_same_file, refuse_overwrite
 from mcaptrack.geometry import clocks
@@ -178,6 +187,10 @@ def ingest(
                 report.remarks.append(place.words(written_to))
         for lost in report.lost:
             warn(f"lost: {lost}", "lost")
+        warn_unused("there is no label file", label_format=label_format != "auto" and not report.has_labels)
+        warn_unused("there is no ground plane", point=point != "foot" and ground_plane is None)
+        keep = "the channels of a recording keep their names"
+        warn_unused(keep, camera=camera != "camera" and not report.uses_camera)
     return IngestResult(
         log=target,
         messages=report.messages,

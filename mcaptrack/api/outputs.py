@@ -19,6 +19,7 @@ from mcaptrack.api.common import (
     no_progress,
     optional_path,
     paths_of,
+    warn_unused,
     warnings_about,
 )
 from mcaptrack.errors import McaptrackError, call
@@ -300,6 +301,7 @@ def render(
     refuse_overwrite(target, force)
     options = RenderOptions(width_px=width, max_fps=max_fps, start_s=start_s, end_s=end_s)
     with warnings_about(path) as warnings, logs.read(path) as opened:
+        warn_unused("the name of the output says what is written", gif=gif and output is not None)
         prefix = pipeline.find_camera(opened, camera)
         pictures = pipeline.camera_at(opened, prefix).pictures
         if pictures is None:

@@ -23,11 +23,13 @@ from mcaptrack.api.common import (
     no_progress,
     optional_path,
     paths_of,
+    warn_unused,
 )
 from mcaptrack.api.ingesting import parse_fps
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation import (
     COMBINED,
+    DEFAULT_GATES_M,
     EvaluateOptions,
     EvaluationInput,
     EvaluationRow,
@@ -35,7 +37,7 @@ from mcaptrack.evaluation import (
     sequence_of_log,
 )
 from mcaptrack.evaluation import evaluate as score_sequences
-from mcaptrack.evaluation.aligned import Similarity
+from mcaptrack.evaluation.aligned import IOU_THRESHOLD, Similarity
 from mcaptrack.evaluation.metrics import Rules
 from mcaptrack.geometry.arrays import Floats
 from mcaptrack.geometry.plane import Point
@@ -267,6 +269,19 @@ def evaluate(
         progress("evaluate", total, total)
         for words in outcome.notes:
             warn(words, "not-compared")
+        has_point, has_plane = point != "foot", ground_plane is not None
+        if truth is None:
+            reason = "it is about label files; logs have theirs inside"
+            warn_unused(reason, ground_plane=has_plane, point=has_point, fps=fps is not None)
+        else:
+            warn_unused("files of tracks are of no camera", camera=camera is not None)
+            warn_unused("there is no ground plane", point=has_point and not has_plane)
+            warn_unused("only tables hold several channels", topic=bool(topics) and not any(map(holds_tables, paths)))
+        compared = {result.similarity for result in outcome.results}
+        if "metres" not in compared:
+            warn_unused("nothing is compared by distance on the ground", gate_m=gates != DEFAULT_GATES_M)
+        if "iou" not in compared:
+            warn_unused("nothing is compared by overlap", min_iou=min_iou != IOU_THRESHOLD)
     return Scores(tuple(outcome.results), tuple(notes), tuple(dict.fromkeys(warnings)))
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from mcaptrack import log as logs
 from mcaptrack import pipeline
 from mcaptrack.api.checked import checked
-from mcaptrack.api.common import PathLike, Progress, names_of, no_progress
+from mcaptrack.api.common import PathLike, Progress, names_of, no_progress, warn_unused
 from mcaptrack.api.running import RunResult, Where, transform_of, transforms_of, work
 from mcaptrack.evaluation.aligned import Similarity
 from mcaptrack.evaluation.events import EventOptions
@@ -156,5 +156,12 @@ def events(
     ['/camera/retracks', '/camera/tracks']
 
     """
+
+    def plan(*_: object) -> list[Job]:
+        if similarity is not None:
+            unused = {"gate_m": gate_m is not None} if similarity == "iou" else {"min_iou": min_iou is not None}
+            warn_unused(f"ground truth and tracks are compared by {similarity}", **unused)
+        return []
+
     watch = Watch(EventOptions(similarity, gate_m, min_iou), topics=names_of(topic), again=True)
-    return work(Where(log, camera, None, output, sidecar, force), lambda *_: [], watch, progress, None)
+    return work(Where(log, camera, None, output, sidecar, force), plan, watch, progress, None)

@@ -278,7 +278,8 @@ def check_ranges(values: Mapping[str, Any]) -> None:
 
 def is_on_command_line(parameter: str) -> bool:
     """Whether an option of the running command was given on its command line."""
-    source = RUNNING.get().get_parameter_source(parameter)
+    context = RUNNING.get()
+    source = context.get_parameter_source(parameter) if context is not None else None
     return source is not None and source.name == "COMMANDLINE"
 
 

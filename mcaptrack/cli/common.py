@@ -7,6 +7,7 @@ import io
 import json
 import logging
 import math
+import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout
@@ -20,7 +21,7 @@ from typing import Annotated, Any, Final, Literal, NamedTuple, ParamSpec
 import typer
 
 from mcaptrack import SCHEMA_VERSION, notices
-from mcaptrack.cli.command import LAST_PANELS, Command, Reading, check_ranges, read_config
+from mcaptrack.cli.command import LAST_PANELS, Command, Reading, check_ranges, is_on_command_line, read_config
 from mcaptrack.cli.flags import with_flags
 from mcaptrack.cli.inputs import check_paths
 from mcaptrack.cli.settings import Declared
@@ -48,6 +49,8 @@ class _Batch:
     failed: list[Failed] = field(default_factory=list)
 
 
+#: A warning of a parameter that has no effect.
+_UNUSED: Final = re.compile(r"`(\w+)=` ")
 #: The warnings of the running command, and its inputs.
 _WARNED: Final[ContextVar[list[Notice]]] = ContextVar("warned")
 _BATCH: Final[ContextVar[_Batch]] = ContextVar("batch")
@@ -324,6 +327,11 @@ def one_line(command: Callable[P, None]) -> Callable[P, None]:
 
 def _show_warning(notice: Notice) -> None:
     """Print a warning to stderr, unless it was printed before."""
+    unused = _UNUSED.match(notice.message) if notice.code == "option-not-used" else None
+    if unused:
+        if not is_on_command_line(unused[1]):
+            return  # a file or the environment sets it, for the commands in which it has an effect
+        notice = notice._replace(log=None)
     warned = _WARNED.get()
     notice = notice._replace(message=with_flags(notice.message))
     if notice not in warned:

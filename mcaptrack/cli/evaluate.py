@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal
 import typer
 
 from mcaptrack.cli import common
-from mcaptrack.cli.command import warn_unused
 from mcaptrack.cli.text import console, printable, say
 from mcaptrack.errors import McaptrackError
 
@@ -92,7 +91,6 @@ def evaluate(
     Example: mcaptrack evaluate tracks.txt --truth gt.txt --fail-under idf1=0.7
     """
     import mcaptrack
-    from mcaptrack.api.scoring import holds_tables
 
     limits = dict(_limit(text) for text in fail_under or ())
     gates = _gates(gate_m)
@@ -112,19 +110,6 @@ def evaluate(
             fps=fps,
             progress=talk.progress,
         )
-        if truths:
-            warn_unused("files of tracks are of no camera", "camera")
-            if ground_plane is None:
-                warn_unused("there is no ground plane", "point")
-            if not any(map(holds_tables, paths)):
-                warn_unused("only tables hold several channels", "topic")
-        else:
-            warn_unused("it is about label files; logs have theirs inside", "ground_plane", "point", "fps")
-        compared = {result.similarity for result in scores.results}
-        if "metres" not in compared:
-            warn_unused("nothing is compared by distance on the ground", "gate_m")
-        if "iou" not in compared:
-            warn_unused("nothing is compared by overlap", "min_iou")
     with common.printed_to(output, force):
         if json:
             common.print_json({"results": scores.rows()})

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from mcaptrack.cli import common
-from mcaptrack.cli.command import warn_unused
 from mcaptrack.cli.running import run_on_logs
 
 if TYPE_CHECKING:
@@ -52,8 +51,6 @@ def events(
 
     Example: mcaptrack events log.mcap --similarity metres --gate-m 1
     """
-    if similarity is not None:
-        warn_unused(f"people and tracks are compared by {similarity}", "gate_m" if similarity == "iou" else "min_iou")
     given = {"logs": logs, "camera": camera, "output": output, "sidecar": sidecar, "force": force}
 
     def run(path: Path, **where: Any) -> RunResult:

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 import typer
 
 from mcaptrack.cli import common
-from mcaptrack.cli.command import warn_unused
 from mcaptrack.cli.flags import with_flags
 
 if TYPE_CHECKING:
@@ -189,7 +188,6 @@ def ingest(
             with talk.attempt(source, sources):
                 done = mcaptrack.ingest(source, output, progress=talk.progress, **given)
                 results.append(done)
-                _warn_unused(done, ground_plane)
                 for words in done.notes:
                     talk.say(words)
                 for words in done.details:
@@ -209,13 +207,3 @@ def _as_json(done: IngestResult) -> dict[str, Any]:
         "notes": [with_flags(words) for words in (*done.notes, *done.details)],
         "lost": [with_flags(words) for words in done.lost],
     }
-
-
-def _warn_unused(done: IngestResult, ground_plane: Path | None) -> None:
-    """Warn of options for parts that the input doesn't have."""
-    if not done.has_labels:
-        warn_unused("there is no label file", "label_format")
-    if ground_plane is None:
-        warn_unused("there is no ground plane", "point")
-    if not done.uses_camera:
-        warn_unused("the channels of a recording keep their names", "camera")

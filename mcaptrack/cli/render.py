@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Annotated, Any, Final
 
 from mcaptrack.cli import common
-from mcaptrack.cli.command import warn_unused
 
 _PICTURE: Final = "Pictures"
 
@@ -91,8 +90,6 @@ def render(
 
     paths = common.expand(logs)
     common.only_one_output(paths, output)
-    if output is not None:
-        warn_unused("the name that -o gives says what is written", "gif")
     given: dict[str, Any] = {"topic": topic, "width": width, "max_fps": max_fps, "start_s": start_s, "end_s": end_s}
     given |= {"gif": gif, "camera": camera, "force": force}
     results = []
