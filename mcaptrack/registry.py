@@ -180,12 +180,40 @@ def is_installed(kind: Kind, name: str) -> bool:
     return name in names(kind)
 
 
+@contextmanager
+def blamed(entry: Entry, what: str) -> Iterator[None]:
+    """Run the code of another package: whatever it raises becomes a McaptrackError that names it.
+
+    Interruptions pass as they are: Ctrl-C, and the exit that a signal asks for.
+    """
+    try:
+        yield
+    except BaseException as error:
+        if is_interruption(error):
+            raise
+        raise failure(entry, what, error) from error
+
+
+def is_interruption(error: BaseException) -> bool:
+    """Whether this ends the process from outside: Ctrl-C or a signal, and not ``sys.exit`` in the code of others."""
+    is_signal = isinstance(error, SystemExit) and isinstance(error.code, int) and error.code > 128
+    return is_signal or isinstance(error, KeyboardInterrupt)
+
+
 def failure(entry: Entry, what: str, error: BaseException) -> McaptrackError:
     """An exception of the code of another package, as one line with the entry and the place in its source."""
+    if isinstance(error, McaptrackError):
+        return McaptrackError(f"{entry}: {error}")
     frames = [frame for frame in extract_tb(error.__traceback__) if f"/{_OWN}/" not in Path(frame.filename).as_posix()]
     where = f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
-    words = " ".join(f"{type(error).__name__}: {error}".split()).removesuffix(":")
-    return McaptrackError(f"{entry} {what}: {words}{where}")
+    return McaptrackError(f"{entry} {what}: {_words(error)}{where}")
+
+
+def _words(error: BaseException) -> str:
+    try:
+        return " ".join(f"{type(error).__name__}: {error}".split()).removesuffix(":")
+    except Exception:  # an exception of others that can't even be printed
+        return type(error).__name__
 
 
 def distribution_of(module: str) -> tuple[str, str]:
@@ -213,7 +241,9 @@ def _of_point(point: EntryPoint) -> tuple[str, str]:
 def _is(point: EntryPoint, cls: type) -> bool:
     try:
         return point.load() is cls
-    except Exception:  # an entry point that can't be imported is another class
+    except BaseException as error:  # an entry point that can't be imported is another class
+        if is_interruption(error):
+            raise
         return False
 
 
@@ -225,13 +255,16 @@ def _load(what: str, reference: str) -> Any:
         raise McaptrackError(f"{what}: {reference} is not of the form module:Class")
     try:
         found: Any = import_module(module.strip())
-    except (Exception, SystemExit) as error:  # code of other packages may raise anything
-        words = " ".join(f"{type(error).__name__}: {error}".split())
-        raise McaptrackError(f"{what} can't be imported: {words}") from error
+    except BaseException as error:  # code of other packages may raise anything
+        if is_interruption(error):
+            raise
+        raise McaptrackError(f"{what} can't be imported: {_words(error)}") from error
     for part in parts:
         found = getattr(found, part, None)
-    if not callable(found) or not hasattr(found, "__qualname__"):
+    if found is None:
         raise McaptrackError(f"{what}: {module} has no class {path}")
+    if not callable(found) or not hasattr(found, "__qualname__"):
+        raise McaptrackError(f"{what}: {path} in {module} is no class but of type {type(found).__name__}")
     return found
 
 

@@ -8,7 +8,9 @@ has, all that installed packages declare as entry points.
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import redirect_stdout, suppress
 from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any, Final
@@ -42,17 +44,14 @@ def with_plugins(commands: Mapping[str, Any], words: Sequence[str]) -> dict[str,
         if stage.kind is None:
             continue
         try:
-            plugins = dict(_of_words(stage, words))
+            with redirect_stdout(sys.stderr):  # what modules print while they are imported
+                plugins = dict(_of_words(stage, words)) if called in (stage.name, "run") else {}
+                plugins |= _of_settings(stage, files, commands[stage.name].settings)
+            if plugins:
+                found[stage.name] = _command(stage, plugins, commands[stage.name].rich_help_panel)
         except McaptrackError as error:
             say(f"mcaptrack: {error}")
             raise typer.Exit(common.REFUSED) from None
-        for name in _of_settings(stage, files, commands[stage.name].settings):
-            try:
-                plugins.setdefault(name, stage.find(name).cls)
-            except McaptrackError:
-                continue  # the stage that uses it reports the error
-        if plugins:
-            found[stage.name] = _command(stage, plugins, commands[stage.name].rich_help_panel)
     return found
 
 
@@ -76,8 +75,17 @@ def _of_words(stage: Stage, words: Sequence[str]) -> Iterator[tuple[str, type[Tr
             yield name, stage.find(name).cls
 
 
-def _of_settings(stage: Stage, files: Sequence[ConfigFile], known: Mapping[str, Any]) -> list[str]:
-    """Return the plug-ins that environment and files name for a stage.
+def _of_settings(stage: Stage, files: Sequence[ConfigFile], known: Mapping[str, Any]) -> dict[str, type[Transform]]:
+    """Return the plug-ins that environment and files name for a stage; the stage that uses it reports a missing one."""
+    out = {}
+    for name in _names_of_settings(stage, files, known):
+        with suppress(McaptrackError):
+            out[name] = stage.find(name).cls
+    return out
+
+
+def _names_of_settings(stage: Stage, files: Sequence[ConfigFile], known: Mapping[str, Any]) -> list[str]:
+    """Return the names of plug-ins that environment and files give for a stage.
 
     A file in the working folder can't name modules.
     """
@@ -103,5 +111,5 @@ def _of_settings(stage: Stage, files: Sequence[ConfigFile], known: Mapping[str, 
 def _command(stage: Stage, plugins: Mapping[str, type[Transform]], panel: str) -> Any:
     """Return the command of a stage with the options of plug-ins."""
     app = typer.Typer(add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False)
-    common.register(app, panel, stage.name, common.one_line(stage_command(stage, plugins)), stage_help(stage))
+    common.register(app, panel, stage.name, common.one_line(stage_command(stage, plugins)), stage_help(stage, plugins))
     return get_command(app)

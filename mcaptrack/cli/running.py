@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import redirect_stdout
 from typing import TYPE_CHECKING, Any
 
 from mcaptrack import notices
@@ -29,7 +31,8 @@ def run_on_logs(given: Mapping[str, Any], run: Run, *, shows_events: bool = Fals
         for path in paths:
             with talk.attempt(path, paths), notices.about(given["output"] or path):
                 names = ("camera", "output", "sidecar", "force")
-                result = run(path, **{name: given[name] for name in names}, progress=talk.progress)
+                with redirect_stdout(sys.stderr):  # what plug-ins print: stdout is for results
+                    result = run(path, **{name: given[name] for name in names}, progress=talk.progress)
                 results.append(_as_json(result))
                 _print(result, shows_events, talk)
     if given["json"]:

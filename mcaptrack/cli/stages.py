@@ -5,11 +5,14 @@ from __future__ import annotations
 import inspect
 import math
 import re
+import sys
+from collections import Counter
 from collections.abc import Callable, Mapping
+from contextlib import redirect_stdout
 from dataclasses import MISSING, Field, fields, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, get_args, get_type_hints
 
 import typer
 
@@ -68,12 +71,19 @@ def add_stages(app: typer.Typer, panel: str) -> None:
         common.register(app, panel, stage.name, common.one_line(stage_command(stage)), stage_help(stage))
 
 
-def stage_help(stage: Stage) -> str:
-    """Return the help of the command of a stage."""
+def stage_help(stage: Stage, plugins: Mapping[str, type[Transform]] = MappingProxyType({})) -> str:
+    """Return the help of the command of a stage; the docstrings of plug-ins come first."""
     where = f"From /camera/{stage.input_topic} to /camera/{stage.output_topic}. Inputs that are missing are made first."
-    docs = [inspect.cleandoc(one.__doc__ or "") for one in stage.built_in().values()]
+    others = [f"{name}: {text}" for name, one in plugins.items() if (text := _own_doc(one))]
+    docs = [*others, *(inspect.cleandoc(one.__doc__ or "") for one in stage.built_in().values())]
     words = [re.split(r"\n\n\w+\n---", doc)[0] for doc in docs]  # without the sections on use from Python
     return "\n\n".join([*words, where, _EXAMPLES[stage.name]])
+
+
+def _own_doc(cls: type[Transform]) -> str:
+    """The docstring of a class, unless it is the signature that a dataclass without one gets."""
+    text = inspect.cleandoc(cls.__doc__ or "")
+    return "" if text.startswith(f"{cls.__name__}(") else text
 
 
 def _panel(theme: str, of: str) -> str:
@@ -126,6 +136,16 @@ def _options_of(kind: type[Transform]) -> dict[str, Field[Any]]:
 
 def _parameter(name: str, annotation: Any, default: Any) -> inspect.Parameter:
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
+
+
+def _flags(parameter: inspect.Parameter) -> set[str]:
+    """The names that an option has on the command line, without the dashes; also those that it had before."""
+    about = get_args(parameter.annotation)[1]
+    # Typer takes the first name for a default until it reads the annotation.
+    names = (about.default, *(about.param_decls or ()))
+    given = [part for name in names if isinstance(name, str) for part in name.split("/")]
+    was = about.declared.was if hasattr(about, "declared") else ""
+    return {name.removeprefix("--") for name in (*given, was, parameter.name.replace("_", "-")) if name}
 
 
 def stage_command(stage: Stage, plugins: Mapping[str, type[Transform]] = MappingProxyType({})) -> Callable[..., None]:
@@ -181,19 +201,21 @@ def stage_command(stage: Stage, plugins: Mapping[str, type[Transform]] = Mapping
         _parameter("config", common.Config, None),
     ]
 
-    taken = [parameter.name for parameter in parameters]
-    if twice := {name for name in taken if taken.count(name) > 1 or name == "help"}:
+    flags = Counter(flag for parameter in parameters for flag in _flags(parameter)) + Counter(["help"])
+    if twice := {flag.replace("-", "_") for flag, count in flags.items() if count > 1}:
         words = f"{' and '.join(plugins)} can't have a parameter {' or '.join(sorted(twice))}"
         raise McaptrackError(f"{words}: that is the name of an option of {stage.name}")
 
     def command(**given: Any) -> None:
         wanted = {option: given[option] for option in owners if given[option] is not None}
-        transform = _transform(stage, given, wanted, owners)
+        with redirect_stdout(sys.stderr):  # what plug-ins print: stdout is for results
+            transform = _transform(stage, given, wanted, owners)
 
         def run(path: Path, **where: Any) -> RunResult:
             from mcaptrack.api.running import run_stage
 
-            where |= {"topic": given["topic"], "to": given["to"], "stages": _configured(), "mode": given.get("mode")}
+            where |= {"topic": given["topic"], "to": given["to"], "stages": _configured()}
+            where["mode"] = given["mode"] if stage.modes else None
             return run_stage(stage.name, transform, path, **where)
 
         run_on_logs(given, run)
@@ -230,7 +252,7 @@ def _transform(
         for option, value in wanted.items()
         if option in own
     }
-    if profile := given.get("profile"):
+    if stage.profiles and (profile := given.get("profile")):
         return replace(stage.profiles[profile], **values)
     return stage.make(name, **values)
 
@@ -241,7 +263,7 @@ def _chosen(stage: Stage, given: Mapping[str, Any], wanted: Mapping[str, Any]) -
     Raises McaptrackError if the profile is of another transform.
     """
     name = (given.get(stage.kind) if stage.kind else "") or ""
-    if profile := given.get("profile"):
+    if stage.profiles and (profile := given.get("profile")):
         meant = stage.choice(stage.profiles[profile])
         if name not in ("", meant):
             raise McaptrackError(f"the profile {profile} is of the {stage.kind} {meant}, not of {name}")

@@ -145,11 +145,13 @@ def _run_job(
     """The channels that a job makes. ``made`` are those of jobs before it."""
     transform = _in_context(opened, prefix, job, given.frames, planes)
     outputs: list[list[Frame]] = [[] for _ in transform.writes]
+    taken: list[int] = []
     try:
         with collected() as warnings:
             entry = STAGES[job.stage].entry(type(transform))
             is_own = STAGES[job.stage].is_built_in(type(transform))
-            results = transform(given.stream) if is_own else guarded(entry, transform, given.stream)
+            stream = _counting(given.stream, taken)
+            results = transform(stream) if is_own else guarded(entry, transform, stream)
             for result in results:
                 for frame, channel in zip(result, outputs, strict=True):
                     channel.append(frame)
@@ -158,7 +160,7 @@ def _run_job(
     except McaptrackError as error:
         where = "" if str(opened.path) in str(error) else f"{opened.path}: {job.source}: "
         raise type(error)(f"{where}{error}") from None
-    left_out = given.messages() - len(outputs[0])
+    left_out = given.messages() - len(taken)
     if transform.reads is VIDEO and left_out > 0:
         warn(
             f"{job.source}: {left_out} of {given.messages()} messages were left out: a video has to begin with a key "
@@ -269,6 +271,13 @@ def _frames(opened: log.Log, topic: str, schema: Schema) -> list[Frame]:
     """The rows of a channel, ours or others'."""
     theirs = foreign.holds_detections(opened.channel(topic))
     return foreign.detections(opened, topic) if theirs else opened.frames(topic, schema)
+
+
+def _counting(frames: Iterable[Frame], taken: list[int]) -> Iterator[Frame]:
+    """The frames; ``taken`` gets the number of each."""
+    for frame in frames:
+        taken.append(frame.index)
+        yield frame
 
 
 def _counted(frames: Sequence[Frame], stage: str, progress: Progress) -> Iterator[Frame]:

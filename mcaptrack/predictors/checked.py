@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,10 +15,12 @@ from numpy.typing import NDArray
 from mcaptrack.errors import McaptrackError
 from mcaptrack.predictors.forecast import Forecast
 from mcaptrack.predictors.onnx import are_covariances
-from mcaptrack.registry import Entry, failure
+from mcaptrack.registry import Entry, blamed, failure
 
 Floats = NDArray[np.float64]
 _WRONG = (TypeError, ValueError, OverflowError)
+#: More steps than anything predicts or looks at; arrays of more do not fit into memory.
+_MOST: Final = 10_000
 
 
 @dataclass(frozen=True)
@@ -34,20 +36,19 @@ class CheckedPredictor:
     @classmethod
     def of(cls, entry: Entry, parameters: Mapping[str, Any]) -> Self:
         """Make the predictor. Raises McaptrackError if that fails, or if what comes of it is no predictor."""
-        try:
+        with blamed(entry, f"could not be made with {', '.join(parameters)}"):
             inner = entry.cls(**parameters)
-        except McaptrackError:
-            raise
-        except Exception as error:  # the code of others may raise anything
-            raise failure(entry, f"could not be made with {', '.join(parameters)}", error) from error
         if not callable(getattr(inner, "predict", None)):
             raise McaptrackError(f"{entry} has no method predict, so it is no predictor")
         try:
             steps, step_s, past = int(inner.steps), float(inner.step_s), int(inner.past)
         except (AttributeError, *_WRONG) as error:
             raise failure(entry, "needs the numbers steps, step_s and past", error) from error
-        if steps < 1 or past < 1 or not 0 < step_s < np.inf:
-            raise McaptrackError(f"{entry} has steps={steps}, step_s={step_s:g}, past={past}; all have to be above 0")
+        if not (0 < steps <= _MOST and 0 < past <= _MOST and 0 < step_s < np.inf):
+            raise McaptrackError(
+                f"{entry} has steps={steps}, step_s={step_s:g}, past={past}; all have to be above 0, steps and past at "
+                f"most {_MOST}"
+            )
         return cls(entry, inner, steps, step_s, past)
 
     @property
@@ -56,21 +57,22 @@ class CheckedPredictor:
 
     @property
     def weights_sha256(self) -> str | None:
-        found = getattr(self.inner, "weights_sha256", None)
-        return None if found is None else str(found)
+        with blamed(self.entry, "could not say its weights_sha256"):
+            found = getattr(self.inner, "weights_sha256", None)
+            return None if found is None else str(found)
 
     def predict(self, xy_m: Floats, valid: NDArray[np.bool_]) -> Forecast:
         """Positions (B, L', 2) of which ``valid`` (B, L') are known, the last one always -> forecasts."""
         batch = len(valid)
         if batch == 0:
             return Forecast(np.empty((0, self.steps, 2)), np.empty((0, self.steps, 2, 2)))
-        try:
-            mean, cov = self.inner.predict(xy_m.copy(), valid.copy())
-            mean, cov = np.asarray(mean, np.float64), np.asarray(cov, np.float64)
-        except McaptrackError:
-            raise
-        except Exception as error:  # as above
-            raise failure(self.entry, f"failed on {batch} tracks", error) from error
+        with blamed(self.entry, f"failed on {batch} {'track' if batch == 1 else 'tracks'}"):
+            given = self.inner.predict(xy_m.copy(), valid.copy())
+        if not isinstance(given, tuple | list) or len(given) != 2:
+            raise McaptrackError(
+                f"{self.entry} gave a {type(given).__name__}; predict has to return mean and covariance"
+            )
+        mean, cov = (self._numbers(one) for one in given)
         wanted = (batch, self.steps, 2), (batch, self.steps, 2, 2)
         if (mean.shape, cov.shape) != wanted:
             raise McaptrackError(
@@ -82,3 +84,10 @@ class CheckedPredictor:
         if not are_covariances(cov):
             raise McaptrackError(f"{self.entry} gave covariances that are not symmetric with variances above 0")
         return Forecast(mean, cov)
+
+    def _numbers(self, given: Any) -> Floats:
+        with blamed(self.entry, "gave what can't be read as numbers"):
+            array = np.asarray(given)
+            if array.dtype.kind not in "fiu":
+                raise TypeError(f"an array of {array.dtype}")
+            return array.astype(np.float64)

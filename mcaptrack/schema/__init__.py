@@ -180,7 +180,8 @@ class Schema:
         names = rows.dtype.names
         wanted = tuple(column.name for column in self.columns)
         if rows.ndim != 1 or names is None:
-            raise ValueError(f"{self.name} needs a structured array of rows, not {rows.dtype} of shape {rows.shape}")
+            kind = "without columns" if names is None else "with columns"
+            raise ValueError(f"{self.name} needs a structured array (N,), not an array of shape {rows.shape} {kind}")
         if set(names) != set(wanted):
             raise ValueError(f"{self.name} has the columns {', '.join(wanted)}; the rows have {', '.join(names)}")
         for column in self.columns:

@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Iterator
+from typing import Final
 
 import numpy as np
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.registry import Entry, failure
-from mcaptrack.schema import Frame
+from mcaptrack.notices import warn
+from mcaptrack.registry import Entry, failure, is_interruption
+from mcaptrack.schema import TRACKS, Frame, Rows, Schema
 from mcaptrack.transforms.protocol import Transform
+
+#: Kinds whose main output has one frame for each frame that is read, at its time and with its number.
+_ONE_FOR_EACH: Final = ("detector", "tracker")
+#: Above the largest time in nanoseconds, and above the largest frame number, that a log can hold.
+_END_NS, _END_INDEX = 2**63, 2**32
 
 
 def guarded(entry: Entry, transform: Transform, frames: Iterable[Frame]) -> Iterator[tuple[Frame, ...]]:
@@ -31,31 +39,47 @@ def guarded(entry: Entry, transform: Transform, frames: Iterable[Frame]) -> Iter
     ------
     McaptrackError
         If the transform raises an exception, or yields anything but a tuple of frames with the rows of its schemas, in
-        order of time. The message names the transform and the frame. Exceptions of ``frames`` are passed on unchanged.
+        order of time; also if a detector or tracker yields a frame that was not in its input. The message names the
+        transform and the frame. Exceptions of ``frames`` are passed on unchanged.
     """
     source = _Source(frames)
     try:
         made = iter(transform(source))
-    except Exception as error:
+    except BaseException as error:  # code of other packages may raise anything
         raise source.error_of(entry, error) from error
     last_ns: int | None = None
     while True:
         try:
             result = next(made)
         except StopIteration:
-            return
-        except Exception as error:
+            break
+        except BaseException as error:
             raise source.error_of(entry, error) from error
-        yield _checked(entry, transform, result, last_ns, source.where)
-        last_ns = result[0].t_ns if result else last_ns
+        checked = _checked(entry, transform, result, last_ns, source.where)
+        main = checked[list(transform.writes).index("")]
+        if entry.kind in _ONE_FOR_EACH and not source.answered(main):
+            raise McaptrackError(
+                f"{entry} gave frame {main.index} of {main.t_ns} ns {source.where}, which is not in its input or was "
+                "given before; it has to yield one frame for each, with the same t_ns and index"
+            )
+        yield checked
+        last_ns = checked[0].t_ns
+    if entry.kind in _ONE_FOR_EACH and (missing := source.unanswered()):
+        warn(
+            f"{entry} gave no frame for {missing} of {source.count}; a frame without rows says that nothing was there, "
+            "a missing frame does not",
+            "left-out",
+        )
 
 
 class _Source:
-    """The input of a transform: notes which frame was taken last, and which exception the input raised."""
+    """The input of a transform: notes the frames that were taken and not answered, and an exception of the input."""
 
     def __init__(self, frames: Iterable[Frame]) -> None:
         self._frames = iter(frames)
         self._error: BaseException | None = None
+        self._open: Counter[tuple[int, int]] = Counter()
+        self.count = 0
         self.where = "before the first frame"
 
     def __iter__(self) -> Iterator[Frame]:
@@ -70,14 +94,26 @@ class _Source:
             self._error = error
             raise
         self.where = f"at frame {frame.index} ({frame.t_ns} ns)"
+        self._open[frame.t_ns, frame.index] += 1
+        self.count += 1
         return frame
 
-    def error_of(self, entry: Entry, error: Exception) -> Exception:
-        """An exception of the input as it is; one of the transform as an error that names the transform."""
-        if error is self._error:
+    def answered(self, frame: Frame) -> bool:
+        """Note the output for a frame. Returns whether the frame was taken from the input and not answered before."""
+        key = frame.t_ns, frame.index
+        if not self._open[key]:
+            return False
+        self._open[key] -= 1
+        return True
+
+    def unanswered(self) -> int:
+        """The number of frames that were taken and not answered."""
+        return self._open.total()
+
+    def error_of(self, entry: Entry, error: BaseException) -> BaseException:
+        """An exception of the input, or an interruption, as it is; another one as an error that names the transform."""
+        if error is self._error or is_interruption(error):
             return error
-        if isinstance(error, McaptrackError):
-            return McaptrackError(f"{entry}: {error}")
         return failure(entry, f"failed {self.where}", error)
 
 
@@ -87,18 +123,47 @@ def _checked(entry: Entry, transform: Transform, result: object, last_ns: int | 
     # A Frame is a tuple itself; to yield one without a tuple around it is a common mistake.
     frames = result if isinstance(result, tuple) and not isinstance(result, Frame) else None
     if frames is None or len(frames) != len(schemas) or not all(isinstance(one, Frame) for one in frames):
-        gave = f"a {type(result).__name__}" if frames is None else f"a tuple of {len(frames)}"
+        gave = f"a {type(result).__name__}"
+        if frames is not None:
+            gave = f"a tuple of {', '.join(type(one).__name__ for one in frames) or 'nothing'}"
         wanted = f"a tuple with a Frame for each of its outputs ({len(schemas)})"
         raise McaptrackError(f"{entry} gave {gave} {where}; it has to yield {wanted}")
-    for frame, schema in zip(frames, schemas, strict=True):
-        if not isinstance(frame.t_ns, int | np.integer) or not isinstance(frame.index, int | np.integer):
-            raise McaptrackError(f"{entry} gave a frame {where} with a t_ns or index that is no integer")
-        if last_ns is not None and frame.t_ns < last_ns:
-            raise McaptrackError(f"{entry} gave a frame of {frame.t_ns} ns {where}, after one of {last_ns} ns")
-        if not isinstance(frame.rows, np.ndarray):
-            raise McaptrackError(f"{entry} gave rows {where} that are a {type(frame.rows).__name__}, no NumPy array")
-        try:
-            schema.check(frame.rows)
-        except ValueError as error:
-            raise McaptrackError(f"{entry} gave rows {where} that are wrong: {error}") from None
-    return frames
+    return tuple(
+        _checked_frame(entry, frame, schema, last_ns, where) for frame, schema in zip(frames, schemas, strict=True)
+    )
+
+
+def _checked_frame(entry: Entry, frame: Frame, schema: Schema, last_ns: int | None, where: str) -> Frame:
+    """A frame with numbers of Python and rows of its own in the layout of the schema: it may be kept, and written."""
+    if not isinstance(frame.t_ns, int | np.integer) or not isinstance(frame.index, int | np.integer):
+        raise McaptrackError(f"{entry} gave a frame {where} whose t_ns and index are no whole numbers")
+    t_ns, index = int(frame.t_ns), int(frame.index)
+    if not (0 <= t_ns < _END_NS and 0 <= index < _END_INDEX):
+        raise McaptrackError(f"{entry} gave frame {index} of {t_ns} ns {where}; a log holds no such time or number")
+    if last_ns is not None and t_ns < last_ns:
+        raise McaptrackError(f"{entry} gave a frame of {t_ns} ns {where}, after one of {last_ns} ns")
+    if not isinstance(frame.rows, np.ndarray):
+        raise McaptrackError(f"{entry} gave rows {where} that are a {type(frame.rows).__name__}, no NumPy array")
+    try:
+        rows = schema.check(frame.rows)
+        rows = schema.rows(**{name: rows[name] for name in schema.dtype.names or ()})
+    except ValueError as error:
+        raise McaptrackError(f"{entry} gave rows {where} that are wrong: {error}") from None
+    if problem := _problem(schema, rows):
+        raise McaptrackError(f"{entry} gave rows {where} that are wrong: {problem}")
+    return Frame(t_ns, index, rows)
+
+
+def _problem(schema: Schema, rows: Rows) -> str:
+    """What can't be, though it is of the right type: "" if all can."""
+    for name in rows.dtype.names or ():
+        if rows.dtype[name].kind == "f" and np.isinf(rows[name]).any():
+            return f"{schema.name}.{name} is infinite in row {int(np.isinf(rows[name]).argmax())}"
+        if name in ("w_px", "h_px") and (rows[name] < 0).any():
+            first = int((rows[name] < 0).argmax())
+            return f"{schema.name}.{name} is {rows[name][first]:g} in row {first}; sizes are not below 0"
+    if schema is TRACKS:
+        ids, counts = np.unique(rows["track_id"], return_counts=True)
+        if (counts > 1).any():
+            return f"track_id {ids[counts.argmax()]} stands in {counts.max()} rows of one frame; a track has one"
+    return ""

@@ -180,6 +180,8 @@ def option_problem(cls: type[Any]) -> str:
                 f"{cls.__name__}.{parameter.name} is a {_type_name(hints[parameter.name])}; a parameter is a float, an "
                 "int, a bool, a str, a Literal of names, a tuple of any length of one of these, or one of them or None"
             )
+        if not parameter.init:
+            return f"{cls.__name__}.{parameter.name} can't be given (init=False); make it a property"
         if parameter.default is MISSING and parameter.default_factory is MISSING:
             return f"{cls.__name__}.{parameter.name} has no default; every parameter needs one"
     return ""

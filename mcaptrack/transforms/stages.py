@@ -9,15 +9,17 @@ from __future__ import annotations
 import difflib
 import inspect
 from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass, field, fields, is_dataclass
 from types import MappingProxyType
 from typing import Any, Final, get_args
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.registry import BUILT_IN, Entry, Kind, entry_of, failure, find
+from mcaptrack.registry import BUILT_IN, Entry, Kind, blamed, entry_of, find
+from mcaptrack.schema import SCHEMAS
 from mcaptrack.transforms.detect import KnnDetector
 from mcaptrack.transforms.predict import Predict
-from mcaptrack.transforms.protocol import Colour, Transform, option_problem
+from mcaptrack.transforms.protocol import Colour, Transform, check_options, option_problem
 from mcaptrack.transforms.retrack import PROFILES, Retrack, upgrade_parameters
 from mcaptrack.transforms.sample import Sample
 from mcaptrack.transforms.sort import Sort
@@ -149,27 +151,26 @@ class Stage:
         2.0
         """
         entry = self.find(chosen) if chosen else self.entry(self.default)
-        known = [f.name for f in fields(entry.cls) if f.init]
+        known, is_own = [f.name for f in fields(entry.cls) if f.init], self.is_built_in(entry.cls)
         for name in parameters:
             if name not in known:
                 close = difflib.get_close_matches(name, known, 1)
                 meant = f"did you mean {close[0]}? " if close else ""
-                raise McaptrackError(f"{entry} has no parameter {name}; {meant}there are {', '.join(known) or 'none'}")
-        try:
+                what = entry if self.kind else self.name
+                raise McaptrackError(f"{what} has no parameter {name}; {meant}there are {', '.join(known) or 'none'}")
+        with nullcontext() if is_own else blamed(entry, "could not be made"):
             made: Transform = entry.cls(**parameters)
-        except McaptrackError as error:
-            raise error if entry.is_built_in else McaptrackError(f"{entry}: {error}") from None
-        except Exception as error:
-            if entry.is_built_in:
-                raise
-            raise failure(entry, "could not be made", error) from error
+            check_options(made)
         return made
 
     def _check(self, entry: Entry) -> None:
         """Raise McaptrackError if a class of another package can't be a transform of this stage."""
         cls, wanted = entry.cls, self.default
         if not inspect.isclass(cls) or not is_dataclass(cls):
-            raise McaptrackError(f"{entry} is no dataclass; the fields of a transform are its parameters")
+            raise McaptrackError(
+                f"{entry} is no dataclass; the fields of a transform are its parameters: write "
+                "@dataclass(frozen=True, kw_only=True) above the class"
+            )
         reads, writes = getattr(cls, "reads", None), getattr(cls, "writes", None)
         if reads is not wanted.reads:
             is_schema = getattr(reads, "name", "")
@@ -177,12 +178,19 @@ class Stage:
                 f"{entry} reads {is_schema or 'no schema (the class attribute reads)'}; a {entry.kind} reads "
                 f"{wanted.reads.name}"
             )
-        main = writes.get("") if isinstance(writes, Mapping) else None
+        outputs = dict(writes) if isinstance(writes, Mapping) else {}
+        main = outputs.get("")
         if main is not wanted.writes[""]:
             raise McaptrackError(
                 f"{entry} writes {getattr(main, 'name', '') or 'nothing (the class attribute writes)'}; a {entry.kind} "
                 f"writes {wanted.writes[''].name} as its main output, as in writes = {{'': ...}}"
             )
+        for suffix, schema in outputs.items():
+            if not isinstance(suffix, str) or schema not in SCHEMAS.values():
+                raise McaptrackError(
+                    f"{entry} has writes with {suffix!r}: {schema!r}; it maps ends of topics to schemas of rows, as in "
+                    "writes = {'': TRACKS, 'debug': DETECTIONS}"
+                )
         if "__call__" not in dir(cls):
             raise McaptrackError(f"{entry} can't be called with frames; it needs a method __call__")
         if any(one.name == self.kind for one in fields(cls)):
