@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
+from mcaptrack import log as logs
 from mcaptrack import notices
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import is_same_file, refuse_special, refuse_url
@@ -45,6 +46,7 @@ def log_path(path: PathLike) -> Path:
     """Return the path of a log that stands. Raises McaptrackError as ``as_path``, and for a folder."""
     found = as_path(path)
     if found.is_dir():
+        logs.refuse_non_mcap(found)
         raise McaptrackError(f"{found} is a folder, not an MCAP file; give the log in it")
     return found
 
@@ -68,6 +70,7 @@ def log_output(path: PathLike, source: Path) -> Path:
     """
     found = as_path(path)
     if found.is_dir():
+        logs.refuse_non_mcap(found)
         raise McaptrackError(f"{found} is a folder; give the name of a file")
     if found.suffix.lower() != ".mcap" and not is_same_file(found, source):
         raise McaptrackError(f"{found} is not a name for a log: logs are MCAP files; give a name that ends with .mcap")
