@@ -12,7 +12,7 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 from mcaptrack.sources import demo
-from tests.commands import done
+from tests.commands import done, made_log
 from tests.worlds import small_scene
 
 # The same examples each time, so that a failure comes from a change; `--hypothesis-profile search` tries many new ones.
@@ -75,6 +75,12 @@ def finished(_finished, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("finished")
     shutil.copytree(_finished.parent, folder, dirs_exist_ok=True)
     return folder / _finished.name
+
+
+@pytest.fixture(scope="session")
+def template(tmp_path_factory) -> Path:
+    """A small log of two people after all stages, beside the files it was made from. Not to be changed."""
+    return made_log(tmp_path_factory.mktemp("made"))
 
 
 @pytest.fixture

@@ -15,7 +15,7 @@ from mcaptrack.schema import TRACKS, Frame
 from mcaptrack.schema.provenance import Provenance, digest
 from mcaptrack.sources.cameras import camera_at, cameras, find_camera, name_above
 from mcaptrack.transforms import STAGES, TRANSFORMS
-from tests.commands import GROUP, call, done, made_log
+from tests.commands import GROUP, call, done
 from tests.robots import write_log
 from tests.worlds import tracks_at
 
@@ -41,12 +41,6 @@ READING = {
     "run": ("--no-tables",),
     "tune": ("--trials", "1", "-o", "tuned.toml"),
 } | dict.fromkeys(TRANSFORMS, ())
-
-
-@pytest.fixture(scope="module")
-def template(tmp_path_factory) -> Path:
-    """A small log with everything in it. Not to be changed."""
-    return made_log(tmp_path_factory.mktemp("made"))
 
 
 @pytest.fixture

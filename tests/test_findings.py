@@ -22,14 +22,8 @@ from mcaptrack.schema import DETECTIONS, TRACKS, VIDEO, Frame, Schema
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.transforms import TRANSFORMS, KnnDetector
 from mcaptrack.transforms.protocol import option
-from tests.commands import call, done, made_log
+from tests.commands import call, done
 from tests.worlds import boxes_at, ns, tracks_at, walk
-
-
-@pytest.fixture(scope="module")
-def template(tmp_path_factory) -> Path:
-    """A small log with everything in it. Not to be changed."""
-    return made_log(tmp_path_factory.mktemp("made"))
 
 
 @pytest.fixture

@@ -19,19 +19,13 @@ from mcaptrack.predictors import NAMES
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.transforms import PROFILES, TRACKERS, TRANSFORMS
 from mcaptrack.transforms.protocol import bare_type, choices
-from tests.commands import call, done, made_log, toml_value
-
-
-@pytest.fixture(scope="session")
-def finished(tmp_path_factory) -> Path:
-    """A small log with everything in it. Not to be changed."""
-    return made_log(tmp_path_factory.mktemp("finished"))
+from tests.commands import call, done, toml_value
 
 
 @pytest.fixture
-def folder(finished, tmp_path, monkeypatch) -> Path:
+def folder(template, tmp_path, monkeypatch) -> Path:
     """The working folder of a command, with a log of its own."""
-    shutil.copy(finished, tmp_path / "a.mcap")
+    shutil.copy(template, tmp_path / "a.mcap")
     monkeypatch.chdir(tmp_path)
     return tmp_path
 

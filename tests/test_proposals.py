@@ -20,7 +20,7 @@ from mcaptrack.schema import TRACKS
 from mcaptrack.training.sources import SourceOptions, read_scenes
 from mcaptrack.viewing import serving
 from tests.bags import bag1
-from tests.commands import GROUP, call, done, made_log
+from tests.commands import GROUP, call, done
 from tests.interrupted import interrupt
 from tests.robots import write_log
 
@@ -28,12 +28,6 @@ PACKAGE = Path(mcaptrack.__file__).parent
 #: A name that is difficult for a shell, an option parser and a parser of messages.
 NAME = "-a  b'c$(x)`.mcap".replace("`", "")
 VERBS = "|".join(GROUP.commands)
-
-
-@pytest.fixture(scope="module")
-def template(tmp_path_factory) -> Path:
-    """A small log with all channels, beside its video and labels. Tests must not change it."""
-    return made_log(tmp_path_factory.mktemp("made"))
 
 
 class Scene:

@@ -17,25 +17,11 @@ from mcaptrack.foxglove.views import Drawing
 from mcaptrack.foxglove.views.people import ellipse_points, ellipses
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import DETECTIONS, PREDICTIONS, TRACKS, Frame
-from tests.worlds import FORECAST, PICTURES, PLANE, boxes_at, ns, tracks_at
+from tests.worlds import FORECAST, PICTURES, PLANE, boxed, boxes_at, ns, tracks_at
 
 LOOP, LIST = 2, 4
 #: Coordinates are written to a quarter of a pixel.
 PX = 0.126
-
-
-def track_rows(people, observed=True):
-    """{id: (left, top)} with boxes of 10 x 20."""
-    xy = np.array(list(people.values()), float).reshape(-1, 2)
-    return TRACKS.rows(
-        track_id=np.array(list(people), np.int64),
-        x_px=xy[:, 0],
-        y_px=xy[:, 1],
-        w_px=np.full(len(xy), 10.0),
-        h_px=np.full(len(xy), 20.0),
-        observed=np.full(len(xy), observed),
-        source_id=np.full(len(xy), -1),
-    )
 
 
 def view(topic, schema, frames, picture_ns, planes, stamp_ns=None, is_retracked=False):
@@ -67,9 +53,9 @@ def xy(line) -> list[tuple[float, float]]:
 
 CHANNELS = {
     "detections": ("/c/detections", DETECTIONS, [Frame(int(PICTURES[4]), 4, boxes_at([(50, 60)]))]),
-    "tracks": ("/c/tracks", TRACKS, [Frame(int(PICTURES[n]), n, track_rows({2: (n, 5)})) for n in range(3, 6)]),
-    "retracks": ("/c/retracks", TRACKS, [Frame(ns(0.4 * n), n, track_rows({2: (40 * n, 5)})) for n in range(1, 4)]),
-    "truth": ("/c/truth", TRACKS, [Frame(int(PICTURES[4]), 4, track_rows({2: (1, 5)}))]),
+    "tracks": ("/c/tracks", TRACKS, [Frame(int(PICTURES[n]), n, boxed({2: (n, 5)})) for n in range(3, 6)]),
+    "retracks": ("/c/retracks", TRACKS, [Frame(ns(0.4 * n), n, boxed({2: (40 * n, 5)})) for n in range(1, 4)]),
+    "truth": ("/c/truth", TRACKS, [Frame(int(PICTURES[4]), 4, boxed({2: (1, 5)}))]),
     "predictions": ("/c/predictions", PREDICTIONS, [Frame(ns(0.4), 1, FORECAST)]),
     "nothing": ("/c/tracks", TRACKS, []),
     "no detections": ("/c/detections", DETECTIONS, []),
@@ -126,7 +112,7 @@ def test_a_trail_leads_to_the_box_and_fades_into_the_past():
 
 
 def test_trails_stay_where_they_are_while_people_go_on_and_end_after_two_seconds():
-    frames = [Frame(int(PICTURES[n]), n, track_rows({2: (10 * n, 5), 30: (5, 10 * n)})) for n in range(20)]
+    frames = [Frame(int(PICTURES[n]), n, boxed({2: (10 * n, 5), 30: (5, 10 * n)})) for n in range(20)]
     found = messages("/c/retracks/full", TRACKS, frames)
     for earlier, later in pairwise(found[15:]):
         before, after = (set(xy(drawn(message)[-1])) for message in (earlier, later))
@@ -137,7 +123,7 @@ def test_trails_stay_where_they_are_while_people_go_on_and_end_after_two_seconds
 
 
 def test_kinds_of_tracks_differ():
-    rows = [Frame(int(PICTURES[n]), n, track_rows({2: (n, 5)})) for n in range(6)]
+    rows = [Frame(int(PICTURES[n]), n, boxed({2: (n, 5)})) for n in range(6)]
     sort, retracked, true = (messages(f"/c/{name}", TRACKS, rows)[5] for name in ("tracks", "retracks/full", "truth"))
     assert [line.type for line in drawn(sort)] == [LIST]  # sides and trail, and no closed line
     sides = xy(drawn(sort)[0])
@@ -156,7 +142,7 @@ def test_kinds_of_tracks_differ():
 
 def test_interpolated_positions_are_fainter():
     for name in ("tracks", "retracks/full"):
-        rows = [Frame(int(PICTURES[n]), n, track_rows({2: (n, 5)}, observed=n != 4)) for n in range(6)]
+        rows = [Frame(int(PICTURES[n]), n, boxed({2: (n, 5)}, observed=n != 4)) for n in range(6)]
         alpha = []
         for message in messages(f"/c/{name}", TRACKS, rows)[3:6]:
             part = drawn(message)[0]
@@ -174,7 +160,7 @@ def test_a_place_without_a_box_is_marked_with_its_number():
 
 def test_numbers_of_any_length_are_written():
     people = {-4: (0, 0), 7: (10, 0), 12345: (20, 0), 2**40: (30, 0)}
-    message = messages("/c/tracks", TRACKS, [Frame(int(PICTURES[3]), 3, track_rows(people))])[3]
+    message = messages("/c/tracks", TRACKS, [Frame(int(PICTURES[3]), 3, boxed(people))])[3]
     assert sorted(text.text for text in message.texts) == sorted(map(str, people))
 
 
@@ -268,7 +254,7 @@ def test_stamps_are_those_of_the_pictures_where_they_differ_from_the_log():
 def test_drawings_are_independent_of_batches():
     """Messages are made in batches; where one ends is not to be seen."""
     pictures = np.arange(600) * ns(0.1)
-    frames = [Frame(int(t), n, track_rows({2: (n, 5), 5: (5, n)})) for n, t in enumerate(pictures)]
+    frames = [Frame(int(t), n, boxed({2: (n, 5), 5: (5, n)})) for n, t in enumerate(pictures)]
     whole = list(view("/c/tracks", TRACKS, frames, pictures, PLANE))
     part = list(view("/c/tracks", TRACKS, frames[200:330], pictures[200:330], PLANE))
     assert [payload for _, _, payload in whole[230:330]] == [payload for _, _, payload in part[30:]]

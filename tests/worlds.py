@@ -208,7 +208,7 @@ def crossing_tracks(rng: np.random.Generator, ticks: int = 50, rate_hz: float = 
     return frames
 
 
-def boxed(people):
+def boxed(people, observed: bool = True):
     """Rows of tracks from {id: (left, top)}: boxes of 10 x 20 px, without positions in metres."""
     xy = np.array(list(people.values()), float).reshape(-1, 2)
     return TRACKS.rows(
@@ -217,7 +217,7 @@ def boxed(people):
         y_px=xy[:, 1],
         w_px=np.full(len(xy), 10.0),
         h_px=np.full(len(xy), 20.0),
-        observed=np.ones(len(xy), bool),
+        observed=np.full(len(xy), observed),
         source_id=np.full(len(xy), -1),
     )
 

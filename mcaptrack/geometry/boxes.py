@@ -17,11 +17,6 @@ def columns_to_boxes(rows: NDArray[np.void]) -> Floats:
     return np.stack([rows["x_px"], rows["y_px"], rows["w_px"], rows["h_px"]], axis=-1)
 
 
-def xyxy_to_xywh(corners: Floats) -> Floats:
-    """Left, top, right, bottom -> left, top, width, height; (N, 4)."""
-    return np.concatenate([corners[:, :2], corners[:, 2:] - corners[:, :2]], axis=1)
-
-
 def iou(a: Floats, b: Floats) -> Floats:
     """Intersection over union (M, N) of all boxes of ``a`` (M, 4) with all of ``b`` (N, 4); 0 for empty boxes."""
     low = np.maximum(a[:, None, :2], b[None, :, :2])

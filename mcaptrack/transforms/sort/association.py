@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -12,7 +12,6 @@ from mcaptrack.geometry.boxes import overlapping
 from mcaptrack.geometry.plane import GroundPlane
 
 Cost = Literal["iou", "pixels", "metres"]
-COSTS: tuple[Cost, ...] = get_args(Cost)
 
 
 class CandidatePairs(NamedTuple):
