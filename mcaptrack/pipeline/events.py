@@ -43,7 +43,7 @@ from mcaptrack.sources.cameras import camera_at
 STAGE: Final = "events"
 #: What is watched unless something else is asked for, below the camera's prefix.
 WATCHED: Final = ("tracks", "retracks")
-#: What tracks became, with all that the log knows: forecasts are held against it, beside the truth.
+#: The tracks of the whole log: forecasts are compared with them, and with the ground truth.
 _BECAME: Final = "retracks"
 _EVENTS, _COUNTS = "/events", "/counts"
 _ERRORS, _SCORES = "/errors", "/scores"
@@ -70,7 +70,7 @@ def outputs(topic: str) -> tuple[str, ...]:
 def make_events(opened: log.Log, prefix: str, made: Mapping[str, Made], watch: Watch) -> dict[str, Made]:
     """Events of all watched channels where they are missing or out of date, and errors of predictions likewise.
 
-    ``made`` are channels that were just made. What can't be compared with the truth is left out, with a warning.
+    ``made`` are channels that were just made. What can't be compared with the ground truth is left out, with a warning.
     Raises McaptrackError for topics that were asked for and hold no tracks.
     """
     out: dict[str, Made] = {}

@@ -17,7 +17,7 @@ from mcaptrack.sources import foreign
 from mcaptrack.sources.cameras import camera_at
 from mcaptrack.transforms import STAGES
 
-#: Tracks within this distance of the truth are right, as in the demonstration.
+#: Tracks within this distance of the ground truth match it, as in the demonstration.
 _GATE_M = 1.0
 _MIN_IOU = 0.5
 
@@ -60,7 +60,7 @@ class Summary:
 
 
 def summarise(opened: log.Log, prefix: str) -> Summary:
-    """Count what a log holds of a camera, and score it against the truth if it has one.
+    """Count what a log holds of a camera, and score it against its ground truth, if it has one.
 
     Warns where re-tracking lost more than it mended.
     """

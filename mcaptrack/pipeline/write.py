@@ -253,7 +253,7 @@ def _last_step(opened: log.Log, prefix: str, shown: Mapping[str, Shown]) -> int:
 
 
 def _is_truth_known(opened: log.Log, prefix: str, shown: Mapping[str, Shown]) -> bool:
-    """Whether any forecast is held against the truth."""
+    """Whether any forecast is compared with the ground truth."""
     for name in ("retracks/predictions", "predictions"):
         frames = _frames(opened, shown, f"{prefix}/{name}/scores", FORECAST_SCORES)
         if any(np.isfinite(frame.rows["ade_m"]).any() for frame in frames):
