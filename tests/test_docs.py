@@ -172,6 +172,19 @@ def test_the_floors_on_the_map_are_those_that_are_held():
     assert all(re.search(rf"\b{name}\b", text) for name in layers)
 
 
+def test_the_scores_of_the_method_are_those_of_the_ablation():
+    """Both pages have scores of profiles within 1 m: IDF1, MOTA and identity switches."""
+    ablation, method = ((ROOT / "docs" / f"{name}.md").read_text() for name in ("ablation", "method"))
+    noisy, detections = (ablation.split(f"<!-- {name} -->")[1] for name in ("sdd-noisy", "sdd-detections"))
+    steps = {"paper": "paper", "authors": "authors", "default": r"\+ smoothing \(the default\)"}
+    for profile, step in steps.items():
+        idf1, mota, switches = re.search(rf"^\| {step} \|(?:[^|]*\|){{2}} ([^|]*) \|", noisy, re.M)[1].split(" / ")
+        if profile != "authors":  # with an LSTM on the other page
+            assert f"| `--profile {profile}` | {idf1} | {mota} | {int(switches):,} |" in method
+        idf1 = re.search(rf"^\| {step} \|(?:[^|]*\|){{2}} ([\d.]+)", detections, re.M)[1]
+        assert re.search(rf"\b{idf1} for `{profile}`", method)
+
+
 def test_every_dependency_is_pinned():
     wanted = [
         *PROJECT["dependencies"],
