@@ -196,6 +196,8 @@ def proposals() -> set[str]:
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in ("call", "command"):
                 first = node.args[0]
                 verb = first.value if isinstance(first, ast.Constant) else "*"
+                if verb == "open":
+                    continue  # no command does this
                 out.add(f"{path.relative_to(PACKAGE).as_posix()}:{name}:{verb}")
     return out
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from types import ModuleType, SimpleNamespace
 
 import numpy as np
+import pyarrow as pa
 import pytest
 
 import mcaptrack
@@ -305,7 +306,7 @@ class TestWriting:
         elif library == "polars":
             given = module.DataFrame(columns)
         else:
-            given = pytest.importorskip("pyarrow").table(columns)
+            given = pa.table(columns)
         if library == "duckdb":
             given = module.sql("select t_ns, x_px, y_px, w_px, h_px::decimal(9, 2) as h_px, score from given")
         with mcaptrack.open(tmp_path / "a.mcap", create=True) as opened:
