@@ -25,6 +25,7 @@ Code = Literal[
     "chosen-camera",
     "classes",
     "clock",
+    "device",
     "extrapolated",
     "held-back",
     "journal",

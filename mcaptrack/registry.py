@@ -47,6 +47,7 @@ BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(
             "knn": "mcaptrack.transforms.detect.background:KnnDetector",
             "mog2": "mcaptrack.transforms.detect.background:Mog2Detector",
             "frame-difference": "mcaptrack.transforms.detect.background:FrameDifferenceDetector",
+            "onnx": "mcaptrack.transforms.detect.onnx.detector:OnnxDetector",
         },
         "tracker": {
             "sort": "mcaptrack.transforms.sort:Sort",

@@ -9,7 +9,7 @@ from typing import get_type_hints
 import numpy as np
 import pytest
 
-from mcaptrack.transforms import STAGES, TRACKERS, TRANSFORMS, RetrackByConsistency
+from mcaptrack.transforms import STAGES, TRACKERS, TRANSFORMS, MotionDetector, OnnxDetector, RetrackByConsistency
 from mcaptrack.transforms.protocol import bare_type
 from mcaptrack.transforms.retrack import RetrackOptions
 from tests.effects import Case, others, retrack, sort
@@ -38,7 +38,8 @@ def test_an_option_has_the_effect_that_its_scene_says(option: str, case: Case):
 
 def test_detectors_differ_in_how_long_they_see_people_who_stop():
     found = {}
-    for name, kind in STAGES["detect"].built_in().items():
+    motion = {name: kind for name, kind in STAGES["detect"].built_in().items() if issubclass(kind, MotionDetector)}
+    for name, kind in motion.items():
         found[name] = others.all_boxes([[frame for (frame,) in kind(stabilise=False)(others.STOPS)]])
     assert found["frame-difference"] < found["mog2"] < found["knn"]
 
@@ -56,13 +57,15 @@ RANGES = {
     "history_s": (0.1, 1e6),
     "horizon_s": (0.1, 60.0),
     "link_confidence": (0.01, 0.99),
+    "max_memory_mb": (10, 1_000_000),
     "max_pixels": (1000, 10**9),
     "min_history": (1, 100),
     "min_hits": (0, 1000),
+    "overlap": (0.0, 0.5),
     "rate_hz": (0.1, 1000.0),
     "sigma_m": (1e-6, 1e6),
 }
-SHARES = {"alpha", "beta", "min_iou", "low_min_iou", "track_confidence"}
+SHARES = {"alpha", "beta", "max_iou", "min_iou", "low_min_iou", "track_confidence"}
 ANY = {"min_score", "high_score", "new_score"}
 
 
@@ -72,7 +75,8 @@ def test_ranges_quantities_are_not_negative_and_shares_are_within_0_and_1(kind):
         name, hint = option.name, get_type_hints(kind)[option.name]
         if option.metadata.get("context") or bare_type(hint) not in (int, float):
             continue
-        usual = (0.0, 1.0) if name in SHARES else (-np.inf, np.inf) if name in ANY else (0.0, 1e6)
+        is_share = name in SHARES or (kind is OnnxDetector and name == "min_score")
+        usual = (0.0, 1.0) if is_share else (-np.inf, np.inf) if name in ANY else (0.0, 1e6)
         assert (option.metadata["least"], option.metadata["most"]) == RANGES.get(name, usual), name
         low, high = option.metadata["search"] or (option.metadata["least"], option.metadata["most"])
         assert option.metadata["least"] <= low < high <= option.metadata["most"]

@@ -71,7 +71,7 @@ def _of_words(stage: Stage, words: Sequence[str]) -> Iterator[tuple[str, type[Tr
     if len(given) > 1:
         return  # both the old and the new name: the parser refuses that
     for name in chain.from_iterable(given):
-        if name not in BUILT_IN[stage.kind or ""]:
+        if stage.split(name)[0] not in BUILT_IN[stage.kind or ""]:
             yield name, stage.find(name).cls
 
 
@@ -105,7 +105,7 @@ def _names_of_settings(stage: Stage, files: Sequence[ConfigFile], known: Mapping
     options |= {name.removeprefix(start).lower().replace("_", "-") for name in os.environ if name.startswith(start)}
     if options - set(known):
         found += names(kind)
-    return [name for name in dict.fromkeys(found) if name and name not in BUILT_IN[kind]]
+    return [name for name in dict.fromkeys(found) if name and stage.split(name)[0] not in BUILT_IN[kind]]
 
 
 def _command(stage: Stage, plugins: Mapping[str, type[Transform]], panel: str) -> Any:

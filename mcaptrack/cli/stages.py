@@ -7,7 +7,7 @@ import math
 import re
 import sys
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import redirect_stdout
 from dataclasses import MISSING, Field, fields, replace
 from pathlib import Path
@@ -86,23 +86,24 @@ def _own_doc(cls: type[Transform]) -> str:
     return "" if text.startswith(f"{cls.__name__}(") else text
 
 
-def _panel(theme: str, of: str) -> str:
-    """Return the heading of an option in the help: its theme, and the only transform that has it, if there is one."""
+def _panel(theme: str, of: Sequence[str]) -> str:
+    """Return the heading of an option in the help: its theme, and the transforms that have it, if not all do."""
     if not of:
         return theme
-    return f"{theme} ({of} alone)" if theme else f"Options of {of} alone"
+    those = ", ".join(of[:-1]) + f" and {of[-1]}" if len(of) > 1 else f"{of[0]} alone"
+    return f"{theme} ({those})" if theme else f"Options of {those}"
 
 
-def _option(field: Field[Any], annotation: Any, of: str = "") -> inspect.Parameter:
+def _option(field: Field[Any], annotation: Any, of: Sequence[str] = ()) -> inspect.Parameter:
     """Return the option for a parameter. Its value is None unless it is set; its help shows the default.
 
-    ``of`` is the name of the only transform that has the parameter; "" if all have it.
+    ``of`` are the names of the transforms that have the parameter; none if all have it.
     """
     (kind, is_tuple), about = member_type(annotation), field.metadata
     flag = "--" + field.name.replace("_", "-")
     switch = f"{flag}/--no-{flag[2:]}" if kind is bool and not is_tuple else flag
     default = default_of(field)
-    words = about.get("help", "") or f"parameter {field.name} of {of}"
+    words = about.get("help", "") or f"parameter {field.name} of {' and '.join(of)}"
     info = common.option(
         switch,
         panel=_panel(about.get("theme", ""), of),
@@ -186,7 +187,7 @@ def stage_command(stage: Stage, plugins: Mapping[str, type[Transform]] = Mapping
         name = having[0]
         is_shared = built_in <= set(having)
         hint = get_type_hints(kinds[name])[option]
-        parameters.append(_option(own[name][option], hint, "" if is_shared else name))
+        parameters.append(_option(own[name][option], hint, () if is_shared else having))
     to = common.option("--to", panel=common.FILES, help="Write to this channel instead of the default one.")
     parameters += [
         _parameter("topic", Topic, None),

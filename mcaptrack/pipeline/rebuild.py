@@ -72,6 +72,9 @@ def rebuild(stage: Stage, made: Provenance, known: Mapping[str, Transform]) -> T
     predictor = getattr(transform, "predictor", "")
     if made.weights_sha256 and ":" in predictor and weights_sha256(predictor) != made.weights_sha256:
         raise McaptrackError(f"{predictor} holds other weights than those it was made with")
+    own = transform.weights_sha256() if made.weights_sha256 and hasattr(transform, "weights_sha256") else None
+    if own not in (None, made.weights_sha256):
+        raise McaptrackError(f"{stage.choice(transform)} holds other weights than those it was made with")
     return transform
 
 

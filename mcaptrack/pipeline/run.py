@@ -30,7 +30,7 @@ from mcaptrack.sources.cameras import camera_at
 from mcaptrack.sources.video import EncodedPicture, decode_bgr, decode_gray
 from mcaptrack.transforms import FULL, STAGES, Sample, Transform
 from mcaptrack.transforms.guarded import guarded
-from mcaptrack.transforms.protocol import colour_of
+from mcaptrack.transforms.protocol import ModelCard, colour_of
 from mcaptrack.transforms.to_video_rate import to_video_rate, unchanged_tracks
 
 Progress = Callable[[str, int, int], None]
@@ -188,13 +188,16 @@ def _provenance_of(job: Job, transform: Transform, input_digest: str, warnings: 
     except TypeError as error:
         raise McaptrackError(f"the parameters of {entry} can't be kept in a log: {error}") from None
     predictor = getattr(transform, "predictor", None)
+    card = transform.model_card() if hasattr(transform, "model_card") else ModelCard()
     return Provenance(
         job.stage,
         parameters,
         job.source,
         input_digest,
-        weights_sha256=weights_sha256(predictor) if isinstance(predictor, str) else "",
+        weights_sha256=weights_sha256(predictor) if isinstance(predictor, str) else card.weights_sha256,
         plugins=plugins_of(stage, transform),
+        classes={str(number): name for number, name in card.classes.items()},
+        model=card.facts,
         warnings=[(notice.code, notice.message) for notice in warnings],
     )
 

@@ -38,7 +38,8 @@ class Provenance:
 
     ``references`` are the topics that the input was compared with, and their digests; empty for missing topics.
     ``plugins`` are the classes of other packages that were used: the ``transform`` itself if it is not built in, and
-    its ``predictor``. ``warnings`` are the warnings when it was made, with code and message.
+    its ``predictor``. ``classes`` are the names of the classes in its rows by ``class_id``, and ``model`` what its
+    network turned out to be. ``warnings`` are the warnings when it was made, with code and message.
     """
 
     transform: str
@@ -49,6 +50,8 @@ class Provenance:
     weights_sha256: str = ""
     references: Mapping[str, str] = field(default_factory=dict)
     plugins: Mapping[str, Plugin] = field(default_factory=dict)
+    classes: Mapping[str, str] = field(default_factory=dict)
+    model: Mapping[str, str] = field(default_factory=dict)
     warnings: Sequence[Sequence[str]] = ()
     version: str = __version__
 
@@ -68,14 +71,13 @@ class Provenance:
             "weights_sha256": self.weights_sha256,
             "references": json.dumps(dict(self.references), sort_keys=True, separators=(",", ":")),
             "plugins": json.dumps({key: one._asdict() for key, one in self.plugins.items()}, sort_keys=True),
+            "classes": json.dumps(dict(self.classes), ensure_ascii=False),
+            "model": json.dumps(dict(self.model), sort_keys=True),
             "warnings": json.dumps(self.warnings, separators=(",", ":")),
         }
-        if not self.warnings:
-            del values["warnings"]
-        if not self.references:
-            del values["references"]
-        if not self.plugins:
-            del values["plugins"]
+        for name in ("warnings", "references", "plugins", "classes", "model"):
+            if not getattr(self, name):
+                del values[name]
         return {_PREFIX + key: value for key, value in values.items() if value}
 
     @classmethod
@@ -85,10 +87,12 @@ class Provenance:
         if "transform" not in values:
             return None
         parameters, references = (_read(values.pop(key, ""), dict) for key in ("parameters", "references"))
+        classes, model = (_texts(values.pop(key, "")) for key in ("classes", "model"))
         plugins = _plugins(values)
         warnings = [one for one in _read(values.pop("warnings", ""), list) if _is_warning(one)]
-        known = {key: value for key, value in values.items() if key in cls.__dataclass_fields__}
-        return cls(parameters=parameters, references=references, warnings=warnings, plugins=plugins, **known)
+        known: dict[str, Any] = {key: value for key, value in values.items() if key in cls.__dataclass_fields__}
+        known |= {"references": references, "warnings": warnings, "plugins": plugins, "classes": classes}
+        return cls(parameters=parameters, model=model, **known)
 
 
 def _read(text: str, kind: type[T]) -> T:
@@ -98,6 +102,11 @@ def _read(text: str, kind: type[T]) -> T:
     except (ValueError, RecursionError):
         return kind()
     return value if isinstance(value, kind) else kind()
+
+
+def _texts(text: str) -> dict[str, str]:
+    """Parse a JSON object of texts; others are left out."""
+    return {key: value for key, value in _read(text, dict).items() if isinstance(value, str)}
 
 
 def _is_warning(value: object) -> bool:

@@ -10,7 +10,13 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Final
 
-from mcaptrack.transforms.detect import FrameDifferenceDetector, KnnDetector, Mog2Detector, MotionDetector
+from mcaptrack.transforms.detect import (
+    FrameDifferenceDetector,
+    KnnDetector,
+    Mog2Detector,
+    MotionDetector,
+    OnnxDetector,
+)
 from mcaptrack.transforms.predict import Predict
 from mcaptrack.transforms.protocol import Transform
 from mcaptrack.transforms.retrack import PROFILES, Retrack, RetrackByConsistency
@@ -30,6 +36,7 @@ __all__ = [
     "Mog2Detector",
     "MotionDetector",
     "OcSort",
+    "OnnxDetector",
     "Predict",
     "Retrack",
     "RetrackByConsistency",

@@ -25,8 +25,8 @@ import typing
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import MISSING, field, fields
 from functools import cache
-from types import UnionType
-from typing import Any, ClassVar, Final, Literal, Protocol, get_args, get_origin, get_type_hints
+from types import MappingProxyType, UnionType
+from typing import Any, ClassVar, Final, Literal, NamedTuple, Protocol, get_args, get_origin, get_type_hints
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.registry import Kind
@@ -61,6 +61,18 @@ class Transform(WithOptions, Protocol):
     def latency_s(self) -> Mapping[str, float]:
         """How far each output depends on later input, in seconds."""
         ...
+
+
+class ModelCard(NamedTuple):
+    """What the network of a transform turned out to be, for the provenance of its channels: the digest of its file, the
+    names of the classes in its rows by ``class_id``, and other facts.
+
+    A transform with a network may have a method ``model_card`` that gives it after a run.
+    """
+
+    weights_sha256: str = ""
+    classes: Mapping[int, str] = MappingProxyType({})
+    facts: Mapping[str, str] = MappingProxyType({})
 
 
 #: What a transform gets of pictures: brightness, (height, width), or blue, green and red, (height, width, 3).

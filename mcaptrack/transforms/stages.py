@@ -26,6 +26,8 @@ from mcaptrack.transforms.sort import Sort
 
 #: Suffix of the topic of tracks at the video's rate (``Stage.at_video_rate``).
 FULL: Final = "/full"
+#: The field for the file that a name may end with, as in ``onnx:FILE``.
+_FILE: Final = "file"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,10 +102,18 @@ class Stage:
         """
         if self.kind is None:
             raise McaptrackError(f"{self.name} has one transform only, which can't be replaced by {name}")
-        entry = find(self.kind, name)
+        own, file = self.split(name)
+        entry = find(self.kind, own)
         if not entry.is_built_in:
             self._check(entry)
+        if file is not None and _FILE not in {f.name for f in fields(entry.cls)}:
+            raise McaptrackError(f"{entry} takes no file, so {name} names nothing")
         return entry
+
+    def split(self, name: str) -> tuple[str, str | None]:
+        """A name, and the file that it ends with: ("onnx", "FILE") for "onnx:FILE"; None for names without a file."""
+        own, colon, file = name.partition(":")
+        return (own, file) if colon and own in BUILT_IN.get(self.kind or "", ()) else (name, None)
 
     def entry(self, cls: type[Transform]) -> Entry:
         """The entry of a class of transforms of this stage."""
@@ -120,7 +130,8 @@ class Stage:
         """The value of ``option`` that a transform has; "" if there is no choice."""
         if self.parameter:
             return str(getattr(transform, self.parameter))
-        return self.entry(type(transform)).name if self.kind else ""
+        file = getattr(transform, _FILE, "")
+        return self.entry(type(transform)).name + (f":{file}" if file else "") if self.kind else ""
 
     def is_built_in(self, cls: type[Transform]) -> bool:
         """Whether a class is a built-in transform of this stage."""
@@ -132,7 +143,8 @@ class Stage:
         Parameters
         ----------
         chosen : str
-            The name of the detector, tracker and so on (see ``mcaptrack.registry``); the default if it is "".
+            The name of the detector, tracker and so on (see ``mcaptrack.registry``), as NAME:FILE where it takes a
+            file; the default if it is "".
         **parameters
             Values of its fields.
 
@@ -158,6 +170,8 @@ class Stage:
                 meant = f"did you mean {close[0]}? " if close else ""
                 what = entry if self.kind else self.name
                 raise McaptrackError(f"{what} has no parameter {name}; {meant}there are {', '.join(known) or 'none'}")
+        if (file := self.split(chosen)[1]) is not None and parameters.setdefault(_FILE, file) != file:
+            raise McaptrackError(f"{chosen} and `{_FILE}={parameters[_FILE]}` are two files; give one")
         with nullcontext() if is_own else blamed(entry, "could not be made"):
             made: Transform = entry.cls(**parameters)
             check_options(made)

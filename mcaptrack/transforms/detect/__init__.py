@@ -2,6 +2,7 @@
 
 ``background`` has the motion detectors, for cameras that stand still or nearly; ``camera_motion`` registers pictures of
 a shaking camera, ``foreground`` compares a picture with its background, ``steadiness`` warns where the camera moves.
+``onnx`` has learned detectors.
 """
 
 from __future__ import annotations
@@ -12,5 +13,6 @@ from mcaptrack.transforms.detect.background import (
     Mog2Detector,
     MotionDetector,
 )
+from mcaptrack.transforms.detect.onnx import OnnxDetector
 
-__all__ = ["FrameDifferenceDetector", "KnnDetector", "Mog2Detector", "MotionDetector"]
+__all__ = ["FrameDifferenceDetector", "KnnDetector", "Mog2Detector", "MotionDetector", "OnnxDetector"]

@@ -1,0 +1,315 @@
+"""Pictures -> detections by a network in ONNX format.
+
+Pictures go through the network beside one another, one on each core; what is found in one doesn't depend on others.
+
+Letters: N boxes.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from itertools import chain, islice
+from math import sqrt
+from pathlib import Path
+from types import MappingProxyType
+from typing import ClassVar, Final, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaptrack.errors import McaptrackError
+from mcaptrack.geometry.arrays import Image
+from mcaptrack.schema import DETECTIONS, VIDEO, Frame, Schema
+from mcaptrack.transforms.detect.onnx import classes as known_classes
+from mcaptrack.transforms.detect.onnx.convention import Contest, choose, refuse_if_misread
+from mcaptrack.transforms.detect.onnx.layouts import Layout, ScoreError, class_count, possible
+from mcaptrack.transforms.detect.onnx.nms import Boxes, join_tiles, suppress
+from mcaptrack.transforms.detect.onnx.placing import Size, Tile, place, tiles_of
+from mcaptrack.transforms.detect.onnx.session import DetectorNetwork, Device, read_file, workers
+from mcaptrack.transforms.protocol import Colour, ModelCard, check_options, option
+
+LayoutChoice = Literal["auto", "yolox", "yolox-legacy", "nanodet", "rtdetr", "dfine", "rfdetr", "ultralytics"]
+
+#: Headings of options.
+_NETWORK: Final = "The network"
+_BOXES: Final = "What is detected"
+#: The size of the input follows that of the picture.
+_AS_PICTURE: Final = "picture"
+#: Pixels of an input that follows the picture: smaller pictures are enlarged, at most twice, and larger ones reduced.
+_LEAST_PIXELS, _MOST_PIXELS = 700_000, 1_000_000
+_MOST_TILES: Final = 64
+#: So many pictures in which nothing was found are kept, to try other layouts on.
+_KEPT: Final = 4
+
+
+@dataclass(frozen=True, kw_only=True)
+class OnnxDetector:
+    """With `--detector onnx:FILE` a network in ONNX format finds objects in each picture.
+
+    Reads video, writes detections: one box for each object of the chosen classes.
+
+    Examples
+    --------
+    Nothing is opened before there are pictures:
+
+    >>> detector = OnnxDetector(file="people.onnx", classes="person,bicycle", tiles="2x2")
+    >>> list(detector([]))
+    []
+    """
+
+    file: str = option("", "ONNX file of the network; `onnx:FILE` names it, too", theme=_NETWORK)
+    layout: LayoutChoice = option(
+        "auto",
+        "family of the network, which says what it takes and gives; `auto` tells it by names, shapes and a trial",
+        theme=_NETWORK,
+    )
+    input_size: str = option(
+        "",
+        "width and height of the network's input, as in 960x736, or `picture` for about those of the picture; "
+        "otherwise the network's own",
+        theme=_NETWORK,
+    )
+    device: Device = option(
+        "auto", "where the network runs; `auto` takes a GPU if ONNX Runtime can use one", theme=_NETWORK
+    )
+    max_memory_mb: int = option(
+        1000, "most memory that the network may take, in MB", least=10, most=1_000_000, theme=_NETWORK
+    )
+    tiles: str = option(
+        "1x1", "columns and rows of tiles that each picture is cut into, as in 3x2, for small objects", theme=_BOXES
+    )
+    overlap: float = option(
+        0.2, "how much of its width or height a tile shares with the next one", least=0.0, most=0.5, theme=_BOXES
+    )
+    classes: str = option(
+        "person", "classes to detect, by name or index with commas between them; `all` for every one", theme=_BOXES
+    )
+    min_score: float = option(
+        0.1, "boxes with a lower score are left out", least=0.0, most=1.0, search=(0.05, 0.6), theme=_BOXES
+    )
+    max_iou: float = option(
+        0.6, "boxes of one class that overlap more are one object", least=0.0, most=1.0, search=(0.4, 0.8), theme=_BOXES
+    )
+
+    reads: ClassVar[Schema] = VIDEO
+    writes: ClassVar[Mapping[str, Schema]] = MappingProxyType({"": DETECTIONS})
+    latency_s: ClassVar[Mapping[str, float]] = MappingProxyType({"": 0.0})
+    colour: ClassVar[Colour] = "bgr"
+
+    def __post_init__(self) -> None:
+        check_options(self)
+        tiles = _numbers(self.tiles)
+        if tiles is None or not 0 < tiles[0] * tiles[1] <= _MOST_TILES:
+            raise McaptrackError(f"tiles takes columns x rows, as in 3x2, {_MOST_TILES} at most, not {self.tiles}")
+        if self.input_size not in ("", _AS_PICTURE) and _numbers(self.input_size) is None:
+            raise McaptrackError(f"input_size takes width x height, as in 960x736, or picture, not {self.input_size}")
+
+    def __call__(self, frames: Iterable[Frame]) -> Iterator[tuple[Frame, ...]]:
+        frames = iter(frames)
+        first = next(frames, None)
+        if first is None:
+            return
+        run = _Run(self, self.weights(), first.rows)
+        for frame, boxes in run.detect(chain([first], frames)):
+            yield (Frame(frame.t_ns, frame.index, run.to_rows(boxes, frame.rows)),)
+        object.__setattr__(self, "_card", run.card())
+
+    def weights(self) -> Path:
+        """The file of the network. Raises McaptrackError if none is named, or it is not there."""
+        if not self.file:
+            raise McaptrackError("detector onnx needs a file, as in onnx:FILE")
+        if not Path(self.file).is_file():
+            raise McaptrackError(f"detector onnx: there is no file {self.file}")
+        return Path(self.file)
+
+    def weights_sha256(self) -> str:
+        """The digest of the network's file. Raises McaptrackError if it can't be read."""
+        return read_file(self.weights(), self.max_memory_mb * 1_000_000).sha256
+
+    def model_card(self) -> ModelCard:
+        """What the network turned out to be when it ran last."""
+        card: ModelCard = getattr(self, "_card", ModelCard())
+        return card
+
+    def why_empty(self, given: Sequence[Frame], made: Sequence[Frame]) -> str:
+        """Why there are no detections, for a warning."""
+        return f"the network finds no {self.classes} with a score of at least {self.min_score:g}"
+
+
+class _Seen(NamedTuple):
+    """A picture and what each layout that is still possible finds in it; None where the outputs make no sense."""
+
+    frame: Frame
+    found: Mapping[str, Boxes | None]
+
+
+class _Run:
+    """One run of a detector: its network, opened for the first picture, and which layout it has."""
+
+    def __init__(self, options: OnnxDetector, path: Path, first: Image) -> None:
+        self._options, self._path = options, path
+        most_bytes = options.max_memory_mb * 1_000_000
+        file = read_file(path, most_bytes)
+        self._grid = _numbers(options.tiles) or (1, 1)
+        self._network = DetectorNetwork(file, self._input_size(first), options.device, most_bytes)
+        self._sha256 = file.sha256
+        seen = self._network.signature
+        layouts = choose(path, options.layout, seen)
+        count = class_count(layouts[0], seen)
+        self._names = known_classes.names_of(file.names, count)
+        self._wanted = np.array(known_classes.wanted(self._names, options.classes, str(path)), np.int64)
+        self._numbers = known_classes.numbers_of(self._names)
+        self._contest = Contest(path, layouts)
+
+    def detect(self, frames: Iterator[Frame]) -> Iterator[tuple[Frame, Boxes]]:
+        """The boxes of each picture, of all classes. Raises McaptrackError as the network and the contest do."""
+        waiting: list[_Seen] = []
+        kept: list[Image] = []
+        pictures, anything = 0, False
+        for seen in self._look(frames):
+            if not self._contest.is_settled:
+                self._contest.see(seen.found)
+            waiting.append(seen)
+            pictures += 1
+            if not anything and (pictures & (pictures - 1)) == 0:  # the first, second, fourth, eighth ...
+                kept = [*kept, seen.frame.rows][-_KEPT:]
+            if self._contest.is_settled:
+                for frame, boxes in self._drain(waiting):
+                    anything |= len(boxes.score) > 0
+                    yield frame, boxes
+        self._contest.end()
+        for frame, boxes in self._drain(waiting):
+            anything |= len(boxes.score) > 0
+            yield frame, boxes
+        if not anything:
+            self._refuse_if_misread(pictures, kept)
+
+    def to_rows(self, boxes: Boxes, image: Image) -> NDArray[np.void]:
+        """Rows of the wanted classes, within the picture, in reading order."""
+        boxes = boxes.take(np.isin(boxes.label, self._wanted))
+        height, width = image.shape[:2]
+        xyxy = np.clip(boxes.xyxy, 0, [width, height, width, height])
+        boxes = boxes._replace(xyxy=xyxy).take((xyxy[:, 2] > xyxy[:, 0]) & (xyxy[:, 3] > xyxy[:, 1]))
+        order = np.lexsort((boxes.score, boxes.label, boxes.xyxy[:, 0], boxes.xyxy[:, 1]))
+        x1, y1, x2, y2 = boxes.xyxy[order].T
+        numbers = [self._numbers[label] for label in boxes.label[order].tolist()]
+        return DETECTIONS.rows(
+            x_px=x1, y_px=y1, w_px=x2 - x1, h_px=y2 - y1, score=boxes.score[order], class_id=np.array(numbers, np.int64)
+        )
+
+    def card(self) -> ModelCard:
+        """What the network turned out to be."""
+        facts = {"layout": self._contest.layouts[0].name, "input_size": "x".join(map(str, self._network.size))}
+        names = {self._numbers[index]: self._names[index] for index in self._wanted.tolist()}
+        return ModelCard(self._sha256, names, facts)
+
+    def _drain(self, waiting: list[_Seen]) -> Iterator[tuple[Frame, Boxes]]:
+        """The pictures that wait, with the boxes of the layout that was settled on."""
+        name = self._contest.layouts[0].name
+        for frame, found in waiting:
+            boxes = found[name]
+            if boxes is None:
+                raise McaptrackError(
+                    f"{self._path}, read as {name}: scores of frame {frame.index} are no likelihoods from 0 to 1; "
+                    "choose another `layout=`"
+                )
+            yield frame, boxes
+        waiting.clear()
+
+    def _look(self, frames: Iterator[Frame]) -> Iterator[_Seen]:
+        """Look at pictures, several beside one another; results come in order."""
+        count, batch = workers(), self._network.batch
+        with ThreadPoolExecutor(count) as pool:
+            running: deque[Future[list[_Seen]]] = deque()
+            try:
+                while some := list(islice(frames, batch)):
+                    running.append(pool.submit(self._look_at, some))
+                    if len(running) > count:
+                        yield from running.popleft().result()
+                while running:
+                    yield from running.popleft().result()
+            finally:
+                for future in running:
+                    future.cancel()
+
+    def _look_at(self, frames: list[Frame]) -> list[_Seen]:
+        found: list[dict[str, Boxes | None]] = [{} for _ in frames]
+        for layout in self._contest.layouts:
+            for one, boxes in zip(found, self._boxes(layout, frames), strict=True):
+                one[layout.name] = boxes
+        return [_Seen(frame, one) for frame, one in zip(frames, found, strict=True)]
+
+    def _boxes(self, layout: Layout, frames: list[Frame]) -> list[Boxes | None]:
+        """What a layout finds in pictures; None where the outputs make no sense."""
+        size, options = self._network.size, self._options
+        tiles = [tiles_of(frame.rows.shape[1], frame.rows.shape[0], *self._grid, options.overlap) for frame in frames]
+        jobs = [(frame, tile) for frame, those in zip(frames, tiles, strict=True) for tile in those]
+        parts: list[Boxes | None] = []
+        for start in range(0, len(jobs), self._network.batch):
+            some = jobs[start : start + self._network.batch]
+            placed = [place(frame.rows, tile, size, layout.fit, layout.pad) for frame, tile in some]
+            outputs = self._network.run(np.stack([layout.blob(canvas) for canvas, _ in placed]))
+            if not all(np.isfinite(array.sum(dtype=np.float64)) for array in outputs.values()):
+                raise McaptrackError(
+                    f"{self._path} gives numbers that are not finite at {some[0][0].t_ns} ns (frame {some[0][0].index})"
+                )
+            try:
+                read = layout.read(outputs, size, options.min_score)
+            except ScoreError:
+                parts += [None] * len(some)
+                continue
+            parts += [
+                boxes._replace(xyxy=placement.to_picture(boxes.xyxy))
+                for boxes, (_, placement) in zip(read, placed, strict=True)
+            ]
+        out: list[Boxes | None] = []
+        for those in tiles:
+            own, parts = parts[: len(those)], parts[len(those) :]
+            out.append(self._merged(layout, own, those))
+        return out
+
+    def _merged(self, layout: Layout, parts: list[Boxes | None], tiles: list[Tile]) -> Boxes | None:
+        """The boxes of a picture from those of its tiles."""
+        known = [boxes for boxes in parts if boxes is not None]
+        if len(known) < len(parts):
+            return None
+        if len(known) == 1:
+            return known[0] if layout.suppresses else suppress(known[0], self._options.max_iou)
+        suppressed = known if layout.suppresses else [suppress(boxes, self._options.max_iou) for boxes in known]
+        return join_tiles(suppressed, tiles, self._options.max_iou)
+
+    def _refuse_if_misread(self, pictures: int, kept: Sequence[Image]) -> None:
+        layout = self._contest.layouts[0]
+        others = [one for one in possible(self._network.signature) if one.name != layout.name]
+        frames = [Frame(0, 0, image) for image in kept]
+        found = {str(one.name): [self._boxes(one, [frame])[0] for frame in frames] for one in others}
+        refuse_if_misread(self._path, layout, pictures, found, self._options.layout != "auto")
+
+    def _input_size(self, first: Image) -> Size | None:
+        if self._options.input_size != _AS_PICTURE:
+            return _numbers(self._options.input_size)
+        height, width = first.shape[:2]
+        x1, y1, x2, y2 = tiles_of(width, height, *self._grid, self._options.overlap)[0]
+        return size_for(x2 - x1, y2 - y1)
+
+
+def size_for(width: int, height: int) -> Size:
+    """The size of an input for pictures of this size: about the same, from 0.7 to 1 million pixels, enlarged at most
+    twice; multiples of 32.
+    """
+    pixels = width * height
+    scale = min(2.0, sqrt(_LEAST_PIXELS / pixels)) if pixels < _LEAST_PIXELS else min(1.0, sqrt(_MOST_PIXELS / pixels))
+    wide, high = (max(32, -(-round(side * scale) // 32) * 32) for side in (width, height))
+    return wide, high
+
+
+def _numbers(text: str) -> tuple[int, int] | None:
+    """Two whole numbers from 1 to 99999 with an x between them; None for anything else."""
+    parts = text.split("x")
+    if len(parts) != 2 or not all(part.isascii() and part.isdecimal() and 0 < len(part) < 6 for part in parts):
+        return None
+    first, second = map(int, parts)
+    return (first, second) if first and second else None

@@ -1,0 +1,168 @@
+"""Boxes that mean the same object: class-wise non-maximum suppression, and joining across the seams of tiles.
+
+Letters: N boxes.
+"""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from mcaptrack.geometry.arrays import Bools, Floats, Ints
+
+#: So many boxes of a picture, the likeliest, are looked at: pairs of them are compared.
+_MOST: Final = 1000
+#: Boxes of two tiles are one object if so much of the smaller one is covered by the other.
+_COVERED: Final = 0.7
+#: Parts of a box on both sides of a seam are one object if they agree so well along the seam.
+_ALONG: Final = 0.6
+#: A box that ends so near to an edge of its tile is cut off there, in pixels of the picture.
+_EDGE_PX: Final = 4.0
+
+
+class Boxes(NamedTuple):
+    """Boxes (N, 4) as x1, y1, x2, y2 in pixels, scores (N,), and class indices (N,)."""
+
+    xyxy: Floats
+    score: Floats
+    label: Ints
+
+    def take(self, which: Ints | Bools) -> Boxes:
+        """Some of them."""
+        return Boxes(self.xyxy[which], self.score[which], self.label[which])
+
+    @classmethod
+    def joined(cls, parts: list[Boxes]) -> Boxes:
+        """All of several, in order."""
+        if not parts:
+            return cls(np.empty((0, 4)), np.empty(0), np.empty(0, np.int64))
+        return cls(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+
+
+def suppress(boxes: Boxes, max_iou: float) -> Boxes:
+    """Greedy non-maximum suppression within each class: the likeliest first, without those that overlap it.
+
+    Parameters
+    ----------
+    boxes : Boxes
+        N boxes; the 1000 likeliest are looked at.
+    max_iou : float
+        Boxes of one class whose intersection over union is greater are one object.
+
+    Returns
+    -------
+    Boxes
+        Those that are kept, the likeliest first.
+
+    """
+    boxes = boxes.take(_by_score(boxes)[:_MOST])
+    beaten_by = np.triu(_overlaps(boxes.xyxy)[0] > max_iou, 1) & (boxes.label[:, None] == boxes.label)
+    kept = np.ones(len(boxes.score), bool)
+    while True:  # after n rounds the n likeliest are settled; usually three rounds are enough for all
+        again = ~(beaten_by & kept[:, None]).any(axis=0)
+        if (again == kept).all():
+            return boxes.take(kept)
+        kept = again
+
+
+def join_tiles(parts: list[Boxes], tiles: list[tuple[int, int, int, int]], max_iou: float) -> Boxes:
+    """The boxes of a picture from those of its tiles.
+
+    A box that an edge of its tile cuts off is dropped where another tile's box covers it; two that continue one another
+    across a seam become one.
+
+    Parameters
+    ----------
+    parts : list of Boxes
+        For each tile, in pixels of the picture.
+    tiles : list of (x1, y1, x2, y2)
+        In pixels of the picture.
+    max_iou : float
+        As for ``suppress``.
+
+    Returns
+    -------
+    Boxes
+        The likeliest first.
+
+    """
+    boxes = Boxes.joined(parts)
+    tile = np.repeat(np.arange(len(parts)), [len(part.score) for part in parts])
+    cut = np.concatenate([_cut(part.xyxy, one, tiles) for part, one in zip(parts, tiles, strict=True)])
+    order = _by_score(boxes)[:_MOST]
+    boxes, tile, cut = boxes.take(order), tile[order], cut[order]
+    inner = _overlaps(boxes.xyxy)[1]
+    area = _areas(boxes.xyxy)
+    smaller = np.minimum(area[:, None], area)
+    is_cut = np.asarray(cut.any(axis=1))
+    other = (tile[:, None] != tile) & (boxes.label[:, None] == boxes.label)
+    # Of a pair that is one object, a box that is cut is a part of the other one.
+    is_part = is_cut[:, None] & (area[:, None] <= area) & (inner >= _COVERED * smaller)
+    same = other & (is_part | is_part.T | (_continued(boxes.xyxy, cut) & (inner > 0)))
+    group = _groups(same)
+    xyxy, score = boxes.xyxy.copy(), boxes.score.copy()
+    first = np.unique(group, return_index=True)[1]
+    for number in first[np.bincount(group, minlength=len(group))[group[first]] > 1]:
+        members = group == group[number]
+        whole = members & ~is_cut
+        those = whole if whole.any() else members
+        if whole.any():
+            best = np.flatnonzero(whole)[0]
+            xyxy[number], score[number] = boxes.xyxy[best], boxes.score[members].max()
+        else:
+            xyxy[number, :2] = boxes.xyxy[those, :2].min(axis=0)
+            xyxy[number, 2:] = boxes.xyxy[those, 2:].max(axis=0)
+    return suppress(Boxes(xyxy, score, boxes.label).take(first), max_iou)
+
+
+def _by_score(boxes: Boxes) -> Ints:
+    """The order from the likeliest on; equal ones from the top left."""
+    return np.lexsort((boxes.xyxy[:, 0], boxes.xyxy[:, 1], -boxes.score))
+
+
+def _areas(xyxy: Floats) -> Floats:
+    return np.asarray(np.prod(np.maximum(xyxy[:, 2:] - xyxy[:, :2], 0), axis=1))
+
+
+def _overlaps(xyxy: Floats) -> tuple[Floats, Floats]:
+    """Intersection over union of all pairs (N, N), and the area of the intersection."""
+    low = np.maximum(xyxy[:, None, :2], xyxy[:, :2])
+    high = np.minimum(xyxy[:, None, 2:], xyxy[:, 2:])
+    inner = np.prod(np.maximum(high - low, 0), axis=-1)
+    area = _areas(xyxy)
+    union = area[:, None] + area - inner
+    return np.divide(inner, union, out=np.zeros_like(inner), where=union > 0), inner
+
+
+def _cut(xyxy: Floats, tile: tuple[int, int, int, int], tiles: list[tuple[int, int, int, int]]) -> Bools:
+    """Whether each side (N, 4) of boxes ends at an edge of their tile that is no edge of the picture."""
+    every = np.array(tiles)
+    outer = np.array([*every[:, :2].min(axis=0), *every[:, 2:].max(axis=0)])
+    edges = np.array(tile)
+    return np.asarray((np.abs(xyxy - edges) <= _EDGE_PX) & (edges != outer))
+
+
+def _continued(xyxy: Floats, cut: Bools) -> Bools:
+    """Whether pairs (N, N) are the two parts of one box: cut on sides that face each other, and of equal extent."""
+    out = np.zeros((len(xyxy), len(xyxy)), bool)
+    for axis in (0, 1):
+        across, along = axis, 1 - axis
+        low, high = xyxy[:, along], xyxy[:, along + 2]
+        inner = np.minimum(high[:, None], high) - np.maximum(low[:, None], low)
+        union = np.maximum(high[:, None], high) - np.minimum(low[:, None], low)
+        agrees = inner >= _ALONG * np.maximum(union, 1e-9)
+        faces = cut[:, None, across + 2] & cut[None, :, across]
+        out |= agrees & (faces | faces.T)
+    return out
+
+
+def _groups(same: Bools) -> Ints:
+    """The number of the first member of the group of each, where pairs that are the same are in one group."""
+    number = np.arange(len(same))
+    joined = same | np.eye(len(same), dtype=bool)
+    while True:
+        again = np.where(joined, number, len(same)).min(axis=1, initial=len(same))
+        if (again == number).all():
+            return number
+        number = again
