@@ -16,9 +16,12 @@ from typing import Any, Final
 
 import numpy as np
 
+from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Image
 from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
+from mcaptrack.registry import Entry
 from mcaptrack.schema import DETECTIONS, TRACKS, VIDEO, Frame, Schema
+from mcaptrack.transforms.guarded import guarded
 from mcaptrack.transforms.protocol import Colour, Transform, check_options, colour_of
 
 __all__ = ["LAWS", "LawError", "check_transform", "sample_frames"]
@@ -173,23 +176,28 @@ def _tracks(rng: np.random.Generator, step_s: float) -> list[Frame]:
 
 def declares(transform: Transform, frames: Sequence[Frame], seed: int) -> None:
     """It is a frozen dataclass that declares ``reads``, ``writes`` and ``latency_s``, and parameters in range."""
+    if isinstance(transform, type):
+        raise LawError(f"declares: {transform.__name__} is a class; give a transform, as in {transform.__name__}()")
     name = type(transform).__name__
     if not is_dataclass(transform):
         raise LawError(f"declares: {name} is no dataclass; the fields of a transform are its parameters")
     if not type(transform).__dataclass_params__.frozen:  # type: ignore[attr-defined]
         raise LawError(f"declares: {name} is not frozen; make it with @dataclass(frozen=True, kw_only=True)")
-    for attribute, kind in (("reads", Schema), ("writes", Mapping)):
+    for attribute, kind in (("reads", Schema), ("writes", Mapping), ("latency_s", Mapping)):
         if not isinstance(getattr(transform, attribute, None), kind):
             raise LawError(f"declares: {name}.{attribute} is no {kind.__name__}")
     if "" not in transform.writes:
         raise LawError(f"declares: {name}.writes has no main output; it needs the key ''")
     if set(transform.latency_s) != set(transform.writes):
         raise LawError(f"declares: {name}.latency_s is of {[*transform.latency_s]}, writes is of {[*transform.writes]}")
+    for suffix, latency_s in transform.latency_s.items():
+        if not latency_s >= 0:
+            raise LawError(f"declares: {name}.latency_s of '{suffix}' is {latency_s}; it is 0 or more, in seconds")
     check_options(transform)
 
 
 def conforms(transform: Transform, frames: Sequence[Frame], seed: int) -> None:
-    """Every output has the rows of its schema, at times that increase."""
+    """Every output has the rows of its schema, at times that increase; and a run on a log takes it."""
     for number, result in enumerate(transform(frames)):
         if not isinstance(result, tuple) or len(result) != len(transform.writes):
             raise LawError(f"conforms: result {number} is no tuple of {len(transform.writes)} frames, one an output")
@@ -202,6 +210,14 @@ def conforms(transform: Transform, frames: Sequence[Frame], seed: int) -> None:
             if number and frame.t_ns <= output[number - 1].t_ns:
                 before = output[number - 1].t_ns
                 raise LawError(f"conforms: {_where(suffix, number, frame)} is not later than {before} ns before it")
+    reads_and_writes = (transform.reads, transform.writes[""])
+    kind = {(VIDEO, DETECTIONS): "detector", (DETECTIONS, TRACKS): "tracker"}.get(reads_and_writes, "transform")
+    cls = type(transform)
+    try:
+        for _ in guarded(Entry(cls.__name__, kind, cls, cls.__module__, "", ""), transform, frames):
+            pass
+    except McaptrackError as error:
+        raise LawError(f"conforms: {error}") from None
 
 
 def repeats(transform: Transform, frames: Sequence[Frame], seed: int) -> None:

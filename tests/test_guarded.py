@@ -11,6 +11,7 @@ import pytest
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import collected
+from mcaptrack.predictors import entry_of
 from mcaptrack.predictors.checked import CheckedPredictor
 from mcaptrack.registry import Entry
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame
@@ -232,6 +233,15 @@ class Own:
         if isinstance(self.result, BaseException):
             raise self.result
         return self.result
+
+
+class NeedsFile(Own):
+    def __init__(self, steps: int, step_s: float, file: str) -> None: ...
+
+
+def test_a_class_that_needs_a_file_is_told_how_to_get_one():
+    with pytest.raises(McaptrackError, match="needs a file; only one with an entry point takes one, as in NAME:FILE"):
+        entry_of(f"{__name__}:NeedsFile")
 
 
 MEAN, COV = np.zeros((1, 2, 2)), np.tile(np.eye(2), (1, 2, 1, 1))

@@ -54,8 +54,12 @@ class Numbered:
                 rows = TRACKS.empty(1)
             if self.breaks == "schema":
                 rows = rows[["track_id"]]
+            if self.breaks == "id" and len(rows):
+                rows["track_id"] = 1
+            if self.breaks == "size" and len(rows):
+                rows["h_px"] = -1
             t_ns = 0 if self.breaks == "time" else frame.t_ns
-            result = (Frame(t_ns, frame.index, rows),)
+            result = (Frame(t_ns, 0 if self.breaks == "index" else frame.index, rows),)
             yield result * 2 if self.breaks == "tuple" else result
 
 
@@ -74,6 +78,9 @@ def test_all_defaults_pass(stage):
     [
         ("schema", "conforms: output '', frame 0 at .* ns: mcaptrack.Tracks has the columns"),
         ("time", "conforms: output '', frame 1 at 0 ns is not later than 0 ns before it"),
+        ("id", "conforms: tracker Numbered gave rows at frame .* track_id 1 stands in . rows of one frame"),
+        ("size", "conforms: tracker Numbered gave rows at frame .* mcaptrack.Tracks.h_px is -1 in row 0"),
+        ("index", "conforms: tracker Numbered gave frame 0 of .* which is not in its input"),
         ("tuple", "conforms: result 0 is no tuple of 1 frames"),
         ("state", "pure: the second run differs from the first in result 0 at"),
         ("input", "pure: it changes its input, first in frame 0 at"),
@@ -100,6 +107,19 @@ def test_declarations_and_parameters_are_checked():
     class NoLatency(NotData):
         latency_s: ClassVar = {}
 
+    @dataclass(frozen=True)
+    class Timeless:
+        reads: ClassVar = DETECTIONS
+        writes: ClassVar = {"": TRACKS}
+
+    @dataclass(frozen=True)
+    class Early(Timeless):
+        latency_s: ClassVar = {"": -1}
+
+    @dataclass(frozen=True)
+    class Never(Timeless):
+        latency_s: ClassVar = {"": float("nan")}
+
     @dataclass(frozen=True, kw_only=True)
     class Unkept(Numbered):
         how: float = 1.0
@@ -109,6 +129,10 @@ def test_declarations_and_parameters_are_checked():
 
     for transform, words in (
         (NotData(), "declares: NotData is no dataclass"),
+        (Numbered, "declares: Numbered is a class; give a transform, as in Numbered()"),
+        (Timeless(), "declares: Timeless.latency_s is no Mapping"),
+        (Early(), "declares: Early.latency_s of '' is -1; it is 0 or more, in seconds"),
+        (Never(), "declares: Never.latency_s of '' is nan; it is 0 or more, in seconds"),
         (Thawed(), "declares: Thawed is not frozen"),
         (NoLatency(), "declares: NoLatency.latency_s is of [], writes is of ['']"),
         (Unkept(), "provenance: how is 3.0 when it was kept"),

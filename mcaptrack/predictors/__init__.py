@@ -86,6 +86,10 @@ def entry_of(name: PredictorName) -> tuple[Entry, Path | None]:
     if not colon or not is_installed("predictor", kind):
         entry = find("predictor", name)
         if _file_of(entry) is inspect.Parameter.empty:
+            if ":" in name:
+                raise McaptrackError(
+                    f"predictor {name} needs a file; only one with an entry point takes one, as in NAME:FILE"
+                )
             raise McaptrackError(f"predictor {name} needs a file, as in {name}:FILE")
         return entry, None
     entry = find("predictor", kind)
