@@ -6,15 +6,19 @@ import json
 import shutil
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from importlib import invalidate_caches
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+import mcaptrack
 from mcaptrack import log
+from mcaptrack.pipeline.rebuild import MissingPluginError, rebuild
 from mcaptrack.schema import SCHEMAS
 from mcaptrack.schema.provenance import Plugin, Provenance
+from mcaptrack.transforms import STAGES
 from tests.commands import call, done, made_log
 from tests.distributions import package
 
@@ -73,11 +77,26 @@ class Standing:
     def predict(self, xy_m, valid):
         mean = np.repeat(xy_m[:, -1:], self.steps, axis=1)
         return mean, np.tile(np.eye(2), (len(xy_m), self.steps, 1, 1))
+
+
+@dataclass(frozen=True)
+class Spread(Standing):
+    sigma_m: float = option(1.0, "the error, in metres", least=0.1)
+    shift: Literal["none", "east"] = "none"
+    weights: dict = None
+
+    def predict(self, xy_m, valid):
+        mean, cov = super().predict(xy_m, valid)
+        return mean + [float(self.shift == "east"), 0.0], cov * self.sigma_m**2
+
+
+def spread(steps, step_s, *, sigma_m=2.0, **others):
+    return Spread(steps, step_s, sigma_m=sigma_m)
 """
 ENTRIES = {
     "detectors": {"corner": "own:Corner"},
     "trackers": {"single": "own:Single"},
-    "predictors": {"standing": "own:Standing"},
+    "predictors": {"standing": "own:Standing", "spread": "own:Spread", "spread-function": "own:spread"},
 }
 ALL = ["--detector", "corner", "--tracker", "single", "--predictor", "standing"]
 
@@ -221,6 +240,84 @@ def test_a_log_cannot_have_a_module_imported(place):
     done("run", "a.mcap", "--no-tables", "--force", "-q", "--tracker", "beside_the_log:Single")
     assert made("/camera/tracks").parameters["tracker"] == "beside_the_log:Single"
     del sys.modules["beside_the_log"]
+
+
+class TestOptionsOfPredictors:
+    """The own parameters of a predictor are options of ``predict``, wherever options are set."""
+
+    def variances(self) -> set[float]:
+        return set(rows("/camera/predictions")["cov_xx_m2"])
+
+    def test_they_are_used_kept_in_the_log_and_used_again(self, place):
+        done("predict", "a.mcap", "--predictor", "spread", "--sigma-m", "3", "--horizon-s", "2", "-q")
+        first = made("/camera/predictions")
+        assert (first.parameters["sigma_m"], first.parameters["shift"]) == (3.0, "none")
+        assert "weights" not in first.parameters
+        assert first.plugins == {"predictor": Plugin("spread", "own:Spread", "own", "1.5")}
+        assert self.variances() == {9.0}
+        done("run", "a.mcap", "--no-tables", "--force", "-q")
+        assert made("/camera/predictions") == first
+        done("run", "a.mcap", "--no-tables", "-q", "--predictor", "cv")
+        assert "sigma_m" not in made("/camera/predictions").parameters
+
+    def test_files_the_environment_and_python_set_them(self, place, monkeypatch):
+        (place / "mcaptrack.toml").write_text('[predict]\npredictor = "spread"\nsigma-m = 4\nshift = "east"\n')
+        done("run", "a.mcap", "--no-tables", "--force", "-q")
+        assert (self.variances(), made("/camera/predictions").parameters["shift"]) == ({16.0}, "east")
+        done("predict", "a.mcap", "--predictor", "cv", "-q")  # the options of the other one are left out
+        assert "sigma_m" not in made("/camera/predictions").parameters
+        monkeypatch.setenv("MCAPTRACK_PREDICT_SIGMA_M", "5")
+        done("predict", "a.mcap", "--predictor=own:Spread", "-q")
+        assert self.variances() == {25.0}
+        mcaptrack.predict("a.mcap", predictor="spread-function", sigma_m=0.5)
+        assert self.variances() == {0.25}
+        assert made("/camera/predictions").parameters["predictor"] == "spread-function"
+
+    def test_the_help_lists_them_with_their_defaults(self, monkeypatch, place):
+        monkeypatch.setenv("COLUMNS", "120")
+        assert "--sigma-m" not in call("predict", "--help").out
+        said = call("predict", "--predictor", "spread", "--help").out
+        assert "Options of spread alone" in said
+        assert "The error, in metres." in said
+        assert "--weights" not in said
+        assert "--past" not in said
+
+    @pytest.mark.parametrize(
+        ("words", "code", "said"),
+        [
+            (["--predictor", "spread", "--sigma-m", "0"], 1, "--sigma-m has to be from 0.1 to 1000000, not 0"),
+            (["--predictor", "spread", "--shift", "west"], 2, "invalid value for '--shift'"),
+            (["--predictor", "cv", "--sigma-m", "1"], 2, "no such option: --sigma-m"),
+            (["--predictor", "spread", "--predictor", "cv", "--sigma-m", "1"], 1, "--sigma-m is an option of spread, not of cv"),
+            (["--predictor", "nearest"], 1, "no predictor is called nearest"),
+        ],
+    )  # fmt: skip
+    def test_wrong_ones_are_refused_in_one_line(self, place, words, code, said):
+        refused = call("predict", "a.mcap", *words)
+        assert (refused.code, refused.err.count("\n")) == (code, 1)
+        assert said in refused.err
+
+    def test_a_parameter_of_predict_is_refused(self, place):
+        install(text=MODULE.replace("sigma_m", "horizon_s"))
+        refused = call("predict", "a.mcap", "--predictor", "spread")
+        assert refused.code == 1
+        assert "predictor spread (own 1.5) can't have a parameter horizon_s: that is one of predict" in refused.err
+
+    def test_an_option_that_another_version_lacks_is_named(self, place):
+        done("predict", "a.mcap", "--predictor", "spread", "--sigma-m", "3", "-q")
+        install("2.0", MODULE.replace("sigma_m", "error_m"))
+        refused = call("run", "a.mcap", "--no-tables", "--force")
+        assert refused.code == 1
+        assert "it was made with sigma_m, which Predict with spread does not have" in refused.err
+
+    def test_a_log_that_hides_its_predictor_has_no_module_imported(self, place):
+        (place / "beside_the_log.py").write_text(MODULE)
+        done("predict", "a.mcap", "--predictor", "beside_the_log:Spread", "-q")
+        del sys.modules["beside_the_log"]
+        known = made("/camera/predictions")
+        with pytest.raises(MissingPluginError, match="imported only if you name it"):
+            rebuild(STAGES["predict"], replace(known, plugins={}), {})
+        assert "beside_the_log" not in sys.modules
 
 
 def test_files_and_environment_choose_them_and_set_their_options(place, monkeypatch):

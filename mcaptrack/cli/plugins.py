@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import redirect_stdout, suppress
+from contextlib import nullcontext, redirect_stdout, suppress
 from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any, Final
@@ -41,12 +41,13 @@ def with_plugins(commands: Mapping[str, Any], words: Sequence[str]) -> dict[str,
     files = [] if set(words) & set(_HELP) else _files(called, words)
     found = dict(commands)
     for stage in STAGES.values():
-        if stage.kind is None:
+        if not stage.option:
             continue
         try:
             with redirect_stdout(sys.stderr):  # what modules print while they are imported
                 plugins = dict(_of_words(stage, words)) if called in (stage.name, "run") else {}
                 plugins |= _of_settings(stage, files, commands[stage.name].settings)
+            plugins = {name: cls for name, cls in plugins.items() if cls is not stage.default}
             if plugins:
                 found[stage.name] = _command(stage, plugins, commands[stage.name].rich_help_panel)
         except McaptrackError as error:
@@ -67,12 +68,14 @@ def _values(words: Sequence[str], option: str) -> list[str]:
 
 
 def _of_words(stage: Stage, words: Sequence[str]) -> Iterator[tuple[str, type[Transform]]]:
-    given = [values for option in filter(None, (stage.kind, stage.was)) if (values := _values(words, option))]
+    given = [values for option in filter(None, (stage.option, stage.was)) if (values := _values(words, option))]
     if len(given) > 1:
         return  # both the old and the new name: the parser refuses that
     for name in chain.from_iterable(given):
-        if stage.split(name)[0] not in BUILT_IN[stage.kind or ""]:
-            yield name, stage.find(name).cls
+        if stage.split(name)[0] in BUILT_IN[stage.option]:
+            continue
+        with nullcontext() if stage.kind else suppress(McaptrackError):  # a predictor: the command reports the error
+            yield name, stage.choose(name)
 
 
 def _of_settings(stage: Stage, files: Sequence[ConfigFile], known: Mapping[str, Any]) -> dict[str, type[Transform]]:
@@ -80,7 +83,7 @@ def _of_settings(stage: Stage, files: Sequence[ConfigFile], known: Mapping[str, 
     out = {}
     for name in _names_of_settings(stage, files, known):
         with suppress(McaptrackError):
-            out[name] = stage.find(name).cls
+            out[name] = stage.choose(name)
     return out
 
 
@@ -89,8 +92,8 @@ def _names_of_settings(stage: Stage, files: Sequence[ConfigFile], known: Mapping
 
     A file in the working folder can't name modules.
     """
-    kind = stage.kind
-    assert kind is not None
+    kind = stage.option
+    assert kind
     found = [os.environ.get(f"{PREFIX}{command}_{kind}".upper(), "") for command in (stage.name, "run")]
     options: set[str] = set()
     for file in files:

@@ -240,12 +240,12 @@ def _transform(
     transform.
     """
     name = _chosen(stage, given, wanted)
-    cls = stage.find(name).cls if name else stage.default
+    cls = stage.with_part(stage.find(name).cls if name else stage.default, wanted.get(stage.parameter))
     own = _options_of(cls)
     for option in wanted:
         if option in owners and option not in own and is_on_command_line(option):
             flag = "--" + option.replace("_", "-")
-            chosen = name or stage.entry(cls).name
+            chosen = name or wanted.get(stage.option) or stage.choice(stage.default())
             raise McaptrackError(f"{flag} is an option of {' and '.join(owners[option])}, not of {chosen}")
     hints = get_type_hints(cls)
     values = {

@@ -52,10 +52,14 @@ def rebuild(stage: Stage, made: Provenance, known: Mapping[str, Transform]) -> T
     """
     had = stage.upgrade(made.parameters)
     cls = _class_of(stage, made, had, known)
-    if plugin := made.plugins.get("predictor"):
+    plugin, name = made.plugins.get("predictor"), had.get("predictor")
+    if plugin is None and isinstance(name, str) and _is_of_a_module(name):
+        plugin = Plugin(name, name, "", "")
+    if plugin:
         named = {name for other in known.values() if isinstance(name := getattr(other, "predictor", None), str)}
         if plugin.name not in named:
             _installed("predictor", plugin)
+    cls = stage.with_part(cls, had.get(stage.parameter))
     types = {f.name: f for f in fields(cls)}
     renamed = {was: name for name, f in types.items() if (was := f.metadata.get("was"))}
     had = {renamed.get(name, name): value for name, value in had.items()}
@@ -76,6 +80,12 @@ def rebuild(stage: Stage, made: Provenance, known: Mapping[str, Transform]) -> T
     if own not in (None, made.weights_sha256):
         raise McaptrackError(f"{stage.choice(transform)} holds other weights than those it was made with")
     return transform
+
+
+def _is_of_a_module(predictor: str) -> bool:
+    """Whether a predictor is ``module:Class``, and not ``NAME:FILE``."""
+    name, colon, _ = predictor.partition(":")
+    return bool(colon) and not is_installed("predictor", name)
 
 
 def _class_of(stage: Stage, made: Provenance, had: dict[str, Any], known: Mapping[str, Transform]) -> type[Transform]:

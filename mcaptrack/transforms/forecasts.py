@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from mcaptrack.geometry.clocks import NS_PER_S
@@ -24,11 +26,13 @@ class Forecaster:
         Number of observed positions that a prediction needs, the current one included.
     rate_hz : float
         Rate of the frames.
+    **options
+        Own parameters of the predictor.
     """
 
-    def __init__(self, predictor: str, horizon_s: float, min_history: int, rate_hz: float) -> None:
+    def __init__(self, predictor: str, horizon_s: float, min_history: int, rate_hz: float, **options: Any) -> None:
         self._rate_hz, self._min_history = rate_hz, min_history
-        self._predictor = make(predictor, max(1, round(horizon_s * rate_hz)), 1 / rate_hz)
+        self._predictor = make(predictor, max(1, round(horizon_s * rate_hz)), 1 / rate_hz, **options)
         self._histories = Histories(max(self._predictor.past, min_history))
         self._last_ns: int | None = None
 

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields, make_dataclass
+from functools import cache
 from types import MappingProxyType
 from typing import ClassVar
 
+from mcaptrack.errors import McaptrackError
 from mcaptrack.predictors import PredictorName, entry_of
+from mcaptrack.predictors.own_options import own_options
+from mcaptrack.registry import Entry
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame, Schema
 from mcaptrack.transforms.forecasts import Forecaster
-from mcaptrack.transforms.protocol import check_options, context, option
+from mcaptrack.transforms.protocol import check_options, context, is_option_type, option
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,12 +52,18 @@ class Predict:
     writes: ClassVar[Mapping[str, Schema]] = MappingProxyType({"": PREDICTIONS})
     latency_s: ClassVar[Mapping[str, float]] = MappingProxyType({"": 0.0})
 
+    #: The parameters that are those of the predictor (see ``predict_with``).
+    own_options: ClassVar[tuple[str, ...]] = ()
+
     def __post_init__(self) -> None:
         check_options(self)
-        entry_of(self.predictor)
+        entry, _ = entry_of(self.predictor)
+        if self.own_options and predict_with(self.predictor) is not type(self):
+            raise McaptrackError(f"{', '.join(self.own_options)} are no parameters of {entry}")
 
     def __call__(self, frames: Iterable[Frame]) -> Iterator[tuple[Frame, ...]]:
-        forecaster = Forecaster(self.predictor, self.horizon_s, self.min_history, self.rate_hz)
+        own = {name: getattr(self, name) for name in self.own_options}
+        forecaster = Forecaster(self.predictor, self.horizon_s, self.min_history, self.rate_hz, **own)
         for frame in frames:
             yield (frame._replace(rows=forecaster.predict(frame)),)
 
@@ -61,3 +71,31 @@ class Predict:
         """Why there are no predictions, for a warning."""
         needed_s = (self.min_history - 1) / self.rate_hz
         return f"no track has the {needed_s:.3g} s without a gap that a prediction needs (min_history)"
+
+
+def predict_with(predictor: PredictorName) -> type[Predict]:
+    """The transform for a predictor: ``Predict`` with the predictor's own parameters as fields, if it has any.
+
+    Only predictors of other packages have own parameters. Those of a type that options can't have keep their defaults.
+    Raises McaptrackError if there is no such predictor, or if a parameter has the name of one of ``Predict``.
+    """
+    entry, _ = entry_of(predictor)
+    return Predict if entry.is_built_in else _with_own_options(entry)
+
+
+@cache
+def _with_own_options(entry: Entry) -> type[Predict]:
+    own = [one for one in own_options(entry.cls) if is_option_type(one.annotation)]
+    if not own:
+        return Predict
+    if taken := {one.name for one in own} & {one.name for one in fields(Predict)}:
+        raise McaptrackError(f"{entry} can't have a parameter {', '.join(sorted(taken))}: that is one of predict")
+    made: type[Predict] = make_dataclass(
+        f"{Predict.__name__} with {entry.name}",
+        [(one.name, one.annotation, field(default=one.default, metadata=one.metadata)) for one in own],
+        bases=(Predict,),
+        namespace={"own_options": tuple(one.name for one in own), "variant_of": Predict, "__doc__": Predict.__doc__},
+        frozen=True,
+        kw_only=True,
+    )
+    return made

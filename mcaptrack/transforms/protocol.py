@@ -177,6 +177,12 @@ def member_type(annotation: Any) -> tuple[Any, bool]:
     return kind, False
 
 
+def is_option_type(annotation: Any) -> bool:
+    """Whether an option can have this type."""
+    kind, _ = member_type(annotation)
+    return kind in _KINDS or (bool(choices(kind)) and all(isinstance(one, str) for one in get_args(kind)))
+
+
 @cache
 def option_problem(cls: type[Any]) -> str:
     """Why the fields of a class can't be options; "" if they can."""
@@ -185,9 +191,7 @@ def option_problem(cls: type[Any]) -> str:
     except Exception as error:  # annotations are code
         return f"the types of its fields can't be read: {type(error).__name__}: {error}"
     for parameter in fields(cls):
-        kind, _ = member_type(hints[parameter.name])
-        is_choice = bool(choices(kind)) and all(isinstance(one, str) for one in get_args(kind))
-        if not (parameter.metadata.get("context") or kind in _KINDS or is_choice):
+        if not (parameter.metadata.get("context") or is_option_type(hints[parameter.name])):
             return (
                 f"{cls.__name__}.{parameter.name} is a {_type_name(hints[parameter.name])}; a parameter is a float, an "
                 "int, a bool, a str, a Literal of names, a tuple of any length of one of these, or one of them or None"

@@ -12,13 +12,13 @@ from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, field, fields, is_dataclass
 from types import MappingProxyType
-from typing import Any, Final, get_args
+from typing import Any, Final, Literal, get_args
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.registry import BUILT_IN, Entry, Kind, blamed, entry_of, find
 from mcaptrack.schema import SCHEMAS
 from mcaptrack.transforms.detect import KnnDetector
-from mcaptrack.transforms.predict import Predict
+from mcaptrack.transforms.predict import Predict, predict_with
 from mcaptrack.transforms.protocol import Colour, Transform, check_options, option_problem
 from mcaptrack.transforms.retrack import PROFILES, Retrack, upgrade_parameters
 from mcaptrack.transforms.sample import Sample
@@ -49,9 +49,11 @@ class Stage:
         is one transform only.
     was : str
         The former name of this option.
-    parameter : str
+    parameter : Kind or ""
         The parameter of its transform that names an entry of the registry, such as its predictor; ``run`` has an option
         of the same name.
+    variant : Callable or None
+        Returns the transform with the options of the entry that ``parameter`` names.
     needs_scale : bool
         Whether it converts boxes to metres, so that a scale is estimated if no ground plane is given.
     repairs_tracks : bool
@@ -75,7 +77,8 @@ class Stage:
     rows: str
     kind: Kind | None = None
     was: str = ""
-    parameter: str = ""
+    parameter: Kind | Literal[""] = ""
+    variant: Callable[[str], type[Transform]] | None = None
     needs_scale: bool = False
     repairs_tracks: bool = False
     at_video_rate: bool = False
@@ -117,12 +120,20 @@ class Stage:
 
     def entry(self, cls: type[Transform]) -> Entry:
         """The entry of a class of transforms of this stage."""
-        if self.kind is None and cls is self.default:
+        if self.kind is None and _base(cls) is self.default:
             return Entry(self.name, self.name, cls, cls.__module__, "", "")
         return entry_of(self.kind or self.name, cls)
 
+    def choose(self, name: str) -> type[Transform]:
+        """The transform that a value of ``option`` chooses. Raises McaptrackError if there is none."""
+        return self.find(name).cls if self.kind else self.with_part(self.default, name)
+
+    def with_part(self, cls: type[Transform], name: object) -> type[Transform]:
+        """A transform of this stage with the options of the entry that ``parameter`` names, if it has own ones."""
+        return self.variant(name) if self.variant and cls is self.default and isinstance(name, str) else cls
+
     @property
-    def option(self) -> str:
+    def option(self) -> Kind | Literal[""]:
         """The option that chooses a transform or a part of it; "" if there is no choice."""
         return self.kind or self.parameter
 
@@ -135,7 +146,7 @@ class Stage:
 
     def is_built_in(self, cls: type[Transform]) -> bool:
         """Whether a class is a built-in transform of this stage."""
-        return cls in self.built_in().values()
+        return _base(cls) in self.built_in().values()
 
     def make(self, chosen: str = "", /, **parameters: Any) -> Transform:
         """Make a transform of this stage.
@@ -163,7 +174,8 @@ class Stage:
         2.0
         """
         entry = self.find(chosen) if chosen else self.entry(self.default)
-        known, is_own = [f.name for f in fields(entry.cls) if f.init], self.is_built_in(entry.cls)
+        cls = self.with_part(entry.cls, parameters.get(self.parameter))
+        known, is_own = [f.name for f in fields(cls) if f.init], self.is_built_in(cls)
         for name in parameters:
             if name not in known:
                 close = difflib.get_close_matches(name, known, 1)
@@ -173,7 +185,7 @@ class Stage:
         if (file := self.split(chosen)[1]) is not None and parameters.setdefault(_FILE, file) != file:
             raise McaptrackError(f"{chosen} and `{_FILE}={parameters[_FILE]}` are two files; give one")
         with nullcontext() if is_own else blamed(entry, "could not be made"):
-            made: Transform = entry.cls(**parameters)
+            made: Transform = cls(**parameters)
             check_options(made)
         return made
 
@@ -215,6 +227,12 @@ class Stage:
             raise McaptrackError(f"{entry}: {problem}")
 
 
+def _base(cls: type[Transform]) -> type[Transform]:
+    """The class itself, or the one that it is a variant of (``Stage.variant``)."""
+    base: type[Transform] = vars(cls).get("variant_of", cls)
+    return base
+
+
 _STAGES: Final = (
     Stage(
         name="detect",
@@ -244,6 +262,7 @@ _STAGES: Final = (
         output_topic="predictions",
         rows="forecasts",
         parameter="predictor",
+        variant=predict_with,
     ),
     Stage(
         name="retrack",
