@@ -516,6 +516,17 @@ def test_a_camera_is_named_where_something_is_written_below_it(tmp_path):
             assert any(topic.startswith("/gate/") for topic in opened.channels) == is_used
 
 
+def test_results_beside_a_recording_are_left_out_and_that_is_said(tmp_path):
+    bag1(tmp_path / "a.bag", 2, 100)
+    make(tmp_path / "a.bag", tmp_path / "a.mcap")
+    beside = tmp_path / "a.results.mcap"
+    make(tmp_path / "a.bag", beside)
+    report = make(tmp_path / "a.mcap", tmp_path / "b.mcap")
+    words = f"{beside} holds results of a.mcap; they are left out"
+    assert [(one.message, one.code) for one in report.warnings] == [(words, "left-out")]
+    assert len(recorded(tmp_path / "b.mcap")) == len(recorded(tmp_path / "a.mcap"))
+
+
 def test_a_cut_bag_exits_with_3(tmp_path):
     bag1(tmp_path / "a.bag", 10, 1000)
     data = (tmp_path / "a.bag").read_bytes()

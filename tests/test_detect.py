@@ -11,7 +11,7 @@ from mcaptrack.geometry.clocks import FrameClock
 from mcaptrack.schema import Frame
 from mcaptrack.sources.synthetic import SyntheticScene
 from mcaptrack.transforms import FrameDifferenceDetector, KnnDetector, Mog2Detector, MotionDetector
-from mcaptrack.transforms.detect.background import _PersonHeight
+from mcaptrack.transforms.detect.background import _halve, _PersonHeight
 from mcaptrack.transforms.detect.camera_motion import CameraMotion
 from mcaptrack.transforms.detect.foreground import FrameDifference
 from tests.worlds import ns, small_scene
@@ -257,3 +257,21 @@ class TestCameraMotion:
         for _ in range(30):
             found, _ = camera.estimate(np.full((60, 80), 90, np.uint8))
             np.testing.assert_array_equal(found, [[1, 0, 0], [0, 1, 0]])
+
+
+@pytest.mark.parametrize(
+    ("shape", "max_pixels", "halved"),
+    [
+        ((8, 8), 64, (8, 8)),
+        ((8, 8), 63, (4, 4)),
+        ((8, 8), 16, (4, 4)),
+        ((8, 8), 15, (2, 2)),
+        ((9, 7), 20, (4, 3)),
+        ((4, 100), 10, (2, 50)),
+        ((100, 3), 10, (100, 3)),
+        ((2, 2), 1, (2, 2)),
+    ],
+)
+def test_pictures_are_halved_until_they_are_small_enough_or_narrow(shape, max_pixels, halved):
+    image, halvings = _halve(np.zeros(shape, np.uint8), max_pixels)
+    assert image.shape == halved == tuple(side >> halvings for side in shape)

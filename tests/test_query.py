@@ -691,6 +691,7 @@ def test_long_values_are_cut_in_tables_only(known):
     shown = run(known, LONG)
     assert max(map(len, shown.stdout.splitlines())) < 4000
     assert "3 long values are cut; --format json or csv has all of it" in shown.stderr
+    assert "columns fit" not in shown.stderr  # only a terminal has an end
     assert "1 long value is cut" in run(known, "select repeat('x', 5000) as words").stderr
     assert "cut" not in run(known, "select repeat('x', 1000) as words").stderr
     for form in ("json", "jsonl", "csv"):
