@@ -84,6 +84,16 @@ def test_rows_in_any_layout_become_rows_of_the_schema(rows):
     assert TRACKS.joined([frame.rows for (frame,) in made]).tolist() == ROWS.tolist() * 4
 
 
+def test_a_box_may_have_no_size():
+    assert answers(one(rows=changed(w_px=[0, 0])))[0][0].rows["w_px"].tolist() == [0, 0]
+
+
+def test_the_main_output_answers_a_frame_wherever_it_stands():
+    transform = type("Late", (), {"writes": {"other": TRACKS, "": TRACKS}})
+    transform.__call__ = lambda _, frames: ((one(index=9)(frame)[0][0], one()(frame)[0][0]) for frame in frames)
+    assert len(list(guarded(Entry("late", "tracker", transform, __name__, "", ""), transform(), GIVEN))) == 4
+
+
 def test_times_and_numbers_of_numpy_become_those_of_python():
     made = answers(lambda frame: [(Frame(np.int64(frame.t_ns), np.uint32(frame.index), ROWS),)])
     assert {(type(frame.t_ns), type(frame.index)) for (frame,) in made} == {(int, int)}
@@ -182,6 +192,7 @@ class Unprintable(Exception):
     ("error", "said"),
     [
         (SystemExit(0), "failed at frame 0 (0 ns): SystemExit: 0 (test_guarded.py, line"),
+        (SystemExit(2), "failed at frame 0 (0 ns): SystemExit: 2"),
         (SystemExit("bye"), "failed at frame 0 (0 ns): SystemExit: bye"),
         (GeneratorExit(), "failed at frame 0 (0 ns): GeneratorExit"),
         (MemoryError(), "failed at frame 0 (0 ns): MemoryError"),
@@ -278,6 +289,7 @@ def test_a_forecast_may_be_of_any_numbers(kind):
         ({"past": 10**9}, "has steps=2, step_s=0.5, past=1000000000; all have to be above 0, steps and past at most 10000"),
         ({"steps": 10**9}, "steps and past at most 10000"),
         ({"step_s": float("nan")}, "has steps=2, step_s=nan, past=1; all"),
+        ({"step_s": 0.0}, "has steps=2, step_s=0, past=1; all"),
         ({"past": "two"}, "needs the numbers steps, step_s and past: ValueError"),
     ],
 )  # fmt: skip
