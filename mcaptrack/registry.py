@@ -45,6 +45,7 @@ BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(
     {
         "detector": {
             "knn": "mcaptrack.transforms.detect.background:KnnDetector",
+            "median": "mcaptrack.transforms.detect.median:MedianDetector",
             "mog2": "mcaptrack.transforms.detect.background:Mog2Detector",
             "frame-difference": "mcaptrack.transforms.detect.background:FrameDifferenceDetector",
             "onnx": "mcaptrack.transforms.detect.onnx.detector:OnnxDetector",

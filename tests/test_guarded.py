@@ -299,3 +299,35 @@ def test_a_predictor_that_goes_wrong_is_named(attributes, said):
     assert str(refused.value).startswith("predictor own ")
     assert said in str(refused.value)
     assert "\n" not in str(refused.value)
+
+
+@dataclass(frozen=True)
+class Twice:
+    """Counts its frames before it answers any."""
+
+    reads: ClassVar = DETECTIONS
+    writes: ClassVar = {"": TRACKS}
+    latency_s: ClassVar = {"": float("inf")}
+    passes: ClassVar = 2
+
+    def __call__(self, frames: Iterable[Frame]) -> Iterator[Any]:
+        count = sum(1 for _ in frames)
+        for number, frame in enumerate(frames):
+            yield (frame._replace(rows=ROWS[: 2 * number // count]),)
+
+
+class Once(Twice):
+    """The same, and says nothing of it."""
+
+    passes: ClassVar = 1
+
+
+def test_frames_are_read_twice_by_a_transform_that_says_so():
+    with collected() as warnings:
+        made = [
+            list(guarded(Entry("mine", "tracker", kind, __name__, "pack", "1"), kind(), GIVEN))
+            for kind in (Twice, Once)
+        ]
+    assert [len(frame.rows) for (frame,) in made[0]] == [0, 0, 1, 1]
+    assert made[1] == []
+    assert [warning.code for warning in warnings] == ["left-out"]

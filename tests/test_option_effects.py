@@ -56,6 +56,7 @@ RANGES = {
     "direction_frames": (2, 100),
     "history_s": (0.1, 1e6),
     "horizon_s": (0.1, 60.0),
+    "least_visible": (0.05, 1.0),
     "link_confidence": (0.01, 0.99),
     "max_memory_mb": (10, 1_000_000),
     "max_pixels": (1000, 10**9),

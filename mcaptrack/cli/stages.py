@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 #: Examples for the help, by command.
 _EXAMPLES: Final = {
-    "detect": "Example: mcaptrack detect log.mcap --detector mog2",
+    "detect": "Example: mcaptrack detect log.mcap --detector median",
     "track": "Example: mcaptrack track log.mcap --tracker bytetrack",
     "sample": "Example: mcaptrack sample log.mcap --rate-hz 2.5",
     "predict": "Example: mcaptrack predict log.mcap --predictor cv",

@@ -30,7 +30,7 @@ from mcaptrack.sources.cameras import camera_at
 from mcaptrack.sources.video import EncodedPicture, decode_bgr, decode_gray
 from mcaptrack.transforms import FULL, STAGES, Sample, Transform
 from mcaptrack.transforms.guarded import guarded
-from mcaptrack.transforms.protocol import ModelCard, colour_of
+from mcaptrack.transforms.protocol import ModelCard, colour_of, passes_of
 from mcaptrack.transforms.to_video_rate import to_video_rate, unchanged_tracks
 
 Progress = Callable[[str, int, int], None]
@@ -128,6 +128,16 @@ def outdated_by(opened: log.Log, digests: Mapping[str, str]) -> list[str]:
     return found
 
 
+class _Again:
+    """Frames that can be read more than once, each time from the beginning."""
+
+    def __init__(self, begin: Callable[[], Iterator[Frame]]) -> None:
+        self._begin = begin
+
+    def __iter__(self) -> Iterator[Frame]:
+        return self._begin()
+
+
 class _Input(NamedTuple):
     """What a job reads: the frames as they come, all of them if they are rows, their digest, once they were read, and
     how many messages they were read from.
@@ -145,12 +155,12 @@ def _run_job(
     """The channels that a job makes. ``made`` are those of jobs before it."""
     transform = _in_context(opened, prefix, job, given.frames, planes)
     outputs: list[list[Frame]] = [[] for _ in transform.writes]
-    taken: list[int] = []
+    taken: set[int] = set()
     try:
         with collected() as warnings:
             entry = STAGES[job.stage].entry(type(transform))
             is_own = STAGES[job.stage].is_built_in(type(transform))
-            stream = _counting(given.stream, taken)
+            stream = _Again(lambda: _counting(given.stream, taken))
             results = transform(stream) if is_own else guarded(entry, transform, stream)
             for result in results:
                 for frame, channel in zip(result, outputs, strict=True):
@@ -267,7 +277,7 @@ def _input(
         frames, said = made[job.source].frames, made[job.source].provenance.digest
     else:
         frames, said = _frames(opened, job.source, job.transform.reads), digest_of(opened, job.source)
-    return _Input(_counted(frames, job.stage, progress), frames, lambda: said, lambda: len(frames))
+    return _Input(_Again(lambda: _counted(frames, job.stage, progress)), frames, lambda: said, lambda: len(frames))
 
 
 def _frames(opened: log.Log, topic: str, schema: Schema) -> list[Frame]:
@@ -276,10 +286,10 @@ def _frames(opened: log.Log, topic: str, schema: Schema) -> list[Frame]:
     return foreign.detections(opened, topic) if theirs else opened.frames(topic, schema)
 
 
-def _counting(frames: Iterable[Frame], taken: list[int]) -> Iterator[Frame]:
+def _counting(frames: Iterable[Frame], taken: set[int]) -> Iterator[Frame]:
     """The frames; ``taken`` gets the number of each."""
     for frame in frames:
-        taken.append(frame.index)
+        taken.add(frame.index)
         yield frame
 
 
@@ -291,23 +301,28 @@ def _counted(frames: Sequence[Frame], stage: str, progress: Progress) -> Iterato
 
 def _pictures(
     opened: log.Log, job: Job, stamps: list[int], progress: Progress
-) -> tuple[Callable[[], str], Iterator[Frame]]:
+) -> tuple[Callable[[], str], Iterable[Frame]]:
     """The pictures that a job reads, as its transform wants them; ``stamps`` gets the stamp of each."""
     import hashlib
 
     total, channel = hashlib.sha256(), opened.channel(job.source)
+    decode = decode_bgr if colour_of(job.transform) == "bgr" else decode_gray
+    steps = channel.messages * passes_of(job.transform)
+    done = 0
 
-    def encoded() -> Iterator[EncodedPicture]:
-        stamps.clear()
+    def encoded(is_first: bool) -> Iterator[EncodedPicture]:
+        nonlocal done
         for index, (message, picture) in enumerate(foreign.pictures(opened, channel.topic)):
-            total.update(message.t_ns.to_bytes(8, "little") + message.payload)
-            stamps.append(picture.stamp_ns)
+            if is_first:
+                total.update(message.t_ns.to_bytes(8, "little") + message.payload)
+                stamps.append(picture.stamp_ns)
             where = f"{opened.path}: {channel.topic} at {message.t_ns} ns: frame {index}"
             yield EncodedPicture(message.t_ns, index, picture.format, picture.data, picture.layout, where)
-            progress(job.stage, index + 1, channel.messages)
+            done += 1
+            progress(job.stage, min(done, steps), steps)
 
-    decode = decode_bgr if colour_of(job.transform) == "bgr" else decode_gray
-    return total.hexdigest, decode(encoded())
+    stamps.clear()
+    return total.hexdigest, _Again(lambda: decode(encoded(is_first=not stamps)))
 
 
 def input_of(

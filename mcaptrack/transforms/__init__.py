@@ -13,6 +13,7 @@ from typing import Final
 from mcaptrack.transforms.detect import (
     FrameDifferenceDetector,
     KnnDetector,
+    MedianDetector,
     Mog2Detector,
     MotionDetector,
     OnnxDetector,
@@ -33,6 +34,7 @@ __all__ = [
     "ByteTrack",
     "FrameDifferenceDetector",
     "KnnDetector",
+    "MedianDetector",
     "Mog2Detector",
     "MotionDetector",
     "OcSort",

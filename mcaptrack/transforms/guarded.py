@@ -12,7 +12,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import warn
 from mcaptrack.registry import Entry, failure, is_interruption
 from mcaptrack.schema import TRACKS, Frame, Rows, Schema
-from mcaptrack.transforms.protocol import Transform
+from mcaptrack.transforms.protocol import Transform, passes_of
 
 #: Kinds whose main output has one frame for each frame that is read, at its time and with its number.
 _ONE_FOR_EACH: Final = ("detector", "tracker")
@@ -42,7 +42,7 @@ def guarded(entry: Entry, transform: Transform, frames: Iterable[Frame]) -> Iter
         order of time; also if a detector or tracker yields a frame that was not in its input. The message names the
         transform and the frame. Exceptions of ``frames`` are passed on unchanged.
     """
-    source = _Source(frames)
+    source = _Source(frames, passes_of(transform))
     try:
         made = iter(transform(source))
     except BaseException as error:  # code of other packages may raise anything
@@ -75,17 +75,24 @@ def guarded(entry: Entry, transform: Transform, frames: Iterable[Frame]) -> Iter
 class _Source:
     """The input of a transform: notes the frames that were taken and not answered, and an exception of the input."""
 
-    def __init__(self, frames: Iterable[Frame]) -> None:
+    def __init__(self, frames: Iterable[Frame], passes: int) -> None:
+        self._all, self._passes = frames, passes
         self._frames = iter(frames)
+        self._is_begun = False
         self._error: BaseException | None = None
         self._open: Counter[tuple[int, int]] = Counter()
         self.count = 0
         self.where = "before the first frame"
 
     def __iter__(self) -> Iterator[Frame]:
+        if self._is_begun and self._passes > 1:
+            self._frames = iter(self._all)
+            self._is_begun, self.count = False, 0
+            self._open.clear()
         return self
 
     def __next__(self) -> Frame:
+        self._is_begun = True
         try:
             frame = next(self._frames)
         except StopIteration:

@@ -7,6 +7,9 @@ Calling it with an iterable of frames gives an iterator of tuples of frames, one
 A transform that reads pictures (``reads = VIDEO``) gets their brightness, (height, width), unless its class attribute
 ``colour`` is "bgr"; then it gets blue, green and red, (height, width, 3).
 
+A transform that reads its frames twice says so by its class attribute ``passes = 2``; the frames can then be iterated
+as often, each time from the beginning.
+
 All transforms obey these laws; ``mcaptrack.testing.check_transform`` tests them:
 
 * Schema: the rows of every output have the columns of its schema, with valid values.
@@ -82,6 +85,11 @@ Colour = Literal["bgr", "grey"]
 def colour_of(transform: Any) -> Colour:
     """What a transform (or its class) gets of pictures: brightness unless its ``colour`` says otherwise."""
     return "bgr" if getattr(transform, "colour", "grey") == "bgr" else "grey"
+
+
+def passes_of(transform: Any) -> int:
+    """How often a transform (or its class) reads its frames: once unless its ``passes`` says otherwise."""
+    return int(getattr(transform, "passes", 1))
 
 
 #: The default upper end of parameters with a lower one: days in seconds, hundreds of kilometres in metres.

@@ -223,6 +223,8 @@ class Stage:
             raise McaptrackError(f"{entry}: a parameter can't have the name of the option `{self.kind}=`")
         if getattr(cls, "colour", "grey") not in get_args(Colour):
             raise McaptrackError(f"{entry}: its class attribute colour is one of {', '.join(get_args(Colour))}")
+        if getattr(cls, "passes", 1) not in (1, 2):
+            raise McaptrackError(f"{entry}: its class attribute passes is 1 or 2")
         if problem := option_problem(cls):
             raise McaptrackError(f"{entry}: {problem}")
 

@@ -1,7 +1,8 @@
 """Pictures -> detections.
 
-``background`` has the motion detectors, for cameras that stand still or nearly; ``camera_motion`` registers pictures of
-a shaking camera, ``foreground`` compares a picture with its background, ``steadiness`` warns where the camera moves.
+``background`` and ``median`` have the motion detectors, for cameras that stand still or nearly. ``camera_motion``
+registers pictures of a shaking camera, ``foreground`` and ``median_background`` compare a picture with its background,
+``people`` separates people who are one region, ``steadiness`` warns where the camera moves.
 ``onnx`` has learned detectors.
 """
 
@@ -13,6 +14,7 @@ from mcaptrack.transforms.detect.background import (
     Mog2Detector,
     MotionDetector,
 )
+from mcaptrack.transforms.detect.median import MedianDetector
 from mcaptrack.transforms.detect.onnx import OnnxDetector
 
-__all__ = ["FrameDifferenceDetector", "KnnDetector", "Mog2Detector", "MotionDetector", "OnnxDetector"]
+__all__ = ["FrameDifferenceDetector", "KnnDetector", "MedianDetector", "Mog2Detector", "MotionDetector", "OnnxDetector"]

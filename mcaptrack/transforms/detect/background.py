@@ -31,7 +31,7 @@ from mcaptrack.transforms.protocol import Colour, check_options, option
 _JOIN_HEIGHTS: Final = 0.2
 _MIN_AREA_HEIGHTS: Final = 0.03
 #: If a larger share of the picture than this differs, the light changed or the model is new: no detections.
-_MAX_FOREGROUND: Final = 0.5
+MAX_FOREGROUND: Final = 0.5
 #: Smaller regions are noise, whatever the height of people.
 _MIN_AREA_PX: Final = 20.0
 #: The height of people until enough regions were measured.
@@ -67,16 +67,16 @@ class MotionDetector:
         foreground = make_foreground_model(self.method, self.threshold, self.history_s)
         for frame in frames:
             clock.tick(frame.t_ns)
-            image, halvings = _halve(frame.rows, self.max_pixels)
+            image, halvings = halve(frame.rows, self.max_pixels)
             to_reference, is_new = camera.estimate(image) if self.stabilise else (IDENTITY, False)
             steadiness.update(frame.t_ns, camera.view, is_new)
             if is_new:  # another view has another background
                 foreground = make_foreground_model(self.method, self.threshold, self.history_s)
-            mask = _clear_border(foreground.mask(_warp(image, to_reference), clock), to_reference)
-            if np.count_nonzero(mask) > _MAX_FOREGROUND * mask.size:
+            mask = clear_border(foreground.mask(warp(image, to_reference), clock), to_reference)
+            if np.count_nonzero(mask) > MAX_FOREGROUND * mask.size:
                 mask = np.zeros_like(mask)
             boxes = _find_boxes(mask, height.update(mask))
-            yield (Frame(frame.t_ns, frame.index, _boxes_to_rows(_unwarp_boxes(boxes, to_reference) * 2**halvings)),)
+            yield (Frame(frame.t_ns, frame.index, boxes_to_rows(unwarp_boxes(boxes, to_reference) * 2**halvings)),)
         steadiness.check()
 
     def why_empty(self, given: Sequence[Frame], made: Sequence[Frame]) -> str:
@@ -136,19 +136,19 @@ class FrameDifferenceDetector(MotionDetector):
     method: ClassVar[Method] = "frame-difference"
 
 
-def _halve(image: Image, max_pixels: int) -> tuple[Image, int]:
+def halve(image: Image, max_pixels: int) -> tuple[Image, int]:
     """The picture, halved until it has at most ``max_pixels``, and how often."""
     import cv2
 
     halvings = 0
-    while image.size > max_pixels and min(image.shape) >= 4:
-        height, width = image.shape
+    while (size := image.shape[:2])[0] * size[1] > max_pixels and min(size) >= 4:
+        height, width = size
         image = np.asarray(cv2.resize(image, (width // 2, height // 2), interpolation=cv2.INTER_AREA), np.uint8)
         halvings += 1
     return image, halvings
 
 
-def _warp(image: Image, to_reference: Floats) -> Image:
+def warp(image: Image, to_reference: Floats) -> Image:
     """The picture as the reference camera would see it."""
     import cv2
 
@@ -158,7 +158,7 @@ def _warp(image: Image, to_reference: Floats) -> Image:
     return np.asarray(cv2.warpAffine(image, to_reference, size, borderMode=cv2.BORDER_REPLICATE), np.uint8)
 
 
-def _clear_border(mask: Image, to_reference: Floats) -> Image:
+def clear_border(mask: Image, to_reference: Floats) -> Image:
     """The mask without the border that a warped picture does not cover."""
     if to_reference is IDENTITY:
         return mask
@@ -214,7 +214,7 @@ def _find_boxes(mask: Image, person_px: float) -> Floats:
     return _region_boxes(closed, max(_MIN_AREA_PX, _MIN_AREA_HEIGHTS * person_px**2))
 
 
-def _unwarp_boxes(boxes: Floats, to_reference: Floats) -> Floats:
+def unwarp_boxes(boxes: Floats, to_reference: Floats) -> Floats:
     """Boxes (N, 4) of the reference picture in the picture itself. They stay upright, as rotations are small."""
     if to_reference is IDENTITY:
         return boxes
@@ -227,7 +227,7 @@ def _unwarp_boxes(boxes: Floats, to_reference: Floats) -> Floats:
     return np.concatenate([centres - size / 2, size], axis=1)
 
 
-def _boxes_to_rows(boxes: Floats) -> NDArray[np.void]:
+def boxes_to_rows(boxes: Floats) -> NDArray[np.void]:
     """Rows of boxes (N, 4), sorted from top to bottom, then from left to right."""
     boxes = boxes[np.lexsort((boxes[:, 0], boxes[:, 1]))]
     x, y, w, h = boxes.T

@@ -1,0 +1,177 @@
+"""The background of a camera that stands still: the median of pictures from a long time, in colour.
+
+A picture differs from it where a colour lies outside of the range that the background has within a pixel, by more than
+the noise there. What sways (leaves, flags, tapes) shows colours that lie close by in the background: there the range is
+taken over a wider surrounding.
+
+Letters: S samples, H, W height and width of pictures.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from mcaptrack.geometry.arrays import Bools, Image
+
+#: Samples are taken evenly over time: at most so many, at least half of that from a longer recording.
+MAX_SAMPLES: Final = 48
+#: Differences of colour (0 to 255) that always count as noise, and the multiple of the standard deviation that does.
+MIN_THRESHOLD: Final = 22.0
+_DEVIATIONS: Final = 4.0
+#: Standard deviation of normal noise in units of its median absolute deviation.
+_PER_MAD: Final = 1.4826
+#: A colour this far outside of the range of the surrounding still lies within.
+_SWAY_MARGIN: Final = 8
+#: A place sways if at least this share of what differs there is in the range of the surrounding.
+_SWAY_SHARE: Final = 0.6
+#: In units of the height of people: the surrounding, and the cells in which shares are counted.
+_SWAY_RADIUS: Final = 0.2
+_SWAY_CELL: Final = 0.3
+#: Cells with less than this sum of differing pixels a pixel, over all samples, are not judged.
+_SWAY_LEAST: Final = 0.02
+#: A shadow is darker by these factors, nearly the same in all colours.
+_SHADOW: Final = (0.55, 0.98)
+_SHADOW_TINT: Final = 0.12
+#: Light that is brighter or darker by more than this share is compensated, on a grid of every so many pixels.
+_LIGHT: Final = 0.02
+_GRID: Final = 8
+
+
+class Sampler:
+    """Keeps pictures that lie evenly in time, however many come."""
+
+    def __init__(self) -> None:
+        self.pictures: list[Image] = []
+        self._step, self._seen = 1, 0
+
+    def add(self, picture: Callable[[], Image]) -> None:
+        """Take the next picture, which is only made if it is kept."""
+        if self._seen % self._step == 0:
+            if len(self.pictures) == MAX_SAMPLES:
+                self.pictures = self.pictures[::2]
+                self._step *= 2
+            if self._seen % self._step == 0:
+                self.pictures.append(picture())
+        self._seen += 1
+
+
+def largest(image: Image) -> Image:
+    """The largest channel of each pixel, (H, W)."""
+    import cv2
+
+    blue, green, red = cv2.split(image)
+    return np.asarray(cv2.max(cv2.max(blue, green), red), np.uint8)
+
+
+def _middle(images: Sequence[Image]) -> Image:
+    """The median of each pixel and channel; of an even number the upper one."""
+    at = len(images) // 2
+    return np.asarray(np.partition(np.stack(images), at, axis=0)[at], np.uint8)
+
+
+@dataclass(frozen=True)
+class Background:
+    """A background, and which pixels of a picture differ from it.
+
+    Attributes
+    ----------
+    median : (H, W, 3) uint8
+        Its colours: blue, green, red.
+    threshold : (H, W) uint8
+        The largest difference that is noise.
+    lowest, highest : (H, W, 3) uint8
+        The range of its colours around each pixel.
+    is_grey : bool
+        Whether it has no colours, so that shadows can't be told by them.
+
+    """
+
+    median: Image
+    threshold: Image
+    lowest: Image
+    highest: Image
+    is_grey: bool
+
+    @classmethod
+    def of(cls, samples: Sequence[Image], threshold: float | None = None) -> Background:
+        """The background of pictures (H, W, 3), with the differences that count as noise everywhere at least."""
+        import cv2
+
+        median = _middle(samples)
+        deviation = _middle([largest(np.asarray(cv2.absdiff(image, median), np.uint8)) for image in samples])
+        least = MIN_THRESHOLD if threshold is None else threshold
+        noise = np.clip(np.maximum(least, _DEVIATIONS * _PER_MAD * deviation.astype(np.float32)), 0, 255)
+        lowest, highest = _range(median, 1)
+        return cls(median, noise.astype(np.uint8), lowest, highest, not np.ptp(median, axis=-1).any())
+
+    def swaying(self, samples: Sequence[Image], person_px: float) -> Background:
+        """The same, with a wider range at places that sway in ``samples``.
+
+        ``person_px`` is how tall people are, in pixels.
+        """
+        import cv2
+
+        lowest, highest = _range(self.median, max(2, round(_SWAY_RADIUS * person_px)))
+        differs = np.zeros(self.threshold.shape, np.float32)
+        is_near = differs.copy()
+        for image in samples:
+            mask = self.mask(image, shadows=True) > 0
+            differs += mask
+            is_near += mask & (_outside(image, lowest, highest) <= _SWAY_MARGIN)
+        cell = round(_SWAY_CELL * person_px) | 1
+        total = np.asarray(cv2.boxFilter(differs, -1, (cell, cell)), np.float32)
+        near = np.asarray(cv2.boxFilter(is_near, -1, (cell, cell)), np.float32)
+        sways = (near > _SWAY_SHARE * total) & (total > _SWAY_LEAST)
+        half = cell // 2 | 1
+        wide: Bools = np.asarray(cv2.dilate(sways.astype(np.uint8), np.ones((half, half), np.uint8))) > 0
+        return Background(
+            self.median,
+            self.threshold,
+            np.where(wide[..., None], lowest, self.lowest),
+            np.where(wide[..., None], highest, self.highest),
+            self.is_grey,
+        )
+
+    def mask(self, image: Image, shadows: bool) -> Image:
+        """255 where ``image`` (H, W, 3) differs; not where it only lies in the shade, if ``shadows`` are removed."""
+        import cv2
+
+        image = self._same_light(image)
+        difference = _outside(image, self.lowest, self.highest)
+        mask = np.asarray(cv2.compare(difference, self.threshold, cv2.CMP_GT), np.uint8)
+        if shadows and not self.is_grey:
+            at = np.flatnonzero(mask.view(np.bool_))
+            seen, known = (np.take(colours.reshape(-1, 3), at, axis=0).T for colours in (image, self.median))
+            blue, green, red = (seen.astype(np.float32) + 1) / (known.astype(np.float32) + 1)
+            darker = (blue + green + red) / 3
+            tint = np.maximum(np.maximum(blue, green), red) - np.minimum(np.minimum(blue, green), red)
+            is_shadow = (darker > _SHADOW[0]) & (darker < _SHADOW[1]) & (tint < _SHADOW_TINT)
+            mask.reshape(-1)[at[is_shadow]] = 0
+        return mask
+
+    def _same_light(self, image: Image) -> Image:
+        """The picture in the light of the background: exposure and clouds change all of it by a factor."""
+        import cv2
+
+        seen, known = image[::_GRID, ::_GRID], self.median[::_GRID, ::_GRID]
+        factor = float(np.median((known.astype(np.float32) + 1) / (seen.astype(np.float32) + 1)))
+        return image if abs(factor - 1) < _LIGHT else np.asarray(cv2.convertScaleAbs(image, alpha=factor), np.uint8)
+
+
+def _range(image: Image, radius: int) -> tuple[Image, Image]:
+    """The lowest and the highest value of each channel within a distance."""
+    import cv2
+
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE if radius > 1 else cv2.MORPH_RECT, (2 * radius + 1,) * 2)
+    return np.asarray(cv2.erode(image, kernel), np.uint8), np.asarray(cv2.dilate(image, kernel), np.uint8)
+
+
+def _outside(image: Image, lowest: Image, highest: Image) -> Image:
+    """How far each pixel lies outside of a range, in its worst channel, (H, W)."""
+    import cv2
+
+    return largest(np.asarray(cv2.max(cv2.subtract(image, highest), cv2.subtract(lowest, image)), np.uint8))

@@ -1,0 +1,291 @@
+"""The median detector on drawn scenes with known people: standing, in groups, in shade, behind things, in wind."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+import pytest
+
+import mcaptrack
+from mcaptrack import McaptrackError
+from mcaptrack.geometry.assignment import assign
+from mcaptrack.geometry.boxes import columns_to_boxes, iou
+from mcaptrack.schema import Frame
+from mcaptrack.transforms import STAGES, MedianDetector
+from mcaptrack.transforms.detect.median_background import MAX_SAMPLES, Background, Sampler
+from mcaptrack.transforms.detect.people import Learner, Person, Separator
+from tests.worlds import ns, small_scene
+
+HEIGHT, WIDTH = 160, 240
+STEADY = MedianDetector(stabilise=False)
+
+
+def ground(seed: int = 0) -> np.ndarray:
+    """A coloured picture with a little texture."""
+    rng = np.random.default_rng(seed)
+    return (np.array([120, 140, 130]) + rng.normal(0, 3, (HEIGHT, WIDTH, 1))).clip(0, 255).astype(np.uint8)
+
+
+def figure(image: np.ndarray, x: float, foot: float, colour=(30, 30, 160), tall: float = 40.0) -> tuple[float, ...]:
+    """Draw a person whose feet stand at (x, foot): a head, a body, two legs. Returns the box."""
+    half = tall * 0.16
+    for low, high, wide in ((0.0, 0.18, 0.5), (0.18, 0.6, 1.0), (0.6, 1.0, 0.7)):
+        top, bottom = foot - tall * (1 - low), foot - tall * (1 - high)
+        left, right = x - half * wide, x + half * wide
+        image[max(round(top), 0) : max(round(bottom), 0), max(round(left), 0) : max(round(right), 0)] = colour
+    return x - half, foot - tall, 2 * half, tall
+
+
+def film(paint, count: int = 60, step_s: float = 0.5, seed: int = 0) -> list[Frame]:
+    """Pictures of a scene: ``paint(image, number)`` draws on the ground."""
+    frames, still, rng = [], ground(seed), np.random.default_rng(seed + 1)
+    for number in range(count):
+        image = still.copy()
+        paint(image, number)
+        noisy = image + rng.normal(0, 1.5, image.shape)
+        frames.append(Frame(ns(step_s * number), number, noisy.clip(0, 255).astype(np.uint8)))
+    return frames
+
+
+def boxes_of(frames: Sequence[Frame], detector: MedianDetector = STEADY) -> list[np.ndarray]:
+    return [columns_to_boxes(frame.rows) for (frame,) in detector(frames)]
+
+
+def walk(image: np.ndarray, number: int) -> None:
+    """One person walks through again and again, so that there is something to learn a shape from."""
+    figure(image, 20 + 7.5 * (number % 28), 150)
+
+
+def hits(found: np.ndarray, true) -> int:
+    return len(assign(1 - iou(np.array(true, float).reshape(-1, 4), found), 0.5)[0]) if len(found) else 0
+
+
+def test_walking_people_of_a_rendered_scene_are_found():
+    shots = list(small_scene().shots())
+    frames = [Frame(ns(shot.seconds), n, shot.image) for n, shot in enumerate(shots)]
+    found = boxes_of(frames, MedianDetector())
+    right = sum(hits(seen, shot.boxes) for seen, shot in zip(found, shots, strict=True))
+    assert right > 0.75 * sum(len(shot.boxes) for shot in shots)
+    assert right > 0.75 * sum(map(len, found))
+
+
+def test_who_stands_for_a_third_of_the_time_is_found_all_the_while_also_from_the_first_picture_on():
+    def paint(image, number):
+        walk(image, number)
+        if number < 20:
+            figure(image, 200, 80, (160, 60, 30))
+
+    found = boxes_of(film(paint))
+    there = [hits(seen, [(193.6, 40, 12.8, 40)]) for seen in found]
+    assert there == [1] * 20 + [0] * 40
+    assert all(len(seen) == 1 for seen in found[20:])
+
+
+def test_three_who_stand_side_by_side_get_three_boxes_and_one_region_without_separation():
+    def paint(image, number):
+        walk(image, number)
+        if number % 3 == 0:
+            for x in (100, 110, 120):
+                figure(image, x, 80)
+
+    frames = film(paint)
+    true = [(x - 6.4, 40, 12.8, 40) for x in (100, 110, 120)]
+    assert [hits(seen, true) for seen in boxes_of(frames)[::3]] == [3] * 20
+    joined = boxes_of(frames, MedianDetector(stabilise=False, separate=False))[::3]
+    assert all(hits(seen, [(93.6, 40, 32.8, 40)]) == 1 for seen in joined)
+
+
+def test_one_behind_another_gets_a_box_of_a_whole_person_if_enough_of_them_is_seen():
+    def paint(image, number):
+        walk(image, number)
+        if number % 3 == 0:
+            figure(image, 150, 70)
+            figure(image, 153, 92)
+
+    frames = film(paint)
+    true = [(143.6, 30, 12.8, 40), (146.6, 52, 12.8, 40)]
+    assert [hits(seen, true) for seen in boxes_of(frames)[::3]] == [2] * 20
+    strict = MedianDetector(stabilise=False, least_visible=0.95)
+    assert sum(hits(seen, true) for seen in boxes_of(frames, strict)[::3]) < 40
+
+
+def test_a_person_behind_a_pole_is_one_box():
+    def paint(image, number):
+        figure(image, 20 + 7.5 * (number % 28), 150)
+        figure(image, 20 + 7.5 * (number % 28), 70)
+        image[44:56, 100:140] = (200, 210, 90)  # a sign before the upper path
+
+    found = boxes_of(film(paint))
+    for number in (12, 13, 14, 40, 41, 42):
+        x = 20 + 7.5 * (number % 28)
+        assert hits(found[number], [(x - 6.4, 30, 12.8, 40), (x - 6.4, 110, 12.8, 40)]) == 2
+        assert len(found[number]) == 2
+
+
+def test_shadows_are_left_out_of_boxes_unless_they_are_kept():
+    def paint(image, number):
+        x = 20 + 7.5 * (number % 28)
+        image[146:152, round(x) : round(x) + 30] = image[146:152, round(x) : round(x) + 30] * 0.7
+        figure(image, x, 150)
+
+    frames = film(paint)[:26]
+    width = {
+        is_removed: np.median(
+            [
+                seen[0, 2]
+                for seen in boxes_of(frames, MedianDetector(stabilise=False, remove_shadows=is_removed, separate=False))
+            ]
+        )
+        for is_removed in (True, False)
+    }
+    assert 11 <= width[True] <= 15
+    assert width[False] >= 30
+
+
+def test_light_that_changes_for_all_of_the_picture_is_no_motion():
+    def paint(image, number):
+        walk(image, number)
+
+    frames = film(paint)
+    lit = [f._replace(rows=(f.rows * (1.0 if f.index < 40 else 0.75)).astype(np.uint8)) for f in frames]
+    for before, after in zip(boxes_of(frames), boxes_of(lit), strict=True):
+        assert len(after) == len(before) == 1
+        assert hits(after, before) == 1
+
+
+def test_leaves_in_the_wind_are_no_people():
+    rng = np.random.default_rng(5)
+    leaves = [(rng.uniform(20, 70), rng.uniform(15, 50), tuple(rng.integers(20, 120, 3).tolist())) for _ in range(60)]
+
+    def paint(image, number):
+        walk(image, number)
+        gust = 5 * np.sin(number * 0.9) * (number % 7 < 4)
+        for x, y, (b, g, r) in leaves:
+            cv2.circle(image, (round(x + gust), round(y)), 5, (b, g + 80, r), -1)
+
+    found = boxes_of(film(paint))
+    assert sum(len(seen) for seen in found) <= 1.15 * len(found)
+
+
+def test_each_block_of_time_has_its_own_background():
+    def paint(image, number):
+        walk(image, number)
+        if number >= 70:
+            image[20:70, 90:130] = (40, 90, 200)  # a van parks, and stays
+
+    frames, van = film(paint, 120), [(90, 20, 40, 50)]
+    for history_s, there in ((30.0, 0), (600.0, 50)):
+        found = boxes_of(frames, MedianDetector(stabilise=False, history_s=history_s, separate=False))
+        assert sum(hits(seen, van) for seen in found[70:]) == there
+
+
+def test_people_of_a_shaking_camera_are_boxed_where_they_are_in_each_picture():
+    scene = small_scene(shake_px=2.5, contrast=6.0)
+    shots = list(scene.shots())
+    frames = [Frame(ns(shot.seconds), n, shot.image) for n, shot in enumerate(shots)]
+    right = {
+        is_on: sum(
+            hits(seen, shot.boxes)
+            for seen, shot in zip(boxes_of(frames, MedianDetector(stabilise=is_on)), shots, strict=True)
+        )
+        for is_on in (True, False)
+    }
+    assert right[True] > 0.6 * sum(len(shot.boxes) for shot in shots)
+
+
+def test_large_pictures_are_halved_and_their_boxes_are_in_full_pixels():
+    frames = film(walk)
+    large = [f._replace(rows=np.repeat(np.repeat(f.rows, 2, axis=0), 2, axis=1)) for f in frames]
+    halved = MedianDetector(stabilise=False, max_pixels=HEIGHT * WIDTH)
+    for plain, doubled in zip(boxes_of(frames), boxes_of(large, halved), strict=True):
+        np.testing.assert_allclose(doubled, 2 * plain)
+
+
+def test_grey_pictures_are_taken_too_and_shadows_stay_there():
+    grey = [frame._replace(rows=frame.rows.mean(axis=2).astype(np.uint8)) for frame in film(walk)]
+    found = boxes_of(grey)
+    assert all(hits(seen, [(13.6 + 7.5 * (n % 28), 110, 12.8, 40)]) == 1 for n, seen in enumerate(found))
+
+
+def test_an_iterator_is_refused_because_the_pictures_are_read_twice():
+    with pytest.raises(McaptrackError, match="reads the pictures twice; give it a list"):
+        list(STEADY(iter(film(walk))))
+
+
+@pytest.mark.parametrize("count", [0, 1, 4])
+def test_too_few_pictures_have_no_background_and_no_detections(count):
+    assert [len(seen) for seen in boxes_of(film(walk, count))] == [0] * count
+
+
+def test_a_log_is_read_twice_and_its_detections_are_those_of_the_pictures(tmp_path):
+    folder = tmp_path / "pictures"
+    folder.mkdir()
+    for frame in film(walk):
+        cv2.imwrite(str(folder / f"{frame.index:03}.png"), frame.rows)
+    path = tmp_path / "log.mcap"
+    mcaptrack.ingest(folder, output=path, fps=2)
+    steps = []
+    report = mcaptrack.detect(path, detector="median", progress=lambda stage, done, total: steps.append((done, total)))
+    assert steps[-1] == (120, 120)
+    assert sorted(steps) == steps
+    with mcaptrack.open(path) as recording:
+        table = recording.table("detections")
+    assert 50 <= len(table) <= 70
+    assert report is not None
+    known = STAGES["detect"].built_in()
+    assert known["median"] is MedianDetector
+
+
+def test_samples_lie_evenly_over_all_that_came():
+    for count in (10, MAX_SAMPLES, MAX_SAMPLES + 1, 1000, 5000):
+        sampler = Sampler()
+        for number in range(count):
+            sampler.add(lambda number=number: np.full((1, 1, 3), number % 251, np.uint8))
+        kept = len(sampler.pictures)
+        assert min(count, MAX_SAMPLES // 2) <= kept <= MAX_SAMPLES
+        steps = np.diff([int(picture[0, 0, 0]) for picture in sampler.pictures]) % 251
+        assert len(set(steps.tolist())) <= 1
+
+
+def test_the_background_is_the_median_of_each_channel_and_the_noise_its_deviation():
+    rng = np.random.default_rng(3)
+    samples = [rng.integers(0, 255, (12, 16, 3), dtype=np.uint8) for _ in range(9)]
+    background = Background.of(samples)
+    median = np.median(np.stack(samples), axis=0)
+    np.testing.assert_array_equal(background.median, median.astype(np.uint8))
+    deviation = np.median(np.abs(np.stack(samples) - median).max(axis=-1), axis=0)
+    np.testing.assert_array_equal(background.threshold, np.clip(4 * 1.4826 * deviation, 22, 255).astype(np.uint8))
+
+
+def test_height_is_learned_as_a_line_over_the_feet_from_those_who_stand_alone():
+    learner, rng = Learner(), np.random.default_rng(1)
+    for _ in range(40):
+        mask = np.zeros((240, 320), np.uint8)
+        for foot in rng.permutation([80, 130, 180, 230])[:2]:
+            figure(mask, rng.uniform(30, 290), foot, 255, 10 + 0.2 * foot)
+        learner.add([mask], 40.0)
+    person = learner.person()
+    assert person is not None
+    for foot in (80, 150, 230):
+        assert person.height(foot) == pytest.approx(10 + 0.2 * foot, rel=0.05)
+
+
+def test_the_same_people_are_found_wherever_the_picture_is_cut():
+    """A region's people depend on the region alone, not on where it lies in the picture."""
+    learner = Learner()
+    for x in range(30, 200, 8):
+        mask = np.zeros((120, 240), np.uint8)
+        figure(mask, x, 80, 255)
+        learner.add([mask], 40.0)
+    person = learner.person()
+    assert person is not None
+    level = Person(0.0, person.height(80), person.template)
+    separator = Separator(level, 0.5)
+    mask = np.zeros((120, 240), np.uint8)
+    for x in (60, 70, 81):
+        figure(mask, x, 80, 255)
+    moved = np.roll(mask, (17, 90), axis=(0, 1))
+    np.testing.assert_allclose(separator.boxes(moved), separator.boxes(mask) + [90, 17, 0, 0], atol=1e-6)
+    assert len(separator.boxes(mask)) == 3
