@@ -1,4 +1,4 @@
-"""What is odd about a channel that a stage made: that nothing came of it and why, or that it can't be relied on."""
+"""Warn about results that are empty or unreliable, and about memory that runs out."""
 
 from __future__ import annotations
 
@@ -15,16 +15,19 @@ from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.cameras import camera_at
 from mcaptrack.transforms import STAGES, Transform
 
-#: The stages that results in metres come from: all but those that read pictures.
+#: The stages with results in metres: all except those that read pictures.
 _IN_METRES: Final = {name for name, stage in STAGES.items() if stage.default.reads is not VIDEO}
-#: What stages take, measured with 2 to 20 people at 15 pictures a second, in bytes.
+#: The memory that stages need, in bytes, measured with 2 to 20 people at 15 pictures a second.
 _BASE, _A_PICTURE, _A_BOX = 100_000_000, 3_000, 1_600
 
 
 def warn_of_nothing(
     stage: str, source: str, transform: Transform, given: Sequence[Frame], made: Sequence[Frame]
 ) -> None:
-    """Warn if no rows came of a stage's input though there were some, or if there were none; with the likely reason."""
+    """Warn if a stage made no rows, with the likely reason.
+
+    ``given`` are the frames that the stage read, ``made`` those of its first output.
+    """
     if any(len(frame.rows) for frame in made):
         return
     if transform.reads is not VIDEO and not any(len(frame.rows) for frame in given):
@@ -35,7 +38,7 @@ def warn_of_nothing(
 
 
 def warn_of_memory(pictures: int, boxes: int) -> None:
-    """Warn if running stages on so many boxes in so many pictures takes more memory than there is."""
+    """Warn if stages need more memory for this number of pictures and boxes than is free."""
     needed, free = _BASE + pictures * _A_PICTURE + boxes * _A_BOX, free_memory()
     if free is not None and needed > free:
         warn(
@@ -46,7 +49,7 @@ def warn_of_memory(pictures: int, boxes: int) -> None:
 
 
 def free_memory() -> int | None:
-    """How many bytes of memory this process can still take, as Linux says; None where that isn't known."""
+    """Return the free memory for this process in bytes, as Linux reports it; None if it isn't known."""
     found = []
     try:
         lines = Path("/proc/meminfo").read_text().splitlines()
@@ -54,23 +57,23 @@ def free_memory() -> int | None:
         most, now = (Path(f"/sys/fs/cgroup/memory.{name}").read_text().strip() for name in ("max", "current"))
         found += [int(most) - int(now)] if most != "max" else []
     except (OSError, ValueError):
-        pass  # no Linux, or no group of its own
+        pass  # not Linux, or no memory limit for this process's control group
     return min(found, default=None)
 
 
 def warn_of_what_stands(
     opened: log.Log, prefix: str, made: Mapping[str, Provenance], planes: Planes, is_all: bool
 ) -> None:
-    """Warn of what was odd when channels were made, and of a scale that was guessed.
+    """Repeat the warnings that channels carry in their provenance, and warn about an estimated scale.
 
-    This is about channels that were ``made`` now and what these were made from, or, with ``is_all``, about all of the
-    camera.
+    This covers the channels in ``made``, by topic, and the channels that they were made from; with ``is_all`` it covers
+    all channels of the camera.
     """
     known = dict(made)
     for topic in sorted(camera_at(opened, prefix).topics):
-        how = Provenance.from_metadata(opened.channels[topic].metadata)
-        if how is not None:
-            known.setdefault(topic, how)
+        provenance = Provenance.from_metadata(opened.channels[topic].metadata)
+        if provenance is not None:
+            known.setdefault(topic, provenance)
     topics = list(known) if is_all else list(made)
     for topic in topics:
         if known[topic].input in known and known[topic].input not in topics:

@@ -1,4 +1,4 @@
-"""The ground planes of a camera: given, or guessed from its boxes."""
+"""Read the ground planes of a camera, or estimate a scale from the heights of its boxes."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _ASSUME: Final = "assume-ground-plane"
 
 
 def read_planes(opened: log.Log, prefix: str) -> Planes | None:
-    """The ground planes of a camera with the times from which they hold; None if there are none."""
+    """Return the ground planes of a camera, each with its start time in ns; None if the log has none."""
     topic = camera_at(opened, prefix).ground_plane
     if topic not in opened.channels:
         return None
@@ -30,7 +30,7 @@ def read_planes(opened: log.Log, prefix: str) -> Planes | None:
 
 
 def planes_to_json(planes: Planes) -> list[Any]:
-    """Planes as the parameters of a channel have them."""
+    """Convert ground planes to the JSON values that the parameters of a channel contain."""
     kept: list[Any] = json.loads(json.dumps([(t_ns, asdict(plane)) for t_ns, plane in planes]))
     return kept
 
@@ -38,13 +38,14 @@ def planes_to_json(planes: Planes) -> list[Any]:
 def guess_plane(
     frames: Sequence[Frame], source: str, digest: str
 ) -> tuple[Planes | None, tuple[list[Frame], Provenance] | None]:
-    """A scale from boxes where no ground plane is given: planes, and the frames and making of the channel for them.
+    """Estimate a ground plane from the heights of boxes: the planes, and the frames and provenance of their channel.
 
-    ``source`` is where the boxes are from, and ``digest`` what that holds. None and None if there are no boxes.
+    ``source`` is the topic of the boxes, and ``digest`` the digest of its messages. Both results are None if no frame
+    has boxes in pixels.
     """
     rows = np.concatenate([frame.rows[["x_px", "y_px", "w_px", "h_px"]] for frame in frames]) if frames else None
     if rows is None or not np.isfinite(rows["h_px"]).any():
-        return None, None  # nothing in pixels: nothing to bring to metres
+        return None, None  # without boxes in pixels there is nothing to convert to metres
     width, height = (int(np.nanmax(rows[a] + rows[b]).round()) for a, b in (("x_px", "w_px"), ("y_px", "h_px")))
     plane: GroundPlane = assumed_plane(rows["h_px"], width, height)
     start = frames[0].t_ns
@@ -52,6 +53,6 @@ def guess_plane(
 
 
 def is_poor(frames: Sequence[Frame]) -> bool:
-    """Whether one scale can't hold for all of the picture, by the boxes of tracks."""
+    """Return whether the size of boxes varies too much over the picture for one scale."""
     boxes = columns_to_boxes(TRACKS.joined([frame.rows for frame in frames]))
     return ground_depth(boxes[np.isfinite(boxes).all(axis=1)]) < LEAST_DEPTH

@@ -1,7 +1,7 @@
-"""The transform that made a channel, made again from what its provenance says.
+"""Create the transform that made a channel again, from the channel's provenance.
 
-Nothing is imported because a log names it, unless it is built in or an entry point of an installed package, or the user
-names it, too.
+A class that a log names is imported only if it is built in, is an entry point of an installed package, or is named by
+the user, too: a log must not be able to run code.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from mcaptrack.transforms.protocol import member_type
 class MissingPluginError(McaptrackError):
     """A class of another package that made a channel is not installed, or not named by the user.
 
-    ``options`` name it for ``run``; there are none if that is not enough.
+    ``options`` are the options of ``run`` that name the class; empty if naming it is not enough.
     """
 
-    def __init__(self, words: str, **options: str) -> None:
-        super().__init__(words)
+    def __init__(self, message: str, **options: str) -> None:
+        super().__init__(message)
         self.options = options
 
 
 def plugins_of(stage: Stage, transform: Transform) -> dict[str, Plugin]:
-    """The classes of other packages that a transform consists of: the transform, and the predictor that it names."""
+    """Return the classes of other packages in a transform: "transform" for itself, "predictor" for its predictor."""
     cls = type(transform)
     found = {} if stage.is_built_in(cls) else {"transform": _plugin(stage.entry(cls))}
     predictor = getattr(transform, "predictor", None)
@@ -44,32 +44,32 @@ def plugins_of(stage: Stage, transform: Transform) -> dict[str, Plugin]:
 
 
 def rebuild(stage: Stage, made: Provenance, known: Mapping[str, Transform]) -> Transform:
-    """The transform that made a channel, with the parameters it had.
+    """Return the transform that made a channel, with the same parameters.
 
-    ``known`` are transforms by stage that the user named; their classes may be used, beside those that are installed.
-    Raises MissingPluginError if a class of another package can't be had, and McaptrackError for parameters that there
-    are no more.
+    ``known`` are the transforms that the user named, by stage; their classes may be used in addition to installed ones.
+    Raises MissingPluginError if a class of another package is not available, and McaptrackError for parameters that no
+    longer exist.
     """
-    had = stage.upgrade(made.parameters)
-    cls = _class_of(stage, made, had, known)
-    plugin, name = made.plugins.get("predictor"), had.get("predictor")
+    parameters = stage.upgrade(made.parameters)
+    cls = _class_of(stage, made, parameters, known)
+    plugin, name = made.plugins.get("predictor"), parameters.get("predictor")
     if plugin is None and isinstance(name, str) and _is_of_a_module(name):
         plugin = Plugin(name, name, "", "")
     if plugin:
         named = {name for other in known.values() if isinstance(name := getattr(other, "predictor", None), str)}
         if plugin.name not in named:
             _installed("predictor", plugin)
-    cls = stage.with_part(cls, had.get(stage.parameter))
+    cls = stage.with_part(cls, parameters.get(stage.parameter))
     types = {f.name: f for f in fields(cls)}
     renamed = {was: name for name, f in types.items() if (was := f.metadata.get("was"))}
-    had = {renamed.get(name, name): value for name, value in had.items()}
-    strange = sorted(set(had) - set(types))
-    if strange:
-        raise McaptrackError(f"it was made with {', '.join(strange)}, which {cls.__name__} does not have")
+    parameters = {renamed.get(name, name): value for name, value in parameters.items()}
+    unknown = sorted(set(parameters) - set(types))
+    if unknown:
+        raise McaptrackError(f"it was made with {', '.join(unknown)}, which {cls.__name__} does not have")
     hints = get_type_hints(cls)
     values = {
         name: tuple(value) if isinstance(value, list) and member_type(hints[name])[1] else value
-        for name, value in had.items()
+        for name, value in parameters.items()
         if not types[name].metadata.get("context")
     }
     transform: Transform = cls(**values)
@@ -83,14 +83,16 @@ def rebuild(stage: Stage, made: Provenance, known: Mapping[str, Transform]) -> T
 
 
 def _is_of_a_module(predictor: str) -> bool:
-    """Whether a predictor is ``module:Class``, and not ``NAME:FILE``."""
+    """Return whether a predictor's name has the form ``module:Class`` and not ``NAME:FILE``."""
     name, colon, _ = predictor.partition(":")
     return bool(colon) and not is_installed("predictor", name)
 
 
-def _class_of(stage: Stage, made: Provenance, had: dict[str, Any], known: Mapping[str, Transform]) -> type[Transform]:
-    """The class; takes the parameter that names it out of ``had``."""
-    name = str(had.pop(stage.kind, had.pop(stage.was, ""))) if stage.kind else ""
+def _class_of(
+    stage: Stage, made: Provenance, parameters: dict[str, Any], known: Mapping[str, Transform]
+) -> type[Transform]:
+    """Return the class of the transform; removes the parameter that names it from ``parameters``."""
+    name = str(parameters.pop(stage.kind, parameters.pop(stage.was, ""))) if stage.kind else ""
     plugin = made.plugins.get("transform")
     if plugin is None:
         built_in = stage.built_in()
@@ -102,26 +104,28 @@ def _class_of(stage: Stage, made: Provenance, had: dict[str, Any], known: Mappin
         _compare_versions(stage.entry(type(given)), plugin)
         return type(given)
     if stage.kind is None:
-        raise MissingPluginError(f"{_words(stage.name, plugin)} made it; run it again from Python, with that class")
+        raise MissingPluginError(
+            f"{_name_with_package(stage.name, plugin)} made it; run it again from Python, with that class"
+        )
     cls: type[Transform] = stage.find(_installed(stage.kind, plugin).name).cls
     return cls
 
 
 def _installed(kind: Any, plugin: Plugin) -> Entry:
-    """The entry that a plug-in is, if it may be imported. Raises MissingPluginError."""
-    words = _words(kind, plugin)
+    """Return the registry's entry for a plug-in. Raises MissingPluginError if it may not or can't be imported."""
+    named = _name_with_package(kind, plugin)
     if ":" in plugin.name:
         why = "a class without an entry point is imported only if you name it"
-        raise MissingPluginError(f"{words} made it, and {why}", **{kind: plugin.name})
+        raise MissingPluginError(f"{named} made it, and {why}", **{kind: plugin.name})
     if not is_installed(kind, plugin.name):
         package = f"{plugin.distribution} {plugin.version}".strip() or "the package that has it"
         raise MissingPluginError(
-            f"{words} made it, which is not installed; install {package}, or replace it with another `{kind}=`"
+            f"{named} made it, which is not installed; install {package}, or replace it with another `{kind}=`"
         )
     entry = find(kind, plugin.name)
     if entry.distribution != plugin.distribution:
         raise MissingPluginError(
-            f"{words} made it; the {kind} of that name is now that of {entry.distribution or 'mcaptrack'}. Install "
+            f"{named} made it; the {kind} of that name is now that of {entry.distribution or 'mcaptrack'}. Install "
             f"{plugin.distribution}, or replace it with another `{kind}=`"
         )
     _compare_versions(entry, plugin)
@@ -137,7 +141,7 @@ def _compare_versions(entry: Entry, plugin: Plugin) -> None:
         )
 
 
-def _words(kind: str, plugin: Plugin) -> str:
+def _name_with_package(kind: str, plugin: Plugin) -> str:
     package = f"{plugin.distribution} {plugin.version}".strip()
     return f"{kind} {plugin.name}" + (f" ({package})" if package else "")
 

@@ -1,4 +1,4 @@
-"""What a log holds of a camera once stages ran: in numbers, for people and programs."""
+"""Count the results for one camera of a log, and score them against the ground truth."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from mcaptrack.sources import foreign
 from mcaptrack.sources.cameras import camera_at
 from mcaptrack.transforms import STAGES
 
-#: Tracks within this distance of the ground truth match it, as in the demonstration.
+#: Maximum distance in metres, and minimum IoU of boxes, at which a track matches the ground truth, as in the demo.
 _GATE_M = 1.0
 _MIN_IOU = 0.5
 
 
 @dataclass(frozen=True)
 class Repair:
-    """What re-tracking made of tracks: gaps between them that it closed, tracks that it took apart and left out."""
+    """The changes that re-tracking made, as counts: tracks after it; tracks joined, split and left out by it."""
 
     tracks: int
     joined: int
@@ -34,7 +34,7 @@ class Repair:
 
 @dataclass(frozen=True)
 class SummaryScores:
-    """Identity scores (IDF1, 0 to 1) and switches of samples and of re-tracked tracks, and how they were matched."""
+    """IDF1 (0 to 1) and identity switches, each before and after re-tracking; ``by`` is the matching rule in words."""
 
     idf1: tuple[float, float]
     switches: tuple[int, int]
@@ -43,7 +43,7 @@ class SummaryScores:
 
 @dataclass(frozen=True)
 class Summary:
-    """What is there of a camera; None for what isn't there. ``ground_plane`` is "given" or "assumed"."""
+    """Counts and scores for one camera; None for channels that the log lacks. ``ground_plane``: "given", "assumed"."""
 
     pictures: int | None = None
     boxes: int | None = None
@@ -55,14 +55,14 @@ class Summary:
     ground_plane: str | None = None
 
     def to_json(self) -> dict[str, Any]:
-        """As JSON."""
+        """Convert the summary to JSON values."""
         return asdict(self)
 
 
 def summarise(opened: log.Log, prefix: str) -> Summary:
-    """Count what a log holds of a camera, and score it against its ground truth, if it has one.
+    """Count the results for a camera, and score them against its ground truth, if it has one.
 
-    Warns where re-tracking lost more than it mended.
+    Warns if IDF1 is lower after re-tracking than before.
     """
     camera = camera_at(opened, prefix)
     names = ("detect", "track", "sample", "predict", "retrack")
@@ -91,13 +91,13 @@ def summarise(opened: log.Log, prefix: str) -> Summary:
 
 
 def _rows(opened: log.Log, topic: str, schema: Schema) -> Rows | None:
-    """All rows of a channel; None if it isn't there or holds something else."""
+    """Return all rows of a channel; None if it is missing or has another schema."""
     channel = opened.channels.get(topic)
     return opened.rows(topic, schema).rows if channel and channel.schema_name == schema.name else None
 
 
 def _count_boxes(opened: log.Log, tracks: str, usual: str) -> int | None:
-    """How many boxes tracks were made from."""
+    """Return the number of boxes that tracks were made from."""
     channel = opened.channels.get(tracks)
     made = Provenance.from_metadata(channel.metadata) if channel else None
     source = opened.channels.get(made.input if made else usual) or opened.channels.get(usual)
@@ -110,7 +110,7 @@ def _count_boxes(opened: log.Log, tracks: str, usual: str) -> int | None:
 
 
 def _repair(tracked: Rows, repaired: Rows) -> Repair:
-    """What became of which track, by the sources that re-tracked rows name."""
+    """Count joined, split and missing tracks by the column ``source_id`` of re-tracked rows."""
     named = repaired[repaired["source_id"] >= 0]
     pairs = np.unique(np.stack([named["track_id"], named["source_id"]]), axis=1)
     ids, sources = np.unique(pairs[0]), np.unique(pairs[1])
@@ -123,21 +123,21 @@ def _repair(tracked: Rows, repaired: Rows) -> Repair:
 
 
 def _scores(opened: log.Log, truth: str, topics: tuple[str, str]) -> SummaryScores | None:
-    """Scores before and after re-tracking, on the clock that both share; None if they can't be compared."""
+    """Score tracks before and after re-tracking, at their common sample times; None if they can't be compared."""
     there = [opened.channels.get(topic) for topic in (truth, *topics)]
     if not all(channel and channel.schema_name == TRACKS.name for channel in there):
         return None
     candidates = [Candidate(topic, None, opened.frames(topic, TRACKS)) for topic in topics]
     sequence = EvaluationInput(opened.path.stem, opened.frames(truth, TRACKS), candidates)
-    ways = {
+    rules = {
         f"within {_GATE_M:g} m": EvaluateOptions(similarities=("metres",), gates_m=(_GATE_M,)),
         f"by an overlap of {_MIN_IOU:g}": EvaluateOptions(similarities=("iou",), min_iou=_MIN_IOU),
     }
-    for by, options in ways.items():
+    for by, options in rules.items():
         try:
             rows = [result.to_json() for result in evaluate([sequence], options).results]
         except McaptrackError:
-            continue  # one of them has no places in these units
+            continue  # one of them has no positions in this unit
         idf1, switches = (tuple(row[name] for row in rows) for name in ("IDF1", "IDSW"))
         return SummaryScores((idf1[0], idf1[1]), (switches[0], switches[1]), by)
     return None
