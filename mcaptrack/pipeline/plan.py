@@ -174,9 +174,38 @@ class _Planner:
         source = self.source_of(stage)
         self.ensure(source)
         self._said.append(f"{topic} is missing: running {stage}")
-        transform = self._defaults.get(stage) or STAGES[stage].default()
+        transform = self._defaults.get(stage) or self._suited(stage, source) or STAGES[stage].default()
         self._add(Job(stage, transform, source, _main(self._opened, stage, topic)))
         return True
+
+    def _suited(self, stage: str, source: str) -> Transform | None:
+        """Make the transform that suits the one which makes, or made, the input of a stage; None if that names none."""
+        option, maker = STAGES[stage].option, self._maker_of(source)
+        name = getattr(maker, "suits", {}).get(option, "") if option else ""
+        if not name or maker is None:
+            return None
+        kind = next(one for one in STAGES.values() if f"{self._prefix}/{one.output_topic}" == source)
+        self._said.append(f"{stage} by {name}, which suits the {kind.option} {kind.choice(maker)}; `{option}=` chooses")
+        return STAGES[stage].make(name)
+
+    def _maker_of(self, topic: str) -> Transform | None:
+        """Return the transform that makes a channel now, or that made it; None if no stage of the camera does."""
+        for job in self.jobs:
+            if topic in job.outputs():
+                return job.transform
+        channel = self._opened.channels.get(topic)
+        made = Provenance.from_metadata(channel.metadata) if channel else None
+        return self._before(made.transform, made)[0] if made and made.transform in STAGES else None
+
+    def _is_made_by_another(self, topic: str) -> bool:
+        """Whether a channel is made now by a transform of another class than made it before."""
+        channel = self._opened.channels.get(topic)
+        made = Provenance.from_metadata(channel.metadata) if channel else None
+        jobs = [job for job in self.jobs if topic in job.outputs()]
+        if not jobs or made is None or made.transform not in STAGES:
+            return False
+        stage, before = STAGES[made.transform], self._before(made.transform, made)[0]
+        return before is None or stage.choice(before) != stage.choice(jobs[0].transform)
 
     def _make_again(self, made: Provenance, stage: str, topic: str) -> bool:
         """Plan a channel that a stage makes, if the channel is missing, out of date, or gets another input now."""
@@ -189,8 +218,10 @@ class _Planner:
         is_usual = (
             main == f"{self._prefix}/{STAGES[stage].output_topic}"
         )  # what stands elsewhere was asked for as it is
-        wanted = self._defaults.get(stage, before) if is_usual else before
-        is_replaced = is_usual and self._is_replaced(STAGES[stage], before, wanted)
+        is_open = is_usual and stage not in self._defaults and self._is_made_by_another(source)
+        suited = self._suited(stage, source) if is_open else None
+        wanted = self._defaults.get(stage, suited or before) if is_usual else before
+        is_replaced = is_usual and (self._is_replaced(STAGES[stage], before, wanted) or suited is wanted is not None)
         if wanted and not is_replaced and not self._anew:
             self._warn_of_settings(main, _differing(before, wanted) if before else str(why_not))
         if not is_due and not self._anew and not is_replaced:

@@ -7,6 +7,9 @@ Calling it with an iterable of frames gives an iterator of tuples of frames, one
 A transform that reads pictures (``reads = VIDEO``) gets their brightness, (height, width), unless its class attribute
 ``colour`` is "bgr"; then it gets blue, green and red, (height, width, 3).
 
+A detector can name the tracker that suits it by its class attribute ``suits = {"tracker": NAME}``; ``run`` takes that
+one unless another is chosen.
+
 A transform that reads its frames twice says so by its class attribute ``passes = 2``; the frames can then be iterated
 as often, each time from the beginning.
 

@@ -98,6 +98,8 @@ class OnnxDetector:
     writes: ClassVar[Mapping[str, Schema]] = MappingProxyType({"": DETECTIONS})
     latency_s: ClassVar[Mapping[str, float]] = MappingProxyType({"": 0.0})
     colour: ClassVar[Colour] = "bgr"
+    #: Boxes of low scores are of people partly hidden: only ByteTrack makes use of them.
+    suits: ClassVar[Mapping[str, str]] = MappingProxyType({"tracker": "bytetrack"})
 
     def __post_init__(self) -> None:
         check_options(self)
