@@ -5,6 +5,7 @@ __version__ = "0.2.0"
 SCHEMA_VERSION = 1
 
 _PARTS = {
+    "catalogue": ["Model", "get_model", "models"],
     "contents": ["ChannelInfo", "LogInfo", "info"],
     "demonstration": ["DemoResult", "demo"],
     "fetching": ["FetchedMessage"],

@@ -1,3 +1,6 @@
+from mcaptrack.api.catalogue import Model as Model
+from mcaptrack.api.catalogue import get_model as get_model
+from mcaptrack.api.catalogue import models as models
 from mcaptrack.api.contents import ChannelInfo as ChannelInfo
 from mcaptrack.api.contents import LogInfo as LogInfo
 from mcaptrack.api.contents import info as info
@@ -60,6 +63,7 @@ __all__ = [
     "LogServer",
     "McaptrackError",
     "McaptrackWarning",
+    "Model",
     "Notice",
     "Recording",
     "RenderResult",
@@ -78,9 +82,11 @@ __all__ = [
     "evaluate",
     "events",
     "export",
+    "get_model",
     "info",
     "ingest",
     "list_tables",
+    "models",
     "open",
     "predict",
     "query",

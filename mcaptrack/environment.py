@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Mapping
+from pathlib import Path
 from types import MappingProxyType
 from typing import Final
 
@@ -16,6 +18,7 @@ VARIABLES: Final[Mapping[str, str]] = MappingProxyType(
         "MCAPTRACK_MAX_CHUNK_MIB": "chunks of a log with a larger stated size are refused, in MiB",
         "MCAPTRACK_MAX_MEGAPIXELS": "pictures with a larger stated size are refused, in millions of pixels",
         "MCAPTRACK_MAX_UNPACKED_MIB": "compressed data that unpacks to more is refused, in MiB",
+        "MCAPTRACK_MODELS": "the folder of fetched weights of detectors",
         "MCAPTRACK_DATA": "a folder with reference recordings, for the tests",
     }
 )
@@ -38,6 +41,12 @@ def whole_number(name: str, otherwise: int) -> int:
     if not (text.isascii() and text.isdecimal() and len(text) <= 9 and int(text) > 0):
         raise McaptrackError(f"{name} needs a whole number from 1 to 999999999, not {text[:20]!r}")
     return int(text)
+
+
+def cache_folder() -> Path:
+    """The user's folder for files that can be fetched again."""
+    usual = Path.home() / ("Library/Caches" if sys.platform == "darwin" else ".cache")
+    return Path(os.environ.get("XDG_CACHE_HOME") or usual) / "mcaptrack"
 
 
 def hush_libraries() -> None:

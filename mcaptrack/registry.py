@@ -49,6 +49,9 @@ BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(
             "mog2": "mcaptrack.transforms.detect.background:Mog2Detector",
             "frame-difference": "mcaptrack.transforms.detect.background:FrameDifferenceDetector",
             "onnx": "mcaptrack.transforms.detect.onnx.detector:OnnxDetector",
+            "yolox-nano": "mcaptrack.transforms.detect.onnx.catalogued:YoloxNano",
+            "yolox-tiny": "mcaptrack.transforms.detect.onnx.catalogued:YoloxTiny",
+            "yolox-s": "mcaptrack.transforms.detect.onnx.catalogued:YoloxS",
         },
         "tracker": {
             "sort": "mcaptrack.transforms.sort:Sort",

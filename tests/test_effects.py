@@ -27,6 +27,7 @@ from mcaptrack.viewing.serving import Server
 from tests.bags import plain
 from tests.commands import GROUP, call, done, made_log
 from tests.effects.commands import CASES
+from tests.models import DATA, stocked
 from tests.worlds import small_scene
 
 
@@ -71,6 +72,7 @@ def template(tmp_path_factory) -> Path:
     (folder / "tall.txt").write_text("\n".join(map(",".join, tall)) + "\n")
     walk = [f"{row[0]} {row[1]} {0.1 * (float(row[2]) + 4)} 3.2" for row in rows]
     (folder / "walk.txt").write_text("\n".join(walk) + "\n")
+    (folder / "known.onnx").write_bytes(DATA)
     (folder / "query.sql").write_text("select count(*) as n from tracks")
     (folder / "more.csv").write_text("a\n1\n")
     (folder / "verbose.toml").write_text("\n".join(f"[{name}]\nverbose = true" for name in GROUP.commands))
@@ -99,6 +101,9 @@ def see(template, tmp_path, monkeypatch) -> Callable[[str], Seen]:
     monkeypatch.setattr(Server, "serve_forever", _interrupted)
     monkeypatch.setattr(secrets, "token_urlsafe", lambda _: "secret")
     monkeypatch.setattr(webbrowser, "open", lambda address: print(f"opened {address}"))
+
+    stocked(monkeypatch, tmp_path, "http://127.0.0.1:1/network.onnx")  # which can't be reached
+    monkeypatch.setenv("MCAPTRACK_MODELS", "models")
 
     def run(line: str) -> Seen:
         folder = tmp_path / "work"

@@ -57,6 +57,7 @@ ONLY_OPTIONS = {
         "fail_under": "Scores.below",
     },
     "info": {"output": "the result", "force": "the result"},
+    "models": {"source": "get_model"},
     "query": {
         "file": "the query is text",
         "form": "Arrow writes all formats",

@@ -22,6 +22,7 @@ from mcaptrack.viewing import serving
 from tests.bags import bag1
 from tests.commands import GROUP, call, done
 from tests.interrupted import interrupt
+from tests.models import stocked
 from tests.robots import write_log
 
 PACKAGE = Path(mcaptrack.__file__).parent
@@ -141,6 +142,15 @@ SCENES: dict[str, Callable[[Scene], str]] = {
     "log/journal_check.py:recover_command:recover": Scene.damaged,
     "log/snapshot.py:reporting_bad_times:drop": Scene.late,
     "log/recording_files.py:refuse_non_mcap:ingest": Scene.bag,
+    "transforms/detect/onnx/catalogue.py:stored:get_model": lambda s: s.says(
+        "detect", "LOG", "--detector", "yolox-nano"
+    ),
+    "api/catalogue.py:get_model:get_model": lambda s: s.says(
+        "models", "get", "yolox-nano", "--from", "http://127.0.0.1:1/"
+    ),
+    "cli/models.py:models:models": lambda s: s.says("models", "get"),
+    "cli/models.py:_list:models": lambda s: s.says("models"),
+    "cli/models.py:models:run": lambda s: s.says("models", "get", "yolox-nano"),
     "log/reader.py:channel:info": lambda s: s.says("export", "LOG", "--topic", "/nothing"),
     "pipeline/checks.py:_lacks:info": lambda s: s.says("sample", "LOG", "--topic", "/nothing"),
     "pipeline/checks.py:_lacks:ingest": lambda s: s.ingested("truth.txt", "--as", "truth", "--fps", "10").says(
@@ -243,7 +253,9 @@ def test_a_proposed_command_works(where, template, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(serving.Server, "serve_forever", lambda *_, **__: (_ for _ in ()).throw(KeyboardInterrupt))
     verb = where.rpartition(":")[2]
-    verb = {"list_tables": "query"}.get(verb, verb)
+    verb = {"list_tables": "query", "get_model": "models"}.get(verb, verb)
+    if verb == "models" or where.startswith("cli/models"):
+        stocked(monkeypatch, tmp_path)
     said = SCENES[where](Scene(template, tmp_path))
     lines = re.findall(r"mcaptrack ((?:" + VERBS + r")\b[^`\n]*?)(?=`|\n|$|    )", said)
     lines = [line for line in lines if verb in ("*", line.split()[0])]
@@ -254,6 +266,7 @@ def test_a_proposed_command_works(where, template, tmp_path, monkeypatch):
         "INPUT": "boxes.txt",
         "HOMOGRAPHY": "plane.txt",
         "LOG": f"./{NAME}",
+        "FILE": "known.onnx",
     }
     for line in dict.fromkeys(lines):
         words = [given.get(word, word) for word in words_of(line)]

@@ -33,8 +33,8 @@ def detect(
     log : path
         The log.
     detector : str or Transform, optional
-        "knn" (the default), "median", "mog2" or "frame-difference", the name of an installed detector, "module:Class",
-        or a transform.
+        "knn" (the default), "median", "mog2", "frame-difference", "onnx:FILE", "yolox-nano" or another name that
+        `models` lists, the name of an installed detector, "module:Class", or a transform.
     topic : str, optional
         Read this channel instead of the usual one, /camera/video.
     to : str, optional

@@ -18,6 +18,7 @@ from mcaptrack.cli.evaluate import evaluate
 from mcaptrack.cli.events import events
 from mcaptrack.cli.files import check, drop, recover
 from mcaptrack.cli.ingest import ingest
+from mcaptrack.cli.models import models
 from mcaptrack.cli.query import query
 from mcaptrack.cli.render import render
 from mcaptrack.cli.report import report
@@ -63,6 +64,7 @@ register(app, _MAKE, "ingest", ingest)
 register(app, _MAKE, "demo", demo)
 add_stages(app, _RUN)
 register(app, _RUN, "events", events)
+register(app, _RUN, "models", models)
 register(app, _LOOK, "info", info, reads=True)
 register(app, _LOOK, "view", view, reads=True)
 register(app, _LOOK, "render", render)

@@ -16,6 +16,8 @@ RUNNING: Final[ContextVar[Any]] = ContextVar("running", default=None)
 _CALL: Final = re.compile(r"`mcaptrack\.(\w+)\(([^`]*)\)`")
 #: Functions that are a command with an option, by name.
 _WITH_OPTION: Final = {"list_tables": ("query", "--tables")}
+#: Functions that are an action of a command, by name.
+_ACTIONS: Final = {"get_model": ("models", "get")}
 _PARAMETER: Final = re.compile(r"`([a-z]\w*)=([^`]*)`")
 
 
@@ -35,10 +37,10 @@ def _command(found: re.Match[str]) -> str:
         return found[0]
     words: list[str | Path] = [Path(value) if value.startswith("-") else value for value in values]
     for parameter, value in options.items():
-        flag = flag_of(parameter, value, name)
+        flag = flag_of(parameter, value, _ACTIONS.get(name, (name,))[0])
         words += [flag] if isinstance(value, bool) else [flag, str(value)]
     name, *more = _WITH_OPTION.get(name, (name,))
-    return command(name, *words, *more)
+    return command(*_ACTIONS.get(name, (name,)), *words, *more)
 
 
 def _option(found: re.Match[str]) -> str:

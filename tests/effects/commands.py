@@ -192,6 +192,11 @@ CASES: dict[str, dict[str, Case]] = {
         force=("drop a.mcap /camera/retracks -o fresh.mcap", "--force"),
     ),
     "demo": common("demo", output="-o b", force=("demo -o taken", "--force"), scene="--scene crowd", seed="--seed 3"),
+    "models": common(
+        "models",
+        quiet=("models get yolox-nano --from known.onnx", "-q"),
+        **{"from": ("models get yolox-nano", "--from known.onnx")},
+    ),
     "docs": common("docs", output="-o pages.txt", force=("docs -o clip.mp4", "--force")),
 }
 

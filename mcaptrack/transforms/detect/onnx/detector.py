@@ -34,7 +34,7 @@ from mcaptrack.transforms.protocol import Colour, ModelCard, check_options, opti
 LayoutChoice = Literal["auto", "yolox", "yolox-legacy", "nanodet", "rtdetr", "dfine", "rfdetr", "ultralytics"]
 
 #: Headings of options.
-_NETWORK: Final = "The network"
+NETWORK: Final = "The network"
 _BOXES: Final = "What is detected"
 #: The size of the input follows that of the picture.
 _AS_PICTURE: Final = "picture"
@@ -60,23 +60,23 @@ class OnnxDetector:
     []
     """
 
-    file: str = option("", "ONNX file of the network; `onnx:FILE` names it, too", theme=_NETWORK)
+    file: str = option("", "ONNX file of the network; `onnx:FILE` names it, too", theme=NETWORK)
     layout: LayoutChoice = option(
         "auto",
         "family of the network, which says what it takes and gives; `auto` tells it by names, shapes and a trial",
-        theme=_NETWORK,
+        theme=NETWORK,
     )
     input_size: str = option(
         "",
         "width and height of the network's input, as in 960x736, or `picture` for about those of the picture; "
         "otherwise the network's own",
-        theme=_NETWORK,
+        theme=NETWORK,
     )
     device: Device = option(
-        "auto", "where the network runs; `auto` takes a GPU if ONNX Runtime can use one", theme=_NETWORK
+        "auto", "where the network runs; `auto` takes a GPU if ONNX Runtime can use one", theme=NETWORK
     )
     max_memory_mb: int = option(
-        1000, "most memory that the network may take, in MB", least=10, most=1_000_000, theme=_NETWORK
+        1000, "most memory that the network may take, in MB", least=10, most=1_000_000, theme=NETWORK
     )
     tiles: str = option(
         "1x1", "columns and rows of tiles that each picture is cut into, as in 3x2, for small objects", theme=_BOXES

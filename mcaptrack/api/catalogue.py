@@ -1,0 +1,150 @@
+"""The catalogue of detectors whose weights can be fetched."""
+
+from __future__ import annotations
+
+import logging
+import re
+from pathlib import Path
+from typing import Any
+
+from mcaptrack.api.common import PathLike
+from mcaptrack.errors import McaptrackError, call
+from mcaptrack.files import publish_bytes
+from mcaptrack.transforms.detect.onnx import catalogue
+from mcaptrack.transforms.detect.onnx.catalogue import Model
+
+__all__ = ["Model", "get_model", "models"]
+
+#: How long to wait for a connection, and for the next bytes, in seconds.
+_WAIT_S = (10, 60)
+
+
+def models(name: str | None = None) -> tuple[Model, ...]:
+    """List the detectors whose weights can be fetched.
+
+    Parameters
+    ----------
+    name : str, optional
+        List this one only.
+
+    Returns
+    -------
+    tuple of Model
+        With licence, size, origin and what each is good for.
+
+    Raises
+    ------
+    McaptrackError
+        If there is none of that name.
+
+    Examples
+    --------
+    >>> import mcaptrack
+    >>> [model.name for model in mcaptrack.models()]
+    ['yolox-nano', 'yolox-tiny', 'yolox-s']
+    """
+    return (catalogue.find(name),) if name else tuple(catalogue.CATALOGUE.values())
+
+
+def get_model(name: str, *, source: PathLike | None = None) -> Path:
+    """Fetch the weights of a detector of the catalogue, once, into the user's folder of caches.
+
+    Only a file with the known digest is taken. The environment variable ``MCAPTRACK_MODELS`` names another folder.
+
+    Parameters
+    ----------
+    name : str
+        Name of the model, as `models` lists it.
+    source : path or str, optional
+        Take the weights from this file, or from this http(s) address, instead of the known ones.
+
+    Returns
+    -------
+    pathlib.Path
+        The file.
+
+    Raises
+    ------
+    McaptrackError
+        If there is no such model, or if its file can't be fetched or is another one.
+
+    Examples
+    --------
+    >>> import mcaptrack
+    >>> try:
+    ...     mcaptrack.get_model("yolox-nano", source="log.mcap")
+    ... except mcaptrack.McaptrackError as error:
+    ...     print(str(error)[:38])
+    log.mcap is not the file of yolox-nano
+    """
+    model = catalogue.find(name)
+    text = "" if source is None else str(source)
+    if text and not text.startswith(("http://", "https://")):
+        path = Path(text)
+        try:
+            data = path.read_bytes()
+        except OSError as error:
+            raise McaptrackError(f"{path} can't be read: {error.strerror}") from None
+        catalogue.check(model, data, path)
+        _make_folder(model)
+        publish_bytes(model.path, data)
+        return model.path
+    if not text and model.path.is_file():
+        return catalogue.stored(model)
+    _make_folder(model)
+    failures = []
+    for url in (text,) if text else model.urls:
+        try:
+            return _fetch(model, url)
+        except McaptrackError as error:
+            failures.append(str(error))
+    by_hand = call("get_model", name, source="FILE")
+    raise McaptrackError(
+        f"{name} can't be fetched: {'; '.join(failures)}. Get its file from {model.source} on another machine, and "
+        f"hand it over with {by_hand}"
+    )
+
+
+def _make_folder(model: Model) -> None:
+    try:
+        model.path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise McaptrackError(f"{model.path.parent} can't be made: {error.strerror}") from None
+
+
+def _fetch(model: Model, url: str) -> Path:
+    """Fetch a file that has to have the known digest. Raises McaptrackError if that fails."""
+    try:
+        import pooch
+        import requests
+    except ImportError:
+        raise McaptrackError(
+            "fetching needs pooch, which is not installed; `pip install 'mcaptrack[onnx]'` installs it"
+        ) from None
+
+    def download(address: str, output: Any, _: Any) -> None:
+        """Save what an address gives, as far as the file may be long."""
+        with requests.get(address, stream=True, timeout=_WAIT_S) as response, Path(output).open("wb") as file:
+            response.raise_for_status()
+            for chunk in response.iter_content(1 << 16):
+                file.write(chunk)
+                if file.tell() > model.size_bytes:
+                    raise McaptrackError(f"{url} gives more than the {model.size_bytes:,} bytes of {model.name}")
+
+    pooch.get_logger().setLevel(logging.ERROR)
+    known = f"sha256:{model.sha256}"
+    try:
+        return Path(pooch.retrieve(url, known, fname=model.path.name, path=model.path.parent, downloader=download))
+    except requests.RequestException as error:
+        raise McaptrackError(f"{url}: {_reason(error)}") from None
+    except ValueError:  # of pooch: another digest
+        raise McaptrackError(f"{url} gives another file than that of {model.name} (SHA-256)") from None
+    except OSError as error:
+        raise McaptrackError(f"{model.path} can't be written: {error.strerror or error}") from None
+
+
+def _reason(error: Any) -> str:
+    if error.response is not None:
+        return f"HTTP status {error.response.status_code}"
+    why = re.search(r"\[Errno -?\d+\] ([\w ]+)", str(error))
+    return why[1] if why else re.sub(r"(?<=[a-z])(?=[A-Z])", " ", type(error).__name__).lower()

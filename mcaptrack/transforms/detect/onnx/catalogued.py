@@ -1,0 +1,81 @@
+"""The detectors of the catalogue, each with the settings that suit it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+from mcaptrack.errors import McaptrackError
+from mcaptrack.transforms.detect.onnx.catalogue import check, find, stored
+from mcaptrack.transforms.detect.onnx.detector import NETWORK, LayoutChoice, OnnxDetector
+from mcaptrack.transforms.protocol import option
+
+
+@dataclass(frozen=True, kw_only=True)
+class CataloguedDetector(OnnxDetector):
+    """What the detectors of the catalogue share: YOLOX, with an input of about the size of the picture."""
+
+    layout: LayoutChoice = option("yolox", "family of the network", theme=NETWORK)
+    input_size: str = option(
+        "picture",
+        "width and height of the network's input, as in 416x416, or `picture` for about those of the picture",
+        theme=NETWORK,
+    )
+
+    #: Its name in the catalogue.
+    model: ClassVar[str]
+
+    def weights(self) -> Path:
+        """The file of the network. Raises McaptrackError if it was not fetched, or is another one."""
+        known = find(self.model)
+        if not self.file:
+            return stored(known)
+        path = super().weights()
+        try:
+            check(known, path.read_bytes(), path)
+        except OSError as error:
+            raise McaptrackError(f"{path} can't be read: {error.strerror}") from None
+        return path
+
+    def weights_sha256(self) -> str:
+        """The digest of the network's file."""
+        return find(self.model).sha256
+
+
+@dataclass(frozen=True, kw_only=True)
+class YoloxNano(CataloguedDetector):
+    """With `--detector yolox-nano` a small network finds people and other objects in each picture.
+
+    Reads video, writes detections. `mcaptrack models get yolox-nano` fetches its weights once.
+
+    References
+    ----------
+    .. [1] Z. Ge, S. Liu, F. Wang, Z. Li, J. Sun: YOLOX: Exceeding YOLO Series in 2021. arXiv:2107.08430.
+    """
+
+    model: ClassVar[str] = "yolox-nano"
+
+
+@dataclass(frozen=True, kw_only=True)
+class YoloxTiny(CataloguedDetector):
+    """With `--detector yolox-tiny` a larger network does the same more slowly.
+
+    References
+    ----------
+    .. [1] Z. Ge, S. Liu, F. Wang, Z. Li, J. Sun: YOLOX: Exceeding YOLO Series in 2021. arXiv:2107.08430.
+    """
+
+    model: ClassVar[str] = "yolox-tiny"
+
+
+@dataclass(frozen=True, kw_only=True)
+class YoloxS(CataloguedDetector):
+    """With `--detector yolox-s` a network for GPUs does the same.
+
+    References
+    ----------
+    .. [1] Z. Ge, S. Liu, F. Wang, Z. Li, J. Sun: YOLOX: Exceeding YOLO Series in 2021. arXiv:2107.08430.
+    """
+
+    model: ClassVar[str] = "yolox-s"

@@ -1,0 +1,69 @@
+"""A catalogue with one small network, and a server that has its file."""
+
+from __future__ import annotations
+
+import hashlib
+import threading
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+from mcaptrack.transforms.detect.onnx import catalogue
+from mcaptrack.transforms.detect.onnx.catalogue import Model
+from tests.onnx_graphs import detector
+
+DATA = detector("yolox")
+NAME = "yolox-nano"
+
+
+class Handler(BaseHTTPRequestHandler):
+    """Gives the network, or what is wrong, by the name of the file."""
+
+    def do_GET(self) -> None:  # the name that the server calls
+        status, data, length = {
+            "/network.onnx": (200, DATA, len(DATA)),
+            "/other.onnx": (200, DATA[:-1] + b"x", len(DATA)),
+            "/short.onnx": (200, DATA[:100], 100),
+            "/broken.onnx": (200, DATA[:100], len(DATA)),
+            "/long.onnx": (200, DATA + bytes(10**6), len(DATA) + 10**6),
+            "/moved.onnx": (302, b"", 0),
+        }.get(self.path, (404, b"no such file", 12))
+        self.send_response(status)
+        self.send_header("Content-Length", str(length))
+        if status == 302:
+            self.send_header("Location", "/network.onnx")
+        self.end_headers()
+        self.wfile.write(data)
+
+    def log_message(self, *_: Any) -> None:
+        pass
+
+
+def serve() -> tuple[ThreadingHTTPServer, str]:
+    """A server, and its address."""
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+    threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
+    return server, f"http://127.0.0.1:{server.server_port}"
+
+
+def stocked(monkeypatch: Any, folder: Path, *urls: str) -> Model:
+    """Put the small network into the catalogue, its file into ``folder`` as known.onnx; an own folder for models."""
+    if not urls:
+        server, address = serve()
+        monkeypatch.callback = server.shutdown
+        urls = (f"{address}/network.onnx",)
+    model = Model(
+        name=NAME,
+        urls=urls,
+        sha256=hashlib.sha256(DATA).hexdigest(),
+        size_bytes=len(DATA),
+        licence="Apache-2.0",
+        source="https://example.org",
+        trained_on="blue blocks",
+        good_for="tests",
+    )
+    (folder / "known.onnx").write_bytes(DATA)
+    monkeypatch.setattr(catalogue, "CATALOGUE", MappingProxyType({NAME: model}))
+    monkeypatch.setenv("MCAPTRACK_MODELS", str(folder / "models"))
+    return model
