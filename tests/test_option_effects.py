@@ -76,7 +76,7 @@ def test_ranges_quantities_are_not_negative_and_shares_are_within_0_and_1(kind):
         name, hint = option.name, get_type_hints(kind)[option.name]
         if option.metadata.get("context") or bare_type(hint) not in (int, float):
             continue
-        is_share = name in SHARES or (kind is OnnxDetector and name == "min_score")
+        is_share = name in SHARES or (issubclass(kind, OnnxDetector) and name == "min_score")
         usual = (0.0, 1.0) if is_share else (-np.inf, np.inf) if name in ANY else (0.0, 1e6)
         assert (option.metadata["least"], option.metadata["most"]) == RANGES.get(name, usual), name
         low, high = option.metadata["search"] or (option.metadata["least"], option.metadata["most"])

@@ -27,6 +27,7 @@ NOT_RUN = {
     "minutes": "it takes minutes",
     "torch": "it needs torch, several gigabytes",
     "viewer": "it waits for a viewer",
+    "weights": "it needs weights of a network, which are fetched",
     "reference data": "it needs recordings whose licences don't let them come along",
 }
 #: Languages of blocks; text is output.
