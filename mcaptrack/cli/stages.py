@@ -86,11 +86,16 @@ def _own_doc(cls: type[Transform]) -> str:
     return "" if text.startswith(f"{cls.__name__}(") else text
 
 
+def _listed(names: Sequence[str]) -> str:
+    """Return names in words: "a, b and c"."""
+    return " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
+
+
 def _panel(theme: str, of: Sequence[str]) -> str:
     """Return the heading of an option in the help: its theme, and the transforms that have it, if not all do."""
     if not of:
         return theme
-    those = ", ".join(of[:-1]) + f" and {of[-1]}" if len(of) > 1 else f"{of[0]} alone"
+    those = _listed(of) if len(of) > 1 else f"{of[0]} alone"
     return f"{theme} ({those})" if theme else f"Options of {those}"
 
 
@@ -246,7 +251,7 @@ def _transform(
         if option in owners and option not in own and is_on_command_line(option):
             flag = "--" + option.replace("_", "-")
             chosen = name or wanted.get(stage.option) or stage.choice(stage.default())
-            raise McaptrackError(f"{flag} is an option of {' and '.join(owners[option])}, not of {chosen}")
+            raise McaptrackError(f"{flag} is an option of {_listed(owners[option])}, not of {chosen}")
     hints = get_type_hints(cls)
     values = {
         option: tuple(value) if member_type(hints[option])[1] else value

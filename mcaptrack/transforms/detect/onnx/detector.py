@@ -91,7 +91,12 @@ class OnnxDetector:
         0.1, "boxes with a lower score are left out", least=0.0, most=1.0, search=(0.05, 0.6), theme=_BOXES
     )
     max_iou: float = option(
-        0.45, "boxes of one class that overlap more are one object", least=0.0, most=1.0, search=(0.3, 0.8), theme=_BOXES
+        0.45,
+        "boxes of one class that overlap more are one object",
+        least=0.0,
+        most=1.0,
+        search=(0.3, 0.8),
+        theme=_BOXES,
     )
 
     reads: ClassVar[Schema] = VIDEO
