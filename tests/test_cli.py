@@ -19,6 +19,7 @@ from mcaptrack import __version__, log
 from mcaptrack.cli.demo import _next_commands
 from mcaptrack.schema import COUNTS, EVENTS, EventKind
 from mcaptrack.sources import synthetic
+from mcaptrack.sources.demo import read_scores
 from tests.commands import call, printed, start
 from tests.worlds import small_scene, write_clip
 
@@ -480,6 +481,18 @@ def test_the_demonstration(tmp_path, monkeypatch):
         "ground_plane.txt",
         "truth.txt",
     ]
+    compared, seeds, files, more = (part.splitlines() for part in shown.split("\n\n"))
+    assert compared[0].split() == ["within", "1", "m,", "2.5", "Hz", "SORT", "re-tracked"]
+    assert (len(compared), seeds[0].partition(":")[0]) == (7, "This is scene square, seed 2")
+    assert [line.split()[0] for line in seeds[1:]] == list(read_scores()["scenes"])
+    assert len({len(line) for line in compared}) == 1
+    assert files == [
+        f"video    {folder / 'demo.mp4'}",
+        f"log      {folder / 'demo.mcap'}",
+        f"layouts  {'  '.join(f'{folder}/demo{end}.layout.json' for end in ('', '.comparing', '.predictions'))}",
+        f"tables   {folder / 'demo.tables'}",
+    ]
+    assert (more[0].split()[0], more[1], len(more)) == ("Open", "See more:", 6)
     scored = json.loads(
         printed("evaluate", folder / "demo.mcap", "--similarity", "metres", "--gate-m", "1", "--json")[0]
     )

@@ -157,6 +157,25 @@ def test_a_short_interruption_does_not_split_an_event():
     ]
 
 
+@pytest.mark.parametrize(("frames", "level"), [(9, "DEBUG"), (10, "WARNING")])
+def test_what_lasts_a_whole_second_is_not_brief(frames, level):
+    truth = walk(lambda n: {4: (n / 10, 2.0)}, 80, 10)
+    missed = find_events(walk(lambda n: {1: (n / 10, 2.0)} if not 20 <= n < 20 + frames else {}, 80, 10), truth)
+    assert rows_of(missed, MISS)["duration_s"].tolist() == [pytest.approx(frames / 10)]
+    assert said(missed)[1:] == [
+        (level, f"person 4 is missed for {frames / 10} s at 2.00 s, (2.0, 2.0) m, last tracked as 1")
+    ]
+    alone = find_events(walk(lambda n: {1: (n / 10, 2.0)} if 20 <= n < 20 + frames else {}, 80, 10), None)
+    assert said(alone) == (
+        [("DEBUG", "track 1 exists for 0.9 s at 2.00 s, (2.0, 2.0) m")]
+        if frames < 10
+        else [
+            ("INFO", "track 1 begins at 2.00 s, (2.0, 2.0) m"),
+            ("INFO", "track 1 ends at 2.90 s, (2.9, 2.0) m, after 1.0 s"),
+        ]
+    )
+
+
 def test_a_switch_has_the_time_without_a_track():
     truth = walk(lambda n: {4: (n / 10, 2.0)}, 60, 10)
     tracks = walk(lambda n: {} if 20 <= n < 32 else {(7 if n < 20 else 12): (n / 10, 2.0)}, 60, 10)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import socket
+import struct
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
@@ -271,3 +272,16 @@ def test_a_log_may_be_moved_with_its_journal_and_is_then_saved_to_another_file(p
         look(moved / path.name)
     assert "belongs to another file than" in said[0].message
     assert "If it was left half written, `mcaptrack.recover(" in said[0].message
+
+
+def test_the_pieces_of_a_journal_follow_each_other_and_all_but_the_last_say_so(path):
+    """The numbers of the format: a journal is read by other versions than the one that wrote it."""
+    raw = journal_of(path).read_bytes()
+    head = struct.Struct("<QQQQQQ32s32s")
+    magic = b"mcaptrack journal 2\n"
+    assert raw.startswith(magic)
+    at, _, _, _, size, start, *_ = head.unpack_from(raw, len(magic))
+    assert at == len(magic) + head.size + 32 + size - start
+    where, length, final = struct.unpack_from("<QQQ", raw, at)
+    assert (where, final) == (start, 2**64 - 1)
+    assert 0 < length <= path.stat().st_size

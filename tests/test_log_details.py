@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import struct
+import zlib
 from importlib import import_module
 from pathlib import Path
 
@@ -274,3 +276,25 @@ def test_a_copy_that_differs_in_any_byte_is_not_taken(tmp_path, monkeypatch):
             else:
                 with pytest.raises(McaptrackError, match="does not hold what was written to it"):
                     extend_log._compare(source, copy, end)
+
+
+def test_indexes_that_list_another_number_of_messages_than_was_counted_are_noticed(tmp_path):
+    path = tmp_path / "a.mcap"
+    write_stock(path, FORTY)  # 14 messages of a, 13 of b and 13 of c
+    whole = bytearray(path.read_bytes())
+    for number, count in ((2, 14), (3, 12)):
+        at = whole.rindex(struct.pack("<HQ", number, 13))
+        whole[at : at + 10] = struct.pack("<HQ", number, count)
+    footer = len(whole) - 8 - 20
+    start = int.from_bytes(whole[footer : footer + 8], "little")
+    whole[footer + 16 : footer + 20] = zlib.crc32(whole[start : footer + 16]).to_bytes(4, "little")
+    path.write_bytes(whole)
+    with log.read(path) as opened:
+        assert len(list(opened.messages("a"))) == 14
+        for topic, number, count in (("b", 2, 14), ("c", 3, 12)):
+            with pytest.raises(
+                McaptrackError, match=f"its indexes list 13 messages of channel {number}, and there are {count}"
+            ):
+                list(opened.messages(topic))
+            for span in ((0, None), (None, 1000), (0, 1000)):
+                assert len(list(opened.messages(topic, *span))) == 13

@@ -245,3 +245,69 @@ def test_no_changed_byte_of_a_summary_goes_unnoticed(tmp_path):
         if not log.check(path).findings:
             unnoticed.append(at - start)
     assert unnoticed == []
+
+
+def summarised(path: Path, *records: bytes) -> int:
+    """Write a log with a schema, a channel and a chunk, and a summary of these records; returns where that begins."""
+    data = MAGIC + b"".join([HEADER, A, B, *WHOLE, END])
+    footer = struct.pack("<BQQQ", 0x02, 20, len(data), 0)
+    crc = zlib.crc32(b"".join(records) + footer)
+    path.write_bytes(data + b"".join(records) + footer + crc.to_bytes(4, "little") + MAGIC)
+    return len(data)
+
+
+STATISTICS = record(0x0B, struct.pack("<QHIIIIQQIHQ", 2, 1, 1, 0, 0, 1, 5, 7, 10, 2, 2))
+CHUNK_AT = len(MAGIC + HEADER + A + B)
+CHUNK_INDEX = record(
+    0x08,
+    struct.pack("<QQQQ", 5, 7, CHUNK_AT, len(WHOLE[0]))
+    + struct.pack("<IHQQ", 10, 2, CHUNK_AT + len(WHOLE[0]), len(WHOLE[1]))
+    + text("")
+    + struct.pack("<QQ", 2 * SIZE, 2 * SIZE),
+)
+OTHER_SCHEMA, OTHER_CHANNEL = schema(1, "Other"), channel(2, 1, "/b")
+
+
+@pytest.mark.parametrize(
+    ("records", "found"),
+    [
+        ([A, B, CHUNK_INDEX, STATISTICS], []),
+        ([CHUNK_INDEX, STATISTICS], []),
+        (
+            [schema(3), B, CHUNK_INDEX, STATISTICS],
+            [("summary-no-schema", "warning", "schema 1 is missing in the summary")],
+        ),
+        (
+            [A, channel(3, 1, "/b"), CHUNK_INDEX, STATISTICS],
+            [("summary-no-channel", "error", "channel 2 is missing in the summary")],
+        ),
+        (
+            [OTHER_SCHEMA, B, CHUNK_INDEX, STATISTICS],
+            [("summary-schema", "error", "schema 1 in the summary differs from that in the data section")],
+        ),
+        (
+            [A, OTHER_CHANNEL, CHUNK_INDEX, STATISTICS],
+            [("summary-channel", "error", "channel 2 in the summary differs from that in the data section")],
+        ),
+        (
+            [A, B, STATISTICS],
+            [("no-chunk-index", "warning", "the summary lists no chunks: finding a message takes a scan")],
+        ),
+        ([A, B, CHUNK_INDEX], [("no-statistics", "warning", "there are no statistics: counting takes a scan")]),
+    ],
+    ids=[
+        "whole",
+        "no schemas and channels",
+        "no schema",
+        "no channel",
+        "another schema",
+        "another channel",
+        "no chunks",
+        "no statistics",
+    ],
+)
+def test_what_a_summary_lacks_is_a_warning_where_it_costs_time_and_an_error_where_it_hides_messages(
+    records, found, tmp_path
+):
+    start = summarised(tmp_path / "a.mcap", *records)
+    assert findings(tmp_path / "a.mcap") == [(kind, start, level, words) for kind, level, words in found]

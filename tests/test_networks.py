@@ -343,6 +343,17 @@ class TestOnnx:
         assert [notice.code for notice in said] == ["extrapolated"]
         assert "predicts 1.2 s ahead; beyond it, up to 2.4 s, predictions are a straight line" in said[0].message
 
+    @pytest.mark.parametrize(("steps", "said"), [(6, 0), (7, 0), (8, 1)])
+    def test_half_a_step_beyond_its_last_one_is_still_its_own(self, tmp_path, steps, said):
+        path = tmp_path / "w.safetensors"
+        save(path, STORED["red"], CARDS["red"] | {"step_s": "1.0"})
+        with notices.collected() as heard:
+            made = make(f"red:{path}", steps, 0.5)
+        assert (made.steps, made.step_s, len(heard)) == (steps, 0.5, said)
+        if said:
+            words = f"red:{path} predicts 3 s ahead; beyond it, up to 4 s, predictions are a straight line"
+            assert heard == [notices.Notice(words, "extrapolated")]
+
     @pytest.mark.parametrize(
         "cov", [[[1, 2], [2, 1]], [[0, 0], [0, 1]], [[-1, 0], [0, 1]], [[1, 0.5], [0.2, 1]], [[1, 0], [0, np.nan]]]
     )

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import re
+import struct
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +20,7 @@ from hypothesis import strategies as st
 from mcaptrack.schema import DETECTIONS, EVENTS, PREDICTIONS, SCHEMAS, TRACKS
 from mcaptrack.schema.codec import RowCodec
 from mcaptrack.schema.proto import KINDS, parse
+from mcaptrack.schema.provenance import Plugin, Provenance, digest
 from tests.strategies import columns
 
 ALL = st.sampled_from(sorted(SCHEMAS.values(), key=lambda schema: schema.name))
@@ -260,3 +265,69 @@ def test_units_and_meaning_reach_arrow():
 def test_what_has_no_fixed_width_is_no_row_schema(text, words):
     with pytest.raises(ValueError, match=words):
         parse(text, "x.proto")
+
+
+# Provenance
+
+
+def test_provenance_of_the_first_version_names_its_class():
+    """It had `implementation` and `distribution` instead of `plugins`."""
+    before = {"transform": "track", "implementation": "own:Single", "distribution": "own pkg 1.5"}
+    plugins = {"transform": {"name": "new", "implementation": "new:It"}, "predictor": {"name": "p"}, "odd": 3}
+    old, package = Plugin("own:Single", "own:Single", "own pkg", "1.5"), {"distribution": "alone"}
+    for changed, wanted in (
+        ({}, {"transform": old}),
+        (package, {"transform": old._replace(distribution="", version="alone")}),
+        ({"distribution": ""}, {"transform": old._replace(distribution="", version="")}),
+        ({"implementation": ""}, {}),
+        ({"plugins": json.dumps(plugins)}, {"transform": Plugin("new", "new:It"), "predictor": Plugin("p", "")}),
+        ({"plugins": "[1]"}, {"transform": old}),
+    ):
+        made = Provenance.from_metadata({f"mcaptrack.{key}": value for key, value in (before | changed).items()})
+        assert made.plugins == wanted
+
+
+def test_provenance_comes_back_from_its_metadata():
+    whole = Provenance(
+        "track",
+        {"b": 1.5, "a": None},
+        "/in",
+        "d1",
+        "d2",
+        "w",
+        {"/t": "d3"},
+        {"transform": Plugin("own", "own:It", "pkg", "1")},
+        {"1": "person"},
+        {"layout": "x"},
+        [["lost", "words"]],
+        "0.0.9",
+    )
+    assert Provenance.from_metadata(whole.to_metadata()) == whole
+    least = Provenance("sample", {})
+    assert Provenance.from_metadata(least.to_metadata() | {"other": "1", "mcaptrack.later": "2"}) == replace(
+        least, warnings=[]
+    )
+    assert least.to_metadata().keys() == {"mcaptrack.transform", "mcaptrack.version", "mcaptrack.parameters"}
+    assert Provenance.from_metadata({"mcaptrack.input": "/in", "transform": "track"}) is None
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "wanted"),
+    [
+        ("warnings", '[["a", "b"], ["a"], ["a", 1], "ab", ["a", "b", "c"]]', [["a", "b"]]),
+        ("warnings", '{"a": "b"}', []),
+        ("classes", '{"1": "person", "2": 2}', {"1": "person"}),
+        ("model", '{"a": "b", "c": null}', {"a": "b"}),
+        ("references", "[" * 100_000, {}),
+        ("parameters", "[1]", {}),
+    ],
+)
+def test_what_others_wrote_as_provenance_is_read_as_far_as_it_can_be(name, text, wanted):
+    made = Provenance.from_metadata({"mcaptrack.transform": "track", f"mcaptrack.{name}": text})
+    assert getattr(made, name) == wanted
+
+
+def test_a_digest_is_of_times_numbers_and_payloads():
+    messages = [(1, 2, b"ab"), (3, 4, b"")]
+    text = b"".join(struct.pack("<QQQ", t, n, len(data)) + data for t, n, data in messages)
+    assert digest(messages) == hashlib.sha256(text).hexdigest()

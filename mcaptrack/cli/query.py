@@ -234,7 +234,8 @@ def _print_answer(answer: Any, limit: int) -> str:
     fitting = _fitting(names, rows, out.width) if sys.stdout.isatty() else len(names)
     table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False)
     for name, is_number in zip(names[:fitting], numbers, strict=False):
-        table.add_column(name, justify="right" if is_number else "left", no_wrap=not sys.stdout.isatty())
+        justify: Literal["left", "right"] = "right" if is_number else "left"
+        table.add_column(name, justify=justify, no_wrap=not sys.stdout.isatty(), overflow="fold")
     for row in rows:
         table.add_row(*(Text("null", "dim") if word is None else word for word in row[:fitting]))
     out.print(table)
