@@ -1,0 +1,802 @@
+"""Planning and writing of logs that were put together by hand: what runs and why, what is said, what is drawn."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mcaptrack import log, notices, pipeline
+from mcaptrack.errors import McaptrackError
+from mcaptrack.geometry.plane import GroundPlane
+from mcaptrack.pipeline import findings
+from mcaptrack.pipeline import write as writing
+from mcaptrack.schema import DETECTIONS, FORECAST_SCORES, GROUND_PLANE, PREDICTIONS, TRACKS, Frame, Schema
+from mcaptrack.schema.ground_plane import plane_to_rows
+from mcaptrack.schema.provenance import CLOCK, INGEST, VIEW, Provenance, digest
+from mcaptrack.transforms import STAGES, OcSort, Predict, Retrack, Sample, Sort, Transform
+from tests.worlds import boxes_at, ns, tracks_at, walk
+
+PLANE = GroundPlane((0.1, 0, 0, 0, 0.1, 0, 0, 0, 1), 640, 480)
+Channels = Mapping[str, tuple[Schema, Provenance | None, Sequence[Frame]]]
+
+
+def written(path: Path, channels: Channels, clock: str = "") -> Path:
+    """A log of these channels, each with how it was made, and its frames."""
+    with log.create(path) as writer:
+        for topic, (schema, made, frames) in channels.items():
+            metadata = made.to_metadata() if made else {}
+            number = writer.add_channel(topic, (schema.name, "protobuf", schema.descriptor), "protobuf", metadata)
+            for frame in frames:
+                writer.add_message(number, frame.t_ns, frame.index, schema.codec.encode(frame.rows))
+        if clock:
+            writer.add_metadata(CLOCK, {"start_ns": clock})
+    return path
+
+
+def parameters_of(stage: str, transform: Transform) -> dict[str, Any]:
+    kind = STAGES[stage].kind
+    choice = {kind: STAGES[stage].entry(type(transform)).name} if kind else {}
+    kept: dict[str, Any] = json.loads(json.dumps(asdict(transform) | choice))
+    return kept
+
+
+def made_by(stage: str, transform: Transform, source: str, said: str, own: str) -> Provenance:
+    return Provenance(stage, parameters_of(stage, transform), f"/camera/{source}", said, own)
+
+
+def finished(**changed: Any) -> dict[str, tuple[Schema, Provenance | None, Sequence[Frame]]]:
+    """A camera with boxes that were ingested, after all stages; ``changed`` are other values of a provenance."""
+    making = {
+        "detections": (DETECTIONS, Provenance(INGEST, {}, "", "", "d")),
+        "tracks": (TRACKS, made_by("track", Sort(), "detections", "d", "t")),
+        "samples": (TRACKS, made_by("sample", Sample(), "tracks", "t", "s")),
+        "predictions": (PREDICTIONS, made_by("predict", Predict(), "samples", "s", "p")),
+        "retracks": (TRACKS, made_by("retrack", Retrack(), "samples", "s", "r")),
+        "retracks/online": (TRACKS, made_by("retrack", Retrack(), "samples", "s", "o")),
+        "retracks/predictions": (PREDICTIONS, made_by("retrack", Retrack(), "samples", "s", "q")),
+        "retracks/full": (TRACKS, made_by("retrack", Retrack(), "samples", "s", "f")),
+    }
+    return {
+        f"/camera/{name}": (schema, replace(made, **changed.get(name, {})), [Frame(ns(1), 0, schema.empty())])
+        for name, (schema, made) in making.items()
+    }
+
+
+def planned(
+    path: Path, channels: Channels, **options: Any
+) -> tuple[list[pipeline.Job], list[str], list[tuple[str, str]]]:
+    """The jobs that everything takes, what is said of them, and warnings with their codes."""
+    said: list[str] = []
+    with log.read(written(path, channels)) as opened, notices.listening(lambda _: None), notices.collected() as warned:
+        jobs = pipeline.plan_all(opened, "/camera", said.append, **options)
+    return jobs, said, [(one.message, one.code) for one in warned]
+
+
+def stages_of(jobs: Iterable[pipeline.Job]) -> list[str]:
+    return [job.stage for job in jobs]
+
+
+EARLIER = "/camera/{} was made from an earlier /camera/{}: running {} again, as before".format
+#: What differs, the options of the plan, the stages that run, what is said, and what is warned of.
+PLANS: dict[str, tuple[dict[str, Any], dict[str, Any], list[str], list[str], list[tuple[str, str]]]] = {
+    "nothing": ({}, {}, [], [], []),
+    "other boxes": (
+        {"detections": {"digest": "D"}},
+        {},
+        ["track", "sample", "predict", "retrack"],
+        [
+            EARLIER("tracks", "detections", "track"),
+            EARLIER("samples", "tracks", "sample"),
+            EARLIER("predictions", "samples", "predict"),
+            EARLIER("retracks", "samples", "retrack"),
+        ],
+        [],
+    ),
+    "other samples": (
+        {"samples": {"digest": "S"}},
+        {},
+        ["predict", "retrack"],
+        [EARLIER("predictions", "samples", "predict"), EARLIER("retracks", "samples", "retrack")],
+        [],
+    ),
+    "anew": ({}, {"anew": True}, ["track", "sample", "predict", "retrack"], [], []),
+    "anew, though due": (
+        {"detections": {"digest": "D"}},
+        {"anew": True},
+        ["track", "sample", "predict", "retrack"],
+        [],
+        [],
+    ),
+    "another tracker, chosen": (
+        {},
+        {"defaults": {"track": OcSort()}, "chosen": ("tracker",)},
+        ["track", "sample", "predict", "retrack"],
+        [
+            "/camera/tracks was made by another tracker: running track again",
+            EARLIER("samples", "tracks", "sample"),
+            EARLIER("predictions", "samples", "predict"),
+            EARLIER("retracks", "samples", "retrack"),
+        ],
+        [],
+    ),
+    "another predictor, chosen": (
+        {},
+        {"defaults": {"predict": Predict(predictor="kalman")}, "chosen": ("predictor",)},
+        ["predict"],
+        ["/camera/predictions was made by another predictor: running predict again"],
+        [],
+    ),
+    "the same tracker, chosen": ({}, {"defaults": {"track": Sort()}, "chosen": ("tracker",)}, [], [], []),
+    "another tracker, not chosen": (
+        {},
+        {"defaults": {"track": OcSort()}, "chosen": ("detector",)},
+        [],
+        [],
+        [("/camera/tracks was made with other settings than now (OcSort, not Sort); {force} takes these", "other-settings")],
+    ),
+    "one other setting": (
+        {},
+        {"defaults": {"track": Sort(max_age_s=2.0)}},
+        [],
+        [],
+        [("/camera/tracks was made with other settings than now (max_age_s 2.0, not 1.4); {force} takes these", "other-settings")],
+    ),
+    "three other settings": (
+        {},
+        {"defaults": {"track": Sort(max_age_s=2.0, min_hits_s=0.5, min_iou=0.25)}},
+        [],
+        [],
+        [("/camera/tracks was made with other settings than now (max_age_s 2.0, not 1.4; min_hits_s 0.5, not 0.3; min_iou 0.25, not 0.2); {force} takes these", "other-settings")],
+    ),
+    "five other settings, said once": (
+        {},
+        {"defaults": {"retrack": Retrack(min_history=3, drift_ratio=0.5, link_s=1.0, smooth=False, max_age_s=1.0)}},
+        [],
+        [],
+        [("/camera/retracks was made with other settings than now (min_history 3, not 2; drift_ratio 0.5, not 0.08; max_age_s 1.0, not 2.0; and 2 more); {force} takes these", "other-settings")],
+    ),
+    "other settings, where it runs as before": (
+        {"detections": {"digest": "D"}},
+        {"defaults": {"sample": Sample(max_gap_s=3.0)}},
+        ["track", "sample", "predict", "retrack"],
+        [
+            EARLIER("tracks", "detections", "track"),
+            EARLIER("samples", "tracks", "sample"),
+            EARLIER("predictions", "samples", "predict"),
+            EARLIER("retracks", "samples", "retrack"),
+        ],
+        [("/camera/samples was made with other settings than now (max_gap_s 3.0, not 2.0); {force} takes these", "other-settings")],
+    ),
+    "a parameter that is gone": (
+        {"predictions": {"parameters": {"strange": 1, "more": 2}}, "samples": {"digest": "S"}},
+        {},
+        ["retrack"],
+        [EARLIER("retracks", "samples", "retrack")],
+        [("/camera/predictions is out of date and stays as it is: it was made with more, strange, which Predict does not have", "out-of-date")],
+    ),
+    "a parameter that is gone, and anew": (
+        {"tracks": {"parameters": {"strange": 1}}},
+        {"anew": True},
+        ["sample", "predict", "retrack"],
+        [],
+        [("/camera/tracks is not made again, it stays as it is: it was made with strange, which Sort does not have", "left-out")],
+    ),
+    "a parameter that is gone, and another setting": (
+        {"predictions": {"parameters": {"strange": 1}}},
+        {"defaults": {"predict": Predict()}},
+        [],
+        [],
+        [("/camera/predictions was made with other settings than now (it was made with strange, which Predict does not have); {force} takes these", "other-settings")],
+    ),
+    "compared with something that is gone": (
+        {"predictions": {"references": {"/camera/truth": "x"}}},
+        {},
+        ["predict"],
+        [EARLIER("predictions", "samples", "predict")],
+        [],
+    ),
+    "compared with nothing, as now": ({"predictions": {"references": {"/camera/truth": ""}}}, {}, [], [], []),
+    "compared with something else": (
+        {"predictions": {"references": {"/camera/tracks": "T"}}},
+        {},
+        ["predict"],
+        [EARLIER("predictions", "samples", "predict")],
+        [],
+    ),
+    "a plane that is gone": (
+        {"tracks": {"parameters": parameters_of("track", Sort(ground_planes=((0, PLANE),)))}},
+        {},
+        ["track", "sample", "predict", "retrack"],
+        [
+            EARLIER("tracks", "detections", "track"),
+            EARLIER("samples", "tracks", "sample"),
+            EARLIER("predictions", "samples", "predict"),
+            EARLIER("retracks", "samples", "retrack"),
+        ],
+        [],
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("changed", "options", "stages", "said", "warned"), PLANS.values(), ids=PLANS)
+def test_what_runs_why_and_what_is_said_of_it(changed, options, stages, said, warned, tmp_path):
+    path = tmp_path / "a.mcap"
+    force = f"`mcaptrack.run('{path}', force=True)`"
+    found = planned(path, finished(**changed), **options)
+    assert (stages_of(found[0]), found[1]) == (stages, said)
+    assert found[2] == [(message.replace("{force}", force), code) for message, code in warned]
+
+
+def test_a_stage_runs_with_what_is_asked_or_else_as_before(tmp_path):
+    before, now = Sort(max_age_s=0.5), Sort(max_age_s=2.5)
+    channels = finished(tracks={"parameters": parameters_of("track", before), "input_digest": "other"})
+    (first, *_), *_ = planned(tmp_path / "a.mcap", channels, defaults={"track": now})
+    assert first.transform == before
+    (first, *_), *_ = planned(tmp_path / "b.mcap", channels, defaults={"track": now}, anew=True)
+    assert first.transform == now
+    (first, *_), *_ = planned(tmp_path / "c.mcap", channels, anew=True)
+    assert first.transform == before
+    del channels["/camera/tracks"]
+    (first, *_), said, _ = planned(tmp_path / "d.mcap", channels, defaults={"track": now})
+    assert (first.transform, said[0]) == (now, "/camera/tracks is missing: running track")
+
+
+def test_another_input_is_taken_and_said(tmp_path):
+    channels = finished() | {
+        "/camera/others": (DETECTIONS, Provenance(INGEST, {}, "", "", "o"), [Frame(0, 0, DETECTIONS.empty())])
+    }
+    jobs, said, _ = planned(tmp_path / "a.mcap", channels, source="/camera/others")
+    assert [(job.stage, job.source, job.target) for job in jobs][0] == ("track", "/camera/others", "/camera/tracks")
+    assert said[0] == "/camera/tracks was made from /camera/detections: running track again, from /camera/others"
+    assert planned(tmp_path / "b.mcap", channels, source="/camera/detections")[:2] == ([], [])
+    with pytest.raises(McaptrackError) as error:
+        planned(tmp_path / "c.mcap", channels, source="/camera/samples")
+    assert re.match(r".*c\.mcap: /camera/samples holds mcaptrack\.Tracks; run begins with one of ", str(error.value))
+
+
+def test_only_outputs_that_are_there_are_made_again(tmp_path):
+    channels = finished(samples={"digest": "S"})
+    for gone, keep in (((), None), (("online",), ("", "predictions")), (("online", "predictions"), ("",))):
+        left = {topic: one for topic, one in channels.items() if topic.rpartition("retracks/")[2] not in gone}
+        jobs, *_ = planned(tmp_path / "a.mcap", left)
+        assert jobs[-1].keep == keep
+        assert jobs[-1].kept() == {f"/camera/retracks/{one}".rstrip("/") for one in keep or Retrack().writes} | {
+            "/camera/retracks/full"
+        }
+
+
+def test_an_output_that_is_missing_is_made_as_the_others_beside_it(tmp_path):
+    retrack = Retrack(link_s=7.0)
+    channels = finished(
+        **{f"retracks{end}": {"parameters": parameters_of("retrack", retrack)} for end in ("", "/full", "/predictions")}
+    )
+    del channels["/camera/retracks/online"]
+    said: list[str] = []
+    with log.read(written(tmp_path / "a.mcap", channels)) as opened:
+        jobs = pipeline.plan_stage(
+            opened, "/camera", "predict", Predict(), "/camera/retracks/online", "/camera/more", say=said.append
+        )
+    assert [(job.stage, job.source, job.target) for job in jobs] == [
+        ("retrack", "/camera/samples", "/camera/retracks"),
+        ("predict", "/camera/retracks/online", "/camera/more"),
+    ]
+    assert (jobs[0].transform, jobs[0].keep) == (retrack, None)
+    assert said == ["/camera/retracks/online is missing: running retrack, as for what it made beside it"]
+
+
+def test_channels_made_from_what_was_replaced_are_stale(tmp_path):
+    channels = finished() | {
+        "/camera/tracks/events": (
+            TRACKS,
+            Provenance("events", {}, "/camera/tracks", "t", references={"/camera/truth": "u"}),
+            [],
+        ),
+        "/camera/tracks/view/image": (TRACKS, Provenance(VIEW, {}, "/camera/tracks", "t"), []),
+    }
+    with log.read(written(tmp_path / "a.mcap", channels)) as opened:
+        assert pipeline.outdated_by(opened, {"/camera/tracks": "t"}) == []
+        assert pipeline.outdated_by(opened, {"/camera/tracks": "T"}) == ["/camera/samples", "/camera/tracks/events"]
+        assert pipeline.outdated_by(opened, {"/camera/tracks": "T", "/camera/samples": "s"}) == [
+            "/camera/tracks/events"
+        ]
+        assert pipeline.outdated_by(opened, {"/camera/truth": "U"}) == ["/camera/tracks/events"]
+        assert pipeline.outdated_by(opened, {"/camera/detections": "D"}) == ["/camera/tracks"]
+
+
+# What a stage knows of the log
+
+
+def paced(rate_hz: float, count: int = 9) -> list[Frame]:
+    return walk(lambda n: {1: (n * 0.1, 0.0)}, count, rate_hz)
+
+
+@pytest.mark.parametrize(("rate_hz", "is_said"), [(2.5, False), (5.0, False), (6.25, True)])
+def test_the_rate_of_other_inputs_is_known_and_a_high_one_is_said(tmp_path, rate_hz, is_said):
+    ingested = Provenance(INGEST, {}, digest="x")
+    channels = {
+        "/camera/tracks": (TRACKS, ingested, paced(rate_hz)),
+        "/camera/samples": (TRACKS, ingested, paced(rate_hz)),
+    }
+    words = (
+        "/camera/tracks has 6.25 frames a second, and retrack takes steps at that rate; /camera/samples has 2.5 unless it "
+        "was made otherwise"
+    )
+    with log.read(written(tmp_path / "a.mcap", channels)) as opened:
+        for source in ("/camera/tracks", None):
+            with notices.listening(lambda _: None), notices.collected() as said:
+                frames, known = pipeline.input_of(opened, "/camera", "retrack", Retrack(), source)
+            assert known == {"rate_hz": rate_hz, "ground_planes": (), "poor_scale": False}
+            assert [frame.t_ns for frame in frames] == [frame.t_ns for frame in paced(rate_hz)]
+            assert [(one.message, one.code) for one in said] == [(words, "clock")] * (is_said and source is not None)
+
+
+def test_frames_that_share_a_time_have_no_part_in_the_rate(tmp_path):
+    at = [0.0, 0.0, 0.4, 0.4, 0.4, 0.8]
+    frames = [Frame(ns(t), n, tracks_at({1: (t, 0.0)})) for n, t in enumerate(at)]
+    path = written(tmp_path / "a.mcap", {"/camera/samples": (TRACKS, Provenance(INGEST, {}), frames)})
+    with log.read(path) as opened:
+        assert pipeline.input_of(opened, "/camera", "predict", Predict())[1]["rate_hz"] == 2.5
+    path = written(tmp_path / "b.mcap", {"/camera/samples": (TRACKS, Provenance(INGEST, {}), frames[:2])})
+    with log.read(path) as opened:
+        assert pipeline.input_of(opened, "/camera", "predict", Predict(rate_hz=4.0))[1]["rate_hz"] == 4.0
+
+
+@pytest.mark.parametrize(("clock", "start_ns"), [("70", 70), ("0", 0), ("", None), ("soon", None)])
+def test_the_clock_begins_as_the_log_says(tmp_path, clock, start_ns):
+    channels = {"/camera/tracks": (TRACKS, Provenance(INGEST, {}), paced(10.0))}
+    with log.read(written(tmp_path / "a.mcap", channels, clock)) as opened:
+        known = pipeline.input_of(opened, "/camera", "sample", Sample())[1]
+    assert known == {"start_ns": start_ns, "ground_planes": ()}
+
+
+def plane_at(t_ns: int, plane: GroundPlane = PLANE) -> Frame:
+    return Frame(t_ns, 0, plane_to_rows(plane))
+
+
+def test_planes_are_known_with_their_times_and_a_guessed_one_is_doubted(tmp_path):
+    for assumed in (False, True):
+        plane = replace(PLANE, assumed=assumed)
+        channels = {
+            "/camera/samples": (TRACKS, Provenance(INGEST, {}), paced(2.5)),
+            "/camera/ground_plane": (
+                GROUND_PLANE,
+                Provenance("assume-ground-plane", {}),
+                [plane_at(5, plane), plane_at(9, plane)],
+            ),
+        }
+        with log.read(written(tmp_path / "a.mcap", channels)) as opened:
+            assert pipeline.read_planes(opened, "/camera") == [(5, plane), (9, plane)]
+            known = pipeline.input_of(opened, "/camera", "retrack", Retrack())[1]
+        assert known["ground_planes"] == ((5, plane), (9, plane))
+
+
+def test_what_stages_made_is_counted_and_progress_is_told(tmp_path):
+    frames = walk(lambda n: {1: (n * 0.1, 0.0), 2: (n * 0.1, 3.0)} if n > 1 else {1: (n * 0.1, 0.0)}, 30, 10.0)
+    path = written(tmp_path / "a.mcap", {"/camera/tracks": (TRACKS, Provenance(INGEST, {}, digest="x"), frames)})
+    told: list[tuple[str, int, int]] = []
+    with log.read(path) as opened:
+        jobs = pipeline.plan_stage(opened, "/camera", "sample", Sample())
+        report = pipeline.run(opened, "/camera", jobs, progress=lambda *some: told.append(some))
+    with log.read(path) as opened:
+        samples = opened.frames("/camera/samples", TRACKS)
+    assert told == [("sample", n + 1, 30) for n in range(30)]
+    assert (report.stages, report.frames) == (["sample"], {"/camera/samples": len(samples)})
+    assert report.rows == {"/camera/samples": sum(len(frame.rows) for frame in samples)}
+    assert report.tracks == {"/camera/samples": 2}
+    assert report.stale == []
+
+
+def test_re_tracked_people_are_carried_to_the_rate_of_the_tracks_they_come_from(tmp_path):
+    tracks = walk(lambda n: {1: (n * 0.05, 0.0), 2: (n * 0.05, 6.0)}, 60, 10.0)
+    ingested = Provenance(INGEST, {}, digest="x")
+    with log.read(written(tmp_path / "a.mcap", {"/camera/tracks": (TRACKS, ingested, tracks)})) as opened:
+        pipeline.run(opened, "/camera", pipeline.plan_all(opened, "/camera"))
+    with log.read(tmp_path / "a.mcap") as opened:
+        assert [f.t_ns for f in opened.frames("/camera/retracks/full", TRACKS)] == [f.t_ns for f in tracks]
+        samples = opened.frames("/camera/samples", TRACKS)
+        made = Provenance.from_metadata(opened.channel("/camera/samples").metadata)
+    for how, is_known in ((made, True), (ingested, False)):  # samples that stand, and others of unknown tracks
+        there = {"/camera/samples": (TRACKS, how, samples), "/camera/tracks": (TRACKS, ingested, tracks)}
+        with log.read(written(tmp_path / "b.mcap", there)) as opened:
+            pipeline.run(opened, "/camera", pipeline.plan_stage(opened, "/camera", "retrack", Retrack()))
+        with log.read(tmp_path / "b.mcap") as opened:
+            assert ("/camera/retracks/full" in opened.channels) is is_known
+
+
+# What is odd
+
+
+def test_what_was_odd_when_a_channel_was_made_is_said_for_what_runs_and_what_it_was_made_from(tmp_path):
+    odd = {
+        name: {"warnings": [("clock", f"odd {name}")]}
+        for name in ("detections", "tracks", "samples", "predictions", "retracks")
+    }
+    with log.read(written(tmp_path / "a.mcap", finished(**odd))) as opened:
+
+        def said(made: dict[str, Provenance], is_all: bool) -> list[tuple[str, str]]:
+            with notices.listening(lambda _: None), notices.collected() as heard:
+                findings.warn_of_what_stands(opened, "/camera", made, (), is_all)
+            return [(one.message, one.code) for one in heard]
+
+        now = Provenance("predict", {}, "/camera/samples", warnings=[("strange", "odd now")])
+        chain = [("odd samples", "clock"), ("odd tracks", "clock"), ("odd detections", "clock")]
+        assert said({"/camera/predictions": now}, is_all=False) == [("odd now", "other"), *chain]
+        assert said({}, is_all=False) == []
+        every = [f"odd {name}" for name in sorted(odd)]
+        assert sorted(message for message, _ in said({}, is_all=True)) == every
+        assert [message for message, _ in said({"/camera/predictions": now}, is_all=True)][0] == "odd now"
+
+
+GUESSED = (
+    "no ground plane is known: taking 20 px for a metre, since people are 1.7 m high; distances, speeds and re-tracking "
+    "go by it. Give one with `mcaptrack.ingest('INPUT', ground_plane='HOMOGRAPHY')`"
+)
+
+
+@pytest.mark.parametrize(
+    ("stage", "assumed", "is_said"),
+    [("track", True, True), ("track", False, False), ("detect", True, False), (INGEST, True, False)],
+)
+def test_a_guessed_scale_is_said_of_what_is_in_metres(tmp_path, stage, assumed, is_said):
+    plane = GroundPlane((0.05, 0, 0, 0, 0.05, 0, 0, 0, 1), 64, 48, assumed=assumed)
+    with (
+        log.read(written(tmp_path / "a.mcap", finished())) as opened,
+        notices.listening(lambda _: None),
+        notices.collected() as said,
+    ):
+        findings.warn_of_what_stands(
+            opened, "/camera", {"/camera/other": Provenance(stage, {})}, [(0, plane)], is_all=False
+        )
+    assert [(one.message, one.code) for one in said] == [(GUESSED, "assumed-ground-plane")] * is_said
+
+
+@pytest.mark.parametrize(
+    ("parameters", "is_said"),
+    [({"poor_scale": True}, True), ({"poor_scale": True, "side_view": True}, False), ({"side_view": False}, False)],
+)
+def test_tracks_that_are_only_passed_on_are_said(tmp_path, parameters, is_said):
+    path = written(tmp_path / "a.mcap", finished())
+    words = (
+        "tracks were not re-tracked but passed on: without a ground plane that needs a camera that looks down, and this "
+        f"one looks along the ground. To insist: `mcaptrack.retrack('{path}', side_view=True)`"
+    )
+    with log.read(path) as opened, notices.listening(lambda _: None), notices.collected() as said:
+        findings.warn_of_what_stands(
+            opened, "/camera", {"/camera/x": Provenance("retrack", parameters)}, (), is_all=False
+        )
+    assert [(one.message, one.code) for one in said] == [(words, "held-back")] * is_said
+
+
+def test_little_memory_is_said_in_numbers(monkeypatch):
+    monkeypatch.setattr(findings, "free_memory", lambda: 150_000_000)
+    with notices.listening(lambda _: None), notices.collected() as said:
+        findings.warn_of_memory(20_000, 50_000)
+    assert [(one.message, one.code) for one in said] == [
+        (
+            "50,000 boxes in 20,000 pictures take about 0.2 GB of memory, and 0.1 GB are free: what is computed stays in "
+            "memory until all is written",
+            "memory",
+        )
+    ]
+
+
+@pytest.mark.parametrize(
+    ("files", "free"),
+    [
+        ({"meminfo": "MemTotal: 9 kB\nMemAvailable:  7 kB\n", "memory.max": "5000\n", "memory.current": "900\n"}, 4100),
+        ({"meminfo": "MemAvailable: 3 kB\n", "memory.max": "5000\n", "memory.current": "900\n"}, 3072),
+        ({"meminfo": "MemAvailable: 3 kB\n", "memory.max": "max\n", "memory.current": "900\n"}, 3072),
+        ({"meminfo": "MemAvailable: 3 kB\n"}, 3072),
+        ({"meminfo": "MemFree: 3 kB\n"}, None),
+        ({}, None),
+    ],
+)
+def test_free_memory_is_the_least_that_linux_grants(monkeypatch, files, free):
+    def read_text(path: Path) -> str:
+        if path.name not in files:
+            raise FileNotFoundError
+        return files[path.name]
+
+    monkeypatch.setattr(findings.Path, "read_text", read_text)
+    assert findings.free_memory() == free
+
+
+# What is drawn
+
+
+def at(x: float, frames: int = 2) -> list[Frame]:
+    return [Frame(ns(n), n, tracks_at({1: (x, 0.0), 2: (float("nan"), 0.0)})) for n in range(frames)]
+
+
+def test_people_are_where_the_best_tracks_say(tmp_path):
+    """Re-tracked, tracked, true or sampled: the first that knows a place."""
+    names = ("retracks", "tracks", "truth", "samples")
+    channels = {f"/camera/{name}": (TRACKS, Provenance(INGEST, {}), at(float(n))) for n, name in enumerate(names)}
+    for number, name in enumerate(names):
+        with log.read(written(tmp_path / "a.mcap", channels)) as opened:
+            assert writing._places(opened, "/camera", {})[:, 0].tolist() == pytest.approx(
+                [number, np.nan] * 2, nan_ok=True
+            )
+            shown = {"/camera/retracks": writing.Shown(TRACKS, at(9.0, 1), "", "")}
+            assert writing._places(opened, "/camera", shown)[0].tolist() == [9.0, 0.0]
+        nowhere = [Frame(0, 0, tracks_at({1: (float("nan"), 1.0)}))] * (number % 2)
+        wrong = (DETECTIONS, Provenance(INGEST, {}), [Frame(0, 0, boxes_at([(1, 1)]))])
+        channels[f"/camera/{name}"] = (TRACKS, Provenance(INGEST, {}), nowhere) if number < 2 else wrong
+    with log.read(written(tmp_path / "a.mcap", channels)) as opened:
+        assert writing._places(opened, "/camera", {}).shape == (0, 2)
+
+
+def forecast(*steps: int) -> list[Frame]:
+    """A frame of the first of these steps, and one of the others."""
+    frames = []
+    for number, some in enumerate((steps[:1], steps[1:])):
+        rows = PREDICTIONS.empty(len(some))
+        for name in rows.dtype.names:
+            rows[name] = some if name == "step" else 0
+        frames.append(Frame(ns(number), number, rows))
+    return frames
+
+
+def scored(*errors: float) -> list[Frame]:
+    rows = [FORECAST_SCORES.empty(1) for _ in errors]
+    for row, error in zip(rows, errors, strict=True):
+        row["ade_m"] = error
+    return [Frame(ns(n), n, row) for n, row in enumerate(rows)]
+
+
+def test_forecasts_of_re_tracked_people_come_first(tmp_path):
+    def known(of_retracks: list[Frame], of_samples: list[Frame]) -> int:
+        channels = {
+            "/camera/retracks/predictions": (PREDICTIONS, None, of_retracks),
+            "/camera/predictions": (PREDICTIONS, None, of_samples),
+        }
+        with log.read(written(tmp_path / "a.mcap", channels)) as opened:
+            return writing._last_step(opened, "/camera", {})
+
+    assert [known(forecast(1, 3, 2), forecast(1, 9)), known(forecast(), forecast(1, 9)), known([], [])] == [3, 9, 0]
+    nan = float("nan")
+    for first, second, is_known in (
+        ([nan, 1.0], [], True),
+        ([nan, nan], [nan, 2.0], True),
+        ([nan], [nan], False),
+        ([], [], False),
+    ):
+        channels = {
+            "/camera/retracks/predictions/scores": (FORECAST_SCORES, None, scored(*first)),
+            "/camera/predictions/scores": (FORECAST_SCORES, None, scored(*second)),
+        }
+        with log.read(written(tmp_path / "b.mcap", channels)) as opened:
+            assert writing._is_truth_known(opened, "/camera", {}) is is_known
+
+
+def test_a_camera_starts_with_its_first_picture_or_row(tmp_path):
+    ingested = Provenance(INGEST, {})
+    frames = [Frame(ns(n), n, tracks_at({1: (0.0, 0.0)})) for n in (5, 6)]
+    early = [Frame(ns(2), 0, tracks_at({1: (0.0, 0.0)}))]
+    path = written(
+        tmp_path / "a.mcap", {"/camera/tracks": (TRACKS, ingested, frames), "/other/tracks": (TRACKS, ingested, early)}
+    )
+    with log.read(path) as opened:
+        camera = pipeline.camera_at(opened, "/camera")
+        shown = {"/camera/x": writing.Shown(TRACKS, early, "", ""), "/camera/y": writing.Shown(TRACKS, [], "", "")}
+        none = np.empty(0, np.int64)
+        assert writing._start_ns(opened, camera, {}, none) == ns(5)
+        assert writing._start_ns(opened, camera, shown, none) == ns(2)
+        assert writing._start_ns(opened, camera, shown, np.array([ns(1), ns(9)])) == ns(1)
+    with log.read(written(tmp_path / "b.mcap", {})) as opened:
+        assert writing._start_ns(opened, camera, {}, none) == 0
+
+
+def test_what_was_ingested_is_drawn_once_and_again_when_it_is_new(tmp_path):
+    ingested = Provenance(INGEST, {}, digest="x")
+    for suffix, schema, frames in (
+        ("scene", TRACKS, at(0.0)),
+        ("image", DETECTIONS, [Frame(0, 0, boxes_at([(1, 1)]))]),
+    ):
+        other = "image" if suffix == "scene" else "scene"
+        for view, drawn_from, is_shown in (
+            (suffix, "x", False),
+            (suffix, "y", True),
+            (other, "x", True),
+            ("", "", True),
+        ):
+            channels = {
+                "/camera/labels": (schema, ingested, frames),
+                "/camera/made": (schema, replace(ingested, transform="track"), frames),
+                "/camera/recorded": (schema, None, frames),
+                "/other/labels": (schema, ingested, frames),
+                "/camera/scores": (FORECAST_SCORES, ingested, scored(1.0)),
+            }  # fmt: skip
+            if view:
+                channels[f"/camera/labels/view/{view}"] = (
+                    TRACKS,
+                    Provenance(VIEW, {}, "/camera/labels", drawn_from),
+                    [],
+                )
+            with log.read(written(tmp_path / "a.mcap", channels)) as opened:
+                shown = writing._shown(opened, pipeline.camera_at(opened, "/camera"), {})
+            assert list(shown) == ["/camera/labels"] * is_shown
+            for one in shown.values():
+                assert (one.schema, one.digest, one.made_by, len(one.frames)) == (schema, "x", "", len(frames))
+
+
+def views_of(
+    names: Mapping[str, tuple[Schema, str]], pictures: Sequence[int] = ()
+) -> list[tuple[str, str, str, str, list[int]]]:
+    """Topic, schema, source, group and times of each view."""
+    ns_ = np.array(pictures, np.int64)
+    frames = {
+        TRACKS: at(1.0),
+        DETECTIONS: [Frame(0, 0, boxes_at([(9, 9)]))],
+        PREDICTIONS: forecast(1, 2),
+        GROUND_PLANE: [plane_at(0)],
+        FORECAST_SCORES: scored(1.0),
+    }
+    shown = {
+        f"/camera/{name}": writing.Shown(schema, frames[schema], f"of {name}", made_by)
+        for name, (schema, made_by) in names.items()
+    }
+    drawn = writing._Drawn("/camera", ns_, ns_, [(0, PLANE)])
+    found = [*drawn.views(shown, 3), *drawn.views(shown, 3)]
+    kinds = {"foxglove.ImageAnnotations": "image", "foxglove.SceneUpdate": "scene", "foxglove.FrameTransform": "frame"}
+    twice = [view.topic for view in found].count("/camera/view/tf")
+    assert twice <= 1  # the frame is named once
+    found = found[: (len(found) + twice) // 2]
+    assert all(
+        view.provenance.transform == VIEW and view.provenance.input_digest == f"of {view.provenance.input[8:]}"
+        for view in found
+    )
+    return [
+        (view.topic[8:], kinds[view.schema_name], view.provenance.input[8:], view.group, [t for t, *_ in view.messages])
+        for view in found
+    ]
+
+
+def test_each_channel_has_its_views(tmp_path):
+    own, seen = [0, ns(1)], [7, 8, 9]
+    tf = ("view/tf", "frame", "tracks", "", [3])
+    assert views_of({"tracks": (TRACKS, "track")}) == [("tracks/view/scene", "scene", "tracks", "track", own), tf]
+    assert views_of({"tracks": (TRACKS, "track")}, seen) == [
+        ("tracks/view/image", "image", "tracks", "track", seen),
+        ("tracks/view/scene", "scene", "tracks", "track", seen),
+        tf,
+    ]
+    assert views_of({"detections": (DETECTIONS, "detect")}) == []
+    assert views_of({"detections": (DETECTIONS, "detect")}, seen) == [
+        ("detections/view/image", "image", "detections", "detect", seen)
+    ]
+    assert [one[:4] for one in views_of({"predictions": (PREDICTIONS, "predict")}, seen)] == [
+        ("predictions/view/image", "image", "predictions", "predict"),
+        ("predictions/view/scene", "scene", "predictions", "predict"),
+        ("view/tf", "frame", "predictions", ""),
+    ]
+    assert views_of({"ground_plane": (GROUND_PLANE, "")}) == [
+        ("ground_plane/view/scene", "scene", "ground_plane", "", [3]),
+        ("view/tf", "frame", "ground_plane", "", [3]),
+    ]
+    assert views_of({"scores": (FORECAST_SCORES, "events")}, seen) == []
+    names = {
+        "samples": (TRACKS, "sample"),
+        "retracks": (TRACKS, "retrack"),
+        "retracks/online": (TRACKS, "retrack"),
+        "retracks/full": (TRACKS, "retrack"),
+    }
+    assert [one[0] for one in views_of(names, seen)] == [
+        "retracks/full/view/image",
+        "retracks/full/view/scene",
+        "view/tf",
+    ]
+
+
+def test_a_view_that_others_recorded_stays_and_that_is_said(tmp_path):
+    ingested = Provenance(INGEST, {}, digest="x")
+    channels = {"/camera/truth": (TRACKS, ingested, at(1.0)), "/camera/truth/view/scene": (TRACKS, None, at(2.0))}
+    path = written(tmp_path / "a.mcap", channels)
+    with log.read(path) as opened:
+        before = [message.payload for message in opened.messages("/camera/truth/view/scene")]
+        report = pipeline.run(opened, "/camera", [], tmp_path / "b.mcap")
+    words = "no view at /camera/truth/view/scene, which was recorded by others (mcaptrack.Tracks)"
+    assert [(one.message, one.code) for one in report.warnings] == [(words, "left-out")]
+    with log.read(tmp_path / "b.mcap") as opened:
+        assert [message.payload for message in opened.messages("/camera/truth/view/scene")] == before
+        assert "/camera/view/tf" in opened.channels
+
+
+def test_views_are_found_by_what_is_best_or_by_name(tmp_path):
+    path = tmp_path / "a.mcap"
+
+    def found(names: Sequence[str], *topics: str) -> list[str]:
+        with log.read(written(path, {f"/{name}": (TRACKS, None, []) for name in names})) as opened:
+            return pipeline.find_views(opened, "/camera", topics)
+
+    image = "/view/image"
+    names = [f"camera/{name}{image}" for name in ("detections", "tracks", "retracks/full", "retracks/predictions")]
+    assert found(names) == [f"/camera/retracks/full{image}", f"/camera/retracks/predictions{image}"]
+    assert found(names[:2]) == [f"/camera/tracks{image}"]
+    assert found([*names[:1], f"other/tracks{image}"]) == [f"/camera/detections{image}"]
+    assert found(names, "/camera/retracks") == [f"/camera/retracks/full{image}"]
+    assert found([*names, f"camera/retracks{image}"], "/camera/retracks") == [f"/camera/retracks{image}"]
+    assert found(names, f"/camera/tracks{image}", "/camera/detections") == [
+        f"/camera/tracks{image}",
+        f"/camera/detections{image}",
+    ]
+    with pytest.raises(McaptrackError) as error:
+        found([f"other/tracks{image}", "camera/tracks/view/scene"])
+    assert str(error.value) == f"{path} has no views of /camera yet; `mcaptrack.run('{path}')` makes them"
+    with pytest.raises(McaptrackError, match="/camera/samples/view/image"):
+        found(names, "/camera/samples")
+
+
+def test_a_digest_is_of_the_messages_whether_or_not_it_was_kept(tmp_path):
+    made = writing.Made.of(TRACKS, at(1.0), Provenance(INGEST, {}))
+    channels = {"/a": (TRACKS, made.provenance, at(2.0)), "/b": (TRACKS, None, at(1.0))}
+    with log.read(written(tmp_path / "a.mcap", channels)) as opened:
+        assert writing.digest_of(opened, "/a") == writing.digest_of(opened, "/b") == made.provenance.digest
+    wanted = digest((frame.t_ns, frame.index, TRACKS.codec.encode(frame.rows)) for frame in at(1.0))
+    assert (made.provenance.digest, made.size()) == (wanted, 2)
+    assert made._replace(words=[(1, 2, b"x")]).size() == 1
+
+
+# What a log holds, in numbers
+
+
+def test_forecasts_and_planes_are_counted(tmp_path):
+    def summary(channels: Channels) -> pipeline.Summary:
+        with log.read(written(tmp_path / "a.mcap", channels)) as opened:
+            return pipeline.summarise(opened, "/camera")
+
+    ingested = Provenance(INGEST, {})
+    ahead = forecast(1, 1, 2, 3)
+    for frame in ahead:
+        frame.rows["ahead_s"] = frame.rows["step"] * 0.40004
+    channels: dict[str, Any] = {"/camera/predictions": (PREDICTIONS, ingested, ahead)}
+    found = summary(channels)
+    assert (found.forecasts, found.horizon_s, found.ground_plane, found.tracks) == (2, 1.2, None, None)
+    found = summary(channels | {"/camera/retracks/predictions": (PREDICTIONS, ingested, forecast(1, 1))})
+    assert (found.forecasts, found.horizon_s) == (2, 0.0)
+    assert summary(channels | {"/camera/retracks/predictions": (PREDICTIONS, ingested, [])}).horizon_s is None
+    for assumed, word in (((True, True), "assumed"), ((True, False), "given"), ((), None)):
+        planes = [plane_at(n, replace(PLANE, assumed=one)) for n, one in enumerate(assumed)]
+        assert summary({"/camera/ground_plane": (GROUND_PLANE, ingested, planes)}).ground_plane == word
+
+
+def test_boxes_are_those_that_tracks_were_made_from(tmp_path):
+    boxes = [Frame(ns(n), n, boxes_at([(5, 5), (9, 9)])) for n in range(3)]
+    channels = {
+        "/camera/detections": (DETECTIONS, Provenance(INGEST, {}), boxes),
+        "/camera/other": (DETECTIONS, Provenance(INGEST, {}), boxes[:1]),
+    }
+    for source, count in (("/camera/detections", 6), ("/camera/other", 2), ("/camera/gone", 6), (None, 6)):
+        tracks = {"/camera/tracks": (TRACKS, Provenance("track", {}, source), at(1.0))} if source else {}
+        with log.read(written(tmp_path / "a.mcap", channels | tracks)) as opened:
+            assert pipeline.summarise(opened, "/camera").boxes == count
+
+
+def test_a_loss_by_re_tracking_is_said_with_its_scores(tmp_path):
+    truth = walk(lambda n: {1: (n * 0.4, 0.0), 2: (n * 0.4, 5.0)}, 10)
+    swapped = walk(lambda n: {1 + n // 5: (n * 0.4, 0.0), 2 - n // 5: (n * 0.4, 5.0)}, 10)
+    channels = {
+        f"/camera/{name}": (TRACKS, Provenance(how, {}), frames)
+        for name, how, frames in (
+            ("truth", INGEST, truth),
+            ("samples", "sample", truth),
+            ("retracks", "retrack", swapped),
+        )
+    }
+    with (
+        log.read(written(tmp_path / "a.mcap", channels)) as opened,
+        notices.listening(lambda _: None),
+        notices.collected() as said,
+    ):
+        scores = pipeline.summarise(opened, "/camera").scores
+    assert scores is not None
+    assert scores.by == "within 1 m"
+    words = "re-tracking made it worse: IDF1 100.0% before, 50.0% after, against /camera/truth, within 1 m"
+    assert [(one.message, one.code) for one in said] == [(words, "worse")]
