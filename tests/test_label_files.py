@@ -224,7 +224,9 @@ def test_every_column_is_read_as_by_hand(text, name, role, wanted, tmp_path):
         dict(labels.classes),
         labels.left_out,
         ignored
-        and tuple(one.tolist() for one in (ignored.frame, ignored.boxes_px.astype(int), ignored.forgiven, ignored.region)),
+        and tuple(
+            one.tolist() for one in (ignored.frame, ignored.boxes_px.astype(int), ignored.forgiven, ignored.region)
+        ),
     )
     assert str(read) == str(wanted)  # as text, for NaN is not itself
     assert labels.has_ids == any(one != -1 for one in wanted.id)

@@ -253,7 +253,7 @@ def test_another_input_is_taken_and_said(tmp_path):
         "/camera/others": (DETECTIONS, Provenance(INGEST, {}, "", "", "o"), [Frame(0, 0, DETECTIONS.empty())])
     }
     jobs, said, _ = planned(tmp_path / "a.mcap", channels, source="/camera/others")
-    assert [(job.stage, job.source, job.target) for job in jobs][0] == ("track", "/camera/others", "/camera/tracks")
+    assert next((job.stage, job.source, job.target) for job in jobs) == ("track", "/camera/others", "/camera/tracks")
     assert said[0] == "/camera/tracks was made from /camera/detections: running track again, from /camera/others"
     assert planned(tmp_path / "b.mcap", channels, source="/camera/detections")[:2] == ([], [])
     with pytest.raises(McaptrackError) as error:
@@ -431,7 +431,7 @@ def test_what_was_odd_when_a_channel_was_made_is_said_for_what_runs_and_what_it_
         assert said({}, is_all=False) == []
         every = [f"odd {name}" for name in sorted(odd)]
         assert sorted(message for message, _ in said({}, is_all=True)) == every
-        assert [message for message, _ in said({"/camera/predictions": now}, is_all=True)][0] == "odd now"
+        assert next(message for message, _ in said({"/camera/predictions": now}, is_all=True)) == "odd now"
 
 
 GUESSED = (

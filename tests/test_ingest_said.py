@@ -1,0 +1,548 @@
+"""What is said of inputs and kept of them: remarks, warnings, counts, names of classes, and which pictures are taken."""
+
+from __future__ import annotations
+
+import bz2
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from rosbags.rosbag1 import Writer as BagWriter
+
+from mcaptrack import log
+from mcaptrack.errors import McaptrackError
+from mcaptrack.schema import DETECTIONS, GROUND_PLANE, TRACKS, Frame, Schema
+from mcaptrack.schema.ground_plane import rows_to_plane
+from mcaptrack.schema.provenance import CLOCK, INGEST, Provenance
+from mcaptrack.sources.ingest import IngestOptions, IngestReport, ingest, label_frames
+from mcaptrack.sources.ingest.bags import decompression, plain_yaml
+from mcaptrack.sources.ingest.bags.plain_yaml import Fields, UnsupportedYamlError
+from mcaptrack.sources.ingest.labels.camera import (
+    CameraTopics,
+    camera_prefix,
+    choose_camera,
+    detections_topic,
+    labels_of,
+)
+from mcaptrack.sources.ingest.recording_job import RecordingJob
+from tests.bags import ROS1, STRING1, T0, bag1
+from tests.worlds import boxes_at, ns, tracks_at
+
+KITTI = "".join(
+    f"{frame} {number} {name} 0 0 0 10 20 14 28 1 1 1 1 1 1 0\n"
+    for number, (frame, name) in enumerate([(0, "Car"), (0, "Pedestrian"), (1, "Car"), (1, "Misc")])
+)
+
+
+def write(path: Path, text: str) -> Path:
+    path.write_text(text)
+    return path
+
+
+def made(source: Path, into: Path | None = None, **options: Any) -> tuple[IngestReport, Path]:
+    """The report of ingesting a file, and the log."""
+    given = IngestOptions(**options)
+    out = into or source.with_name("out.mcap")
+    if into is None:
+        return ingest(source, out, given), out
+    with log.read(into) as opened:
+        return ingest(source, out, given, into=opened), out
+
+
+def said(report: IngestReport) -> list[tuple[str, str]]:
+    return [(one.message, one.code) for one in report.warnings]
+
+
+def parameters_of(path: Path, topic: str) -> dict[str, Any]:
+    with log.read(path) as opened:
+        found = Provenance.from_metadata(opened.channel(topic).metadata)
+    assert found is not None
+    return dict(found.parameters)
+
+
+# Labels
+
+
+def test_classes_of_detections_are_listed_and_their_names_kept(tmp_path):
+    found = write(tmp_path / "found.txt", KITTI)
+    report, path = made(found, role="detections", fps=Fraction(10))
+    assert report.remarks[0] == f"{found} has several classes; class_id is 1 Pedestrian (1), 3 Car (2), 8 Misc (1)"
+    with log.read(path) as opened:
+        metadata = opened.channel("/camera/detections").metadata
+        assert metadata["mcaptrack.classes"] == '{"1":"Pedestrian","3":"Car","8":"Misc"}'
+        rows = opened.rows("/camera/detections", DETECTIONS).rows
+    assert rows["class_id"].tolist() == [3, 1, 3, 8]
+    assert [rows[name][0] for name in ("x_px", "y_px", "w_px", "h_px")] == [10, 20, 4, 8]
+    assert (report.messages, report.has_labels, report.uses_camera) == ({"/camera/detections": 2}, True, True)
+
+
+def test_classes_without_names_are_listed_by_number_and_one_alone_is_not(tmp_path):
+    rows = "1,-1,1,1,2,2,0.5,{}\n1,-1,5,1,2,2,0.5,7\n2,-1,5,1,2,2,0.5,7\n"
+    found = write(tmp_path / "found.txt", rows.format(2))
+    report, path = made(found, role="detections", fps=Fraction(10))
+    assert report.remarks[0] == f"{found} has several classes; class_id is 2 (1), 7 (2)"
+    with log.read(path) as opened:
+        assert "mcaptrack.classes" not in opened.channel("/camera/detections").metadata
+    report, _ = made(write(found, rows.format(7)), role="detections", fps=Fraction(10))
+    assert report.remarks == [f"{found}: 2 frames (by the last label) from 1 on, 10 a second (by `fps=`)"]
+
+
+def test_tracks_have_no_classes_and_what_is_left_out_of_them_is_said(tmp_path):
+    found = write(tmp_path / "found.txt", KITTI)
+    report, path = made(found, role="truth", fps=Fraction(10), first_frame=0)
+    assert said(report) == [(f"{found} also holds 2 Car, 1 Misc; left out of truth", "left-out")]
+    assert report.remarks == [f"{found}: 2 frames (by the last label) from 0 on, 10 a second (by `fps=`)"]
+    assert parameters_of(path, "/camera/truth") == {
+        "file": "found.txt",
+        "format": "kitti",
+        "first_frame": 0,
+        "fps": "10",
+    }
+    with log.read(path) as opened:
+        assert "mcaptrack.classes" not in opened.channel("/camera/truth").metadata
+
+
+@pytest.mark.parametrize(
+    ("text", "rate", "of"),
+    [
+        ('1 1 1 5 5 0 0 0 0 "Pedestrian"\n1 1 1 5 5 29 0 0 0 "Pedestrian"\n', 30, "Stanford Drone"),
+        ("0 1 1 1\n10 1 1 1\n20 2 1 1\n", 25, "trajnet, a label every 0.4 s"),
+        ("0 1 1 0 1 0 0 0\n6 1 1 0 1 0 0 0\n", 15, "obsmat, a label every 0.4 s"),
+    ],
+)
+def test_rates_that_formats_imply_are_warned_of_and_others_are_remarks(tmp_path, text, rate, of):
+    labels = write(tmp_path / "a.txt", text)
+    report, path = made(labels)
+    last = int(text.splitlines()[-1].split()[5 if rate == 30 else 0])
+    words = f"{labels}: {last + 1} frames (by the last label) from 0 on, "
+    assert said(report)[-1] == (f"{words}{rate} a second (by {of}); `fps=` sets another rate", "clock")
+    assert not [remark for remark in report.remarks if "a second" in remark]
+    report, _ = made(labels, fps=Fraction(rate))
+    assert report.remarks[-1] == f"{words}{rate} a second (by `fps=`)"
+    assert not [message for message, _ in said(report) if "second" in message]
+    report, _ = made(labels, fps=Fraction(12))
+    assert said(report)[-1] == (f"{labels}: {rate} frames a second by {of}, and 12 by `fps=`, which is used", "clock")
+    with log.read(path) as opened:
+        assert opened.metadata(CLOCK) == {"start_ns": "0"}
+
+
+def test_rates_that_differ_are_refused(tmp_path):
+    first, other = write(tmp_path / "a.txt", "0 1 1 1\n10 1 1 1\n"), write(tmp_path / "b.txt", "0 1 1 1\n12 1 1 1\n")
+    with pytest.raises(McaptrackError) as error:
+        made(first, role="tracks", labels={"truth": other})
+    of = "trajnet, a label every 0.4 s"
+    assert str(error.value) == f"{first}: 25 by {of} and 30 by {of}: give the frames per second with `fps=`"
+
+
+def test_frames_are_counted_by_whoever_counts_most(tmp_path):
+    (tmp_path / "seq").mkdir()
+    write(tmp_path / "seq" / "seqinfo.ini", "frameRate=10\nseqLength=9\n")
+    truth = write(tmp_path / "seq" / "gt.txt", "1,1,1,1,2,2\n4,1,1,1,2,2\n")
+    report, _ = made(truth, role="truth")
+    assert report.remarks == [f"{truth}: 9 frames (by seqinfo.ini) from 1 on, 10 a second (by seqinfo.ini)"]
+    tracks = write(tmp_path / "t.txt", "1,1,1,1,2,2\n6,1,1,1,2,2\n")
+    report, out = made(tracks, fps=Fraction(5))
+    assert report.messages == {"/camera/tracks": 6}
+    report, _ = made(write(tmp_path / "u.txt", "1,1,1,1,2,2\n"), out, role="truth")  # as many as stand there
+    assert report.messages == {"/camera/truth": 6}
+    assert report.remarks[-1].endswith("u.txt: 6 frames (by the last label) from 1 on, 5 a second (by /camera/tracks)")
+    with pytest.raises(McaptrackError, match="/camera/tracks has 5 frames a second, not 7, and labels of one camera"):
+        made(write(tmp_path / "v.txt", "1,-1,1,1,2,2\n"), out, fps=Fraction(7))
+
+
+@pytest.mark.parametrize(
+    ("frames", "is_taken"), [(0, False), (1, True), (10_000_000, None), (10_000_001, False), (-1, False)]
+)
+def test_a_number_of_frames_has_bounds(tmp_path, frames, is_taken):
+    labels = write(tmp_path / "a.txt", "1,1,1,1,2,2\n")
+    if is_taken:
+        assert made(labels, fps=Fraction(1), frames=frames)[0].messages == {"/camera/tracks": frames}
+    elif is_taken is False:
+        with pytest.raises(McaptrackError) as error:
+            made(labels, fps=Fraction(1), frames=frames)
+        assert str(error.value) == f"`frames=` is a number from 1 to 10000000, not {frames}"
+
+
+def test_options_of_videos_and_roles_are_refused_by_name(tmp_path):
+    labels = write(tmp_path / "a.txt", "1,1,1,1,2,2\n")
+    given = {"image_format": "jpeg", "quality": 3, "keyframe_interval_s": 2.0}
+    for at, (name, value) in enumerate(given.items()):
+        with pytest.raises(McaptrackError) as error:
+            made(labels, fps=Fraction(1), **{name: value})
+        assert str(error.value) == f"{labels} is a label file; `{name}=` is for videos"
+        assert IngestOptions(**dict([*given.items()][at:])).for_videos() == f"`{name}=`"
+    assert IngestOptions(fps=Fraction(1)).for_videos() == ""
+    other = write(tmp_path / "b.txt", "1,1,1,1,2,2\n")
+    with pytest.raises(McaptrackError) as error:
+        made(labels, fps=Fraction(1), labels={"tracks": other})
+    assert str(error.value) == f"{labels} and {other} are both tracks; give the role of {labels} with `role=`"
+
+
+def test_a_plane_of_labels_alone_is_as_large_as_their_boxes(tmp_path):
+    plane = write(tmp_path / "h.txt", "0.1,0,0\n0,0.2,0\n0,0,1\n")
+    labels = write(tmp_path / "a.txt", "1,1,10,20,30.2,5,1\n2,1,5,2,3,40.5,1\n")
+    for point, y in (("foot", 0.2 * 25), ("center", 0.2 * 22.5)):
+        report, path = made(labels, fps=Fraction(1), ground_plane=plane, point=point, start_ns=77)
+        with log.read(path) as opened:
+            (frame,) = opened.frames("/camera/ground_plane", GROUND_PLANE)
+            rows = opened.rows("/camera/tracks", TRACKS).rows
+            assert opened.metadata(CLOCK) == {"start_ns": "77"}
+        found = rows_to_plane(frame.rows)
+        assert (found.width_px, found.height_px, found.assumed, frame.t_ns) == (41, 43, False, 77)
+        assert (rows["x_m"][0], rows["y_m"][0]) == pytest.approx((0.1 * 25.1, y))
+        assert (rows["observed"].tolist(), rows["source_id"].tolist()) == ([True, True], [-1, -1])
+        assert parameters_of(path, "/camera/ground_plane") == {"file": "h.txt", "point": point}
+        assert (report.messages, report.uses_camera) == ({"/camera/ground_plane": 1, "/camera/tracks": 2}, True)
+    where, path = made(write(tmp_path / "b.txt", "0 1 1 1\n10 1 2 2\n"), ground_plane=plane)
+    with log.read(path) as opened:
+        found = rows_to_plane(opened.frames("/camera/ground_plane", GROUND_PLANE)[0].rows)
+        assert opened.rows("/camera/tracks", TRACKS).rows["x_m"].tolist() == [1, 2]
+    assert (found.width_px, found.height_px, where.messages["/camera/tracks"]) == (0, 0, 2)
+
+
+def test_labels_beside_others_of_a_log_share_its_time(tmp_path):
+    out = tmp_path / "out.mcap"
+    ingest(
+        write(tmp_path / "a.txt", "1,1,1,1,2,2\n11,1,1,1,2,2\n"), out, IngestOptions(fps=Fraction(10), start_ns=ns(5))
+    )
+    later = write(tmp_path / "b.txt", "1,1,1,1,2,2\n2,1,1,1,2,2\n")
+    for start_ns, fits in (
+        (ns(6), True),
+        (ns(6) + 1, False),
+        (ns(5) - ns(0.1), True),
+        (ns(5) - ns(0.1) - 1, False),
+        (None, True),
+    ):
+        options = IngestOptions(fps=Fraction(10), start_ns=start_ns, camera="other", role="truth", frames=2)
+        copy = tmp_path / "copy.mcap"
+        copy.write_bytes(out.read_bytes())
+        with log.read(copy) as opened:
+            if fits:
+                ingest(later, copy, options, into=opened)
+                continue
+            with pytest.raises(McaptrackError) as error:
+                ingest(later, copy, options, into=opened)
+            first = start_ns / 1e9
+            assert str(error.value) == (
+                f"{copy} is from 5.000 s to 6.000 s, the labels would be from {first:.3f} s to {first + 0.1:.3f} s, and "
+                "/other has no pictures to take times from; say when frame 1 was with `start_time=`"
+            )
+    with log.read(copy) as opened:
+        assert opened.times("/other/truth").tolist() == [ns(5), ns(5.1)]
+
+
+def test_a_free_name_is_proposed_for_topics_that_are_there(tmp_path):
+    out = tmp_path / "out.mcap"
+    number = write(tmp_path / "a.txt", "1,1,1,1,2,2\n")
+    ingest(number, out, IngestOptions(fps=Fraction(10)))
+    with log.read(out) as opened, pytest.raises(McaptrackError) as error:
+        ingest(number, out, IngestOptions(fps=Fraction(10)), into=opened)
+    assert str(error.value) == f"{out} has /camera/tracks already; `force=True` replaces them"
+    for there, free in (((), "camera/labels"), (("",), "camera/labels2"), (("", "2"), "camera/labels3")):
+        with log.create(out) as writer:
+            for name in ("/camera", *(f"/camera/labels{end}" for end in there)):
+                writer.add_message(
+                    writer.add_channel(f"{name}/tracks", ("a/B", "jsonschema", b"{}"), "json", {}), 0, 0, b"{}"
+                )
+        with log.read(out) as opened, pytest.raises(McaptrackError, match=f"`camera='{free}'` puts these beside them"):
+            ingest(number, out, IngestOptions(fps=Fraction(10)), into=opened, force=True)
+
+
+def test_files_that_are_compared_say_what_is_assumed_of_them(tmp_path):
+    labels = write(tmp_path / "a.txt", "1,1,1,1,2,2\n3,1,1,1,2,2\n")
+    with pytest.warns(
+        UserWarning, match=r"a\.txt: 3 frames \(by the last label\) from 1 on, 1 a second \(by assumption\)"
+    ):
+        frames = label_frames({"tracks": labels}, None, None, "foot")
+    assert [(frame.t_ns, frame.index, len(frame.rows)) for frame in frames["tracks"]] == [
+        (0, 0, 1),
+        (ns(1), 1, 0),
+        (ns(2), 2, 1),
+    ]
+
+
+# Which camera
+
+BOTH, LEFT, RIGHT = ["/left/image", "/right/image"], ["/left/image"], ["/rig/right/raw", "/rig/right/video"]
+#: The name of the camera, the topics of pictures, and what is chosen: the prefix and the topic.
+CHOSEN = [
+    ("camera", [], ("/camera", "")),
+    ("camera", LEFT, ("/left", "/left/image")),
+    ("left", BOTH, ("/left", "/left/image")),
+    ("/left/", BOTH, ("/left", "/left/image")),
+    ("left/image", BOTH, ("/left", "/left/image")),
+    ("left/labels", BOTH, ("/left/labels", "/left/image")),
+    ("left/image/labels", BOTH, ("/left/image/labels", "/left/image")),
+    ("left/a/b", BOTH, ("/left/a/b", "/left/image")),
+    ("rig/right", RIGHT, ("/rig/right", "/rig/right/video")),
+    ("rig/right/raw", RIGHT, ("/rig/right", "/rig/right/raw")),
+    ("top", BOTH, ("/top", "")),
+    ("camera", ["/image"], ("/camera", "/image")),
+    ("camera", ["/camera/a"], ("/camera", "/camera/a")),
+]
+
+
+@pytest.mark.parametrize(("name", "topics", "wanted"), CHOSEN)
+def test_the_camera_that_a_name_means(name, topics, wanted):
+    assert choose_camera("it", name, topics) == CameraTopics(*wanted)
+
+
+NOT_CHOSEN = [
+    ("camera", BOTH, "it has pictures of several cameras, /left/image, /right/image; labels and ground planes belong to those of one: choose with `camera='left'`"),
+    ("camera", ["/left/b", "/left/a", "/right/a"], "it has pictures of several cameras, /left/a, /left/b, /right/a; labels and ground planes belong to those of one: choose with `camera='left/a'`"),
+    ("left", ["/left/b", "/left/a"], "it: /left has several topics of pictures, /left/a, /left/b; name one with `camera='left/a'`"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "topics", "words"), NOT_CHOSEN)
+def test_of_several_cameras_one_has_to_be_named(name, topics, words):
+    with pytest.raises(McaptrackError) as error:
+        choose_camera("it", name, topics)
+    assert str(error.value) == words
+
+
+def test_the_camera_of_a_topic_is_the_part_before_its_last_slash():
+    given = {"/left/image": "/left", "/a/b/c": "/a/b", "/image": "/camera", "image": "/camera", "a/b/": "/a"}
+    assert {topic: camera_prefix(topic) for topic in given} == given
+
+
+def test_labels_of_a_log_are_those_that_were_ingested(tmp_path):
+    def add(writer: log.LogWriter, topic: str, schema: Schema, how: Provenance | None, frames: list[Frame]) -> None:
+        metadata = how.to_metadata() if how else {}
+        number = writer.add_channel(topic, (schema.name, "protobuf", schema.descriptor), "protobuf", metadata)
+        for frame in frames:
+            writer.add_message(number, frame.t_ns, frame.index, schema.codec.encode(frame.rows))
+
+    rows = [Frame(ns(n), 2 * n, tracks_at({1: (0.0, 0.0)})) for n in range(3)]
+    boxes = [Frame(0, 0, boxes_at([(1, 1)]))]
+    with log.create(tmp_path / "a.mcap") as writer:
+        add(writer, "/camera/tracks", TRACKS, Provenance(INGEST, {"fps": "25/2"}), rows)
+        add(writer, "/camera/truth", TRACKS, Provenance(INGEST, {"fps": 4}), rows[:1])
+        add(writer, "/camera/detections", DETECTIONS, Provenance("detect", {}), boxes)
+        add(writer, "/other/tracks", TRACKS, Provenance(INGEST, {}), [])
+        add(writer, "/other/truth", TRACKS, None, rows)
+        add(writer, "/other/detections", DETECTIONS, Provenance("track", {}), boxes)
+        add(writer, "/third/detections", DETECTIONS, Provenance("detect", {}), [])
+    with log.read(tmp_path / "a.mcap") as opened:
+        found = labels_of(opened, "/camera")
+        assert {topic: (one.t_ns.tolist(), one.frames, one.fps) for topic, one in found.items()} == {
+            "/camera/tracks": ([0, ns(1), ns(2)], 5, Fraction(25, 2)),
+            "/camera/truth": ([0], 1, None),
+        }
+        assert labels_of(opened, "/other") == {}
+        topics = [detections_topic(opened, prefix) for prefix in ("/camera", "/other", "/third", "/none")]
+    assert topics == ["/camera/detections", "", "", ""]
+
+
+# Recordings and videos
+
+
+def test_messages_are_counted_by_topic_and_progress_is_told(tmp_path):
+    bag1(tmp_path / "a.bag", messages=9, size=10)
+    told: list[tuple[str, int, int]] = []
+    report = ingest(tmp_path / "a.bag", tmp_path / "a.mcap", IngestOptions(), progress=lambda *some: told.append(some))
+    assert report.messages == {"/talk": 9, "/silent": 0}  # of two publishers
+    assert (told, report.has_labels, report.uses_camera, report.lost) == ([("ingest", 9, 9)], False, False, [])
+    with BagWriter(tmp_path / "b.bag") as writer:
+        talk = writer.add_connection("/talk", STRING1, typestore=ROS1)
+        for number in range(520):
+            writer.write(talk, T0 + number, b"\0")
+    told.clear()
+    ingest(tmp_path / "b.bag", tmp_path / "b.mcap", IngestOptions(), progress=lambda *some: told.append(some))
+    assert told == [("ingest", number, 520) for number in (256, 512, 520)]
+
+
+@pytest.mark.parametrize(
+    ("given", "name"),
+    [
+        ({"fps": Fraction(10)}, "`fps=`"),
+        ({"start_ns": 0}, "`start_time=`"),
+        ({"image_format": "jpeg"}, "`image_format=`"),
+        ({"role": "truth"}, "`role=`"),
+        ({"frames": 0}, "`frames=`"),
+    ],
+)
+def test_options_that_would_change_a_recording_are_refused(tmp_path, given, name):
+    bag1(tmp_path / "a.bag", messages=1, size=1)
+    with pytest.raises(McaptrackError) as error:
+        made(tmp_path / "a.bag", **given)
+    assert str(error.value) == (
+        f"{tmp_path / 'a.bag'} is a log: its messages stay as they are, and so do their times; leave {name} out"
+    )
+
+
+def test_a_message_that_no_log_should_hold_is_refused(tmp_path, monkeypatch):
+    bag1(tmp_path / "a.bag", messages=1, size=100)
+    module = __import__(RecordingJob.__module__, fromlist=["_"])
+    for most, is_taken in ((100, True), (99, False)):
+        monkeypatch.setattr(module, "_MAX_MESSAGE_BYTES", most)
+        if is_taken:
+            made(tmp_path / "a.bag")
+            continue
+        with pytest.raises(McaptrackError, match="a message of 100 bytes; at most 99 go into a log"):
+            made(tmp_path / "a.bag")
+
+
+def images(folder: Path, numbers: range, suffix: str = ".jpg") -> Path:
+    folder.mkdir()
+    for number in numbers:
+        cv2.imwrite(str(folder / f"{number:03}{suffix}"), np.full((48, 64, 3), 3 * number, np.uint8))
+    return folder
+
+
+def test_a_folder_of_images_is_kept_with_how_it_was_made(tmp_path):
+    told: list[tuple[str, int, int]] = []
+    folder = images(tmp_path / "images", range(1, 4), ".png")
+    options = IngestOptions(fps=Fraction(25, 2), image_format="jpeg", quality=70, camera="gate")
+    report = ingest(folder, tmp_path / "a.mcap", options, progress=lambda *some: told.append(some))
+    assert parameters_of(tmp_path / "a.mcap", "/gate/video") == {
+        "file": "images",
+        "image_format": "jpeg",
+        "fps": "25/2",
+        "quality": 70,
+    }
+    assert told == [("ingest", number, 3) for number in (1, 2, 3)]
+    assert (report.messages, report.has_labels, report.uses_camera, said(report)) == (
+        {"/gate/video": 3},
+        False,
+        True,
+        [],
+    )
+    with log.read(tmp_path / "a.mcap") as opened:
+        assert [(m.t_ns, m.sequence) for m in opened.messages("/gate/video")] == [
+            (0, 0),
+            (80_000_000, 1),
+            (160_000_000, 2),
+        ]
+        assert opened.metadata(CLOCK) == {"start_ns": "0"}
+    for given, words in (
+        ({}, f"{folder}: a folder of images has no clock; give the frames per second with `fps=`"),
+        ({"frames": 3}, f"{folder} is not a label file; `frames=` applies to labels without pictures"),
+        ({"first_frame": 3, "fps": Fraction(1)}, f"{folder}: `first_frame=` is about label files, and none is given"),
+    ):
+        with pytest.raises(McaptrackError) as error:
+            ingest(folder, tmp_path / "b.mcap", IngestOptions(**given))
+        assert str(error.value) == words
+
+
+# Untrusted bytes
+
+
+def test_limits_of_decompression(monkeypatch):
+    mib = 2**20
+    monkeypatch.delenv(decompression.ENVIRONMENT, raising=False)
+    assert [decompression.limit_of(size) for size in (0, mib, mib + 1)] == [64 * mib, 64 * mib, 64 * (mib + 1)]
+    monkeypatch.setenv(decompression.ENVIRONMENT, "3")
+    assert decompression.limit_of(10 * mib) == 3 * mib
+    end = f"when decompressed, which is unusual; {decompression.ENVIRONMENT} sets another limit"
+    assert str(decompression.too_large(None, 3 * mib)) == f"it has more than 3 MiB {end}"
+    assert str(decompression.too_large(7, 2 * mib)) == f"it says that it has 7 bytes, more than 2 MiB {end}"
+
+
+def test_decompression_ends_at_its_limit():
+    zstandard = pytest.importorskip("zstandard")
+    data = bytes(range(256)) * 20
+    for packed in (zstandard.compress(data), zstandard.ZstdCompressor(write_content_size=False).compress(data)):
+        assert decompression.unzstd(packed, len(data)) == data
+        with pytest.raises(decompression.NotUnpackedError, match="MiB when decompressed"):
+            decompression.unzstd(packed, len(data) - 1)
+    with pytest.raises(decompression.NotUnpackedError, match="it is cut off"):
+        decompression.unzstd(packed[:-3], len(data))
+    steps = [decompression.decompress_steps(bz2.BZ2Decompressor(), bz2.compress(data), most) for most in (0, 7, 10**6)]
+    assert steps == [b"", data[:7], data]
+    assert decompression.decompress_steps(bz2.BZ2Decompressor(), bz2.compress(data)[:-9], 10**6) in (b"", data)
+
+
+LOADED = {
+    "a": "a",
+    "[a, [], {}]": ["a", [], {}],
+    "a: 1\nb: [x, {c: d}]\ne: ''": {"a": "1", "b": ["x", {"c": "d"}], "e": ""},
+    "- - a\n  - b\n- c": [["a", "b"], "c"],
+    "\ufeffa: b": {"a": "b"},
+}
+
+
+@pytest.mark.parametrize(("text", "value"), LOADED.items())
+def test_yaml_is_read_as_text_lists_and_maps(text, value):
+    loaded = plain_yaml.load(text.encode())
+    assert loaded == value
+    assert plain_yaml.load(plain_yaml.dump(loaded).encode()) == value
+
+
+NOT_LOADED = {
+    "": "it holds 0 documents, not one",
+    "a\n---\nb": "it holds 2 documents, not one",
+    "a\n---\n%b": "it has a line that begins with %; directives are not read",
+    "x: 1\na: &b c": "line 2: anchors and aliases are not read",
+    "\na: !!int 3": "line 2: tags are not read",
+    "a: 1\nb: 2\na: 3": "line 3: 'a' is there twice",
+    "[a]: 1": "line 1: a list or a map is a key",
+    "[" * 31 + "]" * 31: None,
+    "[" * 32 + "]" * 32: "line 1: it is nested more than 32 deep",
+}
+
+
+@pytest.mark.parametrize(("text", "words"), NOT_LOADED.items())
+def test_other_yaml_is_refused_with_its_line(text, words):
+    if words is None:
+        plain_yaml.load(text.encode())
+        return
+    with pytest.raises(UnsupportedYamlError) as error:
+        plain_yaml.load(text.encode())
+    assert str(error.value) == words
+
+
+def test_yaml_has_limits(monkeypatch):
+    monkeypatch.setattr(plain_yaml, "MAX_BYTES", 4)
+    assert plain_yaml.load(b"abcd") == "abcd"
+    with pytest.raises(UnsupportedYamlError, match="it has 5 bytes; at most 4 are read"):
+        plain_yaml.load(b"abcde")
+    with pytest.raises(UnsupportedYamlError, match="byte 1 is no UTF-8"):
+        plain_yaml.load(b"a\xff")
+    monkeypatch.setattr(plain_yaml, "MAX_BYTES", 400)
+    monkeypatch.setattr(plain_yaml, "_MAX_VALUES", 8)
+    assert plain_yaml.load(b"[a, b, c]") == ["a", "b", "c"]  # four more events begin and end it
+    with pytest.raises(UnsupportedYamlError, match="line 2: it has more than 8 values"):
+        plain_yaml.load(b"[a, b, c, d]")
+
+
+def test_fields_are_of_the_kind_that_is_asked_for():
+    fields = Fields(
+        plain_yaml.load(
+            b"n: 7\nq: '7'\nbig: 9223372036854775807\nbigger: 9223372036854775808\nm: {a: b}\nl: [1]\nnull: ~\nempty: ''\nnone:\nminus: -1"
+        ),
+        "it",
+    )
+    assert (fields.whole("n"), fields.whole("big"), fields.text("n"), fields.text("empty", "x")) == (
+        7,
+        2**63 - 1,
+        "7",
+        "",
+    )
+    assert (fields.text("none", "x"), fields.text("gone", "x"), fields.text("q", "x")) == ("x", "x", "7")
+    assert (fields.values("l"), fields.values("none"), fields.values("gone"), fields.map("m").text("a")) == (
+        ["1"],
+        [],
+        [],
+        "b",
+    )
+    assert (fields.any("none"), fields.any("gone"), fields.any("l"), fields.any("empty")) == (None, None, ["1"], "")
+    for wrong, words in (
+        (lambda: fields.whole("q"), "it: q is '7', not a whole number"),
+        (lambda: fields.whole("bigger"), "it: bigger is '9223372036854775808', not a whole number"),
+        (lambda: fields.whole("minus"), "it: minus is '-1', not a whole number"),
+        (lambda: fields.whole("gone"), "it: gone is missing, not a whole number"),
+        (lambda: fields.text("l"), "it: l is a list, not text"),
+        (lambda: fields.text("m", "x"), "it: m is a map, not text"),
+        (lambda: fields.text("gone"), "it: gone is missing, not text"),
+        (lambda: fields.values("m"), "it: m is a map, not a list"),
+        (lambda: fields.values("empty"), "it: empty is '', not a list"),
+        (lambda: fields.map("l"), "it: l is a list, not a map"),
+        (lambda: fields.map("m").map("a"), "it: m: a is 'b', not a map"),
+    ):
+        with pytest.raises(UnsupportedYamlError) as error:
+            wrong()
+        assert str(error.value) == words
