@@ -1,0 +1,358 @@
+"""Parts of the median detector against plain implementations of what they say, with numbers at their ends."""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+import pytest
+
+from mcaptrack.transforms.detect.median_background import Background, Sampler
+from mcaptrack.transforms.detect.people import (
+    Learner,
+    Person,
+    Separator,
+    _Crop,
+    _fit_height,
+    _joined_parts,
+    _mode,
+    region_boxes,
+    typical_height,
+)
+
+ROWS = 24
+
+
+def drawn(size: tuple[int, int], *boxes: tuple[int, int, int, int]) -> np.ndarray:
+    """A mask (height, width) with boxes x, y, w, h."""
+    mask = np.zeros(size, np.uint8)
+    for x, y, w, h in boxes:
+        mask[y : y + h, x : x + w] = 255
+    return mask
+
+
+@pytest.mark.parametrize(
+    ("values", "wanted"),
+    [([3], 3), ([2, 1], 1.5), ([10, 3, 1, 2], 1.5), ([0, 5, 5.25, 5.75, 9], 5.125), ([1, 2, 9, 9.5, 9.75], 9.625)],
+)
+def test_the_densest_half_is_halved_until_two_values_are_left(values, wanted):
+    assert _mode(np.array(values, float)) == wanted
+
+
+class TestHeightOverFeet:
+    FOOT = np.array([50.0, 70.0, 90.0, 110.0, 130.0, 150.0])
+
+    def fit(self, height, foot=FOOT, weight=None, picture=200):
+        weight = np.ones(len(foot)) if weight is None else np.array(weight, float)
+        return _fit_height(foot, np.array(height, float), weight, picture)
+
+    def test_a_line_is_found_beside_regions_that_do_not_follow_it(self):
+        height = 10 + 0.2 * self.FOOT
+        foot = np.append(self.FOOT, [60.0, 80.0, 100.0])
+        slope, level = self.fit(np.append(height, [60.0, 5.0, 70.0]), foot)
+        assert (slope, level) == (pytest.approx(0.2), pytest.approx(10))
+
+    def test_those_with_more_weight_decide(self):
+        foot = np.concatenate([self.FOOT, self.FOOT])
+        height = np.concatenate([10 + 0.2 * self.FOOT, 40 + 0.4 * self.FOOT])
+        for heavy, (slope, level) in (([3] * 6 + [1] * 6, (0.2, 10)), ([1] * 6 + [3] * 6, (0.4, 40))):
+            assert self.fit(height, foot, heavy) == (pytest.approx(slope), pytest.approx(level))
+
+    def test_who_is_farther_away_is_not_taller(self):
+        slope, level = self.fit(30 - 0.02 * self.FOOT)
+        assert (slope, level) == (0, pytest.approx(np.median(30 - 0.02 * self.FOOT)))
+
+    @pytest.mark.parametrize(("spread", "is_level"), [(20.0, True), (20.5, False)])
+    def test_feet_that_spread_over_a_tenth_of_the_picture_or_less_give_no_slope(self, spread, is_level):
+        foot = np.linspace(100.0, 100.0 + spread, 6)
+        slope, level = self.fit(20 + 0.2 * (foot - 100), foot)
+        assert (slope == 0) == is_level
+        assert level == pytest.approx(np.median(20 + 0.2 * (foot - 100)) if is_level else 0, abs=1e-6)
+
+
+def joined(boxes: np.ndarray, expected: np.ndarray) -> set[frozenset[int]]:
+    """Groups by comparing each pair, and joining what is linked."""
+    groups = [{n} for n in range(len(boxes))]
+    for i, (ax, ay, aw, ah) in enumerate(boxes[:, :4].tolist()):
+        for j, (bx, by, bw, bh) in enumerate(boxes[:, :4].tolist()):
+            if i == j or not (ah < 0.7 * expected[i] or bh < 0.7 * expected[j]):
+                continue
+            aside, gap = 0.05 * expected[i], 0.4 * expected[i]
+            is_beside = ax - aside < bx + bw and bx < ax + aw + aside
+            is_above = ay - gap < by + bh and by < ay + ah + gap
+            tall = max(ay + ah, by + bh) - min(ay, by)
+            if is_beside and is_above and tall <= 1.2 * max(expected[i], expected[j]):
+                one = next(group for group in groups if i in group)
+                other = next(group for group in groups if j in group)
+                if one is not other:
+                    one |= other
+                    groups.remove(other)
+    return {frozenset(group) for group in groups}
+
+
+@pytest.mark.parametrize("seed", range(60))
+def test_parts_above_each_other_are_joined_up_to_the_height_of_one_person(seed):
+    rng = np.random.default_rng(seed)
+    count = int(rng.integers(1, 7))
+    corner, size = rng.integers(0, 25, (count, 2)), rng.integers(1, 24, (count, 2))
+    found = np.column_stack([corner, size, size.prod(axis=1)])
+    expected = rng.choice([20.0, 20.0, 30.0], count)
+    groups = _joined_parts(found, expected)
+    assert {frozenset(group.tolist()) for group in groups} == joined(found, expected)
+    assert sorted(np.concatenate(groups).tolist()) == list(range(count))
+
+
+@pytest.mark.parametrize(
+    ("lower", "is_one"),
+    [
+        ((10, 23, 4, 9), True),
+        ((10, 24, 4, 9), True),  # together 24 rows: 1.2 times 20
+        ((10, 25, 4, 9), False),
+        ((14, 23, 4, 9), True),  # a column aside
+        ((15, 23, 4, 9), False),
+        ((6, 23, 4, 9), True),
+        ((5, 23, 4, 9), False),
+        ((10, 25, 4, 7), True),
+        ((10, 26, 4, 7), False),  # 8 rows lie between them
+        ((10, 16, 4, 14), True),
+    ],
+)
+def test_parts_at_the_ends_of_the_distances(lower, is_one):
+    found = np.array([(10, 9, 4, 9, 36), (*lower, lower[2] * lower[3])])
+    assert len(_joined_parts(found, np.array([20.0, 20.0]))) == (1 if is_one else 2)
+
+
+class TestRegions:
+    @pytest.mark.parametrize(
+        ("box", "person_px", "there"),
+        [((20, 20, 5, 4), 10, 1), ((20, 20, 19, 1), 10, 0), ((20, 20, 10, 5), 50, 1), ((20, 20, 7, 7), 50, 0)],
+    )
+    def test_regions_have_20_pixels_and_two_percent_of_a_squared_height(self, box, person_px, there):
+        assert region_boxes(drawn((60, 60), box), person_px).tolist() == [[*map(float, box)]] * there
+
+    @pytest.mark.parametrize(("gap", "count"), [(1, 1), (4, 1), (5, 2)])
+    def test_regions_above_each_other_are_joined_over_a_fifth_of_a_height(self, gap, count):
+        """An opening of up to 4 rows is closed by a column of 5."""
+        mask = drawn((60, 40), (10, 10, 6, 8), (10, 18 + gap, 6, 8))
+        assert len(region_boxes(mask, 25)) == count
+
+    def test_the_typical_height_is_the_median_weighted_by_area(self):
+        assert typical_height([]) == typical_height([drawn((100, 100), (5, 5, 19, 1))]) == 20
+        assert typical_height([drawn((100, 100), (5, 5, 5, 4))]) == 4
+        # 6 x 10 and 5 x 12 have the same area; 8 x 15 = 120 is half of all.
+        low, middle, high = (5, 5, 6, 10), (30, 5, 5, 12), (50, 5, 8, 15)
+        assert typical_height([drawn((100, 100), low, middle, high)]) == 12
+        assert typical_height([drawn((100, 100), low), drawn((100, 100), high)]) == 15
+        assert typical_height([drawn((100, 100), low, (30, 5, 2, 50))]) == 10  # half the picture is no person
+        assert typical_height([drawn((100, 100), low, (30, 5, 2, 49))]) == 49
+
+
+class TestLearning:
+    def learned(self, boxes, size=(120, 120), person_px=20.0):
+        learner = Learner()
+        learner.add([drawn(size, box) for box in boxes], person_px)
+        return learner.person()
+
+    def test_eight_regions_that_are_alike_are_needed(self):
+        boxes = [(20 + n, 40, 8, 20) for n in range(8)]
+        person = self.learned(boxes)
+        assert (person.slope, person.level) == (0, 20)
+        assert self.learned(boxes[:7]) is None
+        assert self.learned([*boxes[:7], (20, 20, 8, 40)]) is None  # which is twice as tall
+        for x, y, is_cut in ((1, 40, True), (2, 40, False), (111, 40, True), (110, 40, False), (40, 1, True)):
+            assert (self.learned([*boxes[:7], (x, y, 8, 20)]) is None) == is_cut
+        for y, is_cut in ((3, False), (98, True), (97, False)):  # closing reaches the edge from 2 rows away
+            assert (self.learned([*boxes[:7], (40, y, 8, 20)]) is None) == is_cut
+
+    def test_the_shape_is_the_mean_of_those_alone_and_the_same_on_both_sides(self):
+        person = self.learned([(20 + n, 40, 8, 24) for n in range(10)], person_px=24.0)
+        template = person.template
+        assert template.shape == (ROWS, math.ceil(24 * 8 / 24 * 1.8) // 2 * 2 + 2)
+        np.testing.assert_array_equal(template, template[:, ::-1])
+        middle = template.shape[1] // 2
+        np.testing.assert_array_equal(template[:, middle - 4 : middle + 4], 1)
+        assert template.sum() == 8 * ROWS
+        wide = self.learned([(20 + n, 40, 8, 24) for n in range(10)] + [(20, 40, 11, 24)] * 5, person_px=24.0)
+        np.testing.assert_array_equal(wide.template, template)  # 11 is more than 1.35 times 8
+        wide = self.learned([(20 + n, 40, 8, 24) for n in range(10)] + [(20, 40, 10, 24)] * 10, person_px=24.0)
+        np.testing.assert_allclose(wide.template[:, middle - 5], 0.5)
+
+    def test_people_are_at_least_eight_pixels_tall(self):
+        person = Person(0.1, 5.0, np.zeros((ROWS, 10), np.float32))
+        assert (person.height(20), person.height(30), person.height(50)) == (8, 8, 10)
+
+
+def template(half: int = 4, columns: int = 12) -> np.ndarray:
+    shape = np.zeros((ROWS, columns), np.float32)
+    shape[:, columns // 2 - half : columns // 2 + half] = 0.9
+    shape[:4, :] *= 0.5
+    return shape
+
+
+PERSON = Person(0.0, 24.0, template())
+
+
+class TestSeparating:
+    @pytest.mark.parametrize(
+        ("box", "there"),
+        [
+            ((40, 40, 8, 24), 1),
+            ((40, 40, 8, 30), 1),  # 1.25 times as tall
+            ((40, 40, 12, 24), 1),  # at most 1.6 times as wide as 8
+            ((40, 40, 7, 4), 0),  # 28 pixels: less than three times two percent of 24 squared
+            ((40, 40, 7, 5), 1),
+            ((40, 40, 2, 12), 1),  # half as tall as a person
+            ((40, 40, 2, 11), 0),
+            ((40, 40, 5, 3), 0),
+            ((1, 40, 7, 4), 1),  # at the edge of the picture a part is seen
+            ((2, 40, 7, 4), 0),
+            ((40, 1, 7, 4), 1),
+            ((40, 2, 7, 4), 0),
+            ((92, 40, 7, 4), 1),
+            ((91, 40, 7, 4), 0),
+            ((40, 95, 7, 4), 1),
+            ((40, 94, 7, 4), 0),
+        ],
+    )
+    def test_a_region_of_one_person_is_a_box_if_enough_of_it_is_seen(self, box, there):
+        found = Separator(PERSON, 0.5).boxes(drawn((100, 100), box))
+        assert found.tolist() == [[*map(float, box)]] * there
+
+    def test_nothing_has_no_boxes(self):
+        assert Separator(PERSON, 0.5).boxes(drawn((100, 100))).shape == (0, 4)
+
+    @pytest.mark.parametrize("count", [2, 3])
+    def test_people_side_by_side_get_a_box_each(self, count):
+        mask = drawn((100, 140), *((30 + 9 * n, 40, 8, 24) for n in range(count)))
+        mask[50:54, 30 : 30 + 9 * count - 1] = 255  # they hold hands
+        found = Separator(PERSON, 0.5).boxes(mask)
+        found = found[np.argsort(found[:, 0])]
+        np.testing.assert_allclose(found, [(30 + 9 * n, 40, 8, 24) for n in range(count)], atol=1.01)
+
+    def test_a_place_gains_what_its_pixels_say(self):
+        """The log-likelihood of a person at each place, summed pixel by pixel."""
+        separator = Separator(PERSON, 0.5)
+        rng = np.random.default_rng(2)
+        ink = (rng.random((30, 26)) > 0.4).astype(np.float32)
+        shape = np.clip(PERSON.template.astype(float), 0, 0.97)
+        hit, miss = np.log((0.03 + 0.97 * shape) / 0.03), np.log(1 - shape)
+        others = [(12, 26)]
+        left = ink.copy()
+        for row in range(ROWS):
+            for column in range(12):
+                y, x = 26 - ROWS + 1 + row, 12 - 6 + column
+                left[y, x] *= 1 - shape[row, column]
+        gains = separator._gains(ink, separator._filter(1 - ink, separator._miss), others)
+        for x, y in ((0, 0), (12, 26), (25, 29), (6, 23), (20, 10)):
+            total = 0.0
+            for row in range(ROWS):
+                for column in range(12):
+                    at_y, at_x = y - ROWS + 1 + row, x - 6 + column
+                    if 0 <= at_y < 30 and 0 <= at_x < 26:
+                        total += left[at_y, at_x] * hit[row, column] + (1 - ink[at_y, at_x]) * miss[row, column]
+            assert gains[y, x] == pytest.approx(total, rel=1e-4, abs=1e-3)
+        place, gain = separator._best(ink, separator._filter(1 - ink, separator._miss), others)
+        assert gain == pytest.approx(float(gains.max()))
+        assert gains[place[1], place[0]] == gains.max()
+
+    def test_a_crop_has_its_margin_and_its_points(self):
+        region = np.zeros((6, 8), bool)
+        region[2:, 3:5] = True
+        crop = _Crop(region, 1.0, (4, 5))
+        assert crop.ink.shape == (16, 16)
+        np.testing.assert_array_equal(crop.ink[5:11, 4:12], region)
+        assert crop.ink.sum() == region.sum()
+        half = _Crop(region, 2.0, (4, 5))
+        assert half.ink.shape == (22, 24)
+        assert half.to_picture(4 + 2 * 3, 5 + 2 * 2) == (3, 2)
+        unknown = crop.beyond(2, 1, (11, 8))
+        for row in range(16):
+            for column in range(16):
+                x, y = 2 + column + 0.5 - 4, 1 + row + 0.5 - 5
+                assert unknown[row, column] == (x < 0 or x > 11 or y < 0 or y > 8)
+
+
+class TestBackground:
+    STILL = np.full((40, 48, 3), (100, 120, 140), np.uint8)
+
+    def background(self, **changed) -> Background:
+        return Background.of([self.STILL] * 5, **changed)
+
+    def test_samples_are_every_so_many_pictures_a_power_of_two(self):
+        for count in (1, 47, 48, 49, 96, 97, 500):
+            sampler = Sampler()
+            for number in range(count):
+                sampler.add(lambda number=number: number)
+            step = next(2**n for n in range(20) if math.ceil(count / 2**n) <= 48)
+            assert sampler.pictures == list(range(0, count, step))
+
+    @pytest.mark.parametrize(("threshold", "least"), [(None, 22), (5.0, 5), (300.0, 255)])
+    def test_differences_above_the_threshold_count(self, threshold, least):
+        background = self.background(threshold=threshold)
+        assert (background.threshold == least).all()
+        for channel in range(3):
+            for by in (least, least + 1, -least, -least - 1):
+                value = int(self.STILL[0, 0, channel]) + by
+                if not 0 <= value <= 255:
+                    continue
+                image = self.STILL.copy()
+                image[20:24, 20:24, channel] = value
+                assert (background.mask(image, shadows=False)[20:24, 20:24] == 255 * (abs(by) > least)).all()
+
+    @pytest.mark.parametrize(
+        ("factor", "tint", "is_shadow"),
+        [(0.5, 0, False), (0.6, 0, True), (0.75, 0, True), (0.75, 0.1, True), (0.75, 0.14, False), (1.3, 0, False)],
+    )
+    def test_a_shadow_is_darker_and_of_the_same_colour(self, factor, tint, is_shadow):
+        image = self.STILL.copy()
+        image[20:24, 20:24] = np.rint((self.STILL[0, 0] + 1.0) * (factor + np.array([0, 0, tint])) - 1).astype(np.uint8)
+        background = self.background(threshold=5.0)
+        assert (background.mask(image, shadows=False)[20:24, 20:24] == 255).all()
+        assert (background.mask(image, shadows=True)[20:24, 20:24] == 255 * (not is_shadow)).all()
+        grey = Background.of([np.full_like(self.STILL, 120)] * 5, 5.0)
+        assert grey.is_grey
+        assert not background.is_grey
+        image[:] = 120
+        image[20:24, 20:24] = 80
+        assert (grey.mask(image, shadows=True)[20:24, 20:24] == 255).all()
+
+    @pytest.mark.parametrize("factor", [0.8, 0.97, 1.1])
+    def test_light_that_changes_everywhere_is_compensated(self, factor):
+        image = cv2.convertScaleAbs(self.STILL, alpha=factor)
+        image[20:24, 20:24] = 250
+        same = self.background()._same_light(image)
+        assert np.abs(same[:16].astype(int) - self.STILL[:16]).max() <= 1
+        almost = cv2.convertScaleAbs(self.STILL, alpha=1.01)
+        assert self.background()._same_light(almost) is almost
+
+    def test_a_pixel_beside_another_colour_may_have_it(self):
+        still = self.STILL.copy()
+        still[:, 24:] = (20, 220, 20)
+        background = Background.of([still] * 5)
+        np.testing.assert_array_equal(background.lowest[10, 22:26, 0], [100, 20, 20, 20])
+        np.testing.assert_array_equal(background.highest[10, 22:26, 0], [100, 100, 100, 20])
+        moved = np.roll(still, 1, axis=1)
+        assert not background.mask(moved, shadows=False)[:, 20:30].any()
+        assert background.mask(np.roll(still, 2, axis=1), shadows=False)[:, 20:30].any()
+
+    def test_what_sways_has_the_range_of_a_wider_surrounding_and_what_passes_has_not(self):
+        """A flag shows its own colour a few pixels aside; a person brings another one."""
+        still = np.full((80, 120, 3), (100, 120, 140), np.uint8)
+        still[20:40, 20:30] = (20, 40, 220)
+        flag, person = [], []
+        for number in range(8):
+            image = still.copy()
+            image[20:40, 30:33] = (20, 40, 220) if number % 2 else (100, 120, 140)
+            flag.append(image)
+            passing = still.copy()
+            passing[20:60, 60:70] = (240, 240, 10) if number % 2 else (100, 120, 140)
+            person.append(passing)
+        plain = Background.of([still] * 5)
+        swaying, passing = plain.swaying(flag, 20.0), plain.swaying(person, 20.0)
+        assert plain.mask(flag[1], shadows=False)[20:40, 31:33].all()
+        assert not swaying.mask(flag[1], shadows=False).any()
+        assert (passing.mask(person[1], shadows=False)[20:60, 60:70] == 255).all()
+        np.testing.assert_array_equal(passing.highest, plain.highest)
+        np.testing.assert_array_equal(swaying.lowest[:, 60:], plain.lowest[:, 60:])
+        assert (swaying.median == plain.median).all()
