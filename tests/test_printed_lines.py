@@ -2,31 +2,37 @@
 
 from __future__ import annotations
 
+import inspect
 import io
 import json
 import os
 import re
 from contextlib import redirect_stdout
+from contextvars import copy_context
 from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
 import pytest
 
+import mcaptrack
 from mcaptrack.api.running import RunResult
 from mcaptrack.cli import common, running
-from mcaptrack.cli.config import MAX_BYTES, read_toml
+from mcaptrack.cli.config import MAX_BYTES, ConfigFile, read_toml
 from mcaptrack.cli.evaluate import _gates, _limit
-from mcaptrack.cli.plugins import _values
+from mcaptrack.cli.flags import RUNNING, with_flags
+from mcaptrack.cli.plugins import _files, _names_of_settings, _values
 from mcaptrack.cli.query import _asked, _form, _named, _print_answer
 from mcaptrack.cli.settings import Declared, Setting
-from mcaptrack.cli.show import _lineage
+from mcaptrack.cli.show import _lineage, _print
 from mcaptrack.cli.text import console, printable
 from mcaptrack.cli.tune import _range
 from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import Notice
 from mcaptrack.pipeline.summary import Repair, Summary, SummaryScores
+from mcaptrack.transforms import STAGES
 from tests.commands import GROUP, call
+from tests.test_settings import another, options_of, words_for
 
 
 class Terminal(io.StringIO):
@@ -553,3 +559,355 @@ def test_a_page_is_drawn_on_a_terminal_and_printed_as_it_is_elsewhere(tmp_path, 
     with pytest.raises(SystemExit):
         GROUP.main(["docs", "sql", "-o", os.fspath(target)], prog_name="mcaptrack")
     assert "```" in target.read_text()
+
+
+# What commands give to the functions of the same names, and what they say of it
+
+
+class Stop(McaptrackError):
+    """Ends a command once its function was called."""
+
+
+def asked_of(monkeypatch: pytest.MonkeyPatch, name: str) -> list[dict[str, Any]]:
+    """The arguments of calls of a function of the library, by parameter; it ends the command."""
+    calls: list[dict[str, Any]] = []
+    signature = inspect.signature(getattr(mcaptrack, name))
+
+    def called(*args: Any, **given: Any) -> None:
+        calls.append(dict(signature.bind(*args, **given).arguments))
+        raise Stop("stop")
+
+    monkeypatch.setattr(mcaptrack, name, called)
+    return calls
+
+
+#: Options that a command treats itself or gives in another form.
+OWN = {"json", "quiet", "verbose", "form", "csv", "fail_under", "search", "file", "rows", "tables", "study", "output"}
+OF_FUNCTIONS = ("demo", "drop", "evaluate", "events", "export", "ingest", "recover", "render", "report", "train")
+
+
+@pytest.mark.parametrize("command", [*OF_FUNCTIONS, "tune", "view"])
+def test_every_option_arrives_under_its_name(command, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    known = inspect.signature(getattr(mcaptrack, command)).parameters
+    calls = asked_of(monkeypatch, command)
+    first = {"drop": ["x.mcap", "/a"], "demo": []}.get(command, ["x.mcap"])
+    tried = set()
+    for one in options_of(command):
+        value = another(one, None)
+        if one.parameter in OWN or one.parameter not in known:
+            continue
+        if one.kind is bool:
+            value = True
+        if one.kind in (int, float):
+            value = one.kind(max(one.declared.least, min(one.declared.most, value)))
+        if one.parameter == "gate_m" and one.kind is str:
+            value = "0.25"
+        if one.parameter == "similarity":
+            value = "metres"
+        call(command, *first, *words_for(one, value))
+        got = calls.pop()[one.parameter]
+        got = [str(part) for part in got] if isinstance(got, list | tuple) else got
+        wanted = (
+            [str(part) for part in value]
+            if one.many
+            else ["0.25"]
+            if one.parameter == "gate_m" and one.kind is str
+            else value
+        )
+        assert (str(got) if isinstance(got, Path) else got) == wanted, one.name
+        tried.add(one.parameter)
+    assert tried or command in ("recover", "drop")
+
+
+@pytest.mark.parametrize(
+    "command", ["detect", "track", "sample", "predict", "retrack", "run", "events", "render", "recover", "ingest"]
+)
+def test_several_inputs_are_not_written_to_one_output(command):
+    refused = call(command, "a.mcap", "b.mcap", "-o", "x.mcap")
+    assert (refused.code, refused.out) == (1, "")
+    assert refused.err == (
+        "mcaptrack: 2 inputs can't all be written to x.mcap; give one input, or no name for the output\n"
+    )
+
+
+def test_commands_that_only_read_are_known():
+    assert {name for name, one in GROUP.commands.items() if one.reads} == {
+        "check", "docs", "evaluate", "info", "query", "view"
+    }  # fmt: skip
+
+
+class TestTune:
+    SCORES = {"IDF1": 0.75, "MOTA": 0.5, "HOTA": 0.25, "IDSW": 1, "FP": 2, "FN": 3}
+
+    def tuned(self, monkeypatch, *words: object, best: int = 3, similarity: str = "iou") -> tuple[Any, dict[str, Any]]:
+        given: dict[str, Any] = {}
+
+        def tune(inputs: Any, **more: Any) -> mcaptrack.TuneResult:
+            given.update(more)
+            return mcaptrack.TuneResult(
+                stage=more["stage"],
+                metric=more["metric"],
+                similarity=similarity,
+                settings={"max_age_s": 2.5},
+                scores=self.SCORES,
+                default_scores=self.SCORES | {"IDF1": 0.5},
+                trials=7,
+                best=best,
+                notes=(),
+                warnings=(),
+            )
+
+        monkeypatch.setattr(mcaptrack, "tune", tune)
+        return call("tune", "x.mcap", *words), given
+
+    @pytest.fixture(autouse=True)
+    def folder(self, tmp_path, monkeypatch):
+        monkeypatch.chdir(tmp_path)
+
+    def test_settings_that_beat_the_defaults_are_written(self, monkeypatch):
+        outcome, _ = self.tuned(monkeypatch)
+        assert outcome.err == "mcaptrack.toml: IDF1 0.5000 with the defaults, 0.7500 now\n"
+        assert Path("mcaptrack.toml").read_text() == "[track]\nmax-age-s = 2.5\n"
+        outcome, _ = self.tuned(
+            monkeypatch, "-o", "b.toml", "--metric", "mota", "--stage", "sample", "--similarity", "iou"
+        )
+        assert outcome.err == "b.toml: MOTA 0.5000 with the defaults, 0.5000 now\n"
+        assert Path("b.toml").read_text() == "[sample]\nmax-age-s = 2.5\n"
+
+    def test_the_file_stays_if_nothing_beats_the_defaults(self, monkeypatch):
+        outcome, _ = self.tuned(monkeypatch, best=0)
+        assert outcome.err == "nothing that was tried beats the defaults (IDF1 0.5000); mcaptrack.toml stays\n"
+        assert not Path("mcaptrack.toml").exists()
+        assert json.loads(self.tuned(monkeypatch, "--json", best=0)[0].out)["results"] == [
+            {
+                "stage": "track",
+                "metric": "IDF1",
+                "settings": {"max_age_s": 2.5},
+                "trials": 7,
+                "best": 0,
+                "scores": self.SCORES,
+                "default_scores": self.SCORES | {"IDF1": 0.5},
+            }
+        ]
+
+    @pytest.mark.parametrize(
+        ("words", "study", "tracker"),
+        [
+            ([], "mcaptrack.sort.trials.jsonl", "sort"),
+            (["--tracker", "own:It"], "mcaptrack.own.It.trials.jsonl", "own:It"),
+            (["--stage", "retrack", "-o", "to/b.toml"], "to/b.retrack.trials.jsonl", None),
+            (["--study", "mine"], "mine", "sort"),
+        ],
+    )
+    def test_trials_are_kept_beside_the_settings(self, monkeypatch, words, study, tracker):
+        _, given = self.tuned(monkeypatch, *words, best=0)
+        assert (given["study"], given["tracker"]) == (Path(study), tracker)
+
+    @pytest.mark.parametrize(
+        ("words", "similarity", "unused"),
+        [
+            ([], "iou", []),
+            (["--gate-m", "1"], "iou", ["--gate-m changes nothing here: overlap is compared"]),
+            (["--gate-m", "1"], "metres", []),
+            (["--min-iou", "0.4"], "metres", ["--min-iou changes nothing here: distance is compared"]),
+            (["--min-iou", "0.4"], "iou", []),
+            (
+                ["--tracker", "sort", "--stage", "sample"],
+                "iou",
+                ["--tracker changes nothing here: sample has no trackers"],
+            ),
+            (["--tracker", "sort"], "iou", []),
+            (["--fps", "5"], "iou", ["--fps changes nothing here: it is about label files; logs have theirs inside"]),
+            (["--truth", "t.txt", "--fps", "5"], "iou", []),
+            (
+                ["--truth", "t.txt", "--point", "foot"],
+                "iou",
+                ["--point changes nothing here: there is no ground plane"],
+            ),
+            (["--truth", "t.txt", "--point", "foot", "--ground-plane", "p.txt"], "iou", []),
+            (
+                ["--truth", "t.txt", "--camera", "c", "--topic", "/t"],
+                "iou",
+                [
+                    f"--{name} changes nothing here: files of detections are of no camera"
+                    for name in ("topic", "camera")
+                ],
+            ),
+            (["--camera", "c"], "iou", []),
+        ],
+    )
+    def test_options_without_an_effect_are_said(self, monkeypatch, words, similarity, unused):
+        outcome, _ = self.tuned(monkeypatch, *words, best=0, similarity=similarity)
+        assert [line for line in outcome.err.splitlines() if "changes nothing" in line] == [
+            f"warning: {one}" for one in unused
+        ]
+
+
+class TestQuery:
+    @pytest.fixture(autouse=True)
+    def answers(self, tmp_path, monkeypatch):
+        monkeypatch.chdir(tmp_path)
+        many = pa.table({"n": pa.array(range(61), pa.int64()), "word": ["a\x1b[31m"] * 61})
+        monkeypatch.setattr(mcaptrack, "query", lambda paths, sql, files: many)
+
+    def on_screen(self, monkeypatch, *words: str) -> str:
+        with redirect_stdout(on_terminal(monkeypatch, 80)) as screen, pytest.raises(SystemExit):
+            GROUP.main(["query", "x.mcap", "select 1", *words], prog_name="mcaptrack")
+        return re.sub(r"\x1b\[[0-9;]*m", "", screen.getvalue())
+
+    def test_a_terminal_shows_sixty_rows_and_a_pipe_all(self, monkeypatch):
+        rows = {
+            words: len(self.on_screen(monkeypatch, *words).splitlines()) - 2
+            for words in ((), ("--rows", "0"), ("--rows", "5"))
+        }
+        assert rows == {(): 60, ("--rows", "0"): 61, ("--rows", "5"): 5}
+        assert self.on_screen(monkeypatch, "-o", "a.txt") == ""
+        assert len(Path("a.txt").read_text().splitlines()) == 63
+        outcome = call("query", "x.mcap", "select 1")
+        assert (len(outcome.out.splitlines()), outcome.err) == (63, "")
+
+    def test_a_note_is_left_out_with_quiet(self):
+        words = ["query", "x.mcap", "select 1", "--rows", "2"]
+        assert call(*words, "-v").err.endswith("the first 2 of 61 rows; --rows 0 shows all\n")
+        assert call(*words, "-q").err == ""
+
+    def test_control_characters_are_escapes_on_a_terminal_and_data_elsewhere(self, monkeypatch):
+        assert r'0,"a\x1b[31m"' in self.on_screen(monkeypatch, "--format", "csv")
+        assert '0,"a\x1b[31m"\n' in call("query", "x.mcap", "select 1", "--format", "csv").out
+
+    def test_options_without_an_effect_are_said(self, monkeypatch):
+        monkeypatch.setattr(mcaptrack, "list_tables", lambda paths, files: mcaptrack.TableList((), (), ()))
+        words = ["query", "x.mcap", "select 1", "--rows", "2", "--format"]
+        for form in ("csv", "json", "jsonl"):
+            assert call(*words, form).err == f"warning: --rows changes nothing here: {form} has all rows\n"
+        outcome = call("query", "--tables", "--rows", "2", "--format", "csv")
+        assert outcome.err.splitlines() == [
+            f"warning: --{name} changes nothing here: --tables lists what could be asked" for name in ("format", "rows")
+        ]
+
+    def test_an_answer_replaces_a_file_on_request_only(self):
+        Path("a.json").write_text("old")
+        words = ["query", "x.mcap", "select 1", "--json", "-o", "a.json"]
+        assert call(*words).code == 1
+        assert Path("a.json").read_text() == "old"
+        assert call(*words, "--force").code == 0
+        assert len(json.loads(Path("a.json").read_text())["results"]) == 61
+        Path("x.mcap").write_text("")
+        refused = call("query", "x.mcap", "select 1", "-o", "x.mcap", "--force")
+        assert "x.mcap is both input and output; give another name with -o" in refused.err
+
+
+def test_a_channel_that_results_replace_is_said_and_drawn_once():
+    described = {"schema": "S", "messages": 1234, "replaced": False, "transform": None, "input": None, "plugins": None}
+    described |= {"stale": False, "parameters": {"b": 1, "a": 2}}
+    data = {
+        "log": "a\x1b.mcap",
+        "bytes": 12345,
+        "messages": 6789,
+        "start_ns": 5,
+        "end_ns": 10**18 + 5,
+        "results": "a.results.mcap",
+        "channels": [
+            described | {"topic": "/a", "replaced": True},
+            described | {"topic": "/a"},
+            described | {"topic": "/b"},
+        ],
+    }
+    for verbose in (False, True):
+        with redirect_stdout(io.StringIO()) as out:
+            _print(data, verbose)
+        more = [["│   └── a=2, b=1"], ["    └── a=2, b=1"]] if verbose else [[], []]
+        assert [line.rstrip() for line in out.getvalue().splitlines()] == [
+            r"a\x1b.mcap  12,345 bytes, 6,789 messages, 1000000000.000 s",
+            "with results in a.results.mcap",
+            f"{'topic':<31}schema  messages",
+            *(f"{topic:<31}S          1,234" for topic in ("/a  (replaced by the results)", "/a", "/b")),
+            "lineage",
+            "├── /a",
+            *more[0],
+            "└── /b",
+            *more[1],
+        ]
+
+
+@pytest.mark.parametrize(
+    ("message", "wanted"),
+    [
+        ("give `fps=` or `ground_plane=`", "give --fps or --ground-plane"),
+        ("give `fps=25` and `force=True`", "give --fps 25 and --force"),
+        ("give `point='foot'`", "give --point foot"),
+        ("`sidecar=False`", "--sidecar"),
+        ("`fps=a b`", "`fps=a b`"),
+        ("`mcaptrack.run('a b.mcap')`", "`mcaptrack run 'a b.mcap'`"),
+        ("`mcaptrack.run('-a.mcap')`", "`mcaptrack run ./-a.mcap`"),
+        ("`mcaptrack.run('a.mcap', force=True)`", "`mcaptrack run a.mcap --force`"),
+        ("`mcaptrack.track('a.mcap', max_age_s=2.0)`", "`mcaptrack track a.mcap --max-age-s 2.0`"),
+        ("`mcaptrack.list_tables('a.mcap')`", "`mcaptrack query a.mcap --tables`"),
+        ("`mcaptrack.run(path)`", "`mcaptrack.run(path)`"),
+        ("`mcaptrack.run(**x)`", "`mcaptrack.run(**x)`"),
+        ("`code` stays", "`code` stays"),
+    ],
+)
+def test_words_of_the_library_become_words_of_the_command_line(message, wanted):
+    assert copy_context().run(lambda: (RUNNING.set(None), with_flags(message))[1]) == wanted
+
+
+def test_options_are_called_as_the_running_command_calls_them():
+    group = GROUP.make_context("mcaptrack", ["ingest"])
+    context = GROUP.commands["ingest"].make_context("ingest", ["x.mp4"], parent=group)
+
+    def said(message: str) -> str:
+        RUNNING.set(context)
+        return with_flags(message)
+
+    for message, wanted in (
+        ("`label_format=`", "--format"),
+        ("`role='truth'`", "--as truth"),
+        ("`sidecar=True`", "--sidecar"),
+        ("`sidecar=False`", "--in-place"),
+        ("`output=`", "-o"),
+        ("`inputs=`", "--inputs"),
+        ("`mcaptrack.run('a', events=False)`", "`mcaptrack run a --no-events`"),
+        ("`mcaptrack.run('a', sidecar=False)`", "`mcaptrack run a --in-place`"),
+        ("`mcaptrack.demo(seed=3)`", "`mcaptrack demo --seed 3`"),
+    ):
+        assert copy_context().run(said, message) == wanted
+
+
+class TestNamesOfPlugins:
+    STAGE = STAGES["track"]
+
+    def names(self, *files: ConfigFile) -> list[str]:
+        return _names_of_settings(self.STAGE, files, {"tracker": 1, "min-iou": 1})
+
+    def test_files_and_environment_name_them_in_order_and_once(self, monkeypatch):
+        trusted = ConfigFile(Path("u"), {"track": {"tracker": "mod:A"}, "run": {"tracker": "b"}}, True)
+        other = ConfigFile(Path("w"), {"track": {"tracker": "mod:C"}, "run": {"tracker": "b"}, "detect": 3}, False)
+        assert self.names(trusted, other) == ["mod:A", "b"]
+        monkeypatch.setenv("MCAPTRACK_TRACK_TRACKER", "own")
+        monkeypatch.setenv("MCAPTRACK_RUN_TRACKER", "second")
+        assert self.names(other) == ["own", "second", "b"]
+        monkeypatch.setenv("MCAPTRACK_RUN_TRACKER", "sort")
+        assert self.names() == ["own"]
+        assert self.names(ConfigFile(Path("w"), {"track": 3, "run": {"tracker": 7}}, True)) == ["own"]
+
+    @pytest.mark.parametrize("where", ["file", "environment"])
+    @pytest.mark.parametrize(("option", "is_unknown"), [("min-iou", False), ("min_iou", False), ("own-option", True)])
+    def test_an_option_that_is_none_of_theirs_loads_all_that_are_installed(
+        self, monkeypatch, option, is_unknown, where
+    ):
+        monkeypatch.setattr("mcaptrack.cli.plugins.names", lambda kind: ("sort", "installed"))
+        files = []
+        if where == "file":
+            files = [ConfigFile(Path("w"), {"track": {option: 1}}, False)]
+        else:
+            monkeypatch.setenv(f"MCAPTRACK_TRACK_{option.upper().replace('-', '_')}", "1")
+        assert self.names(*files) == (["installed"] if is_unknown else [])
+
+    def test_the_file_on_the_command_line_counts(self, tmp_path, monkeypatch):
+        for name in "ab":
+            (tmp_path / name).write_text(f"[track]\ntracker = '{name}'\n")
+        monkeypatch.setenv("MCAPTRACK_TRACK_CONFIG", str(tmp_path / "b"))
+        assert [file.path for file in _files("track", [f"--config={tmp_path / 'a'}"])] == [tmp_path / "a"]
+        assert [file.path for file in _files("track", [])] == [tmp_path / "b"]
