@@ -521,16 +521,16 @@ def test_people_are_where_the_best_tracks_say(tmp_path):
     channels = {f"/camera/{name}": (TRACKS, Provenance(INGEST, {}), at(float(n))) for n, name in enumerate(names)}
     for number, name in enumerate(names):
         with log.read(written(tmp_path / "a.mcap", channels)) as opened:
-            assert writing._places(opened, "/camera", {})[:, 0].tolist() == pytest.approx(
+            assert writing._positions(opened, "/camera", {})[:, 0].tolist() == pytest.approx(
                 [number, np.nan] * 2, nan_ok=True
             )
-            shown = {"/camera/retracks": writing.Shown(TRACKS, at(9.0, 1), "", "")}
-            assert writing._places(opened, "/camera", shown)[0].tolist() == [9.0, 0.0]
+            shown = {"/camera/retracks": writing.ChannelToDraw(TRACKS, at(9.0, 1), "", "")}
+            assert writing._positions(opened, "/camera", shown)[0].tolist() == [9.0, 0.0]
         nowhere = [Frame(0, 0, tracks_at({1: (float("nan"), 1.0)}))] * (number % 2)
         wrong = (DETECTIONS, Provenance(INGEST, {}), [Frame(0, 0, boxes_at([(1, 1)]))])
         channels[f"/camera/{name}"] = (TRACKS, Provenance(INGEST, {}), nowhere) if number < 2 else wrong
     with log.read(written(tmp_path / "a.mcap", channels)) as opened:
-        assert writing._places(opened, "/camera", {}).shape == (0, 2)
+        assert writing._positions(opened, "/camera", {}).shape == (0, 2)
 
 
 def forecast(*steps: int) -> list[Frame]:
@@ -585,7 +585,10 @@ def test_a_camera_starts_with_its_first_picture_or_row(tmp_path):
     )
     with log.read(path) as opened:
         camera = pipeline.camera_at(opened, "/camera")
-        shown = {"/camera/x": writing.Shown(TRACKS, early, "", ""), "/camera/y": writing.Shown(TRACKS, [], "", "")}
+        shown = {
+            "/camera/x": writing.ChannelToDraw(TRACKS, early, "", ""),
+            "/camera/y": writing.ChannelToDraw(TRACKS, [], "", ""),
+        }
         none = np.empty(0, np.int64)
         assert writing._start_ns(opened, camera, {}, none) == ns(5)
         assert writing._start_ns(opened, camera, shown, none) == ns(2)
@@ -621,7 +624,7 @@ def test_what_was_ingested_is_drawn_once_and_again_when_it_is_new(tmp_path):
                     [],
                 )
             with log.read(written(tmp_path / "a.mcap", channels)) as opened:
-                shown = writing._shown(opened, pipeline.camera_at(opened, "/camera"), {})
+                shown = writing._channels_to_draw(opened, pipeline.camera_at(opened, "/camera"), {})
             assert list(shown) == ["/camera/labels"] * is_shown
             for one in shown.values():
                 assert (one.schema, one.digest, one.made_by, len(one.frames)) == (schema, "x", "", len(frames))
@@ -640,10 +643,10 @@ def views_of(
         FORECAST_SCORES: scored(1.0),
     }
     shown = {
-        f"/camera/{name}": writing.Shown(schema, frames[schema], f"of {name}", made_by)
+        f"/camera/{name}": writing.ChannelToDraw(schema, frames[schema], f"of {name}", made_by)
         for name, (schema, made_by) in names.items()
     }
-    drawn = writing._Drawn("/camera", ns_, ns_, [(0, PLANE)])
+    drawn = writing._ViewFactory("/camera", ns_, ns_, [(0, PLANE)])
     found = [*drawn.views(shown, 3), *drawn.views(shown, 3)]
     kinds = {"foxglove.ImageAnnotations": "image", "foxglove.SceneUpdate": "scene", "foxglove.FrameTransform": "frame"}
     twice = [view.topic for view in found].count("/camera/view/tf")
@@ -741,7 +744,7 @@ def test_a_digest_is_of_the_messages_whether_or_not_it_was_kept(tmp_path):
         assert writing.digest_of(opened, "/a") == writing.digest_of(opened, "/b") == made.provenance.digest
     wanted = digest((frame.t_ns, frame.index, TRACKS.codec.encode(frame.rows)) for frame in at(1.0))
     assert (made.provenance.digest, made.size()) == (wanted, 2)
-    assert made._replace(words=[(1, 2, b"x")]).size() == 1
+    assert made._replace(encoded=[(1, 2, b"x")]).size() == 1
 
 
 # What a log holds, in numbers

@@ -1,6 +1,7 @@
-"""Stages in order: which channel feeds which transform, what has to run first, and what it leaves in the log.
+"""Run stages on a log: plan them, check their inputs and outputs, run their transforms, and write the results.
 
-A stage runs on a log that stands and adds its channels to it, with what they were made from and how.
+A stage reads a channel of an existing log and adds its own channels to the log, with their provenance: the input, the
+transform and its parameters.
 """
 
 from mcaptrack.pipeline.checks import Job

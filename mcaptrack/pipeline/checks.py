@@ -1,6 +1,6 @@
-"""What a stage may read and write: checked before anything runs.
+"""Check the inputs and outputs of stages before any of them runs.
 
-A stage replaces what it made itself, and nothing else: not what was recorded or ingested, and not what another made.
+A stage may replace only channels that it made itself: not recorded or ingested ones, and not those of other stages.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from mcaptrack.transforms.protocol import check_options
 
 
 class Job(NamedTuple):
-    """A transform to run from one topic to another; ``keep`` are the outputs that go into the log, None for all."""
+    """A transform with its input and output topic; ``keep`` are the outputs that are written, None for all."""
 
     stage: str
     transform: Transform
@@ -30,24 +30,27 @@ class Job(NamedTuple):
     keep: tuple[str, ...] | None = None
 
     def outputs(self) -> dict[str, Schema]:
-        """Topic and schema of each output, in the transform's order."""
+        """Return the schemas of all outputs by topic, in the transform's order."""
         return {f"{self.target}/{suffix}".rstrip("/"): schema for suffix, schema in self.transform.writes.items()}
 
     def kept(self) -> set[str]:
-        """The topics that go into the log."""
+        """Return the topics that are written to the log."""
         kept = {f"{self.target}/{suffix}".rstrip("/") for suffix in self.keep or self.transform.writes}
         return kept | {self.target + FULL} if STAGES[self.stage].at_video_rate and self.target in kept else kept
 
 
 def check_inputs(opened: log.Log, prefix: str, jobs: Sequence[Job]) -> None:
-    """Every job's input is in the log or made by a job before it, and of the right kind; nothing else is replaced."""
+    """Raise McaptrackError if a job's input is missing or of the wrong kind, or if a job would replace other results.
+
+    Inputs may be in the log, or come from an earlier job.
+    """
     coming: dict[str, Schema] = {}
     for job in jobs:
         if not is_dataclass(job.transform):
             raise McaptrackError(
                 f"{type(job.transform).__qualname__} is no dataclass; the fields of a transform are its parameters"
             )
-        check_options(job.transform)  # those of others, too
+        check_options(job.transform)  # also for transforms of other packages
         if job.source in coming:
             name, is_read = coming[job.source].name, coming[job.source] is job.transform.reads
         elif job.source in opened.channels:
@@ -64,7 +67,7 @@ def check_inputs(opened: log.Log, prefix: str, jobs: Sequence[Job]) -> None:
 
 
 def fits(channel: log.Channel, reads: Schema) -> tuple[str, bool]:
-    """What a channel holds, and whether a stage that reads this schema can read it."""
+    """Return the name of a channel's schema, and whether a stage that reads ``reads`` can read the channel."""
     if reads is VIDEO:
         return channel.schema_name, foreign.holds_pictures(channel)
     theirs = reads is DETECTIONS and foreign.holds_detections(channel)
@@ -72,7 +75,7 @@ def fits(channel: log.Channel, reads: Schema) -> tuple[str, bool]:
 
 
 def _lacks(opened: log.Log, prefix: str, job: Job) -> str:
-    """What is missing for a job, what there is, and what to do."""
+    """Return the message for a missing input: what is missing, what the log has, and what to do."""
     there = [topic for topic in sorted(opened.channels) if "/view/" not in topic]
     has, hint = f"it has {', '.join(there) or 'none'}", f"{call('info', opened.path)} shows more"
     if job.transform.reads is VIDEO and job.source == f"{prefix}/{STAGES[job.stage].input_topic}":
@@ -86,7 +89,10 @@ def _lacks(opened: log.Log, prefix: str, job: Job) -> str:
 
 
 def _check_outputs(opened: log.Log, prefix: str, job: Job) -> None:
-    """A stage replaces what it made itself, and nothing else; names of a camera stand for what they usually hold."""
+    """Raise McaptrackError if a job would replace other channels than its own, or write to a name reserved for others.
+
+    The usual names below a camera are reserved for their stage.
+    """
     usual = USUAL.get(job.target.removeprefix(prefix + "/")) if job.target.startswith(prefix + "/") else None
     if usual not in (None, job.stage):
         by = f"what {usual} makes" if usual else "what is ingested"
@@ -108,12 +114,12 @@ def _check_outputs(opened: log.Log, prefix: str, job: Job) -> None:
 
 
 def may_replace(opened: log.Log, topic: str, transform: str) -> bool:
-    """Whether a topic is free, or holds what the same transform made and nothing else."""
+    """Return whether a topic is free, or holds only channels that the same transform made."""
     return all(made is not None and made.transform == transform for made, _ in _making(opened, topic))
 
 
 def how_it_came(opened: log.Log, topic: str) -> str:
-    """Where a channel is from, in words; of several that share the topic, what others recorded before all else."""
+    """Describe the origin of a channel as text; if several channels share the topic, a recorded one goes first."""
     made, schema_name = min(_making(opened, topic), key=lambda found: found[0] is not None)
     if made is None:
         return f"was recorded by others ({schema_name or 'no schema'})"
@@ -121,7 +127,7 @@ def how_it_came(opened: log.Log, topic: str) -> str:
 
 
 def _making(opened: log.Log, topic: str) -> list[tuple[Provenance | None, str]]:
-    """How each of the channels that share a topic was made, and the name of its schema."""
+    """Return provenance (None if recorded) and schema name of each of the channels that share a topic."""
     return [
         (Provenance.from_metadata(channel.metadata), schema.name if schema else "")
         for part in opened.parts

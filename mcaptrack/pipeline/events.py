@@ -1,10 +1,10 @@
-"""The last stage: what became of tracks and of forecasts, beside their channels.
+"""Run the last stage: find events of tracks and errors of forecasts, and write them beside their channels.
 
-<tracks>/events             what happened to identities: rows of Events
-<tracks>/events/view/log    the same in words, for a viewer
-<tracks>/counts             how tracking stands, frame by frame
-<predictions>/errors        how far off each forecast was: rows of ForecastErrors
-<predictions>/scores        their means, frame by frame
+<tracks>/events             identity events (births, switches, misses, ...): rows of Events
+<tracks>/events/view/log    the same events as text, for a viewer
+<tracks>/counts             counts of tracks and tracking errors in each frame
+<predictions>/errors        the error of each forecast in metres: rows of ForecastErrors
+<predictions>/scores        the mean errors in each frame
 """
 
 from __future__ import annotations
@@ -41,19 +41,20 @@ from mcaptrack.sources.cameras import camera_at
 
 #: The name of the stage, in reports and in the provenance.
 STAGE: Final = "events"
-#: What is watched unless something else is asked for, below the camera's prefix.
+#: The channels of tracks that get events by default, below the camera's prefix.
 WATCHED: Final = ("tracks", "retracks")
-#: The tracks of the whole log: forecasts are compared with them, and with the ground truth.
-_BECAME: Final = "retracks"
+#: The offline tracks: forecasts are compared with them, and with the ground truth.
+_OFFLINE: Final = "retracks"
 _EVENTS, _COUNTS = "/events", "/counts"
 _ERRORS, _SCORES = "/errors", "/scores"
 
 
 @dataclass(frozen=True)
 class Watch:
-    """Which channels of tracks events are made of; none named are the usual ones, and those that have events.
+    """The channels of tracks to find events in, and the options for that.
 
-    With ``again`` they are made whether or not they stand; with ``anew``, too, as they were asked for before.
+    Without ``topics`` these are the default channels and those that have events already. With ``again`` events are
+    found again with ``options`` even if they are up to date; with ``anew`` also, but with the options they had before.
     """
 
     options: EventOptions = EventOptions()
@@ -63,46 +64,47 @@ class Watch:
 
 
 def outputs(topic: str) -> tuple[str, ...]:
-    """The topics that the events of a channel of tracks take."""
+    """Return the topics for the events of a channel of tracks."""
     return topic + _EVENTS, topic + _EVENTS + SUFFIX, topic + _COUNTS
 
 
 def make_events(opened: log.Log, prefix: str, made: Mapping[str, Made], watch: Watch) -> dict[str, Made]:
-    """Events of all watched channels where they are missing or out of date, and errors of predictions likewise.
+    """Find the events of tracks and the errors of forecasts that are missing or out of date.
 
-    ``made`` are channels that were just made. What can't be compared with the ground truth is left out, with a warning.
-    Raises McaptrackError for topics that were asked for and hold no tracks.
+    ``made`` are the channels of this run, by topic. Returns the new channels by topic. A channel that can't be compared
+    with the ground truth is left out, with a warning. Raises McaptrackError for given topics that hold no tracks.
     """
     out: dict[str, Made] = {}
-    topics = watch.topics or _watched(opened, prefix, made)
+    topics = watch.topics or _default_topics(opened, prefix, made)
     if watch.again and not topics:
         raise McaptrackError(f"{opened.path} has no tracks of {prefix}; {call('run', opened.path)} makes them")
 
     @cache
-    def truth() -> _Truth:
+    def truth() -> _GroundTruth:
         return _read_truth(opened, camera_at(opened, prefix).truth)
 
     for topic in topics:
-        options = watch.options if watch.again else _asked(opened, topic, watch.options)
-        stands = _asked(opened, topic, EventOptions()) == options and not _is_due(opened, outputs(topic), made)
-        if stands and not (watch.again or watch.anew):
+        options = watch.options if watch.again else _options_for(opened, topic, watch.options)
+        has_same_options = _options_for(opened, topic, EventOptions()) == options
+        is_up_to_date = has_same_options and not _is_outdated(opened, outputs(topic), made)
+        if is_up_to_date and not (watch.again or watch.anew):
             continue
-        taken = _taken(opened, outputs(topic))
-        if taken:
+        conflict = _find_conflict(opened, outputs(topic))
+        if conflict:
             if watch.topics:
-                raise McaptrackError(f"{opened.path}: events would replace {taken}")
-            warn(f"no events of {topic}: they would replace {taken}", "left-out")
+                raise McaptrackError(f"{opened.path}: events would replace {conflict}")
+            warn(f"no events of {topic}: they would replace {conflict}", "left-out")
             continue
         frames, tracks_digest = _rows(opened, topic, made)
         found = find_events(frames, truth().frames, options, opened.path.stem, topic)
-        for words in found.notes:
-            warn(words, "not-compared")
+        for note in found.notes:
+            warn(note, "not-compared")
         parameters = found.parameters(options)
         provenance = Provenance(STAGE, parameters, topic, tracks_digest, references=truth().digests)
         out[topic + _EVENTS] = events = Made.of(EVENTS, found.events, provenance)
-        words_of = list(log_messages(found.events, topic, opened.start_ns, found.frame_interval_s))
+        text = list(log_messages(found.events, topic, opened.start_ns, found.frame_interval_s))
         view = Provenance(VIEW, {}, topic + _EVENTS, events.provenance.digest)
-        out[topic + _EVENTS + SUFFIX] = Made(EVENTS, [], view, words_of, foxglove.schema_record(foxglove.LOG))
+        out[topic + _EVENTS + SUFFIX] = Made(EVENTS, [], view, text, foxglove.schema_record(foxglove.LOG))
         out[topic + _COUNTS] = Made.of(COUNTS, found.counts, provenance)
     if not watch.topics:
         for name in FORECAST_INPUTS:
@@ -116,24 +118,24 @@ def _forecast_errors(
     name: str,
     made: Mapping[str, Made],
     again: bool,
-    truth: Callable[[], _Truth],
+    truth: Callable[[], _GroundTruth],
 ) -> dict[str, Made]:
-    """How far off the forecasts of one channel were, if they are there and that is missing or out of date."""
-    topic, tracks, later = (f"{prefix}/{one}" for one in (name, FORECAST_INPUTS[name], _BECAME))
-    if not _holds(opened, topic, made, PREDICTIONS) or not _holds(opened, tracks, made):
+    """Find the errors of the forecasts in one channel, if the channel exists and its errors are missing or outdated."""
+    topic, tracks, later = (f"{prefix}/{one}" for one in (name, FORECAST_INPUTS[name], _OFFLINE))
+    if not _has_rows(opened, topic, made, PREDICTIONS) or not _has_rows(opened, tracks, made):
         return {}
-    later = later if _holds(opened, later, made) else tracks
+    later = later if _has_rows(opened, later, made) else tracks
     topics = (topic + _ERRORS, topic + _SCORES)
-    if not again and not _is_due(opened, topics, made) and later in _made_from(opened, topics[0]):
+    if not again and not _is_outdated(opened, topics, made) and later in _input_digests(opened, topics[0]):
         return {}
-    taken = _taken(opened, topics)
-    if taken:
-        warn(f"no errors of {topic}: they would replace {taken}", "left-out")
+    conflict = _find_conflict(opened, topics)
+    if conflict:
+        warn(f"no errors of {topic}: they would replace {conflict}", "left-out")
         return {}
     forecasts, digest_of_forecasts = _rows(opened, topic, made, PREDICTIONS)
-    (from_tracks, of_tracks), (became, of_later) = (_rows(opened, one, made) for one in (tracks, later))
+    (history, of_tracks), (offline, of_later) = (_rows(opened, one, made) for one in (tracks, later))
     try:
-        found = find_forecast_errors(forecasts, from_tracks, truth().frames, became, topic)
+        found = find_forecast_errors(forecasts, history, truth().frames, offline, topic)
     except McaptrackError as error:
         warn(f"no errors of forecasts: {error}", "not-compared")
         return {}
@@ -145,51 +147,52 @@ def _forecast_errors(
     }
 
 
-def tally(happened: Mapping[str, Made]) -> dict[str, dict[str, int]]:
-    """How many events of each kind, in words, each channel of tracks has."""
+def tally(made: Mapping[str, Made]) -> dict[str, dict[str, int]]:
+    """Count the events of each kind for each channel of tracks: count by name of the kind, by topic of the tracks."""
     out = {}
-    for topic, channel in happened.items():
+    for topic, channel in made.items():
         if channel.schema is EVENTS and channel.record is None:
             kinds = EVENTS.joined([frame.rows for frame in channel.frames])["kind"]
             counts = np.bincount(kinds, minlength=max(EVENT_KINDS) + 1).tolist()
-            out[topic.removesuffix(_EVENTS)] = {words: counts[kind] for kind, words in EVENT_KINDS.items()}
+            out[topic.removesuffix(_EVENTS)] = {name: counts[kind] for kind, name in EVENT_KINDS.items()}
     return out
 
 
-class _Truth(NamedTuple):
-    """The true tracks of a camera, None if there are none, and their digest by topic: nothing where that holds
-    something else.
+class _GroundTruth(NamedTuple):
+    """The ground truth of a camera, None if there is none, and its digest by topic.
+
+    The digest is "" if the log has no such topic; ``digests`` is empty if the topic holds no tracks.
     """
 
     frames: list[Frame] | None
     digests: dict[str, str]
 
 
-def _read_truth(opened: log.Log, topic: str) -> _Truth:
+def _read_truth(opened: log.Log, topic: str) -> _GroundTruth:
     if topic not in opened.channels:
-        return _Truth(None, {topic: ""})
-    if not _holds(opened, topic):
-        return _Truth(None, {})
+        return _GroundTruth(None, {topic: ""})
+    if not _has_rows(opened, topic):
+        return _GroundTruth(None, {})
     try:
-        return _Truth(opened.frames(topic, TRACKS), {topic: digest_of(opened, topic)})
+        return _GroundTruth(opened.frames(topic, TRACKS), {topic: digest_of(opened, topic)})
     except McaptrackError as error:
         warn(f"no misses, false tracks and switches: {error}", "not-compared")
-        return _Truth(None, {})
+        return _GroundTruth(None, {})
 
 
-def _watched(opened: log.Log, prefix: str, made: Mapping[str, Made]) -> list[str]:
-    """The usual channels of tracks, and those of the camera that have events already."""
+def _default_topics(opened: log.Log, prefix: str, made: Mapping[str, Made]) -> list[str]:
+    """Return the default channels of tracks, and those of the camera that have events already."""
     topics = [f"{prefix}/{name}" for name in WATCHED]
     topics += [
         topic.removesuffix(_EVENTS)
         for topic in sorted(camera_at(opened, prefix).topics)
         if topic.endswith(_EVENTS) and may_replace(opened, topic, STAGE)
     ]
-    return [topic for topic in dict.fromkeys(topics) if _holds(opened, topic, made)]
+    return [topic for topic in dict.fromkeys(topics) if _has_rows(opened, topic, made)]
 
 
-def _asked(opened: log.Log, topic: str, given: EventOptions) -> EventOptions:
-    """The options that the events of a channel were made with, unless others are given now."""
+def _options_for(opened: log.Log, topic: str, given: EventOptions) -> EventOptions:
+    """Return the given options if they differ from the defaults, else those that the log's events were found with."""
     channel = opened.channels.get(topic + _EVENTS)
     known = Provenance.from_metadata(channel.metadata) if channel else None
     asked: Any = known.parameters.get("asked") if known and known.transform == STAGE else None
@@ -198,7 +201,7 @@ def _asked(opened: log.Log, topic: str, given: EventOptions) -> EventOptions:
     similarity = asked.get("similarity")
     if similarity not in ("iou", "metres"):
         similarity = None
-    if "gate" in asked:  # as version 0.1 said it
+    if "gate" in asked:  # version 0.1 had one parameter for both
         asked = {"min_iou" if similarity == "iou" else "gate_m": asked["gate"]}
     gates = {name: gate for name in ("gate_m", "min_iou") if _is_gate(gate := asked.get(name))}
     return EventOptions(similarity, **gates)
@@ -208,30 +211,29 @@ def _is_gate(value: Any) -> bool:
     return isinstance(value, float | int) and not isinstance(value, bool) and value > 0
 
 
-def _is_due(opened: log.Log, topics: Sequence[str], made: Mapping[str, Made]) -> bool:
-    """Whether one of what the first of these topics was made with is missing, or was made from others than there are
-    now.
-    """
+def _is_outdated(opened: log.Log, topics: Sequence[str], made: Mapping[str, Made]) -> bool:
+    """Return whether one of these topics is missing, or an input of the first one has changed since."""
     if not all(topic in opened.channels for topic in topics) or is_stale(opened, topics[0]):
         return True
-    was = _made_from(opened, topics[0])
-    return not was or any(name in made and made[name].provenance.digest != then for name, then in was.items())
+    then = _input_digests(opened, topics[0])
+    return not then or any(name in made and made[name].provenance.digest != digest for name, digest in then.items())
 
 
-def _made_from(opened: log.Log, topic: str) -> dict[str, str]:
+def _input_digests(opened: log.Log, topic: str) -> dict[str, str]:
+    """Return the digests of a channel's inputs when it was made, by topic."""
     known = Provenance.from_metadata(opened.channel(topic).metadata)
     return known.made_from() if known else {}
 
 
-def _taken(opened: log.Log, topics: Sequence[str]) -> str:
-    """The first of these topics that holds what events may not replace, and how that came; "" if there is none."""
+def _find_conflict(opened: log.Log, topics: Sequence[str]) -> str:
+    """Return the first of these topics that events may not replace, with its origin, as text; "" if there is none."""
     made_by = {topic: VIEW if topic.endswith(SUFFIX) else STAGE for topic in topics}
     taken = [topic for topic, transform in made_by.items() if not may_replace(opened, topic, transform)]
     return f"{taken[0]}, which {how_it_came(opened, taken[0])}" if taken else ""
 
 
-def _holds(opened: log.Log, topic: str, made: Mapping[str, Made] = {}, schema: Schema = TRACKS) -> bool:
-    """Whether rows of a schema stand in a channel, or were just made for it."""
+def _has_rows(opened: log.Log, topic: str, made: Mapping[str, Made] = {}, schema: Schema = TRACKS) -> bool:
+    """Return whether a channel of the log or of this run has the given schema."""
     if topic in made:
         return made[topic].schema is schema
     channel = opened.channels.get(topic)
@@ -241,7 +243,7 @@ def _holds(opened: log.Log, topic: str, made: Mapping[str, Made] = {}, schema: S
 def _rows(
     opened: log.Log, topic: str, made: Mapping[str, Made], schema: Schema = TRACKS
 ) -> tuple[Sequence[Frame], str]:
-    """The frames of a channel, and their digest."""
+    """Return the frames of a channel, and the digest of its messages."""
     if topic in made:
         return made[topic].frames, made[topic].provenance.digest
     return opened.frames(topic, schema), digest_of(opened, topic)

@@ -1,7 +1,7 @@
-"""Which channel feeds which transform, and what has to run, and before what.
+"""Plan the jobs of a run: the stages that have to run, their order, and the input of each.
 
-What is missing is made first; what was made from a channel that has changed since is made again, by the same transform
-with the parameters that it had, or left as it is where that can't be done.
+Missing inputs are made first. A channel that is out of date, because its input has changed, is made again by the same
+transform with the same parameters, or left as it is, with a warning, if that isn't possible.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from mcaptrack.transforms import STAGES, Stage, Transform
 
 Say = Callable[[str], None]
 
-#: So many parameters that differ are named.
+#: The maximum number of differing parameters in a message.
 _NAMED: Final = 3
 
 
@@ -39,11 +39,11 @@ def plan_stage(
     say: Say = lambda _: None,
     defaults: Mapping[str, Transform] = {},
 ) -> list[Job]:
-    """The jobs that run one stage, whether or not its channel stands, and before it what is missing or out of date.
+    """Plan one stage, even if its channel is up to date, and before it all inputs that are missing or out of date.
 
-    ``source`` and ``target`` are topics other than the usual ones; ``defaults`` are transforms for stages that are
-    missing, where they are not to be the usual ones. Raises McaptrackError if there is nothing to start
-    from, or if the stage would replace what it did not make.
+    ``source`` and ``target`` are topics that replace the usual ones; ``defaults`` are transforms by stage that replace
+    the default ones for missing inputs. ``say`` is called with a line for each job. Raises McaptrackError if there is
+    no input, or if the stage would replace channels that it did not make.
     """
     planner = _Planner(opened, prefix, defaults=defaults)
     usual = f"{prefix}/{STAGES[stage].output_topic}"
@@ -62,25 +62,25 @@ def plan_all(
     anew: bool = False,
     chosen: Collection[str] = (),
 ) -> list[Job]:
-    """The jobs that bring everything about a camera up to date; none if it is.
+    """Plan the jobs that bring all results of a camera up to date; empty if they are.
 
-    ``source`` is a topic with pictures or with boxes that others detected, to begin with; ``defaults`` as in
-    ``plan_stage``. With ``anew`` what is up to date is made again, too, as ``defaults`` say or else as before.
-    ``chosen`` are options by which ``defaults`` were chosen ("tracker"): what was made by another one is made again.
-    Raises McaptrackError as ``plan_stage`` does, and if what made a channel is not installed.
+    ``source`` is the topic of pictures or of recorded detections to begin with; ``defaults`` as in ``plan_stage``. With
+    ``anew``, channels that are up to date are made again, too, by the transform in ``defaults`` or else the same one.
+    ``chosen`` are options that the user gave for ``defaults`` ("tracker"): a channel that was made with another choice
+    is made again. Raises McaptrackError as ``plan_stage`` does, and if the class that made a channel is not installed.
     """
     planner = _Planner(opened, prefix, {_stage_from(opened, source): source} if source else {}, defaults, anew, chosen)
     read = {stage.input_topic for stage in STAGES.values()}
     for stage in STAGES.values():
         if stage.output_topic not in read:
             planner.ensure(f"{prefix}/{stage.output_topic}")
-    for topic in sorted(camera_at(opened, prefix).topics):  # also what was written elsewhere
+    for topic in sorted(camera_at(opened, prefix).topics):  # including results at other topics than the usual ones
         planner.ensure(topic)
     return planner.checked(say)
 
 
 def _stage_from(opened: log.Log, source: str) -> str:
-    """The first stage of a run that begins with this topic. Raises McaptrackError if none reads it."""
+    """Return the first stage of a run that begins with this topic. Raises McaptrackError if no stage reads it."""
     channel = opened.channel(source)
     for stage in STAGES.values():
         if stage.default.reads in (VIDEO, DETECTIONS) and fits(channel, stage.default.reads)[1]:
@@ -116,14 +116,14 @@ class _Planner:
         self._differing: set[str] = set()
 
     def checked(self, say: Say) -> list[Job]:
-        """The jobs, once it is known that they can run; only then it is said what runs and why."""
+        """Check the jobs and return them; only after that report which run and why."""
         check_inputs(self._opened, self._prefix, self.jobs)
         for words in self._said:
             say(words)
         return self.jobs
 
     def source_of(self, stage: str) -> str:
-        """The topic that a stage reads, unless it was made from another one before."""
+        """Return the topic that a stage reads if it has not run before."""
         usual = f"{self._prefix}/{STAGES[stage].input_topic}"
         if stage in self._sources or usual in self._opened.channels:
             return self._sources.get(stage, usual)
@@ -140,9 +140,9 @@ class _Planner:
         return usual
 
     def ensure(self, topic: str) -> bool:
-        """Plan what makes ``topic``; returns whether it will change."""
+        """Plan the jobs that make ``topic``, if any are needed. Returns whether the topic will change."""
         if topic not in self._changes:
-            self._changes[topic] = False  # a channel that says it was made from itself ends the search
+            self._changes[topic] = False  # ends the search at a channel that names itself as an input
             self._changes[topic] = self._plan(topic)
         return self._changes[topic]
 
@@ -156,11 +156,11 @@ class _Planner:
         if made is None or made.transform not in STAGES:
             if usual in self._sources and topic != self._sources[usual]:
                 raise McaptrackError(self._not_made(usual, topic))
-            return False  # recorded or ingested: nothing makes it but its recording
+            return False  # no stage makes recorded and ingested channels
         return self._make_again(made, made.transform, topic)
 
     def _sibling(self, stage: str, topic: str) -> Provenance | None:
-        """The provenance of the other outputs of a stage, if its output at ``topic`` is missing."""
+        """Return the provenance of another output of the stage that makes ``topic``; None if there is none."""
         topics = STAGES[stage].outputs(_main(self._opened, stage, topic)) if stage else ()
         found = (
             Provenance.from_metadata(self._opened.channels[one].metadata)
@@ -170,7 +170,7 @@ class _Planner:
         return next((made for made in found if made and made.transform == stage), None)
 
     def _make(self, stage: str, topic: str) -> bool:
-        """Plan a channel that is missing."""
+        """Plan the job for a missing channel. Returns True: the channel will change."""
         source = self.source_of(stage)
         self.ensure(source)
         self._said.append(f"{topic} is missing: running {stage}")
@@ -179,7 +179,7 @@ class _Planner:
         return True
 
     def _suited(self, stage: str, source: str) -> Transform | None:
-        """Make the transform that suits the one which makes, or made, the input of a stage; None if that names none."""
+        """Create the transform that the maker of a stage's input recommends for the stage; None if it names none."""
         option, maker = STAGES[stage].option, self._maker_of(source)
         name = getattr(maker, "suits", {}).get(option, "") if option else ""
         if not name or maker is None:
@@ -198,7 +198,7 @@ class _Planner:
         return self._before(made.transform, made)[0] if made and made.transform in STAGES else None
 
     def _is_made_by_another(self, topic: str) -> bool:
-        """Whether a channel is made now by a transform of another class than made it before."""
+        """Return whether this run makes a channel by another class of transforms than before."""
         channel = self._opened.channels.get(topic)
         made = Provenance.from_metadata(channel.metadata) if channel else None
         jobs = [job for job in self.jobs if topic in job.outputs()]
@@ -208,7 +208,7 @@ class _Planner:
         return before is None or stage.choice(before) != stage.choice(jobs[0].transform)
 
     def _make_again(self, made: Provenance, stage: str, topic: str) -> bool:
-        """Plan a channel that a stage makes, if the channel is missing, out of date, or gets another input now."""
+        """Plan the stage of a channel again if the channel is missing, out of date, or gets another input now."""
         is_missing = topic not in self._opened.channels
         had = made.input or self.source_of(stage)
         source = self._sources.get(stage, had)
@@ -217,7 +217,7 @@ class _Planner:
         main = _main(self._opened, stage, topic)
         is_usual = (
             main == f"{self._prefix}/{STAGES[stage].output_topic}"
-        )  # what stands elsewhere was asked for as it is
+        )  # a result at another topic keeps the parameters that it was requested with
         is_open = is_usual and stage not in self._defaults and self._is_made_by_another(source)
         suited = self._suited(stage, source) if is_open else None
         wanted = self._defaults.get(stage, suited or before) if is_usual else before
@@ -248,20 +248,20 @@ class _Planner:
         return True
 
     def _is_replaced(self, stage: Stage, before: Transform | None, wanted: Transform | None) -> bool:
-        """Whether something else is chosen for a stage than what it was done by."""
+        """Return whether the user chose another class for a stage than the one that made its channel."""
         if wanted is None or stage.option not in self._chosen:
             return False
         return before is None or stage.choice(before) != stage.choice(wanted)
 
     def _before(self, stage: str, made: Provenance) -> tuple[Transform | None, McaptrackError | None]:
-        """The transform that made a channel, with the parameters it had; None, and why, where it can't be had today."""
+        """Return the transform that made a channel, with the same parameters; or None, and the reason why not."""
         try:
             return rebuild(STAGES[stage], made, self._defaults), None
         except McaptrackError as error:
             return None, error
 
     def _refusal(self, topic: str, source: str, why_not: McaptrackError | None) -> str:
-        """Why a channel can't be made again, and what to do."""
+        """Return the message for a channel that can't be made again: the reason, and what to do."""
         words = f"{self._opened.path}: {topic} can't be made from {source}: {why_not}"
         if not isinstance(why_not, MissingPluginError) or not why_not.options:
             return words
@@ -269,7 +269,7 @@ class _Planner:
         return f"{words}, as in {again}; another name replaces what it made"
 
     def _warn_of_settings(self, main: str, differing: str) -> None:
-        """Say once for all outputs of a stage that they were made with other settings."""
+        """Warn, once for all outputs of a stage, that they were made with other settings."""
         if main in self._differing or not differing:
             return
         self._differing.add(main)
@@ -290,7 +290,7 @@ class _Planner:
 
 
 def _differing(before: Transform, wanted: Transform) -> str:
-    """The parameters in which two transforms of a stage differ, in words; "" if there are none."""
+    """Return the differing parameters of two transforms as text; "" if there are none."""
     if type(before) is not type(wanted):
         return f"{type(wanted).__name__}, not {type(before).__name__}"
     names = [f.name for f in fields(before) if not f.metadata.get("context")]
@@ -300,7 +300,7 @@ def _differing(before: Transform, wanted: Transform) -> str:
 
 
 def _main(opened: log.Log, stage: str, topic: str) -> str:
-    """The topic that a stage writes to so that ``topic`` comes of it: itself, or what its last part stands below."""
+    """Return the main output topic of the stage that makes ``topic``: itself, or the topic above its last part."""
     for suffix in STAGES[stage].default.writes:
         if suffix and topic.endswith("/" + suffix):
             below = [one for one in STAGES[stage].outputs(topic)[1:] if one in opened.channels]
@@ -309,7 +309,7 @@ def _main(opened: log.Log, stage: str, topic: str) -> str:
 
 
 def is_stale(opened: log.Log, topic: str) -> bool:
-    """Whether what ``topic`` was made from or compared with, or the ground plane, is another than it was then."""
+    """Return whether an input or reference of ``topic``, or its ground plane, has changed since it was made."""
     made = Provenance.from_metadata(opened.channel(topic).metadata)
     if made is None:
         return False

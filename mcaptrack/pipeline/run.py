@@ -1,4 +1,4 @@
-"""Running stages: what they read, what they know of the log, and what they make of it."""
+"""Run stages: read their inputs, pass them facts about the log, and write their outputs."""
 
 from __future__ import annotations
 
@@ -38,11 +38,10 @@ Progress = Callable[[str, int, int], None]
 
 @dataclass
 class Report:
-    """What a run did: the stages that ran, the frames, rows and tracks of each topic they made, and the layouts for
-    their views.
+    """The result of a run: its stages; the frames, rows and tracks of each topic they made; layout files by name.
 
-    ``stale`` are the channels that were made from something that has now been replaced. ``events`` says for each
-    channel of tracks how many events of each kind were found. ``warnings`` are what was assumed, left out or looks odd.
+    ``stale`` are the channels that are out of date, because this run replaced their input. ``events`` are the numbers
+    of events of each kind by channel of tracks. ``warnings`` report what was assumed, left out or looks unusual.
     """
 
     stages: list[str] = field(default_factory=list)
@@ -55,7 +54,7 @@ class Report:
     warnings: list[Notice] = field(default_factory=list)
 
     def count(self, topic: str, made: Made) -> None:
-        """Count what was made."""
+        """Count the frames, rows and tracks of a new channel."""
         rows = made.schema.joined([frame.rows for frame in made.frames])
         self.frames[topic], self.rows[topic] = len(made.frames), len(rows)
         if made.schema is TRACKS:
@@ -70,11 +69,11 @@ def run(
     progress: Progress = lambda *_: None,
     watch: Watch | None = None,
 ) -> Report:
-    """Run the jobs and put their channels and the views of these into the log, or into a copy of it at ``output``.
+    """Run the jobs, and write their channels and views into the log, or into a copy of it at ``output``.
 
-    With ``watch`` the events of tracks follow as the last stage, as far as they are missing or out of date.
+    With ``watch`` the last stage finds events of tracks, if they are missing or out of date.
 
-    Nothing is written until everything is computed; then the log is replaced as a whole.
+    The log is replaced as a whole, after everything was computed.
     """
     with collected() as warnings:
         report = _run(opened, prefix, jobs, output, progress, watch)
@@ -91,7 +90,7 @@ def _run(
     planes = read_planes(opened, prefix)
     for job in jobs:
         given = _input(opened, job, made, stamps, progress)
-        # A guessed scale is guessed anew from new detections; a given one stands.
+        # New detections give a new estimate of the scale; a given ground plane is kept.
         stage, has_boxes = STAGES[job.stage], job.transform.reads is DETECTIONS
         is_due = has_boxes and job.target == f"{prefix}/{stage.output_topic}" and is_assumed(planes)
         if is_due or (planes is None and stage.needs_scale):
@@ -118,7 +117,7 @@ def _run(
 
 
 def outdated_by(opened: log.Log, digests: Mapping[str, str]) -> list[str]:
-    """The other channels that a stage made from, or compared with, these topics when they had other digests."""
+    """Return the other channels that stages made from earlier contents of these topics, or compared with them."""
     found = []
     for topic, there in sorted(opened.channels.items()):
         known = Provenance.from_metadata(there.metadata)
@@ -139,8 +138,8 @@ class _Again:
 
 
 class _Input(NamedTuple):
-    """What a job reads: the frames as they come, all of them if they are rows, their digest, once they were read, and
-    how many messages they were read from.
+    """The input of a job: a stream of frames, all frames if they are rows (else empty), and, after the stream was read,
+    the digest and the number of its messages.
     """
 
     stream: Iterable[Frame]
@@ -152,7 +151,7 @@ class _Input(NamedTuple):
 def _run_job(
     opened: log.Log, prefix: str, job: Job, given: _Input, made: Mapping[str, Made], planes: Planes
 ) -> dict[str, Made]:
-    """The channels that a job makes. ``made`` are those of jobs before it."""
+    """Run a job, and return its channels by topic. ``made`` are the channels of earlier jobs."""
     transform = _in_context(opened, prefix, job, given.frames, planes)
     outputs: list[list[Frame]] = [[] for _ in transform.writes]
     taken: set[int] = set()
@@ -165,7 +164,7 @@ def _run_job(
             for result in results:
                 for frame, channel in zip(result, outputs, strict=True):
                     channel.append(frame)
-            if not warnings:  # otherwise it is known why
+            if not warnings:  # otherwise a warning has given the reason
                 warn_of_nothing(job.stage, job.source, transform, given.frames, outputs[0])
     except McaptrackError as error:
         where = "" if str(opened.path) in str(error) else f"{opened.path}: {job.source}: "
@@ -189,7 +188,7 @@ def _run_job(
 
 
 def _provenance_of(job: Job, transform: Transform, input_digest: str, warnings: Sequence[Notice]) -> Provenance:
-    """How a job makes its channels. Raises McaptrackError for parameters that can't be kept in a log."""
+    """Return the provenance of a job's channels. Raises McaptrackError for parameters that a log can't hold."""
     stage = STAGES[job.stage]
     entry = stage.entry(type(transform))
     choice = {stage.kind: entry.name} if stage.kind else {}
@@ -213,7 +212,7 @@ def _provenance_of(job: Job, transform: Transform, input_digest: str, warnings: 
 
 
 def _carried(opened: log.Log, job: Job, made: Mapping[str, Made], planes: Planes, holds_back: bool) -> dict[str, Made]:
-    """The re-tracked people at the rate of the tracks that their samples were made from; nothing if there are none."""
+    """Return the re-tracked channel at the rate of the tracks that were sampled; empty if there are no such tracks."""
     samples = (
         made[job.source].provenance
         if job.source in made
@@ -233,7 +232,7 @@ def _carried(opened: log.Log, job: Job, made: Mapping[str, Made], planes: Planes
 
 
 def _in_context(opened: log.Log, prefix: str, job: Job, frames: Sequence[Frame], planes: Planes) -> Transform:
-    """The transform with what the log knows: ground planes, the start of the clock, its rate."""
+    """Return the transform with its context fields filled in: ground planes, start of the clock in ns, rate in Hz."""
     names = {f.name for f in fields(job.transform) if f.metadata.get("context")}
     known: dict[str, Any] = {}
     if "ground_planes" in names:
@@ -257,7 +256,7 @@ def _in_context(opened: log.Log, prefix: str, job: Job, frames: Sequence[Frame],
 
 
 def _clock_start(opened: log.Log, prefix: str) -> int | None:
-    """When the clock of prediction begins: as ingest said, or with the first picture of the camera."""
+    """Return the start of the prediction clock in ns: from the log's metadata, or the time of the first picture."""
     said = opened.metadata(CLOCK)
     if said and (start := parse_ns(said.get("start_ns", ""))) is not None:
         return start
@@ -268,7 +267,7 @@ def _clock_start(opened: log.Log, prefix: str) -> int | None:
 def _input(
     opened: log.Log, job: Job, made: Mapping[str, Made], stamps: dict[str, list[int]], progress: Progress
 ) -> _Input:
-    """What a job reads; ``stamps`` gets those of pictures."""
+    """Return the input of a job; the capture times of pictures in ns are appended to ``stamps``, by topic."""
     if job.source not in made and job.transform.reads is VIDEO:
         seen = stamps.setdefault(job.source, [])
         digest, pictures = _pictures(opened, job, seen, progress)
@@ -281,13 +280,13 @@ def _input(
 
 
 def _frames(opened: log.Log, topic: str, schema: Schema) -> list[Frame]:
-    """The rows of a channel, ours or others'."""
+    """Read the rows of a channel, or the detections of a recording in a foreign format."""
     theirs = foreign.holds_detections(opened.channel(topic))
     return foreign.detections(opened, topic) if theirs else opened.frames(topic, schema)
 
 
 def _counting(frames: Iterable[Frame], taken: set[int]) -> Iterator[Frame]:
-    """The frames; ``taken`` gets the number of each."""
+    """Yield the frames, and add the number of each to ``taken``."""
     for frame in frames:
         taken.add(frame.index)
         yield frame
@@ -302,7 +301,10 @@ def _counted(frames: Sequence[Frame], stage: str, progress: Progress) -> Iterato
 def _pictures(
     opened: log.Log, job: Job, stamps: list[int], progress: Progress
 ) -> tuple[Callable[[], str], Iterable[Frame]]:
-    """The pictures that a job reads, as its transform wants them; ``stamps`` gets the stamp of each."""
+    """Return the digest (once they were read) and the pictures for a job, decoded in its transform's colour format.
+
+    The capture time of each in ns is appended to ``stamps``.
+    """
     import hashlib
 
     total, channel = hashlib.sha256(), opened.channel(job.source)
@@ -328,9 +330,9 @@ def _pictures(
 def input_of(
     opened: log.Log, prefix: str, stage: str, transform: Transform, source: str | None = None
 ) -> tuple[list[Frame], dict[str, Any]]:
-    """What a stage would read from a log, and what the log knows for it (the fields made with ``context``).
+    """Return the frames that a stage would read from a log, and the values of its context fields by name.
 
-    Raises McaptrackError if the input isn't there.
+    Raises McaptrackError if the log has no such input.
     """
     topic = source or f"{prefix}/{STAGES[stage].input_topic}"
     job = Job(stage, transform, topic, f"{prefix}/{STAGES[stage].output_topic}")

@@ -1,9 +1,9 @@
-"""Which channels belong to which camera: its pictures, its ground truth, and all that was made from them.
+"""Assign channels to cameras: pictures, ground truth, and all results made from them.
 
-A camera is a name (``/camera``) below which results are written. Which channels are its own does not follow from their
-names: each channel says what it was made from, and such a chain ends at something that was recorded or ingested.
-Channels whose chains end below the same name belong together, wherever a stage was told to write them. Boxes that a
-detector recorded, and labels, belong to the pictures beside them: the ones with the longest common part of the name.
+A camera is a name (``/camera``) below which results are written. A channel's own name does not decide its camera: the
+provenance of each channel names its input, and this chain of inputs ends at a channel that was recorded or ingested.
+Channels belong to the same camera if their chains end below the same name, even if a stage wrote them elsewhere.
+Recorded detections and labels belong to the pictures with the longest common part of the name.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources import foreign
 from mcaptrack.transforms import STAGES
 
-#: The name of a camera that has no other.
+#: The default name of a camera.
 DEFAULT_CAMERA: Final = "camera"
-#: What is ingested, below the name of its camera.
+#: The topics of ingested channels, below the name of their camera.
 VIDEO, TRUTH, GROUND_PLANE = "video", "truth", "ground_plane"
-#: What stands below the name of a camera, and the stage that makes it; "" where it comes in.
+#: The usual topics below the name of a camera, and the stage that makes each; "" for ingested channels.
 USUAL: Final[Mapping[str, str]] = {VIDEO: "", TRUTH: "", GROUND_PLANE: ""} | {
     topic: stage.name for stage in STAGES.values() for topic in stage.outputs(stage.output_topic)
 }
@@ -34,9 +34,10 @@ USUAL: Final[Mapping[str, str]] = {VIDEO: "", TRUTH: "", GROUND_PLANE: ""} | {
 class Camera(NamedTuple):
     """A camera of a log.
 
-    ``prefix`` is the name below which its results are written; ``names`` are all below which something of it came in.
-    ``pictures`` is None where there are none, or several and nothing to tell which; so are ``boxes``, those that others
-    detected. ``truth`` and ``ground_plane`` are where these stand, or would stand. ``topics`` are all its channels.
+    ``prefix`` is the name below which its results are written; ``names`` are all names below which it has recorded or
+    ingested channels. ``pictures`` is the topic of its pictures, and ``boxes`` that of recorded detections; each is
+    None if there is no such channel, or no unique one. ``truth`` and ``ground_plane`` are the topics for these, whether
+    or not the log has them. ``topics`` are all its channels.
     """
 
     prefix: str
@@ -49,19 +50,20 @@ class Camera(NamedTuple):
 
 
 def name_above(topic: str) -> str:
-    """The name of the camera that a recorded channel belongs to: "/front" for "/front/image"."""
+    """Return the name of the camera that a recorded channel belongs to: "/front" for "/front/image"."""
     bare = topic.strip("/")
     usual = max((name for name in USUAL if bare.endswith("/" + name)), key=len, default=bare.rpartition("/")[2])
     return "/" + (bare.removesuffix(usual).strip("/") or DEFAULT_CAMERA)
 
 
 def find_camera(opened: log.Log, name: str | None = None, topic: str | None = None) -> str:
-    """The prefix of the camera that a topic belongs to, or of this name, or of the only one of the log.
+    """Return the prefix of a camera: the one of a topic, the one with this name, or the only one of the log.
 
-    Raises McaptrackError if the log has several and none is named, or if name and topic are of different ones.
+    Raises McaptrackError if the log has several cameras and none is named, or if the topic belongs to another camera
+    than the named one.
     """
     if topic:
-        prefix = _of_topic(opened, topic)
+        prefix = _prefix_of_topic(opened, topic)
         if name and "/" + name.strip("/") not in (prefix, *camera_at(opened, prefix).names):
             raise McaptrackError(
                 f"{opened.path}: {topic} belongs to the camera {prefix[1:]}, not to {name}; leave `camera=` out"
@@ -71,10 +73,10 @@ def find_camera(opened: log.Log, name: str | None = None, topic: str | None = No
         _refuse_unknown(opened, name)
         return camera_at(opened, "/" + name.strip("/")).prefix
     known = cameras(opened)
-    # Recordings of which nothing was made yet count where there is nothing else.
-    chosen = [camera for camera in known if _is_ours(opened, camera)]
+    # Recorded cameras without results count only if no camera has any.
+    chosen = [camera for camera in known if _has_own_channels(opened, camera)]
     if not chosen:
-        # Of several recordings one has to be named: the planner says which there are.
+        # With several recorded cameras, the planner asks for one by name and lists them.
         return known[0].prefix if len(known) == 1 else f"/{DEFAULT_CAMERA}"
     if len(chosen) == 1:
         return chosen[0].prefix
@@ -87,14 +89,14 @@ def find_camera(opened: log.Log, name: str | None = None, topic: str | None = No
 
 
 def _refuse_unknown(opened: log.Log, name: str) -> None:
-    """Raise McaptrackError for a name that no camera of the log has, if it has any."""
+    """Raise McaptrackError if the log has cameras, but none of this name."""
     names = [one.strip("/") for camera in cameras(opened) for one in camera.names]
     if names and name.strip("/") not in names:
         raise McaptrackError(f"{opened.path} has no camera {name}; it has {', '.join(sorted(names))}")
 
 
-def _of_topic(opened: log.Log, topic: str) -> str:
-    """Results stand beside the channel that they come from, unless its camera has some elsewhere."""
+def _prefix_of_topic(opened: log.Log, topic: str) -> str:
+    """Return the prefix for results of a topic: the name above its source, unless its camera has results elsewhere."""
     name = name_above(chain_of(opened, topic)[-1])
     found = camera_at(opened, name)
     has_results = any(
@@ -103,21 +105,19 @@ def _of_topic(opened: log.Log, topic: str) -> str:
     return found.prefix if has_results else name
 
 
-def _is_ours(opened: log.Log, camera: Camera) -> bool:
-    """Whether anything of a camera was ingested or made."""
+def _has_own_channels(opened: log.Log, camera: Camera) -> bool:
+    """Return whether a camera has channels that were ingested or made by a stage."""
     return any(Provenance.from_metadata(opened.channels[topic].metadata) for topic in camera.topics)
 
 
 def camera_at(opened: log.Log, prefix: str) -> Camera:
-    """The camera of this name, with or without channels in the log."""
+    """Return the camera of this name, even if the log has no channels for it."""
     found = next((camera for camera in cameras(opened) if prefix in camera.names), None)
     return found or _Channels(opened).camera([prefix])
 
 
 def chain_of(opened: log.Log, topic: str) -> list[str]:
-    """A channel, what it was made from, what that was made from, and so on: to something that was recorded or ingested,
-    or is gone by now.
-    """
+    """Return a topic, its input, the input of that, and so on, up to a recorded, ingested or missing channel."""
     chain: list[str] = []
     while topic and topic not in chain:
         chain.append(topic)
@@ -128,75 +128,81 @@ def chain_of(opened: log.Log, topic: str) -> list[str]:
 
 
 def is_made_by_stage(channel: log.Channel) -> bool:
-    """Whether a stage made a channel, so that it can make it again."""
+    """Return whether a stage made a channel, and so can make it again."""
     made = Provenance.from_metadata(channel.metadata)
     return made is not None and made.transform in STAGES
 
 
-_KNOWN: Final[WeakKeyDictionary[log.Log, list[Camera]]] = WeakKeyDictionary()
+_CACHE: Final[WeakKeyDictionary[log.Log, list[Camera]]] = WeakKeyDictionary()
 
 
 def cameras(opened: log.Log) -> list[Camera]:
-    """All cameras of a log, by name."""
-    if opened not in _KNOWN:
-        _KNOWN[opened] = _Channels(opened).cameras()
-    return _KNOWN[opened]
+    """Return all cameras of a log, sorted by name."""
+    if opened not in _CACHE:
+        _CACHE[opened] = _Channels(opened).cameras()
+    return _CACHE[opened]
 
 
 class _Channels:
-    """The channels of a log that belong to cameras, by the name below which their chains begin."""
+    """The channels of a log that belong to cameras, grouped by the name above the source of their chain of inputs."""
 
     def __init__(self, opened: log.Log) -> None:
         self._opened = opened
-        self._made = {topic: Provenance.from_metadata(one.metadata) for topic, one in opened.channels.items()}
-        self._below: dict[str, set[str]] = {}
+        self._provenance = {topic: Provenance.from_metadata(one.metadata) for topic, one in opened.channels.items()}
+        self._topics: dict[str, set[str]] = {}
         self._source: dict[str, str] = {}
         for topic, channel in opened.channels.items():
-            is_ours = self._made[topic] is not None or channel.schema_name in SCHEMAS
+            is_ours = self._provenance[topic] is not None or channel.schema_name in SCHEMAS
             if is_ours or foreign.holds_pictures(channel) or foreign.holds_detections(channel):
                 self._source[topic] = chain_of(opened, topic)[-1]
-                self._below.setdefault(name_above(self._source[topic]), set()).add(topic)
-        self._pictured = {name for name in self._below if self._pictures([name])}
+                self._topics.setdefault(name_above(self._source[topic]), set()).add(topic)
+        self._with_pictures = {name for name in self._topics if self._picture_topics([name])}
 
     def cameras(self) -> list[Camera]:
-        """The names put together to cameras."""
-        labels = {name for name, topics in self._below.items() if all(_is_label(self._source[one]) for one in topics)}
-        joined = {name: [name] for name in self._below}
-        for name in sorted(set(self._below) - self._pictured):
-            others = self._pictured or (set(self._below) - labels)
-            target = _nearest(name, others) if name in labels or self._boxes([name]) else None
-            if target in joined and target != name and not (self._results([name]) and self._results(joined[target])):
+        """Group names to cameras: names with labels or detections alone join the nearest camera with pictures."""
+        labels = {name for name, topics in self._topics.items() if all(_is_label(self._source[one]) for one in topics)}
+        joined = {name: [name] for name in self._topics}
+        for name in sorted(set(self._topics) - self._with_pictures):
+            others = self._with_pictures or (set(self._topics) - labels)
+            target = _nearest(name, others) if name in labels or self._detection_topics([name]) else None
+            if (
+                target in joined
+                and target != name
+                and not (self._result_topics([name]) and self._result_topics(joined[target]))
+            ):
                 joined[target] += joined.pop(name)
         return [self.camera(names) for _, names in sorted(joined.items())]
 
     def camera(self, names: list[str], prefix: str | None = None) -> Camera:
-        """The camera of these names; its results stand, or will stand, below ``prefix``."""
-        prefix = prefix or next((name for name in names if self._results([name])), names[0])
-        pictures = self._pictures(names)
-        nearest = None if pictures else _nearest(prefix, self._pictured)
+        """Return the camera with these names; ``prefix``: the name for its results, by default the one that has any."""
+        prefix = prefix or next((name for name in names if self._result_topics([name])), names[0])
+        pictures = self._picture_topics(names)
+        nearest = None if pictures else _nearest(prefix, self._with_pictures)
         return Camera(
             prefix,
             tuple(names),
-            self._usual_pictures(names) or _only(pictures or (self._pictures([nearest]) if nearest else [])),
-            _only(self._boxes(names)),
-            self._given(names, TRUTH) or f"{prefix}/{TRUTH}",
-            self._given(names, GROUND_PLANE) or f"{prefix}/{GROUND_PLANE}",
-            frozenset(topic for name in names for topic in self._below.get(name, ())),
+            self._default_pictures(names) or _only(pictures or (self._picture_topics([nearest]) if nearest else [])),
+            _only(self._detection_topics(names)),
+            self._label_topic(names, TRUTH) or f"{prefix}/{TRUTH}",
+            self._label_topic(names, GROUND_PLANE) or f"{prefix}/{GROUND_PLANE}",
+            frozenset(topic for name in names for topic in self._topics.get(name, ())),
         )
 
-    def _pictures(self, names: list[str]) -> list[str]:
-        return self._those(names, foreign.holds_pictures)
+    def _picture_topics(self, names: list[str]) -> list[str]:
+        return self._select(names, foreign.holds_pictures)
 
-    def _usual_pictures(self, names: list[str]) -> str | None:
-        """The video, or what detections were made from."""
+    def _default_pictures(self, names: list[str]) -> str | None:
+        """Return the topic of the video, or of the pictures that detections were made from; None if there is none."""
         topics = [f"{name}/{VIDEO}" for name in names]
-        topics += [made.input for name in names if (made := self._made.get(f"{name}/{STAGES['detect'].output_topic}"))]
+        topics += [
+            made.input for name in names if (made := self._provenance.get(f"{name}/{STAGES['detect'].output_topic}"))
+        ]
         there = [self._opened.channels[topic] for topic in topics if topic in self._opened.channels]
         return next((channel.topic for channel in there if foreign.holds_pictures(channel)), None)
 
-    def _boxes(self, names: list[str]) -> list[str]:
-        """What others detected."""
-        return self._those(
+    def _detection_topics(self, names: list[str]) -> list[str]:
+        """Return the topics of detections that no stage made."""
+        return self._select(
             names,
             lambda channel: (
                 foreign.holds_detections(channel)
@@ -204,18 +210,18 @@ class _Channels:
             ),
         )
 
-    def _results(self, names: list[str]) -> list[str]:
-        """What stages made, below these names themselves."""
-        return [one for name in names for one in self._those([name], is_made_by_stage) if one.startswith(name + "/")]
+    def _result_topics(self, names: list[str]) -> list[str]:
+        """Return the topics below these names that stages made."""
+        return [one for name in names for one in self._select([name], is_made_by_stage) if one.startswith(name + "/")]
 
-    def _given(self, names: list[str], label: str) -> str | None:
-        """A label below one of the names; what a stage was told to write there is none."""
+    def _label_topic(self, names: list[str], label: str) -> str | None:
+        """Return the first topic below one of the names for a label, unless a stage made it; None if there is none."""
         topics = [f"{name}/{label}" for name in names]
         there = [self._opened.channels[topic] for topic in topics if topic in self._opened.channels]
         return next((channel.topic for channel in there if not is_made_by_stage(channel)), None)
 
-    def _those(self, names: list[str], wanted: Callable[[log.Channel], bool]) -> list[str]:
-        topics = sorted(topic for name in names for topic in self._below.get(name, ()))
+    def _select(self, names: list[str], wanted: Callable[[log.Channel], bool]) -> list[str]:
+        topics = sorted(topic for name in names for topic in self._topics.get(name, ()))
         return [topic for topic in topics if wanted(self._opened.channels[topic])]
 
 
@@ -228,7 +234,7 @@ def _only(topics: list[str]) -> str | None:
 
 
 def _nearest(name: str, others: set[str]) -> str | None:
-    """The other name that shares the longest part with this one; None if there are several."""
+    """Return the other name with the longest common part; None if there are several."""
 
     def shared(other: str) -> int:
         pairs = zip(name.split("/"), other.split("/"), strict=False)

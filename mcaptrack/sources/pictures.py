@@ -39,7 +39,7 @@ class Pixels(Protocol):
 
 
 class Pictures:
-    """The pictures of a channel with random access: each costs the decoding of one group of pictures at most.
+    """The pictures of a channel with random access: reading one decodes at most one group of pictures.
 
     ``t_ns`` are their sorted log times, (M,); pictures are numbered in this order. ``decoded`` counts the pictures that
     have been decoded. Raises McaptrackError if there is no such channel, or if it holds no pictures.
@@ -52,7 +52,7 @@ class Pictures:
         self.decoded = 0
 
     def at(self, times_ns: Iterable[int], pixels: Pixels = decode_bgr) -> Iterator[Frame]:
-        """The pictures at these times: for each time the latest picture that is not later, in order, without repeats.
+        """Yield, for each of these times in ns, the latest picture that is not later; in order, without repeats.
 
         Times before the first picture give the first one.
         """
@@ -60,7 +60,7 @@ class Pictures:
         return self.frames(np.maximum(found, 0).tolist() if len(self.t_ns) else [], pixels)
 
     def frames(self, numbers: Iterable[int], pixels: Pixels = decode_bgr) -> Iterator[Frame]:
-        """The pictures with these numbers, in order, without repeats; ``index`` is the number.
+        """Yield the pictures with these numbers, in order, without repeats; ``index`` is the number.
 
         Rows are (height, width, 3) uint8, blue, green, red, or with ``pixels=brightness`` (height, width). Pictures of
         a video before the first that decoding can begin with are left out. Raises McaptrackError for pictures that are
@@ -82,7 +82,7 @@ class Pictures:
             wanted = wanted[len(fed) :]
 
     def _entry(self, number: int) -> int | None:
-        """The message to begin decoding at for a picture: the last key picture before it, or its parameter sets.
+        """Return the message at which decoding of a picture begins: its key picture, or the parameter sets of that.
 
         None if there is none.
         """
@@ -98,9 +98,9 @@ class Pictures:
         return None
 
     def _run(self, start: int, wanted: list[int], fed: dict[int, bool]) -> Iterator[EncodedPicture]:
-        """The pictures to decode from ``start`` on.
+        """Yield the pictures to decode from ``start`` on.
 
-        The wanted ones among them are added to ``fed``, with whether their message has a picture.
+        Adds each wanted number to ``fed``, with whether its message contains a picture.
         """
         waiting: list[EncodedPicture] = []
         for number, picture in self._read(start, len(self.t_ns)):
@@ -124,7 +124,7 @@ class Pictures:
                     return
 
     def _from_before(self, number: int, start: int, pixels: Pixels) -> Frame:
-        """A picture that needs an earlier key picture: leading pictures of open groups depend on the previous group."""
+        """Decode a picture from an earlier key picture: leading pictures of open groups depend on the group before."""
         for _ in range(_BACK):
             if start == 0:
                 break
@@ -135,7 +135,7 @@ class Pictures:
         raise McaptrackError(f"{where} can't be decoded, from the key picture before it on")
 
     def _read(self, start: int, end: int) -> Iterator[tuple[int, EncodedPicture]]:
-        """The encoded pictures with numbers from ``start`` (inclusive) to ``end`` (exclusive)."""
+        """Yield the encoded pictures with numbers from ``start`` (inclusive) to ``end`` (exclusive)."""
         for first in range(start, end, _BLOCK):
             until = min(first + _BLOCK, end)
             # Messages may share a time, so the interval may contain others.
