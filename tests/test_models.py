@@ -161,6 +161,7 @@ class TestDetecting:
 
     def test_what_it_made_is_up_to_date_without_the_weights(self, model, log):
         mcaptrack.get_model(NAME)
-        done("run", log, "--detector", NAME, "--no-tables")
+        err = call("run", log, "--detector", NAME, "--no-tables").err
+        assert "track by bytetrack (new_score 0.7, min_hits_frames 1), which suits the detector yolox-nano" in err
         model.path.unlink()
         assert "nothing to do" in call("run", log, "--no-tables").err

@@ -453,6 +453,16 @@ class TestInLogs:
         done("run", log, "--detector", f"onnx:{path}", "--force", "--no-tables", "--quiet")
         assert "other weights" not in call("run", log, "--force", "--no-tables").err
 
+    def test_run_tracks_in_metres_where_a_ground_plane_is_given(self, network, log, recorded, tmp_path):
+        path, pictures = network(), recorded.parent / "pictures"
+        assert "track by bytetrack, which" in call("run", log, "--no-tables", "--detector", f"onnx:{path}").err
+        (tmp_path / "plane.txt").write_text("0.05 0 0\n0 0.05 0\n0 0 1\n")
+        plane, other = tmp_path / "plane.txt", tmp_path / "other.mcap"
+        done("ingest", pictures, "--fps", "10", "--ground-plane", plane, "-o", other)
+        assert "bytetrack (cost metres), which" in call("run", other, "--no-tables", "--detector", f"onnx:{path}").err
+        made = [Provenance.from_metadata(metadata_of(one, "/camera/tracks")).parameters for one in (log, other)]
+        assert [(one["tracker"], one["cost"]) for one in made] == [("bytetrack", "iou"), ("bytetrack", "metres")]
+
     def test_another_file_is_another_detector(self, network, log):
         first, second = network(name="a.onnx"), network("ultralytics", name="b.onnx")
         done("run", log, "--detector", f"onnx:{first}", "--no-tables", "--quiet")

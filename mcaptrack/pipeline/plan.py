@@ -12,6 +12,7 @@ from typing import Final
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError, call
+from mcaptrack.geometry.plane import is_assumed
 from mcaptrack.notices import warn
 from mcaptrack.pipeline.checks import Job, check_inputs, fits, how_it_came
 from mcaptrack.pipeline.planes import planes_to_json, read_planes
@@ -185,8 +186,15 @@ class _Planner:
         if not name or maker is None:
             return None
         kind = next(one for one in STAGES.values() if f"{self._prefix}/{one.output_topic}" == source)
-        self._said.append(f"{stage} by {name}, which suits the {kind.option} {kind.choice(maker)}; `{option}=` chooses")
-        return STAGES[stage].make(name)
+        parameters = dict(getattr(maker, "suits_with", {}).get(option, {}))
+        planes = read_planes(self._opened, self._prefix)
+        if planes and not is_assumed(planes):
+            parameters |= getattr(maker, "suits_on_ground", {}).get(option, {})
+        words = name + (f" ({', '.join(f'{key} {value}' for key, value in parameters.items())})" if parameters else "")
+        self._said.append(
+            f"{stage} by {words}, which suits the {kind.option} {kind.choice(maker)}; `{option}=` chooses"
+        )
+        return STAGES[stage].make(name, **parameters)
 
     def _maker_of(self, topic: str) -> Transform | None:
         """Return the transform that makes a channel now, or that made it; None if no stage of the camera does."""

@@ -8,7 +8,8 @@ A transform that reads pictures (``reads = VIDEO``) gets their brightness, (heig
 ``colour`` is "bgr"; then it gets blue, green and red, (height, width, 3).
 
 A detector can name the tracker that suits it by its class attribute ``suits = {"tracker": NAME}``; ``run`` takes that
-one unless another is chosen.
+one unless another is chosen, with the parameters of ``suits_with = {"tracker": {...}}``, and where a ground plane is
+given, of ``suits_on_ground``.
 
 A transform that reads its frames twice says so by its class attribute ``passes = 2``; the frames can then be iterated
 as often, each time from the beginning.

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
+from types import MappingProxyType
+from typing import Any, ClassVar
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.transforms.detect.onnx.catalogue import check, find, stored
@@ -23,6 +25,10 @@ class CataloguedDetector(OnnxDetector):
         theme=NETWORK,
     )
 
+    #: False boxes score up to 0.6 and begin no tracks, so that those that begin need no confirmation.
+    suits_with: ClassVar[Mapping[str, Mapping[str, Any]]] = MappingProxyType(
+        {"tracker": MappingProxyType({"new_score": 0.7, "min_hits_frames": 1})}
+    )
     #: Its name in the catalogue.
     model: ClassVar[str]
 

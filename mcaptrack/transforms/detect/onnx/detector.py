@@ -15,7 +15,7 @@ from itertools import chain, islice
 from math import sqrt
 from pathlib import Path
 from types import MappingProxyType
-from typing import ClassVar, Final, Literal, NamedTuple
+from typing import Any, ClassVar, Final, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -105,6 +105,9 @@ class OnnxDetector:
     colour: ClassVar[Colour] = "bgr"
     #: Boxes of low scores are of people partly hidden: only ByteTrack makes use of them.
     suits: ClassVar[Mapping[str, str]] = MappingProxyType({"tracker": "bytetrack"})
+    suits_on_ground: ClassVar[Mapping[str, Mapping[str, Any]]] = MappingProxyType(
+        {"tracker": MappingProxyType({"cost": "metres"})}
+    )
 
     def __post_init__(self) -> None:
         check_options(self)
