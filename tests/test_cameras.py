@@ -50,7 +50,7 @@ def path(template, tmp_path, monkeypatch) -> Path:
 
 
 def answer(command: str, path: Path) -> Any:
-    """What a command says of a log, without what is about the file or the time that it took."""
+    """Return a command's output for a log, without parts that depend on the file's name or on time."""
     copied = Path(shutil.copy(path, path.with_name("asked.mcap")))
     given = json.loads(done(command, copied, *READING[command], "--json", "-q").out)
     for result in given.get("results", []):
@@ -61,12 +61,12 @@ def answer(command: str, path: Path) -> Any:
     return given
 
 
-def test_every_command_with_a_camera_is_asked():
+def test_all_commands_with_a_camera_option_are_covered():
     having = {name for name, command in GROUP.commands.items() if any("--camera" in p.opts for p in command.params)}
     assert having - {"ingest"} == set(READING)
 
 
-def test_wherever_stages_wrote_every_command_works_as_before(path):
+def test_commands_give_the_same_output_for_results_at_other_topics(path):
     before = {command: answer(command, path) for command in READING}
     for stage, target in PLACES:
         done(stage, path, "--to", f"{target}/{stage}", "-q")
@@ -76,7 +76,7 @@ def test_wherever_stages_wrote_every_command_works_as_before(path):
 
 
 @pytest.mark.parametrize(("stage", "target"), PLACES)
-def test_what_a_stage_writes_belongs_to_the_camera_that_it_comes_from(path, stage, target):
+def test_outputs_belong_to_the_camera_of_their_source(path, stage, target):
     done(stage, path, "--to", target, "-q")
     with log.read(path) as opened:
         assert [camera.prefix for camera in cameras(opened)] == ["/camera"]
@@ -92,7 +92,7 @@ def test_what_a_stage_writes_belongs_to_the_camera_that_it_comes_from(path, stag
                 assert made.input == target
 
 
-def test_a_channel_elsewhere_is_made_again_when_its_input_is(path):
+def test_a_channel_at_another_topic_is_made_again_with_its_input(path):
     done("track", path, "--to", "/elsewhere", "--max-age-s", 3, "-q")
     done("sample", path, "--topic", "/elsewhere", "-q")
     done("detect", path, "--detector", "mog2", "-q")
@@ -106,7 +106,7 @@ def test_a_channel_elsewhere_is_made_again_when_its_input_is(path):
 
 
 def outputs(path: Path, topic: str) -> dict[str, Any]:
-    """The outputs of re-tracking that stand below a topic, and the parameters of each."""
+    """Return the outputs of re-tracking below a topic, with the parameters of each."""
     with log.read(path) as opened:
         known = {name: Provenance.from_metadata(channel.metadata) for name, channel in opened.channels.items()}
     return {
@@ -117,14 +117,14 @@ def outputs(path: Path, topic: str) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize(("mode", "made"), [("online", ["/online", "/predictions"]), ("offline", ["", "/full"])])
-def test_what_is_made_again_is_what_stood_there(path, mode, made):
+def test_only_existing_outputs_are_made_again(path, mode, made):
     done("retrack", path, "--to", "/again", "--mode", mode, "--max-age-s", 1, "-q")
     done("sample", path, "--rate-hz", 5, "-q")
     done("run", path, "--no-tables", "-q")
     assert outputs(path, "/again") == dict.fromkeys(made, 1)
 
 
-def test_outputs_that_are_missing_are_made_as_those_beside_them_were(path):
+def test_missing_outputs_are_made_with_the_parameters_of_existing_ones(path):
     done("drop", path, "/camera/retracks*", "-o", "dropped.mcap", "-q")
     done("retrack", "dropped.mcap", "--mode", "online", "--max-age-s", 1, "-q")
     said = done("run", "dropped.mcap", "--no-tables").err
@@ -134,7 +134,7 @@ def test_outputs_that_are_missing_are_made_as_those_beside_them_were(path):
     )
 
 
-def test_a_stage_does_not_replace_what_its_input_was_made_from(path):
+def test_a_stage_does_not_replace_the_source_of_its_input(path):
     before = path.read_bytes()
     outcome = call("sample", path, "--topic", "/camera/retracks")
     assert (outcome.code, path.read_bytes()) == (1, before)
@@ -143,7 +143,7 @@ def test_a_stage_does_not_replace_what_its_input_was_made_from(path):
 
 
 @pytest.mark.parametrize("stage", STAGES)
-def test_no_stage_replaces_what_it_did_not_make(path, stage):
+def test_stages_do_not_replace_channels_of_other_stages(path, stage):
     before = path.read_bytes()
     for name in {"video", "truth", "ground_plane", *(stage.output_topic for stage in STAGES.values())} - {
         STAGES[stage].output_topic
@@ -158,8 +158,8 @@ def test_no_stage_replaces_what_it_did_not_make(path, stage):
     [*((stage, "") for stage in STAGES), ("track", "/view/image"), ("retrack", "/view/scene")]
     + [("retrack", f"/{suffix}") for suffix in ("online", "predictions", "full")],
 )
-def test_no_stage_replaces_what_others_recorded(path, stage, below):
-    """Not where it writes, nor beside that: neither outputs nor views."""
+def test_stages_do_not_replace_recorded_channels(path, stage, below):
+    """This holds for all outputs and for their views."""
     with log.read(path) as opened, log.extend(opened) as writer:
         channel = writer.add_channel(f"/theirs{below}", ("", "", b""), "json", {})
         writer.add_message(channel, 1, 0, b'{"mine": 1}')
@@ -171,7 +171,7 @@ def test_no_stage_replaces_what_others_recorded(path, stage, below):
         assert (outcome.code, "was recorded by others" in outcome.err) == (1, True), outcome.err
 
 
-def test_boxes_that_were_ingested_are_not_replaced(template, tmp_path):
+def test_stages_do_not_replace_ingested_detections(template, tmp_path):
     rows = "".join(f"{n},-1,{10 + 2 * n},20,10,34,1,-1,-1,-1\n" for n in range(1, 30))
     (tmp_path / "det.txt").write_text(rows)
     path = tmp_path / "boxes.mcap"
@@ -192,7 +192,7 @@ LAYOUTS = [
 
 
 def label(path: Path, topic: str) -> None:
-    """Put a true track into a log, as ingest does."""
+    """Write a ground truth track into a log, as ingest does."""
     with log.read(path) as opened:
         times = opened.times(next(name for name in opened.channels))
     frames = [Frame(t_ns, n, tracks_at({1: (n / 10, 1.0)})) for n, t_ns in enumerate(times.tolist())]
@@ -211,7 +211,7 @@ def label(path: Path, topic: str) -> None:
         for layout, truth in zip(LAYOUTS, ["beside", "/camera/truth", "beside", "beside", None], strict=True)
     ],
 )
-def test_own_boxes_and_pictures_are_one_camera_with_one_set_of_results(tmp_path, pictures, boxes, truth):
+def test_recorded_detections_and_pictures_are_one_camera(tmp_path, pictures, boxes, truth):
     path = tmp_path / "boxes.mcap"
     write_log(path, pictures, boxes=boxes)
     if truth:
@@ -237,7 +237,7 @@ def test_own_boxes_and_pictures_are_one_camera_with_one_set_of_results(tmp_path,
     done("events", path, "-q")
 
 
-def test_each_of_two_cameras_has_its_boxes_and_its_results(tmp_path):
+def test_two_cameras_keep_their_detections_and_results_apart(tmp_path):
     path = tmp_path / "two.mcap"
     write_log(path, "/front/image", boxes="/front/yolo/boxes")
     write_log(tmp_path / "other.mcap", "/rear/image", boxes="/rear/yolo/boxes")
@@ -261,7 +261,7 @@ def test_each_of_two_cameras_has_its_boxes_and_its_results(tmp_path):
     assert (outcome.code, "belongs to the camera front/yolo, not to rear" in outcome.err) == (1, True)
 
 
-def test_boxes_without_pictures_are_taken(tmp_path):
+def test_detections_without_pictures_are_tracked(tmp_path):
     path = tmp_path / "boxes.mcap"
     write_log(path, boxes="/lidar/boxes")
     said = done("run", path, "--no-tables").err
@@ -270,7 +270,7 @@ def test_boxes_without_pictures_are_taken(tmp_path):
         assert "/lidar/retracks" in opened.channels
 
 
-def test_a_chain_of_inputs_that_goes_round_ends(tmp_path):
+def test_a_circular_chain_of_inputs_ends(tmp_path):
     path = tmp_path / "round.mcap"
     with log.create(path) as writer:
         for name, source in (("a", "/x/b"), ("b", "/x/a"), ("c", "/x/c")):

@@ -40,7 +40,7 @@ def made_by(path: Path, topic: str) -> Provenance:
 
 
 def written(path: Path, **tracks: list[Frame]) -> Path:
-    """A log of nothing but tracks of a camera, by name."""
+    """Write a log with only these channels of tracks of a camera, by name."""
     with log.create(path) as writer:
         for name, frames in tracks.items():
             how = Provenance("retrack" if name == "retracks" else "track", {}).to_metadata()
@@ -56,7 +56,7 @@ def written(path: Path, **tracks: list[Frame]) -> Path:
 
 
 def of_sources(*parts: tuple[int, int]) -> list[Frame]:
-    """Tracks that were re-tracked, each for a second: their ids and those they come from, one part after another."""
+    """Return re-tracked frames, one row and one second each, with these pairs of track id and source id."""
     frames = []
     for number, (track, source) in enumerate(parts):
         rows = tracks_at({track: (float(number), 1.0)})
@@ -65,8 +65,8 @@ def of_sources(*parts: tuple[int, int]) -> list[Frame]:
     return frames
 
 
-def test_repairs_are_counted_by_what_became_of_which_track(tmp_path):
-    """Tracks 1 and 2 are one person, 3 was two people, 4 is left out; 12 takes up what was left of 3."""
+def test_summary_counts_joined_split_and_missing_tracks(tmp_path):
+    """Tracks 1 and 2 are joined as 10, 3 is split into 11 and 12, and 4 is left out."""
     tracks = [Frame(ns(float(n)), n, tracks_at({n + 1: (float(n), 1.0)})) for n in range(4)]
     path = written(tmp_path / "a.mcap", tracks=tracks, retracks=of_sources((10, 1), (10, 2), (11, 3), (12, 3)))
     with log.read(path) as opened:
@@ -78,7 +78,7 @@ def test_repairs_are_counted_by_what_became_of_which_track(tmp_path):
 
 
 @pytest.mark.parametrize("is_worse", [False, True])
-def test_scores_before_and_after_are_those_of_samples_and_retracked_and_a_loss_is_said(tmp_path, is_worse):
+def test_summary_scores_samples_and_retracks_and_warns_of_a_loss(tmp_path, is_worse):
     truth = walk(lambda n: {1: (n * 0.4, 0.0), 2: (n * 0.4, 5.0)}, 10)
     swapped = walk(lambda n: {1 + n // 5: (n * 0.4, 0.0), 2 - n // 5: (n * 0.4, 5.0)}, 10)
     samples, retracks = (truth, swapped) if is_worse else (swapped, truth)
@@ -90,8 +90,8 @@ def test_scores_before_and_after_are_those_of_samples_and_retracked_and_a_loss_i
     assert [notice.code for notice in said] == ["worse"] * is_worse
 
 
-def test_what_is_odd_about_the_whole_is_counted_with_the_rest(path, monkeypatch):
-    """It is found after the stages have run."""
+def test_warnings_of_the_summary_are_counted_with_those_of_stages(path, monkeypatch):
+    """The summary is made after all stages."""
     summarise = pipeline.summarise
 
     def odd(*given):
@@ -109,7 +109,7 @@ def test_what_is_odd_about_the_whole_is_counted_with_the_rest(path, monkeypatch)
     assert counted(after) == (counted(before)[0] + 1, counted(before)[1] | {"worse"})
 
 
-def test_run_ends_with_what_the_log_holds_in_words_and_in_json(path):
+def test_run_ends_with_a_summary_as_text_and_json(path):
     said = done("run", path, "--force", "--no-tables").err
     data = json.loads(done("run", path, "--no-tables", "--json", "-q").out)["results"][0]
     lines = dict(line.strip().split("  ", 1) for line in said.splitlines() if line.startswith("  "))
@@ -132,8 +132,8 @@ def test_run_ends_with_what_the_log_holds_in_words_and_in_json(path):
     assert data["seconds"] > 0
 
 
-def test_what_was_odd_is_said_again_by_every_run_and_by_quiet_ones(path):
-    """Also where nothing is left to do, and with what it was made from."""
+def test_every_run_repeats_the_warnings_even_with_quiet(path):
+    """This holds for runs with nothing to do, and includes warnings of inputs."""
     done("ingest", path.with_name("a.mcap"), "-o", "b.mcap", "-q")
     done("drop", "b.mcap", "/camera/ground_plane", "/camera/[!v]*", "-q")
     first = json.loads(done("run", "b.mcap", "--no-tables", "--json", "-q").out)
@@ -150,21 +150,21 @@ def test_what_was_odd_is_said_again_by_every_run_and_by_quiet_ones(path):
     assert made_by(Path("b.mcap"), "/camera/tracks").warnings == []
 
 
-def test_what_is_missing_is_said_once(path):
+def test_a_missing_channel_is_reported_once(path):
     done("drop", path, "/camera/[!t]*", "/camera/tracks", "-q")
     outcome = call("run", path)
     (line,) = outcome.err.splitlines()
     assert (outcome.code, "/camera/video" in line, "mcaptrack ingest VIDEO --into" in line) == (1, True, True)
 
 
-def test_little_memory_is_said(path, monkeypatch):
+def test_run_warns_of_too_little_memory(path, monkeypatch):
     monkeypatch.setattr(findings, "free_memory", lambda: 1_000_000)
     said = json.loads(done("track", path, "--json", "-q").out)["warnings"]
     assert [one["code"] for one in said] == ["memory"]
 
 
-def test_memory_is_little_where_less_is_free_than_pictures_and_boxes_take(monkeypatch):
-    """100 MB, 3 kB for each picture and 1.6 kB for each box, as measured."""
+def test_the_memory_warning_begins_at_the_estimated_need(monkeypatch):
+    """The need is 100 MB, 3 kB for each picture and 1.6 kB for each box, as measured."""
     needed = 100_000_000 + 1_000 * 3_000 + 20_000 * 1_600
     for free, is_little in ((needed, False), (needed - 1, True), (None, False)):
         monkeypatch.setattr(findings, "free_memory", lambda free=free: free)
@@ -173,7 +173,7 @@ def test_memory_is_little_where_less_is_free_than_pictures_and_boxes_take(monkey
         assert [one.code for one in said] == ["memory"] * is_little
 
 
-def test_nothing_is_made_of_nothing_and_otherwise_the_transform_gives_the_reason():
+def test_empty_results_are_explained_by_the_input_or_the_transform():
     none, some = Frame(ns(0), 0, TRACKS.empty()), Frame(ns(1), 1, TRACKS.empty(1))
     for given, words in (
         ([none, none], "/camera/tracks holds nothing, so nothing was made of it"),
@@ -190,7 +190,7 @@ def test_nothing_is_made_of_nothing_and_otherwise_the_transform_gives_the_reason
 # Without a ground plane
 
 
-def test_a_guessed_plane_is_as_large_as_all_boxes_and_begins_with_the_first_frame():
+def test_an_estimated_plane_covers_all_boxes_and_begins_with_the_first_frame():
     boxes = {"x_px": [10.0, 300.0], "y_px": [20.0, 5.0], "w_px": [20.0, 40.4], "h_px": [34.0, 34.0]}
     rows = DETECTIONS.rows(**boxes, score=[1.0, 1.0], class_id=[1, 1])
     frames = [Frame(ns(3), 0, DETECTIONS.empty()), Frame(ns(4), 1, rows)]
@@ -211,16 +211,16 @@ def ingested(path: Path, rows: Iterable[str], *words: object) -> Path:
 
 
 def side_by_side(frames: int = 60) -> list[str]:
-    """People who walk past each other in front of a camera that stands at their height."""
+    """Return tracks of people who pass each other, seen by a camera at their height."""
     return [f"{n},-1,{x},20,20,60,1,-1,-1,-1" for n in range(1, frames) for x in (n * 3, 200 - n * 3)]
 
 
 def downwards(frames: int = 60) -> list[str]:
-    """The same seen from above: they walk all over the picture."""
+    """Return tracks of people seen from above, with paths over the whole picture."""
     return [f"{n},-1,{x},{n * 4},20,40,1,-1,-1,-1" for n in range(1, frames) for x in (100, 300)]
 
 
-def test_a_camera_that_looks_along_the_ground_has_its_tracks_passed_on_and_that_is_said(tmp_path):
+def test_tracks_of_a_side_view_are_passed_on_with_a_warning(tmp_path):
     path = ingested(tmp_path / "a.mcap", side_by_side())
     data = json.loads(done("run", path, "--no-tables", "--json", "-q").out)
     assert {"held-back", "assumed-ground-plane"} <= {one["code"] for one in data["warnings"]}
@@ -232,19 +232,19 @@ def test_a_camera_that_looks_along_the_ground_has_its_tracks_passed_on_and_that_
     assert made_by(path, "/camera/retracks").parameters["side_view"] is True
 
 
-def test_a_camera_that_looks_down_has_its_tracks_re_tracked(tmp_path):
+def test_tracks_of_a_view_from_above_are_re_tracked(tmp_path):
     path = ingested(tmp_path / "a.mcap", downwards())
     data = json.loads(done("run", path, "--no-tables", "--json", "-q").out)
     assert [one["code"] for one in data["warnings"]] == ["assumed-ground-plane"]
 
 
-def test_a_plane_that_was_given_is_trusted(tmp_path):
+def test_a_given_ground_plane_gives_no_warning(tmp_path):
     (tmp_path / "plane.txt").write_text("0.05,0,0\n0,0.05,0\n0,0,1\n")
     path = ingested(tmp_path / "a.mcap", side_by_side(), "--ground-plane", tmp_path / "plane.txt")
     assert json.loads(done("run", path, "--no-tables", "--json", "-q").out)["warnings"] == []
 
 
-def test_a_sequence_that_is_too_short_says_so(tmp_path):
+def test_a_sequence_that_is_too_short_gives_a_warning(tmp_path):
     (tmp_path / "plane.txt").write_text("0.05,0,0\n0,0.05,0\n0,0,1\n")
     path = ingested(tmp_path / "a.mcap", downwards(15), "--ground-plane", tmp_path / "plane.txt")
     (said,) = json.loads(done("run", path, "--no-tables", "--json", "-q").out)["warnings"]
@@ -258,7 +258,7 @@ _TEXTURE = np.random.default_rng(0).integers(0, 256, (30, 60), dtype=np.uint8).r
 
 
 def view(x: float, y: float = 40.0, walker: int | None = None) -> np.ndarray:
-    """A part of a large picture, with somebody in it."""
+    """Return a part of a large picture, with a person in it, (96, 128) uint8."""
     image = _TEXTURE[round(y) : round(y) + 96, round(x) : round(x) + 128].copy()
     if walker is not None:
         image[30:60, walker : walker + 12] = 255
@@ -266,7 +266,7 @@ def view(x: float, y: float = 40.0, walker: int | None = None) -> np.ndarray:
 
 
 def looks(kind: str, n: int) -> np.ndarray:
-    """Picture ``n`` of 60, of a camera of this kind."""
+    """Return picture ``n`` of 60 from a camera with this kind of motion."""
     walker = (n * 2) % 110
     shake = (3 * np.sin(n * 1.7), 2 * np.cos(n * 2.3))
     return {
@@ -292,7 +292,7 @@ def looks(kind: str, n: int) -> np.ndarray:
         ("is cut", ["view-lost"]),
     ],
 )
-def test_a_camera_that_moves_is_noticed_and_one_that_stands_or_shakes_is_none(kind, codes):
+def test_detect_warns_of_camera_motion_but_not_of_shaking(kind, codes):
     frames = [Frame(ns(n / 10), n, looks(kind, n)) for n in range(60)]
     with notices.collected() as said:
         list(KnnDetector()(frames))
@@ -300,13 +300,13 @@ def test_a_camera_that_moves_is_noticed_and_one_that_stands_or_shakes_is_none(ki
 
 
 @pytest.mark.parametrize("kind", ["pans", "pans over a still scene"])
-def test_a_camera_that_moves_all_the_time_is_refused(kind):
+def test_detect_refuses_a_camera_in_constant_motion(kind):
     frames = [Frame(ns(n / 10), n, looks(kind, n)) for n in range(60)]
     with pytest.raises(McaptrackError, match=r"the camera moves in \d+% of the pictures"):
         list(KnnDetector()(frames))
 
 
-def test_a_camera_that_moved_is_said_by_all_that_is_made_from_what_it_saw(tmp_path):
+def test_later_stages_repeat_the_warning_of_camera_motion(tmp_path):
     import cv2
 
     (tmp_path / "pictures").mkdir()
@@ -320,12 +320,12 @@ def test_a_camera_that_moved_is_said_by_all_that_is_made_from_what_it_saw(tmp_pa
         assert f"warning: {path}: the camera moves in" in outcome.err
 
 
-# Transforms of others
+# Transforms of other packages
 
 
 @dataclass(frozen=True, kw_only=True)
 class Fixed:
-    """A detector of somebody else's: one box in every picture."""
+    """A detector of another package: one box in every picture."""
 
     size_px: float = option(8.0, "how large the box is")
 
@@ -340,7 +340,7 @@ class Fixed:
 
 @dataclass(frozen=True, kw_only=True)
 class Single:
-    """A tracker of somebody else's: all boxes are the same one person's."""
+    """A tracker of another package: it assigns all boxes to one track."""
 
     reads: ClassVar[Schema] = DETECTIONS
     writes: ClassVar[Mapping[str, Schema]] = MappingProxyType({"": TRACKS})
@@ -353,7 +353,7 @@ class Single:
 
 @dataclass(frozen=True, kw_only=True)
 class Sized(Fixed):
-    """One with a parameter that no log can hold."""
+    """A detector with a parameter that a log can't hold."""
 
     sizes_px: dict[str, float] = field(default_factory=dict)
 
@@ -366,8 +366,8 @@ def run_stage(path: Path, stage: str, transform: object) -> None:
 @pytest.mark.parametrize(
     ("stage", "transform", "kind"), [("detect", Fixed(size_px=9.0), "detector"), ("track", Single(), "tracker")]
 )
-def test_results_of_a_class_that_only_the_log_names_are_not_made_again(path, stage, transform, kind):
-    """``run`` says which class made them and which option gives it, and leaves the log as it is."""
+def test_a_class_that_only_the_log_names_is_not_imported(path, stage, transform, kind):
+    """``run`` names the class and the option that allows it, and leaves the log unchanged."""
     topic = {"detect": "/camera/detections", "track": "/camera/tracks"}[stage]
     run_stage(path, stage, transform)
     first, name = made_by(path, topic), f"{__name__}:{type(transform).__name__}"
@@ -388,7 +388,7 @@ def test_results_of_a_class_that_only_the_log_names_are_not_made_again(path, sta
     assert "running " + stage in done("run", "left.mcap", "--no-tables").err
 
 
-def test_results_of_such_a_class_that_are_out_of_date_can_be_replaced(path):
+def test_outdated_results_of_an_unnamed_class_can_be_replaced(path):
     run_stage(path, "track", Single())
     done("detect", path, "--detector", "mog2", "-q")
     assert "tracker tests.test_findings:Single made it" in call("run", path, "--no-tables", "-q").err
@@ -397,7 +397,7 @@ def test_results_of_such_a_class_that_are_out_of_date_can_be_replaced(path):
     assert made_by(path, "/camera/tracks").plugins == {}
 
 
-def test_parameters_that_no_log_can_hold_are_refused(path):
+def test_parameters_that_a_log_can_not_hold_are_refused(path):
     before = path.read_bytes()
     with pytest.raises(McaptrackError, match=r"Sized\.sizes_px is a dict\[str, float\]; a parameter is a float"):
         run_stage(path, "detect", Sized())

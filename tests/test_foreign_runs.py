@@ -30,7 +30,7 @@ IMAGES = "/robot/front/image"
 
 
 def content(path: Path) -> dict[str, list]:
-    """Every channel by the stock reader: what each message is, and what it says of itself."""
+    """Read all channels with the mcap library: the messages and the metadata of each."""
     out: dict[str, list] = {}
     with path.open("rb") as stream:
         for schema, channel, message in make_reader(stream, validate_crcs=True).iter_messages():
@@ -41,13 +41,13 @@ def content(path: Path) -> dict[str, list]:
 
 
 def mcaptrack(*words: object) -> None:
-    """Run a stage on a recording, and write into it."""
+    """Run a stage on a recording in place."""
     assert not app([*map(str, words), "--in-place"], standalone_mode=False), words
 
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory) -> Path:
-    """A log with one camera. Not to be changed."""
+    """Write a recording with one camera; tests must not change it."""
     path = tmp_path_factory.mktemp("theirs") / "robot.mcap"
     write_log(path, IMAGES)
     return path
@@ -62,7 +62,7 @@ def annotations(path: Path, topic: str) -> list[tuple[int, ImageAnnotations]]:
     return [(row[3], ImageAnnotations.FromString(row[6])) for row in content(path)[topic + SUFFIX]]
 
 
-def test_stages_in_place_leave_all_that_was_there_and_draw_at_the_pictures_stamps(robot):
+def test_stages_in_place_keep_all_channels_and_draw_at_capture_times(robot):
     before = content(robot)
     for words in (("detect", "--topic", IMAGES), ("track",), ("retrack",)):
         mcaptrack(words[0], robot, "-q", *words[1:])
@@ -88,7 +88,7 @@ def test_stages_in_place_leave_all_that_was_there_and_draw_at_the_pictures_stamp
     assert layout["configById"]["Image!picture"]["imageMode"]["imageTopic"] == IMAGES
 
 
-def test_people_are_found_where_they_are(robot):
+def test_detected_positions_match_the_ground_truth(robot):
     shots = list(small_scene(5.0).shots())
     mcaptrack("detect", robot, "-q", "--topic", IMAGES)
     with log.read(robot) as opened:
@@ -104,7 +104,7 @@ def test_people_are_found_where_they_are(robot):
     assert near / total > 0.7
 
 
-def test_run_begins_with_the_only_pictures_there_are_and_says_so(robot, capsys):
+def test_run_takes_the_only_pictures_and_reports_it(robot, capsys):
     mcaptrack("run", robot, "--no-tables")
     said = capsys.readouterr().err
     assert f"/robot/front/video is missing: taking the pictures of {IMAGES}" in said
@@ -116,7 +116,7 @@ def test_run_begins_with_the_only_pictures_there_are_and_says_so(robot, capsys):
     assert robot.read_bytes() == before
 
 
-def test_run_with_a_topic_equals_run_without_where_there_is_one(robot, tmp_path):
+def test_run_with_the_only_topic_equals_run_without_a_topic(robot, tmp_path):
     shutil.copy(robot, tmp_path / "b.mcap")
     mcaptrack("run", robot, "-q", "--topic", IMAGES)
     mcaptrack("run", tmp_path / "b.mcap", "-q")
@@ -124,7 +124,7 @@ def test_run_with_a_topic_equals_run_without_where_there_is_one(robot, tmp_path)
     assert (tmp_path / "robot.tables").is_dir()
 
 
-def test_of_several_cameras_one_has_to_be_chosen(tmp_path):
+def test_several_cameras_need_a_choice(tmp_path):
     path = tmp_path / "two.mcap"
     write_log(path, "/left/image", "/right/image")
     with log.read(path) as opened, pytest.raises(McaptrackError) as error:
@@ -142,7 +142,7 @@ def test_of_several_cameras_one_has_to_be_chosen(tmp_path):
         assert "/right/retracks" not in opened.channels
 
 
-def test_boxes_of_others_are_tracked(tmp_path):
+def test_recorded_detections_are_tracked(tmp_path):
     path = tmp_path / "boxes.mcap"
     shots = write_log(path, "/eye/image", boxes="/eye/detections")
     before = content(path)
@@ -161,7 +161,7 @@ def test_boxes_of_others_are_tracked(tmp_path):
         assert "/eye/retracks" in opened.channels
 
 
-def test_what_others_recorded_is_never_replaced(tmp_path):
+def test_recorded_channels_are_never_replaced(tmp_path):
     path = tmp_path / "boxes.mcap"
     write_log(path, "/eye/image", boxes="/eye/detections")
     before = path.read_bytes()
@@ -195,7 +195,7 @@ def test_detections_are_made_again_from_other_pictures(tmp_path, capsys):
         assert not [topic for topic in opened.channels if pipeline.is_stale(opened, topic)]
 
 
-def test_channels_that_hold_something_else_say_what(robot, tmp_path):
+def test_channels_of_the_wrong_schema_are_refused_by_name(robot, tmp_path):
     path = tmp_path / "boxes.mcap"
     write_log(path, "/eye/image", boxes="/eye/boxes")
     with log.read(path) as opened:
@@ -212,7 +212,7 @@ def test_channels_that_hold_something_else_say_what(robot, tmp_path):
 
 
 @pytest.mark.parametrize("payload", [b"", b"\0\1\0\0garbage", None])
-def test_a_message_that_is_damaged_is_named_and_the_log_left_alone(robot, tmp_path, payload):
+def test_a_damaged_message_is_reported_and_the_log_left_unchanged(robot, tmp_path, payload):
     path = tmp_path / "bad.mcap"
     ros = Ros("sensor_msgs/CompressedImage")
     broken = ros.pack(ros.new("sensor_msgs/CompressedImage", ros.header(), "jpeg", pixels(b"no picture")))
@@ -247,7 +247,7 @@ def test_a_real_log_of_images_is_processed_in_place(data, tmp_path):
 
 
 def boxes_log(path: Path, *names: str, damaged: bool = False) -> list[int]:
-    """Messages with one more box each, of these classes in turn; returns how many boxes each has."""
+    """Write messages with one more box each, of these classes in turn; return their numbers of boxes."""
     with path.open("wb") as stream:
         writer = Writer(stream)
         writer.start(profile="ros2", library="theirs")
@@ -263,8 +263,8 @@ def boxes_log(path: Path, *names: str, damaged: bool = False) -> list[int]:
     return [0, 1, 2, 3]
 
 
-def test_boxes_of_others_are_in_the_table_of_detections(tmp_path):
-    """With the numbers that names got, and joined with the messages they stand in."""
+def test_recorded_detections_are_in_the_table_of_detections(tmp_path):
+    """Class names have numbers, and rows can be joined with their messages."""
     path = tmp_path / "a.mcap"
     counts = boxes_log(path, "person", "car", "7")
     with recording.open(path) as opened, pytest.warns(McaptrackWarning, match="1 is a person, 8 is 'car'"):
@@ -279,7 +279,7 @@ def test_boxes_of_others_are_in_the_table_of_detections(tmp_path):
     assert (data["results"][0]["rows"]["detections"], [w["code"] for w in data["warnings"]]) == (6, ["classes"])
 
 
-def test_boxes_of_others_that_can_not_be_read_leave_the_other_tables_as_they_are(tmp_path):
+def test_unreadable_recorded_detections_leave_other_tables_complete(tmp_path):
     path = tmp_path / "a.mcap"
     boxes_log(path, "person", damaged=True)
     outcome = CliRunner().invoke(app, ["export", str(path), "-o", str(tmp_path / "t"), "--json"])
@@ -294,7 +294,7 @@ def test_boxes_of_others_that_can_not_be_read_leave_the_other_tables_as_they_are
     assert "no boxes of /lidar/boxes are in the table" in warning["message"]
 
 
-def test_tracking_boxes_of_named_classes_says_their_numbers(tmp_path, capsys):
+def test_tracking_detections_of_named_classes_reports_their_numbers(tmp_path, capsys):
     path = tmp_path / "a.mcap"
     boxes_log(path, "person", "car", "bicycle")
     mcaptrack("track", path, "--topic", "/lidar/boxes")

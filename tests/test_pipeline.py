@@ -43,7 +43,7 @@ def footage(tmp_path_factory) -> demo.Footage:
 
 @pytest.fixture
 def fresh(footage, tmp_path) -> Path:
-    """A log with a video, its ground plane and its truth."""
+    """Write a log with a video, its ground plane and its ground truth."""
     options = IngestOptions(ground_plane=footage.ground_plane, labels={"truth": footage.ground_truth})
     ingest(footage.video, tmp_path / "a.mcap", options)
     return tmp_path / "a.mcap"
@@ -51,7 +51,7 @@ def fresh(footage, tmp_path) -> Path:
 
 @pytest.fixture(scope="module")
 def finished(footage, tmp_path_factory) -> Path:
-    """The same, with everything run on it. Not to be changed."""
+    """Write the same log with the results of all stages; tests must not change it."""
     path = tmp_path_factory.mktemp("finished") / "a.mcap"
     ingest(
         footage.video, path, IngestOptions(ground_plane=footage.ground_plane, labels={"truth": footage.ground_truth})
@@ -76,7 +76,7 @@ def run_stage(
 
 
 def digests(path: Path) -> dict[str, str]:
-    """What each channel holds."""
+    """Return the SHA-256 of times and payloads of each channel, by topic."""
     with log.read(path) as opened:
         return {
             topic: hashlib.sha256(
@@ -86,7 +86,7 @@ def digests(path: Path) -> dict[str, str]:
         }
 
 
-def test_a_missing_input_is_made_first_and_said(fresh):
+def test_missing_inputs_are_made_first_and_reported(fresh):
     report, said = run_stage(fresh, "retrack", Retrack())
     assert report.stages == ["detect", "track", "sample", "retrack"]
     assert said == [
@@ -99,7 +99,7 @@ def test_a_missing_input_is_made_first_and_said(fresh):
         assert "/camera/predictions" not in opened.channels
 
 
-def test_everything_is_run_once(fresh):
+def test_a_second_run_has_nothing_to_do(fresh):
     report, _ = run_all(fresh)
     assert report.stages == ["detect", "track", "sample", "predict", "retrack"]
     before = fresh.read_bytes()
@@ -108,7 +108,7 @@ def test_everything_is_run_once(fresh):
     assert fresh.read_bytes() == before
 
 
-def test_a_stage_run_again_replaces_its_channels_and_nothing_else(fresh):
+def test_running_a_stage_again_replaces_only_its_channels(fresh):
     run_all(fresh)
     before = digests(fresh)
     run_stage(fresh, "retrack", PROFILES["paper"])
@@ -121,7 +121,7 @@ def test_a_stage_run_again_replaces_its_channels_and_nothing_else(fresh):
     assert digests(fresh) == before
 
 
-def test_what_was_made_from_something_replaced_is_said_and_made_again_as_it_was(fresh):
+def test_outdated_channels_are_reported_and_made_again_with_their_parameters(fresh):
     run_stage(fresh, "track", Sort(max_age_s=0.7))
     run_all(fresh)
     report, _ = run_stage(fresh, "detect", Mog2Detector())
@@ -139,7 +139,7 @@ def test_what_was_made_from_something_replaced_is_said_and_made_again_as_it_was(
         assert [topic for topic in opened.channels if pipeline.is_stale(opened, topic)] == []
 
 
-def test_tracks_remember_their_tracker(fresh):
+def test_tracks_are_made_again_by_the_same_tracker(fresh):
     run_stage(fresh, "track", ByteTrack(low_min_iou=0.4))
     run_all(fresh)
     run_stage(fresh, "track", OcSort(inertia=0.1))
@@ -155,7 +155,7 @@ def test_tracks_remember_their_tracker(fresh):
         assert not pipeline.is_stale(opened, "/camera/tracks")
 
 
-def test_other_topics_can_be_read_and_written(fresh):
+def test_stages_read_and_write_the_given_topics(fresh):
     run_stage(fresh, "track", Sort(), target="/camera/tracks/strict")
     run_stage(fresh, "sample", Sample(), source="/camera/tracks/strict", target="/camera/other")
     with log.read(fresh) as opened:
@@ -163,14 +163,14 @@ def test_other_topics_can_be_read_and_written(fresh):
         assert "/camera/tracks" not in opened.channels
 
 
-def test_outputs_that_are_not_wanted_stay_out(fresh):
+def test_outputs_that_are_not_kept_are_not_written(fresh):
     run_stage(fresh, "retrack", Retrack(), keep=("online", "predictions"))
     with log.read(fresh) as opened:
         assert "/camera/retracks/online" in opened.channels
         assert "/camera/retracks" not in opened.channels
 
 
-def test_another_file_is_written_and_the_log_left_alone(fresh, tmp_path):
+def test_writing_to_another_file_leaves_the_log_unchanged(fresh, tmp_path):
     before = fresh.read_bytes()
     run_stage(fresh, "detect", KnnDetector(), output=tmp_path / "b.mcap")
     assert fresh.read_bytes() == before
@@ -178,7 +178,7 @@ def test_another_file_is_written_and_the_log_left_alone(fresh, tmp_path):
         assert "/camera/detections" in opened.channels
 
 
-def test_a_log_without_what_is_needed_says_what_there_is_and_what_to_do(fresh, tmp_path):
+def test_a_missing_input_error_lists_channels_and_a_remedy(fresh, tmp_path):
     with log.create(tmp_path / "empty.mcap") as writer:
         writer.add_channel("/imu", ("x", "jsonschema", b"{}"), "json", {})
     with pytest.raises(
@@ -195,7 +195,7 @@ def test_a_log_without_what_is_needed_says_what_there_is_and_what_to_do(fresh, t
         run_stage(fresh, "track", Sort(), source="/camera/video")
 
 
-def test_a_failure_in_the_middle_leaves_the_log_as_it_was(fresh, monkeypatch):
+def test_a_failing_stage_leaves_the_log_unchanged(fresh, monkeypatch):
     before = fresh.read_bytes()
 
     def tired(*_):
@@ -208,7 +208,7 @@ def test_a_failure_in_the_middle_leaves_the_log_as_it_was(fresh, monkeypatch):
     assert list(fresh.parent.iterdir()) == [fresh]
 
 
-def test_without_a_ground_plane_a_scale_is_guessed_said_and_kept(footage, tmp_path):
+def test_without_a_ground_plane_a_scale_is_estimated_reported_and_kept(footage, tmp_path):
     path = tmp_path / "a.mcap"
     ingest(footage.video, path, IngestOptions())
     report, _ = run_all(path)
@@ -248,8 +248,8 @@ def test_two_cameras_share_a_log(footage, fresh):
         assert "/camera/detections" not in opened.channels
 
 
-class TestTheWholeLine:
-    def test_the_log_is_complete(self, finished):
+class TestCompleteRun:
+    def test_the_log_has_all_channels(self, finished):
         with log.read(finished) as opened:
             pictures = opened.times("/camera/video").tolist()
             for name in ROWS:
@@ -266,7 +266,7 @@ class TestTheWholeLine:
                 "mcaptrack.predictions.layout.json",
             ]
 
-    def test_the_stock_reader_reads_it_equal(self, finished):
+    def test_the_mcap_library_reads_the_same_messages(self, finished):
         with log.read(finished) as opened, finished.open("rb") as stream:
             reader = make_reader(stream, validate_crcs=True, decoder_factories=[DecoderFactory()])
             frames = {topic: iter(opened.frames(topic, TRACKS)) for topic in ("/camera/tracks", "/camera/retracks")}
@@ -278,7 +278,7 @@ class TestTheWholeLine:
                 np.testing.assert_array_equal([row.x_m for row in decoded.rows], frame.rows["x_m"])
             assert all(next(rest, None) is None for rest in frames.values())
 
-    def test_every_channel_says_how_it_was_made(self, finished):
+    def test_every_channel_has_its_provenance(self, finished):
         with log.read(finished) as opened:
             for topic, channel in opened.channels.items():
                 made = Provenance.from_metadata(channel.metadata)
@@ -295,7 +295,7 @@ class TestTheWholeLine:
         run_all(fresh)
         assert fresh.read_bytes() == finished.read_bytes()
 
-    def test_people_are_found_where_they_are(self, finished):
+    def test_detected_positions_match_the_ground_truth(self, finished):
         with log.read(finished) as opened:
             outcome = evaluate([sequence_of_log(opened, "/camera", [])], EvaluateOptions(gates_m=(1.0,)))
         rows = {(r.tracks, r.similarity): r.to_json() for r in outcome.results}
@@ -306,7 +306,7 @@ class TestTheWholeLine:
         assert rows["/camera/retracks/online", "metres"]["mode"] == "online"
         assert rows["/camera/retracks/online", "metres"]["displacement"]["ADE_m"] < 1.5
 
-    def test_online_tracks_and_forecasts_know_nothing_of_the_future(self, finished, tmp_path):
+    def test_online_tracks_and_forecasts_do_not_depend_on_later_pictures(self, finished, tmp_path):
         """Cut the video in half: what was written of the first half stays as it was."""
         with log.read(finished) as opened:
             frames = opened.frames("/camera/samples", TRACKS)
@@ -328,7 +328,7 @@ class TestTheWholeLine:
                 np.testing.assert_array_equal(cut.rows["x_m"], full.rows["x_m"])
 
 
-def test_a_guessed_scale_is_guessed_anew_from_new_detections(footage, tmp_path):
+def test_new_detections_give_a_new_estimate_of_the_scale(footage, tmp_path):
     path = tmp_path / "a.mcap"
     ingest(footage.video, path, IngestOptions())
     run_all(path)
