@@ -11,7 +11,7 @@ from mcaptrack.geometry.clocks import FrameClock
 from mcaptrack.schema import Frame
 from mcaptrack.sources.synthetic import SyntheticScene
 from mcaptrack.transforms import FrameDifferenceDetector, KnnDetector, Mog2Detector, MotionDetector
-from mcaptrack.transforms.detect.background import _halve, _PersonHeight
+from mcaptrack.transforms.detect.background import _PersonHeight, halve
 from mcaptrack.transforms.detect.camera_motion import CameraMotion
 from mcaptrack.transforms.detect.foreground import FrameDifference
 from tests.worlds import ns, small_scene
@@ -251,6 +251,7 @@ class TestCameraMotion:
         camera.estimate(still)
         for picture in [other] * 10 + [still] + [other] * 15:
             assert not camera.estimate(picture)[1]
+        assert camera.estimate(other)[1]
 
     def test_pictures_without_corners_have_no_motion(self):
         camera = CameraMotion()
@@ -273,5 +274,5 @@ class TestCameraMotion:
     ],
 )
 def test_pictures_are_halved_until_they_are_small_enough_or_narrow(shape, max_pixels, halved):
-    image, halvings = _halve(np.zeros(shape, np.uint8), max_pixels)
+    image, halvings = halve(np.zeros(shape, np.uint8), max_pixels)
     assert image.shape == halved == tuple(side >> halvings for side in shape)

@@ -17,6 +17,7 @@ from mcaptrack.transforms.detect.people import (
     _fit_height,
     _joined_parts,
     _mode,
+    _scaled,
     region_boxes,
     typical_height,
 )
@@ -178,6 +179,22 @@ class TestLearning:
         wide = self.learned([(20 + n, 40, 8, 24) for n in range(10)] + [(20, 40, 10, 24)] * 10, person_px=24.0)
         np.testing.assert_allclose(wide.template[:, middle - 5], 0.5)
 
+    @pytest.mark.parametrize(("box", "is_known"), [((20, 40, 6, 8), False), ((20, 40, 5, 10), True)])
+    def test_regions_to_learn_from_have_two_percent_of_the_squared_height(self, box, is_known):
+        """Of a person of 50 pixels."""
+        assert (self.learned([box] * 8, person_px=50.0) is not None) == is_known
+
+    def test_a_region_is_scaled_around_its_middle(self):
+        region = np.ones((ROWS, 7), bool)
+        region[3:5, 2] = False
+        np.testing.assert_array_equal(
+            _scaled(np.repeat(region, 2, axis=1)[:, :14])[:, 1:15], np.repeat(region, 2, 1) * 255
+        )
+        half = _scaled(np.ones((12, 4), bool))
+        assert half.shape == (ROWS, 10)
+        assert half[:-1, 3:7].min() == 255
+        assert _scaled(np.ones((48, 16), bool)).shape == (ROWS, 10)
+
     def test_people_are_at_least_eight_pixels_tall(self):
         person = Person(0.1, 5.0, np.zeros((ROWS, 10), np.float32))
         assert (person.height(20), person.height(30), person.height(50)) == (8, 8, 10)
@@ -229,6 +246,20 @@ class TestSeparating:
         found = Separator(PERSON, 0.5).boxes(mask)
         found = found[np.argsort(found[:, 0])]
         np.testing.assert_allclose(found, [(30 + 9 * n, 40, 8, 24) for n in range(count)], atol=1.01)
+
+    @pytest.mark.parametrize("apart", [6, 7, 8])
+    def test_places_are_looked_for_again_when_another_person_is_added(self, apart):
+        """They overlap, so that the first two places alone explain the mask differently."""
+        mask = drawn((100, 140), *((30 + apart * n, 40, 8, 24) for n in range(3)))
+        found = Separator(PERSON, 0.5).boxes(mask)
+        seen = [(30, 40, 8, 24), (30 + apart, 40, apart, 24), (30 + 2 * apart, 40, 8, 24)]  # of the middle one
+        np.testing.assert_allclose(found[np.argsort(found[:, 0])], seen, atol=0.01)
+
+    @pytest.mark.parametrize(("wide", "there"), [(8, 0), (9, 1)])
+    def test_a_region_has_two_percent_of_the_squared_height(self, wide, there):
+        """Of a person of 60 pixels 72; at the edge of the picture nothing else is asked."""
+        tall = Person(0.0, 60.0, template())
+        assert len(Separator(tall, 0.5).boxes(drawn((200, 200), (0, 80, wide, 8)))) == there
 
     def test_a_place_gains_what_its_pixels_say(self):
         """The log-likelihood of a person at each place, summed pixel by pixel."""
@@ -335,6 +366,15 @@ class TestBackground:
         moved = np.roll(still, 1, axis=1)
         assert not background.mask(moved, shadows=False)[:, 20:30].any()
         assert background.mask(np.roll(still, 2, axis=1), shadows=False)[:, 20:30].any()
+
+    @pytest.mark.parametrize(("beyond", "is_near"), [(8, True), (9, False)])
+    def test_a_colour_that_is_almost_in_the_range_sways_too(self, beyond, is_near):
+        still = np.full((80, 120, 3), (100, 120, 140), np.uint8)
+        still[20:40, 20:30] = (20, 40, 220)
+        moved = still.copy()
+        moved[20:40, 30:33] = (20 - beyond, 40, 220)
+        plain = Background.of([still] * 5)
+        assert np.array_equal(plain.swaying([moved] * 8, 20.0).lowest, plain.lowest) != is_near
 
     def test_what_sways_has_the_range_of_a_wider_surrounding_and_what_passes_has_not(self):
         """A flag shows its own colour a few pixels aside; a person brings another one."""

@@ -272,6 +272,12 @@ class TestPredict:
         assert out[9].rows["step"].max() == 10
         np.testing.assert_allclose(out[9].rows["ahead_s"].max(), 2.0)
 
+    @pytest.mark.parametrize(("horizon_s", "steps"), [(0.1, 1), (0.6, 2), (0.61, 2), (1.0, 2), (1.01, 3)])
+    def test_there_is_one_step_at_least_and_as_many_as_fit_best(self, horizon_s, steps):
+        """At 2.5 steps a second; a half is rounded to the even number."""
+        out = self.run(walk(lambda n: {1: (float(n), 0.0)}, 6), horizon_s=horizon_s, predictor="cv")
+        assert out[-1].rows["step"].tolist() == list(range(1, steps + 1))
+
     def test_a_gap_in_the_clock_breaks_the_past(self):
         frames = [Frame(ns(0.4 * t), t, tracks_at({1: (float(t), 0.0)})) for t in (0, 1, 2, 3, 6, 7, 8, 9)]
         out = self.run(frames)

@@ -11,6 +11,7 @@ from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import DETECTIONS, Frame
 from mcaptrack.transforms import TRACKERS
 from mcaptrack.transforms.sort import ByteTrack, OcSort, Sort
+from mcaptrack.transforms.sort.association import distance_pairs
 from tests.worlds import boxes_at, detections, ids, ns
 
 FRAMES = {"max_age_frames": 2, "min_hits_frames": 2, "min_iou": 0.3}
@@ -178,6 +179,27 @@ def test_filters_of_class_and_score():
     assert ids(run(frames, min_score=0.5)[-1]) == [1, 2]  # a detection without a score passes
     assert ids(run(frames, class_id=2)[-1]) == [1]
     assert run(frames, class_id=2)[-1].rows["x_px"][0] == pytest.approx(180)
+
+
+def test_a_score_at_the_limit_and_the_largest_class_pass():
+    rows = boxes_at([(50, 50), (120, 50)])
+    rows["score"], rows["class_id"] = [0.5, np.nextafter(np.float32(0.5), np.float32(0))], [2**31 - 1, 1]
+    frames = [Frame(ns(n / 10), n, rows) for n in range(6)]
+    assert ids(run(frames, min_score=0.5)[-1]) == [1]
+    assert ids(run(frames, class_id=2**31 - 1)[-1]) == [1]
+    with pytest.raises(McaptrackError, match=r"^class_id has to be from 0 to 2147483647, not 2147483648$"):
+        Sort(class_id=2**31)
+
+
+def test_a_pair_at_the_gate_is_beyond_it():
+    """Boxes whose centres are 3 and 4 pixels apart along the axes; and two others far away."""
+    boxes = np.array([(0.0, 0, 10, 10), (1000, 0, 1010, 10)]).T
+    predicted = np.array([(3.0, 4, 13, 14), (0, 500, 10, 510)]).T
+    assert len(distance_pairs(boxes, predicted, 5.0, None).detection) == 0
+    pairs = distance_pairs(boxes, predicted, 8.0, None)
+    assert (pairs.detection.tolist(), pairs.track.tolist(), pairs.similarity.tolist()) == ([0], [0], [0.375])
+    assert pairs.shape == (2, 2)
+    assert distance_pairs(boxes[:, :1], predicted, 1.0, None).shape == (1, 2)
 
 
 def test_a_track_continues_with_detections_of_its_class_only():

@@ -53,6 +53,21 @@ def test_every_box_gets_the_name_that_its_track_has():
     assert out == [{1: (7, round(0.1 * n, 6))} for n in range(9)]
 
 
+def test_the_first_number_of_a_track_is_zero():
+    out = full([{0: 0.1 * n} for n in range(9)], [{0: (0, 0.4 * n)} for n in range(3)])
+    assert out == [{0: (0, round(0.1 * n, 6))} for n in range(9)]
+
+
+def test_rows_without_a_box_have_no_source_and_were_not_observed():
+    tracks = [Frame(ns(n / 10), n, boxes({7: 0.1 * n} if n not in (1, 2) else {})) for n in range(9)]
+    samples = [Frame(ns(0.4 * n), 4 * n, named({1: (7, 0.4 * n)})) for n in range(3)]
+    rows = np.concatenate([frame.rows for frame in to_video_rate(tracks, samples, ())])
+    assert rows["source_id"].tolist() == [7, -1, -1, *[7] * 6]
+    assert rows["observed"].tolist() == [True, False, False, *[True] * 6]
+    nothing = [Frame(0, 0, named({1: (-1, 0.0)}))]
+    assert [len(frame.rows) for frame in to_video_rate(tracks[:1], nothing, ())] == [1]
+
+
 def test_a_track_that_is_two_people_changes_its_name_half_way_between_the_ticks():
     out = full([{7: 0.1 * n} for n in range(9)], [{1: (7, 0.0)}, {2: (7, 0.4)}, {2: (7, 0.8)}])
     assert [[who for who, (source, _) in f.items() if source == 7] for f in out] == [[1]] * 3 + [[2]] * 6
