@@ -18,6 +18,7 @@ from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.log import records
 from mcaptrack.log.records import Opcode
+from mcaptrack.log.writer import _free_id
 from mcaptrack.schema.provenance import Provenance
 from tests.commands import done
 from tests.logs import FORTY, SCHEMA, write_stock
@@ -298,3 +299,17 @@ def test_indexes_that_list_another_number_of_messages_than_was_counted_are_notic
                 list(opened.messages(topic))
             for span in ((0, None), (None, 1000), (0, 1000)):
                 assert len(list(opened.messages(topic, *span))) == 13
+
+
+@pytest.mark.parametrize(
+    ("taken", "last", "free"),
+    [((), 0, 1), ((1,), 1, 2), ((1, 3), 2, 4), ((2, 3), 1, 4), ((), 2**16 - 2, 2**16 - 1), ((), 2**16 - 1, 1)]
+    + [((1, 2, 2**16 - 1), 2**16 - 2, 3), (range(2, 2**16), 5, 1)],
+)
+def test_a_new_channel_gets_the_next_number_and_then_the_lowest_that_is_free(taken, last, free):
+    assert _free_id(dict.fromkeys(taken), last, "channels") == free
+
+
+def test_a_log_has_65535_numbers():
+    with pytest.raises(McaptrackError, match=r"^there are 65535 schemas already; a log holds no more$"):
+        _free_id(dict.fromkeys(range(1, 2**16)), 7, "schemas")

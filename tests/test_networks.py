@@ -343,6 +343,14 @@ class TestOnnx:
         assert [notice.code for notice in said] == ["extrapolated"]
         assert "predicts 1.2 s ahead; beyond it, up to 2.4 s, predictions are a straight line" in said[0].message
 
+    def test_tensors_begin_at_a_multiple_of_eight_bytes(self, tmp_path):
+        path = tmp_path / "w.safetensors"
+        for length in range(9):
+            save(path, STORED["red"], CARDS["red"] | {"note": "x" * length})
+            assert int.from_bytes(path.read_bytes()[:8], "little") % 8 == 0
+            assert load(path).card == CARDS["red"] | {"note": "x" * length}
+            np.testing.assert_allclose(load(path).tensors["head.bias"], STORED["red"]["head.bias"], rtol=1e-6)
+
     @pytest.mark.parametrize(("steps", "said"), [(6, 0), (7, 0), (8, 1)])
     def test_half_a_step_beyond_its_last_one_is_still_its_own(self, tmp_path, steps, said):
         path = tmp_path / "w.safetensors"

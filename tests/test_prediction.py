@@ -231,10 +231,38 @@ class TestPredictors:
         assert scale[0] < scale[1] < scale[2]
         assert scale[2] == pytest.approx(TAIL_FACTOR * MAX_SCALE)
 
+    @pytest.mark.parametrize("known", [2, 3, 5, 8])
+    def test_the_scale_is_that_of_the_innovations_of_a_kalman_filter(self, known):
+        """Four innovations of variance 1 are assumed beside those that are seen, along both axes; then 1.5 times."""
+        rng, step_s = np.random.default_rng(known), 0.4
+        pasts = np.cumsum(rng.normal(0.3, [[[0.1]], [[0.25]], [[0.3]], [[0.4]]], (4, known, 2)), axis=1)
+        total = np.zeros(4)
+        move = np.array([[1.0, step_s], [0.0, 1.0]])
+        noise = 0.06 * np.array([[step_s**3 / 3, step_s**2 / 2], [step_s**2 / 2, step_s]])
+        for track in range(4):
+            for axis in range(2):
+                state, cov = np.array([pasts[track, 0, axis], 0.0]), np.diag([0.04, 1.0])
+                for seen in pasts[track, 1:, axis]:
+                    state, cov = move @ state, move @ cov @ move.T + noise
+                    spread = cov[0, 0] + 0.04
+                    innovation, gain = seen - state[0], cov[:, 0] / spread
+                    total[track] += innovation**2 / spread
+                    state, cov = state + gain * innovation, cov - np.outer(gain, cov[0])
+        wanted = 1.5 * np.clip((4 + total) / (4 + 2 * (known - 1)), 0.7, 2.0)
+        assert len(set(wanted.tolist())) > 2 or known < 5
+        for name in LINEAR:
+            predictor = LinearPredictor(name, 3, step_s)
+            cov = predictor.predict(pasts, np.ones((4, known), bool)).cov
+            plain = predictor.table[1][min(known, predictor.past)]
+            np.testing.assert_allclose(cov[:, :, 0, 0], wanted[:, None] * plain, rtol=1e-9)
+            np.testing.assert_allclose(cov[:, :, 1, 1], cov[:, :, 0, 0])
+            assert not cov[:, :, 0, 1].any()
+
     def test_variance_by_hand_for_standing_still(self):
         """One position, weight 1, predicted 1 s ahead: the variances of noise, velocity and drift add up."""
         variance = linear_variance(np.ones((1, 1)), np.array([0.0]), np.array([1.0]))
         assert variance[0] == pytest.approx(POSITION_NOISE_M**2 + SPEED_M_PER_S**2 + DRIFT_M2_PER_S3 / 3)
+        assert variance[0] == pytest.approx(0.2**2 + 1 + 0.06 / 3)
 
     def test_variance_depends_on_no_clock(self):
         weights, times, ahead = np.array([[-1.0, 0.5, 1.5], [-2.0, 1.0, 2.0]]), np.array([0.0, 0.4, 0.8]), [0.4, 0.8]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import io
 import json
+import logging
 import os
 import re
 from contextlib import redirect_stdout
@@ -911,3 +912,37 @@ class TestNamesOfPlugins:
         monkeypatch.setenv("MCAPTRACK_TRACK_CONFIG", str(tmp_path / "b"))
         assert [file.path for file in _files("track", [f"--config={tmp_path / 'a'}"])] == [tmp_path / "a"]
         assert [file.path for file in _files("track", [])] == [tmp_path / "b"]
+
+
+@pytest.mark.parametrize("command", [*OF_FUNCTIONS, "tune", "view", "query", "info", "check"])
+def test_notes_are_printed_unless_quiet_and_details_with_verbose(command, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("x.mcap").write_bytes(b"")
+
+    def called(*_: Any, **__: Any) -> None:
+        logging.getLogger("mcaptrack").info("a note")
+        logging.getLogger("mcaptrack").debug("a detail")
+        raise Stop("stop")
+
+    monkeypatch.setattr(mcaptrack, command, called)
+    words = {"drop": ["x.mcap", "/a"], "demo": [], "query": ["x.mcap", "select 1"]}.get(command, ["x.mcap"])
+    end = (
+        "mcaptrack: stop" if command in ("demo", "drop", "evaluate", "query", "report", "train", "tune", "view") else ""
+    )
+    for more, notes in (([], ["a note"]), (["-q"], []), (["-v"], ["a note", "a detail"]), (["-q", "-v"], [])):
+        outcome = call(command, *words, *more)
+        *said, last = [line for line in outcome.err.splitlines() if not line.startswith("options: ")]
+        assert (outcome.code, outcome.out, said) == (1, "", notes)
+        assert last.startswith("mcaptrack: ")
+        assert last.endswith(end or "stop")
+
+
+@pytest.mark.parametrize(("more", "count"), [([], 1), (["-q"], 1)])
+def test_old_names_of_options_of_stages_are_said_by_run(more, count, tmp_path, monkeypatch):
+    """A stage that `run` runs reads its own settings."""
+    monkeypatch.chdir(tmp_path)
+    Path("mcaptrack.toml").write_text("[sample]\nmax-hole-s = 1.5\n")
+    Path("x.mcap").write_bytes(b"no log")
+    outcome = call("run", "x.mcap", *more)
+    words = "mcaptrack.toml: [sample] max-hole-s is called max-gap-s now; the old name goes with the next release"
+    assert outcome.err.splitlines().count(words) == count
