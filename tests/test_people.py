@@ -255,6 +255,16 @@ class TestSeparating:
         seen = [(30, 40, 8, 24), (30 + apart, 40, apart, 24), (30 + 2 * apart, 40, 8, 24)]  # of the middle one
         np.testing.assert_allclose(found[np.argsort(found[:, 0])], seen, atol=0.01)
 
+    @pytest.mark.parametrize("hidden", [0, 1, 2])
+    def test_a_box_ends_half_way_between_the_shape_and_what_is_seen(self, hidden):
+        """Something hides the left columns of one; their shape, 8 columns wide, begins there, and ends beyond them."""
+        mask = drawn((100, 140), (30, 40, 8, 24), (39, 40, 8, 24))
+        mask[50:54, 30:47] = 255
+        mask[:, : 30 + hidden] = 0
+        found = Separator(PERSON, 0.5).boxes(mask)
+        wanted = [(30 + hidden, 40, 8 - hidden / 2, 24), (39, 40, 8, 24)]
+        np.testing.assert_allclose(found[np.argsort(found[:, 0])], wanted, atol=0.01)
+
     @pytest.mark.parametrize(("wide", "there"), [(8, 0), (9, 1)])
     def test_a_region_has_two_percent_of_the_squared_height(self, wide, there):
         """Of a person of 60 pixels 72; at the edge of the picture nothing else is asked."""
