@@ -400,6 +400,7 @@ def test_re_tracked_people_are_carried_to_the_rate_of_the_tracks_they_come_from(
         pipeline.run(opened, "/camera", pipeline.plan_all(opened, "/camera"))
     with log.read(tmp_path / "a.mcap") as opened:
         assert [f.t_ns for f in opened.frames("/camera/retracks/full", TRACKS)] == [f.t_ns for f in tracks]
+        assert pipeline.plan_all(opened, "/camera") == []
         samples = opened.frames("/camera/samples", TRACKS)
         made = Provenance.from_metadata(opened.channel("/camera/samples").metadata)
     for how, is_known in ((made, True), (ingested, False)):  # samples that stand, and others of unknown tracks
@@ -475,12 +476,12 @@ def test_tracks_that_are_only_passed_on_are_said(tmp_path, parameters, is_said):
 
 
 def test_little_memory_is_said_in_numbers(monkeypatch):
-    monkeypatch.setattr(findings, "free_memory", lambda: 150_000_000)
+    monkeypatch.setattr(findings, "free_memory", lambda: 160_000_000)
     with notices.listening(lambda _: None), notices.collected() as said:
-        findings.warn_of_memory(20_000, 50_000)
+        findings.warn_of_memory(50_000, 500_000)
     assert [(one.message, one.code) for one in said] == [
         (
-            "50,000 boxes in 20,000 pictures take about 0.2 GB of memory, and 0.1 GB are free: what is computed stays in "
+            "500,000 boxes in 50,000 pictures take about 1.1 GB of memory, and 0.2 GB are free: what is computed stays in "
             "memory until all is written",
             "memory",
         )

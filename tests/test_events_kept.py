@@ -1,0 +1,161 @@
+"""Which channels of tracks get events, by which options, and what is said where they get none."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mcaptrack import log, notices, pipeline
+from mcaptrack.errors import McaptrackError
+from mcaptrack.evaluation.events import EventOptions
+from mcaptrack.pipeline import events
+from mcaptrack.pipeline.write import Made
+from mcaptrack.schema import COUNTS, EVENT_KINDS, EVENTS, TRACKS, EventKind, Frame
+from mcaptrack.schema.provenance import INGEST, VIEW, Provenance
+from tests.worlds import ns, walk
+
+WALK = walk(lambda n: {1: (n / 10, 0.0), 2: (n / 10, 4.0)}, 10, 10)
+
+
+def written(path: Path, *channels: tuple[str, Provenance | None, list[Frame]], encoding: str = "protobuf") -> Path:
+    """A log of channels of tracks."""
+    with log.create(path) as writer:
+        for topic, made, frames in channels:
+            metadata = made.to_metadata() if made else {}
+            number = writer.add_channel(topic, (TRACKS.name, "protobuf", TRACKS.descriptor), encoding, metadata)
+            for frame in frames:
+                writer.add_message(number, frame.t_ns, frame.index, TRACKS.codec.encode(frame.rows))
+    return path
+
+
+def watched(path: Path, **options: Any) -> pipeline.Report:
+    with log.read(path) as opened, notices.listening(lambda _: None):
+        return pipeline.run(opened, "/camera", [], watch=pipeline.Watch(**options))
+
+
+TRUE = ("/camera/truth", Provenance(INGEST, {}, digest="x"), WALK)
+TRACKED = ("/camera/tracks", Provenance(INGEST, {}, digest="y"), WALK)
+
+
+def test_what_cannot_be_compared_is_a_warning_of_that_kind(tmp_path):
+    late = [Frame(frame.t_ns + ns(900), frame.index, frame.rows) for frame in WALK]
+    path = written(tmp_path / "a.mcap", TRACKED, (*TRUE[:2], late))
+    (warning,) = watched(path).warnings
+    assert warning.code == "not-compared"
+    assert "never overlap in time" in warning.message
+
+
+@pytest.mark.parametrize("end", ["events", "events/view/log", "counts"])
+def test_events_that_would_replace_something_are_left_out_with_a_warning_or_refused_if_asked_for(tmp_path, end):
+    path = written(tmp_path / "a.mcap", TRACKED, (f"/camera/tracks/{end}", None, WALK))
+    taken = f"would replace /camera/tracks/{end}, which was recorded by others (mcaptrack.Tracks)"
+    report = watched(path)
+    assert [(one.message, one.code) for one in report.warnings] == [
+        (f"no events of /camera/tracks: they {taken}", "left-out")
+    ]
+    assert (report.stages, report.events, report.frames) == ([], {}, {})
+    with pytest.raises(McaptrackError) as error:
+        watched(path, topics=("/camera/tracks",), again=True)
+    assert str(error.value) == f"{path}: events {taken}"
+
+
+def test_a_camera_without_tracks_has_no_events(tmp_path):
+    path = written(tmp_path / "a.mcap", TRUE)
+    assert watched(path).stages == []
+    with pytest.raises(McaptrackError) as error:
+        watched(path, again=True)
+    assert str(error.value) == f"{path} has no tracks of /camera; `mcaptrack.run('{path}')` makes them"
+
+
+def test_the_usual_tracks_and_those_with_events_are_watched(tmp_path):
+    made = Provenance("events", {}, "/camera/other")
+    some = [
+        (f"/camera/{name}", Provenance(INGEST, {}), WALK[:1])
+        for name in ("zebra", "retracks", "other", "third", "tracks")
+    ]
+    beside = [
+        ("/camera/zebra/events", made, []),
+        ("/camera/other/events", made, []),
+        ("/camera/third/events", None, []),
+        ("/camera/gone/events", made, []),
+    ]
+    with log.read(written(tmp_path / "a.mcap", *some, *beside)) as opened:
+        usual = ["/camera/tracks", "/camera/retracks"]
+        assert events._watched(opened, "/camera", {}) == [*usual, "/camera/other", "/camera/zebra"]
+        wrong = Made(COUNTS, [], Provenance("x", {}))
+        assert events._watched(opened, "/camera", {"/camera/tracks": wrong}) == [
+            "/camera/retracks",
+            "/camera/other",
+            "/camera/zebra",
+        ]
+    with log.read(written(tmp_path / "b.mcap", some[-1], encoding="json")) as opened:
+        assert events._watched(opened, "/camera", {}) == []
+
+
+#: What the provenance of events says, and the options that they are made again with.
+ASKED: list[tuple[Any, tuple[Any, Any, Any]]] = [
+    ({"similarity": "iou", "min_iou": 0.4}, ("iou", None, 0.4)),
+    ({"similarity": "metres", "gate_m": 2, "min_iou": 0.5}, ("metres", 2, 0.5)),
+    ({"similarity": "iou", "gate": 0.4}, ("iou", None, 0.4)),
+    ({"similarity": "metres", "gate": 2.0}, ("metres", 2.0, None)),
+    ({"similarity": "strange", "gate": 2.0}, (None, 2.0, None)),
+    ({"gate_m": True, "min_iou": 0}, (None, None, None)),
+    ({"gate_m": 0.001, "min_iou": -1.0}, (None, 0.001, None)),
+    ({"gate_m": "1"}, (None, None, None)),
+    (["iou"], (None, None, None)),
+    (None, (None, None, None)),
+]
+
+
+@pytest.mark.parametrize(("asked", "wanted"), ASKED)
+def test_events_are_made_again_as_they_were_asked_for_unless_something_else_is(tmp_path, asked, wanted):
+    for stage, is_read in (("events", True), (VIEW, False)):
+        made = Provenance(stage, {"asked": asked})
+        with log.read(written(tmp_path / "a.mcap", TRACKED, ("/camera/tracks/events", made, []))) as opened:
+            assert events._asked(opened, "/camera/tracks", EventOptions()) == (
+                EventOptions(*wanted) if is_read else EventOptions()
+            )
+            assert events._asked(opened, "/camera/tracks", EventOptions("iou")) == EventOptions("iou")
+            assert events._asked(opened, "/camera/other", EventOptions()) == EventOptions()
+
+
+def test_events_are_tallied_by_kind_for_each_channel():
+    kinds = [EventKind.BIRTH, EventKind.BIRTH, EventKind.MISS, EventKind.PARTED]
+    rows = EVENTS.empty(len(kinds))
+    rows["kind"] = kinds
+    made = Made(EVENTS, [Frame(0, 0, rows[:1]), Frame(1, 1, rows[1:])], Provenance("events", {}))
+    text = made._replace(record=("foxglove.Log", "protobuf", b""))
+    found = events.tally(
+        {"/a/events": made, "/a/events/view/log": text, "/a/counts": Made(COUNTS, [], made.provenance)}
+    )
+    counted = {"birth": 2, "miss": 1, "parted": 1}
+    assert found == {"/a": dict.fromkeys(EVENT_KINDS.values(), 0) | counted}
+
+
+def test_events_follow_their_tracks_their_truth_and_their_options(tmp_path):
+    path = written(tmp_path / "a.mcap", TRACKED, TRUE)
+    assert watched(path).stages == ["events"]
+    with log.read(path) as opened:
+        made = Provenance.from_metadata(opened.channel("/camera/tracks/events").metadata)
+        view = Provenance.from_metadata(opened.channel("/camera/tracks/events/view/log").metadata)
+        counts = Provenance.from_metadata(opened.channel("/camera/tracks/counts").metadata)
+    assert made is not None
+    assert view is not None
+    assert counts is not None
+    assert made.made_from() == counts.made_from() == {"/camera/tracks": "y", "/camera/truth": "x"}
+    assert (view.transform, view.input, view.input_digest) == (VIEW, "/camera/tracks/events", made.digest)
+    assert watched(path).stages == []
+    assert watched(path, anew=True).frames == {
+        "/camera/tracks/events": 10,
+        "/camera/tracks/events/view/log": 2,
+        "/camera/tracks/counts": 10,
+    }
+    assert watched(path, options=EventOptions("metres", 0.5)).stages == ["events"]
+    assert watched(path, anew=True).stages == ["events"]
+    with log.read(path) as opened:
+        kept = events._asked(opened, "/camera/tracks", EventOptions())
+        assert int(np.sum([len(frame.rows) for frame in opened.frames("/camera/tracks/events", EVENTS)])) == 2
+    assert kept == EventOptions("metres", 0.5)
