@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -291,3 +292,42 @@ def test_files_of_several_sequences_are_combined_and_one_file_stands_alone(tmp_p
     assert {(r.similarity, r.gate, r.rules) for r in together.results} == {("iou", 0.5, "trackeval")}
     (alone,) = evaluate([sequence_of_files(*made[0], 1)], EvaluateOptions(("iou",))).results
     assert (alone.tracks, alone.group) == ("north.txt", "")
+
+
+#: A file of each format with a person at frames 0 and 10 from the first, and what counts them.
+FORMATS = {
+    "mot": "1,1,1,1,9,40\n11,1,1,1,9,40\n",
+    "kitti": "".join(f"{n} 1 Pedestrian 0 0 0 1 1 10 41 1 1 1 1 1 1 0\n" for n in (0, 10)),
+    "sdd": "".join(f'1 1 1 5 9 {n} 0 0 0 "Pedestrian"\n' for n in (0, 10)),
+    "trajnet": "0 1 1 1\n10 1 1 1\n",
+}
+
+
+@pytest.mark.parametrize("found", FORMATS)
+@pytest.mark.parametrize("truth", FORMATS)
+def test_files_of_one_format_or_that_count_frames_are_compared_by_frame(found, truth, tmp_path):
+    paths = [tmp_path / "found.txt", tmp_path / "truth.txt"]
+    for path, name in zip(paths, (found, truth), strict=True):
+        path.write_text(FORMATS[name])
+    counts = {"mot", "kitti"}
+    if found == truth or {found, truth} <= counts:
+        both = compare_files(*paths)
+        for frames in (both.tracks, both.ground_truth):
+            assert [len(frame.rows) for frame in frames] == [1, 1]
+        assert [frame.t_ns for frame in both.tracks] == [frame.t_ns for frame in both.ground_truth]
+        first = {"mot": 1}
+        a, b = (
+            f"{path} counts frames from {first.get(name, 0)}" for path, name in zip(paths, (found, truth), strict=True)
+        )
+        notes = [f"{a}, {b}: their first frames are taken as the same"] * (found != truth)
+        assert both.notes == notes
+        words = "frames are compared by their numbers, whatever the frames per second"
+        assert compare_files(*paths, fps=Fraction(3)).notes == [words, *notes]
+    elif "trajnet" in (found, truth) and "sdd" in (found, truth):
+        with pytest.raises(
+            McaptrackError, match=r"25 by trajnet.* Stanford Drone|30 by Stanford Drone.* 25 by trajnet"
+        ):
+            compare_files(*paths)
+        both = compare_files(*paths, fps=Fraction(5))
+        ends = {frames[-1].t_ns for frames in (both.tracks, both.ground_truth)}
+        assert (ends, both.notes) == ({ns(2)}, [])

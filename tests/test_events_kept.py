@@ -84,15 +84,15 @@ def test_the_usual_tracks_and_those_with_events_are_watched(tmp_path):
     ]
     with log.read(written(tmp_path / "a.mcap", *some, *beside)) as opened:
         usual = ["/camera/tracks", "/camera/retracks"]
-        assert events._watched(opened, "/camera", {}) == [*usual, "/camera/other", "/camera/zebra"]
+        assert events._default_topics(opened, "/camera", {}) == [*usual, "/camera/other", "/camera/zebra"]
         wrong = Made(COUNTS, [], Provenance("x", {}))
-        assert events._watched(opened, "/camera", {"/camera/tracks": wrong}) == [
+        assert events._default_topics(opened, "/camera", {"/camera/tracks": wrong}) == [
             "/camera/retracks",
             "/camera/other",
             "/camera/zebra",
         ]
     with log.read(written(tmp_path / "b.mcap", some[-1], encoding="json")) as opened:
-        assert events._watched(opened, "/camera", {}) == []
+        assert events._default_topics(opened, "/camera", {}) == []
 
 
 #: What the provenance of events says, and the options that they are made again with.
@@ -115,11 +115,11 @@ def test_events_are_made_again_as_they_were_asked_for_unless_something_else_is(t
     for stage, is_read in (("events", True), (VIEW, False)):
         made = Provenance(stage, {"asked": asked})
         with log.read(written(tmp_path / "a.mcap", TRACKED, ("/camera/tracks/events", made, []))) as opened:
-            assert events._asked(opened, "/camera/tracks", EventOptions()) == (
+            assert events._options_for(opened, "/camera/tracks", EventOptions()) == (
                 EventOptions(*wanted) if is_read else EventOptions()
             )
-            assert events._asked(opened, "/camera/tracks", EventOptions("iou")) == EventOptions("iou")
-            assert events._asked(opened, "/camera/other", EventOptions()) == EventOptions()
+            assert events._options_for(opened, "/camera/tracks", EventOptions("iou")) == EventOptions("iou")
+            assert events._options_for(opened, "/camera/other", EventOptions()) == EventOptions()
 
 
 def test_events_are_tallied_by_kind_for_each_channel():
@@ -156,6 +156,6 @@ def test_events_follow_their_tracks_their_truth_and_their_options(tmp_path):
     assert watched(path, options=EventOptions("metres", 0.5)).stages == ["events"]
     assert watched(path, anew=True).stages == ["events"]
     with log.read(path) as opened:
-        kept = events._asked(opened, "/camera/tracks", EventOptions())
+        kept = events._options_for(opened, "/camera/tracks", EventOptions())
         assert int(np.sum([len(frame.rows) for frame in opened.frames("/camera/tracks/events", EVENTS)])) == 2
     assert kept == EventOptions("metres", 0.5)

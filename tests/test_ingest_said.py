@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from rosbags.rosbag1 import Writer as BagWriter
+from rosbags.typesys import Stores, get_typestore
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
@@ -19,7 +20,9 @@ from mcaptrack.schema.ground_plane import rows_to_plane
 from mcaptrack.schema.provenance import CLOCK, INGEST, Provenance
 from mcaptrack.sources.ingest import IngestOptions, IngestReport, ingest, label_frames
 from mcaptrack.sources.ingest.bags import decompression, plain_yaml
+from mcaptrack.sources.ingest.bags.metadata_yaml import read_metadata
 from mcaptrack.sources.ingest.bags.plain_yaml import Fields, UnsupportedYamlError
+from mcaptrack.sources.ingest.bags.ros_definitions import known_definition
 from mcaptrack.sources.ingest.labels.camera import (
     CameraTopics,
     camera_prefix,
@@ -546,3 +549,39 @@ def test_fields_are_of_the_kind_that_is_asked_for():
         with pytest.raises(UnsupportedYamlError) as error:
             wrong()
         assert str(error.value) == words
+
+
+def test_what_metadata_leaves_out_has_its_usual_value(tmp_path):
+    topic = "{topic_metadata: {name: /a, type: t/msg/T}, message_count: 3}"
+    path = write(
+        tmp_path / "metadata.yaml",
+        f"rosbag2_bagfile_information:\n  topics_with_message_count: [{topic}]\n  relative_file_paths: [x/a.db3]\n",
+    )
+    bag, names = read_metadata(path)
+    assert (names, list(bag.topics)) == (["a.db3"], [("/a", "t/msg/T", "cdr", "", "", 3)])
+    assert (bag.distro, bag.packed, bag.text) == ("", False, path.read_bytes())
+    more = "  ros_distro: jazzy\n  compression_mode: {}\n  compression_format: {}\n"
+    for mode, packing, is_packed in (
+        ("MESSAGE", "ZSTD", True),
+        ("file", "zstd", False),
+        ("none", "lz4", False),
+        ("FILE", "lz4", None),
+    ):
+        write(path, bag.text.decode() + more.format(mode, packing))
+        if is_packed is None:
+            with pytest.raises(McaptrackError, match="the bag is compressed with 'lz4'; zstd is read"):
+                read_metadata(path)
+            continue
+        found, _ = read_metadata(path)
+        assert (found.packed, found.distro) == (is_packed, "jazzy")
+
+
+def test_a_definition_has_the_hash_that_a_recording_says():
+    kind = "std_msgs/msg/Empty"
+    known = known_definition(kind, "humble", "")
+    assert known == ("", "ROS 2 Humble")
+    digest = get_typestore(Stores.ROS2_HUMBLE).hash_rihs01(kind)
+    assert known_definition(kind, "humble", digest) == known
+    assert known_definition(kind, "humble", digest[:-1] + "x") == ("", "")
+    assert known_definition(kind, "humble", "another kind of hash") == known
+    assert known_definition("a/msg/B", "humble", "") == ("", "")
