@@ -16,7 +16,7 @@ _PARTS = {
     "rows": ["detections"],
     "running": ["RunResult"],
     "scoring": ["Scores", "evaluate"],
-    "stages": ["detect", "predict", "retrack", "sample", "track"],
+    "stages": ["detect", "motion", "predict", "retrack", "sample", "track"],
     "training": ["TrainResult", "train"],
     "tuning": ["TuneResult", "tune"],
     "upkeep": ["DropResult", "LogCheck", "LogRecovery", "check", "drop", "recover"],

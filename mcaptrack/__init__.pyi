@@ -27,6 +27,7 @@ from mcaptrack.api.running import RunResult as RunResult
 from mcaptrack.api.scoring import Scores as Scores
 from mcaptrack.api.scoring import evaluate as evaluate
 from mcaptrack.api.stages import detect as detect
+from mcaptrack.api.stages import motion as motion
 from mcaptrack.api.stages import predict as predict
 from mcaptrack.api.stages import retrack as retrack
 from mcaptrack.api.stages import sample as sample
@@ -87,6 +88,7 @@ __all__ = [
     "ingest",
     "list_tables",
     "models",
+    "motion",
     "open",
     "predict",
     "query",

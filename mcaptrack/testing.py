@@ -20,7 +20,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Image
 from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
 from mcaptrack.registry import Entry
-from mcaptrack.schema import DETECTIONS, TRACKS, VIDEO, Frame, Schema
+from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, TRACKS, VIDEO, Frame, Schema
 from mcaptrack.transforms.guarded import guarded
 from mcaptrack.transforms.protocol import Colour, Transform, check_options, colour_of
 
@@ -284,7 +284,7 @@ def empties(transform: Transform, frames: Sequence[Frame], seed: int) -> None:
     outputs = _outputs(transform, silent)
     for suffix, output in zip(transform.writes, outputs, strict=True):
         for number, frame in enumerate(output):
-            if len(frame.rows):
+            if len(frame.rows) and transform.writes[suffix] is not CAMERA_MOTION:  # a row per picture
                 raise LawError(f"empties: {_where(suffix, number, frame)} has rows, though its input has none")
     if not any(outputs):
         raise LawError("empties: frames without rows give no frames; a frame without rows says that nothing was there")

@@ -27,6 +27,7 @@ SORT: dict[str, Any] = {
     "min_score": None,
     "class_id": None,
     "mix_classes": False,
+    "camera_motion": "auto",
 }
 
 #: What both methods of re-tracking share.
@@ -55,6 +56,7 @@ DEFAULTS: dict[str, dict[str, Any]] = {
     "sort": SORT,
     "bytetrack": SORT | {"high_score": 0.5, "new_score": 0.6, "low_min_iou": 0.5},
     "ocsort": SORT | {"inertia": 0.2, "direction_frames": 3, "recover": True, "reupdate": True},
+    "motion": {"mask_boxes": True},
     "sample": {"rate_hz": 2.5, "max_gap_s": 2.0},
     "predict": {"predictor": "red", "horizon_s": 4.8, "min_history": 4},
     "retrack": RETRACKING

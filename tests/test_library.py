@@ -72,6 +72,7 @@ ONLY_OPTIONS = {
 ONLY_PARAMETERS = {
     "run": {"stages"},
     "detect": {"stages"},
+    "motion": {"stages", "transform"},
     "track": {"stages"},
     "sample": {"stages", "transform"},
     "predict": {"stages"},

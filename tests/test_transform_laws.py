@@ -36,6 +36,7 @@ SEEDS = st.integers(0, 2**32 - 1)
 #: What the transform of each step reads, by random seed.
 INPUTS = {
     "detect": lambda seed: sample_frames(VIDEO, seed),
+    "motion": lambda seed: sample_frames(VIDEO, seed),
     "track": lambda seed: sample_frames(DETECTIONS, seed),
     "sample": lambda seed: sample_frames(TRACKS, seed, step_s=0.1),
     "predict": lambda seed: sample_frames(TRACKS, seed),
@@ -113,7 +114,7 @@ def test_options_at_the_ends_of_their_ranges_run_without_warnings(name, data, se
     kind = KINDS[name]
     base = data.draw(st.sampled_from(list(PROFILES.values()))) if name == "retrack" else kind()
     ends = ends_of_ranges(type(base))
-    chosen = data.draw(st.lists(st.sampled_from(sorted(ends)), unique=True))
+    chosen = data.draw(st.lists(st.sampled_from(sorted(ends)), unique=True)) if ends else []
     transform = replace(base, **{option: data.draw(st.sampled_from(ends[option])) for option in chosen})
     outputs = zip(*transform(INPUTS[INPUT_OF[name]](seed)), strict=True)
     for schema, output in zip(transform.writes.values(), outputs, strict=True):

@@ -26,7 +26,7 @@ from mcaptrack.files import is_same_file, refuse_overwrite
 from mcaptrack.geometry import clocks
 from mcaptrack.geometry.plane import Point
 from mcaptrack.notices import Notice, warn
-from mcaptrack.sources.ingest import Format, ImageFormat, IngestOptions, Role
+from mcaptrack.sources.ingest import Format, ImageFormat, IngestOptions, InputRole
 from mcaptrack.sources.ingest import ingest as make_log
 from mcaptrack.sources.ingest.sidecar import SidecarChoice
 
@@ -82,10 +82,11 @@ def ingest(
     detections: PathLike | None = None,
     tracks: PathLike | None = None,
     truth: PathLike | None = None,
+    motion: PathLike | None = None,
     label_format: Format = "auto",
     first_frame: int | None = None,
     frames: int | None = None,
-    role: Role | None = None,
+    role: InputRole | None = None,
     into: PathLike | None = None,
     sidecar: bool | None = None,
     force: bool = False,
@@ -117,14 +118,18 @@ def ingest(
         Which point of a box touches the ground.
     detections, tracks, truth : path, optional
         Label files with detections, tracks and ground truth.
+    motion : path, optional
+        File with the motion of the camera: a row per frame, of its number (from 0) and the 2x3 transform from pixels of
+        the frame before.
     label_format : {"auto", "mot", "kitti", "sdd", "trajnet", "obsmat"}, default "auto"
         Format of the label files.
     first_frame : int, optional
         Number of the first picture in label files.
     frames : int, optional
         Number of frames, if there are labels but no pictures.
-    role : {"detections", "tracks", "truth"}, optional
-        What ``source`` holds, if it is a label file; by default as its ids tell.
+    role : {"detections", "tracks", "truth", "motion"}, optional
+        What ``source`` holds, if it is a label file; by default as its ids tell. The motion of a camera goes ``into`` a
+        log.
     into : path, optional
         Add to this log instead of making a new one.
     sidecar : bool, optional
@@ -171,6 +176,7 @@ def ingest(
         first_frame=first_frame,
         frames=frames,
         role=role,
+        motion=optional_path(motion),
     )
     with warnings_about(path) as warnings:
         if into is None:

@@ -13,6 +13,7 @@ from mcaptrack.evaluation.aligned import Similarity
 from mcaptrack.evaluation.events import EventOptions
 from mcaptrack.pipeline import Job, Watch
 from mcaptrack.transforms import STAGES, Transform
+from mcaptrack.transforms.sort.tracker import CameraMotionUse
 
 
 @checked()
@@ -30,6 +31,7 @@ def run(
     tracker: str | Transform | None = None,
     retracker: str | Transform | None = None,
     predictor: str | Transform | None = None,
+    camera_motion: CameraMotionUse | None = None,
     stages: Mapping[str, str | Transform] | None = None,
     progress: Progress = no_progress,
 ) -> RunResult:
@@ -60,6 +62,9 @@ def run(
     detector, tracker, retracker, predictor : str or Transform, optional
         Use this one, also where another one was used before: a built-in name, the name of an installed one,
         "module:Class", or a transform.
+    camera_motion : {"auto", "on", "off"}, optional
+        Whether tracks are compensated for the motion of the camera: if it moves or has cuts, also if it only shakes,
+        or never. By default as before, and "auto" where there are no tracks yet.
     stages : mapping of str to str or Transform, optional
         Transforms, or their names, by stage, for channels that are missing; with ``force`` also for those that exist.
     progress : callable, optional
@@ -90,7 +95,7 @@ def run(
     transforms |= {s.name: transform_of(s.name, chosen[s.option], {}) for s in STAGES.values() if s.option in chosen}
 
     def plan(opened: logs.Log, prefix: str, say: Callable[[str], None]) -> list[Job]:
-        return pipeline.plan_all(opened, prefix, say, topic, transforms, force, chosen)
+        return pipeline.plan_all(opened, prefix, say, topic, transforms, force, chosen, camera_motion or "")
 
     options = events if isinstance(events, EventOptions) else EventOptions()
     watch = Watch(options, anew=force) if events else None

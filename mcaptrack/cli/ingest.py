@@ -95,6 +95,14 @@ def ingest(
     detections: Annotated[Path | None, _label_file("detections: boxes without ids")] = None,
     tracks: Annotated[Path | None, _label_file("tracks: boxes or positions with ids")] = None,
     truth: Annotated[Path | None, _label_file("ground truth: boxes or positions with true ids")] = None,
+    motion: Annotated[
+        Path | None,
+        common.option(
+            panel=_PICTURES,
+            help="File with the motion of the camera: a row per frame, of its number (from 0) and the 2x3 transform "
+            "from pixels of the frame before.",
+        ),
+    ] = None,
     label_format: Annotated[
         Literal["auto", "mot", "kitti", "sdd", "trajnet", "obsmat"],
         common.option("--format", panel=common.LABELS, tuning=True, help="Format of the label files."),
@@ -124,7 +132,7 @@ def ingest(
         ),
     ] = None,
     role: Annotated[
-        Literal["detections", "tracks", "truth"] | None,
+        Literal["detections", "tracks", "truth", "motion"] | None,
         common.option(
             "--as", panel=common.LABELS, help="What INPUT holds, if it is a label file.", show_default="as its ids tell"
         ),
@@ -149,9 +157,9 @@ def ingest(
 ) -> None:
     """Make a log of a video, a folder of images, a ROS bag, an MCAP file, or a label file.
 
-    Writes /camera/video, /camera/ground_plane, /camera/detections, /camera/tracks and /camera/truth, as far as they are
-    given. Streams that viewers can play (H.264, VP9, AV1) are copied without re-encoding; others are re-encoded as
-    H.264, and the reason is printed. Timestamps are those of the file, exact to the nanosecond.
+    Writes /camera/video, /camera/ground_plane, /camera/detections, /camera/tracks, /camera/truth and /camera/motion,
+    as far as they are given. Streams that viewers can play (H.264, VP9, AV1) are copied without re-encoding; others are
+    re-encoded as H.264, and the reason is printed. Timestamps are those of the file, exact to the nanosecond.
 
     From a ROS 1 bag, a rosbag2 folder or database, or an MCAP file every message is copied unchanged, with its
     timestamps; labels belong to its only camera, or to the one that --camera names.
@@ -174,6 +182,7 @@ def ingest(
         "detections": detections,
         "tracks": tracks,
         "truth": truth,
+        "motion": motion,
         "label_format": label_format,
         "first_frame": first_frame,
         "frames": frames,

@@ -114,6 +114,8 @@ def _lines_of_summary(summary: Summary) -> Iterator[tuple[str, str]]:
     if summary.forecasts is not None:
         ahead = "" if summary.horizon_s is None else f", {summary.horizon_s:g} s ahead"
         yield "forecasts", f"{summary.forecasts:,}{ahead}"
+    if summary.camera_motion is not None:
+        yield "camera", f"{summary.camera_motion}"
     if summary.ground_plane == "assumed":
         yield "assumed", "the scale of the ground, from the heights of boxes"
 

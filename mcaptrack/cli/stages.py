@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 #: Examples for the help, by command.
 _EXAMPLES: Final = {
     "detect": "Example: mcaptrack detect log.mcap --detector median",
+    "motion": "Example: mcaptrack motion log.mcap",
     "track": "Example: mcaptrack track log.mcap --tracker bytetrack",
     "sample": "Example: mcaptrack sample log.mcap --rate-hz 2.5",
     "predict": "Example: mcaptrack predict log.mcap --predictor cv",
@@ -311,6 +312,16 @@ def run_all(
     tracker: Annotated[str | None, chooser("tracker", words=_AGAIN)] = None,
     retracker: Annotated[str | None, chooser("retracker", words=_AGAIN)] = None,
     predictor: Annotated[str | None, chooser("predictor", words=_AGAIN)] = None,
+    camera_motion: Annotated[
+        Literal["auto", "on", "off"] | None,
+        common.option(
+            "--camera-motion",
+            tuning=True,
+            help="Compensate tracks for the motion of the camera: if it moves or has cuts (auto), also if it only "
+            "shakes (on), or never (off); also where it was done otherwise before.",
+            show_default="auto",
+        ),
+    ] = None,
 ) -> None:
     """Run all stages that are missing or out of date, then events, views and tables.
 
@@ -332,6 +343,7 @@ def run_all(
         from mcaptrack.evaluation.events import EventOptions
 
         settings, stages = settings_of("events"), _configured(chosen)
+        where["camera_motion"] = camera_motion
         for stage in STAGES.values():
             if stage.option in chosen:
                 where[stage.option] = stages.pop(stage.name)

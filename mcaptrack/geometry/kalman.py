@@ -80,6 +80,21 @@ def correct(state: Floats, measured: Floats) -> None:
     p -= gain * p
 
 
+def move(state: Floats, motion: Floats) -> None:
+    """Move states (17, K) by an affine motion (2, 3) of the camera, in place. Boxes stay upright and keep their ratio.
+
+    Lengths grow by the root of the determinant, areas by the determinant; the variance of the centre stays isotropic.
+    """
+    linear, area = motion[:, :2], abs(float(np.linalg.det(motion[:, :2])))
+    state[:2] = linear @ state[:2] + motion[:, 2:]
+    state[_RATE][:2] = linear @ state[_RATE][:2]
+    state[_AREA] *= area
+    state[_AREA_RATE] *= area
+    for part in (_P, _C, _V):
+        state[part.start] *= area
+        state[part.start + 1] *= area**2
+
+
 def stretch(state: Floats, factor: float) -> None:
     """Convert states (17, K) to frames that last ``factor`` times as long as before, in place."""
     state[_RATE] *= factor

@@ -21,13 +21,17 @@ from mcaptrack.transforms.protocol import check_options
 
 
 class Job(NamedTuple):
-    """A transform with its input and output topic; ``keep`` are the outputs that are written, None for all."""
+    """A transform with its input and output topic; ``keep`` are the outputs that are written, None for all.
+
+    The results of a job with ``is_optional`` are left out, with a warning, if it fails.
+    """
 
     stage: str
     transform: Transform
     source: str
     target: str
     keep: tuple[str, ...] | None = None
+    is_optional: bool = False
 
     def outputs(self) -> dict[str, Schema]:
         """Return the schemas of all outputs by topic, in the transform's order."""

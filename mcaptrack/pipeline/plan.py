@@ -7,13 +7,14 @@ transform with the same parameters, or left as it is, with a warning, if that is
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import fields
-from typing import Final
+from dataclasses import fields, replace
+from typing import Any, Final
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.geometry.plane import is_assumed
 from mcaptrack.notices import warn
+from mcaptrack.pipeline import motion
 from mcaptrack.pipeline.checks import Job, check_inputs, fits, how_it_came
 from mcaptrack.pipeline.planes import planes_to_json, read_planes
 from mcaptrack.pipeline.rebuild import MissingPluginError, rebuild
@@ -50,6 +51,7 @@ def plan_stage(
     usual = f"{prefix}/{STAGES[stage].output_topic}"
     source = source or planner.source_of(stage)
     planner.ensure(source)
+    planner.ensure_motion(transform, source)
     planner.jobs.append(Job(stage, transform, source, target or usual, keep))
     return planner.checked(say)
 
@@ -62,18 +64,21 @@ def plan_all(
     defaults: Mapping[str, Transform] = {},
     anew: bool = False,
     chosen: Collection[str] = (),
+    camera_motion: str = "",
 ) -> list[Job]:
     """Plan the jobs that bring all results of a camera up to date; empty if they are.
 
     ``source`` is the topic of pictures or of recorded detections to begin with; ``defaults`` as in ``plan_stage``. With
     ``anew``, channels that are up to date are made again, too, by the transform in ``defaults`` or else the same one.
+    ``camera_motion`` is what trackers are to do about it ("auto", "on" or "off") where it differs from what they did.
     ``chosen`` are options that the user gave for ``defaults`` ("tracker"): a channel that was made with another choice
     is made again. Raises McaptrackError as ``plan_stage`` does, and if the class that made a channel is not installed.
     """
-    planner = _Planner(opened, prefix, {_stage_from(opened, source): source} if source else {}, defaults, anew, chosen)
+    sources = {_stage_from(opened, source): source} if source else {}
+    planner = _Planner(opened, prefix, sources, defaults, anew, chosen, camera_motion)
     read = {stage.input_topic for stage in STAGES.values()}
     for stage in STAGES.values():
-        if stage.output_topic not in read:
+        if stage.output_topic not in read and not stage.on_demand:
             planner.ensure(f"{prefix}/{stage.output_topic}")
     for topic in sorted(camera_at(opened, prefix).topics):  # including results at other topics than the usual ones
         planner.ensure(topic)
@@ -97,7 +102,7 @@ class _Planner:
 
     ``sources`` gives inputs and ``defaults`` transforms of stages that differ from the usual ones. With ``anew`` all
     stages run, also those that are up to date. A stage also runs if an option in ``chosen`` differs from the one that
-    its channel was made with.
+    its channel was made with; so does one that takes camera motion into account, by ``camera_motion``.
     """
 
     def __init__(
@@ -108,10 +113,12 @@ class _Planner:
         defaults: Mapping[str, Transform] = {},
         anew: bool = False,
         chosen: Collection[str] = (),
+        camera_motion: str = "",
     ) -> None:
         self.jobs: list[Job] = []
         self._opened, self._prefix = opened, prefix
         self._sources, self._defaults, self._anew, self._chosen = sources, defaults, anew, chosen
+        self._camera_motion = camera_motion
         self._changes: dict[str, bool] = {}
         self._said: list[str] = []
         self._differing: set[str] = set()
@@ -126,6 +133,8 @@ class _Planner:
     def source_of(self, stage: str) -> str:
         """Return the topic that a stage reads if it has not run before."""
         usual = f"{self._prefix}/{STAGES[stage].input_topic}"
+        if STAGES[stage].on_demand and (begun := self._given_pictures()):
+            return begun
         if stage in self._sources or usual in self._opened.channels:
             return self._sources.get(stage, usual)
         camera = camera_at(self._opened, self._prefix)
@@ -175,7 +184,9 @@ class _Planner:
         source = self.source_of(stage)
         self.ensure(source)
         self._said.append(f"{topic} is missing: running {stage}")
-        transform = self._defaults.get(stage) or self._suited(stage, source) or STAGES[stage].default()
+        chosen = self._defaults.get(stage) or self._suited(stage, source) or STAGES[stage].default()
+        transform = self._with_choice(chosen)
+        self.ensure_motion(transform, source)
         self._add(Job(stage, transform, source, _main(self._opened, stage, topic)))
         return True
 
@@ -220,16 +231,16 @@ class _Planner:
         is_missing = topic not in self._opened.channels
         had = made.input or self.source_of(stage)
         source = self._sources.get(stage, had)
-        is_due = self.ensure(source) or is_missing or is_stale(self._opened, topic) or source != had
+        is_changed = [self.ensure(one) for one in (source, *made.references)]
+        is_due = any(is_changed) or is_missing or is_stale(self._opened, topic) or source != had
         before, why_not = self._before(stage, made)
         main = _main(self._opened, stage, topic)
-        is_usual = (
-            main == f"{self._prefix}/{STAGES[stage].output_topic}"
-        )  # a result at another topic keeps the parameters that it was requested with
+        # A result at another topic keeps the parameters that it was requested with.
+        is_usual = main == f"{self._prefix}/{STAGES[stage].output_topic}"
         is_open = is_usual and stage not in self._defaults and self._is_made_by_another(source)
         suited = self._suited(stage, source) if is_open else None
-        wanted = self._defaults.get(stage, suited or before) if is_usual else before
-        is_replaced = is_usual and (self._is_replaced(STAGES[stage], before, wanted) or suited is wanted is not None)
+        wanted = self._with_choice(self._defaults.get(stage, suited or before)) if is_usual else before
+        is_replaced = is_usual and (self._is_replaced(STAGES[stage], before, wanted) or suited is not None)
         if wanted and not is_replaced and not self._anew:
             self._warn_of_settings(main, _differing(before, wanted) if before else str(why_not))
         if not is_due and not self._anew and not is_replaced:
@@ -241,12 +252,15 @@ class _Planner:
             why = "is out of date and" if is_due else "is not made again, it"
             warn(f"{topic} {why} stays as it is: {why_not}", "out-of-date" if is_due else "left-out")
             return False
+        self.ensure_motion(transform, source)
         if is_missing:
             self._said.append(f"{topic} is missing: running {stage}, as for what it made beside it")
         elif source != had:
             self._said.append(f"{topic} was made from {had}: running {stage} again, from {source}")
         elif is_replaced:
-            self._said.append(f"{topic} was made by another {STAGES[stage].option}: running {stage} again")
+            is_other = before is None or STAGES[stage].choice(before) != STAGES[stage].choice(transform)
+            by = f"by another {STAGES[stage].option}" if is_other else "with another `camera_motion=`"
+            self._said.append(f"{topic} was made {by}: running {stage} again")
         elif is_due and not self._anew:
             self._said.append(f"{topic} was made from an earlier {source}: running {stage} again, as before")
         there = [f"{main}/{suffix}".rstrip("/") for suffix in transform.writes]
@@ -257,6 +271,9 @@ class _Planner:
 
     def _is_replaced(self, stage: Stage, before: Transform | None, wanted: Transform | None) -> bool:
         """Return whether the user chose another class for a stage than the one that made its channel."""
+        is_chosen = self._camera_motion and hasattr(wanted, "camera_motion")
+        if is_chosen and getattr(before, "camera_motion", "") != self._camera_motion:
+            return True
         if wanted is None or stage.option not in self._chosen:
             return False
         return before is None or stage.choice(before) != stage.choice(wanted)
@@ -283,6 +300,25 @@ class _Planner:
         self._differing.add(main)
         force = call("run", self._opened.path, force=True)
         warn(f"{main} was made with other settings than now ({differing}); {force} takes these", "other-settings")
+
+    def ensure_motion(self, transform: Transform, source: str) -> None:
+        """Plan the motion of the camera if a stage that reads boxes at ``source`` is better with it."""
+        pictures = self._given_pictures() or camera_at(self._opened, self._prefix).pictures
+        if motion.is_motion_wanted(self._opened, self._prefix, transform, source, bool(pictures), self.jobs):
+            count = len(self.jobs)
+            self.ensure(motion.motion_topic(self._prefix))
+            is_asked = getattr(transform, "camera_motion", "") == "on"
+            self.jobs[count:] = [job._replace(is_optional=not is_asked) for job in self.jobs[count:]]
+
+    def _given_pictures(self) -> str:
+        """The topic of the pictures that a run begins with, if it was told which."""
+        return next((topic for name, topic in self._sources.items() if STAGES[name].default.reads is VIDEO), "")
+
+    def _with_choice(self, transform: Any) -> Any:
+        """A transform with what is chosen about camera motion, if it takes that into account."""
+        if self._camera_motion and hasattr(transform, "camera_motion"):
+            return replace(transform, camera_motion=self._camera_motion)
+        return transform
 
     def _add(self, job: Job) -> None:
         self.jobs.append(job)
@@ -325,6 +361,8 @@ def is_stale(opened: log.Log, topic: str) -> bool:
         planes = read_planes(opened, name_above(chain_of(opened, topic)[-1]))
         if planes_to_json(planes or ()) != made.parameters["ground_planes"]:
             return True
+    if motion.is_motion_new(opened, name_above(chain_of(opened, topic)[-1]), made):
+        return True
     if any((name in opened.channels) != bool(then) for name, then in made.references.items()):
         return True
     for name, then in made.made_from().items():

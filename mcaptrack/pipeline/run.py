@@ -19,6 +19,7 @@ from mcaptrack.pipeline.checks import Job, check_inputs
 from mcaptrack.pipeline.events import STAGE as EVENTS_STAGE
 from mcaptrack.pipeline.events import Watch, make_events, tally
 from mcaptrack.pipeline.findings import warn_of_memory, warn_of_nothing, warn_of_what_stands
+from mcaptrack.pipeline.motion import beside
 from mcaptrack.pipeline.planes import guess_plane, is_poor, read_planes
 from mcaptrack.pipeline.rebuild import plugins_of
 from mcaptrack.pipeline.write import Made, digest_of, write
@@ -98,7 +99,13 @@ def _run(
             made |= {camera_at(opened, prefix).ground_plane: Made.of(GROUND_PLANE, *channel)} if channel else {}
         if has_boxes:
             warn_of_memory(len(given.frames), sum(len(frame.rows) for frame in given.frames))
-        made |= _run_job(opened, prefix, job, given, made, planes or ())
+        try:
+            made |= _run_job(opened, prefix, job, given, made, planes or ())
+        except McaptrackError as error:
+            if not job.is_optional:
+                raise
+            warn(f"{job.target} is left out: {error}", "left-out")
+            continue
         for topic in (topic for topic in job.outputs() if topic in made):
             report.count(topic, made[topic])
         report.stages.append(job.stage)
@@ -152,7 +159,8 @@ def _run_job(
     opened: log.Log, prefix: str, job: Job, given: _Input, made: Mapping[str, Made], planes: Planes
 ) -> dict[str, Made]:
     """Run a job, and return its channels by topic. ``made`` are the channels of earlier jobs."""
-    transform = _in_context(opened, prefix, job, given.frames, planes)
+    known = beside(opened, prefix, job, made)
+    transform = replace(_in_context(opened, prefix, job, given.frames, planes), **known.values)
     outputs: list[list[Frame]] = [[] for _ in transform.writes]
     taken: set[int] = set()
     try:
@@ -176,7 +184,7 @@ def _run_job(
             "picture that has its parameter sets",
             "left-out",
         )
-    provenance = _provenance_of(job, transform, given.digest(), warnings)
+    provenance = _provenance_of(job, transform, given.digest(), warnings, known.references)
     out = {
         topic: Made.of(schema, channel, provenance)
         for (topic, schema), channel in zip(job.outputs().items(), outputs, strict=True)
@@ -187,13 +195,19 @@ def _run_job(
     return out
 
 
-def _provenance_of(job: Job, transform: Transform, input_digest: str, warnings: Sequence[Notice]) -> Provenance:
+def _provenance_of(
+    job: Job, transform: Transform, input_digest: str, warnings: Sequence[Notice], references: Mapping[str, str]
+) -> Provenance:
     """Return the provenance of a job's channels. Raises McaptrackError for parameters that a log can't hold."""
     stage = STAGES[job.stage]
     entry = stage.entry(type(transform))
     choice = {stage.kind: entry.name} if stage.kind else {}
+    unrecorded = {f.name for f in fields(transform) if not f.metadata.get("is_recorded", True)}
+    plain = type(job.transform)() if unrecorded else transform
+    recorded = replace(transform, **{name: getattr(plain, name) for name in unrecorded}) if unrecorded else transform
     try:
-        parameters = json.loads(json.dumps(asdict(transform) | choice))
+        parameters = {name: value for name, value in asdict(recorded).items() if name not in unrecorded}
+        parameters = json.loads(json.dumps(parameters | choice))
     except TypeError as error:
         raise McaptrackError(f"the parameters of {entry} can't be kept in a log: {error}") from None
     predictor = getattr(transform, "predictor", None)
@@ -204,6 +218,7 @@ def _provenance_of(job: Job, transform: Transform, input_digest: str, warnings: 
         job.source,
         input_digest,
         weights_sha256=weights_sha256(predictor) if isinstance(predictor, str) else card.weights_sha256,
+        references=references,
         plugins=plugins_of(stage, transform),
         classes={str(number): name for number, name in card.classes.items()},
         model=card.facts,
@@ -339,4 +354,5 @@ def input_of(
     check_inputs(opened, prefix, [job])
     frames = _frames(opened, topic, transform.reads)
     known = _in_context(opened, prefix, job, frames, read_planes(opened, prefix) or ())
+    known = replace(known, **beside(opened, prefix, job, {}).values)
     return frames, {f.name: getattr(known, f.name) for f in fields(known) if f.metadata.get("context")}

@@ -10,8 +10,10 @@ import numpy as np
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation import Candidate, EvaluateOptions, EvaluationInput, evaluate
+from mcaptrack.geometry.camera_path import verdict_of
 from mcaptrack.notices import warn
-from mcaptrack.schema import DETECTIONS, GROUND_PLANE, PREDICTIONS, TRACKS, Rows, Schema
+from mcaptrack.pipeline.motion import motion_topic
+from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, GROUND_PLANE, PREDICTIONS, TRACKS, Rows, Schema
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources import foreign
 from mcaptrack.sources.cameras import camera_at
@@ -43,7 +45,10 @@ class SummaryScores:
 
 @dataclass(frozen=True)
 class Summary:
-    """Counts and scores for one camera; None for channels that the log lacks. ``ground_plane``: "given", "assumed"."""
+    """Counts and scores for one camera; None for channels that the log lacks.
+
+    ``ground_plane`` is "given" or "assumed", ``camera_motion`` "still", "shaking" or "moving".
+    """
 
     pictures: int | None = None
     boxes: int | None = None
@@ -53,6 +58,7 @@ class Summary:
     horizon_s: float | None = None
     scores: SummaryScores | None = None
     ground_plane: str | None = None
+    camera_motion: str | None = None
 
     def to_json(self) -> dict[str, Any]:
         """Convert the summary to JSON values."""
@@ -67,6 +73,7 @@ def summarise(opened: log.Log, prefix: str) -> Summary:
     camera = camera_at(opened, prefix)
     names = ("detect", "track", "sample", "predict", "retrack")
     boxes, tracks, samples, predictions, retracks = (f"{prefix}/{STAGES[name].output_topic}" for name in names)
+    motion = _rows(opened, motion_topic(prefix), CAMERA_MOTION)
     tracked, repaired = _rows(opened, tracks, TRACKS), _rows(opened, retracks, TRACKS)
     forecasts = _rows(opened, f"{retracks}/predictions", PREDICTIONS)
     forecasts = _rows(opened, predictions, PREDICTIONS) if forecasts is None else forecasts
@@ -87,6 +94,7 @@ def summarise(opened: log.Log, prefix: str) -> Summary:
         horizon_s=None if forecasts is None or not len(forecasts) else round(float(forecasts["ahead_s"].max()), 3),
         scores=scores,
         ground_plane=None if planes is None or not len(planes) else "assumed" if planes["assumed"].all() else "given",
+        camera_motion=None if motion is None else verdict_of(motion["verdict"]).name.lower(),
     )
 
 

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 __all__ = [
+    "CAMERA_MOTION",
     "COUNTS",
     "DETECTIONS",
     "EVENTS",
@@ -216,6 +217,7 @@ DETECTIONS: Final = Schema("mcaptrack.Detections")
 TRACKS: Final = Schema("mcaptrack.Tracks")
 PREDICTIONS: Final = Schema("mcaptrack.Predictions")
 GROUND_PLANE: Final = Schema("mcaptrack.GroundPlane")
+CAMERA_MOTION: Final = Schema("mcaptrack.CameraMotion")
 EVENTS: Final = Schema("mcaptrack.Events")
 COUNTS: Final = Schema("mcaptrack.Counts")
 FORECAST_ERRORS: Final = Schema("mcaptrack.ForecastErrors")
@@ -228,6 +230,7 @@ SCHEMAS: Final = {
         TRACKS,
         PREDICTIONS,
         GROUND_PLANE,
+        CAMERA_MOTION,
         EVENTS,
         COUNTS,
         FORECAST_ERRORS,

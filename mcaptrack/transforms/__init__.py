@@ -18,6 +18,7 @@ from mcaptrack.transforms.detect import (
     MotionDetector,
     OnnxDetector,
 )
+from mcaptrack.transforms.motion import EstimateMotion
 from mcaptrack.transforms.predict import Predict
 from mcaptrack.transforms.protocol import Transform
 from mcaptrack.transforms.retrack import PROFILES, Retrack, RetrackByConsistency
@@ -32,6 +33,7 @@ __all__ = [
     "TRACKERS",
     "TRANSFORMS",
     "ByteTrack",
+    "EstimateMotion",
     "FrameDifferenceDetector",
     "KnnDetector",
     "MedianDetector",

@@ -151,19 +151,22 @@ def option(
     return field(default=default, metadata=about)
 
 
-def context(factory: Callable[[], Any]) -> Any:
+def context(factory: Callable[[], Any], *, is_recorded: bool = True) -> Any:
     """Declare a parameter that the log gives, not the user: the ground planes, or the time of the first frame.
 
     Parameters
     ----------
     factory : callable
         Returns its default value.
+    is_recorded : bool, default True
+        Whether the provenance holds its value. What is too large for that is a channel of the log, of which the
+        provenance holds the digest.
 
     Returns
     -------
     dataclasses.Field
     """
-    return field(default_factory=factory, metadata={"context": True})
+    return field(default_factory=factory, metadata={"context": True, "is_recorded": is_recorded})
 
 
 def choices(annotation: Any) -> tuple[str, ...]:

@@ -18,6 +18,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.registry import BUILT_IN, Entry, Kind, blamed, entry_of, find
 from mcaptrack.schema import SCHEMAS
 from mcaptrack.transforms.detect import KnnDetector
+from mcaptrack.transforms.motion import EstimateMotion
 from mcaptrack.transforms.predict import Predict, predict_with
 from mcaptrack.transforms.protocol import Colour, Transform, check_options, option_problem
 from mcaptrack.transforms.retrack import PROFILES, Retrack, upgrade_parameters
@@ -54,6 +55,7 @@ class Stage:
         of the same name.
     variant : Callable or None
         Returns the transform with the options of the entry that ``parameter`` names.
+    on_demand: bool = False
     needs_scale : bool
         Whether it converts boxes to metres, so that a scale is estimated if no ground plane is given.
     repairs_tracks : bool
@@ -79,6 +81,7 @@ class Stage:
     was: str = ""
     parameter: Kind | Literal[""] = ""
     variant: Callable[[str], type[Transform]] | None = None
+    on_demand: bool = False
     needs_scale: bool = False
     repairs_tracks: bool = False
     at_video_rate: bool = False
@@ -244,6 +247,14 @@ _STAGES: Final = (
         input_topic="video",
         output_topic="detections",
         rows="boxes",
+    ),
+    Stage(
+        name="motion",
+        default=EstimateMotion,
+        input_topic="video",
+        output_topic="motion",
+        rows="camera motion",
+        on_demand=True,
     ),
     Stage(
         name="track",

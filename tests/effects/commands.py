@@ -65,6 +65,7 @@ CASES: dict[str, dict[str, Case]] = {
         detections="--detections truth.txt",
         tracks="--tracks truth.txt",
         truth="--truth truth.txt",
+        motion="--motion motion.txt",
         format=("ingest truth.txt --fps 10", "--format kitti"),
         first_frame=("ingest truth.txt --fps 10", "--first-frame 0"),
         frames=("ingest truth.txt --fps 10", "--frames 500"),
@@ -74,6 +75,7 @@ CASES: dict[str, dict[str, Case]] = {
         force=("ingest clip.mp4 -o a.mcap", "--force"),
     ),
     "detect": stage("detect", detector="--detector mog2"),
+    "motion": stage("motion"),
     "track": stage("track", tracker="--tracker ocsort"),
     "sample": stage("sample"),
     "predict": stage("predict"),
@@ -91,6 +93,7 @@ CASES: dict[str, dict[str, Case]] = {
         tracker=("run a.mcap --no-tables", "--tracker ocsort"),
         predictor=("run a.mcap --no-tables", "--predictor cv"),
         retracker=("run a.mcap --no-tables", "--retracker none"),
+        camera_motion=("run a.mcap --no-tables", "--camera-motion on"),
     ),
     "events": common(
         "events a.mcap",

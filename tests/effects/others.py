@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from mcaptrack.schema import Frame
-from mcaptrack.transforms import FrameDifferenceDetector, KnnDetector, Predict, Sample
+from mcaptrack.transforms import EstimateMotion, FrameDifferenceDetector, KnnDetector, Predict, Sample
 from tests.effects import Case, Outputs, change_of_forecasts, forecast_steps, line, rows, shaky
 from tests.worlds import ns, tracks_at
 
@@ -136,3 +136,37 @@ case(
     {1_000_000: 51.0, 10_000: 50.0},
 )
 case("detect", "stabilise", shaken.__doc__, KnnDetector(), shaken(), all_boxes, {False: "more", True: "least"})
+
+
+def lorry() -> list[Frame]:
+    """A lorry that fills most of the picture drives past a street of less contrast; the camera is still."""
+    import cv2
+
+    rng = np.random.default_rng(2)
+    street, load = (
+        cv2.resize(rng.integers(0, 255, (30, 60)).astype(np.uint8), (480, 240), interpolation=cv2.INTER_CUBIC)
+        for _ in range(2)
+    )
+    frames = []
+    for number in range(8):
+        image = street[:, :320] // 4 + 90
+        image[30:200, 60:260] = load[30:200, 60 - 4 * number + 80 : 260 - 4 * number + 80]
+        frames.append(Frame(ns(number / 10), number, image))
+    return frames
+
+
+def motion(outputs: Outputs) -> float:
+    return sum(abs(float(frame.rows["m02_px"][0])) for frame in outputs[0])
+
+
+LORRY = lorry()
+BOXES = {frame.t_ns: np.array([[58.0, 28.0, 204.0, 174.0]]) for frame in LORRY}
+case(
+    "motion",
+    "mask_boxes",
+    lorry.__doc__,
+    EstimateMotion(known_boxes=BOXES),
+    LORRY,
+    motion,
+    {True: "least", False: "more"},
+)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import numpy as np
+
+from mcaptrack.geometry.camera_path import CameraPath, poses_of
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import Frame
 from mcaptrack.transforms import ByteTrack, OcSort, Sort
@@ -46,8 +49,19 @@ def second_scores(scores: list[float]) -> list[Frame]:
     return frames
 
 
+def panned(by: float, count: int = 30) -> tuple[list[Frame], CameraPath]:
+    """A person stands; the camera pans by so many pixels from every fifth picture to the next, and back after ten."""
+    steps = [by * (-1) ** (n // 5) if n % 5 == 0 and n else 0.0 for n in range(count)]
+    frames = detections(lambda n: [(150 + sum(steps[: n + 1]), 50)], count)
+    motions = np.array([[[1.0, 0.0, step], [0.0, 1.0, 0.0]] for step in steps])
+    return frames, CameraPath(np.array([frame.t_ns for frame in frames]), poses_of(motions, 320, 240))
+
+
 def shared(kind: str, tracker: type[Sort]) -> None:
     base = tracker(**FRAMES)
+    frames, path = panned(-45.0)  # a tenth of the diagonal is 40 px
+    moved = tracker(max_age_frames=3, min_hits_frames=0, camera_path=path)
+    case(kind, "camera_motion", panned.__doc__, moved, frames, people, {"off": 6, "auto": 1, "on": 1})
     case(
         kind,
         "max_age_s",

@@ -11,14 +11,15 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.files import is_same_file, refuse_special
 from mcaptrack.schema.provenance import CLOCK
 from mcaptrack.sources.ingest.bags.opening import open_recording
-from mcaptrack.sources.ingest.job import IngestJob, IngestOptions, IngestReport, Progress
+from mcaptrack.sources.ingest.job import MOTION, IngestJob, IngestOptions, IngestReport, InputRole, Progress
 from mcaptrack.sources.ingest.label_job import LabelJob, label_frames
 from mcaptrack.sources.ingest.labels.formats import Format, Role
+from mcaptrack.sources.ingest.motion_job import MotionJob
 from mcaptrack.sources.ingest.recording_job import RecordingJob
 from mcaptrack.sources.ingest.video_job import VideoJob
 from mcaptrack.sources.video import IMAGE_SUFFIXES, ImageFormat
 
-__all__ = ["Format", "ImageFormat", "IngestOptions", "IngestReport", "Role", "ingest", "label_frames"]
+__all__ = ["Format", "ImageFormat", "IngestOptions", "IngestReport", "InputRole", "Role", "ingest", "label_frames"]
 
 VIDEO_SUFFIXES: Final = (
     ".mp4",
@@ -91,7 +92,7 @@ def ingest(
             job.write(writer, has_clock=bool(into and into.metadata(CLOCK)))
         job.check(output)
         job.report.warnings, job.report.has_labels = warned, bool(job.labels)
-        job.report.uses_camera = bool(job.labels or job.homography) or isinstance(job, VideoJob)
+        job.report.uses_camera = bool(job.labels or job.homography or job.options.motion) or isinstance(job, VideoJob)
     return job.report
 
 
@@ -102,6 +103,8 @@ def _job(source: Path, options: IngestOptions, progress: Progress, there: log.Lo
     is_video = source.is_dir() or source.suffix.lower() in VIDEO_SUFFIXES or _is_binary(source)
     if is_video:
         return VideoJob(source, options, progress, there)
+    if options.role == MOTION:
+        return MotionJob(source, options, there)
     return LabelJob([(options.role, source)], options, there)
 
 

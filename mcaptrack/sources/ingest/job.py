@@ -11,7 +11,7 @@ from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Any, Final, Literal, Self
 
 import numpy as np
 
@@ -19,10 +19,11 @@ from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.plane import GroundPlane, Point
 from mcaptrack.notices import Notice, warn
-from mcaptrack.schema import DETECTIONS, GROUND_PLANE, TRACKS, Frame, Rows, Schema
+from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, GROUND_PLANE, TRACKS, Frame, Rows, Schema
 from mcaptrack.schema.ground_plane import plane_to_rows
 from mcaptrack.schema.provenance import CLOCK, Provenance, digest
 from mcaptrack.sources.ingest.labels.formats import Format, Labels, Role
+from mcaptrack.sources.ingest.labels.motions import motion_frames, read_motions
 from mcaptrack.sources.ingest.labels.reading import read_homography, read_labels
 from mcaptrack.sources.ingest.labels.timeline import Placed, Timeline
 from mcaptrack.sources.video import ImageFormat, VideoOptions
@@ -32,6 +33,10 @@ Progress = Callable[[str, int, int], None]
 Frames = Callable[[], Iterator[Frame]]
 
 _SCHEMA_OF: Final[Mapping[Role, Schema]] = {"detections": DETECTIONS, "tracks": TRACKS, "truth": TRACKS}
+#: The role of a file with the motion of the camera, and the last part of its topic.
+MOTION: Final = "motion"
+#: What an input that is a text file can hold.
+InputRole = Role | Literal["motion"]
 #: The key in the metadata of a channel for class names by class id.
 _CLASSES: Final = "mcaptrack.classes"
 _BLOCK: Final = 4096
@@ -40,6 +45,8 @@ _BLOCK: Final = 4096
 @dataclass(frozen=True, kw_only=True)
 class IngestOptions:
     """Options of making a log. ``labels`` are label files by role; ``role`` is that of an input that is a label file.
+
+    ``motion`` is a file with the motion of the camera.
 
     ``fps``, ``image_format``, ``quality`` and ``keyframe_interval_s`` are as in ``video.VideoOptions``. ``first_frame``
     is the number that label files give the first picture, if it isn't that of their format; ``frames`` is the number of
@@ -58,7 +65,8 @@ class IngestOptions:
     label_format: Format = "auto"
     first_frame: int | None = None
     frames: int | None = None
-    role: Role | None = None
+    role: InputRole | None = None
+    motion: Path | None = None
 
     @property
     def video_options(self) -> VideoOptions:
@@ -118,6 +126,7 @@ class IngestJob:
         self.labels: dict[Role, tuple[Path, Labels]] = {
             role: (path, self.read(path, role)) for role, path in options.labels.items()
         }
+        self.motions = read_motions(options.motion) if options.motion else None
         self.check_labels()
 
     def read(self, path: Path, role: Role) -> Labels:
@@ -205,6 +214,8 @@ class IngestJob:
         yield from (f"{self.prefix}/{role}" for role in self.labels)
         if self.homography:
             yield f"{self.prefix}/ground_plane"
+        if self.motions is not None:
+            yield f"{self.prefix}/{MOTION}"
 
     def plane(self, width_px: int, height_px: int) -> GroundPlane | None:
         """The ground plane for pictures of this size; None if none was given."""
@@ -230,6 +241,18 @@ class IngestJob:
             classes = {str(number): name for number, name in labels.classes.items()} if role == "detections" else {}
             frames = self.frames(role, plane, placed)
             self.write_rows(writer, role, _SCHEMA_OF[role], frames, words, classes)
+
+    def write_motion(self, writer: log.LogWriter, timeline: Timeline, size: tuple[int, int]) -> None:
+        """Write the motion of the camera, if it was given; pictures have this width and height."""
+        if self.motions is None or self.options.motion is None:
+            return
+        path, count = self.options.motion, int(timeline.index[-1]) + 1
+        if len(self.motions) != count:
+            words = f"{path} has the motion of {len(self.motions)} frames, and {timeline.of} are {count}"
+            less = "it is taken as none in the rest" if len(self.motions) < count else "the rest is left out"
+            warn(f"{words}; {less}", "left-out")
+        frames = motion_frames(self.motions, timeline.index, timeline.t_ns, size)
+        self.write_rows(writer, MOTION, CAMERA_MOTION, lambda: iter(frames), {"file": path.name})
 
     def label_words(self, labels: Labels) -> dict[str, Any]:
         """Additional parameters in the provenance of labels."""

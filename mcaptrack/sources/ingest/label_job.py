@@ -86,9 +86,11 @@ class LabelJob(IngestJob):
         seen = detections_topic(there, self.prefix) if there is not None and not self.pictures else ""
         if there is not None and (self.pictures or seen):
             self.timeline = self._of_pictures(there, self.pictures or seen)
-            size = picture_size(there, self.pictures) if self.homography and self.pictures else size
+            needs_size = self.homography or self.motions is not None
+            size = picture_size(there, self.pictures) if needs_size and self.pictures else size
         else:
             self.timeline = self._of_rate(default_fps)
+        self._size = size
         self.ground = self.plane(*size) or self._measured_plane()
 
     def _add(self, role: Role | None, path: Path) -> None:
@@ -222,6 +224,7 @@ class LabelJob(IngestJob):
             writer.add_metadata(CLOCK, {"start_ns": str(self._start_ns)})
         self.write_plane(writer, self.ground, int(self.timeline.t_ns[0]))
         self.write_labels(writer, self.ground, self.timeline)
+        self.write_motion(writer, self.timeline, self._size)
 
     def label_words(self, labels: Labels) -> dict[str, Any]:
         """The frame rate, if there were no pictures."""

@@ -58,7 +58,7 @@ class RecordingJob(IngestJob):
             self._connections: list[Connection] = []
             self._channels: dict[Connection, int] = {}
             self._written: dict[int, int] = {}
-            if self.labels or self.homography:
+            if self.labels or self.homography or self.motions is not None:
                 self._find_pictures()
         except BaseException:
             recorded.close()
@@ -117,6 +117,8 @@ class RecordingJob(IngestJob):
             plane = self._plane()
             self.write_plane(writer, plane, int(timeline.t_ns[0]))
             self.write_labels(writer, plane, timeline)
+            if self.motions is not None:
+                self.write_motion(writer, timeline, self._picture_size())
 
     def hint_other_topic(self, topics: Collection[str]) -> str:
         """A hint for topics that exist already."""
@@ -225,13 +227,15 @@ class RecordingJob(IngestJob):
     # Pictures
 
     def _plane(self) -> GroundPlane | None:
-        if self.homography is None:
-            return None
+        return None if self.homography is None else self.plane(*self._picture_size())
+
+    def _picture_size(self) -> tuple[int, int]:
+        """Width and height of the pictures that labels belong to."""
         first = next(decode_gray(self._encoded()), None)
         if first is None:
             raise McaptrackError(f"{self.source}: {self.pictures} has no picture that can be decoded")
         height, width = first.rows.shape
-        return self.plane(width, height)
+        return width, height
 
     def _encoded(self) -> Iterator[EncodedPicture]:
         """The pictures that labels belong to, lazily."""

@@ -96,6 +96,7 @@ class VideoJob(IngestJob):
         self._check_existing(timeline)
         self.write_plane(writer, self._plane, times[0])
         self.write_labels(writer, self._plane, timeline)
+        self.write_motion(writer, timeline, (self.video.width_px, self.video.height_px))
 
     def _say_fps(self, fps: Fraction) -> None:
         """Warn if the given frame rate differs from that of the video."""

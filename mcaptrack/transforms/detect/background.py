@@ -55,6 +55,7 @@ class MotionDetector:
 
     method: ClassVar[Method]
     colour: ClassVar[Colour] = "grey"
+    needs_still_camera: ClassVar[bool] = True
     reads: ClassVar[Schema] = VIDEO
     writes: ClassVar[Mapping[str, Schema]] = MappingProxyType({"": DETECTIONS})
     latency_s: ClassVar[Mapping[str, float]] = MappingProxyType({"": 0.0})

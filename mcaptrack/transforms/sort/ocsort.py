@@ -16,6 +16,7 @@ from typing import Final
 import numpy as np
 
 from mcaptrack.geometry import kalman
+from mcaptrack.geometry.affine import move_boxes, move_points
 from mcaptrack.geometry.arrays import Floats, Indices
 from mcaptrack.transforms.protocol import option
 from mcaptrack.transforms.sort.association import CandidatePairs, associate, iou_pairs
@@ -116,6 +117,16 @@ class OcSort(Sort):
         shape = (len(detection_left), len(track_left))
         pairs = CandidatePairs(detections[found.detection], tracks[found.track], found.similarity, shape)
         return self._of_same_class(step, pairs)
+
+    def _move(self, tracks: Tracks, motion: Floats) -> None:
+        super()._move(tracks, motion)
+        table = tracks.table
+        kalman.move(table[_LAST_STATE], motion)
+        box = table[_LAST_BOX].T
+        moved = move_boxes(motion, np.concatenate([box[:, :2], box[:, 2:] - box[:, :2]], axis=1))
+        table[_LAST_BOX] = np.concatenate([moved[:, :2], moved[:, :2] + moved[:, 2:]], axis=1).T
+        for row in range(_CENTRES, len(table), 2):
+            table[row : row + 2] = move_points(motion, table[row : row + 2].T).T
 
     def _initiate(self, tracks: Tracks, first_id: int, detections: Measurements) -> None:
         tracks.initiate(first_id, detections)

@@ -12,13 +12,15 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice, pairwise
 from types import MappingProxyType
-from typing import ClassVar, Final, NamedTuple
+from typing import ClassVar, Final, Literal, NamedTuple
 
 import numpy as np
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry import kalman
+from mcaptrack.geometry.affine import IDENTITY
 from mcaptrack.geometry.arrays import Bools, Floats, Indices
+from mcaptrack.geometry.camera_path import CameraPath
 from mcaptrack.geometry.clocks import NS_PER_S, FrameClock
 from mcaptrack.geometry.plane import GroundPlane, Planes, plane_at
 from mcaptrack.notices import warn
@@ -70,6 +72,9 @@ class AssociationInput(NamedTuple):
     plane: GroundPlane | None
     one_class: bool
 
+
+#: What trackers do about the motion of the camera.
+CameraMotionUse = Literal["auto", "on", "off"]
 
 # Headings of the options in the help.
 _ASSOCIATION: Final = "Association"
@@ -153,7 +158,13 @@ class Sort:
         None, "ignore detections of other classes", least=0, most=2**31 - 1, theme=_DETECTIONS
     )
     mix_classes: bool = option(False, "a track may continue with a detection of another class", theme=_ASSOCIATION)
+    camera_motion: CameraMotionUse = option(
+        "auto",
+        "move predictions with the camera: if it moves or has cuts (auto), also if it only shakes (on), or never (off)",
+        theme=_ASSOCIATION,
+    )
     ground_planes: Planes = context(tuple)
+    camera_path: CameraPath | None = context(lambda: None, is_recorded=False)
 
     reads: ClassVar[Schema] = DETECTIONS
     writes: ClassVar[Mapping[str, Schema]] = MappingProxyType({"": TRACKS})
@@ -183,8 +194,10 @@ class Sort:
 
     def _step(self, run: _Run, frame: Frame, detections: Measurements) -> Floats:
         """Take one frame; returns the columns of the tracks that are written in it."""
-        tracks, passed_frames = run.tracks, run.tick(frame.t_ns)
+        tracks, before_ns, passed_frames = run.tracks, run.last_ns, run.tick(frame.t_ns)
         self._predict(run, passed_frames)
+        if run.camera_path is not None and before_ns is not None:
+            self._compensate(tracks, run.camera_path.between(before_ns, frame.t_ns))
         plane = plane_at(self.ground_planes, frame.t_ns) if self.cost == "metres" else None
         predicted = kalman.corners(tracks.state)
         step = AssociationInput(detections, tracks, predicted, run.age, passed_frames, plane, run.one_class)
@@ -224,6 +237,13 @@ class Sort:
         for _ in range(frames):  # predict through missing frames, too
             kalman.predict(tracks.state)
 
+    def _compensate(self, tracks: Tracks, motion: Floats | None) -> None:
+        """Move predictions (2, 3) with the camera. At a cut, where there is no motion, all tracks end."""
+        if motion is None:
+            tracks.keep(np.zeros(len(tracks), bool))
+        elif motion is not IDENTITY and len(tracks):
+            self._move(tracks, motion)
+
     def _candidate_pairs(self, step: AssociationInput, min_iou: float) -> tuple[CandidatePairs, float]:
         """The pairs that pass the gate, and the least similarity of an assignment."""
         boxes, predicted = step.detections.corners, step.predicted
@@ -246,6 +266,10 @@ class Sort:
 
     def _empty_tracks(self) -> Tracks:
         return Tracks()
+
+    def _move(self, tracks: Tracks, motion: Floats) -> None:
+        """Move all that is remembered of tracks by the motion (2, 3) of the camera."""
+        kalman.move(tracks.state, motion)
 
     def _associate(self, step: AssociationInput) -> tuple[Indices, Indices]:
         """Indices of detections and of the tracks that they are assigned to."""
@@ -309,6 +333,9 @@ class _Run:
         self._class_id: float | None = None
         self.one_class = True
         self._count = 0
+        self.last_ns: int | None = None
+        path, use = options.camera_path, options.camera_motion
+        self.camera_path = None if path is None or use == "off" or not (use == "on" or path.matters) else path
 
     def note_classes(self, class_id: Floats) -> None:
         """Note the classes of the next detections."""
@@ -319,10 +346,10 @@ class _Run:
     def tick(self, t_ns: int) -> int:
         """Take the time of the next frame; returns the number of frames since the previous one."""
         options = self._options
-        if self._count == 0:
-            self._first_ns = self._last_ns = t_ns
-        frames, passed_ns, usual_ns = self.clock.tick(t_ns), t_ns - self._last_ns, self.clock.interval_ns
-        self._count, self._last_ns = self._count + 1, t_ns
+        if self.last_ns is None:
+            self._first_ns = self.last_ns = t_ns
+        frames, passed_ns, usual_ns = self.clock.tick(t_ns), t_ns - self.last_ns, self.clock.interval_ns
+        self._count, self.last_ns = self._count + 1, t_ns
         if options.max_age_frames is not None:
             self.age, self.frame_age, self.max_age = frames, 1, options.max_age_frames
         else:

@@ -1,0 +1,126 @@
+"""Camera motion in the pipeline: which stages use it, when it is estimated, and the boxes that it leaves out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
+from typing import Any, Final, NamedTuple
+
+from mcaptrack import log
+from mcaptrack.errors import McaptrackError, call
+from mcaptrack.geometry.boxes import columns_to_boxes
+from mcaptrack.notices import warn
+from mcaptrack.pipeline.checks import Job, fits
+from mcaptrack.pipeline.write import Made, digest_of
+from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, VIDEO, Frame, Schema
+from mcaptrack.schema.camera_motion import frames_to_path
+from mcaptrack.schema.provenance import Provenance
+from mcaptrack.sources import foreign
+from mcaptrack.sources.cameras import camera_at
+from mcaptrack.transforms import STAGES, Transform
+
+STAGE: Final = "motion"
+_OFF: Final = "off"
+
+
+class Beside(NamedTuple):
+    """What a job reads beside its input: values of its transform by name, and the digests of the topics."""
+
+    values: Mapping[str, Any]
+    references: Mapping[str, str]
+
+
+def motion_topic(prefix: str) -> str:
+    """The topic with the motion of a camera."""
+    return f"{prefix}/{STAGES[STAGE].output_topic}"
+
+
+def uses_motion(transform: Transform | None) -> bool:
+    """Whether a transform takes camera motion into account where it is known."""
+    return getattr(transform, "camera_motion", _OFF) != _OFF
+
+
+def is_motion_new(opened: log.Log, prefix: str, made: Provenance) -> bool:
+    """Whether a channel that takes camera motion into account was made before the motion was known."""
+    usual = _OFF
+    if made.transform in STAGES and "transform" not in made.plugins:
+        usual = getattr(STAGES[made.transform].default, "camera_motion", _OFF)
+    is_used = made.parameters.get("camera_motion", usual) != _OFF
+    topic = motion_topic(camera_at(opened, prefix).prefix)
+    return is_used and topic in opened.channels and topic not in made.references
+
+
+def is_motion_wanted(
+    opened: log.Log, prefix: str, transform: Transform, boxes: str, has_pictures: bool, jobs: Sequence[Job]
+) -> bool:
+    """Whether the motion of a camera is to be there before its boxes are tracked.
+
+    Not so where the boxes come from a detector that needs a still camera: it has looked already.
+    """
+    if not uses_motion(transform) or not has_pictures:
+        return False
+    return getattr(transform, "camera_motion", "") == "on" or not _needs_still_camera(opened, boxes, jobs)
+
+
+def _needs_still_camera(opened: log.Log, boxes: str, jobs: Sequence[Job]) -> bool:
+    """Whether boxes come, or will come, from a detector that needs a still camera."""
+    for job in jobs:
+        if job.target == boxes:
+            return bool(getattr(job.transform, "needs_still_camera", False))
+    channel = opened.channels.get(boxes)
+    made = Provenance.from_metadata(channel.metadata) if channel else None
+    stage = STAGES.get(made.transform) if made and "transform" not in made.plugins else None
+    if made is None or stage is None or stage.default.reads is not VIDEO:
+        return False
+    name = made.parameters.get("detector", made.parameters.get(stage.was, ""))
+    return bool(getattr(stage.built_in().get(str(name), stage.default), "needs_still_camera", False))
+
+
+def beside(opened: log.Log, prefix: str, job: Job, made: Mapping[str, Made]) -> Beside:
+    """What a job reads beside its input. ``made`` are the channels that jobs before it made."""
+    names = {f.name for f in fields(job.transform) if f.metadata.get("context")}
+    if "camera_path" in names and uses_motion(job.transform):
+        return _path(opened, prefix, job, made)
+    if "known_boxes" in names and getattr(job.transform, "mask_boxes", False):
+        return _boxes(opened, prefix, made)
+    return Beside({}, {})
+
+
+def _path(opened: log.Log, prefix: str, job: Job, made: Mapping[str, Made]) -> Beside:
+    """How the camera moves, if it is known."""
+    topic = motion_topic(prefix)
+    found = _read(opened, topic, CAMERA_MOTION, made)
+    if found is None:
+        if getattr(job.transform, "camera_motion", "") == "on":
+            add = call("ingest", "PICTURES", into=opened.path)
+            warn(f"the motion of the camera is not known: {topic} needs pictures ({add})", "option-not-used")
+        return Beside({}, {})
+    frames, digest = found
+    try:
+        path = frames_to_path(frames)
+    except McaptrackError as error:
+        raise McaptrackError(f"{opened.path}: {topic}: {error}") from None
+    return Beside({"camera_path": path}, {topic: digest})
+
+
+def _boxes(opened: log.Log, prefix: str, made: Mapping[str, Made]) -> Beside:
+    """The boxes of people, by the time of their picture."""
+    usual = f"{prefix}/{next(s.output_topic for s in STAGES.values() if s.default.writes[''] is DETECTIONS)}"
+    topic = usual if usual in made or usual in opened.channels else camera_at(opened, prefix).boxes
+    found = None if topic is None else _read(opened, topic, DETECTIONS, made)
+    if topic is None or found is None or _needs_still_camera(opened, topic, ()):
+        return Beside({}, {})
+    boxes = {frame.t_ns: columns_to_boxes(frame.rows) for frame in found[0] if len(frame.rows)}
+    return Beside({"known_boxes": boxes}, {topic: found[1]})
+
+
+def _read(opened: log.Log, topic: str, schema: Schema, made: Mapping[str, Made]) -> tuple[Sequence[Frame], str] | None:
+    """The frames of a channel and their digest; None if it isn't there or holds something else."""
+    if topic in made:
+        return made[topic].frames, made[topic].provenance.digest
+    channel = opened.channels.get(topic)
+    if channel is None or not fits(channel, schema)[1]:
+        return None
+    theirs = schema is DETECTIONS and foreign.holds_detections(channel)
+    frames = foreign.detections(opened, topic) if theirs else opened.frames(topic, schema)
+    return frames, digest_of(opened, topic)

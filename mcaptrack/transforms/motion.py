@@ -1,0 +1,78 @@
+"""Pictures -> camera motion: how pixels of a scene at rest go from one picture to the next."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import ClassVar, Final
+
+from mcaptrack.geometry.arrays import Floats
+from mcaptrack.geometry.camera_motion import MotionEstimator
+from mcaptrack.geometry.camera_path import Verdict
+from mcaptrack.geometry.clocks import NS_PER_S
+from mcaptrack.notices import warn
+from mcaptrack.schema import CAMERA_MOTION, VIDEO, Frame, Schema
+from mcaptrack.schema.camera_motion import pose_to_rows
+from mcaptrack.transforms.protocol import check_options, context, option
+
+#: From this share of lost pictures on, it is said.
+_LEAST_LOST: Final = 0.02
+
+
+@dataclass(frozen=True, kw_only=True)
+class EstimateMotion:
+    """Estimate how the camera moves, from picture to picture.
+
+    Reads video, writes camera motion: one row per picture, with the transform from the picture before, the one to a
+    reference picture, and whether the camera is still, shaking or moving. Trackers move their predictions by it.
+
+    Examples
+    --------
+    A camera that pans by 3 pixels per picture to the right, so that the scene moves to the left:
+
+    >>> import numpy as np
+    >>> from mcaptrack.schema import Frame
+    >>> blocks = np.random.default_rng(0).integers(0, 255, (30, 60))
+    >>> scene = np.kron(blocks, np.ones((8, 8))).astype(np.uint8)
+    >>> pictures = [Frame(t * 40_000_000, t, scene[:, 3 * t : 3 * t + 320]) for t in range(4)]
+    >>> [round(float(motion.rows["m02_px"][0])) for (motion,) in EstimateMotion()(pictures)]
+    [0, -3, -3, -3]
+    """
+
+    mask_boxes: bool = option(True, "look for features outside of detected boxes, because people move by themselves")
+    known_boxes: Mapping[int, Floats] = context(dict, is_recorded=False)
+
+    reads: ClassVar[Schema] = VIDEO
+    writes: ClassVar[Mapping[str, Schema]] = MappingProxyType({"": CAMERA_MOTION})
+    latency_s: ClassVar[Mapping[str, float]] = MappingProxyType({"": 0.0})
+
+    def __post_init__(self) -> None:
+        check_options(self)
+
+    def __call__(self, frames: Iterable[Frame]) -> Iterator[tuple[Frame, ...]]:
+        camera, boxes = MotionEstimator(), self.known_boxes if self.mask_boxes else {}
+        times: list[int] = []
+        cuts: list[int] = []
+        lost = 0
+        for frame in frames:
+            pose = camera.step(frame.rows, boxes.get(frame.t_ns))
+            times.append(frame.t_ns)
+            cuts += [frame.t_ns] if pose.verdict is Verdict.CUT else []
+            lost += pose.verdict is Verdict.LOST
+            height, width = frame.rows.shape
+            yield (Frame(frame.t_ns, frame.index, pose_to_rows(pose, width, height)),)
+        if cuts:
+            at = (cuts[0] - times[0]) / NS_PER_S
+            many = f"{len(cuts)} cuts, the first" if len(cuts) > 1 else "a cut"
+            warn(f"there is {many} at {at:.1f} s: another scene begins there, and tracks end", "view-lost")
+        if times and lost >= _LEAST_LOST * len(times):
+            share = lost / len(times)
+            warn(
+                f"the motion of the camera is not known in {share:.0%} of the pictures; it is taken as none",
+                "view-lost",
+            )
+
+    def why_empty(self, given: Sequence[Frame], made: Sequence[Frame]) -> str:
+        """Why no rows came of frames, for a warning."""
+        return "it has no pictures that can be decoded"
