@@ -35,7 +35,7 @@ class TestHelp:
         panels = Counter(command.rich_help_panel for command in COMMANDS.values())
         assert 3 <= len(panels) <= 6
         assert None not in panels
-        assert max(panels.values()) <= 8
+        assert max(panels.values()) <= 9
 
     def test_the_first_page_names_every_command(self):
         words = call("--help").out
