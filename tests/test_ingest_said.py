@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import bz2
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -15,8 +16,9 @@ from rosbags.typesys import Stores, get_typestore
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
+from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import DETECTIONS, GROUND_PLANE, TRACKS, Frame, Schema
-from mcaptrack.schema.ground_plane import rows_to_plane
+from mcaptrack.schema.ground_plane import plane_to_rows, rows_to_plane
 from mcaptrack.schema.provenance import CLOCK, INGEST, Provenance
 from mcaptrack.sources.ingest import IngestOptions, IngestReport, ingest, label_frames
 from mcaptrack.sources.ingest.bags import decompression, plain_yaml
@@ -586,3 +588,34 @@ def test_a_definition_has_the_hash_that_a_recording_says():
     assert known_definition(kind, "humble", digest[:-1] + "x") == ("", "")
     assert known_definition(kind, "humble", "another kind of hash") == known
     assert known_definition("a/msg/B", "humble", "") == ("", "")
+
+
+def test_labels_take_the_plane_of_their_camera_if_it_was_measured_and_stays(tmp_path):
+    scale = GroundPlane((0.5, 0, 0, 0, 0.5, 0, 0, 0, 1), 64, 48)
+    labels = write(tmp_path / "a.txt", "1,1,10,20,4,8,1\n2,1,10,20,4,8,1\n")
+    for planes, is_taken in (
+        ([scale], True),
+        ([scale, scale], False),
+        ([replace(scale, assumed=True)], False),
+        ([], False),
+    ):
+        out = tmp_path / "out.mcap"
+        with log.create(out) as writer:
+            record = (GROUND_PLANE.name, "protobuf", GROUND_PLANE.descriptor)
+            number = writer.add_channel("/camera/ground_plane", record, "protobuf", {})
+            for t_ns, plane in enumerate(planes):
+                writer.add_message(number, t_ns, t_ns, GROUND_PLANE.codec.encode(plane_to_rows(plane)))
+        made(labels, out, fps=Fraction(10))
+        with log.read(out) as opened:
+            rows = opened.rows("/camera/tracks", TRACKS).rows
+        wanted = [(6.0, 14.0)] * 2 if is_taken else [(np.nan, np.nan)] * 2  # the foot of the box, halved
+        assert np.array_equal(np.stack([rows["x_m"], rows["y_m"]], axis=1), wanted, equal_nan=True)
+
+
+def test_first_frames_that_differ_are_a_warning_about_the_clock(tmp_path):
+    first, other = write(tmp_path / "a.txt", "1,1,1,1,2,2\n"), write(tmp_path / "b.txt", "0,1,1,1,2,2\n")
+    report, _ = made(first, role="tracks", labels={"truth": other}, fps=Fraction(10))
+    words = (
+        f"frame 1 of {first} and frame 0 of {other} are assumed to be the same picture; `first_frame=` sets the number"
+    )
+    assert said(report) == [(words, "clock")]
