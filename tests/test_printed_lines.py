@@ -942,3 +942,22 @@ def test_old_names_of_options_of_stages_are_said_by_run(tmp_path, monkeypatch):
     outcome = call("run", "x.mcap")
     words = "mcaptrack.toml: [sample] max-hole-s is called max-gap-s now; the old name goes with the next release"
     assert outcome.err.splitlines().count(words) == 1
+
+
+def test_results_beside_a_log_are_recovered_by_themselves(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("a.mcap", "a.results.mcap"):
+        Path(name).write_bytes(b"no log")
+    calls = asked_of(monkeypatch, "recover")
+    call("recover", "*.mcap")
+    assert [str(next(iter(made.values()))) for made in calls] == ["a.mcap", "a.results.mcap"]
+
+
+def test_tables_of_two_logs_of_one_name_are_not_written_to_one_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("x", "y"):
+        Path(name).mkdir()
+        Path(name, "a.mcap").write_bytes(b"no log")
+    calls = asked_of(monkeypatch, "export")
+    refused = call("export", "x/a.mcap", "y/a.mcap", "-o", "tables")
+    assert (refused.code, calls, refused.err.count("\n")) == (1, [], 1)
