@@ -28,6 +28,7 @@ from mcaptrack.geometry.plane import Point
 from mcaptrack.notices import Notice, warn
 from mcaptrack.sources.ingest import Format, ImageFormat, IngestOptions, InputRole
 from mcaptrack.sources.ingest import ingest as make_log
+from mcaptrack.sources.ingest.labels.columns import check_keys, parse_columns
 from mcaptrack.sources.ingest.sidecar import SidecarChoice
 
 _EPOCH: Final = dt.datetime(1970, 1, 1, tzinfo=dt.UTC)
@@ -86,6 +87,8 @@ def ingest(
     label_format: Format = "auto",
     first_frame: int | None = None,
     frames: int | None = None,
+    columns: str | Mapping[str, str] | None = None,
+    size: str | tuple[int, int] | None = None,
     role: InputRole | None = None,
     into: PathLike | None = None,
     sidecar: bool | None = None,
@@ -121,12 +124,18 @@ def ingest(
     motion : path, optional
         File with the motion of the camera: a row per frame, of its number (from 0) and the 2x3 transform from pixels of
         the frame before.
-    label_format : {"auto", "mot", "kitti", "sdd", "trajnet", "obsmat"}, default "auto"
-        Format of the label files.
+    label_format : {"auto", "mot", "kitti", "sdd", "trajnet", "obsmat", "coco", "yolo", "supervision", "csv"}
+        Format of the label files, by default "auto": as their content tells.
     first_frame : int, optional
         Number of the first picture in label files.
     frames : int, optional
         Number of frames, if there are labels but no pictures.
+    columns : dict of str to str, or str, optional
+        Names of the columns of label files with a header, by what they hold: ``{"x": "left", "frame": "n"}`` or
+        "x=left,frame=n". There are x, y, w, h, x2, y2, cx, cy, frame, t (seconds), score, class, name (of the class)
+        and id.
+    size : tuple of int, or str, optional
+        Width and height of the pictures, (1920, 1080) or "1920x1080", if there are only labels in shares of them.
     role : {"detections", "tracks", "truth", "motion"}, optional
         What ``source`` holds, if it is a label file; by default as its ids tell. The motion of a camera goes ``into`` a
         log.
@@ -177,6 +186,8 @@ def ingest(
         frames=frames,
         role=role,
         motion=optional_path(motion),
+        columns=parse_columns(columns) if isinstance(columns, str) else check_keys(columns) if columns else None,
+        size=parse_size(size),
     )
     with warnings_about(path) as warnings:
         if into is None:
@@ -194,6 +205,8 @@ def ingest(
         for lost in report.lost:
             warn(f"lost: {lost}", "lost")
         warn_unused("there is no label file", label_format=label_format != "auto" and not report.has_labels)
+        warn_unused("there is no label file", columns=columns is not None and not report.has_labels)
+        warn_unused("there is no label file", size=size is not None and not report.has_labels)
         warn_unused("there is no ground plane", point=point != "foot" and ground_plane is None)
         keep = "the channels of a recording keep their names"
         warn_unused(keep, camera=camera != "camera" and not report.uses_camera)
@@ -222,6 +235,19 @@ def parse_fps(fps: float | str | Fraction | None) -> Fraction | None:
         raise McaptrackError(
             f"`fps=` needs a number like 25, 29.97 or 30000/1001, from one frame a day to 10000 a second, not {fps!r}"
         ) from None
+
+
+def parse_size(size: str | tuple[int, int] | None) -> tuple[int, int] | None:
+    """Return width and height from "1920x1080" or two numbers."""
+    if size is None:
+        return None
+    parts = size.lower().split("x") if isinstance(size, str) else [str(part) for part in size]
+    if len(parts) != 2 or not all(part.isascii() and part.isdigit() and 0 < len(part) < 7 for part in parts):
+        raise McaptrackError(f"`size=` is the width and height of pictures in pixels, like 1920x1080, not {size!r:.40}")
+    width, height = map(int, parts)
+    if not width or not height:
+        raise McaptrackError(f"`size=` is the width and height of pictures in pixels, like 1920x1080, not {size!r:.40}")
+    return width, height
 
 
 def parse_start_time(time: float | str | dt.datetime | None) -> int | None:

@@ -17,7 +17,7 @@ Inputs = Annotated[
     list[Path],
     typer.Argument(
         metavar="INPUT",
-        help="Videos, folders of images, ROS bags, MCAP files, or label files; each becomes a log.",
+        help="Videos, folders of images, ROS bags, MCAP files, or label files (YOLO: a folder); each becomes a log.",
         show_default=False,
     ),
 ]
@@ -104,9 +104,33 @@ def ingest(
         ),
     ] = None,
     label_format: Annotated[
-        Literal["auto", "mot", "kitti", "sdd", "trajnet", "obsmat"],
-        common.option("--format", panel=common.LABELS, tuning=True, help="Format of the label files."),
+        Literal["auto", "mot", "kitti", "sdd", "trajnet", "obsmat", "coco", "yolo", "supervision", "csv"],
+        common.option(
+            "--format",
+            panel=common.LABELS,
+            tuning=True,
+            help="Format of the label files. auto: as the content tells; csv: any table with a header.",
+        ),
     ] = "auto",
+    columns: Annotated[
+        str | None,
+        common.option(
+            "--columns",
+            panel=common.LABELS,
+            help="Columns of label files with a header: x=left,y=top,w=width,h=height,frame=n. Also x2, y2, cx, cy, t "
+            "(seconds), score, class, name (of the class), id.",
+            show_default="guessed from the header",
+        ),
+    ] = None,
+    size: Annotated[
+        str | None,
+        common.option(
+            "--size",
+            panel=common.LABELS,
+            help="Width and height of the pictures, like 1920x1080, if there are only labels in shares of them.",
+            show_default=False,
+        ),
+    ] = None,
     first_frame: Annotated[
         int | None,
         common.option(
@@ -186,6 +210,8 @@ def ingest(
         "label_format": label_format,
         "first_frame": first_frame,
         "frames": frames,
+        "columns": columns,
+        "size": size,
         "role": role,
         "into": into,
         "sidecar": sidecar,

@@ -14,6 +14,7 @@ from mcaptrack.sources.ingest.bags.opening import open_recording
 from mcaptrack.sources.ingest.job import MOTION, IngestJob, IngestOptions, IngestReport, InputRole, Progress
 from mcaptrack.sources.ingest.label_job import LabelJob, label_frames
 from mcaptrack.sources.ingest.labels.formats import Format, Role
+from mcaptrack.sources.ingest.labels.yolo import is_label_folder
 from mcaptrack.sources.ingest.motion_job import MotionJob
 from mcaptrack.sources.ingest.recording_job import RecordingJob
 from mcaptrack.sources.ingest.video_job import VideoJob
@@ -100,6 +101,8 @@ def _job(source: Path, options: IngestOptions, progress: Progress, there: log.Lo
     recorded = open_recording(source)
     if recorded is not None:
         return RecordingJob(source, options, recorded, progress, there)
+    if source.is_dir() and (options.role or is_label_folder(source)):
+        return LabelJob([(options.role, source)], options, there)
     is_video = source.is_dir() or source.suffix.lower() in VIDEO_SUFFIXES or _is_binary(source)
     if is_video:
         return VideoJob(source, options, progress, there)

@@ -22,6 +22,7 @@ from mcaptrack.notices import Notice, warn
 from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, GROUND_PLANE, TRACKS, Frame, Rows, Schema
 from mcaptrack.schema.ground_plane import plane_to_rows
 from mcaptrack.schema.provenance import CLOCK, Provenance, digest
+from mcaptrack.sources.ingest.labels.box_rows import OTHERS, fitted
 from mcaptrack.sources.ingest.labels.formats import Format, Labels, Role
 from mcaptrack.sources.ingest.labels.motions import motion_frames, read_motions
 from mcaptrack.sources.ingest.labels.reading import read_homography, read_labels
@@ -50,7 +51,8 @@ class IngestOptions:
 
     ``fps``, ``image_format``, ``quality`` and ``keyframe_interval_s`` are as in ``video.VideoOptions``. ``first_frame``
     is the number that label files give the first picture, if it isn't that of their format; ``frames`` is the number of
-    pictures, for labels without pictures.
+    pictures, for labels without pictures. ``columns`` are names of columns of tables with a header, by what they hold;
+    ``size`` is the size of pictures, (width, height), for labels without pictures.
     """
 
     camera: str = "camera"
@@ -67,6 +69,8 @@ class IngestOptions:
     frames: int | None = None
     role: InputRole | None = None
     motion: Path | None = None
+    columns: Mapping[str, str] | None = None
+    size: tuple[int, int] | None = None
 
     @property
     def video_options(self) -> VideoOptions:
@@ -131,7 +135,34 @@ class IngestJob:
 
     def read(self, path: Path, role: Role) -> Labels:
         """Read a label file with the format options."""
-        return read_labels(path, self.options.label_format, role, self.options.first_frame)
+        options = self.options
+        return read_labels(path, options.label_format, role, options.first_frame, options.columns)
+
+    def fit_to_pictures(self, size: Callable[[], tuple[int, int]] | None) -> None:
+        """Convert boxes in shares of the picture to pixels, and warn of boxes outside of it.
+
+        ``size`` returns width and height of the pictures; None if there are none. Raises McaptrackError if the size is
+        not known, or isn't the given one.
+        """
+        given = self.options.size
+        paths = [path for path, labels in self.labels.values() if labels.is_normalised]
+        if not any(labels.format in OTHERS for _, labels in self.labels.values()):
+            return
+        found = size() if size else given
+        if given and found and found != given:
+            raise McaptrackError(
+                f"{self.source}: the pictures are {found[0]}x{found[1]}, not {given[0]}x{given[1]}; leave `size=` out"
+            )
+        if paths and found is None:
+            raise McaptrackError(
+                f"{paths[0]} has boxes in shares of the picture's size; give it with `size='WIDTHxHEIGHT'`, or add the "
+                "labels to a log with pictures with `into=`"
+            )
+        if found is None:
+            return
+        for role, (path, labels) in self.labels.items():
+            if labels.format in OTHERS:
+                self.labels[role] = path, fitted(path, labels, found)
 
     def check_labels(self) -> None:
         """Refuse labels that don't suit their role."""
@@ -150,6 +181,9 @@ class IngestJob:
                 "clock",
             )
         for role, (path, labels) in self.labels.items():
+            self.report.remarks += labels.remarks
+            for words, code in labels.doubts:
+                warn(words, code)
             if labels.left_out:
                 warn(f"{path} also holds {labels.left_out}; left out of {role}", "left-out")
             if labels.step > 1:
@@ -256,7 +290,12 @@ class IngestJob:
 
     def label_words(self, labels: Labels) -> dict[str, Any]:
         """Additional parameters in the provenance of labels."""
-        return {} if self.options.first_frame is None else {"first_frame": labels.first_frame}
+        out: dict[str, Any] = {} if self.options.first_frame is None else {"first_frame": labels.first_frame}
+        if self.options.columns and labels.format in ("csv", "supervision"):
+            out["columns"] = ",".join(f"{key}={name}" for key, name in self.options.columns.items())
+        if self.options.size and labels.format in OTHERS:
+            out["size"] = "{}x{}".format(*self.options.size)
+        return out
 
     def frames(self, role: Role, plane: GroundPlane | None, placed: Placed) -> Frames:
         """The labels of these frames, including empty frames."""

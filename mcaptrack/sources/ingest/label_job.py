@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from fractions import Fraction
+from functools import partial
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -14,6 +15,7 @@ import numpy as np
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
+from mcaptrack.geometry.arrays import Floats
 from mcaptrack.geometry.clocks import NS_PER_S, parse_ns
 from mcaptrack.geometry.plane import GroundPlane, Point
 from mcaptrack.notices import warn
@@ -76,7 +78,6 @@ class LabelJob(IngestJob):
             raise McaptrackError(f"{self.source} is a label file; {options.for_videos()} is for videos")
         if options.frames is not None and not 0 < options.frames <= MAX_FRAMES:
             raise McaptrackError(f"`frames=` is a number from 1 to {MAX_FRAMES}, not {options.frames}")
-        size = self._boxes_extent()
         self._fps: Fraction | None = None
         self._clock = ("", False)  # remark on times that don't come from pictures, and whether they are assumed
         self._other_rates: list[str] = []
@@ -84,10 +85,13 @@ class LabelJob(IngestJob):
         if there is not None:
             self.prefix, self.pictures = camera_of(there, options.camera)
         seen = detections_topic(there, self.prefix) if there is not None and not self.pictures else ""
+        pictures_of = partial(picture_size, there, self.pictures) if there is not None and self.pictures else None
+        self.fit_to_pictures(pictures_of)
+        size = self._boxes_extent()
         if there is not None and (self.pictures or seen):
             self.timeline = self._of_pictures(there, self.pictures or seen)
             needs_size = self.homography or self.motions is not None
-            size = picture_size(there, self.pictures) if needs_size and self.pictures else size
+            size = pictures_of() if needs_size and pictures_of else size
         else:
             self.timeline = self._of_rate(default_fps)
         self._size = size
@@ -136,6 +140,11 @@ class LabelJob(IngestJob):
     def _of_rate(self, default: Fraction | None) -> Timeline:
         """The times of missing pictures, by the frame rate from the options, the files or the log."""
         existing = labels_of(self.there, self.prefix) if self.there else {}
+        timed = {path: labels.times_s for path, labels in self.labels.values() if labels.times_s is not None}
+        if timed and self.options.frames is not None:
+            raise McaptrackError(f"{next(iter(timed))} has times; leave `frames=` out")
+        if timed:
+            return self._of_times(timed)
         known = [_known(path, labels) for path, labels in self.labels.values()]
         rates = {one.fps: one.of for one in known if one.fps}
         if self.options.fps:
@@ -168,6 +177,18 @@ class LabelJob(IngestJob):
             f"{self.source}: {count} frames (by {counted_by}) from {first} on, {float(fps):g} a second (by {of})",
             of in (*_BY_FORMAT.values(), _ASSUMED),
         )
+        return timeline
+
+    def _of_times(self, timed: Mapping[Path, Floats]) -> Timeline:
+        """The times of missing pictures, by the times in the files: regular ones with empty frames in between."""
+        path, seconds = next(iter(timed)), np.unique(np.concatenate(list(timed.values())))
+        if self.options.start_ns is not None:
+            seconds = seconds - seconds[0] + self.options.start_ns / NS_PER_S
+        self._start_ns = round(float(seconds[0]) * NS_PER_S)
+        timeline, words = Timeline.of_times(path, seconds, self.options.fps)
+        if self.there and any(part.index.counts for part in self.there.parts):
+            self._check_overlap(self.there, timeline)
+        self._clock = (f"{self.source}: {words}", False)
         return timeline
 
     def report_assumptions(self) -> None:

@@ -60,6 +60,7 @@ class RecordingJob(IngestJob):
             self._written: dict[int, int] = {}
             if self.labels or self.homography or self.motions is not None:
                 self._find_pictures()
+                self.fit_to_pictures(self._picture_size)
         except BaseException:
             recorded.close()
             raise

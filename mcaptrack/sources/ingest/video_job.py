@@ -40,6 +40,7 @@ class VideoJob(IngestJob):
         self.video: Video = open_video(source, options.video_options)
         if self.video.images and not (options.fps or self.video.fps):
             raise McaptrackError(f"{source}: a folder of images has no clock; give the frames per second with `fps=`")
+        self.fit_to_pictures(lambda: (self.video.width_px, self.video.height_px))
         self._plane = self.plane(self.video.width_px, self.video.height_px)
         self.pictures = f"{self.prefix}/video"
         self._existing_labels = {} if there is None else labels_of(there, self.prefix)

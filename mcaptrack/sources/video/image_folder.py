@@ -39,7 +39,7 @@ class Images(NamedTuple):
 
 def find_images(folder: Path) -> Images:
     """The images of a folder. Raises McaptrackError if there are none."""
-    paths = sorted((p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES), key=_natural)
+    paths = sorted((p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES), key=natural_order)
     if not paths:
         raise McaptrackError(f"{folder} holds no images ({', '.join(IMAGE_SUFFIXES)})")
     in_order = Images(paths, list(range(len(paths))), 1, "")
@@ -56,7 +56,7 @@ def find_images(folder: Path) -> Images:
     return Images(paths, place, every, f"{len(gone)} of {place[-1] + 1} numbered images ({words})" if gone else "")
 
 
-def _natural(path: Path) -> list[tuple[int, str]]:
+def natural_order(path: Path) -> list[tuple[int, str]]:
     """Sort key for natural order: 2.jpg comes before 10.jpg."""
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"([0-9]+)", path.name) if part]
 

@@ -28,18 +28,19 @@ from numpy.typing import NDArray
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
+from mcaptrack.notices import Code
 from mcaptrack.sources.ingest.labels.number_table import Lines, NumberTable
 
-Format = Literal["auto", "mot", "kitti", "sdd", "trajnet", "obsmat"]
+Format = Literal["auto", "mot", "kitti", "sdd", "trajnet", "obsmat", "coco", "yolo", "supervision", "csv"]
 Role = Literal["detections", "tracks", "truth"]
-Classes = NDArray[np.uint32]
+ClassIds = NDArray[np.uint32]
 
 NO_ID: Final = -1
 PERSON: Final = 1
 #: Coordinates, in pixels or metres, and scores can't be larger.
-_MAX_PLACE: Final = 1e8
-_MAX_SCORE: Final = 1e9
-_MAX_FRAME: Final = 2**31 - 1
+MAX_PLACE: Final = 1e8
+MAX_SCORE: Final = 1e9
+MAX_FRAME: Final = 2**31 - 1
 #: Formats in which labels at regular steps are the rule.
 _POSITIONS: Final = ("trajnet", "obsmat")
 #: With fewer labelled frames a regular step of boxes may be a coincidence.
@@ -91,7 +92,9 @@ class Labels:
     detections. ``boxes_px`` (N, 4) or ``xy_m`` (N, 2) is None if the format has none. ``score`` (N,) is NaN for missing
     scores. ``labelled`` (F,) are the sorted frames with rows in the file, including rows that were left out.
     ``class_id`` (N,) is as in the schema of detections; ``classes`` are names by class id. ``left_out`` describes the
-    rows that were left out; those of ground truth are in ``ignored``.
+    rows that were left out; those of ground truth are in ``ignored``. ``remarks`` and ``doubts`` (warnings and their
+    codes) say how the file was understood. ``is_normalised``: boxes are in shares of the picture's size. ``times_s``
+    (F,): the times of frames by the file itself; its frames are then numbered from 0.
     """
 
     format: Format
@@ -102,10 +105,14 @@ class Labels:
     xy_m: Floats | None
     score: Floats
     labelled: Ints
-    class_id: Classes
+    class_id: ClassIds
     classes: Mapping[int, str] = field(default_factory=dict)
     left_out: str = ""
     ignored: IgnoredBoxes | None = None
+    remarks: tuple[str, ...] = ()
+    doubts: tuple[tuple[str, Code], ...] = ()
+    is_normalised: bool = False
+    times_s: Floats | None = None
 
     @property
     def step(self) -> int:
@@ -119,11 +126,16 @@ class Labels:
         return bool((self.id != NO_ID).any())
 
 
-class _ClassNames:
+class ClassNames:
     """The class names of a column, numbered from 0 in order of appearance."""
 
     def __init__(self) -> None:
         self._numbers: dict[str, int] = {}
+
+    @property
+    def names(self) -> list[str]:
+        """The names in order of appearance."""
+        return list(self._numbers)
 
     def number(self, name: str) -> int:
         """The number of a name. Raises ValueError if there are too many names."""
@@ -138,11 +150,10 @@ class _ClassNames:
 
     def count(self, numbers: Floats) -> str:
         """The number of occurrences of each name, as text."""
-        names = list(self._numbers)
         counts = Counter(numbers.astype(int).tolist())
-        return ", ".join(f"{count} {names[number]}" for number, count in counts.most_common())
+        return ", ".join(f"{count} {self.names[number]}" for number, count in counts.most_common())
 
-    def ids(self, numbers: Floats, known: Mapping[str, int]) -> tuple[Classes, dict[int, str]]:
+    def ids(self, numbers: Floats, known: Mapping[str, int]) -> tuple[ClassIds, dict[int, str]]:
         """Convert a column to class ids; returns them and their names."""
         others = sorted({name.lower() for name in self._numbers} - known.keys())
         places = {**known, **{name: number for number, name in enumerate(others, start=max(known.values()) + 1)}}
@@ -152,13 +163,13 @@ class _ClassNames:
         return column, {number: names[number] for number in np.unique(column).tolist()}
 
 
-def _all_persons(count: int) -> Classes:
+def _all_persons(count: int) -> ClassIds:
     return np.full(count, PERSON, np.uint32)
 
 
 def _boxes(table: NumberTable, columns: slice, corners: bool = False) -> Floats:
     """Boxes (N, 4) of left, top, width, height; ``corners``: the columns are left, top, right, bottom."""
-    boxes = table.within(columns, "a coordinate", _MAX_PLACE)
+    boxes = table.within(columns, "a coordinate", MAX_PLACE)
     if corners:
         boxes = np.concatenate([boxes[:, :2], boxes[:, 2:] - boxes[:, :2]], axis=1)
     table.refuse(
@@ -169,13 +180,13 @@ def _boxes(table: NumberTable, columns: slice, corners: bool = False) -> Floats:
 
 
 def _frame(table: NumberTable, column: int) -> Ints:
-    return table.whole(column, "the frame (a count of pictures, no time)", 0, _MAX_FRAME)
+    return table.whole(column, "the frame (a count of pictures, no time)", 0, MAX_FRAME)
 
 
 def _score(table: NumberTable, column: int) -> Floats:
     """A column of scores, NaN for missing ones."""
     score = table.values[:, column]
-    table.refuse(np.abs(score) > _MAX_SCORE, lambda row: f"a score can't be {score[row]:g}")
+    table.refuse(np.abs(score) > MAX_SCORE, lambda row: f"a score can't be {score[row]:g}")
     return score
 
 
@@ -237,7 +248,7 @@ def read_mot(path: Path, lines: Lines, role: Role) -> Labels:
 
 def read_kitti(path: Path, lines: Lines, role: Role) -> Labels:
     """KITTI tracking. Column 18 is the score of a tracker, if there is one."""
-    names = _ClassNames()
+    names = ClassNames()
 
     def parse(parts: list[str]) -> list[float]:
         _columns(parts, 17, 18)
@@ -284,7 +295,7 @@ def read_kitti(path: Path, lines: Lines, role: Role) -> Labels:
 
 def read_sdd(path: Path, lines: Lines, role: Role) -> Labels:
     """Stanford Drone annotations."""
-    names = _ClassNames()
+    names = ClassNames()
 
     def parse(parts: list[str]) -> list[float]:
         _columns(parts, 10, 10)
@@ -335,7 +346,7 @@ def _positions(path: Path, lines: Lines, name: Format, what: str, columns: int, 
 
     table = NumberTable(path, lines, what, columns, parse)
     frame, track_id = _frame(table, 0), table.whole(1, "the id", 0)
-    xy_m, none = table.within(place, "a position", _MAX_PLACE), np.full(len(frame), np.nan)
+    xy_m, none = table.within(place, "a position", MAX_PLACE), np.full(len(frame), np.nan)
     return Labels(name, 0, frame, track_id, None, xy_m, none, np.unique(frame), _all_persons(len(frame)))
 
 

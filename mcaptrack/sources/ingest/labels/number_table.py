@@ -22,21 +22,24 @@ Lines = Iterator[tuple[int, str]]
 _MAX_ROWS: Final = 10_000_000
 _MAX_LINE: Final = 4096
 #: Integers from here on are not exact as float64.
-_EXACT: Final = 2**53
+EXACT: Final = 2**53
 #: The number of characters of a line that errors show.
 _SHOWN: Final = 60
 
 
-def lines_of(path: Path) -> Lines:
-    """The lines of a text file. Raises McaptrackError if it can't be read, isn't text, or has too long lines."""
+def lines_of(path: Path, most: int = _MAX_LINE) -> Lines:
+    """The lines of a text file, of at most ``most`` characters, without empty lines and comments.
+
+    Raises McaptrackError if it can't be read, isn't text, or has longer lines.
+    """
     refuse_special(path)
     try:
         with path.open(encoding="utf-8-sig") as stream:
             number = 0
-            while line := stream.readline(_MAX_LINE + 1):
+            while line := stream.readline(most + 1):
                 number += 1
-                if len(line) > _MAX_LINE:
-                    raise McaptrackError(f"{path}:{number}: a line of more than {_MAX_LINE} characters is no row")
+                if len(line) > most:
+                    raise McaptrackError(f"{path}:{number}: a line of more than {most} characters is no row")
                 if line.strip() and not line.lstrip().startswith("#"):
                     yield number, line
     except UnicodeDecodeError:
@@ -58,7 +61,13 @@ class NumberTable:
     """
 
     def __init__(
-        self, path: Path, lines: Lines, what: str, columns: int, parse: Callable[[list[str]], Sequence[float]]
+        self,
+        path: Path,
+        lines: Lines,
+        what: str,
+        columns: int,
+        parse: Callable[[list[str]], Sequence[float]],
+        split: Callable[[str], list[str]] = split,
     ) -> None:
         self._path = path
         values, numbers = array("d"), array("q")
@@ -90,7 +99,7 @@ class NumberTable:
         self.refuse(largest > most, lambda row: f"{what} can't be {largest[row]:g}; at most {most:g}")
         return values
 
-    def whole(self, column: int, what: str, least: int, most: int = _EXACT - 1) -> Ints:
+    def whole(self, column: int, what: str, least: int, most: int = EXACT - 1) -> Ints:
         """A column (N,) of whole numbers."""
         values = self.values[:, column]
         self.refuse(

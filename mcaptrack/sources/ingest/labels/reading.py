@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Final, get_args
@@ -10,33 +11,36 @@ import numpy as np
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import refuse_special
+from mcaptrack.sources.ingest.labels.delimited import MAX_LINE, SUPERVISION, header_of, read_csv
 from mcaptrack.sources.ingest.labels.formats import READERS, Format, Labels, Role
+from mcaptrack.sources.ingest.labels.json_boxes import is_json, read_json
 from mcaptrack.sources.ingest.labels.number_table import lines_of, split
+from mcaptrack.sources.ingest.labels.yolo import read_yolo
 
 FORMATS: Final = tuple(name for name in get_args(Format) if name != "auto")
 
-#: First bytes of other formats than tables, and their names.
-_OTHERS: Final = {b"{": "JSON", b"[": "JSON", b"<": "XML"}
-#: Bytes to inspect of such a file, and the keys that identify COCO JSON.
-_HEAD: Final = 65536
-_COCO: Final = (b'"images"', b'"annotations"', b'"image_id"', b'"categories"')
-
 
 def read_labels(
-    path: Path, label_format: Format = "auto", role: Role = "tracks", first_frame: int | None = None
+    path: Path,
+    label_format: Format = "auto",
+    role: Role = "tracks",
+    first_frame: int | None = None,
+    columns: Mapping[str, str] | None = None,
 ) -> Labels:
     """Read a label file.
 
     Parameters
     ----------
     path : Path
-        A text file.
+        A text file, or a folder of YOLO labels.
     label_format : str
-        "auto" detects it from the first row.
+        "auto" detects it from the content.
     role : str
         "detections", "tracks" or "truth" (ground truth).
     first_frame : int, optional
         The number of the first picture in the file, if it isn't the one of the format.
+    columns : dict, optional
+        Names of the columns of a table with a header, by what they hold.
 
     Returns
     -------
@@ -48,13 +52,7 @@ def read_labels(
     McaptrackError
         With the line, if the file doesn't have this format, or none of the known ones.
     """
-    _refuse_other_formats(path)
-    if label_format == "auto":
-        found = next(lines_of(path), None)
-        if found is None:
-            raise McaptrackError(f"{path} holds no labels")
-        label_format = _guess(path, *found)
-    labels = READERS[label_format](path, lines_of(path), role)
+    labels = _read(path, label_format, role, columns or {})
     if labels.has_ids and role != "detections":
         _refuse_repeated_ids(path, labels)
     order = np.lexsort((labels.id, labels.frame)) if labels.has_ids else np.argsort(labels.frame, kind="stable")
@@ -68,27 +66,40 @@ def read_labels(
         xy_m=None if xy is None else xy[order],
         score=labels.score[order],
         class_id=labels.class_id[order],
+        doubts=tuple(doubt for doubt in labels.doubts if first_frame is None or doubt[1] != "clock"),
     )
 
 
-def _refuse_other_formats(path: Path) -> None:
-    """Raise McaptrackError for JSON and XML, which labels are often in."""
+def _read(path: Path, label_format: Format, role: Role, columns: Mapping[str, str]) -> Labels:
     refuse_special(path)
-    try:
-        with path.open("rb") as stream:
-            head = stream.read(_HEAD)
-    except OSError as error:
-        raise McaptrackError(f"{path} can't be read: {error.strerror}") from None
-    kind = _OTHERS.get(head.removeprefix(b"\xef\xbb\xbf").lstrip()[:1])
-    if kind == "JSON" and any(word in head for word in _COCO):
-        kind = "COCO JSON"
-    if kind:
-        raise McaptrackError(
-            f"{path} is {kind}, which isn't read; label files are text with a row a box: {', '.join(FORMATS)}"
-        )
+    if path.is_dir():
+        if label_format not in ("auto", "yolo"):
+            raise McaptrackError(f"{path} is a folder, and {label_format} labels are a file")
+        label_format = "yolo"
+    elif label_format in ("auto", "supervision", "coco") and is_json(path):
+        return read_json(path, label_format, role, columns)
+    if label_format == "auto":
+        found = next(lines_of(path, MAX_LINE), None)
+        if found is None:
+            raise McaptrackError(f"{path} holds no labels")
+        label_format = "csv" if columns else _guess(path, *found)
+    if columns and label_format not in ("csv", "supervision"):
+        raise McaptrackError(f"{path}: `columns=` is for tables with a header, not for {label_format}")
+    if label_format == "coco":
+        raise McaptrackError(f"{path} is not JSON, as COCO is")
+    if label_format == "yolo":
+        return read_yolo(path, role)
+    if label_format in ("csv", "supervision"):
+        return read_csv(path, role, columns, label_format)
+    return READERS[label_format](path, lines_of(path), role)
 
 
 def _guess(path: Path, number: int, line: str) -> Format:
+    if line.lstrip().startswith("<"):
+        raise McaptrackError(f"{path} is XML, which isn't read; the formats of labels are {', '.join(FORMATS)}")
+    header = header_of(path, line)
+    if header:
+        return "supervision" if set(SUPERVISION) <= set(header) else "csv"
     columns = split(line)
     if "," in line and 6 <= len(columns) <= 10:
         return "mot"
@@ -102,7 +113,7 @@ def _guess(path: Path, number: int, line: str) -> Format:
         return "obsmat"
     raise McaptrackError(
         f"{path}:{number}: a row of {len(columns)} columns fits no label format ({', '.join(FORMATS)}): "
-        f"{line.strip()[:60]}"
+        f"{line.strip()[:60]}; of a table with a header, `columns=` names the columns"
     )
 
 

@@ -17,7 +17,7 @@ from typing import Final, NamedTuple, Self
 import numpy as np
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.geometry.arrays import Ints
+from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.clocks import LAST_NS, NS_PER_S
 from mcaptrack.notices import warn
 from mcaptrack.sources.ingest.labels.formats import Labels
@@ -27,6 +27,8 @@ MAX_FRAMES: Final = 10_000_000
 #: Limits for unlabelled frames of a file without pictures: in total, and for each labelled frame.
 _EMPTY_FRAMES: Final = 100_000
 _EMPTY_A_LABELLED: Final = 100
+#: Intervals up to this multiple of the smallest are one frame.
+_ALIKE: Final = 1.5
 #: Pictures match a frame rate if none deviates by more than this share of a frame.
 _OFF_FRAMES: Final = Fraction(1, 2)
 
@@ -68,6 +70,32 @@ class Timeline:
             )
         return cls(index, start_ns + _times(index, fps), of)
 
+    @classmethod
+    def of_times(cls, path: Path, seconds: Floats, fps: Fraction | None) -> tuple[Self, str]:
+        """Pictures at the sorted times of labelled frames, and at regular times in between; and words about it.
+
+        The frame rate is the given one, or that of the smallest interval, if all others are multiples of it. Otherwise
+        frames without labels are not known. Raises McaptrackError if times don't fit the given frame rate.
+        """
+        since = seconds - seconds[0]
+        gaps = np.diff(seconds)
+        rate = float(fps) if fps else (1 / float(np.median(gaps[gaps < _ALIKE * gaps.min()])) if len(gaps) else 1.0)
+        index = np.rint(since * rate)
+        is_regular = bool((np.abs(since * rate - index) <= float(_OFF_FRAMES) / 2).all() and (np.diff(index) > 0).all())
+        if fps and not is_regular:
+            raise McaptrackError(f"{path}: its times are no multiples of 1/{fps} s; leave `fps=` out")
+        count = int(index[-1]) + 1 if is_regular else len(seconds)
+        if count > max(_EMPTY_FRAMES, _EMPTY_A_LABELLED * len(seconds)) or count > MAX_FRAMES:
+            is_regular, count = False, len(seconds)
+        all_seconds = np.interp(np.arange(count), index, seconds) if is_regular else seconds
+        t_ns = np.rint(all_seconds * NS_PER_S).astype(np.int64)
+        words = f"{count} frames by the times, about {rate:.4g} a second, {count - len(seconds)} of them without boxes"
+        if not is_regular:
+            words = f"{count} frames by the times, which are irregular; frames without boxes are not known"
+        if (np.diff(t_ns) <= 0).any():
+            raise McaptrackError(f"{path}: its times are less than a nanosecond apart")
+        return cls(np.arange(count), t_ns, "the frames by the times in the file"), words
+
     def fits(self, fps: Fraction) -> bool:
         """Whether the pictures match a frame rate, within half a frame."""
         wanted = self.t_ns[0] + _times(self.index - self.index[0], fps)
@@ -85,6 +113,8 @@ class Timeline:
         Raises McaptrackError if there are labels before the first or after the last picture. If pictures are known to
         be lost, such labels are reported in ``lost`` instead.
         """
+        if labels.times_s is not None:
+            return self._place_by_time(path, labels.times_s)
         every = self._every(path, labels)
         at = (labels.frame - labels.first_frame) // every
         end = int(self.index[-1]) + 1
@@ -104,6 +134,37 @@ class Timeline:
         step = labels.step // every or 1
         known = self.index % step == (int(labels.labelled[0]) - labels.first_frame) // every % step
         return Placed(every * self.index[known] + labels.first_frame, self.index[known], self.t_ns[known])
+
+    def _place_by_time(self, path: Path, seconds: Floats) -> Placed:
+        """Assign frames that have times to the nearest pictures: times of the log, or times since the first picture."""
+        half = float(np.median(np.diff(self.t_ns))) / 2 if len(self.t_ns) > 1 else NS_PER_S / 2
+        first, last = int(self.t_ns[0]), int(self.t_ns[-1])
+        since = seconds * NS_PER_S - first  # exact enough: 256 ns today
+        if since[0] < -half or since[-1] > last - first + half:
+            since = seconds * NS_PER_S
+        if since[-1] > last - first + half:
+            raise McaptrackError(
+                f"{path}: its times are from {seconds[0]:.9g} to {seconds[-1]:.9g} s, {self.of} from "
+                f"{first / NS_PER_S:.3f} to {last / NS_PER_S:.3f} s; give times of the log, or since the first picture"
+            )
+        pictures = (self.t_ns - first).astype(float)
+        after = np.clip(np.searchsorted(pictures, since), 1, max(len(pictures) - 1, 1))
+        before = after - 1
+        after = np.minimum(after, len(pictures) - 1)
+        nearest = np.where(np.abs(pictures[after] - since) < np.abs(since - pictures[before]), after, before)
+        far = np.abs(pictures[nearest] - since) > half
+        if far.any():
+            raise McaptrackError(
+                f"{path}: {int(far.sum())} of {len(seconds)} times are more than half an interval from any of "
+                f"{self.of}, the first at {seconds[far.argmax()]:.9g} s"
+            )
+        same = np.flatnonzero(np.diff(nearest) == 0)
+        if len(same):
+            one, other = seconds[same[0]], seconds[same[0] + 1]
+            raise McaptrackError(f"{path}: {one:.9g} and {other:.9g} s are nearest to the same of {self.of}")
+        number = np.full(len(self.t_ns), -1)
+        number[nearest] = np.arange(len(seconds))
+        return Placed(number, self.index, self.t_ns)
 
     def _every(self, path: Path, labels: Labels) -> int:
         """The step of frame numbers in a label file, which may use the numbers in the names of images."""

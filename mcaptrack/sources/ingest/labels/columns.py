@@ -1,0 +1,111 @@
+"""Which columns of a table with a header hold what: named by the user, or guessed from common headers."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from typing import Final
+
+from mcaptrack.errors import McaptrackError
+
+#: What a column may hold: corners, size and centre of a box in pixels, and more.
+KEYS: Final = ("x", "y", "w", "h", "x2", "y2", "cx", "cy", "frame", "t", "score", "class", "name", "id")
+#: The ways to give a box along x and y; the first that is complete is read.
+_SPANS: Final = ((("x", "w"), ("x", "x2"), ("cx", "w")), (("y", "h"), ("y", "y2"), ("cy", "h")))
+#: Headers by key, without blanks, "_", "-", "." and brackets, and in lower case.
+_HEADERS: Final[Mapping[str, tuple[str, ...]]] = {
+    "x": ("x", "x1", "xmin", "minx", "left", "bbleft", "bboxleft", "bboxx", "bboxx1", "bboxxmin", "xtl", "xleft"),
+    "y": ("y", "y1", "ymin", "miny", "top", "bbtop", "bboxtop", "bboxy", "bboxy1", "bboxymin", "ytl", "ytop"),
+    "w": ("w", "width", "bbwidth", "bboxwidth", "bboxw"),
+    "h": ("h", "height", "bbheight", "bboxheight", "bboxh"),
+    "x2": ("x2", "xmax", "maxx", "right", "bbright", "bboxright", "bboxx2", "bboxxmax", "xbr", "xright"),
+    "y2": ("y2", "ymax", "maxy", "bottom", "bbbottom", "bboxbottom", "bboxy2", "bboxymax", "ybr", "ybottom"),
+    "cx": ("cx", "xc", "xcenter", "xcentre", "centerx", "centrex"),
+    "cy": ("cy", "yc", "ycenter", "ycentre", "centery", "centrey"),
+    "frame": ("frame", "frameindex", "frameidx", "framenumber", "frameno", "framenum", "frameid", "image", "imageid",
+              "imagename", "filename", "file"),
+    "t": ("t", "time", "times", "timestamp", "seconds", "stamp"),
+    "score": ("score", "confidence", "conf", "probability", "prob"),
+    "class": ("class", "classid", "cls", "label", "category", "categoryid", "labelid", "objectclass"),
+    "name": ("classname", "categoryname", "labelname"),
+    "id": ("trackid", "trackerid", "id", "track", "objectid", "targetid", "tid"),
+}  # fmt: skip
+#: Keys of which several columns may fit; the first header of the list above is read.
+_RANKED: Final = ("frame", "t", "class", "id")
+_IGNORED: Final = re.compile(r"[\s_\-.()\[\]/:]+|px$|pixels$")
+
+
+def parse_columns(text: str) -> dict[str, str]:
+    """Columns by key from "x=left,y=top". Raises McaptrackError if it isn't of this form."""
+    out: dict[str, str] = {}
+    for part in filter(None, (part.strip() for part in text.split(","))):
+        key, equals, column = (word.strip() for word in part.partition("="))
+        if not equals or not column:
+            raise McaptrackError(f"`columns=` is like x=left,y=top,w=width,h=height,frame=frame, not {part!r:.60}")
+        if key in out:
+            raise McaptrackError(f"`columns=` names {key} twice")
+        out[key] = column
+    return check_keys(out)
+
+
+def check_keys(columns: Mapping[str, str]) -> dict[str, str]:
+    """Check the keys of columns. Raises McaptrackError, with the known ones."""
+    unknown = [key for key in columns if key not in KEYS]
+    if unknown:
+        raise McaptrackError(f"`columns=` knows no {str(unknown[0])!r:.40}; it knows {', '.join(KEYS)}")
+    return dict(columns)
+
+
+def choose_columns(where: str, header: Sequence[str], given: Mapping[str, str]) -> dict[str, int]:
+    """The index of the column for each key: those ``given`` by name, and guesses for the other keys.
+
+    Raises McaptrackError if a column doesn't exist, if guesses are ambiguous, or if no box or frame can be made.
+    """
+    shown = f"its columns are {', '.join(header)}"[:300]
+    out = {key: _named(where, header, key, column, shown) for key, column in given.items()}
+    plain = [_IGNORED.sub("", name.strip().lower()) for name in header]
+    skipped = _superseded(out)
+    for key, names in _HEADERS.items():
+        fits = [at for name in names for at, one in enumerate(plain) if one == name and at not in out.values()]
+        if key in out or key in skipped or not fits:
+            continue
+        if len(fits) > 1 and key not in _RANKED:
+            words = " and ".join(header[at] for at in fits)
+            raise McaptrackError(
+                f"{where}: {words} could both be {key}; choose with `columns={key + '=' + header[fits[0]]!r}`"
+            )
+        out[key] = fits[0]
+    for axis in _SPANS:
+        found = [pair for pair in axis if all(key in out for key in pair)]
+        if not found:
+            raise McaptrackError(
+                f"{where}: no columns for {' and '.join(axis[0])} (or {' and '.join(axis[1])}) of boxes; {shown}; name "
+                "them with `columns='x=left,y=top,w=width,h=height,frame=frame'`"
+            )
+        for key in {key for pair in axis for key in pair} - set(found[0]):
+            out.pop(key, None)
+    if "frame" in out:
+        out.pop("t", None)
+    elif "t" not in out:
+        raise McaptrackError(
+            f"{where}: no column for the frame or the time of boxes; {shown}; name it with `columns='frame=NAME'` or "
+            "`columns='t=NAME'` (in seconds)"
+        )
+    return out
+
+
+def _named(where: str, header: Sequence[str], key: str, column: str, shown: str) -> int:
+    found = [at for at, name in enumerate(header) if name.strip() == column.strip()]
+    if len(found) != 1:
+        what = f"{len(found)} columns are named {column}" if found else f"no column is named {column}"
+        raise McaptrackError(f"{where}: {what}, as `columns=` says for {key}; {shown}")
+    return found[0]
+
+
+def _superseded(given: Mapping[str, int]) -> set[str]:
+    """Keys that aren't guessed, because others that the user named say the same."""
+    out = {key for key, other in (("frame", "t"), ("t", "frame")) if other in given}
+    for axis in _SPANS:
+        if any(all(key in given for key in pair) for pair in axis):
+            out |= {key for pair in axis for key in pair} - given.keys()
+    return out

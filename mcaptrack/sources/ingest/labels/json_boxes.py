@@ -1,0 +1,255 @@
+"""Read boxes in JSON: annotations and results of COCO, and the JSONSink of supervision.
+
+Letters: N rows, F frames.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from array import array
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, Final, NoReturn
+
+import numpy as np
+
+from mcaptrack.errors import McaptrackError
+from mcaptrack.files import refuse_special
+from mcaptrack.geometry.arrays import Floats
+from mcaptrack.sources.ingest.labels.box_rows import NO_CLASS, BoxRows, FrameNames, numbers_of_names
+from mcaptrack.sources.ingest.labels.delimited import read_rows
+from mcaptrack.sources.ingest.labels.formats import NO_ID, Format, Labels, Role
+
+_MAX_BYTES: Final = 512 * 2**20
+_MAX_ROWS: Final = 10_000_000
+_MAX_CLASSES: Final = 65536
+_MAX_NAME: Final = 256
+#: Keys of the track id of an annotation, and of the frame of an image.
+_TRACK_IDS: Final = ("track_id", "instance_id", "tracker_id")
+_FRAMES: Final = ("frame_id", "frame_index", "mot_frame_id")
+_VIDEOS: Final = ("video_id", "vid_id")
+#: Numbers of a row: frame, left, top, width, height, score, category, id, whether it is a crowd.
+_COLUMNS: Final = 9
+
+
+def is_json(path: Path) -> bool:
+    """Whether the first character of a file is that of a JSON list or object."""
+    refuse_special(path)
+    try:
+        with path.open("rb") as stream:
+            return stream.read(4096).removeprefix(b"\xef\xbb\xbf").lstrip()[:1] in (b"{", b"[")
+    except OSError as error:
+        raise McaptrackError(f"{path} can't be read: {error.strerror}") from None
+
+
+def load_json(path: Path) -> Any:
+    """The content of a JSON file. Raises McaptrackError if it is too large, nested too deep, or invalid."""
+    refuse_special(path)
+    try:
+        size = path.stat().st_size
+        if size > _MAX_BYTES:
+            raise McaptrackError(f"{path} has {size} bytes; at most {_MAX_BYTES} of JSON are read: give it in parts")
+        return json.loads(path.read_bytes().decode("utf-8-sig"))
+    except OSError as error:
+        raise McaptrackError(f"{path} can't be read: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise McaptrackError(f"{path} is not a text file, as JSON is") from None
+    except RecursionError:
+        raise McaptrackError(f"{path} is nested deeper than JSON of boxes is") from None
+    except ValueError as error:
+        raise McaptrackError(f"{path} is not valid JSON: {str(error)[:200]}") from None
+
+
+def read_json(path: Path, label_format: Format, role: Role, given: Mapping[str, str]) -> Labels:
+    """Read JSON of COCO or of supervision, as its content tells. Raises McaptrackError if it is neither."""
+    content = load_json(path)
+    labels = _read_content(path, content, role, given)
+    if label_format not in ("auto", labels.format):
+        raise McaptrackError(f"{path} is of the format {labels.format}, not {label_format}")
+    return labels
+
+
+def _read_content(path: Path, content: Any, role: Role, given: Mapping[str, str]) -> Labels:
+    if isinstance(content, list) and not content:
+        raise McaptrackError(f"{path} holds no boxes")
+    if given and not (isinstance(content, list) and isinstance(content[0], dict) and "x_min" in content[0]):
+        raise McaptrackError(f"{path}: `columns=` is for tables with a header, not for COCO")
+    first = content[0] if isinstance(content, list) and isinstance(content[0], dict) else {}
+    if isinstance(content, dict) and isinstance(content.get("annotations"), list):
+        return _annotations(path, content).labels(role)
+    if "bbox" in first and "image_id" in first:
+        return _results(path, content).labels(role)
+    if "x_min" in first:
+        return read_rows(path, content, role, given)
+    found = f"an object with {', '.join(content)}"[:100] if isinstance(content, dict) else "a list"
+    raise McaptrackError(
+        f"{path} is JSON ({found}{' of ' + ', '.join(first) if first else ''}"[:300]
+        + "), but neither annotations (images, annotations, categories) nor results (image_id, category_id, bbox, "
+        "score) of COCO, nor rows of supervision (x_min, y_min, x_max, y_max, ...)"
+    )
+
+
+class _Rows:
+    """The numbers of boxes; ``kind`` names one of them in messages."""
+
+    def __init__(self, path: Path, kind: str) -> None:
+        self._path, self._kind, self._values = path, kind, array("d")
+
+    def add(self, number: int, entry: Any, frame_of: Callable[[Any], float]) -> None:
+        """Add an annotation or a result. Raises McaptrackError if something is missing or of the wrong type."""
+        if not isinstance(entry, dict):
+            self.refuse(number, "is not an object")
+        box = entry.get("bbox")
+        if not isinstance(box, list) or len(box) != 4 or not all(map(_is_number, box)):
+            self.refuse(number, "has no bbox of 4 numbers: left, top, width, height")
+        inner = entry.get("attributes")
+        track_id = next((d[key] for d in (entry, inner) if isinstance(d, dict) for key in _TRACK_IDS if key in d), None)
+        values = [entry.get("score"), entry.get("category_id"), track_id, entry.get("iscrowd", 0)]
+        for value, key in zip(values, ("score", "category_id", "track_id", "iscrowd"), strict=True):
+            if value is not None and not isinstance(value, bool) and not _is_number(value):
+                self.refuse(number, f"has a {key} that isn't a number, {value!r:.40}")
+        score, category, track_id, crowd = values
+        try:
+            frame = frame_of(entry.get("image_id"))
+        except (ValueError, KeyError, TypeError) as error:
+            self.refuse(number, str(error).strip('"'))
+        self._values.extend(
+            (
+                frame,
+                *map(_float, box),
+                math.nan if score is None else _float(score),
+                NO_CLASS if category is None else _float(category),
+                NO_ID if track_id is None else _float(track_id),
+                bool(crowd),
+            )
+        )
+
+    def refuse(self, number: int, words: str) -> NoReturn:
+        raise McaptrackError(f"{self.at(number)} {words}")
+
+    def at(self, number: int) -> str:
+        return f"{self._path}: {self._kind} {number}"
+
+    def done(self, names: Mapping[int, str] | None) -> BoxRows:
+        """All rows."""
+        values: Floats = np.frombuffer(self._values, np.float64).reshape(-1, _COLUMNS)
+        frame, score, number, track_id, crowd = (values[:, at] for at in (0, 5, 6, 7, 8))
+        boxes, is_crowd = values[:, 1:5], crowd != 0
+        return BoxRows(self._path, "coco", self.at, frame, boxes, track_id, score, number, names, is_crowd)
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _float(value: Any) -> float:
+    try:
+        return float(value)
+    except OverflowError:
+        return math.inf
+
+
+def _results(path: Path, content: list[Any]) -> BoxRows:
+    """Results: a list of image_id, category_id, bbox, score. The number of an image is that of its frame."""
+    _check_count(path, content)
+    rows, names = _Rows(path, "result"), FrameNames()
+
+    def frame_of(image: Any) -> float:
+        if isinstance(image, str):
+            return names.number(image)
+        if not _is_number(image):
+            raise ValueError("has no image_id")
+        return _float(image)
+
+    for number, entry in enumerate(content):
+        rows.add(number, entry, frame_of)
+    out = rows.done(None)
+    out.remarks.append(f"{path}: the number in image_id is taken as the frame")
+    return out
+
+
+def _annotations(path: Path, content: Mapping[str, Any]) -> BoxRows:
+    """Annotations: images, annotations and categories."""
+    images, entries = content.get("images"), content["annotations"]
+    if not isinstance(images, list) or not all(isinstance(image, dict) and "id" in image for image in images):
+        raise McaptrackError(f"{path}: `images` is not a list of objects with an id each")
+    _check_count(path, entries)
+    ids = [_key(image["id"]) for image in images]
+    if len(set(ids)) < len(ids):
+        twice = next(one for one in ids if ids.count(one) > 1)
+        raise McaptrackError(f"{path}: {twice} is the id of several images")
+    videos = {_key(image[key]) for image in images for key in _VIDEOS if key in image}
+    if len(videos) > 1:
+        raise McaptrackError(f"{path} holds {len(videos)} videos (video_id); give one file for each of them")
+    frames, how = _frames(images)
+    by_id = dict(zip(ids, frames, strict=True))
+    rows = _Rows(path, "annotation")
+
+    def frame_of(image: Any) -> float:
+        if _key(image) not in by_id:
+            raise ValueError(f"is of image {image!r:.40}, which isn't among the images")
+        return by_id[_key(image)]
+
+    for number, entry in enumerate(entries):
+        rows.add(number, entry, frame_of)
+    out = rows.done(_categories(path, content.get("categories")))
+    out.labelled = np.unique(np.array(frames, np.int64))
+    out.first_frame = int(out.labelled[0]) if len(frames) else 0
+    out.remarks.append(f"{path}: {len(images)} images, in order of {how}")
+    if out.first_frame > 1:
+        words = f"{path}: its first image has the number {out.first_frame}, and is assumed to be the first picture"
+        out.doubts.append((f"{words}; `first_frame=` sets the number", "clock"))
+    _doubt_outside(out, images, frames)
+    return out
+
+
+def _key(value: Any) -> str:
+    return str(value)[:_MAX_NAME]
+
+
+def _check_count(path: Path, entries: list[Any]) -> None:
+    if len(entries) > _MAX_ROWS:
+        raise McaptrackError(f"{path} has more than {_MAX_ROWS} boxes; give it in parts")
+
+
+def _frames(images: list[dict[str, Any]]) -> tuple[list[int], str]:
+    """The frame numbers of images, and what they are from: a field, the numbers in names, or the order in the list."""
+    for key in _FRAMES:
+        found = [image.get(key) for image in images]
+        numbers = [number for number in found if isinstance(number, int) and 0 <= number < 2**31]
+        if len(numbers) == len(found) and len(set(numbers)) == len(numbers):
+            return numbers, key
+    names = [name for name in (image.get("file_name") for image in images) if isinstance(name, str)]
+    numbered = numbers_of_names(names) if len(names) == len(images) else None
+    if numbered is not None:
+        return numbered, "the numbers in file_name"
+    return list(range(len(images))), "the list `images`"
+
+
+def _categories(path: Path, found: Any) -> dict[int, str] | None:
+    """Class names by number; None if there are none."""
+    if not isinstance(found, list) or not found:
+        return None
+    if len(found) > _MAX_CLASSES:
+        raise McaptrackError(f"{path} has {len(found)} categories; at most {_MAX_CLASSES} are read")
+    out: dict[int, str] = {}
+    for number, entry in enumerate(found):
+        one, name = (entry.get("id"), entry.get("name")) if isinstance(entry, dict) else (None, None)
+        if not isinstance(one, int) or not 0 <= one < 2**31 or not isinstance(name, str) or isinstance(one, bool):
+            raise McaptrackError(f"{path}: category {number} has no whole number as its id, or no name")
+        if one in out:
+            raise McaptrackError(f"{path}: {one} is the id of several categories, {out[one]} and {name[:_MAX_NAME]}")
+        out[one] = " ".join(name.split())[:_MAX_NAME]
+    return out
+
+
+def _doubt_outside(rows: BoxRows, images: list[dict[str, Any]], frames: list[int]) -> None:
+    """Count boxes that lie outside of their image."""
+    sizes = {
+        frame: (_float(image["width"]), _float(image["height"]))
+        for frame, image in zip(frames, images, strict=True)
+        if _is_number(image.get("width")) and _is_number(image.get("height"))
+    }
+    if sizes and len(rows.frame):
+        rows.doubt_outside(np.array([sizes.get(int(frame), (math.inf, math.inf)) for frame in rows.frame]))

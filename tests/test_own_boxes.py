@@ -1,0 +1,245 @@
+"""Boxes of other detectors: COCO, YOLO, supervision and tables with a header, with the boxes computed by hand."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import mcaptrack
+from mcaptrack import log
+from mcaptrack.errors import McaptrackError
+from mcaptrack.schema import DETECTIONS
+from mcaptrack.sources.ingest.labels.columns import KEYS, parse_columns
+from mcaptrack.sources.ingest.labels.reading import read_labels
+
+#: Frame, left, top, width, height, score, class, id: dyadic, so that every format holds them exactly.
+BOXES = [
+    (0, 8.0, 16.0, 32.0, 64.0, 0.5, "person", 7),
+    (0, 40.0, 16.5, 32.0, 64.0, 0.75, "person", 9),
+    (1, 128.0, 8.0, 64.0, 16.0, 0.25, "bicycle", 3),
+    (3, 9.0, 16.0, 32.0, 64.0, 1.0, "person", 7),
+]
+SIZE = (256, 128)
+CLASSES = ["person", "bicycle", "dog"]
+CATEGORIES = [{"id": 5, "name": "dog"}, {"id": 1, "name": "person"}, {"id": 2, "name": "bicycle"}]
+
+
+def written(folder: Path, name: str, text: str) -> Path:
+    path = folder / name
+    path.parent.mkdir(exist_ok=True)
+    path.write_bytes(text.encode())
+    return path
+
+
+def as_coco(folder):
+    images = [{"id": 100 + frame, "file_name": f"a/{frame:06}.jpg", "width": 256, "height": 128} for frame in range(5)]
+    entries = [
+        {
+            "id": number,
+            "image_id": 100 + frame,
+            "category_id": 1 + CLASSES.index(name),
+            "bbox": [*box],
+            "score": score,
+            "track_id": one,
+        }
+        for number, (frame, *box, score, name, one) in enumerate(BOXES)
+    ]
+    content = {"images": images[::-1], "annotations": entries, "categories": CATEGORIES}
+    return written(folder, "a.json", "\ufeff" + json.dumps(content))
+
+
+def as_results(folder):
+    entries = [
+        {"image_id": f"{frame}", "category_id": CLASSES.index(name) + 1, "bbox": box, "score": score}
+        for frame, *box, score, name, _ in BOXES
+    ]
+    return written(folder, "r.json", json.dumps(entries))
+
+
+def as_yolo(folder):
+    lines = {frame: [] for frame in range(5)}
+    for frame, x, y, w, h, score, name, one in BOXES:
+        place = [(x + w / 2) / SIZE[0], (y + h / 2) / SIZE[1], w / SIZE[0], h / SIZE[1]]
+        lines[frame].append(f"{CLASSES.index(name)} {' '.join(map(repr, place))} {score} {one}")
+    for frame, rows in lines.items():
+        written(folder / "labels", f"v_{frame}.txt", "\r\n".join(rows))
+    written(folder, "data.yaml", "names: [person, bicycle, dog]\n")
+    return folder / "labels"
+
+
+def _sink(box, score, name, one, frame):
+    x, y, w, h = box
+    head = {"x_min": x, "y_min": y, "x_max": x + w, "y_max": y + h, "class_id": CLASSES.index(name)}
+    return head | {"confidence": score, "tracker_id": one, "class_name": name, "frame_index": frame}
+
+
+def as_supervision(folder, text="\n"):
+    rows = [_sink(box, score, name, one, frame) for frame, *box, score, name, one in BOXES]
+    lines = [",".join(rows[0]), *(",".join(map(str, row.values())) for row in rows)]
+    return written(folder, "s.csv", text.join(lines))
+
+
+def as_supervision_json(folder):
+    rows = [_sink(box, score, name, one, str(frame)) for frame, *box, score, name, one in BOXES]
+    return written(folder, "s.json", json.dumps(rows))
+
+
+def as_csv(folder):
+    lines = ["Track ID;Frame;left;top;right;bottom;conf;label;note"]
+    for frame, x, y, w, h, score, name, one in BOXES:
+        cells = [one, frame, x, y, x + w, y + h, score, name]
+        lines.append(";".join(str(cell).replace(".", ",") for cell in cells) + ';"a;b"')
+    return written(folder, "a.csv", "\ufeff" + "\r\n".join(lines))
+
+
+WRITERS = {
+    "coco": as_coco,
+    "coco results": as_results,
+    "yolo": as_yolo,
+    "supervision": as_supervision,
+    "supervision JSON": as_supervision_json,
+    "csv": as_csv,
+}
+
+
+@pytest.mark.parametrize("kind", WRITERS)
+def test_every_format_gives_the_same_boxes(kind, tmp_path):
+    labels = read_labels(WRITERS[kind](tmp_path), role="detections")
+    assert labels.format == kind.split()[0]
+    scale = (*SIZE, *SIZE) if labels.is_normalised else (1, 1, 1, 1)
+    frames, *boxes, scores, names, ids = (list(column) for column in zip(*BOXES, strict=True))
+    order = np.lexsort((ids, frames)) if labels.has_ids else np.arange(len(BOXES))
+    assert labels.first_frame == 0
+    assert labels.frame.tolist() == np.array(frames)[order].tolist()
+    assert (labels.boxes_px * scale).tolist() == np.array(boxes).T[order].tolist()
+    assert labels.score.tolist() == np.array(scores)[order].tolist()
+    if kind != "coco results":  # these hold neither names nor ids
+        assert labels.id.tolist() == np.array(ids)[order].tolist()
+        assert [labels.classes[number] for number in labels.class_id.tolist()] == np.array(names)[order].tolist()
+    assert (labels.class_id == 1).tolist() == (np.array(names)[order] == "person").tolist()
+    assert len(set(labels.class_id.tolist())) == 2
+    assert 0 not in labels.class_id
+    tracks = read_labels(WRITERS[kind](tmp_path), role="tracks")
+    assert len(tracks.frame) == 3  # people alone
+    assert tracks.left_out.startswith("1 ")
+
+
+@pytest.mark.parametrize("kind", ["yolo", "csv"])
+def test_ingest_writes_boxes_and_class_names(kind, tmp_path):
+    options = {"size": "256x128"} if kind == "yolo" else {}
+    result = mcaptrack.ingest(WRITERS[kind](tmp_path), tmp_path / "a.mcap", role="detections", fps=10, **options)
+    with log.read(result.log) as opened:
+        frames = list(opened.frames("/camera/detections", DETECTIONS))
+        made = opened.channel("/camera/detections").metadata
+    assert json.loads(made["mcaptrack.classes"]) == {"1": "person", "2" if kind == "csv" else "3": "bicycle"}
+    assert [(frame.t_ns, len(frame.rows)) for frame in frames][:4] == [
+        (0, 2),
+        (10**8, 1),
+        (2 * 10**8, 0),
+        (3 * 10**8, 1),
+    ]
+    assert len(frames) == (5 if kind == "yolo" else 4)  # files without boxes are frames, too
+    assert [tuple(row)[:4] for row in frames[3].rows[["x_px", "y_px", "w_px", "h_px"]]] == [(9, 16, 32, 64)]
+
+
+def test_times_are_frames_and_gaps_are_empty_frames(tmp_path):
+    path = written(tmp_path, "t.csv", "time,cx,cy,w,h\n2.0,50,50,10,20\n2.1,51,50,10,20\n2.3,52,50,10,20\n")
+    result = mcaptrack.ingest(path, tmp_path / "t.mcap", role="detections")
+    with log.read(result.log) as opened:
+        frames = list(opened.frames("/camera/detections", DETECTIONS))
+    assert [round(frame.t_ns / 1e6) for frame in frames] == [2000, 2100, 2200, 2300]
+    assert [frame.rows["x_px"].tolist() for frame in frames] == [[45], [46], [], [47]]
+    late = written(tmp_path, "l.csv", "t_ms,x,y,w,h\n210,1,2,3,4\n90,5,6,7,8\n")
+    mcaptrack.ingest(late, role="detections", camera="camera/own", into=result.log)
+    with log.read(result.log) as opened:
+        assert sum(len(frame.rows) for frame in opened.frames("/camera/own/detections", DETECTIONS)) == 2
+
+
+def test_columns_are_named_by_the_user(tmp_path):
+    path = written(tmp_path, "a.csv", "n,a,b,c,d,p\n3,1,2,11,22,90\n")
+    with pytest.raises(McaptrackError, match="no columns for x and w"):
+        read_labels(path)
+    labels = read_labels(path, columns=parse_columns("x=a,y=b,x2=c,y2=d,frame=n,score=p"), role="detections")
+    assert labels.boxes_px.tolist() == [[1, 2, 10, 20]]
+    assert any("1 above 1 (up to 90)" in words for words, _ in labels.doubts)
+    assert any("states no classes; all boxes are taken as people" in words for words in labels.remarks)
+
+
+HEAD = "frame,left,top,width,height"
+COCO = {"images": [{"id": 1}], "annotations": [{"image_id": 1, "bbox": [1, 2, 3, 4]}]}
+BAD = {
+    "no frame": ("left,top,width,height\n1,2,3,4\n", "no column for the frame or the time"),
+    "two lefts": ("frame,x,left,top,w,h\n1,1,1,2,3,4\n", r"x and left could both be x; choose with `columns='x=x'`"),
+    "a short row": (f"{HEAD}\n1,2,3\n", r"a:2: .*3 columns, and the header has 5"),
+    "a word": (f"{HEAD}\n1,2,x,3,4\n", "a:2: .*not all are numbers"),
+    "not a number": (f"{HEAD}\n1,2,nan,3,4\n", "a:2: a number of the box is missing or not finite"),
+    "infinite": (f"{HEAD}\n1,2,3,4,1e999\n", "a:2: a number of the box is missing"),
+    "huge": (f"{HEAD}\n1,2,3,4,1e9\n", r"a:2: a coordinate can't be 1e\+09"),
+    "a negative width": (f"{HEAD}\n1,2,3,-4,1\n", "a:2: a box can't be -4 wide"),
+    "a fraction of a frame": (f"{HEAD}\n1.5,2,3,4,1\n", "a:2: the frame .* not 1.5"),
+    "two sequences": (f"{HEAD}\na_1.jpg,2,3,4,1\nb_1.jpg,2,3,4,1\n", "names of several sequences"),
+    "a header alone": (f"{HEAD}\n", "holds no boxes"),
+    "one id twice": (f"{HEAD},track_id\n1,2,3,4,5,6\n1,2,3,4,5,6\n", "id 6 appears twice in frame 1"),
+    "other JSON": ('{"a": 1}', "neither annotations .* nor results"),
+    "broken JSON": ("[1,", "is not valid JSON"),
+    "deep JSON": ("[" * 100_000, "is nested deeper|is not valid JSON"),
+    "a number of 5000 digits": ('[{"image_id":1,"bbox":[1,1,1,' + "9" * 5000 + "]}]", "not valid JSON"),
+    "no boxes": ("[]", "holds no boxes"),
+    "NaN in JSON": ('[{"image_id":1,"bbox":[1,1,NaN,1]}]', "result 0: a number of the box is missing or not finite"),
+    "a box of text": ('[{"image_id":1,"bbox":["1",1,1,1]}]', "result 0 has no bbox of 4 numbers"),
+    "an image twice": (json.dumps(COCO | {"images": [{"id": 1}, {"id": 1}]}), "1 is the id of several images"),
+    "no such image": (json.dumps(COCO | {"images": [{"id": 2}]}), "annotation 0 is of image 1, which isn't among"),
+    "two videos": (json.dumps(COCO | {"images": [{"id": 1, "video_id": 1}, {"id": 2, "video_id": 2}]}), "2 videos"),
+    "a category twice": (json.dumps(COCO | {"categories": [{"id": 1, "name": "a"}] * 2}), "1 is the id of several cat"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_what_is_wrong_is_one_line_with_its_place(case, tmp_path):
+    text, words = BAD[case]
+    with pytest.raises(McaptrackError, match=words) as error:
+        read_labels(written(tmp_path, "a", text))
+    assert "\n" not in str(error.value)
+    assert len(str(error.value)) < 600
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("0 0.5 0.5 0.1", "4 columns"),
+        ("0 50 50 10 10", "no share of the picture"),
+        ("0 .1 .1 .1 .1 .1 .1 .1", "outlines"),
+    ],
+)
+def test_a_wrong_row_of_yolo_is_named(line, words, tmp_path):
+    written(tmp_path / "y", "1.txt", f"0 0.5 0.5 0.1 0.1\n{line}\n")
+    with pytest.raises(McaptrackError, match=rf"1\.txt:2: .*{words}"):
+        read_labels(tmp_path / "y")
+
+
+def test_shares_of_the_picture_need_its_size(tmp_path):
+    with pytest.raises(McaptrackError, match="`size='WIDTHxHEIGHT'`"):
+        mcaptrack.ingest(as_yolo(tmp_path), tmp_path / "a.mcap", fps=10)
+
+
+def test_doubts_name_what_they_are_about_with_counts(tmp_path):
+    coco = json.loads(as_coco(tmp_path).read_text("utf-8-sig"))
+    coco["annotations"][0]["bbox"][0] = 300
+    coco["annotations"][1]["category_id"] = 77
+    coco["annotations"][2]["iscrowd"] = 1
+    labels = read_labels(written(tmp_path, "b.json", json.dumps(coco)), role="detections")
+    words = " / ".join(words for words, _ in labels.doubts)
+    assert "1 of 4 boxes lie outside of their pictures" in words
+    assert re.search(r"1 boxes have classes without a name \(77\); their class_id is 0", words)
+    assert labels.left_out == "1 regions of crowds (iscrowd)"
+    assert labels.class_id.tolist() == [1, 0, 1]
+
+
+@pytest.mark.parametrize("text", ["x", "x=", "q=a", "x=a,x=b"])
+def test_wrong_columns_are_refused_with_the_known_ones(text):
+    with pytest.raises(McaptrackError, match=f"`columns=`.*({KEYS[0]}=left|{KEYS[-1]}|twice)"):
+        parse_columns(text)
