@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import DETECTIONS
 from mcaptrack.sources.ingest.labels.columns import KEYS, parse_columns
 from mcaptrack.sources.ingest.labels.reading import read_labels
+from mcaptrack.sources.ingest.labels.timeline import Timeline
 
 #: Frame, left, top, width, height, score, class, id: dyadic, so that every format holds them exactly.
 BOXES = [
@@ -153,10 +155,24 @@ def test_times_are_frames_and_gaps_are_empty_frames(tmp_path):
         frames = list(opened.frames("/camera/detections", DETECTIONS))
     assert [round(frame.t_ns / 1e6) for frame in frames] == [2000, 2100, 2200, 2300]
     assert [frame.rows["x_px"].tolist() for frame in frames] == [[45], [46], [], [47]]
-    late = written(tmp_path, "l.csv", "t_ms,x,y,w,h\n210,1,2,3,4\n90,5,6,7,8\n")
-    mcaptrack.ingest(late, role="detections", camera="camera/own", into=result.log)
-    with log.read(result.log) as opened:
-        assert sum(len(frame.rows) for frame in opened.frames("/camera/own/detections", DETECTIONS)) == 2
+
+
+@pytest.mark.parametrize("start_ns", [0, 1_700_000_000 * 10**9])
+@pytest.mark.parametrize("is_absolute", [False, True])
+def test_times_belong_to_the_nearest_picture(start_ns, is_absolute, tmp_path):
+    pictures = Timeline.spaced(4, Fraction(10), start_ns, "the pictures")
+    times = [(start_ns * is_absolute + ms * 10**6) // 10**6 for ms in (210, 90)]
+    path = written(tmp_path, "l.csv", f"t_ms,x,y,w,h\n{times[0]},1,2,3,4\n{times[1]},5,6,7,8\n")
+    labels = read_labels(path, role="detections")
+    placed = pictures.place(path, labels, [])
+    assert placed.number.tolist() == [-1, 0, 1, -1]
+    assert labels.boxes_px[:, 0].tolist() == [5, 1]
+    written(tmp_path, "l.csv", "t,x,y,w,h\n0.09,1,2,3,4\n0.11,5,6,7,8\n")
+    with pytest.raises(McaptrackError, match=r"0\.09 and 0\.11 s are nearest to the same"):
+        pictures.place(path, read_labels(path), [])
+    written(tmp_path, "l.csv", "t,x,y,w,h\n0.09,1,2,3,4\n7,5,6,7,8\n")
+    with pytest.raises(McaptrackError, match=r"its times are from 0\.09 to 7 s"):
+        pictures.place(path, read_labels(path), [])
 
 
 def test_columns_are_named_by_the_user(tmp_path):

@@ -150,6 +150,9 @@ def _read(path: Path, role: Role, topics: Sequence[str]) -> Labels:
     if role == "tracks" and path.is_file() and _is_blank(path):
         return _no_tracks("mot")
     labels = read_labels(path, role=role)
+    if labels.times_s is not None or labels.is_normalised:
+        what = "times instead of frames" if labels.times_s is not None else "boxes in shares of the picture's size"
+        raise McaptrackError(f"{path} has {what}; make a log of it with {call('ingest', path)}, and compare that")
     if not labels.has_ids:
         raise McaptrackError(f"{path} has no ids (all are -1); {role} need ids")
     return labels

@@ -12,6 +12,7 @@ from mcaptrack.errors import McaptrackError
 KEYS: Final = ("x", "y", "w", "h", "x2", "y2", "cx", "cy", "frame", "t", "score", "class", "name", "id")
 #: The ways to give a box along x and y; the first that is complete is read.
 _SPANS: Final = ((("x", "w"), ("x", "x2"), ("cx", "w")), (("y", "h"), ("y", "y2"), ("cy", "h")))
+_WITH_UNITS: Final = tuple(f"{what}{unit}" for what in ("t", "time", "timestamp") for unit in ("s", "ms", "us", "ns"))
 #: Headers by key, without blanks, "_", "-", "." and brackets, and in lower case.
 _HEADERS: Final[Mapping[str, tuple[str, ...]]] = {
     "x": ("x", "x1", "xmin", "minx", "left", "bbleft", "bboxleft", "bboxx", "bboxx1", "bboxxmin", "xtl", "xleft"),
@@ -24,7 +25,7 @@ _HEADERS: Final[Mapping[str, tuple[str, ...]]] = {
     "cy": ("cy", "yc", "ycenter", "ycentre", "centery", "centrey"),
     "frame": ("frame", "frameindex", "frameidx", "framenumber", "frameno", "framenum", "frameid", "image", "imageid",
               "imagename", "filename", "file"),
-    "t": ("t", "time", "times", "timestamp", "seconds", "stamp"),
+    "t": ("t", "time", "timestamp", "seconds", "stamp", *_WITH_UNITS),
     "score": ("score", "confidence", "conf", "probability", "prob"),
     "class": ("class", "classid", "cls", "label", "category", "categoryid", "labelid", "objectclass"),
     "name": ("classname", "categoryname", "labelname"),
