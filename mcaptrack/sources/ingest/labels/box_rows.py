@@ -207,7 +207,9 @@ def class_ids(rows: BoxRows) -> tuple[ClassIds, dict[int, str]]:
         rows.doubts.append((f"{rows.path}: {int((~stated).sum())} boxes without a class have class_id 0", "classes"))
     if rows.names is None:
         return _unnamed(rows, number, stated), {}
-    largest, places, classes = max(max(rows.names, default=0), PERSON), {}, {}
+    largest = max(max(rows.names, default=0), PERSON)
+    places: dict[int, int] = {}
+    classes: dict[int, str] = {}
     for one, name in sorted(rows.names.items()):
         if name.strip().lower() in PEOPLE:
             place = PERSON
