@@ -113,7 +113,7 @@ def _guess(path: Path, number: int, line: str) -> Format:
         return "obsmat"
     raise McaptrackError(
         f"{path}:{number}: a row of {len(columns)} columns fits no label format ({', '.join(FORMATS)}): "
-        f"{line.strip()[:60]}; of a table with a header, `columns=` names the columns"
+        f"{line.strip()[:60]}"
     )
 
 
