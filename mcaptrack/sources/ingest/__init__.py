@@ -101,14 +101,15 @@ def _job(source: Path, options: IngestOptions, progress: Progress, there: log.Lo
     recorded = open_recording(source)
     if recorded is not None:
         return RecordingJob(source, options, recorded, progress, there)
-    if source.is_dir() and (options.role or is_label_folder(source)):
-        return LabelJob([(options.role, source)], options, there)
+    role = options.role
+    if source.is_dir() and role != MOTION and (role or is_label_folder(source)):
+        return LabelJob([(role, source)], options, there)
     is_video = source.is_dir() or source.suffix.lower() in VIDEO_SUFFIXES or _is_binary(source)
     if is_video:
         return VideoJob(source, options, progress, there)
-    if options.role == MOTION:
+    if role == MOTION:
         return MotionJob(source, options, there)
-    return LabelJob([(options.role, source)], options, there)
+    return LabelJob([(role, source)], options, there)
 
 
 def _is_binary(source: Path) -> bool:
