@@ -7,6 +7,7 @@ SCHEMA_VERSION = 1
 _PARTS = {
     "catalogue": ["Model", "get_model", "models"],
     "contents": ["ChannelInfo", "LogInfo", "info"],
+    "detecting": ["detect", "motion"],
     "demonstration": ["DemoResult", "demo"],
     "fetching": ["FetchedMessage"],
     "ingesting": ["IngestResult", "ingest"],
@@ -16,7 +17,7 @@ _PARTS = {
     "rows": ["detections"],
     "running": ["RunResult"],
     "scoring": ["Scores", "evaluate"],
-    "stages": ["detect", "motion", "predict", "retrack", "sample", "track"],
+    "stages": ["predict", "retrack", "sample", "track"],
     "training": ["TrainResult", "train"],
     "tuning": ["TuneResult", "tune"],
     "upkeep": ["DropResult", "LogCheck", "LogRecovery", "check", "drop", "recover"],

@@ -6,6 +6,8 @@ from mcaptrack.api.contents import LogInfo as LogInfo
 from mcaptrack.api.contents import info as info
 from mcaptrack.api.demonstration import DemoResult as DemoResult
 from mcaptrack.api.demonstration import demo as demo
+from mcaptrack.api.detecting import detect as detect
+from mcaptrack.api.detecting import motion as motion
 from mcaptrack.api.fetching import FetchedMessage as FetchedMessage
 from mcaptrack.api.ingesting import IngestResult as IngestResult
 from mcaptrack.api.ingesting import ingest as ingest
@@ -26,8 +28,6 @@ from mcaptrack.api.rows import detections as detections
 from mcaptrack.api.running import RunResult as RunResult
 from mcaptrack.api.scoring import Scores as Scores
 from mcaptrack.api.scoring import evaluate as evaluate
-from mcaptrack.api.stages import detect as detect
-from mcaptrack.api.stages import motion as motion
 from mcaptrack.api.stages import predict as predict
 from mcaptrack.api.stages import retrack as retrack
 from mcaptrack.api.stages import sample as sample

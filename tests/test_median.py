@@ -15,7 +15,8 @@ from mcaptrack.geometry.boxes import columns_to_boxes, iou
 from mcaptrack.schema import Frame
 from mcaptrack.transforms import STAGES, MedianDetector
 from mcaptrack.transforms.detect.median_background import MAX_SAMPLES, Background, Sampler
-from mcaptrack.transforms.detect.people import Learner, Person, Separator
+from mcaptrack.transforms.detect.people import Separator
+from mcaptrack.transforms.detect.person_model import Learner, Person
 from tests.worlds import ns, small_scene
 
 HEIGHT, WIDTH = 160, 240

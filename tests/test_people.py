@@ -9,13 +9,11 @@ import numpy as np
 import pytest
 
 from mcaptrack.transforms.detect.median_background import Background, Sampler
-from mcaptrack.transforms.detect.people import (
+from mcaptrack.transforms.detect.people import Separator, _Crop, _joined_parts
+from mcaptrack.transforms.detect.person_model import (
     Learner,
     Person,
-    Separator,
-    _Crop,
     _fit_height,
-    _joined_parts,
     _mode,
     _scaled,
     region_boxes,

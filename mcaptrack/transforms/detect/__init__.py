@@ -2,8 +2,8 @@
 
 ``background`` and ``median`` have the motion detectors, for cameras that stand still or nearly. ``camera_motion``
 registers pictures of a shaking camera, ``foreground`` and ``median_background`` compare a picture with its background,
-``people`` separates people who are one region, ``steadiness`` warns where the camera moves. ``onnx`` has learned
-detectors.
+``person_model`` learns how people look, ``people`` separates those who are one region, ``steadiness`` warns where the
+camera moves. ``onnx`` has learned detectors.
 """
 
 from __future__ import annotations

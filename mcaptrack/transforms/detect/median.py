@@ -28,7 +28,8 @@ from mcaptrack.transforms.detect.background import (
 )
 from mcaptrack.transforms.detect.camera_motion import IDENTITY, CameraMotion
 from mcaptrack.transforms.detect.median_background import MIN_THRESHOLD, Background, Sampler
-from mcaptrack.transforms.detect.people import Learner, Person, Separator, region_boxes, typical_height
+from mcaptrack.transforms.detect.people import Separator
+from mcaptrack.transforms.detect.person_model import Learner, Person, region_boxes, typical_height
 from mcaptrack.transforms.detect.steadiness import Steadiness
 from mcaptrack.transforms.protocol import Colour, check_options, option
 
@@ -80,6 +81,7 @@ class MedianDetector:
 
     colour: ClassVar[Colour] = "bgr"
     passes: ClassVar[int] = 2
+    needs_still_camera: ClassVar[bool] = True
     reads: ClassVar[Schema] = VIDEO
     writes: ClassVar[Mapping[str, Schema]] = MappingProxyType({"": DETECTIONS})
     latency_s: ClassVar[Mapping[str, float]] = MappingProxyType({"": inf})

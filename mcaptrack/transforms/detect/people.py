@@ -1,45 +1,21 @@
 """Separate people within the regions of a foreground mask, by the height and shape that people have in the scene.
 
-The height is learned as a line over the row of the feet, from regions that stand alone; the shape is the mean of these
-regions, scaled to one height: the probability that a pixel belongs to a person who stands there. A region that is
-taller or wider than one person is explained by as few people as raise the likelihood of its mask enough: greedily, each
-place being looked for again when another person is added.
+A region that is taller or wider than one person is explained by as few people as raise the likelihood of its mask
+enough: greedily, each place being looked for again when another person is added.
 
-Letters: N boxes (x, y, w, h); T rows of a template, C its columns.
+Letters: N boxes (x, y, w, h).
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mcaptrack.geometry.arrays import Bools, Floats, Image, Ints
+from mcaptrack.transforms.detect.person_model import JOIN, MIN_AREA, MIN_AREA_PX, ROWS, Map, Person, odd, regions
 
-_Map = NDArray[np.float32]
-
-#: Rows of a template.
-_ROWS: Final = 24
-#: Smaller regions are noise; so are those smaller than this share of the squared height of a person.
-MIN_AREA_PX: Final = 20
-_MIN_AREA: Final = 0.02
-#: In heights of a person: a body often gives several regions above each other, which are joined over this distance.
-_JOIN: Final = 0.2
-#: The height of people until enough regions were measured, and the lowest height that is used.
-INITIAL_HEIGHT_PX: Final = 20.0
-_MIN_HEIGHT_PX: Final = 8.0
-#: Regions within this share of the expected height are of one person.
-_TOLERANCE: Final = 0.15
-_SAME_WIDTH: Final = 0.35
-#: So many regions are needed to learn from, and so many are kept.
-_MIN_REGIONS: Final = 8
-_MAX_REGIONS: Final = 4_000
-_DRAWS: Final = 500
-#: The share of the picture's height over which feet have to spread for a slope.
-_MIN_SPREAD: Final = 0.05
 #: A region of one person is at most this much taller and wider than expected.
 _TALL: Final = 1.25
 _WIDE: Final = 1.6
@@ -51,164 +27,9 @@ _PARTS_TALL: Final = 1.2
 #: The probability of foreground where no person is.
 _CLUTTER: Final = 0.03
 _MAX_PROBABILITY: Final = 0.97
-#: A template is wider than people by this factor, so that it holds strides.
-_MARGIN: Final = 1.8
 #: People explain a region if their shapes overlap with it by at least this share of both.
 _EXPLAINED: Final = 0.5
 _ROUNDS: Final = 3
-
-
-@dataclass(frozen=True)
-class Person:
-    """How people look in a scene.
-
-    Attributes
-    ----------
-    slope, level : float
-        Their height is ``slope`` times the row of the feet plus ``level``, in pixels.
-    template : (T, C) float32
-        The probability that a pixel of a person's surrounding belongs to the person. Feet stand at the middle of the
-        last row.
-
-    """
-
-    slope: float
-    level: float
-    template: _Map
-
-    def height(self, foot_px: float) -> float:
-        """How tall a person is who stands at this row, in pixels."""
-        return max(self.slope * foot_px + self.level, _MIN_HEIGHT_PX)
-
-
-def _odd(value: float) -> int:
-    return max(1, round(value) // 2 * 2 + 1)
-
-
-def _regions(mask: Image, join_px: int) -> tuple[NDArray[np.int32], Ints]:
-    """Labels of connected regions, and their x, y, w, h and area (N, 5); label k is row k - 1."""
-    import cv2
-
-    if join_px > 1:
-        mask = np.asarray(cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((join_px, 1), np.uint8)), np.uint8)
-    _, labels, found, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
-    return np.asarray(labels, np.int32), np.asarray(found[1:], np.int64)
-
-
-def typical_height(masks: Sequence[Image]) -> float:
-    """How tall regions of masks are, in pixels: the median weighted by their area."""
-    import cv2
-
-    sizes: list[tuple[int, int]] = []
-    for mask in masks:
-        closed = np.asarray(cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8)), np.uint8)
-        _, found = _regions(closed, 1)
-        large = found[(found[:, 4] >= MIN_AREA_PX) & (found[:, 3] < mask.shape[0] / 2)]
-        sizes += zip(large[:, 3].tolist(), (large[:, 2] * large[:, 3]).tolist(), strict=True)
-    if not sizes:
-        return INITIAL_HEIGHT_PX
-    height, area = np.array(sorted(sizes), np.float64).T
-    total = np.cumsum(area)
-    return float(height[np.searchsorted(total, total[-1] / 2)])
-
-
-def region_boxes(mask: Image, person_px: float) -> Floats:
-    """Boxes (N, 4) around the regions of a mask in which people are about ``person_px`` tall."""
-    _, found = _regions(mask, _odd(_JOIN * person_px))
-    return found[found[:, 4] >= max(MIN_AREA_PX, _MIN_AREA * person_px**2), :4].astype(np.float64)
-
-
-class Learner:
-    """Collects regions of masks of one view, and learns from them how people look."""
-
-    def __init__(self) -> None:
-        self._boxes: list[tuple[int, int, int, int, int]] = []
-        self._cuts: list[Image] = []
-        self._picture_height = 0
-
-    def add(self, masks: Sequence[Image], person_px: float) -> None:
-        """Take the regions of masks in which people are about ``person_px`` tall."""
-        for mask in masks:
-            self._picture_height, width = mask.shape
-            labels, found = _regions(mask, _odd(_JOIN * person_px))
-            for number, (x, y, w, h, area) in enumerate(found.tolist(), start=1):
-                is_cut = x <= 1 or y <= 1 or x + w >= width - 1 or y + h >= self._picture_height - 1
-                if is_cut or area < max(MIN_AREA_PX, _MIN_AREA * person_px**2) or len(self._boxes) >= _MAX_REGIONS:
-                    continue
-                own = (labels[y : y + h, x : x + w] == number) & (mask[y : y + h, x : x + w] > 0)
-                self._boxes.append((x, y, w, h, area))
-                self._cuts.append(_scaled(own))
-
-    def person(self) -> Person | None:
-        """How people look; None if too few regions are alike."""
-        if len(self._boxes) < _MIN_REGIONS:
-            return None
-        _, y, w, h, area = np.array(self._boxes, np.float64).T
-        foot = y + h
-        slope, level = _fit_height(foot, h, np.sqrt(area), self._picture_height)
-        expected = np.maximum(slope * foot + level, _MIN_HEIGHT_PX)
-        is_alike = np.abs(h - expected) < _TOLERANCE * expected
-        if is_alike.sum() < _MIN_REGIONS:
-            return None
-        ratio = w / expected
-        usual = _mode(ratio[is_alike])
-        alone = np.flatnonzero(is_alike & (np.abs(ratio - usual) < _SAME_WIDTH * usual))
-        columns = int(np.ceil(_ROWS * usual * _MARGIN)) // 2 * 2 + 2
-        pile = np.zeros((_ROWS, columns), np.float32)
-        for at in alone.tolist():
-            cut = self._cuts[at]
-            first = (cut.shape[1] - columns) // 2
-            if first >= 0:
-                pile += cut[:, first : first + columns] / np.float32(255)
-            else:
-                pile[:, -first : -first + cut.shape[1]] += cut / np.float32(255)
-        pile /= max(len(alone), 1)
-        return Person(slope, level, ((pile + pile[:, ::-1]) / 2).astype(np.float32))
-
-
-def _scaled(region: Bools) -> Image:
-    """A region, 0 to 255, scaled to the height of templates, its middle in the middle of an even number of columns."""
-    import cv2
-
-    height, width = region.shape
-    scale = _ROWS / height
-    columns = int(np.ceil(width * scale)) // 2 * 2 + 2
-    matrix = np.array([[scale, 0, columns / 2 - scale * width / 2], [0, scale, 0]])
-    ink = np.where(region, np.float32(255), np.float32(0))
-    if scale < 1:
-        ink = np.asarray(cv2.blur(ink, (_odd(1 / scale),) * 2), np.float32)
-    return np.asarray(cv2.warpAffine(ink, matrix, (columns, _ROWS), flags=cv2.INTER_LINEAR), np.float32).astype(
-        np.uint8
-    )
-
-
-def _fit_height(foot: Floats, height: Floats, weight: Floats, picture_px: int) -> tuple[float, float]:
-    """Slope and level of the line of height over the row of feet that most regions follow (RANSAC)."""
-    rng = np.random.default_rng(0)
-    one, two = rng.integers(0, len(foot), (2, _DRAWS))
-    apart = foot[two] - foot[one]
-    is_apart = np.abs(apart) > _MIN_SPREAD * picture_px
-    slope = np.where(is_apart, (height[two] - height[one]) / np.where(is_apart, apart, 1.0), 0.0)
-    slope = np.maximum(slope, 0.0)  # who is farther away is not taller
-    level = height[one] - slope * foot[one]
-    expected = slope[:, None] * foot + level[:, None]
-    agrees = (expected > 0) & (np.abs(height - expected) < _TOLERANCE * expected)
-    best = agrees[int((agrees * weight).sum(axis=1).argmax())]
-    if np.ptp(foot[best]) > 2 * _MIN_SPREAD * picture_px:
-        fitted, at_zero = np.polyfit(foot[best], height[best], 1, w=1 / height[best])
-        if fitted >= 0:
-            return float(fitted), float(at_zero)
-    return 0.0, float(np.median(height[best]))
-
-
-def _mode(values: Floats) -> float:
-    """The half-sample mode: the densest place of values, robust against most of them lying elsewhere."""
-    values = np.sort(values)
-    while len(values) > 2:
-        half = (len(values) + 1) // 2
-        first = int(np.argmin(values[half - 1 :] - values[: len(values) - half + 1]))
-        values = values[first : first + half]
-    return float(values.mean())
 
 
 class Separator:
@@ -227,21 +48,21 @@ class Separator:
         self._least = least_visible * float((shape * self._hit + (1 - shape) * self._miss).sum())
         wide = np.flatnonzero(shape.max(axis=0) > 0.35)
         self._half = (wide[-1] - wide[0] + 1) / 2 if len(wide) else self._columns / 4
-        self._anchor = (self._columns // 2, _ROWS - 1)
+        self._anchor = (self._columns // 2, ROWS - 1)
 
     def boxes(self, mask: Image) -> Floats:
         """Boxes (N, 4) of people in a mask."""
         import cv2
 
         height, width = mask.shape
-        join_px = _odd(_JOIN * self._person.height(0.6 * height))
+        join_px = odd(JOIN * self._person.height(0.6 * height))
         x, y, w, h = cv2.boundingRect(mask)  # all that follows costs time for each pixel
         if not w:
             return np.empty((0, 4))
-        labels, found = _regions(np.ascontiguousarray(mask[y : y + h, x : x + w]), join_px)
+        labels, found = regions(np.ascontiguousarray(mask[y : y + h, x : x + w]), join_px)
         found += (x, y, 0, 0, 0)
         expected = np.array([self._person.height(foot) for foot in (found[:, 1] + found[:, 3]).tolist()])
-        is_large = (found[:, 4] >= MIN_AREA_PX) & (found[:, 4] >= _MIN_AREA * expected**2)
+        is_large = (found[:, 4] >= MIN_AREA_PX) & (found[:, 4] >= MIN_AREA * expected**2)
         numbers = np.flatnonzero(is_large)
         boxes: list[tuple[float, float, float, float]] = []
         for members in _joined_parts(found[numbers], expected[numbers]):
@@ -249,9 +70,9 @@ class Separator:
             x0, y0 = some[:, :2].min(axis=0).tolist()
             x1, y1 = (some[:, :2] + some[:, 2:4]).max(axis=0).tolist()
             tall, wide, high = self._person.height(y1), x1 - x0, y1 - y0
-            if len(members) == 1 and high <= _TALL * tall and wide <= 2 * _WIDE * self._half / _ROWS * tall:
+            if len(members) == 1 and high <= _TALL * tall and wide <= 2 * _WIDE * self._half / ROWS * tall:
                 is_cut = x0 <= 1 or y0 <= 1 or x1 >= width - 1 or y1 >= height - 1
-                if is_cut or some[0, 4] >= 3 * _MIN_AREA * tall**2 or high >= 0.5 * tall:
+                if is_cut or some[0, 4] >= 3 * MIN_AREA * tall**2 or high >= 0.5 * tall:
                     boxes.append((x0, y0, wide, high))
                 continue
             region = np.isin(labels[y0 - y : y1 - y, x0 - x : x1 - x], numbers[members] + 1) & (mask[y0:y1, x0:x1] > 0)
@@ -264,14 +85,14 @@ class Separator:
         """Boxes of the people in a region of a picture of this size (width, height), at x0, y0."""
         h, w = region.shape
         tall = self._person.height(y0 + h)
-        scale = _ROWS / self._person.height(y0 + h - max(h - tall, 0) / 4)
-        crop = _Crop(region, scale, (self._columns // 2 + 1, _ROWS // 2))
+        scale = ROWS / self._person.height(y0 + h - max(h - tall, 0) / 4)
+        crop = _Crop(region, scale, (self._columns // 2 + 1, ROWS // 2))
         ink = crop.ink
         unknown = crop.beyond(x0, y0, size)
         paper = self._filter(np.where(unknown, np.float32(0), 1 - ink), self._miss)
         people = self._places(ink, paper)
         if not people:
-            if (0.4 * tall <= h <= 1.5 * tall and w < tall) or h * w > 4 * self._half / _ROWS * tall**2:
+            if (0.4 * tall <= h <= 1.5 * tall and w < tall) or h * w > 4 * self._half / ROWS * tall**2:
                 yield x0, y0, w, h
             return
         drawn = np.zeros((len(people), *ink.shape), np.float32)
@@ -291,13 +112,13 @@ class Separator:
             if len(own) >= body:
                 seen = np.percentile(own, (3, 97))
                 left, right = (left + float(seen[0])) / 2, (right + float(seen[1]) + 1) / 2
-            a, b = crop.to_picture(left, row - _ROWS + 1)
+            a, b = crop.to_picture(left, row - ROWS + 1)
             c, d = crop.to_picture(right, row + 1)
             a, b, c, d = max(a + x0, 0), max(b + y0, 0), min(c + x0, size[0]), min(d + y0, size[1])
             if c > a and d > b:
                 yield a, b, c - a, d - b
 
-    def _places(self, ink: _Map, paper: _Map) -> list[tuple[int, int]]:
+    def _places(self, ink: Map, paper: Map) -> list[tuple[int, int]]:
         """Column and row of the feet of the people who explain the ink."""
         people: list[tuple[int, int]] = []
         most = int(np.ceil(ink.sum() / (0.4 * self._shape.sum()))) + 1
@@ -321,13 +142,13 @@ class Separator:
                 break
         return people
 
-    def _best(self, ink: _Map, paper: _Map, others: Sequence[tuple[int, int]]) -> tuple[tuple[int, int], float]:
+    def _best(self, ink: Map, paper: Map, others: Sequence[tuple[int, int]]) -> tuple[tuple[int, int], float]:
         """The best place of another person, and the log-likelihood that is gained."""
         gains = self._gains(ink, paper, others)
         row, column = divmod(int(gains.argmax()), gains.shape[1])
         return (column, row), float(gains[row, column])
 
-    def _gains(self, ink: _Map, paper: _Map, others: Sequence[tuple[int, int]]) -> _Map:
+    def _gains(self, ink: Map, paper: Map, others: Sequence[tuple[int, int]]) -> Map:
         """The log-likelihood that a person adds at each place, beside others."""
         left = ink.copy()
         for place in others:
@@ -335,17 +156,17 @@ class Separator:
             left[where] *= 1 - shape
         return self._filter(left, self._hit) + paper
 
-    def _filter(self, image: _Map, kernel: _Map) -> _Map:
+    def _filter(self, image: Map, kernel: Map) -> Map:
         import cv2
 
         return np.asarray(
             cv2.filter2D(image, -1, kernel, anchor=self._anchor, borderType=cv2.BORDER_CONSTANT), np.float32
         )
 
-    def _patch(self, place: tuple[int, int], size: tuple[int, ...]) -> tuple[tuple[slice, slice], _Map]:
+    def _patch(self, place: tuple[int, int], size: tuple[int, ...]) -> tuple[tuple[slice, slice], Map]:
         """Where a person's shape lies in a crop, and the part of the shape that lies there."""
-        x, y = place[0] - self._columns // 2, place[1] - _ROWS + 1
-        x0, x1, y0, y1 = max(x, 0), min(x + self._columns, size[1]), max(y, 0), min(y + _ROWS, size[0])
+        x, y = place[0] - self._columns // 2, place[1] - ROWS + 1
+        x0, x1, y0, y1 = max(x, 0), min(x + self._columns, size[1]), max(y, 0), min(y + ROWS, size[0])
         return (slice(y0, y1), slice(x0, x1)), self._shape[y0 - y : y1 - y, x0 - x : x1 - x]
 
 
@@ -359,12 +180,12 @@ class _Crop:
         columns, rows = (int(np.ceil(n * scale)) + 2 * m for n, m in zip(region.shape[::-1], margin, strict=True))
         ink = region.astype(np.float32)
         if scale < 0.7:
-            ink = np.asarray(cv2.blur(ink, (_odd(1 / scale),) * 2, borderType=cv2.BORDER_CONSTANT), np.float32)
+            ink = np.asarray(cv2.blur(ink, (odd(1 / scale),) * 2, borderType=cv2.BORDER_CONSTANT), np.float32)
         # Pixels are areas: the middle of the first one lies half a pixel from the edge, at any scale.
         middle = (scale - 1) / 2
         matrix = np.array([[scale, 0, margin[0] + middle], [0, scale, margin[1] + middle]])
         #: How much of each pixel is foreground, 0 to 1.
-        self.ink: _Map = np.asarray(cv2.warpAffine(ink, matrix, (columns, rows), flags=cv2.INTER_LINEAR), np.float32)
+        self.ink: Map = np.asarray(cv2.warpAffine(ink, matrix, (columns, rows), flags=cv2.INTER_LINEAR), np.float32)
 
     def to_picture(self, column: float, row: float) -> tuple[float, float]:
         """A point of the crop, in pixels from the corner of the region."""
