@@ -90,6 +90,7 @@ def on_recording(path: Path, elsewhere: Path) -> dict[str, list[object]]:
         "ingest": [truth, "--into", path],
         "run": [path],
         "detect": [path, "--detector", "frame-difference"],
+        "motion": [path],
         "track": [path],
         "sample": [path],
         "predict": [path, "--predictor", "cv"],
@@ -108,6 +109,7 @@ def on_recording(path: Path, elsewhere: Path) -> dict[str, list[object]]:
         "view": [],  # serves until it is interrupted, and opens the log like all others
         "train": [],  # needs torch, and opens logs like all others
         "demo": [],  # takes no log
+        "models": [],  # takes no log
         "docs": [],
     }
 
