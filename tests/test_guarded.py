@@ -284,6 +284,8 @@ def test_a_forecast_may_be_of_any_numbers(kind):
         ({"result": ([[1], [2, 3]], COV)}, "gave what can't be read as numbers: ValueError"),
         ({"result": (MEAN, COV * np.nan)}, "gave numbers that are not finite"),
         ({"result": (MEAN, COV - 1)}, "gave covariances that are not symmetric with variances above 0"),
+        ({"result": (MEAN + 2e15, COV)}, "gave numbers beyond 1e+15 (metres, and their squares)"),
+        ({"result": (MEAN, COV * 1e300)}, "gave numbers beyond 1e+15"),
         ({"result": KeyError("x")}, "failed on 1 track: KeyError: 'x'"),
         ({"result": SystemExit(0)}, "could not be made with steps, step_s: SystemExit: 0"),
         ({"past": 10**9}, "has steps=2, step_s=0.5, past=1000000000; all have to be above 0, steps and past at most 10000"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import shutil
 import sys
 from collections.abc import Iterator
@@ -235,11 +236,74 @@ def test_a_log_cannot_have_a_module_imported(place):
     del sys.modules["beside_the_log"]
     refused = call("run", "a.mcap", "--no-tables", "--force")
     assert refused.code == 1
-    assert "imported only if you name it, as in `mcaptrack run a.mcap --tracker beside_the_log:Single`" in refused.err
+    assert (
+        "imported only if you name it, as in `mcaptrack run a.mcap --force --tracker beside_the_log:Single`"
+        in refused.err
+    )
     assert "beside_the_log" not in sys.modules
     done("run", "a.mcap", "--no-tables", "--force", "-q", "--tracker", "beside_the_log:Single")
     assert made("/camera/tracks").parameters["tracker"] == "beside_the_log:Single"
     del sys.modules["beside_the_log"]
+
+
+def test_all_classes_that_have_to_be_named_are_named_at_once(place):
+    """Whichever of them the user names, the proposal names all, and works."""
+    (place / "beside_the_log.py").write_text(MODULE)
+    names = {"detector": "Corner", "tracker": "Single", "predictor": "Standing"}
+    given = {kind: f"beside_the_log:{name}" for kind, name in names.items()}
+    words = {kind: [f"--{kind}", name] for kind, name in given.items()}
+    for command, kind in (("detect", "detector"), ("track", "tracker"), ("predict", "predictor")):
+        done(command, "a.mcap", *words[kind], "-q")
+    before = {topic: made(topic) for topic in ("/camera/detections", "/camera/tracks", "/camera/predictions")}
+    for kinds in ([], ["tracker"], ["predictor", "detector"]):
+        sys.modules.pop("beside_the_log", None)
+        named = [word for kind in kinds for word in words[kind]]
+        refused = call("run", "a.mcap", "--no-tables", "--force", *named)
+        assert (refused.code, refused.err.count("\n")) == (1, 1)
+        why, proposal, _ = refused.err.split("`")
+        proposed = shlex.split(proposal)
+        assert proposed[:4] == ["mcaptrack", "run", "a.mcap", "--force"]
+        assert dict(zip(proposed[4::2], proposed[5::2], strict=True)) == {f"--{k}": n for k, n in given.items()}
+        assert [f"{kind} {name}" in why for kind, name in given.items()] == [kind not in kinds for kind in given]
+    done(*proposed[1:], "--no-tables", "-q")
+    assert {topic: made(topic) for topic in before} == before
+    del sys.modules["beside_the_log"]
+
+
+@pytest.mark.parametrize("name", ["__main__:Single", "own:maker.<locals>.Single"])
+def test_a_class_that_cannot_be_imported_is_not_proposed_by_name(name):
+    plugin = Plugin(name, name, "", "")
+    with pytest.raises(
+        MissingPluginError, match=r"can't be imported; run it again from Python with that class"
+    ) as told:
+        rebuild(STAGES["track"], Provenance("track", {"tracker": name}, plugins={"transform": plugin}), {})
+    assert not told.value.options
+
+
+def test_tune_names_a_tracker_that_fails(place):
+    """In a run, when it is made with values to try, and at the ends of a range."""
+    (place / "gt.txt").write_text("".join(f"{n},1,10,10,5,5,1,-1,-1,-1\n" for n in range(1, 9)))
+    words = ("tune", "gt.txt", "--truth", "gt.txt", "--fps", "10", "--tracker", "single", "--trials", "2", "-q")
+    text = MODULE.replace('"the id", least=0', '"the id", least=0, search=(0, 9)')
+    install(text=text)
+    done(*words)
+    fails = "    def __post_init__(self):\n        if self.track_id != 7: raise RuntimeError('seven only')\n\n    def __call__"
+    start = text.index("class Single")
+    for old, new, said, more in (
+        ("count = len(first)", "count = 1 / 0", "failed at frame 0 (0 ns): ZeroDivisionError", ()),
+        ("yield (frame._replace(rows=rows),)", "yield rows", "gave a ndarray at frame 0 (0 ns)", ()),
+        ("    def __call__", fails, "could not be made with {'track_id': ", ()),
+        (
+            "    def __call__",
+            fails,
+            "could not be made with the ends of --search: RuntimeError",
+            ("--search", "track-id=1:2"),
+        ),
+    ):
+        install(text=text[:start] + text[start:].replace(old, new, 1))
+        refused = call(*words, "--force", *more)
+        assert (refused.code, refused.err.count("\n")) == (1, 1), refused.err
+        assert f"tracker single (own 1.5) {said}" in refused.err
 
 
 class TestOptionsOfPredictors:
@@ -392,8 +456,10 @@ def test_wrong_options_are_refused_in_one_line(place, words, code, said):
         ("    def __call__", "    def __post_init__(self): raise SystemExit(0)\n\n    def __call__", "could not be made: SystemExit: 0"),
         ("yield (frame._replace(rows=rows),)", "yield frame._replace(rows=rows)", "gave a Frame at frame 0 (0 ns); it has to yield a tuple"),
         ("option(7, ", "option(-7, ", "track_id has to be from 0 to 1000000, not -7"),
+        ('option((1.0,), "factors', 'option((float("inf"),), "factors', "scales has to be finite, which inf is not"),
+        ('option((1.0,), "factors', 'option((float("nan"),), "factors', "scales has to be a number, not nan"),
     ],
-    ids=["raises", "exits", "exits at once", "no tuple", "default"],
+    ids=["raises", "exits", "exits at once", "no tuple", "default", "infinite", "not a number"],
 )  # fmt: skip
 def test_a_tracker_that_goes_wrong_is_named_in_one_line(place, old, new, said):
     assert old in MODULE

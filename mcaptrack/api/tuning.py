@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -21,6 +22,7 @@ from mcaptrack.evaluation.aligned import Similarity
 from mcaptrack.evaluation.tuning import Metric, Range, Task, Trial, declared_ranges, uses_optuna
 from mcaptrack.geometry.plane import Point
 from mcaptrack.notices import Notice, collected
+from mcaptrack.registry import blamed
 from mcaptrack.schema import DETECTIONS
 from mcaptrack.tables.compared import detections_and_ground_truth, pair_files
 from mcaptrack.transforms import STAGES, Transform
@@ -166,7 +168,10 @@ def tune(
     if tracker is not None and not has_tracker:
         raise McaptrackError(f"the stage {stage} has no tracker; leave `tracker=` out")
     base = transform_of(stage, tracker, {})
-    ranges = _ranges(type(base), search)
+    is_own = STAGES[stage].is_built_in(type(base))
+    entry = None if is_own else STAGES[stage].entry(type(base))
+    with blamed(entry, "could not be made with the ends of `search=`") if entry else nullcontext():
+        ranges = _ranges(type(base), search)
     chosen: Similarity = similarity or ("iou" if has_tracker else "metres")
     scoring = EvaluateOptions(similarities=(chosen,), gates_m=(gate_m,), min_iou=min_iou)
     notes, trials_file = Notes(), optional_path(study)
@@ -192,7 +197,16 @@ def tune(
                 detail(f"trial {trial.number}: {metric} {trial.scores[metric]:.4f} {values}".rstrip())
 
         first, best = searching.tune(
-            base, tasks, ranges, scoring, metric=metric, trials=trials, seed=seed, study=trials_file, on_trial=tell
+            base,
+            tasks,
+            ranges,
+            scoring,
+            metric=metric,
+            trials=trials,
+            seed=seed,
+            study=trials_file,
+            on_trial=tell,
+            entry=entry,
         )
     settings = ({"tracker": tracker or "sort"} if has_tracker else {}) | dict(best.parameters)
     return TuneResult(

@@ -11,6 +11,7 @@ import hashlib
 import json
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Final, Literal, Protocol, get_type_hints
@@ -19,8 +20,10 @@ import numpy as np
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation import Candidate, EvaluateOptions, EvaluationInput, evaluate
+from mcaptrack.registry import Entry, blamed
 from mcaptrack.schema import Frame
 from mcaptrack.transforms import Transform
+from mcaptrack.transforms.guarded import guarded
 from mcaptrack.transforms.protocol import bare_type
 
 Metric = Literal["IDF1", "MOTA", "HOTA", "IDP", "IDR", "DetA", "AssA"]
@@ -86,6 +89,7 @@ def tune(
     seed: int = 0,
     study: Path | None = None,
     on_trial: Callable[[Trial, Trial, int], None] = lambda *_: None,
+    entry: Entry | None = None,
 ) -> tuple[Trial, Trial]:
     """Search parameters, and return the first trial (``base`` unchanged) and the best; the earliest of equals.
 
@@ -106,11 +110,13 @@ def tune(
         A file of earlier trials, to which new ones are appended.
     on_trial : callable
         Called with each new trial, the best so far and the number of trials.
+    entry : Entry, optional
+        The entry of a transform of another package, whose outputs are checked and whose errors name it.
 
     Raises
     ------
     McaptrackError
-        If there are no ranges, or if ``study`` belongs to another search.
+        If there are no ranges, if ``study`` belongs to another search, or if a transform of another package fails.
     """
     if not ranges:
         raise McaptrackError(f"{type(base).__name__.lower()} declares no ranges to search in")
@@ -120,7 +126,9 @@ def tune(
     while len(made) < trials:
         number = len(made)
         parameters = {} if number == 0 else propose.ask(number)
-        trial = Trial(number, parameters, trial_scores(replace(base, **parameters), tasks, scoring))
+        with blamed(entry, f"could not be made with {parameters}") if entry else nullcontext():
+            transform = replace(base, **parameters)
+        trial = Trial(number, parameters, trial_scores(transform, tasks, scoring, entry))
         propose.tell(trial)
         known.add(trial)
         on_trial(trial, _best(made, metric), trials)
@@ -131,12 +139,17 @@ def _best(made: Sequence[Trial], metric: str) -> Trial:
     return max(made, key=lambda trial: trial.scores[metric])
 
 
-def trial_scores(transform: Transform, tasks: Sequence[Task], scoring: EvaluateOptions) -> dict[str, float]:
-    """The scores of a transform's main output, over all sequences together."""
+def trial_scores(
+    transform: Transform, tasks: Sequence[Task], scoring: EvaluateOptions, entry: Entry | None = None
+) -> dict[str, float]:
+    """The scores of a transform's main output, over all sequences together; ``entry`` as in ``tune``."""
 
     def sequences() -> Iterator[EvaluationInput]:
         for task in tasks:
-            out = [result[0] for result in replace(transform, **task.context)(task.frames)]
+            known = replace(transform, **task.context)
+            results = guarded(entry, known, task.frames) if entry else known(task.frames)
+            main = list(known.writes).index("")
+            out = [result[main] for result in results]
             yield EvaluationInput(task.name, task.ground_truth, [Candidate("tracks", None, out)])
 
     row = evaluate(sequences(), scoring).results[-1].to_json()

@@ -121,10 +121,13 @@ class _Planner:
         self._camera_motion = camera_motion
         self._changes: dict[str, bool] = {}
         self._said: list[str] = []
+        self._unnamed: dict[str, MissingPluginError] = {}
         self._differing: set[str] = set()
 
     def checked(self, say: Say) -> list[Job]:
         """Check the jobs and return them; only after that report which run and why."""
+        if self._unnamed:
+            raise McaptrackError(self._refusal())
         check_inputs(self._opened, self._prefix, self.jobs)
         for words in self._said:
             say(words)
@@ -247,8 +250,11 @@ class _Planner:
             return False
         transform = wanted if self._anew or is_replaced else before
         if transform is None:
+            if isinstance(why_not, MissingPluginError) and why_not.options:
+                self._unnamed[topic] = why_not
+                return True
             if is_missing or source != had or isinstance(why_not, MissingPluginError):
-                raise McaptrackError(self._refusal(topic, source, why_not))
+                raise McaptrackError(f"{self._opened.path}: {topic} can't be made from {source}: {why_not}")
             why = "is out of date and" if is_due else "is not made again, it"
             warn(f"{topic} {why} stays as it is: {why_not}", "out-of-date" if is_due else "left-out")
             return False
@@ -285,13 +291,19 @@ class _Planner:
         except McaptrackError as error:
             return None, error
 
-    def _refusal(self, topic: str, source: str, why_not: McaptrackError | None) -> str:
-        """Return the message for a channel that can't be made again: the reason, and what to do."""
-        words = f"{self._opened.path}: {topic} can't be made from {source}: {why_not}"
-        if not isinstance(why_not, MissingPluginError) or not why_not.options:
-            return words
-        again = call("run", self._opened.path, **why_not.options)
-        return f"{words}, as in {again}; another name replaces what it made"
+    def _refusal(self) -> str:
+        """Return the message for channels that can't be made again: all classes to name, and a call that names them."""
+        options: dict[str, Any] = {"force": True} if self._anew else {}
+        for name, transform in self._defaults.items():
+            if (option := STAGES[name].option) and option in self._chosen:
+                options[option] = STAGES[name].choice(transform)
+        found: dict[str, str] = {}  # by what has to be named, the first channel that it made
+        for topic, error in self._unnamed.items():
+            found.setdefault(str(error), topic)
+            options |= error.options
+        why = "; ".join(f"{topic} can't be made again: {error}" for error, topic in found.items())
+        again = call("run", self._opened.path, **options)
+        return f"{self._opened.path}: {why}, as in {again}; another name replaces what it made"
 
     def _warn_of_settings(self, main: str, differing: str) -> None:
         """Warn, once for all outputs of a stage, that they were made with other settings."""

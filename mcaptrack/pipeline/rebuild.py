@@ -115,6 +115,11 @@ def _installed(kind: Any, plugin: Plugin) -> Entry:
     """Return the registry's entry for a plug-in. Raises MissingPluginError if it may not or can't be imported."""
     named = _name_with_package(kind, plugin)
     if ":" in plugin.name:
+        if plugin.name.startswith("__main__:") or "<locals>" in plugin.name:  # of a script, a notebook or a function
+            raise MissingPluginError(
+                f"{words} made it, which can't be imported; run it again from Python with that class, or replace it "
+                f"with another `{kind}=`"
+            )
         why = "a class without an entry point is imported only if you name it"
         raise MissingPluginError(f"{named} made it, and {why}", **{kind: plugin.name})
     if not is_installed(kind, plugin.name):

@@ -21,6 +21,8 @@ Floats = NDArray[np.float64]
 _WRONG = (TypeError, ValueError, OverflowError)
 #: More steps than anything predicts or looks at; arrays of more do not fit into memory.
 _MOST: Final = 10_000
+#: Beyond the square of any distance on Earth; distances and likelihoods of larger numbers overflow.
+_LARGEST: Final = 1e15
 
 
 @dataclass(frozen=True)
@@ -81,6 +83,8 @@ class CheckedPredictor:
             )
         if not (np.isfinite(mean).all() and np.isfinite(cov).all()):
             raise McaptrackError(f"{self.entry} gave numbers that are not finite")
+        if max(np.abs(mean).max(), np.abs(cov).max()) > _LARGEST:
+            raise McaptrackError(f"{self.entry} gave numbers beyond {_LARGEST:g} (metres, and their squares)")
         if not are_covariances(cov):
             raise McaptrackError(f"{self.entry} gave covariances that are not symmetric with variances above 0")
         return Forecast(mean, cov)

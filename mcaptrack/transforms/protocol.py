@@ -253,6 +253,8 @@ def _check_value(name: str, value: Any, kind: Any, about: Mapping[str, Any]) -> 
         return
     if not isinstance(value, _KINDS[kind]) or (isinstance(value, bool) and kind is not bool):
         raise McaptrackError(f"{name} needs {kind.__name__}, not {value!r}")
+    if value in (math.inf, -math.inf):
+        raise McaptrackError(f"{name} has to be finite, which {value} is not; None may stand for no limit")
     least, most = about.get("least", -math.inf), about.get("most", math.inf)
     if kind in (int, float) and not least <= value <= most:
         raise McaptrackError(f"{name} has to be {limits(least, most) or 'a number'}, not {value}")
