@@ -8,6 +8,7 @@ import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -16,6 +17,8 @@ from typer.testing import CliRunner
 
 import mcaptrack
 from mcaptrack import log, pipeline, tables
+from mcaptrack.api.outputs import ReportResult
+from mcaptrack.api.scoring import Scores
 from mcaptrack.cli import app
 from mcaptrack.errors import McaptrackError
 from mcaptrack.sources import ingest
@@ -262,3 +265,36 @@ def test_the_document_runs_from_top_to_bottom(tmp_path, monkeypatch):
             name: row[name] for name in row if name in said
         }
         assert (row["recall"] is None) == ("displacement" not in result)
+
+
+def test_topics_and_names_are_text(tmp_path):
+    with mcaptrack.open(some_log(tmp_path / "a.mcap")) as opened:
+        with pytest.raises(McaptrackError, match=r"^`topic=` is text, not None$"):
+            opened.frames(topic=None)
+        with pytest.raises(McaptrackError, match=r"^`topic=` is text, not \['/x'\]$"):
+            opened.table("tracks", ["/x"])
+        assert opened.table("tracks", None).num_rows == opened.table("tracks").num_rows
+
+
+def test_results_are_shown_in_a_line(tmp_path):
+    info = mcaptrack.info(some_log(tmp_path / "a.mcap"))
+    assert repr(info) == f"LogInfo({str(info.log)!r}, {len(info.channels)} channels, {info.messages} messages)"
+    page = ReportResult(Path("page.html"), 12, {"many": [0] * 1000}, ())
+    assert repr(page) == f"ReportResult({str(page.page)!r}, 12 bytes)"
+    row = {
+        "sequence": "<a>",
+        "tracks": "/camera/tracks",
+        "similarity": "iou",
+        "gate": 0.5,
+        "HOTA": 0.5,
+        "MOTA": -0.25,
+        "IDF1": 1,
+    }
+    scores = Scores((SimpleNamespace(to_json=lambda: row),), (), ())  # type: ignore[arg-type]
+    assert repr(scores) == "Scores(1 results; `rows` returns them)"
+    shown = [
+        "".join(
+            f"<td>{cell}</td>" for cell in ("&lt;a&gt;", "/camera/tracks", "iou", 0.5, "0.5000", "-0.2500", "1.0000")
+        )
+    ]
+    assert re.findall(r"<tr>(<td>.*?)</tr>", scores._repr_html_()) == shown

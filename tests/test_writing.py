@@ -137,14 +137,24 @@ class TestDetections:
             ),
             (
                 {"boxes": [[1, 2, 3, 4]], "scores": [1, 2], "box_format": "xywh"},
-                r"1 boxes need score of shape \(1,\), not \(2,\)",
+                r"1 boxes need `scores=` of shape \(1,\), not \(2,\)",
             ),
             ({"boxes": [[1, 2, np.inf, 4]], "box_format": "xyxy"}, "box 0 has numbers that are missing or infinite"),
             ({"boxes": [[1, 2, 3, 4], [1, 2, 3]], "box_format": "xyxy"}, r"boxes are numbers of shape \(N, 4\): "),
             ({"boxes": ["abcd"], "box_format": "xyxy"}, "could not convert string to float"),
-            ({"boxes": [[1, 2, 3, 4]], "scores": ["high"], "box_format": "xywh"}, "score needs numbers"),
-            ({"boxes": [[1, 2, 3, 4]], "classes": ["person"], "box_format": "xywh"}, "class_id needs whole numbers"),
-            ({"boxes": [[1, 2, 3, 4]], "classes": [1.5], "box_format": "xywh"}, "class_id needs whole numbers"),
+            ({"boxes": [[1, 2, 3, 4]], "scores": ["high"], "box_format": "xywh"}, "`scores=` needs numbers"),
+            ({"boxes": [[1, 2, 3, 4]], "classes": ["person"], "box_format": "xywh"}, "`classes=` needs whole numbers"),
+            ({"boxes": [[1, 2, 3, 4]], "classes": [1.5], "box_format": "xywh"}, "`classes=` needs whole numbers"),
+            ({"boxes": np.ones((1, 4)) * 1j, "box_format": "xywh"}, "boxes are numbers .* there are complex numbers"),
+            ({"boxes": np.ones((1, 4)), "scores": np.ones(1) * 1j, "box_format": "xywh"}, "there are complex numbers"),
+            (
+                {"boxes": np.ma.masked_equal([[1, 2, 9, 4]], 9), "box_format": "xywh"},
+                "box 0 has numbers that are missing",
+            ),
+            (
+                {"boxes": [[1, 2, 3, 4]], "classes": np.ma.masked_equal([9], 9), "box_format": "xywh"},
+                "`classes=` needs whole numbers",
+            ),
             ({"boxes": [], "t_ns": 1.5, "box_format": "xyxy"}, r"`t_ns=` needs whole nanoseconds.* not 1.5 \(float\)"),
             ({"boxes": [], "t_ns": "2026-05-01", "box_format": "xyxy"}, "`t_ns=` needs whole nanoseconds"),
             ({"boxes": [], "t_ns": -1, "box_format": "xyxy"}, "from 0 to 9223372036854775807, not -1"),
@@ -161,6 +171,11 @@ class TestDetections:
         time = np.datetime64(1_700_000_000_000_000_001, "ns")
         frame = mcaptrack.detections(np.ones((1, 4), np.float16), None, np.ones(1, np.float32), time, box_format="xywh")
         assert (frame.t_ns, frame.rows["class_id"].tolist()) == (1_700_000_000_000_000_001, [1])
+
+    def test_masked_scores_are_missing_and_a_mask_of_nothing_changes_nothing(self):
+        boxes, scores = np.ma.masked_equal([[1, 2, 3, 4], [5, 6, 7, 8]], 0), np.ma.masked_greater([0.5, 0.9], 0.8)
+        rows = mcaptrack.detections(boxes, scores, box_format="xywh").rows
+        assert (rows["x_px"].tolist(), rows["score"][0], np.isnan(rows["score"][1])) == ([1, 5], 0.5, True)
 
 
 class TestWriting:
@@ -280,6 +295,11 @@ class TestWriting:
             ("/camera/tracks", table(track_id=[1, -1]), "row 0 of the frame at 5 ns has a negative track_id"),
             ("/camera/tracks", table(track_id=[1, 2], x_m=[1, 2]), "a part of a box or of a position"),
             ("/camera/tracks", table(track_id=[1, 2], w_px=[1, np.nan]), "a part of a box or of a position"),
+            (
+                "/camera/tracks",
+                table(track_id=[1, 2], **dict.fromkeys(("y_px", "w_px", "h_px"), [np.nan] * 2)),
+                "a part of a box",
+            ),
             (
                 "/camera/tracks",
                 np.array([(0, 1)], [("t_ns", int), ("track_id", int)]),

@@ -48,6 +48,8 @@ def checked(**ranges: tuple[float, float]) -> Callable[[Callable[P, T]], Callabl
                 choices = [choice for kind in kinds if get_origin(kind) is Literal for choice in get_args(kind)]
                 if choices:
                     _check_choice(name, value, choices)
+                if kinds and set(kinds) <= {str, type(None)} and not isinstance(value, tuple(kinds)):
+                    raise McaptrackError(f"`{name}=` is text, not {value!r:.40}")
                 if name in ranges:
                     _check_range(name, value, ranges[name], is_whole=float not in kinds)
                 if name == "progress" and not callable(value):

@@ -37,19 +37,26 @@ def frame_of(schema: Schema, boxes: Floats, given: Mapping[str, Any], t_ns: int 
         if values is None:
             continue
         try:
-            array = np.asarray(values, np.float64 if name == "score" else None)
+            array = _floats(values) if name == "score" else np.asarray(_unmasked(values))
         except (TypeError, ValueError) as error:
-            raise McaptrackError(f"{name} needs numbers of shape (N,): {_line(error)}") from None
+            raise McaptrackError(f"{_named(name)} needs numbers of shape (N,): {_line(error)}") from None
         if array.shape != (len(boxes),):
-            raise McaptrackError(f"{len(boxes)} boxes need {name} of shape ({len(boxes)},), not {array.shape}")
+            raise McaptrackError(f"{len(boxes)} boxes need {_named(name)} of shape ({len(boxes)},), not {array.shape}")
         columns[name] = array
     time, number = time_of(t_ns), number_of(index)
-    rows = _rows(schema, columns, len(boxes), f"the frame at {time} ns")
+    try:
+        rows = _rows(schema, columns, len(boxes), f"the frame at {time} ns")
+    except McaptrackError as error:
+        words = str(error)
+        for name in given:
+            words = words.replace(f"{schema.name}.{name} ", f"{_named(name)} ")
+        raise McaptrackError(words) from None
     return Frame(time, number, rows)
 
 
 def frames_of_columns(columns: dict[str, Any], schema: Schema | None) -> tuple[Schema, list[Frame]]:
     """Frames of a table: rows of the same ``t_ns`` and ``frame`` are a frame."""
+    columns = {name: _unmasked(values) for name, values in columns.items()}
     if "t_ns" not in columns:
         raise McaptrackError(f"the table has no column t_ns (times in nanoseconds); it has {', '.join(columns)}")
     schema = schema or (TRACKS if "track_id" in columns else DETECTIONS)
@@ -174,7 +181,7 @@ def _whole(values: Any) -> Any:
 def boxes_of(boxes: Any, box_format: BoxFormat) -> Floats:
     """Boxes (N, 4) as left, top, width, height."""
     try:
-        array = np.asarray(boxes, np.float64)
+        array = _floats(boxes)
     except (TypeError, ValueError) as error:
         raise McaptrackError(f"boxes are numbers of shape (N, 4): {_line(error)}") from None
     array = array.reshape(0, 4) if array.shape in ((0,), (0, 0)) else array
@@ -194,6 +201,26 @@ def boxes_of(boxes: Any, box_format: BoxFormat) -> Floats:
             f"box {wrong.argmax()} has a negative size: {array[wrong][0].tolist()} read as {box_format}"
         )
     return xywh
+
+
+def _floats(values: Any) -> Floats:
+    """Numbers; NaN where they are masked. Raises TypeError or ValueError for anything else."""
+    if np.iscomplexobj(values):
+        raise TypeError("there are complex numbers")
+    return np.asarray(_unmasked(values), np.float64)
+
+
+def _unmasked(values: Any) -> Any:
+    """An array without a mask: NaN where numbers are masked."""
+    if not isinstance(values, np.ma.MaskedArray):
+        return values
+    is_missing = values.dtype.kind in "fiub" and np.ma.getmaskarray(values).any()
+    return values.astype(np.float64).filled(np.nan) if is_missing else values.data
+
+
+def _named(column: str) -> str:
+    """The parameter of ``mcaptrack.detections`` that gives a column."""
+    return {"score": "`scores=`", "class_id": "`classes=`"}.get(column, column)
 
 
 def kind_of(value: Any) -> str:

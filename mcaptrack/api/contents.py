@@ -97,6 +97,9 @@ class LogInfo:
     channels: tuple[ChannelInfo, ...]
     warnings: tuple[Notice, ...]
 
+    def __repr__(self) -> str:
+        return f"LogInfo({str(self.log)!r}, {len(self.channels)} channels, {self.messages} messages)"
+
     def to_json(self) -> dict[str, Any]:
         """Return all but the warnings as values of JSON.
 

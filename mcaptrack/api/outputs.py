@@ -151,6 +151,9 @@ class ReportResult:
     data: Mapping[str, Any]
     warnings: tuple[Notice, ...]
 
+    def __repr__(self) -> str:
+        return f"ReportResult({str(self.page)!r}, {self.size} bytes)"
+
 
 @checked()
 def report(

@@ -109,6 +109,7 @@ class Recording:
         """The topics of all channels, in alphabetical order."""
         return tuple(sorted(self._there.channels))
 
+    @checked()
     def table(self, name: str, topic: str | None = None) -> pa.Table:
         """Return a table as Arrow: the same as in the files that ``export`` writes, with the column ``recording``.
 

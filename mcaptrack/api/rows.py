@@ -148,6 +148,10 @@ def _frame(one: Any, schema: Schema | None) -> Frame:
     if isinstance(one, Frame):
         if not isinstance(one.rows, np.ndarray):
             raise McaptrackError(f"the rows of a frame are a structured array, not {kind_of(one.rows)}")
+        if any(np.ma.getmaskarray(one.rows).tobytes()):
+            raise McaptrackError(
+                "the rows of a frame are masked; give frames without a mask, with NaN for missing numbers"
+            )
         return Frame(time_of(one.t_ns), number_of(one.index), one.rows)
     if isinstance(one, Sequence) and len(one) == 2 and is_supervision(one[1]):
         return frame_of_supervision(one[1], one[0], schema=schema)

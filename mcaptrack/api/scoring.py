@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from html import escape
 from itertools import count
 from pathlib import Path
 from typing import Any, Final
@@ -47,6 +48,9 @@ from mcaptrack.tables.compared import compare_files, pair_files
 #: Ends of names of files of tracks: of tables, which hold several channels, and of all.
 _TABLES: Final = (".parquet", ".pq")
 _FILES: Final = (".txt", ".csv", *_TABLES)
+#: What notebooks show of a result: what was compared, and its scores.
+_KEYS: Final = ("sequence", "tracks", "similarity", "gate")
+_SHOWN: Final = ("HOTA", "MOTA", "IDF1")
 #: The scores that a limit can be set for.
 LIMITS: Final = ("MOTA", "IDF1", "IDP", "IDR", "HOTA", "DetA", "AssA", "LocA")
 
@@ -70,6 +74,19 @@ class Scores:
     results: tuple[EvaluationRow, ...]
     notes: tuple[str, ...]
     warnings: tuple[Notice, ...]
+
+    def __repr__(self) -> str:
+        return f"Scores({len(self.results)} results; `rows` returns them)"
+
+    def _repr_html_(self) -> str:
+        """Return the main scores as a table, for notebooks."""
+        cells = [
+            [str(row[name]) for name in _KEYS] + [f"{row.get(name, float('nan')):.4f}" for name in _SHOWN]
+            for row in self.rows()
+        ]
+        lines = ["".join(f"<td>{escape(cell)}</td>" for cell in line) for line in cells]
+        head = "".join(f"<th>{name}</th>" for name in (*_KEYS, *_SHOWN))
+        return f"<table><tr>{head}</tr>{''.join(f'<tr>{line}</tr>' for line in lines)}</table>"
 
     def rows(self) -> list[dict[str, Any]]:
         """Return the results as dictionaries, for a ``pandas.DataFrame``.

@@ -146,7 +146,8 @@ def trial_scores(
 
     def sequences() -> Iterator[EvaluationInput]:
         for task in tasks:
-            known = replace(transform, **task.context)
+            names = {f.name for f in fields(transform)}
+            known = replace(transform, **{name: value for name, value in task.context.items() if name in names})
             results = guarded(entry, known, task.frames) if entry else known(task.frames)
             main = list(known.writes).index("")
             out = [result[main] for result in results]
