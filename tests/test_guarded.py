@@ -128,6 +128,7 @@ def test_a_buffer_that_is_used_again_does_not_change_earlier_frames():
         (one(rows=ROWS.reshape(1, -1)), "needs a structured array (N,), not an array of shape (1, 2) with columns"),
         (one(rows=np.zeros((2, 6))), "needs a structured array (N,), not an array of shape (2, 6) without columns"),
         (one(rows=changed(track_id=[7, 7])), "track_id 7 stands in 2 rows of one frame; a track has one"),
+        (one(rows=changed(track_id=[7, -1])), "mcaptrack.Tracks.track_id is -1 in row 1; ids are not below 0"),
         (one(rows=changed(w_px=[3, -2])), "mcaptrack.Tracks.w_px is -2 in row 1; sizes are not below 0"),
         (one(rows=changed(h_px=[-0.5, 2])), "mcaptrack.Tracks.h_px is -0.5 in row 0; sizes are not below 0"),
         (one(rows=changed(y_m=[0, np.inf])), "mcaptrack.Tracks.y_m is infinite in row 1"),
@@ -139,6 +140,17 @@ def test_what_can_not_be_is_refused_with_its_place(answer, said):
     assert str(refused.value).startswith("tracker mine (pack 1) gave ")
     assert said in str(refused.value)
     assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("scores", "said"),
+    [([0, 1], ""), ([np.nan, np.nan], ""), ([-0.5, np.nan], "from -0.5 to 1"), ([0.5, 90], "from 0 to 90")],
+)
+def test_scores_that_trackers_cannot_use_are_said_once(scores, said):
+    with collected() as warnings:
+        answers(one(rows=changed(score=scores)))
+    expected = f"tracker mine (pack 1) gave scores {said}; trackers that use them need scores from 0 to 1"
+    assert [(warning.code, warning.message) for warning in warnings] == ([("other", expected)] if said else [])
 
 
 def test_frames_that_are_left_out_are_counted():

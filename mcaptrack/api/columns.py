@@ -16,7 +16,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.clocks import LAST_NS
 from mcaptrack.notices import warn
-from mcaptrack.schema import DETECTIONS, TRACKS, Frame, Rows, Schema
+from mcaptrack.schema import DETECTIONS, SCORES_NEEDED, TRACKS, Frame, Rows, Schema
 
 BoxFormat = Literal["xyxy", "xywh"]
 #: The frame number of a frame that was not numbered; ``Recording.write`` gives it one.
@@ -123,7 +123,7 @@ def check_frames(schema: Schema, frames: Sequence[Frame]) -> None:
     odd = (rows["score"] < 0) | (rows["score"] > 1)
     if odd.any():
         low, high = np.nanmin(rows["score"]), np.nanmax(rows["score"])
-        warn(f"scores are from {low:g} to {high:g}; trackers that use them need scores from 0 to 1")
+        warn(f"scores are from {low:g} to {high:g}; {SCORES_NEEDED}")
 
 
 def time_of(t_ns: Any) -> int:

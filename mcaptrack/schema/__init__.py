@@ -215,6 +215,8 @@ class Schema:
 
 DETECTIONS: Final = Schema("mcaptrack.Detections")
 TRACKS: Final = Schema("mcaptrack.Tracks")
+#: What a warning of other scores ends with.
+SCORES_NEEDED: Final = "trackers that use them need scores from 0 to 1"
 PREDICTIONS: Final = Schema("mcaptrack.Predictions")
 GROUND_PLANE: Final = Schema("mcaptrack.GroundPlane")
 CAMERA_MOTION: Final = Schema("mcaptrack.CameraMotion")

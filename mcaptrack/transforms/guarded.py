@@ -11,7 +11,7 @@ import numpy as np
 from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import warn
 from mcaptrack.registry import Entry, failure, is_interruption
-from mcaptrack.schema import TRACKS, Frame, Rows, Schema
+from mcaptrack.schema import SCORES_NEEDED, TRACKS, Frame, Rows, Schema
 from mcaptrack.transforms.protocol import Transform, passes_of
 
 #: Kinds whose main output has one frame for each frame that is read, at its time and with its number.
@@ -48,6 +48,7 @@ def guarded(entry: Entry, transform: Transform, frames: Iterable[Frame]) -> Iter
     except BaseException as error:  # code of other packages may raise anything
         raise source.error_of(entry, error) from error
     last_ns: int | None = None
+    low, high = 0.0, 1.0
     while True:
         try:
             result = next(made)
@@ -62,8 +63,14 @@ def guarded(entry: Entry, transform: Transform, frames: Iterable[Frame]) -> Iter
                 f"{entry} gave frame {main.index} of {main.t_ns} ns {source.where}, which is not in its input or was "
                 "given before; it has to yield one frame for each, with the same t_ns and index"
             )
+        for frame in checked:
+            if "score" in (frame.rows.dtype.names or ()) and len(frame.rows):
+                low = float(np.fmin.reduce(frame.rows["score"], initial=low))
+                high = float(np.fmax.reduce(frame.rows["score"], initial=high))
         yield checked
         last_ns = checked[0].t_ns
+    if low < 0 or high > 1:
+        warn(f"{entry} gave scores from {low:g} to {high:g}; {SCORES_NEEDED}")
     if entry.kind in _ONE_FOR_EACH and (missing := source.unanswered()):
         warn(
             f"{entry} gave no frame for {missing} of {source.count}; a frame without rows says that nothing was there, "
@@ -170,6 +177,9 @@ def _problem(schema: Schema, rows: Rows) -> str:
             first = int((rows[name] < 0).argmax())
             return f"{schema.name}.{name} is {rows[name][first]:g} in row {first}; sizes are not below 0"
     if schema is TRACKS:
+        if (rows["track_id"] < 0).any():
+            first = int((rows["track_id"] < 0).argmax())
+            return f"{schema.name}.track_id is {rows['track_id'][first]} in row {first}; ids are not below 0"
         ids, counts = np.unique(rows["track_id"], return_counts=True)
         if (counts > 1).any():
             return f"track_id {ids[counts.argmax()]} stands in {counts.max()} rows of one frame; a track has one"
