@@ -117,7 +117,7 @@ def _installed(kind: Any, plugin: Plugin) -> Entry:
     if ":" in plugin.name:
         if plugin.name.startswith("__main__:") or "<locals>" in plugin.name:  # of a script, a notebook or a function
             raise MissingPluginError(
-                f"{words} made it, which can't be imported; run it again from Python with that class, or replace it "
+                f"{named} made it, which can't be imported; run it again from Python with that class, or replace it "
                 f"with another `{kind}=`"
             )
         why = "a class without an entry point is imported only if you name it"
