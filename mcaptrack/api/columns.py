@@ -215,7 +215,7 @@ def _unmasked(values: Any) -> Any:
     if not isinstance(values, np.ma.MaskedArray):
         return values
     is_missing = values.dtype.kind in "fiub" and np.ma.getmaskarray(values).any()
-    return values.astype(np.float64).filled(np.nan) if is_missing else values.data
+    return np.ma.filled(values.astype(np.float64), np.nan) if is_missing else values.data
 
 
 def _named(column: str) -> str:
