@@ -10,9 +10,10 @@ import pytest
 
 from mcaptrack.evaluation.metrics import Matchup, score, summary
 from mcaptrack.geometry import kalman
-from mcaptrack.geometry.affine import IDENTITY, move_boxes
+from mcaptrack.geometry.affine import IDENTITY, move_boxes, move_points
 from mcaptrack.geometry.boxes import columns_to_boxes, iou
 from mcaptrack.geometry.camera_path import CameraPath, Verdict, poses_of
+from mcaptrack.geometry.plane import GroundPlane, moved_planes, plane_at
 from mcaptrack.schema import DETECTIONS, Frame
 from mcaptrack.transforms import TRACKERS
 from tests.worlds import detections, ids, ns
@@ -161,3 +162,53 @@ def _scores(truth: np.ndarray, tracks: list[Frame]) -> tuple[float, int]:
         alike.append(iou(rows[:, 2:6], columns_to_boxes(frame.rows)))
     found = summary(score(Matchup(tuple(there), tuple(given), tuple(alike), 0.5, len(people), len(names))))
     return found["IDF1"], found["IDSW"]
+
+
+def plane(*shift: float) -> GroundPlane:
+    return GroundPlane((0.05, 0.0, *shift[:1], 0.0, -0.05, *shift[1:], 0.0, 0.0, 1.0), *SIZE, assumed=True)
+
+
+def test_a_plane_moves_with_the_camera():
+    """What stands still stands still in metres, also where the camera pans, rolls and zooms."""
+    rng, motions = np.random.default_rng(1), []
+    for _ in range(12):
+        turn, scale = np.deg2rad(rng.normal(0, 4)), np.exp(rng.normal(0, 0.05))
+        linear = scale * np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+        motions.append(np.column_stack([linear, rng.uniform(-60, 60, 2)]))
+    motions[0] = IDENTITY
+    path = CameraPath(10 * np.arange(12), poses_of(np.array(motions), *SIZE))
+    planes = moved_planes([(0, plane(1.0, 2.0))], path)
+    points = rng.uniform(0, 400, (5, 2))
+    wanted = plane(1.0, 2.0).pixels_to_metres(points)
+    for number, motion in enumerate(motions):
+        points = move_points(motion, points)
+        now = plane_at(planes, 10 * number + 5)
+        assert now.pixels_to_metres(points) == pytest.approx(wanted)
+        assert now.assumed
+    later = moved_planes([(0, plane(1.0, 2.0)), (60, plane(3.0, 4.0))], path)  # measured again at picture 6
+    assert plane_at(later, 50).homography == plane_at(planes, 50).homography
+    assert plane_at(later, 60) == plane(3.0, 4.0)
+    after = plane_at(later, 70).pixels_to_metres(move_points(motions[7], points))
+    assert after == pytest.approx(plane(3.0, 4.0).pixels_to_metres(points))
+
+
+def test_planes_of_a_still_camera_and_without_a_path_stay_as_they_are():
+    planes = [(0, plane(1.0, 2.0)), (50, plane(3.0, 4.0))]
+    still = CameraPath(10 * np.arange(12), poses_of(np.array([IDENTITY] * 12), *SIZE))
+    assert moved_planes(planes, None) is planes
+    assert moved_planes(planes, still) == planes
+    assert moved_planes((), still) == ()
+
+
+@every_tracker
+def test_people_who_stand_before_a_camera_that_moves_stand_in_metres(kind):
+    still = detections(lambda n: [(300, 200), (420, 260)], 40)
+    seen, path = moved(still, np.array([[[1.0, 0, -9.0], [0, 1, 2.0]]] * 40))
+    planes = ((0, plane(0.0, 0.0)),)
+    for tracker, spread in (
+        (kind(min_hits_s=0.0, camera_path=path, ground_planes=planes), 0.0),
+        (kind(min_hits_s=0.0, camera_path=path, ground_planes=planes, camera_motion="off"), 5.0),
+    ):
+        rows = np.concatenate([frame.rows for (frame,) in tracker(seen)])
+        mine = rows[rows["track_id"] == 1]
+        assert np.ptp(mine["x_m"]) == pytest.approx(spread, abs=0.2) if not spread else np.ptp(mine["x_m"]) > spread

@@ -5,7 +5,7 @@ A transform is affine, (2, 3), see ``affine``. Letters: F pictures.
 
 from __future__ import annotations
 
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right
 from collections import deque
 from collections.abc import Sequence
 from enum import IntEnum
@@ -179,6 +179,12 @@ class CameraPath:
         if not self._poses:
             return None
         return self._poses[max(bisect_right(self._t_ns, t_ns) - 1, 0)]
+
+    def poses_between(self, since_ns: int | None, until_ns: int | None) -> list[tuple[int, CameraPose]]:
+        """Return times and poses of the pictures from one time on and before another; None for no limit."""
+        first = 0 if since_ns is None else bisect_left(self._t_ns, since_ns)
+        last = len(self._t_ns) if until_ns is None else bisect_left(self._t_ns, until_ns)
+        return list(zip(self._t_ns[first:last], self._poses[first:last], strict=True))
 
     @cached_property
     def verdict(self) -> Verdict:

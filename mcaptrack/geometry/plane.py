@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal, get_args
 
 import numpy as np
 
 from mcaptrack.errors import McaptrackError
+from mcaptrack.geometry.affine import IDENTITY, compose, invert
 from mcaptrack.geometry.arrays import Floats
+from mcaptrack.geometry.camera_path import CameraPath
 
 Point = Literal["foot", "center"]
 
@@ -97,12 +100,32 @@ Planes = Sequence[tuple[int, GroundPlane]]
 
 def plane_at(planes: Planes, t_ns: int) -> GroundPlane | None:
     """The plane that is valid at ``t_ns``; None if there is no plane."""
-    valid = None
-    for since_ns, plane in planes:
-        if valid is not None and since_ns > t_ns:
-            break
-        valid = plane
-    return valid
+    if not planes:
+        return None
+    return planes[max(bisect_right(planes, t_ns, key=lambda one: one[0]) - 1, 0)][1]
+
+
+def moved_planes(planes: Planes, path: CameraPath | None) -> Planes:
+    """The planes of a camera that moves: one for each picture at which it has another pose.
+
+    A plane that was measured, or guessed, in one picture is carried on from there by the motion of the camera, until
+    the next one or another scene begins; there it holds as it is. Without a path the planes stay as they are.
+    """
+    if path is None or not planes:
+        return planes
+    out: list[tuple[int, GroundPlane]] = []
+    for number, (since_ns, plane) in enumerate(planes):
+        until_ns = planes[number + 1][0] if number + 1 < len(planes) else None
+        begun = path.pose_at(since_ns) if number else None
+        out.append((since_ns, plane))
+        for t_ns, pose in path.poses_between(since_ns if number else None, until_ns):
+            back = IDENTITY if begun is None or begun.reference != pose.reference else invert(begun.to_reference)
+            motion = IDENTITY if pose is begun else compose(back, pose.to_reference)
+            homography = plane.matrix @ np.vstack([motion, [0.0, 0.0, 1.0]])
+            moved = plane if motion is IDENTITY else replace(plane, homography=tuple(homography.ravel().tolist()))
+            if out[-1][1] != moved:
+                out.append((t_ns, moved))
+    return out
 
 
 def is_assumed(planes: Planes | None) -> bool:

@@ -9,6 +9,7 @@ from typing import Any, Final, NamedTuple
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.geometry.boxes import columns_to_boxes
+from mcaptrack.geometry.plane import Planes, moved_planes
 from mcaptrack.notices import warn
 from mcaptrack.pipeline.checks import Job, fits
 from mcaptrack.pipeline.write import Made, digest_of
@@ -18,6 +19,7 @@ from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources import foreign
 from mcaptrack.sources.cameras import camera_at
 from mcaptrack.transforms import STAGES, Transform
+from mcaptrack.transforms.sort.tracker import used_path
 
 STAGE: Final = "motion"
 _OFF: Final = "off"
@@ -101,6 +103,23 @@ def _path(opened: log.Log, prefix: str, job: Job, made: Mapping[str, Made]) -> B
     except McaptrackError as error:
         raise McaptrackError(f"{opened.path}: {topic}: {error}") from None
     return Beside({"camera_path": path}, {topic: digest})
+
+
+def planes_in_pictures(opened: log.Log, prefix: str, made: Mapping[str, Made], planes: Planes) -> Planes:
+    """The planes of a camera as its pictures show them: moved with the camera where its tracks are."""
+    topic = motion_topic(prefix)
+    stage = next(one for one in STAGES.values() if one.default.reads is DETECTIONS)
+    tracks = f"{prefix}/{stage.output_topic}"
+    channel = opened.channels.get(tracks)
+    how = made[tracks].provenance if tracks in made else Provenance.from_metadata(channel.metadata) if channel else None
+    found = _read(opened, topic, CAMERA_MOTION, made) if planes and how and topic in how.references else None
+    if how is None or found is None:
+        return planes
+    try:
+        path = frames_to_path(found[0])
+    except McaptrackError:
+        return planes  # the tracks were made from an earlier motion
+    return moved_planes(planes, used_path(path, how.parameters.get("camera_motion", _OFF)))
 
 
 def _boxes(opened: log.Log, prefix: str, made: Mapping[str, Made]) -> Beside:

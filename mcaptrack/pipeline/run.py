@@ -19,7 +19,7 @@ from mcaptrack.pipeline.checks import Job, check_inputs
 from mcaptrack.pipeline.events import STAGE as EVENTS_STAGE
 from mcaptrack.pipeline.events import Watch, make_events, tally
 from mcaptrack.pipeline.findings import warn_of_memory, warn_of_nothing, warn_of_what_stands
-from mcaptrack.pipeline.motion import beside
+from mcaptrack.pipeline.motion import beside, planes_in_pictures
 from mcaptrack.pipeline.planes import guess_plane, is_poor, read_planes
 from mcaptrack.pipeline.rebuild import plugins_of
 from mcaptrack.pipeline.write import Made, digest_of, write
@@ -116,7 +116,8 @@ def _run(
         report.events = tally(happened)
         report.stages += [EVENTS_STAGE] if happened else []
     if made or output is not None:
-        report.layouts = write(opened, prefix, made, planes or (), stamps, output)
+        in_pictures = planes_in_pictures(opened, prefix, made, planes or ())
+        report.layouts = write(opened, prefix, made, in_pictures, stamps, output)
     how = {topic: channel.provenance for topic, channel in made.items()}
     warn_of_what_stands(opened, prefix, how, planes or (), is_all=watch is not None or not jobs)
     report.stale = outdated_by(opened, {topic: channel.provenance.digest for topic, channel in made.items()})
@@ -191,7 +192,13 @@ def _run_job(
         if topic in job.kept()
     }
     if job.target + FULL in job.kept():
-        out |= _carried(opened, job, {**made, **out}, planes, getattr(transform, "holds_back", False))
+        out |= _carried(
+            opened,
+            job,
+            {**made, **out},
+            planes_in_pictures(opened, prefix, made, planes),
+            getattr(transform, "holds_back", False),
+        )
     return out
 
 

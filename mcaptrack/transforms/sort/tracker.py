@@ -22,7 +22,7 @@ from mcaptrack.geometry.affine import IDENTITY
 from mcaptrack.geometry.arrays import Bools, Floats, Indices
 from mcaptrack.geometry.camera_path import CameraPath
 from mcaptrack.geometry.clocks import NS_PER_S, FrameClock
-from mcaptrack.geometry.plane import GroundPlane, Planes, plane_at
+from mcaptrack.geometry.plane import GroundPlane, Planes, moved_planes, plane_at
 from mcaptrack.notices import warn
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame, Schema
 from mcaptrack.transforms.protocol import check_options, context, option
@@ -183,7 +183,7 @@ class Sort:
             spans = pairwise(ends.tolist())
             parts = [self._step(run, f, Measurements(columns[:, a:b])) for f, (a, b) in zip(block, spans, strict=True)]
             written, written_ends = np.concatenate(parts, axis=1), np.cumsum([0, *(p.shape[1] for p in parts)])
-            made = tracks_to_frames(block, written, written_ends.tolist(), self.ground_planes)
+            made = tracks_to_frames(block, written, written_ends.tolist(), run.planes)
             yield from ((frame,) for frame in made)
         report.warn()
 
@@ -198,7 +198,7 @@ class Sort:
         self._predict(run, passed_frames)
         if run.camera_path is not None and before_ns is not None:
             self._compensate(tracks, run.camera_path.between(before_ns, frame.t_ns))
-        plane = plane_at(self.ground_planes, frame.t_ns) if self.cost == "metres" else None
+        plane = plane_at(run.planes, frame.t_ns) if self.cost == "metres" else None
         predicted = kalman.corners(tracks.state)
         step = AssociationInput(detections, tracks, predicted, run.age, passed_frames, plane, run.one_class)
         matched, track = self._associate(step)
@@ -288,6 +288,11 @@ class Sort:
         tracks.update(at, detections, hit)
 
 
+def used_path(path: CameraPath | None, use: CameraMotionUse) -> CameraPath | None:
+    """The path of a camera if tracks take it into account."""
+    return path if path is not None and (use == "on" or (use == "auto" and path.matters)) else None
+
+
 class _FilterReport:
     """Counts the detections that pass the filters of class and score, and warns if none does."""
 
@@ -334,8 +339,8 @@ class _Run:
         self.one_class = True
         self._count = 0
         self.last_ns: int | None = None
-        path, use = options.camera_path, options.camera_motion
-        self.camera_path = None if path is None or use == "off" or not (use == "on" or path.matters) else path
+        self.camera_path = used_path(options.camera_path, options.camera_motion)
+        self.planes = moved_planes(options.ground_planes, self.camera_path)
 
     def note_classes(self, class_id: Floats) -> None:
         """Note the classes of the next detections."""
