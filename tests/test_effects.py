@@ -73,6 +73,10 @@ def template(tmp_path_factory) -> Path:
     walk = [f"{row[0]} {row[1]} {0.1 * (float(row[2]) + 4)} 3.2" for row in rows]
     (folder / "walk.txt").write_text("\n".join(walk) + "\n")
     (folder / "known.onnx").write_bytes(DATA)
+    (folder / "table.csv").write_text("frame,id,x,y,w,h\n" + "".join(f"{n},1,{n},24,8,16\n" for n in range(30)))
+    (folder / "yolo").mkdir()
+    for n in range(30):
+        (folder / "yolo" / f"{n:04}.txt").write_text(f"0 {0.1 + n / 100} 0.5 0.1 0.3\n")
     (folder / "motion.txt").write_text("".join(f"{n}\t1\t0\t0.5\t0\t1\t0\n" for n in range(30)))
     (folder / "query.sql").write_text("select count(*) as n from tracks")
     (folder / "more.csv").write_text("a\n1\n")

@@ -377,7 +377,7 @@ def test_a_class_that_only_the_log_names_is_not_imported(path, stage, transform,
     refused = call("run", path, "--no-tables", "--force")
     assert refused.code == 1
     assert f"{kind} {name}" in refused.err.splitlines()[-1]
-    assert f"imported only if you name it, as in `mcaptrack run {path} --{kind} {name}`" in refused.err
+    assert f"imported only if you name it, as in `mcaptrack run {path} --force --{kind} {name}`" in refused.err
     assert path.read_bytes() == before
     with log.read(path) as opened:
         jobs = pipeline.plan_all(opened, "/camera", defaults={stage: type(transform)()}, anew=True)

@@ -109,6 +109,12 @@ class Scene:
         self.says("detect", "LOG", "--detector", "mog2")
         return self.says("run", "LOG", "--no-tables")
 
+    def timed(self, name: str) -> Scene:
+        """Write tracks that name times, not frames."""
+        rows = "".join(f"{n / 10},1,{n},24,8,8\n" for n in range(1, 31))
+        Path(name).write_text("t,id,x,y,w,h\n" + rows)
+        return self
+
     def bag(self) -> str:
         """Replace the log by a recording of another kind."""
         self.path.unlink()
@@ -167,6 +173,9 @@ SCENES: dict[str, Callable[[Scene], str]] = {
     "viewing/report/summary.py:_without_ground_truth:run": lambda s: s.ingested("clip.mp4").page(),
     "viewing/report/sections.py:scores:run": lambda s: s.ingested("clip.mp4").page(),
     "viewing/report/sections.py:forecasts:predict": lambda s: s.without("*predictions*").page(),
+    "tables/compared.py:_read:ingest": lambda s: s.timed("tracks.csv").says(
+        "evaluate", "tracks.csv", "--truth", "truth.txt"
+    ),
     "tables/sql.py:_answer:list_tables": lambda s: s.says("query", "LOG", "show tables"),
     "training/sources.py:_from_log:run": lambda s: s.ingested("clip.mp4").to_train_on(),
 }

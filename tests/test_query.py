@@ -328,6 +328,7 @@ def test_files_and_logs_give_the_same_tables(known, tmp_path):
         assert here.equals(there), name
         assert here.num_rows or name in (
             "detections",
+            "camera_motions",
             "counts",
             "ground_planes",
             "forecast_errors",

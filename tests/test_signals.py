@@ -18,7 +18,7 @@ from tests.effects.commands import line_of
 SOON_S = 2
 SIGNALS = {"Ctrl-C": signal.SIGINT, "kill": signal.SIGTERM}
 #: What is looked at of a command, where it is not the reading, and the writing and publishing of those that write.
-DEEDS = {"demo": ["write"], "tune": ["read", "write"], "view": ["read", "serve"]}
+DEEDS = {"demo": ["write"], "models": ["read"], "tune": ["read", "write"], "view": ["read", "serve"]}
 MOMENTS = [
     (command, deed)
     for command, known in GROUP.commands.items()

@@ -117,4 +117,5 @@ def test_tracks_equal_the_reference(name, seed, data):
 
 @pytest.mark.parametrize("name", TRACKERS)
 def test_every_option_is_varied(name):
-    assert {option.name for option in fields(TRACKERS[name])} == {*SHARED, *OWN[name]}
+    moved = {"camera_motion", "camera_path"}  # test_camera_motion_tracking.py has scenes of these
+    assert {option.name for option in fields(TRACKERS[name])} - moved == {*SHARED, *OWN[name]}

@@ -28,6 +28,8 @@ def _label_file(words: str) -> Any:
 
 
 _PICTURES: Final = "Pictures"
+#: How label files are read.
+_READING: Final = "Reading of label files"
 
 
 @common.one_line
@@ -107,7 +109,7 @@ def ingest(
         Literal["auto", "mot", "kitti", "sdd", "trajnet", "obsmat", "coco", "yolo", "supervision", "csv"],
         common.option(
             "--format",
-            panel=common.LABELS,
+            panel=_READING,
             tuning=True,
             help="Format of the label files. auto: as the content tells; csv: any table with a header.",
         ),
@@ -116,7 +118,7 @@ def ingest(
         str | None,
         common.option(
             "--columns",
-            panel=common.LABELS,
+            panel=_READING,
             help="Columns of label files with a header: x=left,y=top,w=width,h=height,frame=n. Also x2, y2, cx, cy, t "
             "(seconds), score, class, name (of the class), id.",
             show_default="guessed from the header",
@@ -126,7 +128,7 @@ def ingest(
         str | None,
         common.option(
             "--size",
-            panel=common.LABELS,
+            panel=_READING,
             help="Width and height of the pictures, like 1920x1080, if there are only labels in shares of them.",
             show_default=False,
         ),
@@ -135,7 +137,7 @@ def ingest(
         int | None,
         common.option(
             "--first-frame",
-            panel=common.LABELS,
+            panel=_READING,
             least=0,
             most=10**12,
             tuning=True,
@@ -147,7 +149,7 @@ def ingest(
         int | None,
         common.option(
             "--frames",
-            panel=common.LABELS,
+            panel=_READING,
             least=1,
             most=10_000_000,
             tuning=True,

@@ -7,7 +7,7 @@ from dataclasses import fields
 from typing import Any, Final, NamedTuple
 
 from mcaptrack import log
-from mcaptrack.errors import McaptrackError, call
+from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.plane import Planes, moved_planes
 from mcaptrack.notices import warn
@@ -94,8 +94,7 @@ def _path(opened: log.Log, prefix: str, job: Job, made: Mapping[str, Made]) -> B
     found = _read(opened, topic, CAMERA_MOTION, made)
     if found is None:
         if getattr(job.transform, "camera_motion", "") == "on":
-            add = call("ingest", "PICTURES", into=opened.path)
-            warn(f"the motion of the camera is not known: {topic} needs pictures ({add})", "option-not-used")
+            warn(f"the motion of the camera is not known: {topic} needs pictures of it in the log", "option-not-used")
         return Beside({}, {})
     frames, digest = found
     try:

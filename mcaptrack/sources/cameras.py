@@ -16,7 +16,7 @@ from weakref import WeakKeyDictionary
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import warn
-from mcaptrack.schema import DETECTIONS, SCHEMAS
+from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, SCHEMAS
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources import foreign
 from mcaptrack.transforms import STAGES
@@ -211,8 +211,8 @@ class _Channels:
         )
 
     def _result_topics(self, names: list[str]) -> list[str]:
-        """Return the topics below these names that stages made."""
-        return [one for name in names for one in self._select([name], is_made_by_stage) if one.startswith(name + "/")]
+        """Return the topics below these names that stages made; the motion of a camera is part of its pictures."""
+        return [one for name in names for one in self._select([name], _is_result) if one.startswith(name + "/")]
 
     def _label_topic(self, names: list[str], label: str) -> str | None:
         """Return the first topic below one of the names for a label, unless a stage made it; None if there is none."""
@@ -223,6 +223,10 @@ class _Channels:
     def _select(self, names: list[str], wanted: Callable[[log.Channel], bool]) -> list[str]:
         topics = sorted(topic for name in names for topic in self._topics.get(name, ()))
         return [topic for topic in topics if wanted(self._opened.channels[topic])]
+
+
+def _is_result(channel: log.Channel) -> bool:
+    return is_made_by_stage(channel) and channel.schema_name != CAMERA_MOTION.name
 
 
 def _is_label(topic: str) -> bool:

@@ -67,6 +67,8 @@ CASES: dict[str, dict[str, Case]] = {
         truth="--truth truth.txt",
         motion="--motion motion.txt",
         format=("ingest truth.txt --fps 10", "--format kitti"),
+        columns=("ingest table.csv --fps 10 --as tracks", "--columns x=y,y=x"),
+        size=("ingest yolo --fps 10", "--size 640x480"),
         first_frame=("ingest truth.txt --fps 10", "--first-frame 0"),
         frames=("ingest truth.txt --fps 10", "--frames 500"),
         **{"as": ("ingest truth.txt --fps 10", "--as truth")},
