@@ -31,8 +31,7 @@ from mcaptrack.api.supervision import supervision_of
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.files import refuse_overwrite
 from mcaptrack.schema import DETECTIONS, SCHEMAS, TRACKS, Frame
-from mcaptrack.sources import foreign
-from mcaptrack.sources.pictures import Pictures
+from mcaptrack.sources.pictures import Pictures, find_pictures
 from mcaptrack.sources.video import decode_bgr, decode_gray
 from mcaptrack.tables import export
 
@@ -222,7 +221,7 @@ class Recording:
         (0, (48, 64))
 
         """
-        channel = self._pictures(topic)
+        channel = find_pictures(self._log, topic)
         wanted = None if times is None else self._shown(channel, times)
         frames = self._decoded(channel, wanted, colour)
         return frames if wanted is None else (frame for frame in frames for _ in range(wanted[frame.index]))
@@ -344,15 +343,6 @@ class Recording:
             self.close()
             self._open(path)
         return count
-
-    def _pictures(self, topic: str) -> str:
-        there = [c.topic for c in self._log.channels.values() if foreign.holds_pictures(c)]
-        found = [name for name in there if topic in (name, name.removeprefix("/"))]
-        found = found or [name for name in there if name.endswith("/" + topic.strip("/"))]
-        if len(found) != 1:
-            has = f"pictures in {', '.join(sorted(there))}" if there else "no pictures"
-            raise McaptrackError(f"{self.path} has {len(found) or 'no'} channels {topic} with pictures; it has {has}")
-        return found[0]
 
     def _shown(self, topic: str, times: Sequence[int] | NDArray[Any]) -> dict[int, int]:
         """The numbers of the pictures that are shown at these times, and how often each is asked for."""

@@ -95,8 +95,15 @@ class Provenance:
         return cls(parameters=parameters, model=model, **known)
 
 
+def input_of(metadata: Mapping[str, str]) -> str:
+    """Return the topic that a channel was made from, by its metadata; "" if mcaptrack did not make it of one."""
+    return metadata.get(f"{_PREFIX}input", "") if f"{_PREFIX}transform" in metadata else ""
+
+
 def _read(text: str, kind: type[T]) -> T:
     """Parse a JSON object or array; an empty one for anything else."""
+    if not text:
+        return kind()
     try:
         value = json.loads(text)
     except (ValueError, RecursionError):

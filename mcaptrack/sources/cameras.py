@@ -17,7 +17,7 @@ from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import warn
 from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, SCHEMAS
-from mcaptrack.schema.provenance import Provenance
+from mcaptrack.schema.provenance import Provenance, input_of
 from mcaptrack.sources import foreign
 from mcaptrack.transforms import STAGES
 
@@ -122,8 +122,7 @@ def chain_of(opened: log.Log, topic: str) -> list[str]:
     while topic and topic not in chain:
         chain.append(topic)
         channel = opened.channels.get(topic)
-        made = Provenance.from_metadata(channel.metadata) if channel else None
-        topic = made.input if made else ""
+        topic = input_of(channel.metadata) if channel else ""
     return chain
 
 

@@ -38,6 +38,20 @@ class Pixels(Protocol):
         """Decode the wanted pictures."""
 
 
+def find_pictures(opened: log.Log, topic: str) -> str:
+    """Return the channel with pictures of this topic, or the one whose topic ends with it.
+
+    Raises McaptrackError if there is none, or several.
+    """
+    there = [channel.topic for channel in opened.channels.values() if foreign.holds_pictures(channel)]
+    found = [name for name in there if topic in (name, name.removeprefix("/"))]
+    found = found or [name for name in there if name.endswith("/" + topic.strip("/"))]
+    if len(found) != 1:
+        has = f"pictures in {', '.join(sorted(there))}" if there else "no pictures"
+        raise McaptrackError(f"{opened.path} has {len(found) or 'no'} channels {topic} with pictures; it has {has}")
+    return found[0]
+
+
 class Pictures:
     """The pictures of a channel with random access: reading one decodes at most one group of pictures.
 
