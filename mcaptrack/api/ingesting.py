@@ -206,7 +206,7 @@ def ingest(
             warn(f"lost: {lost}", "lost")
         warn_unused("there is no label file", label_format=label_format != "auto" and not report.has_labels)
         warn_unused("there is no label file", columns=columns is not None and not report.has_labels)
-        warn_unused("there is no label file", size=size is not None and not report.has_labels)
+        warn_unused("no label file is of a detector's format", size=size is not None and not report.uses_size)
         warn_unused("there is no ground plane", point=point != "foot" and ground_plane is None)
         keep = "the channels of a recording keep their names"
         warn_unused(keep, camera=camera != "camera" and not report.uses_camera)

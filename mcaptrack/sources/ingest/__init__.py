@@ -13,6 +13,7 @@ from mcaptrack.schema.provenance import CLOCK
 from mcaptrack.sources.ingest.bags.opening import open_recording
 from mcaptrack.sources.ingest.job import MOTION, IngestJob, IngestOptions, IngestReport, InputRole, Progress
 from mcaptrack.sources.ingest.label_job import LabelJob, label_frames
+from mcaptrack.sources.ingest.labels.box_rows import OTHERS
 from mcaptrack.sources.ingest.labels.formats import Format, Role
 from mcaptrack.sources.ingest.labels.yolo import is_label_folder
 from mcaptrack.sources.ingest.motion_job import MotionJob
@@ -93,6 +94,7 @@ def ingest(
             job.write(writer, has_clock=bool(into and into.metadata(CLOCK)))
         job.check(output)
         job.report.warnings, job.report.has_labels = warned, bool(job.labels)
+        job.report.uses_size = any(labels.format in OTHERS for _, labels in job.labels.values())
         job.report.uses_camera = bool(job.labels or job.homography or job.options.motion) or isinstance(job, VideoJob)
     return job.report
 

@@ -97,6 +97,7 @@ class IngestReport:
     """The result of ``ingest``: messages by topic, ``remarks``, details (``notes``), and what was lost.
 
     ``warnings`` report what was assumed, left out or looks unusual. ``has_labels``: there were label files.
+    ``uses_size``: some of them are in a format of a detector, in which the size of pictures counts.
     ``uses_camera``: topics below the camera's name were written.
     """
 
@@ -106,6 +107,7 @@ class IngestReport:
     lost: list[str] = field(default_factory=list)
     warnings: list[Notice] = field(default_factory=list)
     has_labels: bool = False
+    uses_size: bool = False
     uses_camera: bool = False
 
 
