@@ -26,6 +26,7 @@ import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import lru_cache
 from importlib import import_module
 from importlib.metadata import EntryPoint, PackageNotFoundError, entry_points, packages_distributions, version
 from pathlib import Path
@@ -223,8 +224,23 @@ def _words(error: BaseException) -> str:
 
 def distribution_of(module: str) -> tuple[str, str]:
     """Name and version of the distribution of a module; "" and "" if unknown."""
-    found = packages_distributions().get(module.partition(".")[0], [])
+    places = tuple((place, _changed_ns(place)) for place in sys.path)
+    found = _distributions(places).get(module.partition(".")[0], [])
     return (found[0], _version_of(found[0])) if found else ("", "")
+
+
+def _changed_ns(place: str) -> int:
+    """When a folder of ``sys.path`` last gained or lost an entry; 0 if it is no folder."""
+    try:
+        return Path(place or ".").stat().st_mtime_ns
+    except OSError:
+        return 0
+
+
+@lru_cache(maxsize=2)
+def _distributions(_places: tuple[tuple[str, int], ...]) -> Mapping[str, list[str]]:
+    """The distributions of top-level modules; kept as long as nothing is installed, because all files are searched."""
+    return packages_distributions()
 
 
 def _version_of(distribution: str) -> str:
