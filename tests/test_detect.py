@@ -8,9 +8,10 @@ import pytest
 from mcaptrack.geometry.assignment import assign
 from mcaptrack.geometry.boxes import columns_to_boxes, iou
 from mcaptrack.geometry.clocks import FrameClock
+from mcaptrack.notices import collected
 from mcaptrack.schema import Frame
 from mcaptrack.sources.synthetic import SyntheticScene
-from mcaptrack.transforms import FrameDifferenceDetector, KnnDetector, Mog2Detector, MotionDetector
+from mcaptrack.transforms import STAGES, FrameDifferenceDetector, KnnDetector, Mog2Detector, MotionDetector
 from mcaptrack.transforms.detect.background import _PersonHeight, halve
 from mcaptrack.transforms.detect.camera_motion import CameraMotion
 from mcaptrack.transforms.detect.foreground import FrameDifference
@@ -276,3 +277,24 @@ class TestCameraMotion:
 def test_pictures_are_halved_until_they_are_small_enough_or_narrow(shape, max_pixels, halved):
     image, halvings = halve(np.zeros(shape, np.uint8), max_pixels)
     assert image.shape == halved == tuple(side >> halvings for side in shape)
+
+
+@pytest.mark.parametrize("stabilise", [True, False])
+@pytest.mark.parametrize("name", ["knn", "mog2", "frame-difference", "median"])
+def test_pictures_of_another_size_begin_another_view(name, stabilise):
+    """The detections after the change are those of the pictures after it alone."""
+    detector = STAGES["detect"].built_in()[name](stabilise=stabilise)
+    shots = list(small_scene(seconds=4.0).shots())
+    wide = [Frame(ns(shot.seconds), n, shot.image) for n, shot in enumerate(shots)]
+    if name != "median":
+        wide = [frame._replace(rows=frame.rows.mean(axis=2).astype(np.uint8)) for frame in wide]
+    narrow = [f._replace(t_ns=f.t_ns + ns(4.0), index=f.index + len(wide), rows=f.rows[:, 40:].copy()) for f in wide]
+    with collected() as warnings:
+        both = [frame for (frame,) in detector([*wide, *narrow])]
+    alone = [frame for (frame,) in detector(wide)], [frame for (frame,) in detector(narrow)]
+    assert [len(frame.rows) for frame in both[: len(wide)]] == [len(frame.rows) for frame in alone[0]]
+    assert sum(len(frame.rows) for frame in both[len(wide) :]) > 0
+    assert "view-lost" in {warning.code for warning in warnings}
+    if name == "median":  # the others know the height of people by then, and have seen random numbers
+        for late, frame in zip(both[len(wide) :], alone[1], strict=True):
+            np.testing.assert_array_equal(columns_to_boxes(late.rows), columns_to_boxes(frame.rows))

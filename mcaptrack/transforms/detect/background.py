@@ -66,10 +66,12 @@ class MotionDetector:
     def __call__(self, frames: Iterable[Frame]) -> Iterator[tuple[Frame, ...]]:
         clock, camera, height, steadiness = FrameClock(), CameraMotion(), _PersonHeight(), Steadiness()
         foreground = make_foreground_model(self.method, self.threshold, self.history_s)
+        size: tuple[int, ...] = ()
         for frame in frames:
             clock.tick(frame.t_ns)
             image, halvings = halve(frame.rows, self.max_pixels)
-            to_reference, is_new = camera.estimate(image) if self.stabilise else (IDENTITY, False)
+            to_reference, is_new = camera.estimate(image) if self.stabilise else (IDENTITY, image.shape != size)
+            size = image.shape
             steadiness.update(frame.t_ns, camera.view, is_new)
             if is_new:  # another view has another background
                 foreground = make_foreground_model(self.method, self.threshold, self.history_s)

@@ -53,7 +53,7 @@ class CameraMotion:
         Sets ``view``.
         """
         before, self._before = self._before, image
-        if self._reference is None or before is None:
+        if self._reference is None or before is None or before.shape != image.shape:
             self._set_reference(image)
             return IDENTITY, True
         import cv2

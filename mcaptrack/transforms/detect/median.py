@@ -105,9 +105,10 @@ class MedianDetector:
         views: list[_View] = []
         for frame in frames:
             image, _ = _picture(frame, self.max_pixels)
-            to_reference, is_new = _register(camera, image) if self.stabilise else (IDENTITY, not views)
+            to_reference, is_new = _register(camera, image) if self.stabilise else (IDENTITY, False)
+            is_new = is_new or not views or views[-1].size != image.shape
             steadiness.update(frame.t_ns, camera.view, is_new)
-            if is_new or not views or views[-1].size != image.shape:
+            if is_new:
                 if views:
                     views[-1].close(self)
                 views.append(_View(image.shape))
