@@ -121,7 +121,7 @@ def _pictures(rng: np.random.Generator) -> list[Frame]:
 
 
 def _tinted(grey: Image) -> Image:
-    """A picture (H, W, 3) whose three channels differ, and whose green is that of ``grey`` (H, W)."""
+    """A picture (H, W, 3) with three different channels; green is ``grey`` (H, W)."""
     return np.stack([grey // 2, grey, 255 - grey], axis=-1)
 
 

@@ -1,4 +1,4 @@
-"""The catalogue of detectors whose weights can be fetched."""
+"""The catalogue of detectors with weights to fetch."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _WAIT_S = (10, 60)
 
 
 def models(name: str | None = None) -> tuple[Model, ...]:
-    """List the detectors whose weights can be fetched.
+    """List the detectors of the catalogue, with weights to fetch.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""``mcaptrack models``: list the detectors whose weights can be fetched, and fetch them."""
+"""``mcaptrack models``: list the detectors of the catalogue, and fetch their weights."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def models(
     verbose: common.Verbose = False,
     config: common.Config = None,
 ) -> None:
-    """List learned detectors whose weights can be fetched, or fetch those of one, once.
+    """List the learned detectors of the catalogue, or fetch the weights of one, once.
 
     Only a file with the known SHA-256 is taken. The weights are kept in your folder of caches, or where the environment
     variable MCAPTRACK_MODELS says.

@@ -111,7 +111,7 @@ def tune(
     on_trial : callable
         Called with each new trial, the best so far and the number of trials.
     entry : Entry, optional
-        The entry of a transform of another package, whose outputs are checked and whose errors name it.
+        The entry of a transform of another package. Its outputs are checked, and errors name it.
 
     Raises
     ------

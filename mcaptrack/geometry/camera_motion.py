@@ -148,7 +148,7 @@ class MotionEstimator:
         return pose
 
     def _posed(self, to_reference: Floats, inliers: int) -> CameraPose:
-        """The pose of a picture whose transform is known."""
+        """The pose of a picture with a known transform."""
         last, self._misses = self._last, 0
         to_reference, verdict = self._stance.step(to_reference)
         is_same = to_reference is last.to_reference

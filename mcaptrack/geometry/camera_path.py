@@ -150,7 +150,6 @@ class CameraPath:
     Examples
     --------
     >>> import numpy as np
-    from numpy.typing import NDArray
     >>> step = np.array([[1.0, 0.0, -3.0], [0.0, 1.0, 0.0]])  # all moves 3 px to the left: the camera pans to the right
     >>> path = CameraPath(np.array([0, 40, 80]), poses_of(np.array([step] * 3), 640, 480))
     >>> path.between(0, 80)[0, 2]

@@ -12,7 +12,7 @@ from typing import NamedTuple
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.foxglove import views
-from mcaptrack.schema import DETECTIONS, VIDEO, Schema
+from mcaptrack.schema import DETECTIONS, VIDEO, Frame, Schema
 from mcaptrack.schema.provenance import INGEST, VIEW, Provenance
 from mcaptrack.sources import foreign
 from mcaptrack.sources.cameras import USUAL, chain_of
@@ -76,6 +76,12 @@ def fits(channel: log.Channel, reads: Schema) -> tuple[str, bool]:
         return channel.schema_name, foreign.holds_pictures(channel)
     theirs = reads is DETECTIONS and foreign.holds_detections(channel)
     return channel.schema_name, theirs or channel.schema_name == reads.name
+
+
+def read_frames(opened: log.Log, topic: str, schema: Schema) -> list[Frame]:
+    """Read the rows of a channel, or the detections of a recording in a foreign format."""
+    theirs = foreign.holds_detections(opened.channel(topic))
+    return foreign.detections(opened, topic) if theirs else opened.frames(topic, schema)
 
 
 def _lacks(opened: log.Log, prefix: str, job: Job) -> str:

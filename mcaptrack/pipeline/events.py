@@ -37,7 +37,7 @@ from mcaptrack.schema import (
     Schema,
 )
 from mcaptrack.schema.provenance import VIEW, Provenance
-from mcaptrack.sources.cameras import camera_at
+from mcaptrack.sources.cameras import camera_at, provenance_of
 
 #: The name of the stage, in reports and in the provenance.
 STAGE: Final = "events"
@@ -193,8 +193,7 @@ def _default_topics(opened: log.Log, prefix: str, made: Mapping[str, Made]) -> l
 
 def _options_for(opened: log.Log, topic: str, given: EventOptions) -> EventOptions:
     """Return the given options if they differ from the defaults, else those that the log's events were found with."""
-    channel = opened.channels.get(topic + _EVENTS)
-    known = Provenance.from_metadata(channel.metadata) if channel else None
+    known = provenance_of(opened, topic + _EVENTS)
     asked: Any = known.parameters.get("asked") if known and known.transform == STAGE else None
     if given != EventOptions() or not isinstance(asked, dict):
         return given

@@ -11,13 +11,12 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.plane import Planes, moved_planes
 from mcaptrack.notices import warn
-from mcaptrack.pipeline.checks import Job, fits
+from mcaptrack.pipeline.checks import Job, fits, read_frames
 from mcaptrack.pipeline.write import Made, digest_of
 from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, VIDEO, Frame, Schema
 from mcaptrack.schema.camera_motion import frames_to_path
 from mcaptrack.schema.provenance import Provenance
-from mcaptrack.sources import foreign
-from mcaptrack.sources.cameras import camera_at
+from mcaptrack.sources.cameras import camera_at, provenance_of
 from mcaptrack.transforms import STAGES, Transform
 from mcaptrack.transforms.sort.tracker import used_path
 
@@ -69,8 +68,7 @@ def _needs_still_camera(opened: log.Log, boxes: str, jobs: Sequence[Job]) -> boo
     for job in jobs:
         if job.target == boxes:
             return bool(getattr(job.transform, "needs_still_camera", False))
-    channel = opened.channels.get(boxes)
-    made = Provenance.from_metadata(channel.metadata) if channel else None
+    made = provenance_of(opened, boxes)
     stage = STAGES.get(made.transform) if made and "transform" not in made.plugins else None
     if made is None or stage is None or stage.default.reads is not VIDEO:
         return False
@@ -109,8 +107,7 @@ def planes_in_pictures(opened: log.Log, prefix: str, made: Mapping[str, Made], p
     topic = motion_topic(prefix)
     stage = next(one for one in STAGES.values() if one.default.reads is DETECTIONS)
     tracks = f"{prefix}/{stage.output_topic}"
-    channel = opened.channels.get(tracks)
-    how = made[tracks].provenance if tracks in made else Provenance.from_metadata(channel.metadata) if channel else None
+    how = made[tracks].provenance if tracks in made else provenance_of(opened, tracks)
     found = _read(opened, topic, CAMERA_MOTION, made) if planes and how and topic in how.references else None
     if how is None or found is None:
         return planes
@@ -139,6 +136,4 @@ def _read(opened: log.Log, topic: str, schema: Schema, made: Mapping[str, Made])
     channel = opened.channels.get(topic)
     if channel is None or not fits(channel, schema)[1]:
         return None
-    theirs = schema is DETECTIONS and foreign.holds_detections(channel)
-    frames = foreign.detections(opened, topic) if theirs else opened.frames(topic, schema)
-    return frames, digest_of(opened, topic)
+    return read_frames(opened, topic, schema), digest_of(opened, topic)

@@ -21,7 +21,7 @@ from mcaptrack.pipeline.rebuild import MissingPluginError, rebuild
 from mcaptrack.schema import DETECTIONS, VIDEO
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources import foreign
-from mcaptrack.sources.cameras import USUAL, camera_at, chain_of, name_above
+from mcaptrack.sources.cameras import USUAL, camera_at, chain_of, name_above, provenance_of
 from mcaptrack.transforms import STAGES, Stage, Transform
 
 Say = Callable[[str], None]
@@ -160,10 +160,9 @@ class _Planner:
         return self._changes[topic]
 
     def _plan(self, topic: str) -> bool:
-        channel = self._opened.channels.get(topic)
         usual = USUAL.get(topic.removeprefix(self._prefix + "/"), "") if topic.startswith(self._prefix + "/") else ""
-        made = Provenance.from_metadata(channel.metadata) if channel else None
-        if channel is None:
+        made = provenance_of(self._opened, topic)
+        if topic not in self._opened.channels:
             sibling = self._sibling(usual, topic)
             return self._make_again(sibling, usual, topic) if sibling else bool(usual) and self._make(usual, topic)
         if made is None or made.transform not in STAGES:
@@ -175,11 +174,7 @@ class _Planner:
     def _sibling(self, stage: str, topic: str) -> Provenance | None:
         """Return the provenance of another output of the stage that makes ``topic``; None if there is none."""
         topics = STAGES[stage].outputs(_main(self._opened, stage, topic)) if stage else ()
-        found = (
-            Provenance.from_metadata(self._opened.channels[one].metadata)
-            for one in topics
-            if one in self._opened.channels
-        )
+        found = (provenance_of(self._opened, one) for one in topics)
         return next((made for made in found if made and made.transform == stage), None)
 
     def _make(self, stage: str, topic: str) -> bool:
@@ -215,14 +210,12 @@ class _Planner:
         for job in self.jobs:
             if topic in job.outputs():
                 return job.transform
-        channel = self._opened.channels.get(topic)
-        made = Provenance.from_metadata(channel.metadata) if channel else None
+        made = provenance_of(self._opened, topic)
         return self._before(made.transform, made)[0] if made and made.transform in STAGES else None
 
     def _is_made_by_another(self, topic: str) -> bool:
         """Return whether this run makes a channel by another class of transforms than before."""
-        channel = self._opened.channels.get(topic)
-        made = Provenance.from_metadata(channel.metadata) if channel else None
+        made = provenance_of(self._opened, topic)
         jobs = [job for job in self.jobs if topic in job.outputs()]
         if not jobs or made is None or made.transform not in STAGES:
             return False
@@ -369,17 +362,17 @@ def is_stale(opened: log.Log, topic: str) -> bool:
     made = Provenance.from_metadata(opened.channel(topic).metadata)
     if made is None:
         return False
+    prefix = name_above(chain_of(opened, topic)[-1])
     if "ground_planes" in made.parameters:
-        planes = read_planes(opened, name_above(chain_of(opened, topic)[-1]))
+        planes = read_planes(opened, prefix)
         if planes_to_json(planes or ()) != made.parameters["ground_planes"]:
             return True
-    if motion.is_motion_new(opened, name_above(chain_of(opened, topic)[-1]), made):
+    if motion.is_motion_new(opened, prefix, made):
         return True
     if any((name in opened.channels) != bool(then) for name, then in made.references.items()):
         return True
     for name, then in made.made_from().items():
-        source = opened.channels.get(name)
-        now = Provenance.from_metadata(source.metadata) if source else None
+        now = provenance_of(opened, name)
         if now and now.digest and now.digest != then:
             return True
     return False

@@ -15,7 +15,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.clocks import NS_PER_S, parse_ns
 from mcaptrack.geometry.plane import Planes, is_assumed
 from mcaptrack.notices import Notice, collected, warn
-from mcaptrack.pipeline.checks import Job, check_inputs
+from mcaptrack.pipeline.checks import Job, check_inputs, read_frames
 from mcaptrack.pipeline.events import STAGE as EVENTS_STAGE
 from mcaptrack.pipeline.events import Watch, make_events, tally
 from mcaptrack.pipeline.findings import warn_of_memory, warn_of_nothing, warn_of_what_stands
@@ -24,7 +24,7 @@ from mcaptrack.pipeline.planes import guess_plane, is_poor, read_planes
 from mcaptrack.pipeline.rebuild import plugins_of
 from mcaptrack.pipeline.write import Made, digest_of, write
 from mcaptrack.predictors import weights_sha256
-from mcaptrack.schema import DETECTIONS, GROUND_PLANE, TRACKS, VIDEO, Frame, Schema
+from mcaptrack.schema import DETECTIONS, GROUND_PLANE, TRACKS, VIDEO, Frame
 from mcaptrack.schema.provenance import CLOCK, Provenance
 from mcaptrack.sources import foreign
 from mcaptrack.sources.cameras import camera_at
@@ -297,14 +297,8 @@ def _input(
     if job.source in made:
         frames, said = made[job.source].frames, made[job.source].provenance.digest
     else:
-        frames, said = _frames(opened, job.source, job.transform.reads), digest_of(opened, job.source)
+        frames, said = read_frames(opened, job.source, job.transform.reads), digest_of(opened, job.source)
     return _Input(_Again(lambda: _counted(frames, job.stage, progress)), frames, lambda: said, lambda: len(frames))
-
-
-def _frames(opened: log.Log, topic: str, schema: Schema) -> list[Frame]:
-    """Read the rows of a channel, or the detections of a recording in a foreign format."""
-    theirs = foreign.holds_detections(opened.channel(topic))
-    return foreign.detections(opened, topic) if theirs else opened.frames(topic, schema)
 
 
 def _counting(frames: Iterable[Frame], taken: set[int]) -> Iterator[Frame]:
@@ -359,7 +353,7 @@ def input_of(
     topic = source or f"{prefix}/{STAGES[stage].input_topic}"
     job = Job(stage, transform, topic, f"{prefix}/{STAGES[stage].output_topic}")
     check_inputs(opened, prefix, [job])
-    frames = _frames(opened, topic, transform.reads)
+    frames = read_frames(opened, topic, transform.reads)
     known = _in_context(opened, prefix, job, frames, read_planes(opened, prefix) or ())
     known = replace(known, **beside(opened, prefix, job, {}).values)
     return frames, {f.name: getattr(known, f.name) for f in fields(known) if f.metadata.get("context")}

@@ -14,9 +14,8 @@ from mcaptrack.geometry.camera_path import verdict_of
 from mcaptrack.notices import warn
 from mcaptrack.pipeline.motion import motion_topic
 from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, GROUND_PLANE, PREDICTIONS, TRACKS, Rows, Schema
-from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources import foreign
-from mcaptrack.sources.cameras import camera_at
+from mcaptrack.sources.cameras import camera_at, provenance_of
 from mcaptrack.transforms import STAGES
 
 #: Maximum distance in metres, and minimum IoU of boxes, at which a track matches the ground truth, as in the demo.
@@ -106,8 +105,7 @@ def _rows(opened: log.Log, topic: str, schema: Schema) -> Rows | None:
 
 def _count_boxes(opened: log.Log, tracks: str, usual: str) -> int | None:
     """Return the number of boxes that tracks were made from."""
-    channel = opened.channels.get(tracks)
-    made = Provenance.from_metadata(channel.metadata) if channel else None
+    made = provenance_of(opened, tracks)
     source = opened.channels.get(made.input if made else usual) or opened.channels.get(usual)
     if source is None:
         return None

@@ -126,6 +126,12 @@ def chain_of(opened: log.Log, topic: str) -> list[str]:
     return chain
 
 
+def provenance_of(opened: log.Log, topic: str) -> Provenance | None:
+    """Return how a channel was made; None if it is missing, or if mcaptrack did not make it."""
+    channel = opened.channels.get(topic)
+    return Provenance.from_metadata(channel.metadata) if channel else None
+
+
 def is_made_by_stage(channel: log.Channel) -> bool:
     """Return whether a stage made a channel, and so can make it again."""
     made = Provenance.from_metadata(channel.metadata)

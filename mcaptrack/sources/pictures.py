@@ -39,7 +39,7 @@ class Pixels(Protocol):
 
 
 def find_pictures(opened: log.Log, topic: str) -> str:
-    """Return the channel with pictures of this topic, or the one whose topic ends with it.
+    """Return the channel of pictures with this topic, or with a topic that ends with it.
 
     Raises McaptrackError if there is none, or several.
     """

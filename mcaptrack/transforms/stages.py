@@ -55,7 +55,8 @@ class Stage:
         of the same name.
     variant : Callable or None
         Returns the transform with the options of the entry that ``parameter`` names.
-    on_demand: bool = False
+    on_demand : bool
+        Whether it runs only if another stage is better with its output.
     needs_scale : bool
         Whether it converts boxes to metres, so that a scale is estimated if no ground plane is given.
     repairs_tracks : bool

@@ -18,10 +18,11 @@ from typing import ClassVar, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from mcaptrack.geometry.affine import IDENTITY, move_boxes
 from mcaptrack.geometry.arrays import Floats, Image
 from mcaptrack.geometry.clocks import FrameClock
 from mcaptrack.schema import DETECTIONS, VIDEO, Frame, Schema
-from mcaptrack.transforms.detect.camera_motion import IDENTITY, CameraMotion
+from mcaptrack.transforms.detect.camera_motion import CameraMotion
 from mcaptrack.transforms.detect.foreground import Method, make_foreground_model
 from mcaptrack.transforms.detect.steadiness import Steadiness
 from mcaptrack.transforms.protocol import Colour, check_options, option
@@ -223,11 +224,7 @@ def unwarp_boxes(boxes: Floats, to_reference: Floats) -> Floats:
         return boxes
     import cv2
 
-    to_image = np.asarray(cv2.invertAffineTransform(to_reference), np.float64)
-    scale = float(np.sqrt(np.abs(np.linalg.det(to_image[:, :2]))))
-    centres = (boxes[:, :2] + boxes[:, 2:] / 2) @ to_image[:, :2].T + to_image[:, 2]
-    size = boxes[:, 2:] * scale
-    return np.concatenate([centres - size / 2, size], axis=1)
+    return move_boxes(np.asarray(cv2.invertAffineTransform(to_reference), np.float64), boxes)
 
 
 def boxes_to_rows(boxes: Floats) -> NDArray[np.void]:

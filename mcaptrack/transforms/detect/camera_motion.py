@@ -7,6 +7,7 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from mcaptrack.geometry.affine import IDENTITY, move_points, shift_px
 from mcaptrack.geometry.arrays import Floats, Image
 
 Points = NDArray[np.float32]
@@ -33,8 +34,6 @@ _MOVING: Final = 0.002
 #: (lost).
 View = Literal["steady", "far", "moving", "lost"]
 
-IDENTITY: Final = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-
 
 class CameraMotion:
     """Registers pictures by optical flow of corner points; moving people are outliers of the fit."""
@@ -59,7 +58,7 @@ class CameraMotion:
         import cv2
 
         to_image = np.asarray(cv2.invertAffineTransform(self._last), np.float64)
-        found = _fit(self._reference, image, self._points, self._points[:, 0] @ to_image[:, :2].T + to_image[:, 2])
+        found = _fit(self._reference, image, self._points, move_points(to_image, self._points[:, 0].astype(np.float64)))
         if found is None:
             self.view = "moving" if _moves(before, image) else "lost"
             self._misses += 1
@@ -68,9 +67,9 @@ class CameraMotion:
                 return IDENTITY, True
             return self._last, False
         self._misses = 0
-        shift_px = _shift(found, image)
-        self._last = found if shift_px >= _STILL_PX else IDENTITY
-        self.view = "far" if shift_px > _FAR * np.hypot(*image.shape) else "steady"
+        off_px = shift_px(found, *image.shape[::-1])
+        self._last = found if off_px >= _STILL_PX else IDENTITY
+        self.view = "far" if off_px > _FAR * np.hypot(*image.shape) else "steady"
         return self._last, False
 
     def _set_reference(self, image: Image) -> None:
@@ -116,12 +115,4 @@ def _moves(before: Image, image: Image) -> bool:
     """
     points = _corners(before)
     found = _fit(before, image, points, points[:, 0].astype(np.float64)) if len(points) else None
-    return found is not None and _shift(found, image) > _MOVING * np.hypot(*image.shape)
-
-
-def _shift(matrix: Floats, image: Image) -> float:
-    """The largest shift of a corner of the picture by a similarity, in pixels."""
-    height, width = image.shape
-    corners = np.array([[0, 0, 1], [width, 0, 1], [0, height, 1], [width, height, 1]], float)
-    shift = corners @ matrix.T - corners[:, :2]
-    return float(np.hypot(shift[:, 0], shift[:, 1]).max())
+    return found is not None and shift_px(found, *image.shape[::-1]) > _MOVING * np.hypot(*image.shape)

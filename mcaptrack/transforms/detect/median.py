@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import islice
 from math import inf
 from types import MappingProxyType
 from typing import ClassVar, Final
@@ -15,6 +16,7 @@ from typing import ClassVar, Final
 import numpy as np
 
 from mcaptrack.errors import McaptrackError
+from mcaptrack.geometry.affine import IDENTITY
 from mcaptrack.geometry.arrays import Floats, Image
 from mcaptrack.geometry.clocks import seconds_to_ns
 from mcaptrack.schema import DETECTIONS, VIDEO, Frame, Schema
@@ -26,7 +28,7 @@ from mcaptrack.transforms.detect.background import (
     unwarp_boxes,
     warp,
 )
-from mcaptrack.transforms.detect.camera_motion import IDENTITY, CameraMotion
+from mcaptrack.transforms.detect.camera_motion import CameraMotion
 from mcaptrack.transforms.detect.median_background import MIN_THRESHOLD, Background, Sampler
 from mcaptrack.transforms.detect.people import Separator
 from mcaptrack.transforms.detect.person_model import Learner, Person, region_boxes, typical_height
@@ -201,8 +203,6 @@ class _View:
 
 def _with_views(frames: Iterable[Frame], views: Sequence[_View]) -> Iterator[tuple[_View, Iterator[Frame]]]:
     """Views and their frames."""
-    from itertools import islice
-
     pictures = iter(frames)
     for view in views:
         yield view, islice(pictures, len(view.to_reference))

@@ -19,6 +19,7 @@ from mcaptrack.geometry.plane import Planes, plane_at
 from mcaptrack.schema import DETECTIONS, EVENTS, TRACKS, Frame
 from mcaptrack.schema.framing import frame_times
 from mcaptrack.schema.provenance import Provenance
+from mcaptrack.sources.cameras import provenance_of
 from mcaptrack.sources.pictures import Pictures
 from mcaptrack.transforms import STAGES
 from mcaptrack.viewing.report import statistics
@@ -125,8 +126,7 @@ def _without_path(error: McaptrackError, opened: log.Log) -> str:
 def _read(opened: log.Log, out: LogReport) -> None:
     """Read the tracks and the ground planes."""
     camera = pipeline.camera_at(opened, out.prefix)
-    channel = opened.channels.get(f"{out.prefix}/tracks")
-    made = Provenance.from_metadata(channel.metadata) if channel else None
+    made = provenance_of(opened, f"{out.prefix}/tracks")
     stage = STAGES.get(made.transform) if made else None
     tracker = "tracks as given"
     if made and stage and stage.default.reads is DETECTIONS:

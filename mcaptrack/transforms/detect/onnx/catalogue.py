@@ -1,4 +1,4 @@
-"""Detectors of others whose weights may be used: where they come from, how they are checked, where they are kept."""
+"""The catalogue of detectors by other authors: origin, licence and digest of their weights, and their folder."""
 
 from __future__ import annotations
 
