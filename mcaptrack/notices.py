@@ -96,7 +96,7 @@ def _pass_on(notice: Notice, listener: Listener | None) -> None:
 
 
 def _level_of_caller() -> int:
-    """How many calls up the first line outside of the package is, from whoever calls this."""
+    """The number of calls from the caller of this function up to the first line outside of the package."""
     package = str(Path(__file__).parent) + os.sep
     frame, level = sys._getframe(1), 1
     while frame.f_back is not None and (frame.f_code.co_filename.startswith(package) or _is_contextlib(frame)):

@@ -103,7 +103,7 @@ class Entry:
 
     @property
     def implementation(self) -> str:
-        """Where the class is defined, as in ``my_package.tracking:NearestTracker``."""
+        """The place where the class is defined, as in ``my_package.tracking:NearestTracker``."""
         return f"{self.module}:{self.cls.__qualname__}"
 
     @property
@@ -230,7 +230,7 @@ def distribution_of(module: str) -> tuple[str, str]:
 
 
 def _changed_ns(place: str) -> int:
-    """When a folder of ``sys.path`` last gained or lost an entry; 0 if it is no folder."""
+    """The time when a folder of ``sys.path`` last gained or lost an entry; 0 if it is no folder."""
     try:
         return Path(place or ".").stat().st_mtime_ns
     except OSError:

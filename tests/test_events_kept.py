@@ -148,13 +148,13 @@ def test_events_follow_their_tracks_their_truth_and_their_options(tmp_path):
     assert made.made_from() == counts.made_from() == {"/camera/tracks": "y", "/camera/truth": "x"}
     assert (view.transform, view.input, view.input_digest) == (VIEW, "/camera/tracks/events", made.digest)
     assert watched(path).stages == []
-    assert watched(path, anew=True).frames == {
+    assert watched(path, force=True).frames == {
         "/camera/tracks/events": 10,
         "/camera/tracks/events/view/log": 2,
         "/camera/tracks/counts": 10,
     }
     assert watched(path, options=EventOptions("metres", 0.5)).stages == ["events"]
-    assert watched(path, anew=True).stages == ["events"]
+    assert watched(path, force=True).stages == ["events"]
     with log.read(path) as opened:
         kept = events._options_for(opened, "/camera/tracks", EventOptions())
         assert int(np.sum([len(frame.rows) for frame in opened.frames("/camera/tracks/events", EVENTS)])) == 2

@@ -169,7 +169,7 @@ def test_the_memory_warning_begins_at_the_estimated_need(monkeypatch):
     for free, is_little in ((needed, False), (needed - 1, True), (None, False)):
         monkeypatch.setattr(findings, "free_memory", lambda free=free: free)
         with notices.listening(lambda _: None), notices.collected() as said:
-            findings.warn_of_memory(1_000, 20_000)
+            findings.warn_memory(1_000, 20_000)
         assert [one.code for one in said] == ["memory"] * is_little
 
 
@@ -180,10 +180,10 @@ def test_empty_results_are_explained_by_the_input_or_the_transform():
         ([none, some], "no samples of /camera/tracks: "),
     ):
         with notices.listening(lambda _: None), notices.collected() as said:
-            findings.warn_of_nothing("sample", "/camera/tracks", TRANSFORMS["sample"](), given, [none])
+            findings.warn_no_rows("sample", "/camera/tracks", TRANSFORMS["sample"](), given, [none])
         assert [one.message.startswith(words) for one in said] == [True]
     with notices.listening(lambda _: None), notices.collected() as said:
-        findings.warn_of_nothing("sample", "/camera/tracks", TRANSFORMS["sample"](), [none, some], [none, some])
+        findings.warn_no_rows("sample", "/camera/tracks", TRANSFORMS["sample"](), [none, some], [none, some])
     assert said == []
 
 
@@ -380,7 +380,7 @@ def test_a_class_that_only_the_log_names_is_not_imported(path, stage, transform,
     assert f"imported only if you name it, as in `mcaptrack run {path} --force --{kind} {name}`" in refused.err
     assert path.read_bytes() == before
     with log.read(path) as opened:
-        jobs = pipeline.plan_all(opened, "/camera", defaults={stage: type(transform)()}, anew=True)
+        jobs = pipeline.plan_all(opened, "/camera", defaults={stage: type(transform)()}, force=True)
         assert [type(job.transform) for job in jobs if job.stage == stage] == [type(transform)]
         pipeline.run(opened, "/camera", jobs)
     assert made_by(path, topic).plugins == first.plugins

@@ -116,7 +116,7 @@ def test_a_buffer_that_is_used_again_does_not_change_earlier_frames():
         (one(t_ns=2**63), "gave frame 0 of 9223372036854775808 ns at frame 0 (0 ns); a log holds no such"),
         (one(index=-1), "gave frame -1 of 0 ns at frame 0 (0 ns); a log holds no such"),
         (one(index=2**32), "gave frame 4294967296 of 0 ns at frame 0 (0 ns); a log holds no such"),
-        (one(t_ns=0.0), "gave a frame at frame 0 (0 ns) whose t_ns and index are no whole numbers"),
+        (one(t_ns=0.0), "gave a frame at frame 0 (0 ns) with a t_ns or index that is no whole number"),
         (one(t_ns=5), "gave frame 0 of 5 ns at frame 0 (0 ns), which is not in its input"),
         (one(index=3), "gave frame 3 of 0 ns at frame 0 (0 ns), which is not in its input"),
         (lambda frame: [*one()(frame), *one()(frame)], "gave frame 0 of 0 ns at frame 0 (0 ns), which is not in its input or was given before"),

@@ -106,10 +106,10 @@ PLANS: dict[str, tuple[dict[str, Any], dict[str, Any], list[str], list[str], lis
         [EARLIER("predictions", "samples", "predict"), EARLIER("retracks", "samples", "retrack")],
         [],
     ),
-    "anew": ({}, {"anew": True}, ["track", "sample", "predict", "retrack"], [], []),
-    "anew, though due": (
+    "force": ({}, {"force": True}, ["track", "sample", "predict", "retrack"], [], []),
+    "force, though due": (
         {"detections": {"digest": "D"}},
-        {"anew": True},
+        {"force": True},
         ["track", "sample", "predict", "retrack"],
         [],
         [],
@@ -181,9 +181,9 @@ PLANS: dict[str, tuple[dict[str, Any], dict[str, Any], list[str], list[str], lis
         [EARLIER("retracks", "samples", "retrack")],
         [("/camera/predictions is out of date and stays as it is: it was made with more, strange, which Predict does not have", "out-of-date")],
     ),
-    "a parameter that is gone, and anew": (
+    "a parameter that is gone, and force": (
         {"tracks": {"parameters": {"strange": 1}}},
-        {"anew": True},
+        {"force": True},
         ["sample", "predict", "retrack"],
         [],
         [("/camera/tracks is not made again, it stays as it is: it was made with strange, which Sort does not have", "left-out")],
@@ -239,9 +239,9 @@ def test_a_stage_runs_with_what_is_asked_or_else_as_before(tmp_path):
     channels = finished(tracks={"parameters": parameters_of("track", before), "input_digest": "other"})
     (first, *_), *_ = planned(tmp_path / "a.mcap", channels, defaults={"track": now})
     assert first.transform == before
-    (first, *_), *_ = planned(tmp_path / "b.mcap", channels, defaults={"track": now}, anew=True)
+    (first, *_), *_ = planned(tmp_path / "b.mcap", channels, defaults={"track": now}, force=True)
     assert first.transform == now
-    (first, *_), *_ = planned(tmp_path / "c.mcap", channels, anew=True)
+    (first, *_), *_ = planned(tmp_path / "c.mcap", channels, force=True)
     assert first.transform == before
     del channels["/camera/tracks"]
     (first, *_), said, _ = planned(tmp_path / "d.mcap", channels, defaults={"track": now})
@@ -423,7 +423,7 @@ def test_what_was_odd_when_a_channel_was_made_is_said_for_what_runs_and_what_it_
 
         def said(made: dict[str, Provenance], is_all: bool) -> list[tuple[str, str]]:
             with notices.listening(lambda _: None), notices.collected() as heard:
-                findings.warn_of_what_stands(opened, "/camera", made, (), is_all)
+                findings.warn_findings(opened, "/camera", made, (), is_all)
             return [(one.message, one.code) for one in heard]
 
         now = Provenance("predict", {}, "/camera/samples", warnings=[("strange", "odd now")])
@@ -452,9 +452,7 @@ def test_a_guessed_scale_is_said_of_what_is_in_metres(tmp_path, stage, assumed, 
         notices.listening(lambda _: None),
         notices.collected() as said,
     ):
-        findings.warn_of_what_stands(
-            opened, "/camera", {"/camera/other": Provenance(stage, {})}, [(0, plane)], is_all=False
-        )
+        findings.warn_findings(opened, "/camera", {"/camera/other": Provenance(stage, {})}, [(0, plane)], is_all=False)
     assert [(one.message, one.code) for one in said] == [(GUESSED, "assumed-ground-plane")] * is_said
 
 
@@ -469,16 +467,14 @@ def test_tracks_that_are_only_passed_on_are_said(tmp_path, parameters, is_said):
         f"one looks along the ground. To insist: `mcaptrack.retrack('{path}', side_view=True)`"
     )
     with log.read(path) as opened, notices.listening(lambda _: None), notices.collected() as said:
-        findings.warn_of_what_stands(
-            opened, "/camera", {"/camera/x": Provenance("retrack", parameters)}, (), is_all=False
-        )
+        findings.warn_findings(opened, "/camera", {"/camera/x": Provenance("retrack", parameters)}, (), is_all=False)
     assert [(one.message, one.code) for one in said] == [(words, "held-back")] * is_said
 
 
 def test_little_memory_is_said_in_numbers(monkeypatch):
     monkeypatch.setattr(findings, "free_memory", lambda: 160_000_000)
     with notices.listening(lambda _: None), notices.collected() as said:
-        findings.warn_of_memory(50_000, 500_000)
+        findings.warn_memory(50_000, 500_000)
     assert [(one.message, one.code) for one in said] == [
         (
             "500,000 boxes in 50,000 pictures take about 1.1 GB of memory, and 0.2 GB are free: what is computed stays in "

@@ -163,9 +163,9 @@ SCENES: dict[str, Callable[[Scene], str]] = {
         "run", "LOG"
     ),
     "pipeline/events.py:make_events:run": lambda s: s.untracked().says("events", "LOG"),
-    "pipeline/findings.py:warn_of_what_stands:ingest": Scene.side_view,
-    "pipeline/findings.py:warn_of_what_stands:retrack": Scene.side_view,
-    "pipeline/plan.py:_warn_of_settings:run": Scene.of_a_later_version,
+    "pipeline/findings.py:warn_findings:ingest": Scene.side_view,
+    "pipeline/findings.py:warn_findings:retrack": Scene.side_view,
+    "pipeline/plan.py:_warn_settings:run": Scene.of_a_later_version,
     "pipeline/plan.py:_refusal:run": Scene.by_own_tracker,
     "pipeline/plan.py:_not_made:*": Scene.elsewhere,
     "pipeline/write.py:find_views:run": lambda s: s.untracked().says("render", "LOG"),

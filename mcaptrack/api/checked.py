@@ -1,4 +1,4 @@
-"""What functions are given is checked when they are called: choices, ranges of numbers, progress.
+"""Check the arguments of functions when they are called: choices, ranges of numbers, progress.
 
 The command line checks its options itself, by the same ranges. Without these checks ``form="parqet"`` would be an error
 of the program, or change nothing.

@@ -53,8 +53,8 @@ def fetch_message(log: Log, row: Mapping[str, Any]) -> FetchedMessage:
         topic, message = part.message_at(chunk, offset)
     except McaptrackError as error:
         raise McaptrackError(f"{old} ({error})") from None
-    said = (row.get("topic", topic), _whole(row.get("t_ns", message.t_ns)))
-    if said != (topic, message.t_ns):
+    stated = (row.get("topic", topic), _whole(row.get("t_ns", message.t_ns)))
+    if stated != (topic, message.t_ns):
         raise McaptrackError(old)
     return FetchedMessage(topic, message.t_ns, message.publish_ns, message.sequence, message.payload)
 

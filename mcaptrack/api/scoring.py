@@ -276,10 +276,10 @@ def evaluate(
         else:
             plane = optional_path(ground_plane)
             sequences = _from_files(paths, paths_of(truth), parse_fps(fps), plane, point, topics, notes)
-        total, told = sum(len(sequence.candidates) for sequence in sequences), count()
+        total, counter = sum(len(sequence.candidates) for sequence in sequences), count()
 
         def tell(candidate: str) -> None:
-            progress("evaluate", next(told), total)
+            progress("evaluate", next(counter), total)
             detail(candidate)
 
         outcome = score_sequences(sequences, options, tell)

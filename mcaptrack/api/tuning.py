@@ -187,8 +187,8 @@ def tune(
             tasks = _tasks_of_files(pairs, parse_fps(fps), optional_path(ground_plane), point)
         if force and trials_file is not None:
             trials_file.unlink(missing_ok=True)
-        how = "Optuna" if uses_optuna() else _BY_CHANCE
-        notes.say(f"{stage}: {len(ranges)} parameters, {len(tasks)} sequences, trials by {how}")
+        proposals = "Optuna" if uses_optuna() else _BY_CHANCE
+        notes.say(f"{stage}: {len(ranges)} parameters, {len(tasks)} sequences, trials by {proposals}")
 
         def tell(trial: Trial, best: Trial, total: int) -> None:
             progress("tune", trial.number + 1, total)

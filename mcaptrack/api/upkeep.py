@@ -85,8 +85,8 @@ def check(log: PathLike, *, progress: Progress = no_progress) -> LogCheck:
 
 def files_of(log: Path) -> list[Path]:
     """Return the files of a log: itself, and its results if they stand beside it."""
-    beside = logs.results_path(log)
-    return [log, beside] if beside != log and beside.exists() else [log]
+    results = logs.results_path(log)
+    return [log, results] if results != log and results.exists() else [log]
 
 
 @dataclass(frozen=True)
@@ -235,7 +235,7 @@ def drop(
         refuse_overwrite(copy, force)
         if is_same_file(copy, path):
             raise McaptrackError(f"{path} is both input and output; leave `output=` out to change it in place")
-    beside = logs.results_path(path)
+    results = logs.results_path(path)
     with warnings_about(path) as warnings:
         with logs.read(path) as opened:
             dropped = _chosen(opened, names_of(topics))
@@ -248,9 +248,9 @@ def drop(
                     f"{path} is {recording}, which ROS tools read; `output=` writes a copy without "
                     f"{', '.join(sorted(recorded))}, `in_place=True` changes it all the same"
                 )
-        targets = {path: copy or path, beside: logs.results_path(copy) if copy else beside}
-        if copy is not None and beside in holds:
-            refuse_overwrite(targets[beside], force)
+        targets = {path: copy or path, results: logs.results_path(copy) if copy else results}
+        if copy is not None and results in holds:
+            refuse_overwrite(targets[results], force)
         for part, gone in holds.items():
             if gone or copy is not None:
                 target = targets[part] if copy else None
@@ -276,5 +276,9 @@ def _chosen(opened: logs.Log, patterns: Sequence[str]) -> set[str]:
         chosen |= found
     made = {topic: Provenance.from_metadata(channel.metadata) for topic, channel in opened.channels.items()}
     for transform in ("events", "view"):  # in this order: events have views
-        chosen |= {topic for topic, how in made.items() if how and how.transform == transform and how.input in chosen}
+        chosen |= {
+            topic
+            for topic, provenance in made.items()
+            if provenance and provenance.transform == transform and provenance.input in chosen
+        }
     return chosen

@@ -98,7 +98,7 @@ def run(
         return pipeline.plan_all(opened, prefix, say, topic, transforms, force, chosen, camera_motion or "")
 
     options = events if isinstance(events, EventOptions) else EventOptions()
-    watch = Watch(options, anew=force) if events else None
+    watch = Watch(options, force=force) if events else None
     return work(Where(log, camera, topic, output, sidecar, force), plan, watch, progress, tables)
 
 

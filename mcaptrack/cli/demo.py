@@ -72,14 +72,14 @@ def demo(
 
 def _next_commands(target: Path) -> list[str]:
     """Return commands to try next, as they can be typed in the working folder."""
-    command, log = _how_called(), quote(str(target))
+    command, log = _program(), quote(str(target))
     lines = [f"{command} {name} {log}" for name in ("info", "evaluate", "report")]
     if find_spec("duckdb") is None:
         lines.append(f"{_from_here(Path(sys.executable))} -m pip install duckdb")
     return [*lines, f'{command} query {log} "from tracks limit 5"']
 
 
-def _how_called() -> str:
+def _program() -> str:
     """Return how a shell finds the running program: by its name, otherwise by its path."""
     program = Path(sys.argv[0])
     found = which(program.name)

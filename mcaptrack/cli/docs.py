@@ -66,8 +66,8 @@ def documentation() -> dict[str, Path]:
     """Return the pages by name: those in the installed package, or those beside it in a checkout."""
     package = Path(__file__).resolve().parent.parent
     inside = package / "docs"
-    beside = [path for path in package.parent.glob("*.md") if path.stem in ("README", "CHANGELOG")]
-    shown = inside.glob("*.md") if inside.is_dir() else [*beside, *(package.parent / "docs").glob("*.md")]
+    pages = [path for path in package.parent.glob("*.md") if path.stem in ("README", "CHANGELOG")]
+    shown = inside.glob("*.md") if inside.is_dir() else [*pages, *(package.parent / "docs").glob("*.md")]
     return {
         path.stem.lower(): path for path in sorted(shown, key=lambda path: (path.stem != "README", path.stem.lower()))
     }

@@ -145,7 +145,7 @@ def _asked(words: Sequence[str], file: Path | None, tables: bool) -> tuple[list[
         if file is not None:
             raise McaptrackError("--tables needs no query; leave -f out")
         return [Path(name) for name in names], ""
-    if not words or (not from_file and _is_there(words[-1])):
+    if not words or (not from_file and _exists(words[-1])):
         raise McaptrackError("there is no query; give it last, in quotes, or with -f FILE (--tables lists the tables)")
     if not names:
         raise McaptrackError("there is no log; give logs or folders of tables before the query")
@@ -165,7 +165,7 @@ def _asked(words: Sequence[str], file: Path | None, tables: bool) -> tuple[list[
     return [Path(name) for name in names], sql
 
 
-def _is_there(word: str) -> bool:
+def _exists(word: str) -> bool:
     try:
         return Path(word).exists()
     except (OSError, ValueError):  # too long for a name, as queries are
@@ -184,9 +184,9 @@ def _form(form: Form | None, output: Path | None, json: bool) -> Form:
     return chosen
 
 
-def _named(beside: Sequence[str]) -> dict[str, Path]:
+def _named(files: Sequence[str]) -> dict[str, Path]:
     out = {}
-    for words in beside:
+    for words in files:
         name, equals, path = words.partition("=")
         if not equals or not path:
             raise McaptrackError(f"--with {words}: give a name and a file, such as --with zones=zones.csv")

@@ -115,11 +115,11 @@ def log_panel(title: str, topic: str) -> dict[str, Any]:
     return panel(title, {"topicToRender": topic, "minLogLevel": 1, "searchTerms": []})
 
 
-def beside(parts: Sequence[Tree], direction: str = "row") -> Tree:
+def split(parts: Sequence[Tree], direction: str = "row") -> Tree:
     """Parts in a row, or a column, with equal shares."""
     if len(parts) == 1:
         return parts[0]
-    return direction, parts[0], beside(parts[1:], direction), 100 / len(parts)
+    return direction, parts[0], split(parts[1:], direction), 100 / len(parts)
 
 
 def layout(panels: Mapping[str, Config], tree: Tree) -> bytes:

@@ -251,9 +251,9 @@ def _features(image: Image, hidden: Floats | None) -> Points:
     return np.empty((0, 1, 2), np.float32) if found is None else np.asarray(found, np.float32)
 
 
-def _within_reach(points: Floats | Points, there: Points, reach: float) -> int:
-    """How many points (N, 2) lie within reach of where they should be (N, 2)."""
-    away = points - there
+def _within_reach(points: Floats | Points, expected: Points, reach: float) -> int:
+    """Count the points (N, 2) within reach of their expected positions (N, 2)."""
+    away = points - expected
     return int(np.count_nonzero((away * away).sum(axis=1) < reach * reach))
 
 
@@ -264,7 +264,7 @@ def _inside(points: Points, image: Image) -> Bools:
 
 
 def _within(points: Points, boxes: Floats) -> Bools:
-    """Which points (N, 2) lie in one of the boxes."""
+    """Mask the points (N, 2) that lie in one of the boxes."""
     x, y = points.T[:, :, None]
     left, top, width, height = boxes.T
     within: Bools = ((x >= left) & (x <= left + width) & (y >= top) & (y <= top + height)).any(axis=1)

@@ -34,10 +34,10 @@ _LEAST_MOVING: Final = 0.02
 
 
 class Verdict(IntEnum):
-    """What a camera does at a picture: the column ``verdict`` of camera motion.
+    """The state of a camera at a picture: the column ``verdict`` of camera motion.
 
-    It stands where it stood; it shakes about that view; it is further away, or on its way; the picture shows another
-    scene than the one before; or nothing can be said.
+    Still: it shows the same view as before. Shaking: it moves about that view. Moving: it is on its way, or shows
+    another view. Cut: the picture shows another scene than the one before. Lost: its motion can't be estimated.
     """
 
     STILL = 0
@@ -48,7 +48,7 @@ class Verdict(IntEnum):
 
 
 class CameraPose(NamedTuple):
-    """What is known of the camera at a picture.
+    """The position of the camera at a picture.
 
     Attributes
     ----------
@@ -73,7 +73,7 @@ class CameraPose(NamedTuple):
 
 
 class Stance:
-    """Where a camera stands, and what it does: still, shaking about where it stands, or moving away from there."""
+    """The position of a camera and its state: still, shaking about that position, or moving away from it."""
 
     def __init__(self, width_px: float, height_px: float, is_away: bool = False) -> None:
         self._size = (width_px, height_px)
@@ -126,7 +126,7 @@ def poses_of(motions: Floats, width_px: float, height_px: float) -> list[CameraP
 
 
 def verdict_of(verdicts: NDArray[np.integer]) -> Verdict:
-    """What a camera does on the whole, by its verdicts (F,): it is moving, shaking or still.
+    """The state of a camera over a whole log, by its verdicts (F,): moving, shaking or still.
 
     Cuts and lost pictures don't count.
     """
@@ -138,14 +138,14 @@ def verdict_of(verdicts: NDArray[np.integer]) -> Verdict:
 
 
 class CameraPath:
-    """How a camera moved in a log.
+    """The motion of a camera in a log.
 
     Parameters
     ----------
     t_ns : (F,) array of int64
         The times of its pictures, in order.
     poses : sequence of CameraPose
-        What is known of it at each.
+        Its position at each.
 
     Examples
     --------
@@ -187,7 +187,7 @@ class CameraPath:
 
     @cached_property
     def verdict(self) -> Verdict:
-        """What the camera does on the whole, see ``verdict_of``."""
+        """The state of the camera over the whole log, see ``verdict_of``."""
         return verdict_of(np.array([pose.verdict for pose in self._poses], np.int64))
 
     @cached_property

@@ -117,15 +117,15 @@ def rewrite_tail(path: Path, handle: int, start: int, log: OpenFile) -> Iterator
     ``handle`` is open for reading and writing. The block must call ``close`` at its end. Raises McaptrackError if the
     journal can't be written.
     """
-    beside = journal_of(path)
-    if os.path.lexists(beside):  # created since the log was locked
-        raise McaptrackError(f"{beside} can't be written: there is something else with that name")
+    journal_path = journal_of(path)
+    if os.path.lexists(journal_path):  # created since the log was locked
+        raise McaptrackError(f"{journal_path} can't be written: there is something else with that name")
     try:
         written, digest = _write_journal(path, handle, start, log)
     except BaseException as why:
-        beside.unlink(missing_ok=True)  # the log has not been changed yet
+        journal_path.unlink(missing_ok=True)  # the log has not been changed yet
         if isinstance(why, OSError):
-            raise McaptrackError(f"{beside} can't be written: {why.strerror or why}") from why
+            raise McaptrackError(f"{journal_path} can't be written: {why.strerror or why}") from why
         raise
     try:
         try:
@@ -137,8 +137,8 @@ def rewrite_tail(path: Path, handle: int, start: int, log: OpenFile) -> Iterator
             journal.remove(path)
         except OSError as error:  # the change itself is complete
             notices.warn(
-                f"{path} is complete, but {beside} can't be removed ({error.strerror}); the next command that writes "
-                "to the log removes it",
+                f"{path} is complete, but {journal_path} can't be removed ({error.strerror}); the next command that "
+                "writes to the log removes it",
                 "journal",
             )
     finally:

@@ -341,16 +341,16 @@ def read(path: Path, *, sidecar: bool | Callable[[Log], bool] | None = None) -> 
     McaptrackError
         If the file is missing, not an MCAP file, or damaged.
     """
-    log, beside = Log(path), results_path(path)
+    log, results = Log(path), results_path(path)
     try:
         if not path.name.endswith(RESULTS_SUFFIX) and (
-            sidecar(log) if callable(sidecar) else sidecar or (sidecar is None and beside.exists())
+            sidecar(log) if callable(sidecar) else sidecar or (sidecar is None and results.exists())
         ):
-            is_new = not beside.exists()
+            is_new = not results.exists()
             if is_new:
-                with create(beside):
+                with create(results):
                     pass
-            log.attach_results(Log(beside), is_new)
+            log.attach_results(Log(results), is_new)
     except BaseException:
         log.__exit__()
         raise

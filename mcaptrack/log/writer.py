@@ -322,11 +322,11 @@ def _free_id(taken: Mapping[int, object], last: int, what: str) -> int:
 
 def refuse_earlier_results(path: Path) -> None:
     """Raise McaptrackError if a new log at ``path`` would be read with the sidecar of an earlier one."""
-    beside = results_path(path)
-    if not path.name.endswith(RESULTS_SUFFIX) and beside.exists():
+    results = results_path(path)
+    if not path.name.endswith(RESULTS_SUFFIX) and results.exists():
         raise McaptrackError(
-            f"{beside} holds results of an earlier {path.name} and would be read with the new one; remove it first, or "
-            "choose another name"
+            f"{results} holds results of an earlier {path.name} and would be read with the new one; remove it first, "
+            "or choose another name"
         )
 
 

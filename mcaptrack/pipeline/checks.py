@@ -118,7 +118,7 @@ def _check_outputs(opened: log.Log, prefix: str, job: Job) -> None:
         for name, transform in maker.items():
             if not may_replace(opened, name, transform):
                 raise McaptrackError(
-                    f"{opened.path}: {job.stage} would replace {name}, which {how_it_came(opened, name)}; "
+                    f"{opened.path}: {job.stage} would replace {name}, which {describe_origin(opened, name)}; "
                     "write to another channel with `to=`"
                 )
 
@@ -128,7 +128,7 @@ def may_replace(opened: log.Log, topic: str, transform: str) -> bool:
     return all(made is not None and made.transform == transform for made, _ in _making(opened, topic))
 
 
-def how_it_came(opened: log.Log, topic: str) -> str:
+def describe_origin(opened: log.Log, topic: str) -> str:
     """Describe the origin of a channel as text; if several channels share the topic, a recorded one goes first."""
     made, schema_name = min(_making(opened, topic), key=lambda found: found[0] is not None)
     if made is None:

@@ -22,7 +22,7 @@ from mcaptrack.evaluation.event_text import SUFFIX, log_messages
 from mcaptrack.evaluation.events import EventOptions, find_events
 from mcaptrack.evaluation.forecasts import FORECAST_INPUTS, find_forecast_errors
 from mcaptrack.notices import warn
-from mcaptrack.pipeline.checks import how_it_came, may_replace
+from mcaptrack.pipeline.checks import describe_origin, may_replace
 from mcaptrack.pipeline.plan import is_stale
 from mcaptrack.pipeline.write import Made, digest_of
 from mcaptrack.schema import (
@@ -54,13 +54,13 @@ class Watch:
     """The channels of tracks to find events in, and the options for that.
 
     Without ``topics`` these are the default channels and those that have events already. With ``again`` events are
-    found again with ``options`` even if they are up to date; with ``anew`` also, but with the options they had before.
+    found again with ``options`` even if they are up to date; with ``force`` also, but with the options they had before.
     """
 
     options: EventOptions = EventOptions()
     topics: tuple[str, ...] = ()
     again: bool = False
-    anew: bool = False
+    force: bool = False
 
 
 def outputs(topic: str) -> tuple[str, ...]:
@@ -87,7 +87,7 @@ def make_events(opened: log.Log, prefix: str, made: Mapping[str, Made], watch: W
         options = watch.options if watch.again else _options_for(opened, topic, watch.options)
         has_same_options = _options_for(opened, topic, EventOptions()) == options
         is_up_to_date = has_same_options and not _is_outdated(opened, outputs(topic), made)
-        if is_up_to_date and not (watch.again or watch.anew):
+        if is_up_to_date and not (watch.again or watch.force):
             continue
         conflict = _find_conflict(opened, outputs(topic))
         if conflict:
@@ -108,7 +108,7 @@ def make_events(opened: log.Log, prefix: str, made: Mapping[str, Made], watch: W
         out[topic + _COUNTS] = Made.of(COUNTS, found.counts, provenance)
     if not watch.topics:
         for name in FORECAST_INPUTS:
-            out |= _forecast_errors(opened, prefix, name, made, watch.again or watch.anew, truth)
+            out |= _forecast_errors(opened, prefix, name, made, watch.again or watch.force, truth)
     return out
 
 
@@ -228,7 +228,7 @@ def _find_conflict(opened: log.Log, topics: Sequence[str]) -> str:
     """Return the first of these topics that events may not replace, with its origin, as text; "" if there is none."""
     made_by = {topic: VIEW if topic.endswith(SUFFIX) else STAGE for topic in topics}
     taken = [topic for topic, transform in made_by.items() if not may_replace(opened, topic, transform)]
-    return f"{taken[0]}, which {how_it_came(opened, taken[0])}" if taken else ""
+    return f"{taken[0]}, which {describe_origin(opened, taken[0])}" if taken else ""
 
 
 def _has_rows(opened: log.Log, topic: str, made: Mapping[str, Made] = {}, schema: Schema = TRACKS) -> bool:

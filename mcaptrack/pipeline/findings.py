@@ -21,9 +21,7 @@ _IN_METRES: Final = {name for name, stage in STAGES.items() if stage.default.rea
 _BASE, _A_PICTURE, _A_BOX = 100_000_000, 3_000, 1_600
 
 
-def warn_of_nothing(
-    stage: str, source: str, transform: Transform, given: Sequence[Frame], made: Sequence[Frame]
-) -> None:
+def warn_no_rows(stage: str, source: str, transform: Transform, given: Sequence[Frame], made: Sequence[Frame]) -> None:
     """Warn if a stage made no rows, with the likely reason.
 
     ``given`` are the frames that the stage read, ``made`` those of its first output.
@@ -37,7 +35,7 @@ def warn_of_nothing(
     warn(f"no {STAGES[stage].rows} of {source}: {reason}", "nothing-found")
 
 
-def warn_of_memory(pictures: int, boxes: int) -> None:
+def warn_memory(pictures: int, boxes: int) -> None:
     """Warn if stages need more memory for this number of pictures and boxes than is free."""
     needed, free = _BASE + pictures * _A_PICTURE + boxes * _A_BOX, free_memory()
     if free is not None and needed > free:
@@ -61,9 +59,7 @@ def free_memory() -> int | None:
     return min(found, default=None)
 
 
-def warn_of_what_stands(
-    opened: log.Log, prefix: str, made: Mapping[str, Provenance], planes: Planes, is_all: bool
-) -> None:
+def warn_findings(opened: log.Log, prefix: str, made: Mapping[str, Provenance], planes: Planes, is_all: bool) -> None:
     """Repeat the warnings that channels carry in their provenance, and warn about an estimated scale.
 
     This covers the channels in ``made``, by topic, and the channels that they were made from; with ``is_all`` it covers

@@ -24,8 +24,8 @@ STAGE: Final = "motion"
 _OFF: Final = "off"
 
 
-class Beside(NamedTuple):
-    """What a job reads beside its input: values of its transform by name, and the digests of the topics."""
+class SideInputs(NamedTuple):
+    """Inputs of a job beside its main one: values of its transform by name, and the digests of the topics."""
 
     values: Mapping[str, Any]
     references: Mapping[str, str]
@@ -76,30 +76,30 @@ def _needs_still_camera(opened: log.Log, boxes: str, jobs: Sequence[Job]) -> boo
     return bool(getattr(stage.built_in().get(str(name), stage.default), "needs_still_camera", False))
 
 
-def beside(opened: log.Log, prefix: str, job: Job, made: Mapping[str, Made]) -> Beside:
-    """What a job reads beside its input. ``made`` are the channels that jobs before it made."""
+def side_inputs(opened: log.Log, prefix: str, job: Job, made: Mapping[str, Made]) -> SideInputs:
+    """Return the inputs of a job beside its main one. ``made`` are the channels that jobs before it made."""
     names = {f.name for f in fields(job.transform) if f.metadata.get("context")}
     if "camera_path" in names and uses_motion(job.transform):
         return _path(opened, prefix, job, made)
     if "known_boxes" in names and getattr(job.transform, "mask_boxes", False):
         return _boxes(opened, prefix, made)
-    return Beside({}, {})
+    return SideInputs({}, {})
 
 
-def _path(opened: log.Log, prefix: str, job: Job, made: Mapping[str, Made]) -> Beside:
-    """How the camera moves, if it is known."""
+def _path(opened: log.Log, prefix: str, job: Job, made: Mapping[str, Made]) -> SideInputs:
+    """Return the path of the camera, if its motion is known."""
     topic = motion_topic(prefix)
     found = _read(opened, topic, CAMERA_MOTION, made)
     if found is None:
         if getattr(job.transform, "camera_motion", "") == "on":
             warn(f"the motion of the camera is not known: {topic} needs pictures of it in the log", "option-not-used")
-        return Beside({}, {})
+        return SideInputs({}, {})
     frames, digest = found
     try:
         path = frames_to_path(frames)
     except McaptrackError as error:
         raise McaptrackError(f"{opened.path}: {topic}: {error}") from None
-    return Beside({"camera_path": path}, {topic: digest})
+    return SideInputs({"camera_path": path}, {topic: digest})
 
 
 def planes_in_pictures(opened: log.Log, prefix: str, made: Mapping[str, Made], planes: Planes) -> Planes:
@@ -107,26 +107,26 @@ def planes_in_pictures(opened: log.Log, prefix: str, made: Mapping[str, Made], p
     topic = motion_topic(prefix)
     stage = next(one for one in STAGES.values() if one.default.reads is DETECTIONS)
     tracks = f"{prefix}/{stage.output_topic}"
-    how = made[tracks].provenance if tracks in made else provenance_of(opened, tracks)
-    found = _read(opened, topic, CAMERA_MOTION, made) if planes and how and topic in how.references else None
-    if how is None or found is None:
+    tracked = made[tracks].provenance if tracks in made else provenance_of(opened, tracks)
+    found = _read(opened, topic, CAMERA_MOTION, made) if planes and tracked and topic in tracked.references else None
+    if tracked is None or found is None:
         return planes
     try:
         path = frames_to_path(found[0])
     except McaptrackError:
         return planes  # the tracks were made from an earlier motion
-    return moved_planes(planes, used_path(path, how.parameters.get("camera_motion", _OFF)))
+    return moved_planes(planes, used_path(path, tracked.parameters.get("camera_motion", _OFF)))
 
 
-def _boxes(opened: log.Log, prefix: str, made: Mapping[str, Made]) -> Beside:
+def _boxes(opened: log.Log, prefix: str, made: Mapping[str, Made]) -> SideInputs:
     """The boxes of people, by the time of their picture."""
     usual = f"{prefix}/{next(s.output_topic for s in STAGES.values() if s.default.writes[''] is DETECTIONS)}"
     topic = usual if usual in made or usual in opened.channels else camera_at(opened, prefix).boxes
     found = None if topic is None else _read(opened, topic, DETECTIONS, made)
     if topic is None or found is None or _needs_still_camera(opened, topic, ()):
-        return Beside({}, {})
+        return SideInputs({}, {})
     boxes = {frame.t_ns: columns_to_boxes(frame.rows) for frame in found[0] if len(frame.rows)}
-    return Beside({"known_boxes": boxes}, {topic: found[1]})
+    return SideInputs({"known_boxes": boxes}, {topic: found[1]})
 
 
 def _read(opened: log.Log, topic: str, schema: Schema, made: Mapping[str, Made]) -> tuple[Sequence[Frame], str] | None:

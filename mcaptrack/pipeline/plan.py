@@ -15,7 +15,7 @@ from mcaptrack.errors import McaptrackError, call
 from mcaptrack.geometry.plane import is_assumed
 from mcaptrack.notices import warn
 from mcaptrack.pipeline import motion
-from mcaptrack.pipeline.checks import Job, check_inputs, fits, how_it_came
+from mcaptrack.pipeline.checks import Job, check_inputs, describe_origin, fits
 from mcaptrack.pipeline.planes import planes_to_json, read_planes
 from mcaptrack.pipeline.rebuild import MissingPluginError, rebuild
 from mcaptrack.schema import DETECTIONS, VIDEO
@@ -62,20 +62,20 @@ def plan_all(
     say: Say = lambda _: None,
     source: str | None = None,
     defaults: Mapping[str, Transform] = {},
-    anew: bool = False,
+    force: bool = False,
     chosen: Collection[str] = (),
     camera_motion: str = "",
 ) -> list[Job]:
     """Plan the jobs that bring all results of a camera up to date; empty if they are.
 
     ``source`` is the topic of pictures or of recorded detections to begin with; ``defaults`` as in ``plan_stage``. With
-    ``anew``, channels that are up to date are made again, too, by the transform in ``defaults`` or else the same one.
+    ``force``, channels that are up to date are made again, too, by the transform in ``defaults`` or else the same one.
     ``camera_motion`` is what trackers are to do about it ("auto", "on" or "off") where it differs from what they did.
     ``chosen`` are options that the user gave for ``defaults`` ("tracker"): a channel that was made with another choice
     is made again. Raises McaptrackError as ``plan_stage`` does, and if the class that made a channel is not installed.
     """
     sources = {_stage_from(opened, source): source} if source else {}
-    planner = _Planner(opened, prefix, sources, defaults, anew, chosen, camera_motion)
+    planner = _Planner(opened, prefix, sources, defaults, force, chosen, camera_motion)
     read = {stage.input_topic for stage in STAGES.values()}
     for stage in STAGES.values():
         if stage.output_topic not in read and not stage.on_demand:
@@ -100,7 +100,7 @@ def _stage_from(opened: log.Log, source: str) -> str:
 class _Planner:
     """Collects the jobs that make missing channels, and those that are out of date.
 
-    ``sources`` gives inputs and ``defaults`` transforms of stages that differ from the usual ones. With ``anew`` all
+    ``sources`` gives inputs and ``defaults`` transforms of stages that differ from the usual ones. With ``force`` all
     stages run, also those that are up to date. A stage also runs if an option in ``chosen`` differs from the one that
     its channel was made with; so does one that takes camera motion into account, by ``camera_motion``.
     """
@@ -111,16 +111,16 @@ class _Planner:
         prefix: str,
         sources: Mapping[str, str] = {},
         defaults: Mapping[str, Transform] = {},
-        anew: bool = False,
+        force: bool = False,
         chosen: Collection[str] = (),
         camera_motion: str = "",
     ) -> None:
         self.jobs: list[Job] = []
         self._opened, self._prefix = opened, prefix
-        self._sources, self._defaults, self._anew, self._chosen = sources, defaults, anew, chosen
+        self._sources, self._defaults, self._force, self._chosen = sources, defaults, force, chosen
         self._camera_motion = camera_motion
         self._changes: dict[str, bool] = {}
-        self._said: list[str] = []
+        self._notes: list[str] = []
         self._unnamed: dict[str, MissingPluginError] = {}
         self._differing: set[str] = set()
 
@@ -129,7 +129,7 @@ class _Planner:
         if self._unnamed:
             raise McaptrackError(self._refusal())
         check_inputs(self._opened, self._prefix, self.jobs)
-        for words in self._said:
+        for words in self._notes:
             say(words)
         return self.jobs
 
@@ -143,12 +143,12 @@ class _Planner:
         camera = camera_at(self._opened, self._prefix)
         reads = STAGES[stage].default.reads
         if reads is VIDEO and camera.pictures:
-            self._said.append(f"{usual} is missing: taking the pictures of {camera.pictures}")
+            self._notes.append(f"{usual} is missing: taking the pictures of {camera.pictures}")
             if camera.boxes:
-                self._said.append(f"boxes that others detected are in {camera.boxes}; `topic=` takes them instead")
+                self._notes.append(f"boxes that others detected are in {camera.boxes}; `topic=` takes them instead")
             return camera.pictures
         if reads is DETECTIONS and camera.boxes and not camera.pictures:
-            self._said.append(f"{usual} is missing: taking the boxes of {camera.boxes}")
+            self._notes.append(f"{usual} is missing: taking the boxes of {camera.boxes}")
             return camera.boxes
         return usual
 
@@ -181,7 +181,7 @@ class _Planner:
         """Plan the job for a missing channel. Returns True: the channel will change."""
         source = self.source_of(stage)
         self.ensure(source)
-        self._said.append(f"{topic} is missing: running {stage}")
+        self._notes.append(f"{topic} is missing: running {stage}")
         chosen = self._defaults.get(stage) or self._suited(stage, source) or STAGES[stage].default()
         transform = self._with_choice(chosen)
         self.ensure_motion(transform, source)
@@ -200,7 +200,7 @@ class _Planner:
         if planes and not is_assumed(planes):
             parameters |= getattr(maker, "suits_on_ground", {}).get(option, {})
         words = name + (f" ({', '.join(f'{key} {value}' for key, value in parameters.items())})" if parameters else "")
-        self._said.append(
+        self._notes.append(
             f"{stage} by {words}, which suits the {kind.option} {kind.choice(maker)}; `{option}=` chooses"
         )
         return STAGES[stage].make(name, **parameters)
@@ -237,11 +237,11 @@ class _Planner:
         suited = self._suited(stage, source) if is_open else None
         wanted = self._with_choice(self._defaults.get(stage, suited or before)) if is_usual else before
         is_replaced = is_usual and (self._is_replaced(STAGES[stage], before, wanted) or suited is not None)
-        if wanted and not is_replaced and not self._anew:
-            self._warn_of_settings(main, _differing(before, wanted) if before else str(why_not))
-        if not is_due and not self._anew and not is_replaced:
+        if wanted and not is_replaced and not self._force:
+            self._warn_settings(main, _differing(before, wanted) if before else str(why_not))
+        if not is_due and not self._force and not is_replaced:
             return False
-        transform = wanted if self._anew or is_replaced else before
+        transform = wanted if self._force or is_replaced else before
         if transform is None:
             if isinstance(why_not, MissingPluginError) and why_not.options:
                 self._unnamed[topic] = why_not
@@ -253,15 +253,15 @@ class _Planner:
             return False
         self.ensure_motion(transform, source)
         if is_missing:
-            self._said.append(f"{topic} is missing: running {stage}, as for what it made beside it")
+            self._notes.append(f"{topic} is missing: running {stage}, as for what it made beside it")
         elif source != had:
-            self._said.append(f"{topic} was made from {had}: running {stage} again, from {source}")
+            self._notes.append(f"{topic} was made from {had}: running {stage} again, from {source}")
         elif is_replaced:
             is_other = before is None or STAGES[stage].choice(before) != STAGES[stage].choice(transform)
             by = f"by another {STAGES[stage].option}" if is_other else "with another `camera_motion=`"
-            self._said.append(f"{topic} was made {by}: running {stage} again")
-        elif is_due and not self._anew:
-            self._said.append(f"{topic} was made from an earlier {source}: running {stage} again, as before")
+            self._notes.append(f"{topic} was made {by}: running {stage} again")
+        elif is_due and not self._force:
+            self._notes.append(f"{topic} was made from an earlier {source}: running {stage} again, as before")
         there = [f"{main}/{suffix}".rstrip("/") for suffix in transform.writes]
         kept = [one == topic or one in self._opened.channels for one in there]
         keep = tuple(suffix for suffix, is_kept in zip(transform.writes, kept, strict=True) if is_kept)
@@ -286,7 +286,7 @@ class _Planner:
 
     def _refusal(self) -> str:
         """Return the message for channels that can't be made again: all classes to name, and a call that names them."""
-        options: dict[str, Any] = {"force": True} if self._anew else {}
+        options: dict[str, Any] = {"force": True} if self._force else {}
         for name, transform in self._defaults.items():
             if (option := STAGES[name].option) and option in self._chosen:
                 options[option] = STAGES[name].choice(transform)
@@ -298,7 +298,7 @@ class _Planner:
         again = call("run", self._opened.path, **options)
         return f"{self._opened.path}: {why}, as in {again}; another name replaces what it made"
 
-    def _warn_of_settings(self, main: str, differing: str) -> None:
+    def _warn_settings(self, main: str, differing: str) -> None:
         """Warn, once for all outputs of a stage, that they were made with other settings."""
         if main in self._differing or not differing:
             return
@@ -333,8 +333,8 @@ class _Planner:
         source = self._sources[stage]
         other = call(stage, self._opened.path, topic=source, to=f"{topic}_again")
         return (
-            f"{self._opened.path}: {topic} is there and {how_it_came(self._opened, topic)}; leave `topic=` out to go "
-            f"on from it, or run {other}"
+            f"{self._opened.path}: {topic} is there and {describe_origin(self._opened, topic)}; leave `topic=` out to "
+            f"go on from it, or run {other}"
         )
 
 

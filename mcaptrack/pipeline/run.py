@@ -18,8 +18,8 @@ from mcaptrack.notices import Notice, collected, warn
 from mcaptrack.pipeline.checks import Job, check_inputs, read_frames
 from mcaptrack.pipeline.events import STAGE as EVENTS_STAGE
 from mcaptrack.pipeline.events import Watch, make_events, tally
-from mcaptrack.pipeline.findings import warn_of_memory, warn_of_nothing, warn_of_what_stands
-from mcaptrack.pipeline.motion import beside, planes_in_pictures
+from mcaptrack.pipeline.findings import warn_findings, warn_memory, warn_no_rows
+from mcaptrack.pipeline.motion import planes_in_pictures, side_inputs
 from mcaptrack.pipeline.planes import guess_plane, is_poor, read_planes
 from mcaptrack.pipeline.rebuild import plugins_of
 from mcaptrack.pipeline.write import Made, digest_of, write
@@ -98,7 +98,7 @@ def _run(
             planes, channel = guess_plane(given.frames, job.source, given.digest())
             made |= {camera_at(opened, prefix).ground_plane: Made.of(GROUND_PLANE, *channel)} if channel else {}
         if has_boxes:
-            warn_of_memory(len(given.frames), sum(len(frame.rows) for frame in given.frames))
+            warn_memory(len(given.frames), sum(len(frame.rows) for frame in given.frames))
         try:
             made |= _run_job(opened, prefix, job, given, made, planes or ())
         except McaptrackError as error:
@@ -110,16 +110,16 @@ def _run(
             report.count(topic, made[topic])
         report.stages.append(job.stage)
     if watch is not None:
-        happened = make_events(opened, prefix, made, watch)
-        made |= happened
-        report.frames |= {topic: channel.size() for topic, channel in happened.items()}
-        report.events = tally(happened)
-        report.stages += [EVENTS_STAGE] if happened else []
+        events = make_events(opened, prefix, made, watch)
+        made |= events
+        report.frames |= {topic: channel.size() for topic, channel in events.items()}
+        report.events = tally(events)
+        report.stages += [EVENTS_STAGE] if events else []
     if made or output is not None:
         in_pictures = planes_in_pictures(opened, prefix, made, planes or ())
         report.layouts = write(opened, prefix, made, in_pictures, stamps, output)
-    how = {topic: channel.provenance for topic, channel in made.items()}
-    warn_of_what_stands(opened, prefix, how, planes or (), is_all=watch is not None or not jobs)
+    provenances = {topic: channel.provenance for topic, channel in made.items()}
+    warn_findings(opened, prefix, provenances, planes or (), is_all=watch is not None or not jobs)
     report.stale = outdated_by(opened, {topic: channel.provenance.digest for topic, channel in made.items()})
     return report
 
@@ -135,7 +135,7 @@ def outdated_by(opened: log.Log, digests: Mapping[str, str]) -> list[str]:
     return found
 
 
-class _Again:
+class _Repeatable:
     """Frames that can be read more than once, each time from the beginning."""
 
     def __init__(self, begin: Callable[[], Iterator[Frame]]) -> None:
@@ -160,7 +160,7 @@ def _run_job(
     opened: log.Log, prefix: str, job: Job, given: _Input, made: Mapping[str, Made], planes: Planes
 ) -> dict[str, Made]:
     """Run a job, and return its channels by topic. ``made`` are the channels of earlier jobs."""
-    known = beside(opened, prefix, job, made)
+    known = side_inputs(opened, prefix, job, made)
     transform = replace(_in_context(opened, prefix, job, given.frames, planes), **known.values)
     outputs: list[list[Frame]] = [[] for _ in transform.writes]
     taken: set[int] = set()
@@ -168,13 +168,13 @@ def _run_job(
         with collected() as warnings:
             entry = STAGES[job.stage].entry(type(transform))
             is_own = STAGES[job.stage].is_built_in(type(transform))
-            stream = _Again(lambda: _counting(given.stream, taken))
+            stream = _Repeatable(lambda: _counting(given.stream, taken))
             results = transform(stream) if is_own else guarded(entry, transform, stream)
             for result in results:
                 for frame, channel in zip(result, outputs, strict=True):
                     channel.append(frame)
             if not warnings:  # otherwise a warning has given the reason
-                warn_of_nothing(job.stage, job.source, transform, given.frames, outputs[0])
+                warn_no_rows(job.stage, job.source, transform, given.frames, outputs[0])
     except McaptrackError as error:
         where = "" if str(opened.path) in str(error) else f"{opened.path}: {job.source}: "
         raise type(error)(f"{where}{error}") from None
@@ -192,7 +192,7 @@ def _run_job(
         if topic in job.kept()
     }
     if job.target + FULL in job.kept():
-        out |= _carried(
+        out |= _at_video_rate(
             opened,
             job,
             {**made, **out},
@@ -233,7 +233,9 @@ def _provenance_of(
     )
 
 
-def _carried(opened: log.Log, job: Job, made: Mapping[str, Made], planes: Planes, holds_back: bool) -> dict[str, Made]:
+def _at_video_rate(
+    opened: log.Log, job: Job, made: Mapping[str, Made], planes: Planes, holds_back: bool
+) -> dict[str, Made]:
     """Return the re-tracked channel at the rate of the tracks that were sampled; empty if there are no such tracks."""
     samples = (
         made[job.source].provenance
@@ -279,8 +281,8 @@ def _in_context(opened: log.Log, prefix: str, job: Job, frames: Sequence[Frame],
 
 def _clock_start(opened: log.Log, prefix: str) -> int | None:
     """Return the start of the prediction clock in ns: from the log's metadata, or the time of the first picture."""
-    said = opened.metadata(CLOCK)
-    if said and (start := parse_ns(said.get("start_ns", ""))) is not None:
+    clock = opened.metadata(CLOCK)
+    if clock and (start := parse_ns(clock.get("start_ns", ""))) is not None:
         return start
     pictures = camera_at(opened, prefix).pictures
     return min(opened.times(pictures).tolist(), default=None) if pictures else None
@@ -295,10 +297,12 @@ def _input(
         digest, pictures = _pictures(opened, job, seen, progress)
         return _Input(pictures, [], digest, lambda: len(seen))
     if job.source in made:
-        frames, said = made[job.source].frames, made[job.source].provenance.digest
+        frames, digest = made[job.source].frames, made[job.source].provenance.digest
     else:
-        frames, said = read_frames(opened, job.source, job.transform.reads), digest_of(opened, job.source)
-    return _Input(_Again(lambda: _counted(frames, job.stage, progress)), frames, lambda: said, lambda: len(frames))
+        frames, digest = read_frames(opened, job.source, job.transform.reads), digest_of(opened, job.source)
+    return _Input(
+        _Repeatable(lambda: _counted(frames, job.stage, progress)), frames, lambda: digest, lambda: len(frames)
+    )
 
 
 def _counting(frames: Iterable[Frame], taken: set[int]) -> Iterator[Frame]:
@@ -340,7 +344,7 @@ def _pictures(
             progress(job.stage, min(done, steps), steps)
 
     stamps.clear()
-    return total.hexdigest, _Again(lambda: decode(encoded(is_first=not stamps)))
+    return total.hexdigest, _Repeatable(lambda: decode(encoded(is_first=not stamps)))
 
 
 def input_of(
@@ -355,5 +359,5 @@ def input_of(
     check_inputs(opened, prefix, [job])
     frames = read_frames(opened, topic, transform.reads)
     known = _in_context(opened, prefix, job, frames, read_planes(opened, prefix) or ())
-    known = replace(known, **beside(opened, prefix, job, {}).values)
+    known = replace(known, **side_inputs(opened, prefix, job, {}).values)
     return frames, {f.name: getattr(known, f.name) for f in fields(known) if f.metadata.get("context")}

@@ -19,7 +19,7 @@ from mcaptrack.foxglove.views import layouts
 from mcaptrack.geometry.arrays import Ints
 from mcaptrack.geometry.plane import Planes
 from mcaptrack.notices import warn
-from mcaptrack.pipeline.checks import how_it_came, may_replace
+from mcaptrack.pipeline.checks import describe_origin, may_replace
 from mcaptrack.schema import DETECTIONS, FORECAST_SCORES, GROUND_PLANE, PREDICTIONS, SCHEMAS, TRACKS, Frame, Schema
 from mcaptrack.schema.framing import frame_times
 from mcaptrack.schema.provenance import INGEST, VIEW, Provenance, digest
@@ -109,7 +109,7 @@ def write(
     recorded = {topic for topic in outdated if not may_replace(opened, topic, VIEW)}
     outdated -= recorded
     for topic in sorted(recorded):
-        warn(f"no view at {topic}, which {how_it_came(opened, topic)}", "left-out")
+        warn(f"no view at {topic}, which {describe_origin(opened, topic)}", "left-out")
     # Read everything before anything is written, because the log is changed in place.
     start_ns = _start_ns(opened, camera, shown, picture_ns)
     eye = layouts.eye_on(_positions(opened, prefix, shown), planes, start_ns)

@@ -1,1 +1,1 @@
-"""What comes in: videos, logs, messages of other software, labels, drawn scenes; and what belongs to which camera."""
+"""Inputs: videos, logs, messages of other software, labels, drawn scenes; and the channels of each camera."""

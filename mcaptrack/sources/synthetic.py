@@ -116,7 +116,7 @@ class SyntheticScene:
             boxes = {walker.id: self._figure(image, walker, place, now, draw=False) for walker, place in there}
             # From far to near, so that nearer objects occlude those behind them.
             acts: list[tuple[float, Callable[[], object]]] = [
-                (place[1], partial(self._figure, image, who, place, now, draw=True)) for who, place in there
+                (place[1], partial(self._figure, image, person, place, now, draw=True)) for person, place in there
             ]
             acts += [(block.y_m, partial(self._block, image, block)) for block in self.blocks]
             for _, act in sorted(acts, key=lambda pair: -pair[0]) if draw else ():
@@ -138,14 +138,14 @@ class SyntheticScene:
                 noisy = image + grain[y : y + self.height_px, x : x + self.width_px]
                 image = np.clip(noisy, 0, 255).astype(np.uint8)
             ids = [walker.id for walker, _ in there]
-            xywh = np.array([boxes[who] for who in ids]).reshape(-1, 4)
+            xywh = np.array([boxes[person] for person in ids]).reshape(-1, 4)
             corners = xywh[:, :2] + xywh[:, 2:] / 2
             xywh[:, :2] = corners @ moved[:, :2].T + moved[:, 2] - xywh[:, 2:] / 2
             inside = (xywh[:, 0] > -0.3 * xywh[:, 2]) & (xywh[:, 0] + 0.7 * xywh[:, 2] < self.width_px)
             inside &= (xywh[:, 1] > -0.3 * xywh[:, 3]) & (xywh[:, 1] + 0.7 * xywh[:, 3] < self.height_px)
             places = np.array([place for _, place in there]).reshape(-1, 2)
             yield SyntheticFrame(
-                now, image, [who for who, ok in zip(ids, inside, strict=True) if ok], xywh[inside], places[inside]
+                now, image, [person for person, ok in zip(ids, inside, strict=True) if ok], xywh[inside], places[inside]
             )
 
     def _ground(self, rng: np.random.Generator) -> Image:

@@ -35,18 +35,18 @@ def write(
     provenance: Mapping[str, str],
     order: Sequence[str] = (),
     form: Format = "parquet",
-    anew: bool = False,
+    force: bool = False,
 ) -> bool:
     """Write an Arrow table; the file appears when it is complete and reads back identically. Returns whether it was
     written.
 
     ``provenance`` goes into the metadata, ``order`` names the columns by which rows are sorted. A file with the same
-    content and metadata is left as it is, unless ``anew``. Raises McaptrackError if the file can't be written.
+    content and metadata is left as it is, unless ``force``. Raises McaptrackError if the file can't be written.
     """
     words = {"table_version": TABLE_VERSION} | dict(provenance)
-    with ThreadPoolExecutor(1) as beside:  # computes the digest while the file is written
-        content = beside.submit(digest, table.schema, _pieces(table))
-        if form in _DESCRIBED and not anew:
+    with ThreadPoolExecutor(1) as worker:  # computes the digest while the file is written
+        content = worker.submit(digest, table.schema, _pieces(table))
+        if form in _DESCRIBED and not force:
             known = file_metadata(path, form)
             if known is not None and _same(known, words | {"digest": content.result()}):
                 return False

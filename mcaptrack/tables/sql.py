@@ -207,8 +207,8 @@ class Database:
             relation = self._connection.sql(statement)
             return None if relation is None else relation.to_arrow_table()
 
-        with ThreadPoolExecutor(1) as beside:
-            running = beside.submit(compute)
+        with ThreadPoolExecutor(1) as executor:
+            running = executor.submit(compute)
             try:
                 return running.result()
             except BaseException:

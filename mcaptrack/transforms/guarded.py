@@ -14,7 +14,7 @@ from mcaptrack.registry import Entry, failure, is_interruption
 from mcaptrack.schema import SCORES_NEEDED, TRACKS, Frame, Rows, Schema
 from mcaptrack.transforms.protocol import Transform, passes_of
 
-#: Kinds whose main output has one frame for each frame that is read, at its time and with its number.
+#: Kinds with a main output of one frame for each frame that is read, at its time and with its number.
 _ONE_FOR_EACH: Final = ("detector", "tracker")
 #: Above the largest time in nanoseconds, and above the largest frame number, that a log can hold.
 _END_NS, _END_INDEX = 2**63, 2**32
@@ -150,7 +150,7 @@ def _checked(entry: Entry, transform: Transform, result: object, last_ns: int | 
 def _checked_frame(entry: Entry, frame: Frame, schema: Schema, last_ns: int | None, where: str) -> Frame:
     """A frame with numbers of Python and rows of its own in the layout of the schema: it may be kept, and written."""
     if not isinstance(frame.t_ns, int | np.integer) or not isinstance(frame.index, int | np.integer):
-        raise McaptrackError(f"{entry} gave a frame {where} whose t_ns and index are no whole numbers")
+        raise McaptrackError(f"{entry} gave a frame {where} with a t_ns or index that is no whole number")
     t_ns, index = int(frame.t_ns), int(frame.index)
     if not (0 <= t_ns < _END_NS and 0 <= index < _END_INDEX):
         raise McaptrackError(f"{entry} gave frame {index} of {t_ns} ns {where}; a log holds no such time or number")
@@ -169,7 +169,7 @@ def _checked_frame(entry: Entry, frame: Frame, schema: Schema, last_ns: int | No
 
 
 def _problem(schema: Schema, rows: Rows) -> str:
-    """What can't be, though it is of the right type: "" if all can."""
+    """Describe the first impossible value, such as a negative size; "" if all values are possible."""
     for name in rows.dtype.names or ():
         if rows.dtype[name].kind == "f" and np.isinf(rows[name]).any():
             return f"{schema.name}.{name} is infinite in row {int(np.isinf(rows[name]).argmax())}"

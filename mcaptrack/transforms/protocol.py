@@ -66,12 +66,12 @@ class Transform(WithOptions, Protocol):
 
     @property
     def latency_s(self) -> Mapping[str, float]:
-        """How far each output depends on later input, in seconds."""
+        """For each output, how far it depends on later input, in seconds."""
         ...
 
 
 class ModelCard(NamedTuple):
-    """What the network of a transform turned out to be, for the provenance of its channels: the digest of its file, the
+    """A description of the network of a transform, for the provenance of its channels: the digest of its file, the
     names of the classes in its rows by ``class_id``, and other facts.
 
     A transform with a network may have a method ``model_card`` that gives it after a run.
@@ -87,12 +87,12 @@ Colour = Literal["bgr", "grey"]
 
 
 def colour_of(transform: Any) -> Colour:
-    """What a transform (or its class) gets of pictures: brightness unless its ``colour`` says otherwise."""
+    """The pixels that a transform (or its class) reads: brightness unless its ``colour`` says otherwise."""
     return "bgr" if getattr(transform, "colour", "grey") == "bgr" else "grey"
 
 
 def passes_of(transform: Any) -> int:
-    """How often a transform (or its class) reads its frames: once unless its ``passes`` says otherwise."""
+    """The number of times that a transform (or its class) reads its frames: 1 unless its ``passes`` says otherwise."""
     return int(getattr(transform, "passes", 1))
 
 
@@ -200,7 +200,7 @@ def is_option_type(annotation: Any) -> bool:
 
 @cache
 def option_problem(cls: type[Any]) -> str:
-    """Why the fields of a class can't be options; "" if they can."""
+    """The reason why the fields of a class can't be options; "" if they can."""
     try:
         hints = get_type_hints(cls)
     except Exception as error:  # annotations are code

@@ -1,1 +1,1 @@
-"""What people look at: the report, videos with drawings, and logs served to viewers."""
+"""Output for people: the report, videos with drawings, and logs served to viewers."""

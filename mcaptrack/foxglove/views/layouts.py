@@ -9,7 +9,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from mcaptrack.foxglove import layouts
-from mcaptrack.foxglove.layouts import Eye, Tree, beside
+from mcaptrack.foxglove.layouts import Eye, Tree, split
 from mcaptrack.geometry.arrays import Floats
 from mcaptrack.geometry.plane import Planes, plane_at
 
@@ -34,7 +34,7 @@ _EVENTS: Final = "/events/view/log"
 
 
 class CameraChannels(NamedTuple):
-    """What a log has of a camera: the names of its topics below the prefix, the topic of pictures, the coordinate frame
+    """The channels of a camera: the names of its topics below the prefix, the topic of pictures, the coordinate frame
     and the view of the ground, the number of steps of forecasts, and whether their errors against ground truth are
     known.
     """
@@ -52,11 +52,11 @@ class CameraChannels(NamedTuple):
         found = sorted(name.removesuffix(suffix) for name in self.names if name.endswith(suffix))
         return {f"{self.prefix}/{name}{suffix}": name in on for name in found}
 
-    def drawn(self, name: str) -> bool:
+    def has_view(self, name: str) -> bool:
         """Whether a channel has a view."""
         return bool({name + "/view/image", name + "/view/scene"} & self.names)
 
-    def is_seen(self) -> bool:
+    def has_any_view(self) -> bool:
         """Whether there is any view."""
         return any(name.endswith(("/view/image", "/view/scene")) for name in self.names)
 
@@ -84,106 +84,106 @@ def eye_on(places_m: Floats, planes: Planes, t_ns: int) -> Eye:
     )
 
 
-def make(there: CameraChannels) -> dict[str, bytes]:
+def make(camera: CameraChannels) -> dict[str, bytes]:
     """The layout files that are useful for a log, by their names; none if there is nothing to see."""
-    if not there.is_seen():
+    if not camera.has_any_view():
         return {}
-    made = {TRACKING: _tracking(there)}
-    if sum(any(there.drawn(name) for name in names) for _, names in _KINDS) > 1:
-        made[COMPARING] = _comparing(there)
-    if there.drawn("predictions") or there.drawn("retracks/predictions"):
-        made[PREDICTIONS] = _predictions(there)
+    made = {TRACKING: _tracking(camera)}
+    if sum(any(camera.has_view(name) for name in names) for _, names in _KINDS) > 1:
+        made[COMPARING] = _comparing(camera)
+    if camera.has_view("predictions") or camera.has_view("retracks/predictions"):
+        made[PREDICTIONS] = _predictions(camera)
     return made
 
 
-def _tracking(there: CameraChannels) -> bytes:
-    channels = {name.removesuffix("/view/image").removesuffix("/view/scene") for name in there.names}
-    on = best_channels([name for name in channels if there.drawn(name)])
+def _tracking(camera: CameraChannels) -> bytes:
+    channels = {name.removesuffix("/view/image").removesuffix("/view/scene") for name in camera.names}
+    on = best_channels([name for name in channels if camera.has_view(name)])
     panels: dict[str, Any] = {}
-    left = [*_image(there, panels, "picture", "Video", on), *_plots(there, panels)]
-    right = [*_ground(there, panels, "ground", "Ground", on), *_words(there, panels)]
+    left = [*_image(camera, panels, "picture", "Video", on), *_plots(camera, panels)]
+    right = [*_ground(camera, panels, "ground", "Ground", on), *_event_text_or_log(camera, panels)]
     return _file(panels, _columns(left, right, 55.0))
 
 
-def _comparing(there: CameraChannels) -> bytes:
+def _comparing(camera: CameraChannels) -> bytes:
     panels: dict[str, Any] = {}
     upper: list[Tree] = []
     shown = []
     for number, (title, names) in enumerate(_KINDS):
-        found = [name for name in names if there.drawn(name)][:1]
+        found = [name for name in names if camera.has_view(name)][:1]
         if found:
             shown += found
-            upper += _image(there, panels, f"picture{number}", title, found) or _ground(
-                there, panels, f"ground{number}", title, found
+            upper += _image(camera, panels, f"picture{number}", title, found) or _ground(
+                camera, panels, f"ground{number}", title, found
             )
-    lower = [*_ground(there, panels, "ground", "All", shown), *_plots(there, panels)]
-    told = [part for title, names in _KINDS for part in _events(there, panels, title, names)]
-    lower += [beside(told, "column")] if told else []
-    return _file(panels, ("column", beside(upper), beside(lower), 50.0) if lower else beside(upper))
+    lower = [*_ground(camera, panels, "ground", "All", shown), *_plots(camera, panels)]
+    events = [part for title, names in _KINDS for part in _events(camera, panels, title, names)]
+    lower += [split(events, "column")] if events else []
+    return _file(panels, ("column", split(upper), split(lower), 50.0) if lower else split(upper))
 
 
-def _predictions(there: CameraChannels) -> bytes:
-    future = next(name for name in ("retracks/predictions", "predictions") if there.drawn(name))
+def _predictions(camera: CameraChannels) -> bytes:
+    future = next(name for name in ("retracks/predictions", "predictions") if camera.has_view(name))
     past = "retracks/full" if future.startswith("retracks") else "tracks"
     on = [future, past, "truth"]
     panels: dict[str, Any] = {}
-    source = f"{there.prefix}/{future}"
-    last = f"{source}.rows[:]{{step=={there.last_step}}}"
+    source = f"{camera.prefix}/{future}"
+    last = f"{source}.rows[:]{{step=={camera.last_step}}}"
     spread = {f"{last}.cov_{axis}_m2": f"variance at the end, {axis[0]} (m2)" for axis in ("xx", "yy")}
     panels["Plot!spread"] = layouts.plot_panel("Uncertainty of forecasts", spread)
-    told = "retracks" if future.startswith("retracks") else "tracks"
-    left = [*_image(there, panels, "picture", "Forecasts", on), *_errors(there, panels)]
-    right = [*_ground(there, panels, "ground", "Forecasts on the ground", on)]
-    right.append(beside(["Plot!spread", *_events(there, panels, "Tracking", (told,))]))
+    events = "retracks" if future.startswith("retracks") else "tracks"
+    left = [*_image(camera, panels, "picture", "Forecasts", on), *_errors(camera, panels)]
+    right = [*_ground(camera, panels, "ground", "Forecasts on the ground", on)]
+    right.append(split(["Plot!spread", *_events(camera, panels, "Tracking", (events,))]))
     return _file(panels, _columns(left, right, 50.0))
 
 
-def _errors(there: CameraChannels, panels: dict[str, Any]) -> list[Tree]:
+def _errors(camera: CameraChannels, panels: dict[str, Any]) -> list[Tree]:
     """Errors of forecasts: against ground truth, or without it against the later tracks."""
-    front = "" if there.is_truth_known else "later_"
+    front = "" if camera.is_truth_known else "later_"
     labels = {"retracks/predictions": "re-tracked", "predictions": "SORT"}
     paths = {
-        f"{there.prefix}/{name}/scores.rows[:].{front}{measure.lower()}_m": f"{label}: {measure} (m)"
+        f"{camera.prefix}/{name}/scores.rows[:].{front}{measure.lower()}_m": f"{label}: {measure} (m)"
         for measure in ("ADE", "FDE")
         for name, label in labels.items()
-        if f"{name}/scores" in there.names
+        if f"{name}/scores" in camera.names
     }
     if not paths:
         return []
-    words = "ground truth" if there.is_truth_known else "later tracks"
+    words = "ground truth" if camera.is_truth_known else "later tracks"
     panels["Plot!errors"] = layouts.plot_panel(f"Prediction errors, against {words}", paths)
     return ["Plot!errors"]
 
 
-def _image(there: CameraChannels, panels: dict[str, Any], name: str, title: str, on: Collection[str]) -> list[Tree]:
-    if there.pictures is None:
+def _image(camera: CameraChannels, panels: dict[str, Any], name: str, title: str, on: Collection[str]) -> list[Tree]:
+    if camera.pictures is None:
         return []
-    panels[f"Image!{name}"] = layouts.image_panel(title, there.pictures, there.topics("/view/image", on))
+    panels[f"Image!{name}"] = layouts.image_panel(title, camera.pictures, camera.topics("/view/image", on))
     return [f"Image!{name}"]
 
 
-def _ground(there: CameraChannels, panels: dict[str, Any], name: str, title: str, on: Collection[str]) -> list[Tree]:
-    topics = there.topics("/view/scene", [*on, "ground_plane"])
+def _ground(camera: CameraChannels, panels: dict[str, Any], name: str, title: str, on: Collection[str]) -> list[Tree]:
+    topics = camera.topics("/view/scene", [*on, "ground_plane"])
     if not topics:
         return []
-    panels[f"3D!{name}"] = layouts.scene_panel(title, there.frame_id, topics, there.eye)
+    panels[f"3D!{name}"] = layouts.scene_panel(title, camera.frame_id, topics, camera.eye)
     return [f"3D!{name}"]
 
 
-def _plots(there: CameraChannels, panels: dict[str, Any]) -> list[Tree]:
+def _plots(camera: CameraChannels, panels: dict[str, Any]) -> list[Tree]:
     """The number of people, if it is counted; otherwise their positions."""
     labels = {"tracks": "SORT", "retracks": "re-tracked", "retracks/full": "re-tracked", "truth": "truth"}
     counted = {
-        f"{there.prefix}/{name}/counts.rows[:].tracked": label
+        f"{camera.prefix}/{name}/counts.rows[:].tracked": label
         for name, label in labels.items()
-        if f"{name}/counts" in there.names
+        if f"{name}/counts" in camera.names
     }
     places = {
-        f"{there.prefix}/{name}.rows[:].x_m": f"{label}, x (m)"
+        f"{camera.prefix}/{name}.rows[:].x_m": f"{label}, x (m)"
         for name, label in labels.items()
-        if name in there.names and name != "retracks/full"
+        if name in camera.names and name != "retracks/full"
     }
-    if counted and "truth" in there.names:
+    if counted and "truth" in camera.names:
         counted[next(iter(counted)).replace(".tracked", ".people")] = "truth"
     if not counted and not places:
         return []
@@ -192,17 +192,17 @@ def _plots(there: CameraChannels, panels: dict[str, Any]) -> list[Tree]:
     return ["Plot!people"]
 
 
-def _events(there: CameraChannels, panels: dict[str, Any], title: str, names: Collection[str]) -> list[Tree]:
+def _events(camera: CameraChannels, panels: dict[str, Any], title: str, names: Collection[str]) -> list[Tree]:
     """The text of events of the first of these channels that has any."""
-    found = [f"{name}{_EVENTS}" for name in names if f"{name}{_EVENTS}" in there.names][:1]
+    found = [f"{name}{_EVENTS}" for name in names if f"{name}{_EVENTS}" in camera.names][:1]
     for topic in found:
-        panels[f"RosOut!{title}"] = layouts.log_panel(f"{title}: events", f"{there.prefix}/{topic}")
+        panels[f"RosOut!{title}"] = layouts.log_panel(f"{title}: events", f"{camera.prefix}/{topic}")
     return [f"RosOut!{title}" for _ in found]
 
 
-def _words(there: CameraChannels, panels: dict[str, Any]) -> list[Tree]:
+def _event_text_or_log(camera: CameraChannels, panels: dict[str, Any]) -> list[Tree]:
     """The text of events, if there is any; otherwise the contents of the log."""
-    found = _events(there, panels, "Tracking", ("retracks/full", "retracks", "tracks"))
+    found = _events(camera, panels, "Tracking", ("retracks/full", "retracks", "tracks"))
     if not found:
         panels["SourceInfo!log"] = layouts.panel("Log", {})
     return found or ["SourceInfo!log"]
@@ -214,7 +214,7 @@ def _columns(left: Sequence[Tree], right: Sequence[Tree], share: float) -> Tree:
 
 
 def _column(parts: Sequence[Tree]) -> Tree:
-    return ("column", parts[0], beside(parts[1:], "column"), 65.0) if len(parts) > 1 else parts[0]
+    return ("column", parts[0], split(parts[1:], "column"), 65.0) if len(parts) > 1 else parts[0]
 
 
 def _file(panels: Mapping[str, Any], tree: Tree) -> bytes:

@@ -99,19 +99,19 @@ def ingest(
     return job.report
 
 
-def _job(source: Path, options: IngestOptions, progress: Progress, there: log.Log | None) -> IngestJob:
+def _job(source: Path, options: IngestOptions, progress: Progress, into: log.Log | None) -> IngestJob:
     recorded = open_recording(source)
     if recorded is not None:
-        return RecordingJob(source, options, recorded, progress, there)
+        return RecordingJob(source, options, recorded, progress, into)
     role = options.role
     if source.is_dir() and role != MOTION and (role or is_label_folder(source)):
-        return LabelJob([(role, source)], options, there)
+        return LabelJob([(role, source)], options, into)
     is_video = source.is_dir() or source.suffix.lower() in VIDEO_SUFFIXES or _is_binary(source)
     if is_video:
-        return VideoJob(source, options, progress, there)
+        return VideoJob(source, options, progress, into)
     if role == MOTION:
-        return MotionJob(source, options, there)
-    return LabelJob([(role, source)], options, there)
+        return MotionJob(source, options, into)
+    return LabelJob([(role, source)], options, into)
 
 
 def _is_binary(source: Path) -> bool:

@@ -114,17 +114,17 @@ class IngestReport:
 class IngestJob:
     """Base class of inputs: the topics of a camera, its labels and its ground plane.
 
-    ``there`` is the log to which channels are added, if it is not a new one.
+    ``into`` is the log to which channels are added, if it is not a new one.
     """
 
     #: Whether the start time in the log's metadata is replaced.
     drops_clock = False
     #: The proposed camera name if the topics exist already.
-    beside = "{camera}/labels"
+    other_camera = "{camera}/labels"
 
-    def __init__(self, source: Path, options: IngestOptions, there: log.Log | None = None) -> None:
+    def __init__(self, source: Path, options: IngestOptions, into: log.Log | None = None) -> None:
         self._close = ExitStack()
-        self.source, self.options, self.there, self.report = source, options, there, IngestReport()
+        self.source, self.options, self.into, self.report = source, options, into, IngestReport()
         self.prefix = "/" + options.camera.strip("/")
         #: The topic of the pictures that labels belong to; "" if there is none.
         self.pictures = ""
@@ -214,24 +214,24 @@ class IngestJob:
             return log.create(output)
         return log.extend(into, drop=topics_to_replace, drop_metadata=[CLOCK] if self.drops_clock else [])
 
-    def topics_to_replace(self, there: log.Log | None, force: bool) -> set[str]:
+    def topics_to_replace(self, into: log.Log | None, force: bool) -> set[str]:
         """The topics of a log that are replaced.
 
         Raises McaptrackError if other software recorded one of them, and, unless ``force`` is true, if there is any.
         """
-        topics_to_replace = set(self.topics()) & set(there.channels) if there else set()
-        if there and topics_to_replace:
-            log.refuse_to_replace_recorded(there, topics_to_replace, self.hint_other_topic(there.channels))
-        if there and topics_to_replace and not force:
+        topics_to_replace = set(self.topics()) & set(into.channels) if into else set()
+        if into and topics_to_replace:
+            log.refuse_to_replace_recorded(into, topics_to_replace, self.hint_other_topic(into.channels))
+        if into and topics_to_replace and not force:
             raise McaptrackError(
-                f"{there.path} has {', '.join(sorted(topics_to_replace))} already; `force=True` replaces them"
+                f"{into.path} has {', '.join(sorted(topics_to_replace))} already; `force=True` replaces them"
             )
         return topics_to_replace
 
     def hint_other_topic(self, topics: Collection[str]) -> str:
         """A hint for topics that exist already: the option that chooses others."""
         ends = [topic.removeprefix(self.prefix) for topic in self.topics() if topic.startswith(self.prefix)]
-        name = free = self.beside.format(camera=self.prefix.strip("/"))
+        name = free = self.other_camera.format(camera=self.prefix.strip("/"))
         number = 1
         while any(f"/{free}{end}" in topics for end in ends):
             number += 1
@@ -266,17 +266,17 @@ class IngestJob:
         """Write the ground plane, if there is one, valid from a time on."""
         if plane is not None and self.options.ground_plane:
             rows = plane_to_rows(plane)
-            words = {"file": self.options.ground_plane.name, "point": self.options.point}
-            self.write_rows(writer, "ground_plane", GROUND_PLANE, lambda: iter([Frame(t_ns, 0, rows)]), words)
+            parameters = {"file": self.options.ground_plane.name, "point": self.options.point}
+            self.write_rows(writer, "ground_plane", GROUND_PLANE, lambda: iter([Frame(t_ns, 0, rows)]), parameters)
 
     def write_labels(self, writer: log.LogWriter, plane: GroundPlane | None, timeline: Timeline) -> None:
         """Write the labels, each frame at the time of its picture."""
         for role, (path, labels) in self.labels.items():
             placed = timeline.place(path, labels, self.report.lost)
-            words: dict[str, Any] = {"file": path.name, "format": labels.format} | self.label_words(labels)
+            parameters: dict[str, Any] = {"file": path.name, "format": labels.format} | self.label_parameters(labels)
             classes = {str(number): name for number, name in labels.classes.items()} if role == "detections" else {}
             frames = self.frames(role, plane, placed)
-            self.write_rows(writer, role, _SCHEMA_OF[role], frames, words, classes)
+            self.write_rows(writer, role, _SCHEMA_OF[role], frames, parameters, classes)
 
     def write_motion(self, writer: log.LogWriter, timeline: Timeline, size: tuple[int, int]) -> None:
         """Write the motion of the camera, if it was given; pictures have this width and height."""
@@ -290,7 +290,7 @@ class IngestJob:
         frames = motion_frames(self.motions, timeline.index, timeline.t_ns, size)
         self.write_rows(writer, MOTION, CAMERA_MOTION, lambda: iter(frames), {"file": path.name})
 
-    def label_words(self, labels: Labels) -> dict[str, Any]:
+    def label_parameters(self, labels: Labels) -> dict[str, Any]:
         """Additional parameters in the provenance of labels."""
         out: dict[str, Any] = {} if self.options.first_frame is None else {"first_frame": labels.first_frame}
         if self.options.columns and labels.format in ("csv", "supervision"):
@@ -319,10 +319,10 @@ class IngestJob:
         suffix: str,
         schema: Schema,
         frames: Frames,
-        words: Mapping[str, Any],
+        parameters: Mapping[str, Any],
         classes: Mapping[str, str] = {},
     ) -> None:
-        """Write a channel of the camera; ``words`` are the parameters in its provenance, ``classes`` its class names.
+        """Write a channel of the camera; ``parameters`` are those in its provenance, ``classes`` its class names.
 
         Frames are generated twice, for the digest and for the channel, so that they are never all in memory.
         """
@@ -330,7 +330,7 @@ class IngestJob:
         def messages() -> Iterator[tuple[int, int, bytes]]:
             return ((frame.t_ns, frame.index, schema.codec.encode(frame.rows)) for frame in frames())
 
-        made = Provenance("ingest", words, self.pictures, digest=digest(messages())).to_metadata()
+        made = Provenance("ingest", parameters, self.pictures, digest=digest(messages())).to_metadata()
         if classes:
             made[_CLASSES] = json.dumps(classes, sort_keys=True, separators=(",", ":"))
         topic = f"{self.prefix}/{suffix}"

@@ -67,10 +67,10 @@ class LabelJob(IngestJob):
         self,
         inputs: Sequence[tuple[Role | None, Path]],
         options: IngestOptions,
-        there: log.Log | None = None,
+        into: log.Log | None = None,
         default_fps: Fraction | None = None,
     ) -> None:
-        super().__init__(inputs[0][1], options, there)
+        super().__init__(inputs[0][1], options, into)
         for role, path in reversed(inputs):
             self._add(role, path)
         self.check_labels()
@@ -82,14 +82,14 @@ class LabelJob(IngestJob):
         self._clock = ("", False)  # remark on times that don't come from pictures, and whether they are assumed
         self._other_rates: list[str] = []
         self._start_ns = options.start_ns or 0
-        if there is not None:
-            self.prefix, self.pictures = camera_of(there, options.camera)
-        seen = detections_topic(there, self.prefix) if there is not None and not self.pictures else ""
-        pictures_of = partial(picture_size, there, self.pictures) if there is not None and self.pictures else None
+        if into is not None:
+            self.prefix, self.pictures = camera_of(into, options.camera)
+        seen = detections_topic(into, self.prefix) if into is not None and not self.pictures else ""
+        pictures_of = partial(picture_size, into, self.pictures) if into is not None and self.pictures else None
         self.fit_to_pictures(pictures_of)
         size = self._boxes_extent()
-        if there is not None and (self.pictures or seen):
-            self.timeline = self._of_pictures(there, self.pictures or seen)
+        if into is not None and (self.pictures or seen):
+            self.timeline = self._of_pictures(into, self.pictures or seen)
             needs_size = self.homography or self.motions is not None
             size = pictures_of() if needs_size and pictures_of else size
         else:
@@ -119,27 +119,27 @@ class LabelJob(IngestJob):
     def _measured_plane(self) -> GroundPlane | None:
         """The ground plane of the camera in the log, if it was measured and doesn't change."""
         topic = f"{self.prefix}/ground_plane"
-        if self.there is None or topic not in self.there.channels:
+        if self.into is None or topic not in self.into.channels:
             return None
-        planes = [rows_to_plane(frame.rows) for frame in self.there.frames(topic, GROUND_PLANE)]
+        planes = [rows_to_plane(frame.rows) for frame in self.into.frames(topic, GROUND_PLANE)]
         return planes[0] if len(planes) == 1 and not planes[0].assumed else None
 
-    def _of_pictures(self, there: log.Log, topic: str) -> Timeline:
+    def _of_pictures(self, into: log.Log, topic: str) -> Timeline:
         """The pictures in the log. Raises McaptrackError if options contradict them."""
-        options, timeline = self.options, timeline_of(there, topic)
+        options, timeline = self.options, timeline_of(into, topic)
         if options.fps and not timeline.fits(options.fps):
             raise McaptrackError(
-                f"{there.path}: {timeline.of} are {timeline.fps:.6g} a second, not {float(options.fps):g}; labels take "
+                f"{into.path}: {timeline.of} are {timeline.fps:.6g} a second, not {float(options.fps):g}; labels take "
                 "the times of their pictures, so leave `fps=` out"
             )
         for given, name in ((options.start_ns, "`start_time=`"), (options.frames, "`frames=`")):
             if given is not None:
-                raise McaptrackError(f"{there.path}: labels take the times of {timeline.of}; leave {name} out")
+                raise McaptrackError(f"{into.path}: labels take the times of {timeline.of}; leave {name} out")
         return timeline
 
     def _of_rate(self, default: Fraction | None) -> Timeline:
         """The times of missing pictures, by the frame rate from the options, the files or the log."""
-        existing = labels_of(self.there, self.prefix) if self.there else {}
+        existing = labels_of(self.into, self.prefix) if self.into else {}
         timed = {path: labels.times_s for path, labels in self.labels.values() if labels.times_s is not None}
         if timed and self.options.frames is not None:
             raise McaptrackError(f"{next(iter(timed))} has times; leave `frames=` out")
@@ -163,15 +163,15 @@ class LabelJob(IngestJob):
             raise McaptrackError(self._no_clock())
         fps, of = next(iter(rates.items()), (default or Fraction(1), _ASSUMED))
         self._fps = fps
-        if self.there:
-            self._check_existing(self.there, existing, fps)
+        if self.into:
+            self._check_existing(self.into, existing, fps)
             if self.options.start_ns is None:
-                found = self.there.metadata(CLOCK) or {}
+                found = self.into.metadata(CLOCK) or {}
                 self._start_ns = parse_ns(found.get("start_ns", "")) or 0
         count, counted_by = self._count(known, existing)
         timeline = Timeline.spaced(count, fps, self._start_ns, f"the frames that {counted_by} counts")
-        if self.there and any(part.index.counts for part in self.there.parts):
-            self._check_overlap(self.there, timeline)
+        if self.into and any(part.index.counts for part in self.into.parts):
+            self._check_overlap(self.into, timeline)
         first = next(iter(self.labels.values()))[1].first_frame
         self._clock = (
             f"{self.source}: {count} frames (by {counted_by}) from {first} on, {float(fps):g} a second (by {of})",
@@ -186,8 +186,8 @@ class LabelJob(IngestJob):
             seconds = seconds - seconds[0] + self.options.start_ns / NS_PER_S
         self._start_ns = round(float(seconds[0]) * NS_PER_S)
         timeline, words = Timeline.of_times(path, seconds, self.options.fps)
-        if self.there and any(part.index.counts for part in self.there.parts):
-            self._check_overlap(self.there, timeline)
+        if self.into and any(part.index.counts for part in self.into.parts):
+            self._check_overlap(self.into, timeline)
         self._clock = (f"{self.source}: {words}", False)
         return timeline
 
@@ -202,12 +202,12 @@ class LabelJob(IngestJob):
         elif words:
             self.report.remarks.append(words)
 
-    def _check_existing(self, there: log.Log, existing: Mapping[str, ExistingLabels], fps: Fraction) -> None:
+    def _check_existing(self, into: log.Log, existing: Mapping[str, ExistingLabels], fps: Fraction) -> None:
         """Check that the labels of one camera have one frame rate."""
         for topic, labels in existing.items():
             if topic not in self.topics() and labels.fps not in (None, fps):
                 raise McaptrackError(
-                    f"{there.path}: {topic} has {float(labels.fps or 0):g} frames a second, not {float(fps):g}, and "
+                    f"{into.path}: {topic} has {float(labels.fps or 0):g} frames a second, not {float(fps):g}, and "
                     "labels of one camera are of the same pictures; give the same `fps=`, or another `camera=`"
                 )
 
@@ -221,22 +221,22 @@ class LabelJob(IngestJob):
         counts = [count_frames(path, labels) for path, labels in self.labels.values()]
         return max(*counts, *(label.frames for label in existing.values()), 1), "the last label"
 
-    def _check_overlap(self, there: log.Log, timeline: Timeline) -> None:
+    def _check_overlap(self, into: log.Log, timeline: Timeline) -> None:
         """Check that labels without pictures overlap in time with the log."""
         first, last = int(timeline.t_ns[0]), int(timeline.t_ns[-1])
-        if first > there.end_ns or last < there.start_ns:
+        if first > into.end_ns or last < into.start_ns:
             raise McaptrackError(
-                f"{there.path} is from {_seconds(there.start_ns)} to {_seconds(there.end_ns)}, the labels would be "
+                f"{into.path} is from {_seconds(into.start_ns)} to {_seconds(into.end_ns)}, the labels would be "
                 f"from {_seconds(first)} to {_seconds(last)}, and {self.prefix} has no pictures to take times from; "
                 f"say when frame {next(iter(self.labels.values()))[1].first_frame} was with `start_time=`"
             )
 
     def _no_clock(self) -> str:
         words = f"{self.source} has no clock of its own; give the frames per second with `fps=`"
-        pictures = sorted(c.topic for c in self.there.channels.values() if holds_pictures(c)) if self.there else []
-        if pictures and self.there:
+        pictures = sorted(c.topic for c in self.into.channels.values() if holds_pictures(c)) if self.into else []
+        if pictures and self.into:
             camera = pictures[0].strip("/")
-            words += f", or choose the pictures of {', '.join(pictures)} in {self.there.path} with `camera={camera!r}`"
+            words += f", or choose the pictures of {', '.join(pictures)} in {self.into.path} with `camera={camera!r}`"
         return words
 
     def write(self, writer: log.LogWriter, has_clock: bool) -> None:
@@ -247,9 +247,9 @@ class LabelJob(IngestJob):
         self.write_labels(writer, self.ground, self.timeline)
         self.write_motion(writer, self.timeline, self._size)
 
-    def label_words(self, labels: Labels) -> dict[str, Any]:
+    def label_parameters(self, labels: Labels) -> dict[str, Any]:
         """The frame rate, if there were no pictures."""
-        return super().label_words(labels) | ({} if self._fps is None else {"fps": str(self._fps)})
+        return super().label_parameters(labels) | ({} if self._fps is None else {"fps": str(self._fps)})
 
     def all_frames(self, role: Role) -> list[Frame]:
         """The labels of a role as frames, including empty frames."""

@@ -21,25 +21,25 @@ _BOXES: Final = "detections"
 class MotionJob(IngestJob):
     """The motion of the camera of a log: a file that is itself the input."""
 
-    def __init__(self, source: Path, options: IngestOptions, there: log.Log | None) -> None:
+    def __init__(self, source: Path, options: IngestOptions, into: log.Log | None) -> None:
         if options.motion is not None:
             raise McaptrackError(f"{source} and {options.motion} are both the motion of the camera; give one")
-        if there is None:
+        if into is None:
             raise McaptrackError(
                 f"{source}: the motion of a camera belongs to a log with its pictures or boxes; name it with `into=`"
             )
-        super().__init__(source, replace(options, motion=source), there)
-        self.prefix, self.pictures = camera_of(there, options.camera)
-        boxes = there.channels.get(f"{self.prefix}/{_BOXES}")
+        super().__init__(source, replace(options, motion=source), into)
+        self.prefix, self.pictures = camera_of(into, options.camera)
+        boxes = into.channels.get(f"{self.prefix}/{_BOXES}")
         if self.pictures:
-            self._timeline, self._size = timeline_of(there, self.pictures), picture_size(there, self.pictures)
+            self._timeline, self._size = timeline_of(into, self.pictures), picture_size(into, self.pictures)
         elif boxes is not None and boxes.messages and boxes.schema_name == DETECTIONS.name:
-            self._timeline = timeline_of(there, boxes.topic)
-            corner = columns_to_boxes(there.rows(boxes.topic, DETECTIONS).rows)
+            self._timeline = timeline_of(into, boxes.topic)
+            corner = columns_to_boxes(into.rows(boxes.topic, DETECTIONS).rows)
             right, bottom = (corner[:, :2] + corner[:, 2:]).max(axis=0, initial=1.0)
             self._size = (int(np.ceil(right)), int(np.ceil(bottom)))
         else:
-            raise McaptrackError(f"{there.path}: {self.prefix} has no pictures or detections that {source} is about")
+            raise McaptrackError(f"{into.path}: {self.prefix} has no pictures or detections that {source} is about")
 
     def write(self, writer: log.LogWriter, has_clock: bool) -> None:
         """Write the motion."""

@@ -36,7 +36,7 @@ class RecordingJob(IngestJob):
         options: IngestOptions,
         recorded: RecordingReader,
         progress: Progress,
-        there: log.Log | None = None,
+        into: log.Log | None = None,
     ) -> None:
         self._recorded, self._progress = recorded, progress
         try:
@@ -51,7 +51,7 @@ class RecordingJob(IngestJob):
                     raise McaptrackError(
                         f"{source} is a log: its messages stay as they are, and so do their times; leave {name} out"
                     )
-            super().__init__(source, options, there)
+            super().__init__(source, options, into)
             #: The MCAP file that is copied as a whole, if the recording is one.
             self._copied_log: log.Log | None = None
             #: The connections of the pictures that labels belong to.
@@ -108,8 +108,8 @@ class RecordingJob(IngestJob):
 
     def write(self, writer: log.LogWriter, has_clock: bool) -> None:
         """Write everything in the recording, then the labels."""
-        self.report.notes += self._recorded.words.notes
-        self.report.lost += self._recorded.words.lost
+        self.report.notes += self._recorded.findings.notes
+        self.report.lost += self._recorded.findings.lost
         timeline = self._count_copied(writer) if self._copied_log else self._write_messages(writer)
         self._recorded.extras(writer, has_clock, is_copied=self._copied_log is not None)
         if self._connections:
@@ -130,11 +130,11 @@ class RecordingJob(IngestJob):
         with log.read(output) as done:
             index = done.parts[-1].index
             for number, count in self._written.items():
-                there = index.counts.get(number, 0)
-                if there != count:
+                written = index.counts.get(number, 0)
+                if written != count:
                     topic = index.channels[number].topic if number in index.channels else "a channel"
                     raise McaptrackError(
-                        f"{output} is not complete: {there} messages of {topic} where {self.source} has {count}"
+                        f"{output} is not complete: {written} messages of {topic} where {self.source} has {count}"
                     )
 
     # Messages

@@ -32,12 +32,12 @@ class SidecarChoice:
 
     def __call__(self, opened: log.Log) -> bool:
         """Whether to use a sidecar. Raises McaptrackError if there is one, but results must go into the log itself."""
-        beside = log.results_path(opened.path)
+        results = log.results_path(opened.path)
         self.why = ""
-        if self.wanted is False and beside.exists():
+        if self.wanted is False and results.exists():
             raise McaptrackError(
-                f"{beside} holds results of {opened.path}; `sidecar=False` would leave them there and make others: "
-                f"remove {beside.name} first, or leave `sidecar=False` out"
+                f"{results} holds results of {opened.path}; `sidecar=False` would leave them there and make others: "
+                f"remove {results.name} first, or leave `sidecar=False` out"
             )
         if self.wanted:
             self.why = "`sidecar=True` was given"
@@ -50,7 +50,7 @@ class SidecarChoice:
                 else ""
             )
             return False
-        if beside.exists():
+        if results.exists():
             self.why = "earlier results are there"
             return True
         if not recording:

@@ -28,10 +28,10 @@ class VideoJob(IngestJob):
     """A video or image folder, with its labels."""
 
     drops_clock = True
-    beside = "{camera}2"
+    other_camera = "{camera}2"
 
-    def __init__(self, source: Path, options: IngestOptions, progress: Progress, there: log.Log | None) -> None:
-        super().__init__(source, options, there)
+    def __init__(self, source: Path, options: IngestOptions, progress: Progress, into: log.Log | None) -> None:
+        super().__init__(source, options, into)
         self._progress = progress
         if options.role:
             raise McaptrackError(f"{source} is not a label file; `role=` applies to those")
@@ -43,7 +43,7 @@ class VideoJob(IngestJob):
         self.fit_to_pictures(lambda: (self.video.width_px, self.video.height_px))
         self._plane = self.plane(self.video.width_px, self.video.height_px)
         self.pictures = f"{self.prefix}/video"
-        self._existing_labels = {} if there is None else labels_of(there, self.prefix)
+        self._existing_labels = {} if into is None else labels_of(into, self.prefix)
 
     def topics(self) -> Iterator[str]:
         """The topics of pictures and labels."""
@@ -56,26 +56,26 @@ class VideoJob(IngestJob):
         start_ns = video.start_ns if options.start_ns is None else options.start_ns
         start_ns = 0 if start_ns is None else start_ns
         schema_name = foxglove.IMAGE if keep.is_still else foxglove.VIDEO
-        words: dict[str, str | int | float] = {"file": video.path.name, "image_format": video.format}
+        parameters: dict[str, str | int | float] = {"file": video.path.name, "image_format": video.format}
         if options.fps is not None:
-            words["fps"] = str(options.fps)
-            self._say_fps(options.fps)
+            parameters["fps"] = str(options.fps)
+            self._warn_fps(options.fps)
         if video.every > 1:
-            words["every"] = video.every
+            parameters["every"] = video.every
         if video.why_transcode:
-            words |= {"encoded_again_because": video.why_transcode}
-            words |= {"crf": keep.crf, "keyframe_interval_s": keep.key_every_s}
+            parameters |= {"encoded_again_because": video.why_transcode}
+            parameters |= {"crf": keep.crf, "keyframe_interval_s": keep.key_every_s}
             self.report.remarks.append(f"{video.path} is encoded again, as H.264: {video.why_transcode}")
         elif video.format in _FOXGLOVE_ALONE:
             kept = f"{video.path} is kept as {_FOXGLOVE_ALONE[video.format]}, which Foxglove plays"
             self.report.remarks.append(f"{kept} and Lichtblick does not (`image_format='h264'` is for both)")
         elif video.format == "jpeg":
-            words["quality"] = keep.jpeg_quality
+            parameters["quality"] = keep.jpeg_quality
         channel = writer.add_channel(
             self.pictures,
             foxglove.schema_record(schema_name),
             "protobuf",
-            Provenance("ingest", words).to_metadata(),
+            Provenance("ingest", parameters).to_metadata(),
             kind="media",
         )
         writer.add_metadata(CLOCK, {"start_ns": str(start_ns)})
@@ -99,7 +99,7 @@ class VideoJob(IngestJob):
         self.write_labels(writer, self._plane, timeline)
         self.write_motion(writer, timeline, (self.video.width_px, self.video.height_px))
 
-    def _say_fps(self, fps: Fraction) -> None:
+    def _warn_fps(self, fps: Fraction) -> None:
         """Warn if the given frame rate differs from that of the video."""
         own = self.video.fps
         if own and abs(fps - own) > _SAME_FPS * own:
@@ -109,13 +109,13 @@ class VideoJob(IngestJob):
     def _check_existing(self, timeline: Timeline) -> None:
         """Check that existing labels in the log have the times of these pictures."""
         for topic, labels in self._existing_labels.items():
-            if self.there and topic not in self.topics() and not np.isin(labels.t_ns, timeline.t_ns).all():
-                how = (
+            if self.into and topic not in self.topics() and not np.isin(labels.t_ns, timeline.t_ns).all():
+                advice = (
                     f"give `fps={str(labels.fps)!r}`"
                     if labels.fps
                     else "give the `fps=` and `start_time=` that they have"
                 )
                 raise McaptrackError(
-                    f"{self.there.path}: {topic} has labels at other times than {timeline.of}; {how}, or `camera=` for "
-                    "another camera"
+                    f"{self.into.path}: {topic} has labels at other times than {timeline.of}; {advice}, or `camera=` "
+                    "for another camera"
                 )

@@ -86,7 +86,7 @@ class OcSort(Sort):
         return np.concatenate([detection, recovered_detection]), np.concatenate([track, recovered_track])
 
     def _direction_consistency(self, step: AssociationInput, pairs: CandidatePairs) -> Floats:
-        """How well pairs (P,) keep the track's direction: 0.5 straight on, -0.5 straight back, 0 unknown (OCM).
+        """Consistency of pairs (P,) with the track's direction: 0.5 straight on, -0.5 straight back, 0 unknown (OCM).
 
         Weighted by the score of the detection, as in the paper's program.
         """

@@ -276,7 +276,7 @@ class Sort:
         return associate(*self._candidate_pairs(step, self.min_iou))
 
     def _can_start(self, detections: Measurements) -> Bools:
-        """Which detections may start a track if they are assigned to none. Returns a new array."""
+        """Mask the detections that may start a track if they are assigned to none. Returns a new array."""
         return np.ones(len(detections), bool)
 
     def _initiate(self, tracks: Tracks, first_id: int, detections: Measurements) -> None:

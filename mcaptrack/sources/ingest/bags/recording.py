@@ -35,7 +35,7 @@ class RecordingReader(Protocol):
         """The profile in the MCAP registry: ros1, ros2."""
 
     @property
-    def words(self) -> ReadingNotes:
+    def findings(self) -> ReadingNotes:
         """Findings before any message is read."""
 
     @property

@@ -51,7 +51,7 @@ class Bag1:
         self._size = path.stat().st_size
         self._known: dict[int, Connection] = {}
         self.declared_counts: Mapping[Connection, int] | None = None
-        self.words = ReadingNotes()
+        self.findings = ReadingNotes()
         try:
             self._end, self._why_unindexed = self._read_index()
             if self._why_unindexed:

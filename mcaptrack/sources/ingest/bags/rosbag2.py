@@ -54,12 +54,12 @@ def open_bag(folder: Path) -> RecordingReader:
             raise McaptrackError(f"{folder / METADATA} names {other.name} and {path.name}, which are one file")
     source = open_files(paths, folder, bag) if paths else _Files([], folder, bag)
     ours, results = {path.name for path in paths}, {log.results_path(path).name for path in paths}
-    beside = [
+    unnamed = [
         entry.name
         for entry in folder.iterdir()
         if entry.suffix in (".db3", ".mcap") and entry.name not in ours | results
     ]
-    for name in sorted(beside):
+    for name in sorted(unnamed):
         warn(f"{folder / name} is not named in {METADATA}; it is left out", "left-out")
     for path in paths:
         if not follow_links(path).is_relative_to(follow_links(folder)):
@@ -70,7 +70,7 @@ def open_bag(folder: Path) -> RecordingReader:
 def open_files(paths: Sequence[Path], whole: Path, bag: Bag | None = None) -> RecordingReader:
     """Open the files of a split recording as one; ``whole`` names it in messages."""
     if bag is None:
-        bag = _metadata_beside(paths)
+        bag = _own_metadata(paths)
     with ExitStack() as opened:
         parts = [_decompressed_file(path, opened) for path in paths]
         heads = [_first_bytes(path) for path in parts]
@@ -107,25 +107,25 @@ def _decompressed_file(path: Path, opened: ExitStack) -> Path:
     return out
 
 
-def _metadata_beside(paths: Sequence[Path]) -> Bag:
+def _own_metadata(paths: Sequence[Path]) -> Bag:
     """The metadata.yaml beside a single file, if it names the file; without the number of messages."""
-    beside = paths[0].with_name(METADATA)
-    if len(paths) == 1 and holds_metadata(beside):
-        bag, names = read_metadata(beside)
+    metadata = paths[0].with_name(METADATA)
+    if len(paths) == 1 and holds_metadata(metadata):
+        bag, names = read_metadata(metadata)
         if paths[0].name.removesuffix(".zstd") in [name.removesuffix(".zstd") for name in names]:
             return Bag(distro=bag.distro, packed=bag.packed)
     return Bag()
 
 
 class _Files:
-    """Common parts of databases and MCAP files. ``words`` is known before any message is read."""
+    """Common parts of databases and MCAP files. ``findings`` is known before any message is read."""
 
     profile = "ros2"
     as_log: log.Log | None = None
 
     def __init__(self, paths: Sequence[Path], whole: Path, bag: Bag) -> None:
         self.paths, self.whole, self.bag = paths, whole, bag
-        self.words = ReadingNotes()
+        self.findings = ReadingNotes()
         self.closing = ExitStack()
         self.declared_counts: dict[Connection, int] = {}
         self._known_connections: dict[tuple[object, ...], Connection] = {}
@@ -184,9 +184,9 @@ class _Files:
             if topic not in holds:
                 metadata = {"offered_qos_profiles": qos, "topic_type_hash": digest}
                 self.declared_counts[Connection(topic, (kind, "", b""), encoding, metadata)] = holds[topic] = 0
-                self.words.notes.append(f"{topic} ({kind}) is in {METADATA} alone; its channel has no schema")
+                self.findings.notes.append(f"{topic} ({kind}) is in {METADATA} alone; its channel has no schema")
             if holds[topic] < messages:
-                self.words.lost.append(
+                self.findings.lost.append(
                     f"{self.whole}: {METADATA} counts {messages} messages of {topic}, and {holds[topic]} are there"
                 )
 
@@ -202,7 +202,7 @@ class Databases(_Files):
         super().__init__(paths, whole, bag)
         for kind, where in sorted(self._undefined.items()):
             words = f"its definition is that of {where}" if where else "its definition is not known: it has no schema"
-            self.words.notes.append(f"{whole} does not say what {kind} is; {words}")
+            self.findings.notes.append(f"{whole} does not say what {kind} is; {words}")
 
     def extras(self, writer: log.LogWriter, has_clock: bool, is_copied: bool = False) -> None:
         """Write metadata.yaml and the metadata in the databases, as rosbag2 writes them to MCAP files."""
@@ -253,7 +253,7 @@ class Databases(_Files):
             raise McaptrackError(
                 f"{database.path} does not add up: its index counts {total} messages, and {there} are there"
             )
-        self.words.lost += [
+        self.findings.lost += [
             f"{database.path}: {count} messages of topic {_text(key)[:80]}, which is not described"
             for key, count in strange.items()
         ]

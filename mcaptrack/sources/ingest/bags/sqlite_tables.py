@@ -81,8 +81,8 @@ class SqliteTables:
         path, is_copy = follow_links(self.path), False
         # A killed recorder leaves a journal that belongs to the file. It is opened in a copy, because opening it
         # writes.
-        beside = [path.with_name(path.name + end) for end in ("-wal", "-journal")]
-        left = [other for other in beside if other.is_file() and other.stat().st_size]
+        journals = [path.with_name(path.name + end) for end in ("-wal", "-journal")]
+        left = [other for other in journals if other.is_file() and other.stat().st_size]
         if left:
             folder = self._close.enter_context(decompression.temporary_folder())
             for other in (path, *left):

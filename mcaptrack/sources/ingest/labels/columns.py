@@ -1,4 +1,4 @@
-"""Which columns of a table with a header hold what: named by the user, or guessed from common headers."""
+"""Assign the columns of a table with a header: named by the user, or guessed from common headers."""
 
 from __future__ import annotations
 

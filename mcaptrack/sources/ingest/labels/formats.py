@@ -275,7 +275,7 @@ def read_kitti(path: Path, lines: Lines, role: Role) -> Labels:
     left = [names.count(kind[~people & ~kept])] if (~people & ~kept).any() else []
     left += [f"{hidden} Pedestrian, hidden or cut off"] if hidden else []
     sitting = names.are(kind, "person_sitting") | names.are(kind, "person")
-    beside = ~kept & (people | sitting | region)
+    ignored = ~kept & (people | sitting | region)
     class_id, classes = names.ids(kind[kept], _KITTI_CLASSES)
     return Labels(
         "kitti",
@@ -289,7 +289,7 @@ def read_kitti(path: Path, lines: Lines, role: Role) -> Labels:
         class_id,
         classes,
         " and ".join(left),
-        IgnoredBoxes(frame[beside], boxes[beside], ~region[beside], region[beside]) if role == "truth" else None,
+        IgnoredBoxes(frame[ignored], boxes[ignored], ~region[ignored], region[ignored]) if role == "truth" else None,
     )
 
 

@@ -182,7 +182,7 @@ def _annotations(path: Path, content: Mapping[str, Any]) -> BoxRows:
     videos = {_key(image[key]) for image in images for key in _VIDEOS if key in image}
     if len(videos) > 1:
         raise McaptrackError(f"{path} holds {len(videos)} videos (video_id); give one file for each of them")
-    frames, how = _frames(images)
+    frames, order = _frames(images)
     by_id = dict(zip(ids, frames, strict=True))
     rows = _Rows(path, "annotation")
 
@@ -196,7 +196,7 @@ def _annotations(path: Path, content: Mapping[str, Any]) -> BoxRows:
     out = rows.done(_categories(path, content.get("categories")))
     out.labelled = np.unique(np.array(frames, np.int64))
     out.first_frame = int(out.labelled[0]) if len(frames) else 0
-    out.remarks.append(f"{path}: {len(images)} images, in order of {how}")
+    out.remarks.append(f"{path}: {len(images)} images, in order of {order}")
     if out.first_frame > 1:
         words = f"{path}: its first image has the number {out.first_frame}, and is assumed to be the first picture"
         out.doubts.append((f"{words}; `first_frame=` sets the number", "clock"))
