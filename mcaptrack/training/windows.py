@@ -69,7 +69,7 @@ class Windows:
 
 @dataclass(frozen=True, kw_only=True)
 class Corruption:
-    """Random augmentation of windows, drawn anew in every epoch.
+    """Random augmentation of windows, drawn again in every epoch.
 
     Attributes
     ----------

@@ -171,7 +171,7 @@ def _range(image: Image, radius: int) -> tuple[Image, Image]:
 
 
 def _outside(image: Image, lowest: Image, highest: Image) -> Image:
-    """How far each pixel lies outside of a range, in its worst channel, (H, W)."""
+    """The distance of each pixel from a range, in its worst channel, (H, W)."""
     import cv2
 
     return largest(np.asarray(cv2.max(cv2.subtract(image, highest), cv2.subtract(lowest, image)), np.uint8))

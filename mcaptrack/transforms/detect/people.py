@@ -192,7 +192,7 @@ class _Crop:
         return (column - self._margin[0]) / self._scale, (row - self._margin[1]) / self._scale
 
     def beyond(self, x0: int, y0: int, size: tuple[int, int]) -> Bools:
-        """What lies outside of the picture, of which nothing is known; the region's corner is at x0, y0."""
+        """Mask the part outside of the picture, of which nothing is known; the region's corner is at x0, y0."""
         rows, columns = self.ink.shape
         x = x0 + (np.arange(columns) + 0.5 - self._margin[0]) / self._scale
         y = y0 + (np.arange(rows) + 0.5 - self._margin[1]) / self._scale

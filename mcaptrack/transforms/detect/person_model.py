@@ -1,4 +1,4 @@
-"""How people look in a scene: their height over the row of the feet, and their shape.
+"""The appearance of people in a scene: their height over the row of the feet, and their shape.
 
 The height is learned as a line over the row of the feet, from regions of a foreground mask that stand alone; the shape
 is the mean of these regions, scaled to one height: the probability that a pixel belongs to a person who stands there.
@@ -45,7 +45,7 @@ _MARGIN: Final = 1.8
 
 @dataclass(frozen=True)
 class Person:
-    """How people look in a scene.
+    """The appearance of people in a scene.
 
     Attributes
     ----------
@@ -62,7 +62,7 @@ class Person:
     template: Map
 
     def height(self, foot_px: float) -> float:
-        """How tall a person is who stands at this row, in pixels."""
+        """The height of a person who stands at this row, in pixels."""
         return max(self.slope * foot_px + self.level, _MIN_HEIGHT_PX)
 
 
@@ -82,7 +82,7 @@ def regions(mask: Image, join_px: int) -> tuple[NDArray[np.int32], Ints]:
 
 
 def typical_height(masks: Sequence[Image]) -> float:
-    """How tall regions of masks are, in pixels: the median weighted by their area."""
+    """The height of regions of masks, in pixels: the median weighted by their area."""
     import cv2
 
     sizes: list[tuple[int, int]] = []
@@ -126,7 +126,7 @@ class Learner:
                 self._cuts.append(_scaled(own))
 
     def person(self) -> Person | None:
-        """How people look; None if too few regions are alike."""
+        """The appearance of people; None if too few regions are alike."""
         if len(self._boxes) < _MIN_REGIONS:
             return None
         _, y, w, h, area = np.array(self._boxes, np.float64).T

@@ -16,7 +16,7 @@ from mcaptrack.schema.camera_motion import is_motion, pose_to_rows
 from mcaptrack.sources.ingest.labels.number_table import NumberTable, lines_of
 
 _COLUMNS: Final = 7
-_WHAT: Final = "a camera motion (frame,m00,m01,m02,m10,m11,m12: 7 columns)"
+_KIND: Final = "a camera motion (frame,m00,m01,m02,m10,m11,m12: 7 columns)"
 
 
 def read_motions(path: Path) -> Floats:
@@ -24,7 +24,7 @@ def read_motions(path: Path) -> Floats:
 
     Raises McaptrackError, with the line, for anything else.
     """
-    table = NumberTable(path, lines_of(path), _WHAT, _COLUMNS, _parse)
+    table = NumberTable(path, lines_of(path), _KIND, _COLUMNS, _parse)
     if not len(table.values):
         raise McaptrackError(f"{path} holds no camera motion")
     frame, motions = table.values[:, 0], table.values[:, 1:].reshape(-1, 2, 3)

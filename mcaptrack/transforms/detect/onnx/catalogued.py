@@ -16,7 +16,7 @@ from mcaptrack.transforms.protocol import option
 
 @dataclass(frozen=True, kw_only=True)
 class CataloguedDetector(OnnxDetector):
-    """What the detectors of the catalogue share: YOLOX, with an input of about the size of the picture."""
+    """Base of the detectors of the catalogue: YOLOX, with an input of about the size of the picture."""
 
     layout: LayoutChoice = option("yolox", "family of the network", theme=NETWORK)
     input_size: str = option(

@@ -1,4 +1,4 @@
-"""What the classes of a detector are called, which of them are wanted, and the numbers that they get in rows."""
+"""The classes of a detector: their names, the ones that are wanted, and their numbers in rows."""
 
 from __future__ import annotations
 

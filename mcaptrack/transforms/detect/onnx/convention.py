@@ -19,7 +19,7 @@ _PATIENCE: Final = 25
 
 
 def evidence(boxes: Boxes) -> float:
-    """How much of what was found is certain: the sum of high scores."""
+    """The amount of certain evidence: the sum of high scores."""
     return float(boxes.score[boxes.score >= _EVIDENCE].sum())
 
 

@@ -140,7 +140,7 @@ class OnnxDetector:
         return read_file(self.weights(), self.max_memory_mb * 1_000_000).sha256
 
     def model_card(self) -> ModelCard:
-        """What the network turned out to be when it ran last."""
+        """The facts of the network that ran last."""
         card: ModelCard = getattr(self, "_card", ModelCard())
         return card
 
@@ -211,7 +211,7 @@ class _Run:
         )
 
     def card(self) -> ModelCard:
-        """What the network turned out to be."""
+        """The facts of the network."""
         facts = {"layout": self._contest.layouts[0].name, "input_size": "x".join(map(str, self._network.size))}
         names = {self._numbers[index]: self._names[index] for index in self._wanted.tolist()}
         return ModelCard(self._sha256, names, facts)
@@ -253,7 +253,7 @@ class _Run:
         return [_Seen(frame, one) for frame, one in zip(frames, found, strict=True)]
 
     def _boxes(self, layout: Layout, frames: list[Frame]) -> list[Boxes | None]:
-        """What a layout finds in pictures; None where the outputs make no sense."""
+        """The boxes that a layout finds in pictures; None where the outputs make no sense."""
         size, options = self._network.size, self._options
         tiles = [tiles_of(frame.rows.shape[1], frame.rows.shape[0], *self._grid, options.overlap) for frame in frames]
         jobs = [(frame, tile) for frame, those in zip(frames, tiles, strict=True) for tile in those]

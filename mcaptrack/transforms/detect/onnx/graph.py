@@ -1,4 +1,4 @@
-"""What is in an ONNX file, without running it; and the same network for pictures of another size.
+"""Read an ONNX file without running it, and change its network for pictures of another size.
 
 Only the parts of the format (https://onnx.ai/onnx/repo-docs/IR.html) that are read or changed here are declared; the
 protobuf runtime keeps all others as they are.

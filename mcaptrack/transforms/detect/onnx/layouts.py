@@ -46,12 +46,12 @@ _DECODED: Final = 30.0
 
 
 class ScoreError(ValueError):
-    """What should be likelihoods lies outside of 0 to 1: the outputs mean something else."""
+    """Likelihoods lie outside of 0 to 1: the outputs mean something else."""
 
 
 @dataclass(frozen=True)
 class NetworkSignature:
-    """What is known of a network: its inputs, the outputs of a trial (B = 1), the size it ran with, its metadata."""
+    """The known facts of a network: its inputs, the outputs of a trial (B = 1), the size it ran with, its metadata."""
 
     inputs: tuple[str, ...]
     outputs: Outputs
@@ -335,7 +335,7 @@ def possible(seen: NetworkSignature) -> list[Layout]:
 
 
 def class_count(layout: Layout, seen: NetworkSignature) -> int | None:
-    """How many classes a network has; None where its outputs don't say."""
+    """The number of classes of a network; None where its outputs don't say."""
     shape = seen.shapes[0]
     if layout.name == "nanodet":
         parts = _nanodet_parts(seen.outputs, seen.size)

@@ -48,7 +48,7 @@ def suppress(boxes: Boxes, max_iou: float) -> Boxes:
     boxes : Boxes
         N boxes; the 1000 likeliest are looked at.
     max_iou : float
-        Boxes of one class whose intersection over union is greater are one object.
+        Boxes of one class with a greater intersection over union are one object.
 
     Returns
     -------

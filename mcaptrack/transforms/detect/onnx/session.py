@@ -96,7 +96,7 @@ class DetectorNetwork:
         self._sizes = next((one.name for one in inputs if one.name == "orig_target_sizes"), None)
         unknown = [one.name for one in inputs if one.name not in (self._image.name, self._sizes)]
         if unknown:
-            raise McaptrackError(f"{self._what(inputs)}; an input {unknown[0]} is not known")
+            raise McaptrackError(f"{self._describe(inputs)}; an input {unknown[0]} is not known")
         #: Whether it runs on a GPU.
         self.is_on_gpu = _CUDA in self._session.get_providers()
         is_open = not isinstance(self._image.shape[0], int)
@@ -185,7 +185,7 @@ class DetectorNetwork:
     def _image_input(self, inputs: Sequence[Any]) -> Any:
         found = [one for one in inputs if len(one.shape) == 4 and (one.shape[1] == 3 or not _is_known(one.shape[1]))]
         if not found or found[0].type not in _TYPES:
-            raise McaptrackError(f"{self._what(inputs)}; it needs pictures B x 3 x H x W of floats")
+            raise McaptrackError(f"{self._describe(inputs)}; it needs pictures B x 3 x H x W of floats")
         batch = found[0].shape[0]
         if isinstance(batch, int) and batch != 1:
             raise McaptrackError(
@@ -193,7 +193,7 @@ class DetectorNetwork:
             )
         return found[0]
 
-    def _what(self, inputs: Sequence[Any]) -> str:
+    def _describe(self, inputs: Sequence[Any]) -> str:
         takes = ", ".join(f"{one.name} {_shape(one.shape)} {one.type}" for one in inputs[:4])
         return f"{self._file.path} is no detector of pictures: it takes {takes or 'nothing'}"
 
@@ -222,7 +222,7 @@ _OPENING: Final = Lock()
 
 
 def workers() -> int:
-    """How many pictures to detect in beside one another: one for each core that this process may use."""
+    """The number of pictures to detect in at a time: one for each core that this process may use."""
     return max(1, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
 
 
