@@ -12,9 +12,11 @@ import numpy as np
 import pytest
 
 import mcaptrack
+from mcaptrack.registry import KINDS
 from mcaptrack.schema import DETECTIONS, VIDEO
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.transforms import STAGES, OnnxDetector
+from mcaptrack.transforms.protocol import Suited, suited
 from tests.commands import call
 
 BOX = {"x_px": [10.0], "y_px": [10.0], "w_px": [8.0], "h_px": [20.0]}
@@ -100,6 +102,52 @@ def test_the_command_line_says_it_on_stderr(log, monkeypatch):
 
 
 def test_suited_trackers_exist():
-    named = [dict(getattr(cls, "suits", {})) for stage in STAGES.values() for cls in stage.built_in().values()]
-    assert {name for suits in named for name in suits.items()} == {("tracker", "bytetrack")}
-    assert OnnxDetector.suits["tracker"] in STAGES["track"].built_in()
+    found = [(kind, suited(cls, kind)) for one in STAGES.values() for cls in one.built_in().values() for kind in KINDS]
+    assert {(kind, one.name) for kind, one in found if one is not None} == {("tracker", "bytetrack")}
+    tracker = STAGES["track"].make("bytetrack", **OnnxDetector.suits["tracker"].on_ground)
+    assert tracker.cost == "metres"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Strict(Plain):
+    suits: ClassVar = {"tracker": Suited("bytetrack", {"new_score": 0.9}, on_ground={"cost": "metres"})}
+
+
+@pytest.mark.parametrize(("is_planar", "said"), [(False, "(new_score 0.9)"), (True, "(new_score 0.9, cost metres)")])
+def test_the_suited_tracker_is_made_with_the_parameters_that_the_detector_names(log, is_planar, said):
+    if is_planar:
+        plane = log.with_name("plane.txt")
+        plane.write_text("0.1 0 0\n0 0.1 0\n0 0 1\n")
+        mcaptrack.ingest(log.with_name("pictures"), output=log, fps=10, ground_plane=plane, force=True)
+    tracker, notes = run(log, detector=Strict())
+    assert tracker == "bytetrack"
+    assert f"track by bytetrack {said}, which suits" in notes[0]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lost(Plain):
+    suits: ClassVar = {"tracker": "nosuch"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Wrong(Plain):
+    suits: ClassVar = {"tracker": Suited("sort", {"nosuch": 1})}
+
+
+@pytest.mark.parametrize(
+    ("detector", "said"), [(Lost, "no tracker is called nosuch"), (Wrong, "tracker sort has no parameter nosuch")]
+)
+def test_a_suited_tracker_that_there_is_not_is_refused_with_the_detector_and_the_way_out(log, detector, said):
+    with pytest.raises(mcaptrack.McaptrackError, match=said) as refused:
+        run(log, detector=detector())
+    assert f"detector tests.test_suited_trackers:{detector.__name__}" in str(refused.value)
+    assert "`tracker=` chooses another" in str(refused.value)
+    assert run(log, detector=detector(), tracker="sort") == ("sort", [])
+
+
+@pytest.mark.parametrize("suits", ["bytetrack", {"tracker": 5}, {"tracked": "sort"}, None])
+def test_a_class_with_other_suits_is_refused(monkeypatch, suits):
+    monkeypatch.setattr(Choosy, "suits", suits)
+    with pytest.raises(mcaptrack.McaptrackError, match=r"has suits = .*; it maps kinds to names") as refused:
+        STAGES["detect"].find(f"{__name__}:Choosy")
+    assert "\n" not in str(refused.value)

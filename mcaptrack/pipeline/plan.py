@@ -23,6 +23,7 @@ from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources import foreign
 from mcaptrack.sources.cameras import USUAL, camera_at, chain_of, name_above, provenance_of
 from mcaptrack.transforms import STAGES, Stage, Transform
+from mcaptrack.transforms.protocol import suited
 
 Say = Callable[[str], None]
 
@@ -191,19 +192,24 @@ class _Planner:
     def _suited(self, stage: str, source: str) -> Transform | None:
         """Create the transform that the maker of a stage's input recommends for the stage; None if it names none."""
         option, maker = STAGES[stage].option, self._maker_of(source)
-        name = getattr(maker, "suits", {}).get(option, "") if option else ""
-        if not name or maker is None:
+        found = suited(maker, option)
+        if maker is None or found is None:
             return None
-        kind = next(one for one in STAGES.values() if f"{self._prefix}/{one.output_topic}" == source)
-        parameters = dict(getattr(maker, "suits_with", {}).get(option, {}))
-        planes = read_planes(self._opened, self._prefix)
+        made_by = next(one for one in STAGES.values() if f"{self._prefix}/{one.output_topic}" == source)
+        parameters, planes = dict(found.parameters), read_planes(self._opened, self._prefix)
         if planes and not is_assumed(planes):
-            parameters |= getattr(maker, "suits_on_ground", {}).get(option, {})
-        words = name + (f" ({', '.join(f'{key} {value}' for key, value in parameters.items())})" if parameters else "")
+            parameters |= found.on_ground
+        try:
+            transform = STAGES[stage].make(found.name, **parameters)
+        except McaptrackError as error:
+            entry = made_by.entry(type(maker))
+            raise McaptrackError(f"{entry} suits {found.name}, but {error}; `{option}=` chooses another") from None
+        values = ", ".join(f"{key} {value}" for key, value in parameters.items())
+        by = found.name + (f" ({values})" if values else "")
         self._notes.append(
-            f"{stage} by {words}, which suits the {kind.option} {kind.choice(maker)}; `{option}=` chooses"
+            f"{stage} by {by}, which suits the {made_by.option} {made_by.choice(maker)}; `{option}=` chooses"
         )
-        return STAGES[stage].make(name, **parameters)
+        return transform
 
     def _maker_of(self, topic: str) -> Transform | None:
         """Return the transform that makes a channel now, or that made it; None if no stage of the camera does."""

@@ -8,8 +8,7 @@ A transform that reads pictures (``reads = VIDEO``) gets their brightness, (heig
 ``colour`` is "bgr"; then it gets blue, green and red, (height, width, 3).
 
 A detector can name the tracker that suits it by its class attribute ``suits = {"tracker": NAME}``; ``run`` takes that
-one unless another is chosen, with the parameters of ``suits_with = {"tracker": {...}}``, and where a ground plane is
-given, of ``suits_on_ground``.
+one unless another is chosen. A ``Suited`` instead of the name gives its parameters, too.
 
 A transform that reads its frames twice says so by its class attribute ``passes = 2``; the frames can then be iterated
 as often, each time from the beginning.
@@ -80,6 +79,23 @@ class ModelCard(NamedTuple):
     weights_sha256: str = ""
     classes: Mapping[int, str] = MappingProxyType({})
     facts: Mapping[str, str] = MappingProxyType({})
+
+
+class Suited(NamedTuple):
+    """The entry of another stage that suits the output of a transform, for the class attribute ``suits``.
+
+    ``parameters`` are those that it is made with; where a ground plane is given, those of ``on_ground`` are added.
+    """
+
+    name: str
+    parameters: Mapping[str, Any] = MappingProxyType({})
+    on_ground: Mapping[str, Any] = MappingProxyType({})
+
+
+def suited(transform: Any, kind: str) -> Suited | None:
+    """The entry of a kind that suits a transform (or its class); None if it names none."""
+    found = getattr(transform, "suits", {}).get(kind)
+    return Suited(found) if isinstance(found, str) else found
 
 
 #: What a transform gets of pictures: brightness, (height, width), or blue, green and red, (height, width, 3).

@@ -15,12 +15,12 @@ from types import MappingProxyType
 from typing import Any, Final, Literal, get_args
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.registry import BUILT_IN, Entry, Kind, blamed, entry_of, find
+from mcaptrack.registry import BUILT_IN, KINDS, Entry, Kind, blamed, entry_of, find
 from mcaptrack.schema import SCHEMAS
 from mcaptrack.transforms.detect import KnnDetector
 from mcaptrack.transforms.motion import EstimateMotion
 from mcaptrack.transforms.predict import Predict, predict_with
-from mcaptrack.transforms.protocol import Colour, Transform, check_options, option_problem
+from mcaptrack.transforms.protocol import Colour, Suited, Transform, check_options, option_problem
 from mcaptrack.transforms.retrack import PROFILES, Retrack, upgrade_parameters
 from mcaptrack.transforms.sample import Sample
 from mcaptrack.transforms.sort import Sort
@@ -229,6 +229,13 @@ class Stage:
             raise McaptrackError(f"{entry}: its class attribute colour is one of {', '.join(get_args(Colour))}")
         if getattr(cls, "passes", 1) not in (1, 2):
             raise McaptrackError(f"{entry}: its class attribute passes is 1 or 2")
+        suits = getattr(cls, "suits", {})
+        if not isinstance(suits, Mapping) or not all(
+            kind in KINDS and isinstance(one, str | Suited) for kind, one in suits.items()
+        ):
+            raise McaptrackError(
+                f"{entry} has suits = {suits!r}; it maps kinds to names, as in suits = {{'tracker': 'bytetrack'}}"
+            )
         if problem := option_problem(cls):
             raise McaptrackError(f"{entry}: {problem}")
 

@@ -6,12 +6,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, ClassVar
+from typing import ClassVar
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.transforms.detect.onnx.catalogue import check, find, stored
 from mcaptrack.transforms.detect.onnx.detector import NETWORK, LayoutChoice, OnnxDetector
-from mcaptrack.transforms.protocol import option
+from mcaptrack.transforms.protocol import Suited, option
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,8 +26,12 @@ class CataloguedDetector(OnnxDetector):
     )
 
     #: False boxes score up to 0.6 and begin no tracks, so that those that begin need no confirmation.
-    suits_with: ClassVar[Mapping[str, Mapping[str, Any]]] = MappingProxyType(
-        {"tracker": MappingProxyType({"new_score": 0.7, "min_hits_frames": 1})}
+    suits: ClassVar[Mapping[str, Suited]] = MappingProxyType(
+        {
+            "tracker": OnnxDetector.suits["tracker"]._replace(
+                parameters=MappingProxyType({"new_score": 0.7, "min_hits_frames": 1})
+            )
+        }
     )
     #: Its name in the catalogue.
     model: ClassVar[str]

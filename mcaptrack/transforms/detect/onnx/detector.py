@@ -15,7 +15,7 @@ from itertools import chain, islice
 from math import sqrt
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, ClassVar, Final, Literal, NamedTuple
+from typing import ClassVar, Final, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +29,7 @@ from mcaptrack.transforms.detect.onnx.layouts import Layout, ScoreError, class_c
 from mcaptrack.transforms.detect.onnx.nms import Boxes, join_tiles, suppress
 from mcaptrack.transforms.detect.onnx.placing import Size, Tile, place, tiles_of
 from mcaptrack.transforms.detect.onnx.session import DetectorNetwork, Device, read_file, workers
-from mcaptrack.transforms.protocol import Colour, ModelCard, check_options, option
+from mcaptrack.transforms.protocol import Colour, ModelCard, Suited, check_options, option
 
 LayoutChoice = Literal["auto", "yolox", "yolox-legacy", "nanodet", "rtdetr", "dfine", "rfdetr", "ultralytics"]
 
@@ -104,9 +104,8 @@ class OnnxDetector:
     latency_s: ClassVar[Mapping[str, float]] = MappingProxyType({"": 0.0})
     colour: ClassVar[Colour] = "bgr"
     #: Boxes of low scores are of people partly hidden: only ByteTrack makes use of them.
-    suits: ClassVar[Mapping[str, str]] = MappingProxyType({"tracker": "bytetrack"})
-    suits_on_ground: ClassVar[Mapping[str, Mapping[str, Any]]] = MappingProxyType(
-        {"tracker": MappingProxyType({"cost": "metres"})}
+    suits: ClassVar[Mapping[str, Suited]] = MappingProxyType(
+        {"tracker": Suited("bytetrack", on_ground=MappingProxyType({"cost": "metres"}))}
     )
 
     def __post_init__(self) -> None:
