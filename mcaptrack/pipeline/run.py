@@ -297,11 +297,11 @@ def _input(
         digest, pictures = _pictures(opened, job, seen, progress)
         return _Input(pictures, [], digest, lambda: len(seen))
     if job.source in made:
-        frames, digest = made[job.source].frames, made[job.source].provenance.digest
+        frames, of_rows = made[job.source].frames, made[job.source].provenance.digest
     else:
-        frames, digest = read_frames(opened, job.source, job.transform.reads), digest_of(opened, job.source)
+        frames, of_rows = read_frames(opened, job.source, job.transform.reads), digest_of(opened, job.source)
     return _Input(
-        _Repeatable(lambda: _counted(frames, job.stage, progress)), frames, lambda: digest, lambda: len(frames)
+        _Repeatable(lambda: _counted(frames, job.stage, progress)), frames, lambda: of_rows, lambda: len(frames)
     )
 
 
