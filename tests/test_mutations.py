@@ -103,5 +103,20 @@ def test_a_mutant_is_tried_on_the_tests_that_run_its_line_also_after_the_code_ha
     records = lines_kept.Records(tmp_path)
     assert records.knows(file)
     mutants = {m.new: m for m in mutants_of("mcaptrack/b.py", moved.encode())}
-    assert records.tests_of(mutants[b"-"], [file]) == (["second", "first"], 3.0)
-    assert records.tests_of(mutants[b"4"], [file])[0] == ["third", "second", "first", "beside"]  # LIMIT
+    assert records.tests_of(mutants[b"-"], [file]) == [("second", 1.0), ("first", 2.0)]
+    limit = records.tests_of(mutants[b"4"], [file])
+    assert [name for name, _ in limit] == ["third", "second", "first", "beside"]
+
+
+def test_a_default_is_tried_on_the_tests_that_run_the_function_not_on_those_that_import_it(tmp_path, monkeypatch):
+    body = "def f(x=5):\n    return x\n"
+    monkeypatch.setattr(lines_kept, "_package", lambda: {"mcaptrack/a.py": body})
+    tests = {
+        "imports": {"took_s": 0.5, "lines": {"mcaptrack/a.py": [1]}},
+        "runs": {"took_s": 1.0, "lines": {"mcaptrack/a.py": [2]}},
+    }
+    file = "tests/test_mutations.py"
+    records = lines_kept.Records(tmp_path)
+    records.write(file, {"collected": {file: [1]}, "tests": tests, "failed": []})
+    mutant = next(m for m in mutants_of("mcaptrack/a.py", body.encode()) if m.new == b"6")
+    assert records.tests_of(mutant, [file]) == [("runs", 1.0)]

@@ -99,36 +99,27 @@ class Records:
                 moved[number + 1] = range(at + 1, at + 2) if kind == "equal" or b - a == d - c else range(c + 1, d + 1)
         return now, moved
 
-    def tests_of(self, mutant: Mutant, files: Sequence[str]) -> tuple[list[str], float]:
-        """The tests that run the line that is changed, the quickest first, and the time that they take.
+    def tests_of(self, mutant: Mutant, files: Sequence[str]) -> list[tuple[str, float]]:
+        """The tests that run what is changed, the quickest first, and the time that each takes.
 
-        Where the statement or the function begins, if no test runs that line. Defaults and constants run when modules
-        are imported: those matter to all tests that run anything of the function or of the file, to those that stand
-        beside them, and to those that run anything of files that import it.
+        Those that run the line, or the statement or the function if no test runs that line. Constants and defaults run
+        when modules are imported: defaults matter to all tests that run anything of the function; constants to those
+        that run anything of the file, then to those that stand beside them or run files that import it.
         """
         every = [(*test, file) for file in files for test in self._tests(file)]
-        spans = [(mutant.line, mutant.line), mutant.statement, mutant.function]
-        for first, last in spans:
-            wanted = set(range(first, last + 1)) - {0}
+        signature = mutant.function[0] and mutant.statement[0] == mutant.function[0]
+        spans = [mutant.function] if signature else [(mutant.line, mutant.line), mutant.statement, mutant.function]
+        for first, last in spans if mutant.function[0] else ():
+            wanted = set(range(mutant.statement[1] + 1 if signature else first, last + 1))
             chosen = [t for t in every if wanted & t[2].get(mutant.path, set())]
-            chosen += [t for t in every if t not in chosen and self._while_collecting(t[3], mutant, wanted)]
+            chosen += [t for t in every if t not in chosen and wanted & self._collected[t[3]].get(mutant.path, set())]
             if chosen:
-                break
-        else:
-            near = [t for t in every if t[2].get(mutant.path)]
-            chosen = sorted(near, key=lambda t: t[1])
-            around = {test[3] for test in near}
-            chosen += sorted((t for t in every if t not in near and t[3] in around), key=lambda t: t[1])
-            users = self._users(mutant.path)
-            chosen += [t for t in every if t[3] not in around and any(t[2].get(path) for path in users)]
-            return [t[0] for t in chosen], sum(t[1] for t in chosen)
-        return [t[0] for t in sorted(chosen, key=lambda t: t[1])], sum(t[1] for t in chosen)
-
-    def _while_collecting(self, file: str, mutant: Mutant, wanted: set[int]) -> bool:
-        """Whether the line ran while the tests of a file were collected, inside of a function that did."""
-        if not mutant.function[0] or mutant.statement[0] == mutant.function[0]:
-            return False
-        return bool(wanted & self._collected[file].get(mutant.path, set()))
+                return sorted(((t[0], t[1]) for t in chosen), key=lambda t: t[1])
+        near = [t for t in every if t[2].get(mutant.path)]
+        around, users = {test[3] for test in near}, self._users(mutant.path)
+        beside = [t for t in every if t not in near and t[3] in around]
+        beside += [t for t in every if t[3] not in around and any(t[2].get(path) for path in users)]
+        return [(t[0], t[1]) for part in (near, beside) for t in sorted(part, key=lambda t: t[1])]
 
     def _users(self, path: str) -> list[str]:
         """Files that import a module, or names from its package."""
