@@ -21,11 +21,16 @@ Points = NDArray[np.float32]
 
 #: Pictures are reduced by two, and on until they have no more pixels than this.
 _MOST_PIXELS: Final = 200_000
-# Features of a key picture, of which at least so many have to agree on a transform, and so large a share of them.
+# A key picture has about so many cells, with the best feature of each: texts that lie over the picture, or one person,
+# are few of them. Flat cells have none: the smaller eigenvalue of their gradients is less than a share of that of the
+# good cells, or than noise gives.
 _FEATURES: Final = 100
-_FEATURE_DISTANCE_PX: Final = 8
+_LEAST_OF_GOOD: Final = 0.01
+_LEAST_EIGENVALUE: Final = 1e-4
+# At least so many features have to agree on a transform, so large a share of them, over this share of the picture.
 _MIN_INLIERS: Final = 12
 _MIN_SHARE: Final = 0.4
+_MIN_AREA: Final = 0.06
 # Flow is searched in windows of this size, on so many reduced copies of the picture: few where it is known about where,
 # more where it isn't.
 _WINDOW_PX: Final = 11
@@ -36,6 +41,10 @@ _ITERATIONS: Final = (3, 10, 0.03)
 # picture.
 _INLIER_PX: Final = 0.75
 _AT_REST_PX: Final = 0.25
+# Where some features are at rest and others move, those at rest are the scene if they are so large a share of all, and
+# so many against the others.
+_REST_SHARE: Final = 0.3
+_REST_RATIO: Final = 0.65
 # Another key picture is taken when fewer features than this share of all are found again, or when the camera has moved
 # by this share of the diagonal.
 _KEY_SHARE: Final = 0.5
@@ -44,15 +53,33 @@ _KEY_SHIFT: Final = 0.12
 _KEYS_KEPT: Final = 4
 #: After so many pictures in a row without a transform the camera looks elsewhere.
 _PATIENCE: Final = 15
-#: A cut changes brightness by at least this much on average; a covered lens shows too few features.
-_CUT_DIFFERENCE: Final = 8.0
+#: Small copies of pictures of two scenes correlate less than this; light that changes doesn't change that.
+_CUT_CORRELATION: Final = 0.7
+#: A picture of less contrast shows nothing, such as a covered lens, nor does one of so much less than the one before,
+#: such as a flash.
+_LEAST_CONTRAST: Final = 4.0
+_LEAST_CONTRAST_KEPT: Final = 0.4
+# The mean brightness about each pixel, over so many pixels, is taken away, so that light that changes is no motion; so
+# is contrast, if it differs by more than this factor.
+_MEAN_OVER_PX: Final = 31
+_SAME_CONTRAST: Final = 1.15
+_GREY: Final = 128.0
+
+
+class _Picture(NamedTuple):
+    """A reduced picture, against its mean brightness about each pixel; its contrast; and a small copy as it was."""
+
+    image: Image
+    contrast: float
+    copy: Image
 
 
 class _Key(NamedTuple):
-    """A key picture, reduced: its features (N, 1, 2), its pose, and the number of the reference of that."""
+    """A key picture: its features (N, 1, 2), its pose, and the number of the reference of that."""
 
-    image: Image
+    picture: _Picture
     points: Points
+    weight: Floats
     to_reference: Floats
     reference: int
 
@@ -77,9 +104,10 @@ class MotionEstimator:
     def __init__(self) -> None:
         self._count = 0
         self._keys: list[_Key] = []  # the one in use last
-        self._before: Image | None = None
+        self._before: _Picture | None = None
         self._last = CameraPose(IDENTITY, IDENTITY, 0, 0.0, Verdict.STILL)
         self._misses = 0
+        self._is_sudden, self._has_view = False, False
         self._stance = Stance(1, 1)
 
     @property
@@ -102,50 +130,67 @@ class MotionEstimator:
         CameraPose
 
         """
-        small, to_small = _reduced(image)
+        picture, to_small = _reduced(image)
         hidden = None if boxes is None else move_boxes(to_small, boxes)
         self._size = (image.shape[1], image.shape[0])
         self._to_small, self._from_small = to_small, invert(to_small)
-        before, self._before = self._before, small
+        before, self._before = self._before, picture
         if before is None:
-            pose = self._first(small, hidden)
-        elif before.shape != small.shape:
+            pose = self._first(picture, hidden)
+        elif before.image.shape != picture.image.shape:
             self._keys.clear()
-            pose = self._first(small, hidden, Verdict.CUT)
+            pose = self._first(picture, hidden, Verdict.CUT)
         else:
-            pose = self._next(before, small, hidden)
+            pose = self._next(before, picture, hidden)
         self._last, self._count = pose, self._count + 1
         return pose
 
-    def _first(self, small: Image, hidden: Floats | None, verdict: Verdict = Verdict.STILL) -> CameraPose:
+    def _first(self, picture: _Picture, hidden: Floats | None, verdict: Verdict = Verdict.STILL) -> CameraPose:
         """Begin a new reference with this picture."""
-        self._stance, self._misses = Stance(*self._size), 0
-        self._add_key(_Key(small, _features(small, hidden), IDENTITY, self._count))
+        self._stance, self._misses, self._has_view = Stance(*self._size), 0, verdict is Verdict.LOST
+        self._add_key(_Key(picture, *_features(picture.image, hidden), IDENTITY, self._count))
         return CameraPose(IDENTITY, IDENTITY, self._count, 0.0, verdict)
 
     def _add_key(self, key: _Key) -> None:
         self._keys = [*self._keys[1 - _KEYS_KEPT :], key]
 
-    def _next(self, before: Image, small: Image, hidden: Floats | None) -> CameraPose:
+    def _next(self, before: _Picture, picture: _Picture, hidden: Floats | None) -> CameraPose:
         key, last = self._keys[-1], self._last
-        # Where the key picture's features should be now: as far on as from the picture before the last to the last.
-        back = compose(last.from_previous, compose(invert(last.to_reference), key.to_reference))
-        fit = self._fit(key, small, back, hidden)
-        if fit is None and len(key.points) < _MIN_INLIERS and _difference(key.image, small) < _CUT_DIFFERENCE:
+        if len(key.points) < _MIN_INLIERS and _correlation(key.picture, picture) >= _CUT_CORRELATION:
             return self._posed(last.to_reference, 0)  # a picture without features shows no motion either
-        if fit is None:  # too fast, or the key picture is too long ago
-            latest = _Key(before, _features(before, hidden), last.to_reference, last.reference)
-            if (fit := self._fit(latest, small, IDENTITY, hidden, _WIDE_LEVELS)) is not None:
+        fit = None
+        there = compose(invert(last.to_reference), key.to_reference)
+        for is_sudden in (self._is_sudden, not self._is_sudden):
+            # Where the key picture's features should be now: as far on as from the picture before the last to the
+            # last, or as far as the small copies are shifted.
+            motion = self._shift(before, picture) if is_sudden else last.from_previous
+            if (fit := self._fit(key, picture, compose(motion, there), hidden)) is not None:
+                self._is_sudden = is_sudden
+                break
+        if fit is None:  # the key picture is too long ago
+            latest = _Key(before, *_features(before.image, hidden), last.to_reference, last.reference)
+            if (fit := self._fit(latest, picture, IDENTITY, hidden, _WIDE_LEVELS)) is not None:
                 self._add_key(latest)
                 key = latest
         if fit is None:
-            return self._unknown(before, small, hidden)
+            return self._unknown(before, picture, hidden)
         matrix, inliers = fit
+        self._has_view = True
         pose = self._posed(compose(key.to_reference, invert(matrix)), inliers)
         is_far = shift_px(matrix, *self._size) > _KEY_SHIFT * np.hypot(*self._size)
         if is_far or inliers < _KEY_SHARE * len(key.points):
-            self._add_key(_Key(small, _features(small, hidden), pose.to_reference, pose.reference))
+            self._add_key(_Key(picture, *_features(picture.image, hidden), pose.to_reference, pose.reference))
         return pose
+
+    def _shift(self, before: _Picture, picture: _Picture) -> Floats:
+        """About how far the picture is shifted against the one before, (2, 3), by phase correlation."""
+        import cv2
+
+        height, width = picture.copy.shape
+        window = np.outer(np.hanning(height), np.hanning(width)).astype(np.float32)
+        small = (cv2.resize(one.image, (width, height), interpolation=cv2.INTER_AREA) for one in (before, picture))
+        (x, y), _ = cv2.phaseCorrelate(*((np.asarray(one, np.float32) - _GREY) * window for one in small))
+        return np.array([[1.0, 0.0, x * self._size[0] / width], [0.0, 1.0, y * self._size[1] / height]])
 
     def _posed(self, to_reference: Floats, inliers: int) -> CameraPose:
         """The pose of a picture with a known transform."""
@@ -154,7 +199,8 @@ class MotionEstimator:
         is_same = to_reference is last.to_reference
         from_previous = IDENTITY if is_same else compose(invert(to_reference), last.to_reference)
         if not is_too_far(to_reference, *self._size):
-            return CameraPose(from_previous, to_reference, last.reference, float(inliers), verdict)
+            is_elsewhere = self._stance.is_elsewhere
+            return CameraPose(from_previous, to_reference, last.reference, float(inliers), verdict, is_elsewhere)
         back = invert(to_reference)
         self._keys = [
             key._replace(to_reference=compose(back, key.to_reference), reference=self._count)
@@ -164,27 +210,28 @@ class MotionEstimator:
         self._stance = Stance(*self._size, is_away=True)
         return CameraPose(from_previous, IDENTITY, self._count, float(inliers), verdict)
 
-    def _unknown(self, before: Image, small: Image, hidden: Floats | None) -> CameraPose:
+    def _unknown(self, before: _Picture, picture: _Picture, hidden: Floats | None) -> CameraPose:
         """The pose of a picture that shows nothing of the key picture: a cut, or a camera that sees nothing."""
-        is_cut = _difference(before, small) >= _CUT_DIFFERENCE and len(_features(small, hidden)) >= _MIN_INLIERS
+        has_contrast = picture.contrast >= max(_LEAST_CONTRAST, _LEAST_CONTRAST_KEPT * before.contrast)
+        is_cut = self._has_view and has_contrast and _correlation(before, picture) < _CUT_CORRELATION
         self._misses += 1
         if is_cut or self._misses > _PATIENCE:
             for key in reversed(self._keys[:-1] if is_cut else []):  # one that was seen before?
-                fit = self._fit(key, small, IDENTITY, hidden, _WIDE_LEVELS)
+                fit = self._fit(key, picture, IDENTITY, hidden, _WIDE_LEVELS)
                 if fit is not None:
                     self._add_key(key)
                     self._stance, self._misses = Stance(*self._size), 0
                     to_reference, _ = self._stance.step(compose(key.to_reference, invert(fit[0])))
                     return CameraPose(IDENTITY, to_reference, key.reference, float(fit[1]), Verdict.CUT)
-            return self._first(small, hidden, Verdict.CUT if is_cut else Verdict.LOST)
+            return self._first(picture, hidden, Verdict.CUT if is_cut else Verdict.LOST)
         return self._last._replace(from_previous=IDENTITY, inliers=0.0, verdict=Verdict.LOST)
 
     def _fit(
-        self, key: _Key, small: Image, guess: Floats, hidden: Floats | None, levels: int = _LEVELS
+        self, key: _Key, picture: _Picture, guess: Floats, hidden: Floats | None, levels: int = _LEVELS
     ) -> tuple[Floats, int] | None:
         """The transform (2, 3) from a key picture to this one, and how many features agree; None if too few do.
 
-        ``guess`` is about where it leads. All but the reduced picture ``small`` is in pixels of the full picture.
+        ``guess`` is about where it leads. All but the reduced pictures is in pixels of the full picture.
         """
         import cv2
 
@@ -193,8 +240,8 @@ class MotionEstimator:
         near = move_points(compose(self._to_small, compose(guess, self._from_small)), key.points[:, 0].astype(float))
         # Called without a type: the stubs of OpenCV 4 and 5 differ on what may be None.
         moved, found, _ = cv2.calcOpticalFlowPyrLK(
-            key.image,
-            small,
+            key.picture.image,
+            _in_light_of(key.picture, picture),
             key.points,
             np.ascontiguousarray(near[:, None], np.float32),
             winSize=(_WINDOW_PX, _WINDOW_PX),
@@ -203,27 +250,27 @@ class MotionEstimator:
             flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
         )
         there, then = np.asarray(moved, np.float32)[:, 0], key.points[:, 0]
-        known = (np.asarray(found).ravel() == 1) & _inside(there, small)
+        known = (np.asarray(found).ravel() == 1) & _inside(there, picture.image)
         if hidden is not None:
             known &= ~_within(there, hidden)
-        then, there = then[known], there[known]
+        then, there, weight = then[known], there[known], key.weight[known]
         least = max(_MIN_INLIERS, _MIN_SHARE * len(then))
         if len(then) < least:
             return None
         matrix, agree = cv2.estimateAffinePartial2D(
-            then, there, method=cv2.RANSAC, ransacReprojThreshold=_INLIER_PX, maxIters=200, refineIters=10
+            then, there, method=cv2.RANSAC, ransacReprojThreshold=_INLIER_PX, maxIters=200, refineIters=0
         )
-        inliers = 0 if matrix is None else int(np.asarray(agree).sum())
-        at_rest = _within_reach(then, there, _AT_REST_PX)
-        fitted = np.asarray(IDENTITY if matrix is None else matrix, np.float64)
-        if at_rest >= least and at_rest >= _within_reach(move_points(fitted, then), there, _AT_REST_PX):
-            return IDENTITY, at_rest  # what moves, moves by itself
-        if matrix is None or inliers < least:
+        inliers = np.asarray(agree, np.bool_).ravel()
+        fitted = IDENTITY if matrix is None else _similarity(then[inliers], there[inliers], weight[inliers])
+        if (at_rest := _at_rest(then, there, fitted)) is not None:
+            return IDENTITY, at_rest
+        area = np.ptp(there[inliers], axis=0).prod() if inliers.any() else 0.0
+        if matrix is None or np.count_nonzero(inliers) < least or area < _MIN_AREA * picture.image.size:
             return None
-        return compose(self._from_small, compose(fitted, self._to_small)), inliers
+        return compose(self._from_small, compose(fitted, self._to_small)), int(np.count_nonzero(inliers))
 
 
-def _reduced(image: Image) -> tuple[Image, Floats]:
+def _reduced(image: Image) -> tuple[_Picture, Floats]:
     """A picture at half its size, or less, and the transform (2, 3) to its pixels."""
     import cv2
 
@@ -234,27 +281,80 @@ def _reduced(image: Image) -> tuple[Image, Floats]:
     size = (max(width // factor, 1), max(height // factor, 1))
     small = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
     x, y = size[0] / width, size[1] / height  # a pixel is an area about its centre
-    return small, np.array([[x, 0.0, (x - 1) / 2], [0.0, y, (y - 1) / 2]])
+    copy = cv2.resize(small, (max(size[0] // 4, 1), max(size[1] // 4, 1)), interpolation=cv2.INTER_AREA)
+    about = cv2.boxFilter(small, -1, (_MEAN_OVER_PX, _MEAN_OVER_PX))
+    flat = np.asarray(cv2.addWeighted(small, 1.0, about, -1.0, _GREY), np.uint8)
+    picture = _Picture(flat, float(cv2.meanStdDev(flat)[1][0, 0]), np.asarray(copy, np.uint8))
+    return picture, np.array([[x, 0.0, (x - 1) / 2], [0.0, y, (y - 1) / 2]])
 
 
-def _features(image: Image, hidden: Floats | None) -> Points:
-    """Points (N, 1, 2) that can be found again, outside of boxes (N, 4)."""
+def _features(image: Image, hidden: Floats | None) -> tuple[Points, Floats]:
+    """Points (N, 1, 2) that can be found again, spread over the picture, outside of boxes (N, 4), and weights (N,)."""
     import cv2
 
-    mask = None
-    if hidden is not None and len(hidden):
-        mask = np.full(image.shape, 255, np.uint8)
-        for left, top, width, height in hidden:
-            x, y = np.clip([left, left + width], 0, None), np.clip([top, top + height], 0, None)
-            mask[int(y[0]) : int(np.ceil(y[1])) + 1, int(x[0]) : int(np.ceil(x[1])) + 1] = 0
-    found = cv2.goodFeaturesToTrack(image, _FEATURES, 0.01, _FEATURE_DISTANCE_PX, mask=mask)
-    return np.empty((0, 1, 2), np.float32) if found is None else np.asarray(found, np.float32)
+    height, width = image.shape
+    cell = max(round(np.sqrt(height * width / _FEATURES)), 1)
+    strength = np.asarray(cv2.cornerMinEigenVal(image, 3), np.float32)
+    strength[strength < np.asarray(cv2.dilate(strength, np.ones((3, 3), np.uint8)))] = 0
+    for left, top, w, h in hidden if hidden is not None else ():
+        x, y = np.clip([left, left + w], 0, None), np.clip([top, top + h], 0, None)
+        strength[int(y[0]) : int(np.ceil(y[1])) + 1, int(x[0]) : int(np.ceil(x[1])) + 1] = 0
+    rows, columns = -(-height // cell), -(-width // cell)
+    padded = np.zeros((rows * cell, columns * cell), np.float32)
+    padded[:height, :width] = strength
+    cells = padded.reshape(rows, cell, columns, cell).swapaxes(1, 2).reshape(-1, cell * cell)
+    best = cells.argmax(axis=1)
+    peak = cells[np.arange(len(cells)), best]
+    kept = np.flatnonzero(peak >= _LEAST_EIGENVALUE)
+    good = float(np.quantile(peak[kept], 0.75)) if len(kept) else 0.0
+    kept = kept[peak[kept] >= _LEAST_OF_GOOD * good]
+    x, y = kept % columns * cell + best[kept] % cell, kept // columns * cell + best[kept] // cell
+    return np.stack([x, y], axis=1).astype(np.float32)[:, None], np.minimum(peak[kept], good).astype(float)
 
 
-def _within_reach(points: Floats | Points, expected: Points, reach: float) -> int:
-    """Count the points (N, 2) within reach of their expected positions (N, 2)."""
-    away = points - expected
-    return int(np.count_nonzero((away * away).sum(axis=1) < reach * reach))
+def _similarity(points: Points, there: Points, weight: Floats) -> Floats:
+    """The similarity (2, 3) that takes points (N, 2) closest to others (N, 2), by weights (N,)."""
+    first, second = (one.astype(float) @ [1, 1j] for one in (points, there))
+    share = weight / weight.sum()
+    from_middle, to_middle = first @ share, second @ share
+    away = first - from_middle
+    turn = (share * away.conj()) @ (second - to_middle) / max(share @ np.abs(away) ** 2, 1e-12)
+    shift = to_middle - turn * from_middle
+    return np.array([[turn.real, -turn.imag, shift.real], [turn.imag, turn.real, shift.imag]])
+
+
+def _at_rest(then: Points, there: Points, fitted: Floats) -> int | None:
+    """How many features (N, 2) are where they were, if the scene is at rest; None if it moves as was fitted (2, 3)."""
+    rest, off = _apart(then, there), _apart(move_points(fitted, then.astype(float)), there)
+    at_rest = int(np.count_nonzero(rest < _AT_REST_PX))
+    if at_rest >= _REST_SHARE * len(then) and at_rest >= _REST_RATIO * np.count_nonzero(off < _AT_REST_PX):
+        return at_rest
+    alone = np.count_nonzero((rest < _AT_REST_PX) & (off > _INLIER_PX))
+    others = np.count_nonzero((off < _INLIER_PX) & (rest > _INLIER_PX))
+    is_scene = alone >= max(_MIN_INLIERS, _REST_SHARE * len(then)) and alone >= _REST_RATIO * others
+    return at_rest if is_scene else None  # what moves, moves by itself
+
+
+def _apart(points: Floats | Points, there: Points) -> Floats:
+    """How far points (N, 2) are from where they should be (N, 2)."""
+    return np.asarray(np.hypot(*(points - there).T), np.float64)
+
+
+def _in_light_of(first: _Picture, second: _Picture) -> Image:
+    """The second picture with the contrast of the first, if they differ."""
+    import cv2
+
+    ratio = (first.contrast + 1e-6) / (second.contrast + 1e-6)
+    if 1 / _SAME_CONTRAST < ratio < _SAME_CONTRAST:
+        return second.image
+    return np.asarray(cv2.convertScaleAbs(second.image, alpha=ratio, beta=_GREY * (1 - ratio)), np.uint8)
+
+
+def _correlation(first: _Picture, second: _Picture) -> float:
+    """How the small copies of two pictures of one size correlate, from -1 to 1."""
+    a, b = (one.copy - one.copy.mean() for one in (first, second))
+    scale = float(np.sqrt((a * a).sum() * (b * b).sum()))
+    return float((a * b).sum()) / scale if scale > 0 else float(not a.any() and not b.any())
 
 
 def _inside(points: Points, image: Image) -> Bools:
@@ -264,15 +364,8 @@ def _inside(points: Points, image: Image) -> Bools:
 
 
 def _within(points: Points, boxes: Floats) -> Bools:
-    """Mask the points (N, 2) that lie in one of the boxes."""
+    """Which points (N, 2) lie in one of the boxes."""
     x, y = points.T[:, :, None]
     left, top, width, height = boxes.T
     within: Bools = ((x >= left) & (x <= left + width) & (y >= top) & (y <= top + height)).any(axis=1)
     return within
-
-
-def _difference(first: Image, second: Image) -> float:
-    """Mean difference of brightness of two pictures of one size."""
-    import cv2
-
-    return float(np.asarray(cv2.absdiff(first, second)).mean())

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack.geometry.affine import IDENTITY, compose, invert, scale_of, shift_px
-from mcaptrack.geometry.arrays import Floats, Ints
+from mcaptrack.geometry.arrays import Bools, Floats, Ints
 
 #: Less than this, in pixels of the full picture, is no motion.
 STILL_PX: Final = 0.3
@@ -62,6 +62,8 @@ class CameraPose(NamedTuple):
     inliers : float
         How many features agree on the motion; NaN where that isn't known.
     verdict : Verdict
+    is_elsewhere : bool
+        Whether the camera looks elsewhere than at its reference, further away than it shakes.
 
     """
 
@@ -70,6 +72,7 @@ class CameraPose(NamedTuple):
     reference: int
     inliers: float
     verdict: Verdict
+    is_elsewhere: bool = False
 
 
 class Stance:
@@ -81,6 +84,8 @@ class Stance:
         self._recent: deque[Floats] = deque(maxlen=_SETTLED_PICTURES)
         # From pixels of the view where it stands to those of the reference; None where it began on its way.
         self.stand: Floats | None = None if is_away else IDENTITY
+        # Whether the last picture lies further from the reference than a camera shakes.
+        self.is_elsewhere = False
         self._is_away = is_away
 
     def step(self, to_reference: Floats) -> tuple[Floats, Verdict]:
@@ -89,6 +94,7 @@ class Stance:
         if self.stand is not None:
             off = shift_px(compose(invert(self.stand), to_reference), *self._size)
             to_reference = self.stand if off < STILL_PX else to_reference
+        self.is_elsewhere = shift_px(to_reference, *self._size) > FAR * self._diagonal
         self._recent.append(to_reference)
         self._is_away = off > FAR * self._diagonal or (self._is_away and off >= STILL_PX)
         if self._is_away and len(self._recent) == _SETTLED_PICTURES:
@@ -121,17 +127,20 @@ def poses_of(motions: Floats, width_px: float, height_px: float) -> list[CameraP
         if is_too_far(to_reference, width_px, height_px):
             stance, to_reference, reference = Stance(width_px, height_px, is_away=True), IDENTITY, number
         _, verdict = stance.step(to_reference)
-        poses.append(CameraPose(motion, to_reference, reference, np.nan, verdict))
+        poses.append(CameraPose(motion, to_reference, reference, np.nan, verdict, stance.is_elsewhere))
     return poses
 
 
-def verdict_of(verdicts: NDArray[np.integer]) -> Verdict:
-    """The state of a camera over a whole log, by its verdicts (F,): moving, shaking or still.
+def verdict_of(verdicts: NDArray[np.integer], elsewhere: Bools) -> Verdict:
+    """What a camera does on the whole, by its verdicts (F,) and where it looks (F,): it is moving, shaking or still.
 
+    It moves, too, if it has come to look elsewhere so slowly, or so long ago, that it seems to shake or to stand there.
     Cuts and lost pictures don't count.
     """
     least = _LEAST_MOVING * max(len(verdicts), 1)
-    moving, shaking = (np.count_nonzero(verdicts == one) for one in (Verdict.MOVING, Verdict.SHAKING))
+    known = verdicts <= Verdict.MOVING
+    moving = np.count_nonzero(known & (elsewhere | (verdicts == Verdict.MOVING)))
+    shaking = np.count_nonzero(verdicts == Verdict.SHAKING)
     if moving >= least:
         return Verdict.MOVING
     return Verdict.SHAKING if moving + shaking >= least else Verdict.STILL
@@ -188,7 +197,8 @@ class CameraPath:
     @cached_property
     def verdict(self) -> Verdict:
         """The state of the camera over the whole log, see ``verdict_of``."""
-        return verdict_of(np.array([pose.verdict for pose in self._poses], np.int64))
+        verdicts = np.array([pose.verdict for pose in self._poses], np.int64)
+        return verdict_of(verdicts, np.array([pose.is_elsewhere for pose in self._poses], np.bool_))
 
     @cached_property
     def cuts_ns(self) -> list[int]:

@@ -10,10 +10,10 @@ import numpy as np
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation import Candidate, EvaluateOptions, EvaluationInput, evaluate
-from mcaptrack.geometry.camera_path import verdict_of
 from mcaptrack.notices import warn
 from mcaptrack.pipeline.motion import motion_topic
 from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, GROUND_PLANE, PREDICTIONS, TRACKS, Rows, Schema
+from mcaptrack.schema.camera_motion import rows_to_verdict
 from mcaptrack.sources import foreign
 from mcaptrack.sources.cameras import camera_at, provenance_of
 from mcaptrack.transforms import STAGES
@@ -93,7 +93,7 @@ def summarise(opened: log.Log, prefix: str) -> Summary:
         horizon_s=None if forecasts is None or not len(forecasts) else round(float(forecasts["ahead_s"].max()), 3),
         scores=scores,
         ground_plane=None if planes is None or not len(planes) else "assumed" if planes["assumed"].all() else "given",
-        camera_motion=None if motion is None else verdict_of(motion["verdict"]).name.lower(),
+        camera_motion=None if motion is None else rows_to_verdict(motion).name.lower(),
     )
 
 

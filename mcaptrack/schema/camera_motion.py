@@ -9,8 +9,8 @@ import numpy as np
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.affine import IDENTITY
-from mcaptrack.geometry.arrays import Floats
-from mcaptrack.geometry.camera_path import CameraPath, CameraPose, Verdict
+from mcaptrack.geometry.arrays import Bools, Floats
+from mcaptrack.geometry.camera_path import FAR, CameraPath, CameraPose, Verdict, verdict_of
 from mcaptrack.schema import CAMERA_MOTION, Frame, Rows
 
 _MOTION: Final = ("m00", "m01", "m02_px", "m10", "m11", "m12_px")
@@ -41,8 +41,25 @@ def frames_to_path(frames: Sequence[Frame]) -> CameraPath:
         except ValueError:
             verdict = Verdict.LOST
         number = int(row["reference_frame"])
-        poses.append(CameraPose(motion, reference, number, float(row["inliers"]), verdict))
+        is_elsewhere = bool(_elsewhere(frame.rows)[0])
+        poses.append(CameraPose(motion, reference, number, float(row["inliers"]), verdict, is_elsewhere))
     return CameraPath(np.array([frame.t_ns for frame in frames], np.int64), poses)
+
+
+def rows_to_verdict(rows: Rows) -> Verdict:
+    """What a camera does on the whole, by the rows (F,) of all its messages."""
+    return verdict_of(rows["verdict"], _elsewhere(rows))
+
+
+def _elsewhere(rows: Rows) -> Bools:
+    """Whether the camera looks elsewhere than at its reference, at each row (F,)."""
+    matrix = np.stack([rows[name] for name in _REFERENCE], axis=1).reshape(-1, 2, 3)
+    width, height = rows["width_px"].astype(float), rows["height_px"].astype(float)
+    corner = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 1.0], [0.0, 1.0, 1.0], [1.0, 1.0, 1.0]])
+    corners = corner * np.stack([width, height, np.ones(len(rows))], axis=1)[:, None]  # (F, 4, 3)
+    away = np.einsum("fij,fcj->fci", matrix, corners) - corners[..., :2]
+    is_elsewhere: Bools = np.hypot(away[..., 0], away[..., 1]).max(axis=1) > FAR * np.hypot(width, height)
+    return is_elsewhere
 
 
 def _matrix(values: list[float]) -> Floats:

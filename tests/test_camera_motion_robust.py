@@ -1,0 +1,140 @@
+"""Camera motion where pictures show more than a scene at rest: texts over it, light, noise, crowds, slow pans."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from mcaptrack.geometry.affine import IDENTITY
+from mcaptrack.geometry.camera_motion import MotionEstimator
+from mcaptrack.geometry.camera_path import CameraPath, CameraPose, Verdict, poses_of
+from mcaptrack.schema import CAMERA_MOTION, Frame
+from mcaptrack.schema.camera_motion import frames_to_path, pose_to_rows, rows_to_verdict
+from tests.test_camera_motion import HEIGHT, WIDTH, between, corner_error, follow, picture, pose, scene
+
+SCENE = scene(21)
+PAN = [pose(pan=3.0 * k) for k in range(16)]
+
+
+def worst(found: list[CameraPose], poses: list[np.ndarray]) -> float:
+    return max(corner_error(found[k].from_previous, between(poses[k - 1], poses[k])) for k in range(1, len(poses)))
+
+
+def verdict(found: list[CameraPose]) -> Verdict:
+    return CameraPath(np.arange(len(found)), found).verdict
+
+
+def with_texts(image: np.ndarray, number: int) -> np.ndarray:
+    """A clock in a corner, and a line of news: they stand still while the camera pans."""
+    out = image.copy()
+    cv2.rectangle(out, (0, 0), (260, 34), 0, -1)
+    cv2.putText(out, f"CAM 03  15:04:{number:02d}", (4, 24), 0, 0.9, 255, 2)
+    out[320:] = 20
+    cv2.putText(out, "NEWS: PEOPLE WALK ON A PLAZA", (4, 346), 0, 0.8, 255, 2)
+    return out
+
+
+def test_texts_over_the_picture_do_not_hide_a_pan():
+    pale = [picture(SCENE, one, noise=2, seed=k) // 4 + 60 for k, one in enumerate(PAN)]
+    found = follow(with_texts(image, k) for k, image in enumerate(pale))
+    assert worst(found, PAN) < 1.5
+    assert found[-1].to_reference[0, 2] == pytest.approx(3.0 * 15, abs=1.0)
+    still = follow(with_texts(pale[0], k) for k in range(8))
+    assert all(one.from_previous is IDENTITY for one in still)
+
+
+@pytest.mark.parametrize(
+    "light",
+    [lambda k: 0.5 if k >= 8 else 1.0, lambda k: 1 - 0.045 * k, lambda k: 0.7 if k % 2 else 1.0],
+    ids=["step", "ramp", "flicker"],
+)
+def test_light_that_changes_is_no_motion_and_no_cut(light):
+    def seen(poses: list[np.ndarray]) -> list[CameraPose]:
+        return follow((picture(SCENE, one, noise=2, seed=k) * light(k)).astype(np.uint8) for k, one in enumerate(poses))
+
+    still = seen([pose()] * 16)
+    assert all(one.from_previous is IDENTITY and one.verdict is Verdict.STILL for one in still)
+    assert worst(seen(PAN), PAN) < 0.5
+
+
+def test_a_flash_is_no_cut():
+    pictures = [picture(SCENE, one, noise=2, seed=k) for k, one in enumerate(PAN)]
+    pictures[8] = np.clip(pictures[8] * 1.5 + 90.0, 0, 255).astype(np.uint8)
+    found = follow(pictures)
+    assert Verdict.CUT not in {one.verdict for one in found}
+    assert corner_error(found[-1].to_reference, between(PAN[-1], PAN[0])) < 0.5
+
+
+def test_noise_in_which_nothing_is_found_is_no_cut():
+    rng = np.random.default_rng(0)
+    dim = picture(SCENE, pose()) * 0.2 + 40
+    found = follow(np.clip(dim + rng.normal(0, 40, dim.shape), 0, 255).astype(np.uint8) for _ in range(20))
+    assert Verdict.CUT not in {one.verdict for one in found}
+    assert all(one.from_previous is IDENTITY for one in found)
+
+
+def test_leaves_that_sway_in_half_of_the_picture_are_no_motion_of_the_camera():
+    y, x = np.mgrid[0:HEIGHT, 0:WIDTH].astype(np.float32)
+    share, image = np.clip((0.6 * HEIGHT - y) / 20, 0, 1), picture(SCENE, pose())
+    pictures = []
+    for k in range(20):
+        dx = share * 3 * np.sin(k / 3 + y / 40 + x / 90)
+        dy = share * 1.2 * np.cos(k / 2.3 + x / 60)
+        pictures.append(cv2.remap(image, x + dx, y + dy, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT))
+    assert all(one.from_previous is IDENTITY and one.verdict is Verdict.STILL for one in follow(pictures))
+
+
+@pytest.mark.parametrize("speed", [6, 15])
+def test_a_train_through_half_of_the_picture_is_no_motion_of_the_camera(speed):
+    train, pictures = scene(22), []
+    for k in range(24):
+        image = picture(SCENE, pose(), noise=2, seed=k)
+        end = min(speed * k, WIDTH)
+        image[90:265, :end] = np.roll(train[:175], speed * k, axis=1)[:, :end]
+        pictures.append(image)
+    assert all(one.from_previous is IDENTITY and one.verdict is Verdict.STILL for one in follow(pictures))
+
+
+def test_a_person_before_a_white_wall_tells_nothing_of_the_camera():
+    wall, pictures = np.full((HEIGHT, WIDTH), 210, np.uint8), []
+    for k in range(12):
+        image = wall.copy()
+        image[110:250, 40 + 8 * k : 100 + 8 * k] = picture(SCENE, pose())[:140, :60]
+        pictures.append(image)
+    assert all(one.from_previous is IDENTITY for one in follow(pictures))
+
+
+def test_large_shakes_are_followed_at_little_cost():
+    """Up to 60 px to each side at random; the pictures before are hardly ever searched in full."""
+    rng = np.random.default_rng(3)
+    poses = [pose(*rng.uniform(-60, 60, 2), rng.normal(0, 0.7)) for _ in range(24)]
+    camera = MotionEstimator()
+    fits = []
+    fit = camera._fit
+    camera._fit = lambda *given: fits.append(given) or fit(*given)  # type: ignore[method-assign]
+    found = [camera.step(picture(SCENE, one, noise=2, seed=k)) for k, one in enumerate(poses)]
+    assert worst(found, poses) < 1.0
+    assert len(fits) <= 1.3 * len(poses)
+
+
+@pytest.mark.parametrize("step", [0.2, 0.4])
+def test_a_slow_pan_moves_the_camera(step):
+    """Less than a picture's shake from one to the next, but far away in the end."""
+    found = poses_of(np.array([[[1.0, 0, -step], [0, 1, 0]]] * 600), WIDTH, HEIGHT)
+    assert verdict(found) is Verdict.MOVING
+    assert verdict(found[: round(50 / step)]) is Verdict.SHAKING  # a tenth of the diagonal is 60 px
+
+
+def test_a_camera_that_has_turned_once_looks_elsewhere_from_then_on():
+    motions = np.array([IDENTITY] * 2000)
+    motions[100:110, 0, 2] = -20.0
+    found = poses_of(motions, WIDTH, HEIGHT)
+    assert np.mean([one.verdict is Verdict.MOVING for one in found]) < 0.02
+    assert verdict(found) is Verdict.MOVING
+    frames = [Frame(k, k, pose_to_rows(one, WIDTH, HEIGHT)) for k, one in enumerate(found)]
+    path = frames_to_path(frames)
+    assert path.verdict is Verdict.MOVING
+    assert [one.is_elsewhere for _, one in path.poses_between(None, None)] == [one.is_elsewhere for one in found]
+    assert rows_to_verdict(CAMERA_MOTION.joined([frame.rows for frame in frames])) is Verdict.MOVING
+    assert rows_to_verdict(CAMERA_MOTION.joined([frame.rows for frame in frames[:100]])) is Verdict.STILL
