@@ -8,6 +8,7 @@ import re
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
+from zlib import crc32
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -73,7 +74,7 @@ class Mutant:
 
     @property
     def name(self) -> str:
-        return f"{self.path}:{self.line}:{self.start}:{self.kind}"
+        return f"{self.path}:{self.line}:{self.start}:{self.kind}:{crc32(self.new):x}"
 
     def applied(self, source: bytes) -> bytes:
         return source[: self.start] + self.new + source[self.end :]
