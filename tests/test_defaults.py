@@ -26,7 +26,7 @@ SORT: dict[str, Any] = {
     "max_distance_m": 1.0,
     "min_score": None,
     "class_id": None,
-    "mix_classes": False,
+    "across_classes": False,
     "camera_motion": "auto",
 }
 
@@ -46,6 +46,7 @@ RETRACKING = {
     "link_confidence": 0.5,
     "resolve_swaps": True,
     "track_confidence": 0.5,
+    "across_classes": False,
     "smooth": True,
     "interpolated": False,
     "side_view": False,
@@ -98,6 +99,7 @@ PAPER = {
     "link_s": 0.0,
     "resolve_swaps": False,
     "track_confidence": 0.0,
+    "across_classes": False,
     "smooth": False,
     "interpolated": True,
 }

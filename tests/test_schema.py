@@ -298,6 +298,7 @@ def test_provenance_comes_back_from_its_metadata():
         {"/t": "d3"},
         {"transform": Plugin("own", "own:It", "pkg", "1")},
         {"1": "person"},
+        "1",
         {"layout": "x"},
         [["lost", "words"]],
         "0.0.9",

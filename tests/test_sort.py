@@ -207,7 +207,7 @@ def test_a_track_continues_with_detections_of_its_class_only():
     for frame in frames[10:]:
         frame.rows["class_id"] = 3
     assert ids(run(frames)[-1]) == [2]
-    assert ids(run(frames, mix_classes=True)[-1]) == [1]
+    assert ids(run(frames, across_classes=True)[-1]) == [1]
 
 
 def test_bytetrack_continues_tracks_with_low_scores_and_starts_none():

@@ -29,7 +29,7 @@ SHARED = {
     "max_distance_m": [0.5, 2.0],
     "min_score": [None, 0.3],
     "class_id": [None, None, 1],
-    "mix_classes": [False, True],
+    "across_classes": [False, True],
     "ground_planes": [PLANE],
 }
 OWN = {

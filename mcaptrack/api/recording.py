@@ -296,7 +296,15 @@ class Recording:
         schema = boxes[found[0]]
         return supervision_of(self._log.frames(found[0], schema or TRACKS))
 
-    def write(self, topic: str, rows: Any, *, replace: bool = False, sidecar: bool | None = None) -> int:
+    def write(
+        self,
+        topic: str,
+        rows: Any,
+        *,
+        classes: Mapping[int, str] | None = None,
+        replace: bool = False,
+        sidecar: bool | None = None,
+    ) -> int:
         """Write detections or tracks as a channel of the log; ``track``, ``run`` and ``info`` then use it.
 
         Parameters
@@ -307,7 +315,10 @@ class Recording:
         rows : iterable of Frame, structured array, table, or mapping
             Frames as ``mcaptrack.detections`` makes them; or an array, or a table of pandas, Polars, Arrow or DuckDB,
             with a column ``t_ns`` and those of the rows; or ``supervision.Detections`` by time in nanoseconds, as a
-            mapping or as pairs. A table has no frames without rows.
+            mapping or as pairs. A table has no frames without rows. Of a column ``class``, which the tables of a log
+            have, the names are kept.
+        classes : mapping of int to str, optional
+            Names of classes by ``class_id``; 1 is a person.
         replace : bool, default False
             Replace the channel if it exists and holds the same kind of rows. Channels that others recorded are never
             replaced.
@@ -339,7 +350,7 @@ class Recording:
         path = self._log.path
         path = path if path.absolute() == self._place else self._place
         with self._reading:
-            count = write_rows(path, topic, rows, replace=replace, sidecar=sidecar)
+            count = write_rows(path, topic, rows, classes=classes, replace=replace, sidecar=sidecar)
             self.close()
             self._open(path)
         return count

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from mcaptrack import tables
 from mcaptrack.api.checked import checked
+from mcaptrack.api.class_names import numbered_columns
 from mcaptrack.api.columns import (
     UNNUMBERED,
     BoxFormat,
@@ -87,22 +88,26 @@ def detections(
     return frame_of(DETECTIONS, boxes_of(boxes, box_format), {"score": scores, "class_id": classes}, t_ns, index)
 
 
-def frames_of(rows: Any, schema: Schema | None) -> tuple[Schema, list[Frame]]:
-    """Return the schema and the frames, by time, of rows in any form that ``Recording.write`` takes.
+def frames_of(rows: Any, schema: Schema | None) -> tuple[Schema, list[Frame], dict[int, str]]:
+    """Return the schema and the frames, by time, of rows in any form that ``Recording.write`` takes; and the names of
+    classes that these rows bring along, by number.
 
     Raises McaptrackError for anything else, and for rows that do not fit a schema.
     """
+    names: dict[int, str] = {}
     if isinstance(rows, np.ndarray):
         if rows.dtype.names is None or rows.ndim != 1:
             raise McaptrackError(
                 f"an array {rows.shape} of {rows.dtype} is no table; make frames with `mcaptrack.detections`, or give "
                 "an array (N,) with named columns"
             )
-        schema, frames = frames_of_columns({name: rows[name] for name in rows.dtype.names}, schema)
+        columns, names = numbered_columns({name: rows[name] for name in rows.dtype.names})
+        schema, frames = frames_of_columns(columns, schema)
     elif hasattr(rows, "__arrow_c_stream__") or hasattr(
         rows, "__arrow_c_array__"
     ):  # of pyarrow, pandas, Polars, DuckDB
-        schema, frames = frames_of_columns(tables.columns_of(rows), schema)
+        columns, names = numbered_columns(tables.columns_of(rows))
+        schema, frames = frames_of_columns(columns, schema)
     else:
         schema, frames = _of_frames(rows, schema)
     frames.sort(key=lambda frame: (frame.t_ns, frame.index))
@@ -113,7 +118,7 @@ def frames_of(rows: Any, schema: Schema | None) -> tuple[Schema, list[Frame]]:
                 "number pictures of the same time with `index=`"
             )
     check_frames(schema, frames)
-    return schema, frames
+    return schema, frames, names
 
 
 def _of_frames(rows: Any, schema: Schema | None) -> tuple[Schema, list[Frame]]:
@@ -128,7 +133,7 @@ def _of_frames(rows: Any, schema: Schema | None) -> tuple[Schema, list[Frame]]:
     frames = [_frame(one, schema) for one in (rows.items() if hasattr(rows, "items") else rows)]
     if schema is None:
         found = {frame.rows.dtype.names for frame in [frame for frame in frames if len(frame.rows)] or frames}
-        fitting = [one for one in (DETECTIONS, TRACKS) if found == {one.dtype.names}]
+        fitting = [one for one in (DETECTIONS, TRACKS) if found and all(map(one.has_columns, found))]
         if not fitting:
             raise McaptrackError(
                 "it is not clear whether these are detections or tracks; all frames have to be of one kind, and "
@@ -136,12 +141,14 @@ def _of_frames(rows: Any, schema: Schema | None) -> tuple[Schema, list[Frame]]:
             )
         schema = fitting[0]
         frames = [frame if len(frame.rows) else frame._replace(rows=schema.empty()) for frame in frames]
-    for frame in frames:
-        try:
-            schema.check(frame.rows)
-        except ValueError as error:
-            raise McaptrackError(f"the frame at {frame.t_ns} ns: {error}") from None
-    return schema, frames
+    return schema, [_checked(schema, frame) for frame in frames]
+
+
+def _checked(schema: Schema, frame: Frame) -> Frame:
+    try:
+        return frame._replace(rows=schema.check(frame.rows))
+    except ValueError as error:
+        raise McaptrackError(f"the frame at {frame.t_ns} ns: {error}") from None
 
 
 def _frame(one: Any, schema: Schema | None) -> Frame:

@@ -14,7 +14,7 @@ from mcaptrack.api.columns import UNNUMBERED, boxes_of, frame_of
 from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import warn
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame, Schema
-from mcaptrack.sources.foreign.boxes import PEOPLE, PERSON
+from mcaptrack.schema.classes import PEOPLE, PERSON
 
 _SUPERVISION: Final = ("confidence", "class_id", "tracker_id", "mask", "data")
 #: What is added to the classes of a detector that names them, so that none of them is 0 (unknown) or 1 (person).

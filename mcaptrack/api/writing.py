@@ -10,6 +10,7 @@ import numpy as np
 
 from mcaptrack import log as logs
 from mcaptrack import pipeline
+from mcaptrack.api.class_names import checked_names
 from mcaptrack.api.columns import UNNUMBERED
 from mcaptrack.api.common import warnings_about
 from mcaptrack.api.rows import frames_of
@@ -32,20 +33,23 @@ _SUCH: Final = "/own/detections or /own/tracks"
 _LONGEST: Final = 1024
 
 
-def write_rows(path: Path, topic: str, rows: Any, *, replace: bool, sidecar: bool | None) -> int:
+def write_rows(
+    path: Path, topic: str, rows: Any, *, classes: Mapping[int, str] | None, replace: bool, sidecar: bool | None
+) -> int:
     """Write rows as a channel of the log; returns the number of frames. See ``Recording.write``."""
-    place = SidecarChoice(sidecar)
+    place, given = SidecarChoice(sidecar), checked_names(classes)
     with warnings_about(path), logs.read(path, sidecar=place) as opened:
         opened.lock()
         name = _topic(opened, topic)
         prefix, _, last = name.rpartition("/")
-        schema, frames = frames_of(rows, _HOLDS.get(last))
+        schema, frames, found = frames_of(rows, _HOLDS.get(last))
+        names = {str(number): one for number, one in sorted((found | given).items())}
         _refuse_to_replace(opened, name, schema, replace)
         planes = pipeline.read_planes(opened, prefix) or ()
         frames = _numbered(
             opened, prefix, [_in_metres(frame, planes) if schema is TRACKS else frame for frame in frames]
         )
-        made = Made.of(schema, frames, Provenance(INGEST, {"written_with": "mcaptrack.open"}))
+        made = Made.of(schema, frames, Provenance(INGEST, {"written_with": "mcaptrack.open"}, classes=names))
         layouts = write(opened, prefix, {name: made}, planes, {}, None)
         stale = pipeline.outdated_by(opened, {name: made.provenance.digest})
         for layout, content in layouts.items():

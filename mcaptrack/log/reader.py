@@ -22,6 +22,7 @@ from mcaptrack.log.records import ChannelRecord, Damaged
 from mcaptrack.log.snapshot import open_snapshot
 from mcaptrack.log.writer import create
 from mcaptrack.schema import Frame, Schema
+from mcaptrack.schema.classes import with_only_class
 from mcaptrack.schema.framing import split_rows
 
 T = TypeVar("T")
@@ -244,12 +245,20 @@ class Log:
         return heapq.merge(*map(named, topics), key=lambda found: found[1].t_ns)
 
     def rows(self, topic: str, schema: Schema) -> ChannelRows:
-        """All rows of a channel as one array. Raises McaptrackError if the channel has another schema."""
+        """All rows of a channel as one array. Raises McaptrackError if the channel has another schema.
+
+        Where all rows are of one class, which its metadata name, they get that class.
+        """
         if (part := self.part(topic)) is not self:
             return part.rows(topic, schema)
         channel = self.channel(topic)
         if channel.schema_name != schema.name or channel.message_encoding != "protobuf":
             raise McaptrackError(f"{self.path}: {topic} holds {channel.schema_name or 'no schema'}, not {schema.name}")
+        found = self._rows(topic, schema)
+        return found._replace(rows=with_only_class(schema, found.rows, channel.metadata))
+
+    def _rows(self, topic: str, schema: Schema) -> ChannelRows:
+        """All rows of a channel of this file as they stand in its messages."""
         channels = self._ids(topic)
         with self.snapshot.reporting_bad_times(topic):
             found = self._messages.columns(channels, schema)

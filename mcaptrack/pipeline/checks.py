@@ -13,6 +13,7 @@ from mcaptrack import log
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.foxglove import views
 from mcaptrack.schema import DETECTIONS, VIDEO, Frame, Schema
+from mcaptrack.schema.classes import class_names
 from mcaptrack.schema.provenance import INGEST, VIEW, Provenance
 from mcaptrack.sources import foreign
 from mcaptrack.sources.cameras import USUAL, chain_of
@@ -80,8 +81,15 @@ def fits(channel: log.Channel, reads: Schema) -> tuple[str, bool]:
 
 def read_frames(opened: log.Log, topic: str, schema: Schema) -> list[Frame]:
     """Read the rows of a channel, or the detections of a recording in a foreign format."""
-    theirs = foreign.holds_detections(opened.channel(topic))
-    return foreign.detections(opened, topic) if theirs else opened.frames(topic, schema)
+    return read_named_frames(opened, topic, schema)[0]
+
+
+def read_named_frames(opened: log.Log, topic: str, schema: Schema) -> tuple[list[Frame], dict[int, str]]:
+    """Read the rows of a channel as ``read_frames`` does, and the names of their classes by number."""
+    channel = opened.channel(topic)
+    if foreign.holds_detections(channel):
+        return foreign.named_detections(opened, topic)
+    return opened.frames(topic, schema), class_names(channel.metadata)
 
 
 def _lacks(opened: log.Log, prefix: str, job: Job) -> str:

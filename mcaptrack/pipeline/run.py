@@ -15,7 +15,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.clocks import NS_PER_S, parse_ns
 from mcaptrack.geometry.plane import Planes, is_assumed
 from mcaptrack.notices import Notice, collected, warn
-from mcaptrack.pipeline.checks import Job, check_inputs, read_frames
+from mcaptrack.pipeline.checks import Job, check_inputs, read_named_frames
 from mcaptrack.pipeline.events import STAGE as EVENTS_STAGE
 from mcaptrack.pipeline.events import Watch, make_events, tally
 from mcaptrack.pipeline.findings import warn_findings, warn_memory, warn_no_rows
@@ -25,6 +25,7 @@ from mcaptrack.pipeline.rebuild import plugins_of
 from mcaptrack.pipeline.write import Made, digest_of, write
 from mcaptrack.predictors import weights_sha256
 from mcaptrack.schema import DETECTIONS, GROUND_PLANE, TRACKS, VIDEO, Frame
+from mcaptrack.schema.classes import class_names
 from mcaptrack.schema.provenance import CLOCK, Provenance
 from mcaptrack.sources import foreign
 from mcaptrack.sources.cameras import camera_at
@@ -33,6 +34,7 @@ from mcaptrack.transforms import FULL, STAGES, Sample, Transform
 from mcaptrack.transforms.guarded import guarded
 from mcaptrack.transforms.protocol import ModelCard, colour_of, passes_of
 from mcaptrack.transforms.to_video_rate import to_video_rate, unchanged_tracks
+from mcaptrack.transforms.track_classes import settle_classes
 
 Progress = Callable[[str, int, int], None]
 
@@ -147,13 +149,14 @@ class _Repeatable:
 
 class _Input(NamedTuple):
     """The input of a job: a stream of frames, all frames if they are rows (else empty), and, after the stream was read,
-    the digest and the number of its messages.
+    the digest and the number of its messages. ``classes`` are the names of the classes of its rows.
     """
 
     stream: Iterable[Frame]
     frames: list[Frame]
     digest: Callable[[], str]
     messages: Callable[[], int]
+    classes: Mapping[str, str] = {}
 
 
 def _run_job(
@@ -173,6 +176,8 @@ def _run_job(
             for result in results:
                 for frame, channel in zip(result, outputs, strict=True):
                     channel.append(frame)
+            if job.transform.reads is DETECTIONS and job.transform.writes[""] is TRACKS:
+                outputs[0] = settle_classes(outputs[0])
             if not warnings:  # otherwise a warning has given the reason
                 warn_no_rows(job.stage, job.source, transform, given.frames, outputs[0])
     except McaptrackError as error:
@@ -185,7 +190,7 @@ def _run_job(
             "picture that has its parameter sets",
             "left-out",
         )
-    provenance = _provenance_of(job, transform, given.digest(), warnings, known.references)
+    provenance = _provenance_of(job, transform, given, warnings, known.references)
     out = {
         topic: Made.of(schema, channel, provenance)
         for (topic, schema), channel in zip(job.outputs().items(), outputs, strict=True)
@@ -203,9 +208,12 @@ def _run_job(
 
 
 def _provenance_of(
-    job: Job, transform: Transform, input_digest: str, warnings: Sequence[Notice], references: Mapping[str, str]
+    job: Job, transform: Transform, given: _Input, warnings: Sequence[Notice], references: Mapping[str, str]
 ) -> Provenance:
-    """Return the provenance of a job's channels. Raises McaptrackError for parameters that a log can't hold."""
+    """Return the provenance of a job's channels. Classes are named by the transform, or else by its input.
+
+    Raises McaptrackError for parameters that a log can't hold.
+    """
     stage = STAGES[job.stage]
     entry = stage.entry(type(transform))
     choice = {stage.kind: entry.name} if stage.kind else {}
@@ -223,11 +231,11 @@ def _provenance_of(
         job.stage,
         parameters,
         job.source,
-        input_digest,
+        given.digest(),
         weights_sha256=weights_sha256(predictor) if isinstance(predictor, str) else card.weights_sha256,
         references=references,
         plugins=plugins_of(stage, transform),
-        classes={str(number): name for number, name in card.classes.items()},
+        classes={str(number): name for number, name in card.classes.items()} or given.classes,
         model=card.facts,
         warnings=[(notice.code, notice.message) for notice in warnings],
     )
@@ -297,12 +305,14 @@ def _input(
         digest, pictures = _pictures(opened, job, seen, progress)
         return _Input(pictures, [], digest, lambda: len(seen))
     if job.source in made:
-        frames, of_rows = made[job.source].frames, made[job.source].provenance.digest
+        frames, how = made[job.source].frames, made[job.source].provenance
+        of_rows, names = how.digest, class_names(how.to_metadata())
     else:
-        frames, of_rows = read_frames(opened, job.source, job.transform.reads), digest_of(opened, job.source)
-    return _Input(
-        _Repeatable(lambda: _counted(frames, job.stage, progress)), frames, lambda: of_rows, lambda: len(frames)
-    )
+        frames, names = read_named_frames(opened, job.source, job.transform.reads)
+        of_rows = digest_of(opened, job.source)
+    classes = {str(number): name for number, name in sorted(names.items())}
+    stream = _Repeatable(lambda: _counted(frames, job.stage, progress))
+    return _Input(stream, frames, lambda: of_rows, lambda: len(frames), classes)
 
 
 def _counting(frames: Iterable[Frame], taken: set[int]) -> Iterator[Frame]:
@@ -357,7 +367,7 @@ def input_of(
     topic = source or f"{prefix}/{STAGES[stage].input_topic}"
     job = Job(stage, transform, topic, f"{prefix}/{STAGES[stage].output_topic}")
     check_inputs(opened, prefix, [job])
-    frames = read_frames(opened, topic, transform.reads)
+    frames, _ = read_named_frames(opened, topic, transform.reads)
     known = _in_context(opened, prefix, job, frames, read_planes(opened, prefix) or ())
     known = replace(known, **side_inputs(opened, prefix, job, {}).values)
     return frames, {f.name: getattr(known, f.name) for f in fields(known) if f.metadata.get("context")}

@@ -21,6 +21,7 @@ from mcaptrack.geometry.plane import Planes
 from mcaptrack.notices import warn
 from mcaptrack.pipeline.checks import describe_origin, may_replace
 from mcaptrack.schema import DETECTIONS, FORECAST_SCORES, GROUND_PLANE, PREDICTIONS, SCHEMAS, TRACKS, Frame, Schema
+from mcaptrack.schema.classes import has_classes, only_class, classes_beside_rows, without_class
 from mcaptrack.schema.framing import frame_times
 from mcaptrack.schema.provenance import INGEST, VIEW, Provenance, digest
 from mcaptrack.sources import foreign
@@ -46,17 +47,25 @@ class Made(NamedTuple):
 
     @classmethod
     def of(cls, schema: Schema, frames: list[Frame], provenance: Provenance) -> Made:
-        """Check the rows of frames against the schema, and put the digest of the messages into the provenance."""
-        for frame in frames:
-            schema.check(frame.rows)
+        """Check the rows of frames against the schema, and put classes and digest of the messages into the provenance.
+
+        ``provenance`` has the names of classes for schemas with classes.
+        """
+        frames = [frame._replace(rows=schema.check(frame.rows)) for frame in frames]
+        names = provenance.classes if has_classes(schema) else {}
+        only = only_class(schema, frames)
+        provenance = replace(provenance, classes=names, class_id=str(only) if only else "")
         made = cls(schema, frames, provenance)
-        return made._replace(provenance=replace(provenance, digest=digest(made.messages())))
+        beside = classes_beside_rows(provenance.class_id, names)
+        return made._replace(provenance=replace(provenance, digest=digest(made.messages(), beside)))
 
     def messages(self) -> Iterator[tuple[int, int, bytes]]:
         """Yield time in ns, sequence number and payload of each message, one by one: all of them take much memory."""
         if self.encoded is not None:
             return iter(self.encoded)
         encode = self.schema.codec.encode
+        if self.provenance.class_id:  # it stands in the metadata instead
+            return ((frame.t_ns, frame.index, encode(without_class(frame.rows))) for frame in self.frames)
         return ((frame.t_ns, frame.index, encode(frame.rows)) for frame in self.frames)
 
     def size(self) -> int:

@@ -6,7 +6,7 @@ MCAP channel are all derived from one file; there is no second definition.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from enum import IntEnum
 from functools import cached_property
 from pathlib import Path
@@ -136,7 +136,8 @@ class Schema:
         Parameters
         ----------
         **columns : (N,) array or sequence
-            By name of the column. Optional columns may be left out; they are filled with NaN.
+            By name of the column. Optional columns may be left out; they are filled with NaN. Columns that were added
+            to the schema later may be left out, too; they are 0.
 
         Returns
         -------
@@ -169,25 +170,33 @@ class Schema:
                 out[name] = arrays[name]
             elif column.optional:
                 out[name] = np.nan
-            else:
+            elif not column.since:
                 raise ValueError(f"{self.name} needs the column {name}")
         return out
 
     def check(self, rows: NDArray[Any]) -> Rows:
         """Validate rows: exactly this schema's columns, and no NaN in required ones.
 
-        Returns ``rows``. Raises ValueError, with column and schema, otherwise.
+        Columns that were added to the schema later may be missing. Returns ``rows`` with all columns. Raises
+        ValueError, with column and schema, otherwise.
         """
         names = rows.dtype.names
         wanted = tuple(column.name for column in self.columns)
         if rows.ndim != 1 or names is None:
             kind = "without columns" if names is None else "with columns"
             raise ValueError(f"{self.name} needs a structured array (N,), not an array of shape {rows.shape} {kind}")
-        if set(names) != set(wanted):
+        if not self.has_columns(names):
             raise ValueError(f"{self.name} has the columns {', '.join(wanted)}; the rows have {', '.join(names)}")
+        if len(names) < len(wanted):
+            return self.rows(**{name: rows[name] for name in names})
         for column in self.columns:
             self._check_column(column, rows[column.name])
         return rows
+
+    def has_columns(self, names: Iterable[str] | None) -> bool:
+        """Whether rows with these columns are of this schema: all of its columns; those added later may be missing."""
+        first = {column.name for column in self.columns if not column.since}
+        return first <= set(names or ()) <= {column.name for column in self.columns}
 
     def _check_column(self, column: Column, values: NDArray[Any]) -> None:
         where, kind, target = f"{self.name}.{column.name}", values.dtype.kind, self.dtype[column.name]

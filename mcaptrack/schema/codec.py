@@ -5,6 +5,9 @@ bytes at fixed offsets. A payload is therefore a structured array with the tags 
 decoding is a view. Payloads of other protobuf writers (default values omitted, fields in another order) have another
 length or other tags; they are detected and decoded by the protobuf runtime.
 
+Columns that were added to a schema later are left out of messages in which all rows have their default, so that these
+messages stay as they were. A schema has one layout for each time that it grew.
+
 Letters: N rows, M messages.
 """
 
@@ -17,13 +20,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mcaptrack.geometry.arrays import Bools, Ints
 from mcaptrack.geometry.ragged import ragged_range
-from mcaptrack.schema.proto import KINDS, Definition
+from mcaptrack.schema.proto import KINDS, Column, Definition
 
 if TYPE_CHECKING:
     from google.protobuf.message import Message
 
 Rows = NDArray[np.void]
+Bytes = NDArray[np.uint8]
 
 
 def _varint(value: int) -> bytes:
@@ -34,44 +39,89 @@ def _varint(value: int) -> bytes:
     return bytes([*out, value])
 
 
-class RowCodec:
-    """Rows of one schema <-> payload bytes. ``dtype`` is the layout of a row on the wire, with tags as padding."""
+class _Layout:
+    """The bytes of a row with some columns: ``head`` bytes, then for each column its tag and its value."""
 
-    def __init__(self, definition: Definition) -> None:
-        self._definition = definition
+    def __init__(self, columns: Sequence[Column]) -> None:
         body, at = bytearray(), []
-        for column in definition.columns:
+        for column in columns:
             _, width, wire_type, _ = KINDS[column.kind]
             body += _varint(column.number << 3 | wire_type)
             at.append(len(body))
             body += bytes(width)
         head = b"\x0a" + _varint(len(body))  # field 1 of the message, length-delimited
         offsets = [len(head) + offset for offset in at]
-        self._template = np.frombuffer(head + body, np.uint8)
+        self.head = len(head)
+        self.template = np.frombuffer(head + body, np.uint8)
+        self.size = len(self.template)
         self.dtype = np.dtype(
             {
-                "names": [column.name for column in definition.columns],
-                "formats": [KINDS[column.kind][0] for column in definition.columns],
+                "names": [column.name for column in columns],
+                "formats": [KINDS[column.kind][0] for column in columns],
                 "offsets": offsets,
-                "itemsize": len(self._template),
+                "itemsize": self.size,
             }
         )
         # The fixed bits of a row: all bits of tags, and all but the lowest bit of a bool, because other bytes than 0
         # and 1 are longer varints, or true values that NumPy can't represent.
-        fixed = np.full(len(self._template), 0xFF, np.uint8)
-        for column, offset in zip(definition.columns, offsets, strict=True):
+        fixed = np.full(self.size, 0xFF, np.uint8)
+        for column, offset in zip(columns, offsets, strict=True):
             fixed[offset : offset + KINDS[column.kind][1]] = 0xFE if column.kind == "bool" else 0
         self._fixed = fixed
         self._data = np.where(fixed == 0xFF, 0, 0xFF).astype(np.uint8)
-        self._tags = self._template.tobytes()
+        self._tags = self.template.tobytes()
         fixed_at = np.flatnonzero(fixed).tolist()
-        self._fixed_bytes = [(at, fixed[at], self._template[at] & fixed[at]) for at in fixed_at]
+        self._fixed_bytes = [(at, fixed[at], self.template[at] & fixed[at]) for at in fixed_at]
+
+    def filled(self, values: Bytes) -> bytes:
+        """The bytes of rows, from the values in others (N, size)."""
+        return (values & self._data | self.template).tobytes()
+
+    def is_of(self, payload: bytes) -> bool:
+        """Whether every tag is where ``filled`` writes it; then all other bytes are values of the columns."""
+        if len(payload) % self.size:
+            return False
+        raw = np.frombuffer(payload, np.uint8).reshape(-1, self.size)
+        return (raw & self._fixed).tobytes() == self._tags * len(raw)
+
+    def begins(self, raw: Bytes, start: Ints, length: Ints) -> Bools:
+        """Which messages (M,) of ``raw`` have the length and the head of rows of this layout."""
+        fits: Bools = (length > 0) & (length % self.size == 0)
+        for at in range(self.head):
+            fits[fits] &= raw[start[fits] + at] == self.template[at]
+        return fits
+
+    def rows_at(self, raw: Bytes, start: Ints, counts: Ints) -> Bytes | None:
+        """The bytes (N, size) of rows, ``counts`` of them from each ``start`` on; None if a tag is not in its place."""
+        block = np.lib.stride_tricks.sliding_window_view(raw, self.size)[ragged_range(start, counts, step=self.size)]
+        # By column, because few bytes of a row are fixed.
+        if any(((block[:, at] & mask) != tag).any() for at, mask, tag in self._fixed_bytes):
+            return None
+        return block
+
+
+class RowCodec:
+    """Rows of one schema <-> payload bytes. ``dtype`` is the layout of a row on the wire, with tags as padding."""
+
+    def __init__(self, definition: Definition) -> None:
+        self._definition = definition
+        columns = definition.columns
+        grew = [at for at in range(1, len(columns)) if columns[at].since != columns[at - 1].since]
+        self._layouts = [_Layout(columns[:count]) for count in (*grew, len(columns))]  # the shortest first
+        self._later = [columns[count:] for count in grew]
+        self.dtype = self._layouts[-1].dtype
 
     def encode(self, rows: Rows) -> bytes:
         """Encode N rows as one payload. ``rows`` must have the columns of the schema, in any memory layout."""
         if rows.dtype == self.dtype:
-            raw = np.ascontiguousarray(rows).view(np.uint8).reshape(-1, len(self._template))
-            return (raw & self._data | self._template).tobytes()
+            whole = self._layouts[-1]
+            raw = np.ascontiguousarray(rows).view(np.uint8).reshape(-1, whole.size)
+            for layout, later in zip(self._layouts, self._later, strict=False):
+                if all(_is_default(column, rows) for column in later):
+                    values = np.empty((len(raw), layout.size), np.uint8)
+                    values[:, layout.head :] = raw[:, whole.head : whole.head + layout.size - layout.head]
+                    return layout.filled(values)
+            return whole.filled(raw)
         wire = np.empty(len(rows), self.dtype)
         for name in self.dtype.names or ():
             wire[name] = rows[name]
@@ -82,17 +132,16 @@ class RowCodec:
 
         Raises ValueError if the payload is not a message of this schema.
         """
-        if self._is_ours(payload):
-            return np.frombuffer(payload, self.dtype)
-        return self._decode_foreign(payload)
+        layout = self._layout_of(payload)
+        return self._decode_foreign(payload) if layout is None else self._from(layout, payload)
 
     def decode_all(self, payloads: Sequence[bytes]) -> tuple[Rows, NDArray[np.int64]]:
         """Decode many payloads to one array of rows, and the number of rows in each."""
         joined = b"".join(payloads)
-        size = self.dtype.itemsize
-        if self._is_ours(joined) and all(len(payload) % size == 0 for payload in payloads):
-            counts = np.fromiter((len(payload) // size for payload in payloads), np.int64, len(payloads))
-            return np.frombuffer(joined, self.dtype), counts
+        layout = self._layout_of(joined)
+        if layout is not None and all(len(payload) % layout.size == 0 for payload in payloads):
+            counts = np.fromiter((len(payload) // layout.size for payload in payloads), np.int64, len(payloads))
+            return self._from(layout, joined), counts
         parts = [self.decode(payload) for payload in payloads]
         rows = np.concatenate(parts) if parts else np.empty(0, self.dtype)
         return rows, np.array([len(part) for part in parts], np.int64)
@@ -104,17 +153,24 @@ class RowCodec:
 
         None if one has another layout than this codec's.
         """
-        size = self.dtype.itemsize
-        counts, over = np.divmod(end - start, size)
-        if over.any():
+        length = end - start
+        counts, found = np.zeros(len(length), np.int64), []
+        for layout in self._layouts:
+            mine = layout.begins(raw, start, length)
+            if mine.any():
+                counts[mine] = length[mine] // layout.size
+                block = layout.rows_at(raw, start[mine], counts[mine])
+                if block is None:
+                    return None
+                found.append((mine, self._widened(layout, block)))
+        if ((length > 0) & (counts == 0)).any():
             return None
-        if not counts.any():
-            return np.empty(0, self.dtype), counts
-        block = np.lib.stride_tricks.sliding_window_view(raw, size)[ragged_range(start, counts, step=size)]
-        # By column, because few bytes of a row are fixed.
-        if any(((block[:, at] & mask) != tag).any() for at, mask, tag in self._fixed_bytes):
-            return None
-        return block.view(self.dtype)[:, 0], counts
+        if len(found) == 1:
+            return found[0][1], counts
+        out, first = np.empty((int(counts.sum()), self.dtype.itemsize), np.uint8), np.cumsum(counts) - counts
+        for mine, rows in found:
+            out[ragged_range(first[mine], counts[mine])] = self._bytes(rows)
+        return out.view(self.dtype)[:, 0], counts
 
     def longer(self, rows: Rows, taken: int, length: int) -> Rows:
         """An array of ``length`` rows that begins with the first ``taken`` rows; the others are not initialised."""
@@ -126,16 +182,30 @@ class RowCodec:
         """Copy rows into others of this layout; as bytes, because NumPy copies structured arrays field by field."""
         self._bytes(rows)[at : at + len(part)] = self._bytes(part)
 
-    def _bytes(self, rows: Rows) -> NDArray[np.uint8]:
+    def _bytes(self, rows: Rows) -> Bytes:
         return np.asarray(rows.view(np.uint8).reshape(-1, self.dtype.itemsize), np.uint8)
 
-    def _is_ours(self, payload: bytes) -> bool:
-        """Whether every tag is where ``encode`` writes it; then all other bytes are values of the columns."""
-        size = len(self._template)
-        if len(payload) % size:
-            return False
-        raw = np.frombuffer(payload, np.uint8).reshape(-1, size)
-        return (raw & self._fixed).tobytes() == self._tags * len(raw)
+    def _layout_of(self, payload: bytes) -> _Layout | None:
+        """The layout of this codec that a payload has; None if another writer made it."""
+        return next((layout for layout in reversed(self._layouts) if layout.is_of(payload)), None)
+
+    def _from(self, layout: _Layout, payload: bytes) -> Rows:
+        """The read-only rows of a payload of a layout."""
+        rows = self._widened(layout, np.frombuffer(payload, np.uint8).reshape(-1, layout.size))
+        rows.flags.writeable = False
+        return rows
+
+    def _widened(self, layout: _Layout, block: Bytes) -> Rows:
+        """Rows with all columns, from the bytes (N, size) of rows of a layout; later columns have their default."""
+        whole = self._layouts[-1]
+        if layout is not whole:
+            short, block = block, np.tile(whole.template, (len(block), 1))
+            block[:, whole.head : whole.head + layout.size - layout.head] = short[:, layout.head :]
+        rows: Rows = block.view(self.dtype)[:, 0]
+        if layout is not whole:
+            for column in self._later[self._layouts.index(layout)]:
+                rows[column.name] = np.nan if column.optional else 0
+        return rows
 
     def _decode_foreign(self, payload: bytes) -> Rows:
         from google.protobuf.message import DecodeError
@@ -166,3 +236,9 @@ class RowCodec:
             pool.Add(file)
         message_class: Any = GetMessageClass(pool.FindMessageTypeByName(self._definition.name))
         return message_class  # type: ignore[no-any-return]
+
+
+def _is_default(column: Column, rows: Rows) -> bool:
+    """Whether a column has its default in all rows: nothing if it is optional, otherwise 0."""
+    values = rows[column.name]
+    return bool(np.isnan(values).all()) if column.optional else not values.any()

@@ -2,7 +2,8 @@
 
 A schema file holds one message with one nested message ``Row`` and one field ``repeated Row rows = 1``. Everything
 else is refused, because the row codec requires that all rows have the same number of bytes. The comments of the file
-are the descriptions of columns in ``--help``, Arrow and Parquet.
+are the descriptions of columns in ``--help``, Arrow and Parquet. A comment ``// since VERSION, ...`` on a line of its
+own stands above columns that were added in a later version.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ KINDS: Final = {
 }
 UNITS: Final = {"px": "px", "m": "m", "m2": "m^2", "s": "s", "ns": "ns", "hz": "Hz"}
 
+_SINCE = re.compile(r"since (\S+),")
 _COMMENT = re.compile(r"//\s?(.*)$")
 _FIELD = re.compile(r"(optional\s+)?(\w+)\s+([a-z]\w*)\s*=\s*(\d+)\s*;$")
 _MESSAGE = re.compile(r"message\s+([A-Z]\w*)\s*\{$")
@@ -33,13 +35,17 @@ _MESSAGE = re.compile(r"message\s+([A-Z]\w*)\s*\{$")
 
 @dataclass(frozen=True)
 class Column:
-    """One column of a row. ``optional``: the value may be missing, which is NaN in rows and null in tables."""
+    """One column of a row. ``optional``: the value may be missing, which is NaN in rows and null in tables.
+
+    ``since`` is the version that added the column, "" for those that were there from the beginning.
+    """
 
     name: str
     kind: str
     number: int
     optional: bool
     doc: str
+    since: str = ""
 
     @property
     def unit(self) -> str:
@@ -93,7 +99,7 @@ def parse(text: str, origin: str) -> Definition:
 
     Raises ValueError, with the line, for anything outside the subset.
     """
-    package, depth, closed = "", 0, False
+    package, depth, closed, since = "", 0, False, ""
     names: list[str] = []
     doc: list[str] = []
     columns: list[Column] = []
@@ -103,6 +109,8 @@ def parse(text: str, origin: str) -> Definition:
         if not line:
             if comment and not names:
                 doc.append(comment.group(1).strip())
+            elif comment and (added := _SINCE.match(comment.group(1).strip())):
+                since = added.group(1)
             continue
         message, field = _MESSAGE.match(line), _FIELD.match(line)
         if line == 'syntax = "proto3";':
@@ -120,7 +128,8 @@ def parse(text: str, origin: str) -> Definition:
             optional, kind, name, tag = field.groups()
             if optional and kind not in ("double", "float"):
                 raise ValueError(f"{origin}:{number}: only double and float can be optional, not {kind} {name}")
-            columns.append(Column(name, kind, int(tag), bool(optional), comment.group(1).strip() if comment else ""))
+            words = comment.group(1).strip() if comment else ""
+            columns.append(Column(name, kind, int(tag), bool(optional), words, since))
         else:
             raise ValueError(f"{origin}:{number}: not a row schema (fixed-width fields in message Row): {line}")
     numbers = [column.number for column in columns]

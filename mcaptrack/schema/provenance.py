@@ -38,8 +38,9 @@ class Provenance:
 
     ``references`` are the topics that the input was compared with, and their digests; empty for missing topics.
     ``plugins`` are the classes of other packages that were used: the ``transform`` itself if it is not built in, and
-    its ``predictor``. ``classes`` are the names of the classes in its rows by ``class_id``, and ``model`` what its
-    network turned out to be. ``warnings`` are the warnings when it was made, with code and message.
+    its ``predictor``. ``classes`` are the names of the classes in its rows by ``class_id``; ``class_id`` is the class
+    of all rows, where these state none (see ``schema.classes``). ``model`` is what its network turned out to be.
+    ``warnings`` are the warnings when it was made, with code and message.
     """
 
     transform: str
@@ -51,6 +52,7 @@ class Provenance:
     references: Mapping[str, str] = field(default_factory=dict)
     plugins: Mapping[str, Plugin] = field(default_factory=dict)
     classes: Mapping[str, str] = field(default_factory=dict)
+    class_id: str = ""
     model: Mapping[str, str] = field(default_factory=dict)
     warnings: Sequence[Sequence[str]] = ()
     version: str = __version__
@@ -72,6 +74,7 @@ class Provenance:
             "references": json.dumps(dict(self.references), sort_keys=True, separators=(",", ":")),
             "plugins": json.dumps({key: one._asdict() for key, one in self.plugins.items()}, sort_keys=True),
             "classes": json.dumps(dict(self.classes), ensure_ascii=False),
+            "class_id": self.class_id,
             "model": json.dumps(dict(self.model), sort_keys=True),
             "warnings": json.dumps(self.warnings, separators=(",", ":")),
         }
@@ -87,7 +90,7 @@ class Provenance:
         if "transform" not in values:
             return None
         parameters, references = (_read(values.pop(key, ""), dict) for key in ("parameters", "references"))
-        classes, model = (_texts(values.pop(key, "")) for key in ("classes", "model"))
+        classes, model = (read_texts(values.pop(key, "")) for key in ("classes", "model"))
         plugins = _plugins(values)
         warnings = [one for one in _read(values.pop("warnings", ""), list) if _is_warning(one)]
         known: dict[str, Any] = {key: value for key, value in values.items() if key in cls.__dataclass_fields__}
@@ -111,7 +114,7 @@ def _read(text: str, kind: type[T]) -> T:
     return value if isinstance(value, kind) else kind()
 
 
-def _texts(text: str) -> dict[str, str]:
+def read_texts(text: str) -> dict[str, str]:
     """Parse a JSON object of texts; others are left out."""
     return {key: value for key, value in _read(text, dict).items() if isinstance(value, str)}
 
@@ -137,9 +140,9 @@ def _plugins(values: dict[str, str]) -> dict[str, Plugin]:
     }
 
 
-def digest(messages: Iterable[tuple[int, int, bytes]]) -> str:
-    """SHA-256 of messages: of time, frame number and payload of each."""
-    total = hashlib.sha256()
+def digest(messages: Iterable[tuple[int, int, bytes]], beside: str = "") -> str:
+    """SHA-256 of messages: of time, frame number and payload of each; and of what is said ``beside`` them."""
+    total = hashlib.sha256(beside.encode("utf-8", "backslashreplace"))
     for t_ns, index, payload in messages:
         total.update(t_ns.to_bytes(8, "little") + index.to_bytes(8, "little") + len(payload).to_bytes(8, "little"))
         total.update(payload)

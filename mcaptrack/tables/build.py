@@ -15,10 +15,13 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.ragged import group_index
 from mcaptrack.schema import Frame, Rows, Schema
+from mcaptrack.schema.classes import PERSON, majority
 from mcaptrack.schema.framing import split_rows
-from mcaptrack.tables.fields import RECORDING, TABLES, Table
+from mcaptrack.tables.fields import CLASS, RECORDING, TABLES, Table
 
 _BITS: Final = 16
+#: The name of people where a channel names no classes.
+_PERSON: Final = "person"
 
 
 class Part(NamedTuple):
@@ -56,8 +59,13 @@ def table_of(schema: Schema) -> Table:
     return next(table for table in TABLES.values() if table.rows_of is schema)
 
 
-def rows_table(schema: Schema, channels: Mapping[str, Part | Sequence[Frame]]) -> Any:
-    """All rows of channels of one schema as an Arrow table, in the table's order; missing numbers are null."""
+def rows_table(
+    schema: Schema, channels: Mapping[str, Part | Sequence[Frame]], names: Mapping[str, Mapping[int, str]] = {}
+) -> Any:
+    """All rows of channels of one schema as an Arrow table, in the table's order; missing numbers are null.
+
+    ``names`` are the names of classes by their number, for each channel that names any.
+    """
     import pyarrow as pa
 
     table = table_of(schema)
@@ -66,12 +74,29 @@ def rows_table(schema: Schema, channels: Mapping[str, Part | Sequence[Frame]]) -
         for topic, part in sorted(channels.items())
     }
     pieces = [_rows_of(schema, table, Part(*part)) for part in members.values()]
-    names = [field.name for field in table.arrow if field.name != "topic"]
-    columns = {
-        name: pa.chunked_array([piece[name] for piece in pieces], table.arrow.field(name).type) for name in names
-    }
+    own = [field.name for field in table.arrow if field.name not in ("topic", CLASS.name)]
+    columns = {name: pa.chunked_array([piece[name] for piece in pieces], table.arrow.field(name).type) for name in own}
+    if CLASS.name in table.arrow.names:
+        ids = [np.asarray(piece["class_id"]) for piece in pieces]
+        columns[CLASS.name] = _class_column(ids, [names.get(topic, {}) for topic in members])
     columns["topic"] = _repeated(list(members), [len(part[0]) for part in members.values()])
     return pa.table([columns[field.name] for field in table.arrow], schema=table.arrow)
+
+
+def _class_column(ids: Sequence[NDArray[Any]], names: Sequence[Mapping[int, str]]) -> Any:
+    """The names of classes as an Arrow dictionary; ``ids`` and ``names`` are those of each channel."""
+    import pyarrow as pa
+
+    known = {PERSON: _PERSON}
+    words: dict[str, int] = {}
+    codes = [np.empty(0, np.int32)]
+    for some, of_channel in zip(ids, names, strict=True):
+        there, which = np.unique(some, return_inverse=True)
+        called = [{**known, **of_channel}.get(number) for number in there.tolist()]
+        of = [-1 if name is None else words.setdefault(name, len(words)) for name in called]
+        codes.append(np.array(of, np.int32)[which])
+    joined = np.concatenate(codes)
+    return pa.DictionaryArray.from_arrays(pa.array(joined, mask=joined < 0), pa.array(list(words), pa.string()))
 
 
 def _rows_of(schema: Schema, table: Table, part: Part) -> dict[str, Any]:
@@ -131,14 +156,16 @@ def frames_table(channels: Mapping[str, Pointers]) -> Any:
     return pa.table([columns[name] for name in schema.names], schema=schema)
 
 
-def summary_table(channels: Mapping[str, Part]) -> Any:
-    """The table ``track_summary`` of channels of tracks."""
+def summary_table(channels: Mapping[str, Part], names: Mapping[str, Mapping[int, str]] = {}) -> Any:
+    """The table ``track_summary`` of channels of tracks; ``names`` as in ``rows_table``."""
     import pyarrow as pa
 
     table = TABLES["track_summary"]
     parts = {topic: _summary(part) for topic, part in sorted(channels.items())}
     columns = {}
     for field in table.fields[1:]:
+        if field is CLASS:
+            continue
         values = np.concatenate([part[field.name] for part in parts.values()]) if parts else np.empty(0)
         if field.kind == "time":
             columns[field.name] = _times(values.astype(np.int64))
@@ -146,6 +173,8 @@ def summary_table(channels: Mapping[str, Part]) -> Any:
         missing = np.isnan(values) if field.nullable else None
         columns[field.name] = pa.array(values, table.arrow.field(field.name).type, mask=missing)
     columns["topic"] = _repeated(list(parts), [len(part["rows"]) for part in parts.values()])
+    ids = [part["class_id"] for part in parts.values()]
+    columns[CLASS.name] = _class_column(ids, [names.get(topic, {}) for topic in parts])
     return pa.table([columns[name] for name in table.arrow.names], schema=table.arrow)
 
 
@@ -163,6 +192,7 @@ def _summary(part: Part) -> dict[str, NDArray[Any]]:
     out["duration_s"] = (t_ns[last] - t_ns[first]) / 1e9
     track = group_index(count)
     share = np.bincount(track, rows["observed"], len(ids))
+    out["class_id"] = majority(track, rows["class_id"], len(ids))
     out["observed_share"] = share / np.maximum(count, 1)
     place = np.stack([rows["x_m"], rows["y_m"]], axis=-1)
     out |= _motion(place, t_ns, track, len(ids))
@@ -282,6 +312,8 @@ def table_to_frames(schema: Schema, rows: Any, frames: Any, topic: str) -> list[
     order = np.argsort(rows.column("row").to_numpy(), kind="stable")
     columns = {}
     for column in schema.columns:
+        if column.since and column.name not in rows.column_names:  # an older table
+            continue
         values = rows.column(column.name).combine_chunks()
         values = values.fill_null(np.nan) if column.optional else values
         columns[column.name] = values.to_numpy(zero_copy_only=False)[order]

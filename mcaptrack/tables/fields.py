@@ -10,12 +10,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 from mcaptrack.schema import SCHEMAS, Schema
+from mcaptrack.schema.classes import has_classes
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
 #: Version of the tables' columns: the second number grows when columns are added.
-TABLE_VERSION: Final = "1.1"
+TABLE_VERSION: Final = "1.2"
 
 #: The unit of counts and ids.
 _NONE: Final = "1"
@@ -73,6 +74,7 @@ class Table:
         fields = [field.arrow for field in self.fields]
         if self.rows_of is not None:
             fields += [_with_unit(field) for field in self.rows_of.arrow]
+            fields += [CLASS.arrow] if has_classes(self.rows_of) else []
         return pa.schema(fields)
 
 
@@ -92,6 +94,8 @@ _T_NS: Final = Field("t_ns", _INT, "log time as a whole number since 1970, exact
 #: The first columns of each table of rows.
 TIMES: Final = (_TOPIC, _FRAME, _T, _T_NS)
 _ROW: Final = Field("row", _INT, "number of the row in its channel, in the order of the log, from 0")
+#: The last column of each table of rows with a ``class_id``.
+CLASS: Final = Field("class", _NAME, "name of its class in this channel; null if it has none", nullable=True)
 
 #: The column with the name of the log; in files it is in the name of the folder.
 RECORDING: Final = Field("recording", _NAME, "the log, by name; the same in all tables")
@@ -145,6 +149,8 @@ _SUMMARY: Final = Table(
         Field("first_y_px", _FLOAT, "top edge of the first known box", "px", True),
         Field("last_x_px", _FLOAT, "left edge of the last known box", "px", True),
         Field("last_y_px", _FLOAT, "top edge of the last known box", "px", True),
+        Field("class_id", _INT, "class of most of its rows: 0 unknown, 1 person, others by number"),
+        CLASS,
     ),
 )
 

@@ -73,6 +73,7 @@ def to_video_rate(tracks: Sequence[Frame], retracks: Sequence[Frame], planes: Pl
     _to_metres(outside, frame_ns[at[~inside]], planes)
     rows = np.concatenate([base, outside])
     rows_at = np.concatenate([base_at, at[~inside]])
+    _set_classes(rows, retracks)
     order = np.lexsort((rows["track_id"], rows_at))
     rows, rows_at = rows[order], rows_at[order]
     ends = np.searchsorted(rows_at, np.arange(len(tracks)), "right")
@@ -114,6 +115,14 @@ def _retracked_ids(track: Ints, t_ns: Ints, retracks: Sequence[Frame]) -> tuple[
         better = (source[place] == track) & (gap < distance_ns)
         ids[better], distance_ns[better] = owner[place[better]], gap[better]
     return ids, distance_ns
+
+
+def _set_classes(rows: Rows, retracks: Sequence[Frame]) -> None:
+    """Give rows the class of their re-tracked track, in place: that of the tracker's box may be another one."""
+    of = join_frames(TRACKS, retracks).rows
+    ids, first = np.unique(of["track_id"], return_index=True)
+    if len(ids):
+        rows["class_id"] = of["class_id"][first][np.searchsorted(ids, rows["track_id"])]
 
 
 def _to_metres(rows: Rows, t_ns: Ints, planes: Planes) -> None:

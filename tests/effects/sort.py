@@ -147,7 +147,7 @@ def shared(kind: str, tracker: type[Sort]) -> None:
     changing = jump(0.0)
     for frame in changing[10:]:
         frame.rows["class_id"] = 2
-    case(kind, "mix_classes", "a box changes its class", base, changing, people, {False: 2, True: 1})
+    case(kind, "across_classes", "a box changes its class", base, changing, people, {False: 2, True: 1})
 
 
 shared("track", Sort)

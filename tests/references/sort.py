@@ -191,7 +191,7 @@ class ReferenceSort:
         return out, o.min_iou if o.cost == "iou" else 0.0
 
     def same_class(self, box: Box, track: Track) -> bool:
-        return self.options.mix_classes or box.class_id == track.box.class_id
+        return self.options.across_classes or box.class_id == track.box.class_id
 
     def pairs(self, boxes: list[Box]) -> list[tuple[int, int]]:
         return assign(*self.similarities(boxes))

@@ -36,6 +36,7 @@ __all__ = [
     "holds_pictures",
     "is_compressed",
     "is_picture",
+    "named_detections",
     "picture_decoder",
     "picture_reader",
     "pictures",
@@ -107,7 +108,12 @@ def stamps(opened: log.Log, topic: str) -> Ints:
 
 
 def detections(opened: log.Log, topic: str) -> list[Frame]:
-    """The boxes of another detector, one frame for each message. Raises McaptrackError as ``pictures`` does.
+    """The boxes of another detector, one frame for each message. Raises McaptrackError as ``pictures`` does."""
+    return named_detections(opened, topic)[0]
+
+
+def named_detections(opened: log.Log, topic: str) -> tuple[list[Frame], dict[int, str]]:
+    """The boxes of another detector as ``detections`` gives them, and the names of their classes by class id.
 
     Class names are converted to ids (see ``boxes.Classes``), which a warning lists.
     """
@@ -120,7 +126,7 @@ def detections(opened: log.Log, topic: str) -> list[Frame]:
     if numbers:
         names = ", ".join(f"{number} is {name!r}" for name, number in classes.named())
         warn(f"{opened.path}: classes of {topic} are names; in class_id 1 is a person, {names}", "classes")
-    return frames
+    return frames, classes.names_by_id()
 
 
 def _decoded(

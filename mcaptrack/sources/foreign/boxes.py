@@ -15,14 +15,12 @@ import numpy as np
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import DETECTIONS, Rows
+from mcaptrack.schema.classes import PEOPLE, PERSON, UNKNOWN
 from mcaptrack.sources.foreign.decoding import MessageType, decoder_with_errors, plain_name
 
 #: Schemas of boxes of other software.
 DETECTIONS_READ: Final = ("vision_msgs/Detection2DArray",)
 
-_UNKNOWN, PERSON = 0, 1
-#: Class names of people.
-PEOPLE: Final = ("person", "pedestrian", "human")
 _NUMBER: Final = re.compile(r"[0-9]{1,10}")
 _NAME: Final = re.compile(r"[^\W\d_]")
 #: The maximum number of class names of a channel; ids from ``_FIRST_NAME`` on are placeholders until all names are
@@ -48,17 +46,21 @@ class Classes:
         if name.lower() in PEOPLE:
             return PERSON
         if _NUMBER.fullmatch(name):
-            number = int(name) if int(name) < _FIRST_NAME else _UNKNOWN
+            number = int(name) if int(name) < _FIRST_NAME else UNKNOWN
             self._largest = max(self._largest, number)
             return number
         if not _NAME.search(name) or (name not in self._names and len(self._names) == _MAX_NAMES):
-            return _UNKNOWN
+            return UNKNOWN
         return self._names.setdefault(name, _FIRST_NAME + len(self._names))
 
     def numbers(self) -> dict[int, int]:
         """The final id of each class name, by the placeholder from ``class_id``."""
         order = enumerate(sorted(self._names), start=self._largest + 1)
         return {self._names[name]: number for number, name in order}
+
+    def names_by_id(self) -> dict[int, str]:
+        """The names of all classes by their final id."""
+        return dict(enumerate(sorted(self._names), start=self._largest + 1))
 
     def named(self) -> list[tuple[str, int]]:
         """The first class names in alphabetical order, with their ids."""
@@ -111,5 +113,5 @@ def _box(detection: Any, classes: Classes) -> tuple[float, float, float, float, 
 
 def _class_id(guess: Any, classes: Classes) -> int:
     if guess is None:
-        return _UNKNOWN
+        return UNKNOWN
     return classes.class_id(str(guess.class_id if hasattr(guess, "class_id") else guess.id).strip())

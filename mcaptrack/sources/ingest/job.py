@@ -5,7 +5,6 @@ Letters: N rows.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field
@@ -20,8 +19,9 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.plane import GroundPlane, Point
 from mcaptrack.notices import Notice, warn
 from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, GROUND_PLANE, TRACKS, Frame, Rows, Schema
+from mcaptrack.schema.classes import only_class, classes_beside_rows, without_class
 from mcaptrack.schema.ground_plane import plane_to_rows
-from mcaptrack.schema.provenance import CLOCK, Provenance, digest
+from mcaptrack.schema.provenance import CLOCK, INGEST, Provenance, digest
 from mcaptrack.sources.ingest.labels.box_rows import OTHERS, fitted
 from mcaptrack.sources.ingest.labels.formats import Format, Labels, Role
 from mcaptrack.sources.ingest.labels.motions import motion_frames, read_motions
@@ -38,8 +38,6 @@ _SCHEMA_OF: Final[Mapping[Role, Schema]] = {"detections": DETECTIONS, "tracks": 
 MOTION: Final = "motion"
 #: What an input that is a text file can hold.
 InputRole = Role | Literal["motion"]
-#: The key in the metadata of a channel for class names by class id.
-_CLASSES: Final = "mcaptrack.classes"
 _BLOCK: Final = 4096
 
 
@@ -274,9 +272,8 @@ class IngestJob:
         for role, (path, labels) in self.labels.items():
             placed = timeline.place(path, labels, self.report.lost)
             parameters: dict[str, Any] = {"file": path.name, "format": labels.format} | self.label_parameters(labels)
-            classes = {str(number): name for number, name in labels.classes.items()} if role == "detections" else {}
             frames = self.frames(role, plane, placed)
-            self.write_rows(writer, role, _SCHEMA_OF[role], frames, parameters, classes)
+            self.write_rows(writer, role, _SCHEMA_OF[role], frames, parameters, labels.classes)
 
     def write_motion(self, writer: log.LogWriter, timeline: Timeline, size: tuple[int, int]) -> None:
         """Write the motion of the camera, if it was given; pictures have this width and height."""
@@ -320,21 +317,25 @@ class IngestJob:
         schema: Schema,
         frames: Frames,
         parameters: Mapping[str, Any],
-        classes: Mapping[str, str] = {},
+        classes: Mapping[int, str] = {},
     ) -> None:
         """Write a channel of the camera; ``parameters`` are those in its provenance, ``classes`` its class names.
 
-        Frames are generated twice, for the digest and for the channel, so that they are never all in memory.
+        Frames are generated several times, for the digest and for the channel, so that they are never all in memory.
         """
+        only = only_class(schema, frames())
+        without = without_class if only else None
 
         def messages() -> Iterator[tuple[int, int, bytes]]:
-            return ((frame.t_ns, frame.index, schema.codec.encode(frame.rows)) for frame in frames())
+            rows = ((frame, without(frame.rows) if without else frame.rows) for frame in frames())
+            return ((frame.t_ns, frame.index, schema.codec.encode(one)) for frame, one in rows)
 
-        made = Provenance("ingest", parameters, self.pictures, digest=digest(messages())).to_metadata()
-        if classes:
-            made[_CLASSES] = json.dumps(classes, sort_keys=True, separators=(",", ":"))
-        topic = f"{self.prefix}/{suffix}"
-        channel = writer.add_channel(topic, (schema.name, "protobuf", schema.descriptor), "protobuf", made)
+        names = {str(number): name for number, name in sorted(classes.items())}
+        class_id = str(only) if only else ""
+        of_rows = digest(messages(), classes_beside_rows(class_id, names))
+        made = Provenance(INGEST, parameters, self.pictures, digest=of_rows, classes=names, class_id=class_id)
+        topic, record = f"{self.prefix}/{suffix}", (schema.name, "protobuf", schema.descriptor)
+        channel = writer.add_channel(topic, record, "protobuf", made.to_metadata())
         count = 0
         for message in messages():
             writer.add_message(channel, *message)
@@ -363,4 +364,5 @@ def label_rows(labels: Labels, role: Role, plane: GroundPlane | None) -> Rows:
         score=labels.score,
         observed=np.ones(len(labels.frame), bool),
         source_id=np.full(len(labels.frame), -1),
+        class_id=labels.class_id,
     )

@@ -13,6 +13,7 @@ from mcaptrack import __version__, evaluation, log, tables
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.clocks import LAST_NS
 from mcaptrack.schema import DETECTIONS
+from mcaptrack.schema.classes import class_names
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources import foreign
 from mcaptrack.sources.cameras import Camera, cameras
@@ -31,6 +32,7 @@ class LogTables:
         self.opened = opened
         self.recording = recording_name(opened.path)
         self._parts: dict[str, Part] = {}
+        self._class_names: dict[str, dict[int, str]] = {}
         #: Notes about tables, by name.
         self.notes: dict[str, str] = {}
 
@@ -38,11 +40,12 @@ class LogTables:
         """One of ``TABLES`` as Arrow, without the column ``recording``."""
         table = TABLES[name]
         if table.rows_of is not None:
-            return tables.rows_table(table.rows_of, {topic: self._part(topic) for topic in self.topics(name)})
+            parts = {topic: self._part(topic) for topic in self.topics(name)}
+            return tables.rows_table(table.rows_of, parts, self._class_names)
         made: Mapping[str, Callable[[], Any]] = {
             "frames": lambda: tables.frames_table({topic: self._pointers(topic) for topic in self.topics("frames")}),
             "track_summary": lambda: tables.summary_table(
-                {topic: self._part(topic) for topic in self.topics("tracks")}
+                {topic: self._part(topic) for topic in self.topics("tracks")}, self._class_names
             ),
             "metrics": lambda: tables.records_table(table, sorted(self._scores(), key=_order_of_scores)),
             "channels": lambda: tables.records_table(
@@ -136,12 +139,13 @@ class LogTables:
                 if table.rows_of is not None and table.rows_of.name == self.opened.channel(topic).schema_name
             )
             self._parts[topic] = Part(*self.opened.rows(topic, schema))
+            self._class_names[topic] = class_names(self.opened.channel(topic).metadata)
         return self._parts[topic]
 
     def _boxes(self, topic: str) -> Part:
         """Foreign boxes; none, and a note, if they can't be read: the other tables don't depend on them."""
         try:
-            frames = foreign.detections(self.opened, topic)
+            frames, self._class_names[topic] = foreign.named_detections(self.opened, topic)
         except McaptrackError as error:
             self._note("detections", f"{error}; no boxes of {topic} are in the table")
             t_ns = self.opened.times(topic)

@@ -12,10 +12,12 @@ import numpy as np
 from mcaptrack.schema import Frame, Rows
 from mcaptrack.transforms.forecasts import Forecaster
 from mcaptrack.transforms.retrack.assignments import Assignments
+from mcaptrack.transforms.retrack.by_class import join_classes, split_classes
 from mcaptrack.transforms.retrack.consistency import ConsistencyPass
 from mcaptrack.transforms.retrack.likelihood import LikelihoodPass, motion_model
 from mcaptrack.transforms.retrack.offline import offline_tracks
 from mcaptrack.transforms.retrack.options import ConsistencyOptions, LikelihoodOptions, RetrackOptions
+from mcaptrack.transforms.track_classes import vote
 
 Options = TypeVar("Options", bound=RetrackOptions)
 
@@ -85,13 +87,23 @@ Retracking: TypeAlias = Retrack | RetrackByConsistency
 def _retrack(
     options: Options, new_pass: Callable[[Options], OnlinePass], frames: Iterable[Frame]
 ) -> Iterator[tuple[Frame, ...]]:
-    """For each frame the offline tracks, the online tracks and their predictions."""
+    """For each frame the offline tracks, the online tracks and their predictions; each class by itself."""
     if options.holds_back:
         forecaster = Forecaster(options.predictor, options.horizon_s, options.min_history, options.rate_hz)
         for frame in frames:
             online = frame._replace(rows=frame.rows[frame.rows["observed"]])
             yield frame, online, frame._replace(rows=forecaster.predict(frame))
         return
+    frames = list(frames)
+    parts = [frames] if options.across_classes else split_classes(frames)
+    runs = [_retrack_together(options, new_pass, part) for part in parts]
+    yield from runs[0] if len(runs) == 1 else join_classes(runs)
+
+
+def _retrack_together(
+    options: Options, new_pass: Callable[[Options], OnlinePass], frames: Iterable[Frame]
+) -> Iterator[tuple[Frame, ...]]:
+    """Re-track frames without regard to classes."""
     run = new_pass(options)
     times_ns = []
     for frame in frames:
@@ -99,6 +111,7 @@ def _retrack(
         times_ns.append(frame.t_ns)
     model = motion_model(options, run.noise_m)
     rows, step = offline_tracks(options, model, run.assignments, run.samples, run.steps, times_ns)
+    vote(rows)
     first, last = (np.searchsorted(step, run.steps, side) for side in ("left", "right"))
     for (online, predictions), low, high in zip(run.outputs(), first.tolist(), last.tolist(), strict=True):
         yield Frame(online.t_ns, online.index, rows[low:high]), online, predictions

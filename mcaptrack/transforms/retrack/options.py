@@ -119,6 +119,11 @@ class RetrackOptions:
         theme=_OFFLINE,
         was="min_certainty",
     )
+    across_classes: bool = option(
+        False,
+        "a track may continue with one of another class; offline it then has the class of most of its samples",
+        theme=_ASSOCIATION,
+    )
     smooth: bool = option(True, "smooth positions by past and future", theme=_OFFLINE)
     side_view: bool = option(
         False,

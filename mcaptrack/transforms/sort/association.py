@@ -15,16 +15,21 @@ Cost = Literal["iou", "pixels", "metres"]
 
 
 class CandidatePairs(NamedTuple):
-    """Pairs that pass the gate: detection (P,), track (P,), similarity (P,) in (0, 1]; ``shape`` is (N, K)."""
+    """Pairs that pass the gate: detection (P,), track (P,), similarity (P,) in (0, 1]; ``shape`` is (N, K).
+
+    ``class_id`` (P,) are their classes, None if all are associated together.
+    """
 
     detection: Indices
     track: Indices
     similarity: Floats
     shape: tuple[int, int]
+    class_id: Floats | None = None
 
     def select(self, kept: Bools | Indices) -> CandidatePairs:
         """Some of the pairs."""
-        return CandidatePairs(self.detection[kept], self.track[kept], self.similarity[kept], self.shape)
+        of = None if self.class_id is None else self.class_id[kept]
+        return CandidatePairs(self.detection[kept], self.track[kept], self.similarity[kept], self.shape, of)
 
 
 def iou_pairs(boxes: Floats, predicted: Floats, area: Floats, predicted_area: Floats) -> CandidatePairs:
@@ -57,9 +62,15 @@ def associate(pairs: CandidatePairs, min_similarity: float) -> tuple[Indices, In
 
     If no detection and no track is in two pairs, these are the assignment. Otherwise the assignment with the largest
     total similarity is taken, and pairs below ``min_similarity`` are removed afterwards, as in the original program.
+
+    Each class is associated by itself, as if there were no others.
     """
     if not len(pairs.detection):
         return pairs.detection, pairs.track
+    if pairs.class_id is not None:
+        alone = pairs._replace(class_id=None)
+        found = [associate(alone.select(pairs.class_id == one), min_similarity) for one in np.unique(pairs.class_id)]
+        return np.concatenate([one for one, _ in found]), np.concatenate([one for _, one in found])
     above = pairs.similarity > min_similarity
     count = np.count_nonzero(above)
     if count:

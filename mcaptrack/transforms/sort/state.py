@@ -142,6 +142,7 @@ def tracks_to_frames(frames: Sequence[Frame], table: Floats, ends: Sequence[int]
     rows["score"] = table[SCORE]
     rows["observed"] = True
     rows["source_id"] = -1
+    rows["class_id"] = table[CLASS]
     spans = list(pairwise(ends))
     if planes:
         for frame, (low, high) in zip(frames, spans, strict=True):

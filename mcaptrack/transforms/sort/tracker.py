@@ -157,7 +157,12 @@ class Sort:
     class_id: int | None = option(
         None, "ignore detections of other classes", least=0, most=2**31 - 1, theme=_DETECTIONS
     )
-    mix_classes: bool = option(False, "a track may continue with a detection of another class", theme=_ASSOCIATION)
+    across_classes: bool = option(
+        False,
+        "a track may continue with a detection of another class; it then has the class of most of its detections",
+        theme=_ASSOCIATION,
+        was="mix_classes",
+    )
     camera_motion: CameraMotionUse = option(
         "auto",
         "move predictions with the camera: if it moves or has cuts (auto), also if it only shakes (on), or never (off)",
@@ -256,10 +261,12 @@ class Sort:
         return self._of_same_class(step, distance_pairs(boxes, predicted, gate, step.plane)), 0.0
 
     def _of_same_class(self, step: AssociationInput, pairs: CandidatePairs) -> CandidatePairs:
-        """The pairs of a detection and a track of the same class; all pairs with ``mix_classes``."""
-        if self.mix_classes or step.one_class or not len(pairs.detection):
+        """The pairs of a detection and a track of the same class; all pairs with ``across_classes``."""
+        if self.across_classes or step.one_class or not len(pairs.detection):
             return pairs
-        same = step.detections.class_id[pairs.detection] == step.tracks.table[CLASS, pairs.track]
+        class_id = step.detections.class_id[pairs.detection]
+        pairs = pairs._replace(class_id=class_id)
+        same = class_id == step.tracks.table[CLASS, pairs.track]
         return pairs if same.all() else pairs.select(same)
 
     # What derived trackers override.

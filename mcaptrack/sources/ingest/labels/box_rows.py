@@ -17,7 +17,7 @@ import numpy as np
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.notices import Code
-from mcaptrack.sources.foreign.boxes import PEOPLE
+from mcaptrack.schema.classes import PEOPLE
 from mcaptrack.sources.ingest.labels.formats import (
     MAX_FRAME,
     MAX_PLACE,

@@ -16,7 +16,7 @@ import numpy as np
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Floats
-from mcaptrack.sources.foreign.boxes import PEOPLE
+from mcaptrack.schema.classes import PEOPLE
 from mcaptrack.sources.ingest.labels.box_rows import NO_CLASS, BoxRows, FrameNames
 from mcaptrack.sources.ingest.labels.columns import choose_columns
 from mcaptrack.sources.ingest.labels.formats import NO_ID, PERSON, ClassNames, Format, Labels, Role

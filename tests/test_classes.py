@@ -1,0 +1,324 @@
+"""Classes from detections to tables: associated each by itself, named everywhere, and unseen where there is only one."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import mcaptrack
+from mcaptrack import log, tables
+from mcaptrack.errors import McaptrackError
+from mcaptrack.schema import DETECTIONS, TRACKS, Frame
+from mcaptrack.schema.classes import class_names
+from mcaptrack.transforms import PROFILES, ByteTrack, OcSort, Sort
+from mcaptrack.transforms.to_video_rate import to_video_rate
+from mcaptrack.transforms.track_classes import settle_classes
+from tests.worlds import noisy_tracks, ns
+
+TRACKERS = {"sort": Sort(), "metres apart": Sort(cost="pixels"), "bytetrack": ByteTrack(), "ocsort": OcSort()}
+every_tracker = pytest.mark.parametrize("tracker", TRACKERS.values(), ids=TRACKERS)
+every_method = pytest.mark.parametrize("method", PROFILES.values(), ids=PROFILES)
+
+
+def crossing(seed, classes=(1, 2), count=6, frames=60):
+    """Boxes of two classes that cross one another: of each frame the rows, and the object behind each row."""
+    rng = np.random.default_rng(seed)
+    start, speed = rng.uniform(0, 300, (count, 2)), rng.uniform(-5, 5, (count, 2))
+    of = np.resize(classes, count)
+    out, truth = [], []
+    for t in range(frames):
+        there = rng.permutation(np.flatnonzero(rng.random(count) > 0.1))
+        x, y = (start + speed * t + rng.normal(0, 1.5, (count, 2)))[there].T
+        size = np.full(len(there), 60.0)
+        score = rng.uniform(0.2, 1.0, len(there))
+        rows = DETECTIONS.rows(x_px=x, y_px=y, w_px=size, h_px=1.5 * size, score=score, class_id=of[there])
+        out.append(Frame(t * 100_000_000, t, rows))
+        truth.append(there)
+    return out, truth
+
+
+def of_class(frames, one):
+    return [frame._replace(rows=frame.rows[frame.rows["class_id"] == one]) for frame in frames]
+
+
+def joined(frames):
+    """Rows with their frame, whatever their ids: ids become the first row of each track."""
+    rows = np.concatenate([frame.rows for frame in frames])
+    at = np.repeat(np.arange(len(frames)), [len(frame.rows) for frame in frames])
+    order = np.lexsort((*(rows[name] for name in ("y_px", "x_px", "y_m", "x_m") if name in rows.dtype.names), at))
+    rows, at = rows[order].copy(), at[order]
+    _, first, which = np.unique(rows["track_id"], return_index=True, return_inverse=True)
+    rows["track_id"] = first[which]
+    return rows, at
+
+
+def same_but_for_ids(found, wanted):
+    (one, at), (other, there) = joined(found), joined(wanted)
+    assert at.tolist() == there.tolist()
+    for name in one.dtype.names:
+        np.testing.assert_allclose(one[name], other[name], rtol=1e-9, err_msg=name)
+
+
+def both(*parts):
+    return [
+        frames[0]._replace(rows=np.concatenate([frame.rows for frame in frames])) for frames in zip(*parts, strict=True)
+    ]
+
+
+def renamed(frames, places):
+    out = []
+    for frame in frames:
+        rows = frame.rows.copy()
+        rows["class_id"] = [places[one] for one in rows["class_id"].tolist()]
+        out.append(frame._replace(rows=rows))
+    return out
+
+
+# Trackers
+
+
+@every_tracker
+def test_each_class_is_tracked_as_if_it_were_alone(tracker):
+    for seed in range(2):
+        frames, _ = crossing(seed)
+        together = [made for (made,) in tracker(frames)]
+        alone = [[made for (made,) in tracker(of_class(frames, one))] for one in (1, 2)]
+        apart = [frame._replace(rows=frame.rows.copy()) for frame in alone[1]]
+        for frame in apart:
+            frame.rows["track_id"] += 1000
+        same_but_for_ids(together, both(alone[0], apart))
+        assert {1, 2} == {int(one) for frame in together for one in frame.rows["class_id"]}
+
+
+@every_tracker
+def test_numbers_of_classes_have_no_influence(tracker):
+    frames, _ = crossing(5)
+    places = {1: 4_000_000_000, 2: 0}
+    found, wanted = ([made for (made,) in tracker(some)] for some in (renamed(frames, places), frames))
+    for one, other in zip(found, renamed(wanted, places), strict=True):
+        for name in one.rows.dtype.names:
+            np.testing.assert_array_equal(one.rows[name], other.rows[name])
+
+
+@every_tracker
+def test_a_track_never_passes_to_an_object_of_another_class(tracker):
+    """The oracle is the scene: which object each box belongs to, and what that object is."""
+    frames, truth = crossing(7, count=10)
+    owners = {}
+    for frame, there, (made,) in zip(frames, truth, tracker(frames), strict=True):
+        for row in made.rows:
+            box = np.abs(frame.rows["x_px"] - row["x_px"]) + np.abs(frame.rows["y_px"] - row["y_px"])
+            owners.setdefault(int(row["track_id"]), set()).add((int(row["class_id"]), int(there[box.argmin()] % 2) + 1))
+    assert (
+        sum(len(found) == 1 for found in owners.values()) >= 0.9 * len(owners) > 5
+    )  # boxes move a little by the filter
+    assert all(len({one for one, _ in found}) == 1 for found in owners.values())
+
+
+def test_across_classes_a_track_has_the_class_of_most_of_its_detections():
+    box = {"x_px": [100.0], "y_px": [50.0], "w_px": [40.0], "h_px": [120.0]}
+    of = [2, 1, 1, 2, 1, 1, 1, 2]
+    frames = [Frame(t * 100_000_000, t, DETECTIONS.rows(class_id=[one], **box)) for t, one in enumerate(of)]
+    tracker = Sort(min_hits_s=0.0, across_classes=True)
+    raw = [made for (made,) in tracker(frames)]
+    assert [int(frame.rows["class_id"][0]) for frame in raw] == of
+    with pytest.warns(UserWarning, match="1 of 1 tracks have detections of several classes"):
+        settled = settle_classes(raw)
+    assert [frame.rows["class_id"].tolist() for frame in settled] == [[1]] * 8
+    assert [frame.rows["x_px"].tolist() for frame in settled] == [frame.rows["x_px"].tolist() for frame in raw]
+    tie = [frame._replace(rows=frame.rows.copy()) for frame in raw[:6]]
+    for frame, one in zip(tie, [5, 3, 3, 5, 3, 5], strict=True):
+        frame.rows["class_id"] = one
+    with pytest.warns(UserWarning, match="several classes"):
+        assert [frame.rows["class_id"].tolist() for frame in settle_classes(tie)] == [[5]] * 6  # it was the first
+    apart = [made.rows["track_id"].tolist() for (made,) in Sort(min_hits_s=0.0)(frames)]
+    assert {one for ids in apart for one in ids} == {1, 2}
+
+
+# Re-tracking
+
+
+def samples_of_two_classes(seed, numbers=(1, 2)):
+    """Tracks of two crowds in one place, at the rate of samples, with gaps and swapped ids within each."""
+    out = []
+    for part, number in enumerate(numbers):
+        frames = noisy_tracks(np.random.default_rng(seed + 100 * part), ticks=40, hidden=0.05)
+        for frame in frames:
+            frame.rows["class_id"] = number
+            frame.rows["track_id"] += 1000 * part
+        out.append([frame._replace(t_ns=time.t_ns) for frame, time in zip(frames, (out or [frames])[0], strict=True)])
+    return out
+
+
+@every_method
+def test_each_class_is_retracked_as_if_it_were_alone(method):
+    parts = samples_of_two_classes(3)
+    together = list(zip(*method(both(*parts)), strict=True))
+    alone = [list(zip(*method(part), strict=True)) for part in parts]
+    last = max(int(frame.rows["track_id"].max(initial=0)) for output in alone[0] for frame in output)
+    for found, first, second in zip(together, *alone, strict=True):
+        for frame in second:
+            frame.rows["track_id"] += last
+        for frame, one, other in zip(found, first, second, strict=True):
+            np.testing.assert_array_equal(frame.rows, np.concatenate([one.rows, other.rows]))
+    assert {1, 2} == {int(one) for frame in together[0] for one in frame.rows["class_id"]}
+
+
+@every_method
+def test_numbers_of_classes_have_no_influence_on_retracking(method):
+    places = {1: 9, 2: 1}
+    frames = both(*samples_of_two_classes(4))
+    found, wanted = (list(zip(*method(some), strict=True)) for some in (renamed(frames, places), frames))
+    for output, others in zip(found, wanted, strict=True):
+        has_classes = "class_id" in output[0].rows.dtype.names
+        for frame, other in zip(output, renamed(others, places) if has_classes else others, strict=True):
+            np.testing.assert_array_equal(frame.rows, other.rows)
+
+
+def walk_in_two_pieces(second):
+    """A walk with a new id, and perhaps another class, in its middle."""
+
+    def row(t):
+        ids, number = ([7], 1) if t < 10 else ([8], second)
+        return TRACKS.rows(
+            track_id=ids, x_m=[t / 2], y_m=[0.0], observed=[True], source_id=[-1], class_id=[number],
+            x_px=[t * 5.0], y_px=[0.0], w_px=[10.0], h_px=[20.0],
+        )  # fmt: skip
+
+    return [Frame(ns(t / 2.5), t, row(t)) for t in range(24)]
+
+
+def test_links_join_no_two_classes_but_across_classes():
+    method = replace(PROFILES["default"], track_confidence=0.0)
+
+    def ids(frames, **options):
+        made = [found for found, *_ in replace(method, **options)(frames)]
+        return {(int(row["track_id"]), int(row["class_id"])) for frame in made for row in frame.rows}
+
+    assert {one for _, one in ids(walk_in_two_pieces(2))} == {1, 2}
+    assert len(ids(walk_in_two_pieces(1))) == 1
+    assert ids(walk_in_two_pieces(2), across_classes=True) == {(1, 2)}  # 14 of 24 samples
+
+
+def test_boxes_at_video_rate_have_the_class_of_their_retracked_track():
+    frames = walk_in_two_pieces(2)
+    method = replace(PROFILES["default"], track_confidence=0.0, across_classes=True)
+    full = to_video_rate(frames, [found for found, *_ in method(frames)], ())
+    assert {int(one) for frame in full for one in frame.rows["class_id"]} == {2}
+    assert sum(len(frame.rows) for frame in full) == len(frames)
+
+
+# Logs and tables
+
+
+def written(path, number, names=None, other=None):
+    """A log of one object, or of two, tracked; returns the metadata and messages of the tracks."""
+    with mcaptrack.open(path, create=True) as opened:
+        frames = []
+        for t in range(12):
+            boxes, classes = [[10 + 2 * t, 20, 30, 60]], [number]
+            if other is not None:
+                boxes, classes = [*boxes, [200 - 2 * t, 90, 30, 60]], [*classes, other]
+            frames.append(mcaptrack.detections(boxes, None, classes, t * 100_000_000, box_format="xywh"))
+        opened.write("/camera/detections", frames, classes=names)
+    mcaptrack.track(path)
+    with log.read(path) as opened:
+        there = opened.channel("/camera/tracks").metadata
+        return there, [message.payload for message in opened.messages("/camera/tracks")]
+
+
+def test_rows_of_one_class_are_the_same_as_without_classes(tmp_path):
+    """Without its later fields a schema is as it was: messages have the bytes that they had before there were classes."""
+    without, plain = written(tmp_path / "plain.mcap", 0)
+    assert "mcaptrack.class_id" not in without
+    digests = {without["mcaptrack.digest"]}
+    assert len(plain[-1]) == 81  # a row of ten fields, in bytes counted by hand
+    for number in (1, 2, 4_000_000_000):
+        metadata, payloads = written(tmp_path / f"{number}.mcap", number)
+        assert payloads == plain
+        assert metadata["mcaptrack.class_id"] == str(number)
+        with log.read(tmp_path / f"{number}.mcap") as opened:
+            assert np.unique(opened.rows("/camera/tracks", TRACKS).rows["class_id"]).tolist() == [number]
+            assert {int(one) for f in opened.frames("/camera/tracks", TRACKS) for one in f.rows["class_id"]} == {number}
+        digests.add(metadata["mcaptrack.digest"])
+    assert len(digests) == 3  # that of people is the one from before; what is made from others is then out of date
+
+
+def test_names_go_from_detections_to_tables(tmp_path):
+    path = tmp_path / "a.mcap"
+    metadata, payloads = written(path, 1, {1: "person", 7: "vélo \"quoted\" 'ß' 自転車"}, 7)
+    name = class_names(metadata)[7]
+    assert name.endswith("自転車")
+    assert "mcaptrack.class_id" not in metadata
+    assert len(payloads[-1]) == 2 * 86
+    with mcaptrack.open(path) as opened:
+        for table in ("detections", "tracks", "track_summary"):
+            rows = opened.table(table).to_pylist()
+            assert {(row["class_id"], row["class"]) for row in rows} == {(1, "person"), (7, name)}
+        assert str(opened.table("tracks").schema.field("class").type).startswith("dictionary<values=string")
+        table, array = opened.table("tracks"), opened.array("tracks")
+    with mcaptrack.open(tmp_path / "b.mcap", create=True) as back:
+        for topic, rows in (("/a/tracks", table), ("/b/tracks", array), ("/c/tracks", table.to_pandas())):
+            back.write(topic, rows)
+            assert json.loads(back._log.channel(topic).metadata["mcaptrack.classes"]) == {"1": "person", "7": name}
+    mcaptrack.export(path, tmp_path / "t", form="csv")
+    assert "自転車" in next((tmp_path / "t").glob("tracks/*/*.csv")).read_text()
+    assert mcaptrack.query(path, "select class, count(*) as n from tracks group by class").num_rows == 2
+
+
+def test_tables_without_a_class_column_are_read_as_before(tmp_path):
+    rows = TRACKS.rows(track_id=[1], x_m=[1.0], y_m=[2.0], observed=[True], source_id=[-1], class_id=[3])
+    frames = [Frame(1, 0, rows)]
+    new = tables.rows_table(TRACKS, {"/a": frames}, {"/a": {3: "cart"}})
+    old = new.drop_columns(["class_id", "class"])
+    assert new.to_pylist()[0]["class"] == "cart"
+    places = tables.frames_table({"/a": tables.Pointers("f", *(np.array([n]) for n in (1, 0, 1, 0, 0)))})
+    assert tables.table_to_frames(TRACKS, old, places, "/a")[0].rows["class_id"].tolist() == [0]
+    assert tables.table_to_frames(TRACKS, new, places, "/a")[0].rows["class_id"].tolist() == [3]
+
+
+@pytest.mark.parametrize(
+    ("classes", "words"),
+    [
+        ({1: "car"}, "class 1 is a person; give 'car' another number"),
+        ({2: ""}, "the name of class 2 is printable text"),
+        ({2: "a\nb"}, "the name of class 2 is printable text"),
+        ({2: "x" * 201}, "the name of class 2 is printable text of at most 200 characters"),
+        ({2: "\ud800"}, "the name of class 2 is printable text"),
+        ({2: 3}, "the name of class 2 is printable text"),
+        ({-1: "x"}, "a class is a whole number from 0"),
+        ({2**32: "x"}, "a class is a whole number from 0"),
+        ({"2": "x"}, "a class is a whole number from 0"),
+        (["x"], "`classes=` is a mapping"),
+    ],
+)
+def test_names_that_cant_be_are_refused(tmp_path, classes, words):
+    with (
+        mcaptrack.open(tmp_path / "a.mcap", create=True) as opened,
+        pytest.raises(McaptrackError, match=words) as caught,
+    ):
+        opened.write(
+            "/a/detections", [mcaptrack.detections([[1, 2, 3, 4]], t_ns=0, box_format="xywh")], classes=classes
+        )
+    assert "\n" not in str(caught.value)
+
+
+def test_a_thousand_classes_of_one_name_and_strange_metadata_are_read(tmp_path):
+    names = {number: "thing" if number % 2 else f"thing {number}" for number in range(2, 1002)}
+    path = tmp_path / "a.mcap"
+    boxes = np.stack([np.arange(1000) * 50.0, np.zeros(1000), np.full(1000, 20.0), np.full(1000, 30.0)], axis=-1)
+    with mcaptrack.open(path, create=True) as opened:
+        frames = [mcaptrack.detections(boxes, None, [*names], t * 100_000_000, box_format="xywh") for t in range(8)]
+        opened.write("/camera/detections", frames, classes=names)
+    mcaptrack.track(path)
+    with mcaptrack.open(path) as opened:
+        rows = opened.table("track_summary").to_pylist()
+    assert {row["class_id"]: row["class"] for row in rows} == names
+    strange = {"1": "human", "x": "a", "٣": "b", "9" * 5000: "c", "7": "", "8": 3, "9": "ok", "4294967296": "d"}
+    assert class_names({"mcaptrack.classes": json.dumps(strange)}) == {1: "human", 9: "ok"}
+    assert class_names({"mcaptrack.classes": '{"2": "\\ud800"}'})[2].encode() == b"\\ud800"
+    for text in ("[1]", "{", "[" * 100_000, "null"):
+        assert class_names({"mcaptrack.classes": text}) == {1: "person"}
