@@ -160,7 +160,7 @@ class Sort:
     across_classes: bool = option(
         False,
         "a track may continue with a detection of another class; it then has the class of most of its detections",
-        theme=_ASSOCIATION,
+        theme=_DETECTIONS,
         was="mix_classes",
     )
     camera_motion: CameraMotionUse = option(
