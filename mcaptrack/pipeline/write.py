@@ -21,7 +21,7 @@ from mcaptrack.geometry.plane import Planes
 from mcaptrack.notices import warn
 from mcaptrack.pipeline.checks import describe_origin, may_replace
 from mcaptrack.schema import DETECTIONS, FORECAST_SCORES, GROUND_PLANE, PREDICTIONS, SCHEMAS, TRACKS, Frame, Schema
-from mcaptrack.schema.classes import has_classes, only_class, classes_beside_rows, without_class
+from mcaptrack.schema.classes import classes_beside_rows, has_classes, only_class, without_class
 from mcaptrack.schema.framing import frame_times
 from mcaptrack.schema.provenance import INGEST, VIEW, Provenance, digest
 from mcaptrack.sources import foreign

@@ -19,7 +19,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.plane import GroundPlane, Point
 from mcaptrack.notices import Notice, warn
 from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, GROUND_PLANE, TRACKS, Frame, Rows, Schema
-from mcaptrack.schema.classes import only_class, classes_beside_rows, without_class
+from mcaptrack.schema.classes import classes_beside_rows, only_class, without_class
 from mcaptrack.schema.ground_plane import plane_to_rows
 from mcaptrack.schema.provenance import CLOCK, INGEST, Provenance, digest
 from mcaptrack.sources.ingest.labels.box_rows import OTHERS, fitted
