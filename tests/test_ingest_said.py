@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import bz2
+import json
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
@@ -77,7 +78,7 @@ def test_classes_of_detections_are_listed_and_their_names_kept(tmp_path):
     assert report.remarks[0] == f"{found} has several classes; class_id is 1 Pedestrian (1), 3 Car (2), 8 Misc (1)"
     with log.read(path) as opened:
         metadata = opened.channel("/camera/detections").metadata
-        assert metadata["mcaptrack.classes"] == '{"1":"Pedestrian","3":"Car","8":"Misc"}'
+        assert json.loads(metadata["mcaptrack.classes"]) == {"1": "Pedestrian", "3": "Car", "8": "Misc"}
         rows = opened.rows("/camera/detections", DETECTIONS).rows
     assert rows["class_id"].tolist() == [3, 1, 3, 8]
     assert [rows[name][0] for name in ("x_px", "y_px", "w_px", "h_px")] == [10, 20, 4, 8]
@@ -95,7 +96,7 @@ def test_classes_without_names_are_listed_by_number_and_one_alone_is_not(tmp_pat
     assert report.remarks == [f"{found}: 2 frames (by the last label) from 1 on, 10 a second (by `fps=`)"]
 
 
-def test_tracks_have_no_classes_and_what_is_left_out_of_them_is_said(tmp_path):
+def test_tracks_are_of_people_and_what_is_left_out_of_them_is_said(tmp_path):
     found = write(tmp_path / "found.txt", KITTI)
     report, path = made(found, role="truth", fps=Fraction(10), first_frame=0)
     assert said(report) == [(f"{found} also holds 2 Car, 1 Misc; left out of truth", "left-out")]
@@ -107,7 +108,7 @@ def test_tracks_have_no_classes_and_what_is_left_out_of_them_is_said(tmp_path):
         "fps": "10",
     }
     with log.read(path) as opened:
-        assert "mcaptrack.classes" not in opened.channel("/camera/truth").metadata
+        assert json.loads(opened.channel("/camera/truth").metadata["mcaptrack.classes"]) == {"1": "Pedestrian"}
 
 
 @pytest.mark.parametrize(

@@ -150,7 +150,7 @@ def lorry() -> list[Frame]:
     frames = []
     for number in range(8):
         image = street[:, :320] // 4 + 90
-        image[30:200, 60:260] = load[30:200, 60 - 4 * number + 80 : 260 - 4 * number + 80]
+        image[20:220, 30:290] = load[20:220, 30 - 4 * number + 80 : 290 - 4 * number + 80]
         frames.append(Frame(ns(number / 10), number, image))
     return frames
 
@@ -160,7 +160,7 @@ def motion(outputs: Outputs) -> float:
 
 
 LORRY = lorry()
-BOXES = {frame.t_ns: np.array([[58.0, 28.0, 204.0, 174.0]]) for frame in LORRY}
+BOXES = {frame.t_ns: np.array([[28.0, 18.0, 264.0, 204.0]]) for frame in LORRY}
 case(
     "motion",
     "mask_boxes",

@@ -31,6 +31,13 @@ def case(option: str, *args: Any) -> None:
     CASES["consistency" if option in own else "retrack", option] = Case(*args)
 
 
+def of_another_class(frames: list[Frame], first: int) -> list[Frame]:
+    """Frames with rows of class 1, and of class 2 from a tick on."""
+    for tick, frame in enumerate(frames):
+        frame.rows["class_id"] = 1 + (tick >= first)
+    return frames
+
+
 def online_rows(outputs: Outputs) -> int:
     return sum(len(frame.rows) for frame in outputs[1])
 
@@ -296,6 +303,14 @@ case(
     hidden(range(20, 35), 60),
     people,
     {0.0: 2, 6.0: 2, 6.4: 1},
+)
+case(
+    "across_classes",
+    "the same, and behind the wall the detector's class changes",
+    replace(LIKELY, min_track_s=0.4, link_s=20.0),
+    of_another_class(hidden(range(20, 35), 60), 30),
+    people,
+    {False: 2, True: 1},
 )
 case(
     "side_view",
