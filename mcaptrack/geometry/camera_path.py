@@ -209,3 +209,38 @@ class CameraPath:
     def matters(self) -> bool:
         """Whether tracks are worse without it: the camera does more than shake, or there are cuts."""
         return self.verdict is Verdict.MOVING or bool(self.cuts_ns)
+
+    def to_scene(self, boxes: Floats, t_ns: Ints) -> Floats:
+        """Move boxes (N, 4) of pictures at times (N,) to the pixels of their reference picture.
+
+        There, what is at rest stays where it is; between two pictures the camera is taken to move evenly.
+        """
+        return _moved_each(self._to_reference(t_ns), boxes)
+
+    def to_pictures(self, boxes: Floats, t_ns: Ints) -> Floats:
+        """Move boxes (N, 4) from the pixels of the reference picture to those of the picture at each time (N,)."""
+        linear, shift = np.split(self._to_reference(t_ns), [2], axis=2)
+        back = np.linalg.inv(linear)
+        return _moved_each(np.concatenate([back, -back @ shift], axis=2), boxes)
+
+    def _to_reference(self, t_ns: Ints) -> Floats:
+        """The transforms to the reference picture (N, 2, 3) at times (N,)."""
+        matrices, references, times = self._arrays
+        after = np.searchsorted(times, t_ns, "right")
+        before, after = np.clip(after - 1, 0, None), np.clip(after, None, len(times) - 1)
+        after = np.where(references[after] == references[before], after, before)
+        span = np.maximum(times[after] - times[before], 1)
+        share = np.clip((t_ns - times[before]) / span, 0.0, 1.0)[:, None, None]
+        return np.asarray(matrices[before] + share * (matrices[after] - matrices[before]))
+
+    @cached_property
+    def _arrays(self) -> tuple[Floats, Ints, Ints]:
+        matrices = np.array([pose.to_reference for pose in self._poses])
+        return matrices, np.array([pose.reference for pose in self._poses]), np.array(self._t_ns)
+
+
+def _moved_each(matrices: Floats, boxes: Floats) -> Floats:
+    """Move each box (N, 4) by a transform of its own (N, 2, 3); boxes stay upright."""
+    size = boxes[:, 2:] * np.sqrt(np.abs(np.linalg.det(matrices[:, :, :2])))[:, None]
+    middle = (matrices[:, :, :2] @ (boxes[:, :2] + boxes[:, 2:] / 2)[:, :, None])[:, :, 0] + matrices[:, :, 2]
+    return np.concatenate([middle - size / 2, size], axis=1)

@@ -128,6 +128,28 @@ def moved_planes(planes: Planes, path: CameraPath | None) -> Planes:
     return out
 
 
+def scene_planes(planes: Planes, path: CameraPath | None) -> Planes:
+    """The planes of a camera that moves in the pixels of its reference pictures, where they stay as they are.
+
+    Without a path they are those of all pictures.
+    """
+    if path is None:
+        return planes
+    out = list(planes[:1])
+    for number, (since_ns, plane) in enumerate(planes[1:], start=1):
+        until_ns = planes[number + 1][0] if number + 1 < len(planes) else None
+        begun = path.pose_at(since_ns)
+        first = [(since_ns, begun)] if begun else []
+        for t_ns, pose in [*first, *path.poses_between(since_ns, until_ns)]:
+            is_there = begun is not None and begun.reference == pose.reference
+            back = invert(begun.to_reference) if begun is not None and is_there else IDENTITY
+            homography = plane.matrix @ np.vstack([back, [0.0, 0.0, 1.0]])
+            moved = plane if back is IDENTITY else replace(plane, homography=tuple(homography.ravel().tolist()))
+            if out[-1][1] != moved:
+                out.append((t_ns, moved))
+    return out
+
+
 def is_assumed(planes: Planes | None) -> bool:
     """Whether there are planes and all of them were guessed."""
     return planes is not None and len(planes) > 0 and all(plane.assumed for _, plane in planes)

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
 from typing import Any, Final, NamedTuple
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
+from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.boxes import columns_to_boxes
+from mcaptrack.geometry.camera_path import CameraPath
 from mcaptrack.geometry.plane import Planes, moved_planes
 from mcaptrack.notices import warn
 from mcaptrack.pipeline.checks import Job, fits, read_frames
 from mcaptrack.pipeline.write import Made, digest_of
-from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, VIDEO, Frame, Schema
+from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, TRACKS, VIDEO, Frame, Schema
 from mcaptrack.schema.camera_motion import frames_to_path
+from mcaptrack.schema.framing import join_frames, split_rows
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.cameras import camera_at, provenance_of
 from mcaptrack.transforms import STAGES, Transform
@@ -102,20 +105,53 @@ def _path(opened: log.Log, prefix: str, job: Job, made: Mapping[str, Made]) -> S
     return SideInputs({"camera_path": path}, {topic: digest})
 
 
+def path_of(
+    opened: log.Log, prefix: str, topic: str, made: Mapping[str, Made]
+) -> tuple[CameraPath | None, Mapping[str, str]]:
+    """Return the camera's path, if the tracks that a channel was made from are compensated for it, and its digest.
+
+    The digest is by topic. The path is None if the tracks are not compensated, or were made from an earlier motion.
+    """
+    motion, seen = motion_topic(prefix), {""}
+    while topic not in seen:
+        seen.add(topic)
+        how = made[topic].provenance if topic in made else provenance_of(opened, topic)
+        if how is None:
+            break
+        if motion in how.references and "camera_motion" in how.parameters:
+            found = _read(opened, motion, CAMERA_MOTION, made)
+            try:
+                path = used_path(frames_to_path(found[0]), how.parameters["camera_motion"]) if found else None
+            except McaptrackError:
+                break
+            return path, {motion: found[1]} if found and path is not None else {}
+        topic = how.input
+    return None, {}
+
+
 def planes_in_pictures(opened: log.Log, prefix: str, made: Mapping[str, Made], planes: Planes) -> Planes:
     """The planes of a camera as its pictures show them: moved with the camera where its tracks are."""
-    topic = motion_topic(prefix)
     stage = next(one for one in STAGES.values() if one.default.reads is DETECTIONS)
-    tracks = f"{prefix}/{stage.output_topic}"
-    tracked = made[tracks].provenance if tracks in made else provenance_of(opened, tracks)
-    found = _read(opened, topic, CAMERA_MOTION, made) if planes and tracked and topic in tracked.references else None
-    if tracked is None or found is None:
-        return planes
-    try:
-        path = frames_to_path(found[0])
-    except McaptrackError:
-        return planes  # the tracks were made from an earlier motion
-    return moved_planes(planes, used_path(path, tracked.parameters.get("camera_motion", _OFF)))
+    return (
+        moved_planes(planes, path_of(opened, prefix, f"{prefix}/{stage.output_topic}", made)[0]) if planes else planes
+    )
+
+
+def to_scene(frames: Sequence[Frame], path: CameraPath | None) -> list[Frame]:
+    """Return frames of tracks with boxes in pixels of the reference picture; as they are without a path."""
+    return list(frames) if path is None else _moved(frames, path.to_scene)
+
+
+def to_pictures(frames: Sequence[Frame], path: CameraPath | None) -> list[Frame]:
+    """Return frames of tracks with boxes in pixels of the picture at their time; as they are without a path."""
+    return list(frames) if path is None else _moved(frames, path.to_pictures)
+
+
+def _moved(frames: Sequence[Frame], move: Callable[[Floats, Ints], Floats]) -> list[Frame]:
+    joined = join_frames(TRACKS, frames)
+    rows = joined.rows.copy()
+    rows["x_px"], rows["y_px"], rows["w_px"], rows["h_px"] = move(columns_to_boxes(rows), joined.row_ns).T
+    return split_rows(joined.t_ns, [frame.index for frame in frames], rows, joined.ends[1:])
 
 
 def _boxes(opened: log.Log, prefix: str, made: Mapping[str, Made]) -> SideInputs:

@@ -12,14 +12,15 @@ import numpy as np
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
+from mcaptrack.geometry.camera_path import CameraPath
 from mcaptrack.geometry.clocks import NS_PER_S, parse_ns
-from mcaptrack.geometry.plane import Planes, is_assumed
+from mcaptrack.geometry.plane import Planes, is_assumed, scene_planes
 from mcaptrack.notices import Notice, collected, warn
 from mcaptrack.pipeline.checks import Job, check_inputs, read_named_frames
 from mcaptrack.pipeline.events import STAGE as EVENTS_STAGE
 from mcaptrack.pipeline.events import Watch, make_events, tally
 from mcaptrack.pipeline.findings import warn_findings, warn_memory, warn_no_rows
-from mcaptrack.pipeline.motion import planes_in_pictures, side_inputs
+from mcaptrack.pipeline.motion import path_of, planes_in_pictures, side_inputs, to_pictures, to_scene
 from mcaptrack.pipeline.planes import guess_plane, is_poor, read_planes
 from mcaptrack.pipeline.rebuild import plugins_of
 from mcaptrack.pipeline.write import Made, digest_of, write
@@ -158,12 +159,21 @@ class _Input(NamedTuple):
     messages: Callable[[], int]
     classes: Mapping[str, str] = {}
 
+    def in_scene(self, path: CameraPath) -> _Input:
+        """Return the same tracks with boxes in pixels of the reference picture."""
+        return self._replace(
+            stream=_Repeatable(lambda: iter(to_scene(list(self.stream), path))), frames=to_scene(self.frames, path)
+        )
+
 
 def _run_job(
     opened: log.Log, prefix: str, job: Job, given: _Input, made: Mapping[str, Made], planes: Planes
 ) -> dict[str, Made]:
     """Run a job, and return its channels by topic. ``made`` are the channels of earlier jobs."""
     known = side_inputs(opened, prefix, job, made)
+    path, motion = path_of(opened, prefix, job.source, made) if job.transform.reads is TRACKS else (None, {})
+    if path is not None:  # boxes of pictures that the camera moved between can't be joined as they are
+        given, planes = given.in_scene(path), scene_planes(planes, path)
     transform = replace(_in_context(opened, prefix, job, given.frames, planes), **known.values)
     outputs: list[list[Frame]] = [[] for _ in transform.writes]
     taken: set[int] = set()
@@ -190,9 +200,9 @@ def _run_job(
             "picture that has its parameter sets",
             "left-out",
         )
-    provenance = _provenance_of(job, transform, given, warnings, known.references)
+    provenance = _provenance_of(job, transform, given, warnings, {**known.references, **motion})
     out = {
-        topic: Made.of(schema, channel, provenance)
+        topic: Made.of(schema, to_pictures(channel, path) if schema is TRACKS else channel, provenance)
         for (topic, schema), channel in zip(job.outputs().items(), outputs, strict=True)
         if topic in job.kept()
     }
@@ -201,7 +211,8 @@ def _run_job(
             opened,
             job,
             {**made, **out},
-            planes_in_pictures(opened, prefix, made, planes),
+            planes,
+            path,
             getattr(transform, "holds_back", False),
         )
     return out
@@ -242,9 +253,12 @@ def _provenance_of(
 
 
 def _at_video_rate(
-    opened: log.Log, job: Job, made: Mapping[str, Made], planes: Planes, holds_back: bool
+    opened: log.Log, job: Job, made: Mapping[str, Made], planes: Planes, path: CameraPath | None, holds_back: bool
 ) -> dict[str, Made]:
-    """Return the re-tracked channel at the rate of the tracks that were sampled; empty if there are no such tracks."""
+    """Return the re-tracked channel at the rate of the tracks that were sampled; empty if there are no such tracks.
+
+    ``planes`` are those of reference pictures where the camera moves by ``path``.
+    """
     samples = (
         made[job.source].provenance
         if job.source in made
@@ -259,8 +273,9 @@ def _at_video_rate(
     if not tracks:
         return {}
     retracked = made[job.target]
-    frames = unchanged_tracks(tracks, planes) if holds_back else to_video_rate(tracks, retracked.frames, planes)
-    return {job.target + FULL: Made.of(TRACKS, frames, retracked.provenance)}
+    tracks, slow = to_scene(tracks, path), to_scene(retracked.frames, path)
+    frames = unchanged_tracks(tracks, planes) if holds_back else to_video_rate(tracks, slow, planes)
+    return {job.target + FULL: Made.of(TRACKS, to_pictures(frames, path), retracked.provenance)}
 
 
 def _in_context(opened: log.Log, prefix: str, job: Job, frames: Sequence[Frame], planes: Planes) -> Transform:
