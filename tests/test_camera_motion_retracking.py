@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,8 @@ from mcaptrack import log
 from mcaptrack.geometry.affine import IDENTITY, move_boxes
 from mcaptrack.geometry.camera_path import CameraPath, poses_of
 from mcaptrack.geometry.plane import GroundPlane, scene_planes
-from mcaptrack.schema import TRACKS
+from mcaptrack.schema import EVENT_KINDS, EVENTS, TRACKS
+from mcaptrack.sources.camera_motion import read_ground_truth
 from tests.commands import done
 
 #: Left edges and tops of people who stand, 20 px wide and 60 px high, in the first picture.
@@ -106,3 +108,48 @@ def test_planes_stand_in_the_scene():
     assert (one, since) == (first, 40)
     seen = np.array([[100.0, 50.0]])  # in the fifth picture, to which the scene has moved by 24 px
     assert other.pixels_to_metres(seen + [24, 0]) == pytest.approx(later.pixels_to_metres(seen))
+
+
+def test_ground_truth_is_in_metres_where_the_pictures_show_it(tmp_path, monkeypatch):
+    """People who stand: a plane that holds for the first picture would let their ground truth sway with the camera."""
+    monkeypatch.chdir(tmp_path)
+    write(tmp_path, 60, range(0))
+    truth = [f"{n + 1},{k + 1},{x + sway(n):.3f},{y},20,60,1,1,1" for n in range(60) for k, (x, y) in enumerate(PEOPLE)]
+    (tmp_path / "gt.txt").write_text("\n".join(truth) + "\n")
+    given = [
+        "--fps",
+        10,
+        "--motion",
+        "motion.txt",
+        "--ground-plane",
+        "plane.txt",
+        "--truth",
+        "gt.txt",
+        "--label-format",
+    ]
+    done("ingest", "det.txt", *given[:-1], "-o", "a.mcap", "-q")
+    summary = json.loads(done("run", "a.mcap", "--no-tables", "-q", "--json").out)["results"][0]
+    assert summary["summary"]["scores"]["idf1"][1] > 0.95
+    for topic in ("tracks", "retracks"):
+        scored = (
+            "evaluate",
+            "a.mcap",
+            "--topic",
+            f"/camera/{topic}",
+            "--similarity",
+            "metres",
+            "--gate-m",
+            0.1,
+            "--json",
+        )
+        assert json.loads(done(*scored).out)["results"][0]["IDF1"] > 0.9, topic
+    with log.read(tmp_path / "a.mcap") as opened:
+        kinds = opened.rows("/camera/retracks/events", EVENTS).rows["kind"]
+        assert not {"identity switch", "false track"} & {EVENT_KINDS[kind] for kind in kinds.tolist()}
+        frames = read_ground_truth(opened, "/camera")
+    places = np.array([np.stack([frame.rows["x_m"], frame.rows["y_m"]], axis=1) for frame in frames])
+    assert np.ptp(places, axis=0).max() < 0.02
+    done("run", "a.mcap", "--camera-motion", "off", "--no-tables", "-q")
+    with log.read(tmp_path / "a.mcap") as opened:  # tracks and ground truth are in the same metres
+        places = [frame.rows["x_m"][0] for frame in read_ground_truth(opened, "/camera")]
+    assert np.ptp(places) > 2.0

@@ -190,8 +190,8 @@ def test_the_offline_steps_equal_the_reference(seed, chosen):
     compare(transform, frames, reference)
 
 
-#: Options that decide whether anything is re-tracked at all.
-WHETHER = {"side_view", "poor_scale"}
+#: Options that decide whether anything is re-tracked at all, or together.
+WHETHER = {"side_view", "poor_scale", "across_classes"}
 
 
 def test_every_option_is_varied():

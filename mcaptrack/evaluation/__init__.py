@@ -30,6 +30,7 @@ from mcaptrack.evaluation.metrics import Rules, Score
 from mcaptrack.evaluation.metrics.displacement import Displacement, combine_displacements
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame
 from mcaptrack.schema.provenance import Provenance
+from mcaptrack.sources.camera_motion import read_ground_truth
 from mcaptrack.sources.cameras import camera_at
 from mcaptrack.transforms import STAGES
 
@@ -127,7 +128,7 @@ def ground_truth_of_log(opened: log.Log, prefix: str) -> list[Frame]:
     if topic not in opened.channels:
         add = call("ingest", "LABELS", role="truth", into=opened.path)
         raise McaptrackError(f"{opened.path} has no channel {topic}; add one with {add}")
-    return opened.frames(topic, TRACKS)
+    return read_ground_truth(opened, prefix)
 
 
 def sequence_of_log(opened: log.Log, prefix: str, topics: Sequence[str]) -> EvaluationInput:

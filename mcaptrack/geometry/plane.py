@@ -81,8 +81,12 @@ class GroundPlane:
 
     def boxes_to_metres(self, xywh: Floats) -> Floats:
         """Boxes (N, 4) -> the points (N, 2) where they touch the ground."""
+        return self.pixels_to_metres(self.feet(xywh))
+
+    def feet(self, xywh: Floats) -> Floats:
+        """Boxes (N, 4) -> the points (N, 2) of the image that touch the ground."""
         x, y, w, h = xywh.T
-        return self.pixels_to_metres(np.stack([x + w / 2, y + h * self._anchor], axis=-1))
+        return np.stack([x + w / 2, y + h * self._anchor], axis=-1)
 
     def standing_boxes(self, xy_m: Floats, size_px: Floats) -> Floats:
         """Boxes (N, 4) of the given widths and heights (N, 2) that touch the ground at points (N, 2)."""

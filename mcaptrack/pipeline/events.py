@@ -23,6 +23,7 @@ from mcaptrack.evaluation.events import EventOptions, find_events
 from mcaptrack.evaluation.forecasts import FORECAST_INPUTS, find_forecast_errors
 from mcaptrack.notices import warn
 from mcaptrack.pipeline.checks import describe_origin, may_replace
+from mcaptrack.pipeline.motion import ground_truth_with
 from mcaptrack.pipeline.plan import is_stale
 from mcaptrack.pipeline.write import Made, digest_of
 from mcaptrack.schema import (
@@ -81,7 +82,7 @@ def make_events(opened: log.Log, prefix: str, made: Mapping[str, Made], watch: W
 
     @cache
     def truth() -> _GroundTruth:
-        return _read_truth(opened, camera_at(opened, prefix).truth)
+        return _read_truth(opened, prefix, made)
 
     for topic in topics:
         options = watch.options if watch.again else _options_for(opened, topic, watch.options)
@@ -168,13 +169,14 @@ class _GroundTruth(NamedTuple):
     digests: dict[str, str]
 
 
-def _read_truth(opened: log.Log, topic: str) -> _GroundTruth:
+def _read_truth(opened: log.Log, prefix: str, made: Mapping[str, Made]) -> _GroundTruth:
+    topic = camera_at(opened, prefix).truth
     if topic not in opened.channels:
         return _GroundTruth(None, {topic: ""})
     if not _has_rows(opened, topic):
         return _GroundTruth(None, {})
     try:
-        return _GroundTruth(opened.frames(topic, TRACKS), {topic: digest_of(opened, topic)})
+        return _GroundTruth(ground_truth_with(opened, prefix, made), {topic: digest_of(opened, topic)})
     except McaptrackError as error:
         warn(f"no misses, false tracks and switches: {error}", "not-compared")
         return _GroundTruth(None, {})

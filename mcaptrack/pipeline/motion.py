@@ -19,9 +19,9 @@ from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, TRACKS, VIDEO, Frame, Sc
 from mcaptrack.schema.camera_motion import frames_to_path
 from mcaptrack.schema.framing import join_frames, split_rows
 from mcaptrack.schema.provenance import Provenance
+from mcaptrack.sources.camera_motion import motion_topic, path_of, read_ground_truth, tracks_topic
 from mcaptrack.sources.cameras import camera_at, provenance_of
 from mcaptrack.transforms import STAGES, Transform
-from mcaptrack.transforms.sort.tracker import used_path
 
 STAGE: Final = "motion"
 _OFF: Final = "off"
@@ -32,11 +32,6 @@ class SideInputs(NamedTuple):
 
     values: Mapping[str, Any]
     references: Mapping[str, str]
-
-
-def motion_topic(prefix: str) -> str:
-    """The topic with the motion of a camera."""
-    return f"{prefix}/{STAGES[STAGE].output_topic}"
 
 
 def uses_motion(transform: Transform | None) -> bool:
@@ -105,36 +100,25 @@ def _path(opened: log.Log, prefix: str, job: Job, made: Mapping[str, Made]) -> S
     return SideInputs({"camera_path": path}, {topic: digest})
 
 
-def path_of(
+def path_with(
     opened: log.Log, prefix: str, topic: str, made: Mapping[str, Made]
 ) -> tuple[CameraPath | None, Mapping[str, str]]:
-    """Return the camera's path, if the tracks that a channel was made from are compensated for it, and its digest.
+    """Return what ``path_of`` does, with the channels of this run."""
+    return path_of(opened, prefix, topic, *_of_run(made))
 
-    The digest is by topic. The path is None if the tracks are not compensated, or were made from an earlier motion.
-    """
-    motion, seen = motion_topic(prefix), {""}
-    while topic not in seen:
-        seen.add(topic)
-        how = made[topic].provenance if topic in made else provenance_of(opened, topic)
-        if how is None:
-            break
-        if motion in how.references and "camera_motion" in how.parameters:
-            found = _read(opened, motion, CAMERA_MOTION, made)
-            try:
-                path = used_path(frames_to_path(found[0]), how.parameters["camera_motion"]) if found else None
-            except McaptrackError:
-                break
-            return path, {motion: found[1]} if found and path is not None else {}
-        topic = how.input
-    return None, {}
+
+def ground_truth_with(opened: log.Log, prefix: str, made: Mapping[str, Made]) -> list[Frame]:
+    """Return what ``read_ground_truth`` does, with the channels of this run."""
+    return read_ground_truth(opened, prefix, *_of_run(made))
+
+
+def _of_run(made: Mapping[str, Made]) -> tuple[dict[str, Provenance], dict[str, Sequence[Frame]]]:
+    return {topic: one.provenance for topic, one in made.items()}, {topic: one.frames for topic, one in made.items()}
 
 
 def planes_in_pictures(opened: log.Log, prefix: str, made: Mapping[str, Made], planes: Planes) -> Planes:
     """The planes of a camera as its pictures show them: moved with the camera where its tracks are."""
-    stage = next(one for one in STAGES.values() if one.default.reads is DETECTIONS)
-    return (
-        moved_planes(planes, path_of(opened, prefix, f"{prefix}/{stage.output_topic}", made)[0]) if planes else planes
-    )
+    return moved_planes(planes, path_with(opened, prefix, tracks_topic(prefix), made)[0]) if planes else planes
 
 
 def to_scene(frames: Sequence[Frame], path: CameraPath | None) -> list[Frame]:

@@ -21,6 +21,7 @@ from mcaptrack.pipeline.rebuild import MissingPluginError, rebuild
 from mcaptrack.schema import DETECTIONS, VIDEO
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources import foreign
+from mcaptrack.sources.camera_motion import motion_topic
 from mcaptrack.sources.cameras import USUAL, camera_at, chain_of, name_above, provenance_of
 from mcaptrack.transforms import STAGES, Stage, Transform
 from mcaptrack.transforms.protocol import suited
@@ -317,7 +318,7 @@ class _Planner:
         pictures = self._given_pictures() or camera_at(self._opened, self._prefix).pictures
         if motion.is_motion_wanted(self._opened, self._prefix, transform, source, bool(pictures), self.jobs):
             count = len(self.jobs)
-            self.ensure(motion.motion_topic(self._prefix))
+            self.ensure(motion_topic(self._prefix))
             is_asked = getattr(transform, "camera_motion", "") == "on"
             self.jobs[count:] = [job._replace(is_optional=not is_asked) for job in self.jobs[count:]]
 

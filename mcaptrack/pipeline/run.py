@@ -20,7 +20,7 @@ from mcaptrack.pipeline.checks import Job, check_inputs, read_named_frames
 from mcaptrack.pipeline.events import STAGE as EVENTS_STAGE
 from mcaptrack.pipeline.events import Watch, make_events, tally
 from mcaptrack.pipeline.findings import warn_findings, warn_memory, warn_no_rows
-from mcaptrack.pipeline.motion import path_of, planes_in_pictures, side_inputs, to_pictures, to_scene
+from mcaptrack.pipeline.motion import path_with, planes_in_pictures, side_inputs, to_pictures, to_scene
 from mcaptrack.pipeline.planes import guess_plane, is_poor, read_planes
 from mcaptrack.pipeline.rebuild import plugins_of
 from mcaptrack.pipeline.write import Made, digest_of, write
@@ -171,7 +171,7 @@ def _run_job(
 ) -> dict[str, Made]:
     """Run a job, and return its channels by topic. ``made`` are the channels of earlier jobs."""
     known = side_inputs(opened, prefix, job, made)
-    path, motion = path_of(opened, prefix, job.source, made) if job.transform.reads is TRACKS else (None, {})
+    path, motion = path_with(opened, prefix, job.source, made) if job.transform.reads is TRACKS else (None, {})
     if path is not None:  # boxes of pictures that the camera moved between can't be joined as they are
         given, planes = given.in_scene(path), scene_planes(planes, path)
     transform = replace(_in_context(opened, prefix, job, given.frames, planes), **known.values)

@@ -11,10 +11,10 @@ from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation import Candidate, EvaluateOptions, EvaluationInput, evaluate
 from mcaptrack.notices import warn
-from mcaptrack.pipeline.motion import motion_topic
 from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, GROUND_PLANE, PREDICTIONS, TRACKS, Rows, Schema
 from mcaptrack.schema.camera_motion import rows_to_verdict
 from mcaptrack.sources import foreign
+from mcaptrack.sources.camera_motion import motion_topic, read_ground_truth
 from mcaptrack.sources.cameras import camera_at, provenance_of
 from mcaptrack.transforms import STAGES
 
@@ -77,7 +77,7 @@ def summarise(opened: log.Log, prefix: str) -> Summary:
     forecasts = _rows(opened, f"{retracks}/predictions", PREDICTIONS)
     forecasts = _rows(opened, predictions, PREDICTIONS) if forecasts is None else forecasts
     planes = _rows(opened, camera.ground_plane, GROUND_PLANE)
-    scores = _scores(opened, camera.truth, (samples, retracks))
+    scores = _scores(opened, prefix, camera.truth, (samples, retracks))
     if scores is not None and scores.idf1[1] < scores.idf1[0]:
         was, now = scores.idf1
         warn(
@@ -128,13 +128,13 @@ def _repair(tracked: Rows, repaired: Rows) -> Repair:
     )
 
 
-def _scores(opened: log.Log, truth: str, topics: tuple[str, str]) -> SummaryScores | None:
+def _scores(opened: log.Log, prefix: str, truth: str, topics: tuple[str, str]) -> SummaryScores | None:
     """Score tracks before and after re-tracking, at their common sample times; None if they can't be compared."""
     there = [opened.channels.get(topic) for topic in (truth, *topics)]
     if not all(channel and channel.schema_name == TRACKS.name for channel in there):
         return None
     candidates = [Candidate(topic, None, opened.frames(topic, TRACKS)) for topic in topics]
-    sequence = EvaluationInput(opened.path.stem, opened.frames(truth, TRACKS), candidates)
+    sequence = EvaluationInput(opened.path.stem, read_ground_truth(opened, prefix), candidates)
     rules = {
         f"within {_GATE_M:g} m": EvaluateOptions(similarities=("metres",), gates_m=(_GATE_M,)),
         f"by an overlap of {_MIN_IOU:g}": EvaluateOptions(similarities=("iou",), min_iou=_MIN_IOU),

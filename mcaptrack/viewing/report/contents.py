@@ -19,6 +19,7 @@ from mcaptrack.geometry.plane import Planes, plane_at
 from mcaptrack.schema import DETECTIONS, EVENTS, TRACKS, Frame
 from mcaptrack.schema.framing import frame_times
 from mcaptrack.schema.provenance import Provenance
+from mcaptrack.sources.camera_motion import read_ground_truth
 from mcaptrack.sources.cameras import provenance_of
 from mcaptrack.sources.pictures import Pictures
 from mcaptrack.transforms import STAGES
@@ -146,7 +147,8 @@ def _read(opened: log.Log, out: LogReport) -> None:
         if there.schema_name != TRACKS.name or there.message_encoding != "protobuf":
             out.notes.append(f"{topic} holds {there.schema_name or 'no schema'}, not tracks; it is left out")
             continue
-        out.track_sets[role] = TrackSet(topic, role, names[role], opened.frames(topic, TRACKS))
+        frames = read_ground_truth(opened, out.prefix) if role == "truth" else opened.frames(topic, TRACKS)
+        out.track_sets[role] = TrackSet(topic, role, names[role], frames)
     try:
         out.planes = pipeline.read_planes(opened, out.prefix) or ()
     except DamagedError:

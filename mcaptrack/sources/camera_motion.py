@@ -1,0 +1,112 @@
+"""The motion of a camera that its tracks are compensated for, and ground truth in metres before such a camera."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Final
+
+import numpy as np
+
+from mcaptrack import log
+from mcaptrack.errors import McaptrackError
+from mcaptrack.geometry.boxes import columns_to_boxes
+from mcaptrack.geometry.camera_path import CameraPath
+from mcaptrack.geometry.plane import Planes, scene_planes
+from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, GROUND_PLANE, TRACKS, Frame
+from mcaptrack.schema.camera_motion import frames_to_path
+from mcaptrack.schema.framing import join_frames, split_rows
+from mcaptrack.schema.ground_plane import rows_to_plane
+from mcaptrack.schema.provenance import Provenance
+from mcaptrack.sources.cameras import camera_at, provenance_of
+from mcaptrack.transforms import STAGES
+from mcaptrack.transforms.sort.tracker import used_path
+
+#: Positions that differ by no more than this, in metres, are those of a plane.
+_SAME_M: Final = 1e-6
+
+
+def motion_topic(prefix: str) -> str:
+    """The topic with the motion of a camera."""
+    return f"{prefix}/{STAGES['motion'].output_topic}"
+
+
+def tracks_topic(prefix: str) -> str:
+    """The usual topic of the tracks of a camera."""
+    return f"{prefix}/{next(one.output_topic for one in STAGES.values() if one.default.reads is DETECTIONS)}"
+
+
+def path_of(
+    opened: log.Log,
+    prefix: str,
+    topic: str,
+    provenances: Mapping[str, Provenance] = {},
+    frames: Mapping[str, Sequence[Frame]] = {},
+) -> tuple[CameraPath | None, Mapping[str, str]]:
+    """Return the camera's path, if the tracks that a channel was made from are compensated for it, and its digest.
+
+    ``provenances`` and ``frames`` are those of channels that are not in the log yet, by topic. The digest is by topic.
+    The path is None if the tracks are not compensated, or were made from an earlier motion.
+    """
+    motion, seen = motion_topic(prefix), {""}
+    while topic not in seen:
+        seen.add(topic)
+        made = provenances.get(topic) or provenance_of(opened, topic)
+        if made is None:
+            break
+        if motion in made.references and "camera_motion" in made.parameters:
+            path = used_path(_read_path(opened, motion, frames), made.parameters["camera_motion"])
+            return path, {} if path is None else {motion: made.references[motion]}
+        topic = made.input
+    return None, {}
+
+
+def _read_path(opened: log.Log, topic: str, frames: Mapping[str, Sequence[Frame]]) -> CameraPath | None:
+    channel = opened.channels.get(topic)
+    if topic not in frames and (channel is None or channel.schema_name != CAMERA_MOTION.name):
+        return None
+    try:
+        return frames_to_path(frames[topic] if topic in frames else opened.frames(topic, CAMERA_MOTION))
+    except McaptrackError:
+        return None
+
+
+def read_ground_truth(
+    opened: log.Log,
+    prefix: str,
+    provenances: Mapping[str, Provenance] = {},
+    frames: Mapping[str, Sequence[Frame]] = {},
+) -> list[Frame]:
+    """Return the ground truth of a camera, with positions in metres where its pictures show them.
+
+    Labels got their positions from their boxes and the ground plane of the log. Where tracks are compensated for the
+    motion of the camera, so are these, because the plane holds for one picture. Parameters are those of ``path_of``.
+    """
+    camera = camera_at(opened, prefix)
+    truth = opened.frames(camera.truth, TRACKS)
+    path, _ = path_of(opened, prefix, tracks_topic(prefix), provenances, frames)
+    if path is None or camera.ground_plane not in opened.channels:
+        return truth
+    planes = [(frame.t_ns, rows_to_plane(frame.rows)) for frame in opened.frames(camera.ground_plane, GROUND_PLANE)]
+    return in_metres(truth, planes, path)
+
+
+def in_metres(frames: Sequence[Frame], planes: Planes, path: CameraPath) -> list[Frame]:
+    """Return frames of tracks with the positions in metres that the planes of a moving camera give to their boxes.
+
+    Rows with positions that don't come from their boxes and the first plane keep them.
+    """
+    joined = join_frames(TRACKS, frames)
+    rows, boxes = joined.rows.copy(), columns_to_boxes(joined.rows)
+    given = np.stack([rows["x_m"], rows["y_m"]], axis=1)
+    if not planes or not len(rows):
+        return list(frames)
+    with np.errstate(invalid="ignore"):
+        is_derived = (np.abs(planes[0][1].boxes_to_metres(boxes) - given) <= _SAME_M).all(axis=1)
+    still = scene_planes(planes, path)
+    which = np.searchsorted(np.array([since for since, _ in still[1:]], np.int64), joined.row_ns, "right")
+    for number, (_, plane) in enumerate(still):
+        of = is_derived & (which == number)
+        feet = plane.feet(boxes[of])
+        at = path.to_scene(np.concatenate([feet, np.zeros_like(feet)], axis=1), joined.row_ns[of])[:, :2]
+        rows["x_m"][of], rows["y_m"][of] = plane.pixels_to_metres(at).T
+    return split_rows(joined.t_ns, [frame.index for frame in frames], rows, joined.ends[1:])
