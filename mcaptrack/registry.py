@@ -11,9 +11,10 @@ There are three kinds of names, on the command line, in files for ``--config`` a
 
 * ``module:Class``, as in ``my_module:NearestTracker``. Installed modules are searched first, then the working folder.
 
-Entry points can't replace built-in names. ``names`` imports nothing; ``find`` imports the module of the entry that
-it finds. ``entry_of`` is the inverse: from a class to its entry. The provenance of a channel stores the fields of an
-``Entry``: name, module and class, and the name and version of the distribution (the installed package).
+Entry points can't replace built-in names, and their names hold no colon. ``names`` imports nothing; ``find`` imports
+the module of the entry that it finds. ``entry_of`` is the inverse: from a class to its entry. The provenance of a
+channel stores the fields of an ``Entry``: name, module and class, and the name and version of the distribution (the
+installed package).
 
 Interfaces are defined in ``mcaptrack.transforms.protocol`` and ``mcaptrack.predictors.forecast``. To add a built-in
 entry: a line in ``BUILT_IN``.
@@ -22,13 +23,14 @@ entry: a line in ``BUILT_IN``.
 from __future__ import annotations
 
 import difflib
+import signal
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib import import_module
-from importlib.metadata import EntryPoint, PackageNotFoundError, entry_points, packages_distributions, version
+from importlib.metadata import Distribution, EntryPoint, PackageNotFoundError, distributions, packages_distributions
 from pathlib import Path
 from traceback import extract_tb
 from types import MappingProxyType
@@ -40,6 +42,9 @@ from mcaptrack.errors import McaptrackError
 Kind = Literal["detector", "tracker", "predictor", "retracker", "fuser"]
 KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
 _OWN: Final = "mcaptrack"
+_FOLDER: Final = Path(__file__).parent
+#: Exit codes of processes that end by a signal.
+_SIGNALLED: Final = frozenset(128 + number for number in (signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGHUP", 1)))
 
 #: Module and class of the built-in entries, by kind and name; the first of a kind is its default.
 BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(
@@ -122,7 +127,7 @@ def names(kind: Kind) -> tuple[str, ...]:
     return (*BUILT_IN[kind], *sorted({point.name for point in _installed(kind)} - set(BUILT_IN[kind])))
 
 
-def find(kind: Kind, name: str) -> Entry:
+def find(kind: Kind, name: str, distribution: str = "") -> Entry:
     """Find an entry by its name, and import it.
 
     Parameters
@@ -131,6 +136,8 @@ def find(kind: Kind, name: str) -> Entry:
         One of ``KINDS``.
     name : str
         A built-in name, the name of an entry point, or ``module:Class``.
+    distribution : str, optional
+        The package to take if several have an entry point of this name.
 
     Returns
     -------
@@ -156,6 +163,7 @@ def find(kind: Kind, name: str) -> Entry:
     points = [point for point in _installed(kind) if point.name == name]
     if not points:
         raise McaptrackError(_unknown(kind, name))
+    points = [point for point in points if _of_point(point)[0] == distribution] or points
     if len(points) > 1:
         values = " and ".join(sorted(f"{point.value} ({' '.join(_of_point(point))})" for point in points))
         raise McaptrackError(f"several installed packages have a {kind} {name}: {values}; name one as module:Class")
@@ -202,15 +210,14 @@ def blamed(entry: Entry, what: str) -> Iterator[None]:
 
 def is_interruption(error: BaseException) -> bool:
     """Whether this ends the process from outside: Ctrl-C or a signal, and not ``sys.exit`` in the code of others."""
-    is_signal = isinstance(error, SystemExit) and isinstance(error.code, int) and error.code > 128
-    return is_signal or isinstance(error, KeyboardInterrupt)
+    return isinstance(error, KeyboardInterrupt) or (isinstance(error, SystemExit) and error.code in _SIGNALLED)
 
 
 def failure(entry: Entry, what: str, error: BaseException) -> McaptrackError:
     """An exception of the code of another package, as one line with the entry and the place in its source."""
     if isinstance(error, McaptrackError):
         return McaptrackError(f"{entry}: {error}")
-    frames = [frame for frame in extract_tb(error.__traceback__) if f"/{_OWN}/" not in Path(frame.filename).as_posix()]
+    frames = [frame for frame in extract_tb(error.__traceback__) if _FOLDER not in Path(frame.filename).parents]
     where = f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
     return McaptrackError(f"{entry} {what}: {_words(error)}{where}")
 
@@ -225,8 +232,11 @@ def _words(error: BaseException) -> str:
 def distribution_of(module: str) -> tuple[str, str]:
     """Name and version of the distribution of a module; "" and "" if unknown."""
     places = tuple((place, _changed_ns(place)) for place in sys.path)
-    found = _distributions(places).get(module.partition(".")[0], [])
-    return (found[0], _version_of(found[0])) if found else ("", "")
+    found = [name for name in _distributions(places).get(module.partition(".")[0], []) if name]
+    try:
+        return _name_and_version(Distribution.from_name(found[0])) if found else ("", "")
+    except PackageNotFoundError:
+        return "", ""
 
 
 def _changed_ns(place: str) -> int:
@@ -240,23 +250,43 @@ def _changed_ns(place: str) -> int:
 @lru_cache(maxsize=2)
 def _distributions(_places: tuple[tuple[str, int], ...]) -> Mapping[str, list[str]]:
     """The distributions of top-level modules; kept as long as nothing is installed, because all files are searched."""
-    return packages_distributions()
-
-
-def _version_of(distribution: str) -> str:
     try:
-        return version(distribution)
-    except PackageNotFoundError:
-        return ""
+        return packages_distributions()
+    except Exception:  # metadata of another package that can't be read
+        return {}
 
 
-def _installed(kind: str) -> list[EntryPoint]:
-    """The entry points of a kind, without duplicates."""
-    return list({(p.name, p.value, *_of_point(p)): p for p in entry_points(group=f"{_OWN}.{kind}s")}.values())
+def _name_and_version(distribution: Distribution | None) -> tuple[str, str]:
+    """Name and version of a distribution; "" for what its metadata lack."""
+    try:
+        found = ("", "") if distribution is None else (distribution.metadata["Name"], distribution.version)
+    except Exception:  # metadata that can't be read
+        return "", ""
+    return found[0] or "", found[1] or ""
+
+
+def _installed(kind: str, unreadable: list[str] | None = None) -> list[EntryPoint]:
+    """The entry points of a kind, without duplicates.
+
+    Packages with entry points that can't be read are left out; their names are added to ``unreadable``.
+    """
+    found: dict[str, list[EntryPoint]] = {}
+    for distribution in distributions():
+        name, _ = _name_and_version(distribution)
+        key = name.lower().replace("-", "_") or f"{distribution!r}"
+        if key in found:
+            continue  # the first one on the path is the one that is imported
+        try:
+            found[key] = [point for point in distribution.entry_points if point.group == f"{_OWN}.{kind}s"]
+        except Exception:  # whatever parsing raises
+            found[key] = []
+            if unreadable is not None:
+                unreadable.append(name)
+    return [point for points in found.values() for point in points if ":" not in point.name]
 
 
 def _of_point(point: EntryPoint) -> tuple[str, str]:
-    return (point.dist.name, point.dist.version) if point.dist else ("", "")
+    return _name_and_version(point.dist)
 
 
 def _is(point: EntryPoint, cls: type) -> bool:
@@ -302,11 +332,13 @@ def _working_folder() -> Iterator[None]:
 
 
 def _unknown(kind: Kind, name: str) -> str:
-    known = names(kind)
+    known, unreadable = names(kind), list[str]()
+    _installed(kind, unreadable)
     close = difflib.get_close_matches(name, known, 1)
     meant = f"did you mean {close[0]}? " if close else ""
     there = f"there are {', '.join(known)}" if known else f"no {kind} is built in or installed"
     return (
         f"no {kind} is called {name}; {meant}{there}; an installed package gives more by its entry points in "
         f"{_OWN}.{kind}s, and module:Class names any class"
+        + (f". The entry points of {', '.join(unreadable)} can't be read" if unreadable else "")
     )

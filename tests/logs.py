@@ -45,10 +45,10 @@ def write_log(path: Path, messages, kind: str = "rows") -> None:
 
 
 def write_stock(path: Path, messages, **options) -> None:
-    """A log that somebody else recorded, with an attachment and metadata."""
+    """A log that other software recorded, with an attachment and metadata."""
     with path.open("wb") as stream:
         writer = Writer(stream, **options)
-        writer.start("ros2", "somebody")
+        writer.start("ros2", "other-software")
         schema = writer.register_schema(*SCHEMA)
         numbers = {topic: writer.register_channel(topic, "json", schema, {"about": topic}) for topic in "abc"}
         for count, (topic, t_ns, sequence, payload) in enumerate(messages):

@@ -352,7 +352,7 @@ class TestResample:
         assert self.at([20], hole=20) == []
         assert [row[1] for row in self.at([5], hole=20)] == [1]
 
-    def test_nobody_is_there_before_the_first_or_after_the_last_row(self):
+    def test_there_are_no_rows_before_the_first_or_after_the_last(self):
         assert self.at([-5, 41]) == []
 
     @given(st.lists(st.integers(0, 100), unique=True, min_size=1).map(sorted))

@@ -358,7 +358,7 @@ class TestRosbag2:
         assert "1 messages of topic 7, which is not described" in report.lost[0]
 
     @pytest.mark.parametrize("storage", ["SQLITE3", "MCAP"])
-    def test_messages_that_metadata_counts_and_nobody_finds_are_missed(self, tmp_path, storage):
+    def test_messages_that_metadata_counts_and_the_bag_lacks_are_reported(self, tmp_path, storage):
         bag2(tmp_path / "bag", storage)
         text = (tmp_path / "bag" / "metadata.yaml").read_text()
         (tmp_path / "bag" / "metadata.yaml").write_text(text.replace("message_count: 30", "message_count: 33"))

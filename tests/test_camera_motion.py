@@ -167,7 +167,7 @@ def test_pictures_that_show_nothing_are_lost_and_the_view_is_found_again():
         assert np.array_equal(one.to_reference, IDENTITY)
 
 
-def test_a_camera_that_is_blind_for_long_begins_anew_unless_it_looks_where_it_looked():
+def test_a_camera_that_is_blind_for_long_begins_again_unless_it_has_the_same_view():
     dark = np.zeros((HEIGHT, WIDTH), np.uint8)
     for after, is_same in ((9, True), (12, False)):
         found = follow([picture(scene(9), pose())] * 3 + [dark] * 20 + [picture(scene(after), pose())] * 3)

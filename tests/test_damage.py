@@ -333,7 +333,7 @@ def test_hostile_logs_cost_neither_time_nor_memory(tmp_path):
     assert done.returncode == 0, done.stderr
 
 
-def test_what_nobody_can_save_is_said(tmp_path):
+def test_content_that_cannot_be_recovered_is_named(tmp_path):
     for name, data in {"text.mcap": b"I am no log\n" * 9, "magic.mcap": MAGIC}.items():
         (tmp_path / name).write_bytes(data)
         with pytest.raises(McaptrackError, match="no message in it is intact"):

@@ -43,7 +43,7 @@ def test_people_walk_at_the_speed_of_walkers_and_are_as_many_as_said(seed):
         for walker in people:
             for (t0, x0, y0), (t1, x1, y1) in pairwise(walker.route):
                 speed = np.hypot(x1 - x0, y1 - y0) / (t1 - t0)
-                # Who joins somebody takes a detour in the time that the straight way takes.
+                # A person who joins another takes a detour in the time that the straight way takes.
                 assert 0.85 < speed < 1.65 or (name == "standing" and (speed == 0 or walker.id == 2))
 
 

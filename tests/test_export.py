@@ -172,7 +172,7 @@ def test_exporting_again_writes_what_changed_and_touches_nothing_else(tmp_path):
     )["x_m"].to_list() == [7.0]
 
 
-def test_a_log_that_was_written_anew_with_the_same_rows_changes_no_table_of_rows(tmp_path):
+def test_a_log_that_was_written_again_with_the_same_rows_changes_no_table_of_rows(tmp_path):
     path, folder = some_log(tmp_path / "a.mcap"), tmp_path / "tables"
     exported(path, folder)
     with log.read(path) as opened, log.extend(opened, drop=["/imu"]):

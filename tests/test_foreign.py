@@ -332,7 +332,7 @@ class TestBoxes:
         assert classes.class_id("name 00000") == 2**32 - 1024
         assert sorted(classes.numbers().values()) == list(range(2, 1026))
 
-    def test_nobody_is_seen_too(self):
+    def test_a_message_without_boxes_is_a_frame_without_rows(self):
         kind, payload = vision("v4", [])
         assert len(boxes_decoder(kind, Classes())(payload)) == 0
 

@@ -143,7 +143,7 @@ def test_rates_that_differ_are_refused(tmp_path):
     assert str(error.value) == f"{first}: 25 by {of} and 30 by {of}: give the frames per second with `fps=`"
 
 
-def test_frames_are_counted_by_whoever_counts_most(tmp_path):
+def test_the_number_of_frames_is_the_largest_of_all_counts(tmp_path):
     (tmp_path / "seq").mkdir()
     write(tmp_path / "seq" / "seqinfo.ini", "frameRate=10\nseqLength=9\n")
     truth = write(tmp_path / "seq" / "gt.txt", "1,1,1,1,2,2\n4,1,1,1,2,2\n")

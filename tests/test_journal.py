@@ -201,14 +201,14 @@ def test_a_journal_that_fits_a_file_that_is_no_log_changes_nothing(tmp_path):
     assert everything(tmp_path) == before
 
 
-def test_what_somebody_else_wrote_into_a_half_written_log_is_not_undone(path):
-    """Be it a few rows only: nobody can say what they are."""
+def test_what_another_program_wrote_into_a_half_written_log_is_not_undone(path):
+    """Also where it is a few rows only: their content is not known."""
     with log.read(path) as opened:
         first = opened.index.data_end  # where new results begin
     with path.open("rb+") as stream:
         for row in range(4):
             stream.seek((first // 512 + 2 * row + 1) * 512)
-            stream.write(b"by somebody else")
+            stream.write(b"by other software")
     before = everything(path.parent)
     with notices.collected() as said, notices.listening(said.append), pytest.raises(McaptrackError):
         look(path)
@@ -256,10 +256,10 @@ def test_a_journal_that_comes_while_results_are_computed_is_not_overwritten(tmp_
     whole = path.read_bytes()
     with log.read(path) as opened:
         opened.lock()
-        journal_of(path).write_bytes(b"somebody's own")
+        journal_of(path).write_bytes(b"other content")
         with pytest.raises(McaptrackError, match="there is something else with that name"), log.extend(opened):
             pass
-    assert journal_of(path).read_bytes() == b"somebody's own"
+    assert journal_of(path).read_bytes() == b"other content"
     assert path.read_bytes() == whole
 
 

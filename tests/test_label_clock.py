@@ -44,7 +44,7 @@ from tests.worlds import ns, write_clip
 
 ROLES: tuple[Role, ...] = get_args(Role)
 FORMATS = tuple(name for name in get_args(Format) if name not in ("auto", *OTHERS))
-#: By hand: the pictures that are labelled, and by whom. The first ones and the last ones are empty.
+#: By hand: the pictures that are labelled, and by which files. The first ones and the last ones are empty.
 SEEN = {k: [1, 2] if k % 2 else [1] for k in (3, 4, 5, 7, 15)}
 #: For formats that are labelled every so many frames by custom.
 STEP = 4

@@ -39,7 +39,7 @@ def test_what_is_written_is_read_back_by_us_and_by_the_stock_reader(tmp_path_fac
 
 
 @pytest.mark.parametrize("options", STOCK_OPTIONS.values(), ids=STOCK_OPTIONS)
-def test_somebody_elses_log_keeps_everything_when_channels_are_added(tmp_path, options):
+def test_a_log_of_other_software_keeps_everything_when_channels_are_added(tmp_path, options):
     path = tmp_path / "theirs.mcap"
     write_stock(path, SOME, **options)
     before = our_messages(path)
@@ -60,7 +60,7 @@ def test_somebody_elses_log_keeps_everything_when_channels_are_added(tmp_path, o
     kinds = [type(record).__name__ for record in found]
     assert kinds.count("Attachment") == kinds.count("Metadata") == 1
     header = found[0]
-    assert (header.profile, header.library) == ("ros2", "somebody")
+    assert (header.profile, header.library) == ("ros2", "other-software")
 
 
 @pytest.mark.parametrize("options", STOCK_OPTIONS.values(), ids=STOCK_OPTIONS)

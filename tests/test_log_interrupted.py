@@ -167,9 +167,7 @@ def test_killed_while_it_is_put_back_it_can_be_put_back_still(path, change):
 
 
 @pytest.mark.parametrize("error", [OSError(errno.ENOSPC, "No space left on device"), KeyboardInterrupt()])
-def test_when_the_disk_is_full_or_somebody_interrupts_it_is_the_old_log_or_the_new_one(
-    path, change, monkeypatch, error
-):
+def test_a_full_disk_or_an_interruption_leaves_the_old_log_or_the_new_one(path, change, monkeypatch, error):
     def fail() -> None:
         raise error
 
@@ -251,7 +249,7 @@ def test_a_newer_log_that_takes_the_place_of_a_half_written_one_is_never_rolled_
 
 
 def test_a_writer_that_is_at_work_is_seen_beside(path, change):
-    """Whoever reads meanwhile sees the log as it was, at every step, and waits for nobody."""
+    """A reader sees the log as it was, at every step, and does not wait."""
     said: list[notices.Notice] = []
     steps = []
 
@@ -283,7 +281,7 @@ def test_a_writer_that_is_at_work_is_seen_beside(path, change):
     }
 
 
-def test_who_extends_a_log_goes_on_seeing_what_it_was(path, change):
+def test_the_writer_of_a_log_goes_on_seeing_its_content_before_the_change(path, change):
     with log.read(path) as opened:
         before = {topic: [m.payload for m in opened.messages(topic)] for topic in opened.channels}
         dropped = list(before)[1]
@@ -300,7 +298,7 @@ def test_who_extends_a_log_goes_on_seeing_what_it_was(path, change):
 
 
 def test_a_log_that_was_moved_away_with_its_journal_can_be_saved(path, change, tmp_path):
-    """Its journal fits by what it holds, but can't prove whose it is: it is used for another file only."""
+    """Its journal fits by what it holds, but doesn't name its file: it is used for another file only."""
     for _ in left_behind(path, change, lambda: change.make(path)):
         if not journal_of(path).exists():
             continue

@@ -127,7 +127,7 @@ def test_where_the_owner_cant_be_kept_the_file_stays_the_same_one(path, monkeypa
         assert path.stat().st_uid == other
 
 
-def test_nobody_may_read_more_in_the_journal_than_in_the_log(tmp_path, monkeypatch):
+def test_the_journal_has_the_permissions_of_the_log(tmp_path, monkeypatch):
     path = tmp_path / "a.mcap"
     write_log(path, [("a", n, n, bytes([n]) * 3000) for n in range(100)], "media")
     path.chmod(0o604)

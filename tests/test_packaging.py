@@ -90,7 +90,7 @@ def test_the_wheel_has_all_that_is_needed_and_nothing_else(shipped):
     assert f"mcaptrack-{__version__}.dist-info/licenses/LICENSE" in about
 
 
-def test_the_wheel_says_where_the_project_is_and_whose(metadata):
+def test_the_wheel_names_the_project_and_its_authors(metadata):
     urls = dict(line.split(", ") for line in metadata.get_all("Project-URL"))
     assert set(urls) == {"Homepage", "Repository", "Documentation", "Changelog", "Issues"}
     for address in urls.values():
@@ -141,7 +141,7 @@ def strings() -> Iterator[tuple[str, str]]:
 SAID = [*help_texts(), *strings()]
 
 
-def test_pages_that_help_and_errors_name_exist_for_whoever_installed_a_wheel(shipped):
+def test_pages_that_help_and_errors_name_are_in_the_wheel(shipped):
     named = [(where, page) for where, text in SAID for page in re.findall(r"`mcaptrack docs (\w+)`", text)]
     assert {page for _, page in named} >= {"tables", "sql"}
     for where, page in named:

@@ -1,4 +1,4 @@
-"""Streams that are passed on, read back by nobody but the stock MCAP library and FFmpeg; and those that may not be."""
+"""Streams that are passed on, read back by the stock MCAP library and FFmpeg; and those that may not be."""
 
 from __future__ import annotations
 

@@ -229,6 +229,46 @@ def test_an_entry_point_that_another_package_has_now_is_not_the_same(place):
     assert "tracker single (own 1.5) made it; the tracker of that name is now that of thief" in refused.err
 
 
+def test_of_two_packages_with_one_name_a_run_takes_the_one_that_made_the_channel(place):
+    done("track", "a.mcap", "--tracker", "single", "-q")
+    before = made("/camera/tracks")
+    package(Path("site"), "other", "3", "mcaptrack.trackers", {"single": "elsewhere:Single"})
+    uncached()
+    assert codes("run", "a.mcap", "--no-tables", "--force") == []
+    assert made("/camera/tracks") == before
+    refused = call("run", "a.mcap", "--no-tables", "--tracker", "single")
+    assert refused.code == 1
+    assert "several installed packages have a tracker single: elsewhere:Single (other 3) and own:Single (own 1.5)" in (
+        refused.err
+    )
+
+
+@pytest.mark.parametrize("kind", ["tracker", "predictor"])
+def test_a_class_that_is_broken_now_is_refused_like_one_that_is_missing(place, kind):
+    """Nothing is left as it was beside results that were made again."""
+    command, name, topic = {
+        "tracker": ("track", "single", "/camera/tracks"),
+        "predictor": ("predict", "standing", "/camera/predictions"),
+    }[kind]
+    done(command, "a.mcap", f"--{kind}", name, "-q")
+    install(text="import no_such_module")
+    before = Path("a.mcap").read_bytes()
+    refused = call("run", "a.mcap", "--no-tables", "--force")
+    assert (refused.code, refused.err.count("\n")) == (1, 1), refused.err
+    assert f"{topic} can't be made from" in refused.err
+    assert f"{kind} {name} (own 1.5) made it; {kind} {name} (own 1.5) can't be imported: ModuleNotFound" in refused.err
+    assert f"Or replace it with another --{kind}" in refused.err
+    assert Path("a.mcap").read_bytes() == before
+    done("info", "a.mcap")
+
+
+def test_a_parameter_that_a_package_no_longer_has_is_named_with_the_package(place):
+    done("track", "a.mcap", "--tracker", "single", "-q")
+    install("2.0", MODULE.replace("track_id: int", "number: int").replace("self.track_id", "self.number"))
+    said = done("run", "a.mcap", "--no-tables", "--force").err
+    assert "it was made with track_id, which tracker single (own 2.0) does not have" in said
+
+
 def test_a_log_cannot_have_a_module_imported(place):
     """Only the user can name a class that has no entry point."""
     (place / "beside_the_log.py").write_text(MODULE)
@@ -278,6 +318,35 @@ def test_a_class_that_cannot_be_imported_is_not_proposed_by_name(name):
     ) as told:
         rebuild(STAGES["track"], Provenance("track", {"tracker": name}, plugins={"transform": plugin}), {})
     assert not told.value.options
+
+
+@pytest.mark.parametrize(
+    ("stage", "parameters", "plugins", "said"),
+    [
+        ("track", {"tracker": "deepsort"}, {}, "tracker deepsort made it, which this version does not have"),
+        ("sample", {}, {"transform": Plugin("own:A", "own:A", "own", "1")}, r"sample own:A \(own 1\) made it; run it again"),
+        ("predict", {"predictor": "own:Standing"}, {}, "own:Standing made it, and a class without an entry point"),
+    ],
+)  # fmt: skip
+def test_a_channel_of_an_unknown_class_is_not_made_again(place, stage, parameters, plugins, said):
+    with pytest.raises(mcaptrack.McaptrackError, match=said):
+        rebuild(STAGES[stage], Provenance(stage, parameters, plugins=plugins), {})
+
+
+def test_another_version_of_a_class_that_is_named_is_a_warning(place):
+    text = MODULE + "\n@dataclass(frozen=True, kw_only=True)\nclass Hidden(Single): ...\n"
+    install(text=text)
+    words = ("--tracker", "own:Hidden")
+    assert "other-version" not in codes("track", "a.mcap", *words)
+    install("2.0", text)
+    assert "other-version" in codes("run", "a.mcap", "--no-tables", "--force", *words)
+
+
+def test_help_reads_no_file_of_settings(place):
+    (place / "mcaptrack.toml").write_text("[track")
+    assert call("track", "a.mcap").code == 2
+    assert call("track", "--help").code == 0
+    assert call("track", "--tracker", "single", "--help").code == 0
 
 
 def test_tune_names_a_tracker_that_fails(place):
@@ -520,6 +589,19 @@ def test_what_plugins_print_is_kept_apart_from_results(place):
     found = done("run", "a.mcap", "--no-tables", "--json", "-q")
     assert json.loads(found.out)
     assert "loaded" in found.err.split()
+
+
+def test_what_programs_of_plugins_print_is_kept_apart_from_results(place, capfd):
+    """Libraries in C and child processes write to the file descriptor."""
+    text = "import os\nos.write(1, b'loaded ')\n" + MODULE.replace(
+        "count = len(first)", "os.system('echo called'); count = len(first)"
+    )
+    install(text=text)
+    found = done("track", "a.mcap", "--tracker", "single", "--json", "-q")
+    assert json.loads(found.out)
+    out, err = capfd.readouterr()
+    assert out == ""
+    assert {"loaded", "called"} <= set(err.split())
 
 
 @pytest.mark.parametrize(

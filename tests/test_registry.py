@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import pytest
 from mcaptrack import registry
 from mcaptrack.errors import McaptrackError
 from mcaptrack.predictors import NAMES
-from mcaptrack.registry import BUILT_IN, KINDS, entry_of, find, names
+from mcaptrack.registry import BUILT_IN, KINDS, blamed, entry_of, find, names
 from mcaptrack.transforms import STAGES, ByteTrack, Sort
 from tests.distributions import package
 
@@ -91,6 +92,51 @@ def test_module_and_class_is_found_also_in_the_working_folder(tmp_path, monkeypa
     del sys.modules["beside_it"]
 
 
+def test_installed_modules_are_searched_before_the_working_folder(installed, tmp_path, monkeypatch):
+    (tmp_path / "own_trackers.py").write_text("class Nearest: ...")
+    monkeypatch.chdir(tmp_path)
+    entry = find("tracker", "own_trackers:Nearest")
+    assert (entry.cls().gain, entry.distribution, entry.version) == (2.0, "own-trackers", "1.5")
+
+
+def test_a_search_leaves_the_working_folder_where_it_was_on_the_path(monkeypatch):
+    monkeypatch.setattr(sys, "path", ["", *sys.path])
+    before = list(sys.path)
+    find("tracker", "mcaptrack.transforms:Sort")
+    assert sys.path == before
+
+
+def test_the_first_of_two_copies_of_a_package_is_the_one_that_is_imported(installed, tmp_path, monkeypatch):
+    (tmp_path / "later").mkdir()
+    package(tmp_path / "later", "own_trackers", "1.0", "mcaptrack.trackers", {"nearest": "own_trackers:Nearest"})
+    monkeypatch.setattr(sys, "path", [*sys.path, str(tmp_path / "later")])
+    assert find("tracker", "nearest").version == "1.5"
+
+
+def test_a_package_that_is_installed_later_is_known(installed):
+    (installed / "fresh.py").write_text(PLUGIN)
+    assert registry.distribution_of("fresh") == ("", "")
+    package(installed, "fresh", "3", "mcaptrack.trackers", {})
+    assert registry.distribution_of("fresh.part") == ("fresh", "3")
+
+
+def test_an_entry_point_may_name_extras(installed):
+    package(installed, "other", "2", "mcaptrack.trackers", {"extra": "own_trackers:Nearest [gpu]"})
+    assert find("tracker", "extra").cls is find("tracker", "nearest").cls
+
+
+def test_an_exception_that_cannot_be_printed_is_named_by_its_type(installed):
+    class Silent(Exception):
+        def __str__(self) -> str:
+            raise ValueError
+
+    with (
+        pytest.raises(McaptrackError, match=r"nearest \(own-trackers 1.5\) failed: Silent \("),
+        blamed(find("tracker", "nearest"), "failed"),
+    ):
+        raise Silent
+
+
 def test_a_class_that_inherits_from_a_built_in_one_is_another(monkeypatch):
     class Sort(ByteTrack):
         pass
@@ -104,12 +150,104 @@ def test_built_in_names_cannot_be_taken(installed):
     package(installed, "thief", "1", "mcaptrack.trackers", {"sort": "own_trackers:Nearest"})
     assert names("tracker").count("sort") == 1
     assert find("tracker", "sort").cls is Sort
+    (installed / "own_trackers" / "__init__.py").write_text("class Thief: ...")
+    package(installed, "another", "1", "mcaptrack.trackers", {"ocsort": "own_trackers:Thief"})
+    assert entry_of("tracker", find("tracker", "own_trackers:Thief").cls).name == "own_trackers:Thief"
 
 
-def test_two_packages_of_one_name_are_refused(installed):
+def test_two_packages_of_one_name_are_refused_unless_one_of_them_is_named(installed):
     package(installed, "other", "2", "mcaptrack.trackers", {"nearest": "elsewhere:Nearest"})
-    with pytest.raises(McaptrackError, match=r"several installed packages have a tracker nearest: elsewhere:Nearest"):
+    for distribution in ("", "third"):
+        with pytest.raises(
+            McaptrackError, match=r"several installed packages have a tracker nearest: elsewhere:Nearest"
+        ):
+            find("tracker", "nearest", distribution)
+    assert find("tracker", "nearest", "own-trackers").implementation == "own_trackers:Nearest"
+    assert STAGES["track"].find("nearest", "own-trackers").distribution == "own-trackers"
+
+
+GOOD = "Metadata-Version: 2.1\nName: broken\nVersion: 1\n"
+POINT = b"[mcaptrack.trackers]\nodd = own_trackers:Nearest\n"
+
+
+@pytest.mark.parametrize(
+    ("metadata", "points"),
+    [
+        (GOOD, b"[mcaptrack.trackers]\nodd\n"),
+        (GOOD, b"[other]\nodd\n"),
+        (GOOD, b"[mcaptrack.trackers]\nodd\xff = a:B\n"),
+        (GOOD, b"no section"),
+    ],
+)
+def test_damaged_entry_points_of_another_package_harm_nothing_and_are_named_where_a_name_is_missing(
+    installed, metadata, points
+):
+    info = installed / "broken-1.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text(metadata)
+    (info / "entry_points.txt").write_bytes(points)
+    assert names("tracker") == ("sort", "bytetrack", "ocsort", "nearest")
+    entry = find("tracker", "nearest")
+    assert entry_of("tracker", entry.cls) == entry
+    with pytest.raises(McaptrackError, match="no tracker is called nosuch") as refused:
+        find("tracker", "nosuch")
+    assert "The entry points of broken can't be read" in str(refused.value) or points == b"no section"
+
+
+@pytest.mark.parametrize(
+    ("metadata", "of"),
+    [
+        (None, ("", "")),
+        ("", ("", "")),
+        ("Metadata-Version: 2.1\nName: broken\n", ("broken", "")),
+        ("Metadata-Version: 2.1\nVersion: 1\n", ("", "1")),
+    ],
+)
+def test_an_entry_point_of_a_package_without_name_or_version_is_found(installed, metadata, of):
+    info = installed / "broken-1.dist-info"
+    info.mkdir()
+    if metadata is not None:
+        (info / "METADATA").write_text(metadata)
+    (info / "entry_points.txt").write_bytes(POINT)
+    entry = find("tracker", "odd")
+    assert (entry.distribution, entry.version) == of
+    assert str(entry).startswith("tracker odd")
+    assert find("tracker", "nearest").distribution == "own-trackers"
+
+
+def test_names_with_a_colon_are_those_of_classes(installed):
+    """Such an entry point can't be named, so it isn't offered."""
+    package(installed, "other", "2", "mcaptrack.trackers", {"own:x": "own_trackers:Nearest"})
+    assert "own:x" not in names("tracker")
+
+
+@pytest.mark.parametrize("code", [0, 1, 200, 255, "word", None])
+def test_an_exit_in_the_code_of_a_package_is_no_signal(installed, code):
+    (installed / "own_trackers" / "__init__.py").write_text(f"raise SystemExit({code!r})")
+    with pytest.raises(McaptrackError, match=r"nearest \(own-trackers 1.5\) can't be imported: SystemExit"):
         find("tracker", "nearest")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_an_exit_by_a_signal_passes(installed, number):
+    (installed / "own_trackers" / "__init__.py").write_text(f"raise SystemExit({128 + number})")
+    with pytest.raises(SystemExit):
+        find("tracker", "nearest")
+
+
+def test_the_place_of_a_failure_is_named_also_below_a_folder_called_mcaptrack(tmp_path, monkeypatch):
+    """As of an environment in a checkout of the repository."""
+    folder = tmp_path / "mcaptrack" / "site"
+    folder.mkdir(parents=True)
+    (folder / "deep_tracker.py").write_text("def fail():\n    raise ValueError('deep')\n")
+    monkeypatch.syspath_prepend(str(folder))
+    entry = find("tracker", "deep_tracker:fail")
+    with (
+        pytest.raises(McaptrackError, match=r"failed: ValueError: deep \(deep_tracker.py, line 2\)"),
+        blamed(entry, "failed"),
+    ):
+        entry.cls()
+    del sys.modules["deep_tracker"]
 
 
 @pytest.mark.parametrize(
@@ -149,6 +287,11 @@ def test_what_cannot_be_found_is_said_in_one_line(installed, text, name, said):
         (PLUGIN.replace('{"": TRACKS}', "TRACKS"), "writes nothing"),
         (PLUGIN.replace("__call__", "call"), "can't be called with frames"),
         (PLUGIN.replace("gain: float", "gain: dict"), "Nearest.gain is a dict; a parameter is a float"),
+        (
+            PLUGIN.replace("    reads:", '    colour: ClassVar = "blue"\n    reads:'),
+            "its class attribute colour is one of bgr, grey",
+        ),
+        (PLUGIN.replace("    reads:", "    passes: ClassVar = 3\n    reads:"), "its class attribute passes is 1 or 2"),
         (PLUGIN.replace("gain: float", "tracker: float"), "a parameter can't have the name of the option `tracker=`"),
         (
             PLUGIN.replace('gain: float = option(2.0, "how much", least=0.0)', "gain: float"),

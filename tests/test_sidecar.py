@@ -83,7 +83,7 @@ def test_results_of_an_earlier_log_are_not_taken_for_those_of_a_new_one(path, tm
     assert sorted(our_messages(path)) == ["a", "b", "c", "new"]
 
 
-def test_all_stages_run_beside_a_log_that_nobody_may_write_to(fresh, tmp_path):
+def test_all_stages_run_beside_a_log_that_is_read_only(fresh, tmp_path):
     before = fresh.read_bytes()
     os.chmod(fresh, 0o444)
     if not os.access(fresh, os.W_OK):  # whoever is root may write to anything

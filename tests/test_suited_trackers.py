@@ -79,7 +79,7 @@ def test_a_detector_that_names_none_gets_the_usual_one(log):
     assert run(log, detector=Plain()) == ("sort", [])
 
 
-def test_who_only_detected_before_gets_the_suited_one_too(log):
+def test_a_log_with_detections_alone_gets_the_suited_tracker_too(log):
     mcaptrack.detect(log, detector="knn")
     assert run(log)[0] == "sort"
     assert run(log, detector=Choosy())[0] == "ocsort"

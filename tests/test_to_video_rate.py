@@ -86,14 +86,14 @@ def test_boxes_of_a_false_track_are_left_out():
     assert all(set(f) == {1} for f in out)
 
 
-def test_nobody_re_tracked_nobody_shown_and_every_frame_there():
+def test_without_re_tracked_tracks_every_frame_is_there_without_rows():
     assert full([{7: 0.0}] * 4, [{}]) == [{}] * 4
     assert to_video_rate([], [], ()) == []
 
 
 @given(seed=st.integers(0, 2**32 - 1))
 @settings(max_examples=25)
-def test_nobody_is_at_two_places_and_no_box_is_two_people(seed):
+def test_no_id_is_at_two_places_and_no_box_has_two_ids(seed):
     rng = np.random.default_rng(seed)
     tracks = [{int(i): float(i) for i in range(5) if rng.random() < 0.7} for _ in range(20)]
     retracks = []

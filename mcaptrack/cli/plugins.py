@@ -8,9 +8,8 @@ has, all that installed packages declare as entry points.
 from __future__ import annotations
 
 import os
-import sys
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import nullcontext, redirect_stdout, suppress
+from contextlib import nullcontext, suppress
 from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any, Final
@@ -21,7 +20,7 @@ from typer.main import get_command
 from mcaptrack.cli import common
 from mcaptrack.cli.config import ConfigFile, read_files
 from mcaptrack.cli.stages import stage_command, stage_help
-from mcaptrack.cli.text import say
+from mcaptrack.cli.text import say, stdout_to_stderr
 from mcaptrack.environment import PREFIX
 from mcaptrack.errors import McaptrackError
 from mcaptrack.registry import BUILT_IN, names
@@ -44,7 +43,7 @@ def with_plugins(commands: Mapping[str, Any], words: Sequence[str]) -> dict[str,
         if not stage.option:
             continue
         try:
-            with redirect_stdout(sys.stderr):  # what modules print while they are imported
+            with stdout_to_stderr():
                 plugins = dict(_of_words(stage, words)) if called in (stage.name, "run") else {}
                 plugins |= _of_settings(stage, files, commands[stage.name].settings)
             plugins = {name: cls for name, cls in plugins.items() if cls is not stage.default}

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import redirect_stdout
 from typing import TYPE_CHECKING, Any
 
 from mcaptrack import notices
 from mcaptrack.cli import common
 from mcaptrack.cli.flags import with_flags
+from mcaptrack.cli.text import stdout_to_stderr
 from mcaptrack.errors import command
 
 if TYPE_CHECKING:
@@ -31,7 +30,7 @@ def run_on_logs(given: Mapping[str, Any], run: Run, *, shows_events: bool = Fals
         for path in paths:
             with talk.attempt(path, paths), notices.about(given["output"] or path):
                 names = ("camera", "output", "sidecar", "force")
-                with redirect_stdout(sys.stderr):  # what plug-ins print: stdout is for results
+                with stdout_to_stderr():
                     result = run(path, **{name: given[name] for name in names}, progress=talk.progress)
                 results.append(_as_json(result))
                 _print(result, shows_events, talk)

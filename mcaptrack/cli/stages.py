@@ -5,10 +5,8 @@ from __future__ import annotations
 import inspect
 import math
 import re
-import sys
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import redirect_stdout
 from dataclasses import MISSING, Field, fields, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -19,7 +17,7 @@ import typer
 from mcaptrack.cli import common
 from mcaptrack.cli.command import is_on_command_line, settings_of
 from mcaptrack.cli.running import run_on_logs
-from mcaptrack.cli.text import say
+from mcaptrack.cli.text import say, stdout_to_stderr
 from mcaptrack.errors import McaptrackError
 from mcaptrack.registry import BUILT_IN, Kind, names
 from mcaptrack.transforms import STAGES, Stage, Transform
@@ -215,7 +213,7 @@ def stage_command(stage: Stage, plugins: Mapping[str, type[Transform]] = Mapping
 
     def command(**given: Any) -> None:
         wanted = {option: given[option] for option in owners if given[option] is not None}
-        with redirect_stdout(sys.stderr):  # what plug-ins print: stdout is for results
+        with stdout_to_stderr():
             transform = _transform(stage, given, wanted, owners)
 
         def run(path: Path, **where: Any) -> RunResult:

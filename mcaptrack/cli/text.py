@@ -6,7 +6,10 @@ don't.
 
 from __future__ import annotations
 
+import os
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, redirect_stdout
 from typing import TYPE_CHECKING, Any, Final, NoReturn
 
 import typer
@@ -17,6 +20,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 WRONG_USAGE: Final = 2
+_STDOUT, _STDERR = 1, 2
 #: Width of output that is not a terminal: lines are not broken, so that they can be searched.
 _UNBROKEN: Final = 100_000
 
@@ -40,6 +44,23 @@ def show(*lines: str) -> None:
 def say(line: str) -> None:
     """Print a line to stderr: a note, a warning or an error."""
     print(printable(with_flags(line)), file=sys.stderr)
+
+
+@contextmanager
+def stdout_to_stderr() -> Iterator[None]:
+    """Send to stderr what plug-ins print, also their libraries and child processes: stdout is for results."""
+    with redirect_stdout(sys.stderr):
+        try:
+            results = os.dup(_STDOUT)
+            os.dup2(_STDERR, _STDOUT)
+        except OSError:  # one of them is closed
+            yield
+            return
+        try:
+            yield
+        finally:
+            os.dup2(results, _STDOUT)
+            os.close(results)
 
 
 def refuse_usage(line: str) -> NoReturn:

@@ -12,7 +12,7 @@ from mcaptrack.cli.command import warn_unused
 from mcaptrack.cli.config import NAME, read_toml, write_settings
 from mcaptrack.cli.settings import old_names
 from mcaptrack.cli.stages import chooser
-from mcaptrack.cli.text import console, show
+from mcaptrack.cli.text import console, show, stdout_to_stderr
 from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import DETECTIONS
 from mcaptrack.transforms import STAGES
@@ -117,27 +117,28 @@ def tune(
     which = tracker.replace(":", ".") if is_tracker else stage
     with common.Talk(quiet, verbose).open() as talk:
         read_toml(output)  # a file that can't be edited is refused before the search
-        done = mcaptrack.tune(
-            common.expand(inputs),
-            truth=common.expand(truth) if truth else None,
-            stage=stage,
-            tracker=tracker if is_tracker else None,
-            metric=metric,
-            trials=trials,
-            search=ranges,
-            seed=seed,
-            study=study or output.with_name(f"{output.stem}.{which}.trials.jsonl"),
-            similarity=similarity,
-            gate_m=gate_m,
-            min_iou=min_iou,
-            fps=fps,
-            ground_plane=ground_plane,
-            point=point,
-            topic=topic,
-            camera=camera,
-            force=force,
-            progress=talk.progress,
-        )
+        with stdout_to_stderr():
+            done = mcaptrack.tune(
+                common.expand(inputs),
+                truth=common.expand(truth) if truth else None,
+                stage=stage,
+                tracker=tracker if is_tracker else None,
+                metric=metric,
+                trials=trials,
+                search=ranges,
+                seed=seed,
+                study=study or output.with_name(f"{output.stem}.{which}.trials.jsonl"),
+                similarity=similarity,
+                gate_m=gate_m,
+                min_iou=min_iou,
+                fps=fps,
+                ground_plane=ground_plane,
+                point=point,
+                topic=topic,
+                camera=camera,
+                force=force,
+                progress=talk.progress,
+            )
         if truth:
             warn_unused("files of detections are of no camera", "camera", "topic")
             if ground_plane is None:

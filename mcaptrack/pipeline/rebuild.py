@@ -6,7 +6,7 @@ the user, too: a log must not be able to run code.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import fields
 from typing import Any, get_type_hints
 
@@ -58,14 +58,15 @@ def rebuild(stage: Stage, made: Provenance, known: Mapping[str, Transform]) -> T
     if plugin:
         named = {name for other in known.values() if isinstance(name := getattr(other, "predictor", None), str)}
         if plugin.name not in named:
-            _installed("predictor", plugin)
+            _installed("predictor", plugin, find)
     cls = stage.with_part(cls, parameters.get(stage.parameter))
     types = {f.name: f for f in fields(cls)}
     renamed = {was: name for name, f in types.items() if (was := f.metadata.get("was"))}
     parameters = {renamed.get(name, name): value for name, value in parameters.items()}
     unknown = sorted(set(parameters) - set(types))
     if unknown:
-        raise McaptrackError(f"it was made with {', '.join(unknown)}, which {cls.__name__} does not have")
+        name = stage.entry(cls) if "transform" in made.plugins else cls.__name__
+        raise McaptrackError(f"it was made with {', '.join(unknown)}, which {name} does not have")
     hints = get_type_hints(cls)
     values = {
         name: tuple(value) if isinstance(value, list) and member_type(hints[name])[1] else value
@@ -107,12 +108,19 @@ def _class_of(
         raise MissingPluginError(
             f"{_name_with_package(stage.name, plugin)} made it; run it again from Python, with that class"
         )
-    cls: type[Transform] = stage.find(_installed(stage.kind, plugin).name).cls
+    cls: type[Transform] = _installed(
+        stage.kind,
+        plugin,
+        lambda _, name: stage.find(name, plugin.distribution),  # of two packages the one that made it
+    ).cls
     return cls
 
 
-def _installed(kind: Any, plugin: Plugin) -> Entry:
-    """Return the registry's entry for a plug-in. Raises MissingPluginError if it may not or can't be imported."""
+def _installed(kind: Any, plugin: Plugin, find: Callable[[Any, str], Entry]) -> Entry:
+    """Return the registry's entry for a plug-in. Raises MissingPluginError if it may not or can't be imported.
+
+    ``find`` finds an entry by its kind and name.
+    """
     named = _name_with_package(kind, plugin)
     if ":" in plugin.name:
         if plugin.name.startswith("__main__:") or "<locals>" in plugin.name:  # of a script, a notebook or a function
@@ -127,7 +135,10 @@ def _installed(kind: Any, plugin: Plugin) -> Entry:
         raise MissingPluginError(
             f"{named} made it, which is not installed; install {package}, or replace it with another `{kind}=`"
         )
-    entry = find(kind, plugin.name)
+    try:
+        entry = find(kind, plugin.name)
+    except McaptrackError as error:
+        raise MissingPluginError(f"{named} made it; {error}. Or replace it with another `{kind}=`") from None
     if entry.distribution != plugin.distribution:
         raise MissingPluginError(
             f"{named} made it; the {kind} of that name is now that of {entry.distribution or 'mcaptrack'}. Install "

@@ -102,15 +102,17 @@ class Stage:
             return {self.name: self.default}
         return {name: find(self.kind, name).cls for name in BUILT_IN[self.kind]}
 
-    def find(self, name: str) -> Entry:
+    def find(self, name: str, distribution: str = "") -> Entry:
         """Find a transform of this stage by name (see ``mcaptrack.registry``).
+
+        ``distribution`` is the package to take if several have an entry point of this name.
 
         Raises McaptrackError if there is none, or if it can't be a transform of this stage.
         """
         if self.kind is None:
             raise McaptrackError(f"{self.name} has one transform only, which can't be replaced by {name}")
         own, file = self.split(name)
-        entry = find(self.kind, own)
+        entry = find(self.kind, own, distribution)
         if not entry.is_built_in:
             self._check(entry)
         if file is not None and _FILE not in {f.name for f in fields(entry.cls)}:
