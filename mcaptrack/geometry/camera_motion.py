@@ -324,7 +324,7 @@ def _similarity(points: Points, there: Points, weight: Floats) -> Floats:
 
 
 def _at_rest(then: Points, there: Points, fitted: Floats) -> int | None:
-    """How many features (N, 2) are where they were, if the scene is at rest; None if it moves as was fitted (2, 3)."""
+    """The number of features (N, 2) at rest, if the scene is; None if it moves as was fitted (2, 3)."""
     rest, off = _apart(then, there), _apart(move_points(fitted, then.astype(float)), there)
     at_rest = int(np.count_nonzero(rest < _AT_REST_PX))
     if at_rest >= _REST_SHARE * len(then) and at_rest >= _REST_RATIO * np.count_nonzero(off < _AT_REST_PX):
@@ -336,7 +336,7 @@ def _at_rest(then: Points, there: Points, fitted: Floats) -> int | None:
 
 
 def _apart(points: Floats | Points, there: Points) -> Floats:
-    """How far points (N, 2) are from where they should be (N, 2)."""
+    """The distances of points (N, 2) from their expected positions (N, 2)."""
     return np.asarray(np.hypot(*(points - there).T), np.float64)
 
 
@@ -351,7 +351,7 @@ def _in_light_of(first: _Picture, second: _Picture) -> Image:
 
 
 def _correlation(first: _Picture, second: _Picture) -> float:
-    """How the small copies of two pictures of one size correlate, from -1 to 1."""
+    """The correlation of the small copies of two pictures of one size, from -1 to 1."""
     a, b = (one.copy - one.copy.mean() for one in (first, second))
     scale = float(np.sqrt((a * a).sum() * (b * b).sum()))
     return float((a * b).sum()) / scale if scale > 0 else float(not a.any() and not b.any())

@@ -132,7 +132,7 @@ def poses_of(motions: Floats, width_px: float, height_px: float) -> list[CameraP
 
 
 def verdict_of(verdicts: NDArray[np.integer], elsewhere: Bools) -> Verdict:
-    """What a camera does on the whole, by its verdicts (F,) and where it looks (F,): it is moving, shaking or still.
+    """The state of a camera over a whole log, by its verdicts (F,) and views (F,): moving, shaking or still.
 
     It moves, too, if it has come to look elsewhere so slowly, or so long ago, that it seems to shake or to stand there.
     Cuts and lost pictures don't count.

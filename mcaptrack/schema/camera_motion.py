@@ -47,7 +47,7 @@ def frames_to_path(frames: Sequence[Frame]) -> CameraPath:
 
 
 def rows_to_verdict(rows: Rows) -> Verdict:
-    """What a camera does on the whole, by the rows (F,) of all its messages."""
+    """The state of a camera over a whole log, by the rows (F,) of all its messages."""
     return verdict_of(rows["verdict"], _elsewhere(rows))
 
 
