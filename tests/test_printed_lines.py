@@ -127,9 +127,9 @@ def test_the_next_command_depends_on_what_there_is(changed, steps):
 
 def printed_lines(made: RunResult, shows_events: bool = False, **talk: bool) -> list[str]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("sys.stderr", io.StringIO())
+        patch.setattr("sys.stderr", printed := io.StringIO())
         running._print(made, shows_events, common.Talk(**{"quiet": False, "verbose": False} | talk))
-        return running.sys.stderr.getvalue().splitlines()
+        return printed.getvalue().splitlines()
 
 
 def test_the_result_of_stages_has_a_line_for_each_channel_below_each_other():

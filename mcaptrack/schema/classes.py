@@ -42,7 +42,7 @@ def class_names(metadata: Mapping[str, str]) -> dict[int, str]:
 
 
 def class_name(number: int, names: Mapping[int, str]) -> str:
-    """How a class is called in texts: by its name, or by its number if it has none."""
+    """The name of a class in texts: its own, or its number if it has none."""
     return names.get(number, "of unknown class" if number == UNKNOWN else f"class {number}")
 
 
