@@ -5,10 +5,12 @@ from __future__ import annotations
 import sqlite3
 import struct
 from collections import Counter
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
 import pytest
+import zstandard
 from mcap.reader import make_reader
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
@@ -23,6 +25,8 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import GROUND_PLANE, TRACKS
 from mcaptrack.schema.ground_plane import rows_to_plane
 from mcaptrack.sources.ingest import IngestOptions, ingest
+from mcaptrack.sources.ingest.bags import rosbag2
+from mcaptrack.sources.ingest.bags.sqlite_tables import SqliteTables
 from tests.bags import MOT, ROS1, ROS2, STRING1, T0, bag1, bag2, camera_bag, database
 from tests.commands import call
 from tests.worlds import write_clip
@@ -559,3 +563,32 @@ def test_real_recordings_are_kept_whole(data, tmp_path):
         assert report.lost == []
         seen += 1
     assert seen >= 10
+
+
+@pytest.mark.parametrize(("left", "most"), [(1000, 2000), (2000, 1000)])
+def test_a_packed_message_is_within_what_is_left_and_within_the_limit_of_one(left, most, monkeypatch):
+    monkeypatch.setattr(rosbag2, "_MAX_MESSAGE_BYTES", most)
+    pack = zstandard.ZstdCompressor().compress
+    assert rosbag2._unpack_message(pack(bytes(1000)), Path("a"), 7, left) == bytes(1000)
+    with pytest.raises(McaptrackError, match="a: the message at 7 ns can't be decompressed: it says that it has 1001 "):
+        rosbag2._unpack_message(pack(bytes(1001)), Path("a"), 7, left)
+
+
+def test_a_database_may_run_nothing_of_its_own(tmp_path, monkeypatch):
+    """Where Python can say so to SQLite, which it can from 3.12 on."""
+    told = {}
+
+    class Database(sqlite3.Connection):
+        def setconfig(self, what, enable=True):
+            told[what] = enable
+
+    names = {"DEFENSIVE": 1010, "ENABLE_TRIGGER": 1003, "ENABLE_VIEW": 1015}
+    for name, number in names.items():
+        monkeypatch.setattr(sqlite3, f"SQLITE_DBCONFIG_{name}", number, raising=False)
+    connect = sqlite3.connect
+    monkeypatch.setattr(sqlite3, "connect", lambda *some, **more: connect(*some, **more, factory=Database))
+    with closing(connect(tmp_path / "a.db3")) as made:
+        made.execute("create table topics (id integer)")
+    with closing(SqliteTables(tmp_path / "a.db3", ["topics"])) as tables:
+        assert tables.count("topics") == 0
+    assert told == {1010: True, 1003: False, 1015: False}

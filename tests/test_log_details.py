@@ -11,17 +11,19 @@ from pathlib import Path
 import pytest
 from mcap.opcode import Opcode as StockOpcode
 from mcap.reader import make_reader
-from mcap.stream_reader import StreamReader
+from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import IndexType, Writer
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.log import records
+from mcaptrack.log.byte_source import ByteSource, OpenFile
+from mcaptrack.log.index import read_index
 from mcaptrack.log.records import Opcode
 from mcaptrack.log.writer import _free_id
 from mcaptrack.schema.provenance import Provenance
 from tests.commands import done
-from tests.logs import FORTY, SCHEMA, write_stock
+from tests.logs import FORTY, SCHEMA, SOME, STOCK_OPTIONS, our_messages, write_stock
 
 MIB = 2**20
 
@@ -313,3 +315,53 @@ def test_a_new_channel_gets_the_next_number_and_then_the_lowest_that_is_free(tak
 def test_a_log_has_65535_numbers():
     with pytest.raises(McaptrackError, match=r"^there are 65535 schemas already; a log holds no more$"):
         _free_id(dict.fromkeys(range(1, 2**16)), 7, "schemas")
+
+
+@pytest.mark.parametrize("options", STOCK_OPTIONS.values(), ids=STOCK_OPTIONS)
+def test_a_log_without_a_summary_has_the_times_and_counts_of_its_messages(options, tmp_path):
+    write_stock(tmp_path / "a.mcap", SOME, **options)
+    data = (tmp_path / "a.mcap").read_bytes()
+    (start,) = struct.unpack_from("<Q", data, len(data) - 28)  # the footer: summary, offsets of it, checksum, magic
+    start = start or len(data) - 37
+    footer = b"\x02" + struct.pack("<QQQI", 20, 0, 0, 0) + data[-8:]
+    (tmp_path / "b.mcap").write_bytes(data[:start] + footer)
+    source = ByteSource.of(OpenFile.at(tmp_path / "b.mcap"))
+    index = read_index(source)
+    assert (index.start_ns, index.end_ns) == (5, 40)
+    assert {index.channels[number].topic: count for number, count in index.counts.items()} == {"a": 2, "b": 2, "c": 1}
+    assert [(one.start_ns, one.end_ns) for one in index.chunks] == [
+        (min(times), max(times))
+        for times in ([one.log_time for one in some] for some in chunks_of(tmp_path / "a.mcap"))
+    ]
+
+
+def chunks_of(path: Path) -> list[list]:
+    """The messages of each chunk, as the stock reader has them."""
+    with path.open("rb") as stream:
+        chunks = [one for one in StreamReader(stream, emit_chunks=True).records if type(one).__name__ == "Chunk"]
+    return [[one for one in breakup_chunk(chunk) if type(one).__name__ == "Message"] for chunk in chunks]
+
+
+def test_messages_far_apart_in_a_log_without_chunks_are_read(tmp_path):
+    """One by one, where more than 16 KiB of others are between them."""
+    some = [(topic, 10 * n, n, bytes([n]) * (n if topic == "a" else 40_000)) for n in range(6) for topic in "ab"]
+    write_stock(tmp_path / "a.mcap", some, use_chunking=False)
+    found = our_messages(tmp_path / "a.mcap")
+    for topic in "ab":
+        assert found[topic] == [(t_ns, sequence, data) for name, t_ns, sequence, data in some if name == topic]
+
+
+def test_records_one_after_the_other_are_read_once():
+    """A file is read in blocks; a record that is cut off by the end of a block is read again."""
+
+    class Read(bytes):
+        taken = 0
+
+        def __getitem__(self, which):
+            Read.taken += len(range(*which.indices(len(self))))
+            return memoryview(bytes.__getitem__(self, which))
+
+    data = Read(records.pack(Opcode.METADATA, bytes(91)) * 3000)
+    found = list(records.walk(data, 0, len(data)))
+    assert [record.start for record in found] == list(range(0, len(data), 100))
+    assert Read.taken < 1.02 * len(data)

@@ -155,6 +155,35 @@ class TestEncounters:
         course, _ = find_swaps(self.apart(slice(8, 15), 0.05), np.full((1, 40), 5.0), STEP_S, 0.05, 1.5)
         assert np.flatnonzero(course[0]).tolist() == list(range(8, 15))
 
+    @pytest.mark.parametrize(("turn", "drift"), [(0.0, 0.05), (0.4, 0.15), (0.9, 0.4)])
+    def test_the_gain_is_that_of_the_most_likely_drift(self, turn, drift):
+        """One walks around the other: the faster, the more their relative velocity drifts. By a filter for each path."""
+        angle = turn * STEP_S * np.arange(30)
+        away = np.stack([1.5 * np.cos(angle), 1.5 * np.sin(angle)], axis=-1)
+        away += np.random.default_rng(1).normal(0, 0.05, (30, 2))
+        away[12:] *= -1
+        course, gain = find_swaps(away[None], np.full((1, 30), 5.0), STEP_S, 0.05, 1.5)
+        assert np.flatnonzero(course[0]).tolist() == list(range(12, 30))
+        none = {one: self.log_likelihood(away, one) for one in (0.05, 0.15, 0.4)}
+        swapped = {one: self.log_likelihood(np.where(course[0][:, None], -away, away), one) for one in none}
+        assert max(swapped, key=swapped.get) == drift
+        assert gain[0] == pytest.approx(swapped[drift] - 5.0 - none[drift])
+
+    def log_likelihood(self, away: np.ndarray, drift: float) -> float:
+        """Of relative positions (T, 2) of two people with a measurement noise of 0.05 m each."""
+        move = np.array([[1, STEP_S], [0, 1]])
+        noise = drift**2 * np.array([[STEP_S**3 / 3, STEP_S**2 / 2], [STEP_S**2 / 2, STEP_S]])
+        mean, cov = np.stack([away[0], np.zeros(2)]), np.diag([2 * 0.05**2, 2 * 1.5**2])
+        total = 0.0
+        for at in away[1:]:
+            mean, cov = move @ mean, move @ cov @ move.T + noise
+            variance = cov[0, 0] + 2 * 0.05**2
+            off = at - mean[0]
+            total += -0.5 * float(off @ off) / variance - np.log(variance)
+            gain = cov[:, 0] / variance
+            mean, cov = mean + np.outer(gain, off), cov - np.outer(gain, cov[0])
+        return float(total)
+
     def test_without_a_swap_none_is_found(self):
         for seed in range(20):
             course, gain = find_swaps(self.apart(slice(0, 0), 0.1, seed), np.full((1, 40), 5.0), STEP_S, 0.1, 1.5)

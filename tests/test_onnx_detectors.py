@@ -20,6 +20,7 @@ from mcaptrack.testing import check_transform
 from mcaptrack.transforms import OnnxDetector
 from mcaptrack.transforms.detect.onnx import session
 from mcaptrack.transforms.detect.onnx.classes import COCO, names_of, numbers_of, wanted
+from mcaptrack.transforms.detect.onnx.layouts import LAYOUTS
 from tests import onnx_graphs
 from tests.commands import call, done
 from tests.onnx_graphs import FLOAT, INPUTS, INT64, REACH, blue_blocks, detector, field, model, node, tensor, value
@@ -117,6 +118,33 @@ class TestLayouts:
         found_by = OnnxDetector(file=str(network(data=data)), classes="all")
         assert boxes(found_by, PICTURE) == [[(5, 5, 4, 4), (64, 32, 32, 32)]]
         assert boxes(replace(found_by, max_iou=1.0), PICTURE) == [[(5, 5, 4, 4), (64, 32, 33, 32), (64, 32, 32, 32)]]
+
+    @pytest.mark.parametrize("layout", ["rtdetr", "dfine", "rfdetr"])
+    def test_networks_that_find_each_object_once_keep_boxes_that_overlap(self, network, layout):
+        """Two people, one behind the other, in shares of the picture by their centres or in its pixels."""
+        places, extents = [[0.5, 0.5, 0.25, 0.5], [0.5, 0.5, 0.25, 0.45]], [[60, 32, 100, 96], [60, 35.2, 100, 92.8]]
+        if layout == "rfdetr":
+            made = {"dets": tensor([places], "a"), "labels": tensor([[[2.0, -9.0]] * 2], "b")}
+            inputs = [value("x", [1, 3, 128, 160])]
+        else:
+            made = {"boxes": tensor([extents], "a"), "scores": tensor([[0.9, 0.8]], "b")}
+            made["labels"] = tensor([[0, 0]], "c", INT64)
+            inputs = [value("x", [1, 3, 128, 160]), value("orig_target_sizes", [1, 2], INT64)]
+        constants = dict(zip("abc", made.values(), strict=False))
+        nodes = [node("Identity", [one], [name]) for one, name in zip(constants, made, strict=True)]
+        kinds = {name: INT64 if (name, layout != "rfdetr") == ("labels", True) else FLOAT for name in made}
+        data = model(nodes, inputs, [value(name, None, kind) for name, kind in kinds.items()], constants)
+        found_by = OnnxDetector(file=str(network(data=data)), layout=layout, classes="all")
+        wanted = [(x1, y1, x2 - x1, y2 - y1) for x1, y1, x2, y2 in extents]
+        assert sorted(boxes(found_by, PICTURE)[0]) == [pytest.approx(one, abs=1e-3) for one in wanted]
+
+    @pytest.mark.parametrize("layout", [*INPUTS, "dfine"])
+    def test_pixels_become_what_the_authors_of_a_layout_trained_with(self, layout):
+        order, divide, mean, deviation = INPUTS["rtdetr" if layout == "dfine" else layout]
+        image = np.random.default_rng(1).integers(0, 256, (6, 8, 3)).astype(np.uint8)
+        channels = image if order == "bgr" else image[..., ::-1]
+        wanted = (channels / divide - np.array(mean)) / np.array(deviation)
+        np.testing.assert_allclose(LAYOUTS[layout].blob(image), wanted.transpose(2, 0, 1), rtol=1e-5, atol=1e-5)
 
     def test_classes_and_distances_in_outputs_of_their_own_are_put_together(self, network):
         picture = blue_blocks((512, 384), (224, 160, 32, 32))

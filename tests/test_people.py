@@ -295,6 +295,14 @@ class TestSeparating:
         assert gain == pytest.approx(float(gains.max()))
         assert gains[place[1], place[0]] == gains.max()
 
+    def test_the_share_that_has_to_be_seen_is_of_what_a_whole_person_gains(self):
+        """On average over pixels that are foreground as often as the shape says."""
+        whole = 0.0
+        for share in PERSON.template.astype(float).ravel().tolist():
+            whole += share * math.log((0.03 + 0.97 * share) / 0.03) + (1 - share) * math.log(1 - share)
+        for least in (0.25, 0.5):
+            assert Separator(PERSON, least)._least == pytest.approx(least * whole, rel=1e-4)
+
     def test_a_crop_has_its_margin_and_its_points(self):
         region = np.zeros((6, 8), bool)
         region[2:, 3:5] = True

@@ -800,3 +800,17 @@ def test_a_loss_by_re_tracking_is_said_with_its_scores(tmp_path):
     assert scores.by == "within 1 m"
     words = "re-tracking made it worse: IDF1 100.0% before, 50.0% after, against /camera/truth, within 1 m"
     assert [(one.message, one.code) for one in said] == [(words, "worse")]
+
+
+def test_an_error_of_a_stage_names_log_and_channel_once(tmp_path, monkeypatch):
+    frames = walk(lambda n: {1: (n * 0.1, 0.0)}, 5, 10.0)
+    path = written(tmp_path / "a.mcap", {"/camera/tracks": (TRACKS, Provenance(INGEST, {}, digest="x"), frames)})
+    for words, shown in (("no", f"{path}: /camera/tracks: no"), (f"{path} is odd", f"{path} is odd")):
+
+        def fail(*_, words=words):
+            raise McaptrackError(words)
+
+        monkeypatch.setattr(Sample, "__call__", fail)
+        with log.read(path) as opened, pytest.raises(McaptrackError) as error:
+            pipeline.run(opened, "/camera", pipeline.plan_stage(opened, "/camera", "sample", Sample()))
+        assert str(error.value) == shown

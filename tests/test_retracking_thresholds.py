@@ -15,7 +15,7 @@ from mcaptrack.schema import Frame
 from mcaptrack.transforms import PROFILES
 from mcaptrack.transforms.retrack.false_tracks import track_log_odds
 from mcaptrack.transforms.retrack.identity_swaps import find_encounters, resolve_swaps
-from mcaptrack.transforms.retrack.linking import link_tracks
+from mcaptrack.transforms.retrack.linking import candidates, link_tracks
 from mcaptrack.transforms.retrack.motion_model import MotionModel, smooth, to_trajectories
 from tests.references.offline import Motion, Path, encounters, exchanged, links, person_log_odds
 from tests.references.online import OnlineTracker
@@ -262,3 +262,16 @@ def test_the_input_id_0_counts_like_any_other():
         return ours_exchanged(paths, {3: names, 5: dict.fromkeys(range(50), 5)})
 
     assert edge(lambda near: is_undone(near, 0), 0.0, 1.49) == edge(lambda near: is_undone(near, 3), 0.0, 1.49)
+
+
+@pytest.mark.parametrize(
+    ("gap", "aside_m", "is_candidate"),
+    [(-1, 0, False), (0, 0, False), (1, 0, True), (50, 0, True), (51, 0, False), (2, 2.99, True), (2, 3.01, False)],
+)
+def test_a_link_leads_forward_in_time_and_no_farther_than_its_limits(gap, aside_m, is_candidate):
+    """Up to 20 s, which are 50 steps, and 1 m and 2.5 m for each second, which is 3 m in two steps."""
+    out, _ = laid_out({1: line(0, 15, (0, 0), (0, 0)), 2: line(14 + gap, 15, (0, aside_m), (0, 0))})
+    forward, backward, _ = smooth(MODEL, out, 0.4)
+    i, j, gap_s = candidates(out, forward, backward, 0.4, 20.0)
+    assert list(zip(i.tolist(), j.tolist(), strict=True)) == [(0, 1)] * is_candidate
+    assert gap_s.tolist() == pytest.approx([0.4 * gap] * is_candidate)

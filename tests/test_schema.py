@@ -18,6 +18,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mcaptrack.schema import DETECTIONS, EVENTS, PREDICTIONS, SCHEMAS, TRACKS
+from mcaptrack.schema.camera_motion import is_motion
 from mcaptrack.schema.codec import RowCodec
 from mcaptrack.schema.proto import KINDS, parse
 from mcaptrack.schema.provenance import Plugin, Provenance, digest
@@ -332,3 +333,19 @@ def test_a_digest_is_of_times_numbers_and_payloads():
     messages = [(1, 2, b"ab"), (3, 4, b"")]
     text = b"".join(struct.pack("<QQQ", t, n, len(data)) + data for t, n, data in messages)
     assert digest(messages) == hashlib.sha256(text).hexdigest()
+
+
+@pytest.mark.parametrize(
+    ("numbers", "is_one"),
+    [
+        ((1, 0, 5, 0, 1, -5), True),
+        ((2e-12, 0, 0, 0, 1, 0), True),
+        ((5e-13, 0, 0, 0, 1, 0), False),
+        ((0, -2e-12, 0, 1, 0, 0), True),
+        ((1, 2, 0, 2, 4, 0), False),
+        ((1, 0, np.nan, 0, 1, 0), False),
+        ((1, 0, 0, 0, 1, np.inf), False),
+    ],
+)
+def test_a_motion_of_a_camera_is_finite_and_can_be_inverted(numbers, is_one):
+    assert is_motion(np.array(numbers, float).reshape(2, 3)) is is_one

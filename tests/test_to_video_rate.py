@@ -5,11 +5,13 @@ from __future__ import annotations
 import json
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import TRACKS, Frame
-from mcaptrack.transforms.to_video_rate import to_video_rate
+from mcaptrack.transforms.to_video_rate import to_video_rate, unchanged_tracks
 from tests.commands import printed
 from tests.worlds import ns
 
@@ -119,3 +121,37 @@ def test_a_log_gets_them_beside_the_others(tmp_path):
     channels = {channel["topic"]: channel for channel in result["channels"]}
     assert channels["/camera/retracks/full"]["messages"] == channels["/camera/tracks"]["messages"] == 40
     assert not channels["/camera/retracks/full"]["stale"]
+
+
+def test_boxes_have_metres_by_the_plane_of_their_time():
+    """Beyond the last sample boxes are those of the tracker; half a metre to a pixel at first, then 2 m."""
+    half, two = (GroundPlane((scale, 0, 0, 0, scale, 0, 0, 0, 1), 640, 480) for scale in (0.5, 2.0))
+    planes = ((0, half), (ns(0.4), two))
+    tracks = [Frame(ns(n / 10), n, boxes({7: 0.1 * n, 8: 1.0})) for n in range(9)]
+    samples = [Frame(0, 0, named({1: (7, 0.0)})), Frame(ns(0.4), 4, named({2: (8, 1.0)}))]
+    rows = [{int(r["track_id"]): r for r in frame.rows} for frame in to_video_rate(tracks, samples, planes)]
+    assert [sorted(some) for some in rows] == [[1, 2]] * 7 + [[2]] * 2  # up to 1.5 times the 0.4 s between samples
+    for n in range(1, 7):
+        scale = 0.5 if n < 4 else 2.0
+        at = rows[n][1]
+        assert (at["x_m"], at["y_m"]) == (pytest.approx(scale * 2 * n), scale * 130)
+    for n in (1, 2, 3, 5, 8):
+        scale = 0.5 if n < 4 else 2.0
+        assert (rows[n][2]["x_m"], rows[n][2]["y_m"]) == (scale * 20, scale * 130)
+    assert (rows[0][1]["x_m"], rows[4][2]["x_m"]) == (0.0, 1.0)  # those of the samples
+    for frame, before in zip(unchanged_tracks(tracks, planes), tracks, strict=True):
+        scale = 0.5 if frame.index < 4 else 2.0
+        assert frame.rows["source_id"].tolist() == frame.rows["track_id"].tolist() == [7, 8]
+        np.testing.assert_allclose(frame.rows["x_m"], [scale * 2 * frame.index, scale * 20])
+        np.testing.assert_array_equal(frame.rows["y_m"], scale * 130)
+        assert np.isnan(before.rows["x_m"]).all()
+    known = unchanged_tracks(samples, planes)[1].rows
+    assert (known["x_m"].tolist(), known["y_m"].tolist()) == ([1.0], [0.0])
+    assert np.isnan(unchanged_tracks(tracks, ())[0].rows["x_m"]).all()
+
+
+def test_of_two_boxes_with_one_id_the_nearer_to_its_sample_is_taken():
+    tracks = [{7: 0.1 * n, 8: 0.1 * n + 0.05} for n in range(5)]
+    out = full(tracks, [{1: (7, 0.0)}, {1: (8, 0.4)}])
+    assert [frame[1][0] for frame in out] == [7, 7, out[2][1][0], 8, 8]
+    assert [len(frame) for frame in out] == [1] * 5
