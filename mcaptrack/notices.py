@@ -26,6 +26,7 @@ Code = Literal[
     "classes",
     "clock",
     "device",
+    "estimated-ground-plane",
     "extrapolated",
     "held-back",
     "journal",

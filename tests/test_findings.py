@@ -17,7 +17,7 @@ import pytest
 from mcaptrack import log, notices, pipeline
 from mcaptrack.errors import McaptrackError
 from mcaptrack.pipeline import findings
-from mcaptrack.pipeline.planes import guess_plane
+from mcaptrack.pipeline.planes import make_plane
 from mcaptrack.schema import DETECTIONS, TRACKS, VIDEO, Frame, Schema
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.transforms import TRANSFORMS, KnnDetector
@@ -190,18 +190,19 @@ def test_empty_results_are_explained_by_the_input_or_the_transform():
 # Without a ground plane
 
 
-def test_an_estimated_plane_covers_all_boxes_and_begins_with_the_first_frame():
+def test_a_guessed_scale_covers_all_boxes_and_begins_with_the_first_frame(path):
     boxes = {"x_px": [10.0, 300.0], "y_px": [20.0, 5.0], "w_px": [20.0, 40.4], "h_px": [34.0, 34.0]}
     rows = DETECTIONS.rows(**boxes, score=[1.0, 1.0], class_id=[1, 1])
     frames = [Frame(ns(3), 0, DETECTIONS.empty()), Frame(ns(4), 1, rows)]
-    planes, made = guess_plane(frames, "/camera/detections", "")
+    with log.read(path) as opened:
+        planes, made = make_plane(opened, "/other", frames, ("/other/detections", ""), {})
+        assert make_plane(opened, "/other", frames[:1], ("/other/detections", ""), {}) == (None, None)
     assert planes is not None
     assert made is not None
-    (((start, plane),), ((frame,), _)) = planes, made
+    (((start, plane),), (frame,)) = planes, made.frames
     assert (start, frame.t_ns) == (ns(3), ns(3))
     assert (plane.width_px, plane.height_px, plane.assumed) == (340, 54, True)
     assert plane.homography[0] == pytest.approx(1.7 / 34)  # people are 1.7 m high
-    assert guess_plane(frames[:1], "/camera/detections", "") == (None, None)
 
 
 def ingested(path: Path, rows: Iterable[str], *words: object) -> Path:

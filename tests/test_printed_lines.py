@@ -94,6 +94,10 @@ SUMMARIES: dict[str, tuple[Summary, list[str]]] = {
         Summary(ground_plane="assumed"),
         ["assumed: the scale of the ground, from the heights of boxes"],
     ),
+    "an estimated plane": (
+        Summary(ground_plane="estimated"),
+        ["estimated: the ground plane, from the boxes of people"],
+    ),
     "a given plane": (Summary(ground_plane="given"), []),
 }
 

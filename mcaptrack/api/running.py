@@ -17,7 +17,7 @@ from mcaptrack.api.common import Notes, PathLike, Progress, as_path, log_output,
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.files import is_same_file, publish_bytes, refuse_overwrite
 from mcaptrack.notices import Notice, warn
-from mcaptrack.pipeline import Job, Summary, Watch
+from mcaptrack.pipeline import AS_BEFORE, Job, PlaneChoice, Summary, Watch
 from mcaptrack.sources.ingest.sidecar import SidecarChoice
 from mcaptrack.tables.export import default_folder, export
 from mcaptrack.transforms import STAGES, Transform
@@ -100,7 +100,14 @@ class Where:
     force: bool
 
 
-def work(where: Where, plan: Plan, watch: Watch | None, progress: Progress, tables: bool | None) -> RunResult:
+def work(
+    where: Where,
+    plan: Plan,
+    watch: Watch | None,
+    progress: Progress,
+    tables: bool | None,
+    plane: PlaneChoice = AS_BEFORE,
+) -> RunResult:
     """Plan and run on one log. ``tables`` is None where a single stage runs, which neither exports nor summarises."""
     began = monotonic()
     path = as_path(where.log)
@@ -119,7 +126,7 @@ def work(where: Where, plan: Plan, watch: Watch | None, progress: Progress, tabl
                 opened.lock()  # a second process is refused before it computes anything
             topics = watch.topics if watch else ()
             prefix = pipeline.find_camera(opened, where.camera, where.topic or next(iter(topics), None))
-            report = pipeline.run(opened, prefix, plan(opened, prefix, notes.say), output, progress, watch)
+            report = pipeline.run(opened, prefix, plan(opened, prefix, notes.say), output, progress, watch, plane)
             written_to = output or opened.parts[-1].path
         layouts = [pipeline.layout_path(target, name) for name in report.layouts]
         for layout, content in zip(layouts, report.layouts.values(), strict=True):

@@ -11,12 +11,12 @@ from mcaptrack.api.common import PathLike, Progress, names_of, no_progress, warn
 from mcaptrack.api.running import RunResult, Where, transform_of, transforms_of, work
 from mcaptrack.evaluation.aligned import Similarity
 from mcaptrack.evaluation.events import EventOptions
-from mcaptrack.pipeline import Job, Watch
+from mcaptrack.pipeline import Job, PlaneChoice, Watch
 from mcaptrack.transforms import STAGES, Transform
 from mcaptrack.transforms.sort.tracker import CameraMotionUse
 
 
-@checked()
+@checked(person_height_m=(0.1, 10))
 def run(
     log: PathLike,
     *,
@@ -32,6 +32,8 @@ def run(
     retracker: str | Transform | None = None,
     predictor: str | Transform | None = None,
     camera_motion: CameraMotionUse | None = None,
+    estimate_plane: bool | None = None,
+    person_height_m: float | None = None,
     stages: Mapping[str, str | Transform] | None = None,
     progress: Progress = no_progress,
 ) -> RunResult:
@@ -65,6 +67,11 @@ def run(
     camera_motion : {"auto", "on", "off"}, optional
         Whether tracks are compensated for the motion of the camera: if it moves or has cuts, also if it only shakes,
         or never. By default as before, and "auto" where there are no tracks yet.
+    estimate_plane : bool, optional
+        Whether to estimate the ground plane from the boxes of a learned detector where none is given. By default as
+        before, and True where there is none yet.
+    person_height_m : float, optional
+        Mean height of people in metres, for a ground plane that is not given. By default as before, or 1.7.
     stages : mapping of str to str or Transform, optional
         Transforms, or their names, by stage, for channels that are missing; with ``force`` also for those that exist.
     progress : callable, optional
@@ -94,12 +101,14 @@ def run(
     transforms = transforms_of(stages)
     transforms |= {s.name: transform_of(s.name, chosen[s.option], {}) for s in STAGES.values() if s.option in chosen}
 
+    plane = PlaneChoice(estimate_plane, person_height_m)
+
     def plan(opened: logs.Log, prefix: str, say: Callable[[str], None]) -> list[Job]:
-        return pipeline.plan_all(opened, prefix, say, topic, transforms, force, chosen, camera_motion or "")
+        return pipeline.plan_all(opened, prefix, say, topic, transforms, force, chosen, camera_motion or "", plane)
 
     options = events if isinstance(events, EventOptions) else EventOptions()
     watch = Watch(options, force=force) if events else None
-    return work(Where(log, camera, topic, output, sidecar, force), plan, watch, progress, tables)
+    return work(Where(log, camera, topic, output, sidecar, force), plan, watch, progress, tables, plane)
 
 
 @checked(gate_m=(0.001, 1e6), min_iou=(0.001, 1))

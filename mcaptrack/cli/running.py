@@ -117,6 +117,8 @@ def _lines_of_summary(summary: Summary) -> Iterator[tuple[str, str]]:
         yield "camera", f"{summary.camera_motion}"
     if summary.ground_plane == "assumed":
         yield "assumed", "the scale of the ground, from the heights of boxes"
+    if summary.ground_plane == "estimated":
+        yield "estimated", "the ground plane, from the boxes of people"
 
 
 def _lines_of_stage(result: RunResult) -> Iterator[tuple[str, str]]:

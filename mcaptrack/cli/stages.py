@@ -320,6 +320,26 @@ def run_all(
             show_default="auto",
         ),
     ] = None,
+    estimate_plane: Annotated[
+        bool | None,
+        common.option(
+            "--estimate-plane/--no-estimate-plane",
+            tuning=True,
+            help="Where no ground plane is given, estimate one from the boxes of a learned detector.",
+            show_default="estimate",
+        ),
+    ] = None,
+    person_height_m: Annotated[
+        float | None,
+        common.option(
+            "--person-height-m",
+            tuning=True,
+            least=0.1,
+            most=10.0,
+            help="Mean height of people in metres, for a ground plane that is not given.",
+            show_default="1.7",
+        ),
+    ] = None,
 ) -> None:
     """Run all stages that are missing or out of date, then events, views and tables.
 
@@ -341,7 +361,7 @@ def run_all(
         from mcaptrack.evaluation.events import EventOptions
 
         settings, stages = settings_of("events"), _configured(chosen)
-        where["camera_motion"] = camera_motion
+        where |= {"camera_motion": camera_motion, "estimate_plane": estimate_plane, "person_height_m": person_height_m}
         for stage in STAGES.values():
             if stage.option in chosen:
                 where[stage.option] = stages.pop(stage.name)

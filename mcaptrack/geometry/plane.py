@@ -26,8 +26,9 @@ class GroundPlane:
     """A homography from pixels to metres, and which point of a box touches the ground.
 
     ``homography`` is row by row, 9 numbers: (x_m, y_m, 1) ~ H (x_px, y_px, 1). ``point`` is "foot", the middle of the
-    box's lower edge, or "center". ``assumed`` says that the scale was guessed. Raises McaptrackError if the homography
-    is not 9 finite numbers or is singular.
+    box's lower edge, or "center". ``assumed`` says that it was not measured but derived from the size of people in the
+    picture: a scale alone, or a plane that was estimated. Raises McaptrackError if the homography is not 9 finite
+    numbers or is singular.
     """
 
     homography: tuple[float, ...]
@@ -56,6 +57,11 @@ class GroundPlane:
         derivative = self.matrix[:2, :2] * w - np.outer([x, y], self.matrix[2, :2])
         size = float((derivative**2).sum())
         return size > 0 and abs(float(np.linalg.det(derivative))) > 1e-9 * size
+
+    @property
+    def is_estimated(self) -> bool:
+        """Whether the plane was estimated from boxes, with its perspective, and is more than a guessed scale."""
+        return self.assumed and any(self.homography[6:8])
 
     @cached_property
     def matrix(self) -> Floats:
@@ -155,8 +161,20 @@ def scene_planes(planes: Planes, path: CameraPath | None) -> Planes:
 
 
 def is_assumed(planes: Planes | None) -> bool:
-    """Whether there are planes and all of them were guessed."""
+    """Whether there are planes and none of them was measured: all are guessed or estimated."""
     return planes is not None and len(planes) > 0 and all(plane.assumed for _, plane in planes)
+
+
+def is_estimated(planes: Planes | None) -> bool:
+    """Whether there are planes and all of them were estimated from boxes."""
+    return planes is not None and len(planes) > 0 and all(plane.is_estimated for _, plane in planes)
+
+
+def origin_of(planes: Planes) -> Literal["given", "estimated", "assumed"]:
+    """Where the planes of a camera are from: measured, estimated from boxes, or a scale that was assumed."""
+    if not is_assumed(planes):
+        return "given"
+    return "estimated" if is_estimated(planes) else "assumed"
 
 
 #: If the ground is less deep in the picture than this, one scale can't be right for all of it (see ``ground_depth``).
@@ -177,8 +195,8 @@ def ground_depth(xywh: Floats) -> float:
     return float((high - low) / np.quantile(xywh[:, 3], 0.95))
 
 
-def assumed_plane(heights_px: Floats, width_px: int, height_px: int) -> GroundPlane:
-    """A plane for a scene without calibration: the image itself, scaled so that the median box is as high as a person.
+def assumed_plane(heights_px: Floats, width_px: int, height_px: int, person_m: float = PERSON_HEIGHT_M) -> GroundPlane:
+    """A plane for a scene without calibration: the image itself, scaled so that the median box is ``person_m`` high.
 
     The origin is the middle of the image and the second axis points up. Distances are right only for a camera that
     looks straight down or from far away; the plane is marked as ``assumed``. Raises McaptrackError if there is no
@@ -187,6 +205,6 @@ def assumed_plane(heights_px: Floats, width_px: int, height_px: int) -> GroundPl
     heights = heights_px[np.isfinite(heights_px) & (heights_px > 0)]
     if len(heights) == 0:
         raise McaptrackError("there are no boxes to guess a scale from; give a ground plane")
-    scale = PERSON_HEIGHT_M / float(np.median(heights))
+    scale = person_m / float(np.median(heights))
     homography = (scale, 0.0, -scale * width_px / 2, 0.0, -scale, scale * height_px / 2, 0.0, 0.0, 1.0)
     return GroundPlane(homography, width_px, height_px, assumed=True)

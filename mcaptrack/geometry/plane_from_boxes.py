@@ -76,12 +76,9 @@ class FittedCamera(NamedTuple):
 
     def axes(self) -> Floats:
         """To the right, away from the camera, and down, in its own axes: (3, 3), one a row."""
-        (sin, cos), (sine, cosine) = (
-            (np.sin(self.roll_rad), np.cos(self.roll_rad)),
-            (np.sin(self.pitch_rad), np.cos(self.pitch_rad)),
-        )
-        down = np.array([sin * cosine, cos * cosine, sine])
-        away = np.array([-sin * sine, -cos * sine, cosine])
+        turn = np.array([np.sin(self.roll_rad), np.cos(self.roll_rad)])  # where down is in the picture
+        down = np.array([*(np.cos(self.pitch_rad) * turn), np.sin(self.pitch_rad)])
+        away = np.array([*(-np.sin(self.pitch_rad) * turn), np.cos(self.pitch_rad)])
         return np.stack([np.cross(down, away), away, down])
 
     def expected_heights(self, feet: Floats) -> Floats:
@@ -102,7 +99,8 @@ class FittedCamera(NamedTuple):
         scale = np.array([self.height * person_m, self.height * person_m, 1.0])
         homography = (self.axes() * scale[:, None]) @ centre
         homography /= np.abs(homography[2]).max()
-        return GroundPlane(tuple(homography.ravel().tolist()), width_px, height_px, assumed=True)
+        rounded = [float(f"{value:.10g}") for value in homography.ravel()]  # the same on all machines
+        return GroundPlane(tuple(rounded), width_px, height_px, assumed=True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -247,7 +245,7 @@ def whole_people(boxes: Floats, frame: Ints, score: Floats, width_px: int, heigh
     left, top, width, height = boxes.T
     size = np.array([width_px, height_px], np.float64)
     edge_x, edge_y = np.maximum(_BORDER_PX, _BORDER * size)
-    use = _is_upright(boxes) & (left > edge_x) & (top > edge_y)
+    use: Bools = _is_upright(boxes) & (left > edge_x) & (top > edge_y)
     use &= (left + width < size[0] - edge_x) & (top + height < size[1] - edge_y)
     known = np.isfinite(score)
     if known.any():
@@ -266,12 +264,14 @@ def _is_upright(boxes: Floats) -> Bools:
     """Which boxes (N, 4) have the shape of an upright person."""
     width, height = boxes.T[2:]
     is_upright: Bools = np.isfinite(boxes).all(axis=1) & (width > 0) & (height > 0)
-    return is_upright & (width > height * _RATIOS[0]) & (width < height * _RATIOS[1])
+    is_upright &= (width > height * _RATIOS[0]) & (width < height * _RATIOS[1])
+    return is_upright
 
 
 def _evenly(count: int, most: int) -> Indices:
     """Numbers from 0 to ``count``, ``most`` of them at equal distances."""
-    return np.linspace(0, count - 1, min(count, most)).round().astype(np.intp)
+    numbers: Indices = np.linspace(0, count - 1, min(count, most)).round().astype(np.intp)
+    return numbers
 
 
 class _Solved(NamedTuple):

@@ -8,8 +8,9 @@ from typing import Final
 
 from mcaptrack import log
 from mcaptrack.errors import call
-from mcaptrack.geometry.plane import Planes, is_assumed
+from mcaptrack.geometry.plane import Planes, is_assumed, is_estimated
 from mcaptrack.notices import known_code, warn
+from mcaptrack.pipeline.planes import plane_in_words
 from mcaptrack.schema import VIDEO, Frame
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.cameras import camera_at
@@ -79,13 +80,8 @@ def warn_findings(opened: log.Log, prefix: str, made: Mapping[str, Provenance], 
         for code, message in known[topic].warnings:
             warn(message, known_code(code))
     if is_assumed(planes) and stages & _IN_METRES:
-        metres = 1 / planes[0][1].homography[0]
-        give = call("ingest", "INPUT", ground_plane="HOMOGRAPHY")
-        warn(
-            f"no ground plane is known: taking {metres:.3g} px for a metre, since people are 1.7 m high; distances, "
-            f"speeds and re-tracking go by it. Give one with {give}",
-            "assumed-ground-plane",
-        )
+        words = plane_in_words(planes, known.get(camera_at(opened, prefix).ground_plane))
+        warn(words, "estimated-ground-plane" if is_estimated(planes) else "assumed-ground-plane")
     if any(
         known[topic].parameters.get("poor_scale") and not known[topic].parameters.get("side_view") for topic in topics
     ):

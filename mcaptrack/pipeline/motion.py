@@ -66,7 +66,11 @@ def _needs_still_camera(opened: log.Log, boxes: str, jobs: Sequence[Job]) -> boo
     for job in jobs:
         if job.target == boxes:
             return bool(getattr(job.transform, "needs_still_camera", False))
-    made = provenance_of(opened, boxes)
+    return detects_motion(provenance_of(opened, boxes))
+
+
+def detects_motion(made: Provenance | None) -> bool:
+    """Whether a channel has the boxes of a detector that needs a still camera."""
     stage = STAGES.get(made.transform) if made and "transform" not in made.plugins else None
     if made is None or stage is None or stage.default.reads is not VIDEO:
         return False
@@ -114,6 +118,15 @@ def ground_truth_with(opened: log.Log, prefix: str, made: Mapping[str, Made]) ->
 
 def _of_run(made: Mapping[str, Made]) -> tuple[dict[str, Provenance], dict[str, Sequence[Frame]]]:
     return {topic: one.provenance for topic, one in made.items()}, {topic: one.frames for topic, one in made.items()}
+
+
+def moves(opened: log.Log, prefix: str, made: Mapping[str, Made]) -> bool:
+    """Whether the camera is known to move, or its pictures to have cuts."""
+    found = _read(opened, motion_topic(prefix), CAMERA_MOTION, made)
+    try:
+        return found is not None and frames_to_path(found[0]).matters
+    except McaptrackError:
+        return False
 
 
 def planes_in_pictures(opened: log.Log, prefix: str, made: Mapping[str, Made], planes: Planes) -> Planes:

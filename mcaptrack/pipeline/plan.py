@@ -16,7 +16,7 @@ from mcaptrack.geometry.plane import is_assumed
 from mcaptrack.notices import warn
 from mcaptrack.pipeline import motion
 from mcaptrack.pipeline.checks import Job, check_inputs, describe_origin, fits
-from mcaptrack.pipeline.planes import planes_to_json, read_planes
+from mcaptrack.pipeline.planes import AS_BEFORE, PlaneChoice, is_plane_due, planes_to_json, read_planes
 from mcaptrack.pipeline.rebuild import MissingPluginError, rebuild
 from mcaptrack.schema import DETECTIONS, VIDEO
 from mcaptrack.schema.provenance import Provenance
@@ -67,17 +67,21 @@ def plan_all(
     force: bool = False,
     chosen: Collection[str] = (),
     camera_motion: str = "",
+    plane: PlaneChoice = AS_BEFORE,
 ) -> list[Job]:
     """Plan the jobs that bring all results of a camera up to date; empty if they are.
 
     ``source`` is the topic of pictures or of recorded detections to begin with; ``defaults`` as in ``plan_stage``. With
     ``force``, channels that are up to date are made again, too, by the transform in ``defaults`` or else the same one.
     ``camera_motion`` is what trackers are to do about it ("auto", "on" or "off") where it differs from what they did.
+    ``plane`` says how to make a ground plane where none is given; where it was made otherwise, it is made again.
     ``chosen`` are options that the user gave for ``defaults`` ("tracker"): a channel that was made with another choice
     is made again. Raises McaptrackError as ``plan_stage`` does, and if the class that made a channel is not installed.
     """
     sources = {_stage_from(opened, source): source} if source else {}
-    planner = _Planner(opened, prefix, sources, defaults, force, chosen, camera_motion)
+    planner = _Planner(opened, prefix, sources, defaults, force, chosen, camera_motion, plane)
+    if plane.estimate and (planes := read_planes(opened, prefix)) and not is_assumed(planes):
+        warn("a ground plane is given, so that none is estimated", "option-not-used")
     read = {stage.input_topic for stage in STAGES.values()}
     for stage in STAGES.values():
         if stage.output_topic not in read and not stage.on_demand:
@@ -116,11 +120,12 @@ class _Planner:
         force: bool = False,
         chosen: Collection[str] = (),
         camera_motion: str = "",
+        plane: PlaneChoice = AS_BEFORE,
     ) -> None:
         self.jobs: list[Job] = []
         self._opened, self._prefix = opened, prefix
         self._sources, self._defaults, self._force, self._chosen = sources, defaults, force, chosen
-        self._camera_motion = camera_motion
+        self._camera_motion, self._plane = camera_motion, plane
         self._changes: dict[str, bool] = {}
         self._notes: list[str] = []
         self._unnamed: dict[str, MissingPluginError] = {}
@@ -244,6 +249,8 @@ class _Planner:
         suited = self._suited(stage, source) if is_open else None
         wanted = self._with_choice(self._defaults.get(stage, suited or before)) if is_usual else before
         is_replaced = is_usual and (self._is_replaced(STAGES[stage], before, wanted) or suited is not None)
+        is_projected = is_usual and STAGES[stage].needs_scale and self._is_plane_due(source)
+        is_due = is_due or is_projected
         if wanted and not is_replaced and not self._force:
             self._warn_settings(main, _differing(before, wanted) if before else str(why_not))
         if not is_due and not self._force and not is_replaced:
@@ -267,6 +274,8 @@ class _Planner:
             is_other = before is None or STAGES[stage].choice(before) != STAGES[stage].choice(transform)
             by = f"by another {STAGES[stage].option}" if is_other else "with another `camera_motion=`"
             self._notes.append(f"{topic} was made {by}: running {stage} again")
+        elif is_projected:
+            self._notes.append(f"{topic} was made with another `estimate_plane=`: running {stage} again, as before")
         elif is_due and not self._force:
             self._notes.append(f"{topic} was made from an earlier {source}: running {stage} again, as before")
         there = [f"{main}/{suffix}".rstrip("/") for suffix in transform.writes]
@@ -274,6 +283,11 @@ class _Planner:
         keep = tuple(suffix for suffix, is_kept in zip(transform.writes, kept, strict=True) if is_kept)
         self._add(Job(stage, transform, source, main, None if all(kept) else keep))
         return True
+
+    def _is_plane_due(self, source: str) -> bool:
+        """Return whether the ground plane is made again from these boxes, because it was made otherwise."""
+        planes = read_planes(self._opened, self._prefix)
+        return is_assumed(planes) and is_plane_due(self._opened, self._prefix, source, self._plane)
 
     def _is_replaced(self, stage: Stage, before: Transform | None, wanted: Transform | None) -> bool:
         """Return whether the user chose another class for a stage than the one that made its channel."""

@@ -14,18 +14,18 @@ from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.camera_path import CameraPath
 from mcaptrack.geometry.clocks import NS_PER_S, parse_ns
-from mcaptrack.geometry.plane import Planes, is_assumed, scene_planes
+from mcaptrack.geometry.plane import Planes, is_assumed, is_estimated, scene_planes
 from mcaptrack.notices import Notice, collected, warn
 from mcaptrack.pipeline.checks import Job, check_inputs, read_named_frames
 from mcaptrack.pipeline.events import STAGE as EVENTS_STAGE
 from mcaptrack.pipeline.events import Watch, make_events, tally
 from mcaptrack.pipeline.findings import warn_findings, warn_memory, warn_no_rows
 from mcaptrack.pipeline.motion import path_with, planes_in_pictures, side_inputs, to_pictures, to_scene
-from mcaptrack.pipeline.planes import guess_plane, is_poor, read_planes
+from mcaptrack.pipeline.planes import AS_BEFORE, PlaneChoice, is_plane_due, is_poor, make_plane, read_planes
 from mcaptrack.pipeline.rebuild import plugins_of
 from mcaptrack.pipeline.write import Made, digest_of, write
 from mcaptrack.predictors import weights_sha256
-from mcaptrack.schema import DETECTIONS, GROUND_PLANE, TRACKS, VIDEO, Frame
+from mcaptrack.schema import DETECTIONS, TRACKS, VIDEO, Frame
 from mcaptrack.schema.classes import class_names
 from mcaptrack.schema.provenance import CLOCK, Provenance
 from mcaptrack.sources import foreign
@@ -72,21 +72,29 @@ def run(
     output: Path | None = None,
     progress: Progress = lambda *_: None,
     watch: Watch | None = None,
+    plane: PlaneChoice = AS_BEFORE,
 ) -> Report:
     """Run the jobs, and write their channels and views into the log, or into a copy of it at ``output``.
 
-    With ``watch`` the last stage finds events of tracks, if they are missing or out of date.
+    With ``watch`` the last stage finds events of tracks, if they are missing or out of date. ``plane`` says how to make
+    a ground plane where none is given.
 
     The log is replaced as a whole, after everything was computed.
     """
     with collected() as warnings:
-        report = _run(opened, prefix, jobs, output, progress, watch)
+        report = _run(opened, prefix, jobs, output, progress, watch, plane)
     report.warnings = list(dict.fromkeys(warnings))
     return report
 
 
 def _run(
-    opened: log.Log, prefix: str, jobs: Sequence[Job], output: Path | None, progress: Progress, watch: Watch | None
+    opened: log.Log,
+    prefix: str,
+    jobs: Sequence[Job],
+    output: Path | None,
+    progress: Progress,
+    watch: Watch | None,
+    choice: PlaneChoice,
 ) -> Report:
     made: dict[str, Made] = {}
     stamps: dict[str, list[int]] = {}
@@ -94,12 +102,13 @@ def _run(
     planes = read_planes(opened, prefix)
     for job in jobs:
         given = _input(opened, job, made, stamps, progress)
-        # New detections give a new estimate of the scale; a given ground plane is kept.
+        # New detections give a new plane; one that was measured is kept.
         stage, has_boxes = STAGES[job.stage], job.transform.reads is DETECTIONS
-        is_due = has_boxes and job.target == f"{prefix}/{stage.output_topic}" and is_assumed(planes)
+        is_usual = job.target == f"{prefix}/{stage.output_topic}"
+        is_due = is_assumed(planes) and is_usual and (has_boxes or is_plane_due(opened, prefix, job.source, choice))
         if is_due or (planes is None and stage.needs_scale):
-            planes, channel = guess_plane(given.frames, job.source, given.digest())
-            made |= {camera_at(opened, prefix).ground_plane: Made.of(GROUND_PLANE, *channel)} if channel else {}
+            planes, channel = make_plane(opened, prefix, given.frames, (job.source, given.digest()), made, choice)
+            made |= {camera_at(opened, prefix).ground_plane: channel} if channel else {}
         if has_boxes:
             warn_memory(len(given.frames), sum(len(frame.rows) for frame in given.frames))
         try:
@@ -297,7 +306,7 @@ def _in_context(opened: log.Log, prefix: str, job: Job, frames: Sequence[Frame],
                     f"{usual} has {Sample().rate_hz:g} unless it was made otherwise",
                     "clock",
                 )
-    if "poor_scale" in names and is_assumed(planes):
+    if "poor_scale" in names and is_assumed(planes) and not is_estimated(planes):
         known["poor_scale"] = is_poor(frames)
     return replace(job.transform, **known)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -10,8 +11,10 @@ import numpy as np
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation import Candidate, EvaluateOptions, EvaluationInput, evaluate
+from mcaptrack.geometry.plane import origin_of
 from mcaptrack.notices import warn
-from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, GROUND_PLANE, PREDICTIONS, TRACKS, Rows, Schema
+from mcaptrack.pipeline.planes import fit_of, read_planes
+from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, PREDICTIONS, TRACKS, Rows, Schema
 from mcaptrack.schema.camera_motion import rows_to_verdict
 from mcaptrack.sources import foreign
 from mcaptrack.sources.camera_motion import motion_topic, read_ground_truth
@@ -46,7 +49,9 @@ class SummaryScores:
 class Summary:
     """Counts and scores for one camera; None for channels that the log lacks.
 
-    ``ground_plane`` is "given" or "assumed", ``camera_motion`` "still", "shaking" or "moving".
+    ``ground_plane`` is "given" (measured), "estimated" from boxes or "assumed" (a scale alone); ``plane_fit`` says how
+    well one fits that was estimated (see ``mcaptrack.geometry.plane_from_boxes.PlaneFit``). ``camera_motion`` is
+    "still", "shaking" or "moving".
     """
 
     pictures: int | None = None
@@ -57,6 +62,7 @@ class Summary:
     horizon_s: float | None = None
     scores: SummaryScores | None = None
     ground_plane: str | None = None
+    plane_fit: Mapping[str, float] | None = None
     camera_motion: str | None = None
 
     def to_json(self) -> dict[str, Any]:
@@ -76,7 +82,7 @@ def summarise(opened: log.Log, prefix: str) -> Summary:
     tracked, repaired = _rows(opened, tracks, TRACKS), _rows(opened, retracks, TRACKS)
     forecasts = _rows(opened, f"{retracks}/predictions", PREDICTIONS)
     forecasts = _rows(opened, predictions, PREDICTIONS) if forecasts is None else forecasts
-    planes = _rows(opened, camera.ground_plane, GROUND_PLANE)
+    planes = read_planes(opened, prefix)
     scores = _scores(opened, prefix, camera.truth, (samples, retracks))
     if scores is not None and scores.idf1[1] < scores.idf1[0]:
         was, now = scores.idf1
@@ -92,7 +98,8 @@ def summarise(opened: log.Log, prefix: str) -> Summary:
         forecasts=None if forecasts is None else int((forecasts["step"] == 1).sum()),
         horizon_s=None if forecasts is None or not len(forecasts) else round(float(forecasts["ahead_s"].max()), 3),
         scores=scores,
-        ground_plane=None if planes is None or not len(planes) else "assumed" if planes["assumed"].all() else "given",
+        ground_plane=None if planes is None else origin_of(planes),
+        plane_fit=fit_of(provenance_of(opened, camera.ground_plane)),
         camera_motion=None if motion is None else rows_to_verdict(motion).name.lower(),
     )
 

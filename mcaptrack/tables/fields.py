@@ -248,7 +248,8 @@ _RECORDINGS: Final = Table(
         Field(
             "ground_plane",
             _TEXT,
-            "given: measured; assumed: guessed from the size of people; mixed: some of each; null: none",
+            "given: measured; estimated: from boxes of people; assumed: a scale from the size of people; mixed: some "
+            "of each; null: none",
             nullable=True,
         ),
         Field(

@@ -191,7 +191,8 @@ class LogTables:
     def _recording(self) -> dict[str, Any]:
         opened = self.opened
         messages = sum(sum(part.index.counts.values()) for part in opened.parts)
-        planes = [bool(a) for topic in self.topics("ground_planes") for a in self._part(topic).rows["assumed"]]
+        rows = [row for topic in self.topics("ground_planes") for row in self._part(topic).rows]
+        planes = {_origin_of_plane(row) for row in rows}
         sources = {
             channel.topic: dict(made.parameters)
             for channel in opened.channels.values()
@@ -212,13 +213,17 @@ class LogTables:
             "size_bytes": sum(part.size for part in opened.parts),
             "digest": opened.fingerprint(),
             "results_file": file_name(opened.results.path) if opened.results else None,
-            "ground_plane": None if not planes else _OF_PLANES[len({*planes}), planes[0]],
+            "ground_plane": None if not planes else planes.pop() if len(planes) == 1 else "mixed",
             "source": json.dumps(sources, sort_keys=True, separators=(",", ":")) if sources else None,
             "mcaptrack_version": __version__,
         }
 
 
-_OF_PLANES: Final = {(1, False): "given", (1, True): "assumed", (2, False): "mixed", (2, True): "mixed"}
+def _origin_of_plane(row: np.void) -> str:
+    """Where a ground plane is from; one that isn't measured is estimated if it has a perspective, else a scale."""
+    if not row["assumed"]:
+        return "given"
+    return "estimated" if row["h20"] or row["h21"] else "assumed"
 
 
 def _order_of_scores(row: Mapping[str, Any]) -> tuple[Any, ...]:

@@ -15,7 +15,7 @@ from mcaptrack.evaluation import EvaluateOptions, EvaluationInput, EvaluationRow
 from mcaptrack.evaluation.aligned import has_positions, resample_frames
 from mcaptrack.evaluation.events import EventOptions, MatchRule, find_events
 from mcaptrack.geometry.clocks import NS_PER_S
-from mcaptrack.geometry.plane import Planes, plane_at
+from mcaptrack.geometry.plane import Planes, is_estimated, origin_of, plane_at
 from mcaptrack.schema import DETECTIONS, EVENTS, TRACKS, Frame
 from mcaptrack.schema.framing import frame_times
 from mcaptrack.schema.provenance import Provenance
@@ -94,9 +94,13 @@ class LogReport:
         return there or {role: one for role, one in self.track_sets.items() if role == "tracks"}
 
     @property
-    def is_assumed(self) -> bool:
-        """Whether the ground plane is a guess."""
-        return any(plane.assumed for _, plane in self.planes)
+    def metres_note(self) -> str:
+        """What has to be said of metres if the ground plane was not measured; otherwise ""."""
+        if not any(plane.assumed for _, plane in self.planes):
+            return ""
+        if is_estimated(self.planes):
+            return " Metres are from a ground plane that was estimated from boxes of people: it was not measured."
+        return " Metres are guessed from the size of people: the ground was not measured."
 
 
 def gather(opened: log.Log, camera: str | None, progress: Callable[[str], None] = lambda _: None) -> LogReport:
@@ -250,7 +254,7 @@ def _statistics(out: LogReport) -> dict[str, Any]:
         "dwell_s": statistics.histograms(
             {topic: statistics.durations_s(frames) for topic, frames in resampled.items()}
         ),
-        "ground_plane": None if not out.planes else "assumed" if out.is_assumed else "given",
+        "ground_plane": origin_of(out.planes) if out.planes else None,
     }
 
 

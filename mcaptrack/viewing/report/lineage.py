@@ -9,7 +9,12 @@ from typing import Any, Final
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.viewing.report.contents import LogReport
 
-_GROUND: Final = {"given": "measured", "assumed": "guessed from the size of people", None: "none"}
+_GROUND: Final = {
+    "given": "measured",
+    "estimated": "estimated from boxes of people",
+    "assumed": "guessed from the size of people",
+    None: "none",
+}
 _MAX_DEPTH: Final = 6
 
 

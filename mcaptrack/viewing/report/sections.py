@@ -166,7 +166,7 @@ def motion(report: LogReport) -> dict[str, Any]:
     if speeds:
         note = "From one row to the next" + (" at the prediction rate" if "samples" in report.track_sets else "")
         note += "; gaps left out."
-        note += " Metres are guessed from the size of people: the ground was not measured." if report.is_assumed else ""
+        note += report.metres_note
         figures.append(_histogram(report, speeds, "Speed.", "speed, m/s", note, "m/s", "step", 2))
     elif report.track_sets:
         missing.append("Speeds are not known: without a ground plane there are no positions on the ground.")

@@ -1,0 +1,248 @@
+"""Ground planes that `run` estimates from boxes: when, what is said and kept of them, and who decides."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import mcaptrack
+from mcaptrack import log, pipeline
+from mcaptrack.errors import McaptrackError
+from mcaptrack.notices import collected
+from mcaptrack.pipeline.planes import AS_BEFORE, PlaneChoice, make_plane
+from mcaptrack.pipeline.write import Made
+from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, TRACKS, Frame
+from mcaptrack.schema.provenance import Provenance
+from tests.commands import done
+from tests.worlds import ns
+
+HIGH_M, PITCH, FOCAL, WIDTH, HEIGHT = 5.0, np.deg2rad(18.0), 640.0, 640, 480
+
+
+def seen(x: np.ndarray, y: np.ndarray, tall: float = 1.7) -> np.ndarray:
+    """Boxes (N, 4) of people at (x, y) metres before a camera 5 m above the ground."""
+    ahead = y * np.cos(PITCH) + (HIGH_M - np.array([[0.0], [tall]])) * np.sin(PITCH)
+    down = (HIGH_M - np.array([[0.0], [tall]])) * np.cos(PITCH) - y * np.sin(PITCH)
+    foot, head = HEIGHT / 2 + FOCAL * down / ahead
+    left = WIDTH / 2 + FOCAL * x / ahead[0]
+    return np.stack([left - 0.2 * (foot - head), head, 0.4 * (foot - head), foot - head], axis=1)
+
+
+def people(frames: int = 60) -> list[np.ndarray]:
+    """The boxes of five people who walk through the picture, by frame."""
+    n = np.arange(frames)[:, None]
+    x = np.array([-3.0, 3.0, -1.5, 2.0, 0.0]) + n * np.array([0.06, -0.05, 0.04, 0.0, -0.02])
+    y = np.array([9.0, 11.0, 14.0, 24.0, 18.0]) + n * np.array([0.0, 0.03, -0.05, -0.12, 0.06])
+    return [seen(*pair) for pair in zip(x, y, strict=True)]
+
+
+BOXES = people()
+
+
+def detections() -> list[Frame]:
+    frames = []
+    for number, some in enumerate(BOXES):
+        x, y, w, h = some.T
+        rows = DETECTIONS.rows(x_px=x, y_px=y, w_px=w, h_px=h, score=np.full(5, 0.9), class_id=np.full(5, 1))
+        frames.append(Frame(ns(number / 10), number, rows))
+    return frames
+
+
+def written(path: Path, made: Provenance, frames: list[Frame], schema: Any = DETECTIONS) -> Path:
+    """Write a log of boxes."""
+    topic = f"/camera/{'tracks' if schema is TRACKS else 'detections'}"
+    with log.create(path) as writer:
+        number = writer.add_channel(topic, (schema.name, "protobuf", schema.descriptor), "protobuf", made.to_metadata())
+        for frame in frames:
+            writer.add_message(number, frame.t_ns, frame.index, schema.codec.encode(frame.rows))
+    return path
+
+
+@pytest.fixture(scope="module")
+def template(tmp_path_factory) -> Path:
+    """A log of boxes that were ingested, after a run."""
+    folder = tmp_path_factory.mktemp("boxes")
+    lines = [
+        f"{number},-1,{','.join(f'{value:.2f}' for value in box)},0.9,-1,-1,-1"
+        for number, some in enumerate(BOXES, start=1)
+        for box in some
+    ]
+    (folder / "boxes.txt").write_text("\n".join(lines) + "\n")
+    done("ingest", folder / "boxes.txt", "--as", "detections", "--fps", "10", "-o", folder / "raw.mcap", "-q")
+    shutil.copy(folder / "raw.mcap", folder / "log.mcap")
+    (folder / "said.json").write_text(done("run", folder / "log.mcap", "--no-tables", "--json", "-q").out)
+    return folder
+
+
+@pytest.fixture
+def path(template, tmp_path) -> Path:
+    return Path(shutil.copy(template / "log.mcap", tmp_path / "log.mcap"))
+
+
+def plane_of(path: Path) -> Provenance:
+    with log.read(path) as opened:
+        made = Provenance.from_metadata(opened.channel("/camera/ground_plane").metadata)
+    assert made is not None
+    return made
+
+
+def test_run_estimates_a_plane_from_boxes_and_says_how_well_it_fits(template):
+    data = json.loads((template / "said.json").read_text())
+    (warning,) = data["warnings"]
+    summary = data["results"][0]["summary"]
+    assert warning["code"] == "estimated-ground-plane"
+    assert summary["ground_plane"] == "estimated"
+    fit = summary["plane_fit"]
+    assert fit["camera_height_m"] == pytest.approx(HIGH_M, rel=0.1)
+    assert fit["pitch_deg"] == pytest.approx(18, abs=3)
+    assert f"estimated from {fit['boxes']} boxes" in warning["message"]
+    assert "m high, looking down by 1" in warning["message"]
+    assert warning["message"].endswith(
+        "with people 1.7 m high. Give one with `mcaptrack ingest INPUT --ground-plane HOMOGRAPHY`"
+    )
+    with log.read(template / "log.mcap") as opened:
+        ((_, plane),) = pipeline.read_planes(opened, "/camera") or ()
+        rows = opened.rows("/camera/tracks", TRACKS).rows
+    assert plane.is_estimated
+    made = plane_of(template / "log.mcap")
+    assert (made.transform, made.input, made.parameters["fit"]) == ("estimate-ground-plane", "/camera/detections", fit)
+    boxes = np.stack([rows["x_px"], rows["y_px"], rows["w_px"], rows["h_px"]], axis=1)
+    assert np.stack([rows["x_m"], rows["y_m"]], axis=1) == pytest.approx(plane.boxes_to_metres(boxes))
+    assert rows["y_m"][0] == pytest.approx(9.0, rel=0.2)
+
+
+def test_nothing_is_made_again_and_the_warning_is_repeated(path):
+    before = path.read_bytes()
+    result = mcaptrack.run(path, tables=False)
+    assert result.stages == ()
+    assert path.read_bytes() == before
+    assert [one.code for one in result.warnings] == ["estimated-ground-plane"]
+
+
+def test_the_choice_of_a_user_is_kept_until_there_is_another(path):
+    first = path.read_bytes()
+    result = mcaptrack.run(path, tables=False, estimate_plane=False)
+    assert result.stages[:2] == ("track", "sample")
+    assert (result.summary.ground_plane, result.summary.plane_fit) == ("assumed", None)
+    assert "taking" in result.warnings[0].message
+    assert plane_of(path).parameters == {"estimate_plane": False}
+    assert mcaptrack.run(path, tables=False).stages == ()
+    assert mcaptrack.run(path, tables=False, estimate_plane=False).stages == ()
+    mcaptrack.track(path)
+    assert plane_of(path).transform == "assume-ground-plane"
+    mcaptrack.run(path, tables=False, estimate_plane=True)
+    assert plane_of(path).transform == "estimate-ground-plane"
+    assert len(path.read_bytes()) == len(first)
+
+
+def test_metres_are_proportional_to_the_height_of_people(path):
+    with log.read(path) as opened:
+        before = opened.rows("/camera/tracks", TRACKS).rows["x_m"]
+    result = mcaptrack.run(path, tables=False, person_height_m=0.85)
+    with log.read(path) as opened:
+        after = opened.rows("/camera/tracks", TRACKS).rows["x_m"]
+    assert after == pytest.approx(before / 2, rel=1e-6)
+    assert "with people 0.85 m high" in result.warnings[0].message
+    assert mcaptrack.run(path, tables=False).stages == ()
+    with pytest.raises(McaptrackError, match="person_height_m"):
+        mcaptrack.run(path, person_height_m=-1.0)
+
+
+def test_a_given_plane_wins(template, tmp_path):
+    (tmp_path / "plane.txt").write_text("0.05,0,0\n0,0.05,0\n0,0,1\n")
+    result = mcaptrack.ingest(
+        template / "boxes.txt", tmp_path / "a.mcap", role="detections", fps=10, ground_plane=tmp_path / "plane.txt"
+    )
+    said = mcaptrack.run(result.log, tables=False, estimate_plane=True)
+    assert said.summary.ground_plane == "given"
+    assert [(one.code, one.message) for one in said.warnings] == [
+        ("option-not-used", "a ground plane is given, so that none is estimated")
+    ]
+    with log.read(result.log) as opened:
+        ((_, plane),) = pipeline.read_planes(opened, "/camera") or ()
+    assert plane.homography[0] == 0.05
+
+
+def made_from(
+    path: Path, provenance: Provenance, frames: list[Frame] | None = None, choice: PlaneChoice = AS_BEFORE, **more: Any
+) -> Provenance:
+    """The provenance of the plane that is made from boxes of this origin."""
+    frames = detections() if frames is None else frames
+    with log.read(written(path, provenance, frames)) as opened:
+        _, made = make_plane(opened, "/camera", frames, ("/camera/detections", "x"), more, choice)
+    assert made is not None
+    return made.provenance
+
+
+LEARNED = Provenance("detect", {"detector": "onnx"}, "/camera/video")
+
+
+@pytest.mark.parametrize(
+    ("provenance", "transform"),
+    [
+        (LEARNED, "estimate-ground-plane"),
+        (Provenance("ingest", {}), "estimate-ground-plane"),
+        (Provenance("detect", {"detector": "knn"}, "/camera/video"), "assume-ground-plane"),
+        (Provenance("detect", {"detector": "median"}, "/camera/video"), "assume-ground-plane"),
+        (Provenance("detect", {"method": "mog2"}, "/camera/video"), "assume-ground-plane"),
+    ],
+)
+def test_boxes_of_motion_detectors_are_not_used(tmp_path, provenance, transform):
+    made = made_from(tmp_path / "a.mcap", provenance)
+    assert made.transform == transform
+    if transform == "assume-ground-plane":
+        assert made.parameters == {}  # as always
+        asked = made_from(tmp_path / "b.mcap", provenance, choice=PlaneChoice(estimate=True))
+        assert asked.parameters == {"refused": "boxes of a motion detector have shadows, and several people in one"}
+
+
+def test_only_boxes_of_people_count(tmp_path):
+    frames = detections()
+    for frame in frames:
+        frame.rows["class_id"][2:] = 7
+    named = Provenance("detect", {"detector": "onnx"}, "/camera/video", classes={"1": "car", "7": "Person"})
+    found = {
+        "without names": made_from(tmp_path / "a.mcap", LEARNED, frames).parameters["fit"]["boxes"],
+        "by name": made_from(tmp_path / "b.mcap", named, frames).parameters["fit"]["boxes"],
+    }
+    assert found["without names"] < 2 * len(frames) + 1 < found["by name"]
+
+
+def test_a_camera_that_moves_is_refused(tmp_path):
+    moves = CAMERA_MOTION.rows(
+        m00=[1.0], m01=[0.0], m02_px=[30.0], m10=[0.0], m11=[1.0], m12_px=[0.0],
+        r00=[1.0], r01=[0.0], r02_px=[30.0], r10=[0.0], r11=[1.0], r12_px=[0.0],
+        reference_frame=[0], inliers=[50.0], verdict=[2], width_px=[WIDTH], height_px=[HEIGHT],
+    )  # fmt: skip
+    frames = [Frame(frame.t_ns, frame.index, moves) for frame in detections()]
+    motion = Made.of(CAMERA_MOTION, frames, Provenance("motion", {}, "/camera/video"))
+    made = made_from(tmp_path / "a.mcap", LEARNED, **{"/camera/motion": motion})
+    assert made.parameters == {"refused": "the camera moves"}
+
+
+def test_boxes_that_cannot_tell_give_a_scale_and_the_reason(tmp_path):
+    path = written(tmp_path / "a.mcap", Provenance("ingest", {}), detections()[:20])
+    with collected() as said:
+        mcaptrack.run(path, tables=False)
+    messages = [one.message for one in said if one.code == "assumed-ground-plane"]
+    assert len(messages) == 1
+    words = "no ground plane is known, and boxes don't tell it (100 of 100 boxes show whole people, and 120 are needed): taking "
+    assert messages[0].startswith(words)
+
+
+def test_tracks_of_other_trackers_give_a_plane_too(tmp_path):
+    frames = []
+    for number, some in enumerate(BOXES):
+        x, y, w, h = some.T
+        rows = TRACKS.rows(track_id=np.arange(1, 6), x_px=x, y_px=y, w_px=w, h_px=h)
+        frames.append(Frame(ns(number / 10), number, rows))
+    path = written(tmp_path / "a.mcap", Provenance("ingest", {}), frames, TRACKS)
+    assert mcaptrack.run(path, tables=False).summary.ground_plane == "estimated"
+    result = mcaptrack.run(path, tables=False, estimate_plane=False)
+    assert "sample" in result.stages
+    assert result.summary.ground_plane == "assumed"
