@@ -47,11 +47,13 @@ _GIRTH: Final = 0.15
 _STARTS: Final = (3.0, 12.0, 25.0, 40.0, 60.0)
 _MOST_STEPS: Final = 100
 # People whose lower part is hidden, or who sit, have boxes that are too short: after a first fit, boxes further than
-# so many standard deviations below or above are left out, twice.
+# so many standard deviations below or above are left out, twice. People differ by more than the least one.
 _BELOW, _ABOVE, _ROUNDS = 2.0, 2.5, 2
-# What is refused: fewer boxes that agree than this share, a typical deviation of more, feet in fewer rows, a steeper
-# camera (degrees), or metres that are less certain (relative standard deviation).
-_LEAST_INLIERS, _MOST_RESIDUAL, _LEAST_ROWS, _STEEPEST = 0.6, 0.15, 4, 65.0
+_LEAST_SPREAD: Final = 0.03
+# What is refused: fewer boxes that agree than this share, a typical deviation of more, people who are about as tall in
+# the picture wherever they stand (ratio), a steeper camera (degrees), or metres that are less certain (relative
+# standard deviation).
+_LEAST_INLIERS, _MOST_RESIDUAL, _LEAST_GROWTH, _STEEPEST = 0.6, 0.15, 1.25, 65.0
 _MOST_SCALE_SD, _MOST_DEPTH_SD = 0.05, 0.5
 
 
@@ -220,17 +222,21 @@ def plane_from_boxes(
         scale_sd=scale_sd,
         depth_sd=depth_sd,
     )
-    _refuse_if_unsure(fit, len(np.unique(_cells(feet[agrees])[0])))
+    shortest, tallest = np.quantile(camera.expected_heights(feet[agrees]), [0.05, 0.95])
+    _refuse_if_unsure(fit, float(tallest / shortest))
     return fit
 
 
-def _refuse_if_unsure(fit: PlaneFit, rows: int) -> None:
-    """Raise McaptrackError, with the reason as a clause, if a plane isn't certain enough to be used."""
+def _refuse_if_unsure(fit: PlaneFit, growth: float) -> None:
+    """Raise McaptrackError, with the reason as a clause, if a plane isn't certain enough to be used.
+
+    ``growth`` is how much taller people are in the picture where they are near than where they are far.
+    """
     if fit.inliers < _LEAST_INLIERS or fit.residual > _MOST_RESIDUAL:
         raise McaptrackError(
             f"heights of boxes don't follow from where they stand: {fit.inliers:.0%} agree, within {fit.residual:.0%}"
         )
-    if rows < _LEAST_ROWS or not fit.depth_sd <= _MOST_DEPTH_SD or not fit.scale_sd <= _MOST_SCALE_SD:
+    if growth < _LEAST_GROWTH or not fit.depth_sd <= _MOST_DEPTH_SD or not fit.scale_sd <= _MOST_SCALE_SD:
         raise McaptrackError("people are all at about the same distance from the camera")
     if fit.pitch_deg > _STEEPEST:
         raise McaptrackError(f"the camera looks down, by about {fit.pitch_deg:.0f} degrees")
@@ -255,7 +261,7 @@ def whole_people(boxes: Floats, frame: Ints, score: Floats, width_px: int, heigh
         some, bottom = boxes[at], top[at] + height[at]
         low = np.maximum(some[:, None, :2], some[None, :, :2])
         high = np.minimum(some[:, None, :2] + some[:, None, 2:], some[None, :, :2] + some[None, :, 2:])
-        shared = np.clip(high - low, 0, None).prod(axis=2) * (bottom[None, :] > bottom[:, None])
+        shared = np.nan_to_num(np.clip(high - low, 0, None).prod(axis=2)) * (bottom[None, :] > bottom[:, None])
         use[at] &= shared.max(axis=1, initial=0.0) <= _MOST_HIDDEN * width[at] * height[at]
     return use
 
@@ -366,7 +372,7 @@ def _agreeing(off: Floats) -> Bools:
     centre = np.median(off)
     spread = 0.0
     for _ in range(5):
-        spread = 1.4826 * float(np.median(off[off >= centre] - centre))
+        spread = max(1.4826 * float(np.median(off[off >= centre] - centre)), _LEAST_SPREAD)
         centre = np.median(off[np.abs(off - centre) <= 2 * spread])
     return (off >= centre - _BELOW * spread) & (off <= centre + _ABOVE * spread)
 
