@@ -127,16 +127,16 @@ def test_nothing_is_made_again_and_the_warning_is_repeated(path):
 
 def test_the_choice_of_a_user_is_kept_until_there_is_another(path):
     first = path.read_bytes()
-    result = mcaptrack.run(path, tables=False, estimate_plane=False)
+    result = mcaptrack.run(path, tables=False, fit_plane=False)
     assert result.stages[:2] == ("track", "sample")
     assert (result.summary.ground_plane, result.summary.plane_fit) == ("assumed", None)
     assert "taking" in result.warnings[0].message
-    assert plane_of(path).parameters == {"estimate_plane": False}
+    assert plane_of(path).parameters == {"fit_plane": False}
     assert mcaptrack.run(path, tables=False).stages == ()
-    assert mcaptrack.run(path, tables=False, estimate_plane=False).stages == ()
+    assert mcaptrack.run(path, tables=False, fit_plane=False).stages == ()
     mcaptrack.track(path)
     assert plane_of(path).transform == "assume-ground-plane"
-    mcaptrack.run(path, tables=False, estimate_plane=True)
+    mcaptrack.run(path, tables=False, fit_plane=True)
     assert plane_of(path).transform == "estimate-ground-plane"
     assert len(path.read_bytes()) == len(first)
 
@@ -159,7 +159,7 @@ def test_a_given_plane_wins(template, tmp_path):
     result = mcaptrack.ingest(
         template / "boxes.txt", tmp_path / "a.mcap", role="detections", fps=10, ground_plane=tmp_path / "plane.txt"
     )
-    said = mcaptrack.run(result.log, tables=False, estimate_plane=True)
+    said = mcaptrack.run(result.log, tables=False, fit_plane=True)
     assert said.summary.ground_plane == "given"
     assert [(one.code, one.message) for one in said.warnings] == [
         ("option-not-used", "a ground plane is given, so that none is estimated")
@@ -243,6 +243,6 @@ def test_tracks_of_other_trackers_give_a_plane_too(tmp_path):
         frames.append(Frame(ns(number / 10), number, rows))
     path = written(tmp_path / "a.mcap", Provenance("ingest", {}), frames, TRACKS)
     assert mcaptrack.run(path, tables=False).summary.ground_plane == "estimated"
-    result = mcaptrack.run(path, tables=False, estimate_plane=False)
+    result = mcaptrack.run(path, tables=False, fit_plane=False)
     assert "sample" in result.stages
     assert result.summary.ground_plane == "assumed"

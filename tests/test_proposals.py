@@ -163,7 +163,7 @@ SCENES: dict[str, Callable[[Scene], str]] = {
         "run", "LOG"
     ),
     "pipeline/events.py:make_events:run": lambda s: s.untracked().says("events", "LOG"),
-    "pipeline/findings.py:warn_findings:ingest": Scene.side_view,
+    "pipeline/planes.py:plane_in_words:ingest": Scene.side_view,
     "pipeline/findings.py:warn_findings:retrack": Scene.side_view,
     "pipeline/plan.py:_warn_settings:run": Scene.of_a_later_version,
     "pipeline/plan.py:_refusal:run": Scene.by_own_tracker,

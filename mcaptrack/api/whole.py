@@ -32,7 +32,7 @@ def run(
     retracker: str | Transform | None = None,
     predictor: str | Transform | None = None,
     camera_motion: CameraMotionUse | None = None,
-    estimate_plane: bool | None = None,
+    fit_plane: bool | None = None,
     person_height_m: float | None = None,
     stages: Mapping[str, str | Transform] | None = None,
     progress: Progress = no_progress,
@@ -67,7 +67,7 @@ def run(
     camera_motion : {"auto", "on", "off"}, optional
         Whether tracks are compensated for the motion of the camera: if it moves or has cuts, also if it only shakes,
         or never. By default as before, and "auto" where there are no tracks yet.
-    estimate_plane : bool, optional
+    fit_plane : bool, optional
         Whether to estimate the ground plane from the boxes of a learned detector where none is given. By default as
         before, and True where there is none yet.
     person_height_m : float, optional
@@ -101,7 +101,7 @@ def run(
     transforms = transforms_of(stages)
     transforms |= {s.name: transform_of(s.name, chosen[s.option], {}) for s in STAGES.values() if s.option in chosen}
 
-    plane = PlaneChoice(estimate_plane, person_height_m)
+    plane = PlaneChoice(fit_plane, person_height_m)
 
     def plan(opened: logs.Log, prefix: str, say: Callable[[str], None]) -> list[Job]:
         return pipeline.plan_all(opened, prefix, say, topic, transforms, force, chosen, camera_motion or "", plane)

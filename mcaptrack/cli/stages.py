@@ -320,10 +320,10 @@ def run_all(
             show_default="auto",
         ),
     ] = None,
-    estimate_plane: Annotated[
+    fit_plane: Annotated[
         bool | None,
         common.option(
-            "--estimate-plane/--no-estimate-plane",
+            "--fit-plane/--no-fit-plane",
             tuning=True,
             help="Where no ground plane is given, estimate one from the boxes of a learned detector.",
             show_default="estimate",
@@ -361,7 +361,7 @@ def run_all(
         from mcaptrack.evaluation.events import EventOptions
 
         settings, stages = settings_of("events"), _configured(chosen)
-        where |= {"camera_motion": camera_motion, "estimate_plane": estimate_plane, "person_height_m": person_height_m}
+        where |= {"camera_motion": camera_motion, "fit_plane": fit_plane, "person_height_m": person_height_m}
         for stage in STAGES.values():
             if stage.option in chosen:
                 where[stage.option] = stages.pop(stage.name)

@@ -46,7 +46,7 @@ _GIRTH: Final = 0.15
 #: Pitches (degrees) that the search begins with.
 _STARTS: Final = (3.0, 12.0, 25.0, 40.0, 60.0)
 _MOST_STEPS: Final = 100
-# People whose lower part is hidden, or who sit, have boxes that are too short: after a first fit, boxes further than
+# People with a hidden lower part, or who sit, have boxes that are too short: after a first fit, boxes further than
 # so many standard deviations below or above are left out, twice. People differ by more than the least one.
 _BELOW, _ABOVE, _ROUNDS = 2.0, 2.5, 2
 _LEAST_SPREAD: Final = 0.03
@@ -366,8 +366,9 @@ def _deviations(camera: FittedCamera, feet: Floats, heights: Floats) -> Floats:
 
 
 def _agreeing(off: Floats) -> Bools:
-    """Which deviations (M,) belong to people who are seen whole: those about the mode, whose spread is seen above it,
-    because boxes that end too high or too low are too short.
+    """Which deviations (M,) belong to people who are seen whole: those about the mode.
+
+    Their spread is measured above the mode, because boxes of people who are partly hidden are too short.
     """
     centre = np.median(off)
     spread = 0.0

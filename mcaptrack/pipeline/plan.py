@@ -275,7 +275,7 @@ class _Planner:
             by = f"by another {STAGES[stage].option}" if is_other else "with another `camera_motion=`"
             self._notes.append(f"{topic} was made {by}: running {stage} again")
         elif is_projected:
-            self._notes.append(f"{topic} was made with another `estimate_plane=`: running {stage} again, as before")
+            self._notes.append(f"{topic} was made with another `fit_plane=`: running {stage} again, as before")
         elif is_due and not self._force:
             self._notes.append(f"{topic} was made from an earlier {source}: running {stage} again, as before")
         there = [f"{main}/{suffix}".rstrip("/") for suffix in transform.writes]

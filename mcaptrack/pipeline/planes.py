@@ -34,9 +34,9 @@ _MOST_FRAMES: Final = 5000
 
 
 class PlaneChoice(NamedTuple):
-    """How to make a plane where none is given: whether to estimate it, and from which mean height of people in metres.
+    """The way to make a plane where none is given: whether it is estimated, and the mean height of people in metres.
 
-    None is what the log's plane was made with, or else the default.
+    None stands for what the plane of the log was made with, or else for the default.
     """
 
     estimate: bool | None = None
@@ -47,14 +47,14 @@ class PlaneChoice(NamedTuple):
         before = made.parameters if made and made.transform in (_ASSUME, _ESTIMATE) else {}
         height_m = before.get("person_height_m")
         height_m = float(height_m) if isinstance(height_m, int | float) and height_m > 0 else PERSON_HEIGHT_M
-        estimate = before.get("estimate_plane") is not False if self.estimate is None else self.estimate
+        estimate = before.get("fit_plane") is not False if self.estimate is None else self.estimate
         return estimate, float(self.person_height_m or height_m)
 
     def is_another(self, made: Provenance | None) -> bool:
         """Whether a plane that was made before would be made in another way now."""
         if made is None or made.transform not in (_ASSUME, _ESTIMATE):
             return False
-        is_untried = made.transform == _ASSUME and not {"refused", "estimate_plane"} & made.parameters.keys()
+        is_untried = made.transform == _ASSUME and not {"refused", "fit_plane"} & made.parameters.keys()
         return (bool(self.estimate) and is_untried) or self.settled(made) != AS_BEFORE.settled(made)
 
 
@@ -105,7 +105,7 @@ def make_plane(
     width, height = (int(np.nanmax(boxes[:, at] + boxes[:, at + 2]).round()) for at in (0, 1))
     plane: GroundPlane | None = None
     if not estimate:
-        parameters["estimate_plane"] = False
+        parameters["fit_plane"] = False
     elif why_not := _why_not(opened, prefix, source[0], made):
         if why_not != _BY_MOTION or choice.estimate:
             parameters["refused"] = why_not

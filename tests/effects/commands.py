@@ -96,7 +96,7 @@ CASES: dict[str, dict[str, Case]] = {
         predictor=("run a.mcap --no-tables", "--predictor cv"),
         retracker=("run a.mcap --no-tables", "--retracker none"),
         camera_motion=("run a.mcap --no-tables", "--camera-motion on"),
-        estimate_plane="--no-estimate-plane",
+        fit_plane="--no-fit-plane",
         person_height_m="--person-height-m 1.5",
     ),
     "events": common(

@@ -95,7 +95,7 @@ class LogReport:
 
     @property
     def metres_note(self) -> str:
-        """What has to be said of metres if the ground plane was not measured; otherwise ""."""
+        """The remark on metres for a ground plane that was not measured; otherwise ""."""
         if not any(plane.assumed for _, plane in self.planes):
             return ""
         if is_estimated(self.planes):
