@@ -18,6 +18,7 @@ from mcaptrack.geometry.plane_from_boxes import plane_from_boxes
 from mcaptrack.pipeline import motion
 from mcaptrack.pipeline.write import Made
 from mcaptrack.schema import GROUND_PLANE, TRACKS, Frame, Rows
+from mcaptrack.schema.classes import PEOPLE, PERSON
 from mcaptrack.schema.ground_plane import plane_to_rows, rows_to_plane
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources import foreign
@@ -25,10 +26,6 @@ from mcaptrack.sources.cameras import camera_at, provenance_of
 from mcaptrack.sources.pictures import Pictures
 
 _ASSUME, _ESTIMATE = "assume-ground-plane", "estimate-ground-plane"
-#: Names of the class of people, in the metadata of channels.
-_PEOPLE: Final = {"person", "people", "pedestrian"}
-#: The number of that class where classes have no names.
-_PERSON: Final = 1
 #: A plane is estimated from boxes of at most so many frames.
 _MOST_FRAMES: Final = 5000
 
@@ -59,7 +56,7 @@ class PlaneChoice(NamedTuple):
 
 
 #: The choice of a user who makes none.
-AS_BEFORE: Final = PlaneChoice()
+AS_BEFORE: Final[PlaneChoice] = PlaneChoice()
 
 
 def read_planes(opened: log.Log, prefix: str) -> Planes | None:
@@ -161,11 +158,11 @@ def _people(
     """Return boxes of people, the number of the frame of each, and their scores; of some frames of a long log."""
     frames = frames[:: -(-len(frames) // _MOST_FRAMES)]
     names = next((one.classes for _, one in _chain(opened, source, made) if one and one.classes), {})
-    wanted = [int(number) for number, name in names.items() if name.lower() in _PEOPLE and number.isdecimal()]
+    wanted = [int(number) for number, name in names.items() if name.lower() in PEOPLE and number.isdecimal()]
     rows: Rows = np.concatenate([frame.rows for frame in frames])
     number = np.repeat(np.arange(len(frames)), [len(frame.rows) for frame in frames])
     if "class_id" in (rows.dtype.names or ()):
-        wanted = wanted or [_PERSON]
+        wanted = wanted or [PERSON]
         is_person = np.isin(rows["class_id"], wanted)
         if is_person.any():
             rows, number = rows[is_person], number[is_person]
