@@ -342,6 +342,14 @@ def test_another_version_of_a_class_that_is_named_is_a_warning(place):
     assert "other-version" in codes("run", "a.mcap", "--no-tables", "--force", *words)
 
 
+def test_a_package_that_is_not_named_is_not_imported(place):
+    install(text="raise RuntimeError('broken')")
+    done("track", "a.mcap", "-q")
+    done("info", "a.mcap")
+    assert call("--help").code == call("run", "--help").code == 0
+    assert "own" not in sys.modules
+
+
 def test_help_reads_no_file_of_settings(place):
     (place / "mcaptrack.toml").write_text("[track")
     assert call("track", "a.mcap").code == 2

@@ -260,6 +260,11 @@ def test_the_place_of_a_failure_is_named_also_below_a_folder_called_mcaptrack(tm
         ("x = (", "nearest", r"tracker nearest \(own-trackers 1.5\) can't be imported: SyntaxError"),
         ("", "nearest", r"tracker nearest \(own-trackers 1.5\): own_trackers has no class Nearest"),
         ("Nearest = 3", "own_trackers:Nearest", "Nearest in own_trackers is no class but of type int"),
+        (
+            "import functools\nNearest = functools.partial(int)",
+            "own_trackers:Nearest",
+            "Nearest in own_trackers is no class but of type partial",
+        ),
         ("raise SystemExit(0)", "own_trackers:Nearest", "can't be imported: SystemExit: 0"),
         ("", "own_trackers:", "own_trackers: is not of the form module:Class"),
         ("", "a b:C", "a b:C is not of the form module:Class"),

@@ -29,7 +29,11 @@ class Numbered:
         return {"": 0.0}
 
     def __call__(self, frames: Iterable[Frame]) -> Iterator[tuple[Frame]]:
-        frames, count = list(frames) if self.breaks in ("causal", "late") else frames, 0
+        frames, count = list(frames) if self.breaks in ("causal", "late", "spawn") else frames, 0
+        if self.breaks == "shared":
+            self.seen.clear()
+        if self.breaks == "spawn" and not frames:
+            yield (Frame(0, 0, TRACKS.empty()),)
         for frame in frames:
             if self.breaks == "skip" and not len(frame.rows):
                 continue
@@ -38,7 +42,9 @@ class Numbered:
             given = frame.rows if self.breaks == "order" else np.sort(frame.rows, order=["x_px", "y_px"])
             ids = count + np.arange(len(given), dtype=np.int64)
             count += len(given)
-            if self.breaks == "state":
+            if self.breaks == "merge" and (np.diff(frame.rows["x_px"]) < 0).any():
+                ids = np.arange(len(given), dtype=np.int64)
+            if self.breaks in ("state", "shared"):
                 self.seen.append(1)
                 ids += len(self.seen)
             if self.breaks == "order" and len(given):
@@ -48,7 +54,10 @@ class Numbered:
                 track_id=ids,
                 **{name: given[name] for name in ("x_px", "y_px", "w_px", "h_px", "score")},
                 observed=np.ones(len(given), bool),
-                source_id=np.full(len(given), len(frames) if self.breaks == "causal" else -1),
+                source_id=np.full(
+                    len(given),
+                    len(frames) if self.breaks == "causal" or (self.breaks == "late" and frame.index > 9) else -1,
+                ),
             )
             if self.breaks == "ghost" and not len(rows):
                 rows = TRACKS.empty(1)
@@ -83,6 +92,9 @@ def test_all_defaults_pass(stage):
         ("index", "conforms: tracker Numbered gave frame 0 of .* which is not in its input"),
         ("tuple", "conforms: result 0 is no tuple of 1 frames"),
         ("state", "pure: the second run differs from the first in result 0 at"),
+        ("shared", "pure: the second run differs from the first in result . at"),
+        ("late", "causal: output '', frame 1. at .* depends on frames after number 14"),
+        ("spawn", "empties: no frames give frames"),
         ("input", "pure: it changes its input, first in frame 0 at"),
         ("causal", "causal: output '', frame 0 at .* depends on frames after number 0"),
         ("order", "order-blind: output '', frame . at .* depends on the order of rows"),
@@ -93,6 +105,12 @@ def test_all_defaults_pass(stage):
 def test_a_broken_law_is_named_with_its_place(breaks, words):
     with pytest.raises(LawError, match=words):
         check_transform(Numbered(breaks=breaks))
+
+
+def test_two_ids_that_become_one_when_rows_are_shuffled_are_noticed():
+    frames = [frame._replace(rows=np.sort(frame.rows, order=["x_px", "y_px"])) for frame in sample_frames(DETECTIONS)]
+    with pytest.raises(LawError, match="order-blind: two ids become one"):
+        check_transform(Numbered(breaks="merge"), frames)
 
 
 def test_declarations_and_parameters_are_checked():
