@@ -151,3 +151,63 @@ def test_boxes_of_tiles_are_joined_across_the_seam(left, right, expected):
 
 def test_boxes_of_two_classes_are_never_joined():
     assert len(joined([(60, 10, 100, 40, 0.6)], [(80, 11, 130, 41, 0.7)], (0, 1))) == 2
+
+
+def seen_in_tiles(people: np.ndarray, tiles: list[tuple[int, int, int, int]]) -> list[Boxes]:
+    """What a perfect detector finds in each tile: the visible part of each person of whom a third or more is there."""
+    parts = []
+    for tile in tiles:
+        xyxy = np.hstack([np.maximum(people[:, :2], tile[:2]), np.minimum(people[:, 2:], tile[2:])])
+        visible = np.prod(np.maximum(xyxy[:, 2:] - xyxy[:, :2], 0), axis=1) / np.prod(
+            people[:, 2:] - people[:, :2], axis=1
+        )
+        some = visible >= 0.35
+        parts.append(Boxes(xyxy[some], 0.4 + visible[some] / 2, np.zeros(some.sum(), int)))
+    return parts
+
+
+def crowd(rng: np.random.Generator, size: tuple[int, int], most_iou: float) -> np.ndarray:
+    """People anywhere in a picture, who overlap one another by ``most_iou`` at most."""
+    people: list[np.ndarray] = []
+    for _ in range(40):
+        wide = rng.uniform(25, 90)
+        shape = np.array([wide, wide * rng.uniform(2, 3)])
+        low = rng.uniform(0, np.array(size) - shape)
+        box = np.concatenate([low, low + shape])
+        if all(overlap(box, other) <= most_iou for other in people):
+            people.append(box)
+    return np.array(people)
+
+
+def lost_and_added(people: np.ndarray, found: np.ndarray) -> tuple[int, int]:
+    """How many people have no box, and how many boxes are no person or a second one."""
+    same = np.array([[overlap(one, box) > 0.8 for box in found] for one in people])
+    return int((~same.any(axis=1)).sum()), len(found) - int(same.any(axis=1).sum())
+
+
+@given(seed=SEEDS, grid=st.sampled_from([(3, 2), (2, 3), (1, 4)]), overlap_of_tiles=st.sampled_from([0.1, 0.2, 0.4]))
+@settings(max_examples=20, deadline=None)
+def test_people_apart_from_one_another_have_one_box_each_wherever_seams_are(seed, grid, overlap_of_tiles):
+    people = crowd(np.random.default_rng(seed), (1400, 1000), 0.0)
+    tiles = tiles_of(1400, 1000, *grid, overlap_of_tiles)
+    assert lost_and_added(people, join_tiles(seen_in_tiles(people, tiles), tiles, 0.45).xyxy) == (0, 0)
+
+
+def test_people_who_hide_one_another_at_a_seam_are_kept():
+    tiles = tiles_of(1400, 1000, 3, 2, 0.2)
+    scenes = [crowd(np.random.default_rng(seed), (1400, 1000), 0.4) for seed in range(8)]
+    counts = [lost_and_added(people, join_tiles(seen_in_tiles(people, tiles), tiles, 0.45).xyxy) for people in scenes]
+    assert sum(map(len, scenes)) > 200
+    assert np.sum(counts, axis=0).tolist() == [0, 0]
+
+
+@pytest.mark.parametrize("across", [0, 1])
+def test_tiles_that_share_nothing_are_joined_where_they_meet(across):
+    tiles = [(0, 0, 100, 100), (100, 0, 200, 100), (200, 0, 300, 100)]
+    parts = [[70, 10, 100, 40], [100, 10, 130, 41], [260, 10, 290, 40]]
+    if across:
+        tiles, parts = ([[one[k] for k in (1, 0, 3, 2)] for one in some] for some in (tiles, parts))
+    boxes = [Boxes(np.array([part], float), np.array([0.5]), np.zeros(1, int)) for part in parts]
+    found = join_tiles(boxes, [tuple(tile) for tile in tiles], 0.45).xyxy.tolist()
+    expected = [[70, 10, 130, 41], [260, 10, 290, 40]]
+    assert sorted(found) == sorted([one[k] for k in ((1, 0, 3, 2) if across else range(4))] for one in expected)

@@ -69,8 +69,8 @@ def suppress(boxes: Boxes, max_iou: float) -> Boxes:
 def join_tiles(parts: list[Boxes], tiles: list[tuple[int, int, int, int]], max_iou: float) -> Boxes:
     """The boxes of a picture from those of its tiles.
 
-    A box that an edge of its tile cuts off is dropped where another tile's box covers it; two that continue one another
-    across a seam become one.
+    A box that an edge of its tile cuts off is dropped where a larger box of another tile covers it; two that continue
+    one another across a seam become one.
 
     Parameters
     ----------
@@ -92,28 +92,26 @@ def join_tiles(parts: list[Boxes], tiles: list[tuple[int, int, int, int]], max_i
     cut = np.concatenate([_cut(part.xyxy, one, tiles) for part, one in zip(parts, tiles, strict=True)])
     order = _by_score(boxes)[:_MOST]
     boxes, tile, cut = boxes.take(order), tile[order], cut[order]
-    inner = _overlaps(boxes.xyxy)[1]
+    overlap, inner = _overlaps(boxes.xyxy)
     area = _areas(boxes.xyxy)
-    smaller = np.minimum(area[:, None], area)
     is_cut = np.asarray(cut.any(axis=1))
     other = (tile[:, None] != tile) & (boxes.label[:, None] == boxes.label)
-    # Of a pair that is one object, a box that is cut is a part of the other one.
-    is_part = is_cut[:, None] & (area[:, None] <= area) & (inner >= _COVERED * smaller)
-    same = other & (is_part | is_part.T | (_continued(boxes.xyxy, cut) & (inner > 0)))
-    group = _groups(same)
+    facing = other & _continued(boxes.xyxy, cut)
+    # Each cut box is a part of one other box at most: two people beside one another are whole in a tile each, and what
+    # either tile cuts off may lie within both.
+    larger = (area[:, None] < area) | ((area[:, None] == area) & np.tri(len(area), k=-1, dtype=bool))
+    part_of = other & ~facing & is_cut[:, None] & larger & (inner >= _COVERED * area[:, None])
+    is_gone = part_of.any(axis=1)
+    score = boxes.score.copy()
+    others = np.where(part_of, overlap, -1.0)[is_gone].argmax(axis=1) if is_gone.any() else []
+    np.maximum.at(score, others, boxes.score[is_gone])
+    boxes, left = boxes._replace(score=score).take(~is_gone), np.flatnonzero(~is_gone)
+    group = _groups(facing[np.ix_(left, left)])
     xyxy, score = boxes.xyxy.copy(), boxes.score.copy()
-    first = np.unique(group, return_index=True)[1]
-    for number in first[np.bincount(group, minlength=len(group))[group[first]] > 1]:
-        members = group == group[number]
-        whole = members & ~is_cut
-        those = whole if whole.any() else members
-        if whole.any():
-            best = np.flatnonzero(whole)[0]
-            xyxy[number], score[number] = boxes.xyxy[best], boxes.score[members].max()
-        else:
-            xyxy[number, :2] = boxes.xyxy[those, :2].min(axis=0)
-            xyxy[number, 2:] = boxes.xyxy[those, 2:].max(axis=0)
-    return suppress(Boxes(xyxy, score, boxes.label).take(first), max_iou)
+    np.minimum.at(xyxy[:, :2], group, boxes.xyxy[:, :2])
+    np.maximum.at(xyxy[:, 2:], group, boxes.xyxy[:, 2:])
+    np.maximum.at(score, group, boxes.score)
+    return suppress(Boxes(xyxy, score, boxes.label).take(np.unique(group)), max_iou)
 
 
 def _by_score(boxes: Boxes) -> Ints:
@@ -144,7 +142,7 @@ def _cut(xyxy: Floats, tile: tuple[int, int, int, int], tiles: list[tuple[int, i
 
 
 def _continued(xyxy: Floats, cut: Bools) -> Bools:
-    """Whether pairs (N, N) are the two parts of one box: cut on sides that face each other, and of equal extent."""
+    """Whether pairs (N, N) are the parts of one box: cut on sides that face each other and meet, of equal extent."""
     out = np.zeros((len(xyxy), len(xyxy)), bool)
     for axis in (0, 1):
         across, along = axis, 1 - axis
@@ -152,7 +150,8 @@ def _continued(xyxy: Floats, cut: Bools) -> Bools:
         inner = np.minimum(high[:, None], high) - np.maximum(low[:, None], low)
         union = np.maximum(high[:, None], high) - np.minimum(low[:, None], low)
         agrees = inner >= _ALONG * np.maximum(union, 1e-9)
-        faces = cut[:, None, across + 2] & cut[None, :, across]
+        meets = xyxy[:, across] <= xyxy[:, None, across + 2] + 2 * _EDGE_PX
+        faces = cut[:, None, across + 2] & cut[None, :, across] & meets & meets.T
         out |= agrees & (faces | faces.T)
     return out
 
