@@ -80,6 +80,25 @@ def model(
     return field(1, 8) + field(7, graph) + field(8, field(2, 13)) + pairs
 
 
+def giving(
+    outputs: Mapping[str, object],
+    *,
+    inputs: Sequence[bytes] = (),
+    shape: Sequence[int | str] = (1, 3, 128, 160),
+    metadata: Mapping[str, str] = {},
+) -> bytes:
+    """A network that gives the same ``outputs`` for every picture; ``inputs`` are those beside the picture."""
+    arrays = {name: np.asarray(array) for name, array in outputs.items()}
+    kinds = {name: FLOAT if array.dtype.kind == "f" else INT64 for name, array in arrays.items()}
+    return model(
+        [node("Identity", [f"{name} as it is"], [name]) for name in arrays],
+        [value("images", shape), *inputs],
+        [value(name, None, kinds[name]) for name in arrays],
+        {name: tensor(array, f"{name} as it is", kinds[name]) for name, array in arrays.items()},
+        metadata,
+    )
+
+
 def blueness(layout: str, blue: float, grey: float = 0.0) -> tuple[np.ndarray, float]:
     """Weights of the three channels of a layout's input, and a bias: ``blue`` for pure blue, ``grey`` for any grey."""
     order, divide, mean, deviation = INPUTS[layout]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import sys
+import weakref
 from dataclasses import fields, replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -174,6 +175,21 @@ class TestConvention:
             assert [len(some) for some in boxes(found_by, grey, grey, PICTURE, grey)] == [0, 0, 1, 0]
             assert facts(found_by)["layout"] == layout
 
+    def test_pictures_are_not_kept_until_the_layout_is_told(self, network, monkeypatch):
+        monkeypatch.setattr("mcaptrack.transforms.detect.onnx.detector.workers", lambda: 2)
+        seen, most = [], []
+
+        def frames():
+            for number in range(40):
+                image = blue_blocks(SIZE)
+                seen.append(weakref.ref(image))
+                yield Frame(number, number, image)
+                del image
+                most.append(sum(one() is not None for one in seen))
+
+        assert len(list(OnnxDetector(file=str(network()))(frames()))) == 40
+        assert max(most) < 12
+
     @pytest.mark.parametrize(("file", "layout"), [("yolox", "yolox-legacy"), ("yolox-legacy", "yolox")])
     def test_a_wrong_layout_that_finds_nothing_is_refused_with_the_one_that_does(self, network, file, layout):
         path = network(file)
@@ -214,7 +230,9 @@ class TestConvention:
             {"rows": tensor(rows, "rows")},
         )
         assert "no likelihoods" in refused(OnnxDetector(file=str(network(data=data))))
-        assert "frame 0 are no likelihoods" in refused(OnnxDetector(file=str(network(data=data)), layout="yolox"))
+        assert "in frame 0 scores are no likelihoods" in refused(
+            OnnxDetector(file=str(network(data=data)), layout="yolox")
+        )
 
 
 def constant(shape: tuple[int, ...], number: float = 0.0, inputs: list[bytes] | None = None) -> bytes:

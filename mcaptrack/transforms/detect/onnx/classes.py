@@ -46,18 +46,20 @@ def names_of(declared: Mapping[int, str], count: int | None) -> dict[int, str]:
 
 
 def numbers_of(names: Mapping[int, str]) -> dict[int, int]:
-    """The number of each class in rows: 1 is a person, 0 stays free for what is unknown.
+    """The number of each class in rows: 1 is a person and nothing else, 0 stays free for what is unknown.
 
-    Others keep their index, plus one where the network counts from 0.
+    Others keep their index, plus one where the network counts from 0; the one that would be 1 takes the number of
+    people, or the next one after all if there are none.
     """
     first = 0 if 0 not in names else 1
     people = _people(names)
     numbers = {index: index + first for index in names}
-    if people is not None and numbers[people] != _PERSON:
-        taken = next((index for index, number in numbers.items() if number == _PERSON), None)
-        if taken is not None:
-            numbers[taken] = numbers[people]
-        numbers[people] = _PERSON
+    free = max(numbers.values(), default=0) + 1 if people is None else numbers[people]
+    for index, number in numbers.items():
+        if people is not None and names[index].casefold() == names[people].casefold():
+            numbers[index] = _PERSON
+        elif number == _PERSON:
+            numbers[index] = free
     return numbers
 
 
@@ -66,25 +68,38 @@ def wanted(names: Mapping[int, str], classes: str, where: str) -> list[int]:
 
     Raises McaptrackError, which begins with ``where``, for one that there is not.
     """
-    if classes.strip() == "all":
+    if are_all(classes):
         return sorted(names)
-    by_name = {name.casefold(): index for index, name in names.items()}
-    out = []
-    for word in (word.strip() for word in classes.split(",")):
-        index = by_name.get(word.casefold())
-        if index is None and word.casefold() == _PEOPLE[0]:
-            index = _people(names)
-        if index is None and word.isdecimal() and int(word) in names:
-            index = int(word)
-        if index is None:
-            close = difflib.get_close_matches(word.casefold(), by_name, 1)
+    by_name: dict[str, list[int]] = {}
+    for index, name in names.items():  # two classes may have one name
+        by_name.setdefault(name.casefold(), []).append(index)
+    out: set[int] = set()
+    for word in filter(None, (word.strip().casefold() for word in classes.split(","))):
+        people = _people(names) if word == _PEOPLE[0] else None
+        found = by_name.get(word) or ([] if people is None else by_name[names[people].casefold()])
+        if not found and word.isdecimal() and int(word) in names:
+            found = [int(word)]
+        if not found:
+            close = difflib.get_close_matches(word, by_name, 1)
             meant = f"did you mean {close[0]}? " if close else ""
-            known = ", ".join(list(names.values())[:10]) + (f" and {len(names) - 10} more" if len(names) > 10 else "")
-            raise McaptrackError(f"{where} has no class {word!r}; {meant}`classes=` takes {known}, or all")
-        out.append(index)
-    return sorted(set(out))
+            raise McaptrackError(f"{where} has no class {word!r}; {meant}`classes=` takes {_known(names)}")
+        out.update(found)
+    if not out:
+        raise McaptrackError(f"`classes=` names none; {where} has {_known(names)}")
+    return sorted(out)
+
+
+def are_all(classes: str) -> bool:
+    """Whether every class is wanted."""
+    return classes.strip().casefold() == "all"
+
+
+def _known(names: Mapping[int, str]) -> str:
+    some = ", ".join(list(names.values())[:10])
+    return f"{some} and {len(names) - 10} more, or all" if len(names) > 10 else f"{some}, or all"
 
 
 def _people(names: Mapping[int, str]) -> int | None:
-    by_name = {name.casefold(): index for index, name in names.items()}
+    """The first index of the class of people."""
+    by_name = {name.casefold(): index for index, name in reversed(list(names.items()))}
     return next((by_name[name] for name in _PEOPLE if name in by_name), None)

@@ -7,11 +7,12 @@ from pathlib import Path
 from typing import Final
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.transforms.detect.onnx.layouts import LAYOUTS, Layout, NetworkSignature, possible
+from mcaptrack.transforms.detect.onnx.layouts import LAYOUTS, Layout, NetworkSignature, possible, recognised
 from mcaptrack.transforms.detect.onnx.nms import Boxes
+from mcaptrack.transforms.detect.onnx.outputs import SURE, MisreadError
 
-#: A box with such a score is evidence that a network was read as it was trained: a wrong reading gives lower ones.
-_EVIDENCE: Final = 0.4
+#: What a layout finds in a picture, or why the outputs can't be read by it.
+Found = Boxes | MisreadError
 #: A layout is taken if its evidence is so many times that of each other one.
 _CLEAR: Final = 2.0
 #: After so many pictures with evidence for several layouts it can't be told.
@@ -20,7 +21,7 @@ _PATIENCE: Final = 25
 
 def evidence(boxes: Boxes) -> float:
     """The amount of certain evidence: the sum of high scores."""
-    return float(boxes.score[boxes.score >= _EVIDENCE].sum())
+    return float(boxes.score[boxes.score >= SURE].sum())
 
 
 def choose(path: Path, name: str, seen: NetworkSignature) -> list[Layout]:
@@ -30,9 +31,12 @@ def choose(path: Path, name: str, seen: NetworkSignature) -> list[Layout]:
     """
     fitting = possible(seen)
     if name == "auto":
-        if not fitting:
-            raise McaptrackError(f"{path} {_outputs(seen)}, as no detector of a known layout does ({_all()})")
-        return fitting
+        if found := recognised(seen):
+            return found
+        if fitting:
+            names = ", ".join(layout.name for layout in fitting)
+            raise McaptrackError(f"{path} {_outputs(seen)}; its layout may be one of {names}: choose with `layout=`")
+        raise McaptrackError(f"{path} {_outputs(seen)}, as no detector of a known layout does ({_all()})")
     if not LAYOUTS[name].fits(seen):
         others = ", ".join(layout.name for layout in fitting)
         fits = f"that fits {others}" if others else f"that fits no layout ({_all()})"
@@ -57,19 +61,20 @@ class Contest:
         """Whether one layout is left."""
         return len(self.layouts) == 1
 
-    def see(self, found: Mapping[str, Boxes | None]) -> None:
-        """Judge by what each layout finds in a picture; None where the outputs make no sense.
+    def see(self, found: Mapping[str, Found]) -> None:
+        """Judge by what each layout finds in a picture.
 
         Raises McaptrackError if none is left, or if it can't be told.
         """
         if self.is_settled:
             return
-        self._keep([layout for layout in self.layouts if found.get(layout.name) is not None])
-        if not self.layouts:
-            raise McaptrackError(f"{self._path}: its scores are no likelihoods from 0 to 1 in any layout that fits")
+        boxes = {name: one for name, one in found.items() if isinstance(one, Boxes)}
+        if not any(layout.name in boxes for layout in self.layouts):
+            why = "; ".join(f"read as {layout.name}, {found[layout.name]}" for layout in self.layouts)
+            raise McaptrackError(f"{self._path} fits no layout: {why}")
+        self._keep([layout for layout in self.layouts if layout.name in boxes])
         for layout in self.layouts:
-            boxes = found[layout.name]
-            self._sums[layout.name] += evidence(boxes) if boxes else 0.0
+            self._sums[layout.name] += evidence(boxes[layout.name])
         ordered = sorted(self.layouts, key=lambda layout: -self._sums[layout.name])
         best, second = (self._sums[layout.name] for layout in (ordered * 2)[:2])
         self._pictures += best > 0
@@ -93,7 +98,7 @@ class Contest:
 
 
 def refuse_if_misread(
-    path: Path, layout: Layout, pictures: int, found: Mapping[str, Sequence[Boxes | None]], is_chosen: bool
+    path: Path, layout: Layout, pictures: int, found: Mapping[str, Sequence[Found]], is_chosen: bool
 ) -> None:
     """Refuse a network that found nothing in any picture though another layout finds boxes in some of them.
 
@@ -105,16 +110,16 @@ def refuse_if_misread(
         The layout by which it found nothing.
     pictures : int
         How many pictures there were.
-    found : mapping of str to sequence of Boxes or None
+    found : mapping of str to sequence of Boxes or MisreadError
         What each other layout that fits finds in some of the pictures.
     is_chosen : bool
         Whether the layout was named.
 
     """
     for name, boxes in found.items():
-        with_boxes = [one for one in boxes if one is not None and evidence(one) > 0]
+        with_boxes = [one for one in boxes if isinstance(one, Boxes) and evidence(one) > 0]
         if with_boxes:
-            count = sum(int((one.score >= _EVIDENCE).sum()) for one in with_boxes)
+            count = sum(int((one.score >= SURE).sum()) for one in with_boxes)
             instead = f"choose `layout={name}`" if is_chosen else "choose with `layout=`"
             raise McaptrackError(
                 f"{path}, read as {layout.name}, finds nothing in {pictures} pictures, and read as {name} finds "
@@ -125,7 +130,9 @@ def refuse_if_misread(
 def _outputs(seen: NetworkSignature) -> str:
     some = [f"{name} {' x '.join(map(str, array.shape)) or 'a number'}" for name, array in seen.outputs.items()]
     more = f" and {len(some) - 6} more" if len(some) > 6 else ""
-    return f"takes {', '.join(seen.inputs)} and gives {', '.join(some[:6])}{more} at {seen.size[0]}x{seen.size[1]}"
+    names = f", with {seen.names} names of classes" if seen.names else ""
+    size = f"{seen.size[0]}x{seen.size[1]}"
+    return f"takes {', '.join(seen.inputs)} and gives {', '.join(some[:6])}{more} at {size}{names}"
 
 
 def _all() -> str:

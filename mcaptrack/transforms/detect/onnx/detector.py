@@ -7,10 +7,10 @@ Letters: N boxes.
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain, islice
 from math import sqrt
 from pathlib import Path
@@ -22,11 +22,13 @@ from numpy.typing import NDArray
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Image
+from mcaptrack.notices import warn
 from mcaptrack.schema import DETECTIONS, VIDEO, Frame, Schema
 from mcaptrack.transforms.detect.onnx import classes as known_classes
-from mcaptrack.transforms.detect.onnx.convention import Contest, choose, refuse_if_misread
-from mcaptrack.transforms.detect.onnx.layouts import Layout, ScoreError, class_count, possible
+from mcaptrack.transforms.detect.onnx.convention import Contest, Found, choose, refuse_if_misread
+from mcaptrack.transforms.detect.onnx.layouts import Layout, class_count, possible, recognised
 from mcaptrack.transforms.detect.onnx.nms import Boxes, join_tiles, suppress
+from mcaptrack.transforms.detect.onnx.outputs import MisreadError
 from mcaptrack.transforms.detect.onnx.placing import Size, Tile, place, tiles_of
 from mcaptrack.transforms.detect.onnx.session import DetectorNetwork, Device, read_file, workers
 from mcaptrack.transforms.protocol import Colour, ModelCard, Suited, check_options, option
@@ -43,6 +45,8 @@ _LEAST_PIXELS, _MOST_PIXELS = 700_000, 1_000_000
 _MOST_TILES: Final = 64
 #: So many pictures in which nothing was found are kept, to try other layouts on.
 _KEPT: Final = 4
+#: So many classes without a name are listed.
+_SHOWN: Final = 8
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,8 +126,8 @@ class OnnxDetector:
         if first is None:
             return
         run = _Run(self, self.weights(), first.rows)
-        for frame, boxes in run.detect(chain([first], frames)):
-            yield (Frame(frame.t_ns, frame.index, run.to_rows(boxes, frame.rows)),)
+        for seen, boxes in run.detect(chain([first], frames)):
+            yield (Frame(seen.t_ns, seen.frame, run.to_rows(boxes, seen.size)),)
         object.__setattr__(self, "_card", run.card())
 
     def weights(self) -> Path:
@@ -145,14 +149,17 @@ class OnnxDetector:
 
     def why_empty(self, given: Sequence[Frame], made: Sequence[Frame]) -> str:
         """Why there are no detections, for a warning."""
-        return f"the network finds no {self.classes} with a score of at least {self.min_score:g}"
+        what = "nothing" if known_classes.are_all(self.classes) else f"no {self.classes}"
+        return f"the network finds {what} with a score of at least {self.min_score:g}"
 
 
 class _Seen(NamedTuple):
-    """A picture and what each layout that is still possible finds in it; None where the outputs make no sense."""
+    """A picture, of which width and height are kept, and what each layout that is still possible finds in it."""
 
-    frame: Frame
-    found: Mapping[str, Boxes | None]
+    t_ns: int
+    frame: int
+    size: Size
+    found: Mapping[str, Found]
 
 
 class _Run:
@@ -168,39 +175,41 @@ class _Run:
         seen = self._network.signature
         layouts = choose(path, options.layout, seen)
         count = class_count(layouts[0], seen)
-        self._names = known_classes.names_of(file.names, count)
+        self._names, self._is_named = known_classes.names_of(file.names, count), bool(file.names)
+        self._unknown: Counter[int] = Counter()
         self._wanted = np.array(known_classes.wanted(self._names, options.classes, str(path)), np.int64)
         self._numbers = known_classes.numbers_of(self._names)
         self._contest = Contest(path, layouts)
 
-    def detect(self, frames: Iterator[Frame]) -> Iterator[tuple[Frame, Boxes]]:
+    def detect(self, frames: Iterator[Frame]) -> Iterator[tuple[_Seen, Boxes]]:
         """The boxes of each picture, of all classes. Raises McaptrackError as the network and the contest do."""
         waiting: list[_Seen] = []
         kept: list[Image] = []
         pictures, anything = 0, False
-        for seen in self._look(frames):
-            if not self._contest.is_settled:
-                self._contest.see(seen.found)
+        for image, seen in self._look(frames):
+            self._contest.see(seen.found)
             waiting.append(seen)
             pictures += 1
             if not anything and (pictures & (pictures - 1)) == 0:  # the first, second, fourth, eighth ...
-                kept = [*kept, seen.frame.rows][-_KEPT:]
+                kept = [*kept, image][-_KEPT:]
             if self._contest.is_settled:
-                for frame, boxes in self._drain(waiting):
+                for one, boxes in self._drain(waiting):
                     anything |= len(boxes.score) > 0
-                    yield frame, boxes
+                    yield one, boxes
         self._contest.end()
-        for frame, boxes in self._drain(waiting):
+        for one, boxes in self._drain(waiting):
             anything |= len(boxes.score) > 0
-            yield frame, boxes
+            yield one, boxes
         if not anything:
             self._refuse_if_misread(pictures, kept)
+        self._warn_of_unknown()
 
-    def to_rows(self, boxes: Boxes, image: Image) -> NDArray[np.void]:
+    def to_rows(self, boxes: Boxes, size: Size) -> NDArray[np.void]:
         """Rows of the wanted classes, within the picture, in reading order."""
+        unknown, count = np.unique(boxes.label[~np.isin(boxes.label, list(self._names))], return_counts=True)
+        self._unknown.update(dict(zip(unknown.tolist(), count.tolist(), strict=True)))
         boxes = boxes.take(np.isin(boxes.label, self._wanted))
-        height, width = image.shape[:2]
-        xyxy = np.clip(boxes.xyxy, 0, [width, height, width, height])
+        xyxy = np.clip(boxes.xyxy, 0, [*size, *size])
         boxes = boxes._replace(xyxy=xyxy).take((xyxy[:, 2] > xyxy[:, 0]) & (xyxy[:, 3] > xyxy[:, 1]))
         order = np.lexsort((boxes.score, boxes.label, boxes.xyxy[:, 0], boxes.xyxy[:, 1]))
         x1, y1, x2, y2 = boxes.xyxy[order].T
@@ -215,24 +224,27 @@ class _Run:
         names = {self._numbers[index]: self._names[index] for index in self._wanted.tolist()}
         return ModelCard(self._sha256, names, facts)
 
-    def _drain(self, waiting: list[_Seen]) -> Iterator[tuple[Frame, Boxes]]:
+    def _drain(self, waiting: list[_Seen]) -> Iterator[tuple[_Seen, Boxes]]:
         """The pictures that wait, with the boxes of the layout that was settled on."""
-        name = self._contest.layouts[0].name
-        for frame, found in waiting:
-            boxes = found[name]
-            if boxes is None:
-                raise McaptrackError(
-                    f"{self._path}, read as {name}: scores of frame {frame.index} are no likelihoods from 0 to 1; "
-                    "choose another `layout=`"
-                )
-            yield frame, boxes
+        layout = self._contest.layouts[0]
+        for seen in waiting:
+            boxes = seen.found[layout.name]
+            if isinstance(boxes, MisreadError):
+                raise McaptrackError(self._misread(seen.frame, layout, boxes))
+            yield seen, boxes
         waiting.clear()
 
-    def _look(self, frames: Iterator[Frame]) -> Iterator[_Seen]:
+    def _misread(self, frame: int, layout: Layout, error: MisreadError) -> str:
+        # RT-DETR and D-FINE differ in nothing but the name.
+        others = [one.name for one in possible(self._network.signature) if replace(one, name=layout.name) != layout]
+        then = f"choose another `layout=` ({', '.join(others)})" if others else "no other layout fits it"
+        return f"{self._path}, read as {layout.name}: in frame {frame} {error}; {then}"
+
+    def _look(self, frames: Iterator[Frame]) -> Iterator[tuple[Image, _Seen]]:
         """Look at pictures, several beside one another; results come in order."""
         count, batch = workers(), self._network.batch
         with ThreadPoolExecutor(count) as pool:
-            running: deque[Future[list[_Seen]]] = deque()
+            running: deque[Future[list[tuple[Image, _Seen]]]] = deque()
             try:
                 while some := list(islice(frames, batch)):
                     running.append(pool.submit(self._look_at, some))
@@ -244,19 +256,22 @@ class _Run:
                 for future in running:
                     future.cancel()
 
-    def _look_at(self, frames: list[Frame]) -> list[_Seen]:
-        found: list[dict[str, Boxes | None]] = [{} for _ in frames]
+    def _look_at(self, frames: list[Frame]) -> list[tuple[Image, _Seen]]:
+        found: list[dict[str, Found]] = [{} for _ in frames]
         for layout in self._contest.layouts:
             for one, boxes in zip(found, self._boxes(layout, frames), strict=True):
                 one[layout.name] = boxes
-        return [_Seen(frame, one) for frame, one in zip(frames, found, strict=True)]
+        return [
+            (frame.rows, _Seen(frame.t_ns, frame.index, (frame.rows.shape[1], frame.rows.shape[0]), one))
+            for frame, one in zip(frames, found, strict=True)
+        ]
 
-    def _boxes(self, layout: Layout, frames: list[Frame]) -> list[Boxes | None]:
-        """The boxes that a layout finds in pictures; None where the outputs make no sense."""
+    def _boxes(self, layout: Layout, frames: list[Frame]) -> list[Found]:
+        """The boxes that a layout finds in pictures, or why its outputs can't be read."""
         size, options = self._network.size, self._options
         tiles = [tiles_of(frame.rows.shape[1], frame.rows.shape[0], *self._grid, options.overlap) for frame in frames]
         jobs = [(frame, tile) for frame, those in zip(frames, tiles, strict=True) for tile in those]
-        parts: list[Boxes | None] = []
+        parts: list[Found] = []
         for start in range(0, len(jobs), self._network.batch):
             some = jobs[start : start + self._network.batch]
             placed = [place(frame.rows, tile, size, layout.fit, layout.pad) for frame, tile in some]
@@ -267,24 +282,24 @@ class _Run:
                 )
             try:
                 read = layout.read(outputs, size, options.min_score)
-            except ScoreError:
-                parts += [None] * len(some)
+            except MisreadError as error:
+                parts += [error] * len(some)
                 continue
             parts += [
                 boxes._replace(xyxy=placement.to_picture(boxes.xyxy))
                 for boxes, (_, placement) in zip(read, placed, strict=True)
             ]
-        out: list[Boxes | None] = []
+        out: list[Found] = []
         for those in tiles:
             own, parts = parts[: len(those)], parts[len(those) :]
             out.append(self._merged(layout, own, those))
         return out
 
-    def _merged(self, layout: Layout, parts: list[Boxes | None], tiles: list[Tile]) -> Boxes | None:
+    def _merged(self, layout: Layout, parts: list[Found], tiles: list[Tile]) -> Found:
         """The boxes of a picture from those of its tiles."""
-        known = [boxes for boxes in parts if boxes is not None]
+        known = [boxes for boxes in parts if isinstance(boxes, Boxes)]
         if len(known) < len(parts):
-            return None
+            return next(error for error in parts if isinstance(error, MisreadError))
         if len(known) == 1:
             return known[0] if layout.suppresses else suppress(known[0], self._options.max_iou)
         suppressed = known if layout.suppresses else [suppress(boxes, self._options.max_iou) for boxes in known]
@@ -292,10 +307,19 @@ class _Run:
 
     def _refuse_if_misread(self, pictures: int, kept: Sequence[Image]) -> None:
         layout = self._contest.layouts[0]
-        others = [one for one in possible(self._network.signature) if one.name != layout.name]
+        others = [one for one in recognised(self._network.signature) if one.name != layout.name]
         frames = [Frame(0, 0, image) for image in kept]
         found = {str(one.name): [self._boxes(one, [frame])[0] for frame in frames] for one in others}
         refuse_if_misread(self._path, layout, pictures, found, self._options.layout != "auto")
+
+    def _warn_of_unknown(self) -> None:
+        """Warn of boxes of classes that names don't include: the names may be of other classes, too."""
+        if self._unknown:
+            classes = sorted(self._unknown)
+            shown = ", ".join(map(str, classes[:_SHOWN])) + (", ..." if len(classes) > _SHOWN else "")
+            which = "in the file" if self._is_named else "of COCO, which are assumed"
+            words = f"{self._path}: {self._unknown.total()} boxes are of classes ({shown}) without a name"
+            warn(f"{words} among the {len(self._names)} {which}; they are left out", "classes")
 
     def _input_size(self, first: Image) -> Size | None:
         if self._options.input_size != _AS_PICTURE:

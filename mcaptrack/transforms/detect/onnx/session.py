@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import warn
 from mcaptrack.transforms.detect.onnx import graph
-from mcaptrack.transforms.detect.onnx.layouts import NetworkSignature, Outputs
+from mcaptrack.transforms.detect.onnx.layouts import NetworkSignature
+from mcaptrack.transforms.detect.onnx.outputs import Outputs
 from mcaptrack.transforms.detect.onnx.placing import Size
 
 Device = Literal["auto", "cpu", "cuda"]
@@ -28,6 +29,9 @@ Device = Literal["auto", "cpu", "cuda"]
 _STEP: Final = 32
 _GREY: Final = 114.0
 _TYPES: Final = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
+_SIZE_TYPES: Final = {**_TYPES, "tensor(int64)": np.int64, "tensor(int32)": np.int32}
+#: The input of RT-DETR and D-FINE for the size of the picture that boxes are given in.
+_SIZES: Final = "orig_target_sizes"
 _CUDA: Final = "CUDAExecutionProvider"
 #: So many pictures go through a GPU together.
 _CUDA_BATCH: Final = 8
@@ -93,8 +97,8 @@ class DetectorNetwork:
         self._check_size(is_other or _known(own) is None)
         if is_other and (old := _known(own)):
             self._session = self._open(graph.resized(file.data, self._image.name, old, wanted), device, old)
-        self._sizes = next((one.name for one in inputs if one.name == "orig_target_sizes"), None)
-        unknown = [one.name for one in inputs if one.name not in (self._image.name, self._sizes)]
+        self._sizes = next((one for one in inputs if one.name == _SIZES and one.type in _SIZE_TYPES), None)
+        unknown = [one.name for one in inputs if one.name != self._image.name and one is not self._sizes]
         if unknown:
             raise McaptrackError(f"{self._describe(inputs)}; an input {unknown[0]} is not known")
         #: Whether it runs on a GPU.
@@ -110,13 +114,13 @@ class DetectorNetwork:
                 raise self._refused_size(_known(own)) from error
             raise
         #: What it takes and gives.
-        self.signature = NetworkSignature(tuple(one.name for one in inputs), outputs, wanted, bool(file.names))
+        self.signature = NetworkSignature(tuple(one.name for one in inputs), outputs, wanted, len(file.names))
 
     def run(self, blob: NDArray[np.float32]) -> Outputs:
         """The outputs by name for pictures (B, 3, height, width). Raises McaptrackError if they can't be computed."""
         given: dict[str, Any] = {self._image.name: blob.astype(_TYPES[self._image.type], copy=False)}
         if self._sizes:
-            given[self._sizes] = np.tile(np.array([self.size], np.int64), (len(blob), 1))
+            given[self._sizes.name] = np.tile(np.array([self.size], _SIZE_TYPES[self._sizes.type]), (len(blob), 1))
         try:
             arrays = self._session.run(None, given)
         except Exception as error:  # ONNX Runtime has no common base class of its errors
@@ -183,7 +187,7 @@ class DetectorNetwork:
         return session
 
     def _image_input(self, inputs: Sequence[Any]) -> Any:
-        found = [one for one in inputs if len(one.shape) == 4 and (one.shape[1] == 3 or not _is_known(one.shape[1]))]
+        found = [one for one in inputs if len(one.shape) == 4 and _are_channels_first(one.shape)]
         if not found or found[0].type not in _TYPES:
             raise McaptrackError(f"{self._describe(inputs)}; it needs pictures B x 3 x H x W of floats")
         batch = found[0].shape[0]
@@ -231,8 +235,8 @@ def _known(size: tuple[int | None, int | None]) -> Size | None:
     return (width, height) if width and height else None
 
 
-def _is_known(size: Any) -> bool:
-    return isinstance(size, int)
+def _are_channels_first(shape: Sequence[Any]) -> bool:
+    return shape[1] == 3 or (not isinstance(shape[1], int) and shape[3] != 3)
 
 
 def _shape(shape: Sequence[Any]) -> str:
