@@ -63,7 +63,8 @@ class Scores:
     ----------
     results : tuple of mcaptrack.evaluation.EvaluationRow
         One for each sequence, channel of tracks, similarity and gate; with several sequences also one for all of them
-        together, with the ``sequence`` "COMBINED".
+        together, with the ``sequence`` "COMBINED". Where ground truth and tracks have several classes, each is followed
+        by one for each class, with the name of the class in ``of_class``.
     notes : tuple of str
         How files were paired and read.
     warnings : tuple of mcaptrack.Notice
@@ -105,7 +106,14 @@ class Scores:
         """
         return [result.to_json() for result in self.results]
 
-    def score(self, name: str, tracks: str = "", similarity: str = "", gate: float | None = None) -> float:
+    def score(
+        self,
+        name: str,
+        tracks: str = "",
+        similarity: str = "",
+        gate: float | None = None,
+        of_class: str | None = None,
+    ) -> float:
         """Return one score, of the only result that fits.
 
         Parameters
@@ -118,6 +126,8 @@ class Scores:
             How ground truth and tracks were matched.
         gate : float, optional
             Largest distance of a match in metres, or least overlap.
+        of_class : str, optional
+            Name of a class; by default all classes together.
 
         Returns
         -------
@@ -137,14 +147,13 @@ class Scores:
         True
 
         """
-        rows = [
-            row for row in self.final() if row["tracks"].endswith(tracks) and row["similarity"].startswith(similarity)
-        ]
+        final = self.final(of_class)
+        rows = [row for row in final if row["tracks"].endswith(tracks) and row["similarity"].startswith(similarity)]
         rows = [row for row in rows if gate in (None, row["gate"])]
         whole = [row for row in rows if row["tracks"] == tracks or row["tracks"].endswith(f"/{tracks}")]
         rows = whole or rows
         if len(rows) != 1:
-            there = ", ".join(f"{row['tracks']} {row['similarity']} {row['gate']:g}" for row in rows or self.final())
+            there = ", ".join(f"{row['tracks']} {row['similarity']} {row['gate']:g}" for row in rows or final)
             raise McaptrackError(
                 f"{len(rows) or 'no'} results fit `tracks={tracks!r}`, `similarity={similarity!r}` and `gate={gate}`; "
                 f"choose one of: {there}"
@@ -152,13 +161,23 @@ class Scores:
         _check_name(name, rows[0])
         return float(rows[0][name])
 
-    def final(self) -> list[dict[str, Any]]:
+    def final(self, of_class: str | None = None) -> list[dict[str, Any]]:
         """Return the rows of all sequences together.
+
+        Parameters
+        ----------
+        of_class : str, optional
+            Name of a class; by default all classes together.
 
         Returns
         -------
         list of dict
             Of ``rows``, those of all sequences together, or of the only sequence.
+
+        Raises
+        ------
+        McaptrackError
+            If no such class was scored.
 
         Examples
         --------
@@ -168,7 +187,10 @@ class Scores:
         True
 
         """
-        rows = self.rows()
+        rows = [row for row in self.rows() if row["class"] == of_class]
+        if not rows and of_class is not None:
+            there = ", ".join(dict.fromkeys(one.of_class for one in self.results if one.of_class is not None))
+            raise McaptrackError(f"no class {of_class!r:.60} was scored by itself; there are {there or 'none'}")
         return [row for row in rows if row["sequence"] == COMBINED] or rows
 
     def below(self, limits: Mapping[str, float]) -> list[str]:

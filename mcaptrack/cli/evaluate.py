@@ -29,6 +29,10 @@ _FORECAST_COLUMNS: Final = {
 }
 
 
+#: Keys of results that are no single value.
+_NESTED: Final = ("displacement", "class_means")
+
+
 @common.one_line
 def evaluate(
     inputs: Annotated[
@@ -154,7 +158,8 @@ def print_results(scores: Scores) -> None:
     out = console()
     table = Table(box=None, pad_edge=False, header_style="bold")
     several = len({result.sequence for result in scores.results}) > 1
-    for name in (*(("sequence",) if several else ()), "tracks", "by"):
+    classes = any(result.of_class is not None for result in scores.results)
+    for name in (*(("sequence",) if several else ()), "tracks", *(("class",) if classes else ()), "by"):
         table.add_column(name, no_wrap=True)
     for name in _COLUMNS:
         table.add_column(name, justify="right", no_wrap=True)
@@ -167,7 +172,11 @@ def print_results(scores: Scores) -> None:
         previous = (result.sequence, by)
         numbers = [f"{100 * row[name]:.1f}" if isinstance(row[name], float) else str(row[name]) for name in _COLUMNS]
         first = [result.sequence] if several else []
-        table.add_row(*first, result.tracks, by, *numbers)
+        own = [_class_cell(result.of_class)] if classes else []
+        table.add_row(*first, result.tracks, *own, by, *numbers)
+        if result.class_means is not None:
+            means = [f"{100 * result.class_means[name]:.1f}" if name in result.class_means else "" for name in _COLUMNS]
+            table.add_row(*first, result.tracks, "mean of classes", by, *means)
     out.print(table)
     forecasts: dict[tuple[str, str], dict[str, float | None]] = {}
     for result in scores.results:
@@ -187,10 +196,14 @@ def print_results(scores: Scores) -> None:
         out.print(table)
 
 
+def _class_cell(name: str | None) -> str:
+    return "all" if name is None else printable(name)
+
+
 def _print_csv(scores: Scores) -> None:
     import csv
 
-    rows = [{k: v for k, v in result.to_json().items() if k != "displacement"} for result in scores.results]
+    rows = [{k: v for k, v in result.to_json().items() if k not in _NESTED} for result in scores.results]
     rows = [{k: printable(v) if isinstance(v, str) else v for k, v in row.items()} for row in rows]
     writer = csv.DictWriter(sys.stdout, fieldnames=list(rows[0]), lineterminator="\n")
     writer.writeheader()

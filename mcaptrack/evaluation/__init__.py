@@ -9,10 +9,12 @@ Letters: N rows, G people of the ground truth, H tracks in one frame.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
+
+import numpy as np
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError, call
@@ -25,10 +27,12 @@ from mcaptrack.evaluation.aligned import (
     make_matchup,
     sides_without,
 )
+from mcaptrack.evaluation.by_class import of_class, share_classes
 from mcaptrack.evaluation.forecasts import FORECAST_INPUTS, score_forecasts
 from mcaptrack.evaluation.metrics import Rules, Score
 from mcaptrack.evaluation.metrics.displacement import Displacement, combine_displacements
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame
+from mcaptrack.schema.classes import class_names
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.camera_motion import read_ground_truth
 from mcaptrack.sources.cameras import camera_at
@@ -76,6 +80,7 @@ class Candidate:
     forecasts: Sequence[Frame] | None = None
     forecasts_name: str = ""
     group: str = ""  # a name shared by the tracks of several sequences, if theirs differ
+    classes: Mapping[int, str] = field(default_factory=dict)  # names of the classes in the rows
 
 
 @dataclass
@@ -85,11 +90,16 @@ class EvaluationInput:
     name: str
     ground_truth: Sequence[Frame]
     candidates: Sequence[Candidate]
+    classes: Mapping[int, str] = field(default_factory=dict)  # names of the classes of the ground truth
 
 
 @dataclass
 class EvaluationRow:
-    """The scores of one channel of tracks, for one similarity and gate."""
+    """The scores of one channel of tracks, for one similarity and gate.
+
+    ``of_class`` is the class that is scored, None for all together. Counts of all together are the sums over classes;
+    ``class_means`` are then the means of rates over classes, as TrackEval gives them ("class averaged").
+    """
 
     sequence: str
     tracks: str
@@ -100,11 +110,16 @@ class EvaluationRow:
     score: Score
     displacement: Displacement | None = None
     group: str = ""
+    of_class: str | None = None
+    class_means: Mapping[str, float] | None = None
 
     def to_json(self) -> dict[str, Any]:
         """The row as ``evaluate --json`` prints it."""
         names = ("sequence", "tracks", "mode", "similarity", "gate", "rules")
-        out = {name: getattr(self, name) for name in names} | metrics.summary(self.score)
+        out = {name: getattr(self, name) for name in names}
+        out |= {"class": self.of_class} | metrics.summary(self.score)
+        if self.class_means is not None:
+            out["class_means"] = dict(self.class_means)
         if self.displacement is not None:
             recall, ade = self.displacement.curve()
             out["displacement"] = self.displacement.summary() | {
@@ -147,8 +162,10 @@ def sequence_of_log(opened: log.Log, prefix: str, topics: Sequence[str]) -> Eval
             mode = "online" if topic.endswith("/online") else "offline"
         name = forecasts_of.get(topic, "")
         forecasts = opened.frames(name, PREDICTIONS) if name in opened.channels else None
-        candidates.append(Candidate(topic, mode, opened.frames(topic, TRACKS), forecasts, name))
-    return EvaluationInput(opened.path.stem, ground_truth, candidates)
+        names = class_names(opened.channel(topic).metadata)
+        candidates.append(Candidate(topic, mode, opened.frames(topic, TRACKS), forecasts, name, classes=names))
+    names = class_names(opened.channel(camera_at(opened, prefix).truth).metadata)
+    return EvaluationInput(opened.path.stem, ground_truth, candidates, names)
 
 
 def evaluate(
@@ -185,16 +202,30 @@ def evaluate(
         raise McaptrackError("; ".join(outcome.notes) or "there is nothing to score")
     if count > 1:
         outcome.results += combined(outcome.results)
+    set_class_means(outcome.results)
     return outcome
+
+
+def set_class_means(results: Sequence[EvaluationRow]) -> None:
+    """Set ``class_means`` of the rows of all classes together, where there are rows for single classes."""
+    groups: dict[tuple[Any, ...], list[EvaluationRow]] = {}
+    for one in results:
+        groups.setdefault((one.sequence, one.tracks, one.mode, one.similarity, one.gate, one.rules), []).append(one)
+    for members in groups.values():
+        rates = [metrics.summary(one.score) for one in members if one.of_class is not None]
+        for one in members:
+            if one.of_class is None and rates:
+                one.class_means = {name: float(np.mean([rate[name] for rate in rates])) for name in metrics.RATES}
 
 
 def combined(results: Sequence[EvaluationRow]) -> list[EvaluationRow]:
     """Combine all sequences: a row for each kind of tracks, similarity and gate."""
     groups: dict[tuple[Any, ...], list[EvaluationRow]] = {}
     for one in results:
-        groups.setdefault((one.group or one.tracks, one.mode, one.similarity, one.gate, one.rules), []).append(one)
+        key = (one.group or one.tracks, one.mode, one.similarity, one.gate, one.rules, one.of_class)
+        groups.setdefault(key, []).append(one)
     out = []
-    for (tracks, mode, similarity, gate, rules), members in groups.items():
+    for (tracks, mode, similarity, gate, rules, one_class), members in groups.items():
         forecasts = [member.displacement for member in members if member.displacement is not None]
         out.append(
             EvaluationRow(
@@ -206,6 +237,7 @@ def combined(results: Sequence[EvaluationRow]) -> list[EvaluationRow]:
                 rules,
                 metrics.combine([member.score for member in members]),
                 combine_displacements(forecasts) if len(forecasts) == len(members) else None,
+                of_class=one_class,
             )
         )
     return out
@@ -214,7 +246,11 @@ def combined(results: Sequence[EvaluationRow]) -> list[EvaluationRow]:
 def _score(
     sequence: EvaluationInput, candidate: Candidate, options: EvaluateOptions, notes: list[str]
 ) -> list[EvaluationRow]:
-    ground_truth, tracks = align(sequence.name, candidate.name, sequence.ground_truth, candidate.frames)
+    aligned = align(sequence.name, candidate.name, sequence.ground_truth, candidate.frames)
+    shared = share_classes(sequence.name, candidate.name, *aligned, sequence.classes, candidate.classes)
+    notes += [shared.note] if shared.note else []
+    ground_truth, tracks = shared.ground_truth, shared.tracks
+    parts = {one: (of_class(ground_truth, number), of_class(tracks, number)) for number, one in shared.names.items()}
     wanted = options.similarities or ("iou", "metres")
     results = []
     for similarity in wanted:
@@ -228,10 +264,14 @@ def _score(
             continue
         gates = (options.min_iou,) if similarity == "iou" else options.gates_m
         for gate in gates:
-            score = metrics.score(make_matchup(ground_truth, tracks, similarity, gate), options.rules)
-            if gate == gates[-1] and score.hota["HOTA_TP"][0] == 0:
+            scores = {
+                one: metrics.score(make_matchup(*part, similarity, gate), options.rules) for one, part in parts.items()
+            }
+            whole = metrics.combine(list(scores.values())) if scores else None
+            whole = whole or metrics.score(make_matchup(ground_truth, tracks, similarity, gate), options.rules)
+            if gate == gates[-1] and whole.hota["HOTA_TP"][0] == 0:
                 notes += explain_no_match(sequence.name, candidate.name, ground_truth, tracks, similarity)
-            results.append(
+            results += [
                 EvaluationRow(
                     sequence.name,
                     candidate.name,
@@ -241,8 +281,10 @@ def _score(
                     options.rules,
                     score,
                     group=candidate.group,
+                    of_class=one,
                 )
-            )
+                for one, score in ((None, whole), *scores.items())
+            ]
     if not results:
         notes.append(
             f"{sequence.name}: {candidate.name} and the ground truth share neither boxes nor positions in metres"
@@ -250,13 +292,23 @@ def _score(
     if candidate.forecasts is not None and any(result.similarity == "metres" for result in results):
         errors = score_forecasts(candidate.forecasts, candidate.frames, sequence.ground_truth, candidate.forecasts_name)
         for result in results:
-            result.displacement = errors if result.similarity == "metres" else None
+            is_of_all = result.similarity == "metres" and result.of_class is None
+            result.displacement = errors if is_of_all else None
     return results
 
 
 def sequence_of_files(
-    name: str, tracks: Path, truth_frames: Sequence[Frame], track_frames: Sequence[Frame], files: int
+    name: str,
+    tracks: Path,
+    truth_frames: Sequence[Frame],
+    track_frames: Sequence[Frame],
+    files: int,
+    classes: tuple[Mapping[int, str], Mapping[int, str]] = ({}, {}),
 ) -> EvaluationInput:
-    """One of ``files`` files of tracks, with its ground truth, as a sequence."""
+    """One of ``files`` files of tracks, with its ground truth, as a sequence.
+
+    ``classes`` are the names of the classes of the ground truth and of the tracks.
+    """
     group = f"{files} files" if files > 1 else ""
-    return EvaluationInput(name, truth_frames, [Candidate(tracks.name, None, track_frames, group=group)])
+    candidate = Candidate(tracks.name, None, track_frames, group=group, classes=classes[1])
+    return EvaluationInput(name, truth_frames, [candidate], classes[0])

@@ -143,16 +143,18 @@ def make_matchup(
 
 
 def compare_rows(
-    ground_truth: Sequence[Frame], tracks: Sequence[Frame], similarity: Similarity, gate: float
+    ground_truth: Sequence[Frame], tracks: Sequence[Frame], similarity: Similarity, gate: float, by_class: bool = False
 ) -> RowComparison:
-    """Like `make_matchup`, with the rows that were compared."""
+    """Like `make_matchup`, with the rows that were compared; ``by_class``: rows of different classes are not alike."""
     people, found = (_locate(part, _COLUMN[similarity]) for part in (ground_truth, tracks))
     places = columns_to_boxes if similarity == "iou" else on_ground
     a, b = places(people.rows), places(found.rows)
     alike: list[Floats] = []
     step = max(1, round(_PAIRS_AT_ONCE / max(1.0, len(a) * len(b) / max(1, len(ground_truth)) ** 2)))
     for first in range(0, len(ground_truth), step):
-        alike += _similarities(a, b, people.ends[first : first + step + 1], found.ends[first : first + step + 1], gate)
+        ends = (people.ends[first : first + step + 1], found.ends[first : first + step + 1])
+        classes = (people.rows["class_id"], found.rows["class_id"]) if by_class else None
+        alike += _similarities(a, b, *ends, gate, classes)
     matched = Matchup(
         tuple(np.split(people.track, people.ends[1:-1])),
         tuple(np.split(found.track, found.ends[1:-1])),
@@ -174,8 +176,13 @@ def _locate(frames: Sequence[Frame], column: str) -> LocatedRows:
     return LocatedRows(rows, track, ids, ends)
 
 
-def _similarities(a: Floats, b: Floats, a_ends: Ints, b_ends: Ints, gate: float) -> list[Floats]:
-    """The similarities of boxes or positions ``a`` and ``b`` in some frames, (G, H) for each; all pairs at once."""
+def _similarities(
+    a: Floats, b: Floats, a_ends: Ints, b_ends: Ints, gate: float, classes: tuple[Ints, Ints] | None
+) -> list[Floats]:
+    """The similarities of boxes or positions ``a`` and ``b`` in some frames, (G, H) for each; all pairs at once.
+
+    Pairs of different ``classes`` have none.
+    """
     people, found = np.diff(a_ends), np.diff(b_ends)
     _, row, column = cross_pairs(people, found)
     row, column = row + a_ends[0], column + b_ends[0]
@@ -184,5 +191,7 @@ def _similarities(a: Floats, b: Floats, a_ends: Ints, b_ends: Ints, gate: float)
     else:
         apart = a[row] - b[column]
         alike = metrics.metres_to_similarity(np.hypot(apart[:, 0], apart[:, 1]), gate)
+    if classes is not None:
+        alike = np.where(classes[0][row] == classes[1][column], alike, 0.0)
     parts = np.split(alike, np.cumsum(people * found)[:-1])
     return [part.reshape(g, h) for part, g, h in zip(parts, people.tolist(), found.tolist(), strict=True)]

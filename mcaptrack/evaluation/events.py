@@ -8,7 +8,7 @@ Letters: F frames of the tracks or of the ground truth, N rows, R events, P matc
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, NamedTuple
 
@@ -28,6 +28,7 @@ from mcaptrack.evaluation.aligned import (
     have_same_times,
     sides_without,
 )
+from mcaptrack.evaluation.by_class import share_classes
 from mcaptrack.evaluation.metrics.clear import is_switch, matches
 from mcaptrack.evaluation.metrics.matchup import RowPairs
 from mcaptrack.evaluation.track_lifecycle import (
@@ -101,6 +102,7 @@ def find_events(
     options: EventOptions = EventOptions(),
     name: str = "the log",
     tracks_name: str = "the tracks",
+    classes: tuple[Mapping[int, str], Mapping[int, str]] = ({}, {}),
 ) -> TrackEvents:
     """Find the events of a channel of tracks and count its rows frame by frame.
 
@@ -113,6 +115,9 @@ def find_events(
     options : EventOptions
     name, tracks_name : str
         Names for messages.
+    classes : tuple of mapping of int to str
+        Names of the classes of the ground truth and of the tracks, by number. Only tracks and people (objects) of one
+        class are matched.
 
     Returns
     -------
@@ -122,7 +127,7 @@ def find_events(
     comparison, rule = None, None
     if ground_truth is not None:
         try:
-            comparison, rule = _compared(tracks, ground_truth, options, (name, tracks_name), notes)
+            comparison, rule = _compared(tracks, ground_truth, options, (name, tracks_name), notes, classes)
         except McaptrackError as error:
             notes.append(f"no misses, false tracks and switches of {tracks_name}: {error}")
     compared = ground_truth or () if comparison else ()
@@ -168,6 +173,7 @@ def _compared(
     options: EventOptions,
     names: tuple[str, str],
     notes: list[str],
+    classes: tuple[Mapping[int, str], Mapping[int, str]],
 ) -> tuple[_Comparison, MatchRule]:
     """Match tracks with the ground truth. Raises McaptrackError if they can't be compared."""
     if not any(len(frame.rows) for frame in ground_truth):
@@ -181,7 +187,9 @@ def _compared(
         unit = "boxes" if similarity == "iou" else "positions in metres"
         raise McaptrackError(f"{' and '.join(missing)} {'have' if len(missing) > 1 else 'has'} no {unit}")
     at_same = align(*names, ground_truth, tracks)
-    compared = compare_rows(*at_same, *rule)
+    shared = share_classes(*names, *at_same, *classes)
+    notes += [shared.note] if shared.note else []
+    compared = compare_rows(shared.ground_truth, shared.tracks, *rule, by_class=bool(shared.names))
     found = matches(compared.matchup)
     if len(found.person) == 0:
         notes += explain_no_match(*names, *at_same, rule.similarity)

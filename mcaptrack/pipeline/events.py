@@ -37,6 +37,7 @@ from mcaptrack.schema import (
     Frame,
     Schema,
 )
+from mcaptrack.schema.classes import class_names
 from mcaptrack.schema.provenance import VIEW, Provenance
 from mcaptrack.sources.cameras import camera_at, provenance_of
 
@@ -97,7 +98,9 @@ def make_events(opened: log.Log, prefix: str, made: Mapping[str, Made], watch: W
             warn(f"no events of {topic}: they would replace {conflict}", "left-out")
             continue
         frames, tracks_digest = _rows(opened, topic, made)
-        found = find_events(frames, truth().frames, options, opened.path.stem, topic)
+        names = class_names(made[topic].provenance.to_metadata() if topic in made else opened.channel(topic).metadata)
+        classes = (truth().classes, names)
+        found = find_events(frames, truth().frames, options, opened.path.stem, topic, classes)
         for note in found.notes:
             warn(note, "not-compared")
         parameters = found.parameters(options)
@@ -162,11 +165,13 @@ def tally(made: Mapping[str, Made]) -> dict[str, dict[str, int]]:
 class _GroundTruth(NamedTuple):
     """The ground truth of a camera, None if there is none, and its digest by topic.
 
-    The digest is "" if the log has no such topic; ``digests`` is empty if the topic holds no tracks.
+    The digest is "" if the log has no such topic; ``digests`` is empty if the topic holds no tracks. ``classes`` are
+    the names of its classes.
     """
 
     frames: list[Frame] | None
     digests: dict[str, str]
+    classes: Mapping[int, str] = {}
 
 
 def _read_truth(opened: log.Log, prefix: str, made: Mapping[str, Made]) -> _GroundTruth:
@@ -176,7 +181,8 @@ def _read_truth(opened: log.Log, prefix: str, made: Mapping[str, Made]) -> _Grou
     if not _has_rows(opened, topic):
         return _GroundTruth(None, {})
     try:
-        return _GroundTruth(ground_truth_with(opened, prefix, made), {topic: digest_of(opened, topic)})
+        names = class_names(opened.channel(topic).metadata)
+        return _GroundTruth(ground_truth_with(opened, prefix, made), {topic: digest_of(opened, topic)}, names)
     except McaptrackError as error:
         warn(f"no misses, false tracks and switches: {error}", "not-compared")
         return _GroundTruth(None, {})

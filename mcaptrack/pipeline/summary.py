@@ -16,6 +16,7 @@ from mcaptrack.notices import warn
 from mcaptrack.pipeline.planes import fit_of, read_planes
 from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, PREDICTIONS, TRACKS, Rows, Schema
 from mcaptrack.schema.camera_motion import rows_to_verdict
+from mcaptrack.schema.classes import class_names
 from mcaptrack.sources import foreign
 from mcaptrack.sources.camera_motion import motion_topic, read_ground_truth
 from mcaptrack.sources.cameras import camera_at, provenance_of
@@ -140,17 +141,19 @@ def _scores(opened: log.Log, prefix: str, truth: str, topics: tuple[str, str]) -
     there = [opened.channels.get(topic) for topic in (truth, *topics)]
     if not all(channel and channel.schema_name == TRACKS.name for channel in there):
         return None
-    candidates = [Candidate(topic, None, opened.frames(topic, TRACKS)) for topic in topics]
-    sequence = EvaluationInput(opened.path.stem, read_ground_truth(opened, prefix), candidates)
+    names = {topic: class_names(opened.channel(topic).metadata) for topic in (truth, *topics)}
+    candidates = [Candidate(topic, None, opened.frames(topic, TRACKS), classes=names[topic]) for topic in topics]
+    sequence = EvaluationInput(opened.path.stem, read_ground_truth(opened, prefix), candidates, names[truth])
     rules = {
         f"within {_GATE_M:g} m": EvaluateOptions(similarities=("metres",), gates_m=(_GATE_M,)),
         f"by an overlap of {_MIN_IOU:g}": EvaluateOptions(similarities=("iou",), min_iou=_MIN_IOU),
     }
     for by, options in rules.items():
         try:
-            rows = [result.to_json() for result in evaluate([sequence], options).results]
+            found = evaluate([sequence], options).results
         except McaptrackError:
             continue  # one of them has no positions in this unit
+        rows = [result.to_json() for result in found if result.of_class is None]
         idf1, switches = (tuple(row[name] for row in rows) for name in ("IDF1", "IDSW"))
         return SummaryScores((idf1[0], idf1[1]), (switches[0], switches[1]), by)
     return None

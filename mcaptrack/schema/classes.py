@@ -43,7 +43,7 @@ def class_names(metadata: Mapping[str, str]) -> dict[int, str]:
 
 def class_name(number: int, names: Mapping[int, str]) -> str:
     """The name of a class in texts: its own, or its number if it has none."""
-    return names.get(number, "of unknown class" if number == UNKNOWN else f"class {number}")
+    return names.get(number) or {UNKNOWN: "unknown", PERSON: "person"}.get(number, f"class {number}")
 
 
 def has_classes(schema: Schema) -> bool:

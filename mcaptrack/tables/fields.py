@@ -157,8 +157,8 @@ _SUMMARY: Final = Table(
 _METRICS: Final = Table(
     "metrics",
     "One row a channel of tracks, similarity and gate: its scores against the ground truth of its camera, the numbers "
-    "of evaluate. No rows where the log has no ground truth.",
-    ("topic", "similarity", "gate"),
+    "of evaluate. Where there are several classes, also a row for each. No rows where the log has no ground truth.",
+    ("topic", "similarity", "gate", "class"),
     ("topic", "similarity", "gate"),
     (
         Field("topic", _NAME, "the tracks that are scored"),
@@ -193,6 +193,18 @@ _METRICS: Final = Table(
         Field("coverage_50", _FLOAT, "share of true futures in the 50 % ellipses", nullable=True),
         Field("coverage_90", _FLOAT, "share of true futures in the 90 % ellipses", nullable=True),
         Field("coverage_95", _FLOAT, "share of true futures in the 95 % ellipses", nullable=True),
+        Field(
+            "class", _NAME, "class that is scored; null for all together, with sums of counts", nullable=True
+        ),
+        Field(
+            "class_mean_MOTA", _FLOAT, "of all together: mean of MOTA over classes", nullable=True
+        ),
+        Field(
+            "class_mean_IDF1", _FLOAT, "of all together: mean of IDF1 over classes", nullable=True
+        ),
+        Field(
+            "class_mean_HOTA", _FLOAT, "of all together: mean of HOTA over classes", nullable=True
+        ),
     ),
 )
 

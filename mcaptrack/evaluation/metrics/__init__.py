@@ -8,7 +8,7 @@ summary(combine([score(a), score(b)])) the same over several sequences
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,11 @@ from mcaptrack.evaluation.metrics.hota import hota
 from mcaptrack.evaluation.metrics.identity import identity
 from mcaptrack.evaluation.metrics.matchup import Matchup, distances, metres_to_similarity
 
-__all__ = ["Matchup", "Rules", "Score", "combine", "distances", "metres_to_similarity", "score", "summary"]
+__all__ = ["RATES", "Matchup", "Rules", "Score", "combine", "distances", "metres_to_similarity", "score", "summary"]
+
+
+#: The rates of ``summary``; its other numbers are counts.
+RATES: Final = ("MOTA", "IDF1", "IDP", "IDR", "HOTA", "DetA", "AssA", "LocA")
 
 
 class Score(NamedTuple):

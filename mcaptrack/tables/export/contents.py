@@ -186,6 +186,7 @@ class LogTables:
             for result in outcome.results:
                 row = result.to_json()
                 forecasts = row.pop("displacement", {})
+                row |= {f"class_mean_{name}": value for name, value in row.pop("class_means", {}).items()}
                 yield row | forecasts | {"topic": result.tracks, "truth": camera.truth}
 
     def _recording(self) -> dict[str, Any]:
@@ -227,7 +228,7 @@ def _origin_of_plane(row: np.void) -> str:
 
 
 def _order_of_scores(row: Mapping[str, Any]) -> tuple[Any, ...]:
-    return tuple(row[name] for name in TABLES["metrics"].order)
+    return (*(row[name] for name in TABLES["metrics"].order), row["class"] or "")
 
 
 def _channel(channel: log.Channel) -> dict[str, object]:

@@ -17,6 +17,7 @@ from mcaptrack.evaluation.events import EventOptions, MatchRule, find_events
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.plane import Planes, is_estimated, origin_of, plane_at
 from mcaptrack.schema import DETECTIONS, EVENTS, TRACKS, Frame
+from mcaptrack.schema.classes import class_names
 from mcaptrack.schema.framing import frame_times
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.camera_motion import read_ground_truth
@@ -190,7 +191,9 @@ def _find_events(opened: log.Log, out: LogReport) -> None:
             continue
         known = _recorded(opened, tracks.topic + "/events")
         if known is None:
-            found = find_events(tracks.frames, ground_truth, EventOptions(), out.name, tracks.topic)
+            truth = out.track_sets["truth"].topic if ground_truth is not None else tracks.topic
+            classes = (class_names(opened.channel(truth).metadata), class_names(opened.channel(tracks.topic).metadata))
+            found = find_events(tracks.frames, ground_truth, EventOptions(), out.name, tracks.topic, classes)
             known = found.events, found.rule
         events, rule = known
         out.channel_events.append(

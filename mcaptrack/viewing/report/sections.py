@@ -26,12 +26,15 @@ Figure = dict[str, Any]
 def scores(report: LogReport) -> dict[str, Any]:
     """All scores by rule, and statistics of tracks that need no ground truth."""
     found = before_after(report, report.results) if report.results else None
-    first = [row for row in report.results if found is None or (row.similarity, row.gate) == found.rule]
-    rest = [row for row in report.results if row not in first]
+    of_all = [row for row in report.results if row.of_class is None]
+    first = [row for row in of_all if found is None or (row.similarity, row.gate) == found.rule]
+    of_classes = [row for row in report.results if row.of_class is not None]
+    of_classes = [row for row in of_classes if found is None or (row.similarity, row.gate) == found.rule]
+    rest = [row for row in of_all if row not in first]
     rules = sorted({(row.similarity, row.gate) for row in rest})
     return {
         "columns": list(_SCORES),
-        "groups": _score_groups(first, report),
+        "groups": _score_groups(first + of_classes, report),
         "other_groups": _score_groups(rest, report),
         "other_rules": "; ".join(rule_text(*rule) for rule in rules),
         "missing": report.missing.get("scores", ""),
@@ -41,13 +44,13 @@ def scores(report: LogReport) -> dict[str, Any]:
 
 
 def _score_groups(results: Sequence[EvaluationRow], report: LogReport) -> list[dict[str, Any]]:
-    """A group of rows for each rule; the best value of a group is marked."""
+    """A group of rows for each rule, and for each class; the best value of a group is marked."""
     known = {one.topic: (one.name, one.role) for one in report.track_sets.values()}
-    groups: dict[tuple[str, float], list[EvaluationRow]] = {}
+    groups: dict[tuple[str, float, str], list[EvaluationRow]] = {}
     for row in results:
-        groups.setdefault((row.similarity, row.gate), []).append(row)
+        groups.setdefault((row.similarity, row.gate, row.of_class or ""), []).append(row)
     out = []
-    for rule, members in sorted(groups.items()):
+    for (similarity, gate, of_class), members in sorted(groups.items()):
         all_values = [summary(row.score) for row in members]
         best = {key: (min if key in _LOWEST else max)(values[key] for values in all_values) for key in _SCORES}
         rows = []
@@ -61,7 +64,8 @@ def _score_groups(results: Sequence[EvaluationRow], report: LogReport) -> list[d
                 for key, is_share in _SCORES.items()
             ]
             rows.append({"name": name, "role": role, "topic": row.tracks, "cells": cells})
-        out.append({"rule": rule_text(*rule), "rows": rows})
+        rule = rule_text(similarity, gate) + (f", {of_class}" if of_class else "")
+        out.append({"rule": rule, "rows": rows})
     return out
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from mcaptrack.errors import command
-from mcaptrack.evaluation import EvaluationRow, combined
+from mcaptrack.evaluation import EvaluationRow, combined, set_class_means
 from mcaptrack.evaluation.metrics import summary
 from mcaptrack.viewing.report.contents import LogReport, result_of
 from mcaptrack.viewing.report.formatting import counted, number, percent, times
@@ -51,7 +51,9 @@ def before_after(report: LogReport, results: Sequence[EvaluationRow]) -> BeforeA
 def combined_results(reports: Sequence[LogReport]) -> list[EvaluationRow]:
     """The scores of all logs together, if several have any."""
     scored = [report for report in reports if report.results]
-    return combined([result for report in scored for result in report.results]) if len(scored) > 1 else []
+    out = combined([result for report in scored for result in report.results]) if len(scored) > 1 else []
+    set_class_means(out)
+    return out
 
 
 def summarize(reports: Sequence[LogReport]) -> dict[str, Any]:

@@ -1,0 +1,114 @@
+"""Classes of ground truth and tracks, brought to common numbers, so that only objects of one class are matched.
+
+Channels number their classes themselves, so classes are the same where their names are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from mcaptrack.schema import Frame
+from mcaptrack.schema.classes import PEOPLE, PERSON, class_name
+
+_SHOWN: Final = 8
+
+
+class SharedClasses(NamedTuple):
+    """Ground truth and tracks with the same numbers of classes: those of the ground truth.
+
+    ``names`` are the classes of the ground truth by number; it is empty if classes are not told apart, because there is
+    only one or because one side has none. ``note`` says what is not compared; "" if all is.
+    """
+
+    ground_truth: list[Frame]
+    tracks: list[Frame]
+    names: Mapping[int, str]
+    note: str
+
+
+def share_classes(
+    name: str,
+    tracks_name: str,
+    ground_truth: Sequence[Frame],
+    tracks: Sequence[Frame],
+    ground_truth_names: Mapping[int, str],
+    track_names: Mapping[int, str],
+) -> SharedClasses:
+    """Bring the classes of ground truth and tracks together.
+
+    Parameters
+    ----------
+    name, tracks_name : str
+        Names of the sequence and of the tracks, for the note.
+    ground_truth, tracks : sequence of Frame
+        Rows of Tracks.
+    ground_truth_names, track_names : mapping of int to str
+        Names of the classes of each by number.
+
+    Returns
+    -------
+    SharedClasses
+        Tracks of classes that the ground truth doesn't have are left out. Where one side states no classes at all, rows
+        are as they were.
+    """
+    there, found = (_numbers(frames) for frames in (ground_truth, tracks))
+    if not any(there) or not any(found):
+        note = ""
+        if there and found and max(len(there), len(found)) > 1:
+            side = tracks_name if any(there) else "the ground truth"
+            note = f"{name}: {side} states no classes; objects of all classes are compared with one another"
+        return SharedClasses(list(ground_truth), list(tracks), {}, note)
+    first: dict[str | int, int] = {}
+    for number in there:
+        first.setdefault(_key(number, ground_truth_names), number)  # two numbers with one name are one class
+    places = {number: first[_key(number, ground_truth_names)] for number in there}
+    places_of_tracks = {number: first.get(_key(number, track_names)) for number in found}
+    names = {number: class_name(number, ground_truth_names) for number in first.values()}
+    beyond = [number for number, place in places_of_tracks.items() if place is None]
+    note = ""
+    if beyond:
+        counts = {one: sum(int((frame.rows["class_id"] == one).sum()) for frame in tracks) for one in beyond}
+        words = [f"{counts[one]} of {class_name(one, track_names)}" for one in sorted(beyond, key=lambda n: -counts[n])]
+        more = f" and {len(words) - _SHOWN} more classes" if len(words) > _SHOWN else ""
+        note = (
+            f"{name}: rows of {tracks_name} of classes that the ground truth doesn't have are not compared: "
+            f"{', '.join(words[:_SHOWN])}{more}"
+        )
+    return SharedClasses(
+        _renumbered(ground_truth, places),
+        _renumbered(tracks, places_of_tracks),
+        names if len(names) > 1 else {},
+        note,
+    )
+
+
+def of_class(frames: Sequence[Frame], number: int) -> list[Frame]:
+    """The rows of a class; frames without any stay, empty."""
+    return [frame._replace(rows=frame.rows[frame.rows["class_id"] == number]) for frame in frames]
+
+
+def _numbers(frames: Sequence[Frame]) -> list[int]:
+    parts = [np.unique(frame.rows["class_id"]) for frame in frames if len(frame.rows)]
+    return [int(one) for one in np.unique(np.concatenate([np.empty(0, np.uint32), *parts]))]
+
+
+def _key(number: int, names: Mapping[int, str]) -> str | int:
+    """What classes of two channels have in common if they are the same: the name, or the number without one."""
+    name = names.get(number, "").strip().casefold()
+    return "person" if number == PERSON or name in PEOPLE else name or number
+
+
+def _renumbered(frames: Sequence[Frame], places: Mapping[int, int | None]) -> list[Frame]:
+    """Frames with other numbers of classes; rows of classes without a place are left out."""
+    if all(number == place for number, place in places.items()):
+        return list(frames)
+    out = []
+    for frame in frames:
+        new = np.array([-1 if (to := places[one]) is None else to for one in frame.rows["class_id"].tolist()], np.int64)
+        rows = frame.rows[new >= 0].copy()
+        rows["class_id"] = new[new >= 0]
+        out.append(frame._replace(rows=rows))
+    return out
