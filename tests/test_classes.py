@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json
+import sys
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import mcaptrack
-from mcaptrack import log, tables
+from mcaptrack import foxglove, log, tables
 from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame
 from mcaptrack.schema.classes import class_names
@@ -267,6 +269,73 @@ def test_names_go_from_detections_to_tables(tmp_path):
     mcaptrack.export(path, tmp_path / "t", form="csv")
     assert "自転車" in next((tmp_path / "t").glob("tracks/*/*.csv")).read_text()
     assert mcaptrack.query(path, "select class, count(*) as n from tracks group by class").num_rows == 2
+
+
+def two_tracks(path, first, second, names):
+    """A log with two tracks of these classes, in boxes of pixels and in metres."""
+    frames = [
+        Frame(t * 100_000_000, t, TRACKS.rows(
+            track_id=[3, 12], x_px=[9.0 + t, 60.0], y_px=[20.0, 5.0], w_px=[17.0] * 2, h_px=[28.0] * 2, x_m=[t / 9, 3.0],
+            y_m=[0.0, 1.0], score=[0.5, 0.25], observed=[True] * 2, source_id=[-1] * 2, class_id=[first, second],
+        ))
+        for t in range(3)
+    ]  # fmt: skip
+    with mcaptrack.open(path, create=True) as opened:
+        opened.write("/camera/tracks", frames, classes=names)
+    return path
+
+
+def texts_of(path, topic):
+    """The texts of the views on the ground, by another reader of protobuf."""
+    with log.read(path) as opened:
+        channel = opened.channel(topic)
+        message = foxglove.message_class(channel.schema_name)()
+        for one in opened.messages(topic):
+            message.ParseFromString(one.payload)
+            yield sorted(text.text for entity in message.entities for text in entity.texts)
+
+
+def test_labels_name_the_class_where_there_are_several(tmp_path):
+    name = "motorcycle with a side car 自転車"
+    two = two_tracks(tmp_path / "two.mcap", 1, 7, {7: name})
+    assert list(texts_of(two, "/camera/tracks/view/scene"))[1] == [f"12 {name[:19]}\u2026", "3 person"]
+    one = two_tracks(tmp_path / "one.mcap", 7, 7, {7: name})
+    assert list(texts_of(one, "/camera/tracks/view/scene"))[1] == ["12", "3"]
+    unnamed = two_tracks(tmp_path / "unnamed.mcap", 0, 9, None)
+    assert list(texts_of(unnamed, "/camera/tracks/view/scene"))[1] == ["12 class 9", "3 unknown"]
+
+
+def supervision(xyxy, **columns):
+    """What supervision.Detections has, as far as it is read."""
+    return SimpleNamespace(**{"xyxy": xyxy, "mask": None, "tracker_id": None, "data": {}} | columns)
+
+
+def test_names_go_into_supervision_and_back(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "supervision", SimpleNamespace(Detections=supervision))
+    path = two_tracks(tmp_path / "a.mcap", 1, 7, {7: "cart"})
+    with mcaptrack.open(path) as opened:
+        found = dict(opened.supervision("tracks"))
+    assert found[0].data["class_name"].tolist() == ["person", "cart"]
+    assert found[0].class_id.tolist() == [1, 7]
+    with mcaptrack.open(tmp_path / "b.mcap", create=True) as back:
+        for table in ("tracks", "detections"):
+            with pytest.warns(UserWarning, match="name their classes"):
+                back.write(f"/own/{table}", found)
+            assert {row["class"] for row in back.table(table).to_pylist()} == {"person", "cart"}
+    plain = two_tracks(tmp_path / "c.mcap", 1, 1, None)
+    with mcaptrack.open(plain) as opened:
+        assert all(boxes.data == {} for _, boxes in opened.supervision("tracks"))
+
+
+def test_classes_of_detections_are_given_by_name():
+    names = {1: "person", 6: "bus", 8: "bus"}
+    boxes = [[1, 2, 3, 4]] * 3
+    found = mcaptrack.detections(boxes, None, ["bus", "human", "bus"], box_format="xywh", class_names=names)
+    assert found.rows["class_id"].tolist() == [6, 1, 6]
+    found = mcaptrack.detections(boxes, None, [8, 1, 6], box_format="xywh", class_names=names)
+    assert found.rows["class_id"].tolist() == [8, 1, 6]
+    with pytest.raises(McaptrackError, match="`class_names=` has no class 'tram'; it has bus, person"):
+        mcaptrack.detections(boxes, None, ["tram"] * 3, box_format="xywh", class_names=names)
 
 
 def test_tables_without_a_class_column_are_read_as_before(tmp_path):

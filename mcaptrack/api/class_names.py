@@ -47,6 +47,23 @@ def _is_person(name: str) -> bool:
     return name.strip().casefold() in PEOPLE
 
 
+def numbers_of(classes: Any, given: Mapping[int, str]) -> Any:
+    """Classes (N,) given by name as numbers; other classes as they are. Raises McaptrackError for unknown names."""
+    names = checked_names(given)
+    values = np.asarray(() if classes is None else classes)
+    if values.dtype.kind not in "UO":
+        return classes
+    known = {name: number for number, name in sorted(names.items(), reverse=True)}
+    out = []
+    for name in values.reshape(-1).tolist():
+        number = PERSON if isinstance(name, str) and _is_person(name) else known.get(name)
+        if number is None:
+            there = ", ".join(list(known)[:8]) + (", ..." if len(known) > 8 else "")
+            raise McaptrackError(f"`class_names=` has no class {name!r:.60}; it has {there or 'none'}")
+        out.append(number)
+    return np.array(out, np.int64).reshape(values.shape)
+
+
 def numbered_columns(columns: Mapping[str, Any]) -> tuple[dict[str, Any], dict[int, str]]:
     """The columns of a table with classes as numbers, and the names of these, where it names them.
 

@@ -1,14 +1,19 @@
-"""Read single messages of a log by their place in the file."""
+"""Read single messages of a log by their place in the file, and pictures by their time."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from mcaptrack.api.columns import times_of
 from mcaptrack.errors import McaptrackError
 from mcaptrack.log import Log
+from mcaptrack.schema import Frame
+from mcaptrack.sources.pictures import Pictures
+from mcaptrack.sources.video import decode_bgr, decode_gray
 
 _NEEDED: Final = ("chunk_offset", "message_offset")
 
@@ -62,3 +67,22 @@ def fetch_message(log: Log, row: Mapping[str, Any]) -> FetchedMessage:
 def _whole(value: Any) -> int | None:
     """Return a whole number of a table; pandas makes floats of columns in which some are missing."""
     return None if value is None or value != value else int(value)  # noqa: PLR0124  # NaN is not itself
+
+
+def shown_pictures(opened: Log, topic: str, times: Sequence[int] | NDArray[Any]) -> dict[int, int]:
+    """The numbers of the pictures that are shown at these times, and how often each is asked for."""
+    wanted = times_of(times, "`times=`")
+    at = np.searchsorted(opened.times(topic), wanted, "right") - 1
+    if len(at) and at.min() < 0:
+        first = int(wanted[at.argmin()])
+        raise McaptrackError(f"{opened.path}: {topic} has no picture at {first} ns; its first picture is later")
+    numbers, counts = np.unique(at, return_counts=True)
+    return dict(zip(numbers.tolist(), counts.tolist(), strict=True))
+
+
+def decoded_pictures(opened: Log, topic: str, wanted: Mapping[int, int] | None, colour: str) -> Iterator[Frame]:
+    """The pictures with the numbers ``wanted``, or all, in the order of time."""
+    pixels = decode_gray if colour == "grey" else decode_bgr
+    found = Pictures(opened, topic)
+    for frame in found.frames(range(len(found.t_ns)) if wanted is None else wanted, pixels):
+        yield frame._replace(rows=frame.rows[..., ::-1]) if colour == "rgb" else frame

@@ -18,21 +18,19 @@ from pathlib import Path
 from threading import RLock
 from typing import TYPE_CHECKING, Any, Literal, Self
 
-import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack import log as logs
 from mcaptrack import tables
 from mcaptrack.api.checked import checked
-from mcaptrack.api.columns import times_of
 from mcaptrack.api.common import as_path, log_output
-from mcaptrack.api.fetching import FetchedMessage, fetch_message
+from mcaptrack.api.fetching import FetchedMessage, decoded_pictures, fetch_message, shown_pictures
 from mcaptrack.api.supervision import supervision_of
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.files import refuse_overwrite
 from mcaptrack.schema import DETECTIONS, SCHEMAS, TRACKS, Frame
-from mcaptrack.sources.pictures import Pictures, find_pictures
-from mcaptrack.sources.video import decode_bgr, decode_gray
+from mcaptrack.schema.classes import class_names
+from mcaptrack.sources.pictures import find_pictures
 from mcaptrack.tables import export
 
 if TYPE_CHECKING:
@@ -222,8 +220,8 @@ class Recording:
 
         """
         channel = find_pictures(self._log, topic)
-        wanted = None if times is None else self._shown(channel, times)
-        frames = self._decoded(channel, wanted, colour)
+        wanted = None if times is None else shown_pictures(self._log, channel, times)
+        frames = decoded_pictures(self._log, channel, wanted, colour)
         return frames if wanted is None else (frame for frame in frames for _ in range(wanted[frame.index]))
 
     def fetch(self, row: Mapping[str, Any]) -> FetchedMessage:
@@ -267,8 +265,9 @@ class Recording:
         Returns
         -------
         iterator of (int, supervision.Detections)
-            Time in nanoseconds, and the boxes in pixels, with ``tracker_id`` for tracks and ``class_id`` for
-            detections; ``confidence`` is NaN where there is none. Rows without a box are left out.
+            Time in nanoseconds, and the boxes in pixels, with ``class_id``, and ``tracker_id`` for tracks;
+            ``confidence`` is NaN where there is none. ``data["class_name"]`` names the classes if the channel names
+            others than people. Rows without a box are left out.
 
         Raises
         ------
@@ -294,7 +293,8 @@ class Recording:
                 f"{self.path} has {len(found) or 'no'} channels {topic} of boxes; it has {', '.join(sorted(boxes))}"
             )
         schema = boxes[found[0]]
-        return supervision_of(self._log.frames(found[0], schema or TRACKS))
+        names = class_names(self._log.channel(found[0]).metadata)
+        return supervision_of(self._log.frames(found[0], schema or TRACKS), names)
 
     def write(
         self,
@@ -354,22 +354,6 @@ class Recording:
             self.close()
             self._open(path)
         return count
-
-    def _shown(self, topic: str, times: Sequence[int] | NDArray[Any]) -> dict[int, int]:
-        """The numbers of the pictures that are shown at these times, and how often each is asked for."""
-        wanted = times_of(times, "`times=`")
-        at = np.searchsorted(self._log.times(topic), wanted, "right") - 1
-        if len(at) and at.min() < 0:
-            first = int(wanted[at.argmin()])
-            raise McaptrackError(f"{self.path}: {topic} has no picture at {first} ns; its first picture is later")
-        numbers, counts = np.unique(at, return_counts=True)
-        return dict(zip(numbers.tolist(), counts.tolist(), strict=True))
-
-    def _decoded(self, topic: str, wanted: Mapping[int, int] | None, colour: Colour) -> Iterator[Frame]:
-        pixels = decode_gray if colour == "grey" else decode_bgr
-        found = Pictures(self._log, topic)
-        for frame in found.frames(range(len(found.t_ns)) if wanted is None else wanted, pixels):
-            yield frame._replace(rows=frame.rows[..., ::-1]) if colour == "rgb" else frame
 
 
 def open(path: str | Path, *, create: bool = False) -> Recording:  # noqa: A001  # mcaptrack.open is its name

@@ -5,7 +5,7 @@ Letters: N objects in one frame.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from mcaptrack import tables
 from mcaptrack.api.checked import checked
-from mcaptrack.api.class_names import numbered_columns
+from mcaptrack.api.class_names import numbered_columns, numbers_of
 from mcaptrack.api.columns import (
     UNNUMBERED,
     BoxFormat,
@@ -26,7 +26,7 @@ from mcaptrack.api.columns import (
     number_of,
     time_of,
 )
-from mcaptrack.api.supervision import frame_of_supervision, is_supervision
+from mcaptrack.api.supervision import frame_of_supervision, is_supervision, names_of_supervision
 from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame, Schema
 
@@ -40,6 +40,7 @@ def detections(
     *,
     box_format: BoxFormat | None = None,
     index: int = UNNUMBERED,
+    class_names: Mapping[int, str] | None = None,
 ) -> Frame:
     """Make a frame of detections, to be tracked or to be written into a log.
 
@@ -52,7 +53,7 @@ def detections(
     scores : array_like of shape (N,), optional
         Confidence of each box, from 0 to 1.
     classes : array_like of shape (N,), optional
-        Class of each box: 0 unknown, 1 person, other numbers as the detector counts.
+        Class of each box: 0 unknown, 1 person, other numbers as the detector counts; or, with ``class_names``, names.
     t_ns : int or numpy.datetime64
         Time of the picture in whole nanoseconds; each picture has its own.
     box_format : {"xyxy", "xywh"}
@@ -60,6 +61,8 @@ def detections(
         needed for ``supervision.Detections``.
     index : int, optional
         Number of the picture in the video; by default frames are numbered when they are written.
+    class_names : mapping of int to str, optional
+        Names of classes by number, to give ``classes`` by name. ``Recording.write(classes=...)`` keeps them in a log.
 
     Returns
     -------
@@ -85,6 +88,7 @@ def detections(
         return frame_of_supervision(boxes, t_ns, index, DETECTIONS)
     if box_format not in ("xyxy", "xywh"):
         raise McaptrackError("say what the columns of boxes are with `box_format='xyxy'` or `box_format='xywh'`")
+    classes = classes if class_names is None else numbers_of(classes, class_names)
     return frame_of(DETECTIONS, boxes_of(boxes, box_format), {"score": scores, "class_id": classes}, t_ns, index)
 
 
@@ -109,7 +113,7 @@ def frames_of(rows: Any, schema: Schema | None) -> tuple[Schema, list[Frame], di
         columns, names = numbered_columns(tables.columns_of(rows))
         schema, frames = frames_of_columns(columns, schema)
     else:
-        schema, frames = _of_frames(rows, schema)
+        schema, frames = _of_frames(rows, schema, names)
     frames.sort(key=lambda frame: (frame.t_ns, frame.index))
     for before, after in pairwise(frames):
         if before[:2] == after[:2]:
@@ -121,7 +125,8 @@ def frames_of(rows: Any, schema: Schema | None) -> tuple[Schema, list[Frame], di
     return schema, frames, names
 
 
-def _of_frames(rows: Any, schema: Schema | None) -> tuple[Schema, list[Frame]]:
+def _of_frames(rows: Any, schema: Schema | None, names: dict[int, str]) -> tuple[Schema, list[Frame]]:
+    """The schema and the frames of an iterable; adds the names of classes that its members give to ``names``."""
     if isinstance(rows, Frame):
         rows = [rows]
     if is_supervision(rows):
@@ -130,7 +135,7 @@ def _of_frames(rows: Any, schema: Schema | None) -> tuple[Schema, list[Frame]]:
         )
     if not isinstance(rows, Iterable) or isinstance(rows, str | bytes):
         raise McaptrackError(f"rows are frames, an array, a table or supervision.Detections, not {kind_of(rows)}")
-    frames = [_frame(one, schema) for one in (rows.items() if hasattr(rows, "items") else rows)]
+    frames = [_frame(one, schema, names) for one in (rows.items() if hasattr(rows, "items") else rows)]
     if schema is None:
         found = {frame.rows.dtype.names for frame in [frame for frame in frames if len(frame.rows)] or frames}
         fitting = [one for one in (DETECTIONS, TRACKS) if found and all(map(one.has_columns, found))]
@@ -151,7 +156,7 @@ def _checked(schema: Schema, frame: Frame) -> Frame:
         raise McaptrackError(f"the frame at {frame.t_ns} ns: {error}") from None
 
 
-def _frame(one: Any, schema: Schema | None) -> Frame:
+def _frame(one: Any, schema: Schema | None, names: dict[int, str]) -> Frame:
     if isinstance(one, Frame):
         if not isinstance(one.rows, np.ndarray):
             raise McaptrackError(f"the rows of a frame are a structured array, not {kind_of(one.rows)}")
@@ -161,6 +166,7 @@ def _frame(one: Any, schema: Schema | None) -> Frame:
             )
         return Frame(time_of(one.t_ns), number_of(one.index), one.rows)
     if isinstance(one, Sequence) and len(one) == 2 and is_supervision(one[1]):
+        names |= names_of_supervision(one[1]) | names
         return frame_of_supervision(one[1], one[0], schema=schema)
     kind = "a mapping of columns" if isinstance(one, tuple) and one and isinstance(one[0], str) else kind_of(one)
     raise McaptrackError(

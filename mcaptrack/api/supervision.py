@@ -5,18 +5,21 @@ Letters: N objects in one frame.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, Final
 
 import numpy as np
 
+from mcaptrack.api.class_names import checked_names
 from mcaptrack.api.columns import UNNUMBERED, boxes_of, frame_of
 from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import warn
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame, Schema
-from mcaptrack.schema.classes import PEOPLE, PERSON
+from mcaptrack.schema.classes import PEOPLE, PERSON, UNKNOWN, class_name
 
 _SUPERVISION: Final = ("confidence", "class_id", "tracker_id", "mask", "data")
+#: The key of names of classes in ``data``.
+_NAMES: Final = "class_name"
 #: What is added to the classes of a detector that names them, so that none of them is 0 (unknown) or 1 (person).
 _OTHERS: Final = 2
 
@@ -54,7 +57,8 @@ def frame_of_supervision(
     if ids is None and len(boxes):
         raise McaptrackError(f"the detections at {t_ns} ns have no tracker ids; tracks need them")
     ids = np.empty(0, np.int64) if ids is None else ids
-    frame = frame_of(TRACKS, boxes, {"score": found.confidence, "track_id": ids}, t_ns, index)
+    columns = {"score": found.confidence, "track_id": ids, "class_id": _classes_of(found)}
+    frame = frame_of(TRACKS, boxes, columns, t_ns, index)
     if (ids < 0).any():
         warn("boxes without a tracker id (-1: the track is not confirmed yet) are left out", "left-out")
     return frame._replace(rows=frame.rows[ids >= 0])
@@ -65,22 +69,45 @@ def _classes_of(found: Any) -> Any:
 
     Detectors count from 0 or from 1, and person may be any number, so names decide where there are some.
     """
-    count, names = len(found.xyxy), found.data.get("class_name")
+    count, names = len(found.xyxy), found.data.get(_NAMES)
     ids = np.zeros(count, np.uint32) if found.class_id is None else np.asarray(found.class_id)
     if names is None or not count:
         return ids
-    is_person = np.array([str(name).lower() in PEOPLE for name in names])
-    if not is_person.all() and found.class_id is not None:
-        raised = f"other numbers are {_OTHERS} higher than the detector's"
+    raised = f"other numbers are {_OTHERS} higher than the detector's"
+    out = _ids_of(found)
+    if (out != ids).any() and (out != PERSON).any():
         warn(f"supervision.Detections name their classes: in class_id 1 is a person, {raised}", "classes")
-        ids = ids + _OTHERS
-    return np.where(is_person, PERSON, ids)
+    return out
 
 
-def supervision_of(frames: Iterable[Frame]) -> Iterator[tuple[int, Any]]:
+def _ids_of(found: Any) -> Any:
+    """Class ids (N,) of detections that name their classes: 1 is a person, others are raised by ``_OTHERS``.
+
+    0 stays what it is if its name says that it is unknown, as in what ``supervision_of`` gives.
+    """
+    names = np.array([str(name).lower() for name in found.data[_NAMES]])
+    is_person = np.isin(names, PEOPLE)
+    if found.class_id is None:
+        return np.where(is_person, PERSON, 0)
+    ids = np.asarray(found.class_id)
+    is_unknown = (ids == UNKNOWN) & (names == class_name(UNKNOWN, {}))
+    return np.where(is_person, PERSON, np.where(is_unknown, UNKNOWN, ids + _OTHERS))
+
+
+def names_of_supervision(found: Any) -> dict[int, str]:
+    """Return the names of the classes by the ids that ``frame_of_supervision`` gives them."""
+    names = found.data.get(_NAMES)
+    if names is None or not len(found.xyxy):
+        return {}
+    out = dict(zip(np.asarray(_ids_of(found)).tolist(), (str(name) for name in names), strict=True))
+    return checked_names({number: name for number, name in out.items() if number != UNKNOWN})
+
+
+def supervision_of(frames: Iterable[Frame], names: Mapping[int, str]) -> Iterator[tuple[int, Any]]:
     """Yield the time in nanoseconds and the ``supervision.Detections`` of each frame of detections or tracks.
 
-    Rows without a box are left out. Raises McaptrackError if supervision is not installed.
+    ``names`` are the names of classes by number, for ``data["class_name"]``, if there are others than people. Rows
+    without a box are left out. Raises McaptrackError if supervision is not installed.
     """
     try:
         from supervision import Detections
@@ -95,4 +122,7 @@ def supervision_of(frames: Iterable[Frame]) -> Iterator[tuple[int, Any]]:
                 columns[name] = rows[column].astype(int)
         left, top = rows["x_px"], rows["y_px"]
         xyxy = np.stack([left, top, left + rows["w_px"], top + rows["h_px"]], axis=-1).astype(np.float32)
+        if set(names) - {PERSON}:
+            called = [class_name(number, names) for number in rows["class_id"].tolist()]
+            columns["data"] = {_NAMES: np.array(called, np.str_)}
         yield frame.t_ns, Detections(xyxy=xyxy, **columns)

@@ -14,6 +14,7 @@ from functools import cache
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mcaptrack.foxglove.messages import ANNOTATIONS, message_class
 from mcaptrack.foxglove.palette import ink
@@ -75,10 +76,10 @@ class Annotations:
         self._lines.setdefault(thickness, []).append(group(parts, frame, self._count))
         self._drawn[frame] = True
 
-    def labels(self, frame: Ints, xy_px: Floats, numbers: Ints, rgb: Floats, size_px: float) -> None:
-        """Write numbers (N,) from positions (N, 2) on, on backgrounds of colours (N, 3)."""
+    def labels(self, frame: Ints, xy_px: Floats, labels: NDArray[Any], rgb: Floats, size_px: float) -> None:
+        """Write labels (N,), numbers or texts, from positions (N, 2) on, on backgrounds of colours (N, 3)."""
         xy, dark = _short(xy_px, PER_PX), ink(rgb)
-        for length, chosen, texts in by_length(numbers):
+        for length, chosen, texts in by_length(labels):
             shades = {
                 f"{front}_{name}": values[chosen, place]
                 for front, values in (("text", dark), ("ground", rgb))

@@ -14,6 +14,7 @@ from functools import cache
 from typing import Any, Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mcaptrack.foxglove.messages import SCENE, message_class
 from mcaptrack.foxglove.template import STAMP, Each, MessageParts, Slot, Template, TextSlot, group, joined, stamps
@@ -54,16 +55,16 @@ class SceneMessages:
         self._add(np.arange(self._count), _head())
 
     def people(
-        self, frame: Ints, numbers: Ints, xy_m: Floats, rgb: Floats, alpha: Floats, marker: PersonMarker,
+        self, frame: Ints, labels: NDArray[Any], xy_m: Floats, rgb: Floats, alpha: Floats, marker: PersonMarker,
         trail_m: Floats, fade: Floats,
     ) -> None:  # fmt: skip
-        """Draw people at (N, 2) with their numbers and a trail through points (N, P, 2), oldest first.
+        """Draw people at (N, 2) with labels (N,), numbers or texts, and a trail through points (N, P, 2), oldest first.
 
         ``fade`` (P,) is the opacity at each point. A trail in pieces is drawn between the first and the second point,
         the third and the fourth, and so on. Trails with another number of points need another call.
         """
         xy, trail = _short(xy_m), _short(trail_m)
-        for length, chosen, words in by_length(numbers):
+        for length, chosen, words in by_length(labels):
             template = _person(self._frame_id, self._lifetime_ns, length, marker, trail.shape[1])
             self._add(
                 frame[chosen], template, entity_id=words, label=words, x=xy[chosen, 0], y=xy[chosen, 1],

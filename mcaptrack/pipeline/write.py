@@ -21,7 +21,7 @@ from mcaptrack.geometry.plane import Planes
 from mcaptrack.notices import warn
 from mcaptrack.pipeline.checks import describe_origin, may_replace
 from mcaptrack.schema import DETECTIONS, FORECAST_SCORES, GROUND_PLANE, PREDICTIONS, SCHEMAS, TRACKS, Frame, Schema
-from mcaptrack.schema.classes import classes_beside_rows, has_classes, only_class, without_class
+from mcaptrack.schema.classes import class_names, classes_beside_rows, has_classes, only_class, without_class
 from mcaptrack.schema.framing import frame_times
 from mcaptrack.schema.provenance import INGEST, VIEW, Provenance, digest
 from mcaptrack.sources import foreign
@@ -159,19 +159,23 @@ def write(
 
 
 class ChannelToDraw(NamedTuple):
-    """A channel that gets views: ``digest`` of its messages; ``made_by``, the stage that made it in this run, or ""."""
+    """A channel that gets views: ``digest`` of its messages; ``made_by``, the stage that made it in this run, or "";
+    ``classes``, the names of its classes by number.
+    """
 
     schema: Schema
     frames: list[Frame]
     digest: str
     made_by: str
+    classes: Mapping[int, str]
 
 
 def _channels_to_draw(opened: log.Log, camera: Camera, made: Mapping[str, Made]) -> dict[str, ChannelToDraw]:
     """Return the channels that get views, by topic: those of this run, and ingested ones without a current view."""
     shown = {
-        topic: ChannelToDraw(channel.schema, channel.frames, channel.provenance.digest, channel.provenance.transform)
+        topic: ChannelToDraw(channel.schema, channel.frames, how.digest, how.transform, class_names(how.to_metadata()))
         for topic, channel in made.items()
+        for how in (channel.provenance,)
     }
     for topic, channel in sorted(opened.channels.items()):
         schema = SCHEMAS.get(channel.schema_name)
@@ -182,7 +186,8 @@ def _channels_to_draw(opened: log.Log, camera: Camera, made: Mapping[str, Made])
         drawn_from = Provenance.from_metadata(drawn.metadata) if drawn else None
         is_new = drawn_from is None or drawn_from.input_digest != known.digest
         if schema in (*views.DRAWN, GROUND_PLANE) and is_new:
-            shown[topic] = ChannelToDraw(schema, opened.frames(topic, schema), known.digest, "")
+            names = class_names(channel.metadata)
+            shown[topic] = ChannelToDraw(schema, opened.frames(topic, schema), known.digest, "", names)
     return shown
 
 
@@ -217,7 +222,8 @@ class _ViewFactory:
             if channel.schema not in views.DRAWN or topic.endswith(_NOT_SHOWN) or topic + FULL in shown:
                 continue  # another channel shows the same tracks at more times
             is_retracked = channel.made_by in STAGES and STAGES[channel.made_by].repairs_tracks
-            drawing = views.Drawing(topic, channel.schema, channel.frames, self._planes, is_retracked)
+            frames, names = channel.frames, channel.classes
+            drawing = views.Drawing(topic, channel.schema, frames, self._planes, is_retracked, names)
             if len(self._picture_ns):
                 drawn = drawing.on_pictures(self._picture_ns, self._stamp_ns)
                 yield View(topic + views.SUFFIX, foxglove.ANNOTATIONS, made_from, group, drawn)

@@ -193,18 +193,10 @@ _METRICS: Final = Table(
         Field("coverage_50", _FLOAT, "share of true futures in the 50 % ellipses", nullable=True),
         Field("coverage_90", _FLOAT, "share of true futures in the 90 % ellipses", nullable=True),
         Field("coverage_95", _FLOAT, "share of true futures in the 95 % ellipses", nullable=True),
-        Field(
-            "class", _NAME, "class that is scored; null for all together, with sums of counts", nullable=True
-        ),
-        Field(
-            "class_mean_MOTA", _FLOAT, "of all together: mean of MOTA over classes", nullable=True
-        ),
-        Field(
-            "class_mean_IDF1", _FLOAT, "of all together: mean of IDF1 over classes", nullable=True
-        ),
-        Field(
-            "class_mean_HOTA", _FLOAT, "of all together: mean of HOTA over classes", nullable=True
-        ),
+        Field("class", _NAME, "class that is scored; null for all together, with sums of counts", nullable=True),
+        Field("class_mean_MOTA", _FLOAT, "of all together: mean of MOTA over classes", nullable=True),
+        Field("class_mean_IDF1", _FLOAT, "of all together: mean of IDF1 over classes", nullable=True),
+        Field("class_mean_HOTA", _FLOAT, "of all together: mean of HOTA over classes", nullable=True),
     ),
 )
 

@@ -5,7 +5,7 @@ Tracks with other times than the pictures are resampled to these, so that boxes 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Final
 
 import numpy as np
@@ -32,12 +32,20 @@ DRAWN: Final = (DETECTIONS, TRACKS, PREDICTIONS)
 class Drawing:
     """A channel to draw.
 
-    ``is_retracked`` says that its tracks are repaired. Predictions need ``planes`` to be drawn on pictures.
+    ``is_retracked`` says that its tracks are repaired; ``classes`` are names of classes by number. Predictions need
+    ``planes`` to be drawn on pictures.
     """
 
     def __init__(
-        self, topic: str, schema: Schema, frames: Sequence[Frame], planes: Planes, is_retracked: bool = False
+        self,
+        topic: str,
+        schema: Schema,
+        frames: Sequence[Frame],
+        planes: Planes,
+        is_retracked: bool = False,
+        classes: Mapping[int, str] = {},
     ) -> None:
+        self._classes = classes
         self._schema, self._frames, self._planes = schema, frames, planes
         self._style = style_of(topic, is_retracked)
         self._known: tuple[Ints, People] | None = None
@@ -70,5 +78,5 @@ class Drawing:
     def _people(self, t_ns: Ints) -> People:
         """The people at these times, computed once for both views."""
         if self._known is None or not np.array_equal(self._known[0], t_ns):
-            self._known = t_ns, people_at(self._frames, t_ns, self._planes)
+            self._known = t_ns, people_at(self._frames, t_ns, self._planes, self._classes)
         return self._known[1]

@@ -92,7 +92,7 @@ def tracks(people: People, t_ns: Ints, frame_id: str, style: TrackStyle) -> View
             if style.marker.in_pieces:
                 trail, opacity = segments(trail, style.dash), np.repeat(opacity[1:], 2)
             scene.people(
-                people.frame[these] - span.start, people.number[these], people.at_m[these], rgb[these], alpha[these],
+                people.frame[these] - span.start, people.label[these], people.at_m[these], rgb[these], alpha[these],
                 style.marker, trail, opacity,
             )  # fmt: skip
         yield from instants.numbered(span, scene)

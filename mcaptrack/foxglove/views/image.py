@@ -124,7 +124,7 @@ def tracks(people: People, pictures: PictureTimes, unit: float, style: TrackStyl
             corner = corner + size * [0, 1] + [0, words_px + style.thickness * unit]
         elif style.name_at == "beside":
             corner = corner + size * [1, 0] + [style.thickness * unit, words_px]
-        drawn.labels(frame[named], corner, people.number[named], rgb[named], words_px)
+        drawn.labels(frame[named], corner, people.label[named], rgb[named], words_px)
         yield from pictures.numbered(span, drawn)
 
 

@@ -5,8 +5,8 @@ Letters: S people shown, N others, P points, F instants.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from typing import Final, NamedTuple
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,7 @@ from mcaptrack.geometry.clocks import seconds_to_ns
 from mcaptrack.geometry.plane import GroundPlane, Planes
 from mcaptrack.geometry.ragged import group_index, ragged_range, run_starts
 from mcaptrack.schema import PREDICTIONS, Frame
+from mcaptrack.schema.classes import class_name
 from mcaptrack.schema.framing import frame_times, join_frames
 from mcaptrack.schema.resampling import resample
 
@@ -24,6 +25,8 @@ from mcaptrack.schema.resampling import resample
 _TRAIL_S: Final = 2.0
 _TRAIL_LINES: Final = 4
 _MAX_GAP_S: Final = 2.0
+#: The longest name of a class in a label.
+_NAME_LENGTH: Final = 20
 #: Forecasts are shown until the next ones are due.
 _FORECAST_S: Final = 1.0
 #: The largest number of points of the line of a forecast.
@@ -34,8 +37,8 @@ CHI2_95: Final = 5.991464547107979
 
 
 class People(NamedTuple):
-    """S people at instants: ids, instants, boxes (S, 4) px, feet (S, 2) px, positions (S, 2) m, and whether
-    observed.
+    """S people at instants: ids, instants, boxes (S, 4) px, feet (S, 2) px, positions (S, 2) m, whether observed, and
+    labels: the ids, or texts with id and class.
     """
 
     number: Ints
@@ -44,6 +47,7 @@ class People(NamedTuple):
     foot_px: Floats
     at_m: Floats
     observed: NDArray[np.bool_]
+    label: NDArray[Any]
 
 
 class Trails(NamedTuple):
@@ -77,8 +81,11 @@ def by_plane(planes: Planes, t_ns: Ints) -> Iterator[tuple[GroundPlane, NDArray[
         yield planes[number][1], which == number
 
 
-def people_at(frames: Sequence[Frame], at_ns: Ints, planes: Planes) -> People:
-    """The people of a channel of tracks at rising times; missing pixels or metres are computed with the plane."""
+def people_at(frames: Sequence[Frame], at_ns: Ints, planes: Planes, classes: Mapping[int, str] = {}) -> People:
+    """The people of a channel of tracks at rising times; missing pixels or metres are computed with the plane.
+
+    ``classes`` are names of classes by number, which labels show if the channel has several classes.
+    """
     rows, frame = resample(frames, at_ns, seconds_to_ns(_MAX_GAP_S))
     box = columns_to_boxes(rows)
     at_m = np.stack([rows["x_m"], rows["y_m"]], axis=-1)
@@ -90,7 +97,23 @@ def people_at(frames: Sequence[Frame], at_ns: Ints, planes: Planes) -> People:
         at_m[unknown] = plane.boxes_to_metres(box[unknown])
         unknown = held & np.isnan(foot).any(axis=1) & np.isfinite(at_m).all(axis=1)
         foot[unknown] = plane.metres_to_pixels(at_m[unknown])
-    return People(rows["track_id"].astype(np.int64), frame, box, foot, at_m, np.array(rows["observed"], bool))
+    number = rows["track_id"].astype(np.int64)
+    label = _labels(number, rows["class_id"].astype(np.int64), classes)
+    return People(number, frame, box, foot, at_m, np.array(rows["observed"], bool), label)
+
+
+def _labels(number: Ints, class_id: Ints, names: Mapping[int, str]) -> NDArray[Any]:
+    """The labels (S,) of people: ids, and the class if there is more than one."""
+    if not len(number) or (class_id == class_id[0]).all():
+        return number
+    pairs, which = np.unique(np.stack([number, class_id]), axis=1, return_inverse=True)
+    called = {one: _shortened(class_name(one, names), _NAME_LENGTH) for one in np.unique(class_id).tolist()}
+    return np.array([f"{one} {called[of]}" for one, of in pairs.T.tolist()])[which.reshape(-1)]
+
+
+def _shortened(text: str, length: int) -> str:
+    """A text of at most so many characters."""
+    return text if len(text) <= length else text[: length - 1] + "\N{HORIZONTAL ELLIPSIS}"
 
 
 def trails(people: People, known: NDArray[np.bool_], at_ns: Ints) -> Trails:
