@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -11,9 +11,6 @@ from numpy.typing import NDArray
 from mcaptrack.api.columns import times_of
 from mcaptrack.errors import McaptrackError
 from mcaptrack.log import Log
-from mcaptrack.schema import Frame
-from mcaptrack.sources.pictures import Pictures
-from mcaptrack.sources.video import decode_bgr, decode_gray
 
 _NEEDED: Final = ("chunk_offset", "message_offset")
 
@@ -78,11 +75,3 @@ def shown_pictures(opened: Log, topic: str, times: Sequence[int] | NDArray[Any])
         raise McaptrackError(f"{opened.path}: {topic} has no picture at {first} ns; its first picture is later")
     numbers, counts = np.unique(at, return_counts=True)
     return dict(zip(numbers.tolist(), counts.tolist(), strict=True))
-
-
-def decoded_pictures(opened: Log, topic: str, wanted: Mapping[int, int] | None, colour: str) -> Iterator[Frame]:
-    """The pictures with the numbers ``wanted``, or all, in the order of time."""
-    pixels = decode_gray if colour == "grey" else decode_bgr
-    found = Pictures(opened, topic)
-    for frame in found.frames(range(len(found.t_ns)) if wanted is None else wanted, pixels):
-        yield frame._replace(rows=frame.rows[..., ::-1]) if colour == "rgb" else frame

@@ -24,13 +24,14 @@ from mcaptrack import log as logs
 from mcaptrack import tables
 from mcaptrack.api.checked import checked
 from mcaptrack.api.common import as_path, log_output
-from mcaptrack.api.fetching import FetchedMessage, decoded_pictures, fetch_message, shown_pictures
+from mcaptrack.api.fetching import FetchedMessage, fetch_message, shown_pictures
 from mcaptrack.api.supervision import supervision_of
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.files import refuse_overwrite
 from mcaptrack.schema import DETECTIONS, SCHEMAS, TRACKS, Frame
 from mcaptrack.schema.classes import class_names
-from mcaptrack.sources.pictures import find_pictures
+from mcaptrack.sources.pictures import Pictures, find_pictures
+from mcaptrack.sources.video import decode_bgr, decode_gray
 from mcaptrack.tables import export
 
 if TYPE_CHECKING:
@@ -221,7 +222,7 @@ class Recording:
         """
         channel = find_pictures(self._log, topic)
         wanted = None if times is None else shown_pictures(self._log, channel, times)
-        frames = decoded_pictures(self._log, channel, wanted, colour)
+        frames = self._decoded(channel, wanted, colour)
         return frames if wanted is None else (frame for frame in frames for _ in range(wanted[frame.index]))
 
     def fetch(self, row: Mapping[str, Any]) -> FetchedMessage:
@@ -354,6 +355,12 @@ class Recording:
             self.close()
             self._open(path)
         return count
+
+    def _decoded(self, topic: str, wanted: Mapping[int, int] | None, colour: Colour) -> Iterator[Frame]:
+        pixels = decode_gray if colour == "grey" else decode_bgr
+        found = Pictures(self._log, topic)
+        for frame in found.frames(range(len(found.t_ns)) if wanted is None else wanted, pixels):
+            yield frame._replace(rows=frame.rows[..., ::-1]) if colour == "rgb" else frame
 
 
 def open(path: str | Path, *, create: bool = False) -> Recording:  # noqa: A001  # mcaptrack.open is its name

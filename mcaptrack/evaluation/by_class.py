@@ -96,7 +96,7 @@ def _numbers(frames: Sequence[Frame]) -> list[int]:
 
 
 def _key(number: int, names: Mapping[int, str]) -> str | int:
-    """What classes of two channels have in common if they are the same: the name, or the number without one."""
+    """The key of a class, the same in all channels: its name, or its number if it has none."""
     name = names.get(number, "").strip().casefold()
     return "person" if number == PERSON or name in PEOPLE else name or number
 

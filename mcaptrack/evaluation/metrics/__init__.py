@@ -18,7 +18,7 @@ from mcaptrack.evaluation.metrics.hota import hota
 from mcaptrack.evaluation.metrics.identity import identity
 from mcaptrack.evaluation.metrics.matchup import Matchup, distances, metres_to_similarity
 
-__all__ = ["RATES", "Matchup", "Rules", "Score", "combine", "distances", "metres_to_similarity", "score", "summary"]
+__all__ = ["Matchup", "Rules", "Score", "combine", "distances", "metres_to_similarity", "score", "summary"]
 
 
 #: The rates of ``summary``; its other numbers are counts.
