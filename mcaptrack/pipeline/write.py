@@ -167,7 +167,7 @@ class ChannelToDraw(NamedTuple):
     frames: list[Frame]
     digest: str
     made_by: str
-    classes: Mapping[int, str]
+    classes: Mapping[int, str] = {}
 
 
 def _channels_to_draw(opened: log.Log, camera: Camera, made: Mapping[str, Made]) -> dict[str, ChannelToDraw]:
