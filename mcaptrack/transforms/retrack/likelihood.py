@@ -118,11 +118,10 @@ class LikelihoodPass:
         )
         steps = np.array(self.steps, np.int64)
         xy_m = np.stack([rows["x_m"], rows["y_m"]], axis=-1)
-        past, known = self._past(ids[shown], steps[tick[shown]], xy_m, samples)
-        forecast = self._predict(past, known)
-        predictions = (
-            forecast_to_rows(rows["track_id"], forecast, self._predictor.step_s) if len(rows) else PREDICTIONS.empty()
-        )
+        predictions = PREDICTIONS.empty()
+        if len(rows):
+            forecast = self._predict(*self._past(ids[shown], steps[tick[shown]], xy_m, samples))
+            predictions = forecast_to_rows(rows["track_id"], forecast, self._predictor.step_s)
         horizon = self._predictor.steps
         bounds = np.searchsorted(tick[shown], np.arange(len(self._frames) + 1)).tolist()
         return [
@@ -159,8 +158,6 @@ class LikelihoodPass:
     def _predict(self, past: Floats, known: Bools) -> Forecast:
         predictor = self._predictor
         parts = [predictor.predict(past[k : k + _BATCH], known[k : k + _BATCH]) for k in range(0, len(past), _BATCH)]
-        if not parts:
-            return Forecast(np.empty((0, predictor.steps, 2)), np.empty((0, predictor.steps, 2, 2)))
         return Forecast(*(np.concatenate(members) for members in zip(*parts, strict=True)))
 
 
