@@ -261,11 +261,66 @@ def test_units_and_meaning_reach_arrow():
             "rising field numbers",
         ),
         ("import 'x';", "x.proto:1: not a row schema"),
+        *(
+            (text, f"^x.proto:{line}: not a row schema \\(fixed-width fields in message Row\\): ")
+            for text, line in {
+                "package a;\npackage b;": 2,
+                "package a": 1,
+                "message A {\n}\nmessage B {": 3,
+                "message A {\nmessage Cow {": 2,
+                "message A {\nmessage Row {\nmessage Row {": 3,
+                "message a {": 1,
+                "message A {\nrepeated Row rows = 1;": 2,
+                "message A {\nmessage Row {\nrepeated Row rows = 1;": 3,
+                "message A {\nmessage Row {\n}\nrepeated Row rows = 2;": 4,
+                "message A {\nfloat a = 1;": 2,
+                "message A {\nmessage Row {\nfloat a = 1": 3,
+                "message A {\nmessage Row {\nfloat A = 1;": 3,
+                "message A {\nmessage Row {\nint32 a = 1;": 3,
+                "}": 1,
+            }.items()
+        ),
+        *(
+            (text, "^x.proto: a row schema needs a package, 'repeated Row rows = 1;' and rising field numbers$")
+            for text in (
+                "package p;\nmessage A {\nmessage Row {\ndouble a = 1;\n}\nrepeated Row rows = 1;",
+                "message A {\nmessage Row {\ndouble a = 1;\n}\nrepeated Row rows = 1;\n}",
+                "package p;\nmessage A {\nmessage Row {\ndouble a = 1;\nbool b = 1;\n}\nrepeated Row rows = 1;\n}",
+                "",
+            )
+        ),
     ],
 )
 def test_what_has_no_fixed_width_is_no_row_schema(text, words):
     with pytest.raises(ValueError, match=words):
         parse(text, "x.proto")
+
+
+def test_a_row_schema_is_read_as_it_stands():
+    text = """syntax = "proto3";
+// What it holds, in
+//two lines.
+package p.q;
+
+message Some {
+  message Row {  // no text of a column
+    // neither is this
+    fixed64 id_ns = 2;//at once
+    optional float area_m2 = 5;   // of it
+
+    bool ok = 7;
+  }
+  // nor this
+  repeated Row rows = 1;
+}
+"""
+    found = parse(text, "x.proto")
+    assert (found.name, found.doc) == ("p.q.Some", "What it holds, in two lines.")
+    assert [(one.name, one.kind, one.number, one.optional, one.doc, one.unit) for one in found.columns] == [
+        ("id_ns", "fixed64", 2, False, "at once", "ns"),
+        ("area_m2", "float", 5, True, "of it", "m^2"),
+        ("ok", "bool", 7, False, "", ""),
+    ]
 
 
 # Provenance
