@@ -103,6 +103,11 @@ def test_motion_belongs_to_pictures_and_no_stage_replaces_it(folder):
         ("0 1 0 0 0 1 0\n2 1 0 0 0 1 0\n", "motion.txt:2: frame 2 is not 1: frames count from 0, without gaps"),
         ("1 1 0 0 0 1 0\n", "motion.txt:1: frame 1 is not 0: frames count from 0"),
         ("0 1 0 0 1 0 0\n", "motion.txt:1: the motion is not finite, or can't be inverted"),
+        (
+            "0 1 0 0 0 1 0\n1 0 -5 0 5 0 0\n",
+            "motion.txt:2: the motion enlarges the picture 5 times; no camera does that",
+        ),
+        ("0 0.2 0 0 0 0.2 0\n", "motion.txt:1: the motion enlarges the picture 0.2 times"),
         ("0 1 0 nan 0 1 0\n", "motion.txt:1: the motion is not finite, or can't be inverted"),
     ],
 )

@@ -15,7 +15,9 @@ from mcap_protobuf.schema import build_file_descriptor_set
 from mcaptrack import foxglove
 from mcaptrack.foxglove.views import Drawing
 from mcaptrack.foxglove.views.people import ellipse_points, ellipses
-from mcaptrack.geometry.plane import GroundPlane
+from mcaptrack.geometry.boxes import columns_to_boxes
+from mcaptrack.geometry.camera_path import CameraPath, poses_of
+from mcaptrack.geometry.plane import GroundPlane, moved_planes
 from mcaptrack.schema import DETECTIONS, PREDICTIONS, TRACKS, Frame
 from tests.worlds import FORECAST, PICTURES, PLANE, boxed, boxes_at, ns, tracks_at
 
@@ -24,8 +26,8 @@ LOOP, LIST = 2, 4
 PX = 0.126
 
 
-def view(topic, schema, frames, picture_ns, planes, stamp_ns=None, is_retracked=False):
-    drawing = Drawing(topic, schema, frames, planes, is_retracked)
+def view(topic, schema, frames, picture_ns, planes, stamp_ns=None, is_retracked=False, path=None):
+    drawing = Drawing(topic, schema, frames, planes, is_retracked, path=path)
     return drawing.on_pictures(picture_ns, picture_ns if stamp_ns is None else stamp_ns)
 
 
@@ -120,6 +122,30 @@ def test_trails_stay_where_they_are_while_people_go_on_and_end_after_two_seconds
     for number, message in enumerate(found):
         oldest = min(x for x, y in xy(drawn(message)[-1]) if y == 25) if number else None
         assert oldest is None or 10 * (number - 14) <= oldest - 5 <= 10 * number
+
+
+@pytest.mark.parametrize("name", ["retracks", "predictions"])
+def test_drawings_follow_a_camera_that_sways(name):
+    """A law: what is drawn before a camera that moves is what is drawn before a still one, moved picture by picture."""
+    topic, schema, frames = CHANNELS[name]
+    shift = [round(30 * float(np.sin(2 * n))) if n else 0 for n in range(len(PICTURES))]
+    motions = np.array([[[1.0, 0, now - then], [0, 1, 0]] for then, now in pairwise([0, *shift])])
+    path = CameraPath(PICTURES, poses_of(motions, 640, 480))
+    seen = frames
+    if schema is TRACKS:
+        seen = [frame._replace(rows=frame.rows.copy()) for frame in frames]
+        for frame in seen:
+            boxes = path.to_pictures(columns_to_boxes(frame.rows), np.full(len(frame.rows), frame.t_ns))
+            frame.rows["x_px"] = boxes[:, 0]
+    still, moved = messages(topic, schema, frames), messages(topic, schema, seen, moved_planes(PLANE, path), path=path)
+    count = 0
+    for by, first, second in zip(shift, still, moved, strict=True):
+        assert len(drawn(first)) == len(drawn(second))
+        for one, other in zip(drawn(first), drawn(second), strict=True):
+            wanted = np.array(xy(one)) + [by, 0]
+            assert np.array(xy(other)) == pytest.approx(wanted, abs=2 * PX)
+            count += 1
+    assert count > 5
 
 
 def test_kinds_of_tracks_differ():

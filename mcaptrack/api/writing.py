@@ -21,6 +21,7 @@ from mcaptrack.geometry.plane import Planes, plane_at
 from mcaptrack.pipeline.write import Made, write
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame, Schema
 from mcaptrack.schema.provenance import INGEST, Provenance
+from mcaptrack.sources.camera_motion import path_of, tracks_topic
 from mcaptrack.sources.cameras import USUAL
 from mcaptrack.sources.ingest.sidecar import SidecarChoice
 
@@ -50,7 +51,8 @@ def write_rows(
             opened, prefix, [_in_metres(frame, planes) if schema is TRACKS else frame for frame in frames]
         )
         made = Made.of(schema, frames, Provenance(INGEST, {"written_with": "mcaptrack.open"}, classes=names))
-        layouts = write(opened, prefix, {name: made}, planes, {}, None)
+        path_of_camera, _ = path_of(opened, prefix, tracks_topic(prefix))
+        layouts = write(opened, prefix, {name: made}, planes, {}, None, path_of_camera)
         stale = pipeline.outdated_by(opened, {name: made.provenance.digest})
         for layout, content in layouts.items():
             publish_bytes(pipeline.layout_path(path, layout), content)

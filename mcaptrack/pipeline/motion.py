@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from typing import Any, Final, NamedTuple
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
-from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.camera_path import CameraPath
-from mcaptrack.geometry.plane import Planes, moved_planes
 from mcaptrack.notices import warn
 from mcaptrack.pipeline.checks import Job, fits, read_frames
 from mcaptrack.pipeline.write import Made, digest_of
-from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, TRACKS, VIDEO, Frame, Schema
+from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, VIDEO, Frame, Schema
 from mcaptrack.schema.camera_motion import frames_to_path
-from mcaptrack.schema.framing import join_frames, split_rows
 from mcaptrack.schema.provenance import Provenance
-from mcaptrack.sources.camera_motion import motion_topic, path_of, read_ground_truth, tracks_topic
+from mcaptrack.sources.camera_motion import motion_topic, path_of, read_ground_truth
 from mcaptrack.sources.cameras import camera_at, provenance_of
 from mcaptrack.transforms import STAGES, Transform
 
@@ -127,28 +124,6 @@ def moves(opened: log.Log, prefix: str, made: Mapping[str, Made]) -> bool:
         return found is not None and frames_to_path(found[0]).matters
     except McaptrackError:
         return False
-
-
-def planes_in_pictures(opened: log.Log, prefix: str, made: Mapping[str, Made], planes: Planes) -> Planes:
-    """The planes of a camera as its pictures show them: moved with the camera where its tracks are."""
-    return moved_planes(planes, path_with(opened, prefix, tracks_topic(prefix), made)[0]) if planes else planes
-
-
-def to_scene(frames: Sequence[Frame], path: CameraPath | None) -> list[Frame]:
-    """Return frames of tracks with boxes in pixels of the reference picture; as they are without a path."""
-    return list(frames) if path is None else _moved(frames, path.to_scene)
-
-
-def to_pictures(frames: Sequence[Frame], path: CameraPath | None) -> list[Frame]:
-    """Return frames of tracks with boxes in pixels of the picture at their time; as they are without a path."""
-    return list(frames) if path is None else _moved(frames, path.to_pictures)
-
-
-def _moved(frames: Sequence[Frame], move: Callable[[Floats, Ints], Floats]) -> list[Frame]:
-    joined = join_frames(TRACKS, frames)
-    rows = joined.rows.copy()
-    rows["x_px"], rows["y_px"], rows["w_px"], rows["h_px"] = move(columns_to_boxes(rows), joined.row_ns).T
-    return split_rows(joined.t_ns, [frame.index for frame in frames], rows, joined.ends[1:])
 
 
 def _boxes(opened: log.Log, prefix: str, made: Mapping[str, Made]) -> SideInputs:

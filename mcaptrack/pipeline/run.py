@@ -20,15 +20,17 @@ from mcaptrack.pipeline.checks import Job, check_inputs, read_named_frames
 from mcaptrack.pipeline.events import STAGE as EVENTS_STAGE
 from mcaptrack.pipeline.events import Watch, make_events, tally
 from mcaptrack.pipeline.findings import warn_findings, warn_memory, warn_no_rows
-from mcaptrack.pipeline.motion import path_with, planes_in_pictures, side_inputs, to_pictures, to_scene
+from mcaptrack.pipeline.motion import path_with, side_inputs
 from mcaptrack.pipeline.planes import AS_BEFORE, PlaneChoice, is_plane_due, is_poor, make_plane, read_planes
 from mcaptrack.pipeline.rebuild import plugins_of
 from mcaptrack.pipeline.write import Made, digest_of, write
 from mcaptrack.predictors import weights_sha256
 from mcaptrack.schema import DETECTIONS, TRACKS, VIDEO, Frame
+from mcaptrack.schema.camera_motion import to_pictures, to_scene
 from mcaptrack.schema.classes import class_names
 from mcaptrack.schema.provenance import CLOCK, Provenance
 from mcaptrack.sources import foreign
+from mcaptrack.sources.camera_motion import tracks_topic
 from mcaptrack.sources.cameras import camera_at
 from mcaptrack.sources.video import EncodedPicture, decode_bgr, decode_gray
 from mcaptrack.transforms import FULL, STAGES, Sample, Transform
@@ -128,8 +130,8 @@ def _run(
         report.events = tally(events)
         report.stages += [EVENTS_STAGE] if events else []
     if made or output is not None:
-        in_pictures = planes_in_pictures(opened, prefix, made, planes or ())
-        report.layouts = write(opened, prefix, made, in_pictures, stamps, output)
+        path, _ = path_with(opened, prefix, tracks_topic(prefix), made)
+        report.layouts = write(opened, prefix, made, planes or (), stamps, output, path)
     provenances = {topic: channel.provenance for topic, channel in made.items()}
     warn_findings(opened, prefix, provenances, planes or (), is_all=watch is not None or not jobs)
     report.stale = outdated_by(opened, {topic: channel.provenance.digest for topic, channel in made.items()})

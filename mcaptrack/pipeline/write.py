@@ -17,7 +17,8 @@ from mcaptrack.foxglove import views
 from mcaptrack.foxglove.layouts import Eye
 from mcaptrack.foxglove.views import layouts
 from mcaptrack.geometry.arrays import Ints
-from mcaptrack.geometry.plane import Planes
+from mcaptrack.geometry.camera_path import CameraPath
+from mcaptrack.geometry.plane import Planes, moved_planes
 from mcaptrack.notices import warn
 from mcaptrack.pipeline.checks import describe_origin, may_replace
 from mcaptrack.schema import DETECTIONS, FORECAST_SCORES, GROUND_PLANE, PREDICTIONS, SCHEMAS, TRACKS, Frame, Schema
@@ -99,9 +100,11 @@ def write(
     planes: Planes,
     stamps: Mapping[str, Sequence[int]],
     output: Path | None,
+    path: CameraPath | None = None,
 ) -> dict[str, bytes]:
     """Write channels and their views into the log, or into a copy at ``output``. Returns layout files by name.
 
+    ``path`` is how the camera moves, if its tracks are compensated for it: so are views, and ``planes`` with it.
     ``made`` are the channels by topic; ``stamps`` the capture times in ns of pictures that stages have read, by topic.
     """
     camera = camera_at(opened, prefix)
@@ -112,7 +115,8 @@ def write(
     stamp_ns = _stamps(opened, video, stamps.get(video, ())) if video else picture_ns
     shown = _channels_to_draw(opened, camera, made)
     outdated = {topic + suffix for topic in shown for suffix in views.SUFFIXES}
-    drawn = _ViewFactory(prefix, picture_ns, stamp_ns, planes)
+    planes = moved_planes(planes, path)
+    drawn = _ViewFactory(prefix, picture_ns, stamp_ns, planes, path)
     if any(channel.schema in _ON_GROUND for channel in shown.values()):
         outdated.add(drawn.frame_topic)
     recorded = {topic for topic in outdated if not may_replace(opened, topic, VIEW)}
@@ -204,8 +208,11 @@ class View(NamedTuple):
 class _ViewFactory:
     """Draws the channels of a camera: in its pictures, and on the ground plane."""
 
-    def __init__(self, prefix: str, picture_ns: Ints, stamp_ns: Ints, planes: Planes) -> None:
+    def __init__(
+        self, prefix: str, picture_ns: Ints, stamp_ns: Ints, planes: Planes, path: CameraPath | None = None
+    ) -> None:
         self._prefix, self._picture_ns, self._stamp_ns, self._planes = prefix, picture_ns, stamp_ns, planes
+        self._path = path
         self._frame_id = views.ground.frame_of(prefix)
         self._is_framed = False
         #: The topic of the transform from the world to the ground plane's frame.
@@ -223,7 +230,7 @@ class _ViewFactory:
                 continue  # another channel shows the same tracks at more times
             is_retracked = channel.made_by in STAGES and STAGES[channel.made_by].repairs_tracks
             frames, names = channel.frames, channel.classes
-            drawing = views.Drawing(topic, channel.schema, frames, self._planes, is_retracked, names)
+            drawing = views.Drawing(topic, channel.schema, frames, self._planes, is_retracked, names, self._path)
             if len(self._picture_ns):
                 drawn = drawing.on_pictures(self._picture_ns, self._stamp_ns)
                 yield View(topic + views.SUFFIX, foxglove.ANNOTATIONS, made_from, group, drawn)

@@ -15,6 +15,7 @@ from mcaptrack.foxglove.views.image import View
 from mcaptrack.foxglove.views.people import People, people_at
 from mcaptrack.foxglove.views.style import line_unit, style_of
 from mcaptrack.geometry.arrays import Ints
+from mcaptrack.geometry.camera_path import CameraPath
 from mcaptrack.geometry.plane import Planes
 from mcaptrack.schema import DETECTIONS, PREDICTIONS, TRACKS, Frame, Schema
 
@@ -33,7 +34,8 @@ class Drawing:
     """A channel to draw.
 
     ``is_retracked`` says that its tracks are repaired; ``classes`` are names of classes by number. Predictions need
-    ``planes`` to be drawn on pictures.
+    ``planes`` to be drawn on pictures. ``path`` is how the camera moves, if boxes between pictures and trails are to be
+    compensated for it; so are ``planes`` then.
     """
 
     def __init__(
@@ -44,9 +46,10 @@ class Drawing:
         planes: Planes,
         is_retracked: bool = False,
         classes: Mapping[int, str] = {},
+        path: CameraPath | None = None,
     ) -> None:
         self._classes = classes
-        self._schema, self._frames, self._planes = schema, frames, planes
+        self._schema, self._frames, self._planes, self._path = schema, frames, planes, path
         self._style = style_of(topic, is_retracked)
         self._known: tuple[Ints, People] | None = None
 
@@ -61,9 +64,9 @@ class Drawing:
             yield from image.detections(self._frames, pictures, self._planes)
         elif self._schema is TRACKS:
             unit = line_unit(self._frames, self._planes)
-            yield from image.tracks(self._people(picture_ns), pictures, unit, self._style)
+            yield from image.tracks(self._people(picture_ns), pictures, unit, self._style, self._path)
         elif self._schema is PREDICTIONS:
-            yield from image.predictions(self._frames, pictures, self._planes)
+            yield from image.predictions(self._frames, pictures, self._planes, self._path)
 
     def on_ground(self, t_ns: Ints, frame_id: str) -> View:
         """Scene messages (time, frame, payload) in metres, one for each of the rising times ``t_ns``.
@@ -78,5 +81,5 @@ class Drawing:
     def _people(self, t_ns: Ints) -> People:
         """The people at these times, computed once for both views."""
         if self._known is None or not np.array_equal(self._known[0], t_ns):
-            self._known = t_ns, people_at(self._frames, t_ns, self._planes, self._classes)
+            self._known = t_ns, people_at(self._frames, t_ns, self._planes, self._classes, self._path)
         return self._known[1]

@@ -28,6 +28,7 @@ from mcaptrack.foxglove.views.people import (
 from mcaptrack.foxglove.views.style import INTERPOLATED, OBSERVED, TrackStyle, line_unit
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.boxes import columns_to_boxes
+from mcaptrack.geometry.camera_path import CameraPath
 from mcaptrack.geometry.plane import Planes
 from mcaptrack.schema import DETECTIONS, Frame
 from mcaptrack.schema.framing import frame_times, join_frames
@@ -87,10 +88,13 @@ def detections(frames: Sequence[Frame], pictures: PictureTimes, planes: Planes) 
         yield from pictures.numbered(span, drawn)
 
 
-def tracks(people: People, pictures: PictureTimes, unit: float, style: TrackStyle) -> View:
+def tracks(
+    people: People, pictures: PictureTimes, unit: float, style: TrackStyle, path: CameraPath | None = None
+) -> View:
     """Draw boxes with numbers and fading trails; interpolated positions are fainter.
 
-    ``people`` are those at the times of the pictures; lines of thickness 1 are ``unit`` px thick.
+    ``people`` are those at the times of the pictures; lines of thickness 1 are ``unit`` px thick. ``path`` is how the
+    camera moves, if trails are to stay where people walked.
     """
     has_place = _near(people.foot_px)
     has_box = _near(people.box_px)
@@ -112,9 +116,11 @@ def tracks(people: People, pictures: PictureTimes, unit: float, style: TrackStyl
         drawn.loops(frame[marked], mark, rgb[marked], alpha[marked], style.thickness * unit)
         for points, chosen in by_count(lines.points[rows]):
             if points > 1 and style.dash:
-                path = people.foot_px[lines.row[rows[chosen], -points:]]
+                row = lines.row[rows[chosen], -points:]
+                t_ns = pictures.t_ns[people.frame[row]]
+                walked = _moved(people.foot_px[row], t_ns, t_ns[:, -1], path)
                 of, shade = frame[rows[chosen]], rgb[rows[chosen]]
-                drawn.pairs(of, segments(path, style.dash), shade, fade(points - 1, longest), style.thickness * unit)
+                drawn.pairs(of, segments(walked, style.dash), shade, fade(points - 1, longest), style.thickness * unit)
         named = np.concatenate([boxed, marked])
         named.sort()
         corner = np.where(has_box[named, None], people.box_px[named, :2], people.foot_px[named])
@@ -128,24 +134,42 @@ def tracks(people: People, pictures: PictureTimes, unit: float, style: TrackStyl
         yield from pictures.numbered(span, drawn)
 
 
-def predictions(frames: Sequence[Frame], pictures: PictureTimes, planes: Planes) -> View:
-    """Draw the latest forecasts as lines that fade into the future, with the 95 % ellipses of their last step."""
+def _moved(points: Floats, then_ns: Ints, now_ns: Ints, path: CameraPath | None) -> Floats:
+    """Points (N, P, 2) of pictures at times (N, P) or (N, 1), in the picture at another time for each (N,)."""
+    if path is None:
+        return points
+    boxes = np.concatenate([points, np.zeros_like(points)], axis=-1).reshape(-1, 4)
+    before, later = np.broadcast_to(then_ns, points.shape[:2]).ravel(), np.repeat(now_ns, points.shape[1])
+    return path.to_pictures(path.to_scene(boxes, before), later)[:, :2].reshape(points.shape)
+
+
+def predictions(
+    frames: Sequence[Frame], pictures: PictureTimes, planes: Planes, path: CameraPath | None = None
+) -> View:
+    """Draw the latest forecasts as lines that fade into the future, with the 95 % ellipses of their last step.
+
+    ``path`` is how the camera moves, if forecasts are to stay where they lead to.
+    """
     unit = line_unit((), planes)
     made_ns = frame_times(frames)
     wanted = latest(frames, pictures.t_ns)
     futures = [_in_pixels(future, planes, made_ns) for future in forecasts(frames)] if planes else []
+    # Planes are those of pictures, and forecasts are made between them.
+    last = np.searchsorted(pictures.t_ns, made_ns, "right") - 1
+    seen_ns = pictures.t_ns[np.maximum(last, 0)] if len(pictures.t_ns) else made_ns
     for span, drawn in pictures.batches():
         for future in futures:
             which, frame = shown_at(future.message, wanted[span])
-            rgb = future.rgb[which]
+            rgb, now_ns = future.rgb[which], pictures.t_ns[span][frame]
+            then_ns = seen_ns[future.message[which]][:, None]
             ok = future.has_path[which]
             if future.path_px.shape[1] > 1 and ok.any():
-                path = segments(future.path_px[which[ok]])
-                weaker = fade(path.shape[1] // 2, path.shape[1] // 2, weakest=0.25)[::-1]
-                drawn.pairs(frame[ok], path, rgb[ok], weaker, 1.5 * unit)
+                line = segments(_moved(future.path_px[which[ok]], then_ns[ok], now_ns[ok], path))
+                weaker = fade(line.shape[1] // 2, line.shape[1] // 2, weakest=0.25)[::-1]
+                drawn.pairs(frame[ok], line, rgb[ok], weaker, 1.5 * unit)
             ok = future.has_ellipse[which]
             if ok.any():
-                around_px = future.ellipse_px[which[ok]]
+                around_px = _moved(future.ellipse_px[which[ok]], then_ns[ok], now_ns[ok], path)
                 drawn.loops(frame[ok], around_px, rgb[ok], np.full(len(around_px), 0.5), unit, fill=0.15)
         yield from pictures.numbered(span, drawn)
 

@@ -13,10 +13,12 @@ from numpy.typing import NDArray
 
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.boxes import columns_to_boxes
+from mcaptrack.geometry.camera_path import CameraPath
 from mcaptrack.geometry.clocks import seconds_to_ns
 from mcaptrack.geometry.plane import GroundPlane, Planes
 from mcaptrack.geometry.ragged import group_index, ragged_range, run_starts
 from mcaptrack.schema import PREDICTIONS, Frame
+from mcaptrack.schema.camera_motion import to_scene
 from mcaptrack.schema.classes import class_name
 from mcaptrack.schema.framing import frame_times, join_frames
 from mcaptrack.schema.resampling import resample
@@ -81,13 +83,21 @@ def by_plane(planes: Planes, t_ns: Ints) -> Iterator[tuple[GroundPlane, NDArray[
         yield planes[number][1], which == number
 
 
-def people_at(frames: Sequence[Frame], at_ns: Ints, planes: Planes, classes: Mapping[int, str] = {}) -> People:
+def people_at(
+    frames: Sequence[Frame],
+    at_ns: Ints,
+    planes: Planes,
+    classes: Mapping[int, str] = {},
+    path: CameraPath | None = None,
+) -> People:
     """The people of a channel of tracks at rising times; missing pixels or metres are computed with the plane.
 
-    ``classes`` are names of classes by number, which labels show if the channel has several classes.
+    ``classes`` are names of classes by number, which labels show if the channel has several classes. ``path`` is how
+    the camera moves, if boxes between frames are to be compensated for it.
     """
-    rows, frame = resample(frames, at_ns, seconds_to_ns(_MAX_GAP_S))
+    rows, frame = resample(to_scene(frames, path), at_ns, seconds_to_ns(_MAX_GAP_S))
     box = columns_to_boxes(rows)
+    box = box if path is None else path.to_pictures(box, at_ns[frame])
     at_m = np.stack([rows["x_m"], rows["y_m"]], axis=-1)
     foot = box[:, :2] + box[:, 2:] * [0.5, 1.0]
     for plane, held in by_plane(planes, at_ns[frame]):

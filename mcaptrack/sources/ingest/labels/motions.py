@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.geometry.affine import IDENTITY, compose
+from mcaptrack.geometry.affine import IDENTITY, compose, scale_of
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.camera_path import Verdict, poses_of
 from mcaptrack.schema import Frame
@@ -16,6 +16,8 @@ from mcaptrack.schema.camera_motion import is_motion, pose_to_rows
 from mcaptrack.sources.ingest.labels.number_table import NumberTable, lines_of
 
 _COLUMNS: Final = 7
+#: The largest zoom from one frame to the next.
+_MOST_ZOOM: Final = 4.0
 _KIND: Final = "a camera motion (frame,m00,m01,m02,m10,m11,m12: 7 columns)"
 
 
@@ -34,6 +36,11 @@ def read_motions(path: Path) -> Floats:
     )
     wrong = np.array([not is_motion(motion) for motion in motions])
     table.refuse(wrong, lambda row: "the motion is not finite, or can't be inverted")
+    scale = np.array([scale_of(motion) for motion in motions])
+    table.refuse(
+        (scale > _MOST_ZOOM) | (scale < 1 / _MOST_ZOOM),
+        lambda row: f"the motion enlarges the picture {scale[row]:.3g} times; no camera does that in a frame",
+    )
     return motions
 
 
