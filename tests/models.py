@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
+import gzip
 import hashlib
 import threading
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from time import sleep
 from types import MappingProxyType
 from typing import Any
 
@@ -21,6 +24,9 @@ class Handler(BaseHTTPRequestHandler):
     """Gives the network, or what is wrong, by the name of the file."""
 
     def do_GET(self) -> None:  # the name that the server calls
+        if self.path in ("/slow.onnx", "/endless.onnx", "/packed.onnx"):
+            self.give(self.path)
+            return
         status, data, length = {
             "/network.onnx": (200, DATA, len(DATA)),
             "/other.onnx": (200, DATA[:-1] + b"x", len(DATA)),
@@ -28,13 +34,34 @@ class Handler(BaseHTTPRequestHandler):
             "/broken.onnx": (200, DATA[:100], len(DATA)),
             "/long.onnx": (200, DATA + bytes(10**6), len(DATA) + 10**6),
             "/moved.onnx": (302, b"", 0),
+            "/page.onnx": (200, b"<html>", 6),
+            "/many.onnx": (200, gzip.compress(DATA[:4096]), None),
         }.get(self.path, (404, b"no such file", 12))
         self.send_response(status)
-        self.send_header("Content-Length", str(length))
+        if length is None:
+            self.send_header("Content-Encoding", "gzip")
+        self.send_header("Content-Length", str(len(data) if length is None else length))
+        if data.startswith(b"<"):
+            self.send_header("Content-Type", "text/html; charset=utf-8")
         if status == 302:
             self.send_header("Location", "/network.onnx")
         self.end_headers()
         self.wfile.write(data)
+
+    def give(self, path: str) -> None:
+        """The network slowly, without saying how long it is, or compressed."""
+        self.send_response(200)
+        if path == "/packed.onnx":
+            self.send_header("Content-Encoding", "gzip")
+        self.end_headers()
+        if path == "/slow.onnx":
+            self.wfile.write(DATA[:4096])
+            self.wfile.flush()
+            sleep(0.12)
+            with contextlib.suppress(OSError):
+                self.wfile.write(DATA[4096:8192])
+            return
+        self.wfile.write(gzip.compress(DATA, 1) if path == "/packed.onnx" else DATA)
 
     def log_message(self, *_: Any) -> None:
         pass

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import re
 import sys
@@ -10,7 +11,8 @@ from pathlib import Path
 import pytest
 
 import mcaptrack
-from mcaptrack.errors import McaptrackError
+from mcaptrack import notices
+from mcaptrack.api import catalogue as fetching
 from mcaptrack.registry import BUILT_IN
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.transforms import STAGES
@@ -80,8 +82,10 @@ class TestFetching:
         [
             ("none.onnx", "HTTP status 404"),
             ("other.onnx", "gives another file than that of yolox-nano (SHA-256)"),
-            ("short.onnx", "gives another file than that of yolox-nano (SHA-256)"),
-            ("broken.onnx", "broken.onnx: "),
+            ("short.onnx", f"short.onnx ends after 100 of {len(DATA):,} bytes"),
+            ("page.onnx", "page.onnx gives a web page, not a file"),
+            ("many.onnx", "many.onnx ends after 4,096 of"),
+            ("broken.onnx", "broken.onnx: the connection broke"),
             ("long.onnx", f"gives more than the {len(DATA):,} bytes of yolox-nano"),
         ],
     )
@@ -91,6 +95,18 @@ class TestFetching:
         assert words in err
         assert "hand it over with `mcaptrack models get yolox-nano --from FILE`" in err
         assert list(model.path.parent.iterdir()) == []
+
+    def test_a_server_that_is_too_slow_is_given_up(self, model, address, monkeypatch):
+        monkeypatch.setattr(fetching, "_PATIENCE_S", 0.1)
+        monkeypatch.setattr(fetching, "_LEAST_BYTES_PER_S", 10**9)
+        err = refused("--from", f"{address}/slow.onnx")
+        assert re.search(r"slow\.onnx gives [\d,]+ bytes in \d+ s, which is too slow\. Get its file", err)
+        assert list(model.path.parent.iterdir()) == []
+
+    def test_files_without_a_length_and_compressed_ones_are_taken(self, model, address):
+        for name in ("endless.onnx", "packed.onnx"):
+            assert mcaptrack.get_model(NAME, source=f"{address}/{name}").read_bytes() == DATA
+            model.path.unlink()
 
     def test_without_a_network_the_file_can_be_handed_over(self, tmp_path, monkeypatch):
         stocked(monkeypatch, tmp_path, "http://127.0.0.1:1/network.onnx")
@@ -150,11 +166,26 @@ class TestDetecting:
         with mcaptrack.open(log) as opened:
             assert opened.array("detections")["x_px"] == pytest.approx([0, 32, 64] * 2, abs=0.5)
 
+    def test_weights_are_read_and_hashed_once(self, model, log, monkeypatch):
+        mcaptrack.get_model(NAME)
+        taken, read = hashlib.sha256, []
+
+        def counted(data=b"", **words):
+            read.append(len(data))
+            return taken(data, **words)
+
+        monkeypatch.setattr(hashlib, "sha256", counted)
+        monkeypatch.setattr(hashlib, "file_digest", lambda *_: pytest.fail("hashed again"))
+        done("run", log, "--detector", NAME, "--no-tables", "--quiet")
+        assert read.count(len(DATA)) == 1
+
     def test_weights_that_were_changed_are_refused(self, model, log, tmp_path):
         mcaptrack.get_model(NAME).write_bytes(detector("yolox", metadata={"changed": "yes"}))
         assert "is not the file of yolox-nano" in call("detect", log, "--detector", NAME).err
-        with pytest.raises(McaptrackError, match="is not the file of yolox-nano"):
-            mcaptrack.get_model(NAME)
+        assert "`mcaptrack models get yolox-nano` fetches it again" in call("detect", log, "--detector", NAME).err
+        with notices.collected() as said:
+            assert mcaptrack.get_model(NAME).read_bytes() == DATA
+        assert [notice.message for notice in said] == [f"{model.path} is damaged, or another file; it is fetched again"]
         (tmp_path / "other.onnx").write_bytes(b"other")
         assert "is not the file of" in call("detect", log, "--detector", f"{NAME}:{tmp_path}/other.onnx").err
         done("detect", log, "--detector", f"{NAME}:{tmp_path}/known.onnx", "--input-size", "160x128")

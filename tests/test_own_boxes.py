@@ -9,6 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 import mcaptrack
 from mcaptrack import log
@@ -38,7 +40,7 @@ def written(folder: Path, name: str, text: str) -> Path:
 
 
 def as_coco(folder):
-    images = [{"id": 100 + frame, "file_name": f"a/{frame:06}.jpg", "width": 256, "height": 128} for frame in range(5)]
+    images = [{"id": 100 + frame, "file_name": f"a/{frame:06}.jpg", "width": 256, "height": 128} for frame in range(7)]
     entries = [
         {
             "id": number,
@@ -63,7 +65,7 @@ def as_results(folder):
 
 
 def as_yolo(folder):
-    lines = {frame: [] for frame in range(5)}
+    lines = {frame: [] for frame in range(max(5, *(row[0] + 1 for row in BOXES)))}
     for frame, x, y, w, h, score, name, one in BOXES:
         place = [(x + w / 2) / SIZE[0], (y + h / 2) / SIZE[1], w / SIZE[0], h / SIZE[1]]
         lines[frame].append(f"{CLASSES.index(name)} {' '.join(map(repr, place))} {score} {one}")
@@ -177,7 +179,7 @@ def test_times_belong_to_the_nearest_picture(start_ns, is_absolute, tmp_path):
 
 def test_columns_are_named_by_the_user(tmp_path):
     path = written(tmp_path, "a.csv", "n,a,b,c,d,p\n3,1,2,11,22,90\n")
-    with pytest.raises(McaptrackError, match="no columns for x and w"):
+    with pytest.raises(McaptrackError, match=r"no columns for x and x2 \(or x and w\)"):
         read_labels(path)
     labels = read_labels(path, columns=parse_columns("x=a,y=b,x2=c,y2=d,frame=n,score=p"), role="detections")
     assert labels.boxes_px.tolist() == [[1, 2, 10, 20]]
@@ -249,7 +251,7 @@ def test_doubts_name_what_they_are_about_with_counts(tmp_path):
     coco["annotations"][2]["iscrowd"] = 1
     labels = read_labels(written(tmp_path, "b.json", json.dumps(coco)), role="detections")
     words = " / ".join(words for words, _ in labels.doubts)
-    assert "1 of 4 boxes lie outside of their pictures" in words
+    assert "of 4 boxes 1 lie outside of their pictures; they stay as they are" in words
     assert re.search(r"1 boxes have classes without a name \(77\); their class_id is 0", words)
     assert labels.left_out == "1 regions of crowds (iscrowd)"
     assert labels.class_id.tolist() == [1, 0, 1]
@@ -259,3 +261,138 @@ def test_doubts_name_what_they_are_about_with_counts(tmp_path):
 def test_wrong_columns_are_refused_with_the_known_ones(text):
     with pytest.raises(McaptrackError, match=f"`columns=`.*({KEYS[0]}=left|{KEYS[-1]}|twice)"):
         parse_columns(text)
+
+
+def table(tmp_path, text, role="detections", name="a.csv", **options):
+    return read_labels(written(tmp_path, name, text), role=role, **options)
+
+
+def test_a_width_and_height_beside_two_corners_are_those_of_the_picture(tmp_path):
+    text = "filename,width,height,class,xmin,ymin,xmax,ymax\nf_12.jpg,640,480,person,1,2,31,42\n"
+    assert table(tmp_path, text).boxes_px.tolist() == [[1, 2, 30, 40]]
+    named = table(tmp_path, text, columns=parse_columns("x=xmin,y=ymin,w=width,h=height"))
+    assert named.boxes_px.tolist() == [[1, 2, 640, 480]]
+
+
+@pytest.mark.parametrize(
+    ("head", "expected"),
+    [
+        ("# frame,x1,y1,x2,y2,score", ("csv", [2, 3, 8, 7])),
+        ("#frame,id,x,y,w,h", ("mot", [3, 10, 10, 5])),
+        ("# frame,id,bb_left,bb_top,bb_width,bb_height", ("mot", [3, 10, 10, 5])),
+        ("# made on Monday, by hand", ("mot", [3, 10, 10, 5])),
+    ],
+)
+def test_a_header_that_is_a_comment_names_columns(head, expected, tmp_path):
+    labels = table(tmp_path, f"{head}\n1,2,3,10,10,5\n")
+    assert (labels.format, *labels.boxes_px.tolist()) == expected
+
+
+def test_rows_without_a_box_are_frames_without_boxes(tmp_path):
+    labels = table(tmp_path, f"{HEAD},score\n0,1,2,3,4,.5\n1,,,,,\n2,NaN,nan,None,null,\n5,1,2,3,4,.5\n")
+    assert (labels.frame.tolist(), labels.labelled.tolist()) == ([0, 5], [0, 1, 2, 5])
+    assert "2 rows have no box; they only say that frames exist" in " ".join(labels.remarks)
+
+
+def test_names_beside_numbers_of_classes_are_theirs(tmp_path):
+    text = "frame,x,y,w,h,class,name\n0,1,2,3,4,0,person\n0,1,2,3,5,16,dog\n"
+    assert table(tmp_path, text).classes == {1: "person", 16: "dog"}
+    assert table(tmp_path, text.replace("class,name", "team,name")).classes == {}
+
+
+def test_what_is_assumed_of_boxes_is_said(tmp_path):
+    twice = table(tmp_path, f"{HEAD}\n0,1,2,3,4\n0,1,2,3,4\n0,1,2,3,5\n")
+    assert any("1 of 3 boxes are there before" in words for words, _ in twice.doubts)
+    assert not table(tmp_path, f"{HEAD}\n0,1,2,2,2\n").is_normalised
+    assert table(tmp_path, f"{HEAD}\n0,.9,.2,1.2,.2\n").is_normalised
+    assert "t=t in s" in " ".join(table(tmp_path, "t,x,y,w,h\n0,1,2,3,4\n").remarks)
+    with pytest.raises(McaptrackError, match="may end with _ms, _us or _ns"):
+        table(tmp_path, "timestamp,x,y,w,h\n1700000000000,1,2,3,4\n")
+
+
+@pytest.mark.parametrize(
+    ("columns", "words"),
+    [
+        ("x=a,y=a,w=c,h=d", "names a for y and for another key"),
+        ("x=a,y=b,w=c,h=d,x2=e", "w is not read beside x, y, h, x2"),
+    ],
+)
+def test_columns_that_are_not_read_are_refused(columns, words, tmp_path):
+    with pytest.raises(McaptrackError, match=words):
+        table(tmp_path, "frame,a,b,c,d,e\n0,1,2,3,4,5\n", columns=parse_columns(columns))
+
+
+def coco_with(tmp_path, images=None, box=(1, 2, 30, 40), category="3", name="person"):
+    content = {
+        "images": images or [{"id": k, "file_name": f"f_{k}.jpg", "width": 100, "height": 80} for k in range(2)],
+        "annotations": [{"image_id": 1, "category_id": category, "bbox": box}],
+        "categories": [{"id": category, "name": name}],
+    }
+    return table(tmp_path, json.dumps(content), name="a.json")
+
+
+def test_coco_as_it_comes_from_tools(tmp_path):
+    assert coco_with(tmp_path).classes == {1: "person"}  # numbers as text
+    shares = coco_with(tmp_path, box=(0.1, 0.2, 0.5, 0.5))
+    assert shares.is_normalised
+    corners = coco_with(tmp_path, box=(60, 50, 90, 75))
+    assert any("of 1 boxes 1 lie outside of their pictures by more than half" in words for words, _ in corners.doubts)
+    hashed = [{"id": k, "file_name": f"f_{5 - k}_jpg.rf.{'0a1b' * 8}.jpg"} for k in range(2)]
+    assert coco_with(tmp_path, hashed).frame.tolist() == [4]
+    unordered = coco_with(tmp_path, [{"id": 1, "file_name": "b.jpg"}, {"id": 0, "file_name": "a.jpg"}])
+    assert unordered.frame.tolist() == [0]
+    assert any("the order in `images` is taken as that of the pictures" in words for words, _ in unordered.doubts)
+
+
+def test_yolo_as_it_comes_from_tools(tmp_path):
+    for number, text in ((1, "0 .5 .5 .1 .2 .9\n"), (2, "1 .5 .5 .1 .2 .8\n")):
+        written(tmp_path / "y", f"v_{number}_jpg.rf.{'0a1b' * 8}.txt", text)
+    written(tmp_path / "y", "data.yaml", "names: [person\n")
+    labels = read_labels(tmp_path / "y", role="detections")
+    assert (labels.frame.tolist(), labels.score.tolist()) == ([1, 2], [0.9, 0.8])
+    assert any("column 6 holds confidences" in words for words in labels.remarks)
+    assert any("is not valid YAML" in words and "class names are not known" in words for words, _ in labels.doubts)
+
+
+def test_only_frame_index_of_supervision_counts_from_0(tmp_path):
+    text = as_supervision(tmp_path).read_text().replace("\n0,", "\n")
+    counted = [line.rsplit(",", 1)[0] + f",{int(line.rsplit(',', 1)[1]) + 1}" for line in text.splitlines()[1:]]
+    for column, first in (("frame_index", 0), ("frame_number", 1)):
+        head = text.splitlines()[0].replace("frame_index", column)
+        assert table(tmp_path, "\n".join([head, *counted])).first_frame == first
+
+
+ROWS = st.lists(
+    st.tuples(
+        st.integers(0, 6),
+        *[st.integers(0, 800).map(lambda n: n / 8)] * 2,
+        *[st.integers(1, 800).map(lambda n: n / 8)] * 2,
+        st.integers(0, 64).map(lambda n: n / 64),
+        st.sampled_from(CLASSES[:2]),
+        st.integers(0, 99),
+    ),
+    min_size=1,
+    max_size=12,
+    unique_by=lambda row: (row[0], row[-1]),
+)
+
+
+@given(rows=ROWS, kind=st.sampled_from(sorted(WRITERS)), order=st.randoms(use_true_random=False))
+@settings(max_examples=40, deadline=None)
+def test_boxes_come_back_from_every_format_in_any_order_of_lines(rows, kind, order, tmp_path_factory):
+    rows = [*rows, (5, 64.0, 64.0, 100.5, 32.0, 0.5, "person", 100)]  # never shares of the picture's size
+    order.shuffle(rows)
+    folder = tmp_path_factory.mktemp("rows")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(f"{__name__}.BOXES", rows)
+        labels = read_labels(WRITERS[kind](folder), role="detections", first_frame=0)
+    scale = (*SIZE, *SIZE) if labels.is_normalised else (1, 1, 1, 1)
+    found = np.column_stack([labels.frame, labels.boxes_px * scale, labels.score])
+    expected = np.array([row[:6] for row in rows])
+    assert np.abs(found[np.lexsort(found.T)] - expected[np.lexsort(expected.T)]).max() < 1e-6
+    if kind != "coco results":
+        assert sorted(labels.id.tolist()) == sorted(row[-1] for row in rows)
+        names = [labels.classes[number] for number in labels.class_id.tolist()]
+        assert sorted(zip(labels.frame.tolist(), labels.id.tolist(), names, strict=True)) == sorted(
+            (row[0], row[-1], row[-2]) for row in rows
+        )

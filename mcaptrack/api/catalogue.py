@@ -5,18 +5,24 @@ from __future__ import annotations
 import logging
 import re
 from pathlib import Path
+from time import monotonic
 from typing import Any
 
 from mcaptrack.api.common import PathLike
 from mcaptrack.errors import McaptrackError, call
-from mcaptrack.files import publish_bytes
+from mcaptrack.files import publish_bytes, refuse_special
+from mcaptrack.notices import warn
 from mcaptrack.transforms.detect.onnx import catalogue
 from mcaptrack.transforms.detect.onnx.catalogue import Model
+from mcaptrack.transforms.detect.onnx.session import digest_of
 
 __all__ = ["Model", "get_model", "models"]
 
 #: How long to wait for a connection, and for the next bytes, in seconds.
 _WAIT_S = (10, 60)
+#: A server that gives less is given up after so many seconds.
+_LEAST_BYTES_PER_S, _PATIENCE_S = 2000, 60
+_CHUNK = 4096
 
 
 def models(name: str | None = None) -> tuple[Model, ...]:
@@ -81,16 +87,15 @@ def get_model(name: str, *, source: PathLike | None = None) -> Path:
     text = "" if source is None else str(source)
     if text and not text.startswith(("http://", "https://")):
         path = Path(text)
-        try:
-            data = path.read_bytes()
-        except OSError as error:
-            raise McaptrackError(f"{path} can't be read: {error.strerror}") from None
-        catalogue.check(model, data, path)
+        refuse_special(path)
+        catalogue.check(model, digest_of(path), path.stat().st_size, path)
         _make_folder(model)
-        publish_bytes(model.path, data)
+        publish_bytes(model.path, path.read_bytes())
         return model.path
     if not text and model.path.is_file():
-        return catalogue.stored(model)
+        if digest_of(model.path) == model.sha256:
+            return model.path
+        warn(f"{model.path} is damaged, or another file; it is fetched again", "other")
     _make_folder(model)
     failures = []
     for url in (text,) if text else model.urls:
@@ -124,12 +129,20 @@ def _fetch(model: Model, url: str) -> Path:
 
     def download(address: str, output: Any, _: Any) -> None:
         """Save what an address gives, as far as the file may be long."""
+        begin = monotonic()
         with requests.get(address, stream=True, timeout=_WAIT_S) as response, Path(output).open("wb") as file:
             response.raise_for_status()
-            for chunk in response.iter_content(1 << 16):
+            if response.headers.get("Content-Type", "").startswith("text/html"):
+                raise McaptrackError(f"{url} gives a web page, not a file")
+            for chunk in response.iter_content(_CHUNK):
                 file.write(chunk)
                 if file.tell() > model.size_bytes:
                     raise McaptrackError(f"{url} gives more than the {model.size_bytes:,} bytes of {model.name}")
+                waited_s = monotonic() - begin
+                if waited_s > _PATIENCE_S and file.tell() < waited_s * _LEAST_BYTES_PER_S:
+                    raise McaptrackError(f"{url} gives {file.tell():,} bytes in {waited_s:.0f} s, which is too slow")
+            if file.tell() < model.size_bytes:
+                raise McaptrackError(f"{url} ends after {file.tell():,} of {model.size_bytes:,} bytes")
 
     pooch.get_logger().setLevel(logging.ERROR)
     known = f"sha256:{model.sha256}"
@@ -146,5 +159,7 @@ def _fetch(model: Model, url: str) -> Path:
 def _reason(error: Any) -> str:
     if error.response is not None:
         return f"HTTP status {error.response.status_code}"
+    if "IncompleteRead" in str(error):
+        return "the connection broke"
     why = re.search(r"\[Errno -?\d+\] ([\w ]+)", str(error))
     return why[1] if why else re.sub(r"(?<=[a-z])(?=[A-Z])", " ", type(error).__name__).lower()

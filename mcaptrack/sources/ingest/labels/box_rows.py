@@ -39,7 +39,12 @@ NO_CLASS: Final = -1
 _UNKNOWN: Final = 0
 _MAX_CLASS: Final = 2**31 - 1
 _NUMBERED: Final = re.compile(r"(.*?)([0-9]{1,18})(\D*)", re.DOTALL)
+#: What Roboflow appends to the names of pictures, a hash among it.
+_HASHED: Final = re.compile(r"(_(jpe?g|png|bmp|webp))?\.rf\.[0-9A-Za-z]{8,64}$", re.IGNORECASE)
 _SHOWN: Final = 8
+#: Boxes that are cut off at the edge of the picture reach a little beyond its whole size.
+_MOST_SHARE: Final = 2.0
+_FRAME: Final = "the frame (a count of pictures, no time)"
 
 
 @dataclass
@@ -73,7 +78,7 @@ class BoxRows:
         """Check the rows and convert them. Raises McaptrackError, with the row, if they can't be labels."""
         if not len(self.frame):
             raise McaptrackError(f"{self.path} holds no boxes")
-        frame = self._whole(self.frame, "the frame (a count of pictures, no time)", 0, MAX_FRAME)
+        frame = self._whole(self.frame, _FRAME, 0, MAX_FRAME)
         track_id = self._whole(self.id, "the id", NO_ID, EXACT - 1)
         self._whole(self.number, "the class", NO_CLASS, _MAX_CLASS)
         self._check_boxes()
@@ -81,6 +86,7 @@ class BoxRows:
         class_id, classes = class_ids(self)
         kept, left = self._kept(role, track_id, class_id, classes)
         self._doubt_scores()
+        self._doubt_repeated(frame, track_id, class_id)
         labelled = np.unique(frame) if self.labelled is None else np.union1d(self.labelled, frame)
         first = self.first_frame
         if first is None:
@@ -110,6 +116,27 @@ class BoxRows:
             tuple(self.doubts),
             self.is_normalised,
             self.times_s,
+        )
+
+    def take_shares(self) -> None:
+        """Take boxes as shares of the picture's size if they are fractions, and none is larger than shares are."""
+        is_small = len(self.boxes) > 0 and bool((np.abs(self.boxes) <= _MOST_SHARE).all())
+        if is_small and (self.boxes != np.rint(self.boxes)).any():
+            self.is_normalised = True
+            words = f"no number of a box is above {_MOST_SHARE:g}, so they are taken as shares of the picture's size"
+            self.remarks.append(f"{self.path}: {words}")
+
+    def leave_out_empty(self, is_empty: Bools) -> None:
+        """Take rows (N,) without a box as frames in which there are none."""
+        if not is_empty.any():
+            return
+        self.labelled = np.unique(self._whole(self.frame, _FRAME, 0, MAX_FRAME))
+        kept, at = np.flatnonzero(~is_empty), self.at
+        self.frame, self.boxes, self.id = self.frame[kept], self.boxes[kept], self.id[kept]
+        self.score, self.number = self.score[kept], self.number[kept]
+        self.at = lambda row: at(int(kept[row]))
+        self.remarks.append(
+            f"{self.path}: {len(is_empty) - len(kept)} rows have no box; they only say that frames exist"
         )
 
     def refuse(self, wrong: Any, words: Callable[[int], str]) -> None:
@@ -167,13 +194,25 @@ class BoxRows:
             words = f"{self.path}: of {len(self.score)} scores {' and '.join(parts)}; they stay as they are"
             self.doubts.append((words, "other"))
 
+    def _doubt_repeated(self, frame: Ints, track_id: Ints, class_id: ClassIds) -> None:
+        columns = np.column_stack([frame, track_id, class_id, self.boxes])
+        repeated = len(columns) - len(np.unique(columns, axis=0))
+        if repeated:
+            words = f"{self.path}: {repeated} of {len(columns)} boxes are there before, with the same frame and class"
+            self.doubts.append((f"{words}; they stay as they are", "other"))
+
 
 def outside(path: Path, boxes: Floats, size: Floats) -> str:
-    """Say how many boxes (N, 4) lie outside of pictures of this size (2,) or these sizes (N, 2); "" if none does."""
-    beyond = ((boxes[:, :2] >= size) | (boxes[:, :2] + boxes[:, 2:] <= 0)).any(axis=1)
-    if not beyond.any():
-        return ""
-    return f"{path}: {int(beyond.sum())} of {len(boxes)} boxes lie outside of their pictures; they stay as they are"
+    """Say how many boxes (N, 4) lie outside of pictures of this size (2,) or these sizes (N, 2), as a whole or by half
+    of their area; "" if none does.
+    """
+    low, high = boxes[:, :2], boxes[:, :2] + boxes[:, 2:]
+    beyond = ((low >= size) | (high <= 0)).any(axis=1)
+    inner = np.maximum(np.minimum(high, size) - np.maximum(low, 0), 0).prod(axis=1)
+    half = ~beyond & (inner < boxes[:, 2:].prod(axis=1) / 2)
+    parts = [f"{int(beyond.sum())} lie outside of their pictures"] if beyond.any() else []
+    parts += [f"{int(half.sum())} lie outside of their pictures by more than half"] if half.any() else []
+    return f"{path}: of {len(boxes)} boxes {' and '.join(parts)}; they stay as they are" if parts else ""
 
 
 def fitted(path: Path, labels: Labels, size: tuple[int, int]) -> Labels:
@@ -255,7 +294,7 @@ class FrameNames:
 
     def number(self, name: str) -> int:
         """The number of a name. Raises ValueError if it has none, or if names differ in more than their number."""
-        found = _NUMBERED.fullmatch(PurePath(name.replace("\\", "/")).stem)
+        found = _NUMBERED.fullmatch(_HASHED.sub("", PurePath(name.replace("\\", "/")).stem))
         if found is None:
             raise ValueError("the column of frames holds names without a number")
         around = (found[1], found[3])

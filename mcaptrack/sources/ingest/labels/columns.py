@@ -10,8 +10,9 @@ from mcaptrack.errors import McaptrackError
 
 #: What a column may hold: corners, size and centre of a box in pixels, and more.
 KEYS: Final = ("x", "y", "w", "h", "x2", "y2", "cx", "cy", "frame", "t", "score", "class", "name", "id")
-#: The ways to give a box along x and y; the first that is complete is read.
-_SPANS: Final = ((("x", "w"), ("x", "x2"), ("cx", "w")), (("y", "h"), ("y", "y2"), ("cy", "h")))
+#: The ways to give a box along x and y. The one is read that the user named most of, else the first that is complete:
+#: beside two corners, a width and a height are often those of the picture.
+_SPANS: Final = ((("x", "x2"), ("x", "w"), ("cx", "w")), (("y", "y2"), ("y", "h"), ("cy", "h")))
 _WITH_UNITS: Final = tuple(f"{what}{unit}" for what in ("t", "time", "timestamp") for unit in ("s", "ms", "us", "ns"))
 #: Headers by key, without blanks, "_", "-", "." and brackets, and in lower case.
 _HEADERS: Final[Mapping[str, tuple[str, ...]]] = {
@@ -28,7 +29,7 @@ _HEADERS: Final[Mapping[str, tuple[str, ...]]] = {
     "t": ("t", "time", "timestamp", "seconds", "stamp", *_WITH_UNITS),
     "score": ("score", "confidence", "conf", "probability", "prob"),
     "class": ("class", "classid", "cls", "label", "category", "categoryid", "labelid", "objectclass"),
-    "name": ("classname", "categoryname", "labelname"),
+    "name": ("classname", "categoryname", "labelname", "name"),
     "id": ("trackid", "trackerid", "id", "track", "objectid", "targetid", "tid"),
 }  # fmt: skip
 #: Keys of which several columns may fit; the first header of the list above is read.
@@ -45,6 +46,8 @@ def parse_columns(text: str) -> dict[str, str]:
             raise McaptrackError(f"`columns=` is like x=left,y=top,w=width,h=height,frame=frame, not {part!r:.60}")
         if key in out:
             raise McaptrackError(f"`columns=` names {key} twice")
+        if column in out.values():
+            raise McaptrackError(f"`columns=` names {column} for {key} and for another key")
         out[key] = column
     return check_keys(out)
 
@@ -78,6 +81,7 @@ def choose_columns(where: str, header: Sequence[str], given: Mapping[str, str]) 
         out[key] = fits[0]
     for axis in _SPANS:
         found = [pair for pair in axis if all(key in out for key in pair)]
+        found.sort(key=lambda pair: -len(given.keys() & pair))
         if not found:
             raise McaptrackError(
                 f"{where}: no columns for {' and '.join(axis[0])} (or {' and '.join(axis[1])}) of boxes; {shown}; name "
@@ -85,6 +89,8 @@ def choose_columns(where: str, header: Sequence[str], given: Mapping[str, str]) 
             )
         for key in {key for pair in axis for key in pair} - set(found[0]):
             out.pop(key, None)
+    if "name" not in given and "class" not in out and "name" in out and plain[out["name"]] == "name":
+        out.pop("name")  # of anything: beside a number of a class it is that of the class
     if "frame" in out:
         out.pop("t", None)
     elif "t" not in out:
@@ -92,6 +98,9 @@ def choose_columns(where: str, header: Sequence[str], given: Mapping[str, str]) 
             f"{where}: no column for the frame or the time of boxes; {shown}; name it with `columns='frame=NAME'` or "
             "`columns='t=NAME'` (in seconds)"
         )
+    if unread := [key for key in given if key not in out]:
+        read = ", ".join(key for key in given if key in out)
+        raise McaptrackError(f"{where}: {unread[0]} is not read beside {read}, which `columns=` names; leave it out")
     return out
 
 

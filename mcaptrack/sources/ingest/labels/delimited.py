@@ -9,6 +9,7 @@ import csv
 import math
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any, Final
 
@@ -31,6 +32,10 @@ _MAX_COLUMNS: Final = 1024
 _LEAST_COLUMNS: Final = 4
 #: Between cells of rows that come from JSON.
 _SEPARATOR: Final = "\x1f"
+#: The column that counts frames from 0, as examples of supervision add it.
+_FRAME_INDEX: Final = "frame_index"
+#: Keys of columns that make a box.
+_OF_BOXES: Final = ("x", "y", "w", "h", "x2", "y2", "cx", "cy")
 #: Values of cells that state nothing.
 _EMPTY: Final = ("", "nan", "none", "null", "n/a", "na")
 #: Seconds per unit, by the end of a column's name.
@@ -44,6 +49,15 @@ def header_of(path: Path, line: str) -> list[str]:
     cells = [cell.strip() for cell in _split(path, _delimiter(line), line)]
     is_header = len(cells) >= _LEAST_COLUMNS and not any(_is_number(cell) for cell in cells)
     return cells if is_header and any(line.count(one) for one in _DELIMITERS) else []
+
+
+def comment_header(path: Path, row: str) -> list[str]:
+    """The names of columns by a first line that begins with "#", if it fits the first row; otherwise an empty list."""
+    _, first = next(lines_of(path, MAX_LINE, has_comments=True), (0, ""))
+    names = header_of(path, first.strip().lstrip("#")) if first.lstrip().startswith("#") else []
+    delimiter = _delimiter(row)
+    cells = _split(path, delimiter, row)
+    return names if len(names) == len(cells) and delimiter == _delimiter(first) else []
 
 
 def _is_number(cell: str) -> bool:
@@ -72,6 +86,8 @@ def read_csv(path: Path, role: Role, given: Mapping[str, str], name: Format = "c
     if not number:
         raise McaptrackError(f"{path} holds no labels")
     header = header_of(path, first)
+    if not header and (header := comment_header(path, first)):
+        lines = chain([(number, first)], lines)
     if not header:
         raise McaptrackError(f"{path}:{number}: a table needs a header that names its columns: {first.strip()[:60]}")
     delimiter = _delimiter(first)
@@ -132,8 +148,9 @@ def _read_table(
     columns = {key: table.values[:, place] for place, key in enumerate(keys)}
     none = np.full(len(table.values), np.nan)
     track_id = np.nan_to_num(columns.get("id", none), nan=NO_ID)
-    used = ", ".join(f"{key}={header[at[key]]}" for key in keys)
-    unused = [name for place, name in enumerate(header) if place not in at.values()]
+    unit = f" in {_unit(header[at['t']])[0]}" if "t" in at else ""
+    used = ", ".join(f"{key}={header[at[key]]}{unit * (key == 't')}" for key in keys)
+    unused = [name for place, name in enumerate(header) if name and place not in at.values()]
     remarks = [f"{path}: columns {used}" + (f"; not read: {', '.join(unused)}"[:300] if unused else "")]
     if "id" in at and header[at["id"]].lower() == "id" and "id" not in given and _are_row_numbers(track_id):
         remarks.append(f"{path}: every box has another {header[at['id']]}, so it numbers rows, not tracks")
@@ -153,11 +170,12 @@ def _read_table(
         remarks=remarks,
     )
     if "t" in at:
-        _number_times(rows, columns["t"] * _unit(header[at["t"]]))
-    if name == "csv" and len(boxes) and (np.abs(boxes) <= 1).all():
-        rows.is_normalised = True
-        remarks.append(f"{path}: all boxes are within 0 to 1, so they are taken as shares of the picture's size")
-    if name == "supervision" and rows.times_s is None:
+        _number_times(rows, columns["t"] * _unit(header[at["t"]])[1])
+    parts = np.stack([columns[key] for key in _OF_BOXES if key in columns])
+    rows.leave_out_empty(np.asarray(np.isnan(parts).all(axis=0), bool))
+    if name == "csv":
+        rows.take_shares()
+    if name == "supervision" and header[at.get("frame", 0)].lower() == _FRAME_INDEX:
         rows.first_frame = 0
     return rows.labels(role)
 
@@ -180,16 +198,20 @@ def _boxes(columns: Mapping[str, Floats]) -> Floats:
     return np.stack([left, top, width, height], axis=-1)
 
 
-def _unit(header: str) -> float:
-    """Seconds per unit of a column of times, by its name: seconds, unless it ends with _ms, _us or _ns."""
+def _unit(header: str) -> tuple[str, float]:
+    """The unit of a column of times, by its name, and its seconds: s, unless it ends with _ms, _us or _ns."""
     words = header.strip().lower()
-    return next((scale for end, scale in _UNITS.items() if words.endswith((f"_{end}", f" {end}", f"({end})"))), 1.0)
+    found = (unit for unit in _UNITS.items() if words.endswith((f"_{unit[0]}", f" {unit[0]}", f"({unit[0]})")))
+    return next(found, ("s", 1.0))
 
 
 def _number_times(rows: BoxRows, seconds: Floats) -> None:
     rows.refuse(
         ~(np.isfinite(seconds) & (seconds >= 0) & (seconds < _MAX_SECONDS)),
-        lambda row: f"a time is a number of seconds from 0 to the year 2262, not {seconds[row]:g}",
+        lambda row: (
+            f"a time is a number of seconds from 0 to the year 2262, not {seconds[row]:g}; the name of its column may "
+            "end with _ms, _us or _ns"
+        ),
     )
     rows.times_s, frame = np.unique(seconds, return_inverse=True)
     rows.frame, rows.first_frame = frame.astype(float), 0

@@ -29,6 +29,7 @@ _MAX_NAME: Final = 256
 _TRACK_IDS: Final = ("track_id", "instance_id", "tracker_id")
 _FRAMES: Final = ("frame_id", "frame_index", "mot_frame_id")
 _VIDEOS: Final = ("video_id", "vid_id")
+_BY_LIST: Final = "the list `images`"
 #: Numbers of a row: frame, left, top, width, height, score, category, id, whether it is a crowd.
 _COLUMNS: Final = 9
 
@@ -105,7 +106,8 @@ class _Rows:
             self.refuse(number, "has no bbox of 4 numbers: left, top, width, height")
         inner = entry.get("attributes")
         track_id = next((d[key] for d in (entry, inner) if isinstance(d, dict) for key in _TRACK_IDS if key in d), None)
-        values = [entry.get("score"), entry.get("category_id"), track_id, entry.get("iscrowd", 0)]
+        category_id = _whole_of_text(entry.get("category_id"))
+        values = [entry.get("score"), category_id, _whole_of_text(track_id), entry.get("iscrowd", 0)]
         for value, key in zip(values, ("score", "category_id", "track_id", "iscrowd"), strict=True):
             if value is not None and not isinstance(value, bool) and not _is_number(value):
                 self.refuse(number, f"has a {key} that isn't a number, {value!r:.40}")
@@ -136,7 +138,14 @@ class _Rows:
         values: Floats = np.frombuffer(self._values, np.float64).reshape(-1, _COLUMNS)
         frame, score, number, track_id, crowd = (values[:, at] for at in (0, 5, 6, 7, 8))
         boxes, is_crowd = values[:, 1:5], crowd != 0
-        return BoxRows(self._path, "coco", self.at, frame, boxes, track_id, score, number, names, is_crowd)
+        rows = BoxRows(self._path, "coco", self.at, frame, boxes, track_id, score, number, names, is_crowd)
+        rows.take_shares()
+        return rows
+
+
+def _whole_of_text(value: Any) -> Any:
+    """Return the whole number that a text holds; anything else as it is."""
+    return int(value) if isinstance(value, str) and value.isascii() and value.isdecimal() and len(value) < 16 else value
 
 
 def _is_number(value: Any) -> bool:
@@ -197,10 +206,16 @@ def _annotations(path: Path, content: Mapping[str, Any]) -> BoxRows:
     out.labelled = np.unique(np.array(frames, np.int64))
     out.first_frame = int(out.labelled[0]) if len(frames) else 0
     out.remarks.append(f"{path}: {len(images)} images, in order of {order}")
+    if order == _BY_LIST and len(images) > 1:
+        words = (
+            f"{path}: its images have neither frame_id nor names with numbers of one sequence; the order in `images`"
+        )
+        out.doubts.append((f"{words} is taken as that of the pictures", "clock"))
     if out.first_frame > 1:
         words = f"{path}: its first image has the number {out.first_frame}, and is assumed to be the first picture"
         out.doubts.append((f"{words}; `first_frame=` sets the number", "clock"))
-    _doubt_outside(out, images, frames)
+    if not out.is_normalised:
+        _doubt_outside(out, images, frames)
     return out
 
 
@@ -224,7 +239,7 @@ def _frames(images: list[dict[str, Any]]) -> tuple[list[int], str]:
     numbered = numbers_of_names(names) if len(names) == len(images) else None
     if numbered is not None:
         return numbered, "the numbers in file_name"
-    return list(range(len(images))), "the list `images`"
+    return list(range(len(images))), _BY_LIST
 
 
 def _categories(path: Path, found: Any) -> dict[int, str] | None:
@@ -235,7 +250,7 @@ def _categories(path: Path, found: Any) -> dict[int, str] | None:
         raise McaptrackError(f"{path} has {len(found)} categories; at most {_MAX_CLASSES} are read")
     out: dict[int, str] = {}
     for number, entry in enumerate(found):
-        one, name = (entry.get("id"), entry.get("name")) if isinstance(entry, dict) else (None, None)
+        one, name = (_whole_of_text(entry.get("id")), entry.get("name")) if isinstance(entry, dict) else (None, None)
         if not isinstance(one, int) or not 0 <= one < 2**31 or not isinstance(name, str) or isinstance(one, bool):
             raise McaptrackError(f"{path}: category {number} has no whole number as its id, or no name")
         if one in out:

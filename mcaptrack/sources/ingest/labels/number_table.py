@@ -27,8 +27,9 @@ EXACT: Final = 2**53
 _SHOWN: Final = 60
 
 
-def lines_of(path: Path, most: int = _MAX_LINE) -> Lines:
-    """The lines of a text file, of at most ``most`` characters, without empty lines and comments.
+def lines_of(path: Path, most: int = _MAX_LINE, has_comments: bool = False) -> Lines:
+    """The lines of a text file, of at most ``most`` characters, without empty lines and, unless they are wanted,
+    comments.
 
     Raises McaptrackError if it can't be read, isn't text, or has longer lines.
     """
@@ -40,7 +41,7 @@ def lines_of(path: Path, most: int = _MAX_LINE) -> Lines:
                 number += 1
                 if len(line) > most:
                     raise McaptrackError(f"{path}:{number}: a line of more than {most} characters is no row")
-                if line.strip() and not line.lstrip().startswith("#"):
+                if line.strip() and (has_comments or not line.lstrip().startswith("#")):
                     yield number, line
     except UnicodeDecodeError:
         raise McaptrackError(f"{path} is not a text file, as labels and homographies are") from None

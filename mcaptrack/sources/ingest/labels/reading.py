@@ -11,12 +11,14 @@ import numpy as np
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import refuse_special
-from mcaptrack.sources.ingest.labels.delimited import MAX_LINE, SUPERVISION, header_of, read_csv
+from mcaptrack.sources.ingest.labels.columns import choose_columns
+from mcaptrack.sources.ingest.labels.delimited import MAX_LINE, SUPERVISION, comment_header, header_of, read_csv
 from mcaptrack.sources.ingest.labels.formats import READERS, Format, Labels, Role
 from mcaptrack.sources.ingest.labels.json_boxes import is_json, read_json
 from mcaptrack.sources.ingest.labels.number_table import lines_of, split
 from mcaptrack.sources.ingest.labels.yolo import read_yolo
 
+_MOT_COLUMNS: Final = {"frame": 0, "id": 1, "x": 2, "y": 3, "w": 4, "h": 5}
 FORMATS: Final = tuple(name for name in get_args(Format) if name != "auto")
 
 
@@ -100,6 +102,8 @@ def _guess(path: Path, number: int, line: str) -> Format:
     header = header_of(path, line)
     if header:
         return "supervision" if set(SUPERVISION) <= set(header) else "csv"
+    if _has_other_columns(path, number, line):
+        return "csv"
     columns = split(line)
     if "," in line and 6 <= len(columns) <= 10:
         return "mot"
@@ -115,6 +119,16 @@ def _guess(path: Path, number: int, line: str) -> Format:
         f"{path}:{number}: a row of {len(columns)} columns fits no label format ({', '.join(FORMATS)}): "
         f"{line.strip()[:60]}"
     )
+
+
+def _has_other_columns(path: Path, number: int, line: str) -> bool:
+    """Whether a comment names columns of boxes that are not those of MOTChallenge."""
+    names = comment_header(path, line)
+    try:
+        columns = choose_columns(f"{path}:{number}", names, {}) if names else _MOT_COLUMNS
+    except McaptrackError:
+        return False
+    return any(columns.get(key) != place for key, place in _MOT_COLUMNS.items())
 
 
 def _refuse_repeated_ids(path: Path, labels: Labels) -> None:

@@ -14,6 +14,7 @@ import numpy as np
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Floats
+from mcaptrack.notices import Code
 from mcaptrack.sources.ingest.bags import plain_yaml
 from mcaptrack.sources.ingest.labels.box_rows import BoxRows, numbers_of_names
 from mcaptrack.sources.ingest.labels.formats import NO_ID, Labels, Role
@@ -87,8 +88,11 @@ def read_yolo(folder: Path, role: Role) -> Labels:
         return f"{path}:{line}"
 
     score, track_id = _score_and_id(rows, role)
+    if np.isfinite(rows[:, 6]).any() and not np.isfinite(rows[:, 7]).any():
+        remarks.append(f"{folder}: column 6 holds {'confidences' if np.isfinite(score).any() else 'track ids'}")
     centre, size = rows[:, 2:4], rows[:, 4:6]
-    names, named_by = _class_names(folder, files[0].parent)
+    doubts: list[tuple[str, Code]] = []
+    names, named_by = _class_names(folder, files[0].parent, doubts)
     out = BoxRows(
         folder,
         "yolo",
@@ -102,6 +106,7 @@ def read_yolo(folder: Path, role: Role) -> Labels:
         labelled=np.array(sorted(numbers), np.int64),
         is_normalised=True,
         remarks=remarks,
+        doubts=doubts,
     )
     if named_by is not None:
         out.remarks.append(f"{folder}: class names by {named_by}")
@@ -129,15 +134,25 @@ def _score_and_id(rows: Floats, role: Role) -> tuple[Floats, Floats]:
     return sixth, np.nan_to_num(seventh, nan=NO_ID)
 
 
-def _class_names(folder: Path, labels: Path) -> tuple[dict[int, str] | None, Path | None]:
-    """Class names by number, and the file that they are from: beside the labels or up to two folders above."""
+def _class_names(
+    folder: Path, labels: Path, doubts: list[tuple[str, Code]]
+) -> tuple[dict[int, str] | None, Path | None]:
+    """Class names by number, and the file that they are from: beside the labels or up to two folders above.
+
+    Files that can't be read are added to ``doubts``.
+    """
     for place in dict.fromkeys((labels, folder, folder.parent, folder.parent.parent)):
         for name in _NAMES:
             if (place / name).is_file():
                 lines = [" ".join(line.split())[:_MAX_NAME] for _, line in lines_of(place / name)]
                 return dict(enumerate(lines[:_MAX_CLASSES])), place / name
         for name in _DATA:
-            if (place / name).is_file() and (found := _names_of_yaml(place / name)):
+            try:
+                found = _names_of_yaml(place / name) if (place / name).is_file() else None
+            except McaptrackError as error:
+                doubts.append((f"{error}; class names are not known", "classes"))
+                continue
+            if found:
                 return found, place / name
     return None, None
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -110,27 +109,23 @@ def find(name: str) -> Model:
     return CATALOGUE[name]
 
 
-def check(model: Model, data: bytes, where: str | Path) -> None:
-    """Raise McaptrackError if these are not the bytes of a model's file."""
-    found = hashlib.sha256(data).hexdigest()
-    if found != model.sha256:
+def check(model: Model, sha256: str, size: int, where: Path) -> None:
+    """Raise McaptrackError if a file with this digest and size, in bytes, is not a model's file."""
+    if sha256 != model.sha256:
+        again = f"; {call('get_model', model.name)} fetches it again" if where == model.path else ""
         raise McaptrackError(
-            f"{where} is not the file of {model.name}: it has {len(data):,} bytes and SHA-256 {found[:12]}..., not "
-            f"{model.size_bytes:,} and {model.sha256[:12]}..."
+            f"{where} is not the file of {model.name}: it has {size:,} bytes and SHA-256 {sha256[:12]}..., not "
+            f"{model.size_bytes:,} and {model.sha256[:12]}...{again}"
         )
 
 
 def stored(model: Model) -> Path:
-    """Return the path of a model's file. Raises McaptrackError if it was not fetched, or is another one now."""
-    try:
-        check(model, model.path.read_bytes(), model.path)
-    except FileNotFoundError:
+    """Return the path of a model's file, which isn't read. Raises McaptrackError if it was not fetched."""
+    if not model.path.is_file():
         raise McaptrackError(
             f"the weights of {model.name} are not here yet; {call('get_model', model.name)} fetches them "
             f"({model.size_bytes / 1e6:.1f} MB, {model.licence})"
-        ) from None
-    except OSError as error:
-        raise McaptrackError(f"{model.path} can't be read: {error.strerror}") from None
+        )
     return model.path
 
 

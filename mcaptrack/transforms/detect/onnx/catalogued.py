@@ -8,7 +8,6 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import ClassVar
 
-from mcaptrack.errors import McaptrackError
 from mcaptrack.transforms.detect.onnx.catalogue import check, find, stored
 from mcaptrack.transforms.detect.onnx.detector import NETWORK, LayoutChoice, OnnxDetector
 from mcaptrack.transforms.protocol import Suited, option
@@ -37,16 +36,12 @@ class CataloguedDetector(OnnxDetector):
     model: ClassVar[str]
 
     def weights(self) -> Path:
-        """The file of the network. Raises McaptrackError if it was not fetched, or is another one."""
-        known = find(self.model)
-        if not self.file:
-            return stored(known)
-        path = super().weights()
-        try:
-            check(known, path.read_bytes(), path)
-        except OSError as error:
-            raise McaptrackError(f"{path} can't be read: {error.strerror}") from None
-        return path
+        """The file of the network. Raises McaptrackError if it was not fetched."""
+        return super().weights() if self.file else stored(find(self.model))
+
+    def check_weights(self, sha256: str, size: int) -> None:
+        """Raise McaptrackError if a file with this digest and size, in bytes, is not that of the catalogue."""
+        check(find(self.model), sha256, size, self.weights())
 
     def weights_sha256(self) -> str:
         """The digest of the network's file."""

@@ -30,7 +30,7 @@ from mcaptrack.transforms.detect.onnx.layouts import Layout, class_count, possib
 from mcaptrack.transforms.detect.onnx.nms import Boxes, join_tiles, suppress
 from mcaptrack.transforms.detect.onnx.outputs import MisreadError
 from mcaptrack.transforms.detect.onnx.placing import Size, Tile, place, tiles_of
-from mcaptrack.transforms.detect.onnx.session import DetectorNetwork, Device, read_file, workers
+from mcaptrack.transforms.detect.onnx.session import DetectorNetwork, Device, digest_of, read_file, workers
 from mcaptrack.transforms.protocol import Colour, ModelCard, Suited, check_options, option
 
 LayoutChoice = Literal["auto", "yolox", "yolox-legacy", "nanodet", "rtdetr", "dfine", "rfdetr", "ultralytics"]
@@ -125,7 +125,7 @@ class OnnxDetector:
         first = next(frames, None)
         if first is None:
             return
-        run = _Run(self, self.weights(), first.rows)
+        run = _Run(self, first.rows)
         for seen, boxes in run.detect(chain([first], frames)):
             yield (Frame(seen.t_ns, seen.frame, run.to_rows(boxes, seen.size)),)
         object.__setattr__(self, "_card", run.card())
@@ -140,7 +140,10 @@ class OnnxDetector:
 
     def weights_sha256(self) -> str:
         """The digest of the network's file. Raises McaptrackError if it can't be read."""
-        return read_file(self.weights(), self.max_memory_mb * 1_000_000).sha256
+        return digest_of(self.weights())
+
+    def check_weights(self, sha256: str, size: int) -> None:
+        """Raise McaptrackError if a file with this digest and size, in bytes, is not the right one; any is, here."""
 
     def model_card(self) -> ModelCard:
         """The facts of the network that ran last."""
@@ -165,21 +168,21 @@ class _Seen(NamedTuple):
 class _Run:
     """One run of a detector: its network, opened for the first picture, and which layout it has."""
 
-    def __init__(self, options: OnnxDetector, path: Path, first: Image) -> None:
-        self._options, self._path = options, path
+    def __init__(self, options: OnnxDetector, first: Image) -> None:
         most_bytes = options.max_memory_mb * 1_000_000
-        file = read_file(path, most_bytes)
+        file = read_file(options.weights(), most_bytes, options.check_weights)
+        self._options, self._path = options, file.path
         self._grid = _numbers(options.tiles) or (1, 1)
         self._network = DetectorNetwork(file, self._input_size(first), options.device, most_bytes)
         self._sha256 = file.sha256
         seen = self._network.signature
-        layouts = choose(path, options.layout, seen)
+        layouts = choose(file.path, options.layout, seen)
         count = class_count(layouts[0], seen)
         self._names, self._is_named = known_classes.names_of(file.names, count), bool(file.names)
         self._unknown: Counter[int] = Counter()
-        self._wanted = np.array(known_classes.wanted(self._names, options.classes, str(path)), np.int64)
+        self._wanted = np.array(known_classes.wanted(self._names, options.classes, str(file.path)), np.int64)
         self._numbers = known_classes.numbers_of(self._names)
-        self._contest = Contest(path, layouts)
+        self._contest = Contest(file.path, layouts)
 
     def detect(self, frames: Iterator[Frame]) -> Iterator[tuple[_Seen, Boxes]]:
         """The boxes of each picture, of all classes. Raises McaptrackError as the network and the contest do."""

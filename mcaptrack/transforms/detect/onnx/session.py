@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Lock
@@ -47,8 +47,21 @@ class NetworkFile:
     names: dict[int, str]
 
 
-def read_file(path: Path, most_bytes: int) -> NetworkFile:
-    """Read an ONNX file. Raises McaptrackError if it is none, a part of one, or refers to other files."""
+def digest_of(path: Path) -> str:
+    """The SHA-256 of a file. Raises McaptrackError if it can't be read."""
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise McaptrackError(f"{path} can't be read: {error.strerror}") from None
+
+
+def read_file(path: Path, most_bytes: int, check: Callable[[str, int], None] = lambda *_: None) -> NetworkFile:
+    """Read an ONNX file, once.
+
+    ``check`` gets its digest and size in bytes, and raises McaptrackError if they are wrong. So does this function if
+    the file is none in ONNX format, a part of one, or refers to other files.
+    """
     try:
         if path.stat().st_size > most_bytes:
             raise McaptrackError(
@@ -58,6 +71,8 @@ def read_file(path: Path, most_bytes: int) -> NetworkFile:
         data = path.read_bytes()
     except OSError as error:
         raise McaptrackError(f"{path} can't be read: {error.strerror}") from None
+    sha256 = hashlib.sha256(data).hexdigest()
+    check(sha256, len(data))
     try:
         model = graph.parse(data)
     except graph.NotOnnxError:
@@ -67,7 +82,7 @@ def read_file(path: Path, most_bytes: int) -> NetworkFile:
             f"{path} keeps weights in other files (external data), which are not read; save it as one file with "
             "onnx.save(onnx.load(path), path)"
         )
-    return NetworkFile(path, data, hashlib.sha256(data).hexdigest(), graph.class_names(model))
+    return NetworkFile(path, data, sha256, graph.class_names(model))
 
 
 class _MemoryLimitError(McaptrackError):
