@@ -24,29 +24,30 @@ from tests.worlds import ns
 HIGH_M, PITCH, FOCAL, WIDTH, HEIGHT = 5.0, np.deg2rad(18.0), 640.0, 640, 480
 
 
-def seen(x: np.ndarray, y: np.ndarray, tall: float = 1.7) -> np.ndarray:
-    """Boxes (N, 4) of people at (x, y) metres before a camera 5 m above the ground."""
-    ahead = y * np.cos(PITCH) + (HIGH_M - np.array([[0.0], [tall]])) * np.sin(PITCH)
-    down = (HIGH_M - np.array([[0.0], [tall]])) * np.cos(PITCH) - y * np.sin(PITCH)
+def seen(x: np.ndarray, y: np.ndarray, high: float = HIGH_M, pitch: float = PITCH) -> np.ndarray:
+    """Boxes (N, 4) of people 1.7 m tall at (x, y) metres before a camera."""
+    below = high - np.array([[0.0], [1.7]])
+    ahead = y * np.cos(pitch) + below * np.sin(pitch)
+    down = below * np.cos(pitch) - y * np.sin(pitch)
     foot, head = HEIGHT / 2 + FOCAL * down / ahead
     left = WIDTH / 2 + FOCAL * x / ahead[0]
     return np.stack([left - 0.2 * (foot - head), head, 0.4 * (foot - head), foot - head], axis=1)
 
 
-def people(frames: int = 60) -> list[np.ndarray]:
+def people(frames: int = 60, **camera: float) -> list[np.ndarray]:
     """The boxes of five people who walk through the picture, by frame."""
     n = np.arange(frames)[:, None]
     x = np.array([-3.0, 3.0, -1.5, 2.0, 0.0]) + n * np.array([0.06, -0.05, 0.04, 0.0, -0.02])
     y = np.array([9.0, 11.0, 14.0, 24.0, 18.0]) + n * np.array([0.0, 0.03, -0.05, -0.12, 0.06])
-    return [seen(*pair) for pair in zip(x, y, strict=True)]
+    return [seen(*pair, **camera) for pair in zip(x, y, strict=True)]
 
 
 BOXES = people()
 
 
-def detections() -> list[Frame]:
+def detections(boxes: list[np.ndarray] = BOXES) -> list[Frame]:
     frames = []
-    for number, some in enumerate(BOXES):
+    for number, some in enumerate(boxes):
         x, y, w, h = some.T
         rows = DETECTIONS.rows(x_px=x, y_px=y, w_px=w, h_px=h, score=np.full(5, 0.9), class_id=np.full(5, 1))
         frames.append(Frame(ns(number / 10), number, rows))
@@ -152,6 +153,15 @@ def test_metres_are_proportional_to_the_height_of_people(path):
     assert mcaptrack.run(path, tables=False).stages == ()
     with pytest.raises(McaptrackError, match="person_height_m"):
         mcaptrack.run(path, person_height_m=-1.0)
+
+
+def test_tracks_of_a_camera_that_looks_along_the_ground_are_passed_on(tmp_path):
+    path = written(tmp_path / "a.mcap", Provenance("ingest", {}), detections(people(high=1.6, pitch=0.0)))
+    result = mcaptrack.run(path, tables=False)
+    assert [one.code for one in result.warnings] == ["estimated-ground-plane", "held-back"]
+    with log.read(path) as opened:
+        samples, retracks = (opened.rows(f"/camera/{name}", TRACKS).rows for name in ("samples", "retracks"))
+    np.testing.assert_array_equal(retracks, samples)
 
 
 def test_a_given_plane_wins(template, tmp_path):

@@ -463,8 +463,8 @@ def test_a_guessed_scale_is_said_of_what_is_in_metres(tmp_path, stage, assumed, 
 def test_tracks_that_are_only_passed_on_are_said(tmp_path, parameters, is_said):
     path = written(tmp_path / "a.mcap", finished())
     words = (
-        "tracks were not re-tracked but passed on: without a ground plane that needs a camera that looks down, and this "
-        f"one looks along the ground. To insist: `mcaptrack.retrack('{path}', side_view=True)`"
+        "tracks were not re-tracked but passed on: without a measured ground plane that needs a camera that looks down, "
+        f"and this one looks along the ground. To insist: `mcaptrack.retrack('{path}', side_view=True)`"
     )
     with log.read(path) as opened, notices.listening(lambda _: None), notices.collected() as said:
         findings.warn_findings(opened, "/camera", {"/camera/x": Provenance("retrack", parameters)}, (), is_all=False)

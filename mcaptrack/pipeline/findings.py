@@ -86,7 +86,7 @@ def warn_findings(opened: log.Log, prefix: str, made: Mapping[str, Provenance], 
         known[topic].parameters.get("poor_scale") and not known[topic].parameters.get("side_view") for topic in topics
     ):
         warn(
-            "tracks were not re-tracked but passed on: without a ground plane that needs a camera that looks down, and "
-            f"this one looks along the ground. To insist: {call('retrack', opened.path, side_view=True)}",
+            "tracks were not re-tracked but passed on: without a measured ground plane that needs a camera that looks "
+            f"down, and this one looks along the ground. To insist: {call('retrack', opened.path, side_view=True)}",
             "held-back",
         )

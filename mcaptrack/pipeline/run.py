@@ -14,7 +14,7 @@ from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.camera_path import CameraPath
 from mcaptrack.geometry.clocks import NS_PER_S, parse_ns
-from mcaptrack.geometry.plane import Planes, is_assumed, is_estimated, scene_planes
+from mcaptrack.geometry.plane import Planes, is_assumed, scene_planes
 from mcaptrack.notices import Notice, collected, warn
 from mcaptrack.pipeline.checks import Job, check_inputs, read_named_frames
 from mcaptrack.pipeline.events import STAGE as EVENTS_STAGE
@@ -308,7 +308,7 @@ def _in_context(opened: log.Log, prefix: str, job: Job, frames: Sequence[Frame],
                     f"{usual} has {Sample().rate_hz:g} unless it was made otherwise",
                     "clock",
                 )
-    if "poor_scale" in names and is_assumed(planes) and not is_estimated(planes):
+    if "poor_scale" in names and is_assumed(planes):
         known["poor_scale"] = is_poor(frames)
     return replace(job.transform, **known)
 
