@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import inspect
 import math
 import re
 import shlex
@@ -16,6 +17,7 @@ import pytest
 from mcaptrack import environment
 from mcaptrack.cli.command import LAST_PANELS
 from mcaptrack.cli.stages import shown_default
+from mcaptrack.transforms import STAGES
 from tests.commands import GROUP, call
 
 ROOT = Path(__file__).parent.parent
@@ -68,6 +70,12 @@ class TestHelp:
         for option, default in (("--max-age-s", "1.4"), ("--min-iou", "0.2"), ("--min-hits-frames", "none")):
             assert option in words
             assert f"[default: ({default})]" in words
+
+    @pytest.mark.parametrize("stage", STAGES)
+    def test_the_help_of_a_stage_begins_with_what_its_transforms_do(self, stage):
+        words = COMMANDS[stage].help
+        for transform in STAGES[stage].built_in().values():
+            assert inspect.getdoc(transform).partition("\n\n")[0] in words
 
     @EVERY_COMMAND
     def test_options_are_grouped_below_headings(self, command):

@@ -288,6 +288,18 @@ class TestBranches:
             assert now.t_ns == then.t_ns
             assert sorted(set(then.rows["track_id"].tolist())) == ids(now)
 
+    @pytest.mark.parametrize(
+        ("profile", "horizon_s", "steps"),
+        [(DEFAULT, 0.1, 1), *((profile, 1.01, 3) for profile in PROFILES.values())],
+        ids=["one", *PROFILES],
+    )
+    def test_there_is_one_step_at_least_and_as_many_as_fit_best(self, profile, horizon_s, steps):
+        """At 2.5 steps a second."""
+        frames = walk(lambda n: {7: (0.5 * n, 0.0)}, 12)
+        _, _, predictions = run(replace(profile, horizon_s=horizon_s, predictor="cv"), frames)
+        assert predictions[-1].rows["step"].tolist() == list(range(1, steps + 1))
+        assert predictions[-1].rows["ahead_s"].max() == pytest.approx(0.4 * steps)
+
     def test_online_rows_are_at_the_measured_positions(self):
         frames = walk(lambda n: {7: (0.5 * n, np.sin(n))}, 20)
         _, online, _ = run(DEFAULT, frames)
