@@ -207,7 +207,7 @@ def test_the_id_of_a_track_is_under_several_keys(tmp_path):
     ("count", "shown"), [(8, "10, 11, 12, 13, 14, 15, 16, 17"), (9, "10, 11, 12, 13, 14, 15, 16, 17, ...")]
 )
 def test_eight_classes_without_a_name_are_listed(count, shown, tmp_path):
-    labels = read(tmp_path, coco([0], [box(0, category_id=10 + n) for n in range(count)] + [box(0)]))
+    labels = read(tmp_path, coco([0], [box(0, (n, 2, 3, 4), category_id=10 + n) for n in range(count)] + [box(0)]))
     assert said(tmp_path, labels) == [f": {count} boxes have classes without a name ({shown}); their class_id is 0"]
     assert labels.class_id.tolist() == [0] * count + [1]
 
@@ -225,9 +225,17 @@ def test_eight_classes_with_another_number_are_listed(count, tmp_path):
     assert labels.classes == {last + 1: "n0", last + 2: "n1", 1: "Person"}
 
 
+def test_boxes_that_are_there_before_are_counted(tmp_path):
+    same = [box(0), box(0), box(0), box(0, (1, 2, 3, 5)), box(0, category_id=None), box(0, track_id=1), box(1)]
+    images = [{"id": 0, "frame_id": 0}, {"id": 1, "frame_id": 1}]
+    words = ": 2 of 7 boxes are there before, with the same frame and class; they stay as they are"
+    assert words in said(tmp_path, read(tmp_path, coco(images, same)))
+    assert not any("there before" in words for words in said(tmp_path, read(tmp_path, coco(images, same[2:]))))
+
+
 def test_boxes_without_a_class_have_none_and_that_is_said(tmp_path):
     without = {"image_id": 0, "bbox": [1, 2, 3, 4]}
-    labels = read(tmp_path, coco([0], [box(0), without, without]))
+    labels = read(tmp_path, coco([0], [box(0), without, without | {"bbox": [5, 2, 3, 4]}]))
     assert labels.class_id.tolist() == [1, 0, 0]
     assert said(tmp_path, labels) == [": 2 boxes without a class have class_id 0"]
     assert labels.doubts[0][1] == "classes"
@@ -283,27 +291,38 @@ def test_rows_that_do_not_suit_tracks_are_counted(tmp_path):
     ],
 )
 def test_scores_that_are_no_likelihoods_are_said(scores, words, tmp_path):
-    labels = read(tmp_path, coco([0], [box(0, score=score) for score in scores]))
+    labels = read(tmp_path, coco([0], [box(0, (n, 2, 3, 4), score=score) for n, score in enumerate(scores)]))
     assert labels.score.tolist() == scores
     assert said(tmp_path, labels) == ([f": {words}; they stay as they are"] if words else [])
 
 
+WHOLLY, MOSTLY = "lie outside of their pictures", "lie outside of their pictures by more than half"
+
+
 @pytest.mark.parametrize(
-    ("place", "is_outside"),
+    ("place", "words"),
     [
-        ((99.5, 0, 5, 5), False),
-        ((100, 0, 5, 5), True),
-        ((0, 50, 5, 5), True),
-        ((0, 49.5, 5, 5), False),
-        ((-5, 0, 5, 5), True),
-        ((-5, 0, 5.5, 5), False),
-        ((0, -5, 5, 5), True),
-        ((0, -5, 5, 5.5), False),
+        ((97.5, 0, 5, 5), None),
+        ((97.6, 0, 5, 5), MOSTLY),
+        ((99.5, 0, 5, 5), MOSTLY),
+        ((100, 0, 5, 5), WHOLLY),
+        ((0, 50, 5, 5), WHOLLY),
+        ((0, 49.5, 5, 5), MOSTLY),
+        ((0, 47.5, 5, 5), None),
+        ((-5, 0, 5, 5), WHOLLY),
+        ((-5, 0, 5.5, 5), MOSTLY),
+        ((-2.5, 0, 5, 5), None),
+        ((0, -5, 5, 5), WHOLLY),
+        ((0, -2.6, 5, 5), MOSTLY),
+        ((0, -2.5, 5, 5), None),
+        ((-2, -2, 5, 5), MOSTLY),  # 9 of 25
+        ((-1, -1, 5, 5), None),  # 16 of 25
+        ((-100, -50, 300, 150), MOSTLY),  # the picture is a ninth of it
     ],
 )
-def test_a_box_is_outside_where_no_pixel_of_it_is_inside(place, is_outside, tmp_path):
-    wanted = ["1 of 2 boxes lie outside of their pictures; they stay as they are"] if is_outside else []
-    images = [{"id": 0, "width": 100, "height": 50}, {"id": 1, "width": 1}]
+def test_a_box_is_outside_where_no_pixel_of_it_or_less_than_half_is_inside(place, words, tmp_path):
+    wanted = [f"of 2 boxes 1 {words}; they stay as they are"] if words else []
+    images = [{"id": 0, "frame_id": 0, "width": 100, "height": 50}, {"id": 1, "frame_id": 1, "width": 1}]
     labels = read(tmp_path, coco(images, [box(0, place), box(1, (500, 500, 1, 1))]))
     assert [words.removeprefix(": ") for words in said(tmp_path, labels)] == wanted
     path = tmp_path / "a"
@@ -319,8 +338,10 @@ def test_shares_become_pixels_once(tmp_path):
     once = fitted(tmp_path / "a", labels, (64, 32))
     assert once.boxes_px.tolist() == [[16, 16, 8, 32]]
     assert fitted(tmp_path / "a", once, (64, 32)).boxes_px.tolist() == once.boxes_px.tolist()
-    assert not read(tmp_path, table("0,0.25,0.5,0.125,1.5")).is_normalised
-    assert read(tmp_path, table("0,-1,0.5,0.125,0.5")).is_normalised
+    assert read(tmp_path, table("0,0.25,0.5,0.125,2")).is_normalised
+    assert not read(tmp_path, table("0,0.25,0.5,0.125,2.01")).is_normalised
+    assert not read(tmp_path, table("0,1,0,1,2")).is_normalised  # whole numbers
+    assert read(tmp_path, table("0,-2,0.5,0.125,0.5")).is_normalised
 
 
 # Tables
@@ -355,7 +376,8 @@ def test_times_reach_to_2262(time, is_taken, tmp_path):
     if is_taken:
         assert read(tmp_path, text).times_s.tolist() == [float(time)]
         return
-    words = f":2: a time is a number of seconds from 0 to the year 2262, not {float(time):g}"
+    words = f":2: a time is a number of seconds from 0 to the year 2262, not {float(time):g}; the name of its column may end "
+    words += "with _ms, _us or _ns"
     assert refused(tmp_path, text) == words
 
 
@@ -386,7 +408,7 @@ def test_a_cell_may_say_nothing(empty, tmp_path):
         ("frame,x,y,w,h", "1,10,20,4,6", [10, 20, 4, 6]),
         ("frame,x1,y1,x2,y2", "1,10,20,14,26", [10, 20, 4, 6]),
         ("frame,cx,cy,w,h", "1,10,20,4,6", [8, 17, 4, 6]),
-        ("frame,x1,y1,w,h,x2,y2", "1,10,20,4,6,99,99", [10, 20, 4, 6]),
+        ("frame,x1,y1,w,h,x2,y2", "1,10,20,640,480,14,26", [10, 20, 4, 6]),
         ("frame;x;y;w;h", "1;10,5;20;4;6", [10.5, 20, 4, 6]),
         ("frame\tx\ty\tw\th", "1\t10.5\t20\t4\t6", [10.5, 20, 4, 6]),
     ],
@@ -394,7 +416,7 @@ def test_a_cell_may_say_nothing(empty, tmp_path):
 def test_boxes_have_corners_or_sizes_or_centres(header, row, wanted, tmp_path):
     labels = read(tmp_path, table(row, header=header))
     assert labels.boxes_px.tolist() == [wanted]
-    assert ("; not read: x2, y2" in labels.remarks[0]) == ("w,h,x2" in header)
+    assert ("; not read: w, h" in labels.remarks[0]) == ("w,h,x2" in header)
 
 
 @pytest.mark.parametrize(
@@ -434,7 +456,7 @@ def test_rows_of_json_say_which_one_is_wrong(tmp_path):
 
 def test_a_header_has_four_names_and_no_number(tmp_path):
     assert refused(tmp_path, "a,b,c\n1,2,3").startswith(":1: a row of 3 columns fits no label format")
-    assert refused(tmp_path, "a,b,c,d\n1,2,3,4").startswith(":1: no columns for x and w")
+    assert refused(tmp_path, "a,b,c,d\n1,2,3,4").startswith(":1: no columns for x and x2 (or x and w)")
     assert delimited.header_of(Path("a"), "a,b,c,5") == []
     assert delimited.header_of(Path("a"), '"a b", "c;d",e,f') == ["a b", "c;d", "e", "f"]
     assert delimited.header_of(Path("a"), "abcd") == []
