@@ -29,6 +29,7 @@ from mcaptrack.notices import Notice, warn
 from mcaptrack.sources.ingest import Format, ImageFormat, IngestOptions, InputRole
 from mcaptrack.sources.ingest import ingest as make_log
 from mcaptrack.sources.ingest.labels.columns import check_keys, parse_columns
+from mcaptrack.sources.ingest.labels.wanted import WantedClasses
 from mcaptrack.sources.ingest.sidecar import SidecarChoice
 
 _EPOCH: Final = dt.datetime(1970, 1, 1, tzinfo=dt.UTC)
@@ -89,6 +90,7 @@ def ingest(
     frames: int | None = None,
     columns: str | Mapping[str, str] | None = None,
     size: str | tuple[int, int] | None = None,
+    classes: str = "person",
     role: InputRole | None = None,
     into: PathLike | None = None,
     sidecar: bool | None = None,
@@ -136,6 +138,8 @@ def ingest(
         and id.
     size : tuple of int, or str, optional
         Width and height of the pictures, (1920, 1080) or "1920x1080", if there are only labels in shares of them.
+    classes : str, default "person"
+        Classes of tracks and ground truth, by name or number with commas between them, or "all". Detections keep all.
     role : {"detections", "tracks", "truth", "motion"}, optional
         What ``source`` holds, if it is a label file; by default as its ids tell. The motion of a camera goes ``into`` a
         log.
@@ -188,6 +192,7 @@ def ingest(
         motion=optional_path(motion),
         columns=parse_columns(columns) if isinstance(columns, str) else check_keys(columns) if columns else None,
         size=parse_size(size),
+        classes=WantedClasses(classes),
     )
     with warnings_about(path) as warnings:
         if into is None:
@@ -207,6 +212,8 @@ def ingest(
         warn_unused("there is no label file", label_format=label_format != "auto" and not report.has_labels)
         warn_unused("there is no label file", columns=columns is not None and not report.has_labels)
         warn_unused("no label file is of a detector's format", size=size is not None and not report.uses_size)
+        has_tracks = bool({tracks, truth} - {None}) or (role in ("tracks", "truth") and report.has_labels)
+        warn_unused("there are no tracks and no ground truth", classes=classes != "person" and not has_tracks)
         warn_unused("there is no ground plane", point=point != "foot" and ground_plane is None)
         keep = "the channels of a recording keep their names"
         warn_unused(keep, camera=camera != "camera" and not report.uses_camera)

@@ -124,6 +124,14 @@ def ingest(
             show_default="guessed from the header",
         ),
     ] = None,
+    classes: Annotated[
+        str,
+        common.option(
+            "--classes",
+            panel=_READING,
+            help="Classes of tracks and ground truth, by name or number, as in person,car; all for every one.",
+        ),
+    ] = "person",
     size: Annotated[
         str | None,
         common.option(
@@ -214,6 +222,7 @@ def ingest(
         "frames": frames,
         "columns": columns,
         "size": size,
+        "classes": classes,
         "role": role,
         "into": into,
         "sidecar": sidecar,

@@ -27,6 +27,7 @@ from mcaptrack.sources.ingest.labels.formats import Format, Labels, Role
 from mcaptrack.sources.ingest.labels.motions import motion_frames, read_motions
 from mcaptrack.sources.ingest.labels.reading import read_homography, read_labels
 from mcaptrack.sources.ingest.labels.timeline import Placed, Timeline
+from mcaptrack.sources.ingest.labels.wanted import ONLY_PEOPLE, WantedClasses
 from mcaptrack.sources.video import ImageFormat, VideoOptions
 
 Progress = Callable[[str, int, int], None]
@@ -50,7 +51,8 @@ class IngestOptions:
     ``fps``, ``image_format``, ``quality`` and ``keyframe_interval_s`` are as in ``video.VideoOptions``. ``first_frame``
     is the number that label files give the first picture, if it isn't that of their format; ``frames`` is the number of
     pictures, for labels without pictures. ``columns`` are names of columns of tables with a header, by what they hold;
-    ``size`` is the size of pictures, (width, height), for labels without pictures.
+    ``size`` is the size of pictures, (width, height), for labels without pictures. ``classes`` are those of tracks and
+    ground truth.
     """
 
     camera: str = "camera"
@@ -69,6 +71,7 @@ class IngestOptions:
     motion: Path | None = None
     columns: Mapping[str, str] | None = None
     size: tuple[int, int] | None = None
+    classes: WantedClasses = ONLY_PEOPLE
 
     @property
     def video_options(self) -> VideoOptions:
@@ -136,7 +139,7 @@ class IngestJob:
     def read(self, path: Path, role: Role) -> Labels:
         """Read a label file with the format options."""
         options = self.options
-        return read_labels(path, options.label_format, role, options.first_frame, options.columns)
+        return read_labels(path, options.label_format, role, options.first_frame, options.columns, options.classes)
 
     def fit_to_pictures(self, size: Callable[[], tuple[int, int]] | None) -> None:
         """Convert boxes in shares of the picture to pixels, and warn of boxes outside of it.
@@ -189,7 +192,7 @@ class IngestJob:
             if labels.step > 1:
                 words = f"{path} has labels every {labels.step} frames, from {labels.labelled[0]} on"
                 self.report.remarks.append(f"{words}; the frames in between are left out")
-            if role == "detections" and len(set(labels.class_id.tolist())) > 1:
+            if len(set(labels.class_id.tolist())) > 1:
                 ids, counts = np.unique(labels.class_id, return_counts=True)
                 names = [f" {labels.classes[number]}" if number in labels.classes else "" for number in ids.tolist()]
                 found = zip(ids.tolist(), names, counts.tolist(), strict=True)
@@ -271,7 +274,9 @@ class IngestJob:
         """Write the labels, each frame at the time of its picture."""
         for role, (path, labels) in self.labels.items():
             placed = timeline.place(path, labels, self.report.lost)
-            parameters: dict[str, Any] = {"file": path.name, "format": labels.format} | self.label_parameters(labels)
+            parameters: dict[str, Any] = {"file": path.name, "format": labels.format} | self.label_parameters(
+                role, labels
+            )
             frames = self.frames(role, plane, placed)
             self.write_rows(writer, role, _SCHEMA_OF[role], frames, parameters, labels.classes)
 
@@ -287,11 +292,13 @@ class IngestJob:
         frames = motion_frames(self.motions, timeline.index, timeline.t_ns, size)
         self.write_rows(writer, MOTION, CAMERA_MOTION, lambda: iter(frames), {"file": path.name})
 
-    def label_parameters(self, labels: Labels) -> dict[str, Any]:
+    def label_parameters(self, role: Role, labels: Labels) -> dict[str, Any]:
         """Additional parameters in the provenance of labels."""
         out: dict[str, Any] = {} if self.options.first_frame is None else {"first_frame": labels.first_frame}
         if self.options.columns and labels.format in ("csv", "supervision"):
             out["columns"] = ",".join(f"{key}={name}" for key, name in self.options.columns.items())
+        if role != "detections" and self.options.classes != ONLY_PEOPLE:
+            out["classes"] = self.options.classes.text
         if self.options.size and labels.format in OTHERS:
             out["size"] = "{}x{}".format(*self.options.size)
         return out

@@ -247,9 +247,9 @@ class LabelJob(IngestJob):
         self.write_labels(writer, self.ground, self.timeline)
         self.write_motion(writer, self.timeline, self._size)
 
-    def label_parameters(self, labels: Labels) -> dict[str, Any]:
+    def label_parameters(self, role: Role, labels: Labels) -> dict[str, Any]:
         """The frame rate, if there were no pictures."""
-        return super().label_parameters(labels) | ({} if self._fps is None else {"fps": str(self._fps)})
+        return super().label_parameters(role, labels) | ({} if self._fps is None else {"fps": str(self._fps)})
 
     def all_frames(self, role: Role) -> list[Frame]:
         """The labels of a role as frames, including empty frames."""

@@ -31,6 +31,7 @@ from mcaptrack.sources.ingest.labels.formats import (
     Role,
 )
 from mcaptrack.sources.ingest.labels.number_table import EXACT
+from mcaptrack.sources.ingest.labels.wanted import WantedClasses
 
 #: Formats of other detectors and annotation tools.
 OTHERS: Final[tuple[Format, ...]] = ("coco", "yolo", "supervision", "csv")
@@ -74,8 +75,11 @@ class BoxRows:
     remarks: list[str] = field(default_factory=list)
     doubts: list[tuple[str, Code]] = field(default_factory=list)
 
-    def labels(self, role: Role) -> Labels:
-        """Check the rows and convert them. Raises McaptrackError, with the row, if they can't be labels."""
+    def labels(self, role: Role, wanted: WantedClasses) -> Labels:
+        """Check the rows and convert them; tracks and ground truth are of ``wanted`` classes.
+
+        Raises McaptrackError, with the row, if they can't be labels.
+        """
         if not len(self.frame):
             raise McaptrackError(f"{self.path} holds no boxes")
         frame = self._whole(self.frame, _FRAME, 0, MAX_FRAME)
@@ -84,7 +88,7 @@ class BoxRows:
         self._check_boxes()
         self.refuse(np.abs(self.score) > MAX_SCORE, lambda row: f"a score can't be {self.score[row]:g}")
         class_id, classes = class_ids(self)
-        kept, left = self._kept(role, track_id, class_id, classes)
+        kept, left = self._kept(role, track_id, class_id, classes, wanted)
         self._doubt_scores()
         self._doubt_repeated(frame, track_id, class_id)
         labelled = np.unique(frame) if self.labelled is None else np.union1d(self.labelled, frame)
@@ -165,10 +169,14 @@ class BoxRows:
             lambda row: f"a box can't be {boxes[row, 2]:g} wide and {boxes[row, 3]:g} high",
         )
 
-    def _kept(self, role: Role, track_id: Ints, class_id: ClassIds, classes: Mapping[int, str]) -> tuple[Bools, str]:
+    def _kept(
+        self, role: Role, track_id: Ints, class_id: ClassIds, classes: Mapping[int, str], wanted: WantedClasses
+    ) -> tuple[Bools, str]:
         """Mask the rows that suit a role (N,), and describe the others."""
         crowd = np.zeros(len(class_id), bool) if self.crowd is None else self.crowd
         others = ~crowd & (class_id != PERSON) & (role != "detections")
+        if role != "detections" and not wanted.is_people:
+            others = ~crowd & ~wanted.mask(self.path, class_id, classes)
         lacks_id = ~crowd & ~others & (track_id == NO_ID) & (role != "detections") & bool((track_id != NO_ID).any())
         left = []
         if others.any():
@@ -182,7 +190,7 @@ class BoxRows:
             left.append(f"{int(lacks_id.sum())} boxes without a track id")
         kept = ~crowd & ~others & ~lacks_id
         if not kept.any():
-            what = "boxes" if role == "detections" else "people"
+            what = "boxes" if role == "detections" or not wanted.is_people else "people"
             raise McaptrackError(f"{self.path} holds no {what}, only {' and '.join(left)}")
         return kept, " and ".join(left)
 

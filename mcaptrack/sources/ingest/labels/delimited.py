@@ -22,6 +22,7 @@ from mcaptrack.sources.ingest.labels.box_rows import NO_CLASS, BoxRows, FrameNam
 from mcaptrack.sources.ingest.labels.columns import choose_columns
 from mcaptrack.sources.ingest.labels.formats import NO_ID, PERSON, ClassNames, Format, Labels, Role
 from mcaptrack.sources.ingest.labels.number_table import Lines, NumberTable, lines_of
+from mcaptrack.sources.ingest.labels.wanted import WantedClasses
 
 #: Columns that supervision writes before those of the user.
 SUPERVISION: Final = ("x_min", "y_min", "x_max", "y_max", "class_id", "confidence", "tracker_id")
@@ -79,7 +80,7 @@ def _split(path: Path, delimiter: str, line: str) -> list[str]:
         raise McaptrackError(f"{path}: {error}: {line[:60]!r}") from None
 
 
-def read_csv(path: Path, role: Role, given: Mapping[str, str], name: Format = "csv") -> Labels:
+def read_csv(path: Path, role: Role, given: Mapping[str, str], name: Format, wanted: WantedClasses) -> Labels:
     """Read a table with a header; ``given`` are names of columns by key, see ``columns.KEYS``."""
     lines = lines_of(path, MAX_LINE)
     number, first = next(lines, (0, ""))
@@ -92,10 +93,10 @@ def read_csv(path: Path, role: Role, given: Mapping[str, str], name: Format = "c
         raise McaptrackError(f"{path}:{number}: a table needs a header that names its columns: {first.strip()[:60]}")
     delimiter = _delimiter(first)
     split = partial(_split, path, delimiter)
-    return _read_table(path, number, header, lines, split, role, given, name, has_decimal_commas=delimiter == ";")
+    return _read_table(path, number, header, lines, split, role, given, name, wanted, delimiter == ";")
 
 
-def read_rows(path: Path, content: list[Any], role: Role, given: Mapping[str, str]) -> Labels:
+def read_rows(path: Path, content: list[Any], role: Role, given: Mapping[str, str], wanted: WantedClasses) -> Labels:
     """Read rows of supervision's JSONSink: objects with the same keys."""
     header = [str(key) for key in content[0]][: _MAX_COLUMNS + 1]
 
@@ -108,7 +109,7 @@ def read_rows(path: Path, content: list[Any], role: Role, given: Mapping[str, st
     def split(line: str) -> list[str]:
         return line.split(_SEPARATOR)
 
-    return _read_table(path, 1, header, lines(), split, role, given, "supervision")
+    return _read_table(path, 1, header, lines(), split, role, given, "supervision", wanted)
 
 
 def _read_table(
@@ -120,6 +121,7 @@ def _read_table(
     role: Role,
     given: Mapping[str, str],
     name: Format,
+    wanted: WantedClasses,
     has_decimal_commas: bool = False,
 ) -> Labels:
     if len(header) > _MAX_COLUMNS:
@@ -177,7 +179,7 @@ def _read_table(
         rows.take_shares()
     if name == "supervision" and header[at.get("frame", 0)].lower() == _FRAME_INDEX:
         rows.first_frame = 0
-    return rows.labels(role)
+    return rows.labels(role, wanted)
 
 
 def _class_reader(numbers: ClassNames) -> Callable[[str], float]:

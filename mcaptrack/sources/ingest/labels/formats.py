@@ -10,7 +10,7 @@
 
 Ground truth of MOTChallenge has the class of a box in column 8 since MOT16; MOT15, with 10 columns, has a position
 there. Ground truth also contains boxes that are not scored: see ``IgnoredBoxes``. Tracks and ground truth are
-restricted to people, because their rows have no class; detections keep all classes.
+restricted to people unless other classes are wanted; detections keep all classes.
 
 Letters: N rows, F frames.
 """
@@ -30,6 +30,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.notices import Code
 from mcaptrack.sources.ingest.labels.number_table import Lines, NumberTable
+from mcaptrack.sources.ingest.labels.wanted import WantedClasses
 
 Format = Literal["auto", "mot", "kitti", "sdd", "trajnet", "obsmat", "coco", "yolo", "supervision", "csv"]
 Role = Literal["detections", "tracks", "truth"]
@@ -46,6 +47,12 @@ _POSITIONS: Final = ("trajnet", "obsmat")
 #: With fewer labelled frames a regular step of boxes may be a coincidence.
 _SPARSE_FRAMES: Final = 3
 
+#: The classes of MOT16, 17 and 20.
+_MOT_NAMES: Final = (
+    "pedestrian,person on vehicle,car,bicycle,motorbike,non motorized vehicle,static person,distractor,occluder,"
+    "occluder on the ground,occluder full,reflection,crowd"
+)
+_MOT_CLASSES: Final = dict(enumerate(_MOT_NAMES.split(","), start=1))
 #: Distractor classes of MOT16, 17 and 20: person on a vehicle, static person, distractor, reflection.
 _DISTRACTORS: Final = (2, 7, 8, 12)
 #: People in KITTI that are occluded more than this, or truncated, are not scored; boxes up to this height are not
@@ -195,7 +202,7 @@ def _columns(parts: Sequence[str], least: int, most: int) -> None:
         raise ValueError(f"{len(parts)} column{'s' * (len(parts) != 1)}")
 
 
-def read_mot(path: Path, lines: Lines, role: Role) -> Labels:
+def read_mot(path: Path, lines: Lines, role: Role, wanted: WantedClasses) -> Labels:
     """MOTChallenge."""
 
     def parse(parts: list[str]) -> list[float]:
@@ -209,7 +216,11 @@ def read_mot(path: Path, lines: Lines, role: Role) -> Labels:
     boxes, score, kind = _boxes(table, slice(2, 6)), _score(table, 6), table.values[:, 7]
     named = np.isfinite(kind)
     kept = np.ones(len(frame), bool)
-    if role == "truth":
+    has_others = role != "detections" and not wanted.is_people
+    stated = np.where(named & (kind >= 0) & (kind < 2**31), kind, PERSON).astype(np.int64)
+    if has_others:
+        kept = wanted.mask(path, stated, _MOT_CLASSES) & ((stated != PERSON) | (score != 0) | (role != "truth"))
+    elif role == "truth":
         if (kind == 0).all():
             raise McaptrackError(
                 f"{path}: the class of all {len(kind)} boxes (column 8) is 0; pedestrians are 1 there since MOT16, and "
@@ -226,9 +237,12 @@ def read_mot(path: Path, lines: Lines, role: Role) -> Labels:
             lambda row: f"a class (column 8) is a whole number from -1 (none) on, not {kind[row]:g}",
         )
         class_id = np.where(named & (kind != NO_ID), kind, PERSON).astype(np.uint32)
+    class_id = stated.astype(np.uint32) if has_others else class_id
     gone = ~kept
     others = f"{int(gone.sum())} boxes that don't count (score 0 or a class but 1)" if gone.any() else ""
-    if role == "tracks" and ((kind > 0) & (kind != PERSON)).any():
+    if has_others:
+        others = f"{int(gone.sum())} boxes of other classes (column 8), or with a score of 0" if gone.any() else ""
+    elif role == "tracks" and ((kind > 0) & (kind != PERSON)).any():
         others = f"the classes of {int(((kind > 0) & (kind != PERSON)).sum())} boxes that aren't people (column 8)"
     ignored = IgnoredBoxes(frame[gone], boxes[gone], np.isin(kind[gone], _DISTRACTORS), np.zeros(int(gone.sum()), bool))
     return Labels(
@@ -241,12 +255,13 @@ def read_mot(path: Path, lines: Lines, role: Role) -> Labels:
         score[kept] if role != "truth" else np.full(int(kept.sum()), np.nan),
         np.unique(frame),
         class_id[kept],
+        {one: _MOT_CLASSES[one] for one in np.unique(class_id[kept]).tolist() if has_others and one in _MOT_CLASSES},
         left_out=others,
         ignored=ignored if (kind > 0).any() else None,
     )
 
 
-def read_kitti(path: Path, lines: Lines, role: Role) -> Labels:
+def read_kitti(path: Path, lines: Lines, role: Role, wanted: WantedClasses) -> Labels:
     """KITTI tracking. Column 18 is the score of a tracker, if there is one."""
     names = ClassNames()
 
@@ -261,6 +276,10 @@ def read_kitti(path: Path, lines: Lines, role: Role) -> Labels:
     boxes, score, kind = _boxes(table, slice(4, 8), corners=True), _score(table, 8), table.values[:, 9]
     truncated, occluded = table.values[:, 2], table.values[:, 3]
     people, region = names.are(kind, "pedestrian"), names.are(kind, _KITTI_REGION)
+    if role != "detections" and not wanted.is_people:
+        ids, known = names.ids(kind, _KITTI_CLASSES)
+        people = ~region
+        people[~region] = wanted.mask(path, ids[~region], known)
     if role == "detections":
         kept = ~region
         if not kept.any():
@@ -273,8 +292,9 @@ def read_kitti(path: Path, lines: Lines, role: Role) -> Labels:
         kept &= (truncated <= 0) & (occluded <= _KITTI_OCCLUDED)
     hidden = int((people & ~kept).sum())
     left = [names.count(kind[~people & ~kept])] if (~people & ~kept).any() else []
-    left += [f"{hidden} Pedestrian, hidden or cut off"] if hidden else []
-    sitting = names.are(kind, "person_sitting") | names.are(kind, "person")
+    who = "Pedestrian" if wanted.is_people else "boxes"
+    left += [f"{hidden} {who}, hidden or cut off"] if hidden else []
+    sitting = (names.are(kind, "person_sitting") | names.are(kind, "person")) & wanted.is_people
     ignored = ~kept & (people | sitting | region)
     class_id, classes = names.ids(kind[kept], _KITTI_CLASSES)
     return Labels(
@@ -293,7 +313,7 @@ def read_kitti(path: Path, lines: Lines, role: Role) -> Labels:
     )
 
 
-def read_sdd(path: Path, lines: Lines, role: Role) -> Labels:
+def read_sdd(path: Path, lines: Lines, role: Role, wanted: WantedClasses) -> Labels:
     """Stanford Drone annotations."""
     names = ClassNames()
 
@@ -307,9 +327,11 @@ def read_sdd(path: Path, lines: Lines, role: Role) -> Labels:
     boxes, kind = _boxes(table, slice(1, 5), corners=True), table.values[:, 9]
     lost = table.values[:, 6] != 0
     other = ~names.are(kind, "pedestrian") & (role != "detections")
+    if role != "detections" and not wanted.is_people:
+        other = ~wanted.mask(path, *names.ids(kind, _SDD_CLASSES))
     kept = ~lost & ~other
     if not kept.any():
-        what = "pedestrians" if other.any() else "boxes in sight"
+        what = ("pedestrians" if wanted.is_people else "such boxes") if other.any() else "boxes in sight"
         raise McaptrackError(f"{path} holds no {what}, only {names.count(kind)}")
     left = [names.count(kind[other & ~lost])] if (other & ~lost).any() else []
     left += [f"{int(lost.sum())} boxes out of sight (lost)"] if lost.any() else []
@@ -329,17 +351,19 @@ def read_sdd(path: Path, lines: Lines, role: Role) -> Labels:
     )
 
 
-def read_trajnet(path: Path, lines: Lines, role: Role) -> Labels:
+def read_trajnet(path: Path, lines: Lines, role: Role, wanted: WantedClasses) -> Labels:
     """TrajNet text."""
-    return _positions(path, lines, "trajnet", "TrajNet (frame id x y)", 4, slice(2, 4))
+    return _positions(path, lines, "trajnet", "TrajNet (frame id x y)", 4, slice(2, 4), wanted)
 
 
-def read_obsmat(path: Path, lines: Lines, role: Role) -> Labels:
+def read_obsmat(path: Path, lines: Lines, role: Role, wanted: WantedClasses) -> Labels:
     """ETH's obsmat."""
-    return _positions(path, lines, "obsmat", "an ETH obsmat (frame id x z y vx vz vy)", 8, slice(2, 5, 2))
+    return _positions(path, lines, "obsmat", "an ETH obsmat (frame id x z y vx vz vy)", 8, slice(2, 5, 2), wanted)
 
 
-def _positions(path: Path, lines: Lines, name: Format, what: str, columns: int, place: slice) -> Labels:
+def _positions(
+    path: Path, lines: Lines, name: Format, what: str, columns: int, place: slice, wanted: WantedClasses
+) -> Labels:
     def parse(parts: list[str]) -> list[float]:
         _columns(parts, columns, columns)
         return [float(part) for part in parts]
@@ -347,10 +371,11 @@ def _positions(path: Path, lines: Lines, name: Format, what: str, columns: int, 
     table = NumberTable(path, lines, what, columns, parse)
     frame, track_id = _frame(table, 0), table.whole(1, "the id", 0)
     xy_m, none = table.within(place, "a position", MAX_PLACE), np.full(len(frame), np.nan)
+    wanted.mask(path, _all_persons(len(frame)), {})  # all are people
     return Labels(name, 0, frame, track_id, None, xy_m, none, np.unique(frame), _all_persons(len(frame)))
 
 
-READERS: Final[Mapping[str, Callable[[Path, Lines, Role], Labels]]] = {
+READERS: Final[Mapping[str, Callable[[Path, Lines, Role, WantedClasses], Labels]]] = {
     "mot": read_mot,
     "kitti": read_kitti,
     "sdd": read_sdd,

@@ -20,6 +20,7 @@ from mcaptrack.geometry.arrays import Floats
 from mcaptrack.sources.ingest.labels.box_rows import NO_CLASS, BoxRows, FrameNames, numbers_of_names
 from mcaptrack.sources.ingest.labels.delimited import read_rows
 from mcaptrack.sources.ingest.labels.formats import NO_ID, Format, Labels, Role
+from mcaptrack.sources.ingest.labels.wanted import WantedClasses
 
 _MAX_BYTES: Final = 512 * 2**20
 _MAX_ROWS: Final = 10_000_000
@@ -62,27 +63,27 @@ def load_json(path: Path) -> Any:
         raise McaptrackError(f"{path} is not valid JSON: {str(error)[:200]}") from None
 
 
-def read_json(path: Path, label_format: Format, role: Role, given: Mapping[str, str]) -> Labels:
+def read_json(path: Path, label_format: Format, role: Role, given: Mapping[str, str], wanted: WantedClasses) -> Labels:
     """Read JSON of COCO or of supervision, as its content tells. Raises McaptrackError if it is neither."""
     content = load_json(path)
-    labels = _read_content(path, content, role, given)
+    labels = _read_content(path, content, role, given, wanted)
     if label_format not in ("auto", labels.format):
         raise McaptrackError(f"{path} is of the format {labels.format}, not {label_format}")
     return labels
 
 
-def _read_content(path: Path, content: Any, role: Role, given: Mapping[str, str]) -> Labels:
+def _read_content(path: Path, content: Any, role: Role, given: Mapping[str, str], wanted: WantedClasses) -> Labels:
     if isinstance(content, list) and not content:
         raise McaptrackError(f"{path} holds no boxes")
     if given and not (isinstance(content, list) and isinstance(content[0], dict) and "x_min" in content[0]):
         raise McaptrackError(f"{path}: `columns=` is for tables with a header, not for COCO")
     first = content[0] if isinstance(content, list) and isinstance(content[0], dict) else {}
     if isinstance(content, dict) and isinstance(content.get("annotations"), list):
-        return _annotations(path, content).labels(role)
+        return _annotations(path, content).labels(role, wanted)
     if "bbox" in first and "image_id" in first:
-        return _results(path, content).labels(role)
+        return _results(path, content).labels(role, wanted)
     if "x_min" in first:
-        return read_rows(path, content, role, given)
+        return read_rows(path, content, role, given, wanted)
     found = f"an object with {', '.join(content)}"[:100] if isinstance(content, dict) else "a list"
     raise McaptrackError(
         f"{path} is JSON ({found}{' of ' + ', '.join(first) if first else ''}"[:300]

@@ -16,6 +16,7 @@ from mcaptrack.sources.ingest.labels.delimited import MAX_LINE, SUPERVISION, com
 from mcaptrack.sources.ingest.labels.formats import READERS, Format, Labels, Role
 from mcaptrack.sources.ingest.labels.json_boxes import is_json, read_json
 from mcaptrack.sources.ingest.labels.number_table import lines_of, split
+from mcaptrack.sources.ingest.labels.wanted import ONLY_PEOPLE, WantedClasses
 from mcaptrack.sources.ingest.labels.yolo import read_yolo
 
 _MOT_COLUMNS: Final = {"frame": 0, "id": 1, "x": 2, "y": 3, "w": 4, "h": 5}
@@ -28,6 +29,7 @@ def read_labels(
     role: Role = "tracks",
     first_frame: int | None = None,
     columns: Mapping[str, str] | None = None,
+    wanted: WantedClasses = ONLY_PEOPLE,
 ) -> Labels:
     """Read a label file.
 
@@ -43,6 +45,8 @@ def read_labels(
         The number of the first picture in the file, if it isn't the one of the format.
     columns : dict, optional
         Names of the columns of a table with a header, by what they hold.
+    wanted : WantedClasses
+        The classes of tracks and ground truth; detections keep all.
 
     Returns
     -------
@@ -54,7 +58,7 @@ def read_labels(
     McaptrackError
         With the line, if the file doesn't have this format, or none of the known ones.
     """
-    labels = _read(path, label_format, role, columns or {})
+    labels = _read(path, label_format, role, columns or {}, wanted)
     if labels.has_ids and role != "detections":
         _refuse_repeated_ids(path, labels)
     order = np.lexsort((labels.id, labels.frame)) if labels.has_ids else np.argsort(labels.frame, kind="stable")
@@ -72,14 +76,14 @@ def read_labels(
     )
 
 
-def _read(path: Path, label_format: Format, role: Role, columns: Mapping[str, str]) -> Labels:
+def _read(path: Path, label_format: Format, role: Role, columns: Mapping[str, str], wanted: WantedClasses) -> Labels:
     refuse_special(path)
     if path.is_dir():
         if label_format not in ("auto", "yolo"):
             raise McaptrackError(f"{path} is a folder, and {label_format} labels are a file")
         label_format = "yolo"
     elif label_format in ("auto", "supervision", "coco") and is_json(path):
-        return read_json(path, label_format, role, columns)
+        return read_json(path, label_format, role, columns, wanted)
     if label_format == "auto":
         found = next(lines_of(path, MAX_LINE), None)
         if found is None:
@@ -90,10 +94,10 @@ def _read(path: Path, label_format: Format, role: Role, columns: Mapping[str, st
     if label_format == "coco":
         raise McaptrackError(f"{path} is not JSON, as COCO is")
     if label_format == "yolo":
-        return read_yolo(path, role)
+        return read_yolo(path, role, wanted)
     if label_format in ("csv", "supervision"):
-        return read_csv(path, role, columns, label_format)
-    return READERS[label_format](path, lines_of(path), role)
+        return read_csv(path, role, columns, label_format, wanted)
+    return READERS[label_format](path, lines_of(path), role, wanted)
 
 
 def _guess(path: Path, number: int, line: str) -> Format:

@@ -19,6 +19,7 @@ from mcaptrack.sources.ingest.bags import plain_yaml
 from mcaptrack.sources.ingest.labels.box_rows import BoxRows, numbers_of_names
 from mcaptrack.sources.ingest.labels.formats import NO_ID, Labels, Role
 from mcaptrack.sources.ingest.labels.number_table import NumberTable, lines_of
+from mcaptrack.sources.ingest.labels.wanted import WantedClasses
 from mcaptrack.sources.video.image_folder import IMAGE_SUFFIXES, natural_order
 
 _NAMES: Final = ("classes.txt", "obj.names", "_classes.txt", "labels.txt")
@@ -60,7 +61,7 @@ def is_label_folder(folder: Path) -> bool:
     return bool(label_files(folder))
 
 
-def read_yolo(folder: Path, role: Role) -> Labels:
+def read_yolo(folder: Path, role: Role, wanted: WantedClasses) -> Labels:
     """Read a folder of YOLO labels. The numbers in the names of files are those of frames."""
     if not folder.is_dir():
         raise McaptrackError(f"{folder} is not a folder; labels of YOLO are a folder with a text file for each picture")
@@ -114,7 +115,7 @@ def read_yolo(folder: Path, role: Role) -> Labels:
     out.refuse(
         largest > _MOST, lambda row: f"{largest[row]:g} is no share of the picture's size, as boxes of YOLO are in"
     )
-    return out.labels(role)
+    return out.labels(role, wanted)
 
 
 def _parse(parts: list[str]) -> list[float]:

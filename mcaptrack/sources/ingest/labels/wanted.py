@@ -1,0 +1,60 @@
+"""Which classes of label files become tracks and ground truth. Letters: N rows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaptrack.errors import McaptrackError
+from mcaptrack.geometry.arrays import Bools
+from mcaptrack.schema.classes import PEOPLE, PERSON
+
+_ALL: Final = "all"
+_SHOWN: Final = 10
+
+
+@dataclass(frozen=True)
+class WantedClasses:
+    """Names or numbers of classes with commas between them, or "all"."""
+
+    text: str = PEOPLE[0]
+
+    @property
+    def is_people(self) -> bool:
+        """Whether people alone are wanted."""
+        return self.text.strip().casefold() in PEOPLE
+
+    def mask(self, path: Path, class_id: NDArray[np.integer], names: Mapping[int, str]) -> Bools:
+        """Mask the rows (N,) of wanted classes; ``names`` are those of the file by class id.
+
+        Raises McaptrackError for a class that the file doesn't have, or if there is none at all in the text.
+        """
+        if self.text.strip().casefold() == _ALL:
+            return np.ones(len(class_id), bool)
+        there = np.unique(class_id).tolist()
+        by_name: dict[str, set[int]] = {}
+        for number in there:
+            by_name.setdefault(names.get(number, "").strip().casefold(), set()).add(number)
+        wanted: set[int] = set()
+        for word in (word.strip() for word in self.text.split(",")):
+            found = by_name.get(word.casefold(), set()) if word else set()
+            found = {PERSON} & {*there} if word.casefold() in PEOPLE else found
+            if not found and word.isascii() and word.isdecimal() and int(word[:12]) in there:
+                found = {int(word)}
+            if not found:
+                called = [names.get(number) or f"{number}" for number in there]
+                more = f" and {len(called) - _SHOWN} more" if len(called) > _SHOWN else ""
+                raise McaptrackError(
+                    f"{path} has no class {word!r:.60}; `classes=` takes {', '.join(called[:_SHOWN])}{more}, or {_ALL}"
+                )
+            wanted |= found
+        return np.isin(class_id, sorted(wanted))
+
+
+#: The default: people alone.
+ONLY_PEOPLE: Final = WantedClasses()

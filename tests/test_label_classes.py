@@ -1,0 +1,97 @@
+"""``ingest --classes``: classes other than people in tracks and ground truth, with their names, from every format."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+import mcaptrack
+from mcaptrack.errors import McaptrackError
+
+MOT = "".join(f"{t},{who},{10 * who},20,30,60,{flag},{kind},1\n" for t in (1, 2)
+              for who, flag, kind in ((1, 1, 1), (2, 0, 3), (3, 0, 4), (4, 0, 1)))  # fmt: skip
+KITTI = "".join(
+    f"{t} {who} {kind} {cut} 0 0 {100 * who} 50 {100 * who + 40} 110 1 1 1 1 1 1 0\n"
+    for t in (0, 1)
+    for who, kind, cut in ((1, "Pedestrian", 0), (2, "Car", 0), (3, "Car", 1), (-1, "DontCare", -1))
+)
+SDD = "".join(
+    f'{who} {10 * who} 20 {10 * who + 9} 40 {t} {lost} 0 0 "{kind}"\n'
+    for who, kind, lost in ((1, "Pedestrian", 0), (2, "Biker", 0), (3, "Cart", 1))
+    for t in (0, 12, 24)
+)
+CSV = "frame,id,x,y,w,h,class\n" + "".join(
+    f"{t},{who},{10 * who},20,30,60,{kind}\n"
+    for t in (0, 1, 2)
+    for who, kind in ((1, "human"), (2, "vélo"), (3, "Cat"))
+)
+COCO = json.dumps({
+    "images": [{"id": n, "file_name": f"{n:03}.jpg", "width": 640, "height": 480} for n in (1, 2)],
+    "categories": [{"id": 1, "name": "person"}, {"id": 17, "name": "cat"}, {"id": 3, "name": "car"}],
+    "annotations": [
+        {"id": 10 * n + c, "image_id": n, "category_id": c, "bbox": [10 * c, 20, 30, 60], "track_id": c}
+        for n in (1, 2) for c in (1, 17, 3)
+    ],
+})  # fmt: skip
+FILES = {"mot": ("gt.txt", MOT), "kitti": ("gt.txt", KITTI), "sdd": ("gt.txt", SDD), "csv": ("gt.csv", CSV),
+         "coco": ("gt.json", COCO)}  # fmt: skip
+
+
+def classes_of(folder: Path, form: str, **options):
+    """The ids of each class in the ground truth of a file, by name and number of the class."""
+    name, content = FILES[form]
+    (folder / name).write_text(content)
+    target = folder / f"{form}-{options.get('classes', '')[:5]}.mcap"
+    mcaptrack.ingest(folder / name, target, role=options.pop("role", "truth"), fps=10, force=True, **options)
+    found = {}
+    with mcaptrack.open(target) as log:
+        for row in log.table("tracks").to_pylist():
+            found.setdefault((row["class"], row["class_id"]), set()).add(row["track_id"])
+    return found
+
+
+@pytest.mark.parametrize(
+    ("form", "people", "everything", "one", "of_one"),
+    [
+        ("mot", {("person", 1): {1}}, {("pedestrian", 1): {1}, ("car", 3): {2}, ("bicycle", 4): {3}}, "car,4",
+         {("car", 3): {2}, ("bicycle", 4): {3}}),
+        ("kitti", {("Pedestrian", 1): {1}}, {("Pedestrian", 1): {1}, ("Car", 3): {2}}, "CAR", {("Car", 3): {2}}),
+        ("sdd", {("Pedestrian", 1): {1}}, {("Pedestrian", 1): {1}, ("Biker", 2): {2}}, "person", {("Pedestrian", 1): {1}}),
+        ("csv", {("human", 1): {1}}, {("human", 1): {1}, ("Cat", 2): {3}, ("vélo", 3): {2}}, "vélo", {("vélo", 3): {2}}),
+        ("coco", {("person", 1): {1}}, {("person", 1): {1}, ("car", 3): {3}, ("cat", 17): {17}}, "pedestrian,cat",
+         {("person", 1): {1}, ("cat", 17): {17}}),
+    ],
+)  # fmt: skip
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_wanted_classes_are_kept_with_their_names(tmp_path, form, people, everything, one, of_one):
+    assert classes_of(tmp_path, form) == people
+    assert classes_of(tmp_path, form, classes="all") == everything
+    assert classes_of(tmp_path, form, classes=one) == of_one
+    assert classes_of(tmp_path, form, classes=one, role="tracks").keys() == of_one.keys()
+
+
+@pytest.mark.parametrize(
+    ("classes", "words"),
+    [
+        ("bus", "has no class 'bus'; `classes=` takes human, Cat, vélo, or all"),
+        ("Cat,", "has no class ''"),
+        ("7", "has no class '7'"),
+        ("9" * 5000, "has no class '99999"),
+        ("", "has no class ''"),
+    ],
+)
+def test_classes_that_a_file_lacks_are_refused(tmp_path, classes, words):
+    with pytest.raises(McaptrackError) as caught:
+        classes_of(tmp_path, "csv", classes=classes)
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_what_is_left_out_is_said_and_classes_without_effect_too(tmp_path):
+    with pytest.warns(UserWarning, match="3 Cat; left out of truth"):
+        classes_of(tmp_path, "csv", classes="person,vélo")
+    (tmp_path / "found.csv").write_text(CSV)
+    with pytest.warns(UserWarning, match="classes"):
+        mcaptrack.ingest(tmp_path / "found.csv", tmp_path / "a.mcap", role="detections", fps=10, classes="all")
