@@ -73,6 +73,10 @@ def template(tmp_path_factory) -> Path:
     walk = [f"{row[0]} {row[1]} {0.1 * (float(row[2]) + 4)} 3.2" for row in rows]
     (folder / "walk.txt").write_text("\n".join(walk) + "\n")
     (folder / "known.onnx").write_bytes(DATA)
+    kinds = "".join(
+        f"{n},{who},{9 * n},24,8,16,{kind}\n" for n in range(30) for who, kind in ((1, "person"), (2, "cart"))
+    )
+    (folder / "kinds.csv").write_text(f"frame,id,x,y,w,h,class\n{kinds}")
     (folder / "table.csv").write_text("frame,id,x,y,w,h\n" + "".join(f"{n},1,{n},24,8,16\n" for n in range(30)))
     (folder / "yolo").mkdir()
     for n in range(30):

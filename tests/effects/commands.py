@@ -69,6 +69,7 @@ CASES: dict[str, dict[str, Case]] = {
         format=("ingest truth.txt --fps 10", "--format kitti"),
         columns=("ingest table.csv --fps 10 --as tracks", "--columns x=y,y=x"),
         size=("ingest yolo --fps 10", "--size 640x480"),
+        classes=("ingest kinds.csv --fps 10 --as tracks", "--classes person,cart"),
         first_frame=("ingest truth.txt --fps 10", "--first-frame 0"),
         frames=("ingest truth.txt --fps 10", "--frames 500"),
         **{"as": ("ingest truth.txt --fps 10", "--as truth")},
