@@ -22,7 +22,7 @@ from mcaptrack.schema.provenance import read_texts
 #: The class of what is not known, and of people.
 UNKNOWN, PERSON = 0, 1
 #: Names of people, in lower case.
-PEOPLE: Final = ("person", "pedestrian", "human")
+PEOPLE: Final[tuple[str, ...]] = ("person", "pedestrian", "human")
 _COLUMN: Final = "class_id"
 #: Keys of the metadata of channels: names of classes by number, and the class of all rows that state none.
 _NAMES, _ONLY = "mcaptrack.classes", "mcaptrack.class_id"

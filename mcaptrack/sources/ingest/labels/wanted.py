@@ -22,7 +22,7 @@ _SHOWN: Final = 10
 class WantedClasses:
     """Names or numbers of classes with commas between them, or "all"."""
 
-    text: str = PEOPLE[0]
+    text: str = "person"
 
     @property
     def is_people(self) -> bool:
