@@ -16,6 +16,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame
 from mcaptrack.schema.classes import class_names
 from mcaptrack.transforms import PROFILES, ByteTrack, OcSort, Sort
+from mcaptrack.transforms.sort.association import CandidatePairs, associate
 from mcaptrack.transforms.to_video_rate import to_video_rate
 from mcaptrack.transforms.track_classes import settle_classes
 from tests.worlds import noisy_tracks, ns
@@ -93,6 +94,15 @@ def test_each_class_is_tracked_as_if_it_were_alone(tracker):
             frame.rows["track_id"] += 1000
         same_but_for_ids(together, both(alone[0], apart))
         assert {1, 2} == {int(one) for frame in together for one in frame.rows["class_id"]}
+
+
+def test_competition_in_one_class_does_not_change_another():
+    """Alone, class 1 has one pair above 0.2. Together with others below, two pairs of 0.19 would outweigh it."""
+    detection, track = (np.array(some) for some in ([0, 0, 1, 2, 2, 3], [0, 1, 0, 2, 3, 2]))
+    pairs = CandidatePairs(detection, track, np.array([0.21, 0.19, 0.19, 0.5, 0.4, 0.4]), (4, 4))
+    together = associate(pairs._replace(class_id=np.array([1.0, 1.0, 1.0, 2.0, 2.0, 2.0])), 0.2)
+    assert set(zip(*(some.tolist() for some in together), strict=True)) == {(0, 0), (2, 3), (3, 2)}
+    assert set(zip(*(some.tolist() for some in associate(pairs, 0.2)), strict=True)) == {(2, 3), (3, 2)}
 
 
 @every_tracker
@@ -211,6 +221,9 @@ def test_boxes_at_video_rate_have_the_class_of_their_retracked_track():
     full = to_video_rate(frames, [found for found, *_ in method(frames)], ())
     assert {int(one) for frame in full for one in frame.rows["class_id"]} == {2}
     assert sum(len(frame.rows) for frame in full) == len(frames)
+    retracked = [found for found, *_ in method(frames)]
+    early = to_video_rate(frames, retracked[1:], ())  # the first box has no sample at its time
+    assert [frame.rows["class_id"].tolist() for frame in early[:2]] == [[2], [2]]
 
 
 # Logs and tables
