@@ -28,6 +28,7 @@ Code = Literal[
     "device",
     "estimated-ground-plane",
     "extrapolated",
+    "few-pictures",
     "held-back",
     "journal",
     "left-out",

@@ -50,8 +50,8 @@ _SIGNALLED: Final = frozenset(128 + number for number in (signal.SIGINT, signal.
 BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(
     {
         "detector": {
-            "knn": "mcaptrack.transforms.detect.background:KnnDetector",
             "median": "mcaptrack.transforms.detect.median:MedianDetector",
+            "knn": "mcaptrack.transforms.detect.background:KnnDetector",
             "mog2": "mcaptrack.transforms.detect.background:Mog2Detector",
             "frame-difference": "mcaptrack.transforms.detect.background:FrameDifferenceDetector",
             "onnx": "mcaptrack.transforms.detect.onnx.detector:OnnxDetector",

@@ -52,7 +52,15 @@ RETRACKING = {
     "side_view": False,
 }
 DEFAULTS: dict[str, dict[str, Any]] = {
-    "detect": {"threshold": None, "history_s": 60.0, "max_pixels": 1_000_000, "stabilise": True},
+    "detect": {
+        "threshold": 22.0,
+        "history_s": 600.0,
+        "max_pixels": 1_000_000,
+        "stabilise": True,
+        "remove_shadows": True,
+        "separate": True,
+        "least_visible": 0.5,
+    },
     "track": SORT,
     "sort": SORT,
     "bytetrack": SORT | {"high_score": 0.5, "new_score": 0.6, "low_min_iou": 0.5},
@@ -137,7 +145,7 @@ def test_the_clock_of_prediction_ticks_at_2_5_hz():
 #: Defaults of commands that no transform declares; those of all other options are None, or False.
 COMMANDS: dict[str, dict[str, Any]] = {
     "demo": {"scene": "square", "seed": 2, "output": Path("mcaptrack-demo")},
-    "detect": {"detector": "knn"},
+    "detect": {"detector": "median"},
     "evaluate": {"gate_m": "0.5,1,2", "min_iou": 0.5, "rules": "trackeval", "point": "foot"},
     "export": {"form": "parquet"},
     "ingest": {

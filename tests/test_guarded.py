@@ -325,6 +325,7 @@ class Twice:
     passes: ClassVar = 2
 
     def __call__(self, frames: Iterable[Frame]) -> Iterator[Any]:
+        assert type(self) is Once or iter(frames) is not frames  # how a transform knows that it can read them again
         count = sum(1 for _ in frames)
         for number, frame in enumerate(frames):
             yield (frame._replace(rows=ROWS[: 2 * number // count]),)

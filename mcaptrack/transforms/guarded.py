@@ -92,11 +92,13 @@ class _Source:
         self.where = "before the first frame"
 
     def __iter__(self) -> Iterator[Frame]:
-        if self._is_begun and self._passes > 1:
+        if self._passes == 1:
+            return self
+        if self._is_begun:
             self._frames = iter(self._all)
             self._is_begun, self.count = False, 0
             self._open.clear()
-        return self
+        return iter(self.__next__, None)  # another object: transforms refuse what can be read only once
 
     def __next__(self) -> Frame:
         self._is_begun = True

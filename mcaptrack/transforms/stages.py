@@ -17,7 +17,7 @@ from typing import Any, Final, Literal, get_args
 from mcaptrack.errors import McaptrackError
 from mcaptrack.registry import BUILT_IN, KINDS, Entry, Kind, blamed, entry_of, find
 from mcaptrack.schema import SCHEMAS
-from mcaptrack.transforms.detect import KnnDetector
+from mcaptrack.transforms.detect import MedianDetector
 from mcaptrack.transforms.motion import EstimateMotion
 from mcaptrack.transforms.predict import Predict, predict_with
 from mcaptrack.transforms.protocol import Colour, Suited, Transform, check_options, option_problem
@@ -251,7 +251,7 @@ def _base(cls: type[Transform]) -> type[Transform]:
 _STAGES: Final = (
     Stage(
         name="detect",
-        default=KnnDetector,
+        default=MedianDetector,
         kind="detector",
         was="method",
         input_topic="video",

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from mcaptrack.schema import Frame
-from mcaptrack.transforms import EstimateMotion, FrameDifferenceDetector, KnnDetector, Predict, Sample
+from mcaptrack.transforms import EstimateMotion, FrameDifferenceDetector, KnnDetector, MedianDetector, Predict, Sample
+from tests import drawn
 from tests.effects import Case, Outputs, change_of_forecasts, forecast_steps, line, rows, shaky
 from tests.worlds import ns, tracks_at
 
@@ -136,6 +137,42 @@ case(
     {1_000_000: 51.0, 10_000: 50.0},
 )
 case("detect", "stabilise", shaken.__doc__, KnnDetector(), shaken(), all_boxes, {False: "more", True: "least"})
+
+
+def walks_in_the_sun(image: np.ndarray, number: int) -> None:
+    """A person walks through again and again, with a shadow."""
+    x = 20 + 7.5 * (number % 28)
+    image[146:152, round(x) : round(x) + 30] = image[146:152, round(x) : round(x) + 30] * 0.7
+    drawn.walk(image, number)
+
+
+def stand_abreast(image: np.ndarray, number: int) -> None:
+    """Three stand side by side for a while, and one walks by."""
+    drawn.walk(image, number)
+    if number % 3 == 0:
+        for x in (100, 110, 120):
+            drawn.figure(image, x, 80)
+
+
+def stand_behind(image: np.ndarray, number: int) -> None:
+    """One stands half behind another for a while, and one walks by."""
+    drawn.walk(image, number)
+    if number % 3 == 0:
+        drawn.figure(image, 150, 70)
+        drawn.figure(image, 153, 92)
+
+
+def widest(outputs: Outputs) -> float:
+    return float(max(frame.rows["w_px"].max(initial=0) for frame in outputs[0]))
+
+
+MEDIAN = MedianDetector(stabilise=False)
+for option, scene, measure, wanted in (
+    ("remove_shadows", walks_in_the_sun, widest, {True: "least", False: "more"}),
+    ("separate", stand_abreast, all_boxes, {False: "least", True: "more"}),
+    ("least_visible", stand_behind, all_boxes, {0.95: "least", 0.5: "more"}),
+):
+    case("detect", option, scene.__doc__, MEDIAN, drawn.film(scene), measure, wanted)
 
 
 def lorry() -> list[Frame]:

@@ -65,7 +65,13 @@ class MotionDetector:
         check_options(self)
 
     def __call__(self, frames: Iterable[Frame]) -> Iterator[tuple[Frame, ...]]:
-        clock, camera, height, steadiness = FrameClock(), CameraMotion(), _PersonHeight(), Steadiness()
+        steadiness = Steadiness()
+        yield from self.detect(frames, steadiness)
+        steadiness.check()
+
+    def detect(self, frames: Iterable[Frame], steadiness: Steadiness) -> Iterator[tuple[Frame]]:
+        """The detections of pictures; ``steadiness`` takes how the camera moved."""
+        clock, camera, height = FrameClock(), CameraMotion(), _PersonHeight()
         foreground = make_foreground_model(self.method, self.threshold, self.history_s)
         size: tuple[int, ...] = ()
         for frame in frames:
@@ -81,7 +87,6 @@ class MotionDetector:
                 mask = np.zeros_like(mask)
             boxes = _find_boxes(mask, height.update(mask))
             yield (Frame(frame.t_ns, frame.index, boxes_to_rows(unwarp_boxes(boxes, to_reference) * 2**halvings)),)
-        steadiness.check()
 
     def why_empty(self, given: Sequence[Frame], made: Sequence[Frame]) -> str:
         """Why there are no detections, for a warning."""

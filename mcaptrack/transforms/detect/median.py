@@ -6,12 +6,13 @@ are and which shape they have. The second time it compares each picture with its
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
 from math import inf
 from types import MappingProxyType
-from typing import ClassVar, Final
+from typing import ClassVar, Final, NamedTuple
 
 import numpy as np
 
@@ -19,9 +20,11 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.affine import IDENTITY
 from mcaptrack.geometry.arrays import Floats, Image
 from mcaptrack.geometry.clocks import seconds_to_ns
+from mcaptrack.notices import warn
 from mcaptrack.schema import DETECTIONS, VIDEO, Frame, Schema
 from mcaptrack.transforms.detect.background import (
     MAX_FOREGROUND,
+    KnnDetector,
     boxes_to_rows,
     clear_border,
     halve,
@@ -35,8 +38,11 @@ from mcaptrack.transforms.detect.person_model import Learner, Person, region_box
 from mcaptrack.transforms.detect.steadiness import Steadiness
 from mcaptrack.transforms.protocol import Colour, check_options, option
 
-#: A block of fewer pictures than this has no background.
-_MIN_SAMPLES: Final = 5
+#: A shorter view, or one of fewer pictures, has no background of its own: people hardly move in that time.
+_MIN_SPAN_S: Final = 1.8
+_MIN_PICTURES: Final = 10
+#: The same as ``MAX_FOREGROUND``, where the picture could not be registered.
+_MAX_FOREGROUND_LOST: Final = 0.2
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,6 +103,7 @@ class MedianDetector:
         views = self._learn(frames)
         for view, part in _with_views(frames, views):
             yield from view.detect(part, self)
+        _warn_of_short(views)
 
     def why_empty(self, given: Sequence[Frame], made: Sequence[Frame]) -> str:
         """Why there are no detections, for a warning."""
@@ -105,20 +112,56 @@ class MedianDetector:
     def _learn(self, frames: Iterable[Frame]) -> list[_View]:
         camera, steadiness = CameraMotion(), Steadiness()
         views: list[_View] = []
+        unknown: list[_Picture] = []
         for frame in frames:
             image, _ = _picture(frame, self.max_pixels)
             to_reference, is_new = _register(camera, image) if self.stabilise else (IDENTITY, False)
             is_new = is_new or not views or views[-1].size != image.shape
             steadiness.update(frame.t_ns, camera.view, is_new)
+            picture = _Picture(frame.t_ns, image, to_reference, camera.view in ("moving", "lost") and not is_new)
+            if picture.is_lost:
+                unknown.append(picture)
+                continue
+            begun = _of_next_view(unknown, image) if is_new else []
+            for one in unknown[: len(unknown) - len(begun)]:
+                views[-1].add(one, self)
             if is_new:
                 if views:
                     views[-1].close(self)
                 views.append(_View(image.shape))
-            views[-1].add(frame.t_ns, image, to_reference, self)
+            for one in (*begun, picture):
+                views[-1].add(one, self)
+            unknown = []
         if views:
+            for one in unknown:
+                views[-1].add(one, self)
             views[-1].close(self)
         steadiness.check()
         return views
+
+
+class _Picture(NamedTuple):
+    """A picture, halved and registered; ``is_lost`` if it could not be registered."""
+
+    t_ns: int
+    image: Image
+    to_reference: Floats
+    is_lost: bool = False
+
+
+def _of_next_view(unknown: Sequence[_Picture], reference: Image) -> list[_Picture]:
+    """The last ones of pictures that no view has yet which show what ``reference`` shows, registered to it.
+
+    A cut is noticed only after some pictures.
+    """
+    camera, found = CameraMotion(), deque[_Picture]()
+    _register(camera, reference)
+    for one in reversed(unknown):
+        to_reference, is_new = _register(camera, one.image)
+        if is_new or camera.view != "steady":
+            break
+        found.appendleft(one._replace(to_reference=to_reference, is_lost=False))
+    return [*found]
 
 
 def _picture(frame: Frame, max_pixels: int) -> tuple[Image, int]:
@@ -145,6 +188,8 @@ class _View:
 
     size: tuple[int, ...]
     to_reference: list[Floats] = field(default_factory=list)
+    #: Numbers of pictures that could not be registered.
+    lost: set[int] = field(default_factory=set)
     person: Person | None = None
     _person_px: float = 0.0
     _sampler: Sampler = field(default_factory=Sampler)
@@ -154,22 +199,31 @@ class _View:
     #: Backgrounds, and when each begins to hold.
     _blocks: list[tuple[int, Background]] = field(default_factory=list)
 
-    def add(self, t_ns: int, image: Image, to_reference: Floats, detector: MedianDetector) -> None:
+    @property
+    def is_short(self) -> bool:
+        """Whether no part of it is long enough for a background."""
+        return not self._blocks
+
+    def add(self, picture: _Picture, detector: MedianDetector) -> None:
         """Take a picture, the first time."""
+        t_ns, image, to_reference, is_lost = picture
         if self._start_ns is None:
             self._start_ns = t_ns
         elif t_ns - self._start_ns >= seconds_to_ns(detector.history_s):
             self._finish_block(detector)
             self._start_ns, self._sampler = t_ns, Sampler()
         self._last_ns = t_ns
+        if is_lost:
+            self.lost.add(len(self.to_reference))
+        else:
+            self._sampler.add(lambda: warp(image, to_reference))
         self.to_reference.append(to_reference)
-        self._sampler.add(lambda: warp(image, to_reference))
 
     def _finish_block(self, detector: MedianDetector) -> None:
         samples, start_ns = self._sampler.pictures, self._start_ns or 0
-        is_short = self._last_ns - start_ns < seconds_to_ns(detector.history_s) // 2
-        if len(samples) < _MIN_SAMPLES or (self._blocks and is_short):
-            return  # the background before it holds on
+        least_s = detector.history_s / 2 if self._blocks else min(_MIN_SPAN_S, detector.history_s / 2)
+        if len(samples) < _MIN_PICTURES or self._last_ns - start_ns < seconds_to_ns(least_s):
+            return  # the background before it holds on, if there is one
         background = Background.of(samples, detector.threshold)
         masks = [background.mask(image, detector.remove_shadows) for image in samples]
         person_px = typical_height(masks)
@@ -186,19 +240,42 @@ class _View:
 
     def detect(self, frames: Iterable[Frame], detector: MedianDetector) -> Iterator[tuple[Frame]]:
         """The detections of its pictures, which come for the second time."""
+        if self.is_short:
+            once = KnnDetector(max_pixels=detector.max_pixels, stabilise=detector.stabilise)
+            yield from once.detect(map(_in_grey, frames), Steadiness())
+            return
         separator = Separator(self.person, detector.least_visible) if self.person else None
         block = 0
-        for frame, to_reference in zip(frames, self.to_reference, strict=True):
+        for number, (frame, to_reference) in enumerate(zip(frames, self.to_reference, strict=True)):
             image, halvings = _picture(frame, detector.max_pixels)
             while block + 1 < len(self._blocks) and frame.t_ns >= self._blocks[block + 1][0]:
                 block += 1
             boxes = np.empty((0, 4))
-            if self._blocks:
-                seen = self._blocks[block][1].mask(warp(image, to_reference), detector.remove_shadows)
-                mask = clear_border(seen, to_reference)
-                if np.count_nonzero(mask) <= MAX_FOREGROUND * mask.size:
-                    boxes = separator.boxes(mask) if separator else region_boxes(mask, self._person_px)
+            seen = self._blocks[block][1].mask(warp(image, to_reference), detector.remove_shadows)
+            mask = clear_border(seen, to_reference)
+            most = _MAX_FOREGROUND_LOST if number in self.lost else MAX_FOREGROUND
+            if np.count_nonzero(mask) <= most * mask.size:
+                boxes = separator.boxes(mask) if separator else region_boxes(mask, self._person_px)
             yield (Frame(frame.t_ns, frame.index, boxes_to_rows(unwarp_boxes(boxes, to_reference) * 2**halvings)),)
+
+
+def _in_grey(frame: Frame) -> Frame:
+    import cv2
+
+    return frame if frame.rows.ndim == 2 else frame._replace(rows=cv2.cvtColor(frame.rows, cv2.COLOR_BGR2GRAY))
+
+
+def _warn_of_short(views: Sequence[_View]) -> None:
+    """Warn of pictures in views that were too short."""
+    pictures = sum(len(view.to_reference) for view in views)
+    short = sum(len(view.to_reference) for view in views if view.is_short)
+    if short:
+        where = "all" if short == pictures else f"{short} of {pictures}"
+        warn(
+            f"{where} pictures are in views or blocks of less than {_MIN_SPAN_S} s or {_MIN_PICTURES} pictures: too few"
+            " for a median as the background; detections there are by the detector knn",
+            "few-pictures",
+        )
 
 
 def _with_views(frames: Iterable[Frame], views: Sequence[_View]) -> Iterator[tuple[_View, Iterator[Frame]]]:

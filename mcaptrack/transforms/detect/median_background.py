@@ -10,10 +10,11 @@ Letters: S samples, H, W height and width of pictures.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mcaptrack.geometry.arrays import Bools, Image
 
@@ -22,6 +23,9 @@ MAX_SAMPLES: Final = 48
 #: Differences of colour (0 to 255) that always count as noise, and the multiple of the standard deviation that does.
 MIN_THRESHOLD: Final = 22.0
 _DEVIATIONS: Final = 4.0
+#: Pictures are blurred where the usual noise counts for more than this multiple of the threshold, over so many pixels.
+_NOISY: Final = 1.5
+_BLUR_PX: Final = 5
 #: Standard deviation of normal noise in units of its median absolute deviation.
 _PER_MAD: Final = 1.4826
 #: A colour this far outside of the range of the surrounding still lies within.
@@ -39,6 +43,10 @@ _SHADOW_TINT: Final = 0.12
 #: Light that is brighter or darker by more than this share is compensated, on a grid of every so many pixels.
 _LIGHT: Final = 0.02
 _GRID: Final = 8
+
+
+#: Rows of pictures of which the median is taken together.
+_STRIP: Final = 32
 
 
 class Sampler:
@@ -70,7 +78,11 @@ def largest(image: Image) -> Image:
 def _middle(images: Sequence[Image]) -> Image:
     """The median of each pixel and channel; of an even number the upper one."""
     at = len(images) // 2
-    return np.asarray(np.partition(np.stack(images), at, axis=0)[at], np.uint8)
+    out = np.empty_like(images[0])
+    for row in range(0, len(out), _STRIP):  # in strips, because all pictures are copied twice
+        strip = np.stack([image[row : row + _STRIP] for image in images])
+        out[row : row + _STRIP] = np.partition(strip, at, axis=0)[at]
+    return out
 
 
 @dataclass(frozen=True)
@@ -87,6 +99,8 @@ class Background:
         The range of its colours around each pixel.
     is_grey : bool
         Whether it has no colours, so that shadows can't be told by them.
+    is_blurred : bool
+        Whether it is one of blurred pictures, because there is much noise.
 
     """
 
@@ -95,18 +109,19 @@ class Background:
     lowest: Image
     highest: Image
     is_grey: bool
+    is_blurred: bool = False
 
     @classmethod
     def of(cls, samples: Sequence[Image], threshold: float | None = None) -> Background:
         """The background of pictures (H, W, 3), with the differences that count as noise everywhere at least."""
-        import cv2
-
-        median = _middle(samples)
-        deviation = _middle([largest(np.asarray(cv2.absdiff(image, median), np.uint8)) for image in samples])
         least = MIN_THRESHOLD if threshold is None else threshold
-        noise = np.clip(np.maximum(least, _DEVIATIONS * _PER_MAD * deviation.astype(np.float32)), 0, 255)
+        median, noise = _median_and_noise(samples)
+        is_blurred = bool(np.median(noise) > _NOISY * least)
+        if is_blurred:
+            median, noise = _median_and_noise([_blurred(image) for image in samples])
         lowest, highest = _range(median, 1)
-        return cls(median, noise.astype(np.uint8), lowest, highest, not np.ptp(median, axis=-1).any())
+        limit = np.clip(np.maximum(least, noise), 0, 255).astype(np.uint8)
+        return cls(median, limit, lowest, highest, not np.ptp(median, axis=-1).any(), is_blurred)
 
     def swaying(self, samples: Sequence[Image], person_px: float) -> Background:
         """The same, with a wider range at places that sway in ``samples``.
@@ -121,26 +136,25 @@ class Background:
         for image in samples:
             mask = self.mask(image, shadows=True) > 0
             differs += mask
-            is_near += mask & (_outside(image, lowest, highest) <= _SWAY_MARGIN)
+            seen = _blurred(image) if self.is_blurred else image
+            is_near += mask & (_outside(seen, lowest, highest) <= _SWAY_MARGIN)
         cell = round(_SWAY_CELL * person_px) | 1
         total = np.asarray(cv2.boxFilter(differs, -1, (cell, cell)), np.float32)
         near = np.asarray(cv2.boxFilter(is_near, -1, (cell, cell)), np.float32)
         sways = (near > _SWAY_SHARE * total) & (total > _SWAY_LEAST)
         half = cell // 2 | 1
         wide: Bools = np.asarray(cv2.dilate(sways.astype(np.uint8), np.ones((half, half), np.uint8))) > 0
-        return Background(
-            self.median,
-            self.threshold,
-            np.where(wide[..., None], lowest, self.lowest),
-            np.where(wide[..., None], highest, self.highest),
-            self.is_grey,
+        return replace(
+            self,
+            lowest=np.where(wide[..., None], lowest, self.lowest),
+            highest=np.where(wide[..., None], highest, self.highest),
         )
 
     def mask(self, image: Image, shadows: bool) -> Image:
         """255 where ``image`` (H, W, 3) differs; not where it only lies in the shade, if ``shadows`` are removed."""
         import cv2
 
-        image = self._same_light(image)
+        image = self._same_light(_blurred(image) if self.is_blurred else image)
         difference = _outside(image, self.lowest, self.highest)
         mask = np.asarray(cv2.compare(difference, self.threshold, cv2.CMP_GT), np.uint8)
         if shadows and not self.is_grey:
@@ -160,6 +174,21 @@ class Background:
         seen, known = image[::_GRID, ::_GRID], self.median[::_GRID, ::_GRID]
         factor = float(np.median((known.astype(np.float32) + 1) / (seen.astype(np.float32) + 1)))
         return image if abs(factor - 1) < _LIGHT else np.asarray(cv2.convertScaleAbs(image, alpha=factor), np.uint8)
+
+
+def _median_and_noise(samples: Sequence[Image]) -> tuple[Image, NDArray[np.float32]]:
+    """The median of pictures (H, W, 3), and how far a pixel's noise takes it from there, (H, W)."""
+    import cv2
+
+    median = _middle(samples)
+    deviation = _middle([largest(np.asarray(cv2.absdiff(image, median), np.uint8)) for image in samples])
+    return median, np.float32(_DEVIATIONS * _PER_MAD) * deviation.astype(np.float32)
+
+
+def _blurred(image: Image) -> Image:
+    import cv2
+
+    return np.asarray(cv2.GaussianBlur(image, (_BLUR_PX, _BLUR_PX), 0), np.uint8)
 
 
 def _range(image: Image, radius: int) -> tuple[Image, Image]:

@@ -71,24 +71,35 @@ def odd(value: float) -> int:
     return max(1, round(value) // 2 * 2 + 1)
 
 
+def closed(mask: Image, height: int, width: int) -> Image:
+    """Close gaps of a mask that are smaller than this, both odd; what lies near an edge is not stretched up to it."""
+    import cv2
+
+    y, x = height // 2, width // 2
+    padded = cv2.copyMakeBorder(mask, y, y, x, x, cv2.BORDER_CONSTANT, value=0)
+    kernel = np.ones((height, width), np.uint8)
+    # Dilation may reach into the padding, and erosion reads twice as far: there, what it can't see must be empty.
+    wide = cv2.dilate(padded, kernel)
+    return np.asarray(cv2.erode(wide, kernel, borderType=cv2.BORDER_CONSTANT, borderValue=0), np.uint8)[
+        y : y + mask.shape[0], x : x + mask.shape[1]
+    ]
+
+
 def regions(mask: Image, join_px: int) -> tuple[NDArray[np.int32], Ints]:
     """Labels of connected regions, and their x, y, w, h and area (N, 5); label k is row k - 1."""
     import cv2
 
     if join_px > 1:
-        mask = np.asarray(cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((join_px, 1), np.uint8)), np.uint8)
+        mask = closed(mask, join_px, 1)
     _, labels, found, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
     return np.asarray(labels, np.int32), np.asarray(found[1:], np.int64)
 
 
 def typical_height(masks: Sequence[Image]) -> float:
     """The height of regions of masks, in pixels: the median weighted by their area."""
-    import cv2
-
     sizes: list[tuple[int, int]] = []
     for mask in masks:
-        closed = np.asarray(cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8)), np.uint8)
-        _, found = regions(closed, 1)
+        _, found = regions(closed(mask, 3, 3), 1)
         large = found[(found[:, 4] >= MIN_AREA_PX) & (found[:, 3] < mask.shape[0] / 2)]
         sizes += zip(large[:, 3].tolist(), (large[:, 2] * large[:, 3]).tolist(), strict=True)
     if not sizes:
