@@ -169,7 +169,9 @@ class TestResults:
         assert told[-1] == ("track", 30, 30)
         assert capfd.readouterr() == ("", "")
         assert result.written_to == Path("b.mcap")
-        assert result.tracks["/camera/tracks"] == len(np.unique(mcaptrack.open("b.mcap").array("tracks")["track_id"]))
+        assert result.tracks["/camera/tracks"] == len(
+            np.unique(mcaptrack.open("b.mcap").array("tracks", "/camera/tracks")["track_id"])
+        )
 
     def test_notes_are_logged_and_in_the_result(self, place, caplog):
         done("drop", "log.mcap", "/camera/tracks")

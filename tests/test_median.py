@@ -183,7 +183,7 @@ def test_grey_pictures_are_taken_too_and_shadows_stay_there():
 def test_a_log_that_knn_made_keeps_knn(fresh):
     mcaptrack.detect(fresh, detector="knn")
     with log.read(fresh) as opened:
-        first, *_ = pipeline.plan_all(opened, "/camera", anew=True)
+        first, *_ = pipeline.plan_all(opened, "/camera", force=True)
         assert type(first.transform) is KnnDetector
         first, *_ = pipeline.plan_all(opened, "/camera")
         assert first.stage == "track"

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import islice
 from math import inf
 from types import MappingProxyType
@@ -197,7 +197,7 @@ class _View:
     _start_ns: int | None = None
     _last_ns: int = 0
     #: Backgrounds, and when each begins to hold.
-    _blocks: list[tuple[int, Background]] = field(default_factory=list)
+    _blocks: deque[tuple[int, Background]] = field(default_factory=deque)
 
     @property
     def is_short(self) -> bool:
@@ -230,7 +230,7 @@ class _View:
         background = background.swaying(samples, person_px)
         self._learner.add([background.mask(image, detector.remove_shadows) for image in samples], person_px)
         self._person_px = person_px
-        self._blocks.append((start_ns, background))
+        self._blocks.append((start_ns, replace(background)))  # a copy without the ranges that were computed
 
     def close(self, detector: MedianDetector) -> None:
         """No more pictures come: forget the samples."""
@@ -245,13 +245,12 @@ class _View:
             yield from once.detect(map(_in_grey, frames), Steadiness())
             return
         separator = Separator(self.person, detector.least_visible) if self.person else None
-        block = 0
         for number, (frame, to_reference) in enumerate(zip(frames, self.to_reference, strict=True)):
             image, halvings = _picture(frame, detector.max_pixels)
-            while block + 1 < len(self._blocks) and frame.t_ns >= self._blocks[block + 1][0]:
-                block += 1
+            while len(self._blocks) > 1 and frame.t_ns >= self._blocks[1][0]:
+                self._blocks.popleft()  # no more pictures of this one come
             boxes = np.empty((0, 4))
-            seen = self._blocks[block][1].mask(warp(image, to_reference), detector.remove_shadows)
+            seen = self._blocks[0][1].mask(warp(image, to_reference), detector.remove_shadows)
             mask = clear_border(seen, to_reference)
             most = _MAX_FOREGROUND_LOST if number in self.lost else MAX_FOREGROUND
             if np.count_nonzero(mask) <= most * mask.size:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Final
 
 import numpy as np
@@ -95,21 +96,43 @@ class Background:
         Its colours: blue, green, red.
     threshold : (H, W) uint8
         The largest difference that is noise.
-    lowest, highest : (H, W, 3) uint8
-        The range of its colours around each pixel.
     is_grey : bool
         Whether it has no colours, so that shadows can't be told by them.
     is_blurred : bool
         Whether it is one of blurred pictures, because there is much noise.
+    sways : (H, W) bool, optional
+        Where it sways, and over which distance ``sway_px``.
+    lowest, highest : (H, W, 3) uint8
+        The range of its colours around each pixel. They are computed when they are needed first, because a long
+        recording has many backgrounds, and needs one at a time.
 
     """
 
     median: Image
     threshold: Image
-    lowest: Image
-    highest: Image
     is_grey: bool
     is_blurred: bool = False
+    sways: Bools | None = None
+    sway_px: int = 0
+
+    @cached_property
+    def _limits(self) -> tuple[Image, Image]:
+        near = _range(self.median, 1)
+        if self.sways is None:
+            return near
+        lowest, highest = (
+            np.where(self.sways[..., None], far, close)
+            for far, close in zip(_range(self.median, self.sway_px), near, strict=True)
+        )
+        return lowest, highest
+
+    @property
+    def lowest(self) -> Image:
+        return self._limits[0]
+
+    @property
+    def highest(self) -> Image:
+        return self._limits[1]
 
     @classmethod
     def of(cls, samples: Sequence[Image], threshold: float | None = None) -> Background:
@@ -119,9 +142,8 @@ class Background:
         is_blurred = bool(np.median(noise) > _NOISY * least)
         if is_blurred:
             median, noise = _median_and_noise([_blurred(image) for image in samples])
-        lowest, highest = _range(median, 1)
         limit = np.clip(np.maximum(least, noise), 0, 255).astype(np.uint8)
-        return cls(median, limit, lowest, highest, not np.ptp(median, axis=-1).any(), is_blurred)
+        return cls(median, limit, not np.ptp(median, axis=-1).any(), is_blurred)
 
     def swaying(self, samples: Sequence[Image], person_px: float) -> Background:
         """The same, with a wider range at places that sway in ``samples``.
@@ -130,7 +152,8 @@ class Background:
         """
         import cv2
 
-        lowest, highest = _range(self.median, max(2, round(_SWAY_RADIUS * person_px)))
+        sway_px = max(2, round(_SWAY_RADIUS * person_px))
+        lowest, highest = _range(self.median, sway_px)
         differs = np.zeros(self.threshold.shape, np.float32)
         is_near = differs.copy()
         for image in samples:
@@ -144,11 +167,7 @@ class Background:
         sways = (near > _SWAY_SHARE * total) & (total > _SWAY_LEAST)
         half = cell // 2 | 1
         wide: Bools = np.asarray(cv2.dilate(sways.astype(np.uint8), np.ones((half, half), np.uint8))) > 0
-        return replace(
-            self,
-            lowest=np.where(wide[..., None], lowest, self.lowest),
-            highest=np.where(wide[..., None], highest, self.highest),
-        )
+        return replace(self, sways=wide, sway_px=sway_px)
 
     def mask(self, image: Image, shadows: bool) -> Image:
         """255 where ``image`` (H, W, 3) differs; not where it only lies in the shade, if ``shadows`` are removed."""
