@@ -41,6 +41,8 @@ from mcaptrack.transforms.protocol import Colour, check_options, option
 #: A shorter view, or one of fewer pictures, has no background of its own: people hardly move in that time.
 _MIN_SPAN_S: Final = 1.8
 _MIN_PICTURES: Final = 10
+#: Smaller pictures are registered at their full size.
+_MIN_HALVED_PX: Final = 320 * 240
 #: The same as ``MAX_FOREGROUND``, where the picture could not be registered.
 _MAX_FOREGROUND_LOST: Final = 0.2
 
@@ -171,13 +173,15 @@ def _picture(frame: Frame, max_pixels: int) -> tuple[Image, int]:
 
 
 def _register(camera: CameraMotion, image: Image) -> tuple[Floats, bool]:
-    """The similarity (2, 3) to the reference picture, estimated from brightness at half the size."""
+    """The similarity (2, 3) to the reference picture, from brightness at half the size, if that is not too small."""
     import cv2
 
     height, width = image.shape[:2]
-    half = cv2.resize(image, (max(width // 2, 1), max(height // 2, 1)), interpolation=cv2.INTER_AREA)
-    to_reference, is_new = camera.estimate(np.asarray(cv2.cvtColor(half, cv2.COLOR_BGR2GRAY), np.uint8))
-    if to_reference is not IDENTITY:
+    is_halved = height * width >= _MIN_HALVED_PX
+    if is_halved:
+        image = np.asarray(cv2.resize(image, (width // 2, height // 2), interpolation=cv2.INTER_AREA), np.uint8)
+    to_reference, is_new = camera.estimate(np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8))
+    if is_halved and to_reference is not IDENTITY:
         to_reference = to_reference * np.array([1.0, 1.0, 2.0])
     return to_reference, is_new
 
