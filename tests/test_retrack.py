@@ -8,6 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.histories import Holt
 from mcaptrack.predictors import Forecast
 from mcaptrack.transforms import PROFILES, RetrackByConsistency
@@ -299,6 +300,16 @@ class TestBranches:
         _, _, predictions = run(replace(profile, horizon_s=horizon_s, predictor="cv"), frames)
         assert predictions[-1].rows["step"].tolist() == list(range(1, steps + 1))
         assert predictions[-1].rows["ahead_s"].max() == pytest.approx(0.4 * steps)
+
+    @pytest.mark.parametrize("distance", ["mean", "max", "first"])
+    def test_predictions_of_one_step_are_refused_where_two_predictions_of_one_time_are_compared(self, distance):
+        frames = walk(lambda n: {7: (0.5 * n, 0.0)}, 12)
+        with pytest.raises(McaptrackError, match=r"horizon_s 0\.4 is one step at 2\.5 Hz.*takes 0\.8 s at least"):
+            run(replace(PAPER, distance=distance, horizon_s=0.4), frames)
+        two = run(replace(PAPER, distance=distance, horizon_s=0.8), frames)[0]
+        assert [ids(frame) for frame in two] == [[1]] * 12
+        one = run(replace(PAPER, distance="now", horizon_s=0.4), frames)[0]
+        assert [ids(frame) for frame in one] == [[1]] * 12
 
     def test_online_rows_are_at_the_measured_positions(self):
         frames = walk(lambda n: {7: (0.5 * n, np.sin(n))}, 20)

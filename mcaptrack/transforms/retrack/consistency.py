@@ -13,6 +13,7 @@ from typing import Final
 
 import numpy as np
 
+from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Bools, Floats, Indices, Ints
 from mcaptrack.geometry.assignment import assign
 from mcaptrack.geometry.clocks import NS_PER_S
@@ -35,6 +36,12 @@ class ConsistencyPass:
 
     def __init__(self, options: ConsistencyOptions) -> None:
         horizon = max(1, round(options.horizon_s * options.rate_hz))
+        if horizon == 1 and options.distance != "now":
+            raise McaptrackError(
+                f"horizon_s {options.horizon_s:g} is one step at {options.rate_hz:g} Hz; the distance "
+                f'"{options.distance}" compares predictions of one time made at different steps, which takes '
+                f'{2 / options.rate_hz:g} s at least; the distance "now" needs one step'
+            )
         self._options = options
         self._predictor: Predictor = make(options.predictor, horizon, 1 / options.rate_hz)
         self._holt = Holt(options.alpha, options.beta)
