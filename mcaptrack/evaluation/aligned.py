@@ -102,7 +102,7 @@ def explain_no_match(
     else:
         alike = make_matchup(ground_truth, tracks, "metres", _FAR_M)
         spans = [np.concatenate([on_ground(f.rows) for f in frames]) for frames in both.values()]
-        sizes = [float(np.nanmedian(np.abs(xy - np.nanmedian(xy, axis=0)))) for xy in spans]
+        sizes = [float(np.nanmedian(np.hypot(*(xy - np.nanmedian(xy, axis=0)).T))) for xy in spans]
         what, unit = "positions", "m from their middle"
     if len(alike.pairs.frame):
         return []
