@@ -121,6 +121,13 @@ class Scene:
         bag1(self.path, 3, 10)
         return self.says("info", "LOG")
 
+    def with_other_weights(self) -> str:
+        """Damage the fetched file of a model."""
+        path = mcaptrack.models()[0].path
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(b"damaged")
+        return self.says("detect", "LOG", "--detector", "yolox-nano")
+
     def to_train_on(self) -> str:
         with pytest.raises(McaptrackError) as refused:
             read_scenes([self.path], SourceOptions(), 0.4)
@@ -148,6 +155,7 @@ SCENES: dict[str, Callable[[Scene], str]] = {
     "log/journal_check.py:recover_command:recover": Scene.damaged,
     "log/snapshot.py:reporting_bad_times:drop": Scene.late,
     "log/recording_files.py:refuse_non_mcap:ingest": Scene.bag,
+    "transforms/detect/onnx/catalogue.py:check:get_model": Scene.with_other_weights,
     "transforms/detect/onnx/catalogue.py:stored:get_model": lambda s: s.says(
         "detect", "LOG", "--detector", "yolox-nano"
     ),
