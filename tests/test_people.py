@@ -231,17 +231,17 @@ class TestSeparating:
         ],
     )
     def test_a_region_of_one_person_is_a_box_if_enough_of_it_is_seen(self, box, there):
-        found = Separator(PERSON, 0.5).boxes(drawn((100, 100), box))
+        found = Separator(PERSON, 0.5).boxes(drawn((100, 100), box))[0]
         assert found.tolist() == [[*map(float, box)]] * there
 
     def test_nothing_has_no_boxes(self):
-        assert Separator(PERSON, 0.5).boxes(drawn((100, 100))).shape == (0, 4)
+        assert Separator(PERSON, 0.5).boxes(drawn((100, 100)))[0].shape == (0, 4)
 
     @pytest.mark.parametrize("count", [2, 3])
     def test_people_side_by_side_get_a_box_each(self, count):
         mask = drawn((100, 140), *((30 + 9 * n, 40, 8, 24) for n in range(count)))
         mask[50:54, 30 : 30 + 9 * count - 1] = 255  # they hold hands
-        found = Separator(PERSON, 0.5).boxes(mask)
+        found = Separator(PERSON, 0.5).boxes(mask)[0]
         found = found[np.argsort(found[:, 0])]
         np.testing.assert_allclose(found, [(30 + 9 * n, 40, 8, 24) for n in range(count)], atol=1.01)
 
@@ -249,7 +249,7 @@ class TestSeparating:
     def test_places_are_looked_for_again_when_another_person_is_added(self, apart):
         """They overlap, so that the first two places alone explain the mask differently."""
         mask = drawn((100, 140), *((30 + apart * n, 40, 8, 24) for n in range(3)))
-        found = Separator(PERSON, 0.5).boxes(mask)
+        found = Separator(PERSON, 0.5).boxes(mask)[0]
         seen = [(30, 40, 8, 24), (30 + apart, 40, apart, 24), (30 + 2 * apart, 40, 8, 24)]  # of the middle one
         np.testing.assert_allclose(found[np.argsort(found[:, 0])], seen, atol=0.01)
 
@@ -259,7 +259,7 @@ class TestSeparating:
         mask = drawn((100, 140), (30, 40, 8, 24), (39, 40, 8, 24))
         mask[50:54, 30:47] = 255
         mask[:, : 30 + hidden] = 0
-        found = Separator(PERSON, 0.5).boxes(mask)
+        found = Separator(PERSON, 0.5).boxes(mask)[0]
         wanted = [(30 + hidden, 40, 8 - hidden / 2, 24), (39, 40, 8, 24)]
         np.testing.assert_allclose(found[np.argsort(found[:, 0])], wanted, atol=0.01)
 
@@ -267,7 +267,30 @@ class TestSeparating:
     def test_a_region_has_two_percent_of_the_squared_height(self, wide, there):
         """Of a person of 60 pixels 72; at the edge of the picture nothing else is asked."""
         tall = Person(0.0, 60.0, template())
-        assert len(Separator(tall, 0.5).boxes(drawn((200, 200), (0, 80, wide, 8)))) == there
+        assert len(Separator(tall, 0.5).boxes(drawn((200, 200), (0, 80, wide, 8)))[0]) == there
+
+    @pytest.mark.parametrize("count", [1, 2, 3, 4])
+    def test_a_box_around_several_people_carries_how_many_they_are(self, count):
+        separator = Separator(PERSON, 0.5)
+        mask = drawn((100, 140), *((30 + 9 * n, 40, 8, 24) for n in range(count)), (110, 60, 8, 24))
+        mask[50:54, 30 : 30 + 9 * count - 1] = 255
+        assert separator.boxes(mask)[1].tolist() == [1] * (count + 1)
+        whole = np.array([(110, 60, 8, 24), (30, 40, 9 * count - 1, 24)], float)
+        assert separator.counts(mask, whole).tolist() == [1, count]
+
+    def test_who_is_hidden_too_much_for_a_box_is_counted_in_the_one_before(self):
+        """Three of the eight columns of one behind another can be seen; a third person stands apart, holding their hands."""
+        mask = drawn((100, 140), (30, 40, 8, 24), (33, 40, 8, 24), (50, 40, 8, 24))
+        mask[50:54, 30:58] = 255
+        boxes, people = Separator(PERSON, 0.75).boxes(mask)
+        assert people[np.argsort(boxes[:, 0])].tolist() == [2, 1]
+        assert Separator(PERSON, 0.3).boxes(mask)[1].tolist() == [1, 1, 1]
+
+    def test_the_people_in_what_does_not_look_like_people_are_unknown(self):
+        mask = drawn((100, 140), (20, 40, 90, 7))
+        boxes, people = Separator(PERSON, 0.5).boxes(mask)
+        assert (boxes.tolist(), people.tolist()) == ([[20, 40, 90, 7]], [0])
+        assert Separator(PERSON, 0.5).counts(mask, boxes).tolist() == [0]
 
     def test_a_place_gains_what_its_pixels_say(self):
         """The log-likelihood of a person at each place, summed pixel by pixel."""

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack.geometry.affine import IDENTITY, move_boxes
-from mcaptrack.geometry.arrays import Floats, Image
+from mcaptrack.geometry.arrays import Floats, Image, Ints
 from mcaptrack.geometry.clocks import FrameClock
 from mcaptrack.schema import DETECTIONS, VIDEO, Frame, Schema
 from mcaptrack.transforms.detect.camera_motion import CameraMotion
@@ -232,8 +232,12 @@ def unwarp_boxes(boxes: Floats, to_reference: Floats) -> Floats:
     return move_boxes(np.asarray(cv2.invertAffineTransform(to_reference), np.float64), boxes)
 
 
-def boxes_to_rows(boxes: Floats) -> NDArray[np.void]:
-    """Rows of boxes (N, 4), sorted from top to bottom, then from left to right."""
-    boxes = boxes[np.lexsort((boxes[:, 0], boxes[:, 1]))]
-    x, y, w, h = boxes.T
-    return DETECTIONS.rows(x_px=x, y_px=y, w_px=w, h_px=h, class_id=np.full(len(boxes), _PERSON_CLASS))
+def boxes_to_rows(boxes: Floats, people: Ints | None = None) -> NDArray[np.void]:
+    """Rows of boxes (N, 4), sorted from top to bottom, then from left to right.
+
+    ``people`` (N,) is how many each holds, if that was counted.
+    """
+    order = np.lexsort((boxes[:, 0], boxes[:, 1]))
+    x, y, w, h = boxes[order].T
+    count = np.zeros(len(boxes), np.int64) if people is None else people[order]
+    return DETECTIONS.rows(x_px=x, y_px=y, w_px=w, h_px=h, class_id=np.full(len(boxes), _PERSON_CLASS), people=count)

@@ -239,7 +239,7 @@ class _View:
     def close(self, detector: MedianDetector) -> None:
         """No more pictures come: forget the samples."""
         self._finish_block(detector)
-        self.person = self._learner.person() if detector.separate else None
+        self.person = self._learner.person()
         self._sampler, self._learner = Sampler(), Learner()
 
     def detect(self, frames: Iterable[Frame], detector: MedianDetector) -> Iterator[tuple[Frame]]:
@@ -253,13 +253,18 @@ class _View:
             image, halvings = _picture(frame, detector.max_pixels)
             while len(self._blocks) > 1 and frame.t_ns >= self._blocks[1][0]:
                 self._blocks.popleft()  # no more pictures of this one come
-            boxes = np.empty((0, 4))
+            boxes, people = np.empty((0, 4)), None
             seen = self._blocks[0][1].mask(warp(image, to_reference), detector.remove_shadows)
             mask = clear_border(seen, to_reference)
             most = _MAX_FOREGROUND_LOST if number in self.lost else MAX_FOREGROUND
             if np.count_nonzero(mask) <= most * mask.size:
-                boxes = separator.boxes(mask) if separator else region_boxes(mask, self._person_px)
-            yield (Frame(frame.t_ns, frame.index, boxes_to_rows(unwarp_boxes(boxes, to_reference) * 2**halvings)),)
+                if separator and detector.separate:
+                    boxes, people = separator.boxes(mask)
+                else:
+                    boxes = region_boxes(mask, self._person_px)
+                    people = separator.counts(mask, boxes) if separator else None
+            rows = boxes_to_rows(unwarp_boxes(boxes, to_reference) * 2**halvings, people)
+            yield (Frame(frame.t_ns, frame.index, rows),)
 
 
 def _in_grey(frame: Frame) -> Frame:

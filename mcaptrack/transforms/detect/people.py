@@ -1,7 +1,8 @@
 """Separate people within the regions of a foreground mask, by the height and shape that people have in the scene.
 
 A region that is taller or wider than one person is explained by as few people as raise the likelihood of its mask
-enough: greedily, each place being looked for again when another person is added.
+enough: greedily, each place being looked for again when another person is added. People of whom too little is seen for
+a box of their own are counted in the box of the person who hides them.
 
 Letters: N boxes (x, y, w, h).
 """
@@ -9,7 +10,7 @@ Letters: N boxes (x, y, w, h).
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -30,10 +31,17 @@ _MAX_PROBABILITY: Final = 0.97
 #: People explain a region if their shapes overlap with it by at least this share of both.
 _EXPLAINED: Final = 0.5
 _ROUNDS: Final = 3
+#: The share of a person, in log-likelihood, that must be seen to be counted.
+_COUNTED: Final = 0.3
+
+#: x, y, w, h of a box, and the number of people in it; 0 if unknown.
+_Counted = tuple[float, float, float, float, int]
+#: Column and row of the feet of a person in a crop.
+_Place = tuple[int, int]
 
 
 class Separator:
-    """Boxes of people in masks.
+    """Boxes of people in masks, and how many people each holds.
 
     ``least_visible`` is the share of a person, in log-likelihood, that must be seen for a box of their own.
     """
@@ -45,65 +53,90 @@ class Separator:
         # Log-likelihood that a person adds: at pixels of the foreground, and at those of the background.
         self._hit = np.log((_CLUTTER + (1 - _CLUTTER) * shape) / _CLUTTER).astype(np.float32)
         self._miss = np.log1p(-shape).astype(np.float32)
-        self._least = least_visible * float((shape * self._hit + (1 - shape) * self._miss).sum())
+        whole = float((shape * self._hit + (1 - shape) * self._miss).sum())
+        self._least, self._counted = least_visible * whole, min(least_visible, _COUNTED) * whole
         wide = np.flatnonzero(shape.max(axis=0) > 0.35)
         self._half = (wide[-1] - wide[0] + 1) / 2 if len(wide) else self._columns / 4
         self._anchor = (self._columns // 2, ROWS - 1)
 
-    def boxes(self, mask: Image) -> Floats:
-        """Boxes (N, 4) of people in a mask."""
+    def boxes(self, mask: Image) -> tuple[Floats, Ints]:
+        """Boxes (N, 4) of people in a mask, and the number of people in each (N,); 0 if unknown."""
         import cv2
 
         height, width = mask.shape
         join_px = odd(JOIN * self._person.height(0.6 * height))
         x, y, w, h = cv2.boundingRect(mask)  # all that follows costs time for each pixel
         if not w:
-            return np.empty((0, 4))
+            return np.empty((0, 4)), np.empty(0, np.int64)
         labels, found = regions(np.ascontiguousarray(mask[y : y + h, x : x + w]), join_px)
         found += (x, y, 0, 0, 0)
         expected = np.array([self._person.height(foot) for foot in (found[:, 1] + found[:, 3]).tolist()])
         is_large = (found[:, 4] >= MIN_AREA_PX) & (found[:, 4] >= MIN_AREA * expected**2)
         numbers = np.flatnonzero(is_large)
-        boxes: list[tuple[float, float, float, float]] = []
+        boxes: list[_Counted] = []
         for members in _joined_parts(found[numbers], expected[numbers]):
             some = found[numbers[members]]
             x0, y0 = some[:, :2].min(axis=0).tolist()
             x1, y1 = (some[:, :2] + some[:, 2:4]).max(axis=0).tolist()
             tall, wide, high = self._person.height(y1), x1 - x0, y1 - y0
-            if len(members) == 1 and high <= _TALL * tall and wide <= 2 * _WIDE * self._half / ROWS * tall:
+            if len(members) == 1 and self._is_one(wide, high, tall):
                 is_cut = x0 <= 1 or y0 <= 1 or x1 >= width - 1 or y1 >= height - 1
                 if is_cut or some[0, 4] >= 3 * MIN_AREA * tall**2 or high >= 0.5 * tall:
-                    boxes.append((x0, y0, wide, high))
+                    boxes.append((x0, y0, wide, high, 1))
                 continue
             region = np.isin(labels[y0 - y : y1 - y, x0 - x : x1 - x], numbers[members] + 1) & (mask[y0:y1, x0:x1] > 0)
             boxes.extend(self._separate(region, x0, y0, (width, height)))
-        return np.array(boxes, np.float64).reshape(-1, 4)
+        out = np.array(boxes, np.float64).reshape(-1, 5)
+        return out[:, :4], out[:, 4].astype(np.int64)
 
-    def _separate(
-        self, region: Bools, x0: int, y0: int, size: tuple[int, int]
-    ) -> Iterator[tuple[float, float, float, float]]:
-        """Boxes of the people in a region of a picture of this size (width, height), at x0, y0."""
-        h, w = region.shape
+    def counts(self, mask: Image, boxes: Floats) -> Ints:
+        """How many people each box (N, 4) around a region of a mask holds, (N,); 0 if unknown."""
+        size = (mask.shape[1], mask.shape[0])
+        out = np.zeros(len(boxes), np.int64)
+        for at, (x, y, w, h) in enumerate(boxes.astype(np.int64).tolist()):
+            if self._is_one(w, h, self._person.height(y + h)):
+                out[at] = 1
+            elif (found := self._explained(mask[y : y + h, x : x + w] > 0, x, y, size)).is_by_people:
+                out[at] = len(found.people) + len(found.hidden)
+        return out
+
+    def _is_one(self, wide: float, high: float, tall: float) -> bool:
+        """Whether a region is no larger than a person of this height."""
+        return high <= _TALL * tall and wide <= 2 * _WIDE * self._half / ROWS * tall
+
+    def _explained(self, region: Bools, x0: int, y0: int, size: tuple[int, int]) -> _Explanation:
+        """The people who explain a region of a picture of this size (width, height), at x0, y0."""
+        h = region.shape[0]
         tall = self._person.height(y0 + h)
         scale = ROWS / self._person.height(y0 + h - max(h - tall, 0) / 4)
         crop = _Crop(region, scale, (self._columns // 2 + 1, ROWS // 2))
         ink = crop.ink
         unknown = crop.beyond(x0, y0, size)
         paper = self._filter(np.where(unknown, np.float32(0), 1 - ink), self._miss)
-        people = self._places(ink, paper)
-        if not people:
-            if (0.4 * tall <= h <= 1.5 * tall and w < tall) or h * w > 4 * self._half / ROWS * tall**2:
-                yield x0, y0, w, h
-            return
+        people, hidden = self._places(ink, paper)
         drawn = np.zeros((len(people), *ink.shape), np.float32)
         for layer, place in zip(drawn, people, strict=True):
             where, shape = self._patch(place, ink.shape)
             layer[where] = shape
-        cover = drawn.max(axis=0)
+        cover = drawn.max(axis=0, initial=0.0)
         both = np.count_nonzero((cover > 0.4) & (ink > 0.5))
-        if both < _EXPLAINED * np.count_nonzero((cover > 0.4) | (ink > 0.5)):  # nothing that people make
-            yield x0, y0, w, h
+        either = np.count_nonzero((cover > 0.4) | (ink > 0.5))
+        return _Explanation(crop, people, hidden, drawn, bool(people) and bool(both >= _EXPLAINED * either))
+
+    def _separate(self, region: Bools, x0: int, y0: int, size: tuple[int, int]) -> Iterator[_Counted]:
+        """Boxes of the people in a region of a picture of this size (width, height), at x0, y0."""
+        h, w = region.shape
+        tall = self._person.height(y0 + h)
+        crop, people, hidden, drawn, is_by_people = self._explained(region, x0, y0, size)
+        if not is_by_people:
+            is_plausible = (0.4 * tall <= h <= 1.5 * tall and w < tall) or h * w > 4 * self._half / ROWS * tall**2
+            if people or is_plausible:
+                yield x0, y0, w, h, 0
             return
+        ink, cover = crop.ink, drawn.max(axis=0)
+        count = np.ones(len(people), np.int64)
+        for place in hidden:
+            count[np.argmin(np.linalg.norm(np.subtract(people, place), axis=1))] += 1
         owner, is_ink = drawn.argmax(axis=0), (ink > 0.5) & (cover > 0.1)
         body = 0.3 * np.count_nonzero(self._shape > 0.5)
         for number, (column, row) in enumerate(people):
@@ -116,16 +149,16 @@ class Separator:
             c, d = crop.to_picture(right, row + 1)
             a, b, c, d = max(a + x0, 0), max(b + y0, 0), min(c + x0, size[0]), min(d + y0, size[1])
             if c > a and d > b:
-                yield a, b, c - a, d - b
+                yield a, b, c - a, d - b, int(count[number])
 
-    def _places(self, ink: Map, paper: Map) -> list[tuple[int, int]]:
-        """Column and row of the feet of the people who explain the ink."""
-        people: list[tuple[int, int]] = []
+    def _places(self, ink: Map, paper: Map) -> tuple[list[_Place], list[_Place]]:
+        """Column and row of the feet of the people who explain the ink, and of those who are counted only."""
+        people: list[_Place] = []
         most = int(np.ceil(ink.sum() / (0.4 * self._shape.sum()))) + 1
         while len(people) < most:
             place, gain = self._best(ink, paper, people)
             if gain < self._least:
-                break
+                return people, self._hidden(ink, paper, people, place, gain)
             people.append(place)
             for _ in range(_ROUNDS if len(people) > 1 else 0):
                 before = list(people)
@@ -138,17 +171,25 @@ class Separator:
                 for at, (column, row) in enumerate(people)
             ]
             if min(gains) < self._least:
-                people.pop(int(np.argmin(gains)))
-                break
-        return people
+                place = people.pop(int(np.argmin(gains)))
+                return people, [place] if min(gains) >= self._counted and people else []
+        return people, []
 
-    def _best(self, ink: Map, paper: Map, others: Sequence[tuple[int, int]]) -> tuple[tuple[int, int], float]:
+    def _hidden(self, ink: Map, paper: Map, people: Sequence[_Place], place: _Place, gain: float) -> list[_Place]:
+        """Places of people of whom too little is seen for a box; ``place`` is the likeliest, with its ``gain``."""
+        hidden: list[_Place] = []
+        while gain >= self._counted and len(hidden) < len(people):
+            hidden.append(place)
+            place, gain = self._best(ink, paper, [*people, *hidden])
+        return hidden
+
+    def _best(self, ink: Map, paper: Map, others: Sequence[_Place]) -> tuple[_Place, float]:
         """The best place of another person, and the log-likelihood that is gained."""
         gains = self._gains(ink, paper, others)
         row, column = divmod(int(gains.argmax()), gains.shape[1])
         return (column, row), float(gains[row, column])
 
-    def _gains(self, ink: Map, paper: Map, others: Sequence[tuple[int, int]]) -> Map:
+    def _gains(self, ink: Map, paper: Map, others: Sequence[_Place]) -> Map:
         """The log-likelihood that a person adds at each place, beside others."""
         left = ink.copy()
         for place in others:
@@ -163,7 +204,7 @@ class Separator:
             cv2.filter2D(image, -1, kernel, anchor=self._anchor, borderType=cv2.BORDER_CONSTANT), np.float32
         )
 
-    def _patch(self, place: tuple[int, int], size: tuple[int, ...]) -> tuple[tuple[slice, slice], Map]:
+    def _patch(self, place: _Place, size: tuple[int, ...]) -> tuple[tuple[slice, slice], Map]:
         """Where a person's shape lies in a crop, and the part of the shape that lies there."""
         x, y = place[0] - self._columns // 2, place[1] - ROWS + 1
         x0, x1, y0, y1 = max(x, 0), min(x + self._columns, size[1]), max(y, 0), min(y + ROWS, size[0])
@@ -198,6 +239,19 @@ class _Crop:
         y = y0 + (np.arange(rows) + 0.5 - self._margin[1]) / self._scale
         outside: Bools = ((y < 0) | (y > size[1]))[:, None] | ((x < 0) | (x > size[0]))
         return outside
+
+
+class _Explanation(NamedTuple):
+    """People who explain a region: those with boxes of their own, and those who are only counted.
+
+    ``drawn`` (people, rows, columns) are shapes in the crop. ``is_by_people``: whether the region looks like them.
+    """
+
+    crop: _Crop
+    people: list[_Place]
+    hidden: list[_Place]
+    drawn: Map
+    is_by_people: bool
 
 
 def _joined_parts(found: Ints, expected: Floats) -> list[Ints]:
