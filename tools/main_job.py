@@ -197,8 +197,9 @@ def extras(log: Path) -> None:
         done.append(f"onnx (ONNX Runtime {version('onnxruntime')})")
     if find_spec("optuna"):
         settings = log.with_name("best.toml")
-        mcaptrack_command("tune", log, "--trials", 3, "-o", settings, "--force")
-        assert "[track]" in settings.read_text()
+        (found,) = data("tune", log, "--trials", 3, "-o", settings)["results"]
+        assert settings.exists() == (found["best"] > 0), found  # the defaults may be the best
+        assert not settings.exists() or "[track]" in settings.read_text()
         done.append(f"tune (Optuna {version('optuna')})")
     print("extras:", ", ".join(done) or "none is installed")
 
