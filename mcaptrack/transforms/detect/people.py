@@ -1,7 +1,7 @@
 """Separate people within the regions of a foreground mask, by the height and shape that people have in the scene.
 
 A region that is taller or wider than one person is explained by as few people as raise the likelihood of its mask
-enough: greedily, each place being looked for again when another person is added. People of whom too little is seen for
+enough: greedily, each place being looked for again when another person is added. People with too little in sight for
 a box of their own are counted in the box of the person who hides them.
 
 Letters: N boxes (x, y, w, h).
@@ -90,7 +90,7 @@ class Separator:
         return out[:, :4], out[:, 4].astype(np.int64)
 
     def counts(self, mask: Image, boxes: Floats) -> Ints:
-        """How many people each box (N, 4) around a region of a mask holds, (N,); 0 if unknown."""
+        """Count the people in each box (N, 4) around a region of a mask, (N,); 0 if unknown."""
         size = (mask.shape[1], mask.shape[0])
         out = np.zeros(len(boxes), np.int64)
         for at, (x, y, w, h) in enumerate(boxes.astype(np.int64).tolist()):
@@ -176,7 +176,7 @@ class Separator:
         return people, []
 
     def _hidden(self, ink: Map, paper: Map, people: Sequence[_Place], place: _Place, gain: float) -> list[_Place]:
-        """Places of people of whom too little is seen for a box; ``place`` is the likeliest, with its ``gain``."""
+        """Places of people with too little in sight for a box; ``place`` is the likeliest, with its ``gain``."""
         hidden: list[_Place] = []
         while gain >= self._counted and len(hidden) < len(people):
             hidden.append(place)
