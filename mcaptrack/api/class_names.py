@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.schema.classes import PEOPLE, PERSON, UNKNOWN
+from mcaptrack.schema.classes import PERSON, UNKNOWN, is_person
 
 _LAST: Final = 2**32 - 1
 #: The longest name of a class.
@@ -38,13 +38,9 @@ def _checked_name(number: int, name: object) -> str:
         raise McaptrackError(
             f"the name of class {number} is printable text of at most {_LONGEST} characters, not {name!r:.60}"
         )
-    if number == PERSON and not _is_person(name):
+    if number == PERSON and not is_person(name):
         raise McaptrackError(f"class {PERSON} is a person; give {name!r:.60} another number")
     return str(name)
-
-
-def _is_person(name: str) -> bool:
-    return name.strip().casefold() in PEOPLE
 
 
 def numbers_of(classes: Any, given: Mapping[int, str]) -> Any:
@@ -56,7 +52,7 @@ def numbers_of(classes: Any, given: Mapping[int, str]) -> Any:
     known = {name: number for number, name in sorted(names.items(), reverse=True)}
     out = []
     for name in values.reshape(-1).tolist():
-        number = PERSON if isinstance(name, str) and _is_person(name) else known.get(name)
+        number = PERSON if isinstance(name, str) and is_person(name) else known.get(name)
         if number is None:
             there = ", ".join(list(known)[:8]) + (", ..." if len(known) > 8 else "")
             raise McaptrackError(f"`class_names=` has no class {name!r:.60}; it has {there or 'none'}")
@@ -76,14 +72,14 @@ def numbered_columns(columns: Mapping[str, Any]) -> tuple[dict[str, Any], dict[i
         return out, {}
     names = [name if isinstance(name, str) and name.strip() else "" for name in np.asarray(texts).tolist()]
     if _NUMBER not in out:
-        others = sorted({name for name in names if name and not _is_person(name)})
+        others = sorted({name for name in names if name and not is_person(name)})
         numbers = {name: number for number, name in enumerate(others, start=PERSON + 1)}
         ids = [numbers.get(name, PERSON if name else UNKNOWN) for name in names]
         out[_NUMBER] = np.array(ids, np.uint32)
     found: dict[int, str] = {}
     for number, name in sorted(set(zip(np.asarray(out[_NUMBER]).tolist(), names, strict=False)), key=repr):
         is_other = name and number in found and found[number] != name
-        if is_other and not (number == PERSON and _is_person(name)):
+        if is_other and not (number == PERSON and is_person(name)):
             raise McaptrackError(f"class {number} has two names in the table, {found[number]!r:.60} and {name!r:.60}")
         if name:
             found.setdefault(number, name)

@@ -249,12 +249,9 @@ def parse_size(size: str | tuple[int, int] | None) -> tuple[int, int] | None:
     if size is None:
         return None
     parts = size.lower().split("x") if isinstance(size, str) else [str(part) for part in size]
-    if len(parts) != 2 or not all(part.isascii() and part.isdigit() and 0 < len(part) < 7 for part in parts):
+    if len(parts) != 2 or not all(p.isascii() and p.isdigit() and len(p) < 7 and int(p) for p in parts):
         raise McaptrackError(f"`size=` is the width and height of pictures in pixels, like 1920x1080, not {size!r:.40}")
-    width, height = map(int, parts)
-    if not width or not height:
-        raise McaptrackError(f"`size=` is the width and height of pictures in pixels, like 1920x1080, not {size!r:.40}")
-    return width, height
+    return int(parts[0]), int(parts[1])
 
 
 def parse_start_time(time: float | str | dt.datetime | None) -> int | None:

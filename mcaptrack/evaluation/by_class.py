@@ -11,7 +11,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from mcaptrack.schema import Frame
-from mcaptrack.schema.classes import PEOPLE, PERSON, class_name
+from mcaptrack.schema.classes import PERSON, class_name, is_person
 
 _SHOWN: Final = 8
 
@@ -98,7 +98,7 @@ def _numbers(frames: Sequence[Frame]) -> list[int]:
 def _key(number: int, names: Mapping[int, str]) -> str | int:
     """The key of a class, the same in all channels: its name, or its number if it has none."""
     name = names.get(number, "").strip().casefold()
-    return "person" if number == PERSON or name in PEOPLE else name or number
+    return "person" if number == PERSON or is_person(name) else name or number
 
 
 def _renumbered(frames: Sequence[Frame], places: Mapping[int, int | None]) -> list[Frame]:

@@ -22,7 +22,7 @@ from mcaptrack.schema.classes import PEOPLE, PERSON
 from mcaptrack.schema.ground_plane import plane_to_rows, rows_to_plane
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources import foreign
-from mcaptrack.sources.cameras import camera_at, provenance_of
+from mcaptrack.sources.cameras import camera_at, lineage, provenance_of
 from mcaptrack.sources.pictures import Pictures
 
 _ASSUME, _ESTIMATE = "assume-ground-plane", "estimate-ground-plane"
@@ -132,12 +132,7 @@ def _why_not(opened: log.Log, prefix: str, source: str, made: Mapping[str, Made]
 
 def _chain(opened: log.Log, topic: str, made: Mapping[str, Made]) -> list[tuple[str, Provenance | None]]:
     """Return a channel, its input, the input of that and so on, each with its provenance, also of this run."""
-    chain: dict[str, Provenance | None] = {}
-    while topic and topic not in chain:
-        chain[topic] = made[topic].provenance if topic in made else provenance_of(opened, topic)
-        one = chain[topic]
-        topic = one.input if one else ""
-    return list(chain.items())
+    return list(lineage(opened, topic, {name: one.provenance for name, one in made.items()}))
 
 
 def _picture_size(opened: log.Log, prefix: str, source: str, made: Mapping[str, Made]) -> tuple[int, int] | None:

@@ -239,9 +239,9 @@ def _provenance_of(
     stage = STAGES[job.stage]
     entry = stage.entry(type(transform))
     choice = {stage.kind: entry.name} if stage.kind else {}
-    unrecorded = {f.name for f in fields(transform) if not f.metadata.get("is_recorded", True)}
-    plain = type(job.transform)() if unrecorded else transform
-    recorded = replace(transform, **{name: getattr(plain, name) for name in unrecorded}) if unrecorded else transform
+    large = [f for f in fields(transform) if not f.metadata.get("is_recorded", True)]
+    unrecorded: dict[str, Any] = {f.name: f.default_factory() for f in large if callable(f.default_factory)}
+    recorded = replace(transform, **unrecorded) if unrecorded else transform
     try:
         parameters = {name: value for name, value in asdict(recorded).items() if name not in unrecorded}
         parameters = json.loads(json.dumps(parameters | choice))

@@ -32,18 +32,18 @@ def pose_to_rows(pose: CameraPose, width_px: int, height_px: int) -> Rows:
 
 def frames_to_path(frames: Sequence[Frame]) -> CameraPath:
     """Decode a camera's path. Raises McaptrackError unless each frame has one row, and an invertible motion."""
-    poses = []
     for frame in frames:
         if len(frame.rows) != 1:
             raise McaptrackError(f"a camera motion message holds one row, not {len(frame.rows)}")
-        row = frame.rows[0]
+    rows = CAMERA_MOTION.joined([frame.rows for frame in frames])
+    poses = []
+    for row, is_elsewhere in zip(rows, _elsewhere(rows).tolist(), strict=True):
         motion, reference = (_matrix([float(row[name]) for name in names]) for names in (_MOTION, _REFERENCE))
         try:
             verdict = Verdict(int(row["verdict"]))
         except ValueError:
             verdict = Verdict.LOST
         number = int(row["reference_frame"])
-        is_elsewhere = bool(_elsewhere(frame.rows)[0])
         poses.append(CameraPose(motion, reference, number, float(row["inliers"]), verdict, is_elsewhere))
     return CameraPath(np.array([frame.t_ns for frame in frames], np.int64), poses)
 

@@ -20,7 +20,8 @@ from mcaptrack.schema import Frame, Rows, Schema
 from mcaptrack.schema.provenance import read_texts
 
 #: The class of what is not known, and of people.
-UNKNOWN, PERSON = 0, 1
+UNKNOWN: Final = 0
+PERSON: Final = 1
 #: Names of people, in lower case.
 PEOPLE: Final[tuple[str, ...]] = ("person", "pedestrian", "human")
 _COLUMN: Final = "class_id"
@@ -44,6 +45,11 @@ def class_names(metadata: Mapping[str, str]) -> dict[int, str]:
 def class_name(number: int, names: Mapping[int, str]) -> str:
     """The name of a class in texts: its own, or its number if it has none."""
     return names.get(number) or {UNKNOWN: "unknown", PERSON: "person"}.get(number, f"class {number}")
+
+
+def is_person(name: str) -> bool:
+    """Whether a class of this name is people."""
+    return name.strip().casefold() in PEOPLE
 
 
 def has_classes(schema: Schema) -> bool:
@@ -80,13 +86,19 @@ def with_only_class(schema: Schema, rows: Rows, metadata: Mapping[str, str]) -> 
     return rows
 
 
+def first_classes(track: Ints, class_id: NDArray[Any], count: int) -> Ints:
+    """The class of the first row of each of ``count`` tracks; ``track`` (N,) are their indices by row."""
+    out = np.zeros(count, np.int64)
+    out[track[::-1]] = class_id[::-1]
+    return out
+
+
 def majority(track: Ints, class_id: NDArray[Any], count: int) -> Ints:
     """The class of most rows of each of ``count`` tracks; of several, the one that comes first.
 
     ``track`` (N,) are indices of the tracks of rows, which are ordered by time within each track.
     """
-    out = np.zeros(count, np.int64)
-    out[track[::-1]] = class_id[::-1]  # the class of the first row
+    out = first_classes(track, class_id, count)
     if (class_id == out[track]).all():
         return out
     classes, which = np.unique(class_id, return_inverse=True)

@@ -17,7 +17,7 @@ from mcaptrack.schema.camera_motion import frames_to_path
 from mcaptrack.schema.framing import join_frames, split_rows
 from mcaptrack.schema.ground_plane import rows_to_plane
 from mcaptrack.schema.provenance import Provenance
-from mcaptrack.sources.cameras import camera_at, provenance_of
+from mcaptrack.sources.cameras import camera_at, lineage
 from mcaptrack.transforms import STAGES
 from mcaptrack.transforms.sort.tracker import used_path
 
@@ -47,16 +47,11 @@ def path_of(
     ``provenances`` and ``frames`` are those of channels that are not in the log yet, by topic. The digest is by topic.
     The path is None if the tracks are not compensated, or were made from an earlier motion.
     """
-    motion, seen = motion_topic(prefix), {""}
-    while topic not in seen:
-        seen.add(topic)
-        made = provenances.get(topic) or provenance_of(opened, topic)
-        if made is None:
-            break
-        if motion in made.references and "camera_motion" in made.parameters:
+    motion = motion_topic(prefix)
+    for _, made in lineage(opened, topic, provenances):
+        if made and motion in made.references and "camera_motion" in made.parameters:
             path = used_path(_read_path(opened, motion, frames), made.parameters["camera_motion"])
             return path, {} if path is None else {motion: made.references[motion]}
-        topic = made.input
     return None, {}
 
 

@@ -8,7 +8,7 @@ Recorded detections and labels belong to the pictures with the longest common pa
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from itertools import takewhile
 from typing import Final, NamedTuple
 from weakref import WeakKeyDictionary
@@ -130,6 +130,21 @@ def provenance_of(opened: log.Log, topic: str) -> Provenance | None:
     """Return how a channel was made; None if it is missing, or if mcaptrack did not make it."""
     channel = opened.channels.get(topic)
     return Provenance.from_metadata(channel.metadata) if channel else None
+
+
+def lineage(
+    opened: log.Log, topic: str, provenances: Mapping[str, Provenance] = {}
+) -> Iterator[tuple[str, Provenance | None]]:
+    """Yield a topic, its input, the input of that and so on, like ``chain_of``, each with its provenance.
+
+    ``provenances`` are those of channels that are not in the log yet, by topic.
+    """
+    seen: set[str] = set()
+    while topic and topic not in seen:
+        seen.add(topic)
+        made = provenances.get(topic) or provenance_of(opened, topic)
+        yield topic, made
+        topic = made.input if made else ""
 
 
 def is_made_by_stage(channel: log.Channel) -> bool:

@@ -24,12 +24,13 @@ from mcaptrack.geometry.boxes import iou
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.plane import GroundPlane, Point
 from mcaptrack.schema import Frame
+from mcaptrack.schema.classes import PERSON
 from mcaptrack.schema.framing import split_rows
 from mcaptrack.sources import ingest
 from mcaptrack.sources.ingest.bags.opening import is_mcap
 from mcaptrack.sources.ingest.job import IngestOptions, label_rows
 from mcaptrack.sources.ingest.label_job import LabelJob
-from mcaptrack.sources.ingest.labels.formats import KITTI_HEIGHT_PX, PERSON, IgnoredBoxes, Labels, Role
+from mcaptrack.sources.ingest.labels.formats import KITTI_HEIGHT_PX, IgnoredBoxes, Labels, Role
 from mcaptrack.sources.ingest.labels.reading import read_homography, read_labels
 
 #: Formats that give the frame number of each row.

@@ -9,10 +9,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from mcaptrack.geometry.arrays import Ints
 from mcaptrack.notices import warn
 from mcaptrack.schema import TRACKS, Frame, Rows
-from mcaptrack.schema.classes import majority
+from mcaptrack.schema.classes import first_classes, majority
 from mcaptrack.schema.framing import join_frames, split_rows
 
 
@@ -43,10 +42,3 @@ def vote(rows: Rows) -> tuple[int, int]:
     if changed.any():
         rows["class_id"] = majority(track, rows["class_id"], len(ids))[track]
     return len(np.unique(track[changed])), len(ids)
-
-
-def first_classes(track: Ints, class_id: Ints, count: int) -> Ints:
-    """The class of the first row of each of ``count`` tracks; ``track`` (N,) are their indices by row."""
-    out = np.zeros(count, np.int64)
-    out[track[::-1]] = class_id[::-1]
-    return out

@@ -10,8 +10,8 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from mcaptrack.schema import TRACKS, Frame
+from mcaptrack.schema.classes import first_classes
 from mcaptrack.schema.framing import join_frames, split_rows
-from mcaptrack.transforms.track_classes import first_classes
 
 
 def split_classes(frames: Sequence[Frame]) -> list[Sequence[Frame]]:

@@ -17,13 +17,12 @@ import numpy as np
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.notices import Code
-from mcaptrack.schema.classes import PEOPLE
+from mcaptrack.schema.classes import PEOPLE, PERSON, UNKNOWN
 from mcaptrack.sources.ingest.labels.formats import (
     MAX_FRAME,
     MAX_PLACE,
     MAX_SCORE,
     NO_ID,
-    PERSON,
     ClassIds,
     Format,
     IgnoredBoxes,
@@ -35,9 +34,8 @@ from mcaptrack.sources.ingest.labels.wanted import WantedClasses
 
 #: Formats of other detectors and annotation tools.
 OTHERS: Final[tuple[Format, ...]] = ("coco", "yolo", "supervision", "csv")
-#: A class that a row doesn't state, and the class id of classes that can't be told.
+#: A class that a row doesn't state.
 NO_CLASS: Final = -1
-_UNKNOWN: Final = 0
 _MAX_CLASS: Final = 2**31 - 1
 _NUMBERED: Final = re.compile(r"(.*?)([0-9]{1,18})(\D*)", re.DOTALL)
 #: What Roboflow appends to the names of pictures, a hash among it.
@@ -235,7 +233,7 @@ def fitted(path: Path, labels: Labels, size: tuple[int, int]) -> Labels:
 
 
 def _name(number: int, classes: Mapping[int, str]) -> str:
-    return classes.get(number, f"of class {number}" if number != _UNKNOWN else "of unknown class")
+    return classes.get(number, f"of class {number}" if number != UNKNOWN else "of unknown class")
 
 
 def class_ids(rows: BoxRows) -> tuple[ClassIds, dict[int, str]]:
@@ -278,8 +276,8 @@ def class_ids(rows: BoxRows) -> tuple[ClassIds, dict[int, str]]:
     if moved:
         shown = ", ".join(moved[:_SHOWN]) + (", ..." if len(moved) > _SHOWN else "")
         rows.remarks.append(f"{rows.path}: in class_id 1 is a person: {shown}")
-    ids = np.array([places.get(one, _UNKNOWN) for one in used], np.uint32)
-    out = np.full(len(number), _UNKNOWN, np.uint32)
+    ids = np.array([places.get(one, UNKNOWN) for one in used], np.uint32)
+    out = np.full(len(number), UNKNOWN, np.uint32)
     out[stated] = ids[np.searchsorted(used, number[stated])]
     return out, classes
 
@@ -291,7 +289,7 @@ def _unnamed(rows: BoxRows, number: Ints, stated: Bools) -> ClassIds:
     if begins_with_0:
         words += ", and class_id is one higher than the file's numbers"
     rows.doubts.append((words, "classes"))
-    return np.where(stated, number + begins_with_0, _UNKNOWN).astype(np.uint32)
+    return np.where(stated, number + begins_with_0, UNKNOWN).astype(np.uint32)
 
 
 class FrameNames:

@@ -17,10 +17,10 @@ import numpy as np
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Floats
-from mcaptrack.schema.classes import PEOPLE
+from mcaptrack.schema.classes import PEOPLE, PERSON
 from mcaptrack.sources.ingest.labels.box_rows import NO_CLASS, BoxRows, FrameNames
 from mcaptrack.sources.ingest.labels.columns import choose_columns
-from mcaptrack.sources.ingest.labels.formats import NO_ID, PERSON, ClassNames, Format, Labels, Role
+from mcaptrack.sources.ingest.labels.formats import NO_ID, ClassNames, Format, Labels, Role
 from mcaptrack.sources.ingest.labels.number_table import Lines, NumberTable, lines_of
 from mcaptrack.sources.ingest.labels.wanted import WantedClasses
 

@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.notices import Code
+from mcaptrack.schema.classes import PERSON
 from mcaptrack.sources.ingest.labels.number_table import Lines, NumberTable
 from mcaptrack.sources.ingest.labels.wanted import WantedClasses
 
@@ -37,7 +38,6 @@ Role = Literal["detections", "tracks", "truth"]
 ClassIds = NDArray[np.uint32]
 
 NO_ID: Final = -1
-PERSON: Final = 1
 #: Coordinates, in pixels or metres, and scores can't be larger.
 MAX_PLACE: Final = 1e8
 MAX_SCORE: Final = 1e9

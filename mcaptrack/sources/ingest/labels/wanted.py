@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Bools
-from mcaptrack.schema.classes import PEOPLE, PERSON
+from mcaptrack.schema.classes import PERSON, is_person
 
 _ALL: Final = "all"
 _SHOWN: Final = 10
@@ -27,7 +27,7 @@ class WantedClasses:
     @property
     def is_people(self) -> bool:
         """Whether people alone are wanted."""
-        return self.text.strip().casefold() in PEOPLE
+        return is_person(self.text)
 
     def mask(self, path: Path, class_id: NDArray[np.integer], names: Mapping[int, str]) -> Bools:
         """Mask the rows (N,) of wanted classes; ``names`` are those of the file by class id.
@@ -43,7 +43,7 @@ class WantedClasses:
         wanted: set[int] = set()
         for word in (word.strip() for word in self.text.split(",")):
             found = by_name.get(word.casefold(), set()) if word else set()
-            found = {PERSON} & {*there} if word.casefold() in PEOPLE else found
+            found = {PERSON} & {*there} if is_person(word) else found
             if not found and word.isascii() and word.isdecimal() and int(word[:12]) in there:
                 found = {int(word)}
             if not found:
