@@ -41,6 +41,7 @@ Code = Literal[
     "other-settings",
     "other-version",
     "out-of-date",
+    "transforms",
     "view-lost",
     "worse",
 ]

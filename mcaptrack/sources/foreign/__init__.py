@@ -40,6 +40,7 @@ __all__ = [
     "picture_decoder",
     "picture_reader",
     "pictures",
+    "stamp_of",
     "stamps",
 ]
 
@@ -178,7 +179,7 @@ def _compressed(message: Any) -> Picture:
     data = _bytes(message.data)
     if not data:
         raise ValueError("it holds no data")
-    return Picture(_stamp_of(message), _format(_text(message.format)), data)
+    return Picture(stamp_of(message), _format(_text(message.format)), data)
 
 
 def _format(words: str) -> str:
@@ -201,10 +202,10 @@ def _raw(message: Any) -> Picture:
             getattr(message, "is_bigendian", False)
         ),  # foxglove.RawImage has no such field: it is always little-endian
     )
-    return Picture(_stamp_of(message), _text(message.encoding).lower(), _bytes(message.data), layout)
+    return Picture(stamp_of(message), _text(message.encoding).lower(), _bytes(message.data), layout)
 
 
-def _stamp_of(message: Any) -> int:
+def stamp_of(message: Any) -> int:
     """The stamp of a message in nanoseconds: ``timestamp`` in Foxglove messages, ``header.stamp`` in ROS messages."""
     stamp = message.timestamp if hasattr(message, "timestamp") else message.header.stamp
     if isinstance(stamp, str):

@@ -1,0 +1,247 @@
+"""Frames of reference and how they move: a tree of transforms over time.
+
+A pose (R, p) of the frame ``source`` in the frame ``target`` maps points of the source to points of the target:
+x' = R x + p. Letters: N times or points.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from mcaptrack.geometry.arrays import Bools, Floats, Ints
+from mcaptrack.geometry.transform_series import Reason, Samples, TransformSeries, clean
+
+__all__ = ["Poses", "Reason", "Recorded", "Remark", "Samples", "TransformTree", "plain_frame"]
+
+
+def plain_frame(name: str) -> str:
+    """Return the name of a frame without the leading slash that ROS 1 allowed."""
+    return name.removeprefix("/")
+
+
+class Recorded(NamedTuple):
+    """The recorded poses of ``child`` in ``parent``; ``is_latched``: they hold until the next, as on /tf_static."""
+
+    parent: str
+    child: str
+    is_latched: bool
+    samples: Samples
+
+
+class Remark(NamedTuple):
+    """A contradiction, gap or jump among transforms, as a clause, and the frames that it concerns."""
+
+    text: str
+    frames: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Poses:
+    """Poses of a frame in another at N times.
+
+    ``rotation`` (N, 3, 3) and ``translation`` (N, 3), in metres, are NaN where the pose isn't known. ``reason`` (N,)
+    says why (``Reason``), and ``unknown`` in words, with the number of times.
+    """
+
+    rotation: Floats
+    translation: Floats
+    reason: Ints
+    unknown: Mapping[str, int]
+
+    @property
+    def is_known(self) -> Bools:
+        """Whether each pose is known, (N,)."""
+        return np.asarray(self.reason == Reason.KNOWN)
+
+    def apply(self, points: Floats) -> Floats:
+        """Return points of the source, one at each time (N, 3), in the target; NaN where the pose isn't known."""
+        turned: Floats = np.einsum("nij,nj->ni", self.rotation, points)
+        return turned + self.translation
+
+
+class TransformTree:
+    """Frames, each with the poses over time in its parent: several trees, if there are several roots.
+
+    Parameters
+    ----------
+    recorded : sequence of Recorded
+        All poses of a log. What contradicts other poses is left out, and said in ``remarks``: of several parents of a
+        frame those with fewer messages, and the transform that closes a loop.
+    on_log_time : bool
+        Whether the times of poses are those of the log instead of their stamps.
+
+    """
+
+    def __init__(self, recorded: Sequence[Recorded], *, on_log_time: bool = False) -> None:
+        self._recorded = recorded
+        self._remarks: list[Remark] = []
+        self.series: dict[str, TransformSeries] = {}
+        is_off = [not one.is_latched and one.samples.is_off_clock() for one in recorded]
+        is_timed = any(not one.is_latched and not off for one, off in zip(recorded, is_off, strict=True))
+        found: dict[str, list[TransformSeries]] = {}
+        for one, off in zip(recorded, is_off, strict=True):
+            parent, child = plain_frame(one.parent), plain_frame(one.child)
+            if not parent or not child or parent == child:
+                about = "itself" if parent and child else "a frame without a name"
+                self._remark(
+                    f"{_count(len(one.samples.stamp_ns))} of {child or parent!r} in {about} are left out", child
+                )
+                continue
+            is_moved = off and is_timed and bool(one.samples.stamp_ns.any())
+            series, clauses = clean(parent, child, one.samples, one.is_latched, on_log_time or is_moved)
+            if is_moved and not on_log_time:
+                clauses.insert(0, "its stamps are of another clock than the others', so that the log time is taken")
+            for clause in clauses:
+                self._remark(f"{parent} -> {child}: {clause}", child)
+            if series is not None:
+                found.setdefault(child, []).append(series)
+        for child, several in sorted(found.items()):
+            self.series[child] = self._chosen(child, several)
+        self._break_loops()
+
+    @property
+    def remarks(self) -> tuple[Remark, ...]:
+        """Contradictions, gaps and jumps among the transforms."""
+        return tuple(self._remarks)
+
+    @cached_property
+    def on_log_time(self) -> TransformTree:
+        """The same transforms with the log time in the place of stamps."""
+        return TransformTree(self._recorded, on_log_time=True)
+
+    @cached_property
+    def span_ns(self) -> tuple[int, int] | None:
+        """The first and last time of the frames that move; None if none does."""
+        moving = [series for series in self.series.values() if not series.is_static]
+        if not moving:
+            return None
+        return min(int(one.t_ns[0]) for one in moving), max(int(one.t_ns[-1]) for one in moving)
+
+    def frames(self) -> list[str]:
+        """Return the names of all frames."""
+        return sorted(self.series.keys() | {series.parent for series in self.series.values()})
+
+    def roots(self) -> list[str]:
+        """Return the frames without a parent, those with the most frames below first."""
+        below: dict[str, int] = {}
+        for frame in self.frames():
+            below[self.root_of(frame)] = below.get(self.root_of(frame), 0) + 1
+        return sorted(below, key=lambda root: (-below[root], root))
+
+    def children_of(self, frame: str) -> list[str]:
+        """Return the frames that have this one as parent."""
+        return sorted(child for child, series in self.series.items() if series.parent == plain_frame(frame))
+
+    def root_of(self, frame: str) -> str:
+        """Return the root above a frame: the frame itself if it has no parent, or if there is no such frame."""
+        return self.chain_of(frame)[-1]
+
+    def chain_of(self, frame: str) -> list[str]:
+        """Return a frame, its parent, the parent of that, and so on, up to a root."""
+        chain = [plain_frame(frame)]
+        while chain[-1] in self.series:
+            chain.append(self.series[chain[-1]].parent)
+        return chain
+
+    def between(self, target: str, source: str) -> list[TransformSeries] | None:
+        """Return the transforms on the way from one frame to another; None if they aren't connected."""
+        parts = self._parts(target, source)
+        return None if parts is None else [*parts[0], *parts[1]]
+
+    def remarks_between(self, target: str, source: str) -> list[Remark]:
+        """Return the remarks on the transforms between two frames."""
+        way = self.between(target, source)
+        unconnected = {*self.chain_of(target), *self.chain_of(source)}
+        frames = unconnected if way is None else {one.child for one in way}
+        return [remark for remark in self._remarks if not frames.isdisjoint(remark.frames)]
+
+    def lookup(self, target: str, source: str, stamps_ns: Ints) -> Poses:
+        """Return the poses of ``source`` in ``target`` at times (N,) in nanoseconds.
+
+        They are interpolated; see ``TransformSeries.at`` for where they are known.
+        """
+        from scipy.spatial.transform import Rotation
+
+        stamps_ns = np.asarray(stamps_ns, np.int64)
+        number, words = len(stamps_ns), {}
+        reason = np.zeros(number, np.int64)
+        parts = self._parts(target, source)
+        if parts is None or not number:
+            reason[:] = Reason.UNCONNECTED
+            nothing = {f"no transform connects {plain_frame(source)} with {plain_frame(target)}": number}
+            empty = np.full((number, 3, 3), np.nan)
+            return Poses(empty, empty[:, 0].copy(), reason, nothing if number else {})
+        ends = []
+        for way in parts:
+            turn, shift = Rotation.identity(number), np.zeros((number, 3))
+            for series in way:
+                rotation, translation, why = series.at(stamps_ns)
+                turn, shift = rotation * turn, rotation.apply(shift) + translation
+                is_new = (reason == Reason.KNOWN) & (why != Reason.KNOWN)
+                for code in np.unique(why[is_new]).tolist():
+                    words[f"{_WHERE[code]} {series}"] = int((why[is_new] == code).sum())
+                reason[is_new] = why[is_new]
+            ends.append((turn, shift))
+        (turn, shift), (base, origin) = ends
+        back = base.inv()
+        matrix, moved = (back * turn).as_matrix(), back.apply(shift - origin)
+        is_unknown = reason != Reason.KNOWN
+        matrix[is_unknown], moved[is_unknown] = np.nan, np.nan
+        return Poses(matrix, moved, reason, words)
+
+    def _parts(self, target: str, source: str) -> tuple[list[TransformSeries], list[TransformSeries]] | None:
+        """Return the transforms from the source, and from the target, up to the first frame above both."""
+        up, down = self.chain_of(source), self.chain_of(target)
+        shared = next((frame for frame in up if frame in down), None)
+        if shared is None:
+            return None
+        ways = (up[: up.index(shared)], down[: down.index(shared)])
+        return [self.series[frame] for frame in ways[0]], [self.series[frame] for frame in ways[1]]
+
+    def _chosen(self, child: str, several: list[TransformSeries]) -> TransformSeries:
+        """Return the one of several transforms of a frame that is taken: the one that moves, with the most messages."""
+        best = min(several, key=lambda one: (one.is_static, -one.messages, one.parent))
+        others = {one.parent: one.messages for one in several if one.parent != best.parent}
+        if others:
+            named = " and ".join(f"{parent} ({_count(count)})" for parent, count in sorted(others.items()))
+            taken = f"{best.parent} ({_count(best.messages)})"
+            self._remark(f"{child} has several parents: {taken} is taken, and {named} left out", child)
+        elif len(several) > 1:
+            self._remark(f"{best} is both static and not: the one that moves is taken", child)
+        return best
+
+    def _break_loops(self) -> None:
+        """Leave out the transform with the fewest messages of each loop."""
+        done: set[str] = set()
+        for first in sorted(self.series):
+            way: list[str] = []
+            frame = first
+            while frame in self.series and frame not in done:
+                done.add(frame)
+                way.append(frame)
+                frame = self.series[frame].parent
+            if frame in way:
+                loop = way[way.index(frame) :]
+                weakest = min(loop, key=lambda one: (self.series[one].messages, one))
+                words = " -> ".join([*reversed([*loop, loop[0]])])
+                self._remark(f"the frames {words} form a loop: {self.series[weakest]} is left out", *loop)
+                del self.series[weakest]
+
+    def _remark(self, text: str, *frames: str) -> None:
+        self._remarks.append(Remark(text, frames))
+
+
+_WHERE: Mapping[int, str] = {
+    Reason.BEFORE: "before the first transform",
+    Reason.AFTER: "after the last transform",
+    Reason.GAP: "in a gap or jump of",
+}
+
+
+def _count(messages: int) -> str:
+    return f"{messages:,} message{'' if messages == 1 else 's'}"
