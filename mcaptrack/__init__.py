@@ -1,6 +1,6 @@
 """Detect and track people in a video or a log, repair the tracks, predict where people go, and write the results."""
 
-__version__ = "0.2.0"
+__version__ = "0.3.0.dev0"
 #: Version of the shape of everything that is printed, or put into a page, as JSON.
 SCHEMA_VERSION = 1
 

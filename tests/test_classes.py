@@ -19,7 +19,7 @@ from mcaptrack.transforms import PROFILES, ByteTrack, OcSort, Sort
 from mcaptrack.transforms.sort.association import CandidatePairs, associate
 from mcaptrack.transforms.to_video_rate import to_video_rate
 from mcaptrack.transforms.track_classes import settle_classes
-from tests.worlds import noisy_tracks, ns
+from tests.worlds import assert_same_rows, noisy_tracks, ns
 
 TRACKERS = {"sort": Sort(), "metres apart": Sort(cost="pixels"), "bytetrack": ByteTrack(), "ocsort": OcSort()}
 every_tracker = pytest.mark.parametrize("tracker", TRACKERS.values(), ids=TRACKERS)
@@ -175,7 +175,7 @@ def test_each_class_is_retracked_as_if_it_were_alone(method):
         for frame in second:
             frame.rows["track_id"] += last
         for frame, one, other in zip(found, first, second, strict=True):
-            np.testing.assert_array_equal(frame.rows, np.concatenate([one.rows, other.rows]))
+            assert_same_rows(frame.rows, np.concatenate([one.rows, other.rows]))
     assert {1, 2} == {int(one) for frame in together[0] for one in frame.rows["class_id"]}
 
 
@@ -187,7 +187,7 @@ def test_numbers_of_classes_have_no_influence_on_retracking(method):
     for output, others in zip(found, wanted, strict=True):
         has_classes = "class_id" in output[0].rows.dtype.names
         for frame, other in zip(output, renamed(others, places) if has_classes else others, strict=True):
-            np.testing.assert_array_equal(frame.rows, other.rows)
+            assert_same_rows(frame.rows, other.rows)
 
 
 def walk_in_two_pieces(second):

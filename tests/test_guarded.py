@@ -65,7 +65,7 @@ def changed(**columns: Any) -> np.ndarray:
 def test_what_is_right_passes_as_it_is():
     made = answers(one())
     assert [(frame.t_ns, frame.index) for (frame,) in made] == [(0, 0), (10, 1), (20, 2), (30, 3)]
-    assert all(frame.rows.tolist() == ROWS.tolist() for (frame,) in made)
+    assert all(str(frame.rows.tolist()) == str(ROWS.tolist()) for (frame,) in made)
 
 
 @pytest.mark.parametrize(
@@ -81,7 +81,7 @@ def test_what_is_right_passes_as_it_is():
 def test_rows_in_any_layout_become_rows_of_the_schema(rows):
     made = answers(one(rows=rows))
     assert {frame.rows.dtype for (frame,) in made} == {TRACKS.dtype}
-    assert TRACKS.joined([frame.rows for (frame,) in made]).tolist() == ROWS.tolist() * 4
+    assert str(TRACKS.joined([frame.rows for (frame,) in made]).tolist()) == str(ROWS.tolist() * 4)
 
 
 def test_a_box_may_have_no_size():

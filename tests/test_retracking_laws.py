@@ -13,7 +13,7 @@ from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import Frame, Rows
 from mcaptrack.transforms import PROFILES, RetrackByConsistency
 from mcaptrack.transforms.retrack import Retracking
-from tests.worlds import noisy_tracks, ns, places, walk
+from tests.worlds import assert_same_rows, noisy_tracks, ns, places, walk
 
 SEEDS = st.integers(0, 2**32 - 1)
 #: "now" compares predictions of the current step, which the other distances of Algorithm 1 don't.
@@ -164,11 +164,11 @@ def test_boxes_move_by_the_plane_of_their_time(method):
     assert any((a.rows["x_px"] != b.rows["x_px"]).any() for (a, *_), (b, *_) in zip(before, after, strict=True))
     for frame, earlier, later, found in zip(frames, before, after, both, strict=True):
         for one, wanted in zip(found, later if frame.t_ns >= change else earlier, strict=True):
-            np.testing.assert_array_equal(one.rows, wanted.rows)
+            assert_same_rows(one.rows, wanted.rows)
 
 
 def test_noise_and_speed_are_never_taken_for_less_than_a_millimetre():
     frames = noisy_tracks(np.random.default_rng(4), ticks=40)
     none, least = (replace(PROFILES["default"], noise_m=least, speed_m_per_s=least) for least in (0.0, 1e-3))
     for found, wanted in zip(outputs(none, frames), outputs(least, frames), strict=True):
-        np.testing.assert_array_equal(found, wanted)
+        assert_same_rows(found, wanted)

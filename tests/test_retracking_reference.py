@@ -17,7 +17,7 @@ from mcaptrack.transforms.retrack import Retracking
 from tests.references.algorithm1 import Algorithm1
 from tests.references.online import OnlineTracker
 from tests.references.retracking import Undecided, constant_velocity
-from tests.worlds import crossing_tracks, noisy_tracks
+from tests.worlds import assert_same_rows, crossing_tracks, noisy_tracks
 
 SEEDS = st.integers(0, 2**32 - 1)
 #: Offline, gaps are interpolated and short tracks are left out; nothing else.
@@ -212,7 +212,7 @@ def test_where_nothing_is_re_tracked_tracks_are_the_input_and_predictions_those_
     predicted = [frame.rows for (frame,) in Predict(**options)(frames)]
     for outputs, wanted, forecasts in zip(passed_on, seen, predicted, strict=True):
         for frame, rows in zip(outputs, (*wanted, forecasts), strict=True):
-            np.testing.assert_array_equal(frame.rows, rows)
+            assert_same_rows(frame.rows, rows)
     for ours, theirs in zip(insisted, usual, strict=True):
         for frame, same in zip(ours, theirs, strict=True):
-            np.testing.assert_array_equal(frame.rows, same.rows)
+            assert_same_rows(frame.rows, same.rows)

@@ -63,8 +63,10 @@ def test_the_protobuf_runtime_reads_what_we_write(data):
     message = schema.codec.message_class()
     message.ParseFromString(schema.codec.encode(rows))
     for column in schema.columns:
-        theirs = np.array([getattr(row, column.name) for row in message.rows], rows.dtype[column.name])
-        np.testing.assert_array_equal(theirs, rows[column.name])
+        missing = -1 if rows.dtype[column.name].kind == "i" else np.nan
+        there = [not column.optional or row.HasField(column.name) for row in message.rows]
+        theirs = [getattr(row, column.name) if has else missing for row, has in zip(message.rows, there, strict=True)]
+        np.testing.assert_array_equal(np.array(theirs, rows.dtype[column.name]), rows[column.name])
 
 
 @given(st.data())
@@ -76,7 +78,7 @@ def test_we_read_what_the_protobuf_runtime_writes(data):
         added = message.rows.add()
         for column in schema.columns:
             value = row[column.name].item()
-            if not (column.optional and np.isnan(value)):
+            if not (column.optional and (np.isnan(value) or (value == -1 and isinstance(value, int)))):
                 setattr(added, column.name, value)  # a default value that is not optional is left out on the wire
     read = schema.codec.decode(message.SerializeToString())
     for column in schema.columns:
@@ -118,7 +120,10 @@ def test_a_writer_that_leaves_defaults_out_is_read_between_others():
 def test_a_bool_written_as_another_number_is_read_as_the_byte_1(schema):
     """NumPy takes every byte but 0 for true, but only 1 is the opposite of false: ~ of a byte 2 is true as well."""
     flags = [column.name for column in schema.columns if column.kind == "bool"]
-    payload = bytearray(schema.codec.encode(schema.empty(2)))
+    two = schema.empty(2)
+    for name in (column.name for column in schema.columns if column.since):
+        two[name] = 1  # so that the message has all columns
+    payload = bytearray(schema.codec.encode(two))
     for name in flags:
         payload[schema.dtype.fields[name][1]] = 2  # in the first of two rows
     raw = np.frombuffer(bytes(payload), np.uint8)
@@ -178,6 +183,42 @@ def test_wide_rows_and_high_field_numbers_are_written_as_by_the_protobuf_runtime
     assert all(read[name].tolist() == rows[name].tolist() for name in read.dtype.names)
 
 
+def test_messages_without_later_columns_are_those_of_the_first_version_to_the_byte():
+    """Tag and value of each column by hand; the length of a row below 128 is one byte."""
+
+    def row(*fields: tuple[str, int, float]) -> bytes:
+        tags = {"d": 1, "q": 1, "f": 5, "I": 5, "?": 0}
+        body = b"".join(bytes([n << 3 | tags[kind]]) + struct.pack(f"<{kind}", value) for kind, n, value in fields)
+        return bytes([0x0A, len(body)]) + body
+
+    box = {"x_px": [1.5], "y_px": [2.0], "w_px": [3.0], "h_px": [4.0], "score": [0.5], "class_id": [7]}
+    by_hand = [("d", 1, 1.5), ("d", 2, 2.0), ("d", 3, 3.0), ("d", 4, 4.0), ("f", 5, 0.5), ("I", 6, 7)]
+    encode = DETECTIONS.codec.encode
+    assert encode(DETECTIONS.rows(**box)) == row(*by_hand)
+    assert encode(DETECTIONS.rows(**box, people=[3])) == row(*by_hand, ("I", 7, 3))
+    nothing = -DETECTIONS.rows(**box)["x_m"]  # a NaN of another sign is missing, too
+    assert encode(DETECTIONS.rows(**box, x_m=nothing, y_m=nothing, source_id=[-1])) == row(*by_hand)
+    assert len(encode(DETECTIONS.rows(**box, source_id=[0]))) > len(row(*by_hand)) + 80
+    tracks = TRACKS.rows(track_id=[9], x_m=[1.5], y_m=[2.0], observed=[True], source_id=[-1])
+    boxless = [("d", n, float("nan")) for n in (2, 3, 4, 5)]
+    assert TRACKS.codec.encode(tracks) == row(
+        ("q", 1, 9), *boxless, ("d", 6, 1.5), ("d", 7, 2.0), ("f", 8, float("nan")), ("?", 9, True), ("q", 10, -1)
+    )
+
+
+def test_columns_that_a_message_lacks_are_missing_in_its_rows():
+    for schema in (DETECTIONS, TRACKS):
+        given = {"x_px": [1.0], "y_px": [2.0], "w_px": [3.0], "h_px": [4.0], "class_id": [1]}
+        given |= {"track_id": [1], "observed": [True], "source_id": [-1]} if schema is TRACKS else {}
+        short = schema.codec.encode(schema.rows(**given))
+        theirs = schema.codec.message_class().FromString(short).SerializeToString()
+        raw = np.frombuffer(short, np.uint8)
+        at_once = schema.codec.decode_at(raw, np.array([0]), np.array([len(raw)]))
+        for rows in (schema.codec.decode(short), schema.codec.decode(theirs), at_once[0], schema.empty(1)):
+            assert np.isnan([rows[name][0] for name in ("z_m", "length_m", "heading_rad", "vx_m_per_s")]).all()
+            assert schema is TRACKS or rows["source_id"].tolist() == [-1]
+
+
 def test_bytes_that_are_no_message_are_refused():
     with pytest.raises(ValueError, match=r"5 bytes are not a mcaptrack\.Tracks message"):
         TRACKS.codec.decode(b"\x0a\xff\xff\xff\xff")
@@ -215,8 +256,18 @@ def test_rows_in_another_layout_are_written_the_same():
         ),
         (
             {"x_px": [1.0], "y_px": [float("nan")], "w_px": [1.0], "h_px": [1.0], "class_id": [1]},
-            "mcaptrack.Detections.y_px is required and missing in 1 rows, first in row 0",
+            "mcaptrack.Detections has only a part of x_px, y_px, w_px, h_px in 1 rows, first in row 0",
         ),
+        (
+            {"y_m": [1.0, float("nan"), 2.0], "x_m": [1.0, 1.0, float("nan")], "class_id": [1, 1, 1]},
+            "mcaptrack.Detections has only a part of x_m, y_m in 2 rows, first in row 1",
+        ),
+        (
+            {"x_m": [1.0, float("nan")], "y_m": [2.0, float("nan")], "z_m": [3.0, 3.0], "class_id": [1, 1]},
+            "mcaptrack.Detections needs x_px, y_px, w_px, h_px or x_m, y_m; all of these are missing in 1 rows, first in "
+            "row 1",
+        ),
+        ({"class_id": [1]}, "mcaptrack.Detections needs x_px, y_px, w_px, h_px or x_m, y_m; all of these are missing"),
         (
             {"x_px": ["a"], "y_px": [1.0], "w_px": [1.0], "h_px": [1.0], "class_id": [1]},
             "mcaptrack.Detections.x_px needs numbers",
@@ -254,7 +305,10 @@ def test_units_and_meaning_reach_arrow():
             "message A {\n message Row {\n string name = 1;\n }\n repeated Row rows = 1;\n}",
             "x.proto:3: not a row schema",
         ),
-        ("message A {\n message Row {\n optional bool b = 1;\n }\n repeated Row rows = 1;\n}", "only double and float"),
+        (
+            "message A {\n message Row {\n optional bool b = 1;\n }\n repeated Row rows = 1;\n}",
+            "only double, float, sfixed32, sfixed64 can be optional, not bool b",
+        ),
         ("message A {\n message Row {\n double a = 1;\n }\n}", "needs a package, 'repeated Row rows = 1;'"),
         (
             "package p;\nmessage A {\n message Row {\n double a = 2;\n double b = 1;\n }\n repeated Row rows = 1;\n}",
@@ -355,6 +409,7 @@ def test_provenance_comes_back_from_its_metadata():
         {"transform": Plugin("own", "own:It", "pkg", "1")},
         {"1": "person"},
         "1",
+        "map",
         {"layout": "x"},
         [["lost", "words"]],
         "0.0.9",

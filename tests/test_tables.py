@@ -167,7 +167,7 @@ def test_every_column_says_its_unit_and_meaning(table):
         assert words["description"].strip(), field.name
         assert "unit" in words, field.name
         tail = field.name.rpartition("_")[2]
-        if tail in ("px", "m", "s", "ns", "m2") and "_m_s" not in field.name:
+        if tail in ("px", "m", "s", "ns", "m2", "rad") and not field.name.endswith(("_m_s", "_m_per_s")):
             assert words["unit"] == {"m2": "m^2"}.get(tail, tail), field.name
         if pa.types.is_integer(field.type) or pa.types.is_floating(field.type):
             assert words["unit"], field.name

@@ -36,6 +36,13 @@ def _own_priority() -> Iterator[None]:
         os.sched_setscheduler(0, policy, priority)
 
 
+def assert_same_rows(found: np.ndarray, wanted: np.ndarray) -> None:
+    """Compare rows column by column: missing values are equal, which they are not in a comparison of whole rows."""
+    assert found.dtype.names == wanted.dtype.names
+    for name in wanted.dtype.names:
+        np.testing.assert_array_equal(found[name], wanted[name])
+
+
 def boxes_at(centres: Sequence[tuple[float, float]], size: tuple[float, float] = (20.0, 40.0), score: float = 1.0):
     """Rows of detections around centres, in pixels."""
     xy = np.array(centres, float).reshape(-1, 2)

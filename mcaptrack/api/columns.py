@@ -16,7 +16,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.clocks import LAST_NS
 from mcaptrack.notices import warn
-from mcaptrack.schema import DETECTIONS, SCORES_NEEDED, TRACKS, Frame, Rows, Schema
+from mcaptrack.schema import BOX_PX, DETECTIONS, PLACE_M, SCORES_NEEDED, SIZES, TRACKS, Frame, Rows, Schema
 
 BoxFormat = Literal["xyxy", "xywh"]
 #: The frame number of a frame that was not numbered; ``Recording.write`` gives it one.
@@ -25,14 +25,12 @@ UNNUMBERED: Final = -1
 _LAST_INDEX: Final = 2**32 - 1
 #: Columns of tables and arrays that are not part of rows. pandas names an index that has no name so.
 _BESIDE: Final = ("t", "t_ns", "frame", "index", "row", "topic", "recording", "__index_level_0__")
-_BOX: Final = ("x_px", "y_px", "w_px", "h_px")
-_PLACE: Final = ("x_m", "y_m")
 _IN_NS: Final = "whole nanoseconds, such as `round(seconds * 1e9)`"
 
 
 def frame_of(schema: Schema, boxes: Floats, given: Mapping[str, Any], t_ns: int | np.datetime64, index: int) -> Frame:
     """Return a frame of boxes (N, 4), with the other columns that are given."""
-    columns: dict[str, Any] = dict(zip(_BOX, boxes.T, strict=True))
+    columns: dict[str, Any] = dict(zip(BOX_PX, boxes.T, strict=True))
     for name, values in given.items():
         if values is None:
             continue
@@ -108,13 +106,13 @@ def check_frames(schema: Schema, frames: Sequence[Frame]) -> None:
             values = ", ".join(f"{name} {rows[name][at]}" for name in rows.dtype.names or ())
             raise McaptrackError(f"row {number} of the frame at {frames[of[at]].t_ns} ns {words}: {values}")
 
-    names = [name for name in (*_BOX, *_PLACE, "score") if name in (rows.dtype.names or ())]
+    names = [name for name in rows.dtype.names or () if rows.dtype[name].kind == "f"]
     refuse(np.any([np.isinf(rows[name]) for name in names], axis=0), "has an infinite number")
-    refuse((rows["w_px"] < 0) | (rows["h_px"] < 0), "has a box of negative size")
+    refuse(np.any([rows[name] < 0 for name in SIZES], axis=0), "has a box of negative size")
+    box, place = (np.sum([np.isfinite(rows[name]) for name in some], axis=0) for some in (BOX_PX, PLACE_M))
+    refuse((box % 4 > 0) | (place % 2 > 0), "has a part of a box or of a position")
+    refuse((box == 0) & (place == 0), "has neither a box nor a position")
     if schema is TRACKS:
-        box, place = (np.sum([np.isfinite(rows[name]) for name in some], axis=0) for some in (_BOX, _PLACE))
-        refuse((box % 4 > 0) | (place % 2 > 0), "has a part of a box or of a position")
-        refuse((box == 0) & (place == 0), "has neither a box nor a position")
         refuse(rows["track_id"] < 0, "has a negative track_id")
         order = np.lexsort((rows["track_id"], of))
         again = np.zeros(len(rows), bool)

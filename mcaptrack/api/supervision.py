@@ -115,6 +115,8 @@ def supervision_of(frames: Iterable[Frame], names: Mapping[int, str]) -> Iterato
         raise McaptrackError("supervision is not installed; install it with: pip install supervision") from None
     for frame in frames:
         rows = frame.rows[np.isfinite(frame.rows["x_px"])]
+        if len(rows) < len(frame.rows):
+            warn("supervision.Detections hold boxes in pixels: rows without one are left out", "left-out")
         # With NaN for missing scores: supervision merges frames only if all have a confidence, or none.
         columns: dict[str, Any] = {"confidence": rows["score"].astype(np.float32)}
         for name, column in (("tracker_id", "track_id"), ("class_id", "class_id")):

@@ -29,7 +29,7 @@ from mcaptrack.evaluation.metrics.displacement import (
 )
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
-from mcaptrack.schema import FORECAST_ERRORS, FORECAST_SCORES, PREDICTIONS, TRACKS, Frame, Rows, Schema
+from mcaptrack.schema import FORECAST_ERRORS, FORECAST_SCORES, PREDICTIONS, TRACKS, Frame, Rows
 from mcaptrack.schema.framing import frame_times, join_frames, split_rows
 from mcaptrack.schema.resampling import is_observed_at
 
@@ -178,7 +178,7 @@ def find_forecast_errors(
         If forecasts differ in their number of steps.
     """
     arrays = _arrays(frames, tracks, name) or _NOTHING
-    rows, scores = _missing_rows(FORECAST_ERRORS, len(arrays.message)), _missing_rows(FORECAST_SCORES, len(frames))
+    rows, scores = FORECAST_ERRORS.empty(len(arrays.message)), FORECAST_SCORES.empty(len(frames))
     rows["track_id"], rows["truth_id"], rows["later_id"] = arrays.forecasts.id, NO_ID, NO_ID
     scores["forecasts"] = np.bincount(arrays.message, minlength=len(frames))
     paths = arrays.clock.positions(tracks)
@@ -197,15 +197,6 @@ def find_forecast_errors(
         split_rows(times, numbers, FORECAST_ERRORS.check(rows), ends),
         split_rows(times, numbers, FORECAST_SCORES.check(scores), np.arange(1, len(frames) + 1)),
     )
-
-
-def _missing_rows(schema: Schema, count: int) -> Rows:
-    """Rows in which every optional column is missing."""
-    rows = schema.empty(count)
-    for column in schema.columns:
-        if column.optional:
-            rows[column.name] = np.nan
-    return rows
 
 
 def _compare(

@@ -14,7 +14,7 @@ from mcaptrack.errors import McaptrackError, call
 from mcaptrack.foxglove import views
 from mcaptrack.schema import DETECTIONS, VIDEO, Frame, Schema
 from mcaptrack.schema.classes import class_names
-from mcaptrack.schema.provenance import INGEST, VIEW, Provenance
+from mcaptrack.schema.provenance import INGEST, VIEW, Provenance, frame_id_of
 from mcaptrack.sources import foreign
 from mcaptrack.sources.cameras import USUAL, chain_of
 from mcaptrack.transforms import FULL, STAGES, Transform
@@ -81,15 +81,17 @@ def fits(channel: log.Channel, reads: Schema) -> tuple[str, bool]:
 
 def read_frames(opened: log.Log, topic: str, schema: Schema) -> list[Frame]:
     """Read the rows of a channel, or the detections of a recording in a foreign format."""
-    return read_named_frames(opened, topic, schema)[0]
+    return read_named_frames(opened, topic, schema).frames
 
 
-def read_named_frames(opened: log.Log, topic: str, schema: Schema) -> tuple[list[Frame], dict[int, str]]:
-    """Read the rows of a channel as ``read_frames`` does, and the names of their classes by number."""
+def read_named_frames(opened: log.Log, topic: str, schema: Schema) -> foreign.NamedFrames:
+    """Read the rows of a channel as ``read_frames`` does, with the names of classes and of the frame of reference."""
     channel = opened.channel(topic)
     if foreign.holds_detections(channel):
         return foreign.named_detections(opened, topic)
-    return opened.frames(topic, schema), class_names(channel.metadata)
+    return foreign.NamedFrames(
+        opened.frames(topic, schema), class_names(channel.metadata), frame_id_of(channel.metadata)
+    )
 
 
 def _lacks(opened: log.Log, prefix: str, job: Job) -> str:

@@ -95,11 +95,12 @@ def make_plane(
     """
     columns = ["x_px", "y_px", "w_px", "h_px"]
     boxes = np.concatenate([columns_to_boxes(frame.rows[columns]) for frame in frames]) if frames else np.empty((0, 4))
-    if not np.isfinite(boxes[:, 3]).any():
+    boxes = boxes[np.isfinite(boxes).all(axis=1)]
+    if not len(boxes):
         return None, None  # without boxes in pixels there is nothing to convert to metres
     estimate, person_m = choice.settled(provenance_of(opened, camera_at(opened, prefix).ground_plane))
     parameters: dict[str, Any] = {} if person_m == PERSON_HEIGHT_M else {"person_height_m": person_m}
-    width, height = (int(np.nanmax(boxes[:, at] + boxes[:, at + 2]).round()) for at in (0, 1))
+    width, height = (int((boxes[:, at] + boxes[:, at + 2]).max().round()) for at in (0, 1))
     plane: GroundPlane | None = None
     if not estimate:
         parameters["fit_plane"] = False

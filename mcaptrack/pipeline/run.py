@@ -16,7 +16,7 @@ from mcaptrack.geometry.camera_path import CameraPath
 from mcaptrack.geometry.clocks import NS_PER_S, parse_ns
 from mcaptrack.geometry.plane import Planes, is_assumed, scene_planes
 from mcaptrack.notices import Notice, collected, warn
-from mcaptrack.pipeline.checks import Job, check_inputs, read_named_frames
+from mcaptrack.pipeline.checks import Job, check_inputs, read_frames, read_named_frames
 from mcaptrack.pipeline.events import STAGE as EVENTS_STAGE
 from mcaptrack.pipeline.events import Watch, make_events, tally
 from mcaptrack.pipeline.findings import warn_findings, warn_memory, warn_no_rows
@@ -161,7 +161,7 @@ class _Repeatable:
 
 class _Input(NamedTuple):
     """The input of a job: a stream of frames, all frames if they are rows (else empty), and, after the stream was read,
-    the digest and the number of its messages. ``classes`` are the names of the classes of its rows.
+    the digest and the number of its messages; the names of its classes, and the frame of its metres.
     """
 
     stream: Iterable[Frame]
@@ -169,6 +169,7 @@ class _Input(NamedTuple):
     digest: Callable[[], str]
     messages: Callable[[], int]
     classes: Mapping[str, str] = {}
+    frame_id: str = ""
 
     def in_scene(self, path: CameraPath) -> _Input:
         """Return the same tracks with boxes in pixels of the reference picture."""
@@ -218,14 +219,8 @@ def _run_job(
         if topic in job.kept()
     }
     if job.target + FULL in job.kept():
-        out |= _at_video_rate(
-            opened,
-            job,
-            {**made, **out},
-            planes,
-            path,
-            getattr(transform, "holds_back", False),
-        )
+        holds_back = getattr(transform, "holds_back", False)
+        out |= _at_video_rate(opened, job, {**made, **out}, planes, path, holds_back)
     return out
 
 
@@ -258,6 +253,7 @@ def _provenance_of(
         references=references,
         plugins=plugins_of(stage, transform),
         classes={str(number): name for number, name in card.classes.items()} or given.classes,
+        frame_id=given.frame_id,
         model=card.facts,
         warnings=[(notice.code, notice.message) for notice in warnings],
     )
@@ -332,13 +328,13 @@ def _input(
         return _Input(pictures, [], digest, lambda: len(seen))
     if job.source in made:
         frames, how = made[job.source].frames, made[job.source].provenance
-        of_rows, names = how.digest, class_names(how.to_metadata())
+        of_rows, names, frame_id = how.digest, class_names(how.to_metadata()), how.frame_id
     else:
-        frames, names = read_named_frames(opened, job.source, job.transform.reads)
+        frames, names, frame_id = read_named_frames(opened, job.source, job.transform.reads)
         of_rows = digest_of(opened, job.source)
     classes = {str(number): name for number, name in sorted(names.items())}
     stream = _Repeatable(lambda: _counted(frames, job.stage, progress))
-    return _Input(stream, frames, lambda: of_rows, lambda: len(frames), classes)
+    return _Input(stream, frames, lambda: of_rows, lambda: len(frames), classes, frame_id)
 
 
 def _counting(frames: Iterable[Frame], taken: set[int]) -> Iterator[Frame]:
@@ -393,7 +389,7 @@ def input_of(
     topic = source or f"{prefix}/{STAGES[stage].input_topic}"
     job = Job(stage, transform, topic, f"{prefix}/{STAGES[stage].output_topic}")
     check_inputs(opened, prefix, [job])
-    frames, _ = read_named_frames(opened, topic, transform.reads)
+    frames = read_frames(opened, topic, transform.reads)
     known = _in_context(opened, prefix, job, frames, read_planes(opened, prefix) or ())
     known = replace(known, **side_inputs(opened, prefix, job, {}).values)
     return frames, {f.name: getattr(known, f.name) for f in fields(known) if f.metadata.get("context")}

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 __all__ = [
+    "BOX_PX",
     "CAMERA_MOTION",
     "COUNTS",
     "DETECTIONS",
@@ -30,8 +31,10 @@ __all__ = [
     "FORECAST_ERRORS",
     "FORECAST_SCORES",
     "GROUND_PLANE",
+    "PLACE_M",
     "PREDICTIONS",
     "SCHEMAS",
+    "SIZES",
     "TRACKS",
     "VIDEO",
     "Column",
@@ -70,10 +73,14 @@ def _folder() -> Path:
 
 
 class Schema:
-    """The schema of a row channel, with its name in MCAP: "mcaptrack.Tracks"."""
+    """The schema of a row channel, with its name in MCAP: "mcaptrack.Tracks".
 
-    def __init__(self, name: str) -> None:
+    ``alternatives`` are groups of optional columns: each row has all columns of at least one group, and none in part.
+    """
+
+    def __init__(self, name: str, *alternatives: tuple[str, ...]) -> None:
         self.name = name
+        self.alternatives = alternatives
 
     def __repr__(self) -> str:
         return f"Schema({self.name!r})"
@@ -114,15 +121,15 @@ class Schema:
             return pa.field(
                 column.name,
                 pa.from_numpy_dtype(self.dtype[column.name]),
-                nullable=column.optional,
+                nullable=column.is_nullable,
                 metadata={key: value for key, value in words.items() if value},
             )
 
         return pa.schema([field(column) for column in self.columns])
 
     def empty(self, count: int = 0) -> Rows:
-        """``count`` rows of zeros."""
-        return np.zeros(count, self.dtype)
+        """``count`` rows in which all optional columns are missing; the others are 0."""
+        return self.codec.blank(count)
 
     def joined(self, parts: Sequence[Rows]) -> Rows:
         """Concatenate rows of this schema; as bytes if their layouts are equal, because NumPy copies field by field."""
@@ -136,8 +143,8 @@ class Schema:
         Parameters
         ----------
         **columns : (N,) array or sequence
-            By name of the column. Optional columns may be left out; they are filled with NaN. Columns that were added
-            to the schema later may be left out, too; they are 0.
+            By name of the column. Optional columns may be left out; they are NaN, or -1 if they hold whole numbers.
+            Columns that were added to the schema later may be left out, too; they are 0.
 
         Returns
         -------
@@ -147,7 +154,7 @@ class Schema:
         ------
         ValueError
             With column and schema, if a column is unknown or missing, has another length, other than whole numbers in
-            an integer column, or NaN in a required one.
+            an integer column, or NaN in a required one; or if a row of detections has neither a box nor a position.
 
         Examples
         --------
@@ -168,10 +175,9 @@ class Schema:
             if name in arrays:
                 self._check_column(column, arrays[name])
                 out[name] = arrays[name]
-            elif column.optional:
-                out[name] = np.nan
-            elif not column.since:
+            elif not column.optional and not column.since:
                 raise ValueError(f"{self.name} needs the column {name}")
+        self._check_alternatives(out)
         return out
 
     def check(self, rows: NDArray[Any]) -> Rows:
@@ -191,12 +197,30 @@ class Schema:
             return self.rows(**{name: rows[name] for name in names})
         for column in self.columns:
             self._check_column(column, rows[column.name])
+        self._check_alternatives(rows)
         return rows
 
     def has_columns(self, names: Iterable[str] | None) -> bool:
         """Whether rows with these columns are of this schema: all of its columns; those added later may be missing."""
         first = {column.name for column in self.columns if not column.since}
         return first <= set(names or ()) <= {column.name for column in self.columns}
+
+    def _check_alternatives(self, rows: Rows) -> None:
+        """Raise ValueError if a row has no whole group of columns of which it needs one, or a part of one."""
+        if not self.alternatives or not len(rows):
+            return
+        is_whole = np.zeros(len(rows), bool)
+        for group in self.alternatives:
+            missing = np.isnan([rows[name] for name in group])
+            partly = missing.any(axis=0) & ~missing.all(axis=0)
+            if partly.any():
+                where = f"in {partly.sum()} rows, first in row {partly.argmax()}"
+                raise ValueError(f"{self.name} has only a part of {', '.join(group)} {where}")
+            is_whole |= ~missing[0]
+        if not is_whole.all():
+            wanted = " or ".join(", ".join(group) for group in self.alternatives)
+            where = f"missing in {(~is_whole).sum()} rows, first in row {is_whole.argmin()}"
+            raise ValueError(f"{self.name} needs {wanted}; all of these are {where}")
 
     def _check_column(self, column: Column, values: NDArray[Any]) -> None:
         where, kind, target = f"{self.name}.{column.name}", values.dtype.kind, self.dtype[column.name]
@@ -222,7 +246,12 @@ class Schema:
                 raise ValueError(f"{where} holds {limits.min} to {limits.max}, not {low if low < limits.min else high}")
 
 
-DETECTIONS: Final = Schema("mcaptrack.Detections")
+#: The columns of a box in a picture, and of a position in space.
+BOX_PX: Final = ("x_px", "y_px", "w_px", "h_px")
+PLACE_M: Final = ("x_m", "y_m")
+#: The columns of sizes of boxes, which are not below 0.
+SIZES: Final = ("w_px", "h_px", "length_m", "width_m", "height_m")
+DETECTIONS: Final = Schema("mcaptrack.Detections", BOX_PX, PLACE_M)
 TRACKS: Final = Schema("mcaptrack.Tracks")
 #: What a warning of other scores ends with.
 SCORES_NEEDED: Final = "trackers that use them need scores from 0 to 1"

@@ -5,8 +5,8 @@ bytes at fixed offsets. A payload is therefore a structured array with the tags 
 decoding is a view. Payloads of other protobuf writers (default values omitted, fields in another order) have another
 length or other tags; they are detected and decoded by the protobuf runtime.
 
-Columns that were added to a schema later are left out of messages in which all rows have their default, so that these
-messages stay as they were. A schema has one layout for each time that it grew.
+Columns that were added to a schema later are left out of messages in which they are missing in all rows, or 0, so that
+these messages stay as they were. A schema has one layout for each time that it grew.
 
 Letters: N rows, M messages.
 """
@@ -110,6 +110,10 @@ class RowCodec:
         self._layouts = [_Layout(columns[:count]) for count in (*grew, len(columns))]  # the shortest first
         self._later = [columns[count:] for count in grew]
         self.dtype = self._layouts[-1].dtype
+        blank = self._layouts[-1].template.copy()
+        for column in columns:
+            blank.view(self.dtype)[column.name] = column.missing
+        self._blank: Bytes = blank
 
     def encode(self, rows: Rows) -> bytes:
         """Encode N rows as one payload. ``rows`` must have the columns of the schema, in any memory layout."""
@@ -117,7 +121,9 @@ class RowCodec:
             whole = self._layouts[-1]
             raw = np.ascontiguousarray(rows).view(np.uint8).reshape(-1, whole.size)
             for layout, later in zip(self._layouts, self._later, strict=False):
-                if all(_is_default(column, rows) for column in later):
+                tail = slice(whole.head + layout.size - layout.head, None)
+                is_short = (raw[:, tail] == self._blank[tail]).all()  # tells most; but there are several NaNs
+                if is_short or all(_is_missing(column, rows) for column in later):
                     values = np.empty((len(raw), layout.size), np.uint8)
                     values[:, layout.head :] = raw[:, whole.head : whole.head + layout.size - layout.head]
                     return layout.filled(values)
@@ -172,6 +178,10 @@ class RowCodec:
             out[ragged_range(first[mine], counts[mine])] = self._bytes(rows)
         return out.view(self.dtype)[:, 0], counts
 
+    def blank(self, count: int) -> Rows:
+        """``count`` rows in which all optional columns are missing; the others are 0."""
+        return np.tile(self._blank, (count, 1)).view(self.dtype)[:, 0]
+
     def longer(self, rows: Rows, taken: int, length: int) -> Rows:
         """An array of ``length`` rows that begins with the first ``taken`` rows; the others are not initialised."""
         out = np.empty((length, self.dtype.itemsize), np.uint8)
@@ -196,15 +206,12 @@ class RowCodec:
         return rows
 
     def _widened(self, layout: _Layout, block: Bytes) -> Rows:
-        """Rows with all columns, from the bytes (N, size) of rows of a layout; later columns have their default."""
+        """Rows with all columns, from the bytes (N, size) of rows of a layout; later columns are missing."""
         whole = self._layouts[-1]
         if layout is not whole:
-            short, block = block, np.tile(whole.template, (len(block), 1))
+            short, block = block, np.tile(self._blank, (len(block), 1))
             block[:, whole.head : whole.head + layout.size - layout.head] = short[:, layout.head :]
         rows: Rows = block.view(self.dtype)[:, 0]
-        if layout is not whole:
-            for column in self._later[self._layouts.index(layout)]:
-                rows[column.name] = np.nan if column.optional else 0
         return rows
 
     def _decode_foreign(self, payload: bytes) -> Rows:
@@ -219,7 +226,9 @@ class RowCodec:
         rows = np.zeros(len(list(found)), self.dtype)
         for column in self._definition.columns:
             if column.optional:
-                rows[column.name] = [getattr(r, column.name) if r.HasField(column.name) else np.nan for r in found]
+                rows[column.name] = [
+                    getattr(r, column.name) if r.HasField(column.name) else column.missing for r in found
+                ]
             else:
                 rows[column.name] = [getattr(r, column.name) for r in found]
         rows.flags.writeable = False
@@ -238,7 +247,7 @@ class RowCodec:
         return message_class  # type: ignore[no-any-return]
 
 
-def _is_default(column: Column, rows: Rows) -> bool:
-    """Whether a column has its default in all rows: nothing if it is optional, otherwise 0."""
+def _is_missing(column: Column, rows: Rows) -> bool:
+    """Whether a column is missing in all rows, or 0 if it can't be."""
     values = rows[column.name]
-    return bool(np.isnan(values).all()) if column.optional else not values.any()
+    return bool((np.isnan(values) if column.is_nullable else values == column.missing).all())

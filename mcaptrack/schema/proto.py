@@ -8,6 +8,7 @@ own stands above columns that were added in a later version.
 
 from __future__ import annotations
 
+import math
 import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
@@ -25,7 +26,9 @@ KINDS: Final = {
     "sfixed32": ("<i4", 4, 5, 15),
     "sfixed64": ("<i8", 8, 1, 16),
 }
-UNITS: Final = {"px": "px", "m": "m", "m2": "m^2", "s": "s", "ns": "ns", "hz": "Hz"}
+UNITS: Final = {"px": "px", "m": "m", "m2": "m^2", "rad": "rad", "m_per_s": "m/s", "s": "s", "ns": "ns", "hz": "Hz"}
+#: Kinds that can be optional, and the value in rows of a column that is missing.
+_MISSING: Final[dict[str, float]] = {"double": math.nan, "float": math.nan, "sfixed32": -1, "sfixed64": -1}
 
 _SINCE = re.compile(r"since (\S+),")
 _COMMENT = re.compile(r"//\s?(.*)$")
@@ -36,6 +39,8 @@ _MESSAGE = re.compile(r"message\s+([A-Z]\w*)\s*\{$")
 @dataclass(frozen=True)
 class Column:
     """One column of a row. ``optional``: the value may be missing, which is NaN in rows and null in tables.
+
+    A whole number that is missing is -1, in tables, too, as ids of other columns are.
 
     ``since`` is the version that added the column, "" for those that were there from the beginning.
     """
@@ -49,8 +54,19 @@ class Column:
 
     @property
     def unit(self) -> str:
-        """The unit in the suffix of the name ("px", "m", "m^2", "s"), "" if there is none."""
-        return UNITS.get(self.name.rpartition("_")[2], "") if "_" in self.name else ""
+        """The unit in the suffix of the name ("px", "m", "m^2", "m/s"), "" if there is none."""
+        endings = [ending for ending in UNITS if self.name.endswith(f"_{ending}")]
+        return UNITS[max(endings, key=len)] if endings else ""
+
+    @property
+    def missing(self) -> float:
+        """The value in rows of a missing one; 0 where it can't be missing."""
+        return _MISSING[self.kind] if self.optional else 0
+
+    @property
+    def is_nullable(self) -> bool:
+        """Whether a missing value is null in tables."""
+        return math.isnan(self.missing)
 
 
 @dataclass(frozen=True)
@@ -126,8 +142,8 @@ def parse(text: str, origin: str) -> Definition:
             closed = True
         elif field and depth == 2 and field.group(2) in KINDS:
             optional, kind, name, tag = field.groups()
-            if optional and kind not in ("double", "float"):
-                raise ValueError(f"{origin}:{number}: only double and float can be optional, not {kind} {name}")
+            if optional and kind not in _MISSING:
+                raise ValueError(f"{origin}:{number}: only {', '.join(_MISSING)} can be optional, not {kind} {name}")
             words = comment.group(1).strip() if comment else ""
             columns.append(Column(name, kind, int(tag), bool(optional), words, since))
         else:

@@ -39,8 +39,9 @@ class Provenance:
     ``references`` are the topics that the input was compared with, and their digests; empty for missing topics.
     ``plugins`` are the classes of other packages that were used: the ``transform`` itself if it is not built in, and
     its ``predictor``. ``classes`` are the names of the classes in its rows by ``class_id``; ``class_id`` is the class
-    of all rows, where these state none (see ``schema.classes``). ``model`` is what its network turned out to be.
-    ``warnings`` are the warnings when it was made, with code and message.
+    of all rows, where these state none (see ``schema.classes``). ``frame_id`` is the frame of its metres, where the log
+    has frames. ``model`` is what its network turned out to be. ``warnings`` are the warnings when it was made,
+    with code and message.
     """
 
     transform: str
@@ -53,6 +54,7 @@ class Provenance:
     plugins: Mapping[str, Plugin] = field(default_factory=dict)
     classes: Mapping[str, str] = field(default_factory=dict)
     class_id: str = ""
+    frame_id: str = ""
     model: Mapping[str, str] = field(default_factory=dict)
     warnings: Sequence[Sequence[str]] = ()
     version: str = __version__
@@ -75,6 +77,7 @@ class Provenance:
             "plugins": json.dumps({key: one._asdict() for key, one in self.plugins.items()}, sort_keys=True),
             "classes": json.dumps(dict(self.classes), ensure_ascii=False),
             "class_id": self.class_id,
+            "frame_id": self.frame_id,
             "model": json.dumps(dict(self.model), sort_keys=True),
             "warnings": json.dumps(self.warnings, separators=(",", ":")),
         }
@@ -101,6 +104,11 @@ class Provenance:
 def input_of(metadata: Mapping[str, str]) -> str:
     """Return the topic that a channel was made from, by its metadata; "" if mcaptrack did not make it of one."""
     return metadata.get(f"{_PREFIX}input", "") if f"{_PREFIX}transform" in metadata else ""
+
+
+def frame_id_of(metadata: Mapping[str, str]) -> str:
+    """Return the frame that the metres of a channel are in, by its metadata; "" where it names none."""
+    return metadata.get(f"{_PREFIX}frame_id", "")
 
 
 def _read(text: str, kind: type[T]) -> T:

@@ -113,7 +113,7 @@ def _rows_of(schema: Schema, table: Table, part: Part) -> dict[str, Any]:
     out = {"frame": pa.array(part.frame[message]), "t": _times(t_ns), "t_ns": pa.array(t_ns), "row": pa.array(number)}
     for column in schema.columns:
         values = np.ascontiguousarray(rows[column.name]) if order is None else rows[column.name][order]
-        missing = np.isnan(values) if column.optional else None
+        missing = np.isnan(values) if column.is_nullable else None
         out[column.name] = pa.array(values, mask=missing if missing is not None and missing.any() else None)
     return out
 
@@ -315,7 +315,7 @@ def table_to_frames(schema: Schema, rows: Any, frames: Any, topic: str) -> list[
         if column.since and column.name not in rows.column_names:  # an older table
             continue
         values = rows.column(column.name).combine_chunks()
-        values = values.fill_null(np.nan) if column.optional else values
+        values = values.fill_null(column.missing) if column.optional else values
         columns[column.name] = values.to_numpy(zero_copy_only=False)[order]
     members = schema.rows(**columns)
     times, numbers, counts = (frames.column(name).to_pylist() for name in ("t_ns", "frame", "rows"))

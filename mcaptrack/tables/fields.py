@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 #: Version of the tables' columns: the second number grows when columns are added.
-TABLE_VERSION: Final = "1.2"
+TABLE_VERSION: Final = "1.3"
 
 #: The unit of counts and ids.
 _NONE: Final = "1"
@@ -223,6 +223,7 @@ _CHANNELS: Final = Table(
         Field("input_digest", _TEXT, "SHA-256 of the messages it was made from", nullable=True),
         Field("encoding", _TEXT, "encoding of its messages", nullable=True),
         Field("weights_sha256", _TEXT, "SHA-256 of the weights it was made with", nullable=True),
+        Field("frame_id", _TEXT, "frame of reference of its metres, where the log has frames", nullable=True),
     ),
 )
 

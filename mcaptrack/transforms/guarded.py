@@ -11,7 +11,7 @@ import numpy as np
 from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import warn
 from mcaptrack.registry import Entry, failure, is_interruption
-from mcaptrack.schema import SCORES_NEEDED, TRACKS, Frame, Rows, Schema
+from mcaptrack.schema import SCORES_NEEDED, SIZES, TRACKS, Frame, Rows, Schema
 from mcaptrack.transforms.protocol import Transform, passes_of
 
 #: Kinds with a main output of one frame for each frame that is read, at its time and with its number.
@@ -175,7 +175,7 @@ def _problem(schema: Schema, rows: Rows) -> str:
     for name in rows.dtype.names or ():
         if rows.dtype[name].kind == "f" and np.isinf(rows[name]).any():
             return f"{schema.name}.{name} is infinite in row {int(np.isinf(rows[name]).argmax())}"
-        if name in ("w_px", "h_px") and (rows[name] < 0).any():
+        if name in SIZES and (rows[name] < 0).any():
             first = int((rows[name] < 0).argmax())
             return f"{schema.name}.{name} is {rows[name][first]:g} in row {first}; sizes are not below 0"
     if schema is TRACKS:

@@ -29,6 +29,7 @@ __all__ = [
     "PICTURES_READ",
     "Classes",
     "MessageType",
+    "NamedFrames",
     "Picture",
     "boxes_decoder",
     "detections",
@@ -65,6 +66,14 @@ class Picture(NamedTuple):
     format: str
     data: bytes
     layout: PixelLayout | None = None
+
+
+class NamedFrames(NamedTuple):
+    """Frames of a channel, the names of their classes by class id, and the frame that their metres are in, or ""."""
+
+    frames: list[Frame]
+    classes: dict[int, str]
+    frame_id: str = ""
 
 
 def holds_pictures(channel: log.Channel) -> bool:
@@ -110,11 +119,11 @@ def stamps(opened: log.Log, topic: str) -> Ints:
 
 def detections(opened: log.Log, topic: str) -> list[Frame]:
     """The boxes of another detector, one frame for each message. Raises McaptrackError as ``pictures`` does."""
-    return named_detections(opened, topic)[0]
+    return named_detections(opened, topic).frames
 
 
-def named_detections(opened: log.Log, topic: str) -> tuple[list[Frame], dict[int, str]]:
-    """The boxes of another detector as ``detections`` gives them, and the names of their classes by class id.
+def named_detections(opened: log.Log, topic: str) -> NamedFrames:
+    """The boxes of another detector as ``detections`` gives them, with the names of their classes.
 
     Class names are converted to ids (see ``boxes.Classes``), which a warning lists.
     """
@@ -127,7 +136,7 @@ def named_detections(opened: log.Log, topic: str) -> tuple[list[Frame], dict[int
     if numbers:
         names = ", ".join(f"{number} is {name!r}" for name, number in classes.named())
         warn(f"{opened.path}: classes of {topic} are names; in class_id 1 is a person, {names}", "classes")
-    return frames, classes.names_by_id()
+    return NamedFrames(frames, classes.names_by_id())
 
 
 def _decoded(

@@ -145,7 +145,7 @@ class LogTables:
     def _boxes(self, topic: str) -> Part:
         """Foreign boxes; none, and a note, if they can't be read: the other tables don't depend on them."""
         try:
-            frames, self._class_names[topic] = foreign.named_detections(self.opened, topic)
+            frames, self._class_names[topic], _ = foreign.named_detections(self.opened, topic)
         except McaptrackError as error:
             self._note("detections", f"{error}; no boxes of {topic} are in the table")
             t_ns = self.opened.times(topic)
@@ -240,7 +240,7 @@ def _channel(channel: log.Channel) -> dict[str, object]:
         "encoding": channel.message_encoding or None,
     }
     if made:
-        names = ("transform", "input", "version", "digest", "input_digest", "weights_sha256")
+        names = ("transform", "input", "version", "digest", "input_digest", "weights_sha256", "frame_id")
         out |= {name: getattr(made, name) or None for name in names}
         out["parameters"] = json.dumps(made.parameters, sort_keys=True, separators=(",", ":"))
         out["compared_with"] = json.dumps(dict(made.references), sort_keys=True) if made.references else None

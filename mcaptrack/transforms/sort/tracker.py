@@ -304,20 +304,23 @@ class _FilterReport:
     """Counts the detections that pass the filters of class and score, and warns if none does."""
 
     def __init__(self, options: Sort) -> None:
-        self._options, self._count, self._kept = options, 0, 0
+        self._options, self._count, self._kept, self._without_box = options, 0, 0, 0
         self._classes: set[int] = set()
         self._highest = -np.inf
 
     def count(self, frames: Sequence[Frame], kept: int) -> None:
         """Count frames, and how many of their detections passed the filters."""
         self._kept += kept
+        self._without_box += sum(int(np.isnan(frame.rows["x_px"]).sum()) for frame in frames)
         for rows in (frame.rows for frame in frames if len(frame.rows) and not self._kept):
             self._count += len(rows)
             self._classes.update(rows["class_id"].tolist())
             self._highest = max(self._highest, float(np.nanmax(rows["score"], initial=-np.inf)))
 
     def warn(self) -> None:
-        """Warn if no detection passed."""
+        """Warn if no detection passed, and of detections that have a position in metres only."""
+        if self._without_box:
+            warn(f"{self._without_box} detections have no box in pixels and are left out", "left-out")
         wanted, least = self._options.class_id, self._options.min_score
         if self._kept or not self._count:
             return
