@@ -15,7 +15,7 @@ import pytest
 from mcaptrack import log, notices, pipeline
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.plane import GroundPlane
-from mcaptrack.pipeline import findings
+from mcaptrack.pipeline import drawing, findings
 from mcaptrack.pipeline import write as writing
 from mcaptrack.schema import DETECTIONS, FORECAST_SCORES, GROUND_PLANE, PREDICTIONS, TRACKS, Frame, Schema
 from mcaptrack.schema.ground_plane import plane_to_rows
@@ -521,7 +521,7 @@ def test_people_are_where_the_best_tracks_say(tmp_path):
             assert writing._positions(opened, "/camera", {})[:, 0].tolist() == pytest.approx(
                 [number, np.nan] * 2, nan_ok=True
             )
-            shown = {"/camera/retracks": writing.ChannelToDraw(TRACKS, at(9.0, 1), "", "")}
+            shown = {"/camera/retracks": drawing.ChannelToDraw(TRACKS, at(9.0, 1), "", "")}
             assert writing._positions(opened, "/camera", shown)[0].tolist() == [9.0, 0.0]
         nowhere = [Frame(0, 0, tracks_at({1: (float("nan"), 1.0)}))] * (number % 2)
         wrong = (DETECTIONS, Provenance(INGEST, {}), [Frame(0, 0, boxes_at([(1, 1)]))])
@@ -583,8 +583,8 @@ def test_a_camera_starts_with_its_first_picture_or_row(tmp_path):
     with log.read(path) as opened:
         camera = pipeline.camera_at(opened, "/camera")
         shown = {
-            "/camera/x": writing.ChannelToDraw(TRACKS, early, "", ""),
-            "/camera/y": writing.ChannelToDraw(TRACKS, [], "", ""),
+            "/camera/x": drawing.ChannelToDraw(TRACKS, early, "", ""),
+            "/camera/y": drawing.ChannelToDraw(TRACKS, [], "", ""),
         }
         none = np.empty(0, np.int64)
         assert writing._start_ns(opened, camera, {}, none) == ns(5)
@@ -640,10 +640,10 @@ def views_of(
         FORECAST_SCORES: scored(1.0),
     }
     shown = {
-        f"/camera/{name}": writing.ChannelToDraw(schema, frames[schema], f"of {name}", made_by)
+        f"/camera/{name}": drawing.ChannelToDraw(schema, frames[schema], f"of {name}", made_by)
         for name, (schema, made_by) in names.items()
     }
-    drawn = writing._ViewFactory("/camera", ns_, ns_, [(0, PLANE)])
+    drawn = drawing.ViewFactory("/camera", ns_, ns_, [(0, PLANE)])
     found = [*drawn.views(shown, 3), *drawn.views(shown, 3)]
     kinds = {"foxglove.ImageAnnotations": "image", "foxglove.SceneUpdate": "scene", "foxglove.FrameTransform": "frame"}
     twice = [view.topic for view in found].count("/camera/view/tf")

@@ -17,8 +17,8 @@ from mcaptrack.foxglove.messages import (
     unpack,
     unpack_picture,
 )
-from mcaptrack.foxglove.palette import colour, colours
-from mcaptrack.foxglove.scenes import PersonMarker, SceneMessages
+from mcaptrack.foxglove.palette import class_colour, colour, colours
+from mcaptrack.foxglove.scenes import Boxes, BoxMarker, PersonMarker, SceneMessages
 
 __all__ = [
     "ANNOTATIONS",
@@ -29,8 +29,11 @@ __all__ = [
     "TRANSFORM",
     "VIDEO",
     "Annotations",
+    "BoxMarker",
+    "Boxes",
     "PersonMarker",
     "SceneMessages",
+    "class_colour",
     "colour",
     "colours",
     "message_class",

@@ -31,6 +31,7 @@ class Eye(NamedTuple):
     """The position from which a scene is seen: the target in metres, distance, tilt and bearing.
 
     ``tilt_deg`` is 0 straight from above; ``bearing_deg`` is the direction of sight, clockwise from the second axis.
+    ``z_m`` is the height of the ground.
     """
 
     x_m: float
@@ -38,6 +39,11 @@ class Eye(NamedTuple):
     distance_m: float
     tilt_deg: float
     bearing_deg: float
+    z_m: float = 0.0
+
+
+#: The view of a robot from behind, in its own frame: the first axis points ahead.
+_BEHIND: Final = Eye(0.0, 0.0, 50.0, 60.0, 90.0)
 
 
 def panel(title: str, config: Config) -> dict[str, Any]:
@@ -55,8 +61,11 @@ def image_panel(title: str, image_topic: str, annotations: Mapping[str, bool]) -
     return panel(title, {"imageMode": mode, "synchronize": False, "syncedTopics": dict.fromkeys(annotations, False)})
 
 
-def scene_panel(title: str, frame_id: str, topics: Mapping[str, bool], eye: Eye) -> dict[str, Any]:
-    """A 3D panel for a coordinate frame with a grid, with the topics of scenes that are on or off."""
+def scene_panel(title: str, frame_id: str, topics: Mapping[str, bool], eye: Eye, follow: str = "") -> dict[str, Any]:
+    """A 3D panel for a coordinate frame with a grid, with the topics of scenes that are on or off.
+
+    The camera stands at ``eye`` in that frame, or moves with the frame of a robot, ``follow``.
+    """
     size = max(10, round(eye.distance_m / 10) * 10 * 2)
     grid = {
         "layerId": "foxglove.Grid",
@@ -68,21 +77,23 @@ def scene_panel(title: str, frame_id: str, topics: Mapping[str, bool], eye: Eye)
         "divisions": size if size <= _MOST_CELLS else max(1, size // 10),
         "lineWidth": 1,
         "color": "#4a4a6a80",
-        "position": [round(eye.x_m), round(eye.y_m), 0],
+        "position": [round(eye.x_m), round(eye.y_m), eye.z_m or 0],
         "rotation": [0, 0, 0],
     }
+    seen = _BEHIND if follow else eye
     camera = {
         **_CAMERA,
-        "distance": eye.distance_m,
-        "phi": eye.tilt_deg,
-        "thetaOffset": eye.bearing_deg,
-        "targetOffset": [eye.x_m, eye.y_m, 0],
+        "distance": seen.distance_m,
+        "phi": seen.tilt_deg,
+        "thetaOffset": seen.bearing_deg,
+        "targetOffset": [seen.x_m, seen.y_m, seen.z_m or 0],
     }
     scene = {
         "cameraState": camera,
         "followMode": "follow-pose",
-        "followTf": frame_id,
-        "scene": {"transforms": {"visible": False}},
+        "followTf": follow or frame_id,
+        # Lines to the parents of frames end at the origin of the map, which may be far away.
+        "scene": {"transforms": {"visible": False, **({"lineWidth": 0} if follow else {})}},
         "transforms": {},
         "topics": {topic: {"visible": is_on} for topic, is_on in topics.items()},
         "layers": {"grid": grid},

@@ -1,8 +1,9 @@
-"""The colours of identities: the same in every panel, and distinct for colour-blind people."""
+"""The colours of identities and classes: the same in every panel, and distinct for colour-blind people."""
 
 from __future__ import annotations
 
 import colorsys
+import re
 from functools import cache
 from typing import Final
 
@@ -10,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack.geometry.arrays import Floats
+from mcaptrack.schema.classes import PEOPLE
 
 Rgba = tuple[float, float, float, float]
 
@@ -38,6 +40,26 @@ def colour(identity: int, alpha: float = 1.0) -> Rgba:
 def colours(identities: NDArray[np.int64]) -> Floats:
     """The colours of N identities, (N, 3)."""
     return _table()[identities % COUNT]
+
+
+#: The places of classes in the palette, by words of their names; other classes take the places after these.
+_CLASSES: Final[dict[str, int]] = {
+    **dict.fromkeys(("car", "vehicle", "automobile"), 0),
+    **dict.fromkeys(PEOPLE, 1),
+    **dict.fromkeys(("bicycle", "bike", "bicyclist", "cyclist", "motorcycle", "motorcyclist", "motorbike"), 3),
+    **dict.fromkeys(("truck", "bus", "van", "trailer", "lorry"), 5),
+}
+_UNKNOWN: Final = (0.75, 0.75, 0.75)
+
+
+def class_colour(class_id: int, name: str = "") -> tuple[float, float, float]:
+    """The colour of a class: by its name, so that cars have one colour in all logs, else by its number; 0 is grey."""
+    words = re.split(r"[\W_]+", name.casefold())
+    found = next((_CLASSES[word] for word in words if word in _CLASSES), None)
+    if found is None and not class_id:
+        return _UNKNOWN
+    red, green, blue, _ = colour(class_id + len(_HUES) if found is None else found)
+    return red, green, blue
 
 
 @cache

@@ -1,4 +1,4 @@
-"""Drawings on the ground plane, in metres: SceneUpdate messages, for many instants at once.
+"""Drawings in metres, on a ground plane or in space: SceneUpdate messages, for many instants at once.
 
 Three rules of the viewers shape these messages: after a seek only the last message of a topic is known, so each message
 removes everything and holds everything; an entity disappears after its lifetime, which counts from the log time; a
@@ -27,6 +27,11 @@ PER_M: Final = 64
 _ALL: Final = 1  # SceneEntityDeletion.ALL
 _LINE_STRIP, _LINE_LOOP, _LINE_LIST = 0, 1, 2
 _UPRIGHT: Final = {"w": 1.0}
+#: The height of ellipses above the ground, and the least height of a drawn box.
+_DISC_M: Final = 0.02
+_SLAB_M: Final = 0.0625
+#: The length of the line that shows the heading of a box, in lengths of the box.
+_AHEAD: Final = 0.75
 
 
 class PersonMarker(NamedTuple):
@@ -39,6 +44,32 @@ class PersonMarker(NamedTuple):
     number_m: float
     thickness_px: float
     in_pieces: bool = False
+
+
+class BoxMarker(NamedTuple):
+    """The drawing of a 3D box: the shares of its height between which it is drawn, and the height of the number above
+    the top (or, if negative, below the bottom) of the box.
+    """
+
+    bottom: float
+    top: float
+    number_m: float
+
+
+class Boxes(NamedTuple):
+    """3D boxes of N objects: centres (N, 3) m, sizes (N, 3) m as length, width and height, and headings (N,) rad."""
+
+    centre_m: Floats
+    size_m: Floats
+    heading_rad: Floats
+
+    def chosen(self, which: NDArray[Any]) -> Boxes:
+        """Some of the boxes."""
+        return Boxes(*(values[which] for values in self))
+
+    def base_m(self) -> Floats:
+        """The heights (N,) of the bottoms."""
+        return np.asarray(self.centre_m[:, 2] - self.size_m[:, 2] / 2, np.float64)
 
 
 class SceneMessages:
@@ -72,24 +103,57 @@ class SceneMessages:
                 **_shades("", rgb[chosen]), **_shades("text_", rgb[chosen]), **_line(trail[chosen], rgb[chosen], fade),
             )  # fmt: skip
 
+    def boxes(
+        self, frame: Ints, labels: NDArray[Any], boxes: Boxes, rgb: Floats, alpha: Floats, label_rgb: Floats,
+        marker: BoxMarker, trail_m: Floats, fade: Floats, line: PersonMarker,
+    ) -> None:  # fmt: skip
+        """Draw boxes of N objects in colours (N, 3), a line that leads ahead from the middle of each top, and labels
+        and trails through points (N, P, 3), as ``people`` does, in colours ``label_rgb`` (N, 3).
+        """
+        base, (length_m, width_m, height_m) = boxes.base_m(), boxes.size_m.T
+        size = _short(np.stack([length_m, width_m, np.maximum((marker.top - marker.bottom) * height_m, _SLAB_M)], -1))
+        middle = _short(boxes.centre_m)
+        middle[:, 2] = _short(base + (marker.top + marker.bottom) / 2 * height_m)
+        over = marker.number_m + (height_m if marker.number_m > 0 else 0)
+        ahead = np.repeat(np.stack([*boxes.centre_m[:, :2].T, base + height_m], axis=-1)[:, None], 2, axis=1)
+        heading = np.stack([np.cos(boxes.heading_rad), np.sin(boxes.heading_rad)], axis=-1)
+        ahead[:, 1, :2] += _AHEAD * length_m[:, None] * heading
+        trail, ahead = _short(trail_m), _short(ahead)
+        for length, chosen, words in by_length(labels):
+            template = _box(self._frame_id, self._lifetime_ns, length, line, trail.shape[1])
+            place = {name: middle[chosen, axis] for axis, name in enumerate("xyz")}
+            above = {"text_x": place["x"], "text_y": place["y"], "text_z": _short((base + over)[chosen])}
+            extent = {name: size[chosen, axis] for axis, name in enumerate(("long", "wide", "high"))}
+            front = {f"ahead__{name}": ahead[chosen, :, axis] for axis, name in enumerate("xyz")}
+            self._add(
+                frame[chosen], template, entity_id=words, label=words, a=alpha[chosen], **place, **above, **extent,
+                **front, **_turned(boxes.heading_rad[chosen]), **_shades("", rgb[chosen]),
+                **_shades("ahead_", rgb[chosen]), **_shades("text_", label_rgb[chosen]),
+                **_line(trail[chosen], label_rgb[chosen], fade),
+            )  # fmt: skip
+
     def forecasts(
         self, frame: Ints, numbers: Ints, path_m: Floats, rgb: Floats, fade: Floats, thickness_px: float,
         ellipses: tuple[Floats, Floats, Floats] | None,
     ) -> None:  # fmt: skip
         """Draw lines through points (N, P, 2) with opacities (P,), and ellipses: centres (N, 2), half axes (N, 2),
-        turns (N,).
+        turns (N,). Points and centres may have a height: (N, P, 3), (N, 3).
 
         A turn is in radians, from the first axis of the plane to the first of the ellipse.
         """
         path = _short(path_m)
+        is_high = path.shape[2] > 2
         for length, chosen, words in by_length(numbers):
-            template = _forecast(self._frame_id, self._lifetime_ns, length, path.shape[1], thickness_px, bool(ellipses))
+            template = _forecast(
+                self._frame_id, self._lifetime_ns, length, path.shape[1], thickness_px, bool(ellipses), is_high
+            )
             more = {}
             if ellipses:
                 (at, half, turn), shades = (part[chosen] for part in ellipses), _shades("", rgb[chosen])
                 size = np.maximum(_short(2 * half), 1 / PER_M)
                 more = {"x": _short(at[:, 0]), "y": _short(at[:, 1]), "wide": size[:, 0], "deep": size[:, 1], **shades}
-                more |= {"turn_z": _short(np.sin(turn / 2), 4096), "turn_w": _short(np.cos(turn / 2), 4096)}
+                more |= _turned(turn)
+                more |= {"z": _short(at[:, 2] + _DISC_M)} if is_high else {}
             line = _line(path[chosen], rgb[chosen], fade)
             self._add(frame[chosen], template, entity_id=words, **more, **line)
 
@@ -118,12 +182,18 @@ def _shades(front: str, rgb: Floats) -> dict[str, Floats]:
     return {front + name: rgb[:, place] for place, name in enumerate("rgb")}
 
 
+def _turned(heading_rad: Floats) -> dict[str, Floats]:
+    """The columns of a rotation about the vertical."""
+    return {"turn_z": _short(np.sin(heading_rad / 2), 4096), "turn_w": _short(np.cos(heading_rad / 2), 4096)}
+
+
 def _line(points_m: Floats, rgb: Floats, fade: Floats) -> dict[str, Floats]:
     """The columns of a line; none for a line of one point."""
     if points_m.shape[1] < 2:
         return {}
     shades = {f"colours__{name}": rgb[:, place, None] for place, name in enumerate("rgb")}
-    return {"points__x": points_m[..., 0], "points__y": points_m[..., 1], "colours__a": _short(fade), **shades}
+    axes = {f"points__{name}": points_m[..., axis] for axis, name in enumerate("xyz"[: points_m.shape[2]])}
+    return {**axes, "colours__a": _short(fade), **shades}
 
 
 def _template(content: dict[str, Any]) -> Template:
@@ -146,16 +216,17 @@ def _entity(frame_id: str, lifetime_ns: int, name: Any, **content: Any) -> Templ
     return _template({"entities": {**whole, **content}})
 
 
-def _lines(count: int, thickness_px: float, in_pieces: bool = False) -> list[dict[str, Any]]:
+def _lines(count: int, thickness_px: float, in_pieces: bool = False, is_high: bool = False) -> list[dict[str, Any]]:
     if count < 2:
         return []
+    axes = "xyz" if is_high else "xy"
     return [
         {
             "type": _LINE_LIST if in_pieces else _LINE_STRIP,
             "pose": {"position": {}, "orientation": _UPRIGHT},
             "thickness": thickness_px,
             "scale_invariant": True,
-            "points": Each("points", count, {"x": Slot("x"), "y": Slot("y")}),
+            "points": Each("points", count, {name: Slot(name) for name in axes}),
             "color": {},
             "colors": Each("colours", count, _paint()),
         }
@@ -171,8 +242,14 @@ def _person(frame_id: str, lifetime_ns: int, length: int, marker: PersonMarker, 
         "top_scale": 1.0,
         "color": _paint(),
     }
-    above = {"x": Slot("text_x"), "y": Slot("text_y"), "z": marker.number_m}
-    name = {
+    name = _label(length, marker.number_m)
+    lines = _lines(points, marker.thickness_px, marker.in_pieces)
+    return _entity(frame_id, lifetime_ns, TextSlot("entity_id", length), cylinders=[body], texts=[name], lines=lines)
+
+
+def _label(length: int, height: float | Slot) -> dict[str, Any]:
+    above = {"x": Slot("text_x"), "y": Slot("text_y"), "z": height}
+    return {
         "pose": {"position": above, "orientation": _UPRIGHT},
         "billboard": True,
         "font_size": 14.0,
@@ -180,17 +257,36 @@ def _person(frame_id: str, lifetime_ns: int, length: int, marker: PersonMarker, 
         "color": {**_paint("text_"), "a": 1.0},
         "text": TextSlot("label", length),
     }
-    lines = _lines(points, marker.thickness_px, marker.in_pieces)
-    return _entity(frame_id, lifetime_ns, TextSlot("entity_id", length), cylinders=[body], texts=[name], lines=lines)
+
+
+@cache
+def _box(frame_id: str, lifetime_ns: int, length: int, line: PersonMarker, points: int) -> Template:
+    turn = {"z": Slot("turn_z"), "w": Slot("turn_w")}
+    body = {
+        "pose": {"position": {name: Slot(name) for name in "xyz"}, "orientation": turn},
+        "size": {"x": Slot("long"), "y": Slot("wide"), "z": Slot("high")},
+        "color": _paint(),
+    }
+    ahead = {
+        "type": _LINE_STRIP,
+        "pose": {"position": {}, "orientation": _UPRIGHT},
+        "thickness": 2.0,
+        "scale_invariant": True,
+        "points": Each("ahead", 2, {name: Slot(name) for name in "xyz"}),
+        "color": {**_paint("ahead_"), "a": 1.0},
+    }
+    lines = [ahead, *_lines(points, line.thickness_px, line.in_pieces, is_high=True)]
+    name = _label(length, Slot("text_z"))
+    return _entity(frame_id, lifetime_ns, TextSlot("entity_id", length), cubes=[body], texts=[name], lines=lines)
 
 
 @cache
 def _forecast(
-    frame_id: str, lifetime_ns: int, length: int, points: int, thickness_px: float, has_ellipse: bool
+    frame_id: str, lifetime_ns: int, length: int, points: int, thickness_px: float, has_ellipse: bool, is_high: bool
 ) -> Template:
     disc = {
         "pose": {
-            "position": {"x": Slot("x"), "y": Slot("y"), "z": 0.02},
+            "position": {"x": Slot("x"), "y": Slot("y"), "z": Slot("z") if is_high else _DISC_M},
             "orientation": {"z": Slot("turn_z"), "w": Slot("turn_w")},
         },
         "size": {"x": Slot("wide"), "y": Slot("deep"), "z": 0.01},
@@ -198,7 +294,7 @@ def _forecast(
         "top_scale": 1.0,
         "color": {**_paint(), "a": 0.25},
     }
-    lines, discs = _lines(points, thickness_px), [disc] if has_ellipse else []
+    lines, discs = _lines(points, thickness_px, is_high=is_high), [disc] if has_ellipse else []
     return _entity(frame_id, lifetime_ns, TextSlot("entity_id", length), cylinders=discs, lines=lines)
 
 

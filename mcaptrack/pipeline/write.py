@@ -14,23 +14,35 @@ from numpy.typing import NDArray
 from mcaptrack import foxglove, log
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.foxglove import views
-from mcaptrack.foxglove.layouts import Eye
 from mcaptrack.foxglove.views import layouts
 from mcaptrack.geometry.arrays import Ints
 from mcaptrack.geometry.camera_path import CameraPath
 from mcaptrack.geometry.plane import Planes, moved_planes
 from mcaptrack.notices import warn
 from mcaptrack.pipeline.checks import describe_origin, may_replace
+from mcaptrack.pipeline.drawing import (
+    ChannelToDraw,
+    View,
+    ViewFactory,
+    frame_topic,
+    has_bodies,
+    new_frames,
+    recorded_drawings,
+    recorded_sources,
+    robot_frame,
+)
 from mcaptrack.schema import DETECTIONS, FORECAST_SCORES, GROUND_PLANE, PREDICTIONS, SCHEMAS, TRACKS, Frame, Schema
 from mcaptrack.schema.classes import class_names, classes_beside_rows, has_classes, only_class, without_class
-from mcaptrack.schema.framing import frame_times
-from mcaptrack.schema.provenance import INGEST, VIEW, Provenance, digest
+from mcaptrack.schema.provenance import INGEST, VIEW, Provenance, digest, frame_id_of
 from mcaptrack.sources import foreign
 from mcaptrack.sources.cameras import VIDEO, Camera, camera_at
-from mcaptrack.transforms import FULL, STAGES
+from mcaptrack.sources.frames import transforms_of
+from mcaptrack.transforms import FULL
 
 #: Log time in ns, channel number, sequence number and payload of a message.
 Numbered = tuple[int, int, int, bytes]
+#: Endings of the topics of forecasts, and of the online tracks that they belong to.
+_PREDICTED, _ONLINE = "/predictions", "/online"
 
 
 class Made(NamedTuple):
@@ -116,9 +128,13 @@ def write(
     shown = _channels_to_draw(opened, camera, made)
     outdated = {topic + suffix for topic in shown for suffix in views.SUFFIXES}
     planes = moved_planes(planes, path)
-    drawn = _ViewFactory(prefix, picture_ns, stamp_ns, planes, path)
-    if any(channel.schema in _ON_GROUND for channel in shown.values()):
-        outdated.add(drawn.frame_topic)
+    frame_id = _frame_id(opened, prefix, shown)
+    is_framed = bool(frame_id) or any(one.frame_id for one in shown.values())
+    tree = transforms_of(opened) if is_framed else None
+    frames = new_frames(prefix, shown, tree.frames() if tree else ())
+    drawn = ViewFactory(prefix, picture_ns, stamp_ns, planes, path, frames)
+    if frames:
+        outdated.add(frame_topic(prefix))
     recorded = {topic for topic in outdated if not may_replace(opened, topic, VIEW)}
     outdated -= recorded
     for topic in sorted(recorded):
@@ -127,12 +143,21 @@ def write(
     start_ns = _start_ns(opened, camera, shown, picture_ns)
     eye = layouts.eye_on(_positions(opened, prefix, shown), planes, start_ns)
     last_step, is_truth_known = _last_step(opened, prefix, shown), _is_truth_known(opened, prefix, shown)
+    sources = recorded_sources(opened, [*camera.topics, *(one.provenance.input for one in made.values())])
+    follow = robot_frame(opened, sources, tree, frame_id) if tree and frame_id else ""
+    by_viewers = recorded_drawings(opened, sources) if frame_id else {}
+    floor_m = _floor_m(opened, prefix, shown) if frame_id else 0.0
     # Write views of unchanged channels first, so that channels made again keep their place and the log its bytes.
     first, last = ({t: c for t, c in shown.items() if (t in made) is is_made} for is_made in (False, True))
     drawn_first = [view for view in drawn.views(first, start_ns) if view.topic not in recorded]
     drawn_last = [view for view in drawn.views(last, start_ns) if view.topic not in recorded]
     topics = {*opened.channels} - outdated | {*made} | {view.topic for view in (*drawn_first, *drawn_last)}
-    layout_files = layouts.make(drawn.camera_channels(topics, video, eye, last_step, is_truth_known))
+    names = frozenset(topic.removeprefix(prefix + "/") for topic in topics if topic.startswith(prefix + "/"))
+    frame_id = frame_id or views.ground.frame_of(prefix)
+    channels = layouts.CameraChannels(
+        prefix, names, video, frame_id, eye._replace(z_m=floor_m), last_step, is_truth_known, follow, by_viewers
+    )
+    layout_files = layouts.make(channels)
     new = {attachment_of(name): content for name, content in layout_files.items()}
     unchanged = {name for name, content in new.items() if opened.attachment(name) == content}
     replaced = [name for name in ATTACHMENTS if name not in unchanged]
@@ -162,25 +187,16 @@ def write(
     return layout_files
 
 
-class ChannelToDraw(NamedTuple):
-    """A channel that gets views: ``digest`` of its messages; ``made_by``, the stage that made it in this run, or "";
-    ``classes``, the names of its classes by number.
-    """
-
-    schema: Schema
-    frames: list[Frame]
-    digest: str
-    made_by: str
-    classes: Mapping[int, str] = {}
-
-
 def _channels_to_draw(opened: log.Log, camera: Camera, made: Mapping[str, Made]) -> dict[str, ChannelToDraw]:
     """Return the channels that get views, by topic: those of this run, and ingested ones without a current view."""
     shown = {
-        topic: ChannelToDraw(channel.schema, channel.frames, how.digest, how.transform, class_names(how.to_metadata()))
+        topic: ChannelToDraw(
+            channel.schema, channel.frames, how.digest, how.transform, class_names(how.to_metadata()), how.frame_id
+        )
         for topic, channel in made.items()
         for how in (channel.provenance,)
     }
+    inputs = {topic: channel.provenance.input for topic, channel in made.items()}
     for topic, channel in sorted(opened.channels.items()):
         schema = SCHEMAS.get(channel.schema_name)
         known = Provenance.from_metadata(channel.metadata)
@@ -190,70 +206,23 @@ def _channels_to_draw(opened: log.Log, camera: Camera, made: Mapping[str, Made])
         drawn_from = Provenance.from_metadata(drawn.metadata) if drawn else None
         is_new = drawn_from is None or drawn_from.input_digest != known.digest
         if schema in (*views.DRAWN, GROUND_PLANE) and is_new:
-            names = class_names(channel.metadata)
-            shown[topic] = ChannelToDraw(schema, opened.frames(topic, schema), known.digest, "", names)
+            names, frame_id = class_names(channel.metadata), known.frame_id
+            shown[topic] = ChannelToDraw(schema, opened.frames(topic, schema), known.digest, "", names, frame_id)
+            inputs[topic] = known.input
+    for topic, one in shown.items():
+        if one.schema is PREDICTIONS:
+            shown[topic] = one._replace(bodies=_bodies(opened, shown, topic, inputs[topic]))
     return shown
 
 
-class View(NamedTuple):
-    """A channel that draws another; ``messages`` are time in ns, sequence number and payload."""
-
-    topic: str
-    schema_name: str
-    provenance: Provenance
-    group: str
-    messages: Iterator[tuple[int, int, bytes]]
-
-
-class _ViewFactory:
-    """Draws the channels of a camera: in its pictures, and on the ground plane."""
-
-    def __init__(
-        self, prefix: str, picture_ns: Ints, stamp_ns: Ints, planes: Planes, path: CameraPath | None = None
-    ) -> None:
-        self._prefix, self._picture_ns, self._stamp_ns, self._planes = prefix, picture_ns, stamp_ns, planes
-        self._path = path
-        self._frame_id = views.ground.frame_of(prefix)
-        self._is_framed = False
-        #: The topic of the transform from the world to the ground plane's frame.
-        self.frame_topic = f"{prefix}/view/tf"
-
-    def views(self, shown: Mapping[str, ChannelToDraw], start_ns: int) -> Iterator[View]:
-        """Yield the views of these channels, and, once, the transform to the frame that scenes are drawn in."""
-        for topic, channel in shown.items():
-            made_from = Provenance(VIEW, {}, topic, channel.digest)
-            group = channel.made_by
-            if topic == f"{self._prefix}/ground_plane":
-                outline = views.ground.outlines(self._planes, start_ns, self._frame_id)
-                yield View(topic + views.SCENE_SUFFIX, foxglove.SCENE, made_from, group, outline)
-            if channel.schema not in views.DRAWN or topic.endswith(_NOT_SHOWN) or topic + FULL in shown:
-                continue  # another channel shows the same tracks at more times
-            is_retracked = channel.made_by in STAGES and STAGES[channel.made_by].repairs_tracks
-            frames, names = channel.frames, channel.classes
-            drawing = views.Drawing(topic, channel.schema, frames, self._planes, is_retracked, names, self._path)
-            if len(self._picture_ns):
-                drawn = drawing.on_pictures(self._picture_ns, self._stamp_ns)
-                yield View(topic + views.SUFFIX, foxglove.ANNOTATIONS, made_from, group, drawn)
-            if channel.schema in _ON_GROUND:
-                own_ns = frame_times(channel.frames)
-                t_ns = self._picture_ns if len(self._picture_ns) else own_ns
-                scene = drawing.on_ground(t_ns, self._frame_id)
-                yield View(topic + views.SCENE_SUFFIX, foxglove.SCENE, made_from, group, scene)
-        on_ground = {topic: channel for topic, channel in shown.items() if channel.schema in _ON_GROUND}
-        if on_ground and not self._is_framed:
-            self._is_framed = True
-            frame = foxglove.pack_transform(start_ns, views.ground.world_of(self._prefix), self._frame_id)
-            topic, channel = next(iter(on_ground.items()))
-            made_from = Provenance(VIEW, {}, topic, channel.digest)
-            yield View(self.frame_topic, foxglove.TRANSFORM, made_from, "", iter([(start_ns, 0, frame)]))
-
-    def camera_channels(
-        self, topics: set[str], video: str | None, eye: Eye, last_step: int, is_truth_known: bool
-    ) -> layouts.CameraChannels:
-        """Describe the camera's channels for layouts."""
-        front = self._prefix + "/"
-        names = frozenset(topic.removeprefix(front) for topic in topics if topic.startswith(front))
-        return layouts.CameraChannels(self._prefix, names, video, self._frame_id, eye, last_step, is_truth_known)
+def _bodies(opened: log.Log, shown: Mapping[str, ChannelToDraw], topic: str, source: str) -> Sequence[Frame]:
+    """Return the tracks that forecasts belong to, if they have 3D boxes: those beside them, or those predicted from."""
+    beside = topic.removesuffix(_PREDICTED)
+    for name in (beside + _ONLINE, beside, source):
+        frames = _frames(opened, shown, name, TRACKS)
+        if frames:
+            return frames if has_bodies(frames) else ()
+    return ()
 
 
 def _start_ns(opened: log.Log, camera: Camera, shown: Mapping[str, ChannelToDraw], picture_ns: Ints) -> int:
@@ -302,6 +271,27 @@ def _positions(opened: log.Log, prefix: str, shown: Mapping[str, ChannelToDraw])
     return np.empty((0, 2))
 
 
+def _frame_id(opened: log.Log, prefix: str, shown: Mapping[str, ChannelToDraw]) -> str:
+    """Return the frame of the metres of a camera's tracks; "" for that of its ground plane."""
+    for name in ("retracks/full", "retracks", "tracks", "truth", "samples"):
+        topic = f"{prefix}/{name}"
+        if topic in shown:
+            return shown[topic].frame_id
+        if topic in opened.channels:
+            return frame_id_of(opened.channels[topic].metadata)
+    return ""
+
+
+def _floor_m(opened: log.Log, prefix: str, shown: Mapping[str, ChannelToDraw]) -> float:
+    """Return the usual height of the bottoms of 3D boxes; 0 if there are none."""
+    for name in ("retracks", "tracks", "truth", "samples"):
+        rows = TRACKS.joined([frame.rows for frame in _frames(opened, shown, f"{prefix}/{name}", TRACKS)])
+        base_m = rows["z_m"] - rows["height_m"] / 2
+        if np.isfinite(base_m).any():
+            return round(float(np.nanmedian(base_m)), 1)
+    return 0.0
+
+
 def _with_number(number: int, messages: Iterable[tuple[int, int, bytes]]) -> Iterator[Numbered]:
     return ((t_ns, number, sequence, data) for t_ns, sequence, data in messages)
 
@@ -310,12 +300,6 @@ def _write_by_time(writer: log.LogWriter, streams: Iterable[Iterator[Numbered]])
     """Merge channels that are each sorted by time, so that messages shown together are close together in the log."""
     for t_ns, number, sequence, data in heapq.merge(*streams, key=lambda message: message[0]):
         writer.add_message(number, t_ns, sequence, data)
-
-
-#: Endings of channels without a view: another channel shows the same tracks at more times.
-_NOT_SHOWN: Final = ("/samples", "/online")
-#: Schemas with a view on the ground plane, in metres.
-_ON_GROUND: Final = (TRACKS, PREDICTIONS, GROUND_PLANE)
 
 
 def layout_path(path: Path, name: str) -> Path:

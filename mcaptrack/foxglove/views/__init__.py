@@ -68,15 +68,15 @@ class Drawing:
         elif self._schema is PREDICTIONS:
             yield from image.predictions(self._frames, pictures, self._planes, self._path)
 
-    def on_ground(self, t_ns: Ints, frame_id: str) -> View:
+    def on_ground(self, t_ns: Ints, frame_id: str, bodies: Sequence[Frame] = ()) -> View:
         """Scene messages (time, frame, payload) in metres, one for each of the rising times ``t_ns``.
 
-        ``frame_id`` is their coordinate frame.
+        ``frame_id`` is their coordinate frame; ``bodies`` are the tracks with 3D boxes that forecasts belong to.
         """
         if self._schema is TRACKS:
-            yield from ground.tracks(self._people(t_ns), t_ns, frame_id, self._style)
+            yield from ground.tracks(self._people(t_ns), t_ns, frame_id, self._style, self._classes)
         elif self._schema is PREDICTIONS:
-            yield from ground.predictions(self._frames, t_ns, frame_id)
+            yield from ground.predictions(self._frames, t_ns, frame_id, bodies)
 
     def _people(self, t_ns: Ints) -> People:
         """The people at these times, computed once for both views."""

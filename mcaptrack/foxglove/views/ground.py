@@ -1,19 +1,22 @@
-"""Rows drawn on the ground plane, in metres: a scene for each picture, or without pictures for each frame.
+"""Rows drawn on the ground plane or as 3D boxes, in metres: a scene for each picture, or for each frame.
 
 Letters: N people, P points.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
-from mcaptrack.foxglove import SceneMessages, colours
+from mcaptrack.foxglove import SceneMessages, class_colour, colours
 from mcaptrack.foxglove.views.image import View, fade
 from mcaptrack.foxglove.views.people import (
+    ForecastPaths,
     People,
+    base_heights,
     by_count,
     ellipses,
     forecasts,
@@ -27,6 +30,7 @@ from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.plane import GroundPlane, Planes
 from mcaptrack.schema import Frame
+from mcaptrack.schema.framing import frame_times
 
 _BATCH: Final = 128
 _WHITE: Final = (1.0, 1.0, 1.0)
@@ -70,39 +74,68 @@ class _Instants:
         yield from zip(self.t_ns[span].tolist(), range(span.start, span.stop), scene.messages(), strict=True)
 
 
-def tracks(people: People, t_ns: Ints, frame_id: str, style: TrackStyle) -> View:
+def tracks(people: People, t_ns: Ints, frame_id: str, style: TrackStyle, classes: Mapping[int, str] = {}) -> View:
     """Draw cylinders with numbers and fading trails; interpolated positions are fainter.
 
-    ``people`` are those at these times.
+    ``people`` are those at these times. 3D boxes are drawn in the colours of their ``classes``, names by number.
     """
     instants = _Instants(t_ns, frame_id)
+    has_body = people.has_body()
     known = np.asarray(np.isfinite(people.at_m).all(axis=1), np.bool_)
     lines = trails(people, known, t_ns)
     longest = lines.row.shape[1] - 1
     rgb = np.broadcast_to(_WHITE, (len(people.number), 3)) if style.is_white else colours(people.number)
-    alpha = 0.875 * np.where(people.observed, OBSERVED, INTERPOLATED)
+    body_rgb = rgb if style.is_white else _class_colours(people.class_id, classes)
+    strength = np.where(people.observed, OBSERVED, INTERPOLATED)
+    alpha, body_alpha = 0.875 * strength, 0.625 * strength
+    places = np.column_stack([people.at_m, people.body.base_m()])
     bounds = np.searchsorted(people.frame, np.arange(len(t_ns) + 1))
     for span, scene in instants.batches():
         rows = np.arange(bounds[span.start], bounds[span.stop])
         rows = rows[known[rows]]
-        for points, chosen in by_count(lines.points[rows]):
-            these = rows[chosen]
-            trail = people.at_m[lines.row[these, -points:]]
+        for points, is_solid, these in _alike(lines.points, has_body, rows):
+            trail = places[lines.row[these, -points:], : 3 if is_solid else 2]
             opacity = fade(points, longest + 1)
             if style.marker.in_pieces:
                 trail, opacity = segments(trail, style.dash), np.repeat(opacity[1:], 2)
-            scene.people(
-                people.frame[these] - span.start, people.label[these], people.at_m[these], rgb[these], alpha[these],
-                style.marker, trail, opacity,
-            )  # fmt: skip
+            frame, label = people.frame[these] - span.start, people.label[these]
+            if is_solid:
+                boxes = people.body.chosen(these)
+                scene.boxes(
+                    frame, label, boxes, body_rgb[these], body_alpha[these], rgb[these], style.box, trail, opacity,
+                    style.marker,
+                )  # fmt: skip
+            else:
+                scene.people(frame, label, people.at_m[these], rgb[these], alpha[these], style.marker, trail, opacity)
         yield from instants.numbered(span, scene)
 
 
-def predictions(frames: Sequence[Frame], t_ns: Ints, frame_id: str) -> View:
-    """Draw the latest forecasts as lines that fade into the future, with the 95 % ellipses of their last step."""
+def _alike(points: Ints, has_body: NDArray[np.bool_], rows: Ints) -> Iterator[tuple[int, bool, Ints]]:
+    """Split rows by the number of points of their trail and by whether they have a 3D box."""
+    for is_solid in (False, True):
+        some = rows[has_body[rows] == is_solid]
+        for count, chosen in by_count(points[some]):
+            yield count, is_solid, some[chosen]
+
+
+def _class_colours(class_id: Ints, classes: Mapping[int, str]) -> Floats:
+    """The colours of classes (N,), (N, 3)."""
+    known, which = np.unique(class_id, return_inverse=True)
+    table = [class_colour(one, classes.get(one, "")) for one in known.tolist()]
+    return np.array(table, float).reshape(-1, 3)[which]
+
+
+def predictions(frames: Sequence[Frame], t_ns: Ints, frame_id: str, bodies: Sequence[Frame] = ()) -> View:
+    """Draw the latest forecasts as lines that fade into the future, with the 95 % ellipses of their last step.
+
+    ``bodies`` are tracks with 3D boxes; forecasts of these are drawn at the height of their bottoms.
+    """
     instants = _Instants(t_ns, frame_id)
     wanted = latest(frames, t_ns)
-    futures = [(future, ellipses(future.spread_m2), colours(future.number)) for future in forecasts(frames)]
+    futures = [
+        (_raised(future, bodies, frame_times(frames)), ellipses(future.spread_m2), colours(future.number))
+        for future in forecasts(frames)
+    ]
     for span, scene in instants.batches():
         for future, (half, turn), rgb in futures:
             which, frame = shown_at(future.message, wanted[span])
@@ -115,6 +148,19 @@ def predictions(frames: Sequence[Frame], t_ns: Ints, frame_id: str) -> View:
                 spread = (future.end_m[at], half[at], turn[at]) if has_ellipse else None
                 scene.forecasts(frame[ok], future.number[at], path[ok], rgb[at], weaker, _FORECAST_PX, spread)
         yield from instants.numbered(span, scene)
+
+
+def _raised(future: ForecastPaths, bodies: Sequence[Frame], made_ns: Ints) -> ForecastPaths:
+    """Forecasts with a height: that of the bottom of the 3D box, or of the usual one if a track has none."""
+    if not bodies:
+        return future
+    height = base_heights(bodies, made_ns[future.message], future.number)
+    known = np.isfinite(height)
+    height[~known] = np.median(height[known]) if known.any() else 0.0
+    along = np.broadcast_to(height[:, None, None], (*future.path_m.shape[:2], 1))
+    return future._replace(
+        path_m=np.concatenate([future.path_m, along], axis=2), end_m=np.column_stack([future.end_m, height])
+    )
 
 
 def outlines(planes: Planes, start_ns: int, frame_id: str) -> View:

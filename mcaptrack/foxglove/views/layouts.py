@@ -37,6 +37,9 @@ class CameraChannels(NamedTuple):
     """The channels of a camera: the names of its topics below the prefix, the topic of pictures, the coordinate frame
     and the view of the ground, the number of steps of forecasts, and whether their errors against ground truth are
     known.
+
+    ``follow`` is the frame of the robot that recorded 3D boxes; ``recorded`` are topics that viewers draw in 3D
+    themselves, and whether they are these boxes.
     """
 
     prefix: str
@@ -46,6 +49,8 @@ class CameraChannels(NamedTuple):
     eye: Eye
     last_step: int
     is_truth_known: bool = False
+    follow: str = ""
+    recorded: Mapping[str, bool] = {}
 
     def topics(self, suffix: str, on: Collection[str]) -> dict[str, bool]:
         """The topics of all views with a suffix, and whether each is on."""
@@ -100,8 +105,10 @@ def _tracking(camera: CameraChannels) -> bytes:
     channels = {name.removesuffix("/view/image").removesuffix("/view/scene") for name in camera.names}
     on = best_channels([name for name in channels if camera.has_view(name)])
     panels: dict[str, Any] = {}
-    left = [*_image(camera, panels, "picture", "Video", on), *_plots(camera, panels)]
-    right = [*_ground(camera, panels, "ground", "Ground", on), *_event_text_or_log(camera, panels)]
+    picture = _image(camera, panels, "picture", "Video", on)
+    scene = _ground(camera, panels, "ground", "Tracks" if camera.recorded else "Ground", on)
+    left = [*(picture or scene), *_plots(camera, panels)]
+    right = [*(scene if picture else ()), *_recorded(camera, panels), *_event_text_or_log(camera, panels)]
     return _file(panels, _columns(left, right, 55.0))
 
 
@@ -166,8 +173,18 @@ def _ground(camera: CameraChannels, panels: dict[str, Any], name: str, title: st
     topics = camera.topics("/view/scene", [*on, "ground_plane"])
     if not topics:
         return []
-    panels[f"3D!{name}"] = layouts.scene_panel(title, camera.frame_id, topics, camera.eye)
+    topics |= dict.fromkeys(camera.recorded, False)
+    panels[f"3D!{name}"] = layouts.scene_panel(title, camera.frame_id, topics, camera.eye, camera.follow)
     return [f"3D!{name}"]
+
+
+def _recorded(camera: CameraChannels, panels: dict[str, Any]) -> list[Tree]:
+    """The boxes that other software recorded, for comparison."""
+    if not any(camera.recorded.values()):
+        return []
+    topics = {**camera.topics("/view/scene", ()), **camera.recorded}
+    panels["3D!recorded"] = layouts.scene_panel("Recorded boxes", camera.frame_id, topics, camera.eye, camera.follow)
+    return ["3D!recorded"]
 
 
 def _plots(camera: CameraChannels, panels: dict[str, Any]) -> list[Tree]:

@@ -11,13 +11,14 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from mcaptrack.foxglove import Boxes
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.camera_path import CameraPath
 from mcaptrack.geometry.clocks import seconds_to_ns
 from mcaptrack.geometry.plane import GroundPlane, Planes
 from mcaptrack.geometry.ragged import group_index, ragged_range, run_starts
-from mcaptrack.schema import PREDICTIONS, Frame
+from mcaptrack.schema import PREDICTIONS, TRACKS, Frame, Rows
 from mcaptrack.schema.camera_motion import to_scene
 from mcaptrack.schema.classes import class_name
 from mcaptrack.schema.framing import frame_times, join_frames
@@ -39,8 +40,8 @@ CHI2_95: Final = 5.991464547107979
 
 
 class People(NamedTuple):
-    """S people at instants: ids, instants, boxes (S, 4) px, feet (S, 2) px, positions (S, 2) m, whether observed, and
-    labels: the ids, or texts with id and class.
+    """S people at instants: ids, instants, boxes (S, 4) px, feet (S, 2) px, positions (S, 2) m, whether observed,
+    labels (the ids, or texts with id and class), classes, and 3D boxes, NaN where there is none.
     """
 
     number: Ints
@@ -50,6 +51,13 @@ class People(NamedTuple):
     at_m: Floats
     observed: NDArray[np.bool_]
     label: NDArray[Any]
+    class_id: Ints
+    body: Boxes
+
+    def has_body(self) -> NDArray[np.bool_]:
+        """Which people (S,) have a 3D box."""
+        known = np.isfinite(self.body.centre_m).all(axis=1) & np.isfinite(self.body.size_m).all(axis=1)
+        return np.asarray(known, np.bool_)
 
 
 class Trails(NamedTuple):
@@ -107,9 +115,38 @@ def people_at(
         at_m[unknown] = plane.boxes_to_metres(box[unknown])
         unknown = held & np.isnan(foot).any(axis=1) & np.isfinite(at_m).all(axis=1)
         foot[unknown] = plane.metres_to_pixels(at_m[unknown])
-    number = rows["track_id"].astype(np.int64)
-    label = _labels(number, rows["class_id"].astype(np.int64), classes)
-    return People(number, frame, box, foot, at_m, np.array(rows["observed"], bool), label)
+    number, class_id = rows["track_id"].astype(np.int64), rows["class_id"].astype(np.int64)
+    label, observed = _labels(number, class_id, classes), np.array(rows["observed"], bool)
+    return People(number, frame, box, foot, at_m, observed, label, class_id, bodies_of(rows))
+
+
+def bodies_of(rows: Rows) -> Boxes:
+    """The 3D boxes of tracks (S,); an unknown heading is drawn along the first axis."""
+    centre, size = (
+        np.stack([rows[name] for name in names], axis=-1)
+        for names in (("x_m", "y_m", "z_m"), ("length_m", "width_m", "height_m"))
+    )
+    return Boxes(centre, size, np.nan_to_num(rows["heading_rad"]))
+
+
+def base_heights(tracks: Sequence[Frame], made_ns: Ints, number: Ints) -> Floats:
+    """The heights (N,) of the bottoms of the 3D boxes of tracks at times (N,) in ns; NaN for tracks without any.
+
+    They are those of the row before, or of the first row of a track that begins later.
+    """
+    joined = join_frames(TRACKS, tracks)
+    base = bodies_of(joined.rows).base_m()
+    known = np.isfinite(base)
+    base, t_ns, of = base[known], joined.row_ns[known], joined.rows["track_id"][known].astype(np.int64)
+    order = np.lexsort((t_ns, of))
+    base, t_ns, of = base[order], t_ns[order], of[order]
+    out = np.full(len(number), np.nan)
+    for one in np.intersect1d(number, of).tolist():
+        low, high = np.searchsorted(of, [one, one + 1])
+        wanted = number == one
+        before = np.searchsorted(t_ns[low:high], made_ns[wanted], "right") - 1
+        out[wanted] = base[low + np.maximum(before, 0)]
+    return out
 
 
 def _labels(number: Ints, class_id: Ints, names: Mapping[int, str]) -> NDArray[Any]:
@@ -194,10 +231,10 @@ def shown_at(message: Ints, wanted: Ints) -> tuple[Ints, Ints]:
 
 
 def segments(points: Floats, drawn: float = 1.0) -> Floats:
-    """The lines between points (N, P, 2) as pairs of ends (N, 2 (P - 1), 2); the first share ``drawn`` of each."""
+    """The lines between points (N, P, D) as pairs of ends (N, 2 (P - 1), D); the first share ``drawn`` of each."""
     start = points[:, :-1]
     end = start + drawn * (points[:, 1:] - start)
-    return np.stack([start, end], axis=2).reshape(len(points), -1, 2)
+    return np.stack([start, end], axis=2).reshape(len(points), -1, points.shape[2])
 
 
 def ellipses(spread_m2: Floats) -> tuple[Floats, Floats]:

@@ -1,0 +1,193 @@
+"""Draw the channels of a camera: on its pictures, and in the coordinate frame of their metres."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from itertools import islice
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from mcaptrack import foxglove, log
+from mcaptrack.errors import McaptrackError
+from mcaptrack.foxglove import views
+from mcaptrack.geometry.arrays import Ints
+from mcaptrack.geometry.camera_path import CameraPath
+from mcaptrack.geometry.plane import Planes
+from mcaptrack.geometry.transform_tree import TransformTree
+from mcaptrack.schema import GROUND_PLANE, PREDICTIONS, TRACKS, Frame, Schema
+from mcaptrack.schema.framing import frame_times
+from mcaptrack.schema.provenance import VIEW, Provenance
+from mcaptrack.sources.cameras import chain_of
+from mcaptrack.sources.foreign.decoding import decoder_with_errors, plain_name
+from mcaptrack.sources.foreign.flatten import message_type_of
+from mcaptrack.transforms import FULL, STAGES
+
+#: Endings of channels without a view: another channel shows the same tracks at more times.
+_NOT_SHOWN: Final = ("/samples", "/online")
+#: The number of messages that are read to find the frame of a channel.
+_MOST_READ: Final = 100
+#: Schemas of recorded messages that viewers draw in 3D, by their names in ROS 1 and Foxglove.
+_DRAWN_BY_VIEWERS: Final = (
+    "foxglove.LaserScan",
+    "foxglove.PointCloud",
+    "foxglove.SceneUpdate",
+    "sensor_msgs/LaserScan",
+    "sensor_msgs/PointCloud2",
+    "visualization_msgs/Marker",
+    "visualization_msgs/MarkerArray",
+)
+#: Schemas with a view on the ground plane, in metres.
+_ON_GROUND: Final = (TRACKS, PREDICTIONS, GROUND_PLANE)
+
+
+class ChannelToDraw(NamedTuple):
+    """A channel that gets views: ``digest`` of its messages; ``made_by``, the stage that made it in this run, or "";
+    ``classes``, the names of its classes by number; ``frame_id``, the frame of its metres, "" for the ground plane.
+
+    Forecasts of tracks with 3D boxes have these tracks, ``bodies``.
+    """
+
+    schema: Schema
+    frames: list[Frame]
+    digest: str
+    made_by: str
+    classes: Mapping[int, str] = {}
+    frame_id: str = ""
+    bodies: Sequence[Frame] = ()
+
+    def is_solid(self) -> bool:
+        """Whether it has 3D boxes, or belongs to tracks that have."""
+        return bool(self.bodies) or (self.schema is TRACKS and has_bodies(self.frames))
+
+
+def has_bodies(frames: Iterable[Frame]) -> bool:
+    """Whether any row of these tracks has a 3D box."""
+    return any(np.isfinite(frame.rows["z_m"]).any() for frame in frames)
+
+
+class View(NamedTuple):
+    """A channel that draws another; ``messages`` are time in ns, sequence number and payload."""
+
+    topic: str
+    schema_name: str
+    provenance: Provenance
+    group: str
+    messages: Iterator[tuple[int, int, bytes]]
+
+
+class ViewFactory:
+    """Draws the channels of a camera: in its pictures, and in the frame of their metres.
+
+    ``frames`` are the coordinate frames that no transform of the log names; None for that of the ground plane alone.
+    """
+
+    def __init__(
+        self,
+        prefix: str,
+        picture_ns: Ints,
+        stamp_ns: Ints,
+        planes: Planes,
+        path: CameraPath | None = None,
+        frames: Sequence[str] | None = None,
+    ) -> None:
+        self._prefix, self._picture_ns, self._stamp_ns, self._planes = prefix, picture_ns, stamp_ns, planes
+        self._path = path
+        self._frames = (views.ground.frame_of(prefix),) if frames is None else frames
+
+    def views(self, shown: Mapping[str, ChannelToDraw], start_ns: int) -> Iterator[View]:
+        """Yield the views of these channels, and, once, the transforms to the frames that no other names."""
+        for topic, channel in shown.items():
+            made_from = Provenance(VIEW, {}, topic, channel.digest)
+            group = channel.made_by
+            frame_id = frame_of(self._prefix, channel)
+            if topic == f"{self._prefix}/ground_plane":
+                outline = views.ground.outlines(self._planes, start_ns, frame_id)
+                yield View(topic + views.SCENE_SUFFIX, foxglove.SCENE, made_from, group, outline)
+            if channel.schema not in views.DRAWN or topic.endswith(_NOT_SHOWN) or topic + FULL in shown:
+                continue  # another channel shows the same tracks at more times
+            is_retracked = channel.made_by in STAGES and STAGES[channel.made_by].repairs_tracks
+            frames, names = channel.frames, channel.classes
+            drawing = views.Drawing(topic, channel.schema, frames, self._planes, is_retracked, names, self._path)
+            is_solid = channel.is_solid()
+            if len(self._picture_ns) and not is_solid:
+                drawn = drawing.on_pictures(self._picture_ns, self._stamp_ns)
+                yield View(topic + views.SUFFIX, foxglove.ANNOTATIONS, made_from, group, drawn)
+            if channel.schema in _ON_GROUND:
+                own_ns = frame_times(channel.frames)
+                t_ns = self._picture_ns if len(self._picture_ns) and not is_solid else own_ns
+                scene = drawing.on_ground(t_ns, frame_id, channel.bodies)
+                yield View(topic + views.SCENE_SUFFIX, foxglove.SCENE, made_from, group, scene)
+        on_ground = {topic: channel for topic, channel in shown.items() if channel.schema in _ON_GROUND}
+        if on_ground and self._frames:
+            transforms = [
+                (start_ns, number, foxglove.pack_transform(start_ns, views.ground.world_of(self._prefix), frame_id))
+                for number, frame_id in enumerate(self._frames)
+            ]
+            self._frames = ()
+            topic, channel = next(iter(on_ground.items()))
+            made_from = Provenance(VIEW, {}, topic, channel.digest)
+            yield View(frame_topic(self._prefix), foxglove.TRANSFORM, made_from, "", iter(transforms))
+
+
+def frame_topic(prefix: str) -> str:
+    """Return the topic of the transforms to the frames that no other transform of the log names."""
+    return f"{prefix}/view/tf"
+
+
+def frame_of(prefix: str, channel: ChannelToDraw) -> str:
+    """Return the coordinate frame that a channel is drawn in."""
+    return channel.frame_id or views.ground.frame_of(prefix)
+
+
+def new_frames(prefix: str, shown: Mapping[str, ChannelToDraw], known: Collection[str]) -> list[str]:
+    """Return the coordinate frames of drawings that are not ``known``, in order."""
+    wanted = [frame_of(prefix, channel) for channel in shown.values() if channel.schema in _ON_GROUND]
+    return [frame_id for frame_id in dict.fromkeys(wanted) if frame_id not in known]
+
+
+def robot_frame(opened: log.Log, sources: Collection[str], tree: TransformTree, fixed: str) -> str:
+    """Return the frame of the robot with the sensors of these topics: the lowest frame above theirs that moves.
+
+    Sensors are fixed to it. "" if the frame of the messages is not known, or does not move in the fixed frame.
+    """
+    for topic in sources:
+        chain = tree.chain_of(_frame_of_messages(opened, topic))
+        for frame_id in chain[: chain.index(fixed)] if fixed in chain else ():
+            if not tree.series[frame_id].is_static:
+                return frame_id
+    return ""
+
+
+def recorded_drawings(opened: log.Log, sources: Collection[str]) -> dict[str, bool]:
+    """Return the recorded topics that viewers draw in 3D, and whether they are among ``sources``."""
+    return {
+        channel.topic: channel.topic in sources
+        for channel in sorted(opened.channels.values(), key=lambda one: one.topic)
+        if plain_name(channel.schema_name) in _DRAWN_BY_VIEWERS and Provenance.from_metadata(channel.metadata) is None
+    }
+
+
+def recorded_sources(opened: log.Log, topics: Iterable[str]) -> list[str]:
+    """Return the recorded topics that these were made from."""
+    found = {topic for one in topics for topic in chain_of(opened, one)[-1:]} & set(opened.channels)
+    return sorted(topic for topic in found if Provenance.from_metadata(opened.channels[topic].metadata) is None)
+
+
+def _frame_of_messages(opened: log.Log, topic: str) -> str:
+    """Return the frame that the first messages of a recorded channel name; "" if they name none."""
+    try:
+        decode = decoder_with_errors(message_type_of(opened, topic), _frame_named)
+        return next(filter(None, (decode(message.payload) for message in islice(opened.timed(topic), _MOST_READ))), "")
+    except McaptrackError:
+        return ""
+
+
+def _frame_named(message: Any) -> str:
+    parts = (getattr(message, name, ()) for name in ("entities", "markers", "boxes", "objects", "detections"))
+    for one in (message, *(part for some in parts for part in some)):
+        for holder in (one, getattr(one, "header", None)):
+            name = getattr(holder, "frame_id", "")
+            if name:
+                return str(name)
+    return ""
