@@ -6,7 +6,7 @@ SCHEMA_VERSION = 1
 
 _PARTS = {
     "catalogue": ["Model", "get_model", "models"],
-    "contents": ["ChannelInfo", "LogInfo", "info"],
+    "contents": ["ChannelInfo", "FrameInfo", "LogInfo", "info"],
     "detecting": ["detect", "motion"],
     "demonstration": ["DemoResult", "demo"],
     "fetching": ["FetchedMessage"],

@@ -2,6 +2,7 @@ from mcaptrack.api.catalogue import Model as Model
 from mcaptrack.api.catalogue import get_model as get_model
 from mcaptrack.api.catalogue import models as models
 from mcaptrack.api.contents import ChannelInfo as ChannelInfo
+from mcaptrack.api.contents import FrameInfo as FrameInfo
 from mcaptrack.api.contents import LogInfo as LogInfo
 from mcaptrack.api.contents import info as info
 from mcaptrack.api.demonstration import DemoResult as DemoResult
@@ -57,6 +58,7 @@ __all__ = [
     "DropResult",
     "ExportResult",
     "FetchedMessage",
+    "FrameInfo",
     "IngestResult",
     "LogCheck",
     "LogInfo",

@@ -17,6 +17,7 @@ from mcaptrack.geometry.transform_tree import Reason, Recorded, Samples, Transfo
 from mcaptrack.notices import collected
 from mcaptrack.sources import frames
 from mcaptrack.sources.foreign import MessageType
+from tests.commands import done
 from tests.ros_messages import BAR, Ros
 
 START_NS = 1_700_000_000_000_000_000
@@ -405,3 +406,71 @@ class TestReading:
         kind, _ = MESSAGES["FrameTransform"]
         with log.read(write(tmp_path / "a.mcap", ("/tf", kind, []))) as opened:
             assert frames.transforms_of(opened) is None
+
+
+def data(*words: object) -> list[dict]:
+    return json.loads(done(*words, "--json").out)["results"]
+
+
+def packed(parent: str, child: str, t_ns: int, x: float = 0.0) -> bytes:
+    one = FrameTransform(parent_frame_id=parent, child_frame_id=child)
+    one.timestamp.seconds, one.timestamp.nanos = divmod(t_ns, S)
+    one.translation.x = x
+    one.rotation.w = 1
+    return one.SerializeToString()
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory) -> Path:
+    """A robot whose localisation is silent from 2 to 4 s, and jumps by 5 m at 6 s, with a lidar and an arm."""
+    kind, _ = MESSAGES["FrameTransform"]
+    times = [number / 10 for number in range(101) if not 20 < number < 40]
+    moving = [(int(at(s)[0]), packed("map", "base_link", int(at(s)[0]), s + 5 * (s > 5.95))) for s in times]
+    fixed = [(START_NS, packed("base_link", name, START_NS, 1.0)) for name in ("lidar", "arm\x1b")]
+    other = [(START_NS, packed("base_link", "lidar", START_NS, 1.0))]
+    path = tmp_path_factory.mktemp("robot") / "robot.mcap"
+    return write(path, ("/tf", kind, moving), ("/tf_static", kind, fixed), ("/other", kind, other))
+
+
+class TestInfo:
+    def test_the_tree_is_drawn(self, robot):
+        lines = done("info", robot, "--frames").out.partition("\nframes\n")[2].splitlines()
+        assert lines == [
+            "└── map",
+            "    └── base_link  10 Hz, 0.000 to 10.000 s  gap: 2.000 to 4.000 s  jump: 6.000 s (5.1 m, 0 degrees)",
+            "        ├── arm\\x1b  static",
+            "        └── lidar  static",
+        ]
+
+    def test_the_same_in_json(self, robot):
+        (one,) = data("info", robot, "--frames")
+        names = [frame["frame"] for frame in one["frames"]]
+        assert names == ["map", "base_link", "arm\x1b", "lidar"]
+        root, base, _, lidar = one["frames"]
+        assert root == {
+            "frame": "map",
+            "parent": None,
+            "static": None,
+            "messages": 0,
+            "rate_hz": None,
+            "start_ns": None,
+            "end_ns": None,
+            "gaps": [],
+            "jumps": [],
+        }
+        assert (base["parent"], base["static"], base["messages"], base["rate_hz"]) == ("map", False, 82, 10.0)
+        assert (base["start_ns"], base["end_ns"]) == (START_NS, START_NS + 10 * S)
+        assert base["gaps"] == [{"start_ns": START_NS + 2 * S, "end_ns": START_NS + 4 * S}]
+        assert base["jumps"] == [{"t_ns": START_NS + 6 * S, "distance_m": 5.1, "angle_deg": 0.0}]
+        assert (lidar["static"], lidar["rate_hz"], lidar["messages"]) == (True, None, 1)
+        assert data("info", robot)[0]["frames"] is None
+
+    def test_it_says_what_contradicts(self, robot):
+        err = done("info", robot, "--frames").err
+        assert "transforms: map -> base_link: it has 1 gap, the longest of 2 s" in err
+        assert "transforms: map -> base_link: it jumps 1 time, farthest by 5.1 m" in err
+
+    def test_a_log_without_transforms(self, tmp_path):
+        kind, _ = MESSAGES["FrameTransform"]
+        path = write(tmp_path / "a.mcap", ("/other", kind._replace(name="foxglove.Log"), []))
+        assert done("info", path, "--frames").out.splitlines()[-1] == "no transforms"

@@ -813,6 +813,7 @@ def test_a_channel_that_results_replace_is_said_and_drawn_once():
         "start_ns": 5,
         "end_ns": 10**18 + 5,
         "results": "a.results.mcap",
+        "frames": None,
         "channels": [
             described | {"topic": "/a", "replaced": True},
             described | {"topic": "/a"},

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from math import degrees
 from pathlib import Path
 from typing import Any, Literal
 
 from mcaptrack import log as logs
 from mcaptrack import pipeline
 from mcaptrack.api.common import PathLike, as_path, warnings_about
-from mcaptrack.notices import Notice
+from mcaptrack.geometry.transform_series import TransformSeries
+from mcaptrack.notices import Notice, warn
 from mcaptrack.schema.provenance import Provenance
+from mcaptrack.sources.frames import read_frames
 
 
 @dataclass(frozen=True)
@@ -63,6 +66,43 @@ class ChannelInfo:
 
 
 @dataclass(frozen=True)
+class FrameInfo:
+    """A frame of reference that a log has transforms of, and how it moves in its parent.
+
+    Attributes
+    ----------
+    frame : str
+        Its name.
+    parent : str or None
+        The frame that its poses are in; None for a root. The fields below are then None, 0 or empty.
+    static : bool or None
+        Whether it never moves in its parent: its transforms hold for all times.
+    messages : int
+        Number of its transforms.
+    rate_hz : float or None
+        Number of transforms in a second, from the usual time between two; None if it is static.
+    start_ns, end_ns : int or None
+        Stamps of the first and last transform, in nanoseconds.
+    gaps : tuple of dict
+        Times without transforms, over which it is not interpolated: ``start_ns``, ``end_ns``.
+    jumps : tuple of dict
+        Steps far beyond the speed around them, as when a localisation is reset: ``t_ns``, ``distance_m``,
+        ``angle_deg``.
+
+    """
+
+    frame: str
+    parent: str | None = None
+    static: bool | None = None
+    messages: int = 0
+    rate_hz: float | None = None
+    start_ns: int | None = None
+    end_ns: int | None = None
+    gaps: tuple[Mapping[str, int], ...] = ()
+    jumps: tuple[Mapping[str, float], ...] = ()
+
+
+@dataclass(frozen=True)
 class LogInfo:
     """The contents of a log.
 
@@ -82,6 +122,8 @@ class LogInfo:
         Names of its attachments.
     channels : tuple of ChannelInfo
         Its channels by topic.
+    frames : tuple of FrameInfo or None
+        Its frames of reference, each after its parent; None unless they were asked for.
     warnings : tuple of mcaptrack.Notice
         What looks odd.
 
@@ -95,6 +137,7 @@ class LogInfo:
     messages: int
     attachments: tuple[str, ...]
     channels: tuple[ChannelInfo, ...]
+    frames: tuple[FrameInfo, ...] | None
     warnings: tuple[Notice, ...]
 
     def __repr__(self) -> str:
@@ -118,18 +161,20 @@ class LogInfo:
         results = str(self.results) if self.results else None
         out = asdict(self) | {"log": str(self.log), "results": results, "attachments": list(self.attachments)}
         del out["warnings"]
-        return out | {"channels": list(out["channels"])}
+        return out | {"channels": list(out["channels"]), "frames": None if self.frames is None else list(out["frames"])}
 
 
-def info(log: PathLike) -> LogInfo:
+def info(log: PathLike, *, frames: bool = False) -> LogInfo:
     """Return the channels of a log, their number of messages, and what was made from what.
 
-    Reads the summary of the log only.
+    Reads the summary of the log only, unless ``frames`` asks for more.
 
     Parameters
     ----------
     log : path
         The log.
+    frames : bool
+        Whether to read the transforms between frames of reference, too, and list the frames.
 
     Returns
     -------
@@ -147,6 +192,8 @@ def info(log: PathLike) -> LogInfo:
     >>> made = {channel.topic: channel.transform for channel in mcaptrack.info("log.mcap").channels}
     >>> made["/camera/tracks"]
     'track'
+    >>> mcaptrack.info("log.mcap", frames=True).frames
+    ()
 
     """
     path = as_path(log)
@@ -163,6 +210,7 @@ def info(log: PathLike) -> LogInfo:
             messages=sum(sum(part.index.counts.values()) for part in opened.parts),
             attachments=tuple(listed.name for part in opened.parts for listed in part.index.attachments),
             channels=channels,
+            frames=_frames(opened) if frames else None,
             warnings=tuple(dict.fromkeys(warnings)),
         )
 
@@ -185,4 +233,43 @@ def _channel(opened: logs.Log, part: logs.Log, channel: logs.Channel) -> Channel
         plugins={part: plugin._asdict() for part, plugin in made.plugins.items()} if made else None,
         parameters=dict(made.parameters) if made else None,
         stale=not replaced and pipeline.is_stale(opened, channel.topic),
+    )
+
+
+def _frames(opened: logs.Log) -> tuple[FrameInfo, ...]:
+    """Return the frames of a log, each after its parent, and warn of what contradicts or lacks."""
+    read = read_frames(opened)
+    for words in read.unread:
+        warn(f"{opened.path}: {words}", "lost")
+    if read.tree is None:
+        return ()
+    for remark in read.tree.remarks:
+        warn(f"{opened.path}: transforms: {remark.text}", "transforms")
+    waiting = read.tree.roots()[::-1]
+    found: list[FrameInfo] = []
+    while waiting:
+        frame = waiting.pop()
+        found.append(_frame(frame, read.tree.series.get(frame)))
+        waiting += read.tree.children_of(frame)[::-1]
+    return tuple(found)
+
+
+def _frame(frame: str, series: TransformSeries | None) -> FrameInfo:
+    if series is None:
+        return FrameInfo(frame)
+    t_ns = series.t_ns.tolist()
+    sizes = zip(*series.step_sizes(series.jumps), strict=True)
+    return FrameInfo(
+        frame,
+        series.parent,
+        series.is_static,
+        series.messages,
+        None if series.is_static else round(1 / series.interval_s, 3),
+        t_ns[0],
+        t_ns[-1],
+        tuple({"start_ns": t_ns[step], "end_ns": t_ns[step + 1]} for step in series.gaps.tolist()),
+        tuple(
+            {"t_ns": t_ns[step + 1], "distance_m": round(float(moved), 6), "angle_deg": round(degrees(turned), 6)}
+            for step, (moved, turned) in zip(series.jumps.tolist(), sizes, strict=True)
+        ),
     )

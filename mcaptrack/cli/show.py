@@ -15,6 +15,12 @@ if TYPE_CHECKING:
 @common.one_line
 def info(
     logs: common.Logs,
+    frames: Annotated[
+        bool,
+        common.option(
+            "--frames", help="Also read the transforms between frames of reference, and draw the tree of frames."
+        ),
+    ] = False,
     output: common.Printed = None,
     force: common.Force = False,
     json: common.Json = False,
@@ -24,9 +30,11 @@ def info(
 ) -> None:
     """Show the channels of a log, their number of messages, and what was made from what.
 
-    Reads the summary only. With -v also the parameters that channels were made with.
+    Reads the summary only, unless --frames is given. With -v also the parameters that channels were made with.
 
     Example: mcaptrack info log.mcap
+
+    Example: mcaptrack info robot.mcap --frames
     """
     import mcaptrack
 
@@ -35,7 +43,7 @@ def info(
     with common.Talk(quiet, verbose).open() as talk, common.printed_to(output, force):
         for path in paths:
             with talk.attempt(path, paths):
-                data = mcaptrack.info(path).to_json()
+                data = mcaptrack.info(path, frames=frames).to_json()
                 if json:
                     results.append(data)
                 else:
@@ -63,10 +71,14 @@ def _print(data: dict[str, Any], verbose: bool) -> None:
     out.print(table)
     shown = {channel["topic"]: channel for channel in reversed(data["channels"]) if not channel["replaced"]}
     out.print(_lineage([*reversed(shown.values())], verbose))
+    if data["frames"] is not None:
+        out.print(_frames(data["frames"], data["start_ns"]) if data["frames"] else "no transforms")
 
 
-#: Deepest level of the drawn lineage. Channels below it are drawn at this level, beside their input.
+#: Deepest level of drawn trees. Channels and frames below it are drawn at this level, beside their input or parent.
 _DEEPEST: Final = 30
+#: The most gaps, or jumps, of a frame that are shown one by one.
+_SHOWN: Final = 3
 
 
 def _lineage(channels: list[dict[str, Any]], verbose: bool) -> Tree:
@@ -96,6 +108,38 @@ def _lineage(channels: list[dict[str, Any]], verbose: bool) -> Tree:
             node.add(Text(printable(words), "dim"))
         below = node if depth < _DEEPEST else parent
         waiting += [(below, other, depth + 1) for other in reversed(made_from.get(channel["topic"], []))]
+    return root
+
+
+def _frames(frames: list[dict[str, Any]], start_ns: int) -> Tree:
+    """Return frames as a tree, with the rate of each, and its times in seconds from the start of the log."""
+    from rich.text import Text
+    from rich.tree import Tree
+
+    def seconds(t_ns: int) -> str:
+        return f"{(t_ns - start_ns) / 1e9:.3f}"
+
+    root = Tree("frames")
+    nodes: dict[str | None, tuple[Tree, int]] = {None: (root, 0)}
+    for frame in frames:
+        label = Text(printable(frame["frame"]))
+        if frame["static"]:
+            label.append("  static", "dim")
+        elif frame["parent"] is not None:
+            span = f"{seconds(frame['start_ns'])} to {seconds(frame['end_ns'])} s"
+            label.append(f"  {frame['rate_hz']:.3g} Hz, {span}", "dim")
+        gaps = [f"{seconds(gap['start_ns'])} to {seconds(gap['end_ns'])} s" for gap in frame["gaps"]]
+        jumps = [
+            f"{seconds(jump['t_ns'])} s ({jump['distance_m']:.2g} m, {jump['angle_deg']:.0f} degrees)"
+            for jump in frame["jumps"]
+        ]
+        for word, found in (("gap", gaps), ("jump", jumps)):
+            if found:
+                more = f" and {len(found) - _SHOWN} more" if len(found) > _SHOWN else ""
+                label.append(f"  {word}{'s' * (len(found) > 1)}: {', '.join(found[:_SHOWN])}{more}", "red")
+        above, depth = nodes[frame["parent"]]
+        node = above.add(label)
+        nodes[frame["frame"]] = (node, depth + 1) if depth < _DEEPEST else (above, depth)
     return root
 
 

@@ -168,7 +168,7 @@ CASES: dict[str, dict[str, Case]] = {
         force=("query a.mcap 'select 1' -o clip.mp4", "--force"),
         verbose=("query a.mcap 'select 1'", "-v"),
     ),
-    "info": common("info a.mcap", output="-o b.txt", force=("info a.mcap -o clip.mp4", "--force")),
+    "info": common("info a.mcap", frames="--frames", output="-o b.txt", force=("info a.mcap -o clip.mp4", "--force")),
     "view": common(
         "view a.mcap",
         port="--port 1",
