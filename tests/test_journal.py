@@ -206,7 +206,7 @@ def test_what_another_program_wrote_into_a_half_written_log_is_not_undone(path):
     with log.read(path) as opened:
         first = opened.index.data_end  # where new results begin
     with path.open("rb+") as stream:
-        for row in range(4):
+        for row in range(2):  # one more was torn by the kill; two at most are expected
             stream.seek((first // 512 + 2 * row + 1) * 512)
             stream.write(b"by other software")
     before = everything(path.parent)

@@ -146,6 +146,13 @@ def test_every_convention_that_is_known_gives_the_same_boxes(case, is_named, tmp
     assert len({box[4] for box in boxes}) == 2
 
 
+def test_rows_of_a_single_class_are_read(tmp_path):
+    scores = grid()[0, :, 4:].max(axis=1, keepdims=True)
+    data = giving({"output0": grid(1, scores=scores)}, metadata={"names": "['person']"})
+    boxes, taken = detect(data, tmp_path)
+    assert (taken, [box[:4] for box in boxes]) == ("ultralytics", [box[:4] for box in EXPECTED])
+
+
 @pytest.mark.parametrize("case", REFUSED)
 @pytest.mark.parametrize("layout", ["auto", "ultralytics"])
 def test_conventions_that_are_not_known_are_refused_with_the_reason(case, layout, tmp_path):

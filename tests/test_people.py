@@ -286,11 +286,14 @@ class TestSeparating:
         assert people[np.argsort(boxes[:, 0])].tolist() == [2, 1]
         assert Separator(PERSON, 0.3).boxes(mask)[1].tolist() == [1, 1, 1]
 
-    def test_the_people_in_what_does_not_look_like_people_are_unknown(self):
-        mask = drawn((100, 140), (20, 40, 90, 7))
+    @pytest.mark.parametrize("is_large", [True, False])
+    def test_the_people_in_what_does_not_look_like_people_are_unknown(self, is_large):
+        """A low region is a box from the area of two whole people on, 2 x 8 x 24 pixels."""
+        box = (20, 40, 56 if is_large else 54, 7)
+        mask = drawn((100, 140), box)
         boxes, people = Separator(PERSON, 0.5).boxes(mask)
-        assert (boxes.tolist(), people.tolist()) == ([[20, 40, 90, 7]], [0])
-        assert Separator(PERSON, 0.5).counts(mask, boxes).tolist() == [0]
+        assert (boxes.tolist(), people.tolist()) == ([[*map(float, box)]] * is_large, [0] * is_large)
+        assert Separator(PERSON, 0.5).counts(mask, np.array([box], float)).tolist() == [0]
 
     def test_a_place_gains_what_its_pixels_say(self):
         """The log-likelihood of a person at each place, summed pixel by pixel."""

@@ -168,6 +168,15 @@ def test_the_distance_within_which_a_track_is_a_duplicate():
         compare(lambda more, s=side: odds(1.0 + more)[s] < sum(near + far) / 4, lambda more: more < 0.2, 0.0, 1.0)
 
 
+@pytest.mark.parametrize(("start", "end"), [(12, 22), (4, 14), (26, 36), (0, 10), (2, 12), (30, 40), (28, 38)])
+def test_a_duplicate_begins_after_the_other_track_and_ends_before_it(start, end):
+    paths = {1: line(0, 40, (0.0, 0.0), (1.0, 0.0)), 2: line(start, end - start, (0.4 * start, 0.5), (1.0, 0.0))}
+    out, _ = laid_out(paths)
+    _, _, smoothed = smooth(MODEL, out, 0.4)
+    found = float(track_log_odds(MODEL, out, smoothed, 0.4)[1])
+    assert found == pytest.approx(person_log_odds(MOTION, paths)[2])
+
+
 def crossing(beside_m: float, gap: int, shift: int, named: str) -> tuple[dict[int, Path], dict[int, dict[int, int]]]:
     """Two people cross, and their track ids are swapped ``shift`` steps after they met, in a gap of the tracks.
 
