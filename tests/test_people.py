@@ -269,6 +269,12 @@ class TestSeparating:
         tall = Person(0.0, 60.0, template())
         assert len(Separator(tall, 0.5).boxes(drawn((200, 200), (0, 80, wide, 8)))[0]) == there
 
+    @pytest.mark.parametrize(("box", "there"), [((40, 40, 6, 4), 1), ((40, 40, 23, 1), 0), ((40, 40, 18, 8), 1)])
+    def test_the_ends_of_what_is_enough_belong_to_it(self, box, there):
+        """Of a person of 20 pixels: an area of six percent of 400, and two fifths of the height."""
+        small = Person(0.0, 20.0, template())
+        assert len(Separator(small, 0.5).boxes(drawn((100, 100), box))[0]) == there
+
     @pytest.mark.parametrize("count", [1, 2, 3, 4])
     def test_a_box_around_several_people_carries_how_many_they_are(self, count):
         separator = Separator(PERSON, 0.5)
