@@ -37,6 +37,17 @@ def iou_of_pairs(a: Floats, b: Floats) -> Floats:
     return np.where(union > 0, intersection / np.where(union > 0, union, 1.0), 0.0)
 
 
+def share_inside(boxes: Floats, width_px: float, height_px: float) -> Floats:
+    """The share of the area of each box (N, 4) that is inside of a picture; NaN for boxes that are empty or missing."""
+    extent = [
+        np.clip(boxes[:, k] + boxes[:, k + 2], 0, size) - np.clip(boxes[:, k], 0, size)
+        for k, size in enumerate((width_px, height_px))
+    ]
+    area = boxes[:, 2] * boxes[:, 3]
+    share: Floats = np.divide(extent[0] * extent[1], area, out=np.full(len(boxes), np.nan), where=area > 0)
+    return share
+
+
 def overlapping(a: Floats, b: Floats, area_a: Floats, area_b: Floats) -> tuple[Indices, Indices, Floats]:
     """The pairs of boxes that overlap, and their intersection over union.
 

@@ -16,6 +16,7 @@ from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.plane import LEAST_DEPTH, PERSON_HEIGHT_M, GroundPlane, Planes, assumed_plane, ground_depth
 from mcaptrack.geometry.plane_from_boxes import plane_from_boxes
 from mcaptrack.pipeline import motion
+from mcaptrack.pipeline.visible import picture_size
 from mcaptrack.pipeline.write import Made
 from mcaptrack.schema import GROUND_PLANE, TRACKS, Frame, Rows
 from mcaptrack.schema.classes import PEOPLE, PERSON
@@ -23,7 +24,6 @@ from mcaptrack.schema.ground_plane import plane_to_rows, rows_to_plane
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources import foreign
 from mcaptrack.sources.cameras import camera_at, lineage, provenance_of
-from mcaptrack.sources.pictures import Pictures
 
 _ASSUME, _ESTIMATE = "assume-ground-plane", "estimate-ground-plane"
 #: A plane is estimated from boxes of at most so many frames.
@@ -141,11 +141,7 @@ def _picture_size(opened: log.Log, prefix: str, source: str, made: Mapping[str, 
     first = _chain(opened, source, made)[-1][0]
     channel = opened.channels.get(first)
     topic = first if channel and foreign.holds_pictures(channel) else camera_at(opened, prefix).pictures
-    try:
-        picture = next(Pictures(opened, topic).frames([0]), None) if topic else None
-    except McaptrackError:
-        return None
-    return None if picture is None else (picture.rows.shape[1], picture.rows.shape[0])
+    return picture_size(opened, topic)
 
 
 def _people(

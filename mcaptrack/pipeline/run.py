@@ -23,15 +23,16 @@ from mcaptrack.pipeline.findings import warn_findings, warn_memory, warn_no_rows
 from mcaptrack.pipeline.motion import path_with, side_inputs
 from mcaptrack.pipeline.planes import AS_BEFORE, PlaneChoice, is_plane_due, is_poor, make_plane, read_planes
 from mcaptrack.pipeline.rebuild import plugins_of
+from mcaptrack.pipeline.visible import picture_size, without_unseen
 from mcaptrack.pipeline.write import Made, digest_of, write
 from mcaptrack.predictors import weights_sha256
-from mcaptrack.schema import DETECTIONS, TRACKS, VIDEO, Frame
+from mcaptrack.schema import DETECTIONS, TRACKS, VIDEO, Frame, Schema
 from mcaptrack.schema.camera_motion import to_pictures, to_scene
 from mcaptrack.schema.classes import class_names
 from mcaptrack.schema.provenance import CLOCK, Provenance
 from mcaptrack.sources import foreign
 from mcaptrack.sources.camera_motion import tracks_topic
-from mcaptrack.sources.cameras import camera_at
+from mcaptrack.sources.cameras import camera_at, provenance_of
 from mcaptrack.sources.video import EncodedPicture, decode_bgr, decode_gray
 from mcaptrack.transforms import FULL, STAGES, Sample, Transform
 from mcaptrack.transforms.guarded import guarded
@@ -213,15 +214,20 @@ def _run_job(
             "left-out",
         )
     provenance = _provenance_of(job, transform, given, warnings, {**known.references, **motion})
-    out = {
-        topic: Made.of(schema, to_pictures(channel, path) if schema is TRACKS else channel, provenance)
+    channels: dict[str, tuple[Schema, Sequence[Frame]]] = {
+        topic: (schema, to_pictures(channel, path) if schema is TRACKS else channel)
         for (topic, schema), channel in zip(job.outputs().items(), outputs, strict=True)
-        if topic in job.kept()
     }
     if job.target + FULL in job.kept():
-        holds_back = getattr(transform, "holds_back", False)
-        out |= _at_video_rate(opened, job, {**made, **out}, planes, path, holds_back)
-    return out
+        is_unchanged = getattr(transform, "holds_back", False)
+        frames = _at_video_rate(opened, job, made, None if is_unchanged else outputs[0], planes, path)
+        channels |= {job.target + FULL: (TRACKS, frames)} if frames else {}
+    seen = without_unseen(channels, lambda: picture_size(opened, camera_at(opened, prefix).pictures))
+    return {
+        topic: Made.of(schema, list(frames), provenance)
+        for topic, (schema, frames) in seen.items()
+        if topic in job.kept()
+    }
 
 
 def _provenance_of(
@@ -260,29 +266,28 @@ def _provenance_of(
 
 
 def _at_video_rate(
-    opened: log.Log, job: Job, made: Mapping[str, Made], planes: Planes, path: CameraPath | None, holds_back: bool
-) -> dict[str, Made]:
-    """Return the re-tracked channel at the rate of the tracks that were sampled; empty if there are no such tracks.
+    opened: log.Log,
+    job: Job,
+    made: Mapping[str, Made],
+    retracked: Sequence[Frame] | None,
+    planes: Planes,
+    path: CameraPath | None,
+) -> list[Frame]:
+    """Return re-tracked tracks at the rate of the tracks that were sampled; no frames if there are no such tracks.
 
-    ``planes`` are those of reference pictures where the camera moves by ``path``.
+    None for ``retracked`` stands for the tracks as they are. Where the camera moves by ``path``, ``planes`` and the
+    boxes of ``retracked`` are those of reference pictures.
     """
-    samples = (
-        made[job.source].provenance
-        if job.source in made
-        else Provenance.from_metadata(opened.channel(job.source).metadata)
-    )
+    samples = made[job.source].provenance if job.source in made else provenance_of(opened, job.source)
     source = samples.input if samples else ""
     if source in made:
         tracks = made[source].frames if made[source].schema is TRACKS else []
     else:
         there = source in opened.channels and opened.channels[source].schema_name == TRACKS.name
         tracks = opened.frames(source, TRACKS) if there else []
-    if not tracks:
-        return {}
-    retracked = made[job.target]
-    tracks, slow = to_scene(tracks, path), to_scene(retracked.frames, path)
-    frames = unchanged_tracks(tracks, planes) if holds_back else to_video_rate(tracks, slow, planes)
-    return {job.target + FULL: Made.of(TRACKS, to_pictures(frames, path), retracked.provenance)}
+    tracks = to_scene(tracks, path)
+    frames = unchanged_tracks(tracks, planes) if retracked is None else to_video_rate(tracks, retracked, planes)
+    return to_pictures(frames, path)
 
 
 def _in_context(opened: log.Log, prefix: str, job: Job, frames: Sequence[Frame], planes: Planes) -> Transform:

@@ -19,7 +19,7 @@ from mcaptrack.geometry.arrays import Ints
 from mcaptrack.log.journal_check import recover_command
 from mcaptrack.schema import Frame
 from mcaptrack.sources import foreign
-from mcaptrack.sources.video import EncodedPicture, decode_bgr, read_head
+from mcaptrack.sources.video import EncodedPicture, decode_bgr, decode_gray, read_head
 
 #: The backward search for a key picture: messages in the second step, the factor for each further step, and the maximum
 #: in one step.
@@ -29,6 +29,17 @@ _NEAR: Final = 64
 _BLOCK: Final = 128
 #: The number of earlier groups of pictures to try for a picture that decoding from its own key picture doesn't show.
 _BACK: Final = 2
+
+
+def size_of_pictures(opened: log.Log, topic: str) -> tuple[int, int] | None:
+    """Return width and height in pixels of the first picture of a channel that can be decoded; None if none can."""
+    found = foreign.pictures(opened, topic)
+    pictures = (
+        EncodedPicture(m.t_ns, number, one.format, one.data, one.layout, f"{opened.path}: {topic} at {m.t_ns} ns")
+        for number, (m, one) in enumerate(found)
+    )
+    first = next(decode_gray(pictures), None)
+    return None if first is None else (first.rows.shape[1], first.rows.shape[0])
 
 
 class Pixels(Protocol):

@@ -19,7 +19,8 @@ from mcaptrack.sources import foreign
 from mcaptrack.sources.foreign.flatten import message_type_of
 from mcaptrack.sources.ingest.labels.formats import Role
 from mcaptrack.sources.ingest.labels.timeline import Timeline
-from mcaptrack.sources.video import EncodedPicture, decode_gray, is_video_codec, read_head
+from mcaptrack.sources.pictures import size_of_pictures
+from mcaptrack.sources.video import is_video_codec, read_head
 from mcaptrack.transforms import STAGES
 
 #: The default camera name.
@@ -165,12 +166,7 @@ def labels_of(opened: log.Log, prefix: str) -> dict[str, ExistingLabels]:
 
 def picture_size(opened: log.Log, topic: str) -> tuple[int, int]:
     """Width and height of the pictures of a channel. Raises McaptrackError if none of them can be decoded."""
-    found = foreign.pictures(opened, topic)
-    for frame in decode_gray(
-        EncodedPicture(
-            m.t_ns, number, picture.format, picture.data, picture.layout, f"{opened.path}: {topic} at {m.t_ns} ns"
-        )
-        for number, (m, picture) in enumerate(found)
-    ):
-        return frame.rows.shape[1], frame.rows.shape[0]
-    raise McaptrackError(f"{opened.path}: {topic} has no picture that can be decoded")
+    size = size_of_pictures(opened, topic)
+    if size is None:
+        raise McaptrackError(f"{opened.path}: {topic} has no picture that can be decoded")
+    return size
