@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.assignment import assign
 from mcaptrack.geometry.boxes import columns_to_boxes, iou
 from mcaptrack.geometry.clocks import FrameClock
@@ -13,8 +14,8 @@ from mcaptrack.schema import Frame
 from mcaptrack.sources.synthetic import SyntheticScene
 from mcaptrack.transforms import STAGES, FrameDifferenceDetector, KnnDetector, Mog2Detector, MotionDetector
 from mcaptrack.transforms.detect.background import _PersonHeight, halve
-from mcaptrack.transforms.detect.camera_motion import CameraMotion
 from mcaptrack.transforms.detect.foreground import FrameDifference
+from mcaptrack.transforms.detect.registration import Registration
 from tests.worlds import ns, small_scene
 
 
@@ -66,20 +67,20 @@ def test_boxes_are_in_pixels_of_the_picture_before_registration():
 
 def test_the_shift_of_the_camera_is_estimated():
     still = next(small_scene().shots()).image.mean(axis=2).astype(np.uint8)
-    camera = CameraMotion()
-    camera.estimate(still)
+    camera = Registration()
+    camera.register(still)
     moved = np.roll(still, (4, -6), axis=(0, 1))
-    matrix, _ = camera.estimate(moved)
+    matrix, _ = camera.register(moved)
     np.testing.assert_allclose(matrix, [[1, 0, 6], [0, 1, -4]], atol=0.15)
-    assert np.array_equal(camera.estimate(still)[0], [[1, 0, 0], [0, 1, 0]])
+    assert np.array_equal(camera.register(still)[0], [[1, 0, 0], [0, 1, 0]])
 
 
 def test_another_view_becomes_the_reference_once():
     here, there = (next(small_scene(seed=seed).shots()).image.mean(axis=2).astype(np.uint8) for seed in (1, 99))
     there = np.random.default_rng(0).permutation(there.ravel()).reshape(there.shape)
-    camera = CameraMotion()
-    assert camera.estimate(here)[1]
-    fresh = [camera.estimate(there)[1] for _ in range(20)]
+    camera = Registration()
+    assert camera.register(here)[1]
+    fresh = [camera.register(there)[1] for _ in range(20)]
     assert fresh.count(True) == 1
 
 
@@ -215,7 +216,7 @@ def test_frame_difference_is_the_largest_of_three_differences_a_sixth_of_a_secon
         np.testing.assert_array_equal(mask, np.where(largest > 9, 255, 0))
 
 
-class TestCameraMotion:
+class TestRegistration:
     def textured(self, seed: int = 3) -> np.ndarray:
         rng = np.random.default_rng(seed)
         return np.kron(rng.integers(40, 200, (20, 30)), np.ones((8, 8))).astype(np.uint8)
@@ -231,34 +232,68 @@ class TestCameraMotion:
         matrix = cv2.getRotationMatrix2D(centre, degrees, scale)
         matrix[:, 2] += shift
         image = cv2.warpAffine(still, matrix, still.shape[::-1], borderMode=cv2.BORDER_REPLICATE)
-        camera = CameraMotion()
-        camera.estimate(still)
-        found, is_new = camera.estimate(image)
+        camera = Registration()
+        camera.register(still)
+        found, is_new = camera.register(image)
         assert not is_new
         corners = np.array([[0, 0, 1], [still.shape[1], 0, 1], [0, still.shape[0], 1], [*still.shape[::-1], 1]])
         back = np.column_stack([corners @ matrix.T, np.ones(4)]) @ found.T
         np.testing.assert_allclose(back, corners[:, :2], atol=0.5)
 
-    def test_the_reference_is_replaced_after_15_pictures_without_a_fit(self):
-        camera = CameraMotion()
-        camera.estimate(self.textured())
-        other = np.random.default_rng(0).integers(0, 255, (160, 240)).astype(np.uint8)
-        fresh = [camera.estimate(other)[1] for _ in range(20)]
-        assert [n for n, is_new in enumerate(fresh, start=1) if is_new] == [16]
+    def other(self) -> np.ndarray:
+        return np.random.default_rng(0).integers(0, 255, (160, 240)).astype(np.uint8)
 
-    def test_a_fit_resets_the_count_of_pictures_without_one(self):
-        camera, still = CameraMotion(), self.textured()
-        other = np.random.default_rng(0).integers(0, 255, (160, 240)).astype(np.uint8)
-        camera.estimate(still)
-        for picture in [other] * 10 + [still] + [other] * 15:
-            assert not camera.estimate(picture)[1]
-        assert camera.estimate(other)[1]
+    @pytest.mark.parametrize("seen", [1, 5])
+    def test_another_view_begins_after_15_pictures_that_do_not_fit(self, seen):
+        """Whether the camera was seen to stand still before, so that the cut is certain, or not."""
+        camera = Registration()
+        for _ in range(seen):
+            camera.register(self.textured())
+        fresh = [camera.register(self.other())[1] for _ in range(40)]
+        assert [n for n, is_new in enumerate(fresh, start=1) if is_new] == [16]
+        assert camera.view == "steady"
+
+    @pytest.mark.parametrize("seen", [1, 5])
+    def test_what_hides_the_view_for_a_while_does_not_end_it(self, seen):
+        camera, still = Registration(), self.textured()
+        for _ in range(seen):
+            camera.register(still)
+        for picture in [self.other()] * 10 + [still] + [self.other()] * 15:
+            assert not camera.register(picture)[1]
+            assert (camera.view == "steady") == (picture is still)
+        assert camera.register(self.other())[1]
+
+    def test_a_view_begins_where_the_camera_has_settled_and_is_the_identity_there(self):
+        wide = np.kron(np.random.default_rng(3).integers(40, 200, (20, 60)), np.ones((8, 8))).astype(np.uint8)
+        camera = Registration()
+        steps = [0] * 5 + list(range(4, 100, 4)) + [100] * 20
+        seen = [(*camera.register(np.ascontiguousarray(wide[:, by : by + 240])), camera.view) for by in steps]
+        begun = [n for n, (_, is_new, _) in enumerate(seen) if is_new]
+        assert begun[0] == 0
+        assert len(begun) == 2
+        assert steps.index(100) < begun[1] <= steps.index(100) + 15
+        assert all(np.array_equal(matrix, [[1, 0, 0], [0, 1, 0]]) for matrix, _, _ in seen[begun[1] :])
+        far = [by > 28.8 for by in steps]
+        assert [view == "moving" for _, _, view in seen[: begun[1]]] == far[: begun[1]]
 
     def test_pictures_without_corners_have_no_motion(self):
-        camera = CameraMotion()
+        camera = Registration()
         for _ in range(30):
-            found, _ = camera.estimate(np.full((60, 80), 90, np.uint8))
+            found, _ = camera.register(np.full((60, 80), 90, np.uint8))
             np.testing.assert_array_equal(found, [[1, 0, 0], [0, 1, 0]])
+
+
+@pytest.mark.parametrize("name", ["knn", "median"])
+def test_a_camera_that_turns_slowly_is_refused(name):
+    """By less from picture to picture than a camera shakes, but further away in the end."""
+    wide = np.kron(np.random.default_rng(4).integers(40, 200, (20, 60, 1)), np.ones((8, 8, 3))).astype(np.uint8)
+    frames = [Frame(ns(n / 10), n, np.ascontiguousarray(wide[:, 2 * n : 2 * n + 240])) for n in range(60)]
+    if name == "knn":
+        frames = [frame._replace(rows=frame.rows[..., 0].copy()) for frame in frames]
+    detector = STAGES["detect"].built_in()[name]
+    with pytest.raises(McaptrackError, match=r"^the camera moves in 7\d% of the pictures"):
+        list(detector()(frames))
+    list(detector(stabilise=False)(frames))
 
 
 @pytest.mark.parametrize(

@@ -52,6 +52,8 @@ def move_boxes(matrix: Floats, boxes: Floats) -> Floats:
 
 def shift_px(matrix: Floats, width_px: float, height_px: float) -> float:
     """The largest distance that a transform moves a corner of the picture, in pixels."""
+    if matrix is IDENTITY:
+        return 0.0
     corners = np.array([[0.0, 0.0], [width_px, 0.0], [0.0, height_px], [width_px, height_px]])
     away = move_points(matrix, corners) - corners
     return float(np.hypot(away[:, 0], away[:, 1]).max())

@@ -107,6 +107,9 @@ class MotionEstimator:
         self._before: _Picture | None = None
         self._last = CameraPose(IDENTITY, IDENTITY, 0, 0.0, Verdict.STILL)
         self._misses = 0
+        # Key pictures from before poses became guesses, how long that is ago, and how often guesses had to be accepted.
+        self._sure: list[_Key] = []
+        self._unsure, self.breaks = 0, 0
         self._is_sudden, self._has_view = False, False
         self._stance = Stance(1, 1)
 
@@ -114,6 +117,11 @@ class MotionEstimator:
     def stand(self) -> Floats | None:
         """From pixels of the view where the camera stands to those of the reference: the same object while it does."""
         return self._stance.stand
+
+    @property
+    def is_guess(self) -> bool:
+        """Whether the pose relies on the camera having been still while its motion could not be estimated."""
+        return bool(self._sure)
 
     def step(self, image: Image, boxes: Floats | None = None) -> CameraPose:
         """Take the next picture.
@@ -148,6 +156,7 @@ class MotionEstimator:
     def _first(self, picture: _Picture, hidden: Floats | None, verdict: Verdict = Verdict.STILL) -> CameraPose:
         """Begin a new reference with this picture."""
         self._stance, self._misses, self._has_view = Stance(*self._size), 0, verdict is Verdict.LOST
+        self._sure = []
         self._add_key(_Key(picture, *_features(picture.image, hidden), IDENTITY, self._count))
         return CameraPose(IDENTITY, IDENTITY, self._count, 0.0, verdict)
 
@@ -156,11 +165,16 @@ class MotionEstimator:
 
     def _next(self, before: _Picture, picture: _Picture, hidden: Floats | None) -> CameraPose:
         key, last = self._keys[-1], self._last
-        if len(key.points) < _MIN_INLIERS and _correlation(key.picture, picture) >= _CUT_CORRELATION:
-            return self._posed(last.to_reference, 0)  # a picture without features shows no motion either
-        fit = None
+        if len(key.points) < _MIN_INLIERS and (
+            _correlation(key.picture, picture) >= _CUT_CORRELATION
+            or len(_features(picture.image, hidden)[0]) < _MIN_INLIERS
+        ):
+            return self._posed(last.to_reference, 0)  # pictures without features show no motion
+        fit = self._fit_sure(picture, hidden)
+        if fit is not None:
+            key = self._keys[-1]
         there = compose(invert(last.to_reference), key.to_reference)
-        for is_sudden in (self._is_sudden, not self._is_sudden):
+        for is_sudden in (self._is_sudden, not self._is_sudden) if fit is None else ():
             # Where the key picture's features should be now: as far on as from the picture before the last to the
             # last, or as far as the small copies are shifted.
             motion = self._shift(before, picture) if is_sudden else last.from_previous
@@ -170,6 +184,8 @@ class MotionEstimator:
         if fit is None:  # the key picture is too long ago
             latest = _Key(before, *_features(before.image, hidden), last.to_reference, last.reference)
             if (fit := self._fit(latest, picture, IDENTITY, hidden, _WIDE_LEVELS)) is not None:
+                if last.verdict is Verdict.LOST and self._misses and not self._sure:
+                    self._sure, self._unsure = self._keys, self._misses + 1
                 self._add_key(latest)
                 key = latest
         if fit is None:
@@ -181,6 +197,19 @@ class MotionEstimator:
         if is_far or inliers < _KEY_SHARE * len(key.points):
             self._add_key(_Key(picture, *_features(picture.image, hidden), pose.to_reference, pose.reference))
         return pose
+
+    def _fit_sure(self, picture: _Picture, hidden: Floats | None) -> tuple[Floats, int] | None:
+        """The transform from the last key picture before poses were guesses; if there is one, these are forgotten."""
+        if not self._sure:
+            return None
+        self._unsure += 1
+        fit = self._fit(self._sure[-1], picture, IDENTITY, hidden, _WIDE_LEVELS)
+        if fit is not None:
+            self._keys, self._sure = self._sure, []
+        elif self._unsure > _PATIENCE:
+            self._sure = []
+            self.breaks += 1
+        return fit
 
     def _shift(self, before: _Picture, picture: _Picture) -> Floats:
         """About how far the picture is shifted against the one before, (2, 3), by phase correlation."""
@@ -201,7 +230,7 @@ class MotionEstimator:
         if not is_too_far(to_reference, *self._size):
             is_elsewhere = self._stance.is_elsewhere
             return CameraPose(from_previous, to_reference, last.reference, float(inliers), verdict, is_elsewhere)
-        back = invert(to_reference)
+        back, self._sure = invert(to_reference), []
         self._keys = [
             key._replace(to_reference=compose(back, key.to_reference), reference=self._count)
             for key in self._keys
@@ -220,7 +249,7 @@ class MotionEstimator:
                 fit = self._fit(key, picture, IDENTITY, hidden, _WIDE_LEVELS)
                 if fit is not None:
                     self._add_key(key)
-                    self._stance, self._misses = Stance(*self._size), 0
+                    self._stance, self._misses, self._sure = Stance(*self._size), 0, []
                     to_reference, _ = self._stance.step(compose(key.to_reference, invert(fit[0])))
                     return CameraPose(IDENTITY, to_reference, key.reference, float(fit[1]), Verdict.CUT)
             return self._first(picture, hidden, Verdict.CUT if is_cut else Verdict.LOST)

@@ -21,6 +21,7 @@ from mcaptrack.pipeline.events import STAGE as EVENTS_STAGE
 from mcaptrack.pipeline.events import Watch, make_events, tally
 from mcaptrack.pipeline.findings import warn_findings, warn_memory, warn_no_rows
 from mcaptrack.pipeline.motion import path_with, side_inputs
+from mcaptrack.pipeline.pictures import pictures_of
 from mcaptrack.pipeline.planes import AS_BEFORE, PlaneChoice, is_plane_due, is_poor, make_plane, read_planes
 from mcaptrack.pipeline.rebuild import plugins_of
 from mcaptrack.pipeline.visible import picture_size, without_unseen
@@ -30,13 +31,11 @@ from mcaptrack.schema import DETECTIONS, TRACKS, VIDEO, Frame, Schema
 from mcaptrack.schema.camera_motion import to_pictures, to_scene
 from mcaptrack.schema.classes import class_names
 from mcaptrack.schema.provenance import CLOCK, Provenance
-from mcaptrack.sources import foreign
 from mcaptrack.sources.camera_motion import tracks_topic
 from mcaptrack.sources.cameras import camera_at, provenance_of
-from mcaptrack.sources.video import EncodedPicture, decode_bgr, decode_gray
 from mcaptrack.transforms import FULL, STAGES, Sample, Transform
 from mcaptrack.transforms.guarded import guarded
-from mcaptrack.transforms.protocol import ModelCard, colour_of, passes_of
+from mcaptrack.transforms.protocol import ModelCard
 from mcaptrack.transforms.to_video_rate import to_video_rate, unchanged_tracks
 from mcaptrack.transforms.track_classes import settle_classes
 
@@ -329,7 +328,7 @@ def _input(
     """Return the input of a job; the capture times of pictures in ns are appended to ``stamps``, by topic."""
     if job.source not in made and job.transform.reads is VIDEO:
         seen = stamps.setdefault(job.source, [])
-        digest, pictures = _pictures(opened, job, seen, progress)
+        digest, pictures = pictures_of(opened, job, seen, progress)
         return _Input(pictures, [], digest, lambda: len(seen))
     if job.source in made:
         frames, how = made[job.source].frames, made[job.source].provenance
@@ -353,35 +352,6 @@ def _counted(frames: Sequence[Frame], stage: str, progress: Progress) -> Iterato
     for count, frame in enumerate(frames, start=1):
         yield frame
         progress(stage, count, len(frames))
-
-
-def _pictures(
-    opened: log.Log, job: Job, stamps: list[int], progress: Progress
-) -> tuple[Callable[[], str], Iterable[Frame]]:
-    """Return the digest (once they were read) and the pictures for a job, decoded in its transform's colour format.
-
-    The capture time of each in ns is appended to ``stamps``.
-    """
-    import hashlib
-
-    total, channel = hashlib.sha256(), opened.channel(job.source)
-    decode = decode_bgr if colour_of(job.transform) == "bgr" else decode_gray
-    steps = channel.messages * passes_of(job.transform)
-    done = 0
-
-    def encoded(is_first: bool) -> Iterator[EncodedPicture]:
-        nonlocal done
-        for index, (message, picture) in enumerate(foreign.pictures(opened, channel.topic)):
-            if is_first:
-                total.update(message.t_ns.to_bytes(8, "little") + message.payload)
-                stamps.append(picture.stamp_ns)
-            where = f"{opened.path}: {channel.topic} at {message.t_ns} ns: frame {index}"
-            yield EncodedPicture(message.t_ns, index, picture.format, picture.data, picture.layout, where)
-            done += 1
-            progress(job.stage, min(done, steps), steps)
-
-    stamps.clear()
-    return total.hexdigest, _Repeatable(lambda: decode(encoded(is_first=not stamps)))
 
 
 def input_of(

@@ -72,7 +72,7 @@ def decode_gray(pictures: Iterable[EncodedPicture], wanted: Container[int] | Non
 
 def decode_bgr(pictures: Iterable[EncodedPicture], wanted: Container[int] | None = None) -> Iterator[Frame]:
     """Decode pictures to BGR: as ``decode_gray``, but ``rows`` is (height, width, 3) uint8 (blue, green, red)."""
-    return _decoded(pictures, raw_bgr, _bgr, wanted, is_grey=False)
+    return _decoded(pictures, raw_bgr, _bgr_of_frame(), wanted, is_grey=False)
 
 
 def _decoded(
@@ -177,8 +177,16 @@ class _VideoDecoder:
                 yield Frame(t_ns, index, self._of_frame(frame))
 
 
-def _bgr(frame: Any) -> Image:
-    return np.asarray(frame.to_ndarray(format="bgr24"), np.uint8)
+def _bgr_of_frame() -> Callable[[Any], Image]:
+    """A function that gives decoded pictures in BGR; it prepares the conversion once, which takes as long as one."""
+    import av
+
+    reformatter: Any = av.video.reformatter.VideoReformatter()
+
+    def bgr(frame: Any) -> Image:
+        return np.asarray(reformatter.reformat(frame, format="bgr24").to_ndarray(), np.uint8)
+
+    return bgr
 
 
 def _luma(frame: Any) -> Image:

@@ -1,6 +1,6 @@
 """Pictures -> detections.
 
-``background`` and ``median`` have the motion detectors, for cameras that stand still or nearly. ``camera_motion``
+``background`` and ``median`` have the motion detectors, for cameras that stand still or nearly. ``registration``
 registers pictures of a shaking camera, ``foreground`` and ``median_background`` compare a picture with its background,
 ``person_model`` learns how people look, ``people`` separates those who are one region, ``steadiness`` warns where the
 camera moves. ``onnx`` has learned detectors.

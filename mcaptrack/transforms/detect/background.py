@@ -22,8 +22,8 @@ from mcaptrack.geometry.affine import IDENTITY, move_boxes
 from mcaptrack.geometry.arrays import Floats, Image, Ints
 from mcaptrack.geometry.clocks import FrameClock
 from mcaptrack.schema import DETECTIONS, VIDEO, Frame, Schema
-from mcaptrack.transforms.detect.camera_motion import CameraMotion
 from mcaptrack.transforms.detect.foreground import Method, make_foreground_model
+from mcaptrack.transforms.detect.registration import Registration
 from mcaptrack.transforms.detect.steadiness import Steadiness
 from mcaptrack.transforms.protocol import Colour, check_options, option
 
@@ -71,13 +71,13 @@ class MotionDetector:
 
     def detect(self, frames: Iterable[Frame], steadiness: Steadiness) -> Iterator[tuple[Frame]]:
         """The detections of pictures; ``steadiness`` takes how the camera moved."""
-        clock, camera, height = FrameClock(), CameraMotion(), _PersonHeight()
+        clock, camera, height = FrameClock(), Registration(), _PersonHeight()
         foreground = make_foreground_model(self.method, self.threshold, self.history_s)
         size: tuple[int, ...] = ()
         for frame in frames:
             clock.tick(frame.t_ns)
             image, halvings = halve(frame.rows, self.max_pixels)
-            to_reference, is_new = camera.estimate(image) if self.stabilise else (IDENTITY, image.shape != size)
+            to_reference, is_new = camera.register(image) if self.stabilise else (IDENTITY, image.shape != size)
             size = image.shape
             steadiness.update(frame.t_ns, camera.view, is_new)
             if is_new:  # another view has another background

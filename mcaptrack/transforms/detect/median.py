@@ -31,18 +31,18 @@ from mcaptrack.transforms.detect.background import (
     unwarp_boxes,
     warp,
 )
-from mcaptrack.transforms.detect.camera_motion import CameraMotion
 from mcaptrack.transforms.detect.median_background import MIN_THRESHOLD, Background, Sampler
 from mcaptrack.transforms.detect.people import Separator
 from mcaptrack.transforms.detect.person_model import Learner, Person, region_boxes, typical_height
+from mcaptrack.transforms.detect.registration import Registration
 from mcaptrack.transforms.detect.steadiness import Steadiness
 from mcaptrack.transforms.protocol import Colour, check_options, option
 
 #: A shorter view, or one of fewer pictures, has no background of its own: people hardly move in that time.
 _MIN_SPAN_S: Final = 1.8
 _MIN_PICTURES: Final = 10
-#: Smaller pictures are registered at their full size.
-_MIN_HALVED_PX: Final = 320 * 240
+#: Pictures in a row without a place in a view that are kept, because they may belong to the next one.
+_MAX_UNKNOWN: Final = 30
 #: The same as ``MAX_FOREGROUND``, where the picture could not be registered.
 _MAX_FOREGROUND_LOST: Final = 0.2
 
@@ -112,7 +112,7 @@ class MedianDetector:
         return f"nothing in its {len(made)} pictures differs from their median by more than the threshold"
 
     def _learn(self, frames: Iterable[Frame]) -> list[_View]:
-        camera, steadiness = CameraMotion(), Steadiness()
+        camera, steadiness = Registration(), Steadiness()
         views: list[_View] = []
         unknown: list[_Picture] = []
         for frame in frames:
@@ -120,9 +120,11 @@ class MedianDetector:
             to_reference, is_new = _register(camera, image) if self.stabilise else (IDENTITY, False)
             is_new = is_new or not views or views[-1].size != image.shape
             steadiness.update(frame.t_ns, camera.view, is_new)
-            picture = _Picture(frame.t_ns, image, to_reference, camera.view in ("moving", "lost") and not is_new)
+            picture = _Picture(frame.t_ns, image, to_reference, camera.view != "steady" and not is_new)
             if picture.is_lost:
                 unknown.append(picture)
+                if len(unknown) > _MAX_UNKNOWN:
+                    views[-1].add(unknown.pop(0), self)
                 continue
             begun = _of_next_view(unknown, image) if is_new else []
             for one in unknown[: len(unknown) - len(begun)]:
@@ -143,7 +145,7 @@ class MedianDetector:
 
 
 class _Picture(NamedTuple):
-    """A picture, halved and registered; ``is_lost`` if it could not be registered."""
+    """A picture, halved and registered; ``is_lost`` if that failed, or if it lies too far from its view."""
 
     t_ns: int
     image: Image
@@ -154,9 +156,9 @@ class _Picture(NamedTuple):
 def _of_next_view(unknown: Sequence[_Picture], reference: Image) -> list[_Picture]:
     """The last ones of pictures that no view has yet which show what ``reference`` shows, registered to it.
 
-    A cut is noticed only after some pictures.
+    A camera that has settled, or a cut without contrast, is noticed only after some pictures.
     """
-    camera, found = CameraMotion(), deque[_Picture]()
+    camera, found = Registration(), deque[_Picture]()
     _register(camera, reference)
     for one in reversed(unknown):
         to_reference, is_new = _register(camera, one.image)
@@ -172,18 +174,11 @@ def _picture(frame: Frame, max_pixels: int) -> tuple[Image, int]:
     return image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2), halvings
 
 
-def _register(camera: CameraMotion, image: Image) -> tuple[Floats, bool]:
-    """The similarity (2, 3) to the reference picture, from brightness at half the size, if that is not too small."""
+def _register(camera: Registration, image: Image) -> tuple[Floats, bool]:
+    """The transform (2, 3) from a picture (H, W, 3) to its view, and whether the view begins with it."""
     import cv2
 
-    height, width = image.shape[:2]
-    is_halved = height * width >= _MIN_HALVED_PX
-    if is_halved:
-        image = np.asarray(cv2.resize(image, (width // 2, height // 2), interpolation=cv2.INTER_AREA), np.uint8)
-    to_reference, is_new = camera.estimate(np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8))
-    if is_halved and to_reference is not IDENTITY:
-        to_reference = to_reference * np.array([1.0, 1.0, 2.0])
-    return to_reference, is_new
+    return camera.register(np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8))
 
 
 @dataclass(eq=False)

@@ -47,7 +47,7 @@ _GRID: Final = 8
 
 
 #: Rows of pictures of which the median is taken together.
-_STRIP: Final = 32
+_STRIP: Final = 8
 
 
 class Sampler:
@@ -77,12 +77,19 @@ def largest(image: Image) -> Image:
 
 
 def _middle(images: Sequence[Image]) -> Image:
-    """The median of each pixel and channel; of an even number the upper one."""
+    """The median of each pixel and channel, of at most 255 pictures; of an even number the upper one.
+
+    It is found bit by bit, as the largest value that at most half of the pictures are below: that takes a sixth of the
+    time of a partition.
+    """
     at = len(images) // 2
-    out = np.empty_like(images[0])
-    for row in range(0, len(out), _STRIP):  # in strips, because all pictures are copied twice
-        strip = np.stack([image[row : row + _STRIP] for image in images])
-        out[row : row + _STRIP] = np.partition(strip, at, axis=0)[at]
+    out = np.zeros_like(images[0])
+    for row in range(0, len(out), _STRIP):  # in strips, which stay in the processor's cache
+        strip, found = np.stack([image[row : row + _STRIP] for image in images]), out[row : row + _STRIP]
+        for bit in (128, 64, 32, 16, 8, 4, 2, 1):
+            candidate = found | np.uint8(bit)
+            below = (strip < candidate).view(np.uint8).sum(axis=0, dtype=np.uint8)
+            np.copyto(found, candidate, where=below <= at)
     return out
 
 
@@ -125,6 +132,21 @@ class Background:
             for far, close in zip(_range(self.median, self.sway_px), near, strict=True)
         )
         return lowest, highest
+
+    @cached_property
+    def _usual(self) -> tuple[Image, Image]:
+        """The lowest and the highest colours that don't differ."""
+        import cv2
+
+        noise = cv2.merge([self.threshold] * 3)
+        return np.asarray(cv2.subtract(self.lowest, noise), np.uint8), np.asarray(
+            cv2.add(self.highest, noise), np.uint8
+        )
+
+    @cached_property
+    def _light(self) -> NDArray[np.float32]:
+        """Its colours on a grid, one brighter than they are."""
+        return self.median[::_GRID, ::_GRID].astype(np.float32) + 1
 
     @property
     def lowest(self) -> Image:
@@ -174,8 +196,7 @@ class Background:
         import cv2
 
         image = self._same_light(_blurred(image) if self.is_blurred else image)
-        difference = _outside(image, self.lowest, self.highest)
-        mask = np.asarray(cv2.compare(difference, self.threshold, cv2.CMP_GT), np.uint8)
+        mask = np.asarray(cv2.bitwise_not(cv2.inRange(image, *self._usual)), np.uint8)
         if shadows and not self.is_grey:
             at = np.flatnonzero(mask.view(np.bool_))
             seen, known = (np.take(colours.reshape(-1, 3), at, axis=0).T for colours in (image, self.median))
@@ -190,8 +211,12 @@ class Background:
         """The picture in the light of the background: exposure and clouds change all of it by a factor."""
         import cv2
 
-        seen, known = image[::_GRID, ::_GRID], self.median[::_GRID, ::_GRID]
-        factor = float(np.median((known.astype(np.float32) + 1) / (seen.astype(np.float32) + 1)))
+        factors = self._light / (image[::_GRID, ::_GRID].astype(np.float32) + 1)
+        least = factors.size // 2 - 1  # if fewer are beyond a limit, the median isn't
+        low, high = np.count_nonzero(factors <= 1 - _LIGHT / 2), np.count_nonzero(factors >= 1 + _LIGHT / 2)
+        if max(low, high) < least:
+            return image
+        factor = float(np.median(factors))
         return image if abs(factor - 1) < _LIGHT else np.asarray(cv2.convertScaleAbs(image, alpha=factor), np.uint8)
 
 

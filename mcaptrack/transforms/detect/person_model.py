@@ -65,6 +65,10 @@ class Person:
         """The height of a person who stands at this row, in pixels."""
         return max(self.slope * foot_px + self.level, _MIN_HEIGHT_PX)
 
+    def heights(self, foot_px: Ints) -> Floats:
+        """The heights (N,) of people who stand at these rows (N,), in pixels."""
+        return np.asarray(np.maximum(self.slope * foot_px + self.level, _MIN_HEIGHT_PX), np.float64)
+
 
 def odd(value: float) -> int:
     """Return an odd number near a value, at least 1."""

@@ -8,7 +8,7 @@ from typing import Final
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.notices import warn
-from mcaptrack.transforms.detect.camera_motion import View
+from mcaptrack.transforms.detect.registration import View
 
 #: A camera that moves in a larger share of the pictures than this is refused, in at least so many pictures.
 _MAX_MOVING: Final = 0.5
@@ -38,7 +38,7 @@ class Steadiness:
     def check(self) -> None:
         """Warn if the camera moved or its view was lost. Raises McaptrackError if it moved in most pictures."""
         pictures = max(self._views.total(), 1)
-        moving = (self._views["moving"] + self._views["far"]) / pictures
+        moving = self._views["moving"] / pictures
         lost = self._views["lost"] / pictures
         if moving > _MAX_MOVING and moving * pictures >= _MIN_MOVING_PICTURES:
             raise McaptrackError(

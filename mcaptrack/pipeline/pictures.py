@@ -1,0 +1,116 @@
+"""The pictures that a transform reads, decoded.
+
+Those that it reads twice are kept in memory in between, so that they are decoded once: the difference of each picture
+from the one before, compressed, because much of it is zero where a camera stands still, above all in a video. Pictures
+that take more than ``MAX_BYTES`` together aren't kept, but decoded again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from mcaptrack import log
+from mcaptrack.geometry.arrays import Image
+from mcaptrack.pipeline.checks import Job
+from mcaptrack.schema import Frame
+from mcaptrack.sources import foreign
+from mcaptrack.sources.video import EncodedPicture, decode_bgr, decode_gray
+from mcaptrack.transforms.protocol import colour_of, passes_of
+
+MAX_BYTES: Final = 500_000_000
+
+
+class _Kept(NamedTuple):
+    t_ns: int
+    index: int  # type: ignore[assignment]  # hides tuple.index, which is not needed here
+    shape: tuple[int, ...]
+    difference: bytes
+
+
+class KeptPictures:
+    """Pictures that can be read repeatedly.
+
+    Parameters
+    ----------
+    decoded : callable
+        Gives the pictures from the first one on.
+    read : callable
+        Called for each picture that is read again without being decoded.
+    max_bytes : int, optional
+        The memory that they may take; with 0 they are always decoded again.
+
+    """
+
+    def __init__(
+        self, decoded: Callable[[], Iterator[Frame]], read: Callable[[], None], max_bytes: int = MAX_BYTES
+    ) -> None:
+        self._decoded, self._read, self._max_bytes = decoded, read, max_bytes
+        self._kept: list[_Kept] = []
+        self._is_complete = False
+
+    def __iter__(self) -> Iterator[Frame]:
+        return self._again() if self._is_complete else self._first()
+
+    def _first(self) -> Iterator[Frame]:
+        import lz4.block
+
+        kept: list[_Kept] = []
+        left, before = self._max_bytes, np.zeros(0, np.uint8)
+        for frame in self._decoded():
+            if left > 0:
+                rows = frame.rows.copy()  # a transform may draw into its pictures
+                difference = rows - before if rows.shape == before.shape else rows
+                packed = lz4.block.compress(np.ascontiguousarray(difference), store_size=False)
+                before, left = rows, left - len(packed)
+                kept.append(_Kept(frame.t_ns, frame.index, rows.shape, packed))
+                if left <= 0:
+                    kept.clear()
+            yield frame
+        self._kept, self._is_complete = kept, left > 0
+
+    def _again(self) -> Iterator[Frame]:
+        import lz4.block
+
+        before: Image = np.zeros(0, np.uint8)
+        for t_ns, index, shape, packed in self._kept:
+            size = int(np.prod(shape))
+            difference = np.frombuffer(lz4.block.decompress(packed, uncompressed_size=size), np.uint8).reshape(shape)
+            before = before + difference if before.shape == shape else difference
+            self._read()
+            yield Frame(t_ns, index, before.copy())
+
+
+def pictures_of(
+    opened: log.Log, job: Job, stamps: list[int], progress: Callable[[str, int, int], None]
+) -> tuple[Callable[[], str], Iterable[Frame]]:
+    """Return the digest (once they were read) and the pictures for a job, decoded in its transform's colour format.
+
+    The capture time of each in ns is appended to ``stamps``.
+    """
+    import hashlib
+
+    total, channel = hashlib.sha256(), opened.channel(job.source)
+    decode = decode_bgr if colour_of(job.transform) == "bgr" else decode_gray
+    steps = channel.messages * passes_of(job.transform)
+    done = 0
+
+    def count() -> None:
+        nonlocal done
+        done += 1
+        progress(job.stage, min(done, steps), steps)
+
+    def encoded(is_first: bool) -> Iterator[EncodedPicture]:
+        for index, (message, picture) in enumerate(foreign.pictures(opened, channel.topic)):
+            if is_first:
+                total.update(message.t_ns.to_bytes(8, "little") + message.payload)
+                stamps.append(picture.stamp_ns)
+            where = f"{opened.path}: {channel.topic} at {message.t_ns} ns: frame {index}"
+            yield EncodedPicture(message.t_ns, index, picture.format, picture.data, picture.layout, where)
+            count()
+
+    stamps.clear()
+    max_bytes = MAX_BYTES if passes_of(job.transform) > 1 else 0
+    return total.hexdigest, KeptPictures(lambda: decode(encoded(is_first=not stamps)), count, max_bytes)
