@@ -3,6 +3,7 @@
 matchup = Matchup(...)                 ground truth and tracks of one sequence, and how similar they are
 summary(score(matchup))                MOTA, IDF1, HOTA and their counts
 summary(combine([score(a), score(b)])) the same over several sequences
+average_over_recalls([ScoredMatchup(matchup, scores_of_tracks)])   AMOTA, AMOTP and sAMOTA
 """
 
 from __future__ import annotations
@@ -17,8 +18,20 @@ from mcaptrack.evaluation.metrics.clear import Rules, clear
 from mcaptrack.evaluation.metrics.hota import hota
 from mcaptrack.evaluation.metrics.identity import identity
 from mcaptrack.evaluation.metrics.matchup import Matchup, distances, metres_to_similarity
+from mcaptrack.evaluation.metrics.recalls import ScoredMatchup, average_over_recalls
 
-__all__ = ["Matchup", "Rules", "Score", "combine", "distances", "metres_to_similarity", "score", "summary"]
+__all__ = [
+    "Matchup",
+    "Rules",
+    "Score",
+    "ScoredMatchup",
+    "average_over_recalls",
+    "combine",
+    "distances",
+    "metres_to_similarity",
+    "score",
+    "summary",
+]
 
 
 #: The rates of ``summary``; its other numbers are counts.
