@@ -222,15 +222,15 @@ def run_page(found: list[Block], prepared: Path) -> None:
     with duckdb.connect() as connection:
         for block in found:
             try:
-                if block.language == "text":
+                if "file" in block.marks:
+                    Path(block.marks["file"]).write_text(block.text)
+                elif block.language == "text":
                     if said is not None:
                         assert_same_words(block.text, said)
                     said = None
                 elif "not run" in block.marks:
                     parse(block)
                     said = None
-                elif "file" in block.marks:
-                    Path(block.marks["file"]).write_text(block.text)
                 else:
                     said = run(block, prepared, connection, names)
             except BaseException as error:

@@ -32,7 +32,7 @@ from mcaptrack.schema import DETECTIONS, TRACKS
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.ingest import IngestOptions, ingest, label_frames
 from mcaptrack.sources.ingest.labels.box_rows import OTHERS
-from mcaptrack.sources.ingest.labels.formats import READERS, Format, Role
+from mcaptrack.sources.ingest.labels.formats import FORMATS_3D, READERS, Format, Role
 from mcaptrack.sources.ingest.labels.reading import read_labels
 from mcaptrack.sources.ingest.labels.timeline import Timeline
 from mcaptrack.sources.video import H264Encoder
@@ -43,7 +43,7 @@ from tests.robots import FPS, PICTURES, ROBOT_NS, lines, robot_log
 from tests.worlds import ns, write_clip
 
 ROLES: tuple[Role, ...] = get_args(Role)
-FORMATS = tuple(name for name in get_args(Format) if name not in ("auto", *OTHERS))
+FORMATS = tuple(name for name in get_args(Format) if name not in ("auto", *OTHERS, *FORMATS_3D))
 #: By hand: the pictures that are labelled, and by which files. The first ones and the last ones are empty.
 SEEN = {k: [1, 2] if k % 2 else [1] for k in (3, 4, 5, 7, 15)}
 #: For formats that are labelled every so many frames by custom.

@@ -37,7 +37,9 @@ FUNCTIONS = dict(public_functions())
 
 def test_every_paper_has_its_function():
     assert set(PAPERS) <= set(FUNCTIONS)
-    assert {name for name in metrics.__all__ if name not in ("Matchup", "Rules", "Score", "ScoredMatchup")} <= set(FUNCTIONS)
+    assert {name for name in metrics.__all__ if name not in ("Matchup", "Rules", "Score", "ScoredMatchup")} <= set(
+        FUNCTIONS
+    )
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)

@@ -58,6 +58,11 @@ class Scene:
         done("ingest", *words, "-o", f"./{NAME}", "--force")
         return self
 
+    def cubes(self) -> Scene:
+        """Add a file of 3D labels."""
+        Path("cubes.csv").write_text("t,id,x_m,y_m\n0,1,2,3\n1,1,2,3\n")
+        return self
+
     def page(self) -> str:
         """Return the text of a report."""
         done("report", f"./{NAME}", "-o", "page.html")
@@ -185,6 +190,9 @@ SCENES: dict[str, Callable[[Scene], str]] = {
         "evaluate", "tracks.csv", "--truth", "truth.txt"
     ),
     "tables/sql.py:_answer:list_tables": lambda s: s.says("query", "LOG", "show tables"),
+    "sources/ingest/job.py:read:ingest": lambda s: (
+        s.without("/camera/truth*").cubes().says("ingest", "clip.mp4", "--truth", "cubes.csv")
+    ),
     "training/sources.py:_from_log:run": lambda s: s.ingested("clip.mp4").to_train_on(),
 }
 

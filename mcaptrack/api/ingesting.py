@@ -90,7 +90,9 @@ def ingest(
     frames: int | None = None,
     columns: str | Mapping[str, str] | None = None,
     size: str | tuple[int, int] | None = None,
-    classes: str = "person",
+    classes: str | None = None,
+    frame_id: str | None = None,
+    scene: str | None = None,
     role: InputRole | None = None,
     into: PathLike | None = None,
     sidecar: bool | None = None,
@@ -126,8 +128,9 @@ def ingest(
     motion : path, optional
         File with the motion of the camera: a row per frame, of its number (from 0) and the 2x3 transform from pixels of
         the frame before.
-    label_format : {"auto", "mot", "kitti", "sdd", "trajnet", "obsmat", "coco", "yolo", "supervision", "csv"}
-        Format of the label files, by default "auto": as their content tells.
+    label_format : {"auto", "mot", "kitti", "sdd", "trajnet", "obsmat", "coco", "yolo", "supervision", "csv", ...}
+        Format of the label files, by default "auto": as their content tells. Those of 3D boxes are "csv", "kitti-3d",
+        "nuscenes" and "argoverse".
     first_frame : int, optional
         Number of the first picture in label files.
     frames : int, optional
@@ -135,11 +138,17 @@ def ingest(
     columns : dict of str to str, or str, optional
         Names of the columns of label files with a header, by what they hold: ``{"x": "left", "frame": "n"}`` or
         "x=left,frame=n". There are x, y, w, h, x2, y2, cx, cy, frame, t (seconds), score, class, name (of the class)
-        and id.
+        and id; of 3D boxes x_m, y_m, z_m, length_m, width_m, height_m, heading_rad or heading_deg, qw, qx, qy, qz,
+        vx_m_per_s and vy_m_per_s.
     size : tuple of int, or str, optional
         Width and height of the pictures, (1920, 1080) or "1920x1080", if there are only labels in shares of them.
-    classes : str, default "person"
-        Classes of tracks and ground truth, by name or number with commas between them, or "all". Detections keep all.
+    classes : str, optional
+        Classes of tracks and ground truth, by name or number with commas between them, or "all"; by default "person",
+        and all of 3D boxes. Detections keep all.
+    frame_id : str, optional
+        Frame of reference of 3D boxes; by default that of the format, or else the root of the log's transforms.
+    scene : str, optional
+        Name of the scene, if the labels are of nuScenes.
     role : {"detections", "tracks", "truth", "motion"}, optional
         What ``source`` holds, if it is a label file; by default as its ids tell. The motion of a camera goes ``into`` a
         log.
@@ -192,7 +201,9 @@ def ingest(
         motion=optional_path(motion),
         columns=parse_columns(columns) if isinstance(columns, str) else check_keys(columns) if columns else None,
         size=parse_size(size),
-        classes=WantedClasses(classes),
+        classes=None if classes is None else WantedClasses(classes),
+        frame_id=frame_id,
+        scene=scene,
     )
     with warnings_about(path) as warnings:
         if into is None:
@@ -213,7 +224,10 @@ def ingest(
         warn_unused("there is no label file", columns=columns is not None and not report.has_labels)
         warn_unused("no label file is of a detector's format", size=size is not None and not report.uses_size)
         has_tracks = bool({tracks, truth} - {None}) or (role in ("tracks", "truth") and report.has_labels)
-        warn_unused("there are no tracks and no ground truth", classes=classes != "person" and not has_tracks)
+        warn_unused("there are no tracks and no ground truth", classes=classes is not None and not has_tracks)
+        without_3d = not report.holds_boxes_3d
+        warn_unused("there are no 3D boxes", frame_id=frame_id is not None and without_3d)
+        warn_unused("there are no tables of nuScenes", scene=scene is not None and without_3d)
         warn_unused("there is no ground plane", point=point != "foot" and ground_plane is None)
         keep = "the channels of a recording keep their names"
         warn_unused(keep, camera=camera != "camera" and not report.uses_camera)

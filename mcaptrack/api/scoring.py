@@ -52,7 +52,7 @@ _FILES: Final = (".txt", ".csv", *_TABLES)
 _KEYS: Final = ("sequence", "tracks", "similarity", "gate")
 _SHOWN: Final = ("HOTA", "MOTA", "IDF1")
 #: The scores that a limit can be set for.
-LIMITS: Final = ("MOTA", "IDF1", "IDP", "IDR", "HOTA", "DetA", "AssA", "LocA")
+LIMITS: Final = ("MOTA", "IDF1", "IDP", "IDR", "HOTA", "DetA", "AssA", "LocA", "AMOTA", "sAMOTA")
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +122,7 @@ class Scores:
             The score, such as "IDF1".
         tracks : str, optional
             Topic of the tracks, or its end: "retracks" for /camera/retracks.
-        similarity : {"iou", "metres"}, optional
+        similarity : {"iou", "metres", "bev-iou", "3d-iou"}, optional
             How ground truth and tracks were matched.
         gate : float, optional
             Largest distance of a match in metres, or least overlap.
@@ -249,8 +249,9 @@ def evaluate(
         and the label files that ``ingest`` reads.
     truth : path or sequence of paths, optional
         Ground truth for files of tracks: one file for each, matched by name or in order.
-    similarity : {"iou", "metres"}, optional
-        Match by overlap of boxes or by distance on the ground; by default both, as far as there are boxes and metres.
+    similarity : {"iou", "metres", "bev-iou", "3d-iou"}, optional
+        Match by overlap of boxes in pictures, by distance on the ground, or by overlap of 3D boxes, seen from above
+        (bev) or in space; by default by the first two, as far as there are boxes and metres.
     gate_m : float or sequence of float, default (0.5, 1, 2)
         Largest distance of a match in metres, from 0.001; scores are given for each.
     min_iou : float, default 0.5
@@ -319,7 +320,7 @@ def evaluate(
         compared = {result.similarity for result in outcome.results}
         if "metres" not in compared:
             warn_unused("nothing is compared by distance on the ground", gate_m=gates != DEFAULT_GATES_M)
-        if "iou" not in compared:
+        if compared <= {"metres"}:
             warn_unused("nothing is compared by overlap", min_iou=min_iou != IOU_THRESHOLD)
     return Scores(tuple(outcome.results), tuple(notes), tuple(dict.fromkeys(warnings)))
 

@@ -44,7 +44,7 @@ class TuneResult:
         The stage that was tuned.
     metric : str
         The score that was maximised.
-    similarity : {"iou", "metres"}
+    similarity : {"iou", "metres", "bev-iou", "3d-iou"}
         How ground truth and tracks were matched.
     settings : dict of str to float, int, str or Transform
         The best parameters, with the tracker they belong to; the function of the stage takes them as they are:
@@ -122,7 +122,7 @@ def tune(
         Random seed.
     study : path, optional
         Keep trials in this file, and continue with those in it.
-    similarity : {"iou", "metres"}, optional
+    similarity : {"iou", "metres", "bev-iou", "3d-iou"}, optional
         Match by overlap of boxes or by distance on the ground; by default by overlap for the stage "track", otherwise
         by distance.
     gate_m : float, default 1

@@ -134,7 +134,7 @@ def events(
     topic : str or sequence of str, optional
         Write events of these channels of tracks. By default of /camera/tracks and /camera/retracks, with the errors
         of predictions.
-    similarity : {"iou", "metres"}, optional
+    similarity : {"iou", "metres", "bev-iou", "3d-iou"}, optional
         How ground truth and tracks are matched: by overlap of boxes or by distance on the ground. By default by
         overlap where tracks are at the video's rate, otherwise by distance.
     gate_m : float, optional
@@ -173,7 +173,7 @@ def events(
 
     def plan(*_: object) -> list[Job]:
         if similarity is not None:
-            unused = {"gate_m": gate_m is not None} if similarity == "iou" else {"min_iou": min_iou is not None}
+            unused = {"min_iou": min_iou is not None} if similarity == "metres" else {"gate_m": gate_m is not None}
             warn_unused(f"ground truth and tracks are compared by {similarity}", **unused)
         return []
 

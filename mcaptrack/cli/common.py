@@ -125,7 +125,7 @@ Config = Annotated[
     ),
 ]
 Camera = Annotated[str | None, option("--camera", panel=FILES, help="Which camera, if the log has several.")]
-SimilarityName = Literal["iou", "metres"]
+SimilarityName = Literal["iou", "metres", "bev-iou", "3d-iou"]
 GroundPlane = Annotated[
     Path | None,
     option(
@@ -153,7 +153,10 @@ LabelFps = Annotated[
 
 def similarity(shown: str) -> Any:
     """Return the option --similarity; ``shown`` is its default in the help."""
-    words = "How ground truth and tracks are matched: by overlap of boxes (iou) or distance on the ground (metres)."
+    words = (
+        "How ground truth and tracks are matched: by overlap of boxes in pictures (iou), distance on the ground "
+        "(metres), or overlap of 3D boxes, seen from above (bev-iou) or in space (3d-iou)."
+    )
     return option("--similarity", panel=SCORES, tuning=True, help=words, show_default=shown)
 
 

@@ -29,6 +29,10 @@ _FORECAST_COLUMNS: Final = {
 }
 
 
+#: Columns of 3D tracks with scores, after the others.
+_AVERAGES: Final = ("AMOTA", "sAMOTA")
+#: Similarities that are overlaps, as the table names them.
+_OVERLAPS: Final = {"iou": "IoU", "bev-iou": "BEV IoU", "3d-iou": "3D IoU"}
 #: Keys of results that are no single value.
 _NESTED: Final = ("displacement", "class_means")
 
@@ -161,21 +165,27 @@ def print_results(scores: Scores) -> None:
     classes = any(result.of_class is not None for result in scores.results)
     for name in (*(("sequence",) if several else ()), "tracks", *(("class",) if classes else ()), "by"):
         table.add_column(name, no_wrap=True)
-    for name in _COLUMNS:
+    columns = (*_COLUMNS, *(_AVERAGES if any(result.averages for result in scores.results) else ()))
+    for name in columns:
         table.add_column(name, justify="right", no_wrap=True)
     previous = None
     for result in sorted(scores.results, key=lambda r: (r.sequence == "COMBINED", r.sequence, r.similarity, r.gate)):
         row = result.to_json()
-        by = f"IoU {result.gate:g}" if result.similarity == "iou" else f"{result.gate:g} m"
+        by = (
+            f"{_OVERLAPS[result.similarity]} {result.gate:g}"
+            if result.similarity in _OVERLAPS
+            else f"{result.gate:g} m"
+        )
         if previous not in (None, (result.sequence, by)):
             table.add_row()
         previous = (result.sequence, by)
-        numbers = [f"{100 * row[name]:.1f}" if isinstance(row[name], float) else str(row[name]) for name in _COLUMNS]
+        cells = [row.get(name, "") for name in columns]
+        numbers = [f"{100 * cell:.1f}" if isinstance(cell, float) else str(cell) for cell in cells]
         first = [result.sequence] if several else []
         own = [_class_cell(result.of_class)] if classes else []
         table.add_row(*first, result.tracks, *own, by, *numbers)
         if result.class_means is not None:
-            means = [f"{100 * result.class_means[name]:.1f}" if name in result.class_means else "" for name in _COLUMNS]
+            means = [f"{100 * result.class_means[name]:.1f}" if name in result.class_means else "" for name in columns]
             table.add_row(*first, result.tracks, "mean of classes", by, *means)
     out.print(table)
     forecasts: dict[tuple[str, str], dict[str, float | None]] = {}
@@ -205,6 +215,7 @@ def _print_csv(scores: Scores) -> None:
 
     rows = [{k: v for k, v in result.to_json().items() if k not in _NESTED} for result in scores.results]
     rows = [{k: printable(v) if isinstance(v, str) else v for k, v in row.items()} for row in rows]
-    writer = csv.DictWriter(sys.stdout, fieldnames=list(rows[0]), lineterminator="\n")
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    writer = csv.DictWriter(sys.stdout, fieldnames=names, lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)

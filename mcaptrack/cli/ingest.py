@@ -106,7 +106,21 @@ def ingest(
         ),
     ] = None,
     label_format: Annotated[
-        Literal["auto", "mot", "kitti", "sdd", "trajnet", "obsmat", "coco", "yolo", "supervision", "csv"],
+        Literal[
+            "auto",
+            "mot",
+            "kitti",
+            "sdd",
+            "trajnet",
+            "obsmat",
+            "coco",
+            "yolo",
+            "supervision",
+            "csv",
+            "kitti-3d",
+            "nuscenes",
+            "argoverse",
+        ],
         common.option(
             "--format",
             panel=_READING,
@@ -120,18 +134,33 @@ def ingest(
             "--columns",
             panel=_READING,
             help="Columns of label files with a header: x=left,y=top,w=width,h=height,frame=n. Also x2, y2, cx, cy, t "
-            "(seconds), score, class, name (of the class), id.",
+            "(seconds), score, class, name (of the class), id; 3D boxes: x_m, y_m, z_m, length_m, width_m, height_m, "
+            "heading_rad, heading_deg, qw to qz.",
             show_default="guessed from the header",
         ),
     ] = None,
     classes: Annotated[
-        str,
+        str | None,
         common.option(
             "--classes",
             panel=_READING,
             help="Classes of tracks and ground truth, by name or number, as in person,car; all for every one.",
+            show_default="person; 3D boxes: all",
         ),
-    ] = "person",
+    ] = None,
+    frame_id: Annotated[
+        str | None,
+        common.option(
+            "--frame",
+            panel=_READING,
+            help="Frame of reference of 3D boxes.",
+            show_default="that of the format, or the root of the log's transforms",
+        ),
+    ] = None,
+    scene: Annotated[
+        str | None,
+        common.option("--scene", panel=_READING, help="Name of the scene, of nuScenes.", show_default=False),
+    ] = None,
     size: Annotated[
         str | None,
         common.option(
@@ -223,6 +252,8 @@ def ingest(
         "columns": columns,
         "size": size,
         "classes": classes,
+        "frame_id": frame_id,
+        "scene": scene,
         "role": role,
         "into": into,
         "sidecar": sidecar,

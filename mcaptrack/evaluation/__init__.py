@@ -21,15 +21,18 @@ from mcaptrack.errors import McaptrackError, call
 from mcaptrack.evaluation import metrics
 from mcaptrack.evaluation.aligned import (
     IOU_THRESHOLD,
+    RowComparison,
     Similarity,
     align,
+    compare_rows,
     explain_no_match,
-    make_matchup,
+    refuse_sides_without,
     sides_without,
 )
+from mcaptrack.evaluation.averages import are_3d, averages, mean_of_classes, scored_matchups
 from mcaptrack.evaluation.by_class import of_class, share_classes
 from mcaptrack.evaluation.forecasts import FORECAST_INPUTS, score_forecasts
-from mcaptrack.evaluation.metrics import Rules, Score
+from mcaptrack.evaluation.metrics import Rules, Score, ScoredMatchup
 from mcaptrack.evaluation.metrics.displacement import Displacement, combine_displacements
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame
 from mcaptrack.schema.classes import class_names
@@ -51,12 +54,13 @@ class EvaluateOptions:
 
     Parameters
     ----------
-    similarities : tuple of {"iou", "metres"}
-        By overlap of boxes, by distance on the ground. Empty: all that the data allow.
+    similarities : tuple of {"iou", "metres", "bev-iou", "3d-iou"}
+        By overlap of boxes in pictures, by distance on the ground, by overlap of oriented boxes on the ground (bird's
+        eye view) or in space. Empty: the first two, as far as the data allow.
     gates_m : tuple of float, m
         The largest distances of a match, for "metres".
     min_iou : float
-        The least overlap of a match, for "iou".
+        The least overlap of a match, for the similarities that are overlaps.
     rules : {"trackeval", "motmetrics"}
         Rules of CLEAR, see `mcaptrack.evaluation.metrics.clear.clear`.
     topics : tuple of str
@@ -98,7 +102,8 @@ class EvaluationRow:
     """The scores of one channel of tracks, for one similarity and gate.
 
     ``of_class`` is the class that is scored, None for all together. Counts of all together are the sums over classes;
-    ``class_means`` are then the means of rates over classes, as TrackEval gives them ("class averaged").
+    ``class_means`` are then the means of rates over classes, as TrackEval gives them ("class averaged"). ``averages``
+    are scores averaged over recalls (AMOTA), of 3D tracks with scores; ``scored`` are the matchups that they are from.
     """
 
     sequence: str
@@ -112,12 +117,14 @@ class EvaluationRow:
     group: str = ""
     of_class: str | None = None
     class_means: Mapping[str, float] | None = None
+    scored: tuple[ScoredMatchup, ...] = field(default=(), repr=False)
+    averages: Mapping[str, float] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
         """The row as ``evaluate --json`` prints it."""
         names = ("sequence", "tracks", "mode", "similarity", "gate", "rules")
         out = {name: getattr(self, name) for name in names}
-        out |= {"class": self.of_class} | metrics.summary(self.score)
+        out |= {"class": self.of_class} | metrics.summary(self.score) | dict(self.averages)
         if self.class_means is not None:
             out["class_means"] = dict(self.class_means)
         if self.displacement is not None:
@@ -202,20 +209,25 @@ def evaluate(
         raise McaptrackError("; ".join(outcome.notes) or "there is nothing to score")
     if count > 1:
         outcome.results += combined(outcome.results)
-    set_class_means(outcome.results)
+    set_means(outcome.results)
     return outcome
 
 
-def set_class_means(results: Sequence[EvaluationRow]) -> None:
-    """Set ``class_means`` of the rows of all classes together, where there are rows for single classes."""
+def set_means(results: Sequence[EvaluationRow]) -> None:
+    """Set averages over recalls, and ``class_means`` of rows of all classes together, where there are several."""
+    for one in results:
+        if one.scored:
+            one.averages = averages(one.scored, one.similarity, one.gate, one.rules)
     groups: dict[tuple[Any, ...], list[EvaluationRow]] = {}
     for one in results:
         groups.setdefault((one.sequence, one.tracks, one.mode, one.similarity, one.gate, one.rules), []).append(one)
     for members in groups.values():
         rates = [metrics.summary(one.score) for one in members if one.of_class is not None]
+        of_classes = [one.averages for one in members if one.of_class is not None and one.averages]
         for one in members:
             if one.of_class is None and rates:
                 one.class_means = {name: float(np.mean([rate[name] for rate in rates])) for name in metrics.RATES}
+                one.averages = mean_of_classes(of_classes)
 
 
 def combined(results: Sequence[EvaluationRow]) -> list[EvaluationRow]:
@@ -227,6 +239,7 @@ def combined(results: Sequence[EvaluationRow]) -> list[EvaluationRow]:
     out = []
     for (tracks, mode, similarity, gate, rules, one_class), members in groups.items():
         forecasts = [member.displacement for member in members if member.displacement is not None]
+        scored = [part for member in members for part in member.scored] if all(m.scored for m in members) else []
         out.append(
             EvaluationRow(
                 COMBINED,
@@ -238,6 +251,7 @@ def combined(results: Sequence[EvaluationRow]) -> list[EvaluationRow]:
                 metrics.combine([member.score for member in members]),
                 combine_displacements(forecasts) if len(forecasts) == len(members) else None,
                 of_class=one_class,
+                scored=tuple(scored),
             )
         )
     return out
@@ -248,27 +262,27 @@ def _score(
 ) -> list[EvaluationRow]:
     aligned = align(sequence.name, candidate.name, sequence.ground_truth, candidate.frames)
     shared = share_classes(sequence.name, candidate.name, *aligned, sequence.classes, candidate.classes)
-    notes += [shared.note] if shared.note else []
+    notes += shared.notes
     ground_truth, tracks = shared.ground_truth, shared.tracks
     parts = {one: (of_class(ground_truth, number), of_class(tracks, number)) for number, one in shared.names.items()}
     wanted = options.similarities or ("iou", "metres")
+    has_averages = are_3d(ground_truth, tracks)
     results = []
     for similarity in wanted:
-        missing = sides_without({"the ground truth": ground_truth, candidate.name: tracks}, similarity)
-        if missing:
-            unit = "boxes" if similarity == "iou" else "positions in metres"
-            if options.similarities:
-                raise McaptrackError(
-                    f"{sequence.name}: {' and '.join(missing)} {'have' if len(missing) > 1 else 'has'} no {unit}"
-                )
+        sides = {"the ground truth": ground_truth, candidate.name: tracks}
+        if options.similarities:
+            refuse_sides_without(f"{sequence.name}: ", sides, similarity)
+        elif sides_without(sides, similarity):
             continue
-        gates = (options.min_iou,) if similarity == "iou" else options.gates_m
+        gates = options.gates_m if similarity == "metres" else (options.min_iou,)
         for gate in gates:
-            scores = {
-                one: metrics.score(make_matchup(*part, similarity, gate), options.rules) for one, part in parts.items()
-            }
-            whole = metrics.combine(list(scores.values())) if scores else None
-            whole = whole or metrics.score(make_matchup(ground_truth, tracks, similarity, gate), options.rules)
+            compared: dict[str | None, RowComparison]
+            compared = {one: compare_rows(*part, similarity, gate) for one, part in parts.items()}
+            compared = compared or {None: compare_rows(ground_truth, tracks, similarity, gate)}
+            scores = {one: metrics.score(part.matchup, options.rules) for one, part in compared.items()}
+            whole = scores.pop(None, None) or metrics.combine(list(scores.values()))
+            is_averaged = has_averages and gate == max(gates)
+            scored = {one: scored_matchups(part) for one, part in compared.items()} if is_averaged else {}
             if gate == gates[-1] and whole.hota["HOTA_TP"][0] == 0:
                 notes += explain_no_match(sequence.name, candidate.name, ground_truth, tracks, similarity)
             results += [
@@ -282,9 +296,12 @@ def _score(
                     score,
                     group=candidate.group,
                     of_class=one,
+                    scored=scored.get(one, ()),
                 )
                 for one, score in ((None, whole), *scores.items())
             ]
+    if has_averages and results and not any(one.averages or one.scored for one in results):
+        notes.append(f"{sequence.name}: {candidate.name} has no scores; there is no AMOTA and no sAMOTA")
     if not results:
         notes.append(
             f"{sequence.name}: {candidate.name} and the ground truth share neither boxes nor positions in metres"

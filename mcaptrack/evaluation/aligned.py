@@ -5,7 +5,7 @@ Letters: N rows, T times, G people of the ground truth, H tracks in one frame.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Final, Literal, NamedTuple
 
 import numpy as np
@@ -13,15 +13,16 @@ import numpy as np
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation import metrics
 from mcaptrack.evaluation.metrics import Matchup
-from mcaptrack.geometry.arrays import Floats, Ints
+from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.boxes import columns_to_boxes, iou_of_pairs
 from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
+from mcaptrack.geometry.oriented_boxes import bev_iou_of_pairs, columns_to_oriented_boxes, iou_3d_of_pairs
 from mcaptrack.geometry.ragged import cross_pairs
 from mcaptrack.schema import TRACKS, Frame, Rows
 from mcaptrack.schema.framing import frame_times, join_frames, split_rows
 from mcaptrack.schema.resampling import is_observed_at, resample
 
-Similarity = Literal["iou", "metres"]
+Similarity = Literal["iou", "metres", "bev-iou", "3d-iou"]
 
 #: The default gates: least overlap of boxes, and largest distance on the ground.
 IOU_THRESHOLD: Final = 0.5
@@ -32,9 +33,22 @@ MAX_GAP_S: Final = 2.0
 _OTHER_UNIT: Final = 8.0
 #: The gate for the test whether tracks are anywhere near the ground truth; twice this distance has similarity 0.
 _FAR_M: Final = 5.0
+_OVERLAPS: Final = {"iou": iou_of_pairs, "bev-iou": bev_iou_of_pairs, "3d-iou": iou_3d_of_pairs}
 #: The number of pairs of boxes compared at once, to limit memory.
 _PAIRS_AT_ONCE: Final = 1_000_000
-_COLUMN: Final[dict[Similarity, str]] = {"iou": "x_px", "metres": "x_m"}
+#: The columns that each similarity needs, and what they are in messages.
+_NEEDED: Final[dict[Similarity, tuple[str, ...]]] = {
+    "iou": ("x_px",),
+    "metres": ("x_m",),
+    "bev-iou": ("x_m", "length_m", "width_m", "heading_rad"),
+    "3d-iou": ("x_m", "z_m", "length_m", "width_m", "height_m", "heading_rad"),
+}
+_UNITS: Final[dict[Similarity, str]] = {
+    "iou": "boxes",
+    "metres": "positions in metres",
+    "bev-iou": "boxes in metres with a heading",
+    "3d-iou": "3D boxes (with z_m, height_m and a heading)",
+}
 
 
 def have_same_times(ground_truth_ns: Ints, tracks_ns: Ints) -> bool:
@@ -74,7 +88,7 @@ def on_ground(rows: Rows) -> Floats:
     return np.stack([rows["x_m"], rows["y_m"]], axis=-1)
 
 
-def sides_without(sides: dict[str, Sequence[Frame]], similarity: Similarity) -> list[str]:
+def sides_without(sides: Mapping[str, Sequence[Frame]], similarity: Similarity) -> list[str]:
     """The names of sides that have rows, but none with the columns that a similarity compares."""
     return [
         name
@@ -85,7 +99,18 @@ def sides_without(sides: dict[str, Sequence[Frame]], similarity: Similarity) -> 
 
 def has_positions(frames: Sequence[Frame], similarity: Similarity) -> bool:
     """Whether any row has the columns that a similarity compares: a box, or a position in metres."""
-    return any(np.isfinite(frame.rows[_COLUMN[similarity]]).any() for frame in frames)
+    return any(_have_positions(frame.rows, similarity).any() for frame in frames)
+
+
+def _have_positions(rows: Rows, similarity: Similarity) -> Bools:
+    return np.asarray(np.isfinite([rows[name] for name in _NEEDED[similarity]]).all(axis=0), bool)
+
+
+def refuse_sides_without(name: str, sides: Mapping[str, Sequence[Frame]], similarity: Similarity) -> None:
+    """Raise McaptrackError if one of the sides has rows, but none with the columns that a similarity compares."""
+    if missing := sides_without(sides, similarity):
+        has = "have" if len(missing) > 1 else "has"
+        raise McaptrackError(f"{name}{' and '.join(missing)} {has} no {_UNITS[similarity]}")
 
 
 def explain_no_match(
@@ -146,30 +171,36 @@ def compare_rows(
     ground_truth: Sequence[Frame], tracks: Sequence[Frame], similarity: Similarity, gate: float, by_class: bool = False
 ) -> RowComparison:
     """Like `make_matchup`, with the rows that were compared; ``by_class``: rows of different classes are not alike."""
-    people, found = (_locate(part, _COLUMN[similarity]) for part in (ground_truth, tracks))
-    places = columns_to_boxes if similarity == "iou" else on_ground
-    a, b = places(people.rows), places(found.rows)
+    people, found = (_locate(part, similarity) for part in (ground_truth, tracks))
+    a, b = (_places(part.rows, similarity) for part in (people, found))
     alike: list[Floats] = []
     step = max(1, round(_PAIRS_AT_ONCE / max(1.0, len(a) * len(b) / max(1, len(ground_truth)) ** 2)))
     for first in range(0, len(ground_truth), step):
         ends = (people.ends[first : first + step + 1], found.ends[first : first + step + 1])
         classes = (people.rows["class_id"], found.rows["class_id"]) if by_class else None
-        alike += _similarities(a, b, *ends, gate, classes)
+        alike += _similarities(a, b, *ends, similarity, gate, classes)
     matched = Matchup(
         tuple(np.split(people.track, people.ends[1:-1])),
         tuple(np.split(found.track, found.ends[1:-1])),
         tuple(alike),
-        gate if similarity == "iou" else 0.5,
+        0.5 if similarity == "metres" else gate,
         len(people.ids),
         len(found.ids),
     )
     return RowComparison(matched, people, found)
 
 
-def _locate(frames: Sequence[Frame], column: str) -> LocatedRows:
+def _places(rows: Rows, similarity: Similarity) -> Floats:
+    """The boxes or positions of rows that a similarity compares."""
+    if similarity == "metres":
+        return on_ground(rows)
+    return columns_to_boxes(rows) if similarity == "iou" else columns_to_oriented_boxes(rows)
+
+
+def _locate(frames: Sequence[Frame], similarity: Similarity) -> LocatedRows:
     joined = join_frames(TRACKS, frames)
     rows, ends = joined.rows, joined.ends
-    usable = np.isfinite(rows[column])
+    usable = _have_positions(rows, similarity)
     if not usable.all():
         ends, rows = np.concatenate([[0], usable.cumsum()])[ends], rows[usable]
     ids, track = np.unique(rows["track_id"], return_inverse=True)
@@ -177,7 +208,13 @@ def _locate(frames: Sequence[Frame], column: str) -> LocatedRows:
 
 
 def _similarities(
-    a: Floats, b: Floats, a_ends: Ints, b_ends: Ints, gate: float, classes: tuple[Ints, Ints] | None
+    a: Floats,
+    b: Floats,
+    a_ends: Ints,
+    b_ends: Ints,
+    similarity: Similarity,
+    gate: float,
+    classes: tuple[Ints, Ints] | None,
 ) -> list[Floats]:
     """The similarities of boxes or positions ``a`` and ``b`` in some frames, (G, H) for each; all pairs at once.
 
@@ -186,8 +223,8 @@ def _similarities(
     people, found = np.diff(a_ends), np.diff(b_ends)
     _, row, column = cross_pairs(people, found)
     row, column = row + a_ends[0], column + b_ends[0]
-    if a.shape[1] == 4:
-        alike = iou_of_pairs(a[row], b[column])
+    if similarity != "metres":
+        alike = _OVERLAPS[similarity](a[row], b[column])
     else:
         apart = a[row] - b[column]
         alike = metrics.metres_to_similarity(np.hypot(apart[:, 0], apart[:, 1]), gate)

@@ -20,13 +20,13 @@ class SharedClasses(NamedTuple):
     """Ground truth and tracks with the same numbers of classes: those of the ground truth.
 
     ``names`` are the classes of the ground truth by number; it is empty if classes are not told apart, because there is
-    only one or because one side has none. ``note`` says what is not compared; "" if all is.
+    only one or because one side has none. ``notes`` say what is not compared.
     """
 
     ground_truth: list[Frame]
     tracks: list[Frame]
     names: Mapping[int, str]
-    note: str
+    notes: tuple[str, ...]
 
 
 def share_classes(
@@ -56,11 +56,11 @@ def share_classes(
     """
     there, found = (_numbers(frames) for frames in (ground_truth, tracks))
     if not any(there) or not any(found):
-        note = ""
+        notes = []
         if there and found and max(len(there), len(found)) > 1:
             side = tracks_name if any(there) else "the ground truth"
-            note = f"{name}: {side} states no classes; objects of all classes are compared with one another"
-        return SharedClasses(list(ground_truth), list(tracks), {}, note)
+            notes.append(f"{name}: {side} states no classes; objects of all classes are compared with one another")
+        return SharedClasses(list(ground_truth), list(tracks), {}, tuple(notes))
     first: dict[str | int, int] = {}
     for number in there:
         first.setdefault(_key(number, ground_truth_names), number)  # two numbers with one name are one class
@@ -68,21 +68,30 @@ def share_classes(
     places_of_tracks = {number: first.get(_key(number, track_names)) for number in found}
     names = {number: class_name(number, ground_truth_names) for number in first.values()}
     beyond = [number for number, place in places_of_tracks.items() if place is None]
-    note = ""
+    notes = []
     if beyond:
-        counts = {one: sum(int((frame.rows["class_id"] == one).sum()) for frame in tracks) for one in beyond}
-        words = [f"{counts[one]} of {class_name(one, track_names)}" for one in sorted(beyond, key=lambda n: -counts[n])]
-        more = f" and {len(words) - _SHOWN} more classes" if len(words) > _SHOWN else ""
-        note = (
-            f"{name}: rows of {tracks_name} of classes that the ground truth doesn't have are not compared: "
-            f"{', '.join(words[:_SHOWN])}{more}"
+        words = _counted(tracks, beyond, track_names)
+        notes.append(
+            f"{name}: rows of {tracks_name} of classes that the ground truth doesn't have are not compared: {words}"
+        )
+    if missed := [number for number in there if places[number] not in places_of_tracks.values()]:
+        words = _counted(ground_truth, missed, ground_truth_names)
+        notes.append(
+            f"{name}: {tracks_name} has no tracks of classes that the ground truth has; all are misses: {words}"
         )
     return SharedClasses(
         _renumbered(ground_truth, places),
         _renumbered(tracks, places_of_tracks),
         names if len(names) > 1 else {},
-        note,
+        tuple(notes),
     )
+
+
+def _counted(frames: Sequence[Frame], numbers: Sequence[int], names: Mapping[int, str]) -> str:
+    """The rows of some classes in words, the most frequent class first."""
+    counts = {one: sum(int((frame.rows["class_id"] == one).sum()) for frame in frames) for one in numbers}
+    words = [f"{counts[one]} of {class_name(one, names)}" for one in sorted(numbers, key=lambda n: -counts[n])]
+    return ", ".join(words[:_SHOWN]) + (f" and {len(words) - _SHOWN} more classes" if len(words) > _SHOWN else "")
 
 
 def of_class(frames: Sequence[Frame], number: int) -> list[Frame]:
@@ -98,7 +107,7 @@ def _numbers(frames: Sequence[Frame]) -> list[int]:
 def _key(number: int, names: Mapping[int, str]) -> str | int:
     """The key of a class, the same in all channels: its name, or its number if it has none."""
     name = names.get(number, "").strip().casefold()
-    return "person" if number == PERSON or is_person(name) else name or number
+    return "person" if is_person(name) or (number == PERSON and not name) else name or number
 
 
 def _renumbered(frames: Sequence[Frame], places: Mapping[int, int | None]) -> list[Frame]:

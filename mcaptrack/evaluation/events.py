@@ -26,6 +26,7 @@ from mcaptrack.evaluation.aligned import (
     explain_no_match,
     has_positions,
     have_same_times,
+    refuse_sides_without,
     sides_without,
 )
 from mcaptrack.evaluation.by_class import share_classes
@@ -50,7 +51,7 @@ from mcaptrack.schema.framing import frame_times, join_frames, split_rows
 class EventOptions:
     """Options of matching tracks with people. ``similarity`` None: the default for the tracks (see `default_rule`).
 
-    ``gate_m`` is the largest distance for "metres", ``min_iou`` the least overlap for "iou"; None: the default.
+    ``gate_m`` is the largest distance for "metres", ``min_iou`` the least overlap for the others; None: the default.
     """
 
     similarity: Similarity | None = None
@@ -59,7 +60,7 @@ class EventOptions:
 
     def rule(self, similarity: Similarity) -> MatchRule:
         """The rule for a similarity, with the gate of these options."""
-        gate, interval = (self.min_iou, IOU_THRESHOLD) if similarity == "iou" else (self.gate_m, GATE_M)
+        gate, interval = (self.gate_m, GATE_M) if similarity == "metres" else (self.min_iou, IOU_THRESHOLD)
         return MatchRule(similarity, interval if gate is None else gate)
 
 
@@ -183,12 +184,10 @@ def _compared(
     if similarity is None:
         raise McaptrackError(f"{names[1]} and the ground truth share neither boxes nor positions in metres")
     rule = options.rule(similarity)
-    if missing := sides_without({"the ground truth": ground_truth, names[1]: tracks}, similarity):
-        unit = "boxes" if similarity == "iou" else "positions in metres"
-        raise McaptrackError(f"{' and '.join(missing)} {'have' if len(missing) > 1 else 'has'} no {unit}")
+    refuse_sides_without("", {"the ground truth": ground_truth, names[1]: tracks}, similarity)
     at_same = align(*names, ground_truth, tracks)
     shared = share_classes(*names, *at_same, *classes)
-    notes += [shared.note] if shared.note else []
+    notes += shared.notes
     compared = compare_rows(shared.ground_truth, shared.tracks, *rule, by_class=bool(shared.names))
     found = matches(compared.matchup)
     if len(found.person) == 0:

@@ -98,4 +98,4 @@ def _intersection(a: Floats, b: Floats) -> Floats:
     at = np.sort(np.stack([start, *places, end]), axis=0)
     height = np.clip(y + slope * (at - x), -half_width, half_width)
     area = ((height[1:] + height[:-1]) / 2 * np.diff(at, axis=0)).sum(axis=0)
-    return np.clip((-np.sign(step_x) * area).sum(axis=1), 0, None)
+    return np.asarray(np.clip((-np.sign(step_x) * area).sum(axis=1), 0, None))

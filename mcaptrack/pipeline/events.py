@@ -12,12 +12,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, get_args
 
 import numpy as np
 
 from mcaptrack import foxglove, log
 from mcaptrack.errors import McaptrackError, call
+from mcaptrack.evaluation.aligned import Similarity
 from mcaptrack.evaluation.event_text import SUFFIX, log_messages
 from mcaptrack.evaluation.events import EventOptions, find_events
 from mcaptrack.evaluation.forecasts import FORECAST_INPUTS, find_forecast_errors
@@ -206,7 +207,7 @@ def _options_for(opened: log.Log, topic: str, given: EventOptions) -> EventOptio
     if given != EventOptions() or not isinstance(asked, dict):
         return given
     similarity = asked.get("similarity")
-    if similarity not in ("iou", "metres"):
+    if similarity not in get_args(Similarity):
         similarity = None
     if "gate" in asked:  # version 0.1 had one parameter for both
         asked = {"min_iou" if similarity == "iou" else "gate_m": asked["gate"]}

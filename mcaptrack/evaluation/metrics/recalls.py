@@ -96,9 +96,10 @@ def average_over_recalls(
     def at(recalls: Floats) -> list[tuple[float, _Counts]]:
         """The recalls that are reached, each with its counts."""
         reached = recalls <= len(scores) / total
-        least = np.interp(recalls[reached], np.arange(1, len(scores) + 1) / total, scores) if len(scores) else []
+        found_recalls = np.arange(1, len(scores) + 1) / total
+        least = np.interp(recalls[reached], found_recalls, scores) if len(scores) else np.empty(0)
         out = []
-        for recall, score in zip(recalls[reached].tolist(), least, strict=True):
+        for recall, score in zip(recalls[reached].tolist(), least.tolist(), strict=True):
             kept = [part.score >= score for part in parts]
             key = tuple(one.tobytes() for one in kept)
             if key not in known:

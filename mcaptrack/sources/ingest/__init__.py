@@ -11,9 +11,11 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.files import is_same_file, refuse_special
 from mcaptrack.schema.provenance import CLOCK
 from mcaptrack.sources.ingest.bags.opening import open_recording
+from mcaptrack.sources.ingest.boxes_3d_job import Boxes3DJob
 from mcaptrack.sources.ingest.job import MOTION, IngestJob, IngestOptions, IngestReport, InputRole, Progress
 from mcaptrack.sources.ingest.label_job import LabelJob, label_frames
 from mcaptrack.sources.ingest.labels.box_rows import OTHERS
+from mcaptrack.sources.ingest.labels.boxes_3d.reading import is_3d
 from mcaptrack.sources.ingest.labels.formats import Format, Role
 from mcaptrack.sources.ingest.labels.yolo import is_label_folder
 from mcaptrack.sources.ingest.motion_job import MotionJob
@@ -87,15 +89,18 @@ def ingest(
     if into is None and is_same_file(output, source):
         raise McaptrackError(f"{source} is both input and output; give another name with `output=`")
     with notices.collected() as warned, _job(source, options, progress, into) as job:
-        if options.first_frame is not None and not job.labels:
+        if options.first_frame is not None and not job.has_labels:
             raise McaptrackError(f"{source}: `first_frame=` is about label files, and none is given")
         job.report_assumptions()
         with job.opened(output, into, force) as writer:
             job.write(writer, has_clock=bool(into and into.metadata(CLOCK)))
         job.check(output)
-        job.report.warnings, job.report.has_labels = warned, bool(job.labels)
+        job.report.warnings, job.report.has_labels = warned, job.has_labels
+        job.report.holds_boxes_3d = isinstance(job, Boxes3DJob)
         job.report.uses_size = any(labels.format in OTHERS for _, labels in job.labels.values())
-        job.report.uses_camera = bool(job.labels or job.homography or job.options.motion) or isinstance(job, VideoJob)
+        job.report.uses_camera = bool(job.has_labels or job.homography or job.options.motion) or isinstance(
+            job, VideoJob
+        )
     return job.report
 
 
@@ -104,6 +109,8 @@ def _job(source: Path, options: IngestOptions, progress: Progress, into: log.Log
     if recorded is not None:
         return RecordingJob(source, options, recorded, progress, into)
     role = options.role
+    if role != MOTION and is_3d(source, options.label_format, options.columns):
+        return Boxes3DJob([(role, source)], options, into)
     if source.is_dir() and role != MOTION and (role or is_label_folder(source)):
         return LabelJob([(role, source)], options, into)
     is_video = source.is_dir() or source.suffix.lower() in VIDEO_SUFFIXES or _is_binary(source)

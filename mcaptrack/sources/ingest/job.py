@@ -15,7 +15,7 @@ from typing import Any, Final, Literal, Self
 import numpy as np
 
 from mcaptrack import log
-from mcaptrack.errors import McaptrackError
+from mcaptrack.errors import McaptrackError, call
 from mcaptrack.geometry.plane import GroundPlane, Point
 from mcaptrack.notices import Notice, warn
 from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, GROUND_PLANE, TRACKS, Frame, Rows, Schema
@@ -23,6 +23,7 @@ from mcaptrack.schema.classes import classes_beside_rows, only_class, without_cl
 from mcaptrack.schema.ground_plane import plane_to_rows
 from mcaptrack.schema.provenance import CLOCK, INGEST, Provenance, digest
 from mcaptrack.sources.ingest.labels.box_rows import OTHERS, fitted
+from mcaptrack.sources.ingest.labels.boxes_3d.reading import is_3d
 from mcaptrack.sources.ingest.labels.formats import Format, Labels, Role
 from mcaptrack.sources.ingest.labels.motions import motion_frames, read_motions
 from mcaptrack.sources.ingest.labels.reading import read_homography, read_labels
@@ -34,7 +35,8 @@ Progress = Callable[[str, int, int], None]
 #: A function that yields frames, from the beginning with each call.
 Frames = Callable[[], Iterator[Frame]]
 
-_SCHEMA_OF: Final[Mapping[Role, Schema]] = {"detections": DETECTIONS, "tracks": TRACKS, "truth": TRACKS}
+#: The schema of each role.
+SCHEMA_OF: Final[Mapping[Role, Schema]] = {"detections": DETECTIONS, "tracks": TRACKS, "truth": TRACKS}
 #: The role of a file with the motion of the camera, and the last part of its topic.
 MOTION: Final = "motion"
 #: What an input that is a text file can hold.
@@ -52,7 +54,8 @@ class IngestOptions:
     is the number that label files give the first picture, if it isn't that of their format; ``frames`` is the number of
     pictures, for labels without pictures. ``columns`` are names of columns of tables with a header, by what they hold;
     ``size`` is the size of pictures, (width, height), for labels without pictures. ``classes`` are those of tracks and
-    ground truth.
+    ground truth, by default people, and all of 3D boxes. ``frame_id`` is the frame of reference of 3D boxes, ``scene``
+    the name of a scene of nuScenes.
     """
 
     camera: str = "camera"
@@ -71,7 +74,9 @@ class IngestOptions:
     motion: Path | None = None
     columns: Mapping[str, str] | None = None
     size: tuple[int, int] | None = None
-    classes: WantedClasses = ONLY_PEOPLE
+    classes: WantedClasses | None = None
+    frame_id: str | None = None
+    scene: str | None = None
 
     @property
     def video_options(self) -> VideoOptions:
@@ -99,7 +104,7 @@ class IngestReport:
 
     ``warnings`` report what was assumed, left out or looks unusual. ``has_labels``: there were label files.
     ``uses_size``: some of them are in a format of a detector, in which the size of pictures counts.
-    ``uses_camera``: topics below the camera's name were written.
+    ``uses_camera``: topics below the camera's name were written. ``holds_boxes_3d``: the labels are 3D boxes.
     """
 
     messages: dict[str, int] = field(default_factory=dict)
@@ -110,6 +115,7 @@ class IngestReport:
     has_labels: bool = False
     uses_size: bool = False
     uses_camera: bool = False
+    holds_boxes_3d: bool = False
 
 
 class IngestJob:
@@ -139,7 +145,18 @@ class IngestJob:
     def read(self, path: Path, role: Role) -> Labels:
         """Read a label file with the format options."""
         options = self.options
-        return read_labels(path, options.label_format, role, options.first_frame, options.columns, options.classes)
+        wanted = options.classes or ONLY_PEOPLE
+        if is_3d(path, options.label_format, options.columns):
+            raise McaptrackError(
+                f"{path} holds 3D boxes, and {self.source} does not; add them with "
+                f"{call('ingest', path, role=role, into='LOG')}"
+            )
+        return read_labels(path, options.label_format, role, options.first_frame, options.columns, wanted)
+
+    @property
+    def has_labels(self) -> bool:
+        """Whether there are label files."""
+        return bool(self.labels)
 
     def fit_to_pictures(self, size: Callable[[], tuple[int, int]] | None) -> None:
         """Convert boxes in shares of the picture to pixels, and warn of boxes outside of it.
@@ -278,7 +295,7 @@ class IngestJob:
                 role, labels
             )
             frames = self.frames(role, plane, placed)
-            self.write_rows(writer, role, _SCHEMA_OF[role], frames, parameters, labels.classes)
+            self.write_rows(writer, role, SCHEMA_OF[role], frames, parameters, labels.classes)
 
     def write_motion(self, writer: log.LogWriter, timeline: Timeline, size: tuple[int, int]) -> None:
         """Write the motion of the camera, if it was given; pictures have this width and height."""
@@ -297,7 +314,7 @@ class IngestJob:
         out: dict[str, Any] = {} if self.options.first_frame is None else {"first_frame": labels.first_frame}
         if self.options.columns and labels.format in ("csv", "supervision"):
             out["columns"] = ",".join(f"{key}={name}" for key, name in self.options.columns.items())
-        if role != "detections" and self.options.classes != ONLY_PEOPLE:
+        if role != "detections" and self.options.classes not in (None, ONLY_PEOPLE):
             out["classes"] = self.options.classes.text
         if self.options.size and labels.format in OTHERS:
             out["size"] = "{}x{}".format(*self.options.size)
@@ -325,8 +342,10 @@ class IngestJob:
         frames: Frames,
         parameters: Mapping[str, Any],
         classes: Mapping[int, str] = {},
+        frame_id: str = "",
     ) -> None:
-        """Write a channel of the camera; ``parameters`` are those in its provenance, ``classes`` its class names.
+        """Write a channel of the camera; ``parameters`` are those in its provenance, ``classes`` its class names, and
+        ``frame_id`` the frame of reference of its positions.
 
         Frames are generated several times, for the digest and for the channel, so that they are never all in memory.
         """
@@ -340,7 +359,9 @@ class IngestJob:
         names = {str(number): name for number, name in sorted(classes.items())}
         class_id = str(only) if only else ""
         of_rows = digest(messages(), classes_beside_rows(class_id, names))
-        made = Provenance(INGEST, parameters, self.pictures, digest=of_rows, classes=names, class_id=class_id)
+        made = Provenance(
+            INGEST, parameters, self.pictures, digest=of_rows, classes=names, class_id=class_id, frame_id=frame_id
+        )
         topic, record = f"{self.prefix}/{suffix}", (schema.name, "protobuf", schema.descriptor)
         channel = writer.add_channel(topic, record, "protobuf", made.to_metadata())
         count = 0

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, get_args
 
 import numpy as np
 
 from mcaptrack import log, pipeline
 from mcaptrack.errors import DamagedError, McaptrackError, command
 from mcaptrack.evaluation import EvaluateOptions, EvaluationInput, EvaluationRow, evaluate, sequence_of_log
-from mcaptrack.evaluation.aligned import has_positions, resample_frames
+from mcaptrack.evaluation.aligned import Similarity, has_positions, resample_frames
 from mcaptrack.evaluation.events import EventOptions, MatchRule, find_events
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.plane import Planes, is_estimated, origin_of, plane_at
@@ -208,9 +208,10 @@ def _recorded(opened: log.Log, topic: str) -> tuple[list[Frame], MatchRule | Non
     made = Provenance.from_metadata(channel.metadata) if channel else None
     if channel is None or made is None or channel.schema_name != EVENTS.name or pipeline.is_stale(opened, topic):
         return None
-    similarity, gate = made.parameters.get("similarity"), made.parameters.get("gate")
+    similarity: Any = made.parameters.get("similarity")
+    gate = made.parameters.get("gate")
     rule = None
-    if similarity in ("iou", "metres") and isinstance(gate, float | int):
+    if similarity in get_args(Similarity) and isinstance(gate, float | int):
         rule = MatchRule(similarity, float(gate))
     return opened.frames(topic, EVENTS), rule
 

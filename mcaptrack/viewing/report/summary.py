@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from mcaptrack.errors import command
-from mcaptrack.evaluation import EvaluationRow, combined, set_class_means
+from mcaptrack.evaluation import EvaluationRow, combined, set_means
 from mcaptrack.evaluation.metrics import summary
 from mcaptrack.viewing.report.contents import LogReport, result_of
 from mcaptrack.viewing.report.formatting import counted, number, percent, times
@@ -30,7 +30,10 @@ class BeforeAfter(NamedTuple):
 
 def rule_text(similarity: str, gate: float) -> str:
     """A rule in words."""
-    return f"within {gate:g} m on the ground" if similarity == "metres" else f"by overlap of boxes of at least {gate:g}"
+    if similarity == "metres":
+        return f"within {gate:g} m on the ground"
+    seen = {"bev-iou": ", seen from above,", "3d-iou": " in space"}.get(similarity, "")
+    return f"by overlap of boxes{seen} of at least {gate:g}"
 
 
 def before_after(report: LogReport, results: Sequence[EvaluationRow]) -> BeforeAfter | None:
@@ -52,7 +55,7 @@ def combined_results(reports: Sequence[LogReport]) -> list[EvaluationRow]:
     """The scores of all logs together, if several have any."""
     scored = [report for report in reports if report.results]
     out = combined([result for report in scored for result in report.results]) if len(scored) > 1 else []
-    set_class_means(out)
+    set_means(out)
     return out
 
 

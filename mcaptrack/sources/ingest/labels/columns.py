@@ -10,12 +10,17 @@ from mcaptrack.errors import McaptrackError
 
 #: What a column may hold: corners, size and centre of a box in pixels, and more.
 KEYS: Final = ("x", "y", "w", "h", "x2", "y2", "cx", "cy", "frame", "t", "score", "class", "name", "id")
+#: What columns of 3D boxes may hold, beside frame, t, score, class, name and id.
+KEYS_3D: Final = (
+    *("x_m", "y_m", "z_m", "length_m", "width_m", "height_m", "heading_rad", "heading_deg"),
+    *("qw", "qx", "qy", "qz", "vx_m_per_s", "vy_m_per_s"),
+)
 #: The ways to give a box along x and y. The one is read that the user named most of, else the first that is complete:
 #: beside two corners, a width and a height are often those of the picture.
 _SPANS: Final = ((("x", "x2"), ("x", "w"), ("cx", "w")), (("y", "y2"), ("y", "h"), ("cy", "h")))
 _WITH_UNITS: Final = tuple(f"{what}{unit}" for what in ("t", "time", "timestamp") for unit in ("s", "ms", "us", "ns"))
 #: Headers by key, without blanks, "_", "-", "." and brackets, and in lower case.
-_HEADERS: Final[Mapping[str, tuple[str, ...]]] = {
+HEADERS: Final[Mapping[str, tuple[str, ...]]] = {
     "x": ("x", "x1", "xmin", "minx", "left", "bbleft", "bboxleft", "bboxx", "bboxx1", "bboxxmin", "xtl", "xleft"),
     "y": ("y", "y1", "ymin", "miny", "top", "bbtop", "bboxtop", "bboxy", "bboxy1", "bboxymin", "ytl", "ytop"),
     "w": ("w", "width", "bbwidth", "bboxwidth", "bboxw"),
@@ -30,11 +35,11 @@ _HEADERS: Final[Mapping[str, tuple[str, ...]]] = {
     "score": ("score", "confidence", "conf", "probability", "prob"),
     "class": ("class", "classid", "cls", "label", "category", "categoryid", "labelid", "objectclass"),
     "name": ("classname", "categoryname", "labelname", "name"),
-    "id": ("trackid", "trackerid", "id", "track", "objectid", "targetid", "tid"),
+    "id": ("trackid", "trackerid", "id", "track", "objectid", "targetid", "tid", "trackuuid", "uuid"),
 }  # fmt: skip
 #: Keys of which several columns may fit; the first header of the list above is read.
 _RANKED: Final = ("frame", "t", "class", "id")
-_IGNORED: Final = re.compile(r"[\s_\-.()\[\]/:]+|px$|pixels$")
+IGNORED: Final = re.compile(r"[\s_\-.()\[\]/:]+|px$|pixels$")
 
 
 def parse_columns(text: str) -> dict[str, str]:
@@ -54,9 +59,10 @@ def parse_columns(text: str) -> dict[str, str]:
 
 def check_keys(columns: Mapping[str, str]) -> dict[str, str]:
     """Check the keys of columns. Raises McaptrackError, with the known ones."""
-    unknown = [key for key in columns if key not in KEYS]
+    known = (*KEYS, *KEYS_3D)
+    unknown = [key for key in columns if key not in known]
     if unknown:
-        raise McaptrackError(f"`columns=` knows no {str(unknown[0])!r:.40}; it knows {', '.join(KEYS)}")
+        raise McaptrackError(f"`columns=` knows no {str(unknown[0])!r:.40}; it knows {', '.join(known)}")
     return dict(columns)
 
 
@@ -67,9 +73,9 @@ def choose_columns(where: str, header: Sequence[str], given: Mapping[str, str]) 
     """
     shown = f"its columns are {', '.join(header)}"[:300]
     out = {key: _named(where, header, key, column, shown) for key, column in given.items()}
-    plain = [_IGNORED.sub("", name.strip().lower()) for name in header]
+    plain = [IGNORED.sub("", name.strip().lower()) for name in header]
     skipped = _superseded(out)
-    for key, names in _HEADERS.items():
+    for key, names in HEADERS.items():
         fits = [at for name in names for at, one in enumerate(plain) if one == name and at not in out.values()]
         if key in out or key in skipped or not fits:
             continue

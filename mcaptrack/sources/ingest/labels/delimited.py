@@ -47,7 +47,7 @@ _MAX_SECONDS: Final = 2**63 / 1e9
 
 def header_of(path: Path, line: str) -> list[str]:
     """The names of columns if a line is a header, otherwise an empty list: none of its cells is a number."""
-    cells = [cell.strip() for cell in _split(path, _delimiter(line), line)]
+    cells = [cell.strip() for cell in split_row(path, delimiter_of(line), line)]
     is_header = len(cells) >= _LEAST_COLUMNS and not any(_is_number(cell) for cell in cells)
     return cells if is_header and any(line.count(one) for one in _DELIMITERS) else []
 
@@ -56,9 +56,14 @@ def comment_header(path: Path, row: str) -> list[str]:
     """The names of columns by a first line that begins with "#", if it fits the first row; otherwise an empty list."""
     _, first = next(lines_of(path, MAX_LINE, has_comments=True), (0, ""))
     names = header_of(path, first.strip().lstrip("#")) if first.lstrip().startswith("#") else []
-    delimiter = _delimiter(row)
-    cells = _split(path, delimiter, row)
-    return names if len(names) == len(cells) and delimiter == _delimiter(first) else []
+    delimiter = delimiter_of(row)
+    cells = split_row(path, delimiter, row)
+    return names if len(names) == len(cells) and delimiter == delimiter_of(first) else []
+
+
+def is_empty(cell: str) -> bool:
+    """Whether a cell states nothing."""
+    return cell.strip().lower() in _EMPTY
 
 
 def _is_number(cell: str) -> bool:
@@ -69,11 +74,13 @@ def _is_number(cell: str) -> bool:
     return True
 
 
-def _delimiter(header: str) -> str:
+def delimiter_of(header: str) -> str:
+    """The character that separates the cells of a line."""
     return max(_DELIMITERS, key=header.count)
 
 
-def _split(path: Path, delimiter: str, line: str) -> list[str]:
+def split_row(path: Path, delimiter: str, line: str) -> list[str]:
+    """The cells of a line. Raises McaptrackError if they can't be told apart."""
     try:
         return next(csv.reader([line], delimiter=delimiter, skipinitialspace=True), [])
     except csv.Error as error:
@@ -91,8 +98,8 @@ def read_csv(path: Path, role: Role, given: Mapping[str, str], name: Format, wan
         lines = chain([(number, first)], lines)
     if not header:
         raise McaptrackError(f"{path}:{number}: a table needs a header that names its columns: {first.strip()[:60]}")
-    delimiter = _delimiter(first)
-    split = partial(_split, path, delimiter)
+    delimiter = delimiter_of(first)
+    split = partial(split_row, path, delimiter)
     return _read_table(path, number, header, lines, split, role, given, name, wanted, delimiter == ";")
 
 
@@ -131,7 +138,7 @@ def _read_table(
 
     def number_of(text: str) -> float:
         text = text.strip()
-        return math.nan if text.lower() in _EMPTY else float(text.replace(",", ".") if has_decimal_commas else text)
+        return math.nan if is_empty(text) else float(text.replace(",", ".") if has_decimal_commas else text)
 
     def frame_of(text: str) -> float:
         return float(text) if _is_number(text) else frames.number(text.strip())
@@ -150,7 +157,7 @@ def _read_table(
     columns = {key: table.values[:, place] for place, key in enumerate(keys)}
     none = np.full(len(table.values), np.nan)
     track_id = np.nan_to_num(columns.get("id", none), nan=NO_ID)
-    unit = f" in {_unit(header[at['t']])[0]}" if "t" in at else ""
+    unit = f" in {unit_of(header[at['t']])[0]}" if "t" in at else ""
     used = ", ".join(f"{key}={header[at[key]]}{unit * (key == 't')}" for key in keys)
     unused = [name for place, name in enumerate(header) if name and place not in at.values()]
     remarks = [f"{path}: columns {used}" + (f"; not read: {', '.join(unused)}"[:300] if unused else "")]
@@ -172,7 +179,7 @@ def _read_table(
         remarks=remarks,
     )
     if "t" in at:
-        _number_times(rows, columns["t"] * _unit(header[at["t"]])[1])
+        _number_times(rows, columns["t"] * unit_of(header[at["t"]])[1])
     parts = np.stack([columns[key] for key in _OF_BOXES if key in columns])
     rows.leave_out_empty(np.asarray(np.isnan(parts).all(axis=0), bool))
     if name == "csv":
@@ -183,7 +190,7 @@ def _read_table(
 
 
 def _class_reader(numbers: ClassNames) -> Callable[[str], float]:
-    return lambda text: math.nan if text.strip().lower() in _EMPTY else numbers.number(text.strip())
+    return lambda text: math.nan if is_empty(text) else numbers.number(text.strip())
 
 
 def _are_row_numbers(track_id: Floats) -> bool:
@@ -200,7 +207,7 @@ def _boxes(columns: Mapping[str, Floats]) -> Floats:
     return np.stack([left, top, width, height], axis=-1)
 
 
-def _unit(header: str) -> tuple[str, float]:
+def unit_of(header: str) -> tuple[str, float]:
     """The unit of a column of times, by its name, and its seconds: s, unless it ends with _ms, _us or _ns."""
     words = header.strip().lower()
     found = (unit for unit in _UNITS.items() if words.endswith((f"_{unit[0]}", f" {unit[0]}", f"({unit[0]})")))

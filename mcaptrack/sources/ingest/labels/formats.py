@@ -33,7 +33,23 @@ from mcaptrack.schema.classes import PERSON
 from mcaptrack.sources.ingest.labels.number_table import Lines, NumberTable
 from mcaptrack.sources.ingest.labels.wanted import WantedClasses
 
-Format = Literal["auto", "mot", "kitti", "sdd", "trajnet", "obsmat", "coco", "yolo", "supervision", "csv"]
+Format = Literal[
+    "auto",
+    "mot",
+    "kitti",
+    "sdd",
+    "trajnet",
+    "obsmat",
+    "coco",
+    "yolo",
+    "supervision",
+    "csv",
+    "kitti-3d",
+    "nuscenes",
+    "argoverse",
+]
+#: Formats that hold 3D boxes alone; tables ("csv") may hold either.
+FORMATS_3D: Final[tuple[str, ...]] = ("kitti-3d", "nuscenes", "argoverse")
 Role = Literal["detections", "tracks", "truth"]
 ClassIds = NDArray[np.uint32]
 

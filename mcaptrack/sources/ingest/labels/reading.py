@@ -13,14 +13,14 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.files import refuse_special
 from mcaptrack.sources.ingest.labels.columns import choose_columns
 from mcaptrack.sources.ingest.labels.delimited import MAX_LINE, SUPERVISION, comment_header, header_of, read_csv
-from mcaptrack.sources.ingest.labels.formats import READERS, Format, Labels, Role
+from mcaptrack.sources.ingest.labels.formats import FORMATS_3D, READERS, Format, Labels, Role
 from mcaptrack.sources.ingest.labels.json_boxes import is_json, read_json
 from mcaptrack.sources.ingest.labels.number_table import lines_of, split
 from mcaptrack.sources.ingest.labels.wanted import ONLY_PEOPLE, WantedClasses
 from mcaptrack.sources.ingest.labels.yolo import read_yolo
 
 _MOT_COLUMNS: Final = {"frame": 0, "id": 1, "x": 2, "y": 3, "w": 4, "h": 5}
-FORMATS: Final = tuple(name for name in get_args(Format) if name != "auto")
+FORMATS: Final = tuple(name for name in get_args(Format) if name not in ("auto", *FORMATS_3D))
 
 
 def read_labels(

@@ -68,7 +68,7 @@ class Timeline:
                 f"{of}: {count} frames at {float(fps):g} a second end {float(count / fps) / 86400:.3g} days after the "
                 "start; times reach to the year 2262"
             )
-        return cls(index, start_ns + _times(index, fps), of)
+        return cls(index, start_ns + frame_times_ns(index, fps), of)
 
     @classmethod
     def of_times(cls, path: Path, seconds: Floats, fps: Fraction | None) -> tuple[Self, str]:
@@ -98,7 +98,7 @@ class Timeline:
 
     def fits(self, fps: Fraction) -> bool:
         """Whether the pictures match a frame rate, within half a frame."""
-        wanted = self.t_ns[0] + _times(self.index - self.index[0], fps)
+        wanted = self.t_ns[0] + frame_times_ns(self.index - self.index[0], fps)
         return bool((np.abs(self.t_ns - wanted) <= float(_OFF_FRAMES / fps * NS_PER_S)).all())
 
     @property
@@ -187,7 +187,7 @@ class Timeline:
         return f"{words}; give the labels of these pictures, or the part of the file that is of them"
 
 
-def _times(index: Ints, fps: Fraction) -> Ints:
+def frame_times_ns(index: Ints, fps: Fraction) -> Ints:
     """The times of pictures (P,) at a frame rate in nanoseconds, rounded half to even."""
     most = int(np.abs(index).max(initial=1)) * fps.denominator * NS_PER_S
     if most >= 2**62 or fps.numerator >= 2**62:

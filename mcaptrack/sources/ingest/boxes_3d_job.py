@@ -1,0 +1,221 @@
+"""Ingest label files with 3D boxes: for a recorded log, or as a log of their own.
+
+Letters: N rows, F frames.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from mcaptrack import log
+from mcaptrack.errors import McaptrackError
+from mcaptrack.geometry.arrays import Ints
+from mcaptrack.geometry.clocks import NS_PER_S
+from mcaptrack.geometry.oriented_boxes import COLUMNS
+from mcaptrack.notices import warn
+from mcaptrack.schema import DETECTIONS, TRACKS, Frame, Rows
+from mcaptrack.schema.framing import split_rows
+from mcaptrack.schema.provenance import CLOCK
+from mcaptrack.sources.ingest.boxes_3d_log import boxes_topic, root_frame
+from mcaptrack.sources.ingest.job import SCHEMA_OF, IngestJob, IngestOptions
+from mcaptrack.sources.ingest.labels.boxes_3d.reading import read_boxes_3d
+from mcaptrack.sources.ingest.labels.boxes_3d.rows import BoxRows3D, TimedLabels
+from mcaptrack.sources.ingest.labels.camera import DEFAULT
+from mcaptrack.sources.ingest.labels.formats import Role
+from mcaptrack.sources.ingest.labels.timeline import frame_times_ns
+
+#: The frame of reference of boxes, if neither the user nor the format nor the log names one.
+FRAME: Final = "map"
+#: Stamps may differ from the times of a log by this much.
+_MARGIN_NS: Final = 60 * NS_PER_S
+
+
+class Boxes3DJob(IngestJob):
+    """Label files with 3D boxes. The first of ``inputs`` is the input itself.
+
+    If its role is None, it depends on whether the file has ids.
+    """
+
+    def __init__(
+        self, inputs: Sequence[tuple[Role | None, Path]], options: IngestOptions, into: log.Log | None = None
+    ) -> None:
+        super().__init__(inputs[0][1], replace(options, labels={}), into)
+        self._refuse_options(options)
+        self.boxes: dict[Role, BoxRows3D] = {}
+        for given, path in (*inputs, *options.labels.items()):
+            rows = read_boxes_3d(path, given or "detections", options.label_format, options.columns, options.scene)
+            role = given or ("tracks" if rows.has_ids else "detections")
+            if role != "detections":
+                rows.check(role)
+            if role in self.boxes:
+                raise McaptrackError(
+                    f"{path} and {self.boxes[role].path} are both {role}; give the role of {path} with `role=`"
+                )
+            self.boxes[role] = rows
+        self._topic = boxes_topic(into, options.camera) if into else ""
+        if self._topic and options.camera == DEFAULT:
+            self.prefix = self._topic.rpartition("/")[0] or self.prefix
+        self._frame_ids = {role: self._frame_id(rows) for role, rows in self.boxes.items()}
+        self._timed = {role: self._at_times(role, rows) for role, rows in self.boxes.items()}
+
+    @property
+    def has_labels(self) -> bool:
+        """Whether there are label files."""
+        return True
+
+    def _refuse_options(self, options: IngestOptions) -> None:
+        given = {
+            options.for_videos(): bool(options.for_videos()),
+            "`ground_plane=`": options.ground_plane is not None,
+            "`motion=`": options.motion is not None,
+            "`size=`": options.size is not None,
+            "`frames=`": options.frames is not None,
+        }
+        for name, is_given in given.items():
+            if is_given:
+                raise McaptrackError(f"{self.source} holds 3D boxes; {name} is for pictures and boxes in them")
+
+    def _frame_id(self, rows: BoxRows3D) -> str:
+        """The frame of reference of rows: as the user says, as the format says, or the root of the log's transforms."""
+        if self.options.frame_id is not None:
+            return self.options.frame_id
+        root = root_frame(self.into) if self.into else ""
+        found = rows.frame_id or root or FRAME
+        reason = "by its format" if rows.frame_id else "the root of the log's transforms" if root else "assumed"
+        words = f"{rows.path}: boxes are taken as those of the frame {found!r} ({reason}); `frame_id=` names another"
+        if reason == "assumed":
+            rows.doubts.append((words, "other"))
+        else:
+            rows.remarks.append(words)
+        return found
+
+    def _at_times(self, role: Role, rows: BoxRows3D) -> TimedLabels:
+        if rows.labelled is None:
+            rows.labelled = np.unique(rows.number)
+        t_ns, labelled = self._times(rows, rows.number, rows.labelled)
+        timed = rows.timed(t_ns, labelled, role, self.options.classes)
+        if self.into is not None and any(part.index.counts for part in self.into.parts):
+            first, last = int(timed.t_ns[0]), int(timed.t_ns[-1])
+            if first > self.into.end_ns + _MARGIN_NS or last < self.into.start_ns - _MARGIN_NS:
+                raise McaptrackError(
+                    f"{rows.path} is from {first / NS_PER_S:.3f} to {last / NS_PER_S:.3f} s, {self.into.path} from "
+                    f"{self.into.start_ns / NS_PER_S:.3f} to {self.into.end_ns / NS_PER_S:.3f} s; give the time of the "
+                    "first labels with `start_time=`"
+                )
+        return timed
+
+    def _times(self, rows: BoxRows3D, number: Ints, labelled: Ints) -> tuple[Ints, Ints]:
+        """The times of rows (N,) and of labelled frames (F,), by their own times, a frame rate, or the log."""
+        options = self.options
+        if rows.t_ns is not None:
+            for name, value in (("fps", options.fps), ("first_frame", options.first_frame)):
+                if value is not None:
+                    raise McaptrackError(f"{rows.path} has times; leave `{name}=` out")
+            shift = 0 if options.start_ns is None else options.start_ns - int(labelled[0])
+            return number + shift, labelled + shift
+        first = options.first_frame if options.first_frame is not None else min(int(labelled[0]), 1)
+        if int(labelled[0]) < first:
+            raise McaptrackError(f"{rows.path}: its first frame is {labelled[0]}, before `first_frame={first}`")
+        if options.first_frame is None and labelled[0] > 0 and rows.format == "csv":
+            words = f"{rows.path}: frames begin with {labelled[0]}; frame {first} is assumed to be the first"
+            rows.doubts.append((f"{words}, `first_frame=` sets the number", "clock"))
+        if rows.format != "csv" and options.first_frame is None:
+            first = 0
+        if options.fps is not None:
+            start = options.start_ns if options.start_ns is not None else self._log_start_ns()
+            rows.remarks.append(f"{rows.path}: frame {first} is at {start / NS_PER_S:.3f} s")
+            both = (start + frame_times_ns(one - first, options.fps) for one in (number, labelled))
+            return next(both), next(both)
+        if self.into is None or not self._topic:
+            raise McaptrackError(
+                f"{rows.path} counts frames and has no clock; give the frames per second with `fps=`, or add it to the "
+                "log of its boxes with `into=`"
+            )
+        times: Ints = self.into.times(self._topic)
+        if int(labelled[-1]) - first >= len(times):
+            raise McaptrackError(
+                f"{rows.path}: its last frame is {labelled[-1]}, and {self._topic} has {len(times)} messages, from "
+                f"frame {first} on; give the number of the first with `first_frame=`, or the rate with `fps=`"
+            )
+        rows.remarks.append(f"{rows.path}: frame {first} is the first message of {self._topic}")
+        return times[number - first], times[labelled - first]
+
+    def _log_start_ns(self) -> int:
+        if self.into is None:
+            return 0
+        return int(self.into.times(self._topic)[0]) if self._topic else self.into.start_ns
+
+    def topics(self) -> Iterator[str]:
+        """The topics that will be written."""
+        yield from (f"{self.prefix}/{role}" for role in self.boxes)
+
+    def report_assumptions(self) -> None:
+        """Report how the boxes were understood, and what of them is left out."""
+        for role, rows in self.boxes.items():
+            self.report.remarks += rows.remarks
+            for words, code in rows.doubts:
+                warn(words, code)
+            if rows.left_out:
+                warn(f"{rows.path} also holds {rows.left_out}; left out of {role}", "left-out")
+            timed = self._timed[role]
+            numbers, counts = np.unique(timed.class_id, return_counts=True)
+            named = [f"{number} {timed.classes.get(number, '')}".strip() for number in numbers.tolist()]
+            words = ", ".join(f"{name} ({count})" for name, count in zip(named, counts.tolist(), strict=True))
+            self.report.remarks.append(f"{rows.path}: class_id is {words}")
+
+    def write(self, writer: log.LogWriter, has_clock: bool) -> None:
+        """Write the boxes."""
+        if self.into is None and not has_clock:
+            start = min(int(timed.t_ns[0]) for timed in self._timed.values())
+            writer.add_metadata(CLOCK, {"start_ns": str(start)})
+        for role, rows in self.boxes.items():
+            timed = self._timed[role]
+            frames = self.all_frames(role)
+            parameters: dict[str, Any] = {"file": rows.path.name, "format": rows.format} | self._parameters(role)
+            self.write_rows(
+                writer,
+                role,
+                SCHEMA_OF[role],
+                lambda frames=frames: iter(frames),  # type: ignore[misc]
+                parameters,
+                timed.classes,
+                self._frame_ids[role],
+            )
+
+    def _parameters(self, role: Role) -> dict[str, Any]:
+        options = self.options
+        given: Mapping[str, Any] = {
+            "first_frame": options.first_frame,
+            "columns": ",".join(f"{key}={name}" for key, name in (options.columns or {}).items()) or None,
+            "classes": options.classes.text if options.classes and role != "detections" else None,
+            "scene": options.scene,
+            "fps": None if options.fps is None else str(options.fps),
+        }
+        return {name: value for name, value in given.items() if value is not None}
+
+    def all_frames(self, role: Role) -> list[Frame]:
+        """The boxes of a role as frames, at all times that the file describes."""
+        timed = self._timed[role]
+        return split_rows(timed.t_ns, range(len(timed.t_ns)), label_rows_3d(timed, role), timed.ends)
+
+
+def label_rows_3d(labels: TimedLabels, role: Role) -> Rows:
+    """Convert the N rows of labels to rows of detections or tracks."""
+    columns = dict(zip(COLUMNS, labels.boxes.T, strict=True))
+    columns |= dict(zip(("vx_m_per_s", "vy_m_per_s"), labels.velocity.T, strict=True))
+    none = np.full(len(labels.boxes), -1)
+    if role == "detections":
+        return DETECTIONS.rows(score=labels.score, class_id=labels.class_id, source_id=none, **columns)
+    return TRACKS.rows(
+        track_id=labels.track_id,
+        score=labels.score,
+        observed=np.ones(len(none), bool),
+        source_id=none,
+        class_id=labels.class_id,
+        **columns,
+    )

@@ -1,0 +1,1 @@
+"""3D boxes of label files: tables, KITTI tracking, nuScenes and Argoverse 2."""

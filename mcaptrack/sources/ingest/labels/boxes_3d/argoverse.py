@@ -1,0 +1,134 @@
+"""Read the 3D boxes of a log of Argoverse 2: annotations.feather, and the poses of the vehicle beside it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from mcaptrack.errors import McaptrackError
+from mcaptrack.geometry.arrays import Floats, Ints
+from mcaptrack.sources.ingest.labels.boxes_3d.rows import BoxRows3D, headings, numbered
+from mcaptrack.sources.ingest.labels.formats import ClassNames
+
+BOXES: Final = "annotations.feather"
+POSES: Final = "city_SE3_egovehicle.feather"
+_QUATERNION: Final = ("qw", "qx", "qy", "qz")
+_PLACE: Final = ("tx_m", "ty_m", "tz_m")
+_SIZE: Final = ("length_m", "width_m", "height_m")
+#: The frames of reference of the boxes with and without the poses.
+CITY, VEHICLE = "map", "base_link"
+
+
+def is_argoverse(path: Path) -> bool:
+    """Whether a path is a table of boxes, or the folder of a log that has one."""
+    return path.suffix == ".feather" or (path.is_dir() and (path / BOXES).is_file())
+
+
+def read_argoverse(path: Path) -> BoxRows3D:
+    """Read the boxes of a log, in the city's frame if the poses are there.
+
+    Raises McaptrackError if a table can't be read, or if there is no pose at the time of a box.
+    """
+    path = path / BOXES if path.is_dir() else path
+    table = _table(path, ("timestamp_ns", "track_uuid", "category", *_SIZE, *_QUATERNION, *_PLACE))
+    count = len(table["track_uuid"])
+
+    def at(row: int) -> str:
+        return f"{path}: row {row + 1}"
+
+    if not count:
+        raise McaptrackError(f"{path} holds no boxes")
+    t_ns = _whole(path, table, "timestamp_ns")
+    place = _floats(path, table, _PLACE)
+    quaternions = _floats(path, table, _QUATERNION)
+    headings(quaternions, path, at)  # boxes that don't stand upright are refused
+    poses, frame_id = path.with_name(POSES), VEHICLE
+    remarks = [f"{path}: there is no {POSES} beside it; boxes stay in the vehicle's frame"]
+    if poses.is_file():
+        place, quaternions = _in_city(poses, t_ns, place, quaternions)
+        frame_id, remarks = CITY, [f"{path}: boxes are in the city's frame, by {POSES}"]
+    heading = headings(quaternions, path, at)[0]
+    names = ClassNames()
+    try:
+        kind = np.array([names.number(str(one)) for one in table["category"]], np.int64)
+    except ValueError as error:
+        raise McaptrackError(f"{path}: {error}") from None
+    remarks.append(f"{path}: tracks are numbered from 1 on, a number for each track_uuid")
+    return BoxRows3D(
+        path,
+        "argoverse",
+        at,
+        np.column_stack([place, _floats(path, table, _SIZE), heading]),
+        numbered([f"#{one}" for one in table["track_uuid"]])[0],
+        kind,
+        names.names,
+        np.full(count, np.nan),
+        np.full((count, 2), np.nan),
+        t_ns=t_ns,
+        labelled=np.unique(t_ns),
+        frame_id=frame_id,
+        remarks=remarks,
+    )
+
+
+def _in_city(path: Path, t_ns: Ints, place: Floats, quaternions: Floats) -> tuple[Floats, Floats]:
+    """Boxes of the vehicle's frame in the city's: positions (N, 3) and quaternions (N, 4), by the pose at each time."""
+    table = _table(path, ("timestamp_ns", *_QUATERNION, *_PLACE))
+    known, first = np.unique(_whole(path, table, "timestamp_ns"), return_index=True)
+    which = np.minimum(np.searchsorted(known, t_ns), max(len(known) - 1, 0))
+    without = known[which] != t_ns if len(known) else np.ones(len(t_ns), bool)
+    if without.any():
+        times = len(np.unique(t_ns[without]))
+        raise McaptrackError(f"{path} has no pose at {times} times of boxes, the first {t_ns[without.argmax()]} ns")
+    turn = _floats(path, table, _QUATERNION)[first][which]
+    turn = turn / np.linalg.norm(turn, axis=1, keepdims=True)
+    return _rotated(turn, place) + _floats(path, table, _PLACE)[first][which], _product(turn, quaternions)
+
+
+def _rotated(quaternions: Floats, points: Floats) -> Floats:
+    """Points (N, 3) rotated by unit quaternions (N, 4)."""
+    axis, w = quaternions[:, 1:], quaternions[:, :1]
+    across = 2 * np.cross(axis, points)
+    return np.asarray(points + w * across + np.cross(axis, across))
+
+
+def _product(a: Floats, b: Floats) -> Floats:
+    """The products (N, 4) of quaternions: the rotation by ``b``, then by ``a``."""
+    (aw, av), (bw, bv) = ((one[:, :1], one[:, 1:]) for one in (a, b))
+    return np.column_stack([aw * bw - (av * bv).sum(axis=1, keepdims=True), aw * bv + bw * av + np.cross(av, bv)])
+
+
+def _table(path: Path, columns: tuple[str, ...]) -> dict[str, Any]:
+    import pyarrow as pa
+    from pyarrow import feather
+
+    try:
+        table = feather.read_table(path)
+    except OSError as error:
+        raise McaptrackError(f"{path} can't be read: {error.strerror or str(error).splitlines()[0]}") from None
+    except (pa.ArrowException, ValueError) as error:
+        raise McaptrackError(f"{path} is no table in Feather format: {str(error).splitlines()[0][:80]}") from None
+    missing = [name for name in columns if name not in table.column_names]
+    if missing:
+        there = ", ".join(table.column_names)[:200]
+        raise McaptrackError(f"{path} has no column {missing[0]}, as Argoverse 2 has; its columns are {there}")
+    return {name: table.column(name).to_pylist() for name in columns}
+
+
+def _floats(path: Path, table: dict[str, Any], names: tuple[str, ...]) -> Floats:
+    try:
+        return np.array([table[name] for name in names], float).T.reshape(-1, len(names))
+    except (TypeError, ValueError):
+        raise McaptrackError(f"{path}: {', '.join(names)} have to be numbers") from None
+
+
+def _whole(path: Path, table: dict[str, Any], name: str) -> Ints:
+    try:
+        values = np.array(table[name])
+        if values.dtype.kind not in "iu" and len(values):
+            raise ValueError
+        return values.astype(np.int64)
+    except (TypeError, ValueError, OverflowError):
+        raise McaptrackError(f"{path}: {name} has to be whole numbers") from None

@@ -1,0 +1,167 @@
+"""Read the 3D boxes of one scene of nuScenes from the folder of its tables."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from mcaptrack.errors import McaptrackError
+from mcaptrack.sources.ingest.labels.boxes_3d.rows import BoxRows3D, headings, numbered
+from mcaptrack.sources.ingest.labels.formats import ClassNames
+
+TABLES: Final = ("scene", "sample", "sample_annotation", "instance", "category")
+#: The classes of the detection and tracking tasks, and the categories that they consist of.
+_CLASSES: Final = {
+    "barrier": ("movable_object.barrier",),
+    "bicycle": ("vehicle.bicycle",),
+    "bus": ("vehicle.bus.bendy", "vehicle.bus.rigid"),
+    "car": ("vehicle.car",),
+    "construction_vehicle": ("vehicle.construction",),
+    "motorcycle": ("vehicle.motorcycle",),
+    "pedestrian": tuple(
+        f"human.pedestrian.{who}" for who in ("adult", "child", "construction_worker", "police_officer")
+    ),
+    "traffic_cone": ("movable_object.trafficcone",),
+    "trailer": ("vehicle.trailer",),
+    "truck": ("vehicle.truck",),
+}
+_CLASS_OF: Final = {category: name for name, categories in _CLASSES.items() for category in categories}
+_NS_PER_US: Final = 1000
+_SHOWN: Final = 10
+#: The frame of reference, by the name that converters to MCAP give it.
+FRAME: Final = "map"
+
+
+def tables_folder(path: Path) -> Path | None:
+    """The folder with the tables: ``path``, or its only ``v1.0-...``; None if it isn't of nuScenes."""
+    if not path.is_dir():
+        return None
+    folders = [path, *sorted(path.glob("v1.0-*"))]
+    found = [one for one in folders if (one / "sample_annotation.json").is_file()]
+    if len(found) > 1:
+        names = ", ".join(one.name for one in found)
+        raise McaptrackError(f"{path} has several sets of tables, {names}; give the folder of one")
+    return found[0] if found else None
+
+
+def read_nuscenes(path: Path, scene: str | None) -> BoxRows3D:
+    """Read the boxes of a scene, at all of its samples. Raises McaptrackError, with the table, if they are invalid."""
+    folder = tables_folder(path)
+    if folder is None:
+        raise McaptrackError(f"{path} holds no tables of nuScenes: sample_annotation.json and others")
+    tables = {name: list(_table(folder, name)) for name in TABLES[:2]}
+    token = _scene(folder, tables["scene"], scene)
+    samples = {
+        _text(folder, "sample", row, "token"): _number(folder, "sample", row, "timestamp") * _NS_PER_US
+        for row in tables["sample"]
+        if row.get("scene_token") == token
+    }
+    if not samples:
+        raise McaptrackError(f"{folder}: the scene has no samples")
+    categories = {
+        _text(folder, "category", r, "token"): _text(folder, "category", r, "name") for r in _table(folder, "category")
+    }
+    category_of = {
+        _text(folder, "instance", row, "token"): categories.get(_text(folder, "instance", row, "category_token"))
+        for row in _table(folder, "instance")
+    }
+    names, ids, kinds, times, boxes, quaternions, tokens = ClassNames(), [], [], [], [], [], []
+    unseen = 0
+    for row in _table(folder, "sample_annotation"):
+        if row.get("sample_token") not in samples:
+            continue
+        tokens.append(_text(folder, "sample_annotation", row, "token"))
+        instance = _text(folder, "sample_annotation", row, "instance_token")
+        category = category_of.get(instance)
+        if category is None:
+            raise McaptrackError(f"{folder}: annotation {tokens[-1]} is of an instance without a category")
+        width, length, height = _numbers(folder, row, "size", 3)
+        boxes.append([*_numbers(folder, row, "translation", 3), length, width, height, np.nan])
+        quaternions.append(_numbers(folder, row, "rotation", 4))
+        ids.append(instance)
+        kinds.append(names.number(_CLASS_OF.get(category, category)))
+        times.append(samples[row["sample_token"]])
+        unseen += row.get("num_lidar_pts") == 0 and row.get("num_radar_pts") == 0
+    if not boxes:
+        raise McaptrackError(f"{folder}: the scene has no boxes")
+    values = np.array(boxes)
+
+    def at(row: int) -> str:
+        return f"{folder}: annotation {tokens[row]}"
+
+    values[:, 6] = headings(np.array(quaternions), folder, at)[0]
+    remarks = [f"{folder}: {len(samples)} samples; tracks are numbered from 1 on, a number for each instance"]
+    if unseen:
+        remarks.append(f"{folder}: {unseen} of {len(boxes)} boxes have no points of lidar or radar; they stay")
+    return BoxRows3D(
+        path,
+        "nuscenes",
+        at,
+        values,
+        numbered([f"#{one}" for one in ids])[0],
+        np.array(kinds, np.int64),
+        names.names,
+        np.full(len(boxes), np.nan),
+        np.full((len(boxes), 2), np.nan),
+        t_ns=np.array(times, np.int64),
+        labelled=np.unique(np.array(list(samples.values()), np.int64)),
+        frame_id=FRAME,
+        usual=frozenset(_CLASSES),
+        remarks=remarks,
+    )
+
+
+def _scene(folder: Path, scenes: list[dict[str, Any]], wanted: str | None) -> str:
+    tokens = {_text(folder, "scene", row, "name"): _text(folder, "scene", row, "token") for row in scenes}
+    if wanted is None and len(tokens) == 1:
+        return next(iter(tokens.values()))
+    if wanted is None or wanted not in tokens:
+        names = ", ".join(sorted(tokens)[:_SHOWN]) + (
+            f" and {len(tokens) - _SHOWN} more" if len(tokens) > _SHOWN else ""
+        )
+        what = f"no scene {wanted!r:.60}" if wanted else f"{len(tokens)} scenes"
+        raise McaptrackError(f"{folder} has {what}; choose one with `scene=`: {names or 'there is none'}")
+    return tokens[wanted]
+
+
+def _table(folder: Path, name: str) -> Iterator[dict[str, Any]]:
+    path = folder / f"{name}.json"
+    try:
+        content = json.loads(path.read_bytes())
+    except FileNotFoundError:
+        raise McaptrackError(f"{folder} has no {path.name}; nuScenes boxes need {', '.join(TABLES)}") from None
+    except OSError as error:
+        raise McaptrackError(f"{path} can't be read: {error.strerror}") from None
+    except (ValueError, RecursionError):
+        raise McaptrackError(f"{path} is not JSON") from None
+    if not isinstance(content, list) or not all(isinstance(row, dict) for row in content):
+        raise McaptrackError(f"{path} is not a table of nuScenes, a list of objects")
+    yield from content
+
+
+def _text(folder: Path, table: str, row: Mapping[str, Any], key: str) -> str:
+    value = row.get(key)
+    if not isinstance(value, str):
+        raise McaptrackError(f"{folder / table}.json: a row has no {key}: {str(dict(row))[:80]}")
+    return value
+
+
+def _number(folder: Path, table: str, row: Mapping[str, Any], key: str) -> int:
+    value = row.get(key)
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise McaptrackError(f"{folder / table}.json: {key} has to be a whole number, not {str(value)[:40]!r}")
+    return value
+
+
+def _numbers(folder: Path, row: Mapping[str, Any], key: str, count: int) -> list[float]:
+    value = row.get(key)
+    numbers = value if isinstance(value, list) else []
+    if len(numbers) != count or not all(isinstance(one, int | float) and not isinstance(one, bool) for one in numbers):
+        raise McaptrackError(
+            f"{folder / 'sample_annotation'}.json: {key} has to be {count} numbers, not {str(value)[:60]}"
+        )
+    return [float(one) for one in numbers]

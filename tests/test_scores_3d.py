@@ -1,0 +1,234 @@
+"""Scores of 3D tracks by class: by distance and by overlap of oriented boxes, against py-motmetrics and by hand."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import motmetrics as mm
+import numpy as np
+import pytest
+
+import mcaptrack
+from mcaptrack.errors import McaptrackError
+from mcaptrack.evaluation import Candidate, EvaluateOptions, EvaluationInput, evaluate
+from mcaptrack.evaluation.by_class import of_class
+from mcaptrack.evaluation.events import EventOptions, find_events
+from mcaptrack.evaluation.metrics import ScoredMatchup, average_over_recalls, metres_to_similarity
+from mcaptrack.evaluation.metrics.matchup import Matchup
+from mcaptrack.geometry.oriented_boxes import COLUMNS, bev_iou_of_pairs, columns_to_oriented_boxes, iou_3d_of_pairs
+from mcaptrack.schema import TRACKS, Frame
+from tests.commands import call
+from tests.worlds import ns
+
+NAMES = {1: "pedestrian", 2: "car", 3: "truck"}
+SIZES = {1: (0.6, 0.6, 1.8), 2: (4.5, 1.9, 1.5), 3: (9.0, 2.6, 3.2)}
+
+
+def frame(number: int, boxes: list, ids: list, classes: list, scores: list | None = None) -> Frame:
+    columns = dict(zip(COLUMNS, np.array(boxes, float).reshape(-1, 7).T, strict=True))
+    rows = TRACKS.rows(
+        track_id=np.array(ids, int),
+        observed=np.ones(len(ids), bool),
+        source_id=np.full(len(ids), -1),
+        class_id=np.array(classes, int),
+        score=np.full(len(ids), np.nan) if scores is None else np.array(scores, float),
+        **columns,
+    )
+    return Frame(ns(number / 10), number, rows)
+
+
+def drawn(seed: int, numbers: dict[int, int] = {1: 1, 2: 2, 3: 3}, scores: bool = True):  # noqa: B006
+    """Objects that drive about, and tracks with noise, misses, switches and ghosts; ``numbers``: classes of tracks."""
+    rng = np.random.default_rng(seed)
+    of = np.array([1, 1, 1, 2, 2, 2, 2, 3])
+    start, heading = rng.uniform(-15, 15, (8, 2)), rng.uniform(-3, 3, 8)
+    speed = np.where(of == 1, 1.0, 6.0)
+    track_score = np.concatenate([rng.uniform(0.3, 1, 8), [0.2, 0.5]])
+    ids = np.arange(8)
+    truth, tracks = [], []
+    for t in range(15):
+        xy = start + (t / 10 * speed)[:, None] * np.stack([np.cos(heading), np.sin(heading)], axis=1)
+        boxes = [[x, y, 0.5, *SIZES[k], h] for (x, y), k, h in zip(xy, of, heading, strict=True)]
+        truth.append(frame(t, boxes, list(range(8)), list(of)))
+        if rng.random() < 0.3:
+            a, b = rng.choice(np.flatnonzero(of == rng.choice([1, 2])), 2, replace=False)
+            ids[[a, b]] = ids[[b, a]]
+        seen = [k for k in range(8) if rng.random() > 0.2]
+        noisy = [np.array(boxes[k]) + rng.normal(0, [0.3, 0.3, 0.1, 0.05, 0.05, 0.05, 0.1]) for k in seen]
+        ghosts = [[*rng.uniform(-15, 15, 2), 0.5, *SIZES[2], 1.0] for _ in range(2)]
+        names = [int(ids[k]) for k in seen] + [8, 9]
+        classes = [numbers[int(of[k])] for k in seen] + [numbers[2]] * 2
+        tracks.append(frame(t, noisy + ghosts, names, classes, [track_score[n] for n in names] if scores else None))
+    return truth, tracks
+
+
+def scored(truth, tracks, options, names=NAMES):
+    result = evaluate(
+        [EvaluationInput("a", truth, [Candidate("/lidar/tracks", None, tracks, classes=names)], NAMES)], options
+    )
+    return {(row.similarity, row.gate, row.of_class): row.to_json() for row in result.results}, result.notes
+
+
+def by_motmetrics(truth, tracks, similarity: str, gate: float) -> dict[str, float]:
+    """CLEAR and identity of all classes together by py-motmetrics: an accumulator for each class."""
+    accumulators = []
+    for number in NAMES:
+        one = mm.MOTAccumulator(auto_id=True)
+        for a, b in zip(of_class(truth, number), of_class(tracks, number), strict=True):
+            boxes = [columns_to_oriented_boxes(part.rows) for part in (a, b)]
+            pairs = [np.repeat(boxes[0], len(boxes[1]), axis=0), np.tile(boxes[1], (len(boxes[0]), 1))]
+            if similarity == "metres":
+                cost = np.hypot(*(pairs[0] - pairs[1])[:, :2].T)
+                cost[cost > gate] = np.nan
+            else:
+                cost = 1 - (bev_iou_of_pairs if similarity == "bev-iou" else iou_3d_of_pairs)(*pairs)
+                cost[cost > 1 - gate] = np.nan
+            one.update(a.rows["track_id"], b.rows["track_id"], cost.reshape(len(boxes[0]), len(boxes[1])))
+        accumulators.append(one)
+    names = ["mota", "idf1", "num_switches", "num_false_positives", "num_misses"]
+    found = mm.metrics.create().compute_many(accumulators, metrics=names, generate_overall=True).loc["OVERALL"]
+    return dict(zip(("MOTA", "IDF1", "IDSW", "FP", "FN"), found.tolist(), strict=True))
+
+
+@pytest.mark.parametrize(("similarity", "gate"), [("metres", 2.0), ("metres", 0.5), ("bev-iou", 0.5), ("3d-iou", 0.3)])
+def test_all_classes_together_are_those_of_py_motmetrics(similarity, gate):
+    truth, tracks = drawn(1)
+    options = EvaluateOptions((similarity,), (gate,), gate, "motmetrics")
+    found, notes = scored(truth, tracks, options)
+    assert notes == []
+    assert [one for _, _, one in found] == [None, "pedestrian", "car", "truck"]
+    row = found[similarity, gate, None]
+    wanted = by_motmetrics(truth, tracks, similarity, gate)
+    assert {name: row[name] for name in wanted} == pytest.approx(wanted)
+    assert row["FP"] > 20
+    assert row["FN"] > 10
+    means = row["class_means"]["MOTA"]
+    assert means == pytest.approx(np.mean([found[similarity, gate, one]["MOTA"] for one in NAMES.values()]))
+
+
+def test_classes_are_joined_by_name_and_the_others_are_named():
+    options = EvaluateOptions(("metres",), (2.0,))
+    truth, tracks = drawn(2)
+    wanted, _ = scored(truth, tracks, options)
+    _, renumbered = drawn(2, {1: 7, 2: 1, 3: 2})
+    found, notes = scored(truth, renumbered, options, {7: "Pedestrian", 1: "car", 2: "truck"})
+    assert notes == []
+    assert list(found.values()) == list(wanted.values())
+    _, notes = scored(truth, renumbered, options, {7: "pedestrian", 1: "vehicle.car", 2: "truck"})
+    count = sum(int((one.rows["class_id"] == 2).sum()) for one in tracks)
+    assert notes == [
+        "a: rows of /lidar/tracks of classes that the ground truth doesn't have are not compared: "
+        f"{count} of vehicle.car",
+        "a: /lidar/tracks has no tracks of classes that the ground truth has; all are misses: 60 of car",
+    ]
+
+
+def test_overlaps_by_hand():
+    car = [0, 0, 0.75, 4, 2, 1.5, 0]
+    for moved, bev, space in (
+        ([1, 0, 0.75, 4, 2, 1.5, 0], 6 / 10, 6 / 10),
+        ([0, 0, 1.5, 4, 2, 1.5, math.pi], 1, 1 / 3),
+        ([0, 0, 0.75, 4, 2, 1.5, math.pi / 2], 1 / 3, 1 / 3),
+    ):
+        truth, tracks = [frame(0, [car], [1], [2])], [frame(0, [moved], [5], [2])]
+        for similarity, iou in (("bev-iou", bev), ("3d-iou", space)):
+            for least, is_match in ((iou - 1e-9, True), (min(1, iou + 1e-6), iou == 1)):
+                row = scored(truth, tracks, EvaluateOptions((similarity,), min_iou=least))[0][similarity, least, None]
+                assert row["FN"] == 1 - is_match, (moved, similarity, least)
+                if is_match:
+                    assert row["LocA"] >= iou - 1e-9
+
+
+def test_averages_are_given_at_the_largest_gate_for_tracks_with_scores():
+    truth, tracks = drawn(3)
+    found, notes = scored(truth, tracks, EvaluateOptions(("metres", "bev-iou"), (1.0, 2.0), 0.3))
+    assert notes == []
+    assert "AMOTA" not in found["metres", 1.0, None]
+    row = found["metres", 2.0, "car"]
+    parts = of_class(truth, 2), of_class(tracks, 2)
+    ids = [np.unique(np.concatenate([one.rows["track_id"] for one in part])) for part in parts]
+    alike = [
+        metres_to_similarity(
+            np.hypot(a.rows["x_m"][:, None] - b.rows["x_m"], a.rows["y_m"][:, None] - b.rows["y_m"]), 2.0
+        )
+        for a, b in zip(*parts, strict=True)
+    ]
+    dense = [
+        tuple(np.searchsorted(own, one.rows["track_id"]) for one in part) for own, part in zip(ids, parts, strict=True)
+    ]
+    rows = np.concatenate([one.rows for one in parts[1]])
+    score = np.array([rows["score"][rows["track_id"] == one].astype(float).mean() for one in ids[1]])
+    wanted = average_over_recalls([ScoredMatchup(Matchup(*dense, tuple(alike), 0.5, len(ids[0]), len(ids[1])), score)])
+    wanted["AMOTP_m"] = 4 * (1 - wanted.pop("AMOTP"))
+    assert {name: row[name] for name in wanted} == pytest.approx(wanted)
+    assert 0.1 < row["AMOTA"] < 1
+    for name in ("AMOTA", "sAMOTA", "AMOTP_m"):
+        mean = np.mean([found["metres", 2.0, one][name] for one in NAMES.values()])
+        assert found["metres", 2.0, None][name] == pytest.approx(mean)
+    assert 0.3 <= found["bev-iou", 0.3, "car"]["AMOTP"] < 1
+    found, notes = scored(truth, drawn(3, scores=False)[1], EvaluateOptions(("metres",), (2.0,)))
+    assert "AMOTA" not in found["metres", 2.0, None]
+    assert notes == ["a: /lidar/tracks has no scores; there is no AMOTA and no sAMOTA"]
+
+
+def test_averages_of_several_sequences_are_of_all_their_matches_together():
+    sequences = [drawn(4), drawn(5)]
+    options = EvaluateOptions(("metres",), (2.0,))
+    inputs = [
+        EvaluationInput(name, truth, [Candidate("t", None, tracks, classes=NAMES)], NAMES)
+        for name, (truth, tracks) in zip("ab", sequences, strict=True)
+    ]
+    rows = {(row.sequence, row.of_class): row for row in evaluate(inputs, options).results}
+    whole, parts = rows["COMBINED", "car"], [rows[name, "car"] for name in "ab"]
+    assert len(whole.scored) == 2
+    wanted = average_over_recalls([one for part in parts for one in part.scored])
+    assert whole.to_json()["AMOTA"] == pytest.approx(wanted["AMOTA"])
+    assert whole.to_json()["AMOTA"] != parts[0].to_json()["AMOTA"]
+
+
+def test_events_of_3d_tracks_by_overlap():
+    truth, tracks = drawn(6)
+    found = find_events(tracks, truth, EventOptions("bev-iou", min_iou=0.3), classes=(NAMES, NAMES))
+    row = scored(truth, tracks, EvaluateOptions(("bev-iou",), min_iou=0.3))[0]["bev-iou", 0.3, None]
+    counts = np.concatenate([one.rows for one in found.counts])
+    assert np.nansum(counts["misses"]) == row["FN"]
+    assert np.nansum(counts["false_tracks"]) == row["FP"]
+    assert counts["switches"][-1] == row["IDSW"]
+
+
+def lines(frames: list[Frame]) -> str:
+    names = ("track_id", *COLUMNS, "score")
+    rows = [
+        ",".join([str(one.t_ns), NAMES[int(row["class_id"])], *(str(row[name]) for name in names)])
+        for one in frames
+        for row in one.rows
+    ]
+    return "\n".join([",".join(["t_ns", "class", *names]), *rows]) + "\n"
+
+
+def test_a_log_of_3d_labels_is_evaluated_on_the_command_line(tmp_path):
+    truth, tracks = drawn(7)
+    log = tmp_path / "log.mcap"
+    for role, frames in (("truth", truth), ("tracks", tracks)):
+        (tmp_path / f"{role}.csv").write_text(lines(frames))
+        mcaptrack.ingest(
+            tmp_path / f"{role}.csv", None if log.exists() else log, into=log if log.exists() else None, role=role
+        )
+    said = call("evaluate", log, "--gate-m", "2", "--json")
+    assert said.code == 0, said.err
+    rows = {row["class"]: row for row in json.loads(said.out)["results"]}
+    wanted, _ = scored(truth, tracks, EvaluateOptions(("metres",), (2.0,)))
+    for name in (None, *NAMES.values()):
+        assert {"IDSW": rows[name]["IDSW"], "AMOTA": rows[name]["AMOTA"]} == pytest.approx(
+            {"IDSW": wanted["metres", 2.0, name]["IDSW"], "AMOTA": wanted["metres", 2.0, name]["AMOTA"]}
+        )
+    printed = call("evaluate", log, "--gate-m", "1,2").out.splitlines()
+    assert printed[0].split()[-2:] == ["AMOTA", "sAMOTA"]
+    assert call("evaluate", log, "--similarity", "3d-iou", "--min-iou", "0.3").out.count("3D IoU 0.3") == 5
+    table = call("evaluate", log, "--gate-m", "1,2", "--csv").out.splitlines()
+    assert "AMOTA" in table[0].split(",")
+    assert len(table) == 9
+    assert call("evaluate", log, "--gate-m", "2", "--fail-under", "amota=0.99").code == 4
+    with pytest.raises(McaptrackError, match=r"have no boxes$"):
+        mcaptrack.evaluate(log, similarity="iou")
