@@ -234,9 +234,9 @@ def _start_ns(opened: log.Log, camera: Camera, shown: Mapping[str, ChannelToDraw
 
 
 def _frames(opened: log.Log, shown: Mapping[str, ChannelToDraw], topic: str, schema: Schema) -> list[Frame]:
-    """Return the frames of a channel of this run or of the log; empty if there is no such channel."""
+    """Return the frames of a channel of this run or of the log; empty if there is none with such rows."""
     if topic in shown:
-        return shown[topic].frames
+        return shown[topic].frames if shown[topic].schema is schema else []
     channel = opened.channels.get(topic)
     return opened.frames(topic, schema) if channel and channel.schema_name == schema.name else []
 
