@@ -270,19 +270,26 @@ def _installed(kind: str, unreadable: list[str] | None = None) -> list[EntryPoin
 
     Packages with entry points that can't be read are left out; their names are added to ``unreadable``.
     """
-    found: dict[str, list[EntryPoint]] = {}
-    for distribution in distributions():
+    group = f"{_OWN}.{kind}s"
+    points = [(found, _points(found, group)) for found in distributions()]
+    if not any(point is None or point for _, point in points):
+        return []  # nothing to tell apart: names are in long files of metadata, which are parsed slowly
+    first: dict[str, tuple[str, list[EntryPoint] | None]] = {}
+    for distribution, found in points:
         name, _ = _name_and_version(distribution)
         key = name.lower().replace("-", "_") or f"{distribution!r}"
-        if key in found:
-            continue  # the first one on the path is the one that is imported
-        try:
-            found[key] = [point for point in distribution.entry_points if point.group == f"{_OWN}.{kind}s"]
-        except Exception:  # whatever parsing raises
-            found[key] = []
-            if unreadable is not None:
-                unreadable.append(name)
-    return [point for points in found.values() for point in points if ":" not in point.name]
+        first.setdefault(key, (name, found))  # the first one on the path is the one that is imported
+    if unreadable is not None:
+        unreadable += [name for name, found in first.values() if found is None]
+    return [point for _, found in first.values() for point in found or () if ":" not in point.name]
+
+
+def _points(distribution: Distribution, group: str) -> list[EntryPoint] | None:
+    """The entry points of a group that a distribution declares; None if they can't be read."""
+    try:
+        return [point for point in distribution.entry_points if point.group == group]
+    except Exception:  # whatever parsing raises
+        return None
 
 
 def _of_point(point: EntryPoint) -> tuple[str, str]:

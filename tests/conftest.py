@@ -12,6 +12,7 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 from mcaptrack.sources import demo
+from tests import bounded
 from tests.commands import done, made_log
 from tests.worlds import small_scene
 
@@ -26,6 +27,14 @@ def no_settings(tmp_path_factory) -> Iterator[None]:
     """Hide the settings of the user who runs the tests."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CONFIG_HOME", str(tmp_path_factory.mktemp("config")))
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def no_wait_for_disks() -> Iterator[None]:
+    """Let ``os.fsync`` check its argument only: no test cuts the power, and disks are slow."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "fsync", lambda handle: os.fstat(handle) and None)
         yield
 
 
@@ -81,6 +90,15 @@ def finished(_finished, tmp_path_factory) -> Path:
 def template(tmp_path_factory) -> Path:
     """A small log of two people after all stages, beside the files it was made from. Not to be changed."""
     return made_log(tmp_path_factory.mktemp("made"))
+
+
+@pytest.fixture(scope="session")
+def commands() -> Iterator[bounded.Commands]:
+    """A process that runs each command in a child of its own, with bounds on time and memory."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # what a shell runs in the background ignores it
+    with bounded.commands() as running:
+        signal.signal(signal.SIGINT, before)
+        yield running
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from mcap.writer import Writer
 
-from tests.ros_messages import Ros, pixels, vision
+from tests.ros_messages import pixels, ros_writer, vision
 from tests.worlds import ns, small_scene
 
 START_NS = 1_700_000_000_000_000_000
@@ -23,7 +23,7 @@ def stamp_of(number: int) -> int:
 
 def write_log(path: Path, *topics: str, boxes: str | None = None) -> list:
     """A log as a robot writes it: a scene on these topics, boxes of what is truly there. Returns the scene's shots."""
-    ros = Ros("sensor_msgs/CompressedImage")
+    ros = ros_writer("sensor_msgs/CompressedImage")
     shots = list(small_scene(5.0).shots())
     with path.open("wb") as stream:
         writer = Writer(stream)
@@ -56,7 +56,7 @@ ROBOT_NS = 1_700_000_000_000_000_000
 
 def robot_log(path: Path, *topics: str, boxes: bool = False) -> Path:
     """Pictures as a robot logs them: late by another time each."""
-    ros = Ros("sensor_msgs/CompressedImage")
+    ros = ros_writer("sensor_msgs/CompressedImage")
     data = pixels(cv2.imencode(".jpg", np.zeros((48, 64), np.uint8))[1].tobytes())
     with path.open("wb") as stream:
         writer = Writer(stream)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -85,13 +87,19 @@ class Ros:
         return bytes(write(message, self.types))
 
 
+@cache
+def ros_writer(name: str, definition: str = "", ros1: bool = False) -> Ros:
+    """The writer of a message type, made once: rosbags compiles code for each."""
+    return Ros(name, definition, ros1)
+
+
 def pixels(data: bytes) -> np.ndarray:
     return np.frombuffer(data, np.uint8)
 
 
 def vision(layout: str, boxes) -> tuple[MessageType, bytes]:
     """Boxes of (centre x, y, width, height, theta, [(id, score)])."""
-    ros = Ros("vision_msgs/Detection2DArray", VISION[layout], ros1=layout == "ros1")
+    ros = ros_writer("vision_msgs/Detection2DArray", VISION[layout], layout == "ros1")
     point = ros.new("geometry_msgs/Point", 0.0, 0.0, 0.0)
     pose = ros.new(
         "geometry_msgs/PoseWithCovariance",

@@ -56,18 +56,17 @@ def fault(commands: bounded.Commands, folder: Path, seed: int) -> str:
     return ""
 
 
-def test_mutants_are_read_or_refused(tmp_path):
+def test_mutants_are_read_or_refused(commands, tmp_path):
     faults, codes = {}, set()
-    with bounded.commands() as commands:
-        for seed in range(FIRST, FIRST + MUTANTS):
-            folder = tmp_path / str(seed)
-            folder.mkdir()
-            words = fault(commands, folder, seed)
-            if words:
-                faults[seed, KINDS[seed % len(KINDS)]] = words
-            else:
-                codes.add((folder / "out.mcap").exists())
-                shutil.rmtree(folder)
+    for seed in range(FIRST, FIRST + MUTANTS):
+        folder = tmp_path / str(seed)
+        folder.mkdir()
+        words = fault(commands, folder, seed)
+        if words:
+            faults[seed, KINDS[seed % len(KINDS)]] = words
+        else:
+            codes.add((folder / "out.mcap").exists())
+            shutil.rmtree(folder)
     assert not faults, "\n".join(f"{seed}: {words}" for seed, words in faults.items())
     assert codes == {True, False}
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import re
 import secrets
 import shlex
@@ -26,7 +27,7 @@ from mcaptrack.sources import synthetic
 from mcaptrack.transforms import STAGES
 from mcaptrack.viewing.serving import Server
 from tests.bags import plain
-from tests.commands import GROUP, call, done, made_log
+from tests.commands import GROUP, call, done
 from tests.effects.commands import CASES
 from tests.models import DATA, stocked
 from tests.worlds import small_scene
@@ -63,10 +64,9 @@ def test_every_option_has_a_case():
 
 
 @pytest.fixture(scope="module")
-def template(tmp_path_factory) -> Path:
+def template(template, tmp_path_factory) -> Path:
     """A folder with inputs of all commands. Tests must not change it."""
-    folder = tmp_path_factory.mktemp("template")
-    made_log(folder)
+    folder = Path(shutil.copytree(template.parent, tmp_path_factory.mktemp("template"), dirs_exist_ok=True))
     done("ingest", folder / "clip.mp4", "--truth", folder / "truth.txt", "-o", folder / "fresh.mcap")
     rows = [line.split(",") for line in (folder / "truth.txt").read_text().splitlines()]
     tall = [[*row[:3], str(float(row[3]) - 6), row[4], "14", *row[6:]] for row in rows]  # as before on the ground
@@ -135,7 +135,7 @@ def see(template, tmp_path, monkeypatch) -> Callable[[str], Seen]:
     def run(line: str) -> Seen:
         folder = tmp_path / "work"
         shutil.rmtree(folder, ignore_errors=True)
-        shutil.copytree(template, folder)
+        shutil.copytree(template, folder, copy_function=_copy)
         monkeypatch.chdir(folder)
         code, out, err = call(*shlex.split(line))
         out = re.sub(r"(?<=127\.0\.0\.1)(:|%3A)\d{5}\b", ":any", out)  # a port that was free
@@ -145,6 +145,14 @@ def see(template, tmp_path, monkeypatch) -> Callable[[str], Seen]:
         return Seen(code, out, err, files)
 
     return run
+
+
+def _copy(source: str, target: str) -> None:
+    """Copy a file; files of tables, which are many, get a second name, because commands replace them as a whole."""
+    if source.endswith(".parquet"):
+        os.link(source, target)
+    else:
+        shutil.copy2(source, target)
 
 
 def _digest(path: Path) -> str:
@@ -199,7 +207,7 @@ ALSO = {
 
 @pytest.mark.parametrize(("command", "base"), [(name, base) for name, bases in ALSO.items() for base in bases])
 def test_an_option_without_effect_is_a_warning(command, base, see):
-    before, silent = see(base), []
+    before, silent = KNOWN.get(base) or see(base), []
     assert before.code == 0, before.err
     for option, case in CASES[command].items():
         is_there = f"--{option}" in base or case.words in base

@@ -19,7 +19,7 @@ from mcaptrack import foxglove
 from mcaptrack.errors import McaptrackError
 from mcaptrack.sources.foreign import Classes, MessageType, boxes_decoder, picture_decoder
 from mcaptrack.sources.video import RAW_ENCODINGS, EncodedPicture, PixelLayout, decode_gray
-from tests.ros_messages import BAR, STAMP_NS, VISION, Ros, boxes, pixels, vision
+from tests.ros_messages import BAR, STAMP_NS, VISION, boxes, pixels, ros_writer, vision
 
 SEC, NSEC = divmod(STAMP_NS, 10**9)
 
@@ -51,13 +51,13 @@ PNG = cv2.imencode(".png", gradient())[1].tobytes()
 
 
 def ros_compressed(data: bytes, words: str, ros1: bool) -> tuple[MessageType, bytes]:
-    ros = Ros("sensor_msgs/CompressedImage", ros1=ros1)
+    ros = ros_writer("sensor_msgs/CompressedImage", ros1=ros1)
     message = ros.new("sensor_msgs/CompressedImage", ros.header(), words, pixels(data))
     return ros.kind, ros.pack(message)
 
 
 def ros_raw(image: np.ndarray, encoding: str, ros1: bool, step: int | None = None, big: int = 0, size=None):
-    ros = Ros("sensor_msgs/Image", ros1=ros1)
+    ros = ros_writer("sensor_msgs/Image", ros1=ros1)
     height, width = size or image.shape[:2]
     step = image.strides[0] if step is None else step
     message = ros.new("sensor_msgs/Image", ros.header(), height, width, encoding, big, step, pixels(image.tobytes()))
@@ -68,7 +68,7 @@ def ros_foxglove(name: str, ros1: bool, *values) -> tuple[MessageType, bytes]:
     definition = FOXGLOVE[name].format(time="time" if ros1 else "builtin_interfaces/Time")
     if not ros1:
         definition += BAR + "MSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n"
-    ros = Ros(f"foxglove_msgs/{name}", definition, ros1)
+    ros = ros_writer(f"foxglove_msgs/{name}", definition, ros1)
     message = ros.new(f"foxglove_msgs/{name}", ros.new("builtin_interfaces/Time", SEC, NSEC), "eye", *values)
     return ros.kind, ros.pack(message)
 

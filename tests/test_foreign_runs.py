@@ -11,19 +11,18 @@ import pytest
 from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
 from mcap.reader import make_reader
 from mcap.writer import Writer
-from typer.testing import CliRunner
 
 from mcaptrack import log, pipeline
 from mcaptrack.api import recording
-from mcaptrack.cli import app
 from mcaptrack.errors import McaptrackError
 from mcaptrack.foxglove.views import SUFFIX
 from mcaptrack.notices import McaptrackWarning
 from mcaptrack.schema import DETECTIONS, TRACKS
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.transforms import KnnDetector, Sort
+from tests.commands import GROUP, call
 from tests.robots import START_NS, stamp_of, write_log
-from tests.ros_messages import Ros, pixels, vision
+from tests.ros_messages import pixels, ros_writer, vision
 from tests.worlds import ns, small_scene
 
 IMAGES = "/robot/front/image"
@@ -42,7 +41,7 @@ def content(path: Path) -> dict[str, list]:
 
 def mcaptrack(*words: object) -> None:
     """Run a stage on a recording in place."""
-    assert not app([*map(str, words), "--in-place"], standalone_mode=False), words
+    assert not GROUP([*map(str, words), "--in-place"], standalone_mode=False), words
 
 
 @pytest.fixture(scope="module")
@@ -214,7 +213,7 @@ def test_channels_of_the_wrong_schema_are_refused_by_name(robot, tmp_path):
 @pytest.mark.parametrize("payload", [b"", b"\0\1\0\0garbage", None])
 def test_a_damaged_message_is_reported_and_the_log_left_unchanged(robot, tmp_path, payload):
     path = tmp_path / "bad.mcap"
-    ros = Ros("sensor_msgs/CompressedImage")
+    ros = ros_writer("sensor_msgs/CompressedImage")
     broken = ros.pack(ros.new("sensor_msgs/CompressedImage", ros.header(), "jpeg", pixels(b"no picture")))
     with path.open("wb") as stream:
         writer = Writer(stream)
@@ -274,17 +273,17 @@ def test_recorded_detections_are_in_the_table_of_detections(tmp_path):
     ]
     expected = [(n, 10.0 * k - 2, 16.0, 4.0, 8.0, (1, 8, 7)[k]) for n in counts for k in range(n)]
     assert rows[["frame", "x_px", "y_px", "w_px", "h_px", "class_id"]].tolist() == expected
-    outcome = CliRunner().invoke(app, ["export", str(path), "-o", str(tmp_path / "t"), "--json"])
-    data = json.loads(outcome.stdout)
+    outcome = call("export", path, "-o", tmp_path / "t", "--json")
+    data = json.loads(outcome.out)
     assert (data["results"][0]["rows"]["detections"], [w["code"] for w in data["warnings"]]) == (6, ["classes"])
 
 
 def test_unreadable_recorded_detections_leave_other_tables_complete(tmp_path):
     path = tmp_path / "a.mcap"
     boxes_log(path, "person", damaged=True)
-    outcome = CliRunner().invoke(app, ["export", str(path), "-o", str(tmp_path / "t"), "--json"])
-    data = json.loads(outcome.stdout)
-    assert (outcome.exit_code, data["results"][0]["rows"]["detections"], data["results"][0]["rows"]["frames"]) == (
+    outcome = call("export", path, "-o", tmp_path / "t", "--json")
+    data = json.loads(outcome.out)
+    assert (outcome.code, data["results"][0]["rows"]["detections"], data["results"][0]["rows"]["frames"]) == (
         0,
         0,
         4,

@@ -29,12 +29,6 @@ from tests.commands import start
 TOPICS = [(1, "/a", STRING1, "cdr", "")]
 
 
-@pytest.fixture(scope="module")
-def commands():
-    with bounded.commands() as running:
-        yield running
-
-
 @pytest.fixture
 def folder(tmp_path) -> Path:
     (tmp_path / "in").mkdir()

@@ -18,7 +18,7 @@ from mcap.writer import Writer
 from mcaptrack.cli.text import printable
 from mcaptrack.sources import synthetic
 from mcaptrack.viewing.serving import Server
-from tests.commands import GROUP, Outcome, call, done, made_log
+from tests.commands import GROUP, Outcome, call, done
 from tests.effects.commands import CASES
 from tests.worlds import small_scene
 
@@ -35,10 +35,9 @@ LINES = sorted(
 
 
 @pytest.fixture(scope="module")
-def template(tmp_path_factory) -> Path:
+def template(template, tmp_path_factory) -> Path:
     """A folder with files and a log of evil names. Not to be changed."""
-    folder = tmp_path_factory.mktemp("evil")
-    made_log(folder)
+    folder = Path(shutil.copytree(template.parent, tmp_path_factory.mktemp("evil"), dirs_exist_ok=True))
     done("ingest", folder / "clip.mp4", "--truth", folder / "truth.txt", "-o", folder / "fresh.mcap")
     shutil.copy(folder / "truth.txt", folder / "tall.txt")
     (folder / "old.jsonl").write_text(f"{EVIL}\n")

@@ -8,16 +8,14 @@ from pathlib import Path
 from typing import Any, get_type_hints
 
 import pytest
-from typer.main import get_command
-from typer.testing import CliRunner
 
 from mcaptrack.cli import app
 from mcaptrack.cli.inputs import refuse_url
 from mcaptrack.errors import McaptrackError
 from mcaptrack.transforms import TRANSFORMS
-from tests.commands import start
+from tests.commands import GROUP, call
 
-COMMANDS = get_command(app).commands
+COMMANDS = GROUP.commands
 #: Arguments that are words, some of which are paths.
 WORDS = {("query", "words"), ("train", "sources")}
 STAGES = TRANSFORMS
@@ -49,12 +47,9 @@ def words_with(name: str, parameter: Any, value: str) -> list[str]:
 def test_a_url_is_refused_as_a_url(tmp_path, monkeypatch, name, parameter, url):
     monkeypatch.chdir(tmp_path)
     Path("a.txt").write_text("1,1,1,1,2,2\n")
-    result = CliRunner().invoke(app, words_with(name, parameter, url))
-    said = [line for line in result.stderr.splitlines() if line]
-    assert (result.exit_code, said) == (
-        1,
-        [f"mcaptrack: {url} is a URL; only files are read and written: copy it here first"],
-    )
+    code, _, err = call(*words_with(name, parameter, url))
+    said = [line for line in err.splitlines() if line]
+    assert (code, said) == (1, [f"mcaptrack: {url} is a URL; only files are read and written: copy it here first"])
     assert os.listdir() == ["a.txt"]
 
 
@@ -76,7 +71,7 @@ def test_a_folder_that_looks_like_a_url_is_a_folder(tmp_path, monkeypatch):
         refuse_url(Path("s3:/b"))
 
 
-#: Of each kind of option one process: a pipe that is opened waits for ever.
+#: One of each kind of option: a pipe that is opened waits for ever.
 PIPES = [
     ("ingest", "inputs"),
     ("ingest", "truth"),
@@ -89,21 +84,15 @@ PIPES = [
 ]
 
 
-def test_a_pipe_is_refused(tmp_path):
-    os.mkfifo(tmp_path / "pipe")
-    (tmp_path / "a.txt").write_text("1,1,1,1,2,2\n")
+@pytest.mark.usefixtures("never_waits")
+def test_a_pipe_is_refused(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    os.mkfifo("pipe")
+    Path("a.txt").write_text("1,1,1,1,2,2\n")
     known = {(name, parameter.name): parameter for name, parameter in PATHS}
-    running = [
-        start(
-            *words_with(name, known[name, option], "pipe"),
-            *(["--truth", "a.txt"] * (name == "evaluate")),
-            folder=tmp_path,
+    for name, option in PIPES:
+        code, _, err = call(
+            *words_with(name, known[name, option], "pipe"), *["--truth", "a.txt"] * (name == "evaluate")
         )
-        for name, option in PIPES
-    ]
-    for process in running:
-        _, err = process.communicate(timeout=60)
-        assert (process.returncode, err.splitlines()) == (
-            1,
-            ["mcaptrack: pipe is a pipe, not a file; save its data to a file first"],
-        )
+        said = ["mcaptrack: pipe is a pipe, not a file; save its data to a file first"]
+        assert (code, err.splitlines()) == (1, said), (name, option)

@@ -29,7 +29,7 @@ from mcaptrack.registry import BUILT_IN
 from mcaptrack.schema import TRACKS
 from mcaptrack.sources import synthetic
 from mcaptrack.transforms import STAGES, ByteTrack
-from tests.commands import GROUP, call, done, made_log
+from tests.commands import GROUP, call, done
 from tests.worlds import small_scene
 
 PACKAGE = Path(mcaptrack.__file__).parent
@@ -91,9 +91,9 @@ def sections_of(function) -> tuple[list[str], list[str]]:
 
 
 @pytest.fixture(scope="module")
-def template(tmp_path_factory) -> Path:
+def template(template, tmp_path_factory) -> Path:
     """A folder with a log that has all results, its video and its labels. Tests must not change it."""
-    folder = made_log(tmp_path_factory.mktemp("made")).parent
+    folder = Path(shutil.copytree(template.parent, tmp_path_factory.mktemp("made"), dirs_exist_ok=True))
     (folder / "a.mcap").rename(folder / "log.mcap")
     shutil.copy(folder / "clip.mp4", folder / "video.mp4")
     return folder

@@ -83,25 +83,56 @@ def change(request, tmp_path_factory) -> Change:
     return Change(old, new, lambda there: add_results(there, 2, after))
 
 
-@pytest.fixture
-def path(tmp_path, tmp_path_factory, monkeypatch, change) -> Path:
-    monkeypatch.setattr(in_place, "_PIECE", 100_000)
-    monkeypatch.setattr(in_place, "_BLOCK", 200_000)
-    path = tmp_path / "a.mcap"
+@pytest.fixture(scope="module")
+def place(tmp_path_factory, change) -> Path:
+    """The log that all tests of a change use, because a journal belongs to one file only."""
+    path = tmp_path_factory.mktemp("place") / "a.mcap"
     path.write_bytes(change.old)
     if change.make is add_to_irregular:
         os.link(path, tmp_path_factory.mktemp("elsewhere") / "also")
     return path
 
 
-def left_behind(path: Path, change: Change, work: Callable[[], object]) -> Iterator[int]:
-    """Kill at each call, one after another; restores nothing."""
-    for at in range(1, 300):
-        reset(path, change.old)
-        if not killed(work, at):
-            return
-        yield at
+@pytest.fixture(scope="module")
+def kills(place, change) -> list[dict[str, bytes]]:
+    """What a process leaves in the folder that is killed at the first call of the change, at the second, and so on."""
+    found: list[dict[str, bytes]] = []
+    with pytest.MonkeyPatch.context() as patch:
+        _use_small_pieces(patch)
+        for at in range(1, 300):
+            reset(place, change.old)
+            if not killed(lambda: change.make(place), at):
+                assert place.read_bytes() == change.new
+                assert [entry.name for entry in place.parent.iterdir()] == ["a.mcap"]
+                return found
+            found.append({entry.name: entry.read_bytes() for entry in place.parent.iterdir()})
     raise AssertionError("it goes on and on")
+
+
+@pytest.fixture
+def path(place, change, monkeypatch) -> Path:
+    _use_small_pieces(monkeypatch)
+    reset(place, change.old)
+    return place
+
+
+def _use_small_pieces(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(in_place, "_PIECE", 100_000)
+    patch.setattr(in_place, "_BLOCK", 200_000)
+
+
+def left_behind(path: Path, kills: list[dict[str, bytes]]) -> Iterator[dict[str, bytes]]:
+    """Put there what each kill left, one after another."""
+    for files in kills:
+        put(path, files)
+        yield files
+
+
+def put(path: Path, files: dict[str, bytes]) -> None:
+    """Make these the files of the folder."""
+    reset(path, files[path.name])
+    for name in files.keys() - {path.name}:
+        path.with_name(name).write_bytes(files[name])
 
 
 def reset(path: Path, content: bytes) -> None:
@@ -141,24 +172,18 @@ def look(path: Path, change: Change) -> str:
     return "old" if left == change.old else "new"
 
 
-def test_killed_at_any_call_it_is_the_old_log_or_the_new_one(path, change):
-    outcomes = [look(path, change) for _ in left_behind(path, change, lambda: change.make(path))]
+def test_killed_at_any_call_it_is_the_old_log_or_the_new_one(path, change, kills):
+    outcomes = [look(path, change) for _ in left_behind(path, kills)]
     assert len(outcomes) > 10
     assert outcomes == sorted(outcomes, reverse=True)  # new from some call on
     assert set(outcomes) == {"old", "new"}
-    assert path.read_bytes() == change.new
-    assert [entry.name for entry in path.parent.iterdir()] == ["a.mcap"]
 
 
-def test_killed_while_it_is_put_back_it_can_be_put_back_still(path, change):
-    middles = {}
-    for at in left_behind(path, change, lambda: change.make(path)):
-        if journal_of(path).exists():
-            middles.setdefault((path.read_bytes(), journal_of(path).read_bytes()), at)
-    for at in list(middles.values())[::3]:
+def test_killed_while_it_is_put_back_it_can_be_put_back_still(path, change, kills):
+    middles = {tuple(files.items()): files for files in kills if journal_of(path).name in files}
+    for files in list(middles.values())[::3]:
         for second in range(1, 100):
-            reset(path, change.old)
-            assert killed(lambda: change.make(path), at)
+            put(path, files)
             if not killed(lambda: mend(path), second):
                 break
             look(path, change)
@@ -220,16 +245,15 @@ def test_what_can_t_be_put_back_at_once_is_put_back_later(path, change, monkeypa
     assert look(path, change) == "old"
 
 
-def test_a_newer_log_that_takes_the_place_of_a_half_written_one_is_never_rolled_back(path, change, tmp_path_factory):
+def test_a_newer_log_that_takes_the_place_of_a_half_written_one_is_never_rolled_back(path, change, kills):
     """Also where it is what the interrupted change would have become, which another machine may have finished."""
     newer = path.parent / "newer"
     newer.write_bytes(change.old)
     add_results(newer, 3, 700)
     other = newer.read_bytes()
-    for at in left_behind(path, change, lambda: change.make(path)):
+    for files in kills:
         for content in (change.new, other):
-            reset(path, change.old)
-            assert killed(lambda: change.make(path), at)
+            put(path, files)
             with path.open("rb+") as stream:  # as cp does: the file stays the same one
                 stream.write(content)
                 stream.truncate(len(content))
@@ -297,9 +321,9 @@ def test_the_writer_of_a_log_goes_on_seeing_its_content_before_the_change(path, 
     assert counts(seen(path)).keys() == before.keys() - {dropped} | {"/more"}
 
 
-def test_a_log_that_was_moved_away_with_its_journal_can_be_saved(path, change, tmp_path):
+def test_a_log_that_was_moved_away_with_its_journal_can_be_saved(path, kills, tmp_path):
     """Its journal fits by what it holds, but doesn't name its file: it is used for another file only."""
-    for _ in left_behind(path, change, lambda: change.make(path)):
+    for _ in left_behind(path, kills):
         if not journal_of(path).exists():
             continue
         folder = tmp_path / "moved"

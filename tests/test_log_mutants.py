@@ -46,22 +46,21 @@ def fault(commands: bounded.Commands, command: str, path: Path, out: Path) -> st
     return ""
 
 
-def test_mutants_of_logs_are_read_or_refused(whole, tmp_path):
+def test_mutants_of_logs_are_read_or_refused(whole, commands, tmp_path):
     faults = {}
-    with bounded.commands() as commands:
-        for seed in range(FIRST, FIRST + MUTANTS):
-            path = tmp_path / str(seed) / "a.mcap"
-            path.parent.mkdir()
-            kind, data = mutant(seed, whole)
-            path.write_bytes(data)
-            for command in COMMANDS if MUTANTS > FEW else [COMMANDS[seed % len(COMMANDS)]]:
-                out = tmp_path / f"{seed}.{command}"
-                out.mkdir()
-                words = fault(commands, command, path, out)
-                if words:
-                    faults[seed, kind, command] = words
-                shutil.rmtree(out)
-            shutil.rmtree(path.parent)
+    for seed in range(FIRST, FIRST + MUTANTS):
+        path = tmp_path / str(seed) / "a.mcap"
+        path.parent.mkdir()
+        kind, data = mutant(seed, whole)
+        path.write_bytes(data)
+        for command in COMMANDS if MUTANTS > FEW else [COMMANDS[seed % len(COMMANDS)]]:
+            out = tmp_path / f"{seed}.{command}"
+            out.mkdir()
+            words = fault(commands, command, path, out)
+            if words:
+                faults[seed, kind, command] = words
+            shutil.rmtree(out)
+        shutil.rmtree(path.parent)
     assert not faults, "\n".join(f"{seed}: {words}" for seed, words in faults.items())
 
 

@@ -19,10 +19,8 @@ import pyarrow.parquet as pq
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from typer.testing import CliRunner
 
 from mcaptrack import log, tables
-from mcaptrack.cli import app
 from mcaptrack.cli.query import _fitting
 from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import EVENTS, PREDICTIONS, TRACKS, Frame
@@ -32,6 +30,7 @@ from mcaptrack.sources.ingest import IngestOptions, ingest
 from mcaptrack.sources.synthetic import demo_scene
 from mcaptrack.tables.export import default_folder, export
 from mcaptrack.tables.sql import Database
+from tests.commands import GROUP, Outcome, call
 from tests.worlds import ns, tracks_at
 
 PAGE = (Path(__file__).parent.parent / "docs" / "sql.md").read_text()
@@ -65,14 +64,14 @@ def agree(found, wanted):
         assert one == pytest.approx(other, abs=1e-9), (one, other)
 
 
-def run(*words, **options):
-    return CliRunner().invoke(app, ["query", *map(str, words)], **options)
+def run(*words) -> Outcome:
+    return call("query", *words)
 
 
 def refusal(*words):
     outcome = run(*words)
-    assert outcome.exit_code == 1, outcome.output
-    (line,) = outcome.stderr.splitlines()
+    assert outcome.code == 1, outcome.out + outcome.err
+    (line,) = outcome.err.splitlines()
     return line.removeprefix("mcaptrack: ")
 
 
@@ -246,8 +245,8 @@ def test_two_runs_are_compared(tmp_path):
     known_log(tmp_path / "before.mcap")
     known_log(tmp_path / "after.mcap", tracked=(7,))
     outcome = run(tmp_path / "*.mcap", query, "--format", "jsonl")
-    assert outcome.exit_code == 0, outcome.output
-    rows = {row["topic"]: row for row in map(json.loads, outcome.stdout.splitlines())}
+    assert outcome.code == 0, outcome.out + outcome.err
+    rows = {row["topic"]: row for row in map(json.loads, outcome.out.splitlines())}
     # Of 22 true rows 11 are found: MOTA is a half, IDF1 is 2 * 11 / (11 + 22).
     assert rows["/camera/samples"] == {"topic": "/camera/samples", "IDF1": -0.33, "MOTA": -0.5, "IDSW": 0}
 
@@ -266,9 +265,7 @@ def test_other_libraries_give_the_same_answers(square, monkeypatch, library):
 
 
 def test_the_commands_of_the_page_have_options_that_exist():
-    from typer.main import get_command
-
-    query = get_command(app).commands["query"]
+    query = GROUP.commands["query"]
     options = {name for parameter in query.params for name in parameter.opts}
     (block, *_) = re.findall(r"```sh\n(.*?)```", PAGE, re.S)
     for line in block.splitlines():
@@ -288,7 +285,7 @@ def test_a_query_reads_only_the_tables_it_names(known, tmp_path):
     content[chunk.offset + 120] ^= 0xFF
     damaged = tmp_path / "damaged.mcap"
     damaged.write_bytes(content)
-    assert run(damaged, "select count(*) as n from tracks where topic = '/camera/truth'", "--format", "csv").stdout == (
+    assert run(damaged, "select count(*) as n from tracks where topic = '/camera/truth'", "--format", "csv").out == (
         '"n"\n22\n'
     )
     assert re.search(r"damaged\.mcap.*damaged.*recover", refusal(damaged, "select count(*) from predictions"))
@@ -429,8 +426,8 @@ def test_queries_read_only_the_logs(known, tmp_path, monkeypatch, query):
         connection.execute("copy hush to 'secret.parquet'")
     there = sorted(tmp_path.rglob("*"))
     outcome = run(known, query)
-    assert outcome.exit_code == 1
-    assert "hush" not in outcome.output
+    assert outcome.code == 1
+    assert "hush" not in outcome.out + outcome.err
     assert sorted(tmp_path.rglob("*")) == there
 
 
@@ -466,7 +463,7 @@ def test_a_given_file_is_a_table(known, tmp_path):
         "where topic = '/camera/truth' group by all order by all"
     )
     outcome = run(known, query, "--with", f"zones={tmp_path / 'zones.csv'}", "--format", "csv")
-    assert outcome.stdout == '"zone","n"\n"left",17\n"right",5\n'
+    assert outcome.out == '"zone","n"\n"left",17\n"right",5\n'
     assert "no such file" in refusal(known, query, "--with", "zones=none.csv")
     assert "give a name and a file" in refusal(known, query, "--with", "zones")
     assert "can't name a table" in refusal(known, query, "--with", f"tracks={tmp_path / 'zones.csv'}")
@@ -522,7 +519,7 @@ def test_errors_are_one_line(known, words, said):
 def test_functions_that_lack_nanoseconds_are_named_with_the_remedy(known):
     query = "select date_trunc('minute', t) from tracks limit 1"
     assert "t::timestamptz" in refusal(known, query)
-    assert run(known, query.replace("t)", "t::timestamptz)")).exit_code == 0
+    assert run(known, query.replace("t)", "t::timestamptz)")).code == 0
 
 
 def test_a_file_that_is_not_a_log_is_refused(tmp_path):
@@ -560,7 +557,7 @@ from tracks where topic = '/camera/retracks/full' order by t_ns limit 1 offset 7
 
 
 def test_answers_are_exact_in_every_form(known, tmp_path):
-    (row,) = map(json.loads, run(known, EVERYTHING, "--format", "jsonl").stdout.splitlines())
+    (row,) = map(json.loads, run(known, EVERYTHING, "--format", "jsonl").out.splitlines())
     wanted = {
         "t": "1970-01-01T00:00:00.700000000Z" if int(duckdb.__version__[0]) > 1 else "1970-01-01T00:00:00.700000Z",
         "t_ns": 700_000_000,
@@ -579,11 +576,11 @@ def test_answers_are_exact_in_every_form(known, tmp_path):
         "yes": True,
     }
     assert row == wanted
-    assert json.loads(run(known, EVERYTHING, "--format", "json").stdout) == [wanted]
-    whole = json.loads(run(known, EVERYTHING, "--json").stdout)
+    assert json.loads(run(known, EVERYTHING, "--format", "json").out) == [wanted]
+    whole = json.loads(run(known, EVERYTHING, "--json").out)
     assert (whole["schema_version"], whole["results"]) == (1, [wanted])
     assert [column["name"] for column in whole["columns"]] == list(wanted)
-    (cells,) = csv.DictReader(io.StringIO(run(known, EVERYTHING, "--format", "csv").stdout, newline=""))
+    (cells,) = csv.DictReader(io.StringIO(run(known, EVERYTHING, "--format", "csv").out, newline=""))
     assert (cells["t"], cells["big"], cells["h"], cells["i"]) == (
         wanted["t"],
         wanted["big"],
@@ -593,7 +590,7 @@ def test_answers_are_exact_in_every_form(known, tmp_path):
     assert (cells["words"], float(cells["d"]), cells["j"]) == ('a"b,\n', 0.1 + 0.2, "")
     for form in ("parquet", "arrow"):
         target = tmp_path / f"answer.{form}"
-        assert run(known, EVERYTHING, "-o", target).exit_code == 0
+        assert run(known, EVERYTHING, "-o", target).code == 0
         table = pq.read_table(target) if form == "parquet" else pa.ipc.open_file(target).read_all()
         assert table.column("t_ns").to_pylist() == [700_000_000]
         assert table.column("t").cast(pa.int64()).to_pylist()[0] in (700_000_000, 700_000)
@@ -623,12 +620,12 @@ def test_json_round_trips_numbers_and_text(rows):
 
 def test_an_answer_is_written_to_a_file_without_loss(known, tmp_path):
     target = tmp_path / "a.csv"
-    assert run(known, "select 1 as a", "-o", target).exit_code == 0
+    assert run(known, "select 1 as a", "-o", target).code == 0
     assert target.read_text() == '"a"\n1\n'
     assert "exists" in refusal(known, "select 2 as a", "-o", target)
-    assert run(known, "select error('no') from tracks", "-o", target, "--force").exit_code == 1
+    assert run(known, "select error('no') from tracks", "-o", target, "--force").code == 1
     assert target.read_text() == '"a"\n1\n'
-    assert run(known, "select 2 as a", "-o", target, "--force").exit_code == 0
+    assert run(known, "select 2 as a", "-o", target, "--force").code == 0
     assert target.read_text() == '"a"\n2\n'
     assert [path.name for path in tmp_path.iterdir()] == ["a.csv"]
     copy = tmp_path / "known.mcap"
@@ -636,35 +633,36 @@ def test_an_answer_is_written_to_a_file_without_loss(known, tmp_path):
     assert "both input and output" in refusal(copy, "select 1", "-o", copy, "--force")
 
 
-def test_a_query_is_read_from_a_file_or_from_standard_input(known, tmp_path):
+def test_a_query_is_read_from_a_file_or_from_standard_input(known, tmp_path, monkeypatch):
     (tmp_path / "q.sql").write_text(
         "\ufeff-- how many\nselect count(*) as n from tracks where topic = '/camera/truth';\n"
     )
     wanted = '"n"\n22\n'
-    assert run(known, "-f", tmp_path / "q.sql", "--format", "csv").stdout == wanted
+    assert run(known, "-f", tmp_path / "q.sql", "--format", "csv").out == wanted
     text = (tmp_path / "q.sql").read_text(encoding="utf-8-sig")
-    assert run(known, "-", "--format", "csv", input=text).stdout == wanted
-    assert run(known, "-f", "-", "--format", "csv", input=text).stdout == wanted
+    for place in (["-"], ["-f", "-"]):
+        monkeypatch.setattr(sys, "stdin", io.StringIO(text))
+        assert run(known, *place, "--format", "csv").out == wanted
 
 
 def test_answers_as_a_table(known):
     query = "select track_id, x_m / 3 as third, null as nothing, '\x1b[31mred' as word from tracks where topic = '/camera/samples' order by row limit 3"
     outcome = run(known, query)
-    lines = outcome.stdout.splitlines()
+    lines = outcome.out.splitlines()
     assert lines[0].split() == ["track_id", "third", "nothing", "word"]
     assert lines[2].split() == ["7", "0", "null", "\\x1b[31mred"]
     assert lines[4].split()[1] == "0.133333"
     shown = run(known, query, "--rows", "1")
-    assert len(shown.stdout.splitlines()) == 3
-    assert "the first 1 of 3 rows" in shown.stderr
+    assert len(shown.out.splitlines()) == 3
+    assert "the first 1 of 3 rows" in shown.err
     for all_rows in ([], ["--rows", "3"], ["--rows", "0"]):
-        assert "rows" not in run(known, query, *all_rows).stderr
-    assert "no rows" in run(known, "select 1 where false").stderr
+        assert "rows" not in run(known, query, *all_rows).err
+    assert "no rows" in run(known, "select 1 where false").err
 
 
 def test_the_tables_are_listed_with_columns_units_and_meanings(known):
-    words = run("--tables").stdout
-    listed = json.loads(run(known, "--tables", "--json").stdout)
+    words = run("--tables").out
+    listed = json.loads(run(known, "--tables", "--json").out)
     assert [table["table"] for table in listed["results"]] == list(tables.TABLES)
     assert listed["recordings"] == ["known"]
     assert "/camera/predictions" in listed["channels"]
@@ -690,14 +688,14 @@ LONG = "select range(5000) as many, repeat('x', 5000) as words, {'a': range(5000
 
 def test_long_values_are_cut_in_tables_only(known):
     shown = run(known, LONG)
-    assert max(map(len, shown.stdout.splitlines())) < 4000
-    assert "3 long values are cut; --format json or csv has all of it" in shown.stderr
-    assert "columns fit" not in shown.stderr  # only a terminal has an end
-    assert "1 long value is cut" in run(known, "select repeat('x', 5000) as words").stderr
-    assert "cut" not in run(known, "select repeat('x', 1000) as words").stderr
+    assert max(map(len, shown.out.splitlines())) < 4000
+    assert "3 long values are cut; --format json or csv has all of it" in shown.err
+    assert "columns fit" not in shown.err  # only a terminal has an end
+    assert "1 long value is cut" in run(known, "select repeat('x', 5000) as words").err
+    assert "cut" not in run(known, "select repeat('x', 1000) as words").err
     for form in ("json", "jsonl", "csv"):
-        assert len(run(known, LONG, "--format", form).stdout) > 3 * 5000
-    (row,) = json.loads(run(known, LONG, "--json").stdout)["results"]
+        assert len(run(known, LONG, "--format", form).out) > 3 * 5000
+    (row,) = json.loads(run(known, LONG, "--json").out)["results"]
     assert (row["many"], row["nested"]["a"], len(row["words"])) == ([*range(5000)], [*range(5000)], 5000)
 
 
@@ -706,7 +704,7 @@ def test_a_table_is_no_wider_than_the_terminal(known, monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
     for rows in ([], ["--rows", "0"]):
         with redirect_stdout(Terminal()) as screen, pytest.raises(SystemExit):
-            app(["query", str(known), LONG, *rows])
+            GROUP(["query", str(known), LONG, *rows])
         text = re.sub(r"\x1b\[[0-9;]*m", "", screen.getvalue())
         assert "…" in text
         assert max(map(len, text.splitlines())) <= 80

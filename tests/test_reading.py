@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from mcaptrack.viewing.serving import Server
-from tests.commands import GROUP, call, done, made_log
+from tests.commands import GROUP, call, done
 from tests.effects.commands import CASES
 
 #: What a command is given, where the case without options of the other tests isn't what reads most.
@@ -60,10 +60,9 @@ def seen(folder: Path) -> dict[str, Seen]:
 
 
 @pytest.fixture(scope="module")
-def template(tmp_path_factory) -> Path:
+def template(template, tmp_path_factory) -> Path:
     """A folder with inputs of all commands. Tests must not change it."""
-    folder = tmp_path_factory.mktemp("reading")
-    made_log(folder)
+    folder = Path(shutil.copytree(template.parent, tmp_path_factory.mktemp("reading"), dirs_exist_ok=True))
     done("ingest", folder / "clip.mp4", "--truth", folder / "truth.txt", "-o", folder / "fresh.mcap")
     return folder
 

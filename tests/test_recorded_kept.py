@@ -11,15 +11,14 @@ from typing import get_args
 import pytest
 from mcap.reader import make_reader
 from mcap.writer import Writer
-from typer.testing import CliRunner
 
 from mcaptrack import log
-from mcaptrack.cli import app
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.ingest import IngestOptions, ingest
 from mcaptrack.sources.ingest.labels.formats import Role
 from mcaptrack.transforms import TRANSFORMS
 from tests.bags import camera_bag
+from tests.commands import call
 from tests.robots import lines, robot_log
 from tests.worlds import write_clip
 
@@ -28,9 +27,8 @@ THEIRS = "theirs/Message"
 
 
 def mcaptrack(*words: object) -> tuple[int, str]:
-    result = CliRunner().invoke(app, [str(word) for word in words])
-    assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
-    return result.exit_code, result.stderr
+    outcome = call(*words)
+    return outcome.code, outcome.err
 
 
 def record(path: Path, *topics: str, source: Path | None = None) -> Path:

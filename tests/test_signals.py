@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from tests import bounded
-from tests.commands import GROUP, done, made_log
+from tests.commands import GROUP, done
 from tests.effects.commands import line_of
 
 #: Seconds of processor time that a command may still take: the time on a clock depends on what else the machine does.
@@ -32,22 +32,12 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 
 @pytest.fixture(scope="module")
-def commands():
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # what a shell runs in the background ignores it
-    with bounded.commands() as running:
-        yield running
-    signal.signal(signal.SIGINT, before)
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory) -> Path:
+def folder(template, tmp_path_factory) -> Path:
     """A folder with inputs of all commands. An interrupted command must not change it."""
     folder = tmp_path_factory.mktemp("ended")
-    made_log(folder)
+    for name in ("a.mcap", "clip.mp4", "plane.txt", "truth.txt"):
+        shutil.copy(template.with_name(name), folder)
     done("ingest", folder / "clip.mp4", "--truth", folder / "truth.txt", "-o", folder / "fresh.mcap")
-    shutil.rmtree(folder / "a.tables")
-    for path in folder.glob("*.layout.json"):
-        path.unlink()
     return folder
 
 

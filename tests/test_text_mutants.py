@@ -47,31 +47,29 @@ def fault(commands, line, folder, out) -> str:
     return "" if outcome.code == 0 or not list(out.glob("*.mcap")) or outcome.code == 3 else f"left behind: {outcome}"
 
 
-def test_mutants_of_labels_and_settings_are_read_or_refused(made, tmp_path):
+def test_mutants_of_labels_and_settings_are_read_or_refused(made, commands, tmp_path):
     faults = {}
-    with bounded.commands() as commands:
-        for seed in range(FIRST, FIRST + MUTANTS):
-            folder, out = tmp_path / f"{seed}", tmp_path / f"{seed}.out"
-            folder.mkdir()
-            shutil.copy(made, folder / "a.mcap")
-            name, data = mutant(seed)
-            (folder / name).write_bytes(data)
-            for given in WITH_SETTINGS if name == SETTINGS else WITH_LABELS:
-                out.mkdir()
-                line = [word.format(labels=folder / name, log=folder / "a.mcap", out=out) for word in given.split()]
-                words = fault(commands, line, folder, out)
-                if words:
-                    faults[seed, name, given] = words
-                shutil.rmtree(out)
-            shutil.rmtree(folder)
+    for seed in range(FIRST, FIRST + MUTANTS):
+        folder, out = tmp_path / f"{seed}", tmp_path / f"{seed}.out"
+        folder.mkdir()
+        shutil.copy(made, folder / "a.mcap")
+        name, data = mutant(seed)
+        (folder / name).write_bytes(data)
+        for given in WITH_SETTINGS if name == SETTINGS else WITH_LABELS:
+            out.mkdir()
+            line = [word.format(labels=folder / name, log=folder / "a.mcap", out=out) for word in given.split()]
+            words = fault(commands, line, folder, out)
+            if words:
+                faults[seed, name, given] = words
+            shutil.rmtree(out)
+        shutil.rmtree(folder)
     assert not faults, "\n".join(f"{seed}: {words[:3000]}" for seed, words in faults.items())
 
 
 @pytest.mark.parametrize("name", sorted(WHOLE.keys() - {"boxes.json", SETTINGS}))
-def test_what_is_whole_is_read(name, tmp_path):
+def test_what_is_whole_is_read(name, commands, tmp_path):
     (tmp_path / name).write_text(WHOLE[name])
-    with bounded.commands() as commands:
-        outcome = commands.run("ingest", tmp_path / name, "--fps", "10", "-o", tmp_path / "a.mcap")
+    outcome = commands.run("ingest", tmp_path / name, "--fps", "10", "-o", tmp_path / "a.mcap")
     assert outcome.code == 0, outcome.err
 
 
