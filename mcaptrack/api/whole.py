@@ -34,6 +34,7 @@ def run(
     camera_motion: CameraMotionUse | None = None,
     fit_plane: bool | None = None,
     person_height_m: float | None = None,
+    ground_frame: str | None = None,
     stages: Mapping[str, str | Transform] | None = None,
     progress: Progress = no_progress,
 ) -> RunResult:
@@ -72,6 +73,9 @@ def run(
         before, and True where there is none yet.
     person_height_m : float, optional
         Mean height of people in metres, for a ground plane that is not given. By default as before, or 1.7.
+    ground_frame : str, optional
+        Frame of reference with the ground as z = 0, for a camera on a robot that has a calibration and transforms. By
+        default as before, or the fixed frame.
     stages : mapping of str to str or Transform, optional
         Transforms, or their names, by stage, for channels that are missing; with ``force`` also for those that exist.
     progress : callable, optional
@@ -101,7 +105,7 @@ def run(
     transforms = transforms_of(stages)
     transforms |= {s.name: transform_of(s.name, chosen[s.option], {}) for s in STAGES.values() if s.option in chosen}
 
-    plane = PlaneChoice(fit_plane, person_height_m)
+    plane = PlaneChoice(fit_plane, person_height_m, ground_frame=ground_frame)
 
     def plan(opened: logs.Log, prefix: str, say: Callable[[str], None]) -> list[Job]:
         return pipeline.plan_all(opened, prefix, say, topic, transforms, force, chosen, camera_motion or "", plane)

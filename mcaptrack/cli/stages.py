@@ -340,6 +340,15 @@ def run_all(
             show_default="1.7",
         ),
     ] = None,
+    ground_frame: Annotated[
+        str | None,
+        common.option(
+            "--ground-frame",
+            tuning=True,
+            help="Frame with the ground as z = 0, for a camera of a robot with a calibration and transforms.",
+            show_default="the fixed frame",
+        ),
+    ] = None,
 ) -> None:
     """Run all stages that are missing or out of date, then events, views and tables.
 
@@ -362,6 +371,7 @@ def run_all(
 
         settings, stages = settings_of("events"), _configured(chosen)
         where |= {"camera_motion": camera_motion, "fit_plane": fit_plane, "person_height_m": person_height_m}
+        where |= {"ground_frame": ground_frame}
         for stage in STAGES.values():
             if stage.option in chosen:
                 where[stage.option] = stages.pop(stage.name)

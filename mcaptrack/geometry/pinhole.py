@@ -63,6 +63,12 @@ class Lens:
         """Return the lens for pixels that ``motion`` (2, 3) moves to those that this one takes."""
         return replace(self, motion=tuple(compose(self._motion, motion).ravel().tolist()))
 
+    def scaled(self, across: float, down: float) -> Lens:
+        """Return the lens for pictures with another number of pixels."""
+        (fx, fy), (cx, cy) = self.focal_px, self.centre_px
+        centre = ((cx + 0.5) * across - 0.5, (cy + 0.5) * down - 0.5)
+        return replace(self, focal_px=(fx * across, fy * down), centre_px=centre)
+
     def undistort(self, xy_px: Floats) -> Floats:
         """Pixels (N, 2) -> pixels (N, 2) of a lens without distortion; NaN where there is no such pixel."""
         moved = move_points(self._motion, xy_px) if self.motion else xy_px

@@ -14,6 +14,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.affine import IDENTITY, compose, invert
 from mcaptrack.geometry.arrays import Floats
 from mcaptrack.geometry.camera_path import CameraPath
+from mcaptrack.geometry.pinhole import Lens
 
 Point = Literal["foot", "center"]
 
@@ -27,8 +28,9 @@ class GroundPlane:
 
     ``homography`` is row by row, 9 numbers: (x_m, y_m, 1) ~ H (x_px, y_px, 1). ``point`` is "foot", the middle of the
     box's lower edge, or "center". ``assumed`` says that it was not measured but derived from the size of people in the
-    picture: a scale alone, or a plane that was estimated. Raises McaptrackError if the homography is not 9 finite
-    numbers or is singular.
+    picture: a scale alone, or a plane that was estimated. With a ``lens``, pixels are those that it makes, and the
+    homography is for pixels without its distortion, with a third component that is positive on the ground. Raises
+    McaptrackError if the homography is not 9 finite numbers or is singular.
     """
 
     homography: tuple[float, ...]
@@ -36,6 +38,7 @@ class GroundPlane:
     height_px: int
     point: Point = "foot"
     assumed: bool = False
+    lens: Lens | None = None
 
     def __post_init__(self) -> None:
         values = np.asarray(self.homography, np.float64)
@@ -71,11 +74,14 @@ class GroundPlane:
     @cached_property
     def _near_side(self) -> float:
         """The sign of the third component on the ground: at the middle of the image's lower edge."""
+        if self.lens is not None:
+            return 1.0
         return float(np.sign(self.matrix[2] @ [self.width_px / 2, self.height_px, 1.0])) or 1.0
 
     def pixels_to_metres(self, xy_px: Floats) -> Floats:
         """Points (N, 2) of the image -> points on the ground (N, 2); NaN above the horizon."""
-        x, y, w = self.matrix @ np.concatenate([xy_px, np.ones((len(xy_px), 1))], axis=1).T
+        straight = xy_px if self.lens is None else self.lens.undistort(xy_px)
+        x, y, w = self.matrix @ np.concatenate([straight, np.ones((len(xy_px), 1))], axis=1).T
         w = np.where(w * self._near_side > 0, w, np.nan)
         return np.stack([x / w, y / w], axis=-1)
 
@@ -83,7 +89,15 @@ class GroundPlane:
         """Points (N, 2) on the ground -> points of the image (N, 2); NaN behind the camera."""
         x, y, w = np.linalg.inv(self.matrix) @ np.concatenate([xy_m, np.ones((len(xy_m), 1))], axis=1).T
         w = np.where(w * self._near_side > 0, w, np.nan)
-        return np.stack([x / w, y / w], axis=-1)
+        straight = np.stack([x / w, y / w], axis=-1)
+        return straight if self.lens is None else self.lens.distort(straight)
+
+    def after(self, motion: Floats) -> GroundPlane:
+        """Return the plane for pixels that ``motion`` (2, 3) moves to those that this one takes."""
+        if self.lens is not None:
+            return replace(self, lens=self.lens.after(motion))
+        homography = self.matrix @ np.vstack([motion, [0.0, 0.0, 1.0]])
+        return replace(self, homography=tuple(homography.ravel().tolist()))
 
     def boxes_to_metres(self, xywh: Floats) -> Floats:
         """Boxes (N, 4) -> the points (N, 2) where they touch the ground."""
@@ -131,8 +145,7 @@ def moved_planes(planes: Planes, path: CameraPath | None) -> Planes:
         for t_ns, pose in path.poses_between(since_ns if number else None, until_ns):
             back = IDENTITY if begun is None or begun.reference != pose.reference else invert(begun.to_reference)
             motion = IDENTITY if pose is begun else compose(back, pose.to_reference)
-            homography = plane.matrix @ np.vstack([motion, [0.0, 0.0, 1.0]])
-            moved = plane if motion is IDENTITY else replace(plane, homography=tuple(homography.ravel().tolist()))
+            moved = plane if motion is IDENTITY else plane.after(motion)
             if out[-1][1] != moved:
                 out.append((t_ns, moved))
     return out
@@ -153,8 +166,7 @@ def scene_planes(planes: Planes, path: CameraPath | None) -> Planes:
         for t_ns, pose in [*first, *path.poses_between(since_ns, until_ns)]:
             is_there = begun is not None and begun.reference == pose.reference
             back = invert(begun.to_reference) if begun is not None and is_there else IDENTITY
-            homography = plane.matrix @ np.vstack([back, [0.0, 0.0, 1.0]])
-            moved = plane if back is IDENTITY else replace(plane, homography=tuple(homography.ravel().tolist()))
+            moved = plane if back is IDENTITY else plane.after(back)
             if out[-1][1] != moved:
                 out.append((t_ns, moved))
     return out

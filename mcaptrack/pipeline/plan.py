@@ -16,7 +16,7 @@ from mcaptrack.geometry.plane import is_assumed
 from mcaptrack.notices import warn
 from mcaptrack.pipeline import motion
 from mcaptrack.pipeline.checks import Job, check_inputs, describe_origin, fits
-from mcaptrack.pipeline.planes import AS_BEFORE, PlaneChoice, is_plane_due, planes_to_json, read_planes
+from mcaptrack.pipeline.planes import AS_BEFORE, PlaneChoice, is_plane_due, planes_to_json, read_planes, warn_unused
 from mcaptrack.pipeline.rebuild import MissingPluginError, rebuild
 from mcaptrack.schema import DETECTIONS, VIDEO
 from mcaptrack.schema.provenance import Provenance
@@ -80,8 +80,7 @@ def plan_all(
     """
     sources = {_stage_from(opened, source): source} if source else {}
     planner = _Planner(opened, prefix, sources, defaults, force, chosen, camera_motion, plane)
-    if plane.estimate and (planes := read_planes(opened, prefix)) and not is_assumed(planes):
-        warn("a ground plane is given, so that none is estimated", "option-not-used")
+    warn_unused(opened, prefix, plane)
     read = {stage.input_topic for stage in STAGES.values()}
     for stage in STAGES.values():
         if stage.output_topic not in read and not stage.on_demand:
@@ -275,7 +274,7 @@ class _Planner:
             by = f"by another {STAGES[stage].option}" if is_other else "with another `camera_motion=`"
             self._notes.append(f"{topic} was made {by}: running {stage} again")
         elif is_projected:
-            self._notes.append(f"{topic} was made with another `fit_plane=`: running {stage} again, as before")
+            self._notes.append(f"{topic} was made with another ground plane: running {stage} again, as before")
         elif is_due and not self._force:
             self._notes.append(f"{topic} was made from an earlier {source}: running {stage} again, as before")
         there = [f"{main}/{suffix}".rstrip("/") for suffix in transform.writes]
@@ -285,9 +284,8 @@ class _Planner:
         return True
 
     def _is_plane_due(self, source: str) -> bool:
-        """Return whether the ground plane is made again from these boxes, because it was made otherwise."""
-        planes = read_planes(self._opened, self._prefix)
-        return is_assumed(planes) and is_plane_due(self._opened, self._prefix, source, self._plane)
+        """Return whether the ground plane is made again from these boxes, because it would be another now."""
+        return is_plane_due(self._opened, self._prefix, source, self._plane)
 
     def _is_replaced(self, stage: Stage, before: Transform | None, wanted: Transform | None) -> bool:
         """Return whether the user chose another class for a stage than the one that made its channel."""

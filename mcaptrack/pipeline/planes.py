@@ -1,11 +1,16 @@
-"""Read the ground planes of a camera, or make one from its boxes: an estimated plane, or a guessed scale."""
+"""Read the ground planes of a camera, or make them: from its calibration and transforms, or from its boxes.
+
+Boxes give an estimated plane, or a guessed scale.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from typing import Any, Final, NamedTuple
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -13,31 +18,49 @@ from mcaptrack import log
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.boxes import columns_to_boxes
-from mcaptrack.geometry.plane import LEAST_DEPTH, PERSON_HEIGHT_M, GroundPlane, Planes, assumed_plane, ground_depth
+from mcaptrack.geometry.plane import (
+    LEAST_DEPTH,
+    PERSON_HEIGHT_M,
+    GroundPlane,
+    Planes,
+    assumed_plane,
+    ground_depth,
+    is_assumed,
+)
 from mcaptrack.geometry.plane_from_boxes import plane_from_boxes
+from mcaptrack.notices import warn
 from mcaptrack.pipeline import motion
+from mcaptrack.pipeline.checks import Job
 from mcaptrack.pipeline.visible import picture_size
-from mcaptrack.pipeline.write import Made
-from mcaptrack.schema import GROUND_PLANE, TRACKS, Frame, Rows
+from mcaptrack.pipeline.write import Made, digest_of
+from mcaptrack.schema import DETECTIONS, GROUND_PLANE, TRACKS, Frame, Rows
 from mcaptrack.schema.classes import PEOPLE, PERSON
 from mcaptrack.schema.ground_plane import plane_to_rows, rows_to_plane
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources import foreign
+from mcaptrack.sources.calibrations import holds_calibrations, see_ground
 from mcaptrack.sources.cameras import camera_at, lineage, provenance_of
+from mcaptrack.transforms import STAGES, Transform
 
-_ASSUME, _ESTIMATE = "assume-ground-plane", "estimate-ground-plane"
+_ASSUME, _ESTIMATE, _CALIBRATE = "assume-ground-plane", "estimate-ground-plane", "calibrate-ground-plane"
+_MADE: Final = (_ASSUME, _ESTIMATE, _CALIBRATE)
 #: A plane is estimated from boxes of at most so many frames.
 _MOST_FRAMES: Final = 5000
+#: More planes are recorded by their digest in the parameters of channels.
+_MOST_RECORDED: Final = 100
 
 
 class PlaneChoice(NamedTuple):
     """The way to make a plane where none is given: whether it is estimated, and the mean height of people in metres.
 
-    None stands for what the plane of the log was made with, or else for the default.
+    Of a calibrated camera: the frame of the metres, and the frame with the ground as z = 0. None stands for what the
+    plane of the log was made with, or else for the default.
     """
 
     estimate: bool | None = None
     person_height_m: float | None = None
+    frame: str | None = None
+    ground_frame: str | None = None
 
     def settled(self, made: Provenance | None) -> tuple[bool, float]:
         """The choice where a plane was made before, or not."""
@@ -49,35 +72,111 @@ class PlaneChoice(NamedTuple):
 
     def is_another(self, made: Provenance | None) -> bool:
         """Whether a plane that was made before would be made in another way now."""
+        if made is not None and made.transform == _CALIBRATE:
+            return self.frames(made) != AS_BEFORE.frames(made)
         if made is None or made.transform not in (_ASSUME, _ESTIMATE):
             return False
         is_untried = made.transform == _ASSUME and not {"refused", "fit_plane"} & made.parameters.keys()
         return (bool(self.estimate) and is_untried) or self.settled(made) != AS_BEFORE.settled(made)
+
+    def frames(self, made: Provenance | None) -> tuple[str, str]:
+        """The frame of the metres and the frame of the ground, "" for the default, where planes were made before."""
+        before = made.parameters if made and made.transform == _CALIBRATE else {}
+        frame = before.get("frame", "") if self.frame is None else self.frame
+        ground_frame = before.get("ground_frame", "") if self.ground_frame is None else self.ground_frame
+        return str(frame), str(ground_frame)
 
 
 #: The choice of a user who makes none.
 AS_BEFORE: Final[PlaneChoice] = PlaneChoice()
 
 
+_READ: Final[WeakKeyDictionary[log.Log, dict[str, Planes | None]]] = WeakKeyDictionary()
+
+
 def read_planes(opened: log.Log, prefix: str) -> Planes | None:
     """Return the ground planes of a camera, each with its start time in ns; None if the log has none."""
     topic = camera_at(opened, prefix).ground_plane
-    if topic not in opened.channels:
-        return None
-    frames = opened.frames(topic, GROUND_PLANE)
-    return [(frame.t_ns, rows_to_plane(frame.rows)) for frame in frames] or None
+    known = _READ.setdefault(opened, {})
+    if topic not in known:
+        frames = opened.frames(topic, GROUND_PLANE) if topic in opened.channels else []
+        known[topic] = [(frame.t_ns, rows_to_plane(frame.rows)) for frame in frames] or None
+    return known[topic]
 
 
 def planes_to_json(planes: Planes) -> list[Any]:
-    """Convert ground planes to the JSON values that the parameters of a channel contain."""
-    kept: list[Any] = json.loads(json.dumps([(t_ns, asdict(plane)) for t_ns, plane in planes]))
-    return kept
+    """Convert ground planes to the JSON values that the parameters of a channel contain: their digest, if many."""
+    values = [(t_ns, {name: one for name, one in asdict(plane).items() if one is not None}) for t_ns, plane in planes]
+    text = json.dumps(values)
+    kept: list[Any] = json.loads(text)
+    return kept if len(kept) <= _MOST_RECORDED else [len(kept), hashlib.sha256(text.encode()).hexdigest()]
 
 
 def is_plane_due(opened: log.Log, prefix: str, source: str, choice: PlaneChoice) -> bool:
-    """Return whether the camera's plane was made from these boxes, and would be made in another way now."""
+    """Return whether the camera's plane was made from these boxes, or calibrated, and would be made otherwise now."""
     made = provenance_of(opened, camera_at(opened, prefix).ground_plane)
-    return made is not None and made.input == source and choice.is_another(made)
+    if made is None or (made.input != source and made.transform != _CALIBRATE):
+        return False
+    is_untried = _UNCALIBRATED not in made.parameters or any(choice.frames(made))
+    is_new = made.transform in (_ASSUME, _ESTIMATE) and is_untried and _is_calibrated(opened)
+    return choice.is_another(made) or is_new
+
+
+def warn_unused(opened: log.Log, prefix: str, choice: PlaneChoice) -> None:
+    """Warn of choices that change nothing, because the plane is given, or the camera isn't calibrated."""
+    topic = camera_at(opened, prefix).ground_plane
+    made = provenance_of(opened, topic)
+    is_given = topic in opened.channels and (made is None or made.transform not in _MADE)
+    if choice.estimate and is_given:
+        warn("a ground plane is given, so that none is estimated", "option-not-used")
+    if choice.ground_frame and (is_given or not _is_calibrated(opened)):
+        why = "a ground plane is given" if is_given else "the log has no calibration of a camera"
+        warn(f"`ground_frame=` changes nothing here: {why}", "option-not-used")
+
+
+def frame_of_planes(opened: log.Log, prefix: str, made: Mapping[str, Made]) -> str:
+    """Return the frame of the metres of a camera's ground planes; "" if it has none, or they name no frame."""
+    topic = camera_at(opened, prefix).ground_plane
+    how = made[topic].provenance if topic in made else provenance_of(opened, topic)
+    return how.frame_id if how else ""
+
+
+#: The parameter of a plane that says why it doesn't follow from a calibration that the log has.
+_UNCALIBRATED: Final = "uncalibrated"
+
+
+def _is_calibrated(opened: log.Log) -> bool:
+    return any(map(holds_calibrations, opened.channels.values()))
+
+
+def calibrated_planes(
+    opened: log.Log, prefix: str, choice: PlaneChoice = AS_BEFORE
+) -> tuple[Planes | None, Made | None, str]:
+    """Return the ground planes that follow from a camera's calibration and the transforms, and their channel.
+
+    Both are None if a plane is given, if these planes are in the log already, or if the log has no calibration. The
+    last result is why no plane follows from a calibration that is there; a warning says it, too.
+    """
+    camera = camera_at(opened, prefix)
+    before = provenance_of(opened, camera.ground_plane)
+    is_given = camera.ground_plane in opened.channels and (before is None or before.transform not in _MADE)
+    is_made = before is not None and before.transform == _CALIBRATE and not choice.is_another(before)
+    if is_given or is_made or not _is_calibrated(opened):
+        return None, None, ""
+    frame, ground_frame = choice.frames(before)
+    try:
+        seen = see_ground(opened, camera, frame, ground_frame)
+    except McaptrackError as error:
+        if frame or ground_frame:
+            raise
+        warn(f"{opened.path}: no ground plane follows from the calibration of {prefix}: {error}", "transforms")
+        return None, None, str(error)
+    if seen is None:
+        return None, None, ""
+    parameters = {"frame": frame, "ground_frame": ground_frame, "ground": seen.ground_frame}
+    how = Provenance(_CALIBRATE, parameters, seen.topic, digest_of(opened, seen.topic), frame_id=seen.frame)
+    frames = [Frame(t_ns, number, plane_to_rows(plane)) for number, (t_ns, plane) in enumerate(seen.planes)]
+    return seen.planes, Made.of(GROUND_PLANE, frames, how), ""
 
 
 def make_plane(
@@ -87,10 +186,12 @@ def make_plane(
     source: tuple[str, str],
     made: Mapping[str, Made],
     choice: PlaneChoice = AS_BEFORE,
+    uncalibrated: str = "",
 ) -> tuple[Planes | None, Made | None]:
     """Make a ground plane from boxes, and its channel: an estimated plane, or a scale if boxes don't give one.
 
     ``source`` is the topic of the boxes and the digest of its messages, ``made`` the channels that jobs before made.
+    ``uncalibrated`` says why the plane doesn't follow from a calibration.
     Both results are None if no frame has boxes in pixels.
     """
     columns = ["x_px", "y_px", "w_px", "h_px"]
@@ -114,11 +215,53 @@ def make_plane(
             plane, parameters = fit.plane, {"person_height_m": person_m, "fit": fit.to_json()}
         except McaptrackError as error:
             parameters["refused"] = str(error)
+    parameters |= {_UNCALIBRATED: uncalibrated} if uncalibrated else {}
     transform = _ASSUME if plane is None else _ESTIMATE
     plane = plane or assumed_plane(boxes[:, 3], width, height, person_m)
     start = frames[0].t_ns
     channel = Made.of(GROUND_PLANE, [Frame(start, 0, plane_to_rows(plane))], Provenance(transform, parameters, *source))
     return [(start, plane)], channel
+
+
+def planes_for(
+    opened: log.Log,
+    prefix: str,
+    job: Job,
+    frames: Sequence[Frame],
+    source: tuple[str, str],
+    made: Mapping[str, Made],
+    planes: Planes | None,
+    choice: PlaneChoice,
+) -> tuple[Planes | None, dict[str, Made], str]:
+    """Return the ground planes for a job that reads these frames, their channel if it is new, and their frame.
+
+    ``planes`` are those so far. New detections give a new plane; one that was measured is kept. ``source`` is as in
+    ``make_plane``.
+    """
+    topic, stage, uncalibrated = camera_at(opened, prefix).ground_plane, STAGES[job.stage], ""
+    channel: Made | None = None
+    uses_planes = "ground_planes" in {f.name for f in fields(job.transform)}
+    if uses_planes and topic not in made and _has_pixels(frames):
+        found, channel, uncalibrated = calibrated_planes(opened, prefix, choice)
+        planes = found or planes
+    is_usual = job.target == f"{prefix}/{stage.output_topic}"
+    is_new = job.transform.reads is DETECTIONS or is_plane_due(opened, prefix, job.source, choice)
+    if (is_assumed(planes) and is_usual and is_new) or (planes is None and stage.needs_scale):
+        planes, channel = make_plane(opened, prefix, frames, source, made, choice, uncalibrated)
+    new = {topic: channel} if channel else {}
+    frame = frame_of_planes(opened, prefix, {**made, **new}) if uses_planes and _has_pixels(frames) else ""
+    return planes, new, frame
+
+
+def _has_pixels(frames: Sequence[Frame]) -> bool:
+    """Return whether rows have boxes in pixels."""
+    return any("x_px" in (frame.rows.dtype.names or ()) and np.isfinite(frame.rows["x_px"]).any() for frame in frames)
+
+
+def recorded_planes(transform: Transform) -> dict[str, Any]:
+    """Return the ground planes of a transform as the parameters of a channel contain them, if it has any."""
+    planes = getattr(transform, "ground_planes", None)
+    return {} if planes is None else {"ground_planes": planes_to_json(planes)}
 
 
 _BY_MOTION: Final = "boxes of a motion detector have shadows, and several people in one"

@@ -22,7 +22,7 @@ from mcaptrack.pipeline.events import Watch, make_events, tally
 from mcaptrack.pipeline.findings import warn_findings, warn_memory, warn_no_rows
 from mcaptrack.pipeline.motion import path_with, side_inputs
 from mcaptrack.pipeline.pictures import pictures_of
-from mcaptrack.pipeline.planes import AS_BEFORE, PlaneChoice, is_plane_due, is_poor, make_plane, read_planes
+from mcaptrack.pipeline.planes import AS_BEFORE, PlaneChoice, is_poor, planes_for, read_planes, recorded_planes
 from mcaptrack.pipeline.rebuild import plugins_of
 from mcaptrack.pipeline.visible import picture_size, without_unseen
 from mcaptrack.pipeline.write import Made, digest_of, write
@@ -104,14 +104,11 @@ def _run(
     planes = read_planes(opened, prefix)
     for job in jobs:
         given = _input(opened, job, made, stamps, progress)
-        # New detections give a new plane; one that was measured is kept.
-        stage, has_boxes = STAGES[job.stage], job.transform.reads is DETECTIONS
-        is_usual = job.target == f"{prefix}/{stage.output_topic}"
-        is_due = is_assumed(planes) and is_usual and (has_boxes or is_plane_due(opened, prefix, job.source, choice))
-        if is_due or (planes is None and stage.needs_scale):
-            planes, channel = make_plane(opened, prefix, given.frames, (job.source, given.digest()), made, choice)
-            made |= {camera_at(opened, prefix).ground_plane: channel} if channel else {}
-        if has_boxes:
+        source = (job.source, given.digest())
+        planes, ground, frame_id = planes_for(opened, prefix, job, given.frames, source, made, planes, choice)
+        made |= ground
+        given = given._replace(frame_id=given.frame_id or frame_id)
+        if job.transform.reads is DETECTIONS:
             warn_memory(len(given.frames), sum(len(frame.rows) for frame in given.frames))
         try:
             made |= _run_job(opened, prefix, job, given, made, planes or ())
@@ -244,6 +241,7 @@ def _provenance_of(
     recorded = replace(transform, **unrecorded) if unrecorded else transform
     try:
         parameters = {name: value for name, value in asdict(recorded).items() if name not in unrecorded}
+        parameters |= recorded_planes(transform)
         parameters = json.loads(json.dumps(parameters | choice))
     except TypeError as error:
         raise McaptrackError(f"the parameters of {entry} can't be kept in a log: {error}") from None

@@ -101,6 +101,7 @@ CASES: dict[str, dict[str, Case]] = {
         camera_motion=("run a.mcap --no-tables", "--camera-motion on"),
         fit_plane="--no-fit-plane",
         person_height_m="--person-height-m 1.5",
+        ground_frame="--ground-frame base_link",
     ),
     "events": common(
         "events a.mcap",

@@ -12,7 +12,7 @@ import numpy as np
 
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.boxes import columns_to_boxes
-from mcaptrack.geometry.plane import Planes, plane_at
+from mcaptrack.geometry.plane import Planes
 from mcaptrack.geometry.ragged import group_index, ragged_range, run_ends, run_starts
 from mcaptrack.schema import TRACKS, Rows
 from mcaptrack.schema.resampling import LINEAR
@@ -108,10 +108,9 @@ def _interpolated(samples: Rows, step: Ints, track: Ints, sample: Ints) -> tuple
 def move_rows(rows: Rows, xy_m: Floats, planes: Planes, t_ns: Ints) -> Rows:
     """Move rows (R,) to other positions (R, 2), and their boxes with them if there is a ground plane at their times."""
     out = rows.copy()
-    for plane in dict.fromkeys(plane_at(planes, t) for t in np.unique(t_ns).tolist()) if planes else ():
-        if plane is None:
-            continue
-        here = np.array([plane_at(planes, t) == plane for t in t_ns.tolist()]) if len(planes) > 1 else slice(None)
+    which = np.maximum(np.searchsorted([since_ns for since_ns, _ in planes], t_ns, side="right") - 1, 0)
+    for number in np.unique(which).tolist() if planes else ():
+        plane, here = planes[number][1], which == number
         size = columns_to_boxes(rows[here])[:, 2:]
         shift = plane.standing_boxes(xy_m[here], size) - plane.standing_boxes(
             np.stack([rows["x_m"][here], rows["y_m"][here]], axis=-1), size

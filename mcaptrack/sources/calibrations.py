@@ -1,0 +1,299 @@
+"""Calibrations of cameras on robots, and the ground that they see: a plane for each picture, from the transforms."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import takewhile
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from mcaptrack import log
+from mcaptrack.errors import McaptrackError
+from mcaptrack.geometry.arrays import Floats, Ints
+from mcaptrack.geometry.pinhole import Lens, ground_homography
+from mcaptrack.geometry.plane import GroundPlane, Planes
+from mcaptrack.geometry.transform_tree import Poses, TransformTree
+from mcaptrack.notices import warn
+from mcaptrack.sources.cameras import Camera
+from mcaptrack.sources.foreign import stamp_of
+from mcaptrack.sources.foreign.decoding import decoder_with_errors, plain_name
+from mcaptrack.sources.foreign.flatten import message_type_of
+from mcaptrack.sources.frames import poses_at, transforms_of
+from mcaptrack.sources.pictures import size_of_pictures
+
+#: Schemas of calibrations, by their names in ROS 1 and Foxglove; ROS 2 adds "/msg/".
+CALIBRATIONS_READ: Final = ("sensor_msgs/CameraInfo", "foxglove.CameraCalibration")
+#: The names of models of distortion: those of OpenCV with up to 8 coefficients, and its fisheye model.
+_POLYNOMIAL: Final = ("plumb_bob", "rational_polynomial")
+_FISHEYE: Final = ("equidistant", "kannala_brandt", "fisheye")
+#: Heights of a camera above the ground that are believed, in metres, unless the user names the ground.
+_HEIGHTS_M: Final = (0.05, 30.0)
+#: Frames on the ground that robots have, in the order in which they are tried.
+_GROUND_FRAMES: Final = ("base_footprint", "base_link")
+#: Pictures of another size than the calibration's have been resized if their shape is the same but for so much.
+_SHAPE: Final = 0.02
+
+
+class Calibration(NamedTuple):
+    """A calibration: the frame of the camera, its lens, and the size of its pictures in pixels.
+
+    ``turn`` (3, 3) rotates points of the frame to the axes of rectified pictures; it is the identity for others.
+    """
+
+    frame_id: str
+    lens: Lens
+    width_px: int
+    height_px: int
+    turn: Floats
+
+
+class GroundSeen(NamedTuple):
+    """The ground planes of a camera for each picture, in metres of ``frame``, and where they are from.
+
+    The ground is z = 0 of ``ground_frame``; ``topic`` is that of the calibration.
+    """
+
+    planes: Planes
+    frame: str
+    ground_frame: str
+    topic: str
+
+
+def holds_calibrations(channel: log.Channel) -> bool:
+    """Return whether a channel has calibrations of cameras."""
+    return plain_name(channel.schema_name) in CALIBRATIONS_READ
+
+
+def find_calibration(opened: log.Log, source: str, frame_id: str) -> str:
+    """Return the topic of the calibration for pictures, or boxes, in this topic and frame.
+
+    It is one in the same frame, or else in the same folder of topics; of several, the one with the most similar name.
+    Raises McaptrackError if there is none, or if several are as similar.
+    """
+    known = {topic: _frame_of(opened, topic) for topic, one in opened.channels.items() if holds_calibrations(one)}
+    same = [topic for topic, named in known.items() if frame_id and named == frame_id]
+    beside = [topic for topic in known if topic.rpartition("/")[0] == source.rpartition("/")[0]]
+    fitting = same or beside
+    if not fitting:
+        frames = ", ".join(f"{topic} (frame {named or 'without a name'})" for topic, named in sorted(known.items()))
+        raise McaptrackError(f"no calibration is of the frame {frame_id!r} of {source}; there is {frames or 'none'}")
+    alike = {topic: _shared_parts(topic, source) for topic in fitting}
+    nearest = sorted(topic for topic in fitting if alike[topic] == max(alike.values()))
+    usable = [topic for topic in nearest if len(nearest) == 1 or _is_usable(opened, topic)]
+    if len(usable) != 1:
+        raise McaptrackError(f"several calibrations fit {source}: {', '.join(nearest)}")
+    return usable[0]
+
+
+def read_calibrations(opened: log.Log, topic: str, is_rectified: bool) -> list[tuple[int, Calibration]]:
+    """Return the calibrations of a channel with the log time from which each holds, in ns; changes only.
+
+    ``is_rectified``: of pictures that are rectified already. Raises McaptrackError for what can't be read.
+    """
+    decode = decoder_with_errors(message_type_of(opened, topic), lambda message: _calibration(message, is_rectified))
+    out: list[tuple[int, Calibration]] = []
+    for message in opened.timed(topic):
+        try:
+            one = decode(message.payload)
+        except McaptrackError as error:
+            raise McaptrackError(f"{topic} at {message.t_ns} ns: {error}") from None
+        if not out or one[:4] != out[-1][1][:4] or not np.array_equal(one.turn, out[-1][1].turn):
+            out.append((message.t_ns, one))
+    if not out:
+        raise McaptrackError(f"{topic} has no messages")
+    return out
+
+
+def see_ground(opened: log.Log, camera: Camera, frame: str = "", ground_frame: str = "") -> GroundSeen | None:
+    """Return the ground planes of a camera, one for each picture in which it stands elsewhere.
+
+    ``frame`` is the frame of the metres, by default the root above the camera; the ground is z = 0 of ``ground_frame``,
+    by default of ``frame``. None if the log has no calibration of a camera. Raises McaptrackError if none fits the
+    camera, or if no transforms connect it with the ground.
+    """
+    sources = [topic for topic in (camera.pictures, camera.boxes) if topic]
+    if not sources or not any(map(holds_calibrations, opened.channels.values())):
+        return None
+    log_ns, stamp_ns, frame_id = _headers(opened, sources)
+    topic = find_calibration(opened, sources[0], frame_id)
+    size = _picture_size(opened, camera.pictures)
+    found = read_calibrations(opened, topic, is_rectified="rect" in sources[0].rpartition("/")[2])
+    known = [(since_ns, _fitted(one, size, topic)) for since_ns, one in found]
+    eye = known[0][1].frame_id or frame_id
+    tree = transforms_of(opened)
+    if tree is None:
+        raise McaptrackError(f"there are no transforms, which say where the camera of {topic} is")
+    frame = frame or tree.root_of(eye)
+    ground = ground_frame or _ground_frame(tree, frame, eye, stamp_ns)
+    poses = poses_at(opened, sources[0], ground, eye, stamp_ns, log_ns)
+    floor = poses_at(opened, sources[0], frame, ground, stamp_ns, log_ns) if ground != frame else None
+    if not poses.is_known.any():
+        raise McaptrackError(f"no pose of the frame {eye} in {ground} is known")
+    planes = _planes(log_ns, known, poses, floor)
+    return GroundSeen(planes, frame, ground, topic)
+
+
+def _planes(
+    log_ns: Ints, known: Sequence[tuple[int, Calibration]], poses: Poses, floor: Poses | None
+) -> list[tuple[int, GroundPlane]]:
+    """Return the planes of pictures at log times (N,), from the poses of the camera on the ground.
+
+    ``floor`` are the poses of the ground in the frame of the metres, unless that is the same.
+    """
+    which = np.maximum(np.searchsorted([t_ns for t_ns, _ in known], log_ns, side="right") - 1, 0)
+    is_known = poses.is_known if floor is None else poses.is_known & floor.is_known
+    out: list[tuple[int, GroundPlane]] = []
+    below = 0
+    for number, t_ns in enumerate(log_ns.tolist()):
+        one = known[which[number]][1]
+        plane = _nowhere(one)
+        if is_known[number]:
+            back = one.turn @ poses.rotation[number].T
+            metres = np.eye(3)
+            if floor is not None:
+                metres[:2] = np.column_stack([floor.rotation[number][:2, :2], floor.translation[number][:2]])
+            try:
+                homography = ground_homography(one.lens, back, -back @ poses.translation[number], metres)
+                plane = GroundPlane(homography, one.width_px, one.height_px, lens=one.lens)
+            except McaptrackError:
+                below += 1
+        if out and out[-1][0] == t_ns:
+            out.pop()
+        if not out or out[-1][1] != plane:
+            out.append((t_ns, plane))
+    if below:
+        warn(
+            f"{below:,} of {len(log_ns):,} pictures have no ground plane: the camera is below the ground", "transforms"
+        )
+    return out
+
+
+def _nowhere(one: Calibration) -> GroundPlane:
+    """Return the plane of a picture in which no point is known to be on the ground."""
+    numbers = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, -1.0)
+    return GroundPlane(numbers, one.width_px, one.height_px, lens=one.lens)
+
+
+def _ground_frame(tree: TransformTree, frame: str, eye: str, stamps_ns: Ints) -> str:
+    """Return the frame with the ground as z = 0: that of the metres, or one of the robot if that can't be."""
+
+    def height_m(ground: str) -> float:
+        heights = tree.lookup(ground, eye, stamps_ns).translation[:, 2]
+        return float(np.median(heights[np.isfinite(heights)])) if np.isfinite(heights).any() else float("nan")
+
+    above = height_m(frame)
+    if not np.isfinite(above) or _HEIGHTS_M[0] < above < _HEIGHTS_M[1]:
+        return frame
+    for other in _GROUND_FRAMES:
+        if other in tree.frames() and _HEIGHTS_M[0] < height_m(other) < _HEIGHTS_M[1]:
+            words = f"{eye} is {above:.3g} m above z = 0 of {frame}: the ground is taken to be z = 0 of {other}"
+            warn(f"{words}. `ground_frame=` chooses", "transforms")
+            return other
+    raise McaptrackError(
+        f"{eye} is {above:.3g} m above z = 0 of {frame}; name a frame on the ground by `ground_frame=`"
+    )
+
+
+def _headers(opened: log.Log, topics: Sequence[str]) -> tuple[Ints, Ints, str]:
+    """Return log times and stamps in ns of all messages, (N,) each, by log time; and the frame of the first one."""
+    times: list[tuple[int, int]] = []
+    frame_id = ""
+    for topic in topics:
+        try:
+            decode = decoder_with_errors(message_type_of(opened, topic), lambda one: (stamp_of(one), _name_of(one)))
+            for message in opened.timed(topic):
+                stamp_ns, named = decode(message.payload)
+                frame_id = frame_id or named
+                times.append((message.t_ns, stamp_ns))
+        except McaptrackError:  # rows of mcaptrack have no stamps
+            times += [(t_ns, t_ns) for t_ns in opened.times(topic).tolist()]
+    log_ns, stamp_ns = np.array(sorted(times), np.int64).reshape(-1, 2).T
+    return log_ns, stamp_ns, frame_id
+
+
+def _picture_size(opened: log.Log, topic: str | None) -> tuple[int, int] | None:
+    """Return width and height of the pictures of a channel; None if there are none that can be decoded."""
+    try:
+        return size_of_pictures(opened, topic) if topic else None
+    except McaptrackError:
+        return None
+
+
+def _frame_of(opened: log.Log, topic: str) -> str:
+    """Return the frame of the first message of a channel; "" if there is none, or it can't be read."""
+    try:
+        decode = decoder_with_errors(message_type_of(opened, topic), _name_of)
+        return next((str(decode(message.payload)) for message in opened.messages(topic)), "")
+    except McaptrackError:
+        return ""
+
+
+def _shared_parts(topic: str, other: str) -> int:
+    """Return the number of parts that the names of two topics begin with together."""
+    pairs = zip(topic.split("/"), other.split("/"), strict=False)
+    return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], pairs))
+
+
+def _is_usable(opened: log.Log, topic: str) -> bool:
+    try:
+        return bool(read_calibrations(opened, topic, is_rectified=False))
+    except McaptrackError:
+        return False
+
+
+def _name_of(message: Any) -> str:
+    holder = message.header if hasattr(message, "header") else message
+    return str(getattr(holder, "frame_id", "")).removeprefix("/")
+
+
+def _calibration(message: Any, is_rectified: bool) -> Calibration:
+    width, height = int(message.width), int(message.height)
+    numbers = {name: _numbers(message, name) for name in "DKRP"}
+    model = str(message.distortion_model).strip().lower()
+    if is_rectified and len(numbers["P"]) == 12 and numbers["P"][0] > 0:
+        p = numbers["P"]
+        turn = np.reshape(numbers["R"], (3, 3)) if any(numbers["R"]) else np.eye(3)
+        return Calibration(_name_of(message), Lens((p[0], p[5]), (p[2], p[6])), width, height, turn)
+    k = numbers["K"]
+    if len(k) != 9 or not k[0] > 0:
+        raise ValueError("it isn't calibrated: its camera matrix is 0")
+    bent = numbers["D"] if any(numbers["D"]) else []
+    if bent and model not in (*_POLYNOMIAL, *_FISHEYE):
+        raise ValueError(f"distortion by {model!r} is not read; {', '.join((*_POLYNOMIAL, *_FISHEYE))} are")
+    is_fisheye = bool(bent) and model in _FISHEYE
+    while not is_fisheye and len(bent) > 8 and not bent[-1]:
+        bent.pop()
+    lens = Lens((k[0], k[4]), (k[2], k[5]), tuple(bent), is_fisheye)
+    return _cropped(message, Calibration(_name_of(message), lens, width, height, np.eye(3)))
+
+
+def _cropped(message: Any, one: Calibration) -> Calibration:
+    """Return the calibration of pictures that are a part of what the sensor sees, or have fewer pixels."""
+    step_x, step_y = (max(int(getattr(message, f"binning_{axis}", 0)), 1) for axis in "xy")
+    roi = getattr(message, "roi", None)
+    left, top, width, height = (int(getattr(roi, name, 0)) for name in ("x_offset", "y_offset", "width", "height"))
+    cx, cy = one.lens.centre_px
+    lens = replace(one.lens, centre_px=(cx - left, cy - top)).scaled(1 / step_x, 1 / step_y)
+    size = ((width or one.width_px) // step_x, (height or one.height_px) // step_y)
+    return one._replace(lens=lens, width_px=size[0], height_px=size[1])
+
+
+def _fitted(one: Calibration, size: tuple[int, int] | None, topic: str) -> Calibration:
+    """Return the calibration for pictures of this width and height, which may have been resized; None: as it is."""
+    if size in (None, (one.width_px, one.height_px), (0, 0)) or size is None:
+        return one
+    if not one.width_px or not one.height_px:
+        return one._replace(width_px=size[0], height_px=size[1])
+    across, down = size[0] / one.width_px, size[1] / one.height_px
+    if abs(across / down - 1) > _SHAPE:
+        was = f"{one.width_px} x {one.height_px}"
+        raise McaptrackError(f"{topic} is for pictures of {was} pixels, and these are {size[0]} x {size[1]}")
+    return one._replace(lens=one.lens.scaled(across, down), width_px=size[0], height_px=size[1])
+
+
+def _numbers(message: Any, name: str) -> list[float]:
+    """Return a field by its name in ROS 1 and Foxglove, or in ROS 2, where it is in small letters."""
+    values = getattr(message, name) if hasattr(message, name) else getattr(message, name.lower())
+    return [float(value) for value in values]
