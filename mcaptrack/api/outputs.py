@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, cast
 
 from mcaptrack import log as logs
 from mcaptrack import pipeline
@@ -28,23 +28,28 @@ from mcaptrack.notices import Notice, collected, warn
 from mcaptrack.tables import Format
 from mcaptrack.tables.export import default_folder, recording_name
 from mcaptrack.tables.export import export as write_tables
+from mcaptrack.tables.rosbag2 import Storage, write_bag
+from mcaptrack.tables.rosbag2 import default_folder as default_bag
 from mcaptrack.viewing import report as pages
 from mcaptrack.viewing.rendering import RenderOptions
 from mcaptrack.viewing.rendering import render as draw_video
 
+#: ROS 2 bags by the format of ``export``.
+_BAGS: Mapping[str, Storage] = {"rosbag2": "mcap", "rosbag2-sqlite3": "sqlite3"}
+
 
 @dataclass(frozen=True)
 class ExportResult:
-    """The tables of a log in a folder.
+    """The tables of a log in a folder, or its bag.
 
     Attributes
     ----------
     log, folder : pathlib.Path
         The log, and the folder with its tables.
     rows : dict of str to int
-        Number of rows of each table.
+        Number of rows of each table; of a bag, the number of messages of each topic.
     written : tuple of str
-        The tables that were written; the others were up to date.
+        The tables that were written; the others were up to date. Of a bag, its topics.
     warnings : tuple of mcaptrack.Notice
         What was left out.
 
@@ -62,28 +67,32 @@ def export(
     log: PathLike,
     output: PathLike | None = None,
     *,
-    form: Format = "parquet",
+    form: Format | Literal["rosbag2", "rosbag2-sqlite3"] = "parquet",
     topic: str | Sequence[str] | None = None,
     blobs: bool = False,
     force: bool = False,
     progress: Progress = no_progress,
 ) -> ExportResult:
-    """Write a log as tables, one row per object and frame.
+    """Write a log as tables, one row per object and frame, or as a ROS 2 bag.
+
+    A bag has detections and tracks as ``vision_msgs/Detection3DArray`` or ``Detection2DArray``, predictions as
+    ``nav_msgs/Path``, drawings of tracks and predictions as ``visualization_msgs/MarkerArray``, and the transforms of
+    the log.
 
     Parameters
     ----------
     log : path
         The log.
     output : path, optional
-        Folder for the tables, by default LOG.tables beside the log.
-    form : {"parquet", "arrow", "csv", "jsonl"}, default "parquet"
-        Format of the files.
+        Folder for the tables, by default LOG.tables beside the log, or for the bag, by default LOG.rosbag2.
+    form : {"parquet", "arrow", "csv", "jsonl", "rosbag2", "rosbag2-sqlite3"}, default "parquet"
+        Format of the files. "rosbag2" is a ROS 2 bag in MCAP, "rosbag2-sqlite3" one in a database.
     topic : str or sequence of str, optional
         Also write a table of all messages of these channels.
     blobs : bool, default False
         With ``topic``: include binary fields, such as pictures and point clouds.
     force : bool, default False
-        Write all tables again, also over those of another log of this name.
+        Write all tables again, also over those of another log of this name; replace a bag.
     progress : callable, optional
         Called as ``progress(stage, done, total)``.
 
@@ -105,6 +114,8 @@ def export(
 
     """
     path = log_path(log)
+    if form in _BAGS:
+        return _export_bag(path, optional_path(output), _BAGS[form], topic, blobs, force, progress)
     folder = optional_path(output) or default_folder(path)
     if folder.exists() and not folder.is_dir():
         raise McaptrackError(f"{folder} is a file; tables go to a folder")
@@ -112,10 +123,32 @@ def export(
         raise McaptrackError("`blobs=True` needs a channel to write; name it with `topic=`")
     with warnings_about(path) as warnings:
         with logs.read(path) as opened:
-            done = write_tables(opened, folder, progress, form=form, topics=names_of(topic), blobs=blobs, force=force)
+            done = write_tables(
+                opened, folder, progress, form=cast("Format", form), topics=names_of(topic), blobs=blobs, force=force
+            )
         for words in done.notes:
             warn(words, "left-out")
     return ExportResult(path, folder, done.rows, tuple(done.written), tuple(dict.fromkeys(warnings)))
+
+
+def _export_bag(
+    path: Path,
+    output: Path | None,
+    storage: Storage,
+    topic: str | Sequence[str] | None,
+    blobs: bool,
+    force: bool,
+    progress: Progress,
+) -> ExportResult:
+    """Write a log as a ROS 2 bag."""
+    with warnings_about(path) as warnings:
+        warn_unused("a bag has no tables", topic=bool(topic), blobs=blobs)
+        folder = output or default_bag(path)
+        with logs.read(path) as opened:
+            done = write_bag(opened, folder, progress, storage=storage, force=force)
+        for words in done.notes:
+            warn(words, "left-out")
+    return ExportResult(path, folder, done.messages, tuple(done.messages), tuple(dict.fromkeys(warnings)))
 
 
 def refuse_same_tables(logs_to_export: Sequence[Path], output: Path | None) -> None:

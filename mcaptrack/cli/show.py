@@ -152,13 +152,13 @@ def export(
             "--output",
             "-o",
             panel=common.FILES,
-            help="Folder for the tables.",
-            show_default="LOG.tables beside the log",
+            help="Folder for the tables, or for the bag.",
+            show_default="LOG.tables or LOG.rosbag2 beside the log",
         ),
     ] = None,
     form: Annotated[
-        Literal["parquet", "arrow", "csv", "jsonl"],
-        common.option("--format", panel=common.FILES, help="Format of the files."),
+        Literal["parquet", "arrow", "csv", "jsonl", "rosbag2", "rosbag2-sqlite3"],
+        common.option("--format", panel=common.FILES, help="Format of the files: of tables, or of a ROS 2 bag."),
     ] = "parquet",
     topic: Annotated[
         list[str] | None,
@@ -180,7 +180,9 @@ def export(
     force: Annotated[
         bool,
         common.option(
-            "--force", panel=common.FILES, help="Write all tables again, also over those of another log of this name."
+            "--force",
+            panel=common.FILES,
+            help="Write all tables again, also over those of another log of this name; replace a bag.",
         ),
     ] = False,
     json: common.Json = False,
@@ -188,11 +190,11 @@ def export(
     verbose: common.Verbose = False,
     config: common.Config = None,
 ) -> None:
-    """Write a log as tables (Parquet), one row per object and frame.
+    """Write a log as tables (Parquet), one row per object and frame, or as a ROS 2 bag.
 
     One folder a table (frames, detections, tracks, track_summary, predictions, events, metrics, channels, recordings
     and others), one file a log in it; several logs can share a folder. Exporting again replaces what has changed.
-    `mcaptrack docs tables` lists all columns.
+    `mcaptrack docs tables` lists all columns. A bag (rosbag2) holds results as ROS messages, for RViz and `ros2 bag`.
 
     Example: mcaptrack export log.mcap -o tables/
 
@@ -203,7 +205,10 @@ def export(
 
     results = []
     paths = common.expand(logs)
-    refuse_same_tables(paths, output)
+    if form.startswith("rosbag2"):
+        common.only_one_output(paths, output)
+    else:
+        refuse_same_tables(paths, output)
     given: dict[str, Any] = {"form": form, "topic": topic, "blobs": blobs, "force": force}
     with common.Talk(quiet, verbose).open() as talk:
         for path in paths:

@@ -18,7 +18,7 @@ from mcaptrack.foxglove.messages import (
     unpack_picture,
 )
 from mcaptrack.foxglove.palette import class_colour, colour, colours
-from mcaptrack.foxglove.scenes import Boxes, BoxMarker, PersonMarker, SceneMessages
+from mcaptrack.foxglove.scenes import CuboidMarker, Cuboids, PersonMarker, SceneMessages
 
 __all__ = [
     "ANNOTATIONS",
@@ -29,8 +29,8 @@ __all__ = [
     "TRANSFORM",
     "VIDEO",
     "Annotations",
-    "BoxMarker",
-    "Boxes",
+    "CuboidMarker",
+    "Cuboids",
     "PersonMarker",
     "SceneMessages",
     "class_colour",

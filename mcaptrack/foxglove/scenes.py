@@ -46,7 +46,7 @@ class PersonMarker(NamedTuple):
     in_pieces: bool = False
 
 
-class BoxMarker(NamedTuple):
+class CuboidMarker(NamedTuple):
     """The drawing of a 3D box: the shares of its height between which it is drawn, and the height of the number above
     the top (or, if negative, below the bottom) of the box.
     """
@@ -56,16 +56,16 @@ class BoxMarker(NamedTuple):
     number_m: float
 
 
-class Boxes(NamedTuple):
+class Cuboids(NamedTuple):
     """3D boxes of N objects: centres (N, 3) m, sizes (N, 3) m as length, width and height, and headings (N,) rad."""
 
     centre_m: Floats
     size_m: Floats
     heading_rad: Floats
 
-    def chosen(self, which: NDArray[Any]) -> Boxes:
+    def chosen(self, which: NDArray[Any]) -> Cuboids:
         """Some of the boxes."""
-        return Boxes(*(values[which] for values in self))
+        return Cuboids(*(values[which] for values in self))
 
     def base_m(self) -> Floats:
         """The heights (N,) of the bottoms."""
@@ -104,8 +104,8 @@ class SceneMessages:
             )  # fmt: skip
 
     def boxes(
-        self, frame: Ints, labels: NDArray[Any], boxes: Boxes, rgb: Floats, alpha: Floats, label_rgb: Floats,
-        marker: BoxMarker, trail_m: Floats, fade: Floats, line: PersonMarker,
+        self, frame: Ints, labels: NDArray[Any], boxes: Cuboids, rgb: Floats, alpha: Floats, label_rgb: Floats,
+        marker: CuboidMarker, trail_m: Floats, fade: Floats, line: PersonMarker,
     ) -> None:  # fmt: skip
         """Draw boxes of N objects in colours (N, 3), a line that leads ahead from the middle of each top, and labels
         and trails through points (N, P, 3), as ``people`` does, in colours ``label_rgb`` (N, 3).

@@ -11,7 +11,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaptrack.foxglove import Boxes
+from mcaptrack.foxglove import Cuboids
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.camera_path import CameraPath
@@ -52,7 +52,7 @@ class People(NamedTuple):
     observed: NDArray[np.bool_]
     label: NDArray[Any]
     class_id: Ints
-    body: Boxes
+    body: Cuboids
 
     def has_body(self) -> NDArray[np.bool_]:
         """Which people (S,) have a 3D box."""
@@ -120,13 +120,13 @@ def people_at(
     return People(number, frame, box, foot, at_m, observed, label, class_id, bodies_of(rows))
 
 
-def bodies_of(rows: Rows) -> Boxes:
+def bodies_of(rows: Rows) -> Cuboids:
     """The 3D boxes of tracks (S,); an unknown heading is drawn along the first axis."""
     centre, size = (
         np.stack([rows[name] for name in names], axis=-1)
         for names in (("x_m", "y_m", "z_m"), ("length_m", "width_m", "height_m"))
     )
-    return Boxes(centre, size, np.nan_to_num(rows["heading_rad"]))
+    return Cuboids(centre, size, np.nan_to_num(rows["heading_rad"]))
 
 
 def base_heights(tracks: Sequence[Frame], made_ns: Ints, number: Ints) -> Floats:

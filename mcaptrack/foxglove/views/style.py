@@ -7,7 +7,7 @@ from typing import Final, Literal, NamedTuple
 
 import numpy as np
 
-from mcaptrack.foxglove import BoxMarker, PersonMarker
+from mcaptrack.foxglove import CuboidMarker, PersonMarker
 from mcaptrack.geometry.plane import Planes
 from mcaptrack.schema import Frame
 
@@ -28,19 +28,19 @@ class TrackStyle(NamedTuple):
     is_white: bool
     name_at: Literal["above", "below", "beside"]
     marker: PersonMarker
-    box: BoxMarker
+    box: CuboidMarker
 
 
 #: On the ground the numbers of a person in several channels have different heights, so that all can be read. So have
 #: those of 3D boxes, of which re-tracked ones are drawn whole, tracked ones at the bottom and true ones at the top.
 RETRACKED: Final = TrackStyle(
-    2.5, False, 1.0, False, "above", PersonMarker(0.4, 1.7, 2.2, 4.0), BoxMarker(0.0, 1.0, 0.5)
+    2.5, False, 1.0, False, "above", PersonMarker(0.4, 1.7, 2.2, 4.0), CuboidMarker(0.0, 1.0, 0.5)
 )
 TRACKED: Final = TrackStyle(
-    2.0, True, 0.6, False, "below", PersonMarker(0.6, 0.06, -0.8, 3.0, in_pieces=True), BoxMarker(0.0, 0.0, -0.8)
+    2.0, True, 0.6, False, "below", PersonMarker(0.6, 0.06, -0.8, 3.0, in_pieces=True), CuboidMarker(0.0, 0.0, -0.8)
 )
 GROUND_TRUTH: Final = TrackStyle(
-    1.0, False, 0.0, True, "beside", PersonMarker(0.12, 4.6, 5.0, 1.5), BoxMarker(1.0, 1.0, 3.0)
+    1.0, False, 0.0, True, "beside", PersonMarker(0.12, 4.6, 5.0, 1.5), CuboidMarker(1.0, 1.0, 3.0)
 )
 #: The opacity of observed and of interpolated positions.
 OBSERVED, INTERPOLATED = 1.0, 0.375
