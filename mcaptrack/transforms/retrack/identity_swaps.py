@@ -26,10 +26,10 @@ _NEAR_M: Final = 2.0
 _MARGIN: Final = 10
 #: Cost of a swap as a log likelihood, and how much more it costs for each of the two tracks that keeps its input id
 #: there (and less for each that takes over the input id of the other).
-_SWAP_COST: Final = 5.0
-_SAME_ID_COST: Final = 2.0
+_SWAP_COST: Final = 4.0
+_SAME_ID_COST: Final = 1.0
 #: The least gain in log likelihood of swaps over none.
-_MIN_GAIN: Final = 3.0
+_MIN_GAIN: Final = 1.0
 
 
 def resolve_swaps(
