@@ -273,7 +273,9 @@ def test_rows_that_do_not_suit_tracks_are_counted(tmp_path):
     assert (truth.forgiven.tolist(), truth.region.tolist()) == ([False], [True])
     assert len(read(tmp_path, content).frame) == len(entries) - 1
     only = coco([0], [box(0, category_id=10), box(0, category_id=99)], categories=kinds)
-    assert refused(tmp_path, only, "tracks") == " holds no people, only 1 k00, 1 of unknown class"
+    assert (
+        refused(tmp_path, only, "tracks") == " holds no people, only 1 k00, 1 of unknown class; `classes=` takes others"
+    )
     crowds = coco([0], [box(0, iscrowd=1)] * 2)
     assert refused(tmp_path, crowds) == " holds no boxes, only 2 regions of crowds (iscrowd)"
     eight = coco([0], [box(0, track_id=1), *entries[4:]], categories=kinds[:1] + kinds[1:9])

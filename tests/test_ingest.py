@@ -98,7 +98,7 @@ class TestLabels:
 
     def test_what_is_no_text_is_said(self, tmp_path):
         (tmp_path / "a.txt").write_bytes(b"\xff\xfe\x00\x00" * 10)
-        with pytest.raises(McaptrackError, match="is not a text file"):
+        with pytest.raises(McaptrackError, match="is not text in UTF-8"):
             read_labels(tmp_path / "a.txt")
         with pytest.raises(McaptrackError, match="can't be read"):
             read_labels(tmp_path / "none.txt")

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from mcaptrack import notices
 from mcaptrack.errors import McaptrackError
-from mcaptrack.sources.ingest.labels import number_table
+from mcaptrack.sources.ingest.labels import formats, number_table
 from mcaptrack.sources.ingest.labels.formats import Labels
 from mcaptrack.sources.ingest.labels.reading import read_homography, read_labels
 from mcaptrack.sources.ingest.labels.timeline import Timeline, count_frames
@@ -317,11 +317,15 @@ def test_a_table_is_no_longer_than_its_limit(tmp_path, monkeypatch):
         read_labels(written(path, "1 1 1 1\n2 1 1 1\n3 1 1 1\n"))
 
 
-def test_a_column_of_classes_has_256_names_at_most(tmp_path):
+def test_a_column_of_classes_has_a_limit_of_names(tmp_path, monkeypatch):
+    """Data sets have up to 21,841 classes; the limit is for files that have something else in this column."""
     rows = [f'{n} 1 1 2 2 {n} 0 0 0 "c{n % 256}"' for n in range(260)]
     path = written(tmp_path / "a.txt", "\n".join(rows))
     labels = read_labels(path, role="detections")
     assert sorted(labels.classes) == list(range(7, 263))
+    assert formats._MAX_NAMES >= 21_841
+    monkeypatch.setattr(formats, "_MAX_NAMES", 256)
+    assert len(read_labels(path, role="detections").classes) == 256
     with pytest.raises(McaptrackError, match=r":261: .*the column of classes has more than 256 names"):
         read_labels(written(path, "\n".join([*rows, '1 1 1 2 2 0 0 0 0 "another"'])), role="detections")
 

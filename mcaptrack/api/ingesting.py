@@ -223,8 +223,8 @@ def ingest(
         warn_unused("there is no label file", label_format=label_format != "auto" and not report.has_labels)
         warn_unused("there is no label file", columns=columns is not None and not report.has_labels)
         warn_unused("no label file is of a detector's format", size=size is not None and not report.uses_size)
-        has_tracks = bool({tracks, truth} - {None}) or (role in ("tracks", "truth") and report.has_labels)
-        warn_unused("there are no tracks and no ground truth", classes=classes is not None and not has_tracks)
+        is_unused = classes is not None and not report.uses_classes
+        warn_unused("there are no tracks and no ground truth", classes=is_unused)
         without_3d = not report.holds_boxes_3d
         warn_unused("there are no 3D boxes", frame_id=frame_id is not None and without_3d)
         warn_unused("there are no tables of nuScenes", scene=scene is not None and without_3d)

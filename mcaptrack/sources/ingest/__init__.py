@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from codecs import BOM_UTF16_BE, BOM_UTF16_LE
 from pathlib import Path
 from typing import Final
 
@@ -96,6 +97,7 @@ def ingest(
             job.write(writer, has_clock=bool(into and into.metadata(CLOCK)))
         job.check(output)
         job.report.warnings, job.report.has_labels = warned, job.has_labels
+        job.report.uses_classes = bool(job.roles - {"detections"})
         job.report.holds_boxes_3d = isinstance(job, Boxes3DJob)
         job.report.uses_size = any(labels.format in OTHERS for _, labels in job.labels.values())
         job.report.uses_camera = bool(job.has_labels or job.homography or job.options.motion) or isinstance(
@@ -125,4 +127,7 @@ def _is_binary(source: Path) -> bool:
     if source.suffix.lower() in IMAGE_SUFFIXES:
         raise McaptrackError(f"{source} is a single image; give the folder that the images lie in")
     with source.open("rb") as stream:
-        return b"\0" in stream.read(4096)
+        head = stream.read(4096)
+    if head.startswith((BOM_UTF16_LE, BOM_UTF16_BE)):
+        raise McaptrackError(f"{source} is text in UTF-16; save it as UTF-8, in which labels are read")
+    return b"\0" in head

@@ -5,7 +5,7 @@ Letters: N rows, F frames.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence, Set
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
@@ -64,9 +64,9 @@ class Boxes3DJob(IngestJob):
         self._timed = {role: self._at_times(role, rows) for role, rows in self.boxes.items()}
 
     @property
-    def has_labels(self) -> bool:
-        """Whether there are label files."""
-        return True
+    def roles(self) -> Set[Role]:
+        """The roles of label files."""
+        return self.boxes.keys()
 
     def _refuse_options(self, options: IngestOptions) -> None:
         given = {

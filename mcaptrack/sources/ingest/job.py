@@ -5,7 +5,7 @@ Letters: N rows.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Set
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field
 from fractions import Fraction
@@ -28,7 +28,7 @@ from mcaptrack.sources.ingest.labels.formats import Format, Labels, Role
 from mcaptrack.sources.ingest.labels.motions import motion_frames, read_motions
 from mcaptrack.sources.ingest.labels.reading import read_homography, read_labels
 from mcaptrack.sources.ingest.labels.timeline import Placed, Timeline
-from mcaptrack.sources.ingest.labels.wanted import ONLY_PEOPLE, WantedClasses
+from mcaptrack.sources.ingest.labels.wanted import ONLY_PEOPLE, WantedClasses, describe_classes
 from mcaptrack.sources.video import ImageFormat, VideoOptions
 
 Progress = Callable[[str, int, int], None]
@@ -103,7 +103,8 @@ class IngestReport:
     """The result of ``ingest``: messages by topic, ``remarks``, details (``notes``), and what was lost.
 
     ``warnings`` report what was assumed, left out or looks unusual. ``has_labels``: there were label files.
-    ``uses_size``: some of them are in a format of a detector, in which the size of pictures counts.
+    ``uses_classes``: some of them are tracks or ground truth, which are of chosen classes. ``uses_size``: some of them
+    are in a format of a detector, in which the size of pictures counts.
     ``uses_camera``: topics below the camera's name were written. ``holds_boxes_3d``: the labels are 3D boxes.
     """
 
@@ -113,6 +114,7 @@ class IngestReport:
     lost: list[str] = field(default_factory=list)
     warnings: list[Notice] = field(default_factory=list)
     has_labels: bool = False
+    uses_classes: bool = False
     uses_size: bool = False
     uses_camera: bool = False
     holds_boxes_3d: bool = False
@@ -156,7 +158,12 @@ class IngestJob:
     @property
     def has_labels(self) -> bool:
         """Whether there are label files."""
-        return bool(self.labels)
+        return bool(self.roles)
+
+    @property
+    def roles(self) -> Set[Role]:
+        """The roles of label files."""
+        return self.labels.keys()
 
     def fit_to_pictures(self, size: Callable[[], tuple[int, int]] | None) -> None:
         """Convert boxes in shares of the picture to pixels, and warn of boxes outside of it.
@@ -209,11 +216,7 @@ class IngestJob:
             if labels.step > 1:
                 words = f"{path} has labels every {labels.step} frames, from {labels.labelled[0]} on"
                 self.report.remarks.append(f"{words}; the frames in between are left out")
-            if len(set(labels.class_id.tolist())) > 1:
-                ids, counts = np.unique(labels.class_id, return_counts=True)
-                names = [f" {labels.classes[number]}" if number in labels.classes else "" for number in ids.tolist()]
-                found = zip(ids.tolist(), names, counts.tolist(), strict=True)
-                words = ", ".join(f"{number}{name} ({count})" for number, name, count in found)
+            if words := describe_classes(labels.class_id, labels.classes):
                 self.report.remarks.append(f"{path} has several classes; class_id is {words}")
 
     def __enter__(self) -> Self:

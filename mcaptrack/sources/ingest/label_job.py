@@ -97,11 +97,19 @@ class LabelJob(IngestJob):
         self._size = size
         self.ground = self.plane(*size) or self._measured_plane()
 
+    def _role_of(self, path: Path) -> Role:
+        """The role of a file: tracks if its rows have ids. Detections keep boxes that tracks leave out."""
+        try:
+            return "tracks" if self.read(path, "tracks").has_ids else "detections"
+        except McaptrackError:
+            if self.read(path, "detections").has_ids:
+                raise
+            return "detections"
+
     def _add(self, role: Role | None, path: Path) -> None:
-        labels = self.read(path, role or "tracks")
         if role is None:
-            role = "tracks" if labels.has_ids else "detections"
-            labels = labels if role == "tracks" else self.read(path, role)
+            role = self._role_of(path)
+        labels = self.read(path, role)
         if role in self.labels:
             raise McaptrackError(
                 f"{path} and {self.labels[role][0]} are both {role}; give the role of {path} with `role=`"

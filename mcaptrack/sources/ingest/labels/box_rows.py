@@ -17,7 +17,7 @@ import numpy as np
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.notices import Code
-from mcaptrack.schema.classes import PEOPLE, PERSON, UNKNOWN
+from mcaptrack.schema.classes import PERSON, UNKNOWN, is_person
 from mcaptrack.sources.ingest.labels.formats import (
     MAX_FRAME,
     MAX_PLACE,
@@ -188,8 +188,9 @@ class BoxRows:
             left.append(f"{int(lacks_id.sum())} boxes without a track id")
         kept = ~crowd & ~others & ~lacks_id
         if not kept.any():
-            what = "boxes" if role == "detections" or not wanted.is_people else "people"
-            raise McaptrackError(f"{self.path} holds no {what}, only {' and '.join(left)}")
+            is_people = role != "detections" and wanted.is_people
+            what, take = ("people", "; `classes=` takes others") if is_people else ("boxes", "")
+            raise McaptrackError(f"{self.path} holds no {what}, only {' and '.join(left)}{take}")
         return kept, " and ".join(left)
 
     def _doubt_scores(self) -> None:
@@ -256,7 +257,7 @@ def class_ids(rows: BoxRows) -> tuple[ClassIds, dict[int, str]]:
     places: dict[int, int] = {}
     classes: dict[int, str] = {}
     for one, name in sorted(rows.names.items()):
-        if name.strip().lower() in PEOPLE:
+        if is_person(name):
             place = PERSON
         elif one > PERSON:
             place = one

@@ -90,7 +90,8 @@ _KITTI_CLASSES: Final = {
 }
 _SDD_CLASSES: Final = {"pedestrian": PERSON, "biker": 2, "skater": 3, "cart": 4, "car": 5, "bus": 6}
 _KITTI_REGION: Final = "dontcare"
-_MAX_NAMES: Final = 256
+#: The number of class names of a column, at most: there are data sets with 21,841 classes.
+_MAX_NAMES: Final = 65_536
 
 
 @dataclass(frozen=True)
@@ -163,7 +164,7 @@ class ClassNames:
     def number(self, name: str) -> int:
         """The number of a name. Raises ValueError if there are too many names."""
         if name not in self._numbers and len(self._numbers) == _MAX_NAMES:
-            raise ValueError(f"the column of classes has more than {_MAX_NAMES} names")
+            raise ValueError(f"the column of classes has more than {_MAX_NAMES:,} names")
         return self._numbers.setdefault(name, len(self._numbers))
 
     def are(self, numbers: Floats, name: str) -> Bools:

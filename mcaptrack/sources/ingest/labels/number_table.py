@@ -44,7 +44,7 @@ def lines_of(path: Path, most: int = _MAX_LINE, has_comments: bool = False) -> L
                 if line.strip() and (has_comments or not line.lstrip().startswith("#")):
                     yield number, line
     except UnicodeDecodeError:
-        raise McaptrackError(f"{path} is not a text file, as labels and homographies are") from None
+        raise McaptrackError(f"{path} is not text in UTF-8, as labels and homographies are") from None
     except OSError as error:
         raise McaptrackError(f"{path} can't be read: {error.strerror}") from None
 

@@ -16,6 +16,7 @@ from mcaptrack.schema.classes import PERSON, is_person
 
 _ALL: Final = "all"
 _SHOWN: Final = 10
+_MAX_LISTED: Final = 20
 
 
 @dataclass(frozen=True)
@@ -58,3 +59,13 @@ class WantedClasses:
 
 #: The default: people alone.
 ONLY_PEOPLE: Final = WantedClasses()
+
+
+def describe_classes(class_id: NDArray[np.integer], names: Mapping[int, str]) -> str:
+    """List the classes of rows (N,), each with its name and the number of its rows; "" for one class."""
+    ids, counts = np.unique(class_id, return_counts=True)
+    if len(ids) < 2:
+        return ""
+    called = [f"{number} {names[number]}" if number in names else f"{number}" for number in ids.tolist()]
+    listed = [f"{name} ({count})" for name, count in zip(called, counts.tolist(), strict=True)][:_MAX_LISTED]
+    return ", ".join(listed) + (f" and {len(ids) - _MAX_LISTED} more" if len(ids) > _MAX_LISTED else "")
