@@ -153,7 +153,6 @@ COMMANDS: dict[str, dict[str, Any]] = {
         "point": "foot",
         "label_format": "auto",
         "camera": "camera",
-        "classes": "person",
     },
     "render": {"start_s": 0.0},
     "retrack": {"mode": "both"},
