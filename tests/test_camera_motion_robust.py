@@ -96,6 +96,25 @@ def test_a_train_through_half_of_the_picture_is_no_motion_of_the_camera(speed):
     assert all(one.from_previous is IDENTITY and one.verdict is Verdict.STILL for one in follow(pictures))
 
 
+def test_a_crowd_before_a_shaking_camera_does_not_make_it_drift():
+    """Forty people with more contrast than the place hide half of its features, each time others."""
+    rng = np.random.default_rng(6)
+    poses = [pose(*rng.normal(0, 1.0, 2)) for _ in range(50)]
+    start, speed = rng.uniform((-200, 0), (WIDTH + 200, HEIGHT - 60), (40, 2)), rng.uniform(-7, 7, 40)
+    looks, pictures = [scene(100 + n, 24, 64) for n in range(40)], []
+    for k, one in enumerate(poses):
+        image = picture(SCENE, one) // 3 + 80
+        for (x, y), fast, look in zip(start, speed, looks, strict=True):
+            left, top = round(x + fast * k), round(y)
+            shown = look[: HEIGHT - top, max(-left, 0) : max(WIDTH - left, 0)]
+            image[top : top + shown.shape[0], max(left, 0) : max(left, 0) + shown.shape[1]] = shown
+        grain = rng.normal(0, 4, image.shape)
+        pictures.append(np.clip(image + grain, 0, 255).astype(np.uint8))
+    found = follow(pictures)
+    off = [corner_error(one.to_reference, between(true, poses[0])) for one, true in zip(found, poses, strict=True)]
+    assert np.mean(off[-20:]) < 0.8
+
+
 def test_a_person_before_a_white_wall_tells_nothing_of_the_camera():
     wall, pictures = np.full((HEIGHT, WIDTH), 210, np.uint8), []
     for k in range(12):

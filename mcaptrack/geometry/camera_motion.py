@@ -29,7 +29,7 @@ _LEAST_OF_GOOD: Final = 0.01
 _LEAST_EIGENVALUE: Final = 1e-4
 # At least so many features have to agree on a transform, so large a share of them, over this share of the picture.
 _MIN_INLIERS: Final = 12
-_MIN_SHARE: Final = 0.4
+_MIN_SHARE: Final = 0.35
 _MIN_AREA: Final = 0.06
 # Flow is searched in windows of this size, on so many reduced copies of the picture: few where it is known about where,
 # more where it isn't.
@@ -45,8 +45,8 @@ _AT_REST_PX: Final = 0.25
 # so many against the others.
 _REST_SHARE: Final = 0.3
 _REST_RATIO: Final = 0.65
-# Another key picture is taken when fewer features than this share of all are found again, or when the camera has moved
-# by this share of the diagonal.
+# Another key picture is taken when fewer features agree than this share of the most that did with this one, or when the
+# camera has moved by this share of the diagonal. A crowd hides many features of any picture.
 _KEY_SHARE: Final = 0.5
 _KEY_SHIFT: Final = 0.12
 #: Key pictures that are kept, to be recognised after a cut.
@@ -110,6 +110,7 @@ class MotionEstimator:
         # Key pictures from before poses became guesses, how long that is ago, and how often guesses had to be accepted.
         self._sure: list[_Key] = []
         self._unsure, self.breaks = 0, 0
+        self._most = 0  # features that agreed with the last key picture
         self._is_sudden, self._has_view = False, False
         self._stance = Stance(1, 1)
 
@@ -161,7 +162,7 @@ class MotionEstimator:
         return CameraPose(IDENTITY, IDENTITY, self._count, 0.0, verdict)
 
     def _add_key(self, key: _Key) -> None:
-        self._keys = [*self._keys[1 - _KEYS_KEPT :], key]
+        self._keys, self._most = [*self._keys[1 - _KEYS_KEPT :], key], 0
 
     def _next(self, before: _Picture, picture: _Picture, hidden: Floats | None) -> CameraPose:
         key, last = self._keys[-1], self._last
@@ -171,8 +172,7 @@ class MotionEstimator:
         ):
             return self._posed(last.to_reference, 0)  # pictures without features show no motion
         fit = self._fit_sure(picture, hidden)
-        if fit is not None:
-            key = self._keys[-1]
+        key = self._keys[-1]
         there = compose(invert(last.to_reference), key.to_reference)
         for is_sudden in (self._is_sudden, not self._is_sudden) if fit is None else ():
             # Where the key picture's features should be now: as far on as from the picture before the last to the
@@ -191,10 +191,10 @@ class MotionEstimator:
         if fit is None:
             return self._unknown(before, picture, hidden)
         matrix, inliers = fit
-        self._has_view = True
+        self._has_view, self._most = True, max(self._most, inliers)
         pose = self._posed(compose(key.to_reference, invert(matrix)), inliers)
         is_far = shift_px(matrix, *self._size) > _KEY_SHIFT * np.hypot(*self._size)
-        if is_far or inliers < _KEY_SHARE * len(key.points):
+        if is_far or inliers < _KEY_SHARE * self._most:
             self._add_key(_Key(picture, *_features(picture.image, hidden), pose.to_reference, pose.reference))
         return pose
 
@@ -205,7 +205,7 @@ class MotionEstimator:
         self._unsure += 1
         fit = self._fit(self._sure[-1], picture, IDENTITY, hidden, _WIDE_LEVELS)
         if fit is not None:
-            self._keys, self._sure = self._sure, []
+            self._keys, self._sure, self._most = self._sure, [], 0
         elif self._unsure > _PATIENCE:
             self._sure = []
             self.breaks += 1
