@@ -60,7 +60,7 @@ def test_a_table_is_read_exactly_with_its_classes_and_frame(tmp_path):
     assert metadata["mcaptrack.frame_id"] == "map"
     assert "not read: points" in " ".join(result.notes)
     assert "frame 'map' (assumed)" in " ".join(one.message for one in result.warnings)
-    _, found, metadata = ingested(table(tmp_path), frame_id="odom", classes="car")
+    _, found, metadata = ingested(table(tmp_path), frame="odom", classes="car")
     assert metadata["mcaptrack.frame_id"] == "odom"
     assert found.rows["track_id"].tolist() == [7, 7]
     assert len(found.t_ns) == 2

@@ -4,16 +4,21 @@ from __future__ import annotations
 
 import json
 import math
+import re
 
 import motmetrics as mm
 import numpy as np
 import pytest
+from foxglove_schemas_protobuf.Log_pb2 import Log as LogMessage
+from mcap.writer import Writer
+from scipy.spatial.transform import Rotation
 
 import mcaptrack
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation import Candidate, EvaluateOptions, EvaluationInput, evaluate
 from mcaptrack.evaluation.by_class import of_class
-from mcaptrack.evaluation.events import EventOptions, find_events
+from mcaptrack.evaluation.event_text import PEOPLE, log_messages, nouns_of
+from mcaptrack.evaluation.events import EventOptions, default_rule, find_events
 from mcaptrack.evaluation.metrics import ScoredMatchup, average_over_recalls, metres_to_similarity
 from mcaptrack.evaluation.metrics.matchup import Matchup
 from mcaptrack.geometry.oriented_boxes import COLUMNS, bev_iou_of_pairs, columns_to_oriented_boxes, iou_3d_of_pairs
@@ -35,7 +40,7 @@ def frame(number: int, boxes: list, ids: list, classes: list, scores: list | Non
         score=np.full(len(ids), np.nan) if scores is None else np.array(scores, float),
         **columns,
     )
-    return Frame(ns(number / 10), number, rows)
+    return Frame(ns(100 + number / 10), number, rows)
 
 
 def drawn(seed: int, numbers: dict[int, int] = {1: 1, 2: 2, 3: 3}, scores: bool = True):  # noqa: B006
@@ -232,3 +237,109 @@ def test_a_log_of_3d_labels_is_evaluated_on_the_command_line(tmp_path):
     assert call("evaluate", log, "--gate-m", "2", "--fail-under", "amota=0.99").code == 4
     with pytest.raises(McaptrackError, match=r"have no boxes$"):
         mcaptrack.evaluate(log, similarity="iou")
+
+
+def test_events_name_the_classes_of_objects_where_not_all_are_people():
+    truth, tracks = drawn(8)
+    found = find_events(tracks, truth, EventOptions(), classes=(NAMES, NAMES))
+    assert found.rule == ("metres", 2.0)
+    of = {int(row["track_id"]): NAMES[int(row["class_id"])] for one in truth for row in one.rows}
+    of_tracks = {int(row["track_id"]): NAMES[int(row["class_id"])] for one in tracks for row in one.rows}
+
+    def said(nouns) -> str:
+        messages = log_messages(found.events, "/t", 0, found.frame_interval_s, nouns)
+        return "\n".join(LogMessage.FromString(data).message for *_, data in messages)
+
+    text = said(nouns_of(truth, tracks, (NAMES, NAMES)))
+    missed = re.findall(r"(\w+) (\d+) (?:is missed|and track|: track)", text)
+    false = re.findall(r"track (\d+) matches no (\w+)", text)
+    assert len(missed) > 5
+    assert len(false) >= 2
+    assert {(noun, of[int(number)]) for noun, number in missed} == {
+        ("car", "car"),
+        ("person", "pedestrian"),
+        ("truck", "truck"),
+    }
+    assert {(noun, of_tracks[int(number)]) for number, noun in false} <= {("car", "car"), ("person", "pedestrian")}
+    people = [of_class(side, 1) for side in (truth, tracks)]
+    assert nouns_of(*people, (NAMES, NAMES)) is PEOPLE
+    assert "car" not in said(PEOPLE)
+
+
+def test_the_default_gate_is_two_metres_for_boxes_in_space_and_one_for_positions():
+    truth, tracks = drawn(9)
+    assert default_rule(truth, tracks) == ("metres", 2.0)
+    flat = [one._replace(rows=one.rows.copy()) for one in truth]
+    for one in flat:
+        one.rows["length_m"] = np.nan
+    assert default_rule(flat, tracks) == ("metres", 1.0)
+    assert find_events(tracks, truth, EventOptions(gate_m=0.7)).rule == ("metres", 0.7)
+
+
+def transforms(path, poses: dict[int, tuple[Rotation, np.ndarray]]) -> None:
+    """A recording with the poses of "odom" in "map", as JSON."""
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start(library="theirs")
+        schema = writer.register_schema("foxglove.FrameTransform", "jsonschema", b"{}")
+        channel = writer.register_channel("/tf", "json", schema)
+        for t_ns, (turn, shift) in poses.items():
+            stamp = {"sec": t_ns // 10**9, "nsec": t_ns % 10**9}
+            x, y, z, w = turn.as_quat().tolist()
+            words = {"timestamp": stamp, "parent_frame_id": "map", "child_frame_id": "odom"}
+            words["translation"] = dict(zip("xyz", shift.tolist(), strict=True))
+            words["rotation"] = {"x": x, "y": y, "z": z, "w": w}
+            writer.add_message(channel, t_ns, json.dumps(words).encode(), t_ns)
+        writer.finish()
+
+
+def test_ground_truth_in_another_frame_is_brought_to_that_of_the_tracks(tmp_path):
+    truth, tracks = drawn(10)
+    log = tmp_path / "log.mcap"
+    rng = np.random.default_rng(1)
+    poses = {one.t_ns: (Rotation.from_euler("z", rng.uniform(-3, 3)), rng.uniform(-50, 50, 3)) for one in truth}
+    transforms(log, poses)
+    moved = []
+    for one in tracks:
+        rows, (turn, shift) = one.rows.copy(), poses[one.t_ns]
+        place = turn.inv().apply(np.stack([rows["x_m"], rows["y_m"], rows["z_m"]], axis=1) - shift)
+        rows["x_m"], rows["y_m"], rows["z_m"] = place.T
+        rows["heading_rad"] -= turn.as_euler("zyx")[0]
+        moved.append(one._replace(rows=rows))
+    for role, frames, frame_id in (("truth", truth, None), ("tracks", moved, "odom")):
+        (tmp_path / f"{role}.csv").write_text(lines(frames))
+        mcaptrack.ingest(tmp_path / f"{role}.csv", into=log, role=role, frame=frame_id)
+    wanted, _ = scored(truth, tracks, EvaluateOptions(("3d-iou",), min_iou=0.3))
+    found = mcaptrack.evaluate(log, similarity="3d-iou", min_iou=0.3)
+    for row in found.rows():
+        for name in ("MOTA", "LocA", "AMOTA"):
+            assert row[name] == pytest.approx(wanted["3d-iou", 0.3, row["class"]][name], abs=1e-9)
+    mcaptrack.ingest(tmp_path / "truth.csv", into=log, role="truth", frame="mars", force=True)
+    with pytest.raises(McaptrackError, match="is in the frame mars, tracks are in odom, and no transform between them"):
+        mcaptrack.evaluate(log)
+
+
+def test_files_of_3d_boxes_are_compared_by_their_times(tmp_path):
+    truth, tracks = drawn(11)
+    for role, frames in (("truth", truth), ("tracks", tracks)):
+        (tmp_path / f"{role}.csv").write_text(lines(frames))
+    found = mcaptrack.evaluate(tmp_path / "tracks.csv", truth=tmp_path / "truth.csv", gate_m=2.0)
+    wanted, _ = scored(truth, tracks, EvaluateOptions(("metres",), (2.0,)))
+    assert [row["class"] for row in found.rows()] == [None, "pedestrian", "car", "truck"]
+    for row in found.rows():
+        for name in ("MOTA", "IDF1", "AMOTA"):
+            assert row[name] == pytest.approx(wanted["metres", 2.0, row["class"]][name])
+
+
+def test_a_report_on_cars_does_not_call_them_people(tmp_path):
+    truth, tracks = drawn(12)
+    log = tmp_path / "log.mcap"
+    for role, frames in (("truth", truth), ("tracks", tracks)):
+        (tmp_path / f"{role}.csv").write_text(lines(frames))
+        target = {"into": log} if log.exists() else {"output": log}
+        mcaptrack.ingest(tmp_path / f"{role}.csv", role=role, **target)
+    text = mcaptrack.report(log, tmp_path / "page.html").page.read_text()
+    assert "Where objects moved" in text
+    assert "How objects move" in text
+    assert "Counted within 2 m on the ground" in text
+    assert re.search(r"Car \d: track \d became track \d", text)

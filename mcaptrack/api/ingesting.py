@@ -91,7 +91,7 @@ def ingest(
     columns: str | Mapping[str, str] | None = None,
     size: str | tuple[int, int] | None = None,
     classes: str | None = None,
-    frame_id: str | None = None,
+    frame: str | None = None,
     scene: str | None = None,
     role: InputRole | None = None,
     into: PathLike | None = None,
@@ -145,7 +145,7 @@ def ingest(
     classes : str, optional
         Classes of tracks and ground truth, by name or number with commas between them, or "all"; by default "person",
         and all of 3D boxes. Detections keep all.
-    frame_id : str, optional
+    frame : str, optional
         Frame of reference of 3D boxes; by default that of the format, or else the root of the log's transforms.
     scene : str, optional
         Name of the scene, if the labels are of nuScenes.
@@ -202,7 +202,7 @@ def ingest(
         columns=parse_columns(columns) if isinstance(columns, str) else check_keys(columns) if columns else None,
         size=parse_size(size),
         classes=None if classes is None else WantedClasses(classes),
-        frame_id=frame_id,
+        frame_id=frame,
         scene=scene,
     )
     with warnings_about(path) as warnings:
@@ -226,7 +226,7 @@ def ingest(
         is_unused = classes is not None and not report.uses_classes
         warn_unused("there are no tracks and no ground truth", classes=is_unused)
         without_3d = not report.holds_boxes_3d
-        warn_unused("there are no 3D boxes", frame_id=frame_id is not None and without_3d)
+        warn_unused("there are no 3D boxes", frame=frame is not None and without_3d)
         warn_unused("there are no tables of nuScenes", scene=scene is not None and without_3d)
         warn_unused("there is no ground plane", point=point != "foot" and ground_plane is None)
         keep = "the channels of a recording keep their names"

@@ -246,7 +246,7 @@ def evaluate(
     ----------
     tracks : path or sequence of paths
         Logs, which hold their ground truth; or, with ``truth``, files of tracks: MOTChallenge, KITTI tracking, Parquet,
-        and the label files that ``ingest`` reads.
+        and the label files that ``ingest`` reads. 3D boxes of files are compared by their times.
     truth : path or sequence of paths, optional
         Ground truth for files of tracks: one file for each, matched by name or in order.
     similarity : {"iou", "metres", "bev-iou", "3d-iou"}, optional
@@ -259,7 +259,7 @@ def evaluate(
     rules : {"trackeval", "motmetrics"}, default "trackeval"
         Rules for counting switches and fragments.
     topic : str or sequence of str, optional
-        Score these channels. By default tracks, samples, retracks and retracks/online.
+        Score these channels. By default tracks, samples, retracks and retracks/online, and retracks/full of 3D boxes.
     camera : str, optional
         Name of the camera, if a log has several.
     ground_plane : path, optional
@@ -364,5 +364,5 @@ def _from_files(
         both = compare_files(path, labels, fps, ground_plane, point, topics)
         for note in both.notes:
             notes.say(note)
-        sequences.append(sequence_of_files(name, path, both.ground_truth, both.tracks, len(pairs)))
+        sequences.append(sequence_of_files(name, path, both.ground_truth, both.tracks, len(pairs), both.classes))
     return sequences

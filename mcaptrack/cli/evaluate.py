@@ -67,7 +67,7 @@ def evaluate(
             "--topic",
             panel=common.SCORES,
             help="Score these channels.",
-            show_default="tracks, samples, retracks, retracks/online",
+            show_default="tracks, samples, retracks, retracks/online; of 3D boxes retracks/full, too",
         ),
     ] = None,
     camera: common.Camera = None,

@@ -148,7 +148,7 @@ def ingest(
             show_default="person; 3D boxes: all",
         ),
     ] = None,
-    frame_id: Annotated[
+    frame: Annotated[
         str | None,
         common.option(
             "--frame",
@@ -252,7 +252,7 @@ def ingest(
         "columns": columns,
         "size": size,
         "classes": classes,
-        "frame_id": frame_id,
+        "frame": frame,
         "scene": scene,
         "role": role,
         "into": into,

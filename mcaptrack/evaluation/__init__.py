@@ -24,12 +24,14 @@ from mcaptrack.evaluation.aligned import (
     RowComparison,
     Similarity,
     align,
+    are_3d,
     compare_rows,
     explain_no_match,
+    has_positions,
     refuse_sides_without,
     sides_without,
 )
-from mcaptrack.evaluation.averages import are_3d, averages, mean_of_classes, scored_matchups
+from mcaptrack.evaluation.averages import averages, mean_of_classes, scored_matchups
 from mcaptrack.evaluation.by_class import of_class, share_classes
 from mcaptrack.evaluation.forecasts import FORECAST_INPUTS, score_forecasts
 from mcaptrack.evaluation.metrics import Rules, Score, ScoredMatchup
@@ -45,6 +47,8 @@ COMBINED: Final = "COMBINED"
 DEFAULT_GATES_M: Final = (0.5, 1.0, 2.0)
 #: The channels of a camera that are scored, and the channels of forecasts made from them.
 SCORED: Final = ("tracks", "samples", "retracks/online", "retracks")
+#: One more channel of 3D boxes: re-tracked, at the rate of the boxes.
+FULL: Final = "retracks/full"
 FORECASTS: Final = tuple(FORECAST_INPUTS)
 
 
@@ -103,7 +107,8 @@ class EvaluationRow:
 
     ``of_class`` is the class that is scored, None for all together. Counts of all together are the sums over classes;
     ``class_means`` are then the means of rates over classes, as TrackEval gives them ("class averaged"). ``averages``
-    are scores averaged over recalls (AMOTA), of 3D tracks with scores; ``scored`` are the matchups that they are from.
+    are scores averaged over recalls (AMOTA), of 3D tracks (``is_3d``) with scores; ``scored`` are the matchups that
+    they are from.
     """
 
     sequence: str
@@ -117,6 +122,7 @@ class EvaluationRow:
     group: str = ""
     of_class: str | None = None
     class_means: Mapping[str, float] | None = None
+    is_3d: bool = False
     scored: tuple[ScoredMatchup, ...] = field(default=(), repr=False)
     averages: Mapping[str, float] = field(default_factory=dict)
 
@@ -156,7 +162,8 @@ def ground_truth_of_log(opened: log.Log, prefix: str) -> list[Frame]:
 def sequence_of_log(opened: log.Log, prefix: str, topics: Sequence[str]) -> EvaluationInput:
     """The ground truth of a camera and its tracks, at the video rate and at the prediction rate."""
     ground_truth = ground_truth_of_log(opened, prefix)
-    usual = [f"{prefix}/{name}" for name in SCORED]
+    names_of_usual = (*SCORED, FULL) if has_positions(ground_truth, "bev-iou") else SCORED
+    usual = [f"{prefix}/{name}" for name in names_of_usual]
     chosen = list(topics) or [topic for topic in usual if topic in opened.channels]
     if not chosen:
         raise McaptrackError(f"{opened.path} has no tracks to score; {call('run', opened.path)} makes them")
@@ -251,6 +258,7 @@ def combined(results: Sequence[EvaluationRow]) -> list[EvaluationRow]:
                 metrics.combine([member.score for member in members]),
                 combine_displacements(forecasts) if len(forecasts) == len(members) else None,
                 of_class=one_class,
+                is_3d=all(member.is_3d for member in members),
                 scored=tuple(scored),
             )
         )
@@ -266,7 +274,7 @@ def _score(
     ground_truth, tracks = shared.ground_truth, shared.tracks
     parts = {one: (of_class(ground_truth, number), of_class(tracks, number)) for number, one in shared.names.items()}
     wanted = options.similarities or ("iou", "metres")
-    has_averages = are_3d(ground_truth, tracks)
+    is_3d = are_3d(ground_truth, tracks)
     results = []
     for similarity in wanted:
         sides = {"the ground truth": ground_truth, candidate.name: tracks}
@@ -281,7 +289,7 @@ def _score(
             compared = compared or {None: compare_rows(ground_truth, tracks, similarity, gate)}
             scores = {one: metrics.score(part.matchup, options.rules) for one, part in compared.items()}
             whole = scores.pop(None, None) or metrics.combine(list(scores.values()))
-            is_averaged = has_averages and gate == max(gates)
+            is_averaged = is_3d and gate == max(gates)
             scored = {one: scored_matchups(part) for one, part in compared.items()} if is_averaged else {}
             if gate == gates[-1] and whole.hota["HOTA_TP"][0] == 0:
                 notes += explain_no_match(sequence.name, candidate.name, ground_truth, tracks, similarity)
@@ -296,11 +304,12 @@ def _score(
                     score,
                     group=candidate.group,
                     of_class=one,
+                    is_3d=is_3d,
                     scored=scored.get(one, ()),
                 )
                 for one, score in ((None, whole), *scores.items())
             ]
-    if has_averages and results and not any(one.averages or one.scored for one in results):
+    if is_3d and results and not any(one.averages or one.scored for one in results):
         notes.append(f"{sequence.name}: {candidate.name} has no scores; there is no AMOTA and no sAMOTA")
     if not results:
         notes.append(

@@ -27,6 +27,8 @@ Similarity = Literal["iou", "metres", "bev-iou", "3d-iou"]
 #: The default gates: least overlap of boxes, and largest distance on the ground.
 IOU_THRESHOLD: Final = 0.5
 GATE_M: Final = 1.0
+#: The default distance for 3D boxes, as nuScenes has it.
+GATE_3D_M: Final = 2.0
 #: The ground truth is interpolated over gaps of at most this length.
 MAX_GAP_S: Final = 2.0
 #: Sizes that differ by more than this factor, without a single match, are taken to be in different units.
@@ -111,6 +113,11 @@ def refuse_sides_without(name: str, sides: Mapping[str, Sequence[Frame]], simila
     if missing := sides_without(sides, similarity):
         has = "have" if len(missing) > 1 else "has"
         raise McaptrackError(f"{name}{' and '.join(missing)} {has} no {_UNITS[similarity]}")
+
+
+def are_3d(ground_truth: Sequence[Frame], tracks: Sequence[Frame]) -> bool:
+    """Whether both have boxes in metres, so that scores of 3D tracking are usual for them."""
+    return all(has_positions(frames, "bev-iou") for frames in (ground_truth, tracks))
 
 
 def explain_no_match(

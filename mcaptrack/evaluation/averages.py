@@ -10,19 +10,13 @@ from typing import Final
 
 import numpy as np
 
-from mcaptrack.evaluation.aligned import LocatedRows, RowComparison, Similarity, has_positions
+from mcaptrack.evaluation.aligned import LocatedRows, RowComparison, Similarity
 from mcaptrack.evaluation.metrics import Rules, ScoredMatchup, average_over_recalls
 from mcaptrack.geometry.arrays import Floats
-from mcaptrack.schema import Frame
 
 #: The similarity of a recall that is not reached: a distance at the gate, no overlap.
 _WORST: Final[dict[Similarity, float]] = {"metres": 0.5}
 _AMOTP: Final = "AMOTP"
-
-
-def are_3d(ground_truth: Sequence[Frame], tracks: Sequence[Frame]) -> bool:
-    """Whether both have boxes in metres, so that scores of 3D tracking are usual for them."""
-    return all(has_positions(frames, "bev-iou") for frames in (ground_truth, tracks))
 
 
 def scored_matchups(compared: RowComparison) -> tuple[ScoredMatchup, ...]:

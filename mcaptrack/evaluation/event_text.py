@@ -6,13 +6,17 @@ each other. Events shorter than a second have the level DEBUG.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from math import isnan
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, NamedTuple
+
+import numpy as np
 
 from mcaptrack import foxglove
 from mcaptrack.geometry.clocks import NS_PER_S
-from mcaptrack.schema import EventKind, Frame
+from mcaptrack.schema import TRACKS, EventKind, Frame
+from mcaptrack.schema.classes import UNKNOWN, class_name, is_person, majority
+from mcaptrack.schema.framing import join_frames
 
 Level = Literal["DEBUG", "INFO", "WARNING", "ERROR"]
 
@@ -28,17 +32,56 @@ _LEVELS: Final[dict[EventKind, Level]] = {
     EventKind.PARTED: "WARNING",
 }
 _BRIEF_S: Final = 1.0
+_PERSON, _OBJECT = "person", "object"
+
+
+class Nouns(NamedTuple):
+    """Nouns for objects of the ground truth and for tracks, by id; ``usual`` is that of all others."""
+
+    ground_truth: Mapping[int, str] = {}
+    tracks: Mapping[int, str] = {}
+    usual: str = _PERSON
+
+
+#: The nouns where all objects are people.
+PEOPLE: Final = Nouns()
+
+
+def nouns_of(
+    ground_truth: Sequence[Frame], tracks: Sequence[Frame], classes: tuple[Mapping[int, str], Mapping[int, str]]
+) -> Nouns:
+    """The nouns for objects: names of their classes, where any is no person. ``classes`` as in `find_events`."""
+    sides = [_class_names(frames, names) for frames, names in zip((ground_truth, tracks), classes, strict=True)]
+    found = {name for side in sides for name in side.values()}
+    if found <= {_PERSON, _OBJECT}:
+        return PEOPLE
+    return Nouns(sides[0], sides[1], _OBJECT)
+
+
+def _class_names(frames: Sequence[Frame], names: Mapping[int, str]) -> dict[int, str]:
+    """The name of the class of each id."""
+    joined = join_frames(TRACKS, frames)
+    ids, which = np.unique(joined.rows["track_id"], return_inverse=True)
+    numbers = majority(which, joined.rows["class_id"], len(ids))
+    nouns = {one: _noun(one, names) for one in np.unique(numbers).tolist()}
+    return {track: nouns[number] for track, number in zip(ids.tolist(), numbers.tolist(), strict=True)}
+
+
+def _noun(number: int, names: Mapping[int, str]) -> str:
+    name = class_name(number, names)
+    return _PERSON if is_person(name) else _OBJECT if number == UNKNOWN and number not in names else name
 
 
 def log_messages(
-    events: Sequence[Frame], tracks_topic: str, start_ns: int, frame_interval_s: float
+    events: Sequence[Frame], tracks_topic: str, start_ns: int, frame_interval_s: float, nouns: Nouns = PEOPLE
 ) -> Iterator[tuple[int, int, bytes]]:
     """foxglove.Log messages (time, frame, payload) of all events.
 
-    Times in the text count from ``start_ns``; ``frame_interval_s`` is the usual time between two compared frames.
+    Times in the text count from ``start_ns``; ``frame_interval_s`` is the usual time between two compared frames;
+    ``nouns`` are those for objects.
     """
     all_events = [(frame.t_ns, row) for frame in events for row in frame.rows]
-    groups = _EventGroups(all_events)
+    groups = _EventGroups(all_events, nouns)
     for frame in events:
         for row in frame.rows:
             where = f"at {(frame.t_ns - start_ns) / NS_PER_S:.2f} s{_place(row)}"
@@ -51,7 +94,8 @@ def log_messages(
 class _EventGroups:
     """Finds rows of events that describe the same thing."""
 
-    def __init__(self, all_events: Sequence[tuple[int, Any]]) -> None:
+    def __init__(self, all_events: Sequence[tuple[int, Any]], nouns: Nouns) -> None:
+        self._nouns = nouns
         of_kind: dict[int, list[tuple[int, Any]]] = {kind: [] for kind in EventKind}
         for t_ns, row in all_events:
             of_kind[int(row["kind"])].append((t_ns, row))
@@ -86,17 +130,19 @@ class _EventGroups:
                 return None
             if life_s < _BRIEF_S:
                 return "DEBUG", f"track {track} exists for {_seconds(life_s)} {where}"
-        text, lasts = describe(row, where, frame_interval_s), float(row["duration_s"])
+        text, lasts = describe(row, where, frame_interval_s, self._nouns), float(row["duration_s"])
         if kind is EventKind.FALSE_TRACK:
             if (t_ns, before, track) in self._apart_s:
                 return None
             if is_unmatched:
-                text = f"track {track} matches no person while it exists, {_span(row, frame_interval_s)} {where}"
+                noun = self._nouns.tracks.get(track, self._nouns.usual)
+                text = f"track {track} matches no {noun} while it exists, {_span(row, frame_interval_s)} {where}"
         elif kind is EventKind.MISS:
             person = int(row["truth_id"])
             track_s = self._apart_s.get((t_ns, person, before))
             if track_s is not None:
-                text = f"person {person} and track {before} are apart {_span(row, frame_interval_s)} {where}"
+                noun = self._nouns.ground_truth.get(person, self._nouns.usual)
+                text = f"{noun} {person} and track {before} are apart {_span(row, frame_interval_s)} {where}"
                 lasts = max(lasts, track_s)
         elif kind is EventKind.JOINED:
             source = int(row["source_id"])
@@ -109,10 +155,11 @@ class _EventGroups:
         return "DEBUG" if is_brief else _LEVELS[kind], text
 
 
-def describe(event: Any, where: str, frame_interval_s: float) -> str:
+def describe(event: Any, where: str, frame_interval_s: float, nouns: Nouns = PEOPLE) -> str:
     """One row of events as text; ``frame_interval_s`` is the usual time between two frames."""
     track, before = f"track {event['track_id']}", int(event["previous_id"])
-    person, source = f"person {event['truth_id']}", int(event["source_id"])
+    truth_id, source = int(event["truth_id"]), int(event["source_id"])
+    person = f"{nouns.ground_truth.get(truth_id, nouns.usual)} {truth_id}"
     lasts = float(event["duration_s"])
     match EventKind(int(event["kind"])):
         case EventKind.BIRTH:
@@ -125,8 +172,9 @@ def describe(event: Any, where: str, frame_interval_s: float) -> str:
             had = f", last tracked as {before}" if before >= 0 else ""
             return f"{person} is missed {_span(event, frame_interval_s)} {where}{had}"
         case EventKind.FALSE_TRACK:
-            was = f", before it was person {before}" if before >= 0 else ""
-            return f"{track} matches no person {_span(event, frame_interval_s)} {where}{was}"
+            was = f", before it was {nouns.ground_truth.get(before, nouns.usual)} {before}" if before >= 0 else ""
+            noun = nouns.tracks.get(int(event["track_id"]), nouns.usual)
+            return f"{track} matches no {noun} {_span(event, frame_interval_s)} {where}{was}"
         case EventKind.JOINED:
             return f"{track} joins the tracker's {before} and {source} {where}{_unseen(lasts)}"
         case EventKind.PARTED:

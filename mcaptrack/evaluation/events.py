@@ -16,12 +16,14 @@ import numpy as np
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation.aligned import (
+    GATE_3D_M,
     GATE_M,
     IOU_THRESHOLD,
     LocatedRows,
     RowComparison,
     Similarity,
     align,
+    are_3d,
     compare_rows,
     explain_no_match,
     has_positions,
@@ -58,10 +60,11 @@ class EventOptions:
     gate_m: float | None = None
     min_iou: float | None = None
 
-    def rule(self, similarity: Similarity) -> MatchRule:
-        """The rule for a similarity, with the gate of these options."""
-        gate, interval = (self.gate_m, GATE_M) if similarity == "metres" else (self.min_iou, IOU_THRESHOLD)
-        return MatchRule(similarity, interval if gate is None else gate)
+    def rule(self, similarity: Similarity, is_3d: bool = False) -> MatchRule:
+        """The rule for a similarity, with the gate of these options, or the default one; 3D boxes have another."""
+        usual_m = GATE_3D_M if is_3d else GATE_M
+        gate, usual = (self.gate_m, usual_m) if similarity == "metres" else (self.min_iou, IOU_THRESHOLD)
+        return MatchRule(similarity, usual if gate is None else gate)
 
 
 class MatchRule(NamedTuple):
@@ -165,7 +168,7 @@ def default_rule(ground_truth: Sequence[Frame], tracks: Sequence[Frame]) -> Matc
         ("iou", "metres") if at_video_rate and has_positions(ground_truth, "iou") else ("metres", "iou")
     )
     chosen = next((one for one in first if one in shared), None)
-    return EventOptions().rule(chosen) if chosen else None
+    return EventOptions().rule(chosen, are_3d(ground_truth, tracks)) if chosen else None
 
 
 def _compared(
@@ -183,7 +186,7 @@ def _compared(
     similarity = options.similarity or (interval.similarity if interval else None)
     if similarity is None:
         raise McaptrackError(f"{names[1]} and the ground truth share neither boxes nor positions in metres")
-    rule = options.rule(similarity)
+    rule = options.rule(similarity, are_3d(ground_truth, tracks))
     refuse_sides_without("", {"the ground truth": ground_truth, names[1]: tracks}, similarity)
     at_same = align(*names, ground_truth, tracks)
     shared = share_classes(*names, *at_same, *classes)

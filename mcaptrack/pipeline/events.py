@@ -19,7 +19,7 @@ import numpy as np
 from mcaptrack import foxglove, log
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.evaluation.aligned import Similarity
-from mcaptrack.evaluation.event_text import SUFFIX, log_messages
+from mcaptrack.evaluation.event_text import SUFFIX, log_messages, nouns_of
 from mcaptrack.evaluation.events import EventOptions, find_events
 from mcaptrack.evaluation.forecasts import FORECAST_INPUTS, find_forecast_errors
 from mcaptrack.notices import warn
@@ -107,7 +107,8 @@ def make_events(opened: log.Log, prefix: str, made: Mapping[str, Made], watch: W
         parameters = found.parameters(options)
         provenance = Provenance(STAGE, parameters, topic, tracks_digest, references=truth().digests)
         out[topic + _EVENTS] = events = Made.of(EVENTS, found.events, provenance)
-        text = list(log_messages(found.events, topic, opened.start_ns, found.frame_interval_s))
+        nouns = nouns_of(truth().frames or (), frames, classes)
+        text = list(log_messages(found.events, topic, opened.start_ns, found.frame_interval_s, nouns))
         view = Provenance(VIEW, {}, topic + _EVENTS, events.provenance.digest)
         out[topic + _EVENTS + SUFFIX] = Made(EVENTS, [], view, text, foxglove.schema_record(foxglove.LOG))
         out[topic + _COUNTS] = Made.of(COUNTS, found.counts, provenance)

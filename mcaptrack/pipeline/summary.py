@@ -11,6 +11,7 @@ import numpy as np
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation import Candidate, EvaluateOptions, EvaluationInput, evaluate
+from mcaptrack.evaluation.aligned import GATE_3D_M, GATE_M, are_3d
 from mcaptrack.geometry.plane import origin_of
 from mcaptrack.notices import warn
 from mcaptrack.pipeline.planes import fit_of, read_planes
@@ -22,8 +23,7 @@ from mcaptrack.sources.camera_motion import motion_topic, read_ground_truth
 from mcaptrack.sources.cameras import camera_at, provenance_of
 from mcaptrack.transforms import STAGES
 
-#: Maximum distance in metres, and minimum IoU of boxes, at which a track matches the ground truth, as in the demo.
-_GATE_M = 1.0
+#: Minimum IoU of boxes at which a track matches the ground truth, as in the demo.
 _MIN_IOU = 0.5
 
 
@@ -144,8 +144,10 @@ def _scores(opened: log.Log, prefix: str, truth: str, topics: tuple[str, str]) -
     names = {topic: class_names(opened.channel(topic).metadata) for topic in (truth, *topics)}
     candidates = [Candidate(topic, None, opened.frames(topic, TRACKS), classes=names[topic]) for topic in topics]
     sequence = EvaluationInput(opened.path.stem, read_ground_truth(opened, prefix), candidates, names[truth])
+    is_3d = all(are_3d(sequence.ground_truth, one.frames) for one in candidates)
+    gate_m = GATE_3D_M if is_3d else GATE_M
     rules = {
-        f"within {_GATE_M:g} m": EvaluateOptions(similarities=("metres",), gates_m=(_GATE_M,)),
+        f"within {gate_m:g} m": EvaluateOptions(similarities=("metres",), gates_m=(gate_m,)),
         f"by an overlap of {_MIN_IOU:g}": EvaluateOptions(similarities=("iou",), min_iou=_MIN_IOU),
     }
     for by, options in rules.items():

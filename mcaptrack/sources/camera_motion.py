@@ -16,8 +16,9 @@ from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, GROUND_PLANE, TRACKS, Fr
 from mcaptrack.schema.camera_motion import frames_to_path
 from mcaptrack.schema.framing import join_frames, split_rows
 from mcaptrack.schema.ground_plane import rows_to_plane
-from mcaptrack.schema.provenance import Provenance
-from mcaptrack.sources.cameras import camera_at, lineage
+from mcaptrack.schema.provenance import Provenance, frame_id_of
+from mcaptrack.sources.cameras import camera_at, lineage, provenance_of
+from mcaptrack.sources.moved_tracks import in_frame
 from mcaptrack.transforms import STAGES
 from mcaptrack.transforms.sort.tracker import used_path
 
@@ -74,10 +75,15 @@ def read_ground_truth(
     """Return the ground truth of a camera, with positions in metres where its pictures show them.
 
     Labels got their positions from their boxes and the ground plane of the log. Where tracks are compensated for the
-    motion of the camera, so are these, because the plane holds for one picture. Parameters are those of ``path_of``.
+    motion of the camera, so are these, because the plane holds for one picture. Where tracks are in another frame of
+    reference, labels are brought to it. Parameters are those of ``path_of``.
     """
     camera = camera_at(opened, prefix)
     truth = opened.frames(camera.truth, TRACKS)
+    made = provenances.get(tracks_topic(prefix)) or provenance_of(opened, tracks_topic(prefix))
+    fixed, own = made.frame_id if made else "", frame_id_of(opened.channel(camera.truth).metadata)
+    if fixed and own:
+        return in_frame(opened, camera.truth, truth, fixed, own)
     path, _ = path_of(opened, prefix, tracks_topic(prefix), provenances, frames)
     if path is None or camera.ground_plane not in opened.channels:
         return truth

@@ -7,7 +7,7 @@ Letters: N boxes of the ground truth, K boxes of the tracks in one frame.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
@@ -28,8 +28,10 @@ from mcaptrack.schema.classes import PERSON
 from mcaptrack.schema.framing import split_rows
 from mcaptrack.sources import ingest
 from mcaptrack.sources.ingest.bags.opening import is_mcap
+from mcaptrack.sources.ingest.boxes_3d_job import FRAME, Boxes3DJob
 from mcaptrack.sources.ingest.job import IngestOptions, label_rows
 from mcaptrack.sources.ingest.label_job import LabelJob
+from mcaptrack.sources.ingest.labels.boxes_3d.reading import is_3d
 from mcaptrack.sources.ingest.labels.formats import KITTI_HEIGHT_PX, IgnoredBoxes, Labels, Role
 from mcaptrack.sources.ingest.labels.reading import read_homography, read_labels
 
@@ -43,11 +45,15 @@ _EPS: Final = float(np.finfo(float).eps)
 
 @dataclass
 class AlignedFiles:
-    """Ground truth and tracks as frames at the same times, and notes for people."""
+    """Ground truth and tracks as frames at the same times, and notes for people.
+
+    ``classes`` are the names of the classes of the ground truth and of the tracks.
+    """
 
     ground_truth: list[Frame]
     tracks: list[Frame]
     notes: list[str] = field(default_factory=list)
+    classes: tuple[Mapping[int, str], Mapping[int, str]] = ({}, {})
 
 
 def pair_files(tracks: Sequence[Path], ground_truths: Sequence[Path]) -> tuple[list[tuple[str, Path, Path]], str]:
@@ -98,6 +104,12 @@ def compare_files(
     topics: Sequence[str] = (),
 ) -> AlignedFiles:
     """Tracks and ground truth as frames. Raises McaptrackError if they can't be read or compared."""
+    have_3d = [is_3d(path) for path in (tracks, ground_truth)]
+    if all(have_3d):
+        return _boxes_3d(tracks, ground_truth, fps, ground_plane)
+    if any(have_3d):
+        words = f"{tracks if have_3d[0] else ground_truth} holds 3D boxes, and {tracks if have_3d[1] else ground_truth}"
+        raise McaptrackError(f"{words} does not; they can't be compared")
     both: dict[Role, tuple[Path, Labels]] = {
         "truth": (ground_truth, _read(ground_truth, "truth", topics)),
         "tracks": (tracks, _read(tracks, "tracks", topics)),
@@ -112,6 +124,15 @@ def compare_files(
     if fps is not None:
         notes.append("frames are compared by their numbers, whatever the frames per second")
     return _by_number(both, ground_plane, point, notes)
+
+
+def _boxes_3d(tracks: Path, ground_truth: Path, fps: Fraction | None, ground_plane: Path | None) -> AlignedFiles:
+    """3D boxes of two files, taken as being in one frame of reference."""
+    options = IngestOptions(fps=fps, ground_plane=ground_plane, frame_id=FRAME)
+    with Boxes3DJob([("tracks", tracks), ("truth", ground_truth)], options) as job:
+        job.report_assumptions()
+        classes = (job.classes("truth"), job.classes("tracks"))
+        return AlignedFiles(job.all_frames("truth"), job.all_frames("tracks"), job.report.remarks, classes)
 
 
 @dataclass

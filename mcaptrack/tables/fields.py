@@ -164,7 +164,11 @@ _METRICS: Final = Table(
         Field("topic", _NAME, "the tracks that are scored"),
         Field("truth", _NAME, "the channel that they are scored against"),
         Field("mode", _TEXT, "online or offline for re-tracked tracks; null for others", nullable=True),
-        Field("similarity", _TEXT, "iou: overlap of boxes; metres: distance on the ground"),
+        Field(
+            "similarity",
+            _TEXT,
+            "iou: overlap of boxes; metres: distance on the ground; bev-iou, 3d-iou: overlap of 3D boxes",
+        ),
         Field("gate", _FLOAT, "least overlap, or largest distance in metres, of a match"),
         Field("rules", _TEXT, "rules for identity switches and fragmentations"),
         Field("MOTA", _FLOAT, "CLEAR: 1 less misses, false positives and switches by rows of the ground truth"),
@@ -197,6 +201,10 @@ _METRICS: Final = Table(
         Field("class_mean_MOTA", _FLOAT, "of all together: mean of MOTA over classes", nullable=True),
         Field("class_mean_IDF1", _FLOAT, "of all together: mean of IDF1 over classes", nullable=True),
         Field("class_mean_HOTA", _FLOAT, "of all together: mean of HOTA over classes", nullable=True),
+        Field("AMOTA", _FLOAT, "3D tracks: MOTA averaged over recalls, as nuScenes has it", nullable=True),
+        Field("AMOTP_m", _FLOAT, "3D tracks: distance of matches averaged over recalls, as nuScenes has it", "m", True),
+        Field("sAMOTA", _FLOAT, "3D tracks: scaled MOTA averaged over recalls, as AB3DMOT has it", nullable=True),
+        Field("AMOTA_unscaled", _FLOAT, "3D tracks: MOTA averaged over recalls, as AB3DMOT has it", nullable=True),
     ),
 )
 

@@ -87,7 +87,7 @@ class Boxes3DJob(IngestJob):
         root = root_frame(self.into) if self.into else ""
         found = rows.frame_id or root or FRAME
         reason = "by its format" if rows.frame_id else "the root of the log's transforms" if root else "assumed"
-        words = f"{rows.path}: boxes are taken as those of the frame {found!r} ({reason}); `frame_id=` names another"
+        words = f"{rows.path}: boxes are taken as those of the frame {found!r} ({reason}); `frame=` names another"
         if reason == "assumed":
             rows.doubts.append((words, "other"))
         else:
@@ -197,6 +197,10 @@ class Boxes3DJob(IngestJob):
             "fps": None if options.fps is None else str(options.fps),
         }
         return {name: value for name, value in given.items() if value is not None}
+
+    def classes(self, role: Role) -> Mapping[int, str]:
+        """The names of the classes of a role by class id."""
+        return self._timed[role].classes
 
     def all_frames(self, role: Role) -> list[Frame]:
         """The boxes of a role as frames, at all times that the file describes."""

@@ -171,7 +171,7 @@ class LogTables:
         return [camera for camera in cameras(self.opened) if camera.truth in tracks]
 
     def _scored(self, camera: Camera) -> list[str]:
-        names = (*evaluation.SCORED, *evaluation.FORECASTS)
+        names = (*evaluation.SCORED, evaluation.FULL, *evaluation.FORECASTS)
         known = [camera.truth, *(f"{camera.prefix}/{name}" for name in names)]
         return [topic for topic in known if topic in self.opened.channels]
 

@@ -65,6 +65,7 @@ def draw(report: LogReport, at: int, total: int) -> None:
         motion=sections.motion(report),
         lineage=lineage.provenance(report),
         notes=report.notes,
+        people=report.has_only_people,
     )
     report.background, report.sequence, report.highlights = None, None, []
     for one in report.track_sets.values():

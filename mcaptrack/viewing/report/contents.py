@@ -13,6 +13,7 @@ from mcaptrack import log, pipeline
 from mcaptrack.errors import DamagedError, McaptrackError, command
 from mcaptrack.evaluation import EvaluateOptions, EvaluationInput, EvaluationRow, evaluate, sequence_of_log
 from mcaptrack.evaluation.aligned import Similarity, has_positions, resample_frames
+from mcaptrack.evaluation.event_text import PEOPLE, nouns_of
 from mcaptrack.evaluation.events import EventOptions, MatchRule, find_events
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.plane import Planes, is_estimated, origin_of, plane_at
@@ -82,6 +83,7 @@ class LogReport:
     missing: dict[str, str] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     html: str = ""
+    has_only_people: bool = True
 
     @property
     def start_s(self) -> float:
@@ -152,8 +154,18 @@ def _read(opened: log.Log, out: LogReport) -> None:
         if there.schema_name != TRACKS.name or there.message_encoding != "protobuf":
             out.notes.append(f"{topic} holds {there.schema_name or 'no schema'}, not tracks; it is left out")
             continue
-        frames = read_ground_truth(opened, out.prefix) if role == "truth" else opened.frames(topic, TRACKS)
+        try:
+            frames = read_ground_truth(opened, out.prefix) if role == "truth" else opened.frames(topic, TRACKS)
+        except DamagedError:
+            raise
+        except McaptrackError as error:
+            out.notes.append(_without_path(error, opened))
+            continue
         out.track_sets[role] = TrackSet(topic, role, names[role], frames)
+    out.has_only_people = all(
+        nouns_of(one.frames, (), (class_names(opened.channel(one.topic).metadata), {})) is PEOPLE
+        for one in out.track_sets.values()
+    )
     try:
         out.planes = pipeline.read_planes(opened, out.prefix) or ()
     except DamagedError:
@@ -190,14 +202,16 @@ def _find_events(opened: log.Log, out: LogReport) -> None:
         if tracks is None or not any(len(frame.rows) for frame in tracks.frames):
             continue
         known = _recorded(opened, tracks.topic + "/events")
+        truth = out.track_sets["truth"].topic if ground_truth is not None else tracks.topic
+        classes = (class_names(opened.channel(truth).metadata), class_names(opened.channel(tracks.topic).metadata))
         if known is None:
-            truth = out.track_sets["truth"].topic if ground_truth is not None else tracks.topic
-            classes = (class_names(opened.channel(truth).metadata), class_names(opened.channel(tracks.topic).metadata))
             found = find_events(tracks.frames, ground_truth, EventOptions(), out.name, tracks.topic, classes)
             known = found.events, found.rule
         events, rule = known
         out.channel_events.append(
-            summarize_events(tracks.topic, events, rule, tracks.frames, ground_truth, (out.start_ns, out.end_ns))
+            summarize_events(
+                tracks.topic, events, rule, tracks.frames, ground_truth, (out.start_ns, out.end_ns), classes
+            )
         )
     out.highlights = most_important(out.channel_events, _THUMBNAILS)
 

@@ -5,14 +5,14 @@ Letters: R events.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaptrack.evaluation.event_text import describe
+from mcaptrack.evaluation.event_text import describe, nouns_of
 from mcaptrack.evaluation.events import MatchRule
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
@@ -103,16 +103,18 @@ def summarize_events(
     tracks: Sequence[Frame],
     ground_truth: Sequence[Frame] | None,
     span_ns: tuple[int, int],
+    classes: tuple[Mapping[int, str], Mapping[int, str]] = ({}, {}),
 ) -> ChannelEvents:
-    """Collect the events of a channel of tracks."""
+    """Collect the events of a channel of tracks. ``classes`` are names of those of the ground truth and of tracks."""
     start_ns, end_ns = span_ns
+    nouns = nouns_of(ground_truth or (), tracks, classes)
     all_rows = [(frame.t_ns, row) for frame in events for row in frame.rows]
     t_ns = np.array([at for at, _ in all_rows], np.int64)
     kind = np.array([int(row["kind"]) for _, row in all_rows], np.int64)
     kinds = (EventKind.SWITCH,) if rule else (EventKind.JOINED, EventKind.PARTED)
     interval = frame_interval_s(tracks)
     chosen = [
-        IdentityEvent(at, row, 0.0, describe(row, f"at {(at - start_ns) / NS_PER_S:.1f} s", interval))
+        IdentityEvent(at, row, 0.0, describe(row, f"at {(at - start_ns) / NS_PER_S:.1f} s", interval, nouns))
         for at, row in all_rows
         if int(row["kind"]) in kinds
     ]

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from mcaptrack.errors import command
 from mcaptrack.evaluation import EvaluationRow, combined, set_means
+from mcaptrack.evaluation.aligned import GATE_3D_M, GATE_M
 from mcaptrack.evaluation.metrics import summary
 from mcaptrack.viewing.report.contents import LogReport, result_of
 from mcaptrack.viewing.report.formatting import counted, number, percent, times
 
 #: The rules of the summary; the first by which tracks can be scored.
-_RULES = (("metres", 1.0), ("iou", 0.5))
+_RULES: Final = (("metres", GATE_M), ("iou", 0.5))
+_RULES_3D: Final = (("metres", GATE_3D_M), *_RULES)
 
 
 class BeforeAfter(NamedTuple):
@@ -38,7 +40,8 @@ def rule_text(similarity: str, gate: float) -> str:
 
 def before_after(report: LogReport, results: Sequence[EvaluationRow]) -> BeforeAfter | None:
     """The scores that the summary compares: before and after re-tracking, at the prediction rate if possible."""
-    for similarity, gate in _RULES:
+    is_3d = bool(results) and all(row.is_3d for row in results)
+    for similarity, gate in _RULES_3D if is_3d else _RULES:
         found = {
             role: result_of(results, one.topic, similarity, gate)
             for role, one in report.track_sets.items()
