@@ -6,10 +6,8 @@ drawings to a picture.
 
 from __future__ import annotations
 
-import base64
 import re
-from collections.abc import Callable, Iterator
-from datetime import UTC, datetime
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -17,30 +15,37 @@ import numpy as np
 from mcaptrack import foxglove, log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Ints
-from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.notices import warn
-from mcaptrack.schema import Frame
+from mcaptrack.schema import Frame, Rows
+from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.foreign.boxes import DETECTIONS_READ, Classes, boxes_decoder
+from mcaptrack.sources.foreign.boxes_3d import BOXES_3D_READ, DRAWINGS, Message3d, boxes_3d_decoder
 from mcaptrack.sources.foreign.decoding import MessageType, decoder_with_errors, plain_name
+from mcaptrack.sources.foreign.values import integer, stamp_of, text, to_bytes
 from mcaptrack.sources.video import PixelLayout
 
 __all__ = [
+    "BOXES_3D_READ",
     "DETECTIONS_READ",
     "PICTURES_READ",
     "Classes",
     "MessageType",
     "NamedFrames",
     "Picture",
+    "boxes_3d",
     "boxes_decoder",
     "detections",
     "holds_detections",
     "holds_pictures",
     "is_compressed",
+    "is_drawing",
     "is_picture",
+    "may_hold_boxes_3d",
     "named_detections",
     "picture_decoder",
     "picture_reader",
     "pictures",
+    "settle_classes",
     "stamp_of",
     "stamps",
 ]
@@ -51,9 +56,6 @@ _RAW: Final = ("foxglove.RawImage", "sensor_msgs/Image")
 PICTURES_READ: Final = (*_COMPRESSED, *_RAW)
 #: Words for video codecs in the format of a compressed picture; other formats are still images.
 _VIDEO_WORDS: Final = {"h264": "h264", "avc": "h264", "h265": "h265", "hevc": "h265", "vp9": "vp9", "av1": "av1"}
-_RFC3339: Final = re.compile(r"(\d{4}-\d\d-\d\d)[Tt ](\d\d:\d\d:\d\d)(?:\.(\d{1,9})\d*)?(Z|z|[+-]\d\d:\d\d)", re.ASCII)
-_EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
-_LIMIT_NS: Final = 2**63
 
 
 class Picture(NamedTuple):
@@ -92,8 +94,19 @@ def is_compressed(schema_name: str) -> bool:
 
 
 def holds_detections(channel: log.Channel) -> bool:
-    """Whether a channel's messages are boxes of another detector, by the name of their schema."""
+    """Whether a channel's messages are boxes in pictures of another detector, by the name of their schema."""
     return plain_name(channel.schema_name) in DETECTIONS_READ
+
+
+def may_hold_boxes_3d(channel: log.Channel) -> bool:
+    """Whether a channel's messages may be 3D boxes of other software, by the name of their schema."""
+    is_recorded = Provenance.from_metadata(channel.metadata) is None  # views of mcaptrack are drawings, too
+    return is_recorded and plain_name(channel.schema_name) in BOXES_3D_READ
+
+
+def is_drawing(channel: log.Channel) -> bool:
+    """Whether a channel's messages are drawings, of which boxes are a kind."""
+    return plain_name(channel.schema_name) in DRAWINGS
 
 
 # Channels
@@ -130,13 +143,23 @@ def named_detections(opened: log.Log, topic: str) -> NamedFrames:
     classes = Classes()
     found = _decoded(opened, topic, lambda kind: boxes_decoder(kind, classes))
     frames = [Frame(message.t_ns, index, rows) for index, (message, rows) in enumerate(found)]
+    return NamedFrames(frames, settle_classes(opened, topic, classes, [frame.rows for frame in frames]))
+
+
+def settle_classes(opened: log.Log, topic: str, classes: Classes, parts: Sequence[Rows]) -> dict[int, str]:
+    """Give rows the final ids of their classes, in place; returns the names by id, which a warning lists."""
     numbers = classes.numbers()
-    for frame in frames:
-        frame.rows["class_id"] = [numbers.get(number, number) for number in frame.rows["class_id"].tolist()]
+    for rows in parts if numbers else ():
+        rows["class_id"] = [numbers.get(number, number) for number in rows["class_id"].tolist()]
     if numbers:
         names = ", ".join(f"{number} is {name!r}" for name, number in classes.named())
         warn(f"{opened.path}: classes of {topic} are names; in class_id 1 is a person, {names}", "classes")
-    return NamedFrames(frames, classes.names_by_id())
+    return classes.names_by_id()
+
+
+def boxes_3d(opened: log.Log, topic: str) -> Iterator[tuple[int, Message3d]]:
+    """The log time in ns of each message of a channel, and its 3D boxes. Raises McaptrackError as ``pictures`` does."""
+    return ((message.t_ns, found) for message, found in _decoded(opened, topic, boxes_3d_decoder))
 
 
 def _decoded(
@@ -185,10 +208,10 @@ def picture_decoder(kind: MessageType) -> Callable[[bytes], Picture]:
 
 
 def _compressed(message: Any) -> Picture:
-    data = _bytes(message.data)
+    data = to_bytes(message.data)
     if not data:
         raise ValueError("it holds no data")
-    return Picture(stamp_of(message), _format(_text(message.format)), data)
+    return Picture(stamp_of(message), _format(text(message.format)), data)
 
 
 def _format(words: str) -> str:
@@ -204,62 +227,11 @@ def _format(words: str) -> str:
 
 def _raw(message: Any) -> Picture:
     layout = PixelLayout(
-        _integer(message.width),
-        _integer(message.height),
-        _integer(message.step),
+        integer(message.width),
+        integer(message.height),
+        integer(message.step),
         bool(
             getattr(message, "is_bigendian", False)
         ),  # foxglove.RawImage has no such field: it is always little-endian
     )
-    return Picture(stamp_of(message), _text(message.encoding).lower(), _bytes(message.data), layout)
-
-
-def stamp_of(message: Any) -> int:
-    """The stamp of a message in nanoseconds: ``timestamp`` in Foxglove messages, ``header.stamp`` in ROS messages."""
-    stamp = message.timestamp if hasattr(message, "timestamp") else message.header.stamp
-    if isinstance(stamp, str):
-        found = _RFC3339.fullmatch(stamp)
-        if not found:
-            raise ValueError(f"{stamp[:40]!r} is no time")
-        day, clock, fraction, zone = found.groups()
-        passed = datetime.fromisoformat(f"{day}T{clock}{zone.upper()}") - _EPOCH
-        t_ns = (passed.days * 86400 + passed.seconds) * NS_PER_S + int((fraction or "").ljust(9, "0"))
-    else:
-        t_ns = _time_field(stamp, "sec", "secs", "seconds") * NS_PER_S + _time_field(
-            stamp, "nsec", "nsecs", "nanosec", "nanos"
-        )
-    if not -_LIMIT_NS <= t_ns < _LIMIT_NS:
-        raise ValueError(f"its stamp, {t_ns} ns, is out of range")
-    return t_ns
-
-
-def _time_field(stamp: Any, *names: str) -> int:
-    for name in names:
-        if hasattr(stamp, name):
-            return _integer(getattr(stamp, name))
-    raise ValueError(f"its stamp has no {names[0]}")
-
-
-def _integer(value: Any) -> int:
-    if isinstance(value, float) and value.is_integer():  # JSON of writers without an integer type
-        value = int(value)
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or not -_LIMIT_NS <= value < _LIMIT_NS:
-        raise ValueError(f"{str(value)[:40]!r} where a whole number belongs")
-    return int(value)
-
-
-def _text(value: Any) -> str:
-    if not isinstance(value, str):
-        raise ValueError(f"a {type(value).__name__} where text belongs")
-    return value
-
-
-def _bytes(value: Any) -> bytes:
-    """Bytes of a field: from protobuf, ROS (an array), JSON (base64, or numbers from ROS bridges)."""
-    if isinstance(value, str):
-        return base64.b64decode(value, validate=True)
-    if isinstance(value, np.ndarray):
-        return value.tobytes()
-    if isinstance(value, bytes | list):
-        return bytes(value)
-    raise ValueError(f"a {type(value).__name__} where bytes belong")
+    return Picture(stamp_of(message), text(message.encoding).lower(), to_bytes(message.data), layout)

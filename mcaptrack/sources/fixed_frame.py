@@ -1,0 +1,215 @@
+"""Read boxes of other software, those in space in the fixed frame.
+
+Boxes in a sensor's frame are brought to a frame that doesn't move, by the transforms of the log at their stamps; all
+later stages are in this frame.
+
+Letters: N boxes.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from itertools import islice
+from typing import Final
+from weakref import WeakKeyDictionary
+
+import numpy as np
+
+from mcaptrack import log
+from mcaptrack.errors import McaptrackError
+from mcaptrack.geometry.arrays import Bools, Floats, Ints
+from mcaptrack.geometry.transform_tree import TransformTree, plain_frame
+from mcaptrack.notices import warn
+from mcaptrack.schema import DETECTIONS, SCORES_NEEDED, Frame, Rows
+from mcaptrack.sources import foreign
+from mcaptrack.sources.foreign.boxes_3d.recorded import Recorded3d, recorded
+from mcaptrack.sources.frames import poses_at, transforms_of
+
+#: Messages of a channel of drawings in which boxes are looked for.
+_TRIED: Final = 50
+_LISTED: Final = 8
+_CACHE: Final[WeakKeyDictionary[log.Log, dict[str, bool]]] = WeakKeyDictionary()
+
+
+def holds_boxes(opened: log.Log, topic: str) -> bool:
+    """Whether a channel has boxes of other software: in pictures, or in space.
+
+    Drawings are boxes if there is one among the first messages.
+    """
+    channel = opened.channel(topic)
+    return foreign.holds_detections(channel) or holds_boxes_3d(opened, topic)
+
+
+def holds_boxes_3d(opened: log.Log, topic: str) -> bool:
+    """Whether a channel has 3D boxes of other software, as ``holds_boxes`` says."""
+    channel = opened.channel(topic)
+    if not foreign.may_hold_boxes_3d(channel):
+        return False
+    if not foreign.is_drawing(channel):
+        return True
+    known = _CACHE.setdefault(opened, {})
+    if topic not in known:
+        try:
+            known[topic] = any(one.boxes for _, one in islice(foreign.boxes_3d(opened, topic), _TRIED))
+        except McaptrackError:
+            known[topic] = False
+    return known[topic]
+
+
+def named_detections(opened: log.Log, topic: str, frame_id: str = "") -> foreign.NamedFrames:
+    """The boxes of other software as rows of detections, with the names of classes and of their frame.
+
+    Parameters
+    ----------
+    opened : Log
+        The log.
+    topic : str
+        A channel of boxes.
+    frame_id : str
+        The frame that boxes in space are brought to; by default the root of the tree that their frame is in.
+
+    Returns
+    -------
+    NamedFrames
+        For boxes in pictures one frame for each message, at its log time. For boxes in space one for each stamp.
+
+    Raises
+    ------
+    McaptrackError
+        If a message can't be read, or if the pose of no box is known.
+    """
+    if not foreign.may_hold_boxes_3d(opened.channel(topic)):
+        return foreign.named_detections(opened, topic)
+    found = recorded(foreign.boxes_3d(opened, topic))
+    for words, count in found.remarks.items():
+        warn(f"{opened.path}: {topic}: {count:,} {words}", "left-out")
+    fixed = _fixed_frame(opened, topic, found, plain_frame(frame_id))
+    is_known, rotation, shift = _poses(opened, topic, found, fixed)
+    start_ns, frame = found.frames()
+    is_left_out = np.zeros(len(start_ns), bool)
+    is_left_out[frame[~is_known]] = True  # nothing is known then, unlike in a frame without boxes
+    is_left_out[frame[is_known]] = False
+    found, frame = found.select(is_known), frame[is_known]
+    _warn_odd(opened, topic, found)
+    rows = _rows(opened, topic, found, rotation[is_known], shift[is_known])
+    names = foreign.settle_classes(opened, topic, found.classes, [rows])
+    order = np.argsort(frame, kind="stable")
+    parts = np.split(rows[order], np.searchsorted(frame[order], np.arange(1, len(start_ns))))
+    kept = np.flatnonzero(~is_left_out).tolist()
+    times = start_ns.tolist()
+    frames = [Frame(times[at], index, parts[at]) for index, at in enumerate(kept)]
+    return foreign.NamedFrames(frames, names, fixed)
+
+
+def _fixed_frame(opened: log.Log, topic: str, found: Recorded3d, wanted: str) -> str:
+    """The frame that boxes are brought to. Raises McaptrackError if there is no such frame."""
+    counts = Counter(found.frame.tolist())
+    usual = found.names[counts.most_common(1)[0][0]] if counts else ""
+    tree = transforms_of(opened)
+    known = set(tree.frames() if tree else ()) | set(found.names)
+    if wanted:
+        if found.names and wanted not in known:
+            there = ", ".join(sorted(known)[:_LISTED]) or "none"
+            raise McaptrackError(
+                f"{opened.path}: there is no frame {wanted} for the boxes of {topic}; there are {there}"
+            )
+        return wanted
+    if tree is None or usual not in tree.frames():
+        if usual or found.names:
+            why = "the log has no transforms" if tree is None else _unknown(tree, usual)
+            warn(
+                f"{opened.path}: {topic}: {why}, so that boxes stay in their frame, {usual or 'which has no name'}",
+                "transforms",
+            )
+        if "optical" in usual:
+            words = f"z is ahead and y down in {usual}, so that x and y are no positions on the ground"
+            warn(f"{opened.path}: {topic}: {words}; `frame=` names another frame", "transforms")
+        return usual
+    return tree.root_of(usual)
+
+
+def _unknown(tree: TransformTree, frame: str) -> str:
+    listed = tree.frames()
+    more = ", ..." if len(listed) > _LISTED else ""
+    return f"no transform has the frame {frame!r} (but {', '.join(listed[:_LISTED])}{more})"
+
+
+def _poses(opened: log.Log, topic: str, found: Recorded3d, fixed: str) -> tuple[Bools, Floats, Floats]:
+    """Whether the pose of the frame of each box is known (N,), its rotation (N, 3, 3) and translation (N, 3).
+
+    Raises McaptrackError if none is.
+    """
+    count = len(found.frame)
+    rotation, shift = np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3))
+    is_known = np.ones(count, bool)
+    for number, name in enumerate(found.names):
+        mine = found.frame == number
+        if name == fixed or not mine.any():
+            continue
+        # Boxes of a message have the same pose, mostly.
+        times, place = np.unique(np.stack([found.stamp_ns[mine], found.log_ns[mine]]), axis=1, return_inverse=True)
+        poses = poses_at(opened, topic, fixed, name, *_rows_of(times))
+        place = place.reshape(-1)
+        is_known[mine] = poses.is_known[place]
+        rotation[mine], shift[mine] = poses.rotation[place], poses.translation[place]
+    if count and not is_known.any():
+        raise McaptrackError(
+            f"{opened.path}: the pose of no box of {topic} in {fixed} is known; {_connected(opened, found)} "
+            "`frame=` names another frame, such as that of the boxes"
+        )
+    return is_known, rotation, shift
+
+
+def _rows_of(times: Ints) -> tuple[Ints, Ints]:
+    return times[0], times[1]
+
+
+def _connected(opened: log.Log, found: Recorded3d) -> str:
+    there = transforms_of(opened)
+    frames = ", ".join((there.frames() if there else [])[:_LISTED]) or "none"
+    return f"boxes are in {', '.join(found.names[:_LISTED])}, and transforms have {frames};"
+
+
+def _warn_odd(opened: log.Log, topic: str, found: Recorded3d) -> None:
+    """Warn of boxes that have the log time instead of their stamp, and of scores that are none."""
+    _, count = found.times()
+    if count:
+        words = "have no stamp, or one that is more than 60 s from the log time: their time is the log time"
+        warn(f"{opened.path}: {topic}: {count:,} of {len(found.stamp_ns):,} boxes {words}", "clock")
+    if ((found.score < 0) | (found.score > 1)).any():
+        low, high = np.nanmin(found.score), np.nanmax(found.score)
+        warn(f"{opened.path}: {topic}: scores are from {low:g} to {high:g}; {SCORES_NEEDED}")
+
+
+def _rows(opened: log.Log, topic: str, found: Recorded3d, rotation: Floats, shift: Floats) -> Rows:
+    """Boxes as rows of detections (N,), from the poses of their frames."""
+    from scipy.spatial.transform import Rotation
+
+    count = len(found.frame)
+    axes = np.empty((0, 3, 3)) if not count else rotation @ Rotation.from_quat(found.orientation).as_matrix()
+    centre = np.einsum("nij,nj->ni", rotation, found.centre) + shift
+    velocity = np.einsum("nij,nj->ni", rotation, found.velocity)
+    # The axis that is most upright is that of the height; of the others the first is that of the length.
+    up = np.abs(axes[:, 2]).argmax(axis=1) if count else np.empty(0, np.intp)
+    along, across = np.where(up == 0, 1, 0), np.where(up == 2, 1, 2)
+    here = np.arange(count)
+    heading = np.arctan2(axes[here, 1, along], axes[here, 0, along])
+    heading = np.where(heading == -np.pi, np.pi, heading)
+    lying = int((up[found.has_heading] != 2).sum())
+    if lying:
+        words = "boxes stand on another side than that of their z axis: their height is along the axis that is upright"
+        warn(f"{opened.path}: {topic}: {lying:,} {words}")
+    return DETECTIONS.rows(
+        x_m=centre[:, 0],
+        y_m=centre[:, 1],
+        z_m=centre[:, 2],
+        length_m=found.size[here, along],
+        width_m=found.size[here, across],
+        height_m=found.size[here, up],
+        heading_rad=np.where(found.has_heading, heading, np.nan),
+        vx_m_per_s=velocity[:, 0],
+        vy_m_per_s=velocity[:, 1],
+        score=found.score,
+        class_id=found.class_id,
+        source_id=found.source_id,
+    )

@@ -1,0 +1,96 @@
+"""DetectedObjects and TrackedObjects of Autoware (autoware_perception_msgs, autoware_auto_perception_msgs)."""
+
+from __future__ import annotations
+
+from math import isfinite, nan
+from typing import Any, Final
+
+from mcaptrack.sources.foreign.boxes_3d.box import (
+    Box3d,
+    Message3d,
+    Vector,
+    head_of,
+    moved,
+    named,
+    number,
+    part,
+    quaternion,
+    rotated,
+    vector,
+)
+from mcaptrack.sources.foreign.values import integer, to_bytes
+
+#: The labels of ObjectClassification.
+_CLASSES: Final = {
+    0: "",
+    1: "car",
+    2: "truck",
+    3: "bus",
+    4: "trailer",
+    5: "motorcycle",
+    6: "bicycle",
+    7: "pedestrian",
+    8: "animal",
+    9: "hazard",
+    10: "over_drivable",
+    11: "under_drivable",
+}
+_POLYGON: Final = 2
+_HEADING_UNKNOWN: Final = 0
+_NOTHING: Final[Vector] = (nan, nan, nan)
+
+
+def boxes_of(message: Any) -> Message3d:
+    """The objects of a message."""
+    head = head_of(message)
+    return Message3d(*head, [_box(one, head) for one in message.objects])
+
+
+def _box(one: Any, head: tuple[int, str]) -> Box3d:
+    kinematics, shape = one.kinematics, one.shape
+    pose = kinematics.pose_with_covariance.pose
+    centre, orientation, size = vector(pose.position), quaternion(part(pose, "orientation")), vector(shape.dimensions)
+    if integer(shape.type) == _POLYGON:
+        middle, size = _around([vector(point) for point in shape.footprint.points], size[2])
+        centre = moved(centre, orientation, middle)
+    velocity = _NOTHING
+    if getattr(kinematics, "has_twist", True):  # along the axes of the object
+        velocity = rotated(orientation, vector(kinematics.twist_with_covariance.twist.linear))
+    name, probability = _class_of(one)
+    existence = number(one.existence_probability)
+    return Box3d(
+        *head,
+        centre,
+        orientation,
+        size,
+        name,
+        existence if existence > 0 else probability,
+        _id(one),
+        velocity,
+        integer(kinematics.orientation_availability) != _HEADING_UNKNOWN,
+    )
+
+
+def _class_of(one: Any) -> tuple[str, float]:
+    """The likeliest class, and its probability; "" and NaN if there is none."""
+    found = [(number(guess.probability), guess.label) for guess in one.classification]
+    known = [(share if isfinite(share) else -1.0, label) for share, label in found]
+    if not known:
+        return "", nan
+    share, label = max(known, key=lambda pair: pair[0])
+    return named(_CLASSES, label), share if share > 0 else nan
+
+
+def _around(points: list[Vector], height: float) -> tuple[Vector, Vector]:
+    """Middle and size of the upright box around a footprint, along the axes of the object."""
+    if not points:
+        return (0.0, 0.0, 0.0), (nan, nan, height)
+    low, high = ([pick(point[axis] for point in points) for axis in (0, 1)] for pick in (min, max))
+    middle = ((low[0] + high[0]) / 2, (low[1] + high[1]) / 2, 0.0)
+    return middle, (high[0] - low[0], high[1] - low[1], height)
+
+
+def _id(one: Any) -> str | None:
+    """The UUID of a tracked object, in hexadecimal; None for a detected one."""
+    found = part(one, "object_id")
+    return None if found is None else to_bytes(found.uuid).hex()

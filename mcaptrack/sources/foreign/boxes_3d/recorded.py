@@ -1,0 +1,231 @@
+"""All 3D boxes of a channel as arrays, in the frames that they were recorded in.
+
+Letters: M messages, N boxes, F frames (times).
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from mcaptrack.geometry.arrays import Bools, Floats, Ints
+from mcaptrack.geometry.clocks import NS_PER_S
+from mcaptrack.geometry.transform_series import OTHER_CLOCK_S
+from mcaptrack.geometry.transform_tree import plain_frame
+from mcaptrack.sources.foreign.boxes import Classes
+from mcaptrack.sources.foreign.boxes_3d.box import Box3d, Message3d
+
+#: Messages with stamps this close are one measurement, as where each box is a message.
+_SAME_NS: Final = 1_000_000
+#: Centres that are farther away are no positions.
+_FARTHEST_M: Final = 1e9
+_NUMBER: Final = re.compile(r"\d{1,18}", re.ASCII)
+
+
+@dataclass(frozen=True)
+class Recorded3d:
+    """The boxes of a channel.
+
+    Attributes
+    ----------
+    names : list of str
+        Names of frames; ``frame`` (N,) are indices of these.
+    message : (N,) of int64
+        Index of the message of each box.
+    stamp_ns, log_ns : (N,) of int64
+        Stamp of each box, or log time where it has none; and log time.
+    centre, orientation, size, velocity : (N, 3), (N, 4), (N, 3) and (N, 3)
+        In the frame of each box; sizes and velocities are NaN where they are unknown.
+    has_heading : (N,) of bool
+        Whether the orientation is known.
+    score : (N,)
+        NaN where there is none.
+    class_id, source_id : (N,) of int64
+        Ids of classes as ``classes.class_id`` gives them; ids of the detector, -1 where there is none.
+    message_ns, message_stamp_ns : (M,) of int64
+        Log time and stamp of each message.
+    is_measured : (M,) of bool
+        False for messages that only take drawings away.
+    remarks : dict of str to int
+        What is odd, in words, and how often.
+    """
+
+    names: list[str]
+    frame: Ints
+    message: Ints
+    stamp_ns: Ints
+    log_ns: Ints
+    centre: Floats
+    orientation: Floats
+    size: Floats
+    velocity: Floats
+    has_heading: Bools
+    score: Floats
+    class_id: Ints
+    source_id: Ints
+    classes: Classes
+    message_ns: Ints
+    message_stamp_ns: Ints
+    is_measured: Bools
+    remarks: dict[str, int]
+
+    def select(self, kept: Bools) -> Recorded3d:
+        """The boxes of a mask (N,); messages stay."""
+        names = ("frame", "message", "stamp_ns", "log_ns", "centre", "orientation", "size", "velocity", "has_heading")
+        return replace(self, **{name: getattr(self, name)[kept] for name in (*names, "score", "class_id", "source_id")})
+
+    def times(self) -> tuple[Ints, int]:
+        """When each box was measured (N,), in ns: its stamp, or the log time; and the number of log times."""
+        is_off = _is_off(self.stamp_ns, self.log_ns)
+        return np.where(is_off, self.log_ns, self.stamp_ns), int(is_off.sum())
+
+    def frames(self) -> tuple[Ints, Ints]:
+        """The times of F frames in ns (F,), increasing, and the frame of each box (N,).
+
+        A message is a frame, unless the stamps of its boxes are far apart; so are messages with one stamp. Messages
+        without boxes are frames, too. One that only takes drawings away is none next to a frame with boxes: then it
+        makes room for these.
+        """
+        box_ns, _ = self.times()
+        count = len(self.message_ns)
+        is_off = _is_off(self.message_stamp_ns, self.message_ns)
+        # A message without boxes may have no stamp: it is as late as the others.
+        late = self.message_ns[~is_off] - self.message_stamp_ns[~is_off]
+        own_ns = self.message_ns - np.int64(np.median(late) if len(late) else 0)
+        own_ns = np.where(is_off, own_ns, self.message_stamp_ns)
+        middle, apart = own_ns.copy(), np.zeros(count, np.int64)
+        for number, some in _by_message(self.message, box_ns):
+            middle[number], apart[number] = np.sort(some)[(len(some) - 1) // 2], some.max() - some.min()
+        has_boxes = np.bincount(self.message, minlength=count).astype(bool)
+        usual = _usual_step(middle[has_boxes])
+        at = np.where((apart <= usual / 2)[self.message], middle[self.message], box_ns)
+        empty = middle[~has_boxes & self.is_measured]
+        starts = _starts(np.concatenate([at, empty]))
+        gone = middle[~has_boxes & ~self.is_measured]
+        if len(starts) and len(gone):
+            near = np.searchsorted(starts, gone)
+            away = [np.abs(starts[np.clip(near + side, 0, len(starts) - 1)] - gone) for side in (-1, 0)]
+            gone = gone[np.minimum(*away) > usual / 2]
+        starts = _starts(np.concatenate([starts, gone]))
+        return starts, np.searchsorted(starts, at, "right") - 1
+
+
+def _is_off(stamp_ns: Ints, log_ns: Ints) -> Bools:
+    """Whether stamps are of another clock than the log time, or missing."""
+    # In floating-point numbers, since stamps may be anywhere.
+    away = np.abs(stamp_ns.astype(np.float64) - log_ns)
+    return np.asarray((stamp_ns <= 0) | (away > OTHER_CLOCK_S * NS_PER_S))
+
+
+def _by_message(message: Ints, values: Ints) -> Iterable[tuple[int, Ints]]:
+    """Each message that has boxes, with the values of its boxes; ``message`` is sorted."""
+    numbers, begins = np.unique(message, return_index=True)
+    return zip(numbers.tolist(), np.split(values, begins[1:]), strict=False) if len(numbers) else ()
+
+
+def _usual_step(t_ns: Ints) -> float:
+    steps = np.diff(np.unique(t_ns))
+    steps = steps[steps > _SAME_NS]
+    return float(np.median(steps)) if len(steps) else 0.0
+
+
+def _starts(t_ns: Ints) -> Ints:
+    """The first times of groups, each within ``_SAME_NS``."""
+    out: list[int] = []
+    for one in np.unique(t_ns).tolist():
+        if not out or one - out[-1] > _SAME_NS:
+            out.append(one)
+    return np.array(out, np.int64)
+
+
+def recorded(messages: Iterable[tuple[int, Message3d]]) -> Recorded3d:
+    """The boxes of messages, each with its log time in ns, as arrays.
+
+    Boxes without a position are left out; sizes that can't be are unknown. ``remarks`` counts both.
+    """
+    boxes: list[Box3d] = []
+    owner: list[int] = []
+    heads: list[tuple[int, int, bool]] = []
+    remarks: Counter[str] = Counter()
+    for number, (t_ns, one) in enumerate(messages):
+        boxes += one.boxes
+        owner += [number] * len(one.boxes)
+        heads.append((t_ns, one.stamp_ns, one.is_measured))
+        remarks.update({f"{words} are left out": count for words, count in one.ignored.items()})
+    head_ns = np.array([head[:2] for head in heads], np.int64).reshape(-1, 2)
+    names = sorted({plain_frame(box.frame_id) for box in boxes})
+    place = {name: number for number, name in enumerate(names)}
+    classes = Classes()
+    message = np.array(owner, np.int64)
+    log_ns = head_ns[message, 0]
+    stamp_ns = np.array([box.stamp_ns for box in boxes], np.int64)
+    out = Recorded3d(
+        names,
+        np.array([place[plain_frame(box.frame_id)] for box in boxes], np.int64),
+        message,
+        np.where(stamp_ns > 0, stamp_ns, log_ns),
+        log_ns,
+        _columns([box.centre for box in boxes], 3),
+        _columns([box.orientation for box in boxes], 4),
+        _columns([box.size for box in boxes], 3),
+        _columns([box.velocity for box in boxes], 3),
+        np.array([box.has_heading for box in boxes], bool),
+        np.array([box.score for box in boxes], np.float64),
+        np.array([classes.class_id(box.class_name) for box in boxes], np.int64),
+        _ids([box.source_id for box in boxes]),
+        classes,
+        head_ns[:, 0],
+        head_ns[:, 1],
+        np.array([head[2] for head in heads], bool),
+        dict(remarks),
+    )
+    return _checked(out)
+
+
+def _columns(values: Sequence[tuple[float, ...]], width: int) -> Floats:
+    return np.array(values, np.float64).reshape(-1, width)
+
+
+def _ids(found: Sequence[int | str | None]) -> Ints:
+    """Ids of boxes: numbers as they are, also as text; other texts are numbered in alphabetical order after these."""
+    numbers: list[int] = []
+    texts: dict[int, str] = {}
+    for at, one in enumerate(found):
+        words = str(one if one is not None else "").strip()
+        is_number = _NUMBER.fullmatch(words)
+        numbers.append(int(words) if is_number else -1)
+        if words and not is_number and not isinstance(one, int):
+            texts[at] = words
+    first = max(numbers, default=-1) + 1
+    place = {name: first + order for order, name in enumerate(sorted(set(texts.values())))}
+    for at, name in texts.items():
+        numbers[at] = place[name]
+    return np.array(numbers, np.int64)
+
+
+def _checked(found: Recorded3d) -> Recorded3d:
+    """The boxes that have a position; sizes and orientations that can't be are unknown, and counted as remarks."""
+    with np.errstate(invalid="ignore"):
+        is_far: Bools = ~np.asarray((np.abs(found.centre) < _FARTHEST_M).all(axis=1))
+        found = found.select(~is_far)
+        size, turn = found.size, found.orientation
+        odd_turn: Bools = ~np.asarray(np.isfinite(turn).all(axis=1))
+        length = np.linalg.norm(np.where(odd_turn[:, None], 0.0, turn), axis=1)
+        is_unturned = ~odd_turn & (length < np.finfo(np.float64).tiny)
+        kinds = {
+            "boxes have no position (no finite number) and are left out": is_far,
+            "boxes have a size that is no finite number: it is unknown": ~np.isfinite(size).all(axis=1),
+            "boxes have a negative size: it is unknown": (size < 0).any(axis=1),
+            "boxes have a size of 0: it is unknown": (size == 0).any(axis=1),
+            "boxes have an orientation that is no finite number: it is unknown": odd_turn,
+            "boxes have an orientation of zeros: they count as not turned": is_unturned,
+        }
+        size = np.where(np.isfinite(size) & (size > 0), size, np.nan)
+    turn = np.where((odd_turn | is_unturned)[:, None], [0.0, 0.0, 0.0, 1.0], turn)
+    remarks = found.remarks | {words: int(which.sum()) for words, which in kinds.items() if which.any()}
+    return replace(found, size=size, orientation=turn, has_heading=found.has_heading & ~odd_turn, remarks=remarks)
