@@ -215,7 +215,7 @@ def _with_options(base: Transform, options: Mapping[str, Option]) -> Transform:
 
 def run_stage(
     stage: str,
-    transform: Transform,
+    transform: Transform | None,
     log: PathLike,
     *,
     topic: str | None = None,
@@ -226,14 +226,19 @@ def run_stage(
     force: bool = False,
     stages: Mapping[str, str | Transform] | None = None,
     mode: Mode | None = None,
+    frame: str | None = None,
+    make: Callable[[str], Transform] | None = None,
     progress: Progress = no_progress,
 ) -> RunResult:
-    """Run one stage with a transform; ``detect``, ``track`` and the others call this with their transform."""
+    """Run one stage with a transform; ``detect``, ``track`` and the others call this with their transform.
+
+    Without a transform ``make`` makes it, by the name of the one that suits the input, or the default one by "".
+    """
     modes = STAGES[stage].modes
     keep = modes[mode or "both"] if modes else None
     before = transforms_of(stages)
 
     def plan(opened: logs.Log, prefix: str, say: Callable[[str], None]) -> list[Job]:
-        return pipeline.plan_stage(opened, prefix, stage, transform, topic, to, keep, say, before)
+        return pipeline.plan_stage(opened, prefix, stage, transform, topic, to, keep, say, before, frame or "", make)
 
     return work(Where(log, camera, topic, output, sidecar, force), plan, None, progress, None)

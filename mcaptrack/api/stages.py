@@ -19,6 +19,7 @@ def track(
     topic: str | None = None,
     to: str | None = None,
     camera: str | None = None,
+    frame: str | None = None,
     output: PathLike | None = None,
     sidecar: bool | None = None,
     force: bool = False,
@@ -33,7 +34,8 @@ def track(
     log : path
         The log.
     tracker : str or Transform, optional
-        "sort" (the default), "bytetrack" or "ocsort", the name of an installed tracker, "module:Class", or a
+        "sort" (the default), "bytetrack" or "ocsort" for boxes in pictures, "ground" (the default for these) for boxes
+        in space, the name of an installed tracker, "module:Class", or a
         transform.
     topic : str, optional
         Read this channel instead of the usual one, /camera/detections.
@@ -41,6 +43,8 @@ def track(
         Write to this channel instead of the usual one, /camera/tracks.
     camera : str, optional
         Name of the camera, if the log has several.
+    frame : str, optional
+        Bring boxes in space (3D) to this frame; by default to the root of the tree of frames, such as map.
     output : path, optional
         Write to this file instead; the log stays unchanged.
     sidecar : bool, optional
@@ -75,8 +79,10 @@ def track(
     """
     return run_stage(
         "track",
-        transform_of("track", tracker, options),
+        None if tracker is None else transform_of("track", tracker, options),
         log,
+        make=lambda name: transform_of("track", name, options),
+        frame=frame,
         topic=topic,
         to=to,
         camera=camera,

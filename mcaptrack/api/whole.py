@@ -22,6 +22,7 @@ def run(
     *,
     topic: str | None = None,
     camera: str | None = None,
+    frame: str | None = None,
     output: PathLike | None = None,
     sidecar: bool | None = None,
     events: bool | EventOptions = True,
@@ -51,6 +52,9 @@ def run(
         Begin with the pictures, or the detections, of this channel.
     camera : str, optional
         Name of the camera, if the log has several.
+    frame : str, optional
+        Bring boxes in space (3D) to this frame. By default as before, or to the root of the tree of frames, such as
+        map.
     output : path, optional
         Write to this file instead; the log stays unchanged.
     sidecar : bool, optional
@@ -108,7 +112,8 @@ def run(
     plane = PlaneChoice(fit_plane, person_height_m, ground_frame=ground_frame)
 
     def plan(opened: logs.Log, prefix: str, say: Callable[[str], None]) -> list[Job]:
-        return pipeline.plan_all(opened, prefix, say, topic, transforms, force, chosen, camera_motion or "", plane)
+        motion = camera_motion or ""
+        return pipeline.plan_all(opened, prefix, say, topic, transforms, force, chosen, motion, plane, frame or "")
 
     options = events if isinstance(events, EventOptions) else EventOptions()
     watch = Watch(options, force=force) if events else None

@@ -7,7 +7,7 @@ import math
 import re
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import MISSING, Field, fields, replace
+from dataclasses import MISSING, Field
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, get_args, get_type_hints
@@ -15,11 +15,13 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, get_args, get_
 import typer
 
 from mcaptrack.cli import common
-from mcaptrack.cli.command import is_on_command_line, settings_of
+from mcaptrack.cli.chosen import configured, is_open, listed, make_transform, options_of
+from mcaptrack.cli.command import settings_of
 from mcaptrack.cli.running import run_on_logs
-from mcaptrack.cli.text import say, stdout_to_stderr
+from mcaptrack.cli.text import stdout_to_stderr
 from mcaptrack.errors import McaptrackError
 from mcaptrack.registry import BUILT_IN, Kind, names
+from mcaptrack.schema import DETECTIONS
 from mcaptrack.transforms import STAGES, Stage, Transform
 from mcaptrack.transforms.protocol import choices, member_type
 
@@ -37,6 +39,9 @@ _EXAMPLES: Final = {
 }
 Topic = Annotated[
     str | None, common.option("--topic", panel=common.FILES, help="Read this channel instead of the default one.")
+]
+Frame = Annotated[
+    str | None, common.option("--frame", panel=common.FILES, help="Bring boxes in space to this frame, such as map.")
 ]
 #: Names that files in the working folder may give: built-in or installed ones, but not ``module:Class``.
 _NAME: Final = r"[A-Za-z0-9_-]+"
@@ -85,16 +90,11 @@ def _own_doc(cls: type[Transform]) -> str:
     return "" if text.startswith(f"{cls.__name__}(") else text
 
 
-def _listed(names: Sequence[str]) -> str:
-    """Return names in words: "a, b and c"."""
-    return " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
-
-
 def _panel(theme: str, of: Sequence[str]) -> str:
     """Return the heading of an option in the help: its theme, and the transforms that have it, if not all do."""
     if not of:
         return theme
-    those = _listed(of) if len(of) > 1 else f"{of[0]} alone"
+    those = listed(of) if len(of) > 1 else f"{of[0]} alone"
     return f"{theme} ({those})" if theme else f"Options of {those}"
 
 
@@ -134,11 +134,6 @@ def shown_default(default: Any) -> str:
     return "none" if default is None else str(default).lower() if isinstance(default, bool) else f"{default}"
 
 
-def _options_of(kind: type[Transform]) -> dict[str, Field[Any]]:
-    """Return the parameters of a transform that are options, by name."""
-    return {f.name: f for f in fields(kind) if not f.metadata.get("context")}
-
-
 def _parameter(name: str, annotation: Any, default: Any) -> inspect.Parameter:
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
 
@@ -159,7 +154,7 @@ def stage_command(stage: Stage, plugins: Mapping[str, type[Transform]] = Mapping
     The options of ``plugins``, transforms of other packages, are added.
     """
     kinds = {**plugins, **stage.built_in()}
-    own = {name: _options_of(kind) for name, kind in kinds.items()}
+    own = {name: options_of(kind) for name, kind in kinds.items()}
     parameters = [_parameter("logs", common.Logs, inspect.Parameter.empty)]
     if stage.kind:
         usual = stage.entry(stage.default).name
@@ -197,6 +192,7 @@ def stage_command(stage: Stage, plugins: Mapping[str, type[Transform]] = Mapping
         _parameter("topic", Topic, None),
         _parameter("to", Annotated[str | None, to], None),
         _parameter("camera", common.Camera, None),
+        *([_parameter("frame", Frame, None)] if stage.default.reads is DETECTIONS else []),
         _parameter("output", common.Output, None),
         _parameter("sidecar", common.Sidecar, None),
         _parameter("force", common.Force, False),
@@ -213,14 +209,20 @@ def stage_command(stage: Stage, plugins: Mapping[str, type[Transform]] = Mapping
 
     def command(**given: Any) -> None:
         wanted = {option: given[option] for option in owners if given[option] is not None}
+
+        def make(name: str) -> Transform:
+            return make_transform(
+                stage, {**given, **({stage.kind: name} if name and stage.kind else {})}, wanted, owners
+            )
+
         with stdout_to_stderr():
-            transform = _transform(stage, given, wanted, owners)
+            transform = None if is_open(stage, given) else make("")
 
         def run(path: Path, **where: Any) -> RunResult:
             from mcaptrack.api.running import run_stage
 
-            where |= {"topic": given["topic"], "to": given["to"], "stages": _configured()}
-            where["mode"] = given["mode"] if stage.modes else None
+            where |= {"topic": given["topic"], "to": given["to"], "stages": configured()}
+            where |= {"mode": given["mode"] if stage.modes else None, "frame": given.get("frame"), "make": make}
             return run_stage(stage.name, transform, path, **where)
 
         run_on_logs(given, run)
@@ -231,60 +233,11 @@ def stage_command(stage: Stage, plugins: Mapping[str, type[Transform]] = Mapping
     return command
 
 
-def _transform(
-    stage: Stage,
-    given: Mapping[str, Any],
-    wanted: Mapping[str, Any],
-    owners: Mapping[str, list[str]] = MappingProxyType({}),
-) -> Transform:
-    """Return the chosen transform with those of the wanted parameters that it has.
-
-    ``owners`` has the names of the transforms that have an option. An option on the command line that the chosen
-    transform lacks is refused; one from a file or the environment is ignored, since it may be meant for another
-    transform.
-    """
-    name = _chosen(stage, given, wanted)
-    cls = stage.with_part(stage.find(name).cls if name else stage.default, wanted.get(stage.parameter))
-    own = _options_of(cls)
-    for option in wanted:
-        if option in owners and option not in own and is_on_command_line(option):
-            flag = "--" + option.replace("_", "-")
-            chosen = name or wanted.get(stage.option) or stage.choice(stage.default())
-            raise McaptrackError(f"{flag} is an option of {_listed(owners[option])}, not of {chosen}")
-    hints = get_type_hints(cls)
-    values = {
-        option: tuple(value) if member_type(hints[option])[1] else value
-        for option, value in wanted.items()
-        if option in own
-    }
-    if stage.profiles and (profile := given.get("profile")):
-        return replace(stage.profiles[profile], **values)
-    return stage.make(name, **values)
-
-
-def _chosen(stage: Stage, given: Mapping[str, Any], wanted: Mapping[str, Any]) -> str:
-    """Return the name of the chosen transform: from its option, the profile, or an option that implies it; else "".
-
-    Raises McaptrackError if the profile is of another transform.
-    """
-    name = (given.get(stage.kind) if stage.kind else "") or ""
-    if stage.profiles and (profile := given.get("profile")):
-        meant = stage.choice(stage.profiles[profile])
-        if name not in ("", meant):
-            raise McaptrackError(f"the profile {profile} is of the {stage.kind} {meant}, not of {name}")
-        return meant
-    for option, implied in stage.implied.items():
-        if not name and option in wanted:
-            if not given.get("quiet"):
-                say(f"{option} belongs to --{stage.kind} {implied}, which is used; the next release requires that")
-            return implied
-    return name
-
-
 def run_all(
     logs: common.Logs,
     topic: Topic = None,
     camera: common.Camera = None,
+    frame: Frame = None,
     output: common.Output = None,
     sidecar: common.Sidecar = None,
     events: Annotated[
@@ -369,9 +322,9 @@ def run_all(
         import mcaptrack
         from mcaptrack.evaluation.events import EventOptions
 
-        settings, stages = settings_of("events"), _configured(chosen)
+        settings, stages = settings_of("events"), configured(chosen)
         where |= {"camera_motion": camera_motion, "fit_plane": fit_plane, "person_height_m": person_height_m}
-        where |= {"ground_frame": ground_frame}
+        where |= {"ground_frame": ground_frame, "frame": frame}
         for stage in STAGES.values():
             if stage.option in chosen:
                 where[stage.option] = stages.pop(stage.name)
@@ -381,19 +334,3 @@ def run_all(
         )
 
     run_on_logs(given, run)
-
-
-def _configured(chosen: Mapping[str, str] = MappingProxyType({})) -> dict[str, Transform]:
-    """Return the transforms that environment and files configure, by stage, for a command that runs several stages.
-
-    ``chosen`` has names from the command line by kind.
-    """
-    out: dict[str, Transform] = {}
-    for stage in STAGES.values():
-        settings = settings_of(stage.name)
-        own = {option for kind in stage.built_in().values() for option in _options_of(kind)}
-        settings |= {kind: name for kind, name in chosen.items() if kind == stage.option}
-        wanted = {option: value for option, value in settings.items() if value is not None}
-        if wanted.keys() & {*own, stage.option, "profile"}:
-            out[stage.name] = _transform(stage, settings, wanted)
-    return out

@@ -6,9 +6,10 @@ transform and its parameters.
 
 from mcaptrack.pipeline.checks import Job
 from mcaptrack.pipeline.events import Watch
-from mcaptrack.pipeline.plan import is_stale, plan_all, plan_stage
+from mcaptrack.pipeline.plan import plan_all, plan_stage
 from mcaptrack.pipeline.planes import AS_BEFORE, PlaneChoice, read_planes
 from mcaptrack.pipeline.run import Report, input_of, outdated_by, run
+from mcaptrack.pipeline.staleness import is_stale
 from mcaptrack.pipeline.summary import Summary, summarise
 from mcaptrack.pipeline.write import LAYOUTS, attachment_of, find_views, layout_path
 from mcaptrack.sources.cameras import Camera, camera_at, find_camera

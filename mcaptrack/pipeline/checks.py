@@ -17,6 +17,7 @@ from mcaptrack.schema.classes import class_names
 from mcaptrack.schema.provenance import INGEST, VIEW, Provenance, frame_id_of
 from mcaptrack.sources import foreign
 from mcaptrack.sources.cameras import USUAL, chain_of
+from mcaptrack.sources.fixed_frame import named_detections
 from mcaptrack.transforms import FULL, STAGES, Transform
 from mcaptrack.transforms.protocol import check_options
 
@@ -24,7 +25,8 @@ from mcaptrack.transforms.protocol import check_options
 class Job(NamedTuple):
     """A transform with its input and output topic; ``keep`` are the outputs that are written, None for all.
 
-    The results of a job with ``is_optional`` are left out, with a warning, if it fails.
+    The results of a job with ``is_optional`` are left out, with a warning, if it fails. ``frame_id`` is the frame that
+    3D boxes are brought to.
     """
 
     stage: str
@@ -33,6 +35,7 @@ class Job(NamedTuple):
     target: str
     keep: tuple[str, ...] | None = None
     is_optional: bool = False
+    frame_id: str = ""
 
     def outputs(self) -> dict[str, Schema]:
         """Return the schemas of all outputs by topic, in the transform's order."""
@@ -64,7 +67,7 @@ def check_inputs(opened: log.Log, prefix: str, jobs: Sequence[Job]) -> None:
             raise McaptrackError(_lacks(opened, prefix, job))
         if not is_read:
             reads = job.transform.reads
-            theirs_too = foreign.DETECTIONS_READ if reads is DETECTIONS else ()
+            theirs_too = foreign.BOXES_READ if reads is DETECTIONS else ()
             wanted = " or ".join(foreign.PICTURES_READ if reads is VIDEO else (reads.name, *theirs_too))
             raise McaptrackError(f"{opened.path}: {job.source} holds {name or 'no schema'}; {job.stage} reads {wanted}")
         _check_outputs(opened, prefix, job)
@@ -75,7 +78,7 @@ def fits(channel: log.Channel, reads: Schema) -> tuple[str, bool]:
     """Return the name of a channel's schema, and whether a stage that reads ``reads`` can read the channel."""
     if reads is VIDEO:
         return channel.schema_name, foreign.holds_pictures(channel)
-    theirs = reads is DETECTIONS and foreign.holds_detections(channel)
+    theirs = reads is DETECTIONS and (foreign.holds_detections(channel) or foreign.may_hold_boxes_3d(channel))
     return channel.schema_name, theirs or channel.schema_name == reads.name
 
 
@@ -84,11 +87,14 @@ def read_frames(opened: log.Log, topic: str, schema: Schema) -> list[Frame]:
     return read_named_frames(opened, topic, schema).frames
 
 
-def read_named_frames(opened: log.Log, topic: str, schema: Schema) -> foreign.NamedFrames:
-    """Read the rows of a channel as ``read_frames`` does, with the names of classes and of the frame of reference."""
+def read_named_frames(opened: log.Log, topic: str, schema: Schema, frame_id: str = "") -> foreign.NamedFrames:
+    """Read the rows of a channel as ``read_frames`` does, with the names of classes and of the frame of reference.
+
+    ``frame_id`` is the frame that 3D boxes are brought to (see ``sources.fixed_frame``).
+    """
     channel = opened.channel(topic)
-    if foreign.holds_detections(channel):
-        return foreign.named_detections(opened, topic)
+    if schema is DETECTIONS and channel.schema_name != DETECTIONS.name:
+        return named_detections(opened, topic, frame_id)
     return foreign.NamedFrames(
         opened.frames(topic, schema), class_names(channel.metadata), frame_id_of(channel.metadata)
     )

@@ -16,13 +16,15 @@ from mcaptrack.geometry.plane import is_assumed
 from mcaptrack.notices import warn
 from mcaptrack.pipeline import motion
 from mcaptrack.pipeline.checks import Job, check_inputs, describe_origin, fits
-from mcaptrack.pipeline.planes import AS_BEFORE, PlaneChoice, is_plane_due, planes_to_json, read_planes, warn_unused
+from mcaptrack.pipeline.planes import AS_BEFORE, PlaneChoice, is_plane_due, read_planes, warn_unused
 from mcaptrack.pipeline.rebuild import MissingPluginError, rebuild
+from mcaptrack.pipeline.spaces import check_spaces, suited_tracker
+from mcaptrack.pipeline.staleness import is_stale
 from mcaptrack.schema import DETECTIONS, VIDEO
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources import foreign
 from mcaptrack.sources.camera_motion import motion_topic
-from mcaptrack.sources.cameras import USUAL, camera_at, chain_of, name_above, provenance_of
+from mcaptrack.sources.cameras import USUAL, camera_at, provenance_of
 from mcaptrack.transforms import STAGES, Stage, Transform
 from mcaptrack.transforms.protocol import suited
 
@@ -36,25 +38,32 @@ def plan_stage(
     opened: log.Log,
     prefix: str,
     stage: str,
-    transform: Transform,
+    transform: Transform | None,
     source: str | None = None,
     target: str | None = None,
     keep: tuple[str, ...] | None = None,
     say: Say = lambda _: None,
     defaults: Mapping[str, Transform] = {},
+    frame_id: str = "",
+    make: Callable[[str], Transform] | None = None,
 ) -> list[Job]:
     """Plan one stage, even if its channel is up to date, and before it all inputs that are missing or out of date.
 
     ``source`` and ``target`` are topics that replace the usual ones; ``defaults`` are transforms by stage that replace
-    the default ones for missing inputs. ``say`` is called with a line for each job. Raises McaptrackError if there is
-    no input, or if the stage would replace channels that it did not make.
+    the default ones for missing inputs. ``say`` is called with a line for each job. ``frame_id`` is the frame that 3D
+    boxes are brought to. ``make`` makes the transform by the name of the one that suits its input, or the default one
+    by "", where ``transform`` is None. Raises McaptrackError if there is no input, or if the stage would replace
+    channels that it did not make.
     """
-    planner = _Planner(opened, prefix, defaults=defaults)
+    planner = _Planner(opened, prefix, defaults=defaults, frame_id=frame_id)
     usual = f"{prefix}/{STAGES[stage].output_topic}"
     source = source or planner.source_of(stage)
     planner.ensure(source)
+    if transform is None:
+        suited = planner.suited_tracker(source) if stage == "track" else ""
+        transform = make(suited) if make else STAGES[stage].make(suited)
     planner.ensure_motion(transform, source)
-    planner.jobs.append(Job(stage, transform, source, target or usual, keep))
+    planner.jobs.append(Job(stage, transform, source, target or usual, keep, frame_id=frame_id))
     return planner.checked(say)
 
 
@@ -68,6 +77,7 @@ def plan_all(
     chosen: Collection[str] = (),
     camera_motion: str = "",
     plane: PlaneChoice = AS_BEFORE,
+    frame_id: str = "",
 ) -> list[Job]:
     """Plan the jobs that bring all results of a camera up to date; empty if they are.
 
@@ -76,10 +86,11 @@ def plan_all(
     ``camera_motion`` is what trackers are to do about it ("auto", "on" or "off") where it differs from what they did.
     ``plane`` says how to make a ground plane where none is given; where it was made otherwise, it is made again.
     ``chosen`` are options that the user gave for ``defaults`` ("tracker"): a channel that was made with another choice
-    is made again. Raises McaptrackError as ``plan_stage`` does, and if the class that made a channel is not installed.
+    is made again; so are tracks of 3D boxes in another frame than ``frame_id``. Raises McaptrackError as ``plan_stage``
+    does, and if the class that made a channel is not installed.
     """
     sources = {_stage_from(opened, source): source} if source else {}
-    planner = _Planner(opened, prefix, sources, defaults, force, chosen, camera_motion, plane)
+    planner = _Planner(opened, prefix, sources, defaults, force, chosen, camera_motion, plane, frame_id)
     warn_unused(opened, prefix, plane)
     read = {stage.input_topic for stage in STAGES.values()}
     for stage in STAGES.values():
@@ -96,7 +107,7 @@ def _stage_from(opened: log.Log, source: str) -> str:
     for stage in STAGES.values():
         if stage.default.reads in (VIDEO, DETECTIONS) and fits(channel, stage.default.reads)[1]:
             return stage.name
-    wanted = ", ".join((*foreign.PICTURES_READ, DETECTIONS.name, *foreign.DETECTIONS_READ))
+    wanted = ", ".join((*foreign.PICTURES_READ, DETECTIONS.name, *foreign.BOXES_READ))
     raise McaptrackError(
         f"{opened.path}: {source} holds {channel.schema_name or 'no schema'}; run begins with one of {wanted}"
     )
@@ -120,11 +131,12 @@ class _Planner:
         chosen: Collection[str] = (),
         camera_motion: str = "",
         plane: PlaneChoice = AS_BEFORE,
+        frame_id: str = "",
     ) -> None:
         self.jobs: list[Job] = []
         self._opened, self._prefix = opened, prefix
         self._sources, self._defaults, self._force, self._chosen = sources, defaults, force, chosen
-        self._camera_motion, self._plane = camera_motion, plane
+        self._camera_motion, self._plane, self._frame_id = camera_motion, plane, frame_id
         self._changes: dict[str, bool] = {}
         self._notes: list[str] = []
         self._unnamed: dict[str, MissingPluginError] = {}
@@ -135,6 +147,7 @@ class _Planner:
         if self._unnamed:
             raise McaptrackError(self._refusal())
         check_inputs(self._opened, self._prefix, self.jobs)
+        check_spaces(self._opened, self.jobs)
         for words in self._notes:
             say(words)
         return self.jobs
@@ -157,6 +170,12 @@ class _Planner:
             self._notes.append(f"{usual} is missing: taking the boxes of {camera.boxes}")
             return camera.boxes
         return usual
+
+    def suited_tracker(self, source: str) -> str:
+        """Return the tracker for boxes that the default one can't take; "" for others."""
+        if name := suited_tracker(self._opened, source):
+            self._notes.append(f"{source} has boxes in space: tracking by {name}")
+        return name
 
     def ensure(self, topic: str) -> bool:
         """Plan the jobs that make ``topic``, if any are needed. Returns whether the topic will change."""
@@ -191,11 +210,13 @@ class _Planner:
         chosen = self._defaults.get(stage) or self._suited(stage, source) or STAGES[stage].default()
         transform = self._with_choice(chosen)
         self.ensure_motion(transform, source)
-        self._add(Job(stage, transform, source, _main(self._opened, stage, topic)))
+        self._add(Job(stage, transform, source, _main(self._opened, stage, topic), frame_id=self._frame_id))
         return True
 
     def _suited(self, stage: str, source: str) -> Transform | None:
         """Create the transform that the maker of a stage's input recommends for the stage; None if it names none."""
+        if stage == "track" and (name := self.suited_tracker(source)):
+            return STAGES[stage].make(name)
         option, maker = STAGES[stage].option, self._maker_of(source)
         found = suited(maker, option)
         if maker is None or found is None:
@@ -248,6 +269,7 @@ class _Planner:
         suited = self._suited(stage, source) if is_open else None
         wanted = self._with_choice(self._defaults.get(stage, suited or before)) if is_usual else before
         is_replaced = is_usual and (self._is_replaced(STAGES[stage], before, wanted) or suited is not None)
+        is_replaced = is_replaced or (stage == "track" and self._frame_id not in ("", made.frame_id))
         is_projected = is_usual and STAGES[stage].needs_scale and self._is_plane_due(source)
         is_due = is_due or is_projected
         if wanted and not is_replaced and not self._force:
@@ -271,7 +293,7 @@ class _Planner:
             self._notes.append(f"{topic} was made from {had}: running {stage} again, from {source}")
         elif is_replaced:
             is_other = before is None or STAGES[stage].choice(before) != STAGES[stage].choice(transform)
-            by = f"by another {STAGES[stage].option}" if is_other else "with another `camera_motion=`"
+            by = f"by another {STAGES[stage].option}" if is_other else "with another `camera_motion=` or `frame=`"
             self._notes.append(f"{topic} was made {by}: running {stage} again")
         elif is_projected:
             self._notes.append(f"{topic} was made with another ground plane: running {stage} again, as before")
@@ -280,7 +302,7 @@ class _Planner:
         there = [f"{main}/{suffix}".rstrip("/") for suffix in transform.writes]
         kept = [one == topic or one in self._opened.channels for one in there]
         keep = tuple(suffix for suffix, is_kept in zip(transform.writes, kept, strict=True) if is_kept)
-        self._add(Job(stage, transform, source, main, None if all(kept) else keep))
+        self._add(Job(stage, transform, source, main, None if all(kept) else keep, frame_id=self._frame_id))
         return True
 
     def _is_plane_due(self, source: str) -> bool:
@@ -374,24 +396,3 @@ def _main(opened: log.Log, stage: str, topic: str) -> str:
             below = [one for one in STAGES[stage].outputs(topic)[1:] if one in opened.channels]
             return topic if below else topic.removesuffix("/" + suffix)
     return topic
-
-
-def is_stale(opened: log.Log, topic: str) -> bool:
-    """Return whether an input or reference of ``topic``, or its ground plane, has changed since it was made."""
-    made = Provenance.from_metadata(opened.channel(topic).metadata)
-    if made is None:
-        return False
-    prefix = name_above(chain_of(opened, topic)[-1])
-    if "ground_planes" in made.parameters:
-        planes = read_planes(opened, prefix)
-        if planes_to_json(planes or ()) != made.parameters["ground_planes"]:
-            return True
-    if motion.is_motion_new(opened, prefix, made):
-        return True
-    if any((name in opened.channels) != bool(then) for name, then in made.references.items()):
-        return True
-    for name, then in made.made_from().items():
-        now = provenance_of(opened, name)
-        if now and now.digest and now.digest != then:
-            return True
-    return False

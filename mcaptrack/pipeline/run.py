@@ -332,7 +332,7 @@ def _input(
         frames, how = made[job.source].frames, made[job.source].provenance
         of_rows, names, frame_id = how.digest, class_names(how.to_metadata()), how.frame_id
     else:
-        frames, names, frame_id = read_named_frames(opened, job.source, job.transform.reads)
+        frames, names, frame_id = read_named_frames(opened, job.source, job.transform.reads, job.frame_id)
         of_rows = digest_of(opened, job.source)
     classes = {str(number): name for number, name in sorted(names.items())}
     stream = _Repeatable(lambda: _counted(frames, job.stage, progress))

@@ -18,9 +18,9 @@ from mcaptrack.pipeline.planes import fit_of, read_planes
 from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, PREDICTIONS, TRACKS, Rows, Schema
 from mcaptrack.schema.camera_motion import rows_to_verdict
 from mcaptrack.schema.classes import class_names
-from mcaptrack.sources import foreign
 from mcaptrack.sources.camera_motion import motion_topic, read_ground_truth
 from mcaptrack.sources.cameras import camera_at, provenance_of
+from mcaptrack.sources.fixed_frame import holds_boxes, named_detections
 from mcaptrack.transforms import STAGES
 
 #: Minimum IoU of boxes at which a track matches the ground truth, as in the demo.
@@ -117,8 +117,8 @@ def _count_boxes(opened: log.Log, tracks: str, usual: str) -> int | None:
     source = opened.channels.get(made.input if made else usual) or opened.channels.get(usual)
     if source is None:
         return None
-    if foreign.holds_detections(source):
-        return sum(len(frame.rows) for frame in foreign.detections(opened, source.topic))
+    if holds_boxes(opened, source.topic):
+        return sum(len(frame.rows) for frame in named_detections(opened, source.topic).frames)
     rows = _rows(opened, source.topic, DETECTIONS)
     return None if rows is None else len(rows)
 

@@ -3,7 +3,8 @@
 A camera is a name (``/camera``) below which results are written. A channel's own name does not decide its camera: the
 provenance of each channel names its input, and this chain of inputs ends at a channel that was recorded or ingested.
 Channels belong to the same camera if their chains end below the same name, even if a stage wrote them elsewhere.
-Recorded detections and labels belong to the pictures with the longest common part of the name.
+Recorded detections and labels belong to the pictures with the longest common part of the name. Boxes in space (3D) have
+a name of their own: they belong to no pictures.
 """
 
 from __future__ import annotations
@@ -17,8 +18,9 @@ from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import warn
 from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, SCHEMAS
-from mcaptrack.schema.provenance import Provenance, input_of
+from mcaptrack.schema.provenance import Provenance, frame_id_of, input_of
 from mcaptrack.sources import foreign
+from mcaptrack.sources.fixed_frame import holds_boxes, holds_boxes_3d
 from mcaptrack.transforms import STAGES
 
 #: The default name of a camera.
@@ -35,8 +37,9 @@ class Camera(NamedTuple):
     """A camera of a log.
 
     ``prefix`` is the name below which its results are written; ``names`` are all names below which it has recorded or
-    ingested channels. ``pictures`` is the topic of its pictures, and ``boxes`` that of recorded detections; each is
-    None if there is no such channel, or no unique one. ``truth`` and ``ground_plane`` are the topics for these, whether
+    ingested channels. ``pictures`` is the topic of its pictures, and ``boxes`` that of recorded detections, in pictures
+    or in space; each is None if there is no such channel, or no unique one. ``in_space`` are the topics of those in
+    space. ``truth`` and ``ground_plane`` are the topics for these, whether
     or not the log has them. ``topics`` are all its channels.
     """
 
@@ -47,6 +50,7 @@ class Camera(NamedTuple):
     truth: str
     ground_plane: str
     topics: frozenset[str]
+    in_space: tuple[str, ...] = ()
 
 
 def name_above(topic: str) -> str:
@@ -72,11 +76,13 @@ def find_camera(opened: log.Log, name: str | None = None, topic: str | None = No
     if name:
         _refuse_unknown(opened, name)
         return camera_at(opened, "/" + name.strip("/")).prefix
-    known = cameras(opened)
+    known = _with_pictures_first(opened, cameras(opened))
     # Recorded cameras without results count only if no camera has any.
     chosen = [camera for camera in known if _has_own_channels(opened, camera)]
     if not chosen:
         # With several recorded cameras, the planner asks for one by name and lists them.
+        if known and all(camera.in_space for camera in known):
+            _refuse_several(opened, [topic for camera in known for topic in camera.in_space])
         return known[0].prefix if len(known) == 1 else f"/{DEFAULT_CAMERA}"
     if len(chosen) == 1:
         return chosen[0].prefix
@@ -86,6 +92,17 @@ def find_camera(opened: log.Log, name: str | None = None, topic: str | None = No
         raise McaptrackError(f"{opened.path} has several cameras, {names}; choose one with `camera=`")
     warn(f"several cameras, {names}: taking {usual[0]}; `camera=` chooses another", "chosen-camera")
     return usual[0]
+
+
+def _with_pictures_first(opened: log.Log, known: list[Camera]) -> list[Camera]:
+    """Return the cameras without those that are boxes in space alone, if there are others; or else all."""
+    return [camera for camera in known if not camera.in_space or _has_own_channels(opened, camera)] or known
+
+
+def _refuse_several(opened: log.Log, topics: list[str]) -> None:
+    """Raise McaptrackError if there are several channels of boxes in space."""
+    if len(topics) > 1:
+        raise McaptrackError(f"{opened.path} has boxes in space in {', '.join(topics)}; choose one with `topic=`")
 
 
 def _refuse_unknown(opened: log.Log, name: str) -> None:
@@ -173,16 +190,22 @@ class _Channels:
         self._source: dict[str, str] = {}
         for topic, channel in opened.channels.items():
             is_ours = self._provenance[topic] is not None or channel.schema_name in SCHEMAS
-            if is_ours or foreign.holds_pictures(channel) or foreign.holds_detections(channel):
+            if is_ours or foreign.holds_pictures(channel) or holds_boxes(opened, topic):
                 self._source[topic] = chain_of(opened, topic)[-1]
                 self._topics.setdefault(name_above(self._source[topic]), set()).add(topic)
         self._with_pictures = {name for name in self._topics if self._picture_topics([name])}
+        #: Names with boxes in space, and neither pictures nor boxes in pictures.
+        self._in_space = {
+            name
+            for name in set(self._topics) - self._with_pictures
+            if self._space_topics([name]) and not self._detection_topics([name])
+        }
 
     def cameras(self) -> list[Camera]:
         """Group names to cameras: names with labels or detections alone join the nearest camera with pictures."""
         labels = {name for name, topics in self._topics.items() if all(_is_label(self._source[one]) for one in topics)}
         joined = {name: [name] for name in self._topics}
-        for name in sorted(set(self._topics) - self._with_pictures):
+        for name in sorted(set(self._topics) - self._with_pictures - self._in_space):
             others = self._with_pictures or (set(self._topics) - labels)
             target = _nearest(name, others) if name in labels or self._detection_topics([name]) else None
             if (
@@ -197,15 +220,17 @@ class _Channels:
         """Return the camera with these names; ``prefix``: the name for its results, by default the one that has any."""
         prefix = prefix or next((name for name in names if self._result_topics([name])), names[0])
         pictures = self._picture_topics(names)
-        nearest = None if pictures else _nearest(prefix, self._with_pictures)
+        is_in_space = not self._in_space.isdisjoint(names)
+        nearest = None if pictures or is_in_space else _nearest(prefix, self._with_pictures)
         return Camera(
             prefix,
             tuple(names),
             self._default_pictures(names) or _only(pictures or (self._picture_topics([nearest]) if nearest else [])),
-            _only(self._detection_topics(names)),
+            _only(self._detection_topics(names) or self._space_topics(names)),
             self._label_topic(names, TRUTH) or f"{prefix}/{TRUTH}",
             self._label_topic(names, GROUND_PLANE) or f"{prefix}/{GROUND_PLANE}",
             frozenset(topic for name in names for topic in self._topics.get(name, ())),
+            tuple(self._space_topics(names)) if is_in_space else (),
         )
 
     def _picture_topics(self, names: list[str]) -> list[str]:
@@ -221,13 +246,13 @@ class _Channels:
         return next((channel.topic for channel in there if foreign.holds_pictures(channel)), None)
 
     def _detection_topics(self, names: list[str]) -> list[str]:
-        """Return the topics of detections that no stage made."""
+        """Return the topics of detections in pictures that no stage made."""
+        return self._select(names, lambda channel: foreign.holds_detections(channel) or _is_ours(channel, False))
+
+    def _space_topics(self, names: list[str]) -> list[str]:
+        """Return the topics of detections in space that no stage made."""
         return self._select(
-            names,
-            lambda channel: (
-                foreign.holds_detections(channel)
-                or (channel.schema_name == DETECTIONS.name and not is_made_by_stage(channel))
-            ),
+            names, lambda channel: holds_boxes_3d(self._opened, channel.topic) or _is_ours(channel, True)
         )
 
     def _result_topics(self, names: list[str]) -> list[str]:
@@ -243,6 +268,12 @@ class _Channels:
     def _select(self, names: list[str], wanted: Callable[[log.Channel], bool]) -> list[str]:
         topics = sorted(topic for name in names for topic in self._topics.get(name, ()))
         return [topic for topic in topics if wanted(self._opened.channels[topic])]
+
+
+def _is_ours(channel: log.Channel, is_in_space: bool) -> bool:
+    """Return whether a channel has rows of detections that no stage made, in space or in pictures."""
+    is_recorded = channel.schema_name == DETECTIONS.name and not is_made_by_stage(channel)
+    return is_recorded and bool(frame_id_of(channel.metadata)) == is_in_space
 
 
 def _is_result(channel: log.Channel) -> bool:

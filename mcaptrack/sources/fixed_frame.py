@@ -21,6 +21,7 @@ from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.transform_tree import TransformTree, plain_frame
 from mcaptrack.notices import warn
 from mcaptrack.schema import DETECTIONS, SCORES_NEEDED, Frame, Rows
+from mcaptrack.schema.provenance import frame_id_of, input_of
 from mcaptrack.sources import foreign
 from mcaptrack.sources.foreign.boxes_3d.recorded import Recorded3d, recorded
 from mcaptrack.sources.frames import poses_at, transforms_of
@@ -66,7 +67,8 @@ def named_detections(opened: log.Log, topic: str, frame_id: str = "") -> foreign
     topic : str
         A channel of boxes.
     frame_id : str
-        The frame that boxes in space are brought to; by default the root of the tree that their frame is in.
+        The frame that boxes in space are brought to; by default that of the tracks that were made from them, or else
+        the root of the tree that their frame is in.
 
     Returns
     -------
@@ -114,6 +116,8 @@ def _fixed_frame(opened: log.Log, topic: str, found: Recorded3d, wanted: str) ->
                 f"{opened.path}: there is no frame {wanted} for the boxes of {topic}; there are {there}"
             )
         return wanted
+    if (before := _frame_before(opened, topic)) in known:
+        return before
     if tree is None or usual not in tree.frames():
         if usual or found.names:
             why = "the log has no transforms" if tree is None else _unknown(tree, usual)
@@ -126,6 +130,12 @@ def _fixed_frame(opened: log.Log, topic: str, found: Recorded3d, wanted: str) ->
             warn(f"{opened.path}: {topic}: {words}; `frame=` names another frame", "transforms")
         return usual
     return tree.root_of(usual)
+
+
+def _frame_before(opened: log.Log, topic: str) -> str:
+    """The frame of a channel that was made from these boxes; "" if there is none."""
+    made = (channel.metadata for channel in opened.channels.values() if input_of(channel.metadata) == topic)
+    return next(filter(None, map(frame_id_of, made)), "")
 
 
 def _unknown(tree: TransformTree, frame: str) -> str:

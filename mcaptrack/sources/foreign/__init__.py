@@ -26,6 +26,7 @@ from mcaptrack.sources.video import PixelLayout
 
 __all__ = [
     "BOXES_3D_READ",
+    "BOXES_READ",
     "DETECTIONS_READ",
     "PICTURES_READ",
     "Classes",
@@ -52,6 +53,8 @@ __all__ = [
 
 _COMPRESSED: Final = (foxglove.VIDEO, foxglove.IMAGE, "sensor_msgs/CompressedImage")
 _RAW: Final = ("foxglove.RawImage", "sensor_msgs/Image")
+#: Schemas of boxes, in pictures and in space.
+BOXES_READ: Final = (*DETECTIONS_READ, *BOXES_3D_READ)
 #: Schemas of pictures, by their names in ROS 1 and Foxglove; ROS 2 adds "/msg/".
 PICTURES_READ: Final = (*_COMPRESSED, *_RAW)
 #: Words for video codecs in the format of a compressed picture; other formats are still images.

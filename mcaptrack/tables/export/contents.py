@@ -17,6 +17,7 @@ from mcaptrack.schema.classes import class_names
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources import foreign
 from mcaptrack.sources.cameras import Camera, cameras
+from mcaptrack.sources.fixed_frame import holds_boxes, holds_boxes_3d, named_detections
 from mcaptrack.sources.foreign.flatten import flattener, message_type_of
 from mcaptrack.tables import TABLES, Part, Pointers
 from mcaptrack.tables.export.names import file_name, recording_name
@@ -73,7 +74,7 @@ class LogTables:
         ours = log.topics_with_schema(self.opened, [schema.name])
         found = [channel.topic for channel in ours if channel.message_encoding == "protobuf"]
         if schema is DETECTIONS:
-            found += [channel.topic for channel in self.opened.channels.values() if foreign.holds_detections(channel)]
+            found += [topic for topic in self.opened.channels if holds_boxes(self.opened, topic)]
         return sorted(found)
 
     def source(self, name: str) -> str:
@@ -130,7 +131,7 @@ class LogTables:
 
     def _part(self, topic: str) -> Part:
         if topic not in self._parts:
-            if foreign.holds_detections(self.opened.channel(topic)):
+            if holds_boxes(self.opened, topic):
                 self._parts[topic] = self._boxes(topic)
                 return self._parts[topic]
             schema = next(
@@ -145,7 +146,7 @@ class LogTables:
     def _boxes(self, topic: str) -> Part:
         """Foreign boxes; none, and a note, if they can't be read: the other tables don't depend on them."""
         try:
-            frames, self._class_names[topic], _ = foreign.named_detections(self.opened, topic)
+            frames, self._class_names[topic], _ = named_detections(self.opened, topic)
         except McaptrackError as error:
             self._note("detections", f"{error}; no boxes of {topic} are in the table")
             t_ns = self.opened.times(topic)
@@ -160,7 +161,9 @@ class LogTables:
         file = file_name(self.opened.part(topic).path)
         count = len(places.t_ns)
         frame, rows = np.arange(count), np.full(count, -1)
-        if of_rows and not foreign.holds_pictures(self.opened.channel(topic)):
+        # Rows of 3D boxes are at their stamps: several messages may be one frame.
+        has_rows = not foreign.holds_pictures(self.opened.channel(topic)) and not holds_boxes_3d(self.opened, topic)
+        if of_rows and has_rows:
             part = self._part(topic)
             frame, rows = part.frame, part.counts
         return Pointers(file, places.t_ns, frame, rows, places.chunk_offset, places.offset)

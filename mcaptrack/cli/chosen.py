@@ -1,0 +1,97 @@
+"""Which transforms the command line, the environment and files choose, and with which parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import Field, fields, replace
+from types import MappingProxyType
+from typing import Any, get_type_hints
+
+from mcaptrack.cli.command import is_on_command_line, settings_of
+from mcaptrack.cli.text import say
+from mcaptrack.errors import McaptrackError
+from mcaptrack.schema import DETECTIONS
+from mcaptrack.transforms import STAGES, Stage, Transform
+from mcaptrack.transforms.protocol import member_type
+
+
+def listed(names: Sequence[str]) -> str:
+    """Return names in words: "a, b and c"."""
+    return " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
+
+
+def options_of(kind: type[Transform]) -> dict[str, Field[Any]]:
+    """Return the parameters of a transform that are options, by name."""
+    return {f.name: f for f in fields(kind) if not f.metadata.get("context")}
+
+
+def is_open(stage: Stage, given: Mapping[str, Any]) -> bool:
+    """Return whether the boxes of a log decide which tracker runs, because the user named none."""
+    is_tracker = stage.default.reads is DETECTIONS
+    return is_tracker and given["tracker"] == stage.entry(stage.default).name and not is_on_command_line("tracker")
+
+
+def make_transform(
+    stage: Stage,
+    given: Mapping[str, Any],
+    wanted: Mapping[str, Any],
+    owners: Mapping[str, list[str]] = MappingProxyType({}),
+) -> Transform:
+    """Return the chosen transform with those of the wanted parameters that it has.
+
+    ``owners`` has the names of the transforms that have an option. An option on the command line that the chosen
+    transform lacks is refused; one from a file or the environment is ignored, since it may be meant for another
+    transform.
+    """
+    name = _chosen(stage, given, wanted)
+    cls = stage.with_part(stage.find(name).cls if name else stage.default, wanted.get(stage.parameter))
+    own = options_of(cls)
+    for option in wanted:
+        if option in owners and option not in own and is_on_command_line(option):
+            flag = "--" + option.replace("_", "-")
+            chosen = name or wanted.get(stage.option) or stage.choice(stage.default())
+            raise McaptrackError(f"{flag} is an option of {listed(owners[option])}, not of {chosen}")
+    hints = get_type_hints(cls)
+    values = {
+        option: tuple(value) if member_type(hints[option])[1] else value
+        for option, value in wanted.items()
+        if option in own
+    }
+    if stage.profiles and (profile := given.get("profile")):
+        return replace(stage.profiles[profile], **values)
+    return stage.make(name, **values)
+
+
+def _chosen(stage: Stage, given: Mapping[str, Any], wanted: Mapping[str, Any]) -> str:
+    """Return the name of the chosen transform: from its option, the profile, or an option that implies it; else "".
+
+    Raises McaptrackError if the profile is of another transform.
+    """
+    name = (given.get(stage.kind) if stage.kind else "") or ""
+    if stage.profiles and (profile := given.get("profile")):
+        meant = stage.choice(stage.profiles[profile])
+        if name not in ("", meant):
+            raise McaptrackError(f"the profile {profile} is of the {stage.kind} {meant}, not of {name}")
+        return meant
+    for option, implied in stage.implied.items():
+        if not name and option in wanted:
+            if not given.get("quiet"):
+                say(f"{option} belongs to --{stage.kind} {implied}, which is used; the next release requires that")
+            return implied
+    return name
+
+
+def configured(chosen: Mapping[str, str] = MappingProxyType({})) -> dict[str, Transform]:
+    """Return the transforms that environment and files configure, by stage, for a command that runs several stages.
+
+    ``chosen`` has names from the command line by kind.
+    """
+    out: dict[str, Transform] = {}
+    for stage in STAGES.values():
+        settings = settings_of(stage.name)
+        own = {option for kind in stage.built_in().values() for option in options_of(kind)}
+        settings |= {kind: name for kind, name in chosen.items() if kind == stage.option}
+        wanted = {option: value for option, value in settings.items() if value is not None}
+        if wanted.keys() & {*own, stage.option, "profile"}:
+            out[stage.name] = make_transform(stage, settings, wanted)
+    return out

@@ -1,0 +1,70 @@
+"""Which tracker suits boxes: one for boxes in pictures, or one for positions in metres."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final, Literal
+
+import numpy as np
+
+from mcaptrack import log
+from mcaptrack.errors import McaptrackError
+from mcaptrack.pipeline.checks import Job
+from mcaptrack.schema import DETECTIONS, TRACKS
+from mcaptrack.schema.provenance import frame_id_of
+from mcaptrack.sources.cameras import is_made_by_stage
+from mcaptrack.sources.fixed_frame import holds_boxes_3d
+from mcaptrack.transforms import STAGES
+
+Space = Literal["picture", "ground"]
+_BOXES: Final = {"picture": "boxes in pixels", "ground": "positions in metres"}
+
+
+def space_of(transform: object) -> str:
+    """Return the space in which a tracker associates: "picture", or "ground" in metres."""
+    return str(getattr(transform, "space", "picture"))
+
+
+def spaces_of_boxes(opened: log.Log, topic: str) -> frozenset[Space]:
+    """Return in which spaces the boxes of a channel are; empty if it has no boxes or isn't there."""
+    channel = opened.channels.get(topic)
+    if channel is None:
+        return frozenset()
+    if holds_boxes_3d(opened, topic):
+        return frozenset({"ground"})
+    if channel.schema_name != DETECTIONS.name:
+        return frozenset({"picture"})
+    if not frame_id_of(channel.metadata) and is_made_by_stage(channel):
+        return frozenset({"picture"})
+    rows = opened.rows(topic, DETECTIONS).rows
+    there: dict[Space, str] = {"picture": "x_px", "ground": "x_m"}
+    return frozenset(space for space, column in there.items() if np.isfinite(rows[column]).any())
+
+
+def tracker_of(space: str) -> str:
+    """Return the name of the first tracker of a space. Raises McaptrackError if there is none."""
+    names = [name for name, cls in STAGES["track"].built_in().items() if space_of(cls) == space]
+    if not names:
+        raise McaptrackError(f"no tracker takes {_BOXES[space]}; `tracker=` names one of your own")
+    return names[0]
+
+
+def suited_tracker(opened: log.Log, source: str) -> str:
+    """Return the tracker for boxes that the default one can't take; "" for others."""
+    spaces, default = spaces_of_boxes(opened, source), space_of(STAGES["track"].default)
+    return tracker_of(next(iter(sorted(spaces)))) if spaces and default not in spaces else ""
+
+
+def check_spaces(opened: log.Log, jobs: Sequence[Job]) -> None:
+    """Raise McaptrackError if a tracker can't take the boxes of its channel."""
+    for job in jobs:
+        if job.transform.reads is not DETECTIONS or job.transform.writes.get("") is not TRACKS:
+            continue
+        spaces, space = spaces_of_boxes(opened, job.source), space_of(job.transform)
+        if spaces and space not in spaces:
+            there = " and ".join(_BOXES[one] for one in sorted(spaces))
+            name, other = STAGES["track"].choice(job.transform), tracker_of(next(iter(sorted(spaces))))
+            raise McaptrackError(
+                f"{opened.path}: {job.source} has {there}, and the tracker {name} takes {_BOXES[space]}; "
+                f"`tracker={other}` takes these"
+            )

@@ -1,0 +1,30 @@
+"""Whether a channel is out of date."""
+
+from __future__ import annotations
+
+from mcaptrack import log
+from mcaptrack.pipeline import motion
+from mcaptrack.pipeline.planes import planes_to_json, read_planes
+from mcaptrack.schema.provenance import Provenance
+from mcaptrack.sources.cameras import chain_of, name_above, provenance_of
+
+
+def is_stale(opened: log.Log, topic: str) -> bool:
+    """Return whether an input or reference of ``topic``, or its ground plane, has changed since it was made."""
+    made = Provenance.from_metadata(opened.channel(topic).metadata)
+    if made is None:
+        return False
+    prefix = name_above(chain_of(opened, topic)[-1])
+    if "ground_planes" in made.parameters:
+        planes = read_planes(opened, prefix)
+        if planes_to_json(planes or ()) != made.parameters["ground_planes"]:
+            return True
+    if motion.is_motion_new(opened, prefix, made):
+        return True
+    if any((name in opened.channels) != bool(then) for name, then in made.references.items()):
+        return True
+    for name, then in made.made_from().items():
+        now = provenance_of(opened, name)
+        if now and now.digest and now.digest != then:
+            return True
+    return False
