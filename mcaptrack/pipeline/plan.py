@@ -60,7 +60,7 @@ def plan_stage(
     source = source or planner.source_of(stage)
     planner.ensure(source)
     if transform is None:
-        suited = planner.suited_tracker(source) if stage == "track" else ""
+        suited = planner.suited_tracker(stage, source)
         transform = make(suited) if make else STAGES[stage].make(suited)
     planner.ensure_motion(transform, source)
     planner.jobs.append(Job(stage, transform, source, target or usual, keep, frame_id=frame_id))
@@ -147,7 +147,7 @@ class _Planner:
         if self._unnamed:
             raise McaptrackError(self._refusal())
         check_inputs(self._opened, self._prefix, self.jobs)
-        check_spaces(self._opened, self.jobs)
+        check_spaces(self._opened, self._prefix, self.jobs, self._frame_id)
         for words in self._notes:
             say(words)
         return self.jobs
@@ -171,9 +171,9 @@ class _Planner:
             return camera.boxes
         return usual
 
-    def suited_tracker(self, source: str) -> str:
-        """Return the tracker for boxes that the default one can't take; "" for others."""
-        if name := suited_tracker(self._opened, source):
+    def suited_tracker(self, stage: str, source: str) -> str:
+        """Return the tracker for boxes that the default one can't take; "" for others, and for other stages."""
+        if name := suited_tracker(self._opened, STAGES[stage], source):
             self._notes.append(f"{source} has boxes in space: tracking by {name}")
         return name
 
@@ -215,7 +215,7 @@ class _Planner:
 
     def _suited(self, stage: str, source: str) -> Transform | None:
         """Create the transform that the maker of a stage's input recommends for the stage; None if it names none."""
-        if stage == "track" and (name := self.suited_tracker(source)):
+        if name := self.suited_tracker(stage, source):
             return STAGES[stage].make(name)
         option, maker = STAGES[stage].option, self._maker_of(source)
         found = suited(maker, option)
@@ -269,7 +269,7 @@ class _Planner:
         suited = self._suited(stage, source) if is_open else None
         wanted = self._with_choice(self._defaults.get(stage, suited or before)) if is_usual else before
         is_replaced = is_usual and (self._is_replaced(STAGES[stage], before, wanted) or suited is not None)
-        is_replaced = is_replaced or (stage == "track" and self._frame_id not in ("", made.frame_id))
+        is_replaced = is_replaced or self._frame_id not in ("", made.frame_id or self._frame_id)
         is_projected = is_usual and STAGES[stage].needs_scale and self._is_plane_due(source)
         is_due = is_due or is_projected
         if wanted and not is_replaced and not self._force:

@@ -9,12 +9,13 @@ import numpy as np
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
+from mcaptrack.notices import warn
 from mcaptrack.pipeline.checks import Job
 from mcaptrack.schema import DETECTIONS, TRACKS
 from mcaptrack.schema.provenance import frame_id_of
-from mcaptrack.sources.cameras import is_made_by_stage
+from mcaptrack.sources.cameras import camera_at, is_made_by_stage
 from mcaptrack.sources.fixed_frame import holds_boxes_3d
-from mcaptrack.transforms import STAGES
+from mcaptrack.transforms import STAGES, Stage
 
 Space = Literal["picture", "ground"]
 _BOXES: Final = {"picture": "boxes in pixels", "ground": "positions in metres"}
@@ -49,14 +50,22 @@ def tracker_of(space: str) -> str:
     return names[0]
 
 
-def suited_tracker(opened: log.Log, source: str) -> str:
-    """Return the tracker for boxes that the default one can't take; "" for others."""
+def suited_tracker(opened: log.Log, stage: Stage, source: str) -> str:
+    """Return the tracker for boxes that the default one can't take; "" for others, and for other stages."""
+    if stage.default.reads is not DETECTIONS:
+        return ""
     spaces, default = spaces_of_boxes(opened, source), space_of(STAGES["track"].default)
     return tracker_of(next(iter(sorted(spaces)))) if spaces and default not in spaces else ""
 
 
-def check_spaces(opened: log.Log, jobs: Sequence[Job]) -> None:
-    """Raise McaptrackError if a tracker can't take the boxes of its channel."""
+def check_spaces(opened: log.Log, prefix: str, jobs: Sequence[Job], frame_id: str = "") -> None:
+    """Raise McaptrackError if a tracker can't take the boxes of its channel.
+
+    Warns if a frame is named and no boxes can be brought to it.
+    """
+    sources = {job.source for job in jobs if job.source in opened.channels}
+    if frame_id and not camera_at(opened, prefix).in_space and not any(holds_boxes_3d(opened, one) for one in sources):
+        warn("`frame=` has no effect: only recorded 3D boxes are brought to a frame", "option-not-used")
     for job in jobs:
         if job.transform.reads is not DETECTIONS or job.transform.writes.get("") is not TRACKS:
             continue

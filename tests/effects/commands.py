@@ -39,6 +39,7 @@ def stage(command: str, **others: str | tuple[str, str]) -> dict[str, Case]:
         output="-o b.mcap",
         sidecar="--sidecar",
         force=(f"{base} -o fresh.mcap", "--force"),
+        **({"frame": "--frame map"} if command == "track" else {}),
         **others,
     )
 
@@ -87,6 +88,7 @@ CASES: dict[str, dict[str, Case]] = {
     "retrack": stage("retrack", retracker="--retracker none", profile="--profile paper", mode="--mode online"),
     "run": common(
         "run fresh.mcap --no-tables",
+        frame="--frame map",
         topic="--topic /none",
         camera="--camera other",
         output="-o b.mcap",
