@@ -93,7 +93,7 @@ def named_detections(opened: log.Log, topic: str, frame_id: str = "") -> foreign
     is_left_out[frame[is_known]] = False
     found, frame = found.select(is_known), frame[is_known]
     _warn_odd(opened, topic, found)
-    rows = _rows(opened, topic, found, rotation[is_known], shift[is_known])
+    rows = rows_of_boxes(found, rotation[is_known], shift[is_known], f"{opened.path}: {topic}")
     names = foreign.settle_classes(opened, topic, found.classes, [rows])
     order = np.argsort(frame, kind="stable")
     parts = np.split(rows[order], np.searchsorted(frame[order], np.arange(1, len(start_ns))))
@@ -191,8 +191,11 @@ def _warn_odd(opened: log.Log, topic: str, found: Recorded3d) -> None:
         warn(f"{opened.path}: {topic}: scores are from {low:g} to {high:g}; {SCORES_NEEDED}")
 
 
-def _rows(opened: log.Log, topic: str, found: Recorded3d, rotation: Floats, shift: Floats) -> Rows:
-    """Boxes as rows of detections (N,), from the poses of their frames."""
+def rows_of_boxes(found: Recorded3d, rotation: Floats, shift: Floats, where: str = "") -> Rows:
+    """Boxes as rows of detections (N,), from the poses of their frames: (N, 3, 3) and (N, 3). Classes are not settled.
+
+    ``where`` is named in warnings.
+    """
     from scipy.spatial.transform import Rotation
 
     count = len(found.frame)
@@ -208,7 +211,7 @@ def _rows(opened: log.Log, topic: str, found: Recorded3d, rotation: Floats, shif
     lying = int((up[found.has_heading] != 2).sum())
     if lying:
         words = "boxes stand on another side than that of their z axis: their height is along the axis that is upright"
-        warn(f"{opened.path}: {topic}: {lying:,} {words}")
+        warn(f"{where}: {lying:,} {words}")
     return DETECTIONS.rows(
         x_m=centre[:, 0],
         y_m=centre[:, 1],
