@@ -60,9 +60,9 @@ DERIVED = (
     "std_msgs/Header header\nderived_object_msgs/Object[] objects\n" + HEADER2
     + BAR + "MSG: derived_object_msgs/Object\nstd_msgs/Header header\nuint32 id\nuint8 detection_level\nbool object_classified\n"
     "geometry_msgs/Pose pose\ngeometry_msgs/Twist twist\ngeometry_msgs/Accel accel\ngeometry_msgs/Polygon polygon\n"
-    "shape_msgs/SolidPrimitive shape\nuint8 classification\nuint8 classification_certainty\nuint32 classification_age\n"
+    "own_shapes/SolidPrimitive shape\nuint8 classification\nuint8 classification_certainty\nuint32 classification_age\n"
     + BAR + "MSG: geometry_msgs/Accel\ngeometry_msgs/Vector3 linear\ngeometry_msgs/Vector3 angular\n"
-    + BAR + "MSG: shape_msgs/SolidPrimitive\nuint8 type\nfloat64[] dimensions\n"
+    + BAR + "MSG: own_shapes/SolidPrimitive\nuint8 type\nfloat64[] dimensions\n"
     + POSES + _TWIST + _POLYGON
 )  # fmt: skip
 

@@ -17,8 +17,26 @@ from mcaptrack.schema import Frame
 from mcaptrack.sources.fixed_frame import named_detections, rows_of_boxes
 from mcaptrack.sources.foreign import MessageType
 from mcaptrack.sources.foreign.boxes_3d import boxes_3d_decoder
+from mcaptrack.sources.foreign.boxes_3d.box import Box3d, Message3d
 from mcaptrack.sources.foreign.boxes_3d.recorded import recorded
-from tests.space_logs import START_NS, WAYS, Robot, Seen, scene_update, write
+from tests.ros_messages import Ros
+from tests.space_logs import (
+    DERIVED,
+    JSK,
+    START_NS,
+    WAYS,
+    Robot,
+    Seen,
+    autoware,
+    covered,
+    header,
+    marker,
+    point,
+    pose,
+    ros,
+    scene_update,
+    write,
+)
 
 NUMBERS = ("x_m", "y_m", "z_m", "length_m", "width_m", "height_m", "heading_rad")
 
@@ -105,3 +123,226 @@ def test_any_pose_of_sensor_and_box_gives_the_numbers_of_scipy(angles, shifts, l
 
 
 _KIND = MessageType("foxglove.SceneUpdate", "protobuf", b"", "protobuf")
+
+
+# Other messages
+
+
+def boxes_of(writer: Ros, message) -> Message3d:
+    return boxes_3d_decoder(writer.kind)(writer.pack(message))
+
+
+SEEN = Seen(
+    np.array([1.0, 2.0, 3.0]), np.array([0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)]), np.array([4.0, 2.0, 1.5]), number=12
+)
+
+
+def test_boxes_of_jsk_have_their_label_as_class_and_no_score_of_zero():
+    writer = ros("jsk_recognition_msgs/BoundingBoxArray", JSK)
+    boxes = [
+        writer.new("jsk_recognition_msgs/BoundingBox", header(writer, stamp, own), pose(writer, SEEN), point(writer, SEEN.size, "Vector3"), value, label)
+        for stamp, own, value, label in ((0, "", 0.75, 3), (START_NS + 5, "roof", 0.0, 0), (0, "roof", 0.5, 1))
+    ]  # fmt: skip
+    found = boxes_of(
+        writer, writer.new("jsk_recognition_msgs/BoundingBoxArray", header(writer, START_NS, "lidar"), boxes)
+    )
+    assert [(box.stamp_ns, box.frame_id) for box in found.boxes] == [
+        (START_NS, "lidar"),
+        (START_NS + 5, "roof"),
+        (START_NS, "roof"),
+    ]
+    assert [(box.class_name, box.source_id) for box in found.boxes] == [("3", None), ("0", None), ("1", None)]
+    np.testing.assert_array_equal([box.score for box in found.boxes], [0.75, np.nan, 0.5])
+    assert (found.boxes[0].centre, found.boxes[0].size) == ((1, 2, 3), (4, 2, 1.5))
+
+
+def test_objects_of_derived_object_msgs_have_shape_class_and_velocity():
+    writer = ros("derived_object_msgs/ObjectArray", DERIVED)
+    still = writer.new("geometry_msgs/Accel", point(writer, [0, 0, 0], "Vector3"), point(writer, [0, 0, 0], "Vector3"))
+    twist = writer.new("geometry_msgs/Twist", point(writer, [5, 6, 7], "Vector3"), point(writer, [0, 0, 0], "Vector3"))
+    objects = [
+        writer.new(
+            "derived_object_msgs/Object", header(writer, 0, ""), 40 + number, 1, True, pose(writer, SEEN), twist, still,
+            writer.new("geometry_msgs/Polygon", []), writer.new("own_shapes/SolidPrimitive", kind, np.array(lengths)), label, certainty, 9,
+        )
+        for number, (kind, lengths, label, certainty) in enumerate(
+            [(1, [4.0, 2.0, 1.5], 6, 80), (3, [1.75, 0.25], 4, 255), (2, [0.5], 0, 0), (0, [], 7, 100), (1, [1.0], 7, 100)]
+        )
+    ]  # fmt: skip
+    found = boxes_of(writer, writer.new("derived_object_msgs/ObjectArray", header(writer, START_NS, "map"), objects))
+    assert [box.size for box in found.boxes] == [(4, 2, 1.5), (0.5, 0.5, 1.75), (1, 1, 1)]
+    assert [box.class_name for box in found.boxes] == ["car", "pedestrian", ""]
+    np.testing.assert_array_equal([box.score for box in found.boxes], [0.8, 1.0, np.nan])
+    assert [(box.source_id, box.velocity) for box in found.boxes] == [(40 + n, (5, 6, 7)) for n in range(3)]
+    assert found.ignored == {"objects without a shape": 2}
+
+
+@pytest.mark.parametrize("package", ["autoware_perception_msgs", "autoware_auto_perception_msgs"])
+@pytest.mark.parametrize("tracked", [False, True], ids=["detected", "tracked"])
+def test_objects_of_autoware(package, tracked):
+    kind = "Tracked" if tracked else "Detected"
+    writer = ros(f"{package}/{kind}Objects", autoware(package, tracked))
+    zero = point(writer, [0, 0, 0], "Vector3")
+    twist = writer.new(
+        "geometry_msgs/TwistWithCovariance",
+        writer.new("geometry_msgs/Twist", point(writer, [3, 0, 0], "Vector3"), zero),
+        np.zeros(36),
+    )
+    at = covered(writer, "Pose", pose(writer, SEEN))
+
+    def one(shape: int, footprint=(), labels=((1, 0.5),), existence=0.9, known=2, uuid=b""):
+        corners = writer.new(
+            "geometry_msgs/Polygon", [writer.new("geometry_msgs/Point32", *map(float, p)) for p in footprint]
+        )
+        form = writer.new(f"{package}/Shape", shape, corners, point(writer, SEEN.size, "Vector3"))
+        guesses = [writer.new(f"{package}/ObjectClassification", *guess) for guess in labels]
+        accel = (
+            []
+            if not tracked
+            else [
+                writer.new(
+                    "geometry_msgs/AccelWithCovariance", writer.new("geometry_msgs/Accel", zero, zero), np.zeros(36)
+                )
+            ]
+        )
+        own = [known, twist, *accel, False] if tracked else [False, known, twist, True, False]
+        id_ = (
+            [writer.new("unique_identifier_msgs/UUID", np.frombuffer(uuid.ljust(16, b"\0"), np.uint8))]
+            if tracked
+            else []
+        )
+        kinematics = writer.new(f"{package}/{kind}ObjectKinematics", at, *own)
+        return writer.new(f"{package}/{kind}Object", *id_, existence, guesses, kinematics, form)
+
+    objects = [
+        one(0, labels=((1, 0.25), (7, 0.75)), uuid=b"b"),
+        one(1, labels=((5, np.nan), (6, 0.5)), existence=0.0, known=0, uuid=b"a"),
+        one(2, [(-1, -1, 0), (3, -1, 0), (3, 1, 0), (0, 1, 0)], labels=(), uuid=b"b"),
+    ]
+    head = header(writer, START_NS, "map")
+    found = boxes_of(writer, writer.new(f"{package}/{kind}Objects", head, objects))
+    assert [box.class_name for box in found.boxes] == ["pedestrian", "bicycle", ""]
+    np.testing.assert_allclose([box.score for box in found.boxes], [0.9, 0.5, 0.9], atol=1e-6)
+    assert [box.has_heading for box in found.boxes] == [True, False, True]
+    # The axes of the object are turned by 90 degrees: x is ahead to y.
+    np.testing.assert_allclose([box.velocity for box in found.boxes], [[0, 3, 0]] * 3, atol=1e-12)
+    assert [box.size for box in found.boxes] == [(4, 2, 1.5), (4, 2, 1.5), (4, 2, 1.5)]
+    np.testing.assert_allclose([box.centre for box in found.boxes], [[1, 2, 3], [1, 2, 3], [1, 3, 3]], atol=1e-12)
+    ids = recorded([(START_NS, found)]).source_id.tolist()
+    assert ids == ([1, 0, 1] if tracked else [-1, -1, -1])
+
+
+def test_markers_that_are_no_cubes_are_counted_and_lists_of_cubes_are_boxes():
+    writer = ros("visualization_msgs/MarkerArray")
+    markers = [
+        marker(writer, START_NS, SEEN, kind=6, points=[(1, 0, 0), (0, 2, 0)], space="objects", text="truck 87%"),
+        marker(writer, START_NS, SEEN, kind=9, text="car 0.9"),
+        marker(writer, START_NS, SEEN, kind=1, action=2),
+        marker(writer, START_NS + 4, SEEN, space="lidar/van", text="12: 0.25"),
+        marker(writer, START_NS, SEEN, space="", text="no number here"),
+    ]
+    found = boxes_of(writer, writer.new("visualization_msgs/MarkerArray", markers))
+    np.testing.assert_allclose(
+        [box.centre for box in found.boxes], [[1, 3, 3], [-1, 2, 3], [1, 2, 3], [1, 2, 3]], atol=1e-12
+    )
+    assert [box.class_name for box in found.boxes] == ["truck", "truck", "van", "no"]
+    np.testing.assert_allclose([box.score for box in found.boxes], [0.87, 0.87, 0.25, np.nan])
+    assert [box.source_id for box in found.boxes] == [None, None, 12, 12]
+    assert found.boxes[2].stamp_ns == START_NS + 4
+    assert found.ignored == {"markers that are no cubes": 1}
+    one = ros("visualization_msgs/Marker")
+    assert boxes_of(one, marker(one, START_NS, SEEN)).boxes[0].source_id == 12
+
+
+def test_cubes_of_one_entity_have_no_id_and_metadata_has_several_names():
+    message = scene_update(START_NS, [SEEN, SEEN])
+    message.entities[0].cubes.add().CopyFrom(message.entities[0].cubes[0])
+    del message.entities[1].metadata[:]
+    message.entities[1].texts.add(text="van 0.25")
+    for key, value in (("Track-ID", "77"), ("probability", "50 %"), ("object_class", "bus")):
+        other = message.entities.add(frame_id="/roof", id="no number")
+        other.cubes.add()
+        other.metadata.add(key=key, value=value)
+    message.entities.add(id="text alone").texts.add(text="car")
+    found = boxes_3d_decoder(_KIND)(message.SerializeToString())
+    assert [box.source_id for box in found.boxes] == [None, None, "12", "77", "no number", "no number"]
+    assert [box.class_name for box in found.boxes] == ["car", "car", "van", "", "", "bus"]
+    np.testing.assert_array_equal([box.score for box in found.boxes], [0.5, 0.5, 0.25, np.nan, 0.5, np.nan])
+    assert found.ignored == {"entities without cubes": 1}
+    arrays = recorded([(START_NS, found)])
+    assert arrays.names == ["lidar", "roof"]
+    assert arrays.source_id.tolist() == [-1, -1, 12, 77, 78, 78]
+    assert arrays.remarks == {
+        "entities without cubes are left out": 1,
+        "boxes have a size of 0: it is unknown": 3,
+        "boxes have an orientation of zeros: they count as not turned": 3,
+    }
+
+
+def test_numbers_that_can_not_be_are_counted_once():
+    nan, inf = float("nan"), float("inf")
+    turn, size = (0.0, 0.0, 0.0, 2.0), (4.0, 2.0, 1.0)
+    boxes = [
+        Box3d(START_NS, "a", (0.0, 0.0, 0.0), turn, size, source_id="b"),
+        Box3d(START_NS, "a", (nan, 0.0, 0.0), turn, size),
+        Box3d(START_NS, "a", (0.0, inf, 0.0), turn, size),
+        Box3d(START_NS, "a", (0.0, 0.0, 1e300), turn, size),
+        Box3d(START_NS, "a", (1.0, 0.0, 0.0), turn, (nan, 2.0, 1.0), source_id=-5),
+        Box3d(START_NS, "a", (2.0, 0.0, 0.0), turn, (-1.0, 2.0, 1.0), source_id="a"),
+        Box3d(START_NS, "a", (3.0, 0.0, 0.0), (nan, 0.0, 0.0, 1.0), (0.0, 0.0, 1.0), source_id="0012"),
+        Box3d(START_NS, "a", (4.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0), size, source_id=2**40),
+    ]
+    found = recorded([(START_NS, Message3d(START_NS, "a", boxes))])
+    assert found.remarks == {
+        "boxes have no position (no finite number) and are left out": 3,
+        "boxes have a size that is no finite number: it is unknown": 1,
+        "boxes have a negative size: it is unknown": 1,
+        "boxes have a size of 0: it is unknown": 1,
+        "boxes have an orientation that is no finite number: it is unknown": 1,
+        "boxes have an orientation of zeros: they count as not turned": 1,
+    }
+    rows = rows_of_boxes(found, np.tile(np.eye(3), (5, 1, 1)), np.zeros((5, 3)))
+    assert rows["x_m"].tolist() == [0, 1, 2, 3, 4]
+    np.testing.assert_array_equal(rows["length_m"], [4, nan, nan, nan, 4])
+    np.testing.assert_array_equal(rows["width_m"], [2, 2, 2, nan, 2])
+    np.testing.assert_array_equal(rows["heading_rad"], [0, 0, 0, nan, 0])
+    assert rows["source_id"].tolist() == [2**40 + 2, -1, 2**40 + 1, 12, 2**40]
+
+
+# Times
+
+
+MS = 1_000_000
+
+
+def message(*stamps_ms: int | None, is_measured: bool = True) -> Message3d:
+    """Boxes with these stamps; None for none. A message without boxes has no stamp."""
+    stamps = [0 if one is None else START_NS + one * MS for one in stamps_ms]
+    boxes = [Box3d(one, "a", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), (1.0, 1.0, 1.0)) for one in stamps]
+    return Message3d(stamps[0] if stamps else 0, "a", boxes, is_measured=is_measured)
+
+
+@pytest.mark.parametrize(
+    ("messages", "times", "frames"),
+    [
+        ({40: message(0), 140: message(100, 100)}, [0, 100], [0, 1, 1]),
+        ({40: message(0), 41: message(0), 140: message(100)}, [0, 100], [0, 0, 1]),  # a message for each box
+        ({140: message(100), 141: message(0)}, [0, 100], [1, 0]),  # late ones
+        ({40: message(0, 10, 20), 140: message(100, 110, 120)}, [10, 110], [0, 0, 0, 1, 1, 1]),  # the middle of a sweep
+        ({40: message(0, 90), 140: message(100, 190)}, [0, 90, 100, 190], [0, 1, 2, 3]),
+        ({40: message(0), 140: message(), 240: message(200)}, [0, 100, 200], [0, 2]),  # without a stamp: as late as others
+        ({40: message(0), 140: message(None), 240: message(200)}, [0, 140, 200], [0, 1, 2]),
+        ({40: message(0), 39: message(is_measured=False), 140: message(100), 139: message(is_measured=False)}, [0, 100], [0, 1]),
+        ({40: message(0), 140: message(100), 240: message(is_measured=False), 340: message(300)}, [0, 100, 200, 300], [0, 1, 3]),
+        ({40: message(-70_000), 140: message(-69_900)}, [40, 140], [0, 1]),  # of another clock
+        ({40: message()}, [40], []),
+        ({}, [], []),
+    ],
+)  # fmt: skip
+def test_messages_are_frames_at_their_stamps(messages, times, frames):
+    found = recorded([(START_NS + t_ns * MS, one) for t_ns, one in sorted(messages.items())])
+    starts, frame = found.frames()
+    assert ((starts - START_NS) / MS).tolist() == times
+    log_ms = (found.message_ns[found.message] - START_NS) // MS
+    order = np.concatenate([np.flatnonzero(log_ms == t_ns) for t_ns in messages] or [np.empty(0, int)])
+    assert frame[order].tolist() == frames
