@@ -23,6 +23,7 @@ entry: a line in ``BUILT_IN``.
 from __future__ import annotations
 
 import difflib
+import re
 import signal
 import sys
 from collections.abc import Iterator, Mapping
@@ -273,15 +274,25 @@ def _installed(kind: str, unreadable: list[str] | None = None) -> list[EntryPoin
     group = f"{_OWN}.{kind}s"
     points = [(found, _points(found, group)) for found in distributions()]
     if not any(point is None or point for _, point in points):
-        return []  # nothing to tell apart: names are in long files of metadata, which are parsed slowly
+        return []
     first: dict[str, tuple[str, list[EntryPoint] | None]] = {}
     for distribution, found in points:
-        name, _ = _name_and_version(distribution)
+        name = _name(distribution)
         key = name.lower().replace("-", "_") or f"{distribution!r}"
         first.setdefault(key, (name, found))  # the first one on the path is the one that is imported
     if unreadable is not None:
         unreadable += [name for name, found in first.values() if found is None]
     return [point for _, found in first.values() for point in found or () if ":" not in point.name]
+
+
+def _name(distribution: Distribution) -> str:
+    """Name of a distribution; "" if its metadata lack it. Only their line is read: they may hold a long description."""
+    try:
+        text = distribution.read_text("METADATA") or distribution.read_text("PKG-INFO") or ""
+    except Exception:  # metadata that can't be read
+        return ""
+    found = re.search(r"^Name:[ \t]*(\S+)", text, re.MULTILINE)
+    return found[1] if found else _name_and_version(distribution)[0]
 
 
 def _points(distribution: Distribution, group: str) -> list[EntryPoint] | None:

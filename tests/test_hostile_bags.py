@@ -9,6 +9,7 @@ import signal
 import socket
 import sqlite3
 import struct
+import time
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -521,7 +522,7 @@ def endless_bag(path: Path) -> None:
     connection = record(said, op=b"\7", conn=bytes(4), topic=b"/a")
     message = record(b"a", op=b"\2", conn=bytes(4), time=struct.pack("<II", 5, 5))
     with path.open("ab") as stream:
-        stream.write(connection + message * 500_000)
+        stream.write(connection + message * 300_000)
 
 
 @pytest.mark.parametrize(("make", "sent"), [(endless_database, signal.SIGINT), (endless_bag, signal.SIGTERM)])
@@ -532,6 +533,7 @@ def test_a_signal_ends_ingesting_and_leaves_nothing(folder, tmp_path, make, sent
     process = start("ingest", folder / name, "-o", tmp_path / "out.mcap")
     while not list(tmp_path.glob(".out.mcap.*.part")):  # it is at the messages
         assert process.poll() is None, process.communicate()
+        time.sleep(0.005)
     process.send_signal(sent)
     _, err = process.communicate(timeout=60)
     assert process.returncode in (128 + sent, -sent)

@@ -135,12 +135,12 @@ def camera_at(opened: log.Log, prefix: str) -> Camera:
 
 def chain_of(opened: log.Log, topic: str) -> list[str]:
     """Return a topic, its input, the input of that, and so on, up to a recorded, ingested or missing channel."""
-    chain: list[str] = []
+    chain: dict[str, None] = {}  # not a list: a chain may be long, and is searched for each of its topics
     while topic and topic not in chain:
-        chain.append(topic)
+        chain[topic] = None
         channel = opened.channels.get(topic)
         topic = input_of(channel.metadata) if channel else ""
-    return chain
+    return list(chain)
 
 
 def provenance_of(opened: log.Log, topic: str) -> Provenance | None:
