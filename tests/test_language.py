@@ -11,10 +11,10 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 SOURCES = sorted((ROOT / "mcaptrack").rglob("*.py"))
-#: docs/tables.md quotes the comments of schemas, which are a part of every log.
 PAGES = [
     *(ROOT / name for name in ("README.md", "ARCHITECTURE.md", "CONTRIBUTING.md")),
-    *sorted(path for path in (ROOT / "docs").glob("*.md") if path.name != "tables.md"),
+    *sorted((ROOT / "docs").glob("*.md")),
+    *sorted((ROOT / "schemas").glob("*.proto")),
 ]
 #: Riddles, and words with a term of the field: identity, predicted, synthetic, again.
 WORDS = re.compile(r"\b(nobody|somebody|whose|whom|foret(old|ells?)|anew|who is who|made up)\b", re.IGNORECASE)
