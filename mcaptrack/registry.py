@@ -64,6 +64,7 @@ BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(
             "sort": "mcaptrack.transforms.sort:Sort",
             "bytetrack": "mcaptrack.transforms.sort:ByteTrack",
             "ocsort": "mcaptrack.transforms.sort:OcSort",
+            "ground": "mcaptrack.transforms.ground:GroundTracker",
         },
         "predictor": {
             "red": "mcaptrack.predictors.built_in:red",

@@ -66,7 +66,7 @@ RANGES = {
     "rate_hz": (0.1, 1000.0),
     "sigma_m": (1e-6, 1e6),
 }
-SHARES = {"alpha", "beta", "max_iou", "min_iou", "low_min_iou", "track_confidence"}
+SHARES = {"alpha", "beta", "birth_score", "max_iou", "min_iou", "low_min_iou", "track_confidence"}
 ANY = {"min_score", "high_score", "new_score"}
 
 

@@ -515,7 +515,7 @@ def test_the_help_lists_the_options_of_the_one_that_is_named(place, monkeypatch)
         (
             ["--tracker", "single", "--min-iou", "0.1"],
             1,
-            "--min-iou is an option of sort, bytetrack and ocsort, not of",
+            "--min-iou is an option of sort, bytetrack, ocsort and ground, not of",
         ),
     ],
 )

@@ -71,7 +71,7 @@ def test_the_default_of_a_stage_is_the_first_of_its_kind(stage):
 
 
 def test_an_entry_point_is_found_and_listed_without_an_import(installed):
-    assert names("tracker") == ("sort", "bytetrack", "ocsort", "nearest")
+    assert names("tracker") == ("sort", "bytetrack", "ocsort", "ground", "nearest")
     assert "own_trackers" not in sys.modules
     entry = find("tracker", "nearest")
     assert (entry.name, entry.implementation) == ("nearest", "own_trackers:Nearest")
@@ -186,7 +186,7 @@ def test_damaged_entry_points_of_another_package_harm_nothing_and_are_named_wher
     info.mkdir()
     (info / "METADATA").write_text(metadata)
     (info / "entry_points.txt").write_bytes(points)
-    assert names("tracker") == ("sort", "bytetrack", "ocsort", "nearest")
+    assert names("tracker") == ("sort", "bytetrack", "ocsort", "ground", "nearest")
     entry = find("tracker", "nearest")
     assert entry_of("tracker", entry.cls) == entry
     with pytest.raises(McaptrackError, match="no tracker is called nosuch") as refused:
@@ -253,7 +253,11 @@ def test_the_place_of_a_failure_is_named_also_below_a_folder_called_mcaptrack(tm
 @pytest.mark.parametrize(
     ("text", "name", "said"),
     [
-        ("", "nosuch", "no tracker is called nosuch; there are sort, bytetrack, ocsort, nearest; an installed package"),
+        (
+            "",
+            "nosuch",
+            "no tracker is called nosuch; there are sort, bytetrack, ocsort, ground, nearest; an installed package",
+        ),
         ("", "ocsrot", "no tracker is called ocsrot; did you mean ocsort\\? there are"),
         ("", "missing_module:A", "tracker missing_module:A can't be imported: ModuleNotFoundError: No module named"),
         ("raise SystemError('two\\nlines')", "own_trackers:A", "can't be imported: SystemError: two lines"),

@@ -13,16 +13,16 @@ import numpy as np
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.camera_path import CameraPath
-from mcaptrack.geometry.clocks import NS_PER_S, parse_ns
-from mcaptrack.geometry.plane import Planes, is_assumed, scene_planes
+from mcaptrack.geometry.plane import Planes, scene_planes
 from mcaptrack.notices import Notice, collected, warn
-from mcaptrack.pipeline.checks import Job, check_inputs, read_frames, read_named_frames
+from mcaptrack.pipeline.checks import Job, check_inputs, read_named_frames
+from mcaptrack.pipeline.context import in_context
 from mcaptrack.pipeline.events import STAGE as EVENTS_STAGE
 from mcaptrack.pipeline.events import Watch, make_events, tally
 from mcaptrack.pipeline.findings import warn_findings, warn_memory, warn_no_rows
 from mcaptrack.pipeline.motion import path_with, side_inputs
 from mcaptrack.pipeline.pictures import pictures_of
-from mcaptrack.pipeline.planes import AS_BEFORE, PlaneChoice, is_poor, planes_for, read_planes, recorded_planes
+from mcaptrack.pipeline.planes import AS_BEFORE, PlaneChoice, planes_for, read_planes, recorded_planes
 from mcaptrack.pipeline.rebuild import plugins_of
 from mcaptrack.pipeline.visible import picture_size, without_unseen
 from mcaptrack.pipeline.write import Made, digest_of, write
@@ -30,10 +30,10 @@ from mcaptrack.predictors import weights_sha256
 from mcaptrack.schema import DETECTIONS, TRACKS, VIDEO, Frame, Schema
 from mcaptrack.schema.camera_motion import to_pictures, to_scene
 from mcaptrack.schema.classes import class_names
-from mcaptrack.schema.provenance import CLOCK, Provenance
+from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.camera_motion import tracks_topic
 from mcaptrack.sources.cameras import camera_at, provenance_of
-from mcaptrack.transforms import FULL, STAGES, Sample, Transform
+from mcaptrack.transforms import FULL, STAGES, Transform
 from mcaptrack.transforms.guarded import guarded
 from mcaptrack.transforms.protocol import ModelCard
 from mcaptrack.transforms.to_video_rate import to_video_rate, unchanged_tracks
@@ -183,7 +183,8 @@ def _run_job(
     path, motion = path_with(opened, prefix, job.source, made) if job.transform.reads is TRACKS else (None, {})
     if path is not None:  # boxes of pictures that the camera moved between can't be joined as they are
         given, planes = given.in_scene(path), scene_planes(planes, path)
-    transform = replace(_in_context(opened, prefix, job, given.frames, planes), **known.values)
+    context = in_context(opened, prefix, job, given.frames, planes, given.classes)
+    transform = replace(context, **known.values)
     outputs: list[list[Frame]] = [[] for _ in transform.writes]
     taken: set[int] = set()
     try:
@@ -287,39 +288,6 @@ def _at_video_rate(
     return to_pictures(frames, path)
 
 
-def _in_context(opened: log.Log, prefix: str, job: Job, frames: Sequence[Frame], planes: Planes) -> Transform:
-    """Return the transform with its context fields filled in: ground planes, start of the clock in ns, rate in Hz."""
-    names = {f.name for f in fields(job.transform) if f.metadata.get("context")}
-    known: dict[str, Any] = {}
-    if "ground_planes" in names:
-        known["ground_planes"] = tuple(planes)
-    if "start_ns" in names:
-        known["start_ns"] = _clock_start(opened, prefix)
-    if "rate_hz" in names:
-        steps = np.diff([frame.t_ns for frame in frames])
-        if (steps > 0).any():  # frames may share a time
-            known["rate_hz"] = round(NS_PER_S / float(np.median(steps[steps > 0])), 6)
-            usual = f"{prefix}/{STAGES[job.stage].input_topic}"
-            if job.source != usual and known["rate_hz"] > 2 * Sample().rate_hz:
-                warn(
-                    f"{job.source} has {known['rate_hz']:g} frames a second, and {job.stage} takes steps at that rate; "
-                    f"{usual} has {Sample().rate_hz:g} unless it was made otherwise",
-                    "clock",
-                )
-    if "poor_scale" in names and is_assumed(planes):
-        known["poor_scale"] = is_poor(frames)
-    return replace(job.transform, **known)
-
-
-def _clock_start(opened: log.Log, prefix: str) -> int | None:
-    """Return the start of the prediction clock in ns: from the log's metadata, or the time of the first picture."""
-    clock = opened.metadata(CLOCK)
-    if clock and (start := parse_ns(clock.get("start_ns", ""))) is not None:
-        return start
-    pictures = camera_at(opened, prefix).pictures
-    return min(opened.times(pictures).tolist(), default=None) if pictures else None
-
-
 def _input(
     opened: log.Log, job: Job, made: Mapping[str, Made], stamps: dict[str, list[int]], progress: Progress
 ) -> _Input:
@@ -362,7 +330,8 @@ def input_of(
     topic = source or f"{prefix}/{STAGES[stage].input_topic}"
     job = Job(stage, transform, topic, f"{prefix}/{STAGES[stage].output_topic}")
     check_inputs(opened, prefix, [job])
-    frames = read_frames(opened, topic, transform.reads)
-    known = _in_context(opened, prefix, job, frames, read_planes(opened, prefix) or ())
+    frames, names, _ = read_named_frames(opened, topic, transform.reads)
+    classes = {str(number): name for number, name in names.items()}
+    known = in_context(opened, prefix, job, frames, read_planes(opened, prefix) or (), classes)
     known = replace(known, **side_inputs(opened, prefix, job, {}).values)
     return frames, {f.name: getattr(known, f.name) for f in fields(known) if f.metadata.get("context")}

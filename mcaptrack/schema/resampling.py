@@ -11,13 +11,17 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaptrack.geometry.arrays import Ints
+from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.ragged import group_index, ragged_range, run_ends, run_starts
 from mcaptrack.schema import TRACKS, Frame, Rows
 from mcaptrack.schema.framing import join_frames
 
-#: The columns of a track that are interpolated.
-LINEAR: Final = ("x_px", "y_px", "w_px", "h_px", "x_m", "y_m", "score")
+#: The columns of a track that are interpolated, and those that are angles.
+LINEAR: Final = (
+    *("x_px", "y_px", "w_px", "h_px", "x_m", "y_m", "score"),
+    *("z_m", "length_m", "width_m", "height_m", "vx_m_per_s", "vy_m_per_s"),
+)
+ANGLES: Final = ("heading_rad",)
 #: A step longer than this many median frame intervals is a gap: rows in it are not observed.
 _MAX_STEP: Final = 1.5
 
@@ -62,10 +66,18 @@ def resample(frames: Sequence[Frame], at_ns: Ints, max_gap_ns: int) -> tuple[Row
     for name in LINEAR:
         start, end = rows[name][before], rows[name][after]
         out[name] = np.where(share == 0, start, start + share * (end - start))
+    for name in ANGLES:
+        start, end = rows[name][before], rows[name][after]
+        out[name] = np.where(share == 0, start, wrapped(start + share * wrapped(end - start)))
     between = rows["observed"][before] & rows["observed"][after] & (span <= _MAX_STEP * usual_ns)
     out["observed"] = np.where(share == 0, rows["observed"][before], between)
     order = np.lexsort((out["track_id"], at))
     return out[order], at[order].astype(np.int64)
+
+
+def wrapped(angle: Floats) -> Floats:
+    """Angles in radians, from -pi (not included) to pi."""
+    return np.asarray(np.pi - (np.pi - angle) % (2 * np.pi))
 
 
 def is_observed_at(frame_ns: Ints, at_ns: Ints, max_gap_ns: int) -> NDArray[np.bool_]:

@@ -18,6 +18,7 @@ from mcaptrack.transforms.detect import (
     MotionDetector,
     OnnxDetector,
 )
+from mcaptrack.transforms.ground import GroundTracker
 from mcaptrack.transforms.motion import EstimateMotion
 from mcaptrack.transforms.predict import Predict
 from mcaptrack.transforms.protocol import Transform
@@ -35,6 +36,7 @@ __all__ = [
     "ByteTrack",
     "EstimateMotion",
     "FrameDifferenceDetector",
+    "GroundTracker",
     "KnnDetector",
     "MedianDetector",
     "Mog2Detector",
@@ -54,5 +56,7 @@ __all__ = [
 TRANSFORMS: Final[Mapping[str, type[Transform]]] = MappingProxyType(
     {name: stage.default for name, stage in STAGES.items()}
 )
-#: The built-in trackers by name.
-TRACKERS: Final[Mapping[str, type[Transform]]] = MappingProxyType(STAGES["track"].built_in())
+#: The built-in trackers of boxes in pictures, by name.
+TRACKERS: Final[Mapping[str, type[Transform]]] = MappingProxyType(
+    {name: kind for name, kind in STAGES["track"].built_in().items() if kind is not GroundTracker}
+)

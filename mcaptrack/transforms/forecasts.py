@@ -8,9 +8,10 @@ import numpy as np
 
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.histories import Histories
-from mcaptrack.predictors import make
+from mcaptrack.predictors import Forecast, make
 from mcaptrack.schema import Frame, Rows
 from mcaptrack.schema.predictions import forecast_to_rows
+from mcaptrack.transforms.motion_limits import ClassNames, units_m
 
 
 class Forecaster:
@@ -26,12 +27,23 @@ class Forecaster:
         Number of observed positions that a prediction needs, the current one included.
     rate_hz : float
         Rate of the frames.
+    class_names : ClassNames
+        Names of classes, by which the unit of their positions is chosen: predictors know the speeds of people.
     **options
         Own parameters of the predictor.
     """
 
-    def __init__(self, predictor: str, horizon_s: float, min_history: int, rate_hz: float, **options: Any) -> None:
+    def __init__(
+        self,
+        predictor: str,
+        horizon_s: float,
+        min_history: int,
+        rate_hz: float,
+        class_names: ClassNames = (),
+        **options: Any,
+    ) -> None:
         self._rate_hz, self._min_history = rate_hz, min_history
+        self._class_names = class_names
         self._predictor = make(predictor, max(1, round(horizon_s * rate_hz)), 1 / rate_hz, **options)
         self._histories = Histories(max(self._predictor.past, min_history))
         self._last_ns: int | None = None
@@ -46,5 +58,8 @@ class Forecaster:
         past, known = self._histories.push(ids, np.stack([frame.rows["x_m"], frame.rows["y_m"]], axis=-1), passed)
         # An interpolated position depends on later ones: a prediction from it would not be causal.
         ready = known[:, -self._min_history :].all(axis=1) & frame.rows["observed"]
-        forecast = self._predictor.predict(past[ready], known[ready])
+        classes, of = np.unique(frame.rows["class_id"][ready], return_inverse=True)
+        unit_m = np.array(units_m(classes.tolist(), self._class_names))[of][:, None, None]
+        mean, cov = self._predictor.predict(past[ready] / unit_m, known[ready])
+        forecast = Forecast(mean * unit_m, cov * unit_m[..., None] ** 2)
         return forecast_to_rows(ids[ready], forecast, self._predictor.step_s)

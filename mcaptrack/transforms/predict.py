@@ -14,6 +14,7 @@ from mcaptrack.predictors.own_options import own_options
 from mcaptrack.registry import Entry
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame, Schema
 from mcaptrack.transforms.forecasts import Forecaster
+from mcaptrack.transforms.motion_limits import ClassNames
 from mcaptrack.transforms.protocol import check_options, context, is_option_type, option
 
 
@@ -47,6 +48,7 @@ class Predict:
         4, "number of positions, the current one included, that a prediction needs", least=1, most=100
     )
     rate_hz: float = context(lambda: 2.5)
+    class_names: ClassNames = context(tuple, is_recorded=False)
 
     reads: ClassVar[Schema] = TRACKS
     writes: ClassVar[Mapping[str, Schema]] = MappingProxyType({"": PREDICTIONS})
@@ -63,7 +65,7 @@ class Predict:
 
     def __call__(self, frames: Iterable[Frame]) -> Iterator[tuple[Frame, ...]]:
         own = {name: getattr(self, name) for name in self.own_options}
-        forecaster = Forecaster(self.predictor, self.horizon_s, self.min_history, self.rate_hz, **own)
+        forecaster = Forecaster(self.predictor, self.horizon_s, self.min_history, self.rate_hz, self.class_names, **own)
         for frame in frames:
             yield (frame._replace(rows=forecaster.predict(frame)),)
 

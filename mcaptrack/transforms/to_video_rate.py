@@ -20,6 +20,8 @@ from mcaptrack.schema.resampling import resample
 
 #: Columns taken from the tracker where it has a box.
 _FROM_TRACKER: Final = ("x_px", "y_px", "w_px", "h_px", "score", "observed")
+#: The same for tracks that a tracker made in metres, with velocities.
+_IN_METRES: Final = ("x_m", "y_m", "z_m", "heading_rad", "vx_m_per_s", "vy_m_per_s")
 
 
 def to_video_rate(tracks: Sequence[Frame], retracks: Sequence[Frame], planes: Planes) -> list[Frame]:
@@ -65,7 +67,8 @@ def to_video_rate(tracks: Sequence[Frame], retracks: Sequence[Frame], planes: Pl
     want = at * width + np.searchsorted(names, ids)
     place = np.minimum(np.searchsorted(have, want), max(len(have) - 1, 0))  # base is ordered by time and id
     inside = have[place] == want if len(have) else np.zeros(len(want), bool)
-    for name in _FROM_TRACKER:
+    in_metres = len(boxes) > 0 and bool(np.isfinite(boxes["vx_m_per_s"]).all())
+    for name in (*_FROM_TRACKER, *_IN_METRES) if in_metres else _FROM_TRACKER:
         base[name][place[inside]] = boxes[name][inside]
     base["source_id"][place[inside]] = boxes["track_id"][inside]
     outside = boxes[~inside]

@@ -6,12 +6,55 @@ Letters: C classes, F frames.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from mcaptrack.schema import TRACKS, Frame
 from mcaptrack.schema.classes import first_classes
 from mcaptrack.schema.framing import join_frames, split_rows
+from mcaptrack.transforms.motion_limits import ClassNames, limits_by_class, units_m
+
+
+class Movers(NamedTuple):
+    """The unit and the kind of the tracks of one class.
+
+    All of re-tracking is made for people. Other classes are re-tracked in a unit of length in which they move as people
+    do: ``unit_m`` metres. ``on_ground`` says that a tracker made their tracks in metres, with velocities, and not
+    from boxes in pictures: detections don't merge where objects occlude one another, and the tracker has confirmed each
+    track by the scores of its detections. ``usual_score`` is the median score of the log,
+    ``drift_m_per_s`` how much velocities change within a second, None for what the options say.
+    """
+
+    unit_m: float = 1.0
+    on_ground: bool = False
+    usual_score: float = 1.0
+    drift_m_per_s: float | None = None
+
+
+#: People in pictures.
+PEOPLE: Final[Movers] = Movers()
+
+
+def usual_score(frames: Sequence[Frame]) -> float:
+    """The median score of the observed rows of a log; 1 where there are none."""
+    parts = [frame.rows["score"][frame.rows["observed"]] for frame in frames if len(frame.rows)]
+    scores = np.concatenate(parts) if parts else np.empty(0)
+    scores = scores[np.isfinite(scores)]
+    return max(float(np.median(scores)), 1e-6) if len(scores) else 1.0
+
+
+def movers_of(frames: Sequence[Frame], class_names: ClassNames, usual_score: float) -> Movers:
+    """The unit and the kind of the tracks in frames of one class."""
+    parts = [frame.rows for frame in frames if len(frame.rows)]
+    if not parts:
+        return PEOPLE
+    on_ground = all(np.isfinite(part["vx_m_per_s"]).all() for part in parts)
+    number = int(parts[0]["class_id"][0])
+    limits = limits_by_class([number], class_names)[number]
+    drift_m_per_s = limits.drift_m_per_s if on_ground else None
+    (unit_m,) = units_m([number], class_names)
+    return Movers(unit_m, on_ground, usual_score, drift_m_per_s)
 
 
 def split_classes(frames: Sequence[Frame]) -> list[Sequence[Frame]]:

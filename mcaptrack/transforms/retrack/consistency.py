@@ -23,6 +23,7 @@ from mcaptrack.schema import Frame, Rows
 from mcaptrack.schema.predictions import forecast_to_rows
 from mcaptrack.transforms.retrack.active_tracks import ActiveTracks, SmoothedHistory
 from mcaptrack.transforms.retrack.assignments import Assignments
+from mcaptrack.transforms.retrack.by_class import PEOPLE, Movers
 from mcaptrack.transforms.retrack.distances import metric_distances, position_distances, prediction_distances
 from mcaptrack.transforms.retrack.motion_model import DEFAULT_NOISE_M
 from mcaptrack.transforms.retrack.options import ConsistencyOptions
@@ -34,7 +35,7 @@ _PRIORITY_COST: Final = -100.0
 class ConsistencyPass:
     """Algorithm 1 over one log: ``step`` for each frame, then ``outputs``."""
 
-    def __init__(self, options: ConsistencyOptions) -> None:
+    def __init__(self, options: ConsistencyOptions, movers: Movers = PEOPLE) -> None:
         horizon = max(1, round(options.horizon_s * options.rate_hz))
         if horizon == 1 and options.distance != "now":
             raise McaptrackError(

@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from mcaptrack.geometry.arrays import Floats
+from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.neighbours import near_pairs
 from mcaptrack.geometry.ragged import group_index
 from mcaptrack.transforms.retrack.motion_model import MotionModel, State, Trajectories
@@ -23,6 +23,11 @@ FEATURES: Final = ("log length", "log count", "log extent", "log speed", "log ro
 #: Weight of each feature as a log odds ratio, and the log odds without any (tools/choose_retrack.py).
 _WEIGHTS: Final = (1.58, -0.58, 1.736, -1.126, -0.559, 0.59, -1.993)
 _BIAS: Final = -3.342
+#: The same for detections with scores: log odds without any; of the mean score, as a ratio to the usual one, above
+#: ``_LOW``, times the number of rows up to ``_ENOUGH``; of log seconds; of the share that was observed; of log extent.
+SCORED: Final = (-3.1, 0.8, 1.1, 5.1, 1.6)
+_LOW: Final = 0.6
+_ENOUGH: Final = 10
 
 
 def track_confidence(model: MotionModel, trajectories: Trajectories, smoothed: State, step_s: float) -> Floats:
@@ -60,6 +65,29 @@ def features(model: MotionModel, trajectories: Trajectories, smoothed: State, st
         ],
         axis=1,
     )
+
+
+def scored_confidence(xy_m: Floats, first: Ints, score: Floats, observed: Bools, usual: float, step_s: float) -> Floats:
+    """The probability that each track of detections with scores is an object, (K,).
+
+    Much in traffic stands still, so a track needs no motion; but what neither moves nor has scores as high as is usual
+    in the log is clutter. Rows (N,) of track k begin at ``first[k]``, of K + 1; ``xy_m`` (N, 2) are their positions.
+    ``usual`` is the median score of the log. Rows without a score count as usual ones.
+    """
+    found = scored_features(xy_m, first, score, observed, usual, step_s)
+    return np.asarray(1 / (1 + np.exp(-(found @ np.array(SCORED)))))
+
+
+def scored_features(xy_m: Floats, first: Ints, score: Floats, observed: Bools, usual: float, step_s: float) -> Floats:
+    """The features of tracks of detections with scores, (K, 5), see ``SCORED``."""
+    begin, length = first[:-1], np.diff(first)
+    counted = observed & ~np.isnan(score)
+    count = np.add.reduceat(observed.astype(float), begin)
+    total = np.add.reduceat(np.where(counted, score / usual - _LOW, 0.0), begin)
+    excess = total / np.maximum(np.add.reduceat(counted.astype(float), begin), 1) * np.minimum(length, _ENOUGH)
+    extent = np.hypot(*(np.maximum.reduceat(xy_m, begin) - np.minimum.reduceat(xy_m, begin)).T)
+    moved = np.log(np.clip(extent, 0.5, 5.0))
+    return np.stack([np.ones(len(begin)), excess, np.log(length * step_s), count / length, moved], axis=1)
 
 
 def _duplicate_share(trajectories: Trajectories, xy: Floats) -> Floats:

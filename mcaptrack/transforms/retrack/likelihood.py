@@ -16,6 +16,7 @@ from mcaptrack.predictors import Forecast, Predictor, make
 from mcaptrack.schema import PREDICTIONS, Frame, Rows
 from mcaptrack.schema.predictions import forecast_to_rows
 from mcaptrack.transforms.retrack.assignments import Assignments
+from mcaptrack.transforms.retrack.by_class import PEOPLE, Movers
 from mcaptrack.transforms.retrack.motion_model import DEFAULT_NOISE_M, MotionModel
 from mcaptrack.transforms.retrack.offline import move_rows
 from mcaptrack.transforms.retrack.online_tracker import Association, OnlineTracker, Step
@@ -30,16 +31,17 @@ _MIN_SPREAD: Final = 1e-3
 class LikelihoodPass:
     """Online tracking over one log: ``step`` for each frame, then ``outputs``."""
 
-    def __init__(self, options: LikelihoodOptions) -> None:
-        rate, self._options = options.rate_hz, options
+    def __init__(self, options: LikelihoodOptions, movers: Movers = PEOPLE) -> None:
+        rate, self._options, self._unit_m = options.rate_hz, options, movers.unit_m
         self._confirm_hits = round(options.confirm_s * rate) + 1
         max_age = max(1, round(options.max_age_s * rate))
+        noise = DEFAULT_NOISE_M if options.noise_m is None else options.noise_m / movers.unit_m
         self._tracker = OnlineTracker(
-            model=motion_model(options, DEFAULT_NOISE_M if options.noise_m is None else options.noise_m),
+            model=motion_model(options, noise, movers),
             association=Association(
                 same_id=options.same_id_bonus,
                 same_id_crowded=options.same_id_bonus / 3,
-                merge_distance_m=options.merge_distance_m,
+                merge_distance_m=options.merge_distance_m / movers.unit_m,
                 merge_timeout_s=options.merge_timeout_s,
             ),
             step_s=1 / rate,
@@ -57,7 +59,7 @@ class LikelihoodPass:
 
     @property
     def noise_m(self) -> float:
-        """The noise of measured positions: as given, or as estimated so far."""
+        """The noise of measured positions: as given, or as estimated so far; in the unit of the objects."""
         return self._tracker.model.noise_m
 
     def step(self, frame: Frame) -> None:
@@ -69,9 +71,9 @@ class LikelihoodPass:
         rows = frame.rows
         observed = np.flatnonzero(rows["observed"]) if not self._options.interpolated else np.arange(len(rows))
         observed = observed[np.argsort(rows["track_id"][observed], kind="stable")]
-        xy_m = np.stack([rows["x_m"][observed], rows["y_m"][observed]], axis=-1)
+        xy = np.stack([rows["x_m"][observed], rows["y_m"][observed]], axis=-1) / self._unit_m
         source = rows["track_id"][observed]
-        result = self._tracker.step(xy_m, source, passed)
+        result = self._tracker.step(xy, source, passed)
         is_matched = result.row >= 0
         self.assignments.add(step, result.ids[is_matched], source[result.row[is_matched]])
         self._frames.append(frame)
@@ -114,7 +116,7 @@ class LikelihoodPass:
         rows["observed"] &= ~coasts
         t_ns = np.array([frame.t_ns for frame in self._frames], np.int64)
         rows[coasts] = move_rows(
-            rows[coasts], mean[shown[coasts], :2], options.ground_planes, t_ns[tick[shown[coasts]]]
+            rows[coasts], mean[shown[coasts], :2] * self._unit_m, options.ground_planes, t_ns[tick[shown[coasts]]]
         )
         steps = np.array(self.steps, np.int64)
         xy_m = np.stack([rows["x_m"], rows["y_m"]], axis=-1)
@@ -156,12 +158,15 @@ class LikelihoodPass:
         return past, np.isfinite(past[..., 0])
 
     def _predict(self, past: Floats, known: Bools) -> Forecast:
-        predictor = self._predictor
+        predictor, past = self._predictor, past / self._unit_m
         parts = [predictor.predict(past[k : k + _BATCH], known[k : k + _BATCH]) for k in range(0, len(past), _BATCH)]
-        return Forecast(*(np.concatenate(members) for members in zip(*parts, strict=True)))
+        mean, cov = (np.concatenate(members) for members in zip(*parts, strict=True))
+        return Forecast(mean * self._unit_m, cov * self._unit_m**2)
 
 
-def motion_model(options: RetrackOptions, noise_m: float) -> MotionModel:
+def motion_model(options: RetrackOptions, noise_m: float, movers: Movers = PEOPLE) -> MotionModel:
     """The motion model of the options, with this noise of measured positions."""
     noise_m, speed_m_per_s = max(noise_m, _MIN_SPREAD), max(options.speed_m_per_s, _MIN_SPREAD)
+    if movers.drift_m_per_s is not None:
+        return MotionModel(noise_m, speed_m_per_s, movers.drift_m_per_s / movers.unit_m, 0.0)
     return MotionModel(noise_m, speed_m_per_s, options.drift_m_per_s, options.drift_ratio)

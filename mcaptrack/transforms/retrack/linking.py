@@ -40,6 +40,7 @@ def link_tracks(
     step_s: float,
     max_gap_s: float,
     min_confidence: float,
+    max_misfit: tuple[float, float] = (np.inf, 0.0),
 ) -> Ints:
     """For each track the one that continues it, or -1; (K,).
 
@@ -50,6 +51,9 @@ def link_tracks(
     first, last = trajectories.first[:-1], trajectories.first[1:] - 1
     continued_by = np.full(len(first), -1)
     i, j, gap_s = candidates(trajectories, forward, backward, step_s, max_gap_s)
+    if np.isfinite(max_misfit[0]):
+        fits = misfits(forward.take(last[i]), backward.take(first[j]), gap_s) <= max_misfit[0] + max_misfit[1] * gap_s
+        i, j, gap_s = i[fits], j[fits], gap_s[fits]
     if len(i) == 0:
         return continued_by
     found = features(model, forward.take(last[i]), backward.take(first[j]), gap_s)
@@ -136,6 +140,12 @@ def features(model: MotionModel, before: State, after: State, gap_s: Floats) -> 
         ],
         axis=1,
     )
+
+
+def misfits(before: State, after: State, gap_s: Floats) -> Floats:
+    """The distances (E,) of ends of tracks to continuations, extrapolated at the mean velocity or at rest."""
+    way = after.mean[:, :2] - before.mean[:, :2]
+    return np.minimum(_length(way - (before.mean[:, 2:] + after.mean[:, 2:]) / 2 * gap_s[:, None]), _length(way))
 
 
 def _length(vector: Floats) -> Floats:

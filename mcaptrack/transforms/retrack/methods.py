@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from types import MappingProxyType
 from typing import Any, Final, Protocol, TypeAlias, TypeVar
@@ -12,8 +12,9 @@ import numpy as np
 from mcaptrack.schema import Frame, Rows
 from mcaptrack.transforms.forecasts import Forecaster
 from mcaptrack.transforms.retrack.assignments import Assignments
-from mcaptrack.transforms.retrack.by_class import join_classes, split_classes
+from mcaptrack.transforms.retrack.by_class import Movers, join_classes, movers_of, split_classes, usual_score
 from mcaptrack.transforms.retrack.consistency import ConsistencyPass
+from mcaptrack.transforms.retrack.kept_ids import KeptIds
 from mcaptrack.transforms.retrack.likelihood import LikelihoodPass, motion_model
 from mcaptrack.transforms.retrack.offline import offline_tracks
 from mcaptrack.transforms.retrack.options import ConsistencyOptions, LikelihoodOptions, RetrackOptions
@@ -85,7 +86,7 @@ Retracking: TypeAlias = Retrack | RetrackByConsistency
 
 
 def _retrack(
-    options: Options, new_pass: Callable[[Options], OnlinePass], frames: Iterable[Frame]
+    options: Options, new_pass: Callable[[Options, Movers], OnlinePass], frames: Iterable[Frame]
 ) -> Iterator[tuple[Frame, ...]]:
     """For each frame the offline tracks, the online tracks and their predictions; each class by itself."""
     if options.holds_back:
@@ -96,21 +97,23 @@ def _retrack(
         return
     frames = list(frames)
     parts = [frames] if options.across_classes else split_classes(frames)
-    runs = [_retrack_together(options, new_pass, part) for part in parts]
+    score = usual_score(frames)
+    runs = [_retrack_together(options, new_pass, part, score) for part in parts]
     yield from runs[0] if len(runs) == 1 else join_classes(runs)
 
 
 def _retrack_together(
-    options: Options, new_pass: Callable[[Options], OnlinePass], frames: Iterable[Frame]
+    options: Options, new_pass: Callable[[Options, Movers], OnlinePass], frames: Sequence[Frame], score: float
 ) -> Iterator[tuple[Frame, ...]]:
-    """Re-track frames without regard to classes."""
-    run = new_pass(options)
+    """Re-track frames without regard to classes; ``score`` is the usual one of the log."""
+    movers = movers_of(frames, options.class_names, score)
+    run: OnlinePass = KeptIds(options, movers) if movers.on_ground else new_pass(options, movers)
     times_ns = []
     for frame in frames:
         run.step(frame)
         times_ns.append(frame.t_ns)
-    model = motion_model(options, run.noise_m)
-    rows, step = offline_tracks(options, model, run.assignments, run.samples, run.steps, times_ns)
+    model = motion_model(options, run.noise_m, movers)
+    rows, step = offline_tracks(options, model, run.assignments, run.samples, run.steps, times_ns, movers)
     vote(rows)
     first, last = (np.searchsorted(step, run.steps, side) for side in ("left", "right"))
     for (online, predictions), low, high in zip(run.outputs(), first.tolist(), last.tolist(), strict=True):

@@ -14,6 +14,7 @@ from mcaptrack.geometry.plane import Planes
 from mcaptrack.predictors import PredictorName
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame, Schema
 from mcaptrack.transforms.durations import longest_track_s
+from mcaptrack.transforms.motion_limits import ClassNames
 from mcaptrack.transforms.protocol import check_options, context, option
 from mcaptrack.transforms.retrack.distances import Covariance, Distance
 
@@ -132,6 +133,7 @@ class RetrackOptions:
     )
     rate_hz: float = context(lambda: 2.5)
     ground_planes: Planes = context(tuple)
+    class_names: ClassNames = context(tuple, is_recorded=False)
     poor_scale: bool = context(lambda: False)
 
     reads: ClassVar[Schema] = TRACKS

@@ -1,0 +1,244 @@
+"""The tracks of the ground tracker as arrays: motion, size, heading, class and life of each.
+
+The motion has the state position, velocity and acceleration. Noise is the same along both axes and no axis influences
+the other, so both have one covariance: six numbers for each track. The acceleration fades (Singer 1970); across the
+velocity it is that of an arc, so that a vehicle that turns is predicted on a circle. Classes that don't turn have no
+acceleration, which leaves a filter of constant velocity.
+
+Tracks are columns and numbers are rows. Letters: K tracks, N detections, C classes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Final
+
+import numpy as np
+
+from mcaptrack.geometry.arrays import Bools, Floats, Indices
+from mcaptrack.transforms.motion_limits import MotionLimits
+
+# Rows of detections.
+X, Y, Z, LENGTH, WIDTH, HEIGHT, HEADING, VX, VY, SCORE, CLASS, SOURCE = range(12)
+DETECTION_ROWS: Final = 12
+PLACE: Final = slice(X, Y + 1)
+#: Position, size and heading.
+BOX: Final = slice(X, HEADING + 1)
+_SIZE: Final = slice(LENGTH, HEIGHT + 1)
+
+# Rows of tracks: those of detections first (velocities are those of the filter), then the rest.
+(
+    _AX, _AY, _PP, _PV, _PA, _VV, _VA, _AA, _COS, _SIN, _FACING, _SIZED,
+    ID, SCORES, HITS, MISSED_S, LAST_FRAME, IS_CONFIRMED,
+    NOISE, GATE_M, _MAX_SPEED, _DRIFT, _TURNS, _SPEED,
+) = range(DETECTION_ROWS, DETECTION_ROWS + 24)  # fmt: skip
+#: The box at the last detection.
+LAST: Final = slice(DETECTION_ROWS + 24, DETECTION_ROWS + 31)
+_ROWS: Final = LAST.stop
+_VELOCITY, _ACCELERATION = slice(VX, VY + 1), slice(_AX, _AY + 1)
+_COVARIANCE: Final = slice(_PP, _AA + 1)
+
+#: The seconds after which an acceleration has faded to 1 / e.
+_FADES_S: Final = 2.0
+#: The share of the drift of velocities that is noise; the rest is an acceleration that lasts.
+_NOISE_SHARE: Final = 0.1
+#: The largest turn rate in rad/s, and the speed in m/s below which an arc means nothing.
+_MAX_TURN: Final = 0.9
+_ARC_SPEED: Final = 1.5
+#: Standard deviation in m/s of a velocity that the detector gave.
+_GIVEN_SPEED: Final = 1.0
+#: How fast mean sizes, heights and headings follow new detections, at the least.
+_SIZE_RATE: Final = 0.05
+_HEIGHT_RATE: Final = 0.3
+_AXIS_RATE: Final = 0.25
+#: The limit of what one detection changes of a size, as a ratio.
+_SIZE_LIMIT: Final = 0.1
+#: The number of sizes that count in full.
+_FIRST_SIZES: Final = 3
+#: The speed in m/s from which the direction of motion tells front from back.
+_FACING_SPEED: Final = 1.0
+
+
+class GroundTracks:
+    """The tracks that are alive: ``table`` (rows, K), and the scores of the classes that each had, ``votes`` (C, K)."""
+
+    def __init__(self) -> None:
+        self.table: Floats = np.empty((_ROWS, 0))
+        self.votes: Floats = np.zeros((0, 0))
+        self._classes: dict[int, int] = {}
+
+    def __len__(self) -> int:
+        return int(self.table.shape[1])
+
+    def keep(self, which: Bools) -> None:
+        """Keep some of the tracks."""
+        self.table, self.votes = self.table.compress(which, axis=1), self.votes.compress(which, axis=1)
+
+    def predict(self, dt: float) -> None:
+        """Predict all tracks by ``dt`` seconds."""
+        t = self.table
+        if dt <= 0 or not len(self):
+            return
+        _predict_covariance(t[_COVARIANCE], t[_DRIFT], t[_TURNS], dt)
+        fade = np.exp(-dt / _FADES_S)
+        g, f = _FADES_S * (1 - fade), _FADES_S * (dt - _FADES_S * (1 - fade))
+        vx, vy, ax, ay = t[VX], t[VY], t[_AX], t[_AY]
+        if t[_TURNS].any():
+            squared = vx * vx + vy * vy
+            turn = (vx * ay - vy * ax) / (squared + _ARC_SPEED**2)
+            np.clip(turn, -_MAX_TURN, _MAX_TURN, out=turn)
+            # what of the acceleration is no turn
+            ax, ay = ax + turn * vy, ay - turn * vx
+            angle = turn * (g if dt > 0.5 else dt)  # a turn ends, too
+            sin, cos = np.sin(angle), np.cos(angle)
+            half = np.sinc(angle / (2 * np.pi)) * dt
+            ch, sh = np.cos(angle / 2), np.sin(angle / 2)
+            t[X] += half * (ch * vx - sh * vy) + f * ax
+            t[Y] += half * (sh * vx + ch * vy) + f * ay
+            self._rotate(t, cos, sin)
+            t[VX] += g * ax
+            t[VY] += g * ay
+            t[_ACCELERATION] *= fade
+        else:
+            t[PLACE] += dt * t[_VELOCITY]
+        t[MISSED_S] += dt
+
+    @staticmethod
+    def _rotate(t: Floats, cos: Floats, sin: Floats) -> None:
+        """Turn velocities, accelerations and headings; the heading is kept as a doubled angle."""
+        for a, b in ((VX, VY), (_AX, _AY)):
+            t[a], t[b] = cos * t[a] - sin * t[b], sin * t[a] + cos * t[b]
+        cos2, sin2 = cos * cos - sin * sin, 2 * sin * cos
+        t[_COS], t[_SIN] = cos2 * t[_COS] - sin2 * t[_SIN], sin2 * t[_COS] + cos2 * t[_SIN]
+
+    def update(self, track: Indices, found: Floats, is_same_class: Bools, frame: int) -> None:
+        """Correct tracks (N,) with one detection each, (rows, N), at a frame."""
+        t = self.table[:, track]
+        _correct(t, found)
+        self._vote(track, found)
+        weight = is_same_class.astype(float)
+        _follow_box(t, found, weight)
+        t[SCORE], t[SOURCE] = found[SCORE], found[SOURCE]
+        score = np.where(np.isnan(found[SCORE]), 0.5, found[SCORE])
+        t[SCORES] += score
+        t[HITS] += 1
+        t[MISSED_S] = 0
+        t[LAST_FRAME] = frame
+        t[LAST] = t[BOX]
+        self.table[:, track] = t
+        self.table[CLASS, track] = self._winners(track)
+
+    def initiate(self, first_id: int, found: Floats, limits: Mapping[int, MotionLimits], frame: int) -> None:
+        """Start a track at each of these detections, (rows, N)."""
+        count = found.shape[1]
+        t = np.zeros((_ROWS, count))
+        t[:DETECTION_ROWS] = found
+        rows = [limits[int(one)] for one in found[CLASS].tolist()]
+        t[NOISE] = [row.noise_m for row in rows]
+        t[GATE_M] = [row.gate_m for row in rows]
+        t[_MAX_SPEED] = [row.max_speed_m_per_s for row in rows]
+        t[_DRIFT] = [row.drift_m_per_s for row in rows]
+        t[_TURNS] = [row.turns for row in rows]
+        t[_SPEED] = [row.speed_m_per_s for row in rows]
+        is_given = np.isfinite(found[VX]) & np.isfinite(found[VY])
+        t[_VELOCITY] = np.where(is_given, found[_VELOCITY], 0.0)
+        t[_PP] = t[NOISE] ** 2
+        t[_VV] = np.where(is_given, _GIVEN_SPEED, t[_SPEED]) ** 2
+        t[_AA] = (t[_DRIFT] * (1 - _NOISE_SHARE)) ** 2 * t[_TURNS]
+        has_heading = np.isfinite(found[HEADING])
+        angle = np.where(has_heading, found[HEADING], 0.0)
+        t[_COS], t[_SIN] = np.cos(2 * angle) * has_heading, np.sin(2 * angle) * has_heading
+        t[_FACING] = np.where(has_heading, 1.0, 0.0)
+        t[_SIZED] = np.isfinite(found[LENGTH])
+        t[ID] = np.arange(first_id, first_id + count)
+        t[SCORES] = np.where(np.isnan(found[SCORE]), 0.5, found[SCORE])
+        t[HITS] = 1
+        t[LAST_FRAME] = frame
+        t[LAST] = t[BOX]
+        self.table = np.concatenate([self.table, t], axis=1)
+        self.votes = np.concatenate([self.votes, np.zeros((len(self.votes), count))], axis=1)
+        self._vote(np.arange(len(self) - count, len(self)), found)
+
+    def _vote(self, track: Indices, found: Floats) -> None:
+        for one in np.unique(found[CLASS]).tolist():
+            if one not in self._classes:
+                self._classes[one] = len(self._classes)
+                self.votes = np.concatenate([self.votes, np.zeros((1, self.votes.shape[1]))])
+        which = [self._classes[one] for one in found[CLASS].tolist()]
+        self.votes[which, track] += np.where(np.isnan(found[SCORE]), 0.5, found[SCORE])
+
+    def _winners(self, track: Indices) -> Floats:
+        """The class with the highest sum of scores, of each of some tracks."""
+        if len(self._classes) == 1:
+            return np.asarray(self.table[CLASS, track])
+        classes = np.array(list(self._classes))
+        return np.asarray(classes[self.votes[:, track].argmax(axis=0)], float)
+
+
+def variance(table: Floats) -> Floats:
+    """The variance of the predicted measurement of each track, per axis, (K,)."""
+    return np.asarray(table[_PP] + table[NOISE] ** 2)
+
+
+def _predict_covariance(cov: Floats, drift: Floats, turns: Floats, dt: float) -> None:
+    """Predict covariances (6, K) by ``dt`` seconds, in place."""
+    fade = np.exp(-dt / _FADES_S)
+    g, f = _FADES_S * (1 - fade), _FADES_S * (dt - _FADES_S * (1 - fade))
+    pp, pv, pa, vv, va, aa = cov.copy()
+    lasting = drift * (1 - _NOISE_SHARE) * turns
+    power = (drift * (1 - (1 - _NOISE_SHARE) * turns)) ** 2
+    cov[0] = pp + dt * (2 * pv + dt * (vv + dt * power / 3)) + f * (2 * pa + 2 * dt * va + f * aa)
+    cov[1] = pv + dt * (vv + dt * power / 2) + g * pa + (f + dt * g) * va + f * g * aa
+    cov[2] = fade * (pa + dt * va + f * aa)
+    cov[3] = vv + dt * power + g * (2 * va + g * aa)
+    cov[4] = fade * (va + g * aa)
+    cov[5] = fade**2 * aa + (1 - fade**2) * lasting**2
+
+
+def _correct(t: Floats, found: Floats) -> None:
+    """Correct the motion of tracks (rows, N) with the positions of detections, in place."""
+    off = found[PLACE] - t[PLACE]
+    pp, pv, pa, vv, va, aa = t[_COVARIANCE].copy()
+    s = pp + t[NOISE] ** 2
+    kp, kv, ka = pp / s, pv / s, pa / s
+    t[PLACE] += kp * off
+    t[_VELOCITY] += kv * off
+    t[_ACCELERATION] += ka * off
+    t[_COVARIANCE] = pp - kp * pp, pv - kp * pv, pa - kp * pa, vv - kv * pv, va - kv * pa, aa - ka * pa
+    speed = np.hypot(t[VX], t[VY])
+    t[_VELOCITY] *= np.minimum(1.0, t[_MAX_SPEED] / np.maximum(speed, 1e-9))
+
+
+def _follow_box(t: Floats, found: Floats, weight: Floats) -> None:
+    """Correct z, size and heading of tracks (rows, N), in place; sizes and headings with ``weight`` 0 don't count."""
+    given = np.isfinite(found[Z])
+    step = np.where(given, _HEIGHT_RATE * (found[Z] - np.where(np.isnan(t[Z]), found[Z], t[Z])), 0.0)
+    t[Z] = np.where(np.isnan(t[Z]), found[Z], t[Z] + step)
+    # Size: a mean with limited steps, which outliers move little.
+    sized = np.isfinite(found[LENGTH]) * weight
+    t[_SIZED] += sized
+    rate = np.maximum(_SIZE_RATE, 1 / np.maximum(t[_SIZED], 1))
+    before = t[_SIZE]
+    is_new = np.isnan(before)
+    limit = np.where(is_new | (t[_SIZED] <= _FIRST_SIZES), np.inf, _SIZE_LIMIT * before)
+    change = np.clip(np.where(np.isnan(found[_SIZE]) | is_new, 0.0, found[_SIZE] - before), -limit, limit)
+    t[_SIZE] = np.where(is_new, found[_SIZE], before + rate * change * weight)
+    # Heading: the axis as a doubled angle, and apart from it which of its ends is the front.
+    turned = np.isfinite(found[HEADING]) * weight
+    measured = np.where(turned > 0, found[HEADING], 0.0)
+    rate = _AXIS_RATE * turned
+    t[_COS] += rate * (np.cos(2 * measured) - t[_COS])
+    t[_SIN] += rate * (np.sin(2 * measured) - t[_SIN])
+    axis = np.arctan2(t[_SIN], t[_COS]) / 2
+    before_axis = np.where(np.isnan(t[HEADING]), measured, t[HEADING])
+    # The axis is known up to half a turn: the one that is nearer to the heading so far.
+    axis = axis + np.pi * np.rint((before_axis - axis) / np.pi)
+    speed = np.hypot(t[VX], t[VY])
+    moves = (t[VX] * np.cos(axis) + t[VY] * np.sin(axis)) * t[_TURNS]
+    facing = 0.95 * t[_FACING] + turned * np.cos(measured - axis)
+    facing += np.where(speed > _FACING_SPEED, 2 * moves / np.maximum(speed, 1e-9), 0.0)
+    is_back = facing < 0
+    heading = axis + np.pi * is_back
+    t[_FACING] = np.abs(facing)
+    has_heading = (t[_COS] != 0) | (t[_SIN] != 0)
+    t[HEADING] = np.where(has_heading, np.arctan2(np.sin(heading), np.cos(heading)), np.nan)

@@ -1,0 +1,246 @@
+"""The ground tracker: tracks of objects in metres, in a frame that doesn't move.
+
+Letters: N detections, K tracks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from types import MappingProxyType
+from typing import ClassVar, Final
+
+import numpy as np
+
+from mcaptrack.geometry.arrays import Floats
+from mcaptrack.geometry.clocks import NS_PER_S
+from mcaptrack.notices import warn
+from mcaptrack.schema import DETECTIONS, TRACKS, Frame, Schema
+from mcaptrack.transforms.ground.association import Cost, associate
+from mcaptrack.transforms.ground.output import Waiting, rows_to_frames
+from mcaptrack.transforms.ground.state import (
+    CLASS,
+    ID,
+    IS_CONFIRMED,
+    LAST_FRAME,
+    MISSED_S,
+    SCORE,
+    SCORES,
+    GroundTracks,
+    X,
+    Y,
+)
+from mcaptrack.transforms.motion_limits import ClassNames, MotionLimits, limits_by_class, read_limits
+from mcaptrack.transforms.protocol import check_options, context, option
+
+_ASSOCIATION: Final = "Association"
+_DETECTIONS: Final = "Detections"
+_LIFE: Final = "Begin and end of tracks"
+#: Tracks that are not confirmed end after this many seconds without a detection.
+_TENTATIVE_S: Final = 0.6
+#: Number of frames that are converted at once.
+_BLOCK_FRAMES: Final = 64
+#: Columns of detections in the order of the rows of ``state``.
+_COLUMNS: Final = (
+    "x_m",
+    "y_m",
+    "z_m",
+    "length_m",
+    "width_m",
+    "height_m",
+    "heading_rad",
+    "vx_m_per_s",
+    "vy_m_per_s",
+    "score",
+    "class_id",
+    "source_id",
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class GroundTracker:
+    """Track detections in metres, such as the 3D boxes of a robot's detector.
+
+    Reads detections with positions in metres, writes tracks with positions, sizes, headings and velocities. Detections
+    are assigned on the ground plane, a class at a time, to the positions that Kalman filters predict: at constant
+    velocity, and on arcs for vehicles. Limits of their motion come from a table by class.
+
+    Rows are written ``delay_s`` late: a track is written from its first detection on if it is confirmed in that time,
+    and gaps that end in it are interpolated.
+
+    Examples
+    --------
+    A car drives 10 m/s and is missed once; a false box is seen once:
+
+    >>> from mcaptrack.schema import DETECTIONS, Frame
+    >>> def row(t):
+    ...     x_m = [float(t)] if t != 4 else [500.0]
+    ...     return DETECTIONS.rows(x_m=x_m, y_m=[0.0], score=[0.8], class_id=[3])
+    >>> frames = [Frame(t * 100_000_000, t, row(t)) for t in range(8)]
+    >>> tracks = [frame.rows for (frame,) in GroundTracker(class_names=((3, "car"),))(frames)]
+    >>> [rows["track_id"].tolist() for rows in tracks]
+    [[1], [1], [1], [1], [1], [1], [1], [1]]
+    >>> [bool(rows["observed"][0]) for rows in tracks]
+    [True, True, True, True, False, True, True, True]
+
+    References
+    ----------
+    X. Weng et al., "3D Multi-Object Tracking: A Baseline and New Evaluation Metrics", IROS 2020; Z. Pang et al.,
+    "SimpleTrack: Understanding and Rethinking 3D Multi-object Tracking", ECCV Workshops 2022; R. A. Singer,
+    "Estimating Optimal Tracking Filter Performance for Manned Maneuvering Targets", IEEE T-AES 1970.
+    """
+
+    max_age_s: float = option(
+        2.0, "a track ends after this many seconds without a detection", least=0.0, search=(0.2, 4.0), theme=_LIFE
+    )
+    delay_s: float = option(
+        1.0,
+        "rows are written this many seconds late, so that false births are taken back and short gaps are filled; 0 for "
+        "results that depend on the past alone",
+        least=0.0,
+        theme=_LIFE,
+    )
+    confirm_score: float = option(
+        1.2,
+        "a track is confirmed once the scores of its detections add up to this; detections without a score count 0.5",
+        least=0.0,
+        search=(0.3, 4.0),
+        theme=_LIFE,
+    )
+    birth_score: float = option(
+        0.2,
+        "detections with a lower score continue tracks, but start none",
+        least=0.0,
+        most=1.0,
+        search=(0.0, 0.8),
+        theme=_LIFE,
+    )
+    cost: Cost = option(
+        "metres",
+        "how detections and tracks are compared: distance of their centres, or overlap of their boxes seen from above",
+        theme=_ASSOCIATION,
+    )
+    min_iou: float = option(
+        0.05,
+        "with --cost iou: least overlap (IoU) of a detection with a track's predicted box",
+        least=0.0,
+        most=1.0,
+        theme=_ASSOCIATION,
+    )
+    min_score: float | None = option(None, "ignore detections with a lower score", theme=_DETECTIONS)
+    class_id: int | None = option(
+        None, "ignore detections of other classes", least=0, most=2**31 - 1, theme=_DETECTIONS
+    )
+    across_classes: bool = option(
+        False,
+        "a track may continue with a detection of another class; it then has the class of most of its detections",
+        theme=_DETECTIONS,
+    )
+    class_limits: str = option(
+        "",
+        "limits of the motion of a class instead of those of the table: NAME=SPEED:DRIFT:NOISE:GATE in m/s, m/s within "
+        "a second, m and m, as in car=40,pedestrian=4::0.1",
+        theme=_ASSOCIATION,
+    )
+    class_names: ClassNames = context(tuple, is_recorded=False)
+
+    reads: ClassVar[Schema] = DETECTIONS
+    writes: ClassVar[Mapping[str, Schema]] = MappingProxyType({"": TRACKS})
+    #: Trackers associate in the "picture" (pixels) or on the "ground" (metres).
+    space: ClassVar[str] = "ground"
+
+    def __post_init__(self) -> None:
+        check_options(self)
+        read_limits(self.class_limits)
+
+    @property
+    def latency_s(self) -> MappingProxyType[str, float]:
+        """Rows are final once they are written."""
+        return MappingProxyType({"": self.delay_s})
+
+    def __call__(self, frames: Iterable[Frame]) -> Iterator[tuple[Frame, ...]]:
+        run = _Run(self)
+        coming = iter(frames)
+        while block := list(islice(coming, _BLOCK_FRAMES)):
+            written = [part for frame in block for part in run.step(frame)]
+            yield from ((frame,) for frame in rows_to_frames(written))
+        yield from ((frame,) for frame in rows_to_frames(list(run.waiting.due(np.inf))))
+        run.warn()
+
+    def why_empty(self, given: Sequence[Frame], made: Sequence[Frame]) -> str:
+        """Why there are no tracks, for a warning."""
+        count = sum(len(frame.rows) for frame in given)
+        return f"no track of {count} detections is confirmed (confirm_score)"
+
+
+class _Run:
+    """The state of one run: its tracks, and the rows that are not written yet."""
+
+    def __init__(self, options: GroundTracker) -> None:
+        self._options = options
+        self.tracks, self.waiting = GroundTracks(), Waiting()
+        self._limits: dict[int, MotionLimits] = {}
+        self._last_ns: int | None = None
+        self._frame, self._next_id = 0, 1
+        self._left_out = 0
+
+    def step(self, frame: Frame) -> Iterator[tuple[Frame, Floats]]:
+        """Take one frame; returns those that are due, with their rows."""
+        options, tracks = self._options, self.tracks
+        dt = 0.0 if self._last_ns is None else (frame.t_ns - self._last_ns) / NS_PER_S
+        self._last_ns = frame.t_ns
+        found = self._detections(frame)
+        tracks.predict(dt)
+        track, row, is_same = associate(tracks.table, found, options.cost, options.min_iou, options.across_classes)
+        before = tracks.table[:, track]
+        if len(track):
+            tracks.update(track, found[:, row], is_same, self._frame)
+            self.waiting.close_gaps(before, tracks.table[:, track], self._frame, frame.t_ns)
+        count = found.shape[1]
+        if len(row) < count:
+            starts = ~(found[SCORE] < options.birth_score)  # a missing score is not lower
+            starts[row] = False
+            self._initiate(found[:, starts])
+        table = tracks.table
+        is_new = (table[IS_CONFIRMED] == 0) & (table[SCORES] >= options.confirm_score)
+        table[IS_CONFIRMED, is_new] = 1
+        self.waiting.confirm(table[ID].compress(is_new))
+        is_found = table[LAST_FRAME] == self._frame
+        self.waiting.add(frame, table.compress(is_found, axis=1))
+        if not is_found.all():
+            age_s = np.where(table[IS_CONFIRMED] == 1, options.max_age_s, min(_TENTATIVE_S, options.max_age_s))
+            is_over = table[MISSED_S] > np.maximum(age_s, 1.5 * dt)
+            if is_over.any():
+                tracks.keep(~is_over)
+        self._frame += 1
+        return self.waiting.due(frame.t_ns - options.delay_s * NS_PER_S)
+
+    def _initiate(self, found: Floats) -> None:
+        """Start a track at each of these detections, (rows, N)."""
+        count = found.shape[1]
+        if not count:
+            return
+        if new := {int(one) for one in np.unique(found[CLASS])} - self._limits.keys():
+            self._limits |= limits_by_class(sorted(new), self._options.class_names, self._options.class_limits)
+        self.tracks.initiate(self._next_id, found, self._limits, self._frame)
+        self._next_id += count
+
+    def _detections(self, frame: Frame) -> Floats:
+        """The detections of a frame that are used, in an order of their own: (rows, N)."""
+        rows, options = frame.rows, self._options
+        found = np.stack([rows[name] for name in _COLUMNS]).astype(float)
+        used = np.isfinite(found[X]) & np.isfinite(found[Y])
+        self._left_out += len(rows) - int(used.sum())
+        if options.min_score is not None:
+            used &= ~(found[SCORE] < options.min_score)
+        if options.class_id is not None:
+            used &= found[CLASS] == options.class_id
+        if not used.all():
+            found = found.compress(used, axis=1)
+        return np.take(found, np.lexsort(found[::-1]), axis=1)
+
+    def warn(self) -> None:
+        """Warn of detections without a position in metres."""
+        if self._left_out:
+            warn(f"{self._left_out} detections have no position in metres, and no track", "left-out")

@@ -1,0 +1,359 @@
+"""Tracks in metres: the ground tracker, and the stages after it."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mcaptrack.errors import McaptrackError
+from mcaptrack.schema import DETECTIONS, TRACKS, Frame
+from mcaptrack.testing import check_transform
+from mcaptrack.transforms import GroundTracker, Predict, Retrack, Sample
+from mcaptrack.transforms.ground.state import VX, VY, GroundTracks, X, Y
+from mcaptrack.transforms.motion_limits import LIMITS, limits_of, limits_row, read_limits
+from mcaptrack.transforms.to_video_rate import to_video_rate
+from tests.references.ground import Axis
+from tools.traffic import CLASSES, Faults, draw_traffic
+
+NAMES = tuple(CLASSES.items())
+PEDESTRIAN, CAR = 1, 3
+BOX = ("x_m", "y_m", "z_m", "length_m", "width_m", "height_m", "heading_rad", "score", "class_id")
+
+
+def scene(seed: int, **how: object) -> tuple[dict[str, np.ndarray], list[Frame]]:
+    """The true objects of drawn traffic, and frames of what a detector finds."""
+    drawn = draw_traffic(seed, **how)
+    at = drawn.boxes["frame"]
+    return drawn.truth, [
+        Frame(int(t_ns), number, DETECTIONS.rows(**{name: drawn.boxes[name][at == number] for name in BOX}))
+        for number, t_ns in enumerate(drawn.t_ns)
+    ]
+
+
+def frames_of(*tracks: dict[int, dict[str, float]], count: int = 0, rate_hz: float = 10.0) -> list[Frame]:
+    """Frames of detections from tracks: columns of each by frame. Scores are 0.8, the class is car."""
+    last = max(max(track) for track in tracks)
+    out = []
+    for number in range(max(count, last + 1)):
+        found = [{"score": 0.8, "class_id": CAR, **track[number]} for track in tracks if number in track]
+        columns = {name: [one[name] for one in found] for name in (found[0] if found else ())}
+        rows = DETECTIONS.rows(**columns) if found else DETECTIONS.empty()
+        out.append(Frame(round(number / rate_hz * 1e9), number, rows))
+    return out
+
+
+def drive(count: int, speed: float = 10.0, missing: tuple[int, ...] = (), **more: float) -> dict[int, dict[str, float]]:
+    """A track along x at 10 frames a second."""
+    return {t: {"x_m": speed * t / 10, "y_m": 0.0, **more} for t in range(count) if t not in missing}
+
+
+def tracked(frames: list[Frame], **options: object) -> list[Frame]:
+    return [frame for (frame,) in GroundTracker(class_names=NAMES, **options)(frames)]
+
+
+def ids(frames: list[Frame]) -> list[list[int]]:
+    return [frame.rows["track_id"].tolist() for frame in frames]
+
+
+@pytest.mark.parametrize("options", [{}, {"delay_s": 0.0}, {"cost": "iou"}, {"across_classes": True}], ids=str)
+def test_the_laws_of_transforms_hold(options: dict[str, object]):
+    _, frames = scene(3, seconds=4.0, density=0.5)
+    frames[20:20] = [frames[20]._replace(rows=DETECTIONS.empty(), t_ns=frames[20].t_ns - 1)]
+    check_transform(GroundTracker(class_names=NAMES, **options), frames)
+
+
+def test_points_without_size_are_tracked_too():
+    points = frames_of(drive(12))
+    (rows,) = (tracked(points)[-1].rows,)
+    assert rows["x_m"] == pytest.approx([11.0], abs=0.2)
+    assert rows["vx_m_per_s"] == pytest.approx([10.0], abs=0.5)
+    assert np.isnan(rows["length_m"]).all()
+    assert np.isnan(rows["heading_rad"]).all()
+
+
+@pytest.mark.parametrize(("row", "class_id"), [("person", PEDESTRIAN), ("car", CAR)])
+def test_the_filter_is_that_of_the_textbook(row: str, class_id: int):
+    """Along a straight line an arc has no part; each axis is a filter of its own."""
+    limits, rng = LIMITS[row], np.random.default_rng(4)
+    tracks, own = GroundTracks(), Axis(1.0, limits.noise_m, limits.speed_m_per_s, limits.drift_m_per_s, limits.turns)
+    found = np.full((12, 1), np.nan)
+    found[[X, Y]], found[9:, 0] = [[1.0], [0.0]], (0.5, class_id, -1)
+    tracks.initiate(1, found, {class_id: limits}, 0)
+    for frame in range(1, 12):
+        seconds = float(rng.uniform(0.05, 0.5))
+        tracks.predict(seconds)
+        own.predict(seconds)
+        assert tracks.table[[X, VX], 0] == pytest.approx(own.mean[:2])
+        if frame % 4:
+            found[X] = 1.0 + frame * 0.3 + rng.normal(0, 0.1)
+            tracks.update(np.array([0]), found, np.array([True]), frame)
+            own.correct(float(found[X, 0]))
+        assert tracks.table[[X, VX, 12], 0] == pytest.approx(own.mean)
+        assert tracks.table[14:20, 0] == pytest.approx(own.cov[np.triu_indices(3)])
+
+
+def turning(count: int, missing: tuple[int, ...] = ()) -> tuple[dict[int, dict[str, float]], np.ndarray]:
+    """A car that goes 8 m/s on a circle of 10 m, with its heading; and its path."""
+    angle = 0.08 * np.arange(count)
+    path = 10 * np.stack([np.sin(angle), 1 - np.cos(angle)], axis=-1)
+    car = {
+        t: {"x_m": path[t, 0], "y_m": path[t, 1], "heading_rad": (angle[t] + np.pi) % (2 * np.pi) - np.pi}
+        for t in range(count)
+        if t not in missing
+    }
+    return car, path
+
+
+def test_a_car_that_turns_is_predicted_on_an_arc():
+    """Half a second later a straight line is v^2 / r * t^2 / 2 = 0.8 m beside the circle, if the velocity is right."""
+    car, path = turning(40)
+    run = tracked(frames_of(car), delay_s=0.0)[-1].rows
+    tracks = GroundTracks()
+    found = np.full((12, 1), np.nan)
+    found[9:, 0] = (0.8, CAR, -1)
+    for frame in range(35):
+        found[[X, Y], 0] = path[frame]
+        if frame:
+            tracks.predict(0.1)
+            tracks.update(np.array([0]), found, np.array([True]), frame)
+        else:
+            tracks.initiate(1, found, {CAR: LIMITS["car"]}, 0)
+    velocity = tracks.table[[VX, VY], 0]
+    straight = tracks.table[[X, Y], 0] + 0.5 * velocity
+    tracks.predict(0.5)
+    arc_m, straight_m = (float(np.hypot(*(at - path[39]))) for at in (tracks.table[[X, Y], 0], straight))
+    assert arc_m < 0.6 * straight_m
+    assert (run["x_m"][0], run["y_m"][0]) == pytest.approx(tuple(path[39]), abs=0.2)
+
+
+def test_a_gap_in_a_turn_is_closed_under_the_same_id():
+    car, _ = turning(60, missing=tuple(range(30, 42)))
+    assert {one for frame in ids(tracked(frames_of(car))) for one in frame} == {1}
+
+
+def test_half_turns_of_headings_are_mended():
+    """Every fifth heading is turned around; those of the track never are."""
+    car = {t: box | {"heading_rad": np.pi - 0.01 if t % 5 == 2 else 0.0} for t, box in drive(30).items()}
+    headings = [float(frame.rows["heading_rad"][0]) for frame in tracked(frames_of(car))]
+    assert np.abs(headings).max() < 0.1
+
+
+def test_motion_tells_front_from_back():
+    """A detector that always takes the back of a car for its front is not followed once the car moves."""
+    car = {t: box | {"heading_rad": np.pi} for t, box in drive(20).items()}
+    assert abs(tracked(frames_of(car))[-1].rows["heading_rad"][0]) < 0.1
+    parked = {t: {"x_m": 0.0, "y_m": 0.0, "heading_rad": 2.0} for t in range(20)}
+    assert tracked(frames_of(parked))[-1].rows["heading_rad"] == pytest.approx([2.0])
+
+
+def test_a_wrong_size_changes_little():
+    sizes = {"z_m": 1.0, "length_m": 4.0, "width_m": 2.0, "height_m": 1.5}
+    car = {t: box | sizes | ({"length_m": 12.0} if t == 15 else {}) for t, box in drive(20).items()}
+    assert tracked(frames_of(car))[-1].rows["length_m"] == pytest.approx([4.0], abs=0.1)
+
+
+def test_low_scores_continue_tracks_and_start_none():
+    strong = {t: box | {"score": 0.8 if t < 5 else 0.1} for t, box in drive(15).items()}
+    weak = {t: {"x_m": 50.0, "y_m": 50.0, "score": 0.1} for t in range(15)}
+    assert ids(tracked(frames_of(strong, weak))) == [[1]] * 15
+
+
+def test_false_births_are_taken_back_and_true_ones_begin_at_the_first_detection():
+    once = {5: {"x_m": 80.0, "y_m": 0.0}}
+    frames = frames_of(drive(20), once)
+    assert ids(tracked(frames)) == [[1]] * 20
+    causal = ids(tracked(frames, delay_s=0.0))
+    assert causal == [[], *[[1]] * 19]
+
+
+def test_a_gap_within_the_delay_is_interpolated():
+    frames = tracked(frames_of(drive(20, missing=(9, 10, 11))))
+    rows = np.concatenate([frame.rows for frame in frames])
+    assert rows["x_m"] == pytest.approx(np.arange(20.0), abs=0.25)
+    assert np.flatnonzero(~rows["observed"]).tolist() == [9, 10, 11]
+    assert len(tracked(frames_of(drive(20, missing=(9, 10, 11))), delay_s=0.0)[10].rows) == 0
+
+
+def test_a_track_keeps_its_id_while_its_class_flickers():
+    """Every fourth detection of a truck says car: one track, and most of its scores say truck."""
+    truck = {t: box | {"class_id": CAR if t % 4 == 3 else 4} for t, box in drive(24).items()}
+    frames = tracked(frames_of(truck))
+    assert ids(frames) == [[1]] * 24
+    assert set(frames[-1].rows["class_id"].tolist()) == {4}
+
+
+def test_objects_of_two_classes_at_one_place_are_two_tracks():
+    rider, bicycle = drive(12, 4.0, class_id=PEDESTRIAN), drive(12, 4.0, class_id=2)
+    assert ids(tracked(frames_of(rider, bicycle)))[-1] == [1, 2]
+
+
+def test_a_limit_of_speed_keeps_two_cars_apart():
+    """3 m from one frame to the next are 30 m/s: a car can do that, and a car that goes 5 m/s at most can't."""
+    first, second = {t: {"x_m": 0.0, "y_m": 0.0} for t in range(3)}, {t: {"x_m": 2.5, "y_m": 0.0} for t in range(3, 9)}
+    assert ids(tracked(frames_of(first, second), class_limits="car=5:0.5:0.1:1"))[-1] == [2]
+
+
+@pytest.mark.parametrize("rate_hz", [2.0, 5.0, 20.0])
+def test_other_rates_of_boxes(rate_hz: float):
+    truth, frames = scene(8, seconds=10.0, rate_hz=rate_hz, density=0.5)
+    switches, found, wrong = compared(truth, tracked(frames))
+    assert found > 0.78
+    assert wrong < 0.12
+    assert switches <= 15
+
+
+def test_boxes_are_compared_by_overlap_on_request():
+    sizes = {"z_m": 1.0, "length_m": 4.0, "width_m": 2.0, "height_m": 1.5, "heading_rad": 0.0}
+    near, beside = drive(12, 5.0, **sizes), {t: {"x_m": 0.5 * t, "y_m": 2.4, **sizes} for t in range(12)}
+    assert ids(tracked(frames_of(near, beside), cost="iou")) == [[1, 2]] * 12
+    jump = {t: box | {"x_m": box["x_m"] + (4.2 if t >= 6 else 0)} for t, box in drive(12, 0.0, **sizes).items()}
+    assert ids(tracked(frames_of(jump), cost="iou"))[-1] == [2]
+
+
+def test_detections_without_a_position_are_left_out_aloud():
+    from mcaptrack.notices import collected
+
+    box = DETECTIONS.rows(x_px=[1.0], y_px=[1.0], w_px=[5.0], h_px=[9.0], class_id=[1])
+    with collected() as notices:
+        assert ids(tracked([Frame(0, 0, box)])) == [[]]
+    assert ["1 detections have no position in metres" in str(notice) for notice in notices] == [True]
+
+
+def test_the_documentation_has_the_table_of_limits():
+    text = (Path(__file__).parent.parent / "docs" / "robots.md").read_text()
+    lines = text.partition("<!-- limits: begin -->")[2].partition("<!-- limits: end -->")[0].split("\n")[3:-1]
+    made = [
+        f"| {row.name} | {row.speed_m_per_s:g} | {row.max_speed_m_per_s:g} | {row.drift_m_per_s:g} | {row.noise_m:g} "
+        f"| {row.gate_m:g} | {'yes' if row.turns else 'no'} |"
+        for row in LIMITS.values()
+    ]
+    assert lines == made
+
+
+@pytest.mark.parametrize(
+    ("name", "row"),
+    {
+        "vehicle.bus.rigid": "bus",
+        "human.pedestrian.adult": "person",
+        "REGULAR_VEHICLE": "car",
+        "LARGE_VEHICLE": "truck",
+        "MOTORCYCLIST": "motorcycle",
+        "Cyclist": "bicycle",
+        "traffic_cone": "object",
+        "Person_sitting": "person",
+        "TYPE_VEHICLE": "car",
+        "BoxTruck": "truck",
+        "": "unknown",
+        "carpet": "unknown",
+    }.items(),
+)
+def test_names_of_data_sets_have_a_row(name: str, row: str):
+    assert limits_row(name) == row
+
+
+def test_limits_of_users_replace_those_of_the_table():
+    own = read_limits("car=40,pedestrian=4::0.1")
+    assert limits_of("car", own) == LIMITS["car"]._replace(max_speed_m_per_s=40.0)
+    assert limits_of("pedestrian", own) == LIMITS["person"]._replace(max_speed_m_per_s=4.0, noise_m=0.1)
+    assert limits_of("bus", own) == LIMITS["bus"]
+    for wrong in ("car", "car=", "=4", "car=fast", "car=1:2:3:4:5", "car=-1"):
+        with pytest.raises(McaptrackError, match="NAME=SPEED"):
+            GroundTracker(class_limits=wrong)
+
+
+def compared(truth: dict[str, np.ndarray], frames: list[Frame]) -> tuple[int, float, float]:
+    """Identity switches; the share of true objects found within 2 m; the share of rows at no object of their class."""
+    switches, found, rows_found, rows = 0, 0, 0, 0
+    last: dict[int, int] = {}
+    for number, frame in enumerate(frames):
+        at = np.flatnonzero(truth["frame"] == number)
+        away = np.hypot(truth["x_m"][at][:, None] - frame.rows["x_m"], truth["y_m"][at][:, None] - frame.rows["y_m"])
+        away[truth["class_id"][at][:, None] != frame.rows["class_id"]] = np.inf
+        rows += len(frame.rows)
+        if not away.size:
+            continue
+        best = away.argmin(axis=1)
+        near = away[np.arange(len(at)), best] < 2.0
+        found += int(near.sum())
+        rows_found += int((away.min(axis=0) < 2.0).sum())
+        for one, track in zip(truth["id"][at[near]].tolist(), frame.rows["track_id"][best[near]].tolist(), strict=True):
+            switches += last.get(one, track) != track
+            last[one] = track
+    return switches, found / len(truth["frame"]), 1 - rows_found / max(rows, 1)
+
+
+def test_drawn_traffic_is_tracked_and_repaired():
+    truth, frames = scene(11, seconds=12.0, density=0.7)
+    tracks = tracked(frames)
+    switches, found, wrong = compared(truth, tracks)
+    assert found > 0.88
+    assert wrong < 0.12
+    samples = [frame for (frame,) in Sample()(tracks)]
+    offline = [one[0] for one in Retrack(class_names=NAMES)(samples)]
+    full = to_video_rate(tracks, offline, ())
+    full_switches, full_found, full_wrong = compared(truth, full)
+    assert full_switches <= switches
+    assert full_found > 0.88
+    assert full_wrong < min(0.06, wrong)
+    rows = np.concatenate([frame.rows for frame in full])
+    for name in ("z_m", "length_m", "width_m", "height_m", "heading_rad", "vx_m_per_s", "vy_m_per_s"):
+        assert np.isfinite(rows[name]).all(), name
+    assert np.abs(rows["heading_rad"]).max() <= np.pi
+    per_track = Counter(
+        (one, kind) for one, kind in {*zip(rows["track_id"].tolist(), rows["class_id"].tolist(), strict=True)}
+    )
+    assert len(per_track) == len(set(rows["track_id"].tolist()))  # one class each
+
+
+def test_headings_are_interpolated_around_the_circle():
+    def row(heading: float) -> np.ndarray:
+        return TRACKS.rows(track_id=[1], x_m=[0.0], y_m=[0.0], heading_rad=[heading], observed=[True], source_id=[-1])
+
+    frames = [Frame(0, 0, row(3.0)), Frame(800_000_000, 1, row(-3.0))]
+    (middle,) = [frame.rows["heading_rad"][0] for (frame,) in Sample(rate_hz=2.5)(frames)][1:2]
+    assert abs(middle) == pytest.approx(np.pi)
+
+
+def test_cars_are_predicted_in_their_own_unit():
+    """A car at four times the speed of a person is predicted at four times the distance."""
+
+    def forecast(name: str, factor: float) -> np.ndarray:
+        rows = [
+            TRACKS.rows(
+                track_id=[1], x_m=[factor * 0.5 * t], y_m=[0.0], observed=[True], source_id=[-1], class_id=[CAR]
+            )
+            for t in range(8)
+        ]
+        frames = [Frame(t * 400_000_000, t, one) for t, one in enumerate(rows)]
+        *_, (last,) = Predict(class_names=((CAR, name),))(frames)
+        return last.rows["x_m"]
+
+    assert forecast("car", 4.0) == pytest.approx(4 * forecast("pedestrian", 1.0))
+
+
+def test_the_faults_of_the_detector_are_what_they_are_set_to():
+    """The scenes that choose the settings have the faults that they say."""
+    none = replace(Faults(), miss_near=0.0, miss_far=0.0, occlusions_per_s=0.0, false_boxes=0.0, clutter=0)
+    truth, frames = scene(2, seconds=3.0, faults=none)
+    assert sum(len(frame.rows) for frame in frames) == len(truth["frame"])
+    assert sum(len(frame.rows) for frame in scene(2, seconds=3.0)[1]) < 0.9 * len(truth["frame"])
+
+
+def test_tracks_face_as_true_vehicles_do():
+    truth, frames = scene(5, seconds=8.0, density=0.6)
+    off = []
+    for number, frame in enumerate(tracked(frames)):
+        at = np.flatnonzero((truth["frame"] == number) & (truth["class_id"] == CAR))
+        rows = frame.rows[frame.rows["class_id"] == CAR]
+        if len(at) and len(rows):
+            away = np.hypot(truth["x_m"][at][:, None] - rows["x_m"], truth["y_m"][at][:, None] - rows["y_m"])
+            best = away.argmin(axis=1)
+            near = away[np.arange(len(at)), best] < 1.0
+            off.append((rows["heading_rad"][best] - truth["heading_rad"][at])[near])
+    turned = np.abs(np.angle(np.exp(1j * np.concatenate(off))))
+    assert (turned > np.pi / 2).mean() < 0.02
+    assert np.median(turned) < 0.08
