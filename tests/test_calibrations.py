@@ -14,17 +14,18 @@ from scipy.spatial.transform import Rotation
 import mcaptrack
 from mcaptrack import foxglove, log
 from mcaptrack.errors import McaptrackError
-from mcaptrack.geometry.pinhole import Lens
-from mcaptrack.geometry.plane import GroundPlane
+from mcaptrack.geometry.camera_path import CameraPath, poses_of
+from mcaptrack.geometry.pinhole import Lens, ground_homography
+from mcaptrack.geometry.plane import GroundPlane, moved_planes, plane_at, scene_planes
 from mcaptrack.notices import collected
-from mcaptrack.pipeline.planes import read_planes
+from mcaptrack.pipeline.planes import planes_to_json, read_planes
 from mcaptrack.schema import TRACKS
 from mcaptrack.schema.ground_plane import plane_to_rows, rows_to_plane
 from mcaptrack.sources.calibrations import find_calibration, read_calibrations, see_ground
 from mcaptrack.sources.cameras import camera_at
 from mcaptrack.sources.foreign import MessageType
 from tests.commands import call, done
-from tests.ros_messages import Ros, vision
+from tests.ros_messages import Ros, pixels, vision
 from tests.test_frames import packed, write
 
 START_NS = 1_700_000_000_000_000_000
@@ -103,6 +104,11 @@ def stamped(payload: bytes, s: float) -> bytes:
     """The same message with another stamp: that of tests.ros_messages is at the begin of CDR's header."""
     sec, nsec = divmod(START_NS + round(s * S), S)
     return payload[:4] + int(sec).to_bytes(4, "little") + int(nsec).to_bytes(4, "little") + payload[12:]
+
+
+def pose_of_eye() -> tuple[np.ndarray, np.ndarray]:
+    """How points of the robot are turned and moved to the frame of its camera."""
+    return EYE.inv().as_matrix(), -EYE.inv().apply(AHEAD)
 
 
 TF = MessageType(*foxglove.schema_record(foxglove.TRANSFORM), "protobuf")
@@ -249,6 +255,22 @@ class TestGround:
         assert len(rows) > 5
         assert np.isnan(rows["x_m"]).all()
 
+    def test_pictures_that_were_resized(self, straight, tmp_path):
+        ros = Ros("sensor_msgs/CompressedImage")
+        half = cv2.imencode(".jpg", np.zeros((SIZE[1] // 2, SIZE[0] // 2), np.uint8))[1].tobytes()
+        payload = ros.pack(ros.new("sensor_msgs/CompressedImage", ros.header(START_NS), "jpeg", pixels(half)))
+        kind, calibration = camera_info("")
+        fixed = [(START_NS, transform("map", "eye", START_NS, EYE, AHEAD))]
+        channels = [("/front/image", ros.kind, [(START_NS, payload)]), ("/tf_static", TF, fixed)]
+        path = write(tmp_path / "a.mcap", *channels, ("/front/camera_info", kind, [(START_NS, calibration)]))
+        ((_, plane),) = ground(path)[0].planes
+        assert (plane.width_px, plane.height_px) == (640, 360)
+        # The middle of a pixel of the small picture is between two of the large one.
+        whole = GroundPlane(ground_homography(Lens((700, 700), (640, 360)), *pose_of_eye(), np.eye(3)), *SIZE)
+        assert plane.pixels_to_metres(np.array([[300.0, 300]])) == pytest.approx(
+            whole.pixels_to_metres(np.array([[600.5, 600.5]]))
+        )
+
     def test_what_is_missing_is_said(self, tmp_path):
         path = robot(tmp_path / "a.mcap", "", tree=False)
         ended = done("run", path, "--topic", "/front/boxes", "--no-tables", "--in-place")
@@ -274,6 +296,33 @@ class TestGround:
         with log.read(path) as opened:
             ((_, plane),) = read_planes(opened, "/front")
         assert plane.lens is None
+
+
+def test_planes_of_each_picture_hold_where_tracks_are_compensated(straight, tmp_path):
+    """Boxes that are moved to the pixels of one picture stand where they did; lenses bend what each picture saw."""
+    for path in (straight, robot(tmp_path / "bent.mcap", "plumb_bob", last_s=0.5)):
+        planes = ground(path)[0].planes[:5]
+        turn = Rotation.from_euler("z", 2, degrees=True).as_matrix()[:2, :2]
+        motions = [np.column_stack([turn, [-12.0 + 2 * number, 5]]) for number in range(5)]
+        t_ns = np.array([since for since, _ in planes])
+        moves = CameraPath(t_ns, poses_of(motions, *SIZE))
+        feet = np.array([[300.0, 500], [700, 650], [1000, 560]])
+        points = np.column_stack([feet, np.zeros((3, 2))])  # boxes without a size
+        for moved, to_here in ((scene_planes(planes, moves), moves.to_scene), (moved_planes(planes, moves), None)):
+            for since_ns, plane in planes:
+                here = points if to_here is None else to_here(points, np.full(3, since_ns))
+                found = plane_at(moved, since_ns)
+                assert found.boxes_to_metres(here) == pytest.approx(plane.boxes_to_metres(points), abs=1e-5)
+                assert found.metres_to_pixels(plane.boxes_to_metres(points)) == pytest.approx(here[:, :2], abs=1e-2)
+
+
+def test_many_planes_are_recorded_by_their_digest():
+    plane = GroundPlane((1.0, 0, 0, 0, 1, 0, 0, 0, 1), 1280, 720)
+    few = planes_to_json([(number, plane) for number in range(100)])
+    assert few[99] == [99, {"homography": [1, 0, 0, 0, 1, 0, 0, 0, 1], "width_px": 1280, "height_px": 720, "point": "foot", "assumed": False}]  # fmt: skip
+    many, other = (planes_to_json([(number, plane) for number in range(start, 101 + start)]) for start in (0, 1))
+    assert many[0] == other[0] == 101
+    assert many[1] != other[1]
 
 
 def test_a_lens_is_kept_in_rows():
@@ -327,6 +376,7 @@ class TestCalibrations:
         channels = [(topic, kinds[name][0], [(START_NS, kinds[name][1])]) for topic, name in topics.items()]
         with log.read(write(tmp_path / "a.mcap", *channels)) as opened:
             assert find_calibration(opened, "/x/image", "left") == "/left/info"
+            assert find_calibration(opened, "/c/image", "left") == "/left/info"
             assert find_calibration(opened, "/b/image", "right") == "/b/info"
             assert find_calibration(opened, "/c/image", "else") == "/c/info"
             with pytest.raises(McaptrackError, match="several calibrations fit /x/image: /a/info, /b/info"):

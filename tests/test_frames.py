@@ -143,12 +143,35 @@ class TestWhereItIsKnown:
         assert poses.translation[:, 1].tolist() == pytest.approx([0, 0, offset, offset, offset, offset])
         assert f"it jumps 1 time, farthest by {offset:.2g} m at 1700000005.000 s" in said(tree)
 
+    def test_a_jump_in_a_gap_is_a_gap(self):
+        seconds = np.concatenate([np.arange(0, 2, 0.025), np.arange(4, 6, 0.025)])
+        places = np.stack([10 * seconds + 500 * (seconds > 3), 0 * seconds, 0 * seconds], axis=1)
+        tree = TransformTree([moves("map", "base_link", seconds, places)])
+        assert "jumps" not in said(tree)
+        assert tree.lookup("map", "base_link", at(1.99, 3)).is_known.tolist() == [True, False]
+
+    def test_a_pose_between_two_jumps_holds(self):
+        seconds = np.arange(0, 1, 0.1)
+        places = np.stack([seconds, np.array([0, 0, 0, 0, 30, 60, 60, 60, 60, 60]), 0 * seconds], axis=1)
+        tree = TransformTree([moves("map", "robot", seconds, places)])
+        assert tree.lookup("map", "robot", at(0.36, 0.43)).translation[:, :2].ravel().tolist() == [0.4, 30, 0.4, 30]
+
     def test_a_jump_on_the_spot(self):
         seconds = np.arange(0, 10, 0.1)
         tree = TransformTree([moves("map", "robot", seconds, np.zeros((100, 3)), yaw(*np.where(seconds < 5, 0, 90)))])
         assert "it jumps 1 time, farthest by 90 degrees" in said(tree)
         matrix = tree.lookup("map", "robot", at(4.93, 4.97)).rotation
         assert matrix[:, 0, 0] == pytest.approx([1, 0], abs=1e-6)
+
+    def test_single_poses_elsewhere_are_left_out(self):
+        seconds = np.arange(0, 10, 0.025)
+        places = np.stack([10 * seconds, 0 * seconds, 0 * seconds], axis=1)
+        places[[100, 250]] += [0, 30, 0]
+        tree = TransformTree([moves("map", "base_link", seconds, places)])
+        assert said(tree) == "map -> base_link: 2 poses far from those before and after are left out"
+        poses = tree.lookup("map", "base_link", at(2.49, 2.5, 2.51))
+        assert poses.translation[:, 0] == pytest.approx([24.9, 25, 25.1])
+        assert poses.translation[:, 1] == pytest.approx([0, 0, 0])
 
     def test_hard_driving_is_no_jump(self):
         """Full brakes from 30 m/s, turns on the spot by 180 degrees a second, and stamps that jitter by a quarter."""
@@ -253,7 +276,8 @@ class TestOddRecordings:
         assert "one message, which is taken for all times" in said(TransformTree([moves("a", "b", [0], [1, 0, 0])]))
 
     def test_static_and_moving(self):
-        tree = TransformTree([drive(), moves("map", "base_link", [0], [7, 7, 7], latched=True)])
+        often = np.arange(0, 10, 0.01)
+        tree = TransformTree([drive(), moves("map", "base_link", often, np.full((1000, 3), 7.0), latched=True)])
         assert x_of(tree, 1.0) == pytest.approx(10)
         assert "base_link is both static and not" in said(tree)
 

@@ -297,7 +297,6 @@ def run_all(
         str | None,
         common.option(
             "--ground-frame",
-            tuning=True,
             help="Frame with the ground as z = 0, for a camera of a robot with a calibration and transforms.",
             show_default="the fixed frame",
         ),

@@ -102,7 +102,8 @@ class TransformSeries:
         return float(np.median(np.diff(self.t_ns))) / NS_PER_S if len(self.t_ns) > 1 else float("nan")
 
     @cached_property
-    def _rotation(self) -> Rotation:
+    def rotation(self) -> Rotation:
+        """The rotations, (M,)."""
         from scipy.spatial.transform import Rotation
 
         return Rotation.from_quat(self.quaternion)
@@ -111,7 +112,7 @@ class TransformSeries:
     def _steps(self) -> tuple[Floats, Floats]:
         """The lengths of the steps between poses, (M - 1,) each: in metres, and in radians."""
         moved = np.linalg.norm(np.diff(self.translation, axis=0), axis=1)
-        return moved, (self._rotation[:-1].inv() * self._rotation[1:]).magnitude()
+        return moved, (self.rotation[:-1].inv() * self.rotation[1:]).magnitude()
 
     @cached_property
     def gaps(self) -> Indices:
@@ -150,7 +151,7 @@ class TransformSeries:
         index = np.clip(np.searchsorted(self.t_ns, t_ns, side="right") - 1, 0, max(last - 1, 0))
         if self.is_static:
             index = np.clip(np.searchsorted(self.t_ns, t_ns, side="right") - 1, 0, last)
-            return self._rotation[index], self.translation[index], known
+            return self.rotation[index], self.translation[index], known
         is_broken = np.zeros(last, bool)
         is_broken[self.gaps] = is_broken[self.jumps] = True
         is_second = 2 * (t_ns - self.t_ns[index]) > self.t_ns[index + 1] - self.t_ns[index]
@@ -167,7 +168,7 @@ class TransformSeries:
         length_ns = self.t_ns[step + 1] - self.t_ns[step]
         share = np.clip((t_ns - self.t_ns[step]) / length_ns, -1.0, 2.0)
         share = np.where(is_broken[step], near - step, share)
-        before, after = self._rotation[step], self._rotation[step + 1]
+        before, after = self.rotation[step], self.rotation[step + 1]
         from scipy.spatial.transform import Rotation
 
         turned = Rotation.from_rotvec(share[:, None] * (before.inv() * after).as_rotvec())
@@ -246,8 +247,15 @@ def _dynamic(parent: str, child: str, samples: Samples, messages: int) -> tuple[
     if (differing := int((_differs(samples) & ~is_last[:-1]).sum())) > 0:
         findings.append(f"{_count(differing, 'stamp')} have several poses, of which the last is taken")
     kept = samples.take(np.flatnonzero(is_last))
-    is_static = len(kept.stamp_ns) == 1
-    series = TransformSeries(parent, child, is_static, messages, kept.stamp_ns, kept.translation, kept.quaternion)
+
+    def series_of(poses: Samples) -> TransformSeries:
+        is_static = len(poses.stamp_ns) == 1
+        return TransformSeries(parent, child, is_static, messages, poses.stamp_ns, poses.translation, poses.quaternion)
+
+    series = series_of(kept)
+    if len(single := _single_outliers(series)):
+        findings.append(f"{_count(len(single), 'pose')} far from those before and after are left out")
+        series = series_of(kept.take(np.delete(np.arange(len(kept.stamp_ns)), single)))
     if len(series.gaps):
         longest = float(np.diff(series.t_ns)[series.gaps].max()) / NS_PER_S
         words = f"{_count(len(series.gaps), 'gap')}, the longest of {longest:.3g} s"
@@ -259,6 +267,19 @@ def _dynamic(parent: str, child: str, samples: Samples, messages: int) -> tuple[
         at_s = series.t_ns[series.jumps[most] + 1] / NS_PER_S
         findings.append(f"it jumps {_count(len(series.jumps), 'time')}, farthest by {size} at {at_s:.3f} s")
     return series, findings
+
+
+def _single_outliers(series: TransformSeries) -> Indices:
+    """Return the poses that the frame jumps to, and from them back to where it was."""
+    jumps = series.jumps
+    there = jumps[:-1][np.diff(jumps) == 1] + 1
+    before, after = series.translation[there - 1], series.translation[there + 1]
+    moved, turned = series.step_sizes(there)
+    apart = np.linalg.norm(after - before, axis=1)
+    between = (series.rotation[there - 1].inv() * series.rotation[there + 1]).magnitude() if len(there) else turned
+    is_back = (apart <= moved / 2 + _SAME_M) & (between <= turned / 2 + _JUMP_RAD)
+    back: Indices = there[is_back]
+    return back[np.diff(back, prepend=-2) > 1]
 
 
 def _one_pass(samples: Samples) -> tuple[Samples, list[str]]:
