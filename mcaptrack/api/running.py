@@ -241,4 +241,5 @@ def run_stage(
     def plan(opened: logs.Log, prefix: str, say: Callable[[str], None]) -> list[Job]:
         return pipeline.plan_stage(opened, prefix, stage, transform, topic, to, keep, say, before, frame or "", make)
 
-    return work(Where(log, camera, topic, output, sidecar, force), plan, None, progress, None)
+    where = Where(log, camera, topic, output, sidecar, force)
+    return work(where, plan, None, progress, None, PlaneChoice(frame=frame))

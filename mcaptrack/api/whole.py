@@ -109,7 +109,7 @@ def run(
     transforms = transforms_of(stages)
     transforms |= {s.name: transform_of(s.name, chosen[s.option], {}) for s in STAGES.values() if s.option in chosen}
 
-    plane = PlaneChoice(fit_plane, person_height_m, ground_frame=ground_frame)
+    plane = PlaneChoice(fit_plane, person_height_m, frame, ground_frame)
 
     def plan(opened: logs.Log, prefix: str, say: Callable[[str], None]) -> list[Job]:
         motion = camera_motion or ""

@@ -13,6 +13,7 @@ from mcaptrack.notices import warn
 from mcaptrack.pipeline.checks import Job
 from mcaptrack.schema import DETECTIONS, TRACKS
 from mcaptrack.schema.provenance import frame_id_of
+from mcaptrack.sources.calibrations import holds_calibrations
 from mcaptrack.sources.cameras import camera_at, is_made_by_stage
 from mcaptrack.sources.fixed_frame import holds_boxes_3d
 from mcaptrack.transforms import STAGES, Stage
@@ -64,7 +65,9 @@ def check_spaces(opened: log.Log, prefix: str, jobs: Sequence[Job], frame_id: st
     Warns if a frame is named and no boxes can be brought to it.
     """
     sources = {job.source for job in jobs if job.source in opened.channels}
-    if frame_id and not camera_at(opened, prefix).in_space and not any(holds_boxes_3d(opened, one) for one in sources):
+    is_calibrated = any(map(holds_calibrations, opened.channels.values()))
+    has_boxes = camera_at(opened, prefix).in_space or any(holds_boxes_3d(opened, one) for one in sources)
+    if frame_id and not has_boxes and not is_calibrated:
         warn("`frame=` has no effect: only recorded 3D boxes are brought to a frame", "option-not-used")
     for job in jobs:
         if job.transform.reads is not DETECTIONS or job.transform.writes.get("") is not TRACKS:
