@@ -221,6 +221,32 @@ def test_only_boxes_of_people_count(tmp_path):
     assert 120 < made_from(tmp_path / "b.mcap", named, frames).parameters["fit"]["boxes"] <= 180
 
 
+def test_boxes_of_other_things_alone_are_refused(tmp_path):
+    frames = detections()
+    for frame in frames:
+        frame.rows["class_id"] = 7
+    named = Provenance("detect", {"detector": "onnx"}, "/camera/video", classes={"1": "person", "7": "car"})
+    assert made_from(tmp_path / "a.mcap", named, frames).parameters == {"refused": "none of them is of a person"}
+    for frame in frames:
+        frame.rows["class_id"] = 0  # unknown
+    assert made_from(tmp_path / "b.mcap", named, frames).parameters["fit"]["boxes"] > 120
+
+
+def test_a_scale_is_that_of_people_where_there_are_other_things(tmp_path):
+    frames = detections()[:20]
+    alone = made_from(tmp_path / "a.mcap", LEARNED, frames)
+    mixed = [frame._replace(rows=np.concatenate([frame.rows] * 4)) for frame in frames]
+    for frame in mixed:
+        frame.rows["class_id"][5:] = 3
+        frame.rows["h_px"][5:] *= 5
+    assert alone.parameters["refused"].endswith("120 are needed")
+    for one in (frames, mixed):
+        with log.read(tmp_path / "a.mcap") as opened:
+            planes, _ = make_plane(opened, "/camera", one, ("/camera/detections", ""), {})
+        assert planes is not None
+        assert planes[0][1].homography[0] == pytest.approx(1.7 / np.median(np.concatenate(BOXES[:20])[:, 3]), rel=0.1)
+
+
 def test_a_camera_that_moves_is_refused(tmp_path):
     moves = CAMERA_MOTION.rows(
         m00=[1.0], m01=[0.0], m02_px=[30.0], m10=[0.0], m11=[1.0], m12_px=[0.0],

@@ -156,6 +156,16 @@ def test_boxes_that_cannot_tell_are_refused(boxes, words):
         fitted(boxes)
 
 
+@pytest.mark.parametrize("seen_m", [1.2, 1.4])
+def test_people_who_sit_among_others_are_refused(seen_m):
+    """Of people who sit and people who stand neither are most: metres along the view can be wrong by a factor of two."""
+    boxes, _ = View(4.0, 20.0).boxes(600, seed=2)
+    boxes[::2, 1] += boxes[::2, 3] * (1 - seen_m / 1.7)
+    boxes[::2, 3] *= seen_m / 1.7
+    with pytest.raises(McaptrackError, match="heights of boxes don't follow from where they stand"):
+        fitted(boxes)
+
+
 def test_a_camera_that_looks_down_is_refused():
     with pytest.raises(McaptrackError, match=r"looks down|same distance|don't follow|shape|show whole"):
         fitted(above())

@@ -15,7 +15,7 @@ from mcaptrack.api.columns import UNNUMBERED, boxes_of, frame_of
 from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import warn
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame, Schema
-from mcaptrack.schema.classes import PEOPLE, PERSON, UNKNOWN, class_name
+from mcaptrack.schema.classes import PERSON, UNKNOWN, class_name, is_person
 
 _SUPERVISION: Final = ("confidence", "class_id", "tracker_id", "mask", "data")
 #: The key of names of classes in ``data``.
@@ -86,12 +86,12 @@ def _ids_of(found: Any) -> Any:
     0 stays what it is if its name says that it is unknown, as in what ``supervision_of`` gives.
     """
     names = np.array([str(name).lower() for name in found.data[_NAMES]])
-    is_person = np.isin(names, PEOPLE)
+    are_people = np.array([is_person(name) for name in names], bool)
     if found.class_id is None:
-        return np.where(is_person, PERSON, 0)
+        return np.where(are_people, PERSON, 0)
     ids = np.asarray(found.class_id)
     is_unknown = (ids == UNKNOWN) & (names == class_name(UNKNOWN, {}))
-    return np.where(is_person, PERSON, np.where(is_unknown, UNKNOWN, ids + _OTHERS))
+    return np.where(are_people, PERSON, np.where(is_unknown, UNKNOWN, ids + _OTHERS))
 
 
 def names_of_supervision(found: Any) -> dict[int, str]:

@@ -53,7 +53,7 @@ _LEAST_SPREAD: Final = 0.03
 # What is refused: fewer boxes that agree than this share, a typical deviation of more, people who are about as tall in
 # the picture wherever they stand (ratio), a steeper camera (degrees), or metres that are less certain (relative
 # standard deviation).
-_LEAST_INLIERS, _MOST_RESIDUAL, _LEAST_GROWTH, _STEEPEST = 0.6, 0.15, 1.25, 65.0
+_LEAST_INLIERS, _MOST_RESIDUAL, _LEAST_GROWTH, _STEEPEST = 0.6, 0.12, 1.25, 65.0
 _MOST_SCALE_SD, _MOST_DEPTH_SD = 0.05, 0.5
 
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError, call
-from mcaptrack.geometry.arrays import Floats, Ints
+from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.plane import (
     LEAST_DEPTH,
@@ -34,7 +34,7 @@ from mcaptrack.pipeline.checks import Job
 from mcaptrack.pipeline.visible import picture_size
 from mcaptrack.pipeline.write import Made, digest_of
 from mcaptrack.schema import DETECTIONS, GROUND_PLANE, TRACKS, Frame, Rows
-from mcaptrack.schema.classes import PEOPLE, PERSON
+from mcaptrack.schema.classes import PERSON, UNKNOWN, is_person
 from mcaptrack.schema.ground_plane import plane_to_rows, rows_to_plane
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources import foreign
@@ -46,6 +46,7 @@ _ASSUME, _ESTIMATE, _CALIBRATE = "assume-ground-plane", "estimate-ground-plane",
 _MADE: Final = (_ASSUME, _ESTIMATE, _CALIBRATE)
 #: A plane is estimated from boxes of at most so many frames.
 _MOST_FRAMES: Final = 5000
+_BOX_COLUMNS: Final = ["x_px", "y_px", "w_px", "h_px", "score", "class_id"]
 #: More planes are recorded by their digest in the parameters of channels.
 _MOST_RECORDED: Final = 100
 
@@ -194,9 +195,8 @@ def make_plane(
     ``uncalibrated`` says why the plane doesn't follow from a calibration.
     Both results are None if no frame has boxes in pixels.
     """
-    columns = ["x_px", "y_px", "w_px", "h_px"]
-    boxes = np.concatenate([columns_to_boxes(frame.rows[columns]) for frame in frames]) if frames else np.empty((0, 4))
-    boxes = boxes[np.isfinite(boxes).all(axis=1)]
+    names = next((one.classes for _, one in _chain(opened, source[0], made) if one and one.classes), {})
+    boxes, number, score, are_people = _boxes(frames, names)
     if not len(boxes):
         return None, None  # without boxes in pixels there is nothing to convert to metres
     estimate, person_m = choice.settled(provenance_of(opened, camera_at(opened, prefix).ground_plane))
@@ -211,13 +211,16 @@ def make_plane(
     else:
         size = _picture_size(opened, prefix, source[0], made) or (width, height)
         try:
-            fit = plane_from_boxes(*_people(opened, frames, source[0], made), *size, person_m)
+            if not are_people.any():
+                raise McaptrackError("none of them is of a person")
+            some = are_people & (number % -(-len(frames) // _MOST_FRAMES) == 0)
+            fit = plane_from_boxes(boxes[some], number[some], score[some], *size, person_m)
             plane, parameters = fit.plane, {"person_height_m": person_m, "fit": fit.to_json()}
         except McaptrackError as error:
             parameters["refused"] = str(error)
     parameters |= {_UNCALIBRATED: uncalibrated} if uncalibrated else {}
     transform = _ASSUME if plane is None else _ESTIMATE
-    plane = plane or assumed_plane(boxes[:, 3], width, height, person_m)
+    plane = plane or assumed_plane(boxes[are_people if are_people.any() else slice(None), 3], width, height, person_m)
     start = frames[0].t_ns
     channel = Made.of(GROUND_PLANE, [Frame(start, 0, plane_to_rows(plane))], Provenance(transform, parameters, *source))
     return [(start, plane)], channel
@@ -287,21 +290,20 @@ def _picture_size(opened: log.Log, prefix: str, source: str, made: Mapping[str, 
     return picture_size(opened, topic)
 
 
-def _people(
-    opened: log.Log, frames: Sequence[Frame], source: str, made: Mapping[str, Made]
-) -> tuple[Floats, Ints, Floats]:
-    """Return boxes of people, the number of the frame of each, and their scores; of some frames of a long log."""
-    frames = frames[:: -(-len(frames) // _MOST_FRAMES)]
-    names = next((one.classes for _, one in _chain(opened, source, made) if one and one.classes), {})
-    wanted = [int(number) for number, name in names.items() if name.lower() in PEOPLE and number.isdecimal()]
-    rows: Rows = np.concatenate([frame.rows for frame in frames])
+def _boxes(frames: Sequence[Frame], names: Mapping[str, str]) -> tuple[Floats, Ints, Floats, Bools]:
+    """Return the boxes of rows in pixels, the number of the frame of each, their scores, and which are of people.
+
+    ``names`` are those of classes by number. Boxes of unknown classes are of people if no box is said to be.
+    """
+    rows: Rows = np.concatenate([frame.rows[_BOX_COLUMNS] for frame in frames]) if frames else DETECTIONS.empty()
     number = np.repeat(np.arange(len(frames)), [len(frame.rows) for frame in frames])
-    if "class_id" in (rows.dtype.names or ()):
-        wanted = wanted or [PERSON]
-        is_person = np.isin(rows["class_id"], wanted)
-        if is_person.any():
-            rows, number = rows[is_person], number[is_person]
-    return columns_to_boxes(rows), number, rows["score"].astype(np.float64)
+    kept = np.isfinite(columns_to_boxes(rows)).all(axis=1)
+    rows, number = rows[kept], number[kept]
+    wanted = [int(one) for one, name in names.items() if is_person(name) and one.isdecimal()] or [PERSON]
+    are_people = np.isin(rows["class_id"], wanted)
+    if not are_people.any():
+        are_people = rows["class_id"] == UNKNOWN
+    return columns_to_boxes(rows), number, rows["score"].astype(np.float64), are_people
 
 
 def fit_of(made: Provenance | None) -> dict[str, float] | None:

@@ -22,8 +22,8 @@ from mcaptrack.schema.provenance import read_texts
 #: The class of what is not known, and of people.
 UNKNOWN: Final = 0
 PERSON: Final = 1
-#: Names of people, in lower case.
-PEOPLE: Final[tuple[str, ...]] = ("person", "pedestrian", "human")
+#: Names of people, in lower case, the usual one first.
+PEOPLE: Final[tuple[str, ...]] = ("person", "pedestrian", "people", "human")
 _COLUMN: Final = "class_id"
 #: Keys of the metadata of channels: names of classes by number, and the class of all rows that state none.
 _NAMES, _ONLY = "mcaptrack.classes", "mcaptrack.class_id"

@@ -15,7 +15,7 @@ import numpy as np
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import DETECTIONS, Rows
-from mcaptrack.schema.classes import PEOPLE, PERSON, UNKNOWN
+from mcaptrack.schema.classes import PERSON, UNKNOWN, is_person
 from mcaptrack.sources.foreign.decoding import MessageType, decoder_with_errors, plain_name
 
 #: Schemas of boxes of other software.
@@ -43,7 +43,7 @@ class Classes:
 
     def class_id(self, name: str) -> int:
         """The id of a class; for a name a placeholder, which ``numbers`` maps to the final id."""
-        if name.lower() in PEOPLE:
+        if is_person(name):
             return PERSON
         if _NUMBER.fullmatch(name):
             number = int(name) if int(name) < _FIRST_NAME else UNKNOWN

@@ -17,7 +17,7 @@ import numpy as np
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Floats
-from mcaptrack.schema.classes import PEOPLE, PERSON
+from mcaptrack.schema.classes import PERSON, is_person
 from mcaptrack.sources.ingest.labels.box_rows import NO_CLASS, BoxRows, FrameNames
 from mcaptrack.sources.ingest.labels.columns import choose_columns
 from mcaptrack.sources.ingest.labels.formats import NO_ID, ClassNames, Format, Labels, Role
@@ -245,7 +245,7 @@ def _classes(
     column, texts = (columns["name"], names.names) if "name" in columns else (number, classes.names)
     if column is None or not texts:
         return none, None
-    others = sorted({text.lower() for text in texts} - set(PEOPLE))
+    others = sorted({text.lower() for text in texts if not is_person(text)})
     places = {text: place for place, text in enumerate(others, start=PERSON + 1)}
     ids = [places.get(text.lower(), PERSON) for text in texts]
     stated = np.isfinite(column)

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import Final
 
 from mcaptrack.errors import McaptrackError
+from mcaptrack.schema.classes import PEOPLE, PERSON
 
 #: The classes of COCO in the order of networks that count 80.
 COCO: Final = tuple(
@@ -24,10 +25,6 @@ COCO: Final = tuple(
 )
 #: The numbers up to 90 that COCO's own numbers of categories leave out.
 _LEFT_OUT: Final = frozenset({0, 12, 26, 29, 30, 45, 66, 68, 69, 71, 83})
-#: Names of people, the usual one first.
-_PEOPLE: Final = ("person", "pedestrian", "people", "human")
-#: The number of people in rows; 0 is unknown.
-_PERSON: Final = 1
 
 
 def names_of(declared: Mapping[int, str], count: int | None) -> dict[int, str]:
@@ -42,7 +39,7 @@ def names_of(declared: Mapping[int, str], count: int | None) -> dict[int, str]:
     if count in (90, 91):
         numbers = [number for number in range(91) if number not in _LEFT_OUT]
         return dict(zip(numbers, COCO, strict=True))
-    return {0: _PEOPLE[0]} if count == 1 else {index: str(index) for index in range(count)}
+    return {0: PEOPLE[0]} if count == 1 else {index: str(index) for index in range(count)}
 
 
 def numbers_of(names: Mapping[int, str]) -> dict[int, int]:
@@ -57,8 +54,8 @@ def numbers_of(names: Mapping[int, str]) -> dict[int, int]:
     free = max(numbers.values(), default=0) + 1 if people is None else numbers[people]
     for index, number in numbers.items():
         if people is not None and names[index].casefold() == names[people].casefold():
-            numbers[index] = _PERSON
-        elif number == _PERSON:
+            numbers[index] = PERSON
+        elif number == PERSON:
             numbers[index] = free
     return numbers
 
@@ -75,7 +72,7 @@ def wanted(names: Mapping[int, str], classes: str, where: str) -> list[int]:
         by_name.setdefault(name.casefold(), []).append(index)
     out: set[int] = set()
     for word in filter(None, (word.strip().casefold() for word in classes.split(","))):
-        people = _people(names) if word == _PEOPLE[0] else None
+        people = _people(names) if word == PEOPLE[0] else None
         found = by_name.get(word) or ([] if people is None else by_name[names[people].casefold()])
         if not found and word.isdecimal() and int(word) in names:
             found = [int(word)]
@@ -102,4 +99,4 @@ def _known(names: Mapping[int, str]) -> str:
 def _people(names: Mapping[int, str]) -> int | None:
     """The first index of the class of people."""
     by_name = {name.casefold(): index for index, name in reversed(list(names.items()))}
-    return next((by_name[name] for name in _PEOPLE if name in by_name), None)
+    return next((by_name[name] for name in PEOPLE if name in by_name), None)
