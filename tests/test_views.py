@@ -304,3 +304,12 @@ def test_schema_records_are_those_of_the_stock_library(name):
     wanted = build_file_descriptor_set(foxglove.message_class(f"foxglove.{name}"))
     assert (schema_name, encoding) == (f"foxglove.{name}", "protobuf")
     assert {f.name: f for f in FileDescriptorSet.FromString(data).file} == {f.name: f for f in wanted.file}
+
+
+def test_forecasts_stay_in_the_world_while_planes_of_pictures_move():
+    """A camera that moves 1 m a picture: the point on the ground goes 10 px to the left."""
+    planes = [(int(t), GroundPlane((0.1, 0, n, 0, 0.1, 0, 0, 0, 1), 640, 480)) for n, t in enumerate(PICTURES)]
+    found = messages(*CHANNELS["predictions"], planes=planes)
+    for number in range(3, 6):
+        (line,) = (one for one in drawn(found[number]) if one.type == LIST)
+        assert xy(line) == [pytest.approx((10 * (x - number), y), abs=PX) for x, y in ((1, 30), (2, 40))]

@@ -15,9 +15,12 @@ from mcaptrack.geometry.arrays import Ints
 from mcaptrack.geometry.camera_path import CameraPath
 from mcaptrack.geometry.plane import Planes
 from mcaptrack.geometry.transform_tree import TransformTree
+from mcaptrack.notices import warn
 from mcaptrack.schema import GROUND_PLANE, PREDICTIONS, TRACKS, Frame, Schema
 from mcaptrack.schema.framing import frame_times
 from mcaptrack.schema.provenance import VIEW, Provenance
+from mcaptrack.sources import foreign
+from mcaptrack.sources.calibrations import holds_calibrations, moving_camera
 from mcaptrack.sources.cameras import chain_of
 from mcaptrack.sources.foreign.decoding import decoder_with_errors, plain_name
 from mcaptrack.sources.foreign.flatten import message_type_of
@@ -80,6 +83,7 @@ class ViewFactory:
     """Draws the channels of a camera: in its pictures, and in the frame of their metres.
 
     ``frames`` are the coordinate frames that no transform of the log names; None for that of the ground plane alone.
+    ``cameras`` are calibrated ones by the topics of their pictures, for tracks with 3D boxes.
     """
 
     def __init__(
@@ -90,9 +94,10 @@ class ViewFactory:
         planes: Planes,
         path: CameraPath | None = None,
         frames: Sequence[str] | None = None,
+        cameras: Mapping[str, views.MovingCamera] = {},
     ) -> None:
         self._prefix, self._picture_ns, self._stamp_ns, self._planes = prefix, picture_ns, stamp_ns, planes
-        self._path = path
+        self._path, self._cameras = path, cameras
         self._frames = (views.ground.frame_of(prefix),) if frames is None else frames
 
     def views(self, shown: Mapping[str, ChannelToDraw], start_ns: int) -> Iterator[View]:
@@ -113,6 +118,9 @@ class ViewFactory:
             if len(self._picture_ns) and not is_solid:
                 drawn = drawing.on_pictures(self._picture_ns, self._stamp_ns)
                 yield View(topic + views.SUFFIX, foxglove.ANNOTATIONS, made_from, group, drawn)
+            for pictures, camera in self._cameras.items() if is_solid else ():
+                seen = drawing.on_camera(camera, channel.bodies)
+                yield View(topic + views.SUFFIX + pictures, foxglove.ANNOTATIONS, made_from, group, seen)
             if channel.schema in _ON_GROUND:
                 own_ns = frame_times(channel.frames)
                 t_ns = self._picture_ns if len(self._picture_ns) and not is_solid else own_ns
@@ -157,6 +165,23 @@ def robot_frame(opened: log.Log, sources: Collection[str], tree: TransformTree, 
             if not tree.series[frame_id].is_static:
                 return frame_id
     return ""
+
+
+def calibrated_cameras(opened: log.Log, frame_id: str) -> dict[str, views.MovingCamera]:
+    """Return where cameras were in a frame, by the topics of their pictures, as far as calibrations and transforms say.
+
+    Pictures without them are left out, with a warning if the log has calibrations.
+    """
+    if not any(map(holds_calibrations, opened.channels.values())):
+        return {}
+    found = {}
+    for topic, channel in sorted(opened.channels.items()):
+        if foreign.holds_pictures(channel) and channel.messages:
+            try:
+                found[topic] = moving_camera(opened, topic, frame_id)
+            except McaptrackError as error:
+                warn(f"{opened.path}: tracks are not drawn on {topic}: {error}", "left-out")
+    return found
 
 
 def recorded_drawings(opened: log.Log, sources: Collection[str]) -> dict[str, bool]:

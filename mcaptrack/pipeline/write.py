@@ -24,6 +24,7 @@ from mcaptrack.pipeline.drawing import (
     ChannelToDraw,
     View,
     ViewFactory,
+    calibrated_cameras,
     frame_topic,
     has_bodies,
     new_frames,
@@ -132,7 +133,11 @@ def write(
     is_framed = bool(frame_id) or any(one.frame_id for one in shown.values())
     tree = transforms_of(opened) if is_framed else None
     frames = new_frames(prefix, shown, tree.frames() if tree else ())
-    drawn = ViewFactory(prefix, picture_ns, stamp_ns, planes, path, frames)
+    solid_in = next((one.frame_id for one in shown.values() if one.is_solid()), "")
+    cameras = calibrated_cameras(opened, solid_in) if solid_in and tree else {}
+    outdated |= {one for one in opened.channels for topic in shown if one.startswith(f"{topic}{views.SUFFIX}/")}
+    outdated |= {topic + views.SUFFIX + pictures for topic in shown for pictures in cameras}
+    drawn = ViewFactory(prefix, picture_ns, stamp_ns, planes, path, frames, cameras)
     if frames:
         outdated.add(frame_topic(prefix))
     recorded = {topic for topic in outdated if not may_replace(opened, topic, VIEW)}
@@ -155,8 +160,9 @@ def write(
     names = frozenset(topic.removeprefix(prefix + "/") for topic in topics if topic.startswith(prefix + "/"))
     frame_id = frame_id or views.ground.frame_of(prefix)
     channels = layouts.CameraChannels(
-        prefix, names, video, frame_id, eye._replace(z_m=floor_m), last_step, is_truth_known, follow, by_viewers
-    )
+        prefix, names, video, frame_id, eye._replace(z_m=floor_m), last_step, is_truth_known, follow, by_viewers,
+        tuple(cameras),
+    )  # fmt: skip
     layout_files = layouts.make(channels)
     new = {attachment_of(name): content for name, content in layout_files.items()}
     unchanged = {name for name, content in new.items() if opened.attachment(name) == content}

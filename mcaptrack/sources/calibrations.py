@@ -11,9 +11,12 @@ import numpy as np
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
+from mcaptrack.foxglove.views import MovingCamera
 from mcaptrack.geometry.arrays import Floats, Ints
+from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.pinhole import Lens, ground_homography
 from mcaptrack.geometry.plane import GroundPlane, Planes
+from mcaptrack.geometry.transform_series import OTHER_CLOCK_S
 from mcaptrack.geometry.transform_tree import Poses, TransformTree
 from mcaptrack.notices import warn
 from mcaptrack.sources.cameras import Camera
@@ -135,6 +138,35 @@ def see_ground(opened: log.Log, camera: Camera, frame: str = "", ground_frame: s
     return GroundSeen(planes, frame, ground, topic)
 
 
+def moving_camera(opened: log.Log, topic: str, frame: str) -> MovingCamera:
+    """Return where the camera of a channel of pictures was in a frame at each of them, and its lens.
+
+    Raises McaptrackError if no calibration fits the pictures, or if no transforms connect the camera with the frame.
+    """
+    log_ns, stamp_ns, frame_id = _headers(opened, [topic])
+    source = find_calibration(opened, topic, frame_id)
+    found = read_calibrations(opened, source, is_rectified="rect" in topic.rpartition("/")[2])
+    size = _picture_size(opened, topic)
+    known = [(since_ns, _fitted(one, size, source)) for since_ns, one in found]
+    first = known[0][1]
+    poses = poses_at(opened, topic, first.frame_id or frame_id, frame, stamp_ns, log_ns)
+    if not poses.is_known.any():
+        raise McaptrackError(f"no pose of the frame {first.frame_id or frame_id} in {frame} is known")
+    which = _holding(known, log_ns)
+    turn = np.array([one.turn for _, one in known])[which]
+    is_other_clock = bool(len(log_ns)) and np.median(np.abs(log_ns - stamp_ns)) > OTHER_CLOCK_S * NS_PER_S
+    return MovingCamera(
+        log_ns, stamp_ns, log_ns if is_other_clock else np.maximum.accumulate(stamp_ns),
+        turn @ poses.rotation, (turn @ poses.translation[..., None])[..., 0],
+        [one.lens for _, one in known], which, first.width_px, first.height_px,
+    )  # fmt: skip
+
+
+def _holding(known: Sequence[tuple[int, Calibration]], log_ns: Ints) -> Ints:
+    """Return which of the calibrations holds at each log time (N,)."""
+    return np.maximum(np.searchsorted([t_ns for t_ns, _ in known], log_ns, side="right") - 1, 0)
+
+
 def _planes(
     log_ns: Ints, known: Sequence[tuple[int, Calibration]], poses: Poses, floor: Poses | None
 ) -> list[tuple[int, GroundPlane]]:
@@ -142,7 +174,7 @@ def _planes(
 
     ``floor`` are the poses of the ground in the frame of the metres, unless that is the same.
     """
-    which = np.maximum(np.searchsorted([t_ns for t_ns, _ in known], log_ns, side="right") - 1, 0)
+    which = _holding(known, log_ns)
     is_known = poses.is_known if floor is None else poses.is_known & floor.is_known
     out: list[tuple[int, GroundPlane]] = []
     below = 0

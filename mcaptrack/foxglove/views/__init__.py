@@ -10,16 +10,17 @@ from typing import Final
 
 import numpy as np
 
-from mcaptrack.foxglove.views import ground, image
+from mcaptrack.foxglove.views import ground, image, projected
 from mcaptrack.foxglove.views.image import View
 from mcaptrack.foxglove.views.people import People, people_at
+from mcaptrack.foxglove.views.projected import MovingCamera
 from mcaptrack.foxglove.views.style import line_unit, style_of
 from mcaptrack.geometry.arrays import Ints
 from mcaptrack.geometry.camera_path import CameraPath
 from mcaptrack.geometry.plane import Planes
 from mcaptrack.schema import DETECTIONS, PREDICTIONS, TRACKS, Frame, Schema
 
-__all__ = ["DRAWN", "SCENE_SUFFIX", "SUFFIX", "SUFFIXES", "Drawing", "View", "ground"]
+__all__ = ["DRAWN", "SCENE_SUFFIX", "SUFFIX", "SUFFIXES", "Drawing", "MovingCamera", "View", "ground"]
 
 
 #: Suffixes of the topics of views: on the pictures, and on the ground.
@@ -67,6 +68,16 @@ class Drawing:
             yield from image.tracks(self._people(picture_ns), pictures, unit, self._style, self._path)
         elif self._schema is PREDICTIONS:
             yield from image.predictions(self._frames, pictures, self._planes, self._path)
+
+    def on_camera(self, camera: MovingCamera, bodies: Sequence[Frame] = ()) -> View:
+        """Annotation messages (time, frame, payload), one for each picture of a calibrated camera, of 3D boxes.
+
+        ``bodies`` are the tracks with 3D boxes that forecasts belong to.
+        """
+        if self._schema is TRACKS:
+            yield from projected.tracks(self._frames, camera, self._style, self._classes)
+        elif self._schema is PREDICTIONS:
+            yield from projected.predictions(self._frames, camera, bodies)
 
     def on_ground(self, t_ns: Ints, frame_id: str, bodies: Sequence[Frame] = ()) -> View:
         """Scene messages (time, frame, payload) in metres, one for each of the rising times ``t_ns``.

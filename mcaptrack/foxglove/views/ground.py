@@ -85,7 +85,7 @@ def tracks(people: People, t_ns: Ints, frame_id: str, style: TrackStyle, classes
     lines = trails(people, known, t_ns)
     longest = lines.row.shape[1] - 1
     rgb = np.broadcast_to(_WHITE, (len(people.number), 3)) if style.is_white else colours(people.number)
-    body_rgb = rgb if style.is_white else _class_colours(people.class_id, classes)
+    body_rgb = rgb if style.is_white else class_colours(people.class_id, classes)
     strength = np.where(people.observed, OBSERVED, INTERPOLATED)
     alpha, body_alpha = 0.875 * strength, 0.625 * strength
     places = np.column_stack([people.at_m, people.body.base_m()])
@@ -118,7 +118,7 @@ def _alike(points: Ints, has_body: NDArray[np.bool_], rows: Ints) -> Iterator[tu
             yield count, is_solid, some[chosen]
 
 
-def _class_colours(class_id: Ints, classes: Mapping[int, str]) -> Floats:
+def class_colours(class_id: Ints, classes: Mapping[int, str]) -> Floats:
     """The colours of classes (N,), (N, 3)."""
     known, which = np.unique(class_id, return_inverse=True)
     table = [class_colour(one, classes.get(one, "")) for one in known.tolist()]
@@ -133,7 +133,7 @@ def predictions(frames: Sequence[Frame], t_ns: Ints, frame_id: str, bodies: Sequ
     instants = _Instants(t_ns, frame_id)
     wanted = latest(frames, t_ns)
     futures = [
-        (_raised(future, bodies, frame_times(frames)), ellipses(future.spread_m2), colours(future.number))
+        (raised(future, frames, bodies), ellipses(future.spread_m2), colours(future.number))
         for future in forecasts(frames)
     ]
     for span, scene in instants.batches():
@@ -150,11 +150,11 @@ def predictions(frames: Sequence[Frame], t_ns: Ints, frame_id: str, bodies: Sequ
         yield from instants.numbered(span, scene)
 
 
-def _raised(future: ForecastPaths, bodies: Sequence[Frame], made_ns: Ints) -> ForecastPaths:
+def raised(future: ForecastPaths, frames: Sequence[Frame], bodies: Sequence[Frame]) -> ForecastPaths:
     """Forecasts with a height: that of the bottom of the 3D box, or of the usual one if a track has none."""
     if not bodies:
         return future
-    height = base_heights(bodies, made_ns[future.message], future.number)
+    height = base_heights(bodies, frame_times(frames)[future.message], future.number)
     known = np.isfinite(height)
     height[~known] = np.median(height[known]) if known.any() else 0.0
     along = np.broadcast_to(height[:, None, None], (*future.path_m.shape[:2], 1))

@@ -153,24 +153,28 @@ def predictions(
     unit = line_unit((), planes)
     made_ns = frame_times(frames)
     wanted = latest(frames, pictures.t_ns)
-    futures = [_in_pixels(future, planes, made_ns) for future in forecasts(frames)] if planes else []
+    futures = list(forecasts(frames)) if planes else []
+    # Planes of pictures: each picture has its own, unless ``path`` says how it moved.
+    has_own = path is None and len(planes) > 1
+    once = [] if has_own else [_in_pixels(future, planes, made_ns[future.message]) for future in futures]
     # Planes are those of pictures, and forecasts are made between them.
     last = np.searchsorted(pictures.t_ns, made_ns, "right") - 1
     seen_ns = pictures.t_ns[np.maximum(last, 0)] if len(pictures.t_ns) else made_ns
     for span, drawn in pictures.batches():
-        for future in futures:
+        for number, future in enumerate(futures):
             which, frame = shown_at(future.message, wanted[span])
-            rgb, now_ns = future.rgb[which], pictures.t_ns[span][frame]
-            then_ns = seen_ns[future.message[which]][:, None]
-            ok = future.has_path[which]
-            if future.path_px.shape[1] > 1 and ok.any():
-                line = segments(_moved(future.path_px[which[ok]], then_ns[ok], now_ns[ok], path))
+            now_ns = pictures.t_ns[span][frame]
+            seen = _in_pixels(future.chosen(which), planes, now_ns) if has_own else once[number].chosen(which)
+            then_ns = seen_ns[seen.message][:, None]
+            ok = seen.has_path
+            if seen.path_px.shape[1] > 1 and ok.any():
+                line = segments(_moved(seen.path_px[ok], then_ns[ok], now_ns[ok], path))
                 weaker = fade(line.shape[1] // 2, line.shape[1] // 2, weakest=0.25)[::-1]
-                drawn.pairs(frame[ok], line, rgb[ok], weaker, 1.5 * unit)
-            ok = future.has_ellipse[which]
+                drawn.pairs(frame[ok], line, seen.rgb[ok], weaker, 1.5 * unit)
+            ok = seen.has_ellipse
             if ok.any():
-                around_px = _moved(future.ellipse_px[which[ok]], then_ns[ok], now_ns[ok], path)
-                drawn.loops(frame[ok], around_px, rgb[ok], np.full(len(around_px), 0.5), unit, fill=0.15)
+                around_px = _moved(seen.ellipse_px[ok], then_ns[ok], now_ns[ok], path)
+                drawn.loops(frame[ok], around_px, seen.rgb[ok], np.full(len(around_px), 0.5), unit, fill=0.15)
         yield from pictures.numbered(span, drawn)
 
 
@@ -184,11 +188,17 @@ class _Future(NamedTuple):
     ellipse_px: Floats
     has_ellipse: NDArray[np.bool_]
 
+    def chosen(self, which: Ints) -> _Future:
+        """Some of the forecasts."""
+        paths, rings = (self.path_px[which], self.has_path[which]), (self.ellipse_px[which], self.has_ellipse[which])
+        return _Future(self.message[which], self.rgb[which], *paths, *rings)
 
-def _in_pixels(future: ForecastPaths, planes: Planes, made_ns: Ints) -> _Future:
+
+def _in_pixels(future: ForecastPaths, planes: Planes, at_ns: Ints) -> _Future:
+    """Forecasts (N,) in the pictures at times (N,)."""
     ring = ellipse_points(future.end_m, *ellipses(future.spread_m2), _ELLIPSE_POINTS)
     path, ellipse = np.full_like(future.path_m, np.nan), np.full_like(ring, np.nan)
-    for plane, held in by_plane(planes, made_ns[future.message]):
+    for plane, held in by_plane(planes, at_ns):
         for out, metres in ((path, future.path_m), (ellipse, ring)):
             out[held] = plane.metres_to_pixels(metres[held].reshape(-1, 2)).reshape(-1, *metres.shape[1:])
     return _Future(future.message, colours(future.number), path, _near(path), ellipse, _near(ellipse))

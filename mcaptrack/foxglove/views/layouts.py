@@ -28,6 +28,8 @@ _KINDS: Final = (
     ("Re-tracked", ("retracks/full", "retracks")),
     ("Truth", ("truth",)),
 )
+#: The most pictures of a layout that are side by side.
+_MOST_CAMERAS: Final = 3
 _TILT_DEG: Final = 45.0
 #: The suffix of the text of events, after the topic of tracks.
 _EVENTS: Final = "/events/view/log"
@@ -39,7 +41,7 @@ class CameraChannels(NamedTuple):
     known.
 
     ``follow`` is the frame of the robot that recorded 3D boxes; ``recorded`` are topics that viewers draw in 3D
-    themselves, and whether they are these boxes.
+    themselves, and whether they are these boxes; ``seen_by`` are the topics of the pictures that boxes are drawn on.
     """
 
     prefix: str
@@ -51,6 +53,7 @@ class CameraChannels(NamedTuple):
     is_truth_known: bool = False
     follow: str = ""
     recorded: Mapping[str, bool] = {}
+    seen_by: tuple[str, ...] = ()
 
     def topics(self, suffix: str, on: Collection[str]) -> dict[str, bool]:
         """The topics of all views with a suffix, and whether each is on."""
@@ -105,7 +108,7 @@ def _tracking(camera: CameraChannels) -> bytes:
     channels = {name.removesuffix("/view/image").removesuffix("/view/scene") for name in camera.names}
     on = best_channels([name for name in channels if camera.has_view(name)])
     panels: dict[str, Any] = {}
-    picture = _image(camera, panels, "picture", "Video", on)
+    picture = _seen_by(camera, panels, on) or _image(camera, panels, "picture", "Video", on)
     scene = _ground(camera, panels, "ground", "Tracks" if camera.recorded else "Ground", on)
     left = [*(picture or scene), *_plots(camera, panels)]
     right = [*(scene if picture else ()), *_recorded(camera, panels), *_event_text_or_log(camera, panels)]
@@ -167,6 +170,16 @@ def _image(camera: CameraChannels, panels: dict[str, Any], name: str, title: str
         return []
     panels[f"Image!{name}"] = layouts.image_panel(title, camera.pictures, camera.topics("/view/image", on))
     return [f"Image!{name}"]
+
+
+def _seen_by(camera: CameraChannels, panels: dict[str, Any], on: Collection[str]) -> list[Tree]:
+    """The pictures of calibrated cameras, side by side, with the 3D boxes on them."""
+    names = []
+    for number, pictures in enumerate(camera.seen_by[:_MOST_CAMERAS]):
+        names.append(f"Image!camera{number}")
+        annotations = camera.topics(f"/view/image{pictures}", on)
+        panels[names[-1]] = layouts.image_panel(pictures, pictures, annotations)
+    return [split(names)] if names else []
 
 
 def _ground(camera: CameraChannels, panels: dict[str, Any], name: str, title: str, on: Collection[str]) -> list[Tree]:

@@ -60,4 +60,9 @@ def line_unit(frames: Sequence[Frame], planes: Planes) -> float:
         boxes = [frame.rows for frame in frames if {"x_px", "w_px"} <= set(frame.rows.dtype.names or ())]
         right = np.concatenate([np.zeros(1), *(rows["x_px"] + rows["w_px"] for rows in boxes)])
         width = float(np.nanmax(right))
-    return float(np.clip(round(width / _WIDTH_PX * 4) / 4, 1.0, 5.0))
+    return unit_of_width(width)
+
+
+def unit_of_width(width_px: float) -> float:
+    """The thickness in px of a line of thickness 1 on pictures of this width."""
+    return float(np.clip(round(width_px / _WIDTH_PX * 4) / 4, 1.0, 5.0))

@@ -1,0 +1,149 @@
+"""3D boxes and forecasts drawn on the pictures of calibrated cameras, which may move.
+
+Letters: M pictures, N objects, E lines, P points.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from mcaptrack.foxglove import Annotations, Cuboids, colours
+from mcaptrack.foxglove.views.ground import class_colours, raised
+from mcaptrack.foxglove.views.image import PictureTimes, View, fade
+from mcaptrack.foxglove.views.people import ellipse_points, ellipses, forecasts, latest, people_at, segments, shown_at
+from mcaptrack.foxglove.views.style import INTERPOLATED, OBSERVED, TrackStyle, unit_of_width
+from mcaptrack.geometry.arrays import Bools, Floats, Ints
+from mcaptrack.geometry.pinhole import Lens, project
+from mcaptrack.schema import Frame
+
+#: Lines are cut off at this distance before the camera.
+_NEAR_M: Final = 0.1
+_TEXT_PX: Final = 12.0
+_ELLIPSE_POINTS: Final = 14
+#: Lines that end farther outside of the picture than so many of its widths are not drawn.
+_MOST_WIDTHS: Final = 8.0
+_WHITE: Final = (1.0, 1.0, 1.0)
+#: The corners of a box, as shares of its size, and its edges as pairs of these.
+_CORNERS: Final = np.array([[x, y, z] for z in (-0.5, 0.5) for y in (-0.5, 0.5) for x in (-0.5, 0.5)])
+_EDGES: Final = np.array([(a, b) for a in range(8) for b in range(a) if bin(a ^ b).count("1") == 1])
+
+
+class MovingCamera(NamedTuple):
+    """M pictures of a calibrated camera: their log times, rising, their stamps, and the times at which the world is
+    drawn on them, rising, in ns; the pose of the world in the camera for each, rotations (M, 3, 3) and translations
+    (M, 3), NaN where it is not known; its lenses, which of them took each picture (M,), and the size of the pictures.
+    """
+
+    t_ns: Ints
+    stamp_ns: Ints
+    at_ns: Ints
+    rotation: Floats
+    translation: Floats
+    lenses: Sequence[Lens]
+    lens: Ints
+    width_px: int
+    height_px: int
+
+
+def tracks(frames: Sequence[Frame], camera: MovingCamera, style: TrackStyle, classes: Mapping[int, str] = {}) -> View:
+    """Draw the edges of 3D boxes in the colours of their classes, with numbers; interpolated ones are fainter."""
+    people = people_at(frames, camera.at_ns, (), classes)
+    unit = unit_of_width(camera.width_px)
+    known = people.has_body()
+    rgb = np.broadcast_to(_WHITE, (len(people.number), 3)) if style.is_white else colours(people.number)
+    body_rgb = rgb if style.is_white else class_colours(people.class_id, classes)
+    alpha = np.where(people.observed, OBSERVED, INTERPOLATED)
+    bounds = np.searchsorted(people.frame, np.arange(len(camera.t_ns) + 1))
+    pictures = PictureTimes(camera.t_ns, camera.stamp_ns)
+    for span, drawn in pictures.batches():
+        rows = np.arange(bounds[span.start], bounds[span.stop])
+        rows = rows[known[rows]]
+        ends = corners(people.body.chosen(rows))[:, _EDGES]
+        px, is_seen = _on_pictures(ends, people.frame[rows], camera)
+        _draw(
+            drawn,
+            people.frame[rows] - span.start,
+            px,
+            is_seen,
+            body_rgb[rows],
+            alpha[rows, None],
+            style.thickness * unit,
+        )
+        named = is_seen.any(axis=1)
+        inside = np.where(is_seen[..., None, None], px, np.inf)[named].reshape(int(named.sum()), -1, 2)
+        corner = np.maximum(inside.min(axis=1, initial=np.inf), [0.0, _TEXT_PX * unit])
+        these = rows[named]
+        drawn.labels(people.frame[these] - span.start, corner, people.label[these], rgb[these], _TEXT_PX * unit)
+        yield from pictures.numbered(span, drawn)
+
+
+def predictions(frames: Sequence[Frame], camera: MovingCamera, bodies: Sequence[Frame]) -> View:
+    """Draw the latest forecasts of tracks with 3D boxes, ``bodies``, as lines on the ground with 95 % ellipses."""
+    unit = unit_of_width(camera.width_px)
+    wanted = latest(frames, camera.at_ns)
+    futures = []
+    for plain in forecasts(frames):
+        future = raised(plain, frames, bodies)
+        flat = ellipse_points(plain.end_m, *ellipses(plain.spread_m2), _ELLIPSE_POINTS)
+        up = np.broadcast_to(future.end_m[:, None, 2:], (*flat.shape[:2], 1))
+        ring = np.concatenate([flat, up], axis=2)
+        ring = np.concatenate([ring, ring[:, :1]], axis=1)
+        futures.append((future, ring, colours(future.number)))
+    pictures = PictureTimes(camera.t_ns, camera.stamp_ns)
+    for span, drawn in pictures.batches():
+        for future, ring, rgb in futures:
+            which, frame = shown_at(future.message, wanted[span])
+            steps = future.path_m.shape[1] - 1
+            weaker = np.broadcast_to(fade(steps, steps, weakest=0.25)[::-1], (len(which), steps))
+            for points, alpha in ((future.path_m, weaker), (ring, np.full((len(which), 1), 0.5))):
+                ends = segments(points[which]).reshape(len(which), points.shape[1] - 1, 2, 3)
+                px, is_seen = _on_pictures(ends, frame + span.start, camera)
+                _draw(drawn, frame, px, is_seen, rgb[which], alpha, 1.5 * unit)
+        yield from pictures.numbered(span, drawn)
+
+
+def corners(boxes: Cuboids) -> Floats:
+    """The corners (N, 8, 3) of boxes."""
+    along, across, up = np.moveaxis(_CORNERS * boxes.size_m[:, None], -1, 0)
+    cosine, sine = np.cos(boxes.heading_rad)[:, None], np.sin(boxes.heading_rad)[:, None]
+    turned = np.stack([along * cosine - across * sine, along * sine + across * cosine, up], axis=-1)
+    return np.asarray(boxes.centre_m[:, None] + turned, np.float64)
+
+
+def _draw(
+    drawn: Annotations, frame: Ints, px: Floats, is_seen: Bools, rgb: Floats, alpha: Floats, thickness: float
+) -> None:
+    """Draw those of the lines (N, E, 2, 2) of objects (N,) that are seen (N, E)."""
+    of, line = np.nonzero(is_seen)
+    if len(of):
+        opacity = np.broadcast_to(alpha, is_seen.shape)[of, line]
+        drawn.pairs(frame[of], px[of, line], rgb[of], opacity[:, None], thickness)
+
+
+def _on_pictures(ends_m: Floats, picture: Ints, camera: MovingCamera) -> tuple[Floats, Bools]:
+    """Lines (N, E, 2, 3) in metres to lines (N, E, 2, 2) in pixels of the pictures (N,), and which are seen (N, E).
+
+    Lines are cut off before the camera. Objects outside of the picture are not seen at all.
+    """
+    turn, shift = camera.rotation[picture], camera.translation[picture]
+    at = np.einsum("nij,neaj->neai", turn, ends_m) + shift[:, None, None]
+    depth = at[..., 2]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        is_seen = (depth > _NEAR_M).any(axis=2)
+        share = (_NEAR_M - depth) / (depth[..., ::-1] - depth)
+        at = np.where((depth < _NEAR_M)[..., None], at + share[..., None] * (at[..., ::-1, :] - at), at)
+    px = np.full((*at.shape[:-1], 2), np.nan)
+    for number in np.unique(camera.lens[picture]).tolist():
+        mine = camera.lens[picture] == number
+        points = at[mine].reshape(-1, 3)
+        px[mine] = project(points, camera.lenses[number], np.eye(3), np.zeros(3))[0].reshape(px[mine].shape)
+    size = np.array([camera.width_px, camera.height_px], float)
+    with np.errstate(invalid="ignore"):
+        is_seen &= (np.abs(px - size / 2) < _MOST_WIDTHS * size.max()).all(axis=(2, 3))
+        known = np.where(is_seen[..., None, None], px, np.nan).reshape(len(px), -1, 2)
+        low, high = np.fmin.reduce(known, axis=1), np.fmax.reduce(known, axis=1)
+        is_inside = ((high > 0) & (low < size)).all(axis=1)
+    return px, np.asarray(is_seen & is_inside[:, None], np.bool_)
