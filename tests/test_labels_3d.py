@@ -99,6 +99,7 @@ def test_other_headers_and_units(header, line, options, tmp_path):
         (HEADER, LINES, {"columns": "x=x_m,x_m=y_m"}, "names x, and 3D boxes have none"),
         (HEADER, [*LINES, LINES[0]], {}, "truth.csv:6: id 7 appears twice at one time"),
         (HEADER, [LINES[0].replace(",7,", ",,")], {}, "has no ids; truth need ids"),
+        (HEADER, [line.replace(",7,", ",-1,").replace(",3,", ",-1.0,") for line in LINES[:2]], {}, "has no ids; truth need ids"),
         (HEADER, [*LINES, LINES[0].replace(",7,", ",,")], {}, "truth.csv:6: the id is missing"),
         (HEADER, [LINES[1].replace(",2,", ",nan,")], {}, "truth.csv:2: x or y of the box is missing"),
         (HEADER, [*LINES, LINES[2].replace("4.5", "")], {}, "truth.csv:6: a number of the box is missing"),

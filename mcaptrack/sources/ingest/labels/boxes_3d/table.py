@@ -31,6 +31,8 @@ _QUATERNION: Final = ("qw", "qx", "qy", "qz")
 _VELOCITY: Final = ("vx_m_per_s", "vy_m_per_s")
 _SHARED: Final = ("t", "frame", "id", "class", "name", "score")
 _AXES: Final = "xyz"
+#: Ids of boxes without a track.
+_NO_IDS: Final = ("-1", "-1.0")
 
 
 def _of_axis(axis: str) -> tuple[str, ...]:
@@ -142,10 +144,11 @@ def _rows(
         heading = none.copy()
         kept = np.flatnonzero(has_box)
         heading[has_box] = headings(quaternions[has_box], path, lambda row: place(int(kept[row])))[0]
-    track_id, are_numbers = numbered([text for text in ids if not is_empty(text)])
+    is_known = np.array([not is_empty(text) and text not in _NO_IDS for text in ids], bool)
+    track_id, are_numbers = numbered([ids[row] for row in np.flatnonzero(is_known)])
     all_ids = np.full(count, NO_ID)
     if "id" in columns:
-        all_ids[[not is_empty(text) for text in ids]] = track_id
+        all_ids[is_known] = track_id
         if not are_numbers:
             remarks.append(f"{path}: its ids are texts; tracks are numbered from 1 on as they come")
     kind = columns["name"] if "name" in columns else columns.get("class", none)
