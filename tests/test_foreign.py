@@ -325,6 +325,20 @@ class TestBoxes:
         assert [numbers.get(n, n) for n in rows["class_id"].tolist()] == [1, 1, 5, 7, 0, 0, 0, 6, 7]
         assert classes.named() == [("bicycle", 6), ("car", 7)]
 
+    @pytest.mark.parametrize(
+        ("names", "wanted"),
+        [
+            (["pedestrian", "car", "pedestrian"], {1: "pedestrian", 2: "car"}),
+            (["person", "car"], {2: "car"}),
+            (["person", "pedestrian"], {}),
+            (["Human"], {1: "Human"}),
+        ],
+    )
+    def test_people_keep_the_name_that_all_of_them_have(self, names, wanted):
+        classes = Classes()
+        assert [classes.class_id(name) == 1 for name in names] == [name != "car" for name in names]
+        assert classes.names_by_id() == wanted
+
     def test_there_are_only_so_many_names(self):
         classes = Classes()
         assert all(classes.class_id(f"name {n:05}") for n in range(1024))

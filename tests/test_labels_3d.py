@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pytest
+from mcap.writer import Writer
 from pyarrow import feather
 from scipy.spatial.transform import Rotation
 
@@ -377,3 +378,29 @@ def test_3d_labels_do_not_go_with_pictures(tmp_path):
     boxes.write_text("1,-1,10,20,30,40,0.9\n")
     with pytest.raises(McaptrackError, match=r"truth\.csv holds 3D boxes, and .*det\.txt does not"):
         mcaptrack.ingest(boxes, tmp_path / "log.mcap", fps=10, truth=table(tmp_path))
+
+
+def test_frames_of_labels_have_the_stamps_of_recorded_boxes(tmp_path):
+    log = tmp_path / "robot.mcap"
+    with log.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start(library="theirs")
+        schema = writer.register_schema("foxglove.SceneUpdate", "jsonschema", b"{}")
+        channel = writer.register_channel("/lidar/boxes", "json", schema)
+        for n in range(3):
+            stamp = {"sec": 100 + n, "nsec": 7}
+            cube = {"pose": {"position": {"x": n, "y": 0, "z": 0}, "orientation": {"x": 0, "y": 0, "z": 0, "w": 1}}}
+            entity = {
+                "timestamp": stamp,
+                "frame_id": "map",
+                "id": "1",
+                "cubes": [cube | {"size": {"x": 4, "y": 2, "z": 1}}],
+            }
+            message = {"deletions": [], "entities": [entity]}
+            writer.add_message(channel, (100 + n) * 10**9 + 40_000_000, json.dumps(message).encode(), 0)
+        writer.finish()
+    frames = table(tmp_path, "0,7,1,2", "2,7,3,2", header="frame,id,x_m,y_m")
+    result = mcaptrack.ingest(frames, into=log, role="truth")
+    assert list(result.messages) == ["/lidar/truth"]
+    with mcaptrack.open(log) as opened:
+        assert [one["t_ns"] for one in opened.table("tracks").to_pylist()] == [100 * 10**9 + 7, 102 * 10**9 + 7]

@@ -28,6 +28,7 @@ _NAME: Final = re.compile(r"[^\W\d_]")
 _MAX_NAMES: Final = 1024
 _FIRST_NAME: Final = 2**32 - _MAX_NAMES
 _SHOWN: Final = 12
+_PERSON: Final = "person"
 
 
 class Classes:
@@ -39,11 +40,13 @@ class Classes:
 
     def __init__(self) -> None:
         self._names: dict[str, int] = {}
+        self._people: set[str] = set()
         self._largest = PERSON
 
     def class_id(self, name: str) -> int:
         """The id of a class; for a name a placeholder, which ``numbers`` maps to the final id."""
         if is_person(name):
+            self._people.add(name)
             return PERSON
         if _NUMBER.fullmatch(name):
             number = int(name) if int(name) < _FIRST_NAME else UNKNOWN
@@ -59,8 +62,9 @@ class Classes:
         return {self._names[name]: number for number, name in order}
 
     def names_by_id(self) -> dict[int, str]:
-        """The names of all classes by their final id."""
-        return dict(enumerate(sorted(self._names), start=self._largest + 1))
+        """The names of all classes by their final id; of people only where all have one name other than "person"."""
+        people = {PERSON: min(self._people)} if len(self._people) == 1 and self._people != {_PERSON} else {}
+        return people | dict(enumerate(sorted(self._names), start=self._largest + 1))
 
     def named(self) -> list[tuple[str, int]]:
         """The first class names in alphabetical order, with their ids."""

@@ -21,7 +21,7 @@ from mcaptrack.notices import warn
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame, Rows
 from mcaptrack.schema.framing import split_rows
 from mcaptrack.schema.provenance import CLOCK
-from mcaptrack.sources.ingest.boxes_3d_log import boxes_topic, root_frame
+from mcaptrack.sources.ingest.boxes_3d_log import boxes_topic, frame_times, root_frame
 from mcaptrack.sources.ingest.job import SCHEMA_OF, IngestJob, IngestOptions
 from mcaptrack.sources.ingest.labels.boxes_3d.reading import read_boxes_3d
 from mcaptrack.sources.ingest.labels.boxes_3d.rows import BoxRows3D, TimedLabels
@@ -136,7 +136,7 @@ class Boxes3DJob(IngestJob):
                 f"{rows.path} counts frames and has no clock; give the frames per second with `fps=`, or add it to the "
                 "log of its boxes with `into=`"
             )
-        times: Ints = self.into.times(self._topic)
+        times = frame_times(self.into, self._topic)
         if int(labelled[-1]) - first >= len(times):
             raise McaptrackError(
                 f"{rows.path}: its last frame is {labelled[-1]}, and {self._topic} has {len(times)} messages, from "
@@ -148,7 +148,7 @@ class Boxes3DJob(IngestJob):
     def _log_start_ns(self) -> int:
         if self.into is None:
             return 0
-        return int(self.into.times(self._topic)[0]) if self._topic else self.into.start_ns
+        return int(frame_times(self.into, self._topic)[0]) if self._topic else self.into.start_ns
 
     def topics(self) -> Iterator[str]:
         """The topics that will be written."""

@@ -4,24 +4,18 @@ from __future__ import annotations
 
 from typing import Final
 
-from mcaptrack import log
+import numpy as np
+
+from mcaptrack import log, notices
 from mcaptrack.errors import McaptrackError
+from mcaptrack.geometry.arrays import Ints
 from mcaptrack.schema import DETECTIONS, TRACKS
+from mcaptrack.schema.framing import frame_times as frame_times_of
 from mcaptrack.schema.provenance import INGEST, Provenance
-from mcaptrack.sources.foreign.decoding import plain_name
+from mcaptrack.sources.fixed_frame import holds_boxes_3d, named_detections
 from mcaptrack.sources.frames import transforms_of
 from mcaptrack.sources.ingest.labels.camera import DEFAULT, camera_prefix
 
-#: Schemas that may hold 3D boxes, by their names in ROS 1 and Foxglove.
-_BOXES_3D: Final = (
-    "vision_msgs/Detection3DArray",
-    "foxglove.SceneUpdate",
-    "visualization_msgs/MarkerArray",
-    "jsk_recognition_msgs/BoundingBoxArray",
-    "derived_object_msgs/ObjectArray",
-    "autoware_perception_msgs/DetectedObjects",
-    "autoware_auto_perception_msgs/DetectedObjects",
-)
 _TRUTH: Final = "truth"
 
 
@@ -30,7 +24,9 @@ def boxes_topic(opened: log.Log, camera: str) -> str:
 
     Raises McaptrackError if there are several, and no name is given.
     """
-    topics = sorted(channel.topic for channel in opened.channels.values() if channel.messages and _holds_boxes(channel))
+    topics = sorted(
+        channel.topic for channel in opened.channels.values() if channel.messages and _holds_boxes(opened, channel)
+    )
     if camera != DEFAULT:
         topics = [topic for topic in topics if camera_prefix(topic) == "/" + camera.strip("/")]
         return topics[0] if topics else ""
@@ -43,16 +39,24 @@ def boxes_topic(opened: log.Log, camera: str) -> str:
     return topics[0] if topics else ""
 
 
-def _holds_boxes(channel: log.Channel) -> bool:
+def _holds_boxes(opened: log.Log, channel: log.Channel) -> bool:
     made = Provenance.from_metadata(channel.metadata)
     if made is None:
-        return plain_name(channel.schema_name) in _BOXES_3D
+        return holds_boxes_3d(opened, channel.topic)
     is_truth = channel.topic.endswith(f"/{_TRUTH}")
     return (
         made.transform == INGEST
         and channel.schema_name in (DETECTIONS.name, TRACKS.name)
         and bool(made.frame_id and not is_truth)
     )
+
+
+def frame_times(opened: log.Log, topic: str) -> Ints:
+    """The times of the frames of 3D boxes (F,): the stamps of recorded messages."""
+    if Provenance.from_metadata(opened.channel(topic).metadata) is not None:
+        return np.asarray(opened.times(topic), np.int64)
+    with notices.collected():  # the command that tracks the boxes says it
+        return frame_times_of(named_detections(opened, topic).frames)
 
 
 def root_frame(opened: log.Log) -> str:
