@@ -23,11 +23,13 @@ entry: a line in ``BUILT_IN``.
 from __future__ import annotations
 
 import difflib
+import os
 import re
 import signal
 import sys
+import threading
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib import import_module
@@ -35,10 +37,11 @@ from importlib.metadata import Distribution, EntryPoint, PackageNotFoundError, d
 from pathlib import Path
 from traceback import extract_tb
 from types import MappingProxyType
-from typing import Any, Final, Literal, get_args
+from typing import Any, Final, Literal, NoReturn, get_args
 
 from mcaptrack import __version__
 from mcaptrack.errors import McaptrackError
+from mcaptrack.notices import warn
 
 Kind = Literal["detector", "tracker", "predictor", "retracker", "fuser"]
 KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
@@ -310,7 +313,8 @@ def _of_point(point: EntryPoint) -> tuple[str, str]:
 
 def _is(point: EntryPoint, cls: type) -> bool:
     try:
-        return point.load() is cls
+        with _contained(f"the package of {point.name}"):
+            return point.load() is cls
     except BaseException as error:  # an entry point that can't be imported is another class
         if is_interruption(error):
             raise
@@ -324,7 +328,8 @@ def _load(what: str, reference: str) -> Any:
     if not all(part.isidentifier() for part in (*module.strip().split("."), *parts)):
         raise McaptrackError(f"{what}: {reference} is not of the form module:Class")
     try:
-        found: Any = import_module(module.strip())
+        with nullcontext() if module.startswith(f"{_OWN}.") else _contained(what):
+            found: Any = import_module(module.strip())
     except BaseException as error:  # code of other packages may raise anything
         if is_interruption(error):
             raise
@@ -336,6 +341,39 @@ def _load(what: str, reference: str) -> Any:
     if not callable(found) or not hasattr(found, "__qualname__"):
         raise McaptrackError(f"{what}: {path} in {module} is no class but of type {type(found).__name__}")
     return found
+
+
+@contextmanager
+def _contained(what: str) -> Iterator[None]:
+    """Import code of other packages: what it changes in this process is undone, with a warning.
+
+    That is the working folder, to which paths are relative, and the handling of Ctrl-C and SIGTERM. ``os._exit``, which
+    would end the command without a word, raises an exception instead.
+    """
+    here, process, leave = os.path.realpath("."), os.getpid(), os._exit
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+
+    def refuse(status: int) -> NoReturn:
+        if os.getpid() != process:  # child processes end like this
+            leave(status)
+        raise RuntimeError(f"it called os._exit({status})")
+
+    os._exit = refuse
+    try:
+        yield
+    finally:
+        os._exit = leave
+        changed = []
+        if os.path.realpath(".") != here:
+            os.chdir(here)
+            changed.append("the working folder")
+        if threading.current_thread() is threading.main_thread():  # others can't set handlers
+            for number, handler in handlers.items():
+                if handler is not None and signal.getsignal(number) is not handler:
+                    signal.signal(number, handler)
+                    changed.append(f"the handling of {number.name}")
+        if changed:
+            warn(f"the import of {what} changed {' and '.join(changed)}; this was undone")
 
 
 @contextmanager

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 from pathlib import Path
 
 import pytest
 
-from mcaptrack import registry
+from mcaptrack import notices, registry
 from mcaptrack.errors import McaptrackError
 from mcaptrack.predictors import NAMES
 from mcaptrack.registry import BUILT_IN, KINDS, blamed, entry_of, find, names
@@ -334,3 +335,38 @@ def test_the_groups_of_entry_points_are_those_of_the_documentation():
     }
     for group in groups:
         assert f".{group.partition('.')[2]}``" in (registry.__doc__ or "")
+
+
+@pytest.mark.parametrize(
+    ("code", "changed"),
+    [
+        ("import os; os.chdir('/')", "the working folder"),
+        ("import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)", "the handling of SIGINT"),
+        ("import signal; signal.signal(signal.SIGTERM, lambda *_: None)", "the handling of SIGTERM"),
+    ],
+)
+def test_an_import_changes_neither_the_working_folder_nor_the_handling_of_signals(
+    installed, tmp_path, monkeypatch, code, changed
+):
+    monkeypatch.chdir(tmp_path)
+    before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+    (installed / "own_trackers" / "__init__.py").write_text(f"{code}\n{PLUGIN.replace('from __future__', '#')}")
+    with notices.collected() as warnings, notices.listening(warnings.append):
+        assert find("tracker", "nearest").name == "nearest"
+    words = f"the import of tracker nearest (own-trackers 1.5) changed {changed}; this was undone"
+    assert [notice.message for notice in warnings] == [words]
+    assert Path.cwd() == tmp_path
+    assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
+
+
+def test_an_exit_without_a_word_is_an_error_that_names_the_package(installed):
+    """In the process itself; a child process may end so."""
+    code = (
+        "import os\nchild = os.fork()\nif child == 0: os._exit(0)\nassert os.waitpid(child, 0)[1] == 0\nos._exit(3)\n"
+    )
+    (installed / "own_trackers" / "__init__.py").write_text(code)
+    leave = os._exit
+    with pytest.raises(McaptrackError) as refused:
+        find("tracker", "nearest")
+    assert str(refused.value).endswith("can't be imported: RuntimeError: it called os._exit(3)")
+    assert os._exit is leave

@@ -23,6 +23,7 @@ from mcaptrack.cli.stages import stage_command, stage_help
 from mcaptrack.cli.text import say, stdout_to_stderr
 from mcaptrack.environment import PREFIX
 from mcaptrack.errors import McaptrackError
+from mcaptrack.notices import listening
 from mcaptrack.registry import BUILT_IN, names
 from mcaptrack.transforms import STAGES, Stage, Transform
 
@@ -43,7 +44,7 @@ def with_plugins(commands: Mapping[str, Any], words: Sequence[str]) -> dict[str,
         if not stage.option:
             continue
         try:
-            with stdout_to_stderr():
+            with stdout_to_stderr(), listening(lambda notice: say(f"warning: {notice.message}")):
                 plugins = dict(_of_words(stage, words)) if called in (stage.name, "run") else {}
                 plugins |= _of_settings(stage, files, commands[stage.name].settings)
             plugins = {name: cls for name, cls in plugins.items() if cls is not stage.default}
