@@ -212,6 +212,18 @@ class TestOddRecordings:
         assert tree.roots() == ["c"]
         assert tree.lookup("c", "b", at(1)).is_known.all()
 
+    def test_a_long_chain_and_a_long_loop(self):
+        """Names of frames may be many: nothing takes time by their square, and no line is endless."""
+        count = 500
+        chain = [moves(f"f{number}", f"f{number + 1}", [0], [1, 0, 0], latched=True) for number in range(count)]
+        tree = TransformTree(chain)
+        assert tree.roots() == ["f0"]
+        assert tree.children_of("/f7") == ["f8"]
+        assert tree.lookup("f0", f"f{count}", at(1)).translation[0, 0] == count
+        tree = TransformTree([*chain, moves(f"f{count}", "f0", [0], [1, 0, 0], latched=True)])
+        assert "(and 494 more) form a loop" in said(tree)
+        assert len(said(tree)) < 200
+
     def test_a_frame_in_itself_or_without_a_name(self):
         tree = TransformTree([drive(), drive("x", "x"), drive("", "y"), drive("/", "z")])
         assert tree.frames() == ["base_link", "map"]

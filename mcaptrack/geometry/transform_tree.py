@@ -16,6 +16,9 @@ import numpy as np
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.transform_series import Reason, Samples, TransformSeries, clean
 
+#: The most frames of a loop that are named.
+_SHOWN = 8
+
 __all__ = ["Poses", "Reason", "Recorded", "Remark", "Samples", "TransformTree", "plain_frame"]
 
 
@@ -126,16 +129,28 @@ class TransformTree:
         """Return the names of all frames."""
         return sorted(self.series.keys() | {series.parent for series in self.series.values()})
 
+    @cached_property
+    def _children(self) -> Mapping[str, list[str]]:
+        """The frames below each frame."""
+        children: dict[str, list[str]] = {}
+        for child, series in sorted(self.series.items()):
+            children.setdefault(series.parent, []).append(child)
+        return children
+
     def roots(self) -> list[str]:
         """Return the frames without a parent, those with the most frames below first."""
         below: dict[str, int] = {}
-        for frame in self.frames():
-            below[self.root_of(frame)] = below.get(self.root_of(frame), 0) + 1
+        for root in self._children.keys() - self.series.keys():
+            waiting = [root]
+            while waiting:
+                children = self._children.get(waiting.pop(), [])
+                waiting += children
+                below[root] = below.get(root, 0) + len(children)
         return sorted(below, key=lambda root: (-below[root], root))
 
     def children_of(self, frame: str) -> list[str]:
         """Return the frames that have this one as parent."""
-        return sorted(child for child, series in self.series.items() if series.parent == plain_frame(frame))
+        return list(self._children.get(plain_frame(frame), ()))
 
     def root_of(self, frame: str) -> str:
         """Return the root above a frame: the frame itself if it has no parent, or if there is no such frame."""
@@ -228,7 +243,9 @@ class TransformTree:
             if frame in way:
                 loop = way[way.index(frame) :]
                 weakest = min(loop, key=lambda one: (self.series[one].messages, one))
-                words = " -> ".join([*reversed([*loop, loop[0]])])
+                names = [*reversed([*loop, loop[0]])]
+                hidden = max(len(names) - _SHOWN, 0)
+                words = " -> ".join(names[:_SHOWN]) + (f" (and {hidden:,} more)" if hidden else "")
                 self._remark(f"the frames {words} form a loop: {self.series[weakest]} is left out", *loop)
                 del self.series[weakest]
 
