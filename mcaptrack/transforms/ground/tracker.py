@@ -102,7 +102,7 @@ class GroundTracker:
         theme=_LIFE,
     )
     confirm_score: float = option(
-        1.2,
+        0.9,
         "a track is confirmed once the scores of its detections add up to this; detections without a score count 0.5",
         least=0.0,
         search=(0.3, 4.0),
