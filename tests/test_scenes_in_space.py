@@ -184,6 +184,7 @@ def test_forecasts_are_at_the_bottom_of_their_boxes():
             assert height == up if entity.id == str(CAR) else GROUND <= height <= GROUND + 2
             assert (line.points[-1].x, line.points[-1].y) == pytest.approx(end, abs=M)
             at = disc.pose.position
+            assert disc.color.a < 0.1  # many lie over one another
             assert (at.x, at.y, at.z) == pytest.approx((*end, height + 0.02), abs=M)
             assert (disc.size.x, disc.size.y) == pytest.approx(2 * np.sqrt(5.991 * np.array([1.0, 0.25])), abs=M)
     assert {point.z for point in drawn_forecasts(())[3].entities[0].lines[0].points} == {0}

@@ -201,8 +201,9 @@ def _recorded(camera: CameraChannels, panels: dict[str, Any]) -> list[Tree]:
 
 
 def _plots(camera: CameraChannels, panels: dict[str, Any]) -> list[Tree]:
-    """The number of people, if it is counted; otherwise their positions."""
-    labels = {"tracks": "SORT", "retracks": "re-tracked", "retracks/full": "re-tracked", "truth": "truth"}
+    """The number of people, or of objects, if it is counted; otherwise their positions."""
+    tracked = "tracker" if camera.recorded else "SORT"
+    labels = {"tracks": tracked, "retracks": "re-tracked", "retracks/full": "re-tracked", "truth": "truth"}
     counted = {
         f"{camera.prefix}/{name}/counts.rows[:].tracked": label
         for name, label in labels.items()
@@ -217,7 +218,7 @@ def _plots(camera: CameraChannels, panels: dict[str, Any]) -> list[Tree]:
         counted[next(iter(counted)).replace(".tracked", ".people")] = "truth"
     if not counted and not places:
         return []
-    title = "People" if counted else "Places"
+    title = ("Objects" if camera.recorded else "People") if counted else "Places"
     panels["Plot!people"] = layouts.plot_panel(title, counted or places)
     return ["Plot!people"]
 
