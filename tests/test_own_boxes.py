@@ -396,3 +396,36 @@ def test_boxes_come_back_from_every_format_in_any_order_of_lines(rows, kind, ord
         assert sorted(zip(labels.frame.tolist(), labels.id.tolist(), names, strict=True)) == sorted(
             (row[0], row[-1], row[-2]) for row in rows
         )
+
+
+class TestPositionsInMetres:
+    def test_they_are_rows_with_boxes_or_without(self):
+        frame = mcaptrack.detections(
+            positions_m=[[1, 2], [3, 4]], sizes_m=[[4, 2, 1.5]] * 2, headings_rad=[0.5, -0.5], velocities_m_per_s=[[1, 0]] * 2,
+            source_ids=[7, -1], scores=[0.5, 0.25], t_ns=9,
+        )  # fmt: skip
+        columns = ("x_m", "y_m", "length_m", "width_m", "height_m", "heading_rad", "vx_m_per_s", "source_id", "score")
+        assert [frame.rows[name].tolist() for name in columns] == [
+            [1, 3], [2, 4], [4, 4], [2, 2], [1.5, 1.5], [0.5, -0.5], [1, 1], [7, -1], [0.5, 0.25]
+        ]  # fmt: skip
+        assert np.isnan(frame.rows["z_m"]).all()
+        assert np.isnan(frame.rows["x_px"]).all()
+        both = mcaptrack.detections([[0, 0, 2, 3]], positions_m=[[1, 2, 3]], box_format="xywh")
+        assert (both.rows["h_px"].tolist(), both.rows["z_m"].tolist()) == ([3], [3])
+        assert len(mcaptrack.detections(positions_m=[]).rows) == 0
+
+    @pytest.mark.parametrize(
+        ("given", "words"),
+        [
+            ({}, r"detections need boxes in pixels \(`boxes=`\), or positions in metres \(`positions_m=`\)"),
+            ({"positions_m": [1, 2]}, r"`positions_m=` needs numbers of shape \(N, 2\) or \(N, 3\), not \(2,\)"),
+            ({"positions_m": [["a", "b"]]}, "`positions_m=` needs numbers: "),
+            ({"positions_m": [[1, 2]], "sizes_m": [[1, 2, 3]] * 2}, r"1 boxes need `sizes_m=` of shape \(1,\), not \(2,\)"),
+            ({"positions_m": [[1, np.nan]]}, "has only a part of x_m, y_m in 1 rows"),
+            ({"positions_m": [[1, 2]], "headings_rad": [[1, 2]]}, r"`headings_rad=` needs numbers of shape \(N,\), not \(1, 2\)"),
+            ({"positions_m": [[1, 2]], "box_format": "xyxy"}, "`box_format=` says what the columns of `boxes=` are"),
+        ],
+    )  # fmt: skip
+    def test_what_is_none_is_one_line(self, given, words):
+        with pytest.raises(McaptrackError, match=words):
+            mcaptrack.detections(**given)

@@ -25,12 +25,23 @@ UNNUMBERED: Final = -1
 _LAST_INDEX: Final = 2**32 - 1
 #: Columns of tables and arrays that are not part of rows. pandas names an index that has no name so.
 _BESIDE: Final = ("t", "t_ns", "frame", "index", "row", "topic", "recording", "__index_level_0__")
+#: Parameters of ``mcaptrack.detections`` by the columns that they give.
+_IN_SPACE: Final = {
+    **dict.fromkeys(("x_m", "y_m", "z_m"), "positions_m"),
+    **dict.fromkeys(("length_m", "width_m", "height_m"), "sizes_m"),
+    **dict.fromkeys(("vx_m_per_s", "vy_m_per_s"), "velocities_m_per_s"),
+    "heading_rad": "headings_rad",
+    "source_id": "source_ids",
+}
 _IN_NS: Final = "whole nanoseconds, such as `round(seconds * 1e9)`"
 
 
-def frame_of(schema: Schema, boxes: Floats, given: Mapping[str, Any], t_ns: int | np.datetime64, index: int) -> Frame:
-    """Return a frame of boxes (N, 4), with the other columns that are given."""
-    columns: dict[str, Any] = dict(zip(BOX_PX, boxes.T, strict=True))
+def frame_of(
+    schema: Schema, boxes: Floats | None, given: Mapping[str, Any], t_ns: int | np.datetime64, index: int
+) -> Frame:
+    """Return a frame of boxes (N, 4), or of positions in ``given``, with the other columns that are given."""
+    columns: dict[str, Any] = {} if boxes is None else dict(zip(BOX_PX, boxes.T, strict=True))
+    count = len(given["x_m"]) if boxes is None else len(boxes)
     for name, values in given.items():
         if values is None:
             continue
@@ -38,18 +49,42 @@ def frame_of(schema: Schema, boxes: Floats, given: Mapping[str, Any], t_ns: int 
             array = _floats(values) if name == "score" else np.asarray(_unmasked(values))
         except (TypeError, ValueError) as error:
             raise McaptrackError(f"{_named(name)} needs numbers of shape (N,): {_line(error)}") from None
-        if array.shape != (len(boxes),):
-            raise McaptrackError(f"{len(boxes)} boxes need {_named(name)} of shape ({len(boxes)},), not {array.shape}")
+        if array.shape != (count,):
+            raise McaptrackError(f"{count} boxes need {_named(name)} of shape ({count},), not {array.shape}")
         columns[name] = array
     time, number = time_of(t_ns), number_of(index)
     try:
-        rows = _rows(schema, columns, len(boxes), f"the frame at {time} ns")
+        rows = _rows(schema, columns, count, f"the frame at {time} ns")
     except McaptrackError as error:
         words = str(error)
         for name in given:
             words = words.replace(f"{schema.name}.{name} ", f"{_named(name)} ")
         raise McaptrackError(words) from None
     return Frame(time, number, rows)
+
+
+def columns_in_space(given: Mapping[tuple[str, ...], Any]) -> dict[str, Any]:
+    """Return columns by name, from arrays (N,) or (N, C) by the names of their columns; the last may be left out.
+
+    Raises McaptrackError for other shapes, and for what is no number.
+    """
+    out: dict[str, Any] = {}
+    for names, values in given.items():
+        if values is None:
+            continue
+        own = _IN_SPACE[names[0]]
+        try:
+            array = np.asarray(values) if names == ("source_id",) else _floats(values)
+        except (TypeError, ValueError) as error:
+            raise McaptrackError(f"`{own}=` needs numbers: {_line(error)}") from None
+        widths = (2, 3) if names == ("x_m", "y_m", "z_m") else (len(names),)
+        array = array.reshape(0, widths[-1]) if not array.size else array
+        table = array[:, None] if len(names) == 1 and array.ndim == 1 else array
+        if table.ndim != 2 or table.shape[1] not in widths:
+            wanted = "(N,)" if len(names) == 1 else " or ".join(f"(N, {width})" for width in widths)
+            raise McaptrackError(f"`{own}=` needs numbers of shape {wanted}, not {array.shape}")
+        out |= dict(zip(names, table.T, strict=False))
+    return out
 
 
 def frames_of_columns(columns: dict[str, Any], schema: Schema | None) -> tuple[Schema, list[Frame]]:
@@ -218,7 +253,9 @@ def _unmasked(values: Any) -> Any:
 
 def _named(column: str) -> str:
     """The parameter of ``mcaptrack.detections`` that gives a column."""
-    return {"score": "`scores=`", "class_id": "`classes=`"}.get(column, column)
+    return {"score": "`scores=`", "class_id": "`classes=`"}.get(column) or (
+        f"`{_IN_SPACE[column]}=`" if column in _IN_SPACE else column
+    )
 
 
 def kind_of(value: Any) -> str:

@@ -303,6 +303,7 @@ class Recording:
         rows: Any,
         *,
         classes: Mapping[int, str] | None = None,
+        frame_id: str = "",
         replace: bool = False,
         sidecar: bool | None = None,
     ) -> int:
@@ -315,17 +316,16 @@ class Recording:
             detections hold detections; those named tracks or truth hold tracks.
         rows : iterable of Frame, structured array, table, or mapping
             Frames as ``mcaptrack.detections`` makes them; or an array, or a table of pandas, Polars, Arrow or DuckDB,
-            with a column ``t_ns`` and those of the rows; or ``supervision.Detections`` by time in nanoseconds, as a
-            mapping or as pairs. A table has no frames without rows. Of a column ``class``, which the tables of a log
-            have, the names are kept.
+            with ``t_ns`` and the columns of rows; or ``supervision.Detections`` by time in nanoseconds, as a mapping or
+            as pairs. A table has no frames without rows. The names in a column ``class`` are kept.
         classes : mapping of int to str, optional
             Names of classes by ``class_id``; 1 is a person.
+        frame_id : str, optional
+            The frame that positions are in; "map" for detections in metres alone.
         replace : bool, default False
-            Replace the channel if it exists and holds the same kind of rows. Channels that others recorded are never
-            replaced.
+            Replace the channel if it exists and holds the same kind of rows, unless others recorded it.
         sidecar : bool, optional
-            Write into LOG.results.mcap beside the log (True) or into the log (False). By default beside recordings
-            that ROS tools read, otherwise into the log.
+            Write into LOG.results.mcap beside the log (True) or into it (False). By default as ``run`` does.
 
         Returns
         -------
@@ -351,7 +351,7 @@ class Recording:
         path = self._log.path
         path = path if path.absolute() == self._place else self._place
         with self._reading:
-            count = write_rows(path, topic, rows, classes=classes, replace=replace, sidecar=sidecar)
+            count = write_rows(path, topic, rows, classes=classes, frame_id=frame_id, replace=replace, sidecar=sidecar)
             self.close()
             self._open(path)
         return count

@@ -20,6 +20,7 @@ from mcaptrack.api.columns import (
     BoxFormat,
     boxes_of,
     check_frames,
+    columns_in_space,
     frame_of,
     frames_of_columns,
     kind_of,
@@ -33,12 +34,17 @@ from mcaptrack.schema import DETECTIONS, TRACKS, Frame, Schema
 
 @checked()
 def detections(
-    boxes: Any,
+    boxes: Any = None,
     scores: ArrayLike | None = None,
     classes: ArrayLike | None = None,
     t_ns: int | np.datetime64 = 0,
     *,
     box_format: BoxFormat | None = None,
+    positions_m: ArrayLike | None = None,
+    sizes_m: ArrayLike | None = None,
+    headings_rad: ArrayLike | None = None,
+    velocities_m_per_s: ArrayLike | None = None,
+    source_ids: ArrayLike | None = None,
     index: int = UNNUMBERED,
     class_names: Mapping[int, str] | None = None,
 ) -> Frame:
@@ -46,10 +52,10 @@ def detections(
 
     Parameters
     ----------
-    boxes : array_like of shape (N, 4), or supervision.Detections
-        Boxes in pixels; (0, 4) for a picture without detections. Of ``supervision.Detections``, boxes, confidence and
-        classes are taken; where ``data["class_name"]`` names the classes, persons become class 1, and the numbers of
-        other classes are raised by 2.
+    boxes : array_like of shape (N, 4), or supervision.Detections, optional
+        Boxes in pixels; (0, 4) for a picture without detections. Not needed with ``positions_m``. Of
+        ``supervision.Detections``, boxes, confidence and classes are taken; where ``data["class_name"]`` names the
+        classes, persons become class 1, and the numbers of other classes are raised by 2.
     scores : array_like of shape (N,), optional
         Confidence of each box, from 0 to 1.
     classes : array_like of shape (N,), optional
@@ -59,6 +65,16 @@ def detections(
     box_format : {"xyxy", "xywh"}
         What the columns of ``boxes`` are: corners (left, top, right, bottom), or left, top, width and height. Not
         needed for ``supervision.Detections``.
+    positions_m : array_like of shape (N, 2) or (N, 3), optional
+        Centres in metres, in a frame that doesn't move; with or instead of ``boxes``.
+    sizes_m : array_like of shape (N, 3), optional
+        Length (along the heading), width and height in metres.
+    headings_rad : array_like of shape (N,), optional
+        Direction of the length in radians, counter-clockwise from the first axis.
+    velocities_m_per_s : array_like of shape (N, 2), optional
+        Velocity along the first two axes.
+    source_ids : array_like of shape (N,), optional
+        Ids that the detector gave; -1 for none.
     index : int, optional
         Number of the picture in the video; by default frames are numbered when they are written.
     class_names : mapping of int to str, optional
@@ -81,15 +97,34 @@ def detections(
     >>> frame = mcaptrack.detections([[10, 20, 30, 60]], [0.9], [1], t_ns=0, box_format="xyxy")
     >>> frame.rows["w_px"].tolist(), frame.rows["h_px"].tolist()
     ([20.0], [40.0])
+    >>> frame = mcaptrack.detections(positions_m=[[4.0, 2.5]], scores=[0.9], classes=[1], t_ns=0)
+    >>> frame.rows["x_m"].tolist(), frame.rows["y_m"].tolist()
+    ([4.0], [2.5])
     """
+    in_space = {
+        ("x_m", "y_m", "z_m"): positions_m,
+        ("length_m", "width_m", "height_m"): sizes_m,
+        ("heading_rad",): headings_rad,
+        ("vx_m_per_s", "vy_m_per_s"): velocities_m_per_s,
+        ("source_id",): source_ids,
+    }
     if is_supervision(boxes):
         if scores is not None or classes is not None or box_format not in (None, "xyxy"):
             raise McaptrackError("supervision.Detections have scores, classes and a box format; give no others")
+        if any(values is not None for values in in_space.values()):
+            raise McaptrackError("supervision.Detections are boxes in pixels; give positions without them")
         return frame_of_supervision(boxes, t_ns, index, DETECTIONS)
-    if box_format not in ("xyxy", "xywh"):
+    given = columns_in_space(in_space)
+    if boxes is None and positions_m is None:
+        raise McaptrackError("detections need boxes in pixels (`boxes=`), or positions in metres (`positions_m=`)")
+    if boxes is None and box_format is not None:
+        raise McaptrackError("`box_format=` says what the columns of `boxes=` are, and there are none")
+    if boxes is not None and box_format not in ("xyxy", "xywh"):
         raise McaptrackError("say what the columns of boxes are with `box_format='xyxy'` or `box_format='xywh'`")
     classes = classes if class_names is None else numbers_of(classes, class_names)
-    return frame_of(DETECTIONS, boxes_of(boxes, box_format), {"score": scores, "class_id": classes}, t_ns, index)
+    given |= {"score": scores, "class_id": classes}
+    pixels = None if boxes is None or box_format is None else boxes_of(boxes, box_format)
+    return frame_of(DETECTIONS, pixels, given, t_ns, index)
 
 
 def frames_of(rows: Any, schema: Schema | None) -> tuple[Schema, list[Frame], dict[int, str]]:

@@ -30,12 +30,21 @@ _HOLDS: Final[Mapping[str, Schema]] = {"detections": DETECTIONS, "tracks": TRACK
 #: The ends of names of channels that stand beside others.
 _BESIDE: Final = ("events", "counts", "errors", "scores", "view")
 _SUCH: Final = "/own/detections or /own/tracks"
+#: The frame of detections in metres, unless it is given.
+_FRAME: Final = "map"
 #: The longest topic in bytes.
 _LONGEST: Final = 1024
 
 
 def write_rows(
-    path: Path, topic: str, rows: Any, *, classes: Mapping[int, str] | None, replace: bool, sidecar: bool | None
+    path: Path,
+    topic: str,
+    rows: Any,
+    *,
+    classes: Mapping[int, str] | None,
+    frame_id: str,
+    replace: bool,
+    sidecar: bool | None,
 ) -> int:
     """Write rows as a channel of the log; returns the number of frames. See ``Recording.write``."""
     place, given = SidecarChoice(sidecar), checked_names(classes)
@@ -50,7 +59,9 @@ def write_rows(
         frames = _numbered(
             opened, prefix, [_in_metres(frame, planes) if schema is TRACKS else frame for frame in frames]
         )
-        made = Made.of(schema, frames, Provenance(INGEST, {"written_with": "mcaptrack.open"}, classes=names))
+        own_frame = frame_id or (_FRAME if schema is DETECTIONS and _in_space(frames) else "")
+        how = Provenance(INGEST, {"written_with": "mcaptrack.open"}, classes=names, frame_id=own_frame)
+        made = Made.of(schema, frames, how)
         path_of_camera, _ = path_of(opened, prefix, tracks_topic(prefix))
         layouts = write(opened, prefix, {name: made}, planes, {}, None, path_of_camera)
         stale = pipeline.outdated_by(opened, {name: made.provenance.digest})
@@ -59,6 +70,12 @@ def write_rows(
         for topic_of_stage in stale:
             warn_stale(topic_of_stage, path)
     return len(frames)
+
+
+def _in_space(frames: Sequence[Frame]) -> bool:
+    """Return whether rows are positions in metres alone."""
+    parts = [frame.rows for frame in frames if len(frame.rows)]
+    return bool(parts) and all(np.isnan(rows["x_px"]).all() for rows in parts)
 
 
 def _topic(opened: logs.Log, topic: str) -> str:

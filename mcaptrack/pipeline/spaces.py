@@ -45,10 +45,14 @@ def spaces_of_boxes(opened: log.Log, topic: str) -> frozenset[Space]:
 
 def tracker_of(space: str) -> str:
     """Return the name of the first tracker of a space. Raises McaptrackError if there is none."""
-    names = [name for name, cls in STAGES["track"].built_in().items() if space_of(cls) == space]
+    names = _trackers_of(space)
     if not names:
         raise McaptrackError(f"no tracker takes {_BOXES[space]}; `tracker=` names one of your own")
     return names[0]
+
+
+def _trackers_of(space: str) -> list[str]:
+    return [name for name, cls in STAGES["track"].built_in().items() if space_of(cls) == space]
 
 
 def suited_tracker(opened: log.Log, stage: Stage, source: str) -> str:
@@ -75,8 +79,8 @@ def check_spaces(opened: log.Log, prefix: str, jobs: Sequence[Job], frame_id: st
         spaces, space = spaces_of_boxes(opened, job.source), space_of(job.transform)
         if spaces and space not in spaces:
             there = " and ".join(_BOXES[one] for one in sorted(spaces))
-            name, other = STAGES["track"].choice(job.transform), tracker_of(next(iter(sorted(spaces))))
+            name, others = STAGES["track"].choice(job.transform), _trackers_of(next(iter(sorted(spaces))))
+            other = f"`tracker={others[0]}` takes these" if others else "no built-in one takes these"
             raise McaptrackError(
-                f"{opened.path}: {job.source} has {there}, and the tracker {name} takes {_BOXES[space]}; "
-                f"`tracker={other}` takes these"
+                f"{opened.path}: {job.source} has {there}, and the tracker {name} takes {_BOXES[space]}; " + other
             )

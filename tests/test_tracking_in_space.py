@@ -1,0 +1,196 @@
+"""Commands on logs with boxes in space: which tracker, which frame, which channel, and what is said."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+import pytest
+
+import mcaptrack
+from mcaptrack import McaptrackError, log
+from mcaptrack.schema import DETECTIONS, TRACKS, Frame, Schema
+from mcaptrack.sources.cameras import cameras
+from mcaptrack.transforms.sort import Sort
+from tests.space_logs import (
+    LATE_NS,
+    START_NS,
+    WAYS,
+    Robot,
+    by_foxglove,
+    by_ros,
+    detection_3d_array,
+    marker_array,
+    scene_update,
+    write,
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ById:
+    """A tracker in metres that takes the ids of the detector."""
+
+    space: ClassVar[str] = "ground"
+    reads: ClassVar[Schema] = DETECTIONS
+    writes: ClassVar[Mapping[str, Schema]] = {"": TRACKS}
+    latency_s: ClassVar[Mapping[str, float]] = {"": 0.0}
+
+    def __call__(self, frames: Iterable[Frame]) -> Iterator[tuple[Frame, ...]]:
+        for frame in frames:
+            names = ("x_m", "y_m", "z_m", "length_m", "width_m", "height_m", "heading_rad", "score", "class_id")
+            columns = {name: frame.rows[name] for name in names}
+            rows = TRACKS.rows(
+                track_id=frame.rows["source_id"],
+                observed=np.ones(len(frame.rows), bool),
+                source_id=frame.rows["source_id"],
+                **columns,
+            )
+            yield (frame._replace(rows=rows),)
+
+
+def said(result) -> list[str]:
+    return [notice.message for notice in result.warnings]
+
+
+def tracked(path: Path) -> tuple[np.ndarray, dict[str, str]]:
+    with log.read(path) as opened:
+        rows = opened.rows("/lidar/tracks", TRACKS)
+        return rows.rows, opened.channel("/lidar/tracks").metadata
+
+
+def test_tracks_are_in_the_root_of_the_frames_and_the_same_in_every_form(tmp_path):
+    wanted = Robot(shots=3).wanted()
+    found = []
+    for way in ("detections since humble", "markers", "scene updates", "json"):
+        path = write(tmp_path / "a.mcap", Robot(shots=3), WAYS[way], "ros" if way[0] in "dm" else "protobuf")
+        result = mcaptrack.track(path, topic="/lidar/boxes", tracker=ById(), sidecar=False)
+        assert result.channels == ("/lidar/tracks",)
+        rows, metadata = tracked(path)
+        assert metadata["mcaptrack.frame_id"] == "map"
+        assert metadata["mcaptrack.input"] == "/lidar/boxes"
+        found.append(rows)
+    for name in ("x_m", "y_m", "z_m", "heading_rad", "length_m"):
+        for rows in found:
+            np.testing.assert_allclose(rows[name], [row[name] for row in wanted], atol=1e-6)
+
+
+def test_a_tracker_of_pictures_is_refused_in_one_line_and_one_of_metres_on_pictures(tmp_path, finished):
+    path = write(tmp_path / "a.mcap", Robot(shots=2), WAYS["markers"])
+    with pytest.raises(
+        McaptrackError, match="/lidar/boxes has positions in metres, and the tracker sort takes boxes in pixels; "
+    ):
+        mcaptrack.track(path, topic="/lidar/boxes", tracker=Sort())
+    with pytest.raises(
+        McaptrackError,
+        match=r"/camera/detections has boxes in pixels, and the tracker .*ById takes positions in metres",
+    ):
+        mcaptrack.track(finished, tracker=ById(), output=tmp_path / "b.mcap")
+
+
+def test_another_frame_makes_tracks_again_and_the_same_stays(tmp_path):
+    path = write(tmp_path / "a.mcap", Robot(shots=6), WAYS["scene updates"], "protobuf")
+    run = {"tracker": ById(), "tables": False, "events": False, "sidecar": False}
+    mcaptrack.run(path, topic="/lidar/boxes", **run)
+    assert tracked(path)[1]["mcaptrack.frame_id"] == "map"
+    assert mcaptrack.run(path, **run).stages == ()
+    assert "track" in mcaptrack.run(path, frame="base_link", **run).stages
+    rows, metadata = tracked(path)
+    assert metadata["mcaptrack.frame_id"] == "base_link"
+    assert np.abs(rows["x_m"]).max() < 100  # the map is at x = 5000 m
+    assert mcaptrack.run(path, **run).stages == ()  # as before
+    assert mcaptrack.export(path, output=tmp_path / "tables", force=True) is not None
+    with pytest.raises(
+        McaptrackError, match="there is no frame moon for the boxes of /lidar/boxes; there are base_link, lidar, map"
+    ):
+        mcaptrack.run(path, frame="moon", **run)
+
+
+def test_a_log_with_boxes_in_space_alone_needs_no_topic_and_one_with_several_says_which(tmp_path):
+    path = write(tmp_path / "a.mcap", Robot(shots=2), WAYS["markers"])
+    assert mcaptrack.track(path, tracker=ById(), sidecar=False).channels == ("/lidar/tracks",)
+
+    def both(writer):
+        first, second = (
+            WAYS["markers"](writer),
+            by_foxglove(lambda t, boxes: scene_update(t, boxes).SerializeToString())(Renamed(writer)),
+        )
+        return lambda number, shot: (first(number, shot), second(number, shot))
+
+    path = write(tmp_path / "b.mcap", Robot(shots=2), both)
+    with log.read(path) as opened:
+        assert [(camera.prefix, camera.boxes, camera.pictures) for camera in cameras(opened)] == [
+            ("/lidar", "/lidar/boxes", None), ("/radar", "/radar/boxes", None)
+        ]  # fmt: skip
+    with pytest.raises(
+        McaptrackError, match="has boxes in space in /lidar/boxes, /radar/boxes; choose one with `topic=`"
+    ):
+        mcaptrack.track(path, tracker=ById())
+    assert mcaptrack.track(path, topic="/radar/boxes", tracker=ById(), sidecar=False).channels == ("/radar/tracks",)
+
+
+class Renamed:
+    """A writer with another name for the channel of boxes."""
+
+    def __init__(self, writer) -> None:
+        self._writer = writer
+
+    def __getattr__(self, name: str):
+        return getattr(self._writer, name)
+
+    def register_channel(self, topic, *others):
+        return self._writer.register_channel("/radar/boxes", *others)
+
+
+def boxes_in(frame_id: str, own: str = ""):
+    return by_ros(lambda t, boxes: detection_3d_array("v4", t, boxes, frame_id, own))
+
+
+@pytest.mark.parametrize(
+    ("boxes", "keep", "count", "words"),
+    [
+        (WAYS["markers"], lambda s: s < START_NS + 330_000_000, 4, "4 of 8 messages are left out, since the pose of lidar in map isn't known: 4 after the last transform map -> base_link"),
+        (WAYS["markers"], lambda s: s > START_NS + 330_000_000, 4, "4 of 8 messages are left out, since the pose of lidar in map isn't known: 4 before the first transform map -> base_link"),
+        (boxes_in("roof"), lambda _: True, 8, "no transform has the frame 'roof' (but base_link, lidar, map), so that boxes stay in their frame, roof"),
+        (boxes_in("lidar", "roof"), lambda _: True, 8, "no transform has the frame 'roof'"),
+        (by_ros(marker_array, late_ns=3600 * 10**9), lambda _: True, 8, "boxes have no stamp, or one that is more than 60 s from the log time: their time is the log time"),
+        (by_ros(lambda t, boxes: marker_array(t, [replace(box, size=box.size * 0) for box in boxes])), lambda _: True, 8, "24 boxes have a size of 0: it is unknown"),
+    ],
+    ids=["end early", "begin late", "unknown frame", "own frame", "another clock", "no size"],
+)  # fmt: skip
+def test_what_transforms_and_boxes_lack_is_one_line(boxes, keep, count, words, tmp_path):
+    path = write(tmp_path / "a.mcap", Robot(), boxes, keep=keep)
+    result = mcaptrack.track(path, topic="/lidar/boxes", tracker=ById(), sidecar=False)
+    assert result.frames == {"/lidar/tracks": count}
+    assert sum(words in line for line in said(result)) == 1, said(result)
+    assert not any("\n" in line for line in said(result))
+
+
+def test_boxes_without_any_known_pose_are_an_error_and_without_transforms_stay_in_their_frame(tmp_path):
+    path = write(tmp_path / "a.mcap", Robot(), WAYS["markers"], keep=lambda s: s < START_NS - 10**9)
+    assert mcaptrack.track(path, tracker=ById(), sidecar=False).frames == {"/lidar/tracks": 8}
+    assert tracked(path)[1]["mcaptrack.frame_id"] == "base_link"  # the root of what is left
+    path = write(tmp_path / "b.mcap", Robot(), boxes_in("roof"))
+    with pytest.raises(
+        McaptrackError,
+        match="the pose of no box of /lidar/boxes in map is known; boxes are in roof, and transforms have base_link, lidar, map; ",
+    ):
+        mcaptrack.track(path, frame="map", tracker=ById())
+    path = write(tmp_path / "c.mcap", Robot(), WAYS["markers"], moving="")
+    result = mcaptrack.track(path, tracker=ById(), sidecar=False)
+    assert any("the log has no transforms, so that boxes stay in their frame, lidar" in line for line in said(result))
+
+
+def test_times_are_stamps_and_tables_hold_the_boxes(tmp_path):
+    path = write(tmp_path / "a.mcap", Robot(shots=3), WAYS["markers"])
+    wanted = Robot(shots=3).wanted()
+    rows = mcaptrack.query(path, "select t_ns, class, x_m, source_id, x_px from detections order by t_ns, source_id")
+    assert rows.column("t_ns").to_pylist() == [row["t_ns"] for row in wanted]
+    assert rows.column("class").to_pylist() == [
+        "person" if row["class"] == "pedestrian" else row["class"] for row in wanted
+    ]
+    np.testing.assert_allclose(rows.column("x_m").to_numpy(), [row["x_m"] for row in wanted], atol=1e-6)
+    assert rows.column("x_px").null_count == len(wanted)
+    assert LATE_NS != 0
