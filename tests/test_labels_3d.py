@@ -404,3 +404,33 @@ def test_frames_of_labels_have_the_stamps_of_recorded_boxes(tmp_path):
     assert list(result.messages) == ["/lidar/truth"]
     with mcaptrack.open(log) as opened:
         assert [one["t_ns"] for one in opened.table("tracks").to_pylist()] == [100 * 10**9 + 7, 102 * 10**9 + 7]
+
+
+def said(path: Path, **options) -> str:
+    result, _, _ = ingested(path, **options)
+    return " ".join([*(one.message for one in result.warnings), *result.notes])
+
+
+def test_what_is_usual_is_not_warned_about(tmp_path):
+    header = "t,frame,id,x_m,y_m,z_m,length_m,width_m,height_m,heading_rad"
+    standing = [f"{n / 10 + k / 100},{n},{k},{5 * k},{40 * k},0,4,2,1.5,0" for n in range(20) for k in range(3)]
+    words = said(table(tmp_path, *standing, header=header))
+    assert "move across" not in words
+    assert "not read: frame" in words
+    hill = [f"{n},{n},1,{5 * n},{5 * n},{5 * n},4,2,1.5,{math.pi / 4}" for n in range(20)]
+    lane = [f"{n},{n},1,{5 * n},{n / 100},0,4,2,1.5,0" for n in range(20)]
+    for rows in (hill, lane):
+        assert "vertical axis" not in said(table(tmp_path, *rows, header=header))
+
+
+def test_a_position_needs_both_axes_and_a_kitti_row_all_sizes(tmp_path):
+    with pytest.raises(McaptrackError, match="no column for y_m"):
+        ingested(table(tmp_path, header=HEADER.replace("y_m", "north")))
+    path = tmp_path / "0002.txt"
+    rows = [
+        kitti(0, 1, "Car", 1.5, 2, 4, 3, 1, 9, 0),
+        kitti(0, 2, "Car", 0, 0, 0, 3, 1, 9, 0),
+        kitti(1, 1, "Car", 1.5, 2, 4, 3, 1, 8, 0),
+    ]
+    path.write_text("\n".join(rows))
+    assert "also holds 1 rows without a 3D box" in said(path, label_format="kitti-3d", fps=10)
