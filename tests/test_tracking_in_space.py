@@ -12,7 +12,7 @@ import pytest
 
 import mcaptrack
 from mcaptrack import McaptrackError, log
-from mcaptrack.schema import DETECTIONS, TRACKS, Frame, Schema
+from mcaptrack.schema import DETECTIONS, EVENTS, TRACKS, EventKind, Frame, Schema
 from mcaptrack.sources.cameras import cameras
 from mcaptrack.transforms.sort import Sort
 from tests.space_logs import (
@@ -51,6 +51,17 @@ class ById:
             yield (frame._replace(rows=rows),)
 
 
+@dataclass(frozen=True, kw_only=True)
+class Renumbered(ById):
+    """The same, where the detector numbers its boxes otherwise in each message."""
+
+    def __call__(self, frames: Iterable[Frame]) -> Iterator[tuple[Frame, ...]]:
+        for number, (frame,) in enumerate(super().__call__(frames)):
+            rows = frame.rows.copy()
+            rows["source_id"] = (rows["source_id"] + number // 4) % 7
+            yield (frame._replace(rows=rows),)
+
+
 def said(result) -> list[str]:
     return [notice.message for notice in result.warnings]
 
@@ -75,6 +86,18 @@ def test_tracks_are_in_the_root_of_the_frames_and_the_same_in_every_form(tmp_pat
     for name in ("x_m", "y_m", "z_m", "heading_rad", "length_m"):
         for rows in found:
             np.testing.assert_allclose(rows[name], [row[name] for row in wanted], atol=1e-6)
+
+
+def test_ids_of_a_detector_are_no_tracks_that_were_repaired(tmp_path):
+    """The ids follow the order in each message, as where a detector numbers its boxes: tracks join none of them."""
+    path = write(tmp_path / "a.mcap", Robot(shots=30), WAYS["scene updates"], "protobuf")
+    mcaptrack.track(path, topic="/lidar/boxes", tracker=Renumbered(), sidecar=False)
+    mcaptrack.events(path, topic="/lidar/tracks")
+    with log.read(path) as opened:
+        kinds = set(opened.rows("/lidar/tracks/events", EVENTS).rows["kind"].tolist())
+        rows = opened.rows("/lidar/tracks", TRACKS).rows
+    assert len(np.unique(rows[rows["track_id"] == rows["track_id"][0]]["source_id"])) > 1
+    assert kinds == {EventKind.BIRTH}
 
 
 def test_a_tracker_of_pictures_is_refused_in_one_line_and_one_of_metres_on_pictures(tmp_path, finished):

@@ -107,6 +107,7 @@ def find_events(
     name: str = "the log",
     tracks_name: str = "the tracks",
     classes: tuple[Mapping[int, str], Mapping[int, str]] = ({}, {}),
+    are_repaired: bool = True,
 ) -> TrackEvents:
     """Find the events of a channel of tracks and count its rows frame by frame.
 
@@ -122,6 +123,8 @@ def find_events(
     classes : tuple of mapping of int to str
         Names of the classes of the ground truth and of the tracks, by number. Only tracks and people (objects) of one
         class are matched.
+    are_repaired : bool
+        Whether ``source_id`` names tracks from before re-tracking. That of tracks of detections may name these.
 
     Returns
     -------
@@ -141,7 +144,7 @@ def find_events(
     joined = join_frames(TRACKS, tracks)
     order = np.lexsort((joined.rows["track_id"], joined.row_ns))
     lifecycle = TrackLifecycle(joined.rows[order], joined.row_ns[order], np.unique(joined.t_ns))
-    parts = [lifecycle.births(), lifecycle.ends(), lifecycle.repairs()]
+    parts = [lifecycle.births(), lifecycle.ends(), *([lifecycle.repairs()] if are_repaired else [])]
     if comparison:
         parts += [_switches(comparison), _misses(comparison), _false_tracks(comparison)]
     events, events_ns = _in_order(parts)

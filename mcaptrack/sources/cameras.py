@@ -149,6 +149,11 @@ def provenance_of(opened: log.Log, topic: str) -> Provenance | None:
     return Provenance.from_metadata(channel.metadata) if channel else None
 
 
+def is_tracked_from_boxes(made: Provenance | None) -> bool:
+    """Return whether a stage made tracks of detections, so that ``source_id`` names no tracks."""
+    return made is not None and made.transform in STAGES and STAGES[made.transform].default.reads is DETECTIONS
+
+
 def lineage(
     opened: log.Log, topic: str, provenances: Mapping[str, Provenance] = {}
 ) -> Iterator[tuple[str, Provenance | None]]:
