@@ -190,8 +190,8 @@ def test_the_offline_steps_equal_the_reference(seed, chosen):
     compare(transform, frames, reference)
 
 
-#: Options that decide whether anything is re-tracked at all, or together.
-WHETHER = {"side_view", "poor_scale", "across_classes"}
+#: Options that decide whether anything is re-tracked at all, together, and in which unit of length.
+WHETHER = {"side_view", "poor_scale", "across_classes", "class_names"}
 
 
 def test_every_option_is_varied():
