@@ -24,7 +24,7 @@ from mcaptrack.pipeline.motion import path_with, side_inputs
 from mcaptrack.pipeline.pictures import pictures_of
 from mcaptrack.pipeline.planes import AS_BEFORE, PlaneChoice, planes_for, read_planes, recorded_planes
 from mcaptrack.pipeline.rebuild import plugins_of
-from mcaptrack.pipeline.visible import picture_size, without_unseen
+from mcaptrack.pipeline.visible import Channels, picture_size, without_unseen
 from mcaptrack.pipeline.write import Made, digest_of, write
 from mcaptrack.predictors import weights_sha256
 from mcaptrack.schema import DETECTIONS, TRACKS, VIDEO, Frame, Schema
@@ -219,7 +219,9 @@ def _run_job(
         is_unchanged = getattr(transform, "holds_back", False)
         frames = _at_video_rate(opened, job, made, None if is_unchanged else outputs[0], planes, path)
         channels |= {job.target + FULL: (TRACKS, frames)} if frames else {}
-    seen = without_unseen(channels, lambda: picture_size(opened, camera_at(opened, prefix).pictures))
+    seen: Channels = channels
+    if not getattr(transform, "keeps_unseen", False):
+        seen = without_unseen(channels, lambda: picture_size(opened, camera_at(opened, prefix).pictures))
     return {
         topic: Made.of(schema, list(frames), provenance)
         for topic, (schema, frames) in seen.items()

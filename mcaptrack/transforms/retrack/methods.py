@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from types import MappingProxyType
-from typing import Any, Final, Protocol, TypeAlias, TypeVar
+from typing import Any, ClassVar, Final, Protocol, TypeAlias, TypeVar
 
 import numpy as np
 
@@ -77,6 +77,9 @@ class RetrackByConsistency(ConsistencyOptions):
     ----------
     Yu and Zhou, "Towards Robust Human Trajectory Prediction in Raw Videos", IROS 2021.
     """
+
+    #: Rows of people outside of the picture stay, as in the paper (see ``pipeline.visible``).
+    keeps_unseen: ClassVar[bool] = True
 
     def __call__(self, frames: Iterable[Frame]) -> Iterator[tuple[Frame, ...]]:
         return _retrack(self, ConsistencyPass, frames)
