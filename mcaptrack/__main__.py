@@ -28,7 +28,12 @@ def _once_more(unraisable: "UnraisableHookArgs") -> None:
         sys.__unraisablehook__(unraisable)
         return
 
-    def again(_: int, __: FrameType | None) -> NoReturn:
+    def again(_: int, where: FrameType | None) -> None:
+        while where is not None and where.f_code is not _once_more.__code__:
+            where = where.f_back
+        if where is not None:  # still here, where it would be ignored, too
+            signal.setitimer(signal.ITIMER_REAL, 10 * _SOON_S)
+            return
         raise ignored
 
     signal.signal(signal.SIGALRM, again)

@@ -431,9 +431,10 @@ def test_an_interrupted_command_leaves_the_old_log_or_the_new_one(fresh, finishe
         assert not list(fresh.parent.glob(".*.part"))
 
 
+@pytest.mark.parametrize("soon_s", [0.01, 1e-5], ids=["soon", "at once"])
 @pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM], ids=["Ctrl-C", "kill"])
-def test_an_interruption_ends_the_command_where_python_ignores_exceptions(sent):
-    """The signal arrives in a callback of the garbage collector, where Python ignores exceptions."""
+def test_an_interruption_ends_the_command_where_python_ignores_exceptions(sent, soon_s):
+    """The signal arrives in a callback of the garbage collector, where Python ignores exceptions, and once more soon."""
     code = (
         "import os, sys, time, types, weakref\n"
         "def app():\n"
@@ -443,7 +444,7 @@ def test_an_interruption_ends_the_command_where_python_ignores_exceptions(sent):
         "    del thing\n"
         "    time.sleep(20)\n"
         "sys.modules['mcaptrack.cli'] = types.SimpleNamespace(app=app)\n"
-        "from mcaptrack.__main__ import main; main()\n"
+        f"import mcaptrack.__main__ as ours; ours._SOON_S = {soon_s}; ours.main()\n"
     )
     ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=15)
     assert ended.returncode == 128 + sent
