@@ -11,7 +11,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaptrack.geometry.arrays import Floats, Ints
+from mcaptrack.geometry.angles import wrapped
+from mcaptrack.geometry.arrays import Ints
 from mcaptrack.geometry.ragged import group_index, ragged_range, run_ends, run_starts
 from mcaptrack.schema import TRACKS, Frame, Rows
 from mcaptrack.schema.framing import join_frames
@@ -73,11 +74,6 @@ def resample(frames: Sequence[Frame], at_ns: Ints, max_gap_ns: int) -> tuple[Row
     out["observed"] = np.where(share == 0, rows["observed"][before], between)
     order = np.lexsort((out["track_id"], at))
     return out[order], at[order].astype(np.int64)
-
-
-def wrapped(angle: Floats) -> Floats:
-    """Angles in radians, from -pi (not included) to pi."""
-    return np.asarray(np.pi - (np.pi - angle) % (2 * np.pi))
 
 
 def is_observed_at(frame_ns: Ints, at_ns: Ints, max_gap_ns: int) -> NDArray[np.bool_]:

@@ -10,6 +10,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from mcaptrack.geometry.angles import wrapped
 from mcaptrack.geometry.arrays import Bools, Floats
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.ragged import group_index, ragged_range
@@ -95,9 +96,9 @@ class Waiting:
         rows[:DETECTION_ROWS] = after[:DETECTION_ROWS, track]
         start, end = before[LAST, track], after[BOX, track]
         step = end - start
-        step[HEADING] = np.arctan2(np.sin(step[HEADING]), np.cos(step[HEADING]))
+        step[HEADING] = wrapped(step[HEADING])
         rows[BOX] = start + share * step
-        rows[HEADING] = np.arctan2(np.sin(rows[HEADING]), np.cos(rows[HEADING]))
+        rows[HEADING] = wrapped(rows[HEADING])
         rows[[VX, VY]] = before[[VX, VY]][:, track] * (1 - share) + after[[VX, VY]][:, track] * share
         rows[SCORE], rows[SOURCE] = np.nan, -1.0
         rows[_OBSERVED], rows[_ID] = 0.0, after[ID, track]

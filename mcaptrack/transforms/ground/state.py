@@ -15,6 +15,7 @@ from typing import Final
 
 import numpy as np
 
+from mcaptrack.geometry.angles import wrapped
 from mcaptrack.geometry.arrays import Bools, Floats, Indices
 from mcaptrack.transforms.motion_limits import MotionLimits
 
@@ -241,4 +242,4 @@ def _follow_box(t: Floats, found: Floats, weight: Floats) -> None:
     heading = axis + np.pi * is_back
     t[_FACING] = np.abs(facing)
     has_heading = (t[_COS] != 0) | (t[_SIN] != 0)
-    t[HEADING] = np.where(has_heading, np.arctan2(np.sin(heading), np.cos(heading)), np.nan)
+    t[HEADING] = np.where(has_heading, wrapped(heading), np.nan)

@@ -10,12 +10,13 @@ from typing import Final
 
 import numpy as np
 
+from mcaptrack.geometry.angles import wrapped
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.plane import Planes
 from mcaptrack.geometry.ragged import group_index, ragged_range, run_ends, run_starts
 from mcaptrack.schema import TRACKS, Rows
-from mcaptrack.schema.resampling import ANGLES, LINEAR, wrapped
+from mcaptrack.schema.resampling import ANGLES, LINEAR
 from mcaptrack.transforms.retrack.assignments import Assignments
 from mcaptrack.transforms.retrack.by_class import PEOPLE, Movers
 from mcaptrack.transforms.retrack.false_tracks import scored_confidence, track_confidence

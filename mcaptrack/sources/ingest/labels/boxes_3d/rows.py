@@ -16,6 +16,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from mcaptrack.errors import McaptrackError
+from mcaptrack.geometry.angles import wrapped
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.clocks import LAST_NS, NS_PER_S
 from mcaptrack.notices import Code
@@ -270,11 +271,6 @@ class BoxRows3D:
         if not kept.any():
             raise McaptrackError(f"{self.path} holds none of the wanted boxes, only {self.left_out}")
         return kept
-
-
-def wrapped(angle: Floats) -> Floats:
-    """Angles in (-pi, pi]."""
-    return np.asarray(np.pi - np.remainder(np.pi - angle, 2 * np.pi))
 
 
 def numbered(texts: list[str]) -> tuple[Ints, bool]:
