@@ -54,14 +54,16 @@ def test_who_stands_for_a_third_of_the_time_is_found_all_the_while_also_from_the
     assert all(len(seen) == 1 for seen in found[20:])
 
 
-def test_three_who_stand_side_by_side_get_three_boxes_and_one_region_without_separation():
-    def paint(image, number):
-        walk(image, number)
-        if number % 3 == 0:
-            for x in (100, 110, 120):
-                figure(image, x, 80)
+def three_side_by_side(image, number):
+    """One person walks, and in every third picture three stand beside each other."""
+    walk(image, number)
+    if number % 3 == 0:
+        for x in (100, 110, 120):
+            figure(image, x, 80)
 
-    frames = film(paint)
+
+def test_three_who_stand_side_by_side_get_three_boxes_and_one_region_without_separation():
+    frames = film(three_side_by_side)
     true = [(x - 6.4, 40, 12.8, 40) for x in (100, 110, 120)]
     assert [hits(seen, true) for seen in boxes_of(frames)[::3]] == [3] * 20
     joined = boxes_of(frames, MedianDetector(stabilise=False, separate=False))[::3]
@@ -69,13 +71,7 @@ def test_three_who_stand_side_by_side_get_three_boxes_and_one_region_without_sep
 
 
 def test_boxes_of_several_people_carry_how_many_they_are():
-    def paint(image, number):
-        walk(image, number)
-        if number % 3 == 0:
-            for x in (100, 110, 120):
-                figure(image, x, 80)
-
-    frames = film(paint)
+    frames = film(three_side_by_side)
     for separate, wanted in ((True, [1, 1, 1, 1]), (False, [1, 3])):
         found = [frame.rows for (frame,) in MedianDetector(stabilise=False, separate=separate)(frames)][::3]
         counts = [sorted(rows["people"].tolist()) for rows in found]
