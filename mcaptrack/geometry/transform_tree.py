@@ -63,8 +63,12 @@ class Poses:
 
     def apply(self, points: Floats) -> Floats:
         """Return points of the source, one at each time (N, 3), in the target; NaN where the pose isn't known."""
-        turned: Floats = np.einsum("nij,nj->ni", self.rotation, points)
-        return turned + self.translation
+        return turned(self.rotation, points) + self.translation
+
+
+def turned(rotation: Floats, vectors: Floats) -> Floats:
+    """Return vectors (N, 3), each turned by its own rotation (N, 3, 3)."""
+    return np.asarray(np.einsum("nij,nj->ni", rotation, vectors))
 
 
 class TransformTree:

@@ -17,8 +17,9 @@ import numpy as np
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
+from mcaptrack.geometry.angles import headings
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
-from mcaptrack.geometry.transform_tree import TransformTree, plain_frame
+from mcaptrack.geometry.transform_tree import TransformTree, plain_frame, turned
 from mcaptrack.notices import warn
 from mcaptrack.schema import DETECTIONS, SCORES_NEEDED, Frame, Rows
 from mcaptrack.schema.provenance import frame_id_of, input_of
@@ -200,14 +201,13 @@ def rows_of_boxes(found: Recorded3d, rotation: Floats, shift: Floats, where: str
 
     count = len(found.frame)
     axes = np.empty((0, 3, 3)) if not count else rotation @ Rotation.from_quat(found.orientation).as_matrix()
-    centre = np.einsum("nij,nj->ni", rotation, found.centre) + shift
-    velocity = np.einsum("nij,nj->ni", rotation, found.velocity)
+    centre = turned(rotation, found.centre) + shift
+    velocity = turned(rotation, found.velocity)
     # The axis that is most upright is that of the height; of the others the first is that of the length.
     up = np.abs(axes[:, 2]).argmax(axis=1) if count else np.empty(0, np.intp)
     along, across = np.where(up == 0, 1, 0), np.where(up == 2, 1, 2)
     here = np.arange(count)
-    heading = np.arctan2(axes[here, 1, along], axes[here, 0, along])
-    heading = np.where(heading == -np.pi, np.pi, heading)
+    heading = headings(axes[here, :, along])
     lying = int((up[found.has_heading] != 2).sum())
     if lying:
         words = "boxes stand on another side than that of their z axis: their height is along the axis that is upright"

@@ -8,8 +8,8 @@ import numpy as np
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
-from mcaptrack.geometry.arrays import Floats
-from mcaptrack.geometry.transform_tree import plain_frame
+from mcaptrack.geometry.angles import headings
+from mcaptrack.geometry.transform_tree import plain_frame, turned
 from mcaptrack.schema import TRACKS, Frame
 from mcaptrack.schema.framing import join_frames, split_rows
 from mcaptrack.sources.frames import poses_at
@@ -33,16 +33,13 @@ def in_frame(opened: log.Log, topic: str, frames: Sequence[Frame], target: str, 
     rotation, rows = poses.rotation[joined.frame], joined.rows.copy()
     shift = poses.translation[joined.frame]
     height = np.nan_to_num(rows["z_m"])  # a position without a height is taken as on the ground
-    place = _turned(rotation, rows["x_m"], rows["y_m"], height) + shift
+    place = turned(rotation, np.stack([rows["x_m"], rows["y_m"], height], axis=1)) + shift
     rows["x_m"], rows["y_m"] = place[:, 0], place[:, 1]
     rows["z_m"] = np.where(np.isnan(rows["z_m"]), np.nan, place[:, 2])
-    ahead = _turned(rotation, np.cos(rows["heading_rad"]), np.sin(rows["heading_rad"]), np.zeros(len(rows)))
-    rows["heading_rad"] = np.arctan2(ahead[:, 1], ahead[:, 0])
-    velocity = _turned(rotation, rows["vx_m_per_s"], rows["vy_m_per_s"], np.zeros(len(rows)))
+    level = np.zeros(len(rows))
+    ahead = np.stack([np.cos(rows["heading_rad"]), np.sin(rows["heading_rad"]), level], axis=1)
+    rows["heading_rad"] = headings(turned(rotation, ahead))
+    velocity = turned(rotation, np.stack([rows["vx_m_per_s"], rows["vy_m_per_s"], level], axis=1))
     rows["vx_m_per_s"], rows["vy_m_per_s"] = velocity[:, 0], velocity[:, 1]
     moved = split_rows(joined.t_ns, [frame.index for frame in frames], rows, joined.ends[1:])
     return [frame for frame, is_known in zip(moved, poses.is_known.tolist(), strict=True) if is_known]
-
-
-def _turned(rotation: Floats, x: Floats, y: Floats, z: Floats) -> Floats:
-    return np.asarray(np.einsum("nij,nj->ni", rotation, np.stack([x, y, z], axis=1)))

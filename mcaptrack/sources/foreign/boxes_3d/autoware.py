@@ -6,9 +6,11 @@ from math import isfinite, nan
 from typing import Any, Final
 
 from mcaptrack.sources.foreign.boxes_3d.box import (
+    UNKNOWN_VECTOR,
     Box3d,
     Message3d,
     Vector,
+    enumeration,
     head_of,
     moved,
     named,
@@ -20,7 +22,7 @@ from mcaptrack.sources.foreign.boxes_3d.box import (
 )
 from mcaptrack.sources.foreign.values import integer, to_bytes
 
-#: The labels of ObjectClassification.
+#: The labels of ObjectClassification, for messages without their definition (JSON). Earlier ones had no bus.
 _CLASSES: Final = {
     0: "",
     1: "car",
@@ -35,9 +37,8 @@ _CLASSES: Final = {
     10: "over_drivable",
     11: "under_drivable",
 }
-_POLYGON: Final = 2
+_CYLINDER, _POLYGON = 1, 2
 _HEADING_UNKNOWN: Final = 0
-_NOTHING: Final[Vector] = (nan, nan, nan)
 
 
 def boxes_of(message: Any) -> Message3d:
@@ -50,10 +51,12 @@ def _box(one: Any, head: tuple[int, str]) -> Box3d:
     kinematics, shape = one.kinematics, one.shape
     pose = kinematics.pose_with_covariance.pose
     centre, orientation, size = vector(pose.position), quaternion(part(pose, "orientation")), vector(shape.dimensions)
-    if integer(shape.type) == _POLYGON:
+    if integer(shape.type) == _CYLINDER:  # x is the diameter
+        size = (size[0], size[0], size[2])
+    elif integer(shape.type) == _POLYGON:
         middle, size = _around([vector(point) for point in shape.footprint.points], size[2])
         centre = moved(centre, orientation, middle)
-    velocity = _NOTHING
+    velocity = UNKNOWN_VECTOR
     if getattr(kinematics, "has_twist", True):  # along the axes of the object
         velocity = rotated(orientation, vector(kinematics.twist_with_covariance.twist.linear))
     name, probability = _class_of(one)
@@ -73,12 +76,12 @@ def _box(one: Any, head: tuple[int, str]) -> Box3d:
 
 def _class_of(one: Any) -> tuple[str, float]:
     """The likeliest class, and its probability; "" and NaN if there is none."""
-    found = [(number(guess.probability), guess.label) for guess in one.classification]
-    known = [(share if isfinite(share) else -1.0, label) for share, label in found]
+    found = [(number(guess.probability), guess) for guess in one.classification]
+    known = [(share if isfinite(share) else -1.0, guess) for share, guess in found]
     if not known:
         return "", nan
-    share, label = max(known, key=lambda pair: pair[0])
-    return named(_CLASSES, label), share if share > 0 else nan
+    share, guess = max(known, key=lambda pair: pair[0])
+    return named(enumeration(guess) or _CLASSES, guess.label), share if share > 0 else nan
 
 
 def _around(points: list[Vector], height: float) -> tuple[Vector, Vector]:

@@ -6,6 +6,7 @@ import re
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import lru_cache
 from math import isfinite, nan
 from typing import Any, Final, NamedTuple
 
@@ -15,6 +16,8 @@ Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 
 _ORIGIN: Final[Vector] = (0.0, 0.0, 0.0)
+#: A velocity or size that isn't stated.
+UNKNOWN_VECTOR: Final[Vector] = (nan, nan, nan)
 #: A quaternion of zeros: the orientation isn't stated.
 UNSTATED: Final[Quaternion] = (0.0, 0.0, 0.0, 0.0)
 _WORD: Final = re.compile(r"[^\W\d_][\w-]*")
@@ -38,7 +41,7 @@ class Box3d(NamedTuple):
     class_name: str = ""
     score: float = nan
     source_id: int | str | None = None
-    velocity: Vector = (nan, nan, nan)
+    velocity: Vector = UNKNOWN_VECTOR
     has_heading: bool = True
 
 
@@ -114,6 +117,21 @@ def moved(centre: Vector, orientation: Quaternion, point: Vector) -> Vector:
 def named(names: Mapping[int, str], label: Any) -> str:
     """The name of a class by its number in an enumeration; the number where it has none."""
     return names.get(integer(label), str(integer(label)))
+
+
+def enumeration(message: Any, prefix: str = "") -> Mapping[int, str]:
+    """The names of classes by number that the recorded definition of a message states, as constants with a prefix.
+
+    Names are in lower case, without the prefix; "unknown" is "". Empty where there are no constants, as in JSON.
+    """
+    return _constants(type(message), prefix)
+
+
+@lru_cache(maxsize=64)
+def _constants(kind: type, prefix: str) -> Mapping[int, str]:
+    whole = {name: value for name, value in vars(kind).items() if name.isupper() and isinstance(value, int)}
+    found = {value: name.removeprefix(prefix).lower() for name, value in whole.items() if name.startswith(prefix)}
+    return {value: "" if name == "unknown" else name for value, name in found.items()}
 
 
 def words_of(said: str) -> tuple[str, float]:

@@ -6,9 +6,11 @@ from math import nan
 from typing import Any, Final
 
 from mcaptrack.sources.foreign.boxes_3d.box import (
+    UNKNOWN_VECTOR,
     Box3d,
     Message3d,
     Vector,
+    enumeration,
     head_of,
     named,
     number,
@@ -19,7 +21,7 @@ from mcaptrack.sources.foreign.boxes_3d.box import (
 )
 from mcaptrack.sources.foreign.values import integer
 
-#: The classes of derived_object_msgs/Object.
+#: The classes of derived_object_msgs/Object, for messages without their definition (JSON).
 _CLASSES: Final = {
     0: "",
     1: "unknown_small",
@@ -34,6 +36,11 @@ _CLASSES: Final = {
     10: "barrier",
     11: "sign",
 }
+_PREFIX: Final = "CLASSIFICATION_"
+#: The largest certainty of a classification.
+_CERTAIN: Final = 255
+#: The level of detection from which the velocity is known.
+_TRACKED: Final = 1
 #: The types of shape_msgs/SolidPrimitive.
 _BOX, _SPHERE, _CYLINDER, _CONE = 1, 2, 3, 4
 
@@ -70,8 +77,8 @@ def _box(one: Any, around: tuple[int, str], size: Vector) -> Box3d:
         vector(one.pose.position),
         quaternion(part(one.pose, "orientation")),
         size,
-        named(_CLASSES, one.classification),
-        min(certainty / 100, 1.0) if certainty else nan,  # a percentage; some write 255
+        named(enumeration(one, _PREFIX) or _CLASSES, one.classification),
+        certainty / _CERTAIN if certainty else nan,
         integer(one.id),
-        vector(one.twist.linear),
+        vector(one.twist.linear) if integer(one.detection_level) == _TRACKED else UNKNOWN_VECTOR,
     )
