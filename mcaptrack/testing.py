@@ -22,7 +22,7 @@ from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
 from mcaptrack.registry import Entry
 from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, TRACKS, VIDEO, Frame, Schema
 from mcaptrack.transforms.guarded import guarded
-from mcaptrack.transforms.protocol import Colour, Transform, check_options, colour_of
+from mcaptrack.transforms.protocol import Colour, Transform, check_options, traits_of
 
 __all__ = ["LAWS", "LawError", "check_transform", "sample_frames"]
 
@@ -63,7 +63,7 @@ def check_transform(transform: Transform, frames: Sequence[Frame] | None = None,
     >>> check_transform(ByteTrack(max_age_s=1.0))
     """
     declares(transform, (), seed)
-    sample = sample_frames(transform.reads, seed, colour=colour_of(transform)) if frames is None else frames
+    sample = sample_frames(transform.reads, seed, colour=traits_of(transform).colour) if frames is None else frames
     given = list(sample)
     if not given:
         raise LawError("there are no frames to check the transform with")

@@ -299,9 +299,17 @@ def test_what_cannot_be_found_is_said_in_one_line(installed, text, name, said):
         (PLUGIN.replace("gain: float", "gain: dict"), "Nearest.gain is a dict; a parameter is a float"),
         (
             PLUGIN.replace("    reads:", '    colour: ClassVar = "blue"\n    reads:'),
-            "its class attribute colour is one of bgr, grey",
+            "has colour = 'blue'; it is 'bgr' or 'grey'",
         ),
-        (PLUGIN.replace("    reads:", "    passes: ClassVar = 3\n    reads:"), "its class attribute passes is 1 or 2"),
+        (PLUGIN.replace("    reads:", "    passes: ClassVar = 3\n    reads:"), "has passes = 3; it is 1 or 2"),
+        (
+            PLUGIN.replace("    reads:", '    space: ClassVar = "metres"\n    reads:'),
+            "has space = 'metres'; it is 'picture' or 'ground'",
+        ),
+        (
+            PLUGIN.replace("    reads:", "    keeps_unseen: ClassVar = 1\n    reads:"),
+            "has keeps_unseen = 1; it is True or False",
+        ),
         (PLUGIN.replace("gain: float", "tracker: float"), "a parameter can't have the name of the option `tracker=`"),
         (
             PLUGIN.replace('gain: float = option(2.0, "how much", least=0.0)', "gain: float"),

@@ -16,7 +16,7 @@ from mcaptrack.registry import KINDS
 from mcaptrack.schema import DETECTIONS, VIDEO
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.transforms import STAGES, OnnxDetector
-from mcaptrack.transforms.protocol import Suited, suited
+from mcaptrack.transforms.protocol import Suited, traits_of
 from tests.commands import call
 
 BOX = {"x_px": [10.0], "y_px": [10.0], "w_px": [8.0], "h_px": [20.0]}
@@ -102,7 +102,8 @@ def test_the_command_line_says_it_on_stderr(log, monkeypatch):
 
 
 def test_suited_trackers_exist():
-    found = [(kind, suited(cls, kind)) for one in STAGES.values() for cls in one.built_in().values() for kind in KINDS]
+    classes = [cls for one in STAGES.values() for cls in one.built_in().values()]
+    found = [(kind, traits_of(cls).suited(kind)) for cls in classes for kind in KINDS]
     assert {(kind, one.name) for kind, one in found if one is not None} == {("tracker", "bytetrack")}
     tracker = STAGES["track"].make("bytetrack", **OnnxDetector.suits["tracker"].on_ground)
     assert tracker.cost == "metres"

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import ast
 import doctest
 import importlib
 import inspect
 import re
+from dataclasses import fields
+from pathlib import Path
 
 import pytest
 
+import mcaptrack
 from mcaptrack.registry import BUILT_IN
 from mcaptrack.transforms import STAGES
+from mcaptrack.transforms.protocol import Traits
 
 BUILT_IN_TRANSFORMS = {name: cls for stage in STAGES.values() for name, cls in stage.built_in().items()}
 PAPERS = {"sort": "Bewley", "bytetrack": "Zhang", "ocsort": "Cao", "knn": "Zivkovic", "mog2": "Zivkovic"}
@@ -37,3 +42,23 @@ def test_examples_run(module):
 
 def test_every_paper_is_of_a_built_in_transform():
     assert set(PAPERS) <= {name for kind in BUILT_IN.values() for name in kind}
+
+
+ROOT = Path(mcaptrack.__file__).parent
+
+
+def test_traits_are_documented_with_their_defaults():
+    page = (ROOT.parent / "docs" / "extend.md").read_text("utf-8")
+    table = re.findall(r"^\| `(\w+)` \| `(.+?)` \|", page.partition("| class attribute | default |")[2], re.MULTILINE)
+    defaults = Traits()
+    assert {name: ast.literal_eval(default) for name, default in table} == {
+        trait.name: getattr(defaults, trait.name) for trait in fields(Traits)
+    }
+
+
+def test_traits_are_read_in_one_place():
+    """Code that asks a transform by getattr has a default of its own, which nothing declares."""
+    names = "|".join(trait.name for trait in fields(Traits))
+    asked = re.compile(rf"""(?:get|has)attr\([^()]*,\s*["'](?:{names})["']""")
+    found = {path.name: asked.findall(path.read_text("utf-8")) for path in sorted(ROOT.rglob("*.py"))}
+    assert {name: those for name, those in found.items() if those} == {}

@@ -19,6 +19,7 @@ from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.camera_motion import motion_topic, path_of, read_ground_truth
 from mcaptrack.sources.cameras import camera_at, provenance_of
 from mcaptrack.transforms import STAGES, Transform
+from mcaptrack.transforms.protocol import traits_of
 
 STAGE: Final = "motion"
 _OFF: Final = "off"
@@ -62,7 +63,7 @@ def _needs_still_camera(opened: log.Log, boxes: str, jobs: Sequence[Job]) -> boo
     """Whether boxes come, or will come, from a detector that needs a still camera."""
     for job in jobs:
         if job.target == boxes:
-            return bool(getattr(job.transform, "needs_still_camera", False))
+            return traits_of(job.transform).needs_still_camera
     return detects_motion(provenance_of(opened, boxes))
 
 
@@ -72,7 +73,7 @@ def detects_motion(made: Provenance | None) -> bool:
     if made is None or stage is None or stage.default.reads is not VIDEO:
         return False
     name = made.parameters.get("detector", made.parameters.get(stage.was, ""))
-    return bool(getattr(stage.built_in().get(str(name), stage.default), "needs_still_camera", False))
+    return traits_of(stage.built_in().get(str(name), stage.default)).needs_still_camera
 
 
 def side_inputs(opened: log.Log, prefix: str, job: Job, made: Mapping[str, Made]) -> SideInputs:

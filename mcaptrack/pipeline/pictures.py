@@ -18,7 +18,7 @@ from mcaptrack.pipeline.checks import Job
 from mcaptrack.schema import Frame
 from mcaptrack.sources import foreign
 from mcaptrack.sources.video import EncodedPicture, decode_bgr, decode_gray
-from mcaptrack.transforms.protocol import colour_of, passes_of
+from mcaptrack.transforms.protocol import traits_of
 
 MAX_BYTES: Final = 500_000_000
 
@@ -93,8 +93,8 @@ def pictures_of(
     import hashlib
 
     total, channel = hashlib.sha256(), opened.channel(job.source)
-    decode = decode_bgr if colour_of(job.transform) == "bgr" else decode_gray
-    steps = channel.messages * passes_of(job.transform)
+    decode = decode_bgr if traits_of(job.transform).colour == "bgr" else decode_gray
+    steps = channel.messages * traits_of(job.transform).passes
     done = 0
 
     def count() -> None:
@@ -112,5 +112,5 @@ def pictures_of(
             count()
 
     stamps.clear()
-    max_bytes = MAX_BYTES if passes_of(job.transform) > 1 else 0
+    max_bytes = MAX_BYTES if traits_of(job.transform).passes > 1 else 0
     return total.hexdigest, KeptPictures(lambda: decode(encoded(is_first=not stamps)), count, max_bytes)

@@ -26,7 +26,7 @@ from mcaptrack.sources import foreign
 from mcaptrack.sources.camera_motion import motion_topic
 from mcaptrack.sources.cameras import USUAL, camera_at, provenance_of
 from mcaptrack.transforms import STAGES, Stage, Transform
-from mcaptrack.transforms.protocol import suited
+from mcaptrack.transforms.protocol import traits_of
 
 Say = Callable[[str], None]
 
@@ -218,7 +218,7 @@ class _Planner:
         if name := self.suited_tracker(stage, source):
             return STAGES[stage].make(name)
         option, maker = STAGES[stage].option, self._maker_of(source)
-        found = suited(maker, option)
+        found = traits_of(maker).suited(option)
         if maker is None or found is None:
             return None
         made_by = next(one for one in STAGES.values() if f"{self._prefix}/{one.output_topic}" == source)

@@ -35,7 +35,7 @@ from mcaptrack.sources.camera_motion import tracks_topic
 from mcaptrack.sources.cameras import camera_at, provenance_of
 from mcaptrack.transforms import FULL, STAGES, Transform
 from mcaptrack.transforms.guarded import guarded
-from mcaptrack.transforms.protocol import ModelCard
+from mcaptrack.transforms.protocol import ModelCard, traits_of
 from mcaptrack.transforms.to_video_rate import to_video_rate, unchanged_tracks
 from mcaptrack.transforms.track_classes import settle_classes
 
@@ -216,11 +216,11 @@ def _run_job(
         for (topic, schema), channel in zip(job.outputs().items(), outputs, strict=True)
     }
     if job.target + FULL in job.kept():
-        is_unchanged = getattr(transform, "holds_back", False)
+        is_unchanged = traits_of(transform).leaves_unchanged
         frames = _at_video_rate(opened, job, made, None if is_unchanged else outputs[0], planes, path)
         channels |= {job.target + FULL: (TRACKS, frames)} if frames else {}
     seen: Channels = channels
-    if not getattr(transform, "keeps_unseen", False):
+    if not traits_of(transform).keeps_unseen:
         seen = without_unseen(channels, lambda: picture_size(opened, camera_at(opened, prefix).pictures))
     return {
         topic: Made.of(schema, list(frames), provenance)

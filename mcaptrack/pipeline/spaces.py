@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 
@@ -17,14 +17,9 @@ from mcaptrack.sources.calibrations import holds_calibrations
 from mcaptrack.sources.cameras import camera_at, is_made_by_stage
 from mcaptrack.sources.fixed_frame import holds_boxes_3d
 from mcaptrack.transforms import STAGES, Stage
+from mcaptrack.transforms.protocol import Space, traits_of
 
-Space = Literal["picture", "ground"]
 _BOXES: Final = {"picture": "boxes in pixels", "ground": "positions in metres"}
-
-
-def space_of(transform: object) -> str:
-    """Return the space in which a tracker associates: "picture", or "ground" in metres."""
-    return str(getattr(transform, "space", "picture"))
 
 
 def spaces_of_boxes(opened: log.Log, topic: str) -> frozenset[Space]:
@@ -52,14 +47,14 @@ def tracker_of(space: str) -> str:
 
 
 def _trackers_of(space: str) -> list[str]:
-    return [name for name, cls in STAGES["track"].built_in().items() if space_of(cls) == space]
+    return [name for name, cls in STAGES["track"].built_in().items() if traits_of(cls).space == space]
 
 
 def suited_tracker(opened: log.Log, stage: Stage, source: str) -> str:
     """Return the tracker for boxes that the default one can't take; "" for others, and for other stages."""
     if stage.default.reads is not DETECTIONS:
         return ""
-    spaces, default = spaces_of_boxes(opened, source), space_of(STAGES["track"].default)
+    spaces, default = spaces_of_boxes(opened, source), traits_of(STAGES["track"].default).space
     return tracker_of(next(iter(sorted(spaces)))) if spaces and default not in spaces else ""
 
 
@@ -76,7 +71,7 @@ def check_spaces(opened: log.Log, prefix: str, jobs: Sequence[Job], frame_id: st
     for job in jobs:
         if job.transform.reads is not DETECTIONS or job.transform.writes.get("") is not TRACKS:
             continue
-        spaces, space = spaces_of_boxes(opened, job.source), space_of(job.transform)
+        spaces, space = spaces_of_boxes(opened, job.source), traits_of(job.transform).space
         if spaces and space not in spaces:
             there = " and ".join(_BOXES[one] for one in sorted(spaces))
             name, others = STAGES["track"].choice(job.transform), _trackers_of(next(iter(sorted(spaces))))

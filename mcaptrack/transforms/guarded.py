@@ -12,7 +12,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import warn
 from mcaptrack.registry import Entry, failure, is_interruption
 from mcaptrack.schema import SCORES_NEEDED, SIZES, TRACKS, Frame, Rows, Schema
-from mcaptrack.transforms.protocol import Transform, passes_of
+from mcaptrack.transforms.protocol import Transform, traits_of
 
 #: Kinds with a main output of one frame for each frame that is read, at its time and with its number.
 _ONE_FOR_EACH: Final = ("detector", "tracker")
@@ -42,7 +42,7 @@ def guarded(entry: Entry, transform: Transform, frames: Iterable[Frame]) -> Iter
         order of time; also if a detector or tracker yields a frame that was not in its input. The message names the
         transform and the frame. Exceptions of ``frames`` are passed on unchanged.
     """
-    source = _Source(frames, passes_of(transform))
+    source = _Source(frames, traits_of(transform).passes)
     try:
         made = iter(transform(source))
     except BaseException as error:  # code of other packages may raise anything

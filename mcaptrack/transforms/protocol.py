@@ -4,14 +4,7 @@ A transform is a frozen, keyword-only dataclass. Its fields are its parameters: 
 of its name and a help text. They become the options of its command, and are stored in the provenance of its channels.
 Calling it with an iterable of frames gives an iterator of tuples of frames, one frame for each of its outputs.
 
-A transform that reads pictures (``reads = VIDEO``) gets their brightness, (height, width), unless its class attribute
-``colour`` is "bgr"; then it gets blue, green and red, (height, width, 3).
-
-A detector can name the tracker that suits it by its class attribute ``suits = {"tracker": NAME}``; ``run`` takes that
-one unless another is chosen. A ``Suited`` instead of the name gives its parameters, too.
-
-A transform that reads its frames twice says so by its class attribute ``passes = 2``; the frames can then be iterated
-as often, each time from the beginning.
+Further class attributes are optional: ``Traits`` declares all of them, with their defaults.
 
 All transforms obey these laws; ``mcaptrack.testing.check_transform`` tests them:
 
@@ -29,13 +22,13 @@ from __future__ import annotations
 import math
 import typing
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import MISSING, field, fields
+from dataclasses import MISSING, dataclass, field, fields
 from functools import cache
 from types import MappingProxyType, UnionType
 from typing import Any, ClassVar, Final, Literal, NamedTuple, Protocol, get_args, get_origin, get_type_hints
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.registry import Kind
+from mcaptrack.registry import KINDS, Kind
 from mcaptrack.schema import Frame, Schema
 
 
@@ -82,7 +75,7 @@ class ModelCard(NamedTuple):
 
 
 class Suited(NamedTuple):
-    """The entry of another stage that suits the output of a transform, for the class attribute ``suits``.
+    """The entry of another stage that suits the output of a transform, for the trait ``suits``.
 
     ``parameters`` are those that it is made with; where a ground plane is given, those of ``on_ground`` are added.
     """
@@ -92,24 +85,73 @@ class Suited(NamedTuple):
     on_ground: Mapping[str, Any] = MappingProxyType({})
 
 
-def suited(transform: Any, kind: str) -> Suited | None:
-    """The entry of a kind that suits a transform (or its class); None if it names none."""
-    found = getattr(transform, "suits", {}).get(kind)
-    return Suited(found) if isinstance(found, str) else found
-
-
 #: What a transform gets of pictures: brightness, (height, width), or blue, green and red, (height, width, 3).
 Colour = Literal["bgr", "grey"]
+#: Where a tracker associates: boxes in pixels, or positions in metres.
+Space = Literal["picture", "ground"]
 
 
-def colour_of(transform: Any) -> Colour:
-    """The pixels that a transform (or its class) reads: brightness unless its ``colour`` says otherwise."""
-    return "bgr" if getattr(transform, "colour", "grey") == "bgr" else "grey"
+@dataclass(frozen=True, kw_only=True)
+class Traits:
+    """What a transform states of itself beside its interface: class attributes of these names, all optional.
+
+    One that depends on parameters is a property. ``traits_of`` gives those of a transform.
+
+    Attributes
+    ----------
+    colour : {"grey", "bgr"}
+        What a transform that reads pictures gets: brightness, (height, width), or blue, green and red, (height, width,
+        3).
+    passes : {1, 2}
+        How often it reads its frames; with 2 they can be iterated twice, each time from the beginning.
+    suits : mapping of str to str or Suited
+        The tracker that suits a detector, as in ``{"tracker": "bytetrack"}``; ``run`` takes it unless another is
+        chosen. A ``Suited`` gives parameters of it, too.
+    space : {"picture", "ground"}
+        Whether a tracker takes boxes in pixels or positions in metres.
+    needs_still_camera : bool
+        Whether a detector finds what moves: then ``run`` doesn't estimate the motion of the camera for trackers.
+    keeps_unseen : bool
+        Whether rows that are not observed and lie outside of the picture stay in the log.
+    leaves_unchanged : bool
+        Whether a re-tracker passes its input on as it is; then so are the tracks at the rate of the video.
+    """
+
+    colour: Colour = "grey"
+    passes: Literal[1, 2] = 1
+    suits: Mapping[str, str | Suited] = field(default_factory=lambda: MappingProxyType({}))
+    space: Space = "picture"
+    needs_still_camera: bool = False
+    keeps_unseen: bool = False
+    leaves_unchanged: bool = False
+
+    def suited(self, kind: str) -> Suited | None:
+        """The entry of a kind (see ``mcaptrack.registry``) that suits the output; None if it names none."""
+        found = self.suits.get(kind)
+        return Suited(found) if isinstance(found, str) else found
 
 
-def passes_of(transform: Any) -> int:
-    """The number of times that a transform (or its class) reads its frames: 1 unless its ``passes`` says otherwise."""
-    return int(getattr(transform, "passes", 1))
+def traits_of(transform: Any) -> Traits:
+    """The traits of a transform, or of its class (without those that depend on parameters)."""
+    given = {trait.name: getattr(transform, trait.name) for trait in fields(Traits) if hasattr(transform, trait.name)}
+    return Traits(**{name: value for name, value in given.items() if not isinstance(value, property)})
+
+
+def trait_problem(cls: type[Any]) -> str:
+    """Describe the first class attribute that can't be the trait of its name; "" if all can."""
+    traits, hints = traits_of(cls), get_type_hints(Traits)
+    for trait in fields(Traits):
+        value, names = getattr(traits, trait.name), get_args(hints[trait.name])
+        if trait.name == "suits":
+            if not isinstance(value, Mapping) or not all(
+                kind in KINDS and isinstance(one, str | Suited) for kind, one in value.items()
+            ):
+                return f"has suits = {value!r}; it maps kinds to names, as in suits = {{'tracker': 'bytetrack'}}"
+        elif hints[trait.name] is bool and not isinstance(value, bool):
+            return f"has {trait.name} = {value!r}; it is True or False"
+        elif hints[trait.name] is not bool and value not in names:
+            return f"has {trait.name} = {value!r}; it is {' or '.join(map(repr, names))}"
+    return ""
 
 
 #: The default upper end of parameters with a lower one: days in seconds, hundreds of kilometres in metres.

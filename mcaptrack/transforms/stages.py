@@ -12,15 +12,15 @@ from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, field, fields, is_dataclass
 from types import MappingProxyType
-from typing import Any, Final, Literal, get_args
+from typing import Any, Final, Literal
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.registry import BUILT_IN, KINDS, Entry, Kind, blamed, entry_of, find
+from mcaptrack.registry import BUILT_IN, Entry, Kind, blamed, entry_of, find
 from mcaptrack.schema import SCHEMAS
 from mcaptrack.transforms.detect import MedianDetector
 from mcaptrack.transforms.motion import EstimateMotion
 from mcaptrack.transforms.predict import Predict, predict_with
-from mcaptrack.transforms.protocol import Colour, Suited, Transform, check_options, option_problem
+from mcaptrack.transforms.protocol import Transform, check_options, option_problem, trait_problem
 from mcaptrack.transforms.retrack import PROFILES, Retrack, upgrade_parameters
 from mcaptrack.transforms.sample import Sample
 from mcaptrack.transforms.sort import Sort
@@ -227,17 +227,8 @@ class Stage:
             raise McaptrackError(f"{entry} can't be called with frames; it needs a method __call__")
         if any(one.name == self.kind for one in fields(cls)):
             raise McaptrackError(f"{entry}: a parameter can't have the name of the option `{self.kind}=`")
-        if getattr(cls, "colour", "grey") not in get_args(Colour):
-            raise McaptrackError(f"{entry}: its class attribute colour is one of {', '.join(get_args(Colour))}")
-        if getattr(cls, "passes", 1) not in (1, 2):
-            raise McaptrackError(f"{entry}: its class attribute passes is 1 or 2")
-        suits = getattr(cls, "suits", {})
-        if not isinstance(suits, Mapping) or not all(
-            kind in KINDS and isinstance(one, str | Suited) for kind, one in suits.items()
-        ):
-            raise McaptrackError(
-                f"{entry} has suits = {suits!r}; it maps kinds to names, as in suits = {{'tracker': 'bytetrack'}}"
-            )
+        if problem := trait_problem(cls):
+            raise McaptrackError(f"{entry} {problem}")
         if problem := option_problem(cls):
             raise McaptrackError(f"{entry}: {problem}")
 

@@ -92,7 +92,7 @@ def _retrack(
     options: Options, new_pass: Callable[[Options, Movers], OnlinePass], frames: Iterable[Frame]
 ) -> Iterator[tuple[Frame, ...]]:
     """For each frame the offline tracks, the online tracks and their predictions; each class by itself."""
-    if options.holds_back:
+    if options.leaves_unchanged:
         forecaster = Forecaster(options.predictor, options.horizon_s, options.min_history, options.rate_hz)
         for frame in frames:
             online = frame._replace(rows=frame.rows[frame.rows["observed"]])

@@ -146,7 +146,7 @@ class RetrackOptions:
         check_options(self)
 
     @property
-    def holds_back(self) -> bool:
+    def leaves_unchanged(self) -> bool:
         """Whether tracks are passed on unchanged, because positions in metres are too wrong to repair them."""
         return self.poor_scale and not self.side_view
 
