@@ -67,13 +67,11 @@ class Ros:
     def __init__(self, name: str, definition: str = "", ros1: bool = False) -> None:
         self.store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
         self.types = "{}/msg/{}".format(*name.split("/"))
-        if definition:
+        if definition:  # of its own types at least; those of the distribution are known
             self.store.register(get_types_from_msg(definition, self.types))
-        else:
-            definition = self.store.generate_msgdef(self.types, ros_version=1 if ros1 else 2)[0]
-        self.ros1, self.definition = ros1, definition
+        self.ros1, self.definition = ros1, self.store.generate_msgdef(self.types, ros_version=1 if ros1 else 2)[0]
         encoding = ("ros1msg", "ros1") if ros1 else ("ros2msg", "cdr")
-        self.kind = MessageType(name if ros1 else self.types, encoding[0], definition.encode(), encoding[1])
+        self.kind = MessageType(name if ros1 else self.types, encoding[0], self.definition.encode(), encoding[1])
 
     def new(self, name: str, *values, **named):
         return self.store.types["{}/msg/{}".format(*name.split("/"))](*values, **named)

@@ -16,83 +16,27 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from mcaptrack.foxglove import schema_record
 from mcaptrack.geometry.clocks import NS_PER_S
-from tests.ros_messages import BAR, HEADER1, HEADER2, POSES, Ros
+from tests.ros_messages import BAR, Ros
 
 START_NS = 1_700_000_000_000_000_000
 LATE_NS = 40_000_000
 NAMES = ("pedestrian", "car", "truck", "bicycle")
 
-_SIZE = BAR + "MSG: geometry_msgs/Vector3\nfloat64 x\nfloat64 y\nfloat64 z\n"
-_BOX3D = BAR + "MSG: vision_msgs/BoundingBox3D\ngeometry_msgs/Pose center\ngeometry_msgs/Vector3 size\n" + POSES + _SIZE
-#: vision_msgs: noetic, before Humble, and since.
+#: The types of vision_msgs: noetic, foxy (before Humble), and since. Others come from the distribution.
 DETECTIONS_3D = {
-    "ros1": (
-        "Header header\nDetection3D[] detections\n" + HEADER1
-        + BAR + "MSG: vision_msgs/Detection3D\nHeader header\nObjectHypothesisWithPose[] results\nBoundingBox3D bbox\n"
-        + BAR + "MSG: vision_msgs/ObjectHypothesisWithPose\nint64 id\nfloat64 score\ngeometry_msgs/PoseWithCovariance pose\n"
-        + _BOX3D
-    ),
-    "v3": (
-        "std_msgs/Header header\nvision_msgs/Detection3D[] detections\n" + HEADER2
-        + BAR + "MSG: vision_msgs/Detection3D\nstd_msgs/Header header\nvision_msgs/ObjectHypothesisWithPose[] results\nvision_msgs/BoundingBox3D bbox\nstring id\n"
-        + BAR + "MSG: vision_msgs/ObjectHypothesisWithPose\nstring id\nfloat64 score\ngeometry_msgs/PoseWithCovariance pose\n"
-        + _BOX3D
-    ),
-    "v4": (
-        "std_msgs/Header header\nvision_msgs/Detection3D[] detections\n" + HEADER2
-        + BAR + "MSG: vision_msgs/Detection3D\nstd_msgs/Header header\nvision_msgs/ObjectHypothesisWithPose[] results\nvision_msgs/BoundingBox3D bbox\nstring id\n"
-        + BAR + "MSG: vision_msgs/ObjectHypothesisWithPose\nvision_msgs/ObjectHypothesis hypothesis\ngeometry_msgs/PoseWithCovariance pose\n"
-        + BAR + "MSG: vision_msgs/ObjectHypothesis\nstring class_id\nfloat64 score\n"
-        + _BOX3D
-    ),
-}  # fmt: skip
-JSK = (
-    "std_msgs/Header header\njsk_recognition_msgs/BoundingBox[] boxes\n" + HEADER2
-    + BAR + "MSG: jsk_recognition_msgs/BoundingBox\nstd_msgs/Header header\ngeometry_msgs/Pose pose\ngeometry_msgs/Vector3 dimensions\nfloat32 value\nuint32 label\n"
-    + POSES + _SIZE
-)  # fmt: skip
-_TWIST = BAR + "MSG: geometry_msgs/Twist\ngeometry_msgs/Vector3 linear\ngeometry_msgs/Vector3 angular\n" + _SIZE
-_POLYGON = (
-    BAR + "MSG: geometry_msgs/Polygon\ngeometry_msgs/Point32[] points\n"
-    + BAR + "MSG: geometry_msgs/Point32\nfloat32 x\nfloat32 y\nfloat32 z\n"
-)  # fmt: skip
-DERIVED = (
-    "std_msgs/Header header\nderived_object_msgs/Object[] objects\n" + HEADER2
-    + BAR + "MSG: derived_object_msgs/Object\nstd_msgs/Header header\nuint32 id\nuint8 detection_level\nbool object_classified\n"
-    "geometry_msgs/Pose pose\ngeometry_msgs/Twist twist\ngeometry_msgs/Accel accel\ngeometry_msgs/Polygon polygon\n"
-    "own_shapes/SolidPrimitive shape\nuint8 classification\nuint8 classification_certainty\nuint32 classification_age\n"
-    + BAR + "MSG: geometry_msgs/Accel\ngeometry_msgs/Vector3 linear\ngeometry_msgs/Vector3 angular\n"
-    + BAR + "MSG: own_shapes/SolidPrimitive\nuint8 type\nfloat64[] dimensions\n"
-    + POSES + _TWIST + _POLYGON
-)  # fmt: skip
-
-
-def autoware(package: str, tracked: bool) -> str:
-    """The definition of DetectedObjects or TrackedObjects."""
-    kind = "Tracked" if tracked else "Detected"
-    own = "unique_identifier_msgs/UUID object_id\n" if tracked else ""
-    kinematics = (
-        "uint8 orientation_availability\ngeometry_msgs/TwistWithCovariance twist_with_covariance\n"
-        "geometry_msgs/AccelWithCovariance acceleration_with_covariance\nbool is_stationary\n"
-        if tracked
-        else "bool has_position_covariance\nuint8 orientation_availability\n"
-        "geometry_msgs/TwistWithCovariance twist_with_covariance\nbool has_twist\nbool has_twist_covariance\n"
+    layout: (
+        "std_msgs/Header header\nvision_msgs/Detection3D[] detections\n"
+        + BAR + "MSG: vision_msgs/Detection3D\nstd_msgs/Header header\nvision_msgs/ObjectHypothesisWithPose[] results\n"
+        "vision_msgs/BoundingBox3D bbox\n" + last
+        + BAR + "MSG: vision_msgs/ObjectHypothesisWithPose\n" + guess + "geometry_msgs/PoseWithCovariance pose\n" + more
+        + BAR + "MSG: vision_msgs/BoundingBox3D\ngeometry_msgs/Pose center\ngeometry_msgs/Vector3 size\n"
     )
-    accel = (
-        BAR + "MSG: geometry_msgs/AccelWithCovariance\ngeometry_msgs/Accel accel\nfloat64[36] covariance\n"
-        + BAR + "MSG: geometry_msgs/Accel\ngeometry_msgs/Vector3 linear\ngeometry_msgs/Vector3 angular\n"
-        + BAR + "MSG: unique_identifier_msgs/UUID\nuint8[16] uuid\n"
-    )  # fmt: skip
-    return (
-        f"std_msgs/Header header\n{package}/{kind}Object[] objects\n" + HEADER2
-        + BAR + f"MSG: {package}/{kind}Object\n{own}float32 existence_probability\n{package}/ObjectClassification[] classification\n"
-        f"{package}/{kind}ObjectKinematics kinematics\n{package}/Shape shape\n"
-        + BAR + f"MSG: {package}/ObjectClassification\nuint8 label\nfloat32 probability\n"
-        + BAR + f"MSG: {package}/{kind}ObjectKinematics\ngeometry_msgs/PoseWithCovariance pose_with_covariance\n{kinematics}"
-        + BAR + f"MSG: {package}/Shape\nuint8 type\ngeometry_msgs/Polygon footprint\ngeometry_msgs/Vector3 dimensions\n"
-        + BAR + "MSG: geometry_msgs/TwistWithCovariance\ngeometry_msgs/Twist twist\nfloat64[36] covariance\n"
-        + POSES + _TWIST + _POLYGON + (accel if tracked else "")
-    )  # fmt: skip
+    for layout, last, guess, more in (
+        ("ros1", "sensor_msgs/PointCloud2 source_cloud\n", "int64 id\nfloat64 score\n", ""),
+        ("v3", "sensor_msgs/PointCloud2 source_cloud\nbool is_tracking\nstring tracking_id\n", "string id\nfloat64 score\n", ""),
+        ("v4", "string id\n", "vision_msgs/ObjectHypothesis hypothesis\n", BAR + "MSG: vision_msgs/ObjectHypothesis\nstring class_id\nfloat64 score\n"),
+    )
+}  # fmt: skip
 
 
 @dataclass
@@ -190,6 +134,12 @@ def covered(writer: Ros, name: str, value):
     return writer.new(f"geometry_msgs/{name}WithCovariance", value, np.zeros(36))
 
 
+def point_cloud(writer: Ros):
+    return writer.new(
+        "sensor_msgs/PointCloud2", header(writer, 0, ""), 0, 0, [], False, 0, 0, np.zeros(0, np.uint8), False
+    )
+
+
 def transforms(robot: Robot, ros1: bool = False) -> Iterator[tuple[str, Ros, int, bytes]]:
     """TFMessages of the robot on /tf, and one on /tf_static: topic, writer, stamp and payload of each."""
     writer = ros("tf2_msgs/TFMessage", ros1=False)
@@ -226,8 +176,9 @@ def detection_3d_array(
             for i, s in guesses
         ]
         bbox = writer.new("vision_msgs/BoundingBox3D", pose(writer, box), point(writer, box.size, "Vector3"))
-        last = [] if layout == "ros1" else [str(box.number)]
-        found.append(writer.new("vision_msgs/Detection3D", header(writer, 0, own), results, bbox, *last))
+        cloud = [] if layout == "v4" else [point_cloud(writer)]
+        last = {"ros1": [], "v3": [True, str(box.number)], "v4": [str(box.number)]}[layout]
+        found.append(writer.new("vision_msgs/Detection3D", header(writer, 0, own), results, bbox, *cloud, *last))
     return writer, writer.pack(writer.new("vision_msgs/Detection3DArray", header(writer, stamp_ns, frame_id), found))
 
 

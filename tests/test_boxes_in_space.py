@@ -21,18 +21,11 @@ from mcaptrack.sources.foreign.boxes_3d.box import Box3d, Message3d
 from mcaptrack.sources.foreign.boxes_3d.recorded import recorded
 from tests.ros_messages import Ros
 from tests.space_logs import (
-    DERIVED,
-    JSK,
     START_NS,
     WAYS,
     Robot,
     Seen,
-    autoware,
-    covered,
-    header,
     marker,
-    point,
-    pose,
     ros,
     scene_update,
     write,
@@ -135,101 +128,6 @@ def boxes_of(writer: Ros, message) -> Message3d:
 SEEN = Seen(
     np.array([1.0, 2.0, 3.0]), np.array([0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)]), np.array([4.0, 2.0, 1.5]), number=12
 )
-
-
-def test_boxes_of_jsk_have_their_label_as_class_and_no_score_of_zero():
-    writer = ros("jsk_recognition_msgs/BoundingBoxArray", JSK)
-    boxes = [
-        writer.new("jsk_recognition_msgs/BoundingBox", header(writer, stamp, own), pose(writer, SEEN), point(writer, SEEN.size, "Vector3"), value, label)
-        for stamp, own, value, label in ((0, "", 0.75, 3), (START_NS + 5, "roof", 0.0, 0), (0, "roof", 0.5, 1))
-    ]  # fmt: skip
-    found = boxes_of(
-        writer, writer.new("jsk_recognition_msgs/BoundingBoxArray", header(writer, START_NS, "lidar"), boxes)
-    )
-    assert [(box.stamp_ns, box.frame_id) for box in found.boxes] == [
-        (START_NS, "lidar"),
-        (START_NS + 5, "roof"),
-        (START_NS, "roof"),
-    ]
-    assert [(box.class_name, box.source_id) for box in found.boxes] == [("3", None), ("0", None), ("1", None)]
-    np.testing.assert_array_equal([box.score for box in found.boxes], [0.75, np.nan, 0.5])
-    assert (found.boxes[0].centre, found.boxes[0].size) == ((1, 2, 3), (4, 2, 1.5))
-
-
-def test_objects_of_derived_object_msgs_have_shape_class_and_velocity():
-    writer = ros("derived_object_msgs/ObjectArray", DERIVED)
-    still = writer.new("geometry_msgs/Accel", point(writer, [0, 0, 0], "Vector3"), point(writer, [0, 0, 0], "Vector3"))
-    twist = writer.new("geometry_msgs/Twist", point(writer, [5, 6, 7], "Vector3"), point(writer, [0, 0, 0], "Vector3"))
-    objects = [
-        writer.new(
-            "derived_object_msgs/Object", header(writer, 0, ""), 40 + number, 1, True, pose(writer, SEEN), twist, still,
-            writer.new("geometry_msgs/Polygon", []), writer.new("own_shapes/SolidPrimitive", kind, np.array(lengths)), label, certainty, 9,
-        )
-        for number, (kind, lengths, label, certainty) in enumerate(
-            [(1, [4.0, 2.0, 1.5], 6, 80), (3, [1.75, 0.25], 4, 255), (2, [0.5], 0, 0), (0, [], 7, 100), (1, [1.0], 7, 100)]
-        )
-    ]  # fmt: skip
-    found = boxes_of(writer, writer.new("derived_object_msgs/ObjectArray", header(writer, START_NS, "map"), objects))
-    assert [box.size for box in found.boxes] == [(4, 2, 1.5), (0.5, 0.5, 1.75), (1, 1, 1)]
-    assert [box.class_name for box in found.boxes] == ["car", "pedestrian", ""]
-    np.testing.assert_array_equal([box.score for box in found.boxes], [0.8, 1.0, np.nan])
-    assert [(box.source_id, box.velocity) for box in found.boxes] == [(40 + n, (5, 6, 7)) for n in range(3)]
-    assert found.ignored == {"objects without a shape": 2}
-
-
-@pytest.mark.parametrize("package", ["autoware_perception_msgs", "autoware_auto_perception_msgs"])
-@pytest.mark.parametrize("tracked", [False, True], ids=["detected", "tracked"])
-def test_objects_of_autoware(package, tracked):
-    kind = "Tracked" if tracked else "Detected"
-    writer = ros(f"{package}/{kind}Objects", autoware(package, tracked))
-    zero = point(writer, [0, 0, 0], "Vector3")
-    twist = writer.new(
-        "geometry_msgs/TwistWithCovariance",
-        writer.new("geometry_msgs/Twist", point(writer, [3, 0, 0], "Vector3"), zero),
-        np.zeros(36),
-    )
-    at = covered(writer, "Pose", pose(writer, SEEN))
-
-    def one(shape: int, footprint=(), labels=((1, 0.5),), existence=0.9, known=2, uuid=b""):
-        corners = writer.new(
-            "geometry_msgs/Polygon", [writer.new("geometry_msgs/Point32", *map(float, p)) for p in footprint]
-        )
-        form = writer.new(f"{package}/Shape", shape, corners, point(writer, SEEN.size, "Vector3"))
-        guesses = [writer.new(f"{package}/ObjectClassification", *guess) for guess in labels]
-        accel = (
-            []
-            if not tracked
-            else [
-                writer.new(
-                    "geometry_msgs/AccelWithCovariance", writer.new("geometry_msgs/Accel", zero, zero), np.zeros(36)
-                )
-            ]
-        )
-        own = [known, twist, *accel, False] if tracked else [False, known, twist, True, False]
-        id_ = (
-            [writer.new("unique_identifier_msgs/UUID", np.frombuffer(uuid.ljust(16, b"\0"), np.uint8))]
-            if tracked
-            else []
-        )
-        kinematics = writer.new(f"{package}/{kind}ObjectKinematics", at, *own)
-        return writer.new(f"{package}/{kind}Object", *id_, existence, guesses, kinematics, form)
-
-    objects = [
-        one(0, labels=((1, 0.25), (7, 0.75)), uuid=b"b"),
-        one(1, labels=((5, np.nan), (6, 0.5)), existence=0.0, known=0, uuid=b"a"),
-        one(2, [(-1, -1, 0), (3, -1, 0), (3, 1, 0), (0, 1, 0)], labels=(), uuid=b"b"),
-    ]
-    head = header(writer, START_NS, "map")
-    found = boxes_of(writer, writer.new(f"{package}/{kind}Objects", head, objects))
-    assert [box.class_name for box in found.boxes] == ["pedestrian", "bicycle", ""]
-    np.testing.assert_allclose([box.score for box in found.boxes], [0.9, 0.5, 0.9], atol=1e-6)
-    assert [box.has_heading for box in found.boxes] == [True, False, True]
-    # The axes of the object are turned by 90 degrees: x is ahead to y.
-    np.testing.assert_allclose([box.velocity for box in found.boxes], [[0, 3, 0]] * 3, atol=1e-12)
-    assert [box.size for box in found.boxes] == [(4, 2, 1.5), (4, 2, 1.5), (4, 2, 1.5)]
-    np.testing.assert_allclose([box.centre for box in found.boxes], [[1, 2, 3], [1, 2, 3], [1, 3, 3]], atol=1e-12)
-    ids = recorded([(START_NS, found)]).source_id.tolist()
-    assert ids == ([1, 0, 1] if tracked else [-1, -1, -1])
 
 
 def test_markers_that_are_no_cubes_are_counted_and_lists_of_cubes_are_boxes():

@@ -1,0 +1,365 @@
+"""Messages of 3D boxes, by the definitions that their packages publish, in every encoding that they exist in."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+
+import numpy as np
+import pytest
+
+from mcaptrack.sources.foreign import MessageType
+from mcaptrack.sources.foreign.boxes_3d import boxes_3d_decoder
+from mcaptrack.sources.foreign.boxes_3d.box import Message3d
+from mcaptrack.sources.foreign.boxes_3d.recorded import recorded
+from tests.ros_messages import BAR, Ros
+from tests.space_logs import (
+    START_NS,
+    Seen,
+    covered,
+    detection_3d_array,
+    header,
+    marker_array,
+    point,
+    pose,
+    ros,
+    scene_update,
+    scene_update_json,
+)
+
+#: Half a turn to the left of the x axis is y.
+SEEN = Seen(
+    np.array([1.0, 2.0, 3.0]), np.array([0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)]), np.array([4.0, 2.0, 1.5]), number=12
+)
+ENCODINGS = ("ros1", "cdr", "json")
+
+JSK = (
+    "std_msgs/Header header\njsk_recognition_msgs/BoundingBox[] boxes\n"
+    + BAR + "MSG: jsk_recognition_msgs/BoundingBox\nstd_msgs/Header header\ngeometry_msgs/Pose pose\n"
+    "geometry_msgs/Vector3 dimensions  # size of bounding box (x, y, z)\nfloat32 value\nuint32 label\n"
+)  # fmt: skip
+KINDS = ("UNKNOWN", "UNKNOWN_SMALL", "UNKNOWN_MEDIUM", "UNKNOWN_BIG", "PEDESTRIAN", "BIKE", "CAR", "TRUCK", "MOTORCYCLE", "OTHER_VEHICLE", "BARRIER", "SIGN")  # fmt: skip
+DERIVED = (
+    "std_msgs/Header header\nderived_object_msgs/Object[] objects\n"
+    + BAR + "MSG: derived_object_msgs/Object\nstd_msgs/Header header\nuint32 id\nuint8 detection_level\n"
+    "uint8 OBJECT_DETECTED=0\nuint8 OBJECT_TRACKED=1\nbool object_classified\ngeometry_msgs/Pose pose\n"
+    "geometry_msgs/Twist twist\ngeometry_msgs/Accel accel\ngeometry_msgs/Polygon polygon\nshape_msgs/SolidPrimitive shape\n"
+    "uint8 classification\n" + "".join(f"uint8 CLASSIFICATION_{name}={n}\n" for n, name in enumerate(KINDS))
+    + "uint8 classification_certainty\nuint32 classification_age\n"
+)  # fmt: skip
+#: The labels since November 2021, and before, when there was no bus.
+LABELS = ("UNKNOWN", "CAR", "TRUCK", "BUS", "TRAILER", "MOTORCYCLE", "BICYCLE", "PEDESTRIAN", "ANIMAL", "HAZARD", "OVER_DRIVABLE", "UNDER_DRIVABLE")  # fmt: skip
+FIRST_LABELS = ("UNKNOWN", "CAR", "TRUCK", "TRAILER", "MOTORCYCLE", "BICYCLE", "PEDESTRIAN")
+
+
+def autoware(package: str, kind: str, labels: tuple[str, ...] = LABELS) -> str:
+    """The definition of DetectedObjects or TrackedObjects."""
+    own = "unique_identifier_msgs/UUID object_id\n" if kind == "Tracked" else ""
+    motion = {
+        "Detected": "bool has_position_covariance\nuint8 orientation_availability\n"
+        "geometry_msgs/TwistWithCovariance twist_with_covariance\nbool has_twist\nbool has_twist_covariance\n",
+        "Tracked": "geometry_msgs/TwistWithCovariance twist_with_covariance\n"
+        "geometry_msgs/AccelWithCovariance acceleration_with_covariance\nuint8 orientation_availability\nbool is_stationary\n",
+    }[kind]
+    return (
+        f"std_msgs/Header header\n{package}/{kind}Object[] objects\n"
+        + BAR + f"MSG: {package}/{kind}Object\n{own}float32 existence_probability\n{package}/ObjectClassification[] classification\n"
+        f"{package}/{kind}ObjectKinematics kinematics\n{package}/Shape shape\n"
+        + BAR + f"MSG: {package}/ObjectClassification\n" + "".join(f"uint8 {name} = {n}\n" for n, name in enumerate(labels))
+        + "uint8 label\nfloat32 probability\n"
+        + BAR + f"MSG: {package}/{kind}ObjectKinematics\nuint8 UNAVAILABLE=0\nuint8 SIGN_UNKNOWN=1\nuint8 AVAILABLE=2\n"
+        f"geometry_msgs/PoseWithCovariance pose_with_covariance\n{motion}"
+        + BAR + f"MSG: {package}/Shape\nuint8 BOUNDING_BOX=0\nuint8 CYLINDER=1\nuint8 POLYGON=2\nuint8 type\n"
+        "geometry_msgs/Polygon footprint\ngeometry_msgs/Vector3 dimensions\n"
+    )  # fmt: skip
+
+
+def plain(message) -> object:
+    """A message as a bridge writes it in JSON."""
+    if isinstance(message, np.ndarray | list):
+        return [plain(one) for one in message]
+    fields = getattr(message, "__dataclass_fields__", None)
+    if fields is None:
+        return message.item() if isinstance(message, np.generic) else message
+    names = [name for name, one in fields.items() if "ClassVar" not in str(one.type) and name != "__msgtype__"]
+    return {name: plain(getattr(message, name)) for name in names}
+
+
+def read(writer: Ros, message, encoding: str) -> Message3d:
+    """The boxes of a message; a writer of ROS 1 or ROS 2 made it."""
+    if encoding != "json":
+        return boxes_3d_decoder(writer.kind)(writer.pack(message))
+    kind = MessageType(writer.kind.name, "jsonschema", b"{}", "json")
+    return boxes_3d_decoder(kind)(json.dumps(plain(message)).encode())
+
+
+def twist(writer: Ros, velocity):
+    still = point(writer, [0, 0, 0], "Vector3")
+    return writer.new("geometry_msgs/Twist", point(writer, velocity, "Vector3"), still)
+
+
+# The same box by every family
+
+
+def by_detections(layout: str) -> tuple[Ros, object]:
+    writer, payload = detection_3d_array(layout, START_NS, [SEEN])
+    name = "vision_msgs/msg/Detection3DArray"
+    store = writer.store
+    return writer, store.deserialize_ros1(payload, name) if writer.ros1 else store.deserialize_cdr(payload, name)
+
+
+def by_markers(ros1: bool) -> tuple[Ros, object]:
+    if not ros1:
+        writer, payload = marker_array(START_NS, [SEEN])
+        return writer, writer.store.deserialize_cdr(payload, "visualization_msgs/msg/MarkerArray")
+    writer = ros("visualization_msgs/MarkerArray", ros1=True)
+    colour = writer.new("std_msgs/ColorRGBA", 0.0, 0.0, 0.0, 1.0)
+    lifetime = writer.new("builtin_interfaces/Duration", 0, 0)
+    cube = writer.new(
+        "visualization_msgs/Marker", header(writer, START_NS, "lidar"), SEEN.name, SEEN.number, 1, 0, pose(writer, SEEN),
+        point(writer, SEEN.size, "Vector3"), colour, lifetime, False, [], [], str(SEEN.score), "", False,
+    )  # fmt: skip
+    return writer, writer.new("visualization_msgs/MarkerArray", [cube])
+
+
+def bounding_box(writer: Ros, own, value: float, label: int):
+    size = point(writer, SEEN.size, "Vector3")
+    return writer.new("jsk_recognition_msgs/BoundingBox", own, pose(writer, SEEN), size, value, label)
+
+
+def by_jsk(ros1: bool) -> tuple[Ros, object]:
+    writer = ros("jsk_recognition_msgs/BoundingBoxArray", JSK, ros1)
+    box = bounding_box(writer, header(writer, 0, ""), SEEN.score, 3)
+    return writer, writer.new("jsk_recognition_msgs/BoundingBoxArray", header(writer, START_NS, "lidar"), [box])
+
+
+def derived(
+    writer: Ros, kind: int, lengths, label: int, certainty: int, level: int = 1, number: int = 12, velocity=(5, 6, 7)
+):
+    still = point(writer, [0, 0, 0], "Vector3")
+    nothing = writer.new("geometry_msgs/Polygon", [])
+    shape = writer.new("shape_msgs/SolidPrimitive", kind, np.array(lengths, float), *([] if writer.ros1 else [nothing]))
+    return writer.new(
+        "derived_object_msgs/Object", header(writer, 0, ""), number, level, True, pose(writer, SEEN),
+        twist(writer, velocity), writer.new("geometry_msgs/Accel", still, still), nothing, shape, label, certainty, 9,
+    )  # fmt: skip
+
+
+def by_derived(ros1: bool) -> tuple[Ros, object]:
+    writer = ros("derived_object_msgs/ObjectArray", DERIVED, ros1)
+    objects = [derived(writer, 1, SEEN.size, 6, 51)]
+    return writer, writer.new("derived_object_msgs/ObjectArray", header(writer, START_NS, "lidar"), objects)
+
+
+class Autoware:
+    """A writer of DetectedObjects or TrackedObjects."""
+
+    def __init__(self, package: str, kind: str, labels: tuple[str, ...] = LABELS) -> None:
+        self.package, self.kind = package, kind
+        self.writer = ros(f"{package}/{kind}Objects", autoware(package, kind, labels))
+
+    def new(self, name: str, *values):
+        return self.writer.new(f"{self.package}/{name}", *values)
+
+    def one(self, shape=0, footprint=(), size=SEEN.size, labels=((1, 0.5),), existence=0.5, known=2, uuid=b"", moves=True):
+        writer = self.writer
+        corners = [writer.new("geometry_msgs/Point32", *map(float, corner)) for corner in footprint]
+        form = self.new("Shape", shape, writer.new("geometry_msgs/Polygon", corners), point(writer, size, "Vector3"))
+        guesses = [self.new("ObjectClassification", *guess) for guess in labels]
+        moving, at = covered(writer, "Twist", twist(writer, [3, 0, 0])), covered(writer, "Pose", pose(writer, SEEN))
+        if self.kind == "Detected":
+            motion = self.new("DetectedObjectKinematics", at, False, known, moving, moves, False)
+            return self.new("DetectedObject", existence, guesses, motion, form)
+        still = point(writer, [0, 0, 0], "Vector3")
+        accel = covered(writer, "Accel", writer.new("geometry_msgs/Accel", still, still))
+        id_ = writer.new("unique_identifier_msgs/UUID", np.frombuffer(uuid.ljust(16, b"\0"), np.uint8))
+        motion = self.new("TrackedObjectKinematics", at, moving, accel, known, False)
+        return self.new("TrackedObject", id_, existence, guesses, motion, form)
+
+    def message(self, *objects):
+        return self.new(f"{self.kind}Objects", header(self.writer, START_NS, "lidar"), list(objects))
+
+
+def by_autoware(package: str, kind: str) -> tuple[Ros, object]:
+    writer = Autoware(package, kind)
+    return writer.writer, writer.message(writer.one())
+
+
+FAMILIES: Mapping[tuple[str, str], Callable[[], tuple[Ros, object]]] = {
+    **{("detections of noetic", one): lambda: by_detections("ros1") for one in ("ros1", "json")},
+    **{("detections of foxy", one): lambda: by_detections("v3") for one in ("cdr", "json")},
+    **{("detections since humble", one): lambda: by_detections("v4") for one in ("cdr", "json")},
+    **{("markers", one): lambda one=one: by_markers(one == "ros1") for one in ENCODINGS},
+    **{("jsk", one): lambda one=one: by_jsk(one == "ros1") for one in ENCODINGS},
+    **{("derived", one): lambda one=one: by_derived(one == "ros1") for one in ENCODINGS},
+    **{
+        (f"{package} {kind}", one): lambda package=package, kind=kind: by_autoware(package, kind)
+        for package in ("autoware_perception_msgs", "autoware_auto_perception_msgs")
+        for kind in ("Detected", "Tracked")
+        for one in ("cdr", "json")
+    },
+}
+#: What differs from a car of score .5 with the id 12.
+DIFFERENT = {
+    "detections of noetic": {"class_name": "2", "source_id": None},  # the number of a class, and no ids
+    "jsk": {"class_name": "3", "source_id": None},
+    "derived": {"score": 51 / 255, "velocity": (5, 6, 7)},
+    "Detected": {"source_id": None, "velocity": (0, 3, 0)},
+    "Tracked": {"source_id": "0" * 32, "velocity": (0, 3, 0)},
+}
+
+
+@pytest.mark.parametrize(("family", "encoding"), FAMILIES, ids="-".join)
+def test_a_box_is_the_same_in_every_family_and_encoding(family, encoding):
+    found = read(*FAMILIES[family, encoding](), encoding)
+    (box,) = found.boxes
+    different = DIFFERENT.get(family) or DIFFERENT.get(family.partition(" ")[2], {})
+    wanted = {"class_name": "car", "score": 0.5, "source_id": 12, "velocity": (np.nan,) * 3} | different
+    assert (box.stamp_ns, box.frame_id, box.has_heading) == (START_NS, "lidar", True)
+    np.testing.assert_allclose(box.centre, SEEN.centre, atol=1e-6)
+    np.testing.assert_allclose(box.orientation, SEEN.turn, atol=1e-6)
+    np.testing.assert_allclose(box.size, SEEN.size, atol=1e-6)
+    np.testing.assert_allclose(box.velocity, wanted["velocity"], atol=1e-6)
+    assert box.score == pytest.approx(wanted["score"])
+    assert str(box.source_id) == str(wanted["source_id"])
+    assert box.class_name == wanted["class_name"]
+    assert found.ignored == {}
+
+
+def test_scenes_of_foxglove_are_the_same_in_all_encodings():
+    protobuf = MessageType("foxglove.SceneUpdate", "protobuf", b"", "protobuf")
+    wanted = boxes_3d_decoder(protobuf)(scene_update(START_NS, [SEEN]).SerializeToString())
+    found = boxes_3d_decoder(protobuf._replace(encoding="json"))(scene_update_json(START_NS, [SEEN]))
+    assert found.boxes == wanted.boxes
+    assert wanted.boxes[0].source_id == "12"
+    for ros1 in (False, True):
+        writer = ros("foxglove_msgs/SceneUpdate", SCENE, ros1)
+        stamp = writer.new("builtin_interfaces/Time", *divmod(START_NS, 10**9))
+        cube = writer.new("foxglove_msgs/CubePrimitive", pose(writer, SEEN), point(writer, SEEN.size, "Vector3"))
+        pairs = [writer.new("foxglove_msgs/KeyValuePair", *pair) for pair in (("class", "car"), ("score", "0.5"))]
+        entity = writer.new("foxglove_msgs/SceneEntity", stamp, "lidar", "12", pairs, [cube])
+        found = read(writer, writer.new("foxglove_msgs/SceneUpdate", [], [entity]), "ros")
+        assert found.boxes == wanted.boxes
+
+
+#: The fields of foxglove_msgs that hold boxes.
+SCENE = (
+    "foxglove_msgs/SceneEntityDeletion[] deletions\nfoxglove_msgs/SceneEntity[] entities\n"
+    + BAR + "MSG: foxglove_msgs/SceneEntityDeletion\ntime timestamp\nuint8 type\nstring id\n"
+    + BAR + "MSG: foxglove_msgs/SceneEntity\ntime timestamp\nstring frame_id\nstring id\n"
+    "foxglove_msgs/KeyValuePair[] metadata\nfoxglove_msgs/CubePrimitive[] cubes\n"
+    + BAR + "MSG: foxglove_msgs/KeyValuePair\nstring key\nstring value\n"
+    + BAR + "MSG: foxglove_msgs/CubePrimitive\ngeometry_msgs/Pose pose\ngeometry_msgs/Vector3 size\n"
+).replace("time timestamp", "builtin_interfaces/Time timestamp")  # fmt: skip
+
+
+# What each family says beside
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_boxes_of_jsk_have_their_own_headers_and_no_score_of_zero(encoding):
+    writer = ros("jsk_recognition_msgs/BoundingBoxArray", JSK, encoding == "ros1")
+    stated = ((0, "", 0.75, 3), (START_NS + 5, "roof", 0.0, 0), (0, "roof", 0.5, 1))
+    boxes = [bounding_box(writer, header(writer, stamp, own), value, label) for stamp, own, value, label in stated]
+    message = writer.new("jsk_recognition_msgs/BoundingBoxArray", header(writer, START_NS, "lidar"), boxes)
+    found = read(writer, message, encoding).boxes
+    heads = [(START_NS, "lidar"), (START_NS + 5, "roof"), (START_NS, "roof")]
+    assert [(box.stamp_ns, box.frame_id) for box in found] == heads
+    assert [(box.class_name, box.source_id) for box in found] == [("3", None), ("0", None), ("1", None)]
+    np.testing.assert_array_equal([box.score for box in found], [0.75, np.nan, 0.5])
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_derived_objects_have_a_shape_and_a_certainty_out_of_255_and_move_if_they_are_tracked(encoding):
+    writer = ros("derived_object_msgs/ObjectArray", DERIVED, encoding == "ros1")
+    objects = [
+        derived(writer, *stated, number=40 + number)
+        for number, stated in enumerate(
+            [
+                (1, [4.0, 2.0, 1.5], 6, 204),
+                (3, [1.75, 0.25], 4, 255, 0),
+                (2, [0.5], 0, 0),
+                (0, [], 7, 100),
+                (1, [1.0], 7, 1),
+            ]
+        )
+    ]
+    message = writer.new("derived_object_msgs/ObjectArray", header(writer, START_NS, "map"), objects)
+    found = read(writer, message, encoding)
+    assert [box.size for box in found.boxes] == [(4, 2, 1.5), (0.5, 0.5, 1.75), (1, 1, 1)]
+    assert [box.class_name for box in found.boxes] == ["car", "pedestrian", ""]
+    np.testing.assert_array_equal([box.score for box in found.boxes], [0.8, 1.0, np.nan])
+    assert [box.source_id for box in found.boxes] == [40, 41, 42]
+    np.testing.assert_array_equal([box.velocity for box in found.boxes], [[5, 6, 7], [np.nan] * 3, [5, 6, 7]])
+    assert found.ignored == {"objects without a shape": 2}
+
+
+@pytest.mark.parametrize("encoding", ["cdr", "json"])
+@pytest.mark.parametrize("kind", ["Detected", "Tracked"])
+def test_objects_of_autoware_have_the_likeliest_class_a_shape_and_a_velocity_along_their_axes(kind, encoding):
+    made = Autoware("autoware_perception_msgs", kind)
+    message = made.message(
+        made.one(labels=((1, 0.25), (7, 0.75)), existence=0.9, uuid=b"b"),
+        made.one(1, size=np.array([0.5, 0, 1.75]), labels=((5, np.nan), (6, 0.5)), existence=0.0, known=0, uuid=b"a"),
+        made.one(2, [(-1, -1, 0), (3, -1, 0), (3, 1, 0), (0, 1, 0)], labels=(), uuid=b"b", moves=False),
+    )
+    found = read(made.writer, message, encoding)
+    assert [box.class_name for box in found.boxes] == ["pedestrian", "bicycle", ""]
+    np.testing.assert_allclose([box.score for box in found.boxes], [0.9, 0.5, 0.5], atol=1e-6)
+    assert [box.has_heading for box in found.boxes] == [True, False, True]
+    # The axes of the object are turned by 90 degrees: x is ahead to y.
+    last = [np.nan] * 3 if kind == "Detected" else [0, 3, 0]
+    np.testing.assert_allclose([box.velocity for box in found.boxes], [[0, 3, 0], [0, 3, 0], last], atol=1e-12)
+    assert [box.size for box in found.boxes] == [(4, 2, 1.5), (0.5, 0.5, 1.75), (4, 2, 1.5)]
+    np.testing.assert_allclose([box.centre for box in found.boxes], [[1, 2, 3], [1, 2, 3], [1, 3, 3]], atol=1e-12)
+    ids = recorded([(START_NS, found)]).source_id.tolist()
+    assert ids == ([1, 0, 1] if kind == "Tracked" else [-1, -1, -1])
+
+
+def test_classes_have_the_numbers_of_the_recorded_definition():
+    """The first definitions had no bus, so that a pedestrian was 6."""
+    made = Autoware("autoware_auto_perception_msgs", "Detected", FIRST_LABELS)
+    objects = [made.one(labels=((number, 1.0),)) for number in range(9)]
+    found = read(made.writer, made.message(*objects), "cdr")
+    names = ["", "car", "truck", "trailer", "motorcycle", "bicycle", "pedestrian", "7", "8"]
+    assert [box.class_name for box in found.boxes] == names
+    writer = ros("derived_object_msgs/ObjectArray", DERIVED.replace("CLASSIFICATION_SIGN=11", "CLASSIFICATION_TRAM=11"))
+    objects = [derived(writer, 1, SEEN.size, number, 9) for number in (0, 1, 5, 10, 11)]
+    message = writer.new("derived_object_msgs/ObjectArray", header(writer, START_NS, "map"), objects)
+    names = ["", "unknown_small", "bike", "barrier", "tram"]
+    assert [box.class_name for box in read(writer, message, "cdr").boxes] == names
+    assert [box.class_name for box in read(writer, message, "json").boxes] == [*names[:-1], "sign"]
+
+
+IDL = """IDL: {package}/msg/DetectedObjects
+module {package} {{ module msg {{ struct DetectedObjects {{
+  std_msgs::msg::Header header; sequence<{package}::msg::DetectedObject> objects; }}; }}; }};
+{bar}IDL: {package}/msg/DetectedObject
+module {package} {{ module msg {{ struct DetectedObject {{
+  float existence_probability; sequence<{package}::msg::ObjectClassification> classification;
+  {package}::msg::DetectedObjectKinematics kinematics; {package}::msg::Shape shape; }}; }}; }};
+{bar}IDL: {package}/msg/ObjectClassification
+module {package} {{ module msg {{
+  module ObjectClassification_Constants {{ {labels} }};
+  struct ObjectClassification {{ uint8 label; @range (min=0.0, max=1.0) float probability; }}; }}; }};
+{bar}IDL: {package}/msg/DetectedObjectKinematics
+module {package} {{ module msg {{ struct DetectedObjectKinematics {{
+  geometry_msgs::msg::PoseWithCovariance pose_with_covariance; boolean has_position_covariance;
+  uint8 orientation_availability; geometry_msgs::msg::TwistWithCovariance twist_with_covariance;
+  boolean has_twist; boolean has_twist_covariance; }}; }}; }};
+{bar}IDL: {package}/msg/Shape
+module {package} {{ module msg {{ struct Shape {{
+  uint8 type; geometry_msgs::msg::Polygon footprint; geometry_msgs::msg::Vector3 dimensions; }}; }}; }};
+"""
+
+
+def test_definitions_in_idl_have_their_constants_in_a_module_beside():
+    package = "autoware_auto_perception_msgs"
+    made = Autoware(package, "Detected", FIRST_LABELS)
+    labels = " ".join(f"const uint8 {name} = {number};" for number, name in enumerate(FIRST_LABELS))
+    text = BAR + IDL.format(package=package, bar=BAR, labels=labels)
+    kind = made.writer.kind._replace(schema_encoding="ros2idl", schema=text.encode())
+    objects = [made.one(labels=((number, 1.0),)) for number in (1, 3, 6)]
+    found = boxes_3d_decoder(kind)(made.writer.pack(made.message(*objects)))
+    assert [box.class_name for box in found.boxes] == ["car", "trailer", "pedestrian"]
+    assert found.boxes[0].velocity == pytest.approx((0, 3, 0))
