@@ -161,7 +161,9 @@ class Autoware:
     def new(self, name: str, *values):
         return self.writer.new(f"{self.package}/{name}", *values)
 
-    def one(self, shape=0, footprint=(), size=SEEN.size, labels=((1, 0.5),), existence=0.5, known=2, uuid=b"", moves=True):
+    def one(
+        self, shape=0, footprint=(), size=SEEN.size, labels=((1, 0.5),), existence=0.5, known=2, uuid=b"", moves=True
+    ):
         writer = self.writer
         corners = [writer.new("geometry_msgs/Point32", *map(float, corner)) for corner in footprint]
         form = self.new("Shape", shape, writer.new("geometry_msgs/Polygon", corners), point(writer, size, "Vector3"))

@@ -11,9 +11,10 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from mcaptrack import log
-from mcaptrack.geometry.transform_tree import Recorded, Samples, TransformTree
+from mcaptrack.geometry.transform_tree import Poses, Recorded, Samples, TransformTree
 from mcaptrack.notices import collected
-from mcaptrack.schema import Frame
+from mcaptrack.schema import TRACKS, Frame
+from mcaptrack.sources import moved_tracks
 from mcaptrack.sources.fixed_frame import named_detections, rows_of_boxes
 from mcaptrack.sources.foreign import MessageType
 from mcaptrack.sources.foreign.boxes_3d import boxes_3d_decoder
@@ -113,6 +114,40 @@ def test_any_pose_of_sensor_and_box_gives_the_numbers_of_scipy(angles, shifts, l
     assert np.cos(off) > 1 - 1e-12
     assert -np.pi < row["heading_rad"] <= np.pi
     assert len(warnings) == (up != 2)
+
+
+def test_tracks_in_another_frame_are_as_boxes_brought_there(monkeypatch):
+    """Half a turn takes a heading of 0 to pi, not to -pi, and a row without a heading or velocity keeps none."""
+    half = np.diag([-1.0, -1.0, 1.0])
+    shift = np.array([10.0, 20.0, 5.0])
+
+    def poses_at(opened, topic, target, source, stamps_ns, log_ns):
+        count = len(stamps_ns)
+        return Poses(np.tile(half, (count, 1, 1)), np.tile(shift, (count, 1)), np.zeros(count, np.int64), {})
+
+    monkeypatch.setattr(moved_tracks, "poses_at", poses_at)
+    nan = np.nan
+    rows = TRACKS.rows(
+        track_id=[1, 2, 3], x_m=[1.0, 2.0, 3.0], y_m=[0.0, 1.0, 2.0], z_m=[1.0, 2.0, nan], heading_rad=[0.0, 2.0, nan],
+        vx_m_per_s=[1.0, 0.0, nan], vy_m_per_s=[0.0, -2.0, nan], observed=[True] * 3, source_id=[-1] * 3,
+    )  # fmt: skip
+    (moved,) = moved_tracks.in_frame(None, "/truth", [Frame(START_NS, 0, rows)], "map", "city")
+    boxes = [
+        Box3d(START_NS, "city", (row["x_m"], row["y_m"], row["z_m"]), turn, (1.0, 1.0, 1.0), velocity=velocity)
+        for row, turn, velocity in zip(
+            rows[:2],
+            [(0.0, 0.0, np.sin(heading / 2), np.cos(heading / 2)) for heading in (0.0, 2.0)],
+            [(1.0, 0.0, 0.0), (0.0, -2.0, 0.0)],
+            strict=True,
+        )
+    ]
+    found = recorded([(START_NS, Message3d(START_NS, "city", boxes))])
+    wanted = rows_of_boxes(found, np.tile(half, (2, 1, 1)), np.tile(shift, (2, 1)))
+    for name in ("x_m", "y_m", "z_m", "heading_rad", "vx_m_per_s", "vy_m_per_s"):
+        np.testing.assert_allclose(moved.rows[name][:2], wanted[name], atol=1e-12, err_msg=name)
+    assert moved.rows["heading_rad"].tolist()[0] == np.pi == wanted["heading_rad"][0]
+    assert np.isnan([moved.rows[name][2] for name in ("z_m", "heading_rad", "vx_m_per_s", "vy_m_per_s")]).all()
+    assert (moved.rows["x_m"][2], moved.rows["y_m"][2]) == (7, 18)
 
 
 _KIND = MessageType("foxglove.SceneUpdate", "protobuf", b"", "protobuf")

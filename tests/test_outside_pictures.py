@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import pytest
 
 from mcaptrack import log
 from mcaptrack.geometry.boxes import columns_to_boxes, share_inside
+from mcaptrack.notices import collected
 from mcaptrack.pipeline.visible import without_unseen
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame
 from tests.commands import done
@@ -47,7 +49,11 @@ def test_rows_outside_of_the_picture_are_left_out_unless_observed():
     odd = [(3, -10, 0, 20, 60, False), (4, -11, 0, 20, 60, False), (5, 500, 0, 20, 60, False)]
     odd += [(6, -15, 0, 20, 60, True), (7, np.nan, np.nan, np.nan, np.nan, False)]
     frames = [Frame(k, k, rows(*seen)) for k in range(20)] + [Frame(20, 20, rows(*seen, *odd))]
-    found = without_unseen({"/a/retracks": (TRACKS, frames)}, lambda: SIZE)
+    with collected() as warnings:
+        found = without_unseen({"/a/retracks": (TRACKS, frames)}, lambda: SIZE)
+    assert [(notice.code, notice.message) for notice in warnings] == [
+        ("left-out", "/a/retracks: 2 rows are left out, outside of the picture and without a detection")
+    ]
     assert ids(found, "/a/retracks") == [[1, 2]] * 20 + [[1, 2, 3, 6, 7]]
     assert [(frame.t_ns, frame.index) for frame in found["/a/retracks"][1]] == [(k, k) for k in range(21)]
 
@@ -101,7 +107,10 @@ def test_who_leaves_a_picture_that_sways_has_no_row_until_he_is_back(tmp_path: P
     done("ingest", "a.mp4", "--ground-plane", "plane.txt", "-o", "a.mcap", "-q")
     done("ingest", "det.txt", "--as", "detections", "--into", "a.mcap", "-q")
     done("ingest", "motion.txt", "--as", "motion", "--into", "a.mcap", "-q")
-    done("run", "a.mcap", "--no-tables", "-q")
+    made = done("run", "a.mcap", "--no-tables", "--json")
+    warnings = [one["message"] for one in json.loads(made.out)["warnings"] if one["code"] == "left-out"]
+    assert [line for line in made.err.splitlines() if "outside of the picture" in line]
+    assert {words.partition(":")[0] for words in warnings if "outside of the picture" in words} >= {"/camera/retracks"}
     with log.read(tmp_path / "a.mcap") as opened:
         names = ("samples", "retracks", "retracks/online", "retracks/full")
         found = {name: opened.frames(f"/camera/{name}", TRACKS) for name in names}

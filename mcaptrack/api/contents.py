@@ -13,7 +13,7 @@ from mcaptrack import pipeline
 from mcaptrack.api.common import PathLike, as_path, warnings_about
 from mcaptrack.geometry.transform_series import TransformSeries
 from mcaptrack.notices import Notice, warn
-from mcaptrack.schema.provenance import Provenance
+from mcaptrack.schema.provenance import Provenance, frame_id_of
 from mcaptrack.sources.frames import read_frames
 
 
@@ -44,6 +44,8 @@ class ChannelInfo:
         Topics that it was compared with, with their digests.
     parameters : dict or None
         The options it was made with.
+    frame : str or None
+        The frame of reference of its metres, for channels of mcaptrack that have one.
     stale : bool
         Whether it is out of date, because what it was made from has changed.
 
@@ -62,6 +64,7 @@ class ChannelInfo:
     references: Mapping[str, str] | None
     plugins: Mapping[str, Mapping[str, str]] | None
     parameters: Mapping[str, Any] | None
+    frame: str | None
     stale: bool
 
 
@@ -232,6 +235,7 @@ def _channel(opened: logs.Log, part: logs.Log, channel: logs.Channel) -> Channel
         references=dict(made.references) if made else None,
         plugins={part: plugin._asdict() for part, plugin in made.plugins.items()} if made else None,
         parameters=dict(made.parameters) if made else None,
+        frame=frame_id_of(channel.metadata) or None,
         stale=not replaced and pipeline.is_stale(opened, channel.topic),
     )
 

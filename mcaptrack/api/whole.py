@@ -33,6 +33,7 @@ def run(
     retracker: str | Transform | None = None,
     predictor: str | Transform | None = None,
     camera_motion: CameraMotionUse | None = None,
+    across_classes: bool | None = None,
     fit_plane: bool | None = None,
     person_height_m: float | None = None,
     ground_frame: str | None = None,
@@ -72,6 +73,9 @@ def run(
     camera_motion : {"auto", "on", "off"}, optional
         Whether tracks are compensated for the motion of the camera: if it moves or has cuts, also if it only shakes,
         or never. By default as before, and "auto" where there are no tracks yet.
+    across_classes : bool, optional
+        Whether a track may continue with a detection, and after re-tracking with a track, of another class. By default
+        as before, and False where there are no tracks yet.
     fit_plane : bool, optional
         Whether to estimate the ground plane from the boxes of a learned detector where none is given. By default as
         before, and True where there is none yet.
@@ -110,10 +114,11 @@ def run(
     transforms |= {s.name: transform_of(s.name, chosen[s.option], {}) for s in STAGES.values() if s.option in chosen}
 
     plane = PlaneChoice(fit_plane, person_height_m, frame, ground_frame)
+    given = {"camera_motion": camera_motion, "across_classes": across_classes}
+    shared = {name: value for name, value in given.items() if value is not None}
 
     def plan(opened: logs.Log, prefix: str, say: Callable[[str], None]) -> list[Job]:
-        motion = camera_motion or ""
-        return pipeline.plan_all(opened, prefix, say, topic, transforms, force, chosen, motion, plane, frame or "")
+        return pipeline.plan_all(opened, prefix, say, topic, transforms, force, chosen, shared, plane, frame or "")
 
     options = events if isinstance(events, EventOptions) else EventOptions()
     watch = Watch(options, force=force) if events else None

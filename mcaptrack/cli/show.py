@@ -101,6 +101,7 @@ def _lineage(channels: list[dict[str, Any]], verbose: bool) -> Tree:
             package = f"{plugin['distribution']} {plugin['version']}".strip()
             words = f"  {plugin['name']}" + (f" ({package})" if package else "")
             label.append(printable(words), "dim")
+        label.append(f"  in {printable(channel['frame'])}" if channel["frame"] else "", "dim")
         label.append("  out of date" if channel["stale"] else "", "red")
         node = parent.add(label)
         if verbose and channel["parameters"]:

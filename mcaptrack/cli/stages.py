@@ -273,6 +273,15 @@ def run_all(
             show_default="auto",
         ),
     ] = None,
+    across_classes: Annotated[
+        bool | None,
+        common.option(
+            "--across-classes/--within-classes",
+            tuning=True,
+            help="Let a track continue with a detection, and after re-tracking with a track, of another class.",
+            show_default="within",
+        ),
+    ] = None,
     fit_plane: Annotated[
         bool | None,
         common.option(
@@ -323,7 +332,7 @@ def run_all(
 
         settings, stages = settings_of("events"), configured(chosen)
         where |= {"camera_motion": camera_motion, "fit_plane": fit_plane, "person_height_m": person_height_m}
-        where |= {"ground_frame": ground_frame, "frame": frame}
+        where |= {"ground_frame": ground_frame, "frame": frame, "across_classes": across_classes}
         for stage in STAGES.values():
             if stage.option in chosen:
                 where[stage.option] = stages.pop(stage.name)

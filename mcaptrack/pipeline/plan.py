@@ -75,7 +75,7 @@ def plan_all(
     defaults: Mapping[str, Transform] = {},
     force: bool = False,
     chosen: Collection[str] = (),
-    camera_motion: str = "",
+    shared: Mapping[str, object] = {},
     plane: PlaneChoice = AS_BEFORE,
     frame_id: str = "",
 ) -> list[Job]:
@@ -83,14 +83,14 @@ def plan_all(
 
     ``source`` is the topic of pictures or of recorded detections to begin with; ``defaults`` as in ``plan_stage``. With
     ``force``, channels that are up to date are made again, too, by the transform in ``defaults`` or else the same one.
-    ``camera_motion`` is what trackers are to do about it ("auto", "on" or "off") where it differs from what they did.
+    ``shared`` are options of several stages that the user gave ("camera_motion"), where they differ from before.
     ``plane`` says how to make a ground plane where none is given; where it was made otherwise, it is made again.
     ``chosen`` are options that the user gave for ``defaults`` ("tracker"): a channel that was made with another choice
     is made again; so are tracks of 3D boxes in another frame than ``frame_id``. Raises McaptrackError as ``plan_stage``
     does, and if the class that made a channel is not installed.
     """
     sources = {_stage_from(opened, source): source} if source else {}
-    planner = _Planner(opened, prefix, sources, defaults, force, chosen, camera_motion, plane, frame_id)
+    planner = _Planner(opened, prefix, sources, defaults, force, chosen, shared, plane, frame_id)
     warn_unused(opened, prefix, plane)
     read = {stage.input_topic for stage in STAGES.values()}
     for stage in STAGES.values():
@@ -118,7 +118,7 @@ class _Planner:
 
     ``sources`` gives inputs and ``defaults`` transforms of stages that differ from the usual ones. With ``force`` all
     stages run, also those that are up to date. A stage also runs if an option in ``chosen`` differs from the one that
-    its channel was made with; so does one that takes camera motion into account, by ``camera_motion``.
+    its channel was made with, or one in ``shared``.
     """
 
     def __init__(
@@ -129,14 +129,14 @@ class _Planner:
         defaults: Mapping[str, Transform] = {},
         force: bool = False,
         chosen: Collection[str] = (),
-        camera_motion: str = "",
+        shared: Mapping[str, object] = {},
         plane: PlaneChoice = AS_BEFORE,
         frame_id: str = "",
     ) -> None:
         self.jobs: list[Job] = []
         self._opened, self._prefix = opened, prefix
         self._sources, self._defaults, self._force, self._chosen = sources, defaults, force, chosen
-        self._camera_motion, self._plane, self._frame_id = camera_motion, plane, frame_id
+        self._shared, self._plane, self._frame_id = shared, plane, frame_id
         self._changes: dict[str, bool] = {}
         self._notes: list[str] = []
         self._unnamed: dict[str, MissingPluginError] = {}
@@ -293,7 +293,8 @@ class _Planner:
             self._notes.append(f"{topic} was made from {had}: running {stage} again, from {source}")
         elif is_replaced:
             is_other = before is None or STAGES[stage].choice(before) != STAGES[stage].choice(transform)
-            by = f"by another {STAGES[stage].option}" if is_other else "with another `camera_motion=` or `frame=`"
+            others = " or ".join(f"`{name}=`" for name in (*self._shared, "frame"))
+            by = f"by another {STAGES[stage].option}" if is_other else f"with another {others}"
             self._notes.append(f"{topic} was made {by}: running {stage} again")
         elif is_projected:
             self._notes.append(f"{topic} was made with another ground plane: running {stage} again, as before")
@@ -311,8 +312,7 @@ class _Planner:
 
     def _is_replaced(self, stage: Stage, before: Transform | None, wanted: Transform | None) -> bool:
         """Return whether the user chose another class for a stage than the one that made its channel."""
-        is_chosen = self._camera_motion and hasattr(wanted, "camera_motion")
-        if is_chosen and getattr(before, "camera_motion", "") != self._camera_motion:
+        if any(hasattr(wanted, name) and getattr(before, name, None) != now for name, now in self._shared.items()):
             return True
         if wanted is None or stage.option not in self._chosen:
             return False
@@ -361,10 +361,9 @@ class _Planner:
         return next((topic for name, topic in self._sources.items() if STAGES[name].default.reads is VIDEO), "")
 
     def _with_choice(self, transform: Any) -> Any:
-        """A transform with what is chosen about camera motion, if it takes that into account."""
-        if self._camera_motion and hasattr(transform, "camera_motion"):
-            return replace(transform, camera_motion=self._camera_motion)
-        return transform
+        """A transform with the shared options that it has."""
+        chosen = {name: value for name, value in self._shared.items() if hasattr(transform, name)}
+        return replace(transform, **chosen) if chosen else transform
 
     def _add(self, job: Job) -> None:
         self.jobs.append(job)

@@ -15,6 +15,7 @@ from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Bools
 from mcaptrack.geometry.boxes import columns_to_boxes, share_inside
+from mcaptrack.notices import warn
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame, Rows, Schema
 from mcaptrack.schema.framing import JoinedFrames, join_frames, split_rows
 from mcaptrack.sources.pictures import size_of_pictures
@@ -43,6 +44,7 @@ def without_unseen(channels: Channels, picture_size: Callable[[], PictureSize]) 
     """Return the outputs of a stage without rows that are not observed and lie outside of the picture.
 
     ``picture_size`` is called if there are rows that are not observed. Predictions go with their rows of online tracks.
+    A warning counts the rows.
     """
     out = dict(channels)
     for topic, (schema, frames) in channels.items():
@@ -51,6 +53,9 @@ def without_unseen(channels: Channels, picture_size: Callable[[], PictureSize]) 
         if not is_unseen.any():
             continue
         out[topic] = schema, _kept(joined, ~is_unseen, frames)
+        count = np.count_nonzero(is_unseen)
+        rows = "row is" if count == 1 else "rows are"
+        warn(f"{topic}: {count:,} {rows} left out, outside of the picture and without a detection", "left-out")
         stem, _, name = topic.rpartition("/")
         predictions = f"{stem}/predictions"
         if name == "online" and predictions in channels:

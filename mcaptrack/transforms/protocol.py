@@ -93,7 +93,7 @@ Space = Literal["picture", "ground"]
 
 @dataclass(frozen=True, kw_only=True)
 class Traits:
-    """What a transform states of itself beside its interface: class attributes of these names, all optional.
+    """Facts about a transform beside its interface: class attributes of these names, all optional.
 
     One that depends on parameters is a property. ``traits_of`` gives those of a transform.
 

@@ -18,7 +18,10 @@ from mcaptrack.viewing.report.summary import before_after, rule_text
 
 #: The columns of the table of scores: whether a column is a share, and whether its lowest value is the best.
 _SCORES: Final = {"IDF1": True, "MOTA": True, "HOTA": True, "IDSW": False, "Frag": False, "FP": False, "FN": False}
-_LOWEST: Final = ("IDSW", "Frag", "FP", "FN")
+_LOWEST: Final = ("IDSW", "Frag", "FP", "FN", "AMOTP_m")
+#: Further columns, where they are known: averages over recalls, of 3D tracks with scores. Their numbers of digits, or
+#: None for shares.
+_AVERAGES: Final = {"AMOTA": None, "AMOTP_m": 2, "AMOTP": 2}
 
 Figure = dict[str, Any]
 
@@ -33,14 +36,21 @@ def scores(report: LogReport) -> dict[str, Any]:
     rest = [row for row in of_all if row not in first]
     rules = sorted({(row.similarity, row.gate) for row in rest})
     return {
-        "columns": list(_SCORES),
+        "columns": _columns(first + of_classes),
         "groups": _score_groups(first + of_classes, report),
+        "other_columns": _columns(rest),
         "other_groups": _score_groups(rest, report),
+        "has_averages": any(row.averages for row in report.results),
         "other_rules": "; ".join(rule_text(*rule) for rule in rules),
         "missing": report.missing.get("scores", ""),
         "tracks": _track_rows(report),
         "no_tracks": f"There are no tracks here; {command('run', Path(report.file))} makes them.",
     }
+
+
+def _columns(results: Sequence[EvaluationRow]) -> list[str]:
+    """The columns of a table of scores."""
+    return [*_SCORES, *(name for name in _AVERAGES if any(name in row.averages for row in results))]
 
 
 def _score_groups(results: Sequence[EvaluationRow], report: LogReport) -> list[dict[str, Any]]:
@@ -50,23 +60,33 @@ def _score_groups(results: Sequence[EvaluationRow], report: LogReport) -> list[d
     for row in results:
         groups.setdefault((row.similarity, row.gate, row.of_class or ""), []).append(row)
     out = []
+    columns = _columns(results)
     for (similarity, gate, of_class), members in sorted(groups.items()):
-        all_values = [summary(row.score) for row in members]
-        best = {key: (min if key in _LOWEST else max)(values[key] for values in all_values) for key in _SCORES}
+        all_values = [{**dict.fromkeys(columns), **summary(row.score), **row.averages} for row in members]
+        best = {key: _best([values[key] for values in all_values], key) for key in columns}
         rows = []
         for row, values in zip(members, all_values, strict=True):
             name, role = known.get(row.tracks, (row.tracks, "truth"))
             cells = [
-                (
-                    percent(values[key]) if is_share else number(values[key]),
-                    len(members) > 1 and values[key] == best[key],
-                )
-                for key, is_share in _SCORES.items()
+                (_score_text(key, values[key]), len(members) > 1 and best[key] is not None and values[key] == best[key])
+                for key in columns
             ]
             rows.append({"name": name, "role": role, "topic": row.tracks, "cells": cells})
         rule = rule_text(similarity, gate) + (f", {of_class}" if of_class else "")
         out.append({"rule": rule, "rows": rows})
     return out
+
+
+def _best(values: Sequence[float | None], key: str) -> float | None:
+    """The best value of a column; None if none is known."""
+    known = [one for one in values if one is not None]
+    return (min if key in _LOWEST else max)(known) if known else None
+
+
+def _score_text(key: str, value: float | None) -> str:
+    if key in _AVERAGES and (digits := _AVERAGES[key]) is not None:
+        return number(value, digits, "m" if key.endswith("_m") else "")
+    return percent(value) if _SCORES.get(key, True) else number(value)
 
 
 def _track_rows(report: LogReport) -> list[dict[str, Any]]:

@@ -124,11 +124,12 @@ def enumeration(message: Any, prefix: str = "") -> Mapping[int, str]:
 
     Names are in lower case, without the prefix; "unknown" is "". Empty where there are no constants, as in JSON.
     """
-    return _constants(type(message), prefix)
+    kind: Any = type(message)
+    return _constants(kind, prefix)
 
 
 @lru_cache(maxsize=64)
-def _constants(kind: type, prefix: str) -> Mapping[int, str]:
+def _constants(kind: Any, prefix: str) -> Mapping[int, str]:
     whole = {name: value for name, value in vars(kind).items() if name.isupper() and isinstance(value, int)}
     found = {value: name.removeprefix(prefix).lower() for name, value in whole.items() if name.startswith(prefix)}
     return {value: "" if name == "unknown" else name for value, name in found.items()}
