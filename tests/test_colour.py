@@ -75,5 +75,5 @@ def test_an_unknown_kind_of_picture_is_refused(tmp_path, monkeypatch):
         "from tests.test_colour import Plain\nclass Odd(Plain):\n    colour = 'hsv'\n", encoding="utf-8"
     )
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(McaptrackError, match=r"detector odd_detector:Odd.*colour is one of bgr, grey"):
+    with pytest.raises(McaptrackError, match=r"detector odd_detector:Odd.*has colour = 'hsv'; it is 'bgr' or 'grey'"):
         STAGES["detect"].find("odd_detector:Odd")
