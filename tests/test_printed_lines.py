@@ -181,7 +181,7 @@ def test_where_results_are_is_said_where_that_needs_a_reason(because, to, said):
 
 def channel(number: int, **more: Any) -> dict[str, Any]:
     plain = {"topic": f"/{number}", "input": f"/{number - 1}", "transform": "track", "plugins": None}
-    return plain | {"stale": False, "parameters": None} | more
+    return plain | {"stale": False, "parameters": None, "frame": None} | more
 
 
 def depths(channels: list[dict[str, Any]]) -> dict[str, int]:
@@ -805,7 +805,7 @@ class TestQuery:
 
 def test_a_channel_that_results_replace_is_said_and_drawn_once():
     described = {"schema": "S", "messages": 1234, "replaced": False, "transform": None, "input": None, "plugins": None}
-    described |= {"stale": False, "parameters": {"b": 1, "a": 2}}
+    described |= {"stale": False, "parameters": {"b": 1, "a": 2}, "frame": None}
     data = {
         "log": "a\x1b.mcap",
         "bytes": 12345,
