@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import sys
@@ -119,6 +120,38 @@ def test_a_package_that_is_installed_later_is_known(installed):
     assert registry.distribution_of("fresh") == ("", "")
     package(installed, "fresh", "3", "mcaptrack.trackers", {})
     assert registry.distribution_of("fresh.part") == ("fresh", "3")
+
+
+@pytest.mark.parametrize("layout", ["", "src"])
+@pytest.mark.parametrize("is_editable", [True, False])
+def test_a_package_that_is_installed_as_editable_is_known_by_its_modules(
+    installed, tmp_path, monkeypatch, layout, is_editable
+):
+    """What pip leaves of it: metadata among the installed packages, and its folder on the path."""
+    project = tmp_path / "a project"
+    place = project / layout / "own_trackers_edited"
+    place.mkdir(parents=True)
+    (place / "__init__.py").write_text("")
+    (place / "part.py").write_text(PLUGIN)
+    environment = project / ".venv" / "packages"
+    environment.mkdir(parents=True)
+    (environment / "beside_the_project.py").write_text(PLUGIN)
+    for folder in (place.parent, environment):
+        monkeypatch.syspath_prepend(str(folder))
+    package(installed, "own-edited", "0.7", "mcaptrack.trackers", {"edited": "own_trackers_edited.part:Nearest"})
+    info = installed / "own_edited-0.7.dist-info"
+    (info / "top_level.txt").unlink()  # hatchling and others write none
+    (info / "RECORD").write_text("_own_edited.pth,,\n")
+    url = {"url": project.as_uri(), "dir_info": {"editable": True} if is_editable else {}}
+    (info / "direct_url.json").write_text(json.dumps(url))
+    known = ("own-edited", "0.7") if is_editable else ("", "")
+    by_class, by_name = find("tracker", "own_trackers_edited.part:Nearest"), find("tracker", "edited")
+    assert (by_class.distribution, by_class.version) == known
+    assert (by_name.module, by_name.distribution, by_name.version) == (by_class.module, "own-edited", "0.7")
+    other = find("tracker", "beside_the_project:Nearest")
+    assert (other.distribution, other.version) == ("", "")
+    for name in ("own_trackers_edited", "own_trackers_edited.part", "beside_the_project"):
+        del sys.modules[name]
 
 
 def test_an_entry_point_may_name_extras(installed):
@@ -378,3 +411,21 @@ def test_an_exit_without_a_word_is_an_error_that_names_the_package(installed):
         find("tracker", "nearest")
     assert str(refused.value).endswith("can't be imported: RuntimeError: it called os._exit(3)")
     assert os._exit is leave
+
+
+def test_an_import_that_takes_long_is_named_meanwhile(installed, monkeypatch):
+    monkeypatch.setattr(registry, "_LONG_S", 0.05)
+    code = "import time\nfrom mcaptrack.notices import warn\ntime.sleep(0.3)\nwarn('the import ends')\n"
+    (installed / "own_trackers" / "__init__.py").write_text(code + PLUGIN.replace("from __future__", "#"))
+    with notices.collected() as warnings, notices.listening(warnings.append):
+        find("tracker", "nearest")
+        find("tracker", "nearest")  # is imported already
+    words = "the import of tracker nearest (own-trackers 1.5) has taken 0.05 s and goes on; Ctrl-C ends it"
+    assert [notice.message for notice in warnings] == [words, "the import ends"]
+
+
+def test_ctrl_c_ends_an_import_that_does_not_end(installed):
+    code = "import signal, time\nsignal.raise_signal(signal.SIGINT)\ntime.sleep(60)\n"
+    (installed / "own_trackers" / "__init__.py").write_text(code)
+    with pytest.raises(KeyboardInterrupt):
+        find("tracker", "nearest")

@@ -24,16 +24,15 @@ from __future__ import annotations
 
 import difflib
 import os
-import re
 import signal
 import sys
 import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
+from contextvars import copy_context
 from dataclasses import dataclass
-from functools import lru_cache
 from importlib import import_module
-from importlib.metadata import Distribution, EntryPoint, PackageNotFoundError, distributions, packages_distributions
+from importlib.metadata import EntryPoint
 from pathlib import Path
 from traceback import extract_tb
 from types import MappingProxyType
@@ -42,11 +41,14 @@ from typing import Any, Final, Literal, NoReturn, get_args
 from mcaptrack import __version__
 from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import warn
+from mcaptrack.registry.distributions import distribution_of, entry_points, package_of
 
 Kind = Literal["detector", "tracker", "predictor", "retracker", "fuser"]
 KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
 _OWN: Final = "mcaptrack"
-_FOLDER: Final = Path(__file__).parent
+_FOLDER: Final = Path(__file__).parent.parent
+#: After so long the import of another package is said to take long.
+_LONG_S: Final = 10.0
 #: Exit codes of processes that end by a signal.
 _SIGNALLED: Final = frozenset(128 + number for number in (signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGHUP", 1)))
 
@@ -127,9 +129,14 @@ class Entry:
         return f"{self.kind} {self.name}" + (f" ({package})" if package and not self.is_built_in else "")
 
 
+def _group(kind: str) -> str:
+    """The group of entry points of a kind."""
+    return f"{_OWN}.{kind}s"
+
+
 def names(kind: Kind) -> tuple[str, ...]:
     """All names of a kind: built-in ones, then those of entry points. Imports nothing."""
-    return (*BUILT_IN[kind], *sorted({point.name for point in _installed(kind)} - set(BUILT_IN[kind])))
+    return (*BUILT_IN[kind], *sorted({point.name for point in entry_points(_group(kind))} - set(BUILT_IN[kind])))
 
 
 def find(kind: Kind, name: str, distribution: str = "") -> Entry:
@@ -165,14 +172,14 @@ def find(kind: Kind, name: str, distribution: str = "") -> Entry:
         with _working_folder():
             found = _load(f"{kind} {name}", name)
         return Entry(name, kind, found, found.__module__, *distribution_of(found.__module__))
-    points = [point for point in _installed(kind) if point.name == name]
+    points = [point for point in entry_points(_group(kind)) if point.name == name]
     if not points:
         raise McaptrackError(_unknown(kind, name))
-    points = [point for point in points if _of_point(point)[0] == distribution] or points
+    points = [point for point in points if package_of(point)[0] == distribution] or points
     if len(points) > 1:
-        values = " and ".join(sorted(f"{point.value} ({' '.join(_of_point(point))})" for point in points))
+        values = " and ".join(sorted(f"{point.value} ({' '.join(package_of(point))})" for point in points))
         raise McaptrackError(f"several installed packages have a {kind} {name}: {values}; name one as module:Class")
-    package = _of_point(points[0])
+    package = package_of(points[0])
     found = _load(f"{kind} {name} ({' '.join(package)})", points[0].value)
     return Entry(name, kind, found, found.__module__, *package)
 
@@ -187,10 +194,10 @@ def entry_of(kind: str, cls: type) -> Entry:
         if where.partition(":")[2] == cls.__qualname__ and _load(name, where) is cls:
             return Entry(name, kind, cls, cls.__module__, _OWN, __version__)
     top = cls.__module__.partition(".")[0]
-    for point in _installed(kind):
+    for point in entry_points(_group(kind)):
         same_package = point.value.partition(":")[0].partition(".")[0] == top
         if same_package and point.name not in built_in and _is(point, cls):
-            return Entry(point.name, kind, cls, cls.__module__, *_of_point(point))
+            return Entry(point.name, kind, cls, cls.__module__, *package_of(point))
     return Entry(f"{cls.__module__}:{cls.__qualname__}", kind, cls, cls.__module__, *distribution_of(cls.__module__))
 
 
@@ -234,83 +241,6 @@ def _words(error: BaseException) -> str:
         return type(error).__name__
 
 
-def distribution_of(module: str) -> tuple[str, str]:
-    """Name and version of the distribution of a module; "" and "" if unknown."""
-    places = tuple((place, _changed_ns(place)) for place in sys.path)
-    found = [name for name in _distributions(places).get(module.partition(".")[0], []) if name]
-    try:
-        return _name_and_version(Distribution.from_name(found[0])) if found else ("", "")
-    except PackageNotFoundError:
-        return "", ""
-
-
-def _changed_ns(place: str) -> int:
-    """The time when a folder of ``sys.path`` last gained or lost an entry; 0 if it is no folder."""
-    try:
-        return Path(place or ".").stat().st_mtime_ns
-    except OSError:
-        return 0
-
-
-@lru_cache(maxsize=2)
-def _distributions(_places: tuple[tuple[str, int], ...]) -> Mapping[str, list[str]]:
-    """The distributions of top-level modules; kept as long as nothing is installed, because all files are searched."""
-    try:
-        return packages_distributions()
-    except Exception:  # metadata of another package that can't be read
-        return {}
-
-
-def _name_and_version(distribution: Distribution | None) -> tuple[str, str]:
-    """Name and version of a distribution; "" for what its metadata lack."""
-    try:
-        found = ("", "") if distribution is None else (distribution.metadata["Name"], distribution.version)
-    except Exception:  # metadata that can't be read
-        return "", ""
-    return found[0] or "", found[1] or ""
-
-
-def _installed(kind: str, unreadable: list[str] | None = None) -> list[EntryPoint]:
-    """The entry points of a kind, without duplicates.
-
-    Packages with entry points that can't be read are left out; their names are added to ``unreadable``.
-    """
-    group = f"{_OWN}.{kind}s"
-    points = [(found, _points(found, group)) for found in distributions()]
-    if not any(point is None or point for _, point in points):
-        return []
-    first: dict[str, tuple[str, list[EntryPoint] | None]] = {}
-    for distribution, found in points:
-        name = _name(distribution)
-        key = name.lower().replace("-", "_") or f"{distribution!r}"
-        first.setdefault(key, (name, found))  # the first one on the path is the one that is imported
-    if unreadable is not None:
-        unreadable += [name for name, found in first.values() if found is None]
-    return [point for _, found in first.values() for point in found or () if ":" not in point.name]
-
-
-def _name(distribution: Distribution) -> str:
-    """Name of a distribution; "" if its metadata lack it. Only their line is read: they may hold a long description."""
-    try:
-        text = distribution.read_text("METADATA") or distribution.read_text("PKG-INFO") or ""
-    except Exception:  # metadata that can't be read
-        return ""
-    found = re.search(r"^Name:[ \t]*(\S+)", text, re.MULTILINE)
-    return found[1] if found else _name_and_version(distribution)[0]
-
-
-def _points(distribution: Distribution, group: str) -> list[EntryPoint] | None:
-    """The entry points of a group that a distribution declares; None if they can't be read."""
-    try:
-        return [point for point in distribution.entry_points if point.group == group]
-    except Exception:  # whatever parsing raises
-        return None
-
-
-def _of_point(point: EntryPoint) -> tuple[str, str]:
-    return _name_and_version(point.dist)
-
-
 def _is(point: EntryPoint, cls: type) -> bool:
     try:
         with _contained(f"the package of {point.name}"):
@@ -348,7 +278,8 @@ def _contained(what: str) -> Iterator[None]:
     """Import code of other packages: what it changes in this process is undone, with a warning.
 
     That is the working folder, to which paths are relative, and the handling of Ctrl-C and SIGTERM. ``os._exit``, which
-    would end the command without a word, raises an exception instead.
+    would end the command without a word, raises an exception instead. An import that doesn't end can't be ended from
+    here, but a warning names it.
     """
     here, process, leave = os.path.realpath("."), os.getpid(), os._exit
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
@@ -358,10 +289,15 @@ def _contained(what: str) -> Iterator[None]:
             leave(status)
         raise RuntimeError(f"it called os._exit({status})")
 
+    words = f"the import of {what} has taken {_LONG_S:g} s and goes on; Ctrl-C ends it"
+    waiting = threading.Timer(_LONG_S, copy_context().run, (warn, words))
+    waiting.daemon = True
     os._exit = refuse
+    waiting.start()
     try:
         yield
     finally:
+        waiting.cancel()
         os._exit = leave
         changed = []
         if os.path.realpath(".") != here:
@@ -390,7 +326,7 @@ def _working_folder() -> Iterator[None]:
 
 def _unknown(kind: Kind, name: str) -> str:
     known, unreadable = names(kind), list[str]()
-    _installed(kind, unreadable)
+    entry_points(_group(kind), unreadable)
     close = difflib.get_close_matches(name, known, 1)
     meant = f"did you mean {close[0]}? " if close else ""
     there = f"there are {', '.join(known)}" if known else f"no {kind} is built in or installed"
