@@ -14,7 +14,7 @@ from mcaptrack.notices import collected
 from mcaptrack.predictors import entry_of
 from mcaptrack.predictors.checked import CheckedPredictor
 from mcaptrack.registry import Entry
-from mcaptrack.schema import DETECTIONS, TRACKS, Frame
+from mcaptrack.schema import BOX_PX, DETECTIONS, PLACE_M, TRACKS, Frame
 from mcaptrack.transforms.guarded import guarded
 
 ROWS = TRACKS.rows(
@@ -84,6 +84,12 @@ def test_rows_in_any_layout_become_rows_of_the_schema(rows):
     assert str(TRACKS.joined([frame.rows for (frame,) in made]).tolist()) == str(ROWS.tolist() * 4)
 
 
+@pytest.mark.parametrize("columns", [BOX_PX, PLACE_M])
+def test_a_row_may_have_a_box_or_a_position_alone(columns):
+    rows = changed(**{name: [np.nan, 1] for name in columns})
+    assert str(answers(one(rows=rows))[3][0].rows.tolist()) == str(rows.tolist())
+
+
 def test_a_box_may_have_no_size():
     assert answers(one(rows=changed(w_px=[0, 0])))[0][0].rows["w_px"].tolist() == [0, 0]
 
@@ -127,11 +133,14 @@ def test_a_buffer_that_is_used_again_does_not_change_earlier_frames():
         (one(rows=None), "gave rows at frame 0 (0 ns) that are a NoneType, no NumPy array"),
         (one(rows=ROWS.reshape(1, -1)), "needs a structured array (N,), not an array of shape (1, 2) with columns"),
         (one(rows=np.zeros((2, 6))), "needs a structured array (N,), not an array of shape (2, 6) without columns"),
-        (one(rows=changed(track_id=[7, 7])), "track_id 7 stands in 2 rows of one frame; a track has one"),
-        (one(rows=changed(track_id=[7, -1])), "mcaptrack.Tracks.track_id is -1 in row 1; ids are not below 0"),
-        (one(rows=changed(w_px=[3, -2])), "mcaptrack.Tracks.w_px is -2 in row 1; sizes are not below 0"),
-        (one(rows=changed(h_px=[-0.5, 2])), "mcaptrack.Tracks.h_px is -0.5 in row 0; sizes are not below 0"),
-        (one(rows=changed(y_m=[0, np.inf])), "mcaptrack.Tracks.y_m is infinite in row 1"),
+        (one(rows=changed(track_id=[7, 7])), "that are wrong: in row 1 track_id 7 stands in 2 rows of one frame; a track has one"),
+        (one(rows=changed(track_id=[7, -1])), "that are wrong: in row 1 track_id is -1; ids are not below 0"),
+        (one(rows=changed(w_px=[3, -2])), "in row 1 w_px is -2; sizes are not below 0"),
+        (one(rows=changed(h_px=[-0.5, 2])), "in row 0 h_px is -0.5; sizes are not below 0"),
+        (one(rows=changed(y_m=[0, np.inf])), "in row 1 y_m is infinite"),
+        (one(rows=changed(y_m=[0, np.nan])), "in row 1 there is only a part of x_m, y_m"),
+        (one(rows=changed(h_px=[np.nan, 1])), "in row 0 there is only a part of x_px, y_px, w_px, h_px"),
+        (one(rows=changed(**{name: [1, np.nan] for name in BOX_PX + PLACE_M})), "in row 1 there is neither a box nor"),
     ],
 )  # fmt: skip
 def test_what_can_not_be_is_refused_with_its_place(answer, said):

@@ -10,13 +10,13 @@ from operator import index as as_index
 from typing import Any, Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.clocks import LAST_NS
 from mcaptrack.notices import warn
-from mcaptrack.schema import BOX_PX, DETECTIONS, PLACE_M, SCORES_NEEDED, SIZES, TRACKS, Frame, Rows, Schema
+from mcaptrack.schema import BOX_PX, DETECTIONS, SCORES_NEEDED, TRACKS, Frame, Rows, Schema
+from mcaptrack.schema.impossible import first_impossible
 
 BoxFormat = Literal["xyxy", "xywh"]
 #: The frame number of a frame that was not numbered; ``Recording.write`` gives it one.
@@ -130,29 +130,13 @@ def _rows(schema: Schema, given: Mapping[str, Any], count: int, where: str) -> R
 
 
 def check_frames(schema: Schema, frames: Sequence[Frame]) -> None:
-    """Raise McaptrackError, for the first such row, if boxes or positions are no boxes or positions."""
+    """Raise McaptrackError for the first row that can't be; warn of scores that trackers can't use."""
     rows = schema.joined([frame.rows for frame in frames])
     of = np.repeat(np.arange(len(frames)), [len(frame.rows) for frame in frames])
-
-    def refuse(wrong: NDArray[np.bool_], words: str) -> None:
-        if wrong.any():
-            at = int(wrong.argmax())
-            number = at - int(np.searchsorted(of, of[at]))
-            values = ", ".join(f"{name} {rows[name][at]}" for name in rows.dtype.names or ())
-            raise McaptrackError(f"row {number} of the frame at {frames[of[at]].t_ns} ns {words}: {values}")
-
-    names = [name for name in rows.dtype.names or () if rows.dtype[name].kind == "f"]
-    refuse(np.any([np.isinf(rows[name]) for name in names], axis=0), "has an infinite number")
-    refuse(np.any([rows[name] < 0 for name in SIZES], axis=0), "has a box of negative size")
-    box, place = (np.sum([np.isfinite(rows[name]) for name in some], axis=0) for some in (BOX_PX, PLACE_M))
-    refuse((box % 4 > 0) | (place % 2 > 0), "has a part of a box or of a position")
-    refuse((box == 0) & (place == 0), "has neither a box nor a position")
-    if schema is TRACKS:
-        refuse(rows["track_id"] < 0, "has a negative track_id")
-        order = np.lexsort((rows["track_id"], of))
-        again = np.zeros(len(rows), bool)
-        again[order[1:]] = (np.diff(of[order]) == 0) & (np.diff(rows["track_id"][order]) == 0)
-        refuse(again, "has a track_id that another row of this frame has")
+    if found := first_impossible(schema, rows, of):
+        at, words = found
+        number = at - int(np.searchsorted(of, of[at]))
+        raise McaptrackError(f"the frame at {frames[of[at]].t_ns} ns: in row {number} {words}")
     odd = (rows["score"] < 0) | (rows["score"] > 1)
     if odd.any():
         low, high = np.nanmin(rows["score"]), np.nanmax(rows["score"])

@@ -11,7 +11,8 @@ import numpy as np
 from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import warn
 from mcaptrack.registry import Entry, failure, is_interruption
-from mcaptrack.schema import SCORES_NEEDED, SIZES, TRACKS, Frame, Rows, Schema
+from mcaptrack.schema import SCORES_NEEDED, Frame, Schema
+from mcaptrack.schema.impossible import first_impossible
 from mcaptrack.transforms.protocol import Transform, traits_of
 
 #: Kinds with a main output of one frame for each frame that is read, at its time and with its number.
@@ -165,24 +166,7 @@ def _checked_frame(entry: Entry, frame: Frame, schema: Schema, last_ns: int | No
         rows = schema.rows(**{name: rows[name] for name in schema.dtype.names or ()})
     except ValueError as error:
         raise McaptrackError(f"{entry} gave rows {where} that are wrong: {error}") from None
-    if problem := _problem(schema, rows):
-        raise McaptrackError(f"{entry} gave rows {where} that are wrong: {problem}")
+    if found := first_impossible(schema, rows):
+        row, problem = found
+        raise McaptrackError(f"{entry} gave rows {where} that are wrong: in row {row} {problem}")
     return Frame(t_ns, index, rows)
-
-
-def _problem(schema: Schema, rows: Rows) -> str:
-    """Describe the first impossible value, such as a negative size; "" if all values are possible."""
-    for name in rows.dtype.names or ():
-        if rows.dtype[name].kind == "f" and np.isinf(rows[name]).any():
-            return f"{schema.name}.{name} is infinite in row {int(np.isinf(rows[name]).argmax())}"
-        if name in SIZES and (rows[name] < 0).any():
-            first = int((rows[name] < 0).argmax())
-            return f"{schema.name}.{name} is {rows[name][first]:g} in row {first}; sizes are not below 0"
-    if schema is TRACKS:
-        if (rows["track_id"] < 0).any():
-            first = int((rows["track_id"] < 0).argmax())
-            return f"{schema.name}.track_id is {rows['track_id'][first]} in row {first}; ids are not below 0"
-        ids, counts = np.unique(rows["track_id"], return_counts=True)
-        if (counts > 1).any():
-            return f"track_id {ids[counts.argmax()]} stands in {counts.max()} rows of one frame; a track has one"
-    return ""
