@@ -10,6 +10,14 @@ changes, in `.mutants_cache/`. A mutant then runs only the tests that run its li
 fails has to fail a second time, alone.
 
     python -m tools.mutants mcaptrack/transforms/retrack --count 40 --seed 3
+
+Records are good only if nothing else keeps the machine busy while they are made: a test that fails then leaves its file
+without a record. `--count 0` makes the missing ones and tries no mutant, so that they can be made beforehand:
+
+    python -m tools.mutants --count 0
+    python -m tools.mutants mcaptrack/cli --count 40 --stale --verbose | tee mutants.log
+
+Each result is printed as soon as it is known, so a run that is ended early has lost none.
 """
 
 from __future__ import annotations
@@ -190,7 +198,7 @@ def difference(mutant: Mutant) -> Iterator[str]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("places", nargs="*", default=["mcaptrack/transforms"], help="files and folders to change")
     parser.add_argument("--count", type=int, default=40, help="how many mutants")
     parser.add_argument("--seed", type=int, default=1, help="random seed")
@@ -227,5 +235,6 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    sys.stdout.reconfigure(line_buffering=True)  # also into a file or a pipe
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     main()
