@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from mcaptrack.errors import McaptrackError
+from mcaptrack.geometry.affine import IDENTITY
 from mcaptrack.geometry.assignment import assign
 from mcaptrack.geometry.boxes import columns_to_boxes, iou
 from mcaptrack.geometry.clocks import FrameClock
@@ -13,7 +14,7 @@ from mcaptrack.notices import collected
 from mcaptrack.schema import Frame
 from mcaptrack.sources.synthetic import SyntheticScene
 from mcaptrack.transforms import STAGES, FrameDifferenceDetector, KnnDetector, Mog2Detector, MotionDetector
-from mcaptrack.transforms.detect.background import _PersonHeight, halve
+from mcaptrack.transforms.detect.background import _PersonHeight, clear_border, halve
 from mcaptrack.transforms.detect.foreground import FrameDifference
 from mcaptrack.transforms.detect.registration import Registration
 from tests.worlds import ns, small_scene
@@ -189,6 +190,25 @@ def test_the_height_of_people_is_the_median_height_weighted_by_area():
     assert height.update(masks[1]) == 10.0  # 480 against 1000 px^2
     assert height.update(masks[1]) == 10.0  # 960
     assert height.update(masks[1]) == 40.0  # 1440
+
+
+@pytest.mark.parametrize(
+    ("motion", "border"),
+    [
+        ([[1, 0, 3.2], [0, 1, -1.5]], 5),
+        ([[1, 0, 0.4], [0, 1, -7.0]], 8),
+        ([[1.1, 0, 0], [0, 1.1, 0]], 17),
+        ([[0.9, 0, 8], [0, 0.9, 6]], 9),
+    ],
+)
+def test_a_border_as_wide_as_the_farthest_corner_moves_is_cleared(motion, border):
+    """Of a picture of 160x120 pixels, and a pixel more."""
+    cleared = clear_border(np.full((120, 160), 255, np.uint8), np.array(motion, float))
+    wanted = np.zeros((120, 160), np.uint8)
+    wanted[border : 120 - border, border : 160 - border] = 255
+    assert (cleared == wanted).all()
+    mask = np.full((4, 6), 255, np.uint8)
+    assert clear_border(mask, IDENTITY) is mask
 
 
 def test_no_detections_where_more_than_half_of_the_picture_differs():

@@ -1,0 +1,800 @@
+"""3D labels at their limits: the last number that is taken and the first one that is refused, and all that is said."""
+
+from __future__ import annotations
+
+import json
+import math
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from pyarrow import feather
+from scipy.spatial.transform import Rotation
+
+from mcaptrack import log, notices
+from mcaptrack.errors import McaptrackError
+from mcaptrack.sources.ingest import IngestOptions, ingest
+from mcaptrack.sources.ingest.labels.boxes_3d.reading import is_3d, read_boxes_3d
+from mcaptrack.sources.ingest.labels.boxes_3d.rows import BoxRows3D, TimedLabels, headings, numbered
+from mcaptrack.sources.ingest.labels.wanted import WantedClasses
+
+USUAL = {
+    "t_ns": "1000",
+    "id": "1",
+    "class": "car",
+    "x_m": "1",
+    "y_m": "2",
+    "z_m": "3",
+    "length_m": "4",
+    "width_m": "2",
+    "height_m": "1.5",
+    "heading_rad": "0.5",
+    "score": "0.5",
+}
+
+
+def table(folder: Path, *rows: dict[str, object], name: str = "a.csv", delimiter: str = ",") -> Path:
+    """A table with the columns of the first row."""
+    lines = [rows[0].keys(), *(row.values() for row in rows)]
+    path = folder / name
+    path.write_text("".join(delimiter.join(map(str, line)) + "\n" for line in lines))
+    return path
+
+
+def usual(**changes: object) -> dict[str, object]:
+    return {key: value for key, value in (USUAL | changes).items() if value is not None}
+
+
+def timed(rows: BoxRows3D, role: str = "truth", classes: str | None = None) -> TimedLabels:
+    labelled = rows.labelled if rows.labelled is not None else np.unique(rows.number)
+    return rows.timed(rows.number, labelled, role, WantedClasses(classes) if classes else None)
+
+
+def framed(**changes: object) -> dict[str, object]:
+    """A row with a frame number instead of a time."""
+    return {"frame": "1"} | usual(t_ns=None) | changes
+
+
+#: A column, the numbers that are taken, and those that are not, with the words for the first of them.
+BOUNDS = [
+    ("x_m", ("1e8", "-1e8"), ("1.0000001e8", "-1.0000001e8"), "a coordinate can't be 1e+08; at most 1e+08 m"),
+    ("y_m", ("1e8", "-1e8"), ("1.0000001e8", "-1.0000001e8"), "a coordinate can't be 1e+08; at most 1e+08 m"),
+    ("z_m", ("1e8", "-1e8"), ("1.0000001e8", "-1.0000001e8"), "a coordinate can't be 1e+08; at most 1e+08 m"),
+    ("x_m", (), ("", "nan", "inf"), "x or y of the box is missing or not finite"),
+    ("y_m", (), ("", "-inf"), "x or y of the box is missing or not finite"),
+    ("z_m", (), ("", "inf"), "a number of the box is missing or not finite"),
+    ("heading_rad", ("12.56", "-12.56"), ("12.57", "-12.57"), "a heading of 12.57 is not in radians"),
+    ("length_m", ("0",), ("-0.001", "", "inf"), "a size can't be -0.001"),
+    ("width_m", ("0",), ("-0.001", "nan"), "a size can't be -0.001"),
+    ("height_m", ("0",), ("-0.001", "x"), "a size can't be -0.001"),
+    ("score", ("1e9", "-1e9", ""), ("1.1e9", "-1.1e9"), "a score can't be 1.1e+09"),
+    ("t_ns", ("0", str(2**63 - 1)), ("-1", str(2**63)), "-1 in the column of times is not from 1970 to 2262"),
+    ("t_ns", ("999.4",), ("", "noon", "inf"), "'' in the column of times is no number"),
+    ("frame", ("0", str(2**31 - 1)), (str(2**31), "-1", "0.5", ""), "a frame can be 0 to 2147483647, not 2147483648"),
+]
+TRIED = [(column, value, "") for column, taken, _, _ in BOUNDS for value in taken] + [
+    (column, value, words if value == refused[0] else ":3: ")
+    for column, _, refused, words in BOUNDS
+    for value in refused
+]
+
+
+@pytest.mark.parametrize(("column", "value", "words"), TRIED)
+def test_a_number_is_taken_up_to_its_bound_and_no_further(column, value, words, tmp_path):
+    row = framed if column == "frame" else usual
+    others = [row(id=2), row(id=1, **{column: value}), row(id=2, frame="7") if row is framed else row(id=2, t_ns=7)]
+    path = table(tmp_path, *others)
+    if words:
+        with pytest.raises(McaptrackError) as refused:
+            read_boxes_3d(path, "truth")
+        assert words in str(refused.value)
+        assert f"{path}:3: " in str(refused.value)
+        return
+    rows = read_boxes_3d(path, "truth")
+    if column == "score":
+        np.testing.assert_equal(rows.score, [0.5, float(value or "nan"), 0.5])
+    elif column in ("t_ns", "frame"):
+        assert rows.number[1] == int(value.partition(".")[0])
+    else:
+        found = rows.boxes[1, ("x_m", "y_m", "z_m", "length_m", "width_m", "height_m", "heading_rad").index(column)]
+        assert found == pytest.approx(
+            math.remainder(float(value), 2 * math.pi) if "heading" in column else float(value)
+        )
+
+
+@pytest.mark.parametrize(
+    ("lengths", "refused"),
+    [
+        ([0.06, 0.04], ""),
+        ([0.049, 0.049], "0.049"),
+        ([60, 60], ""),
+        ([61, 61], "61"),
+        ([0.01, 7, 0.02], "0.02"),
+        ([900, 7, 900], "900"),
+        ([900, 7, 8], ""),
+    ],
+)
+def test_the_median_length_tells_whether_sizes_are_metres(lengths, refused, tmp_path):
+    rows = [usual(id=n, length_m=length, width_m=0.001, height_m=0.001) for n, length in enumerate(lengths)]
+    path = table(tmp_path, *rows)
+    if not refused:
+        assert read_boxes_3d(path, "truth").boxes[:, 3].tolist() == lengths
+        return
+    with pytest.raises(McaptrackError) as error:
+        read_boxes_3d(path, "truth")
+    assert str(error.value) == f"{path}: the median length of its boxes is {refused}; sizes have to be in metres"
+
+
+def test_rows_without_sizes_or_heights_are_boxes_too(tmp_path):
+    rows = [{"t": n / 4, "id": 5, "x_m": n, "y_m": -n} for n in range(3)]
+    found = read_boxes_3d(table(tmp_path, *rows), "truth")
+    assert found.boxes[:, :2].tolist() == [[0, 0], [1, -1], [2, -2]]
+    assert np.isnan(found.boxes[:, 2:]).all()
+    assert found.t_ns.tolist() == [0, 250_000_000, 500_000_000]
+    assert not found.doubts
+
+
+@pytest.mark.parametrize(
+    ("ids", "wanted"),
+    [
+        (["7", "3"], [7, 3]),
+        (["7.0", "3"], [7, 3]),
+        (["0", "0009"], [0, 9]),
+        ([str(10**15), "9" * 16], [10**15, 10**16 - 1]),
+        ([str(10**16), "1"], [1, 2]),
+        (["1.5", "1", "1.5"], [1, 2, 1]),
+        (["b", "a", "b", "c"], [1, 2, 1, 3]),
+        (["²", "1"], [1, 2]),
+        ([], []),
+    ],
+)
+def test_ids_are_numbers_or_are_numbered_as_they_come(ids, wanted):
+    found, are_numbers = numbered(ids)
+    assert found.tolist() == wanted
+    assert are_numbers == all(one.isascii() and one.removesuffix(".0").isdigit() and len(one) < 17 for one in ids)
+
+
+@pytest.mark.parametrize(
+    ("rows", "words"),
+    [
+        ([usual(), usual(id="")], "a.csv:3: the id is missing; truth need ids"),
+        ([usual(), usual(id="-1")], "a.csv:3: the id is missing; truth need ids"),
+        ([usual(), usual()], "a.csv:3: id 1 appears twice at one time"),
+        ([usual(id="b"), usual(id="a"), usual(id="b")], "a.csv:4: id 1 appears twice at one time"),
+        ([framed(), framed(frame=2), framed()], "a.csv:4: id 1 appears twice at frame 1"),
+        ([usual(id=""), usual(id="none")], "a.csv has no ids; truth need ids"),
+        (
+            [usual(id=n, t_ns=n) for n in (1, 2)],
+            "a.csv: every row has another id, so that these number rows, not tracks",
+        ),
+    ],
+)
+def test_each_id_is_there_once_in_a_frame(rows, words, tmp_path):
+    path = table(tmp_path, *rows)
+    with pytest.raises(McaptrackError) as refused:
+        read_boxes_3d(path, "truth")
+    assert str(refused.value) == f"{path.parent}/{words}"
+    found = read_boxes_3d(path, "detections")
+    assert timed(found, "detections").track_id.tolist() == [-1] * len(rows)
+
+
+def test_every_id_may_be_there_once_in_a_single_frame(tmp_path):
+    assert read_boxes_3d(table(tmp_path, usual(id=4), usual(id=9)), "truth").track_id.tolist() == [4, 9]
+
+
+# Doubts about the axes
+
+
+def spread(step: tuple[float, float, float], count: int = 21) -> list[dict[str, object]]:
+    """One track on a line: 5 to 95 % of it are 18 of 20 steps."""
+    place = [tuple(round(n * one, 6) for one in step) for n in range(count)]
+    return [usual(t_ns=n * 10**9, x_m=x, y_m=y, z_m=z, heading_rad=0) for n, (x, y, z) in enumerate(place)]
+
+
+@pytest.mark.parametrize(
+    ("step", "words"),
+    [
+        ((0.16, 0.5, 1.12), "positions spread over 20 m along z, and 2.9 m along x"),
+        ((0.5, 0.16, 1.12), "positions spread over 20 m along z, and 2.9 m along y"),
+        ((0.02, 0.01, 2.0), "positions spread over 36 m along z, and 0.2 m along y"),
+        ((0.16, 0.5, 1.1), ""),
+        ((0.17, 0.5, 1.12), ""),
+        ((0.5, 0.17, 1.12), ""),
+    ],
+)
+def test_flat_positions_along_x_or_y_are_doubted(step, words, tmp_path):
+    path = table(tmp_path, *spread(step))
+    doubts = [one for one, code in read_boxes_3d(path, "truth").doubts if "along z" in one and code == "other"]
+    assert doubts == ([f"{path}: {words}; z has to be the vertical axis"] if words else [])
+
+
+@pytest.mark.parametrize(
+    ("speed", "heading", "count", "across"),
+    [
+        (2.0, 1.5, 21, 20),
+        (2.0, 1.5, 20, 0),
+        (1.01, 1.5, 21, 20),
+        (0.99, 1.5, 21, 0),
+        (2.0, 0.79, 21, 20),
+        (2.0, 0.78, 21, 0),
+        (2.0, -0.79, 21, 20),
+        (2.0, -0.78, 21, 0),
+        (2.0, math.pi - 0.79, 21, 20),
+        (2.0, math.pi - 0.78, 21, 0),
+        (2.0, 0.78 - math.pi, 21, 0),
+    ],
+)
+def test_objects_that_move_across_their_heading_are_doubted(speed, heading, count, across, tmp_path):
+    """Of one track; another stands still, and a step from one track to the other is none."""
+    rows = [usual(t_ns=n * 500_000_000, x_m=n * speed / 2, y_m=5, heading_rad=heading) for n in range(count)]
+    rows += [usual(id=9, t_ns=n * 500_000_000, x_m=-50, y_m=50, heading_rad=heading) for n in range(30)]
+    path = table(tmp_path, *rows[::-1])
+    doubts = [one for one, _ in read_boxes_3d(path, "truth").doubts if "across" in one]
+    words = f"{path}: {across} of {count - 1} boxes of moving objects move across their heading"
+    assert [one.partition(";")[0] for one in doubts] == ([words] if across else [])
+
+
+@pytest.mark.parametrize(("turned", "is_odd"), [(20, False), (21, True)])
+def test_half_of_the_moving_objects_may_move_across_their_heading(turned, is_odd, tmp_path):
+    """Their headings count at the beginning of each step."""
+    rows = [usual(t_ns=n * 10**9, x_m=5 * n, heading_rad=1.5 * (n < turned)) for n in range(41)]
+    doubts = read_boxes_3d(table(tmp_path, *rows), "truth").doubts
+    assert ["21 of 40 boxes" in one for one, _ in doubts] == [True] * is_odd
+
+
+# Classes
+
+
+@pytest.mark.parametrize(
+    ("names", "ids", "classes", "said"),
+    [
+        (["car", "Person", "truck", "car"], [2, 1, 3, 2], {1: "Person", 2: "car", 3: "truck"}, ""),
+        (["van", "Bus"], [3, 2], {2: "Bus", 3: "van"}, ""),
+        (["Car", "car", "CAR"], [2, 2, 2], {2: "Car"}, ""),
+        (["pedestrian", "human"], [1, 1], {1: "pedestrian"}, ""),
+        (["7", "1", "0"], [7, 1, 0], {}, "has no class names; class 1 is taken as people"),
+        (["999999999", "2"], [999999999, 2], {}, "has no class names; class 1 is taken as people"),
+        (["1234567890", "2"], [2, 3], {2: "1234567890", 3: "2"}, ""),
+        (["car", ""], [2, 0], {2: "car"}, "1 boxes without a class have class_id 0"),
+        (["", "none", "x"], [0, 0, 2], {2: "x"}, "2 boxes without a class have class_id 0"),
+    ],
+)
+def test_classes_are_people_and_others_by_name(names, ids, classes, said, tmp_path):
+    path = table(tmp_path, *(usual(id=n, **{"class": name}) for n, name in enumerate(names)))
+    rows = read_boxes_3d(path, "truth")
+    found = timed(rows)
+    assert (found.class_id.tolist(), found.classes) == (ids, classes)
+    assert rows.doubts == ([(f"{path}: {said}" if said[0].isdigit() else f"{path} {said}", "classes")] if said else [])
+
+
+def test_a_table_without_classes_says_so(tmp_path):
+    rows = read_boxes_3d(table(tmp_path, usual(**{"class": None})), "truth")
+    assert timed(rows).class_id.tolist() == [0]
+    assert f"{rows.path} states no classes; class_id is 0" in rows.remarks
+
+
+@pytest.mark.parametrize("kinds", [8, 9, 11])
+def test_eight_classes_that_are_left_out_are_listed(kinds, tmp_path):
+    others = [usual(id=100 * k + n, **{"class": f"k{k:02}"}) for k in range(kinds) for n in range(20 - k)]
+    path = table(tmp_path, *others, usual(id=9999, **{"class": "person"}))
+    rows = read_boxes_3d(path, "truth")
+    assert timed(rows, classes="person").track_id.tolist() == [9999]
+    listed = ", ".join(f"{20 - k} k{k:02}" for k in range(8))
+    more = sum(20 - k for k in range(8, kinds))
+    assert rows.left_out == listed + (f", {more} of other classes" if more else "")
+    rows = read_boxes_3d(path, "detections")
+    assert len(timed(rows, "detections", "person").t_ns) == 1
+    assert not rows.left_out
+
+
+# Quaternions
+
+
+def turned(**angles: float) -> np.ndarray:
+    """w, x, y, z of a rotation by angles in degrees."""
+    rotation = Rotation.from_euler("zyx", [angles.get(axis, 0) for axis in "zyx"], degrees=True)
+    return rotation.as_quat()[[3, 0, 1, 2]]
+
+
+def test_headings_are_those_of_scipy():
+    rng = np.random.default_rng(5)
+    angles = np.column_stack([rng.uniform(-180, 180, 40), rng.uniform(-30, 30, (40, 2))])
+    rotation = Rotation.from_euler("zyx", angles, degrees=True)
+    lengths = rng.uniform(0.91, 1.09, (40, 1))
+    heading, tilt = headings(rotation.as_quat()[:, [3, 0, 1, 2]] * lengths, Path("a"), str)
+    forward, up = rotation.apply([1, 0, 0]), rotation.apply([0, 0, 1])
+    np.testing.assert_allclose(heading, np.arctan2(forward[:, 1], forward[:, 0]), atol=1e-12)
+    np.testing.assert_allclose(tilt, np.arccos(up[:, 2]), atol=1e-7)
+    assert [len(one) for one in headings(np.empty((0, 4)), Path("a"), str)] == [0, 0]
+
+
+@pytest.mark.parametrize("length", [0.0, 0.89, 1.11, math.nan])
+def test_quaternions_have_the_length_1(length):
+    quaternions = np.stack([turned(z=5), turned(z=9) * length, turned(z=7) * 3])
+    with pytest.raises(McaptrackError, match=rf"^row 1: a quaternion of length {length:g} is no rotation$"):
+        headings(quaternions, Path("a"), lambda row: f"row {row}")
+
+
+@pytest.mark.parametrize(("tilts", "degrees"), [((44, 44, 90), 0), ((46, 46, 0), 46), ((0, 0, 180), 0)])
+def test_z_of_most_boxes_is_up(tilts, degrees):
+    quaternions = np.stack([turned(z=20, y=tilt) for tilt in tilts])
+    if not degrees:
+        np.testing.assert_allclose(np.degrees(headings(quaternions, Path("a"), str)[1]), tilts, atol=1e-5)
+        return
+    with pytest.raises(McaptrackError) as refused:
+        headings(quaternions, Path("a"), str)
+    assert str(refused.value) == f"a: z of the boxes is {degrees} degrees from up; it has to be up"
+
+
+def test_quaternions_of_rows_without_a_box_do_not_count(tmp_path):
+    four = dict(zip(("qw", "qx", "qy", "qz"), turned(z=30), strict=True))
+    rows = [{"t": n, "id": 1, "x_m": n, "y_m": 0, "z_m": 0} | four for n in range(3)]
+    rows[1] = dict.fromkeys(rows[0], "") | {"t": 1, "id": 1}
+    found = read_boxes_3d(table(tmp_path, *rows), "truth")
+    np.testing.assert_allclose(found.boxes[:, 6], np.radians([30, 30]))
+    assert found.labelled.tolist() == [0, 10**9, 2 * 10**9]
+    rows[2] |= {"qw": 3}
+    with pytest.raises(McaptrackError, match=r"a\.csv:4: a quaternion of length"):
+        read_boxes_3d(table(tmp_path, *rows), "truth")
+
+
+# Tables
+
+
+@pytest.mark.parametrize(
+    ("header", "is_one"),
+    [
+        ("frame,id,x_m,y_m", True),
+        ("frame,id,x_m,south", False),
+        ("frame,id,x1,z_m", True),
+        ("t,id,u,tz_m", True),
+        ("frame,id,w,length_m", True),
+        ("a,b,c,Heading (rad)", True),
+        ("a,b,c,heading_deg", True),
+        ("t,x,y,z,yaw", True),
+        ("t,x,y,z,qw", True),
+        ("t,x,y,z,speed", False),
+        ("t,x,y,yaw,w,h", False),
+        ("frame,left,top,width,height", False),
+        ("1,2,3,4,5,6", False),
+        ("frame,x_m,y_m", False),
+    ],
+)
+def test_a_table_of_3d_boxes_is_known_by_its_header(header, is_one, tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text(header + "\n")
+    assert is_3d(path) == is_one
+    assert is_3d(path, "csv") == is_one
+    assert not is_3d(path, "mot")
+    assert is_3d(path, "kitti-3d")
+    assert is_3d(path, columns={"x_m": "north"})
+    assert is_3d(path, columns={"x": "left"}) == is_one
+
+
+def test_what_is_no_text_is_no_table_of_3d_boxes(tmp_path):
+    for name, content in (("a.csv", b"frame,id,x_m,y_m\n\0"), ("b.csv", b"frame,id,x_m,y_m,\xff\n"), ("c.csv", b"")):
+        (tmp_path / name).write_bytes(content)
+        assert not is_3d(tmp_path / name)
+    assert not is_3d(tmp_path / "none.csv")
+    assert not is_3d(tmp_path)
+    (tmp_path / "annotations.feather").write_bytes(b"")
+    assert is_3d(tmp_path)
+    assert is_3d(tmp_path / "annotations.feather")
+    assert not is_3d(tmp_path, "mot")
+
+
+#: Tables with several columns for one thing: which of them are read, and which aren't.
+CHOICES = [
+    ("t,frame,id,x_m,y_m,heading_rad,heading_deg", "t=t in s, id=id, x_m=x_m, y_m=y_m, heading_rad=heading_rad", "frame, heading_deg"),
+    ("t,id,x_m,y_m,heading_deg,qw,qx,qy,qz", "t=t in s, id=id, x_m=x_m, y_m=y_m, heading_deg=heading_deg", "qw, qx, qy, qz"),
+    ("t,id,x_m,y_m,qw,qx,qz", "t=t in s, id=id, x_m=x_m, y_m=y_m", "qw, qx, qz"),
+    ("t,id,x_m,y_m,class,class_name", "t=t in s, id=id, x_m=x_m, y_m=y_m, name=class_name", "class"),
+    ("t,id,x_m,y_m,x,y,north", "t=t in s, id=id, x_m=x_m, y_m=y_m", "x, y, north"),
+    ("time_ms,id,x_m,y_m,vx,vy", "t=time_ms in ms, id=id, x_m=x_m, y_m=y_m, vx_m_per_s=vx, vy_m_per_s=vy", ""),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("header", "used", "unused"), CHOICES)
+def test_of_columns_that_say_the_same_one_is_read(header, used, unused, tmp_path):
+    row = {name: {"id": 1, "qw": 1, "class": "a", "class_name": "b"}.get(name, 0) for name in header.split(",")}
+    rows = read_boxes_3d(table(tmp_path, row), "truth")
+    (words,) = [one for one in rows.remarks if ": columns " in one]
+    read, _, left = words.removeprefix(f"{rows.path}: columns ").partition("; not read: ")
+    assert sorted(read.split(", ")) == sorted(used.split(", "))
+    assert left == unused
+
+
+def test_a_column_that_is_named_is_read_although_others_say_the_same(tmp_path):
+    row = {"t": 5, "frame": 9, "id": 1, "x_m": 2, "y_m": 3, "heading_rad": 0.5, "heading_deg": 90}
+    rows = read_boxes_3d(table(tmp_path, row), "truth", columns={"frame": "frame", "heading_deg": "heading_deg"})
+    assert rows.t_ns is None
+    assert rows.frame.tolist() == [9]
+    assert rows.boxes[0, 6] == pytest.approx(math.pi / 2)
+    with pytest.raises(McaptrackError, match=r"a\.csv:1: 2 columns are named t, as `columns=` says for x_m"):
+        (tmp_path / "b").mkdir()
+        path = tmp_path / "b" / "a.csv"
+        path.write_text("t,t,x_m,y_m\n1,2,3,4\n")
+        read_boxes_3d(path, "truth", columns={"x_m": "t"})
+
+
+@pytest.mark.parametrize(
+    ("header", "words"),
+    [
+        ("t,id,x_m,y_m,z_cm", ""),
+        ("t,id,x_m,y_m,length (ft)", ""),
+        ("t,id,x,y_m,z", ""),
+        ("t,id,x [mm],y_m,z", "no column for x_m; x [mm] is not in metres"),
+        ("t,id,x_m,y_px,z", "y_px is not in metres"),
+        ("id,x_m,y_m,z", "no column for the time or the frame of boxes; its columns are id, x_m, y_m, z; name it with"),
+    ],
+)
+def test_columns_are_in_metres(header, words, tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text(f"{header}\n{','.join(['1'] * len(header.split(',')))}\n")
+    if not words:
+        assert read_boxes_3d(path, "detections").boxes[0, :2].tolist() == [1, 1]
+        return
+    with pytest.raises(McaptrackError) as refused:
+        read_boxes_3d(path, "detections")
+    assert f"{path}:1: {words}" in str(refused.value)
+
+
+def test_times_are_exact_in_every_unit(tmp_path):
+    for name, text in (
+        ("t", "1.0000000019"),
+        ("t_ms", "1000.0000019"),
+        ("t_us", "1000000.0019"),
+        ("t_ns", "1000000001.9"),
+    ):
+        row = {name: text, "id": 1, "x_m": 0, "y_m": 0}
+        assert read_boxes_3d(table(tmp_path, row), "truth").t_ns.tolist() == [1_000_000_002], name
+
+
+# KITTI
+
+
+def kitti(*lines: str, folder: Path) -> Path:
+    path = folder / "0001.txt"
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+CAR = "3 7 Car 0 0 -10 1 2 3 4 1.5 2 4 3 1.25 9 0.5"
+
+
+def test_a_line_of_kitti_by_hand(tmp_path):
+    walker = "1 2 Pedestrian 0 0 -10 1 2 3 4 1.8 0.5 0.6 -3 1 9 -0.5 0.75"
+    rows = read_boxes_3d(kitti(CAR, walker, folder=tmp_path), "detections", "kitti-3d")
+    half = math.pi / 2
+    np.testing.assert_allclose(
+        rows.boxes, [[9, -3, -0.5, 4, 2, 1.5, -0.5 - half], [9, 3, -0.1, 0.6, 0.5, 1.8, 0.5 - half]], atol=1e-12
+    )
+    np.testing.assert_equal(rows.score, [np.nan, 0.75])
+    assert (rows.frame.tolist(), rows.track_id.tolist(), rows.labelled.tolist()) == ([3, 1], [7, 2], [1, 3])
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        (" ".join(CAR.split()[:16]), "0001.txt:2: not KITTI tracking (frame id type "),
+        (f"{CAR} 1 2", "score), 19 columns: 3 7 Car"),
+        (CAR.replace("3 7", "-1 7"), "0001.txt:2: the frame (a count of pictures, no time) has to be a whole number from 0 on"),
+        (CAR.replace("3 7", "3 -2"), "0001.txt:2: the id has to be a whole number from -1 on, not -2"),
+        (CAR.replace("1.25 9", "nan 9"), "0001.txt:2: a number of the box is missing or not finite"),
+    ],
+)  # fmt: skip
+def test_lines_of_kitti_that_cannot_be_read(line, words, tmp_path):
+    with pytest.raises(McaptrackError) as refused:
+        read_boxes_3d(kitti(CAR, line, folder=tmp_path), "detections", "kitti-3d")
+    assert words in str(refused.value)
+
+
+@pytest.mark.parametrize("place", [10, 11, 12])
+def test_a_row_of_kitti_without_a_size_is_left_out(place, tmp_path):
+    flat = CAR.split()
+    flat[place] = "0"
+    region = CAR.replace("Car", "dontcare").replace("3 7", "4 -1")
+    path = kitti(" ".join(flat), region, CAR.replace("Car", "Van"), region, folder=tmp_path)
+    rows = read_boxes_3d(path, "truth", "kitti-3d")
+    assert rows.left_out == "2 regions (DontCare) and 1 rows without a 3D box"
+    assert rows.at(0) == f"{path}:3"
+    assert timed(rows).classes == {2: "Van"}
+    assert rows.labelled.tolist() == [3, 4]
+    with pytest.raises(McaptrackError, match=r"0001\.txt holds no 3D boxes$"):
+        read_boxes_3d(kitti(" ".join(flat), region, folder=tmp_path), "truth", "kitti-3d")
+    with pytest.raises(McaptrackError, match="holds no 3D boxes"):
+        read_boxes_3d(kitti("", folder=tmp_path), "truth", "kitti-3d")
+
+
+# nuScenes
+
+
+def nuscenes(folder: Path, **changed: object) -> Path:
+    """The tables of a scene with two boxes of a car and one of an animal."""
+    boxes = [
+        {"token": f"a{n}", "sample_token": f"s{n % 2}", "instance_token": f"i{n // 2}", "translation": [n, 2, 3],
+         "size": [2, 4, 1.5], "rotation": [1, 0, 0, 0], "num_lidar_pts": n, "num_radar_pts": n // 2}
+        for n in range(3)
+    ]  # fmt: skip
+    tables = {
+        "scene": [{"token": "one", "name": "scene-1"}],
+        "sample": [{"token": f"s{n}", "timestamp": 100 + n, "scene_token": "one"} for n in range(3)],
+        "sample_annotation": boxes,
+        "instance": [{"token": f"i{n}", "category_token": f"c{n}"} for n in range(2)],
+        "category": [{"token": "c0", "name": "vehicle.car"}, {"token": "c1", "name": "animal"}],
+    }
+    for table_name, rows in (tables | changed).items():
+        (folder / f"{table_name}.json").write_text(json.dumps(rows))
+    return folder
+
+
+BOX = {"token": "a0", "sample_token": "s0", "instance_token": "i0", "translation": [0, 2, 3], "size": [2, 4, 1.5],
+       "rotation": [1, 0, 0, 0]}  # fmt: skip
+
+
+def test_a_scene_of_nuscenes_by_hand(tmp_path):
+    rows = read_boxes_3d(nuscenes(tmp_path), "truth")
+    assert rows.t_ns.tolist() == [100_000, 101_000, 100_000]
+    assert rows.boxes.tolist() == [[n, 2, 3, 4, 2, 1.5, 0] for n in range(3)]
+    assert rows.labelled.tolist() == [100_000, 101_000, 102_000]
+    assert rows.track_id.tolist() == [1, 1, 2]
+    assert f"{tmp_path}: 3 samples; tracks are numbered from 1 on, a number for each instance" in rows.remarks
+    assert f"{tmp_path}: 1 of 3 boxes have no points of lidar or radar; they stay" in rows.remarks
+    found = timed(rows)
+    assert (found.class_id.tolist(), found.classes, rows.left_out) == ([2, 2], {2: "car"}, "1 animal")
+    rows = read_boxes_3d(tmp_path, "truth")
+    assert timed(rows, classes="animal, car").classes == {2: "car", 3: "animal"}
+
+
+@pytest.mark.parametrize("points", [(0, 1), (1, 0), (None, 0), (1, None)])
+def test_a_box_with_points_of_one_sensor_is_seen(points, tmp_path):
+    lidar, radar = points
+    boxes = [BOX | {"num_lidar_pts": lidar, "num_radar_pts": radar}]
+    assert "points of lidar" not in " ".join(
+        read_boxes_3d(nuscenes(tmp_path, sample_annotation=boxes), "truth").remarks
+    )
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({"scene": [{"token": "one"}]}, "scene.json: a row has no name: {'token': 'one'}"),
+        ({"scene": [{"name": "x", "token": 5}]}, "scene.json: a row has no token"),
+        ({"sample": [{"timestamp": 1, "scene_token": "one"}]}, "sample.json: a row has no token"),
+        ({"sample": [{"token": "s", "timestamp": True, "scene_token": "one"}]}, "sample.json: timestamp has to be a whole number, not 'True'"),
+        ({"category": [{"token": "c0"}]}, "category.json: a row has no name"),
+        ({"instance": [{"token": "i0"}]}, "instance.json: a row has no category_token"),
+        ({"sample_annotation": [{**BOX, "token": 1}]}, "sample_annotation.json: a row has no token"),
+        ({"sample_annotation": [{**BOX, "instance_token": None}]}, "sample_annotation.json: a row has no instance_token"),
+        ({"sample_annotation": [{**BOX, "instance_token": "i9"}]}, "annotation a0 is of an instance without a category"),
+        ({"sample_annotation": [{**BOX, "size": [1, 2]}]}, "size has to be 3 numbers, not [1, 2]"),
+        ({"sample_annotation": [{**BOX, "translation": [1, 2, True]}]}, "translation has to be 3 numbers, not [1, 2, True]"),
+        ({"sample_annotation": [{**BOX, "rotation": "1000"}]}, "rotation has to be 4 numbers, not 1000"),
+        ({"sample_annotation": [{**BOX, "rotation": [2, 0, 0, 0]}]}, "annotation a0: a quaternion of length 2 is no rotation"),
+        ({"sample_annotation": [1]}, "sample_annotation.json is not a table of nuScenes, a list of objects"),
+    ],
+)  # fmt: skip
+def test_tables_of_nuscenes_are_refused_with_their_name(changed, words, tmp_path):
+    with pytest.raises(McaptrackError) as refused:
+        read_boxes_3d(nuscenes(tmp_path, **changed), "truth")
+    assert words in str(refused.value)
+
+
+@pytest.mark.parametrize("count", [10, 11, 13])
+def test_ten_scenes_are_listed(count, tmp_path):
+    scenes = [{"token": f"t{n}", "name": f"s{n:02}"} for n in range(count)]
+    with pytest.raises(McaptrackError) as refused:
+        read_boxes_3d(nuscenes(tmp_path, scene=scenes), "truth")
+    more = f" and {count - 10} more" if count > 10 else ""
+    words = f"{tmp_path} has {count} scenes; choose one with `scene=`: {', '.join(f's{n:02}' for n in range(10))}{more}"
+    assert str(refused.value) == words
+
+
+def test_the_folder_of_nuscenes_holds_one_set_of_tables(tmp_path):
+    for name in ("v1.0-mini", "v1.0-test"):
+        (tmp_path / name).mkdir()
+    nuscenes(tmp_path / "v1.0-test")
+    assert is_3d(tmp_path)
+    assert len(read_boxes_3d(tmp_path, "truth", scene="scene-1").boxes) == 3
+    nuscenes(tmp_path / "v1.0-mini")
+    with pytest.raises(McaptrackError, match=r"several sets of tables, v1\.0-mini, v1\.0-test; give the folder of one"):
+        read_boxes_3d(tmp_path, "truth")
+    (tmp_path / "v1.0-mini" / "category.json").unlink()
+    with pytest.raises(McaptrackError, match=r"v1\.0-mini has no category\.json; nuScenes boxes need scene, sample, "):
+        read_boxes_3d(tmp_path / "v1.0-mini", "truth")
+    (tmp_path / "v1.0-mini" / "category.json").write_text("{")
+    with pytest.raises(McaptrackError, match=r"category\.json is not JSON"):
+        read_boxes_3d(tmp_path / "v1.0-mini", "truth")
+
+
+# Argoverse 2
+
+
+def argoverse(folder: Path, **changed: object) -> Path:
+    columns = {
+        "timestamp_ns": [5, 5, 9],
+        "track_uuid": ["b", "a", "b"],
+        "category": ["BUS", "PEDESTRIAN", "BUS"],
+        **{f"{name}_m": [4.0, 1.0, 4.0] for name in ("length", "width", "height")},
+        **dict(zip(("qw", "qx", "qy", "qz"), np.tile(turned(z=90), (3, 1)).T.tolist(), strict=True)),
+        **{name: [1.0, 2.0, 3.0] for name in ("tx_m", "ty_m", "tz_m")},
+    }
+    feather.write_feather(pa.table(columns | changed), folder / "annotations.feather")
+    return folder
+
+
+def poses(folder: Path, t_ns: list[int], quaternions: list[np.ndarray], x_m: list[float]) -> None:
+    columns = {"timestamp_ns": t_ns, "tx_m": x_m, "ty_m": [0.0] * len(t_ns), "tz_m": [0.0] * len(t_ns)}
+    columns |= dict(zip(("qw", "qx", "qy", "qz"), np.reshape(quaternions, (-1, 4)).T.tolist(), strict=True))
+    feather.write_feather(pa.table(columns), folder / "city_SE3_egovehicle.feather")
+
+
+def test_boxes_of_argoverse_by_hand(tmp_path):
+    rows = read_boxes_3d(argoverse(tmp_path), "truth")
+    np.testing.assert_allclose(rows.boxes[1], [2, 2, 2, 1, 1, 1, math.pi / 2])
+    assert (rows.t_ns.tolist(), rows.track_id.tolist(), rows.labelled.tolist()) == ([5, 5, 9], [1, 2, 1], [5, 9])
+    assert timed(rows).classes == {1: "PEDESTRIAN", 2: "BUS"}
+    # A pose of another length is the same rotation; of two poses at one time the first is taken.
+    poses(tmp_path, [5, 9, 5], [turned(z=90) * 2, turned(), turned(z=10)], [100.0, 0.0, 7.0])
+    rows = read_boxes_3d(tmp_path, "truth")
+    np.testing.assert_allclose(rows.boxes[:, :3], [[99, 1, 1], [98, 2, 2], [3, 3, 3]], atol=1e-12)
+    np.testing.assert_allclose(np.abs(rows.boxes[:, 6]), [math.pi, math.pi, math.pi / 2])
+
+
+@pytest.mark.parametrize("t_ns", [[], [4], [10], [5, 6]])
+def test_a_time_without_a_pose_is_refused(t_ns, tmp_path):
+    poses(argoverse(tmp_path), t_ns, [turned()] * len(t_ns), [0.0] * len(t_ns))
+    count, first = (1, 9) if 5 in t_ns else (2, 5)
+    with pytest.raises(McaptrackError, match=f"has no pose at {count} times of boxes, the first {first} ns$"):
+        read_boxes_3d(tmp_path, "truth")
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({"timestamp_ns": [5.0, 6.0, 7.0]}, "annotations.feather: timestamp_ns has to be whole numbers"),
+        ({"timestamp_ns": ["5", "6", "7"]}, "timestamp_ns has to be whole numbers"),
+        ({"timestamp_ns": [5, 5, -1]}, "annotations.feather: row 3: times have to lie between 1970 and 2262"),
+        ({"tx_m": ["a", "b", "c"]}, "annotations.feather: tx_m, ty_m, tz_m have to be numbers"),
+        ({"length_m": [1.0, None, 2.0]}, "annotations.feather: row 2: a number of the box is missing or not finite"),
+        ({"qw": [1.0, 5.0, 1.0]}, "annotations.feather: row 2: a quaternion of length 5.04975 is no rotation"),
+        ({"qw": [0.0] * 3, "qz": [0.0] * 3, "qx": [1.0] * 3}, "z of the boxes is 180 degrees from up; it has to be up"),
+    ],
+)
+def test_tables_of_argoverse_that_hold_no_boxes(changed, words, tmp_path):
+    if "qw" in changed and "qz" not in changed:
+        changed = changed | {"qz": [0.0, 0.5**0.5, 0.0]}
+    with pytest.raises(McaptrackError) as refused:
+        read_boxes_3d(argoverse(tmp_path, **changed), "truth")
+    assert words in str(refused.value)
+
+
+# Into a log
+
+
+def ingested(source: Path, output: Path, into: Path | None = None, **options: object):
+    """What ``ingest`` wrote: times, remarks and warnings."""
+    role = options.pop("role", "truth")
+    with notices.collected(), notices.listening(lambda _: None):
+        if into is None:
+            report = ingest(source, output, IngestOptions(role=role, **options))
+        else:
+            with log.read(into) as opened:
+                report = ingest(source, into, IngestOptions(role=role, **options), into=opened, force=True)
+    with log.read(into or output) as opened:
+        (topic,) = report.messages
+        times = opened.times(topic).tolist()
+    return times, report.remarks, [one.message for one in report.warnings]
+
+
+S = 10**9
+
+
+@pytest.mark.parametrize(
+    ("frames", "options", "times", "remark", "doubt"),
+    [
+        ((0, 2), {"fps": 2}, (0, S), "frame 0 is at 0.000 s", ""),
+        ((1, 2), {"fps": 2}, (0, S // 2), "frame 1 is at 0.000 s", "frames begin with 1; frame 1 is assumed"),
+        ((4, 5), {"fps": 2}, (3 * S // 2, 2 * S), "frame 1 is at 0.000 s", "frames begin with 4; frame 1 is assumed"),
+        ((4, 5), {"fps": 2, "first_frame": 4}, (0, S // 2), "frame 4 is at 0.000 s", ""),
+        ((4, 5), {"fps": 2, "first_frame": 0, "start_ns": 7 * S}, (9 * S, 19 * S // 2), "frame 0 is at 7.000 s", ""),
+    ],
+)
+def test_frames_have_times_by_a_rate(frames, options, times, remark, doubt, tmp_path):
+    path = table(tmp_path, *(framed(frame=frame) for frame in frames))
+    options = {**options, "fps": Fraction(options["fps"])}
+    found, remarks, warnings = ingested(path, tmp_path / "log.mcap", **options)
+    assert found == list(times)
+    assert f"{path}: {remark}" in remarks
+    doubts = [one for one in warnings if "frames begin" in one]
+    assert [one.partition(" to be the first")[0] for one in doubts] == ([f"{path}: {doubt}"] if doubt else [])
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"fps": Fraction(2), "first_frame": 5}, "its first frame is 4, before `first_frame=5`"),
+        ({}, "counts frames and has no clock; give the frames per second with `fps=`"),
+    ],
+)
+def test_frames_without_a_time_are_refused(options, words, tmp_path):
+    with pytest.raises(McaptrackError, match=words):
+        ingested(table(tmp_path, framed(frame=4)), tmp_path / "log.mcap", **options)
+
+
+@pytest.mark.parametrize("name", ["fps", "first_frame"])
+def test_times_of_a_table_leave_no_room_for_a_rate(name, tmp_path):
+    with pytest.raises(McaptrackError, match=f"has times; leave `{name}=` out"):
+        ingested(table(tmp_path, usual()), tmp_path / "log.mcap", **{name: Fraction(1) if name == "fps" else 0})
+
+
+@pytest.mark.parametrize(
+    ("first_s", "is_taken"),
+    [(40, True), (39.999, False), (110 + 60, True), (110 + 60.001, False), (100, True)],
+)
+def test_labels_are_at_most_a_minute_from_their_log(first_s, is_taken, tmp_path):
+    """Of a log from 100 to 110 s, and labels of one time."""
+    box = usual(id=None, score=None)
+    path = table(tmp_path, box | {"t_ns": 100 * S}, box | {"t_ns": 110 * S}, name="boxes.csv")
+    ingested(path, tmp_path / "log.mcap", role="detections")
+    labels = table(tmp_path, usual(t_ns=5))
+    options = {"start_ns": round(first_s * S)}
+    if is_taken:
+        assert ingested(labels, tmp_path, tmp_path / "log.mcap", **options)[0] == [round(first_s * S)]
+        return
+    with pytest.raises(McaptrackError, match=r"from 100\.000 to 110\.000 s; give the time of the first labels with"):
+        ingested(labels, tmp_path, tmp_path / "log.mcap", **options)
+
+
+def test_frames_of_a_log_are_those_of_its_boxes(tmp_path):
+    box = usual(id=None, score=None)
+    boxes = [box | {"t_ns": t * S} for t in (3, 5, 9)]
+    ingested(table(tmp_path, *boxes, name="boxes.csv"), tmp_path / "log.mcap", role="detections")
+    path = table(tmp_path, framed(frame=1), framed(frame=3))
+    found, remarks, _ = ingested(path, tmp_path, tmp_path / "log.mcap")
+    assert found == [3 * S, 9 * S]
+    assert f"{path}: frame 1 is the first message of /camera/detections" in remarks
+    found, _, _ = ingested(path, tmp_path, tmp_path / "log.mcap", fps=Fraction(4))
+    assert found == [3 * S, 3 * S + S // 2]
+    path = table(tmp_path, framed(frame=1), framed(frame=4))
+    words = f"{path}: its last frame is 4, and /camera/detections has 3 messages, from frame 1 on; give the number of"
+    with pytest.raises(McaptrackError) as refused:
+        ingested(path, tmp_path, tmp_path / "log.mcap")
+    assert words in str(refused.value)
+    assert ingested(path, tmp_path, tmp_path / "log.mcap", first_frame=1, fps=Fraction(1))[0] == [3 * S, 6 * S]
+
+
+def test_all_classes_are_counted_in_a_remark(tmp_path):
+    kinds = ("car", "van", "car", "person")
+    path = table(tmp_path, *(usual(id=n, **{"class": kind}) for n, kind in enumerate(kinds)))
+    _, remarks, warnings = ingested(path, tmp_path / "log.mcap")
+    assert f"{path}: class_id is 1 person (1), 2 car (2), 3 van (1)" in remarks
+    assert f"{path}: boxes are taken as those of the frame 'map' (assumed); `frame=` names another" in warnings
+
+
+@pytest.mark.parametrize(
+    ("options", "name"),
+    [
+        ({"quality": 5}, "`quality=`"),
+        ({"ground_plane": "h.txt"}, "`ground_plane=`"),
+        ({"motion": "m.txt"}, "`motion=`"),
+        ({"size": (1, 1)}, "`size=`"),
+        ({"frames": 0}, "`frames=`"),
+    ],
+)
+def test_options_of_pictures_are_refused(options, name, tmp_path):
+    for key, text in (("ground_plane", "1,0,0\n0,1,0\n0,0,1\n"), ("motion", "0,1,0,0,0,1,0\n")):
+        if key in options:
+            (tmp_path / options[key]).write_text(text)
+            options = {key: tmp_path / options[key]}
+    with pytest.raises(McaptrackError, match=rf"a\.csv holds 3D boxes; {name} is for pictures and boxes in them"):
+        ingested(table(tmp_path, usual()), tmp_path / "log.mcap", **options)
+
+
+def test_two_files_of_one_role_are_refused(tmp_path):
+    path, other = table(tmp_path, usual()), table(tmp_path, usual(), name="b.csv")
+    with pytest.raises(McaptrackError) as refused:
+        ingested(path, tmp_path / "log.mcap", labels={"truth": other})
+    assert str(refused.value) == f"{other} and {path} are both truth; give the role of {other} with `role=`"

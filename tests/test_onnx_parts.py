@@ -1,0 +1,320 @@
+"""Parts of learned detectors: places on grids, which outputs are of which family, and the graph of another size."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mcaptrack.transforms.detect.onnx import graph, outputs
+from mcaptrack.transforms.detect.onnx.outputs import MisreadError
+from tests.onnx_graphs import FLOAT, INT64, field, model, node, tensor, value
+
+WIDE, HIGH = 96, 68  # the height fits no stride
+SIZE = (WIDE, HIGH)
+
+
+def places(*strides: int) -> list[tuple[int, int, int]]:
+    """Column, row and stride of all cells, by hand."""
+    return [
+        (column, row, stride)
+        for stride in strides
+        for row in range(math.ceil(HIGH / stride))
+        for column in range(math.ceil(WIDE / stride))
+    ]
+
+
+@pytest.mark.parametrize("strides", [(8, 16, 32), (8, 16, 32, 64), (32,)])
+def test_cells_are_numbered_row_by_row_and_stride_by_stride(strides):
+    numbers, steps = outputs.grid(SIZE, strides)
+    assert [(*map(int, cell), int(step)) for cell, step in zip(numbers, steps, strict=True)] == places(*strides)
+    assert outputs.cells(SIZE, strides) == len(places(*strides))
+
+
+@pytest.mark.parametrize(("strides", "offset"), [((8, 16, 32), 0.5), ((8, 16, 32, 64), 0.0)])
+def test_a_box_of_nanodet_reaches_from_its_cell(strides, offset):
+    """In each grid, with distances of which each side's bins are sure of one number, or torn between two."""
+    cells = places(*strides)
+    for number in (0, 5, len(cells) - 3, *(cells.index((1, 0, stride)) for stride in strides)):
+        rows = np.zeros((1, len(cells), 2 + 32))
+        rows[0, :, 2:] = np.tile([9, *[0] * 7], 4)
+        sides = (1, 0, 7, 3.5)
+        bins = np.full((4, 8), -50.0)
+        for side, reach in enumerate(sides):
+            bins[side, [math.floor(reach), math.ceil(reach)]] = 4
+        rows[0, number, 2:] = bins.ravel()
+        rows[0, number, 1] = 0.75
+        (found,) = outputs.read_nanodet({"out": rows}, SIZE, 0.3)
+        column, row, stride = cells[number]
+        x, y = (column + offset) * stride, (row + offset) * stride
+        wanted = [x - stride, y, x + 7 * stride, y + 3.5 * stride]
+        np.testing.assert_allclose(found.xyxy, [wanted], atol=1e-9)
+        assert (found.score.tolist(), found.label.tolist()) == ([0.75], [1])
+
+
+def test_a_box_of_yolox_lies_in_its_cell():
+    cells = places(8, 16, 32)
+    rows = np.zeros((1, len(cells), 7))
+    for number, score in ((0, 0.5), (9, 0.19), (30, 0.25), (len(cells) - 1, 1.0)):
+        rows[0, number] = 0.25, 0.75, math.log(2), 0, score, 0.5, 0.9
+    (found,) = outputs.read_yolox({"out": rows}, SIZE, 0.2)
+    for box, number in zip(found.xyxy, (0, 30, len(cells) - 1), strict=True):
+        column, row, stride = cells[number]
+        x, y = (column + 0.25) * stride, (row + 0.75) * stride
+        np.testing.assert_allclose(box, [x - stride, y - stride / 2, x + stride, y + stride / 2])
+    np.testing.assert_allclose(found.score, [0.45, 0.225, 0.9])
+    assert found.label.tolist() == [1, 1, 1]
+    rows[0, 0, 2] = 80
+    (found,) = outputs.read_yolox({"out": rows}, SIZE, 0.25)
+    assert found.xyxy[0, 2] - found.xyxy[0, 0] == pytest.approx(8 * math.exp(15))
+
+
+def array(*shape: int, kind: str = "f4") -> np.ndarray:
+    return np.zeros(shape, kind)
+
+
+DETR = {"labels": array(2, 5, kind="i8"), "boxes": array(2, 5, 4), "scores": array(2, 5)}
+
+
+@pytest.mark.parametrize(
+    ("given", "fits"),
+    [
+        (DETR, True),
+        (DETR | {"labels": array(2, 5)}, True),
+        (DETR | {"more": array(1)}, True),
+        (DETR | {"boxes": array(2, 5, 6)}, False),
+        (DETR | {"boxes": array(2, 4, 4)}, False),
+        (DETR | {"boxes": array(2, 5)}, False),
+        (DETR | {"scores": array(2, 6)}, False),
+        (DETR | {"labels": array(3, 5)}, False),
+        ({name: one[0] for name, one in DETR.items()}, False),
+        (DETR | {"scores": array(2, 5, 4), "labels": array(2, 5, 4)}, False),
+        ({"a": DETR["scores"], "b": DETR["boxes"], "c": DETR["labels"]}, True),
+        ({"a": DETR["scores"], "b": DETR["boxes"], "c": array(2, 5)}, False),
+        ({"a": DETR["scores"], "b": array(2, 5, 4, kind="i8"), "c": DETR["labels"]}, False),
+        ({"a": DETR["scores"], "b": DETR["boxes"]}, False),
+        ({"a": DETR["scores"], "b": DETR["boxes"], "c": DETR["labels"], "d": array(1)}, False),
+    ],
+)
+def test_outputs_of_detr_have_these_shapes(given, fits):
+    found = outputs.detr_parts(given)
+    assert (found is not None) == fits
+    if found is not None:
+        labels, boxes, scores = found
+        assert (labels.shape, boxes.shape, scores.shape) == ((2, 5), (2, 5, 4), (2, 5))
+        assert labels.dtype.kind == "i" or "labels" in given
+
+
+@pytest.mark.parametrize(
+    ("given", "boxes"),
+    [
+        ({"dets": array(1, 7, 4), "labels": array(1, 7, 9)}, "dets"),
+        ({"logits": array(1, 7, 4), "pred_boxes": array(1, 7, 4)}, "pred_boxes"),
+        ({"a": array(1, 7, 9), "b": array(1, 7, 4)}, "b"),
+        ({"a": array(1, 7, 4), "b": array(1, 7, 4)}, ""),
+        ({"a": array(1, 7, 5), "b": array(1, 7, 9)}, ""),
+        ({"dets": array(1, 7, 4), "labels": array(1, 8, 9)}, ""),
+        ({"dets": array(1, 7, 5), "labels": array(1, 7, 9)}, ""),
+        ({"dets": array(7, 4), "labels": array(1, 7, 9)}, ""),
+        ({"dets": array(1, 7, 4), "labels": array(1, 7, 9, kind="i4")}, ""),
+        ({"dets": array(1, 7, 4)}, ""),
+        ({"dets": array(1, 7, 4), "labels": array(1, 7, 9), "masks": array(1, 7, 3)}, ""),
+    ],
+)
+def test_outputs_of_rfdetr_have_these_shapes(given, boxes):
+    found = outputs.rfdetr_parts(given)
+    assert (found is not None) == bool(boxes)
+    assert not boxes or found[0] is given[boxes]
+
+
+COUNT = len(places(8, 16, 32))
+
+
+@pytest.mark.parametrize(
+    ("shape", "kind"),
+    [
+        ((1, 5, COUNT), "columns"),
+        ((1, 84, COUNT), "columns"),
+        ((1, 4, COUNT), None),
+        ((1, 3 * COUNT, 6), "anchors"),
+        ((1, 3 * COUNT, 5), None),
+        ((1, COUNT, 5), "rows"),
+        ((1, COUNT, 4), None),
+        ((1, COUNT, 6), "rows"),
+        ((1, 300, 6), "boxes"),
+        ((1, 300, 7), None),
+        ((300, 6), None),
+    ],
+)
+def test_the_shape_of_one_output_tells_how_boxes_are_arranged(shape, kind):
+    assert outputs.ultralytics_kind({"out": array(*shape)}, SIZE) == kind
+    assert outputs.ultralytics_kind({"out": array(*shape), "more": array(1)}, SIZE) is None
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "fits"),
+    [(0, 1, True), (-0.0009, 1.0009, True), (-0.0011, 1, False), (0, 1.0011, False), (0, math.nan, False)],
+)
+def test_likelihoods_are_from_0_to_1_but_for_what_is_rounded(low, high, fits):
+    if fits:
+        assert outputs.likelihoods(np.array([low, high])).tolist() == [low, high]
+    else:
+        with pytest.raises(MisreadError, match="scores are no likelihoods from 0 to 1"):
+            outputs.likelihoods(np.array([low, high]))
+    assert outputs.likelihoods(np.empty(0)).size == 0
+
+
+def boxes(xyxy: Any, scores: Any, labels: Any = None, least: float = 0.1):
+    xyxy, scores = np.array(xyxy, float), np.array(scores, float)
+    return outputs._boxes(xyxy, scores, np.zeros(len(scores)) if labels is None else np.array(labels, float), least)
+
+
+LARGE = [10.0, 10.0, 30.0, 40.0]
+
+
+@pytest.mark.parametrize(
+    ("given", "scores", "labels", "words"),
+    [
+        ([[0, 0, 1, 2.0]], [0.4], None, "boxes are given as shares of the input"),
+        ([[0, 0, 1, 2.0]], [0.39], None, ""),
+        ([[0, 0, 1, 2.01]], [0.4], None, ""),
+        ([[-2.5, 0, 1, 1]], [0.4], None, ""),
+        ([[30, 10, 10, 40], LARGE], [0.9, 0.9], None, ""),
+        ([[30, 10, 10, 40], [10, 40, 30, 10], LARGE], [0.9] * 3, None, "boxes end before they begin"),
+        ([[30, 10, 10, 40], [10, 40, 30, 10], LARGE], [0.9, 0.2, 0.2], None, "boxes end before they begin"),
+        ([[10, 10, 10, 10]], [0.9], None, ""),
+        ([LARGE, LARGE], [0.4, 0.3], [1.0, 1.5], ""),
+        ([LARGE, LARGE], [0.4, 0.4], [1.0, 1.5], "classes are not whole numbers"),
+    ],
+)
+def test_sure_boxes_tell_what_the_outputs_cannot_be(given, scores, labels, words):
+    if words:
+        with pytest.raises(MisreadError, match=words):
+            boxes(given, scores, labels)
+    else:
+        assert boxes(given, scores, labels).xyxy.tolist() == given
+
+
+def test_boxes_are_kept_from_the_least_score_on_and_scores_end_at_1():
+    found = boxes([LARGE] * 4, [0.0999, 0.1, 1.0005, 0.5], [1, 2, 3, 4])
+    assert (found.score.tolist(), found.label.tolist()) == ([0.1, 1.0, 0.5], [2, 3, 4])
+    assert found.label.dtype.kind == "i"
+
+
+def test_boxes_that_follow_the_grid_are_centres_in_pixels_or_an_error():
+    cells = np.array(places(8, 16, 32), float)
+    centre = (cells[:, :2] + 0.5) * cells[:, 2:]
+    rng = np.random.default_rng(1)
+    size = rng.uniform(5, 30, centre.shape)
+    kind = outputs._kind_of_places
+    assert kind(np.hstack([centre, size]), SIZE) == "pixels"
+    assert kind(np.hstack([rng.uniform(-1, 1, centre.shape), size]), SIZE) == "offsets"
+    assert kind(np.hstack([rng.uniform(-1, 1, centre.shape), centre]), SIZE) == "offsets"
+    assert kind(np.hstack([centre[:, :1], rng.uniform(-1, 1, (len(cells), 1)), size]), SIZE) == "offsets"
+    assert kind(np.hstack([centre[:, ::-1], size]), SIZE) == "offsets"
+    assert kind(np.hstack([centre, centre[:, :1], size[:, :1]]), SIZE) == "pixels"
+    assert kind(np.hstack([centre * 0.3, size]), SIZE) == "pixels"
+    with pytest.raises(MisreadError, match="given by their corners, and centre and size are expected"):
+        kind(np.hstack([centre - size / 2, centre + size / 2]), SIZE)
+    with pytest.raises(MisreadError, match="given as shares of the input, and pixels are expected"):
+        kind(np.hstack([centre / WIDE, size / WIDE]), SIZE)
+    three = [np.tile(centre[cells[:, 2] == stride], (3, 1)) for stride in (8, 16, 32)]
+    rows = np.concatenate(three)
+    assert kind(np.hstack([rows, rows * 0 + 9]), SIZE, 3) == "pixels"
+
+
+# The graph
+
+
+@pytest.mark.parametrize(
+    ("text", "names"),
+    [
+        ("{0: 'person', 2: 'car'}", {0: "person", 2: "car"}),
+        ("['a', 'b']", {0: "a", 1: "b"}),
+        ("('a', 'b')", {0: "a", 1: "b"}),
+        ("{0: 'a', 1: 5}", {}),
+        ("{-1: 'a'}", {}),
+        ("{True: 'a'}", {}),
+        ("{'0': 'a'}", {}),
+        ("'text'", {}),
+        ("{0: 'a'", {}),
+        ("print()", {}),
+        ("", {}),
+        (str(["x" * 99_996]), {0: "x" * 99_996}),
+        (str(["x" * 99_997]), {}),
+    ],
+)
+def test_names_of_classes_are_a_list_or_a_map_from_whole_numbers(text, names):
+    data = model([node("Identity", ["x"], ["y"])], [], [], metadata={"stride": "32", "names": text})
+    assert graph.class_names(graph.parse(data)) == names
+    assert graph.class_names(graph.parse(model([node("Identity", ["x"], ["y"])], [], []))) == {}
+
+
+def test_the_size_of_an_input_is_its_last_two_numbers():
+    data = model(
+        [node("Identity", ["x"], ["y"])],
+        [value("size", [1, 2]), value("x", [1, 3, 128, 160]), value("z", [1, 3, "h", 160])],
+        [],
+    )
+    parsed = graph.parse(data)
+    assert [graph.input_size(parsed, name) for name in ("x", "z", "none")] == [(160, 128), (160, None), (None, None)]
+
+
+@pytest.mark.parametrize("data", [b"", b"\x08\x08", b"text", model([], [], [])])
+def test_what_has_no_nodes_is_no_network(data):
+    with pytest.raises(graph.NotOnnxError):
+        graph.parse(data)
+
+
+def constants(data: bytes) -> dict[str, list[int]]:
+    """The whole numbers of all tensors of a network, by name."""
+    found = graph._constants(graph.parse(data))
+    return {name: np.frombuffer(one.raw_data, "<i8").tolist() for name, one in found.items() if one.data_type == INT64}
+
+
+def test_all_numbers_that_follow_from_the_size_are_changed_and_no_others():
+    """From 160x128 to 320x192: grids of each stride, their cells, and the cells of three and of four grids together."""
+    old, new = (160, 128), (320, 192)
+    steps = (4, 8, 16, 32, 64)
+    cells = {s: ((old[0] // s) * (old[1] // s), (new[0] // s) * (new[1] // s)) for s in steps}
+    joined = [tuple(sum(cells[s][k] for s in some) for k in (0, 1)) for some in (steps[1:4], steps[1:5])]
+    tensors, nodes, wanted = {}, [], {}
+    for number, (before, after) in enumerate([*cells.values(), *joined, (77, 77)]):
+        name = f"shape{number}"
+        tensors[name], wanted[name] = tensor([1, -1, before], name, INT64), [1, -1, after]
+        nodes.append(node("Reshape", ["x", name], [f"r{number}"]))
+    for s in steps:
+        name = f"size{s}"
+        tensors[name] = tensor([1, 8, old[1] // s, old[0] // s], name, INT64)
+        wanted[name] = [1, 8, new[1] // s, new[0] // s]
+        nodes.append(node("Resize", ["x", "", "", name], [f"z{s}"]))
+    tensors["turned"] = tensor([1, 8, 20, 16], "turned", INT64)  # of height 128 is 16, not 20
+    wanted["turned"] = [1, 8, 20, 16]
+    nodes.append(node("Resize", ["x", "", "", "turned"], ["zt"]))
+    held = tensor([1, 255, 320], "", INT64)
+    nodes += [node("Constant", [], ["held"], value=held), node("Reshape", ["x", "held"], ["rh"])]
+    wanted["held"] = [1, 255, (new[0] // 8) * (new[1] // 8)]
+    tensors["axes"], wanted["axes"] = tensor([320, 80], "axes", INT64), [320, 80]
+    nodes.append(node("Slice", ["x", "axes", "axes", "axes"], ["s"]))
+    tensors["scale"] = tensor([320.0, 80.0], "scale", FLOAT)
+    nodes.append(node("Reshape", ["x", "scale"], ["odd"]))
+    data = model(nodes, [value("other", [1, 2]), value("x", [1, 3, 128, 160])], [value("r0", [1, 5, 320])], tensors)
+    made = graph.resized(data, "x", old, new)
+    assert constants(made) == wanted
+    parsed = graph.parse(made)
+    assert graph.input_size(parsed, "x") == new
+    assert [dim.dim_value for dim in parsed.graph.input[0].type.tensor_type.shape.dim] == [1, 2]
+    assert not parsed.graph.output[0].type.tensor_type.HasField("shape")
+    assert [one.op_type for one in parsed.graph.node] == [one.op_type for one in graph.parse(data).graph.node]
+    scale = graph._constants(parsed)["scale"]
+    assert np.frombuffer(scale.raw_data, "<f4").tolist() == [320, 80]
+
+
+def test_weights_in_other_files_are_seen_in_constants_too():
+    far = tensor([1.0], "far") + field(14, 1)
+    plain = [node("Identity", ["x"], ["y"])]
+    assert not graph.is_split(graph.parse(model(plain, [], [], {"w": tensor([1.0], "w")})))
+    assert graph.is_split(graph.parse(model(plain, [], [], {"w": tensor([1.0], "w"), "far": far})))
+    assert graph.is_split(graph.parse(model([*plain, node("Constant", [], ["c"], value=far)], [], [])))
