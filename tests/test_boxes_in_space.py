@@ -26,6 +26,7 @@ from tests.space_logs import (
     WAYS,
     Robot,
     Seen,
+    by_foxglove,
     marker,
     ros,
     scene_update,
@@ -279,3 +280,86 @@ def test_messages_are_frames_at_their_stamps(messages, times, frames):
     log_ms = (found.message_ns[found.message] - START_NS) // MS
     order = np.concatenate([np.flatnonzero(log_ms == t_ns) for t_ns in messages] or [np.empty(0, int)])
     assert frame[order].tolist() == frames
+
+
+# What messages leave out, or say twice
+
+
+UNTURNED, SIZE = (0.0, 0.0, 0.0, 1.0), (4.0, 2.0, 1.0)
+
+
+def box(x: float = 0.0, frame_id: str = "lidar", stamp_ns: int = START_NS, **more) -> Box3d:
+    return Box3d(stamp_ns, frame_id, (x, 0.0, 0.0), UNTURNED, SIZE, **more)
+
+
+def test_velocities_of_zero_are_unknown_if_there_are_no_others():
+    still, moving = box(velocity=(0.0, 0.0, 0.0)), box(velocity=(0.0, 1.0, 0.0))
+    found = recorded([(START_NS, Message3d(START_NS, "lidar", [still, still, box()]))])
+    assert np.isnan(found.velocity).all()
+    assert found.remarks == {"boxes have a velocity of 0, and no box has another: it is unknown": 2}
+    found = recorded([(START_NS, Message3d(START_NS, "lidar", [still, moving, box()]))])
+    np.testing.assert_array_equal(found.velocity[:2], [[0, 0, 0], [0, 1, 0]])
+    assert not found.remarks
+
+
+def test_boxes_that_are_recorded_twice_count_once():
+    nan, late = float("nan"), START_NS + 10**8
+    first = [box(1.0, score=nan), box(2.0, class_name="car"), box(1.0, score=0.5), box(2.0)]
+    found = recorded(
+        [
+            (START_NS, Message3d(START_NS, "lidar", first)),
+            (START_NS + 5, Message3d(START_NS, "lidar", [box(1.0, score=nan, source_id=7), box(3.0), box(2.0)])),
+            (late, Message3d(late, "lidar", [box(1.0, stamp_ns=late)])),
+        ]
+    )
+    _, frame = found.frames()
+    assert np.flatnonzero(found.is_repeated(frame)).tolist() == [4, 6]
+
+
+def log_of(tmp_path: Path, name, stamped: bool = True) -> Path:
+    """A log with boxes in the frames that ``name`` gives for the number of a message, without stamps if so."""
+    robot = Robot(shots=4)
+
+    def make(stamp_ns, boxes):
+        number = (stamp_ns - robot.shots[0].stamp_ns) // 10**8
+        return scene_update(stamp_ns if stamped else 0, boxes, name(number)).SerializeToString()
+
+    return write(tmp_path / "log.mcap", robot, by_foxglove(make))
+
+
+def test_boxes_without_a_frame_are_in_that_of_the_others(tmp_path):
+    whole, _ = read(log_of(tmp_path, lambda _: "lidar"))
+    found, warnings = read(log_of(tmp_path, lambda number: "" if number == 0 else "lidar"))
+    assert found.frame_id == "map"
+    assert [len(frame.rows) for frame in found.frames] == [3, 3, 3, 3]
+    np.testing.assert_array_equal(flat(found.frames)[1]["x_m"], flat(whole.frames)[1]["x_m"])
+    assert "/lidar/boxes: 3 of 12 boxes name no frame: they count as in lidar, as most others are" in warnings
+    found, warnings = read(log_of(tmp_path, lambda _: ""))
+    assert found.frame_id == ""
+    assert "/lidar/boxes: boxes name no frame: they stay as they are, in a frame without a name" in warnings
+
+
+def test_boxes_without_a_stamp_are_counted(tmp_path):
+    found, warnings = read(log_of(tmp_path, lambda _: "lidar", stamped=False))
+    assert len(found.frames) == 4
+    words = "have no stamp, or one that is more than 60 s from the log time: their time is the log time"
+    assert f"/lidar/boxes: 12 of 12 boxes {words}" in warnings
+
+
+def test_a_frame_that_moves_is_said(tmp_path):
+    found, warnings = read(log_of(tmp_path, lambda _: "lidar"), "base_link")
+    assert found.frame_id == "base_link"
+    moving = [words for words in warnings if "base_link moves (map -> base_link isn't static)" in words]
+    assert len(moving) == 1
+    assert not any("moves (" in words for words in read(log_of(tmp_path, lambda _: "lidar"), "map")[1])
+
+
+def test_boxes_in_a_root_are_told_why_nothing_is_above_it(tmp_path, monkeypatch):
+    path = log_of(tmp_path, lambda _: "lidar")
+    zeros, once = np.zeros((1, 3)), np.array([START_NS])
+    useless = [Recorded("base_link", "lidar", True, Samples(once, once, zeros, np.zeros((1, 4))))]
+    monkeypatch.setattr("mcaptrack.sources.fixed_frame.transforms_of", lambda _: TransformTree(useless))
+    found, warnings = read(path)
+    assert found.frame_id == "lidar"
+    words = "transforms: base_link -> lidar: 1 pose without a rotation or a position are left out"
+    assert warnings.count(words) == 1

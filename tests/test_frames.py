@@ -212,6 +212,14 @@ class TestOddRecordings:
         assert tree.roots() == ["c"]
         assert tree.lookup("c", "b", at(1)).is_known.all()
 
+    def test_a_loop_through_a_static_frame(self):
+        """/tf_static is published once; that doesn't make it the weakest."""
+        mount = moves("base_link", "lidar", [0], [[1, 0, 0]], latched=True)
+        odd = moves("lidar", "map", [1, 2, 3], [[9, 9, 9]] * 3)
+        tree = TransformTree([mount, odd, drive()])
+        assert said(tree).endswith("form a loop: lidar -> map is left out")
+        np.testing.assert_allclose(x_of(tree, 5, source="lidar"), 51)
+
     def test_a_long_chain_and_a_long_loop(self):
         """Names of frames may be many: nothing takes time by their square, and no line is endless."""
         count = 500

@@ -88,6 +88,7 @@ class TransformTree:
         self._recorded = recorded
         self._remarks: list[Remark] = []
         self.series: dict[str, TransformSeries] = {}
+        self._latched = {(plain_frame(one.parent), plain_frame(one.child)) for one in recorded if one.is_latched}
         is_off = [not one.is_latched and one.samples.is_off_clock() for one in recorded]
         is_timed = any(not one.is_latched and not off for one, off in zip(recorded, is_off, strict=True))
         found: dict[str, list[TransformSeries]] = {}
@@ -173,10 +174,11 @@ class TransformTree:
         return None if parts is None else [*parts[0], *parts[1]]
 
     def remarks_between(self, target: str, source: str) -> list[Remark]:
-        """Return the remarks on the transforms between two frames."""
+        """Return the remarks on the transforms between two frames, and on why a root between them is one."""
         way = self.between(target, source)
-        unconnected = {*self.chain_of(target), *self.chain_of(source)}
-        frames = unconnected if way is None else {one.child for one in way}
+        frames = {*self.chain_of(target), *self.chain_of(source)}
+        if way is not None:
+            frames = {one.child for one in way} | ({plain_frame(target)} - self.series.keys())
         return [remark for remark in self._remarks if not frames.isdisjoint(remark.frames)]
 
     def lookup(self, target: str, source: str, stamps_ns: Ints) -> Poses:
@@ -235,7 +237,7 @@ class TransformTree:
         return best
 
     def _break_loops(self) -> None:
-        """Leave out the transform with the fewest messages of each loop."""
+        """Leave out the transform with the fewest messages of each loop; of those on /tf_static one is enough."""
         done: set[str] = set()
         for first in sorted(self.series):
             way: list[str] = []
@@ -246,12 +248,16 @@ class TransformTree:
                 frame = self.series[frame].parent
             if frame in way:
                 loop = way[way.index(frame) :]
-                weakest = min(loop, key=lambda one: (self.series[one].messages, one))
+                weakest = min(loop, key=self._strength)
                 names = [*reversed([*loop, loop[0]])]
                 hidden = max(len(names) - _SHOWN, 0)
                 words = " -> ".join(names[:_SHOWN]) + (f" (and {hidden:,} more)" if hidden else "")
                 self._remark(f"the frames {words} form a loop: {self.series[weakest]} is left out", *loop)
                 del self.series[weakest]
+
+    def _strength(self, child: str) -> tuple[bool, int, str]:
+        series = self.series[child]
+        return (series.parent, child) in self._latched, series.messages, child
 
     def _remark(self, text: str, *frames: str) -> None:
         self._remarks.append(Remark(text, frames))

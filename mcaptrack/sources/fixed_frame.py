@@ -25,7 +25,7 @@ from mcaptrack.schema import DETECTIONS, SCORES_NEEDED, Frame, Rows
 from mcaptrack.schema.provenance import frame_id_of, input_of
 from mcaptrack.sources import foreign
 from mcaptrack.sources.foreign.boxes_3d.recorded import Recorded3d, recorded
-from mcaptrack.sources.frames import poses_at, transforms_of
+from mcaptrack.sources.frames import poses_at, transforms_of, warn_of_remarks
 
 #: Messages of a channel of drawings in which boxes are looked for.
 _TRIED: Final = 50
@@ -83,18 +83,27 @@ def named_detections(opened: log.Log, topic: str, frame_id: str = "") -> foreign
     """
     if not foreign.may_hold_boxes_3d(opened.channel(topic)):
         return foreign.named_detections(opened, topic)
-    found = recorded(foreign.boxes_3d(opened, topic))
+    found, unnamed = recorded(foreign.boxes_3d(opened, topic)).in_usual_frame()
     for words, count in found.remarks.items():
         warn(f"{opened.path}: {topic}: {count:,} {words}", "left-out")
+    if unnamed:
+        usual = found.names[np.bincount(found.frame).argmax()]
+        words = f"boxes name no frame: they count as in {usual}, as most others are"
+        warn(f"{opened.path}: {topic}: {unnamed:,} of {len(found.frame):,} {words}", "transforms")
     fixed = _fixed_frame(opened, topic, found, plain_frame(frame_id))
     is_known, rotation, shift = _poses(opened, topic, found, fixed)
     start_ns, frame = found.frames()
+    is_repeated = found.is_repeated(frame)
     is_left_out = np.zeros(len(start_ns), bool)
     is_left_out[frame[~is_known]] = True  # nothing is known then, unlike in a frame without boxes
     is_left_out[frame[is_known]] = False
-    found, frame = found.select(is_known), frame[is_known]
+    if repeated := int(is_repeated.sum()):
+        words = "boxes are recorded again, with the same stamp and numbers: they are left out"
+        warn(f"{opened.path}: {topic}: {repeated:,} of {len(frame):,} {words}", "left-out")
+    is_taken = is_known & ~is_repeated
+    found, frame = found.select(is_taken), frame[is_taken]
     _warn_odd(opened, topic, found)
-    rows = rows_of_boxes(found, rotation[is_known], shift[is_known], f"{opened.path}: {topic}")
+    rows = rows_of_boxes(found, rotation[is_taken], shift[is_taken], f"{opened.path}: {topic}")
     names = foreign.settle_classes(opened, topic, found.classes, [rows])
     order = np.argsort(frame, kind="stable")
     parts = np.split(rows[order], np.searchsorted(frame[order], np.arange(1, len(start_ns))))
@@ -116,16 +125,19 @@ def _fixed_frame(opened: log.Log, topic: str, found: Recorded3d, wanted: str) ->
             raise McaptrackError(
                 f"{opened.path}: there is no frame {wanted} for the boxes of {topic}; there are {there}"
             )
+        if tree and (moving := [one for one in tree.between(tree.root_of(wanted), wanted) or () if not one.is_static]):
+            words = f"{wanted} moves ({moving[0]} isn't static), and so do objects that stand"
+            warn(f"{opened.path}: {topic}: {words}; tracks should be in a frame that doesn't move", "transforms")
         return wanted
-    if (before := _frame_before(opened, topic)) in known:
+    if (before := _frame_before(opened, topic)) and before in known:
         return before
     if tree is None or usual not in tree.frames():
-        if usual or found.names:
+        if counts and not usual:
+            words = "boxes name no frame: they stay as they are, in a frame without a name"
+            warn(f"{opened.path}: {topic}: {words}", "transforms")
+        elif counts:
             why = "the log has no transforms" if tree is None else _unknown(tree, usual)
-            warn(
-                f"{opened.path}: {topic}: {why}, so that boxes stay in their frame, {usual or 'which has no name'}",
-                "transforms",
-            )
+            warn(f"{opened.path}: {topic}: {why}, so that boxes stay in their frame, {usual}", "transforms")
         if "optical" in usual:
             words = f"z is ahead and y down in {usual}, so that x and y are no positions on the ground"
             warn(f"{opened.path}: {topic}: {words}; `frame=` names another frame", "transforms")
@@ -155,10 +167,14 @@ def _poses(opened: log.Log, topic: str, found: Recorded3d, fixed: str) -> tuple[
     is_known = np.ones(count, bool)
     for number, name in enumerate(found.names):
         mine = found.frame == number
-        if name == fixed or not mine.any():
+        if not mine.any():
+            continue
+        if name == fixed:
+            warn_of_remarks(opened, transforms_of(opened), fixed, name)
             continue
         # Boxes of a message have the same pose, mostly.
-        times, place = np.unique(np.stack([found.stamp_ns[mine], found.log_ns[mine]]), axis=1, return_inverse=True)
+        stamps = np.where(found.stamp_ns > 0, found.stamp_ns, found.log_ns)[mine]
+        times, place = np.unique(np.stack([stamps, found.log_ns[mine]]), axis=1, return_inverse=True)
         poses = poses_at(opened, topic, fixed, name, *_rows_of(times))
         place = place.reshape(-1)
         is_known[mine] = poses.is_known[place]

@@ -69,6 +69,12 @@ def read_frames(opened: log.Log) -> FramesRead:
     return _CACHE[opened]
 
 
+def warn_of_remarks(opened: log.Log, tree: TransformTree | None, target: str, source: str) -> None:
+    """Warn of what is odd in the transforms between two frames."""
+    for remark in tree.remarks_between(target, source) if tree else ():
+        warn(f"{opened.path}: transforms: {remark.text}", "transforms")
+
+
 def poses_at(opened: log.Log, topic: str, target: str, source: str, stamps_ns: Ints, log_ns: Ints) -> Poses:
     """Return the poses of a frame in another for messages (N,) of a topic, by their stamps, and warn of gaps.
 
@@ -86,8 +92,7 @@ def poses_at(opened: log.Log, topic: str, target: str, source: str, stamps_ns: I
             poses, tree = by_log_time, tree.on_log_time
             words = "no stamp is within those of the transforms: they are looked up by log time"
             warn(f"{opened.path}: {topic}: {words}", "clock")
-    for remark in tree.remarks_between(target, source):
-        warn(f"{opened.path}: transforms: {remark.text}", "transforms")
+    warn_of_remarks(opened, tree, target, source)
     if poses.unknown:
         why = "; ".join(f"{count:,} {where}" for where, count in poses.unknown.items())
         count = f"{sum(poses.unknown.values()):,} of {len(stamps_ns):,}"

@@ -59,7 +59,8 @@ def decoder_with_errors(kind: MessageType, convert: Callable[[Any], Any]) -> Cal
         except McaptrackError:
             raise
         except Exception as error:  # untrusted bytes in third-party parsers, which raise various exceptions
-            why = " ".join(str(error).split())[:120] or type(error).__name__
+            why = f"it has no field {error.name!r}" if isinstance(error, AttributeError) else str(error)
+            why = " ".join(why.split())[:120] or type(error).__name__
             raise McaptrackError(f"{len(payload)} bytes are not a {kind.name} message ({why})") from None
 
     return decode

@@ -38,7 +38,7 @@ class Recorded3d:
     message : (N,) of int64
         Index of the message of each box.
     stamp_ns, log_ns : (N,) of int64
-        Stamp of each box, or log time where it has none; and log time.
+        Stamp of each box, 0 where it has none; and log time.
     centre, orientation, size, velocity : (N, 3), (N, 4), (N, 3) and (N, 3)
         In the frame of each box; sizes and velocities are NaN where they are unknown.
     has_heading : (N,) of bool
@@ -83,6 +83,29 @@ class Recorded3d:
         """When each box was measured (N,), in ns: its stamp, or the log time; and the number of log times."""
         is_off = _is_off(self.stamp_ns, self.log_ns)
         return np.where(is_off, self.log_ns, self.stamp_ns), int(is_off.sum())
+
+    def in_usual_frame(self) -> tuple[Recorded3d, int]:
+        """The same boxes, those that name no frame in the frame that most others name, and their number."""
+        counts = np.bincount(self.frame, minlength=len(self.names))
+        unnamed = [number for number, name in enumerate(self.names) if not name]
+        counts[unnamed] = 0
+        if not unnamed or not counts.any():
+            return self, 0
+        is_unnamed = np.isin(self.frame, unnamed)
+        return replace(self, frame=np.where(is_unnamed, counts.argmax(), self.frame)), int(is_unnamed.sum())
+
+    def is_repeated(self, frame: Ints) -> Bools:
+        """Whether each box (N,) is an earlier one of its frame (N,) again, as where messages are recorded twice."""
+        out = np.zeros(len(frame), bool)
+        many = max(len(self.message_ns), 1)
+        several = np.bincount(np.unique(frame * many + self.message) // many) > 1  # frames of several messages
+        some = np.flatnonzero(several[frame]) if several.any() else np.empty(0, np.intp)
+        states = (frame[:, None], self.frame[:, None], self.class_id[:, None], self.score[:, None])
+        state = np.concatenate([*states, self.centre, self.size, self.orientation], axis=1)[some]
+        order = np.lexsort(state.T)
+        before, after = state[order[:-1]], state[order[1:]]
+        out[some[order[1:]]] = ((before == after) | (np.isnan(before) & np.isnan(after))).all(axis=1)
+        return out
 
     def frames(self) -> tuple[Ints, Ints]:
         """The times of F frames in ns (F,), increasing, and the frame of each box (N,).
@@ -162,14 +185,12 @@ def recorded(messages: Iterable[tuple[int, Message3d]]) -> Recorded3d:
     place = {name: number for number, name in enumerate(names)}
     classes = Classes()
     message = np.array(owner, np.int64)
-    log_ns = head_ns[message, 0]
-    stamp_ns = np.array([box.stamp_ns for box in boxes], np.int64)
     out = Recorded3d(
         names,
         np.array([place[plain_frame(box.frame_id)] for box in boxes], np.int64),
         message,
-        np.where(stamp_ns > 0, stamp_ns, log_ns),
-        log_ns,
+        np.array([box.stamp_ns for box in boxes], np.int64),
+        head_ns[message, 0],
         _columns([box.centre for box in boxes], 3),
         _columns([box.orientation for box in boxes], 4),
         _columns([box.size for box in boxes], 3),
@@ -225,7 +246,13 @@ def _checked(found: Recorded3d) -> Recorded3d:
             "boxes have an orientation that is no finite number: it is unknown": odd_turn,
             "boxes have an orientation of zeros: they count as not turned": is_unturned,
         }
+        velocity = found.velocity
+        # Programs that don't measure velocities leave them at 0; objects that move can't all have one of 0.
+        if (is_stated := np.isfinite(velocity).all(axis=1)).any() and not velocity[is_stated].any():
+            kinds["boxes have a velocity of 0, and no box has another: it is unknown"] = is_stated
+            velocity = np.full_like(velocity, np.nan)
         size = np.where(np.isfinite(size) & (size > 0), size, np.nan)
     turn = np.where((odd_turn | is_unturned)[:, None], [0.0, 0.0, 0.0, 1.0], turn)
     remarks = found.remarks | {words: int(which.sum()) for words, which in kinds.items() if which.any()}
-    return replace(found, size=size, orientation=turn, has_heading=found.has_heading & ~odd_turn, remarks=remarks)
+    has_heading = found.has_heading & ~odd_turn
+    return replace(found, size=size, orientation=turn, velocity=velocity, has_heading=has_heading, remarks=remarks)
