@@ -18,6 +18,7 @@ from mcaptrack.errors import McaptrackError, call
 from mcaptrack.files import is_same_file, publish_bytes, refuse_overwrite
 from mcaptrack.notices import Notice, warn
 from mcaptrack.pipeline import AS_BEFORE, Job, PlaneChoice, Summary, Watch
+from mcaptrack.sources.fixed_frame import BoxesRead
 from mcaptrack.sources.ingest.sidecar import SidecarChoice
 from mcaptrack.tables.export import default_folder, export
 from mcaptrack.transforms import STAGES, Transform
@@ -115,6 +116,7 @@ def work(
     target, notes = output or path, Notes()
     if output is not None and where.sidecar is not None:
         raise McaptrackError(f"`sidecar={where.sidecar}` and `output=` are two places for the same results; give one")
+    boxes = BoxesRead()
     with warnings_about(target) as warnings:
         if output is not None:
             if is_same_file(output, path):
@@ -126,18 +128,19 @@ def work(
                 opened.lock()  # a second process is refused before it computes anything
             topics = watch.topics if watch else ()
             prefix = pipeline.find_camera(opened, where.camera, where.topic or next(iter(topics), None))
-            report = pipeline.run(opened, prefix, plan(opened, prefix, notes.say), output, progress, watch, plane)
+            jobs = plan(opened, prefix, notes.say)
+            report = pipeline.run(opened, prefix, jobs, output, progress, watch, plane, boxes)
             written_to = output or opened.parts[-1].path
         layouts = [pipeline.layout_path(target, name) for name in report.layouts]
         for layout, content in zip(layouts, report.layouts.values(), strict=True):
             publish_bytes(layout, content)
         for topic in report.stale:
             warn_stale(topic, target)
-        rows = _export(target, where.force, progress) if tables else {}
+        rows = _export(target, where.force, progress, boxes) if tables else {}
         summary = None
         if tables is not None:
             with logs.read(target) as opened:
-                summary = pipeline.summarise(opened, prefix)
+                summary = pipeline.summarise(opened, prefix, boxes)
     return RunResult(
         log=target,
         stages=tuple(report.stages),
@@ -163,10 +166,10 @@ def warn_stale(topic: str, log: Path) -> None:
     warn(f"{topic} is out of date, because its input was replaced; {again} brings it up to date", "out-of-date")
 
 
-def _export(target: Path, force: bool, progress: Progress) -> dict[str, int]:
+def _export(target: Path, force: bool, progress: Progress, boxes: BoxesRead) -> dict[str, int]:
     """Write the tables beside a log; returns their numbers of rows."""
     with logs.read(target) as opened:
-        exported = export(opened, default_folder(target), progress, force=force)
+        exported = export(opened, default_folder(target), progress, force=force, boxes=boxes)
     for words in exported.notes:
         warn(words, "left-out")
     return exported.rows

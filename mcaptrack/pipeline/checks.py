@@ -17,7 +17,7 @@ from mcaptrack.schema.classes import class_names
 from mcaptrack.schema.provenance import INGEST, VIEW, Provenance, frame_id_of
 from mcaptrack.sources import foreign
 from mcaptrack.sources.cameras import USUAL, chain_of
-from mcaptrack.sources.fixed_frame import named_detections
+from mcaptrack.sources.fixed_frame import BoxesRead
 from mcaptrack.transforms import FULL, STAGES, Transform
 from mcaptrack.transforms.protocol import check_options
 
@@ -87,14 +87,17 @@ def read_frames(opened: log.Log, topic: str, schema: Schema) -> list[Frame]:
     return read_named_frames(opened, topic, schema).frames
 
 
-def read_named_frames(opened: log.Log, topic: str, schema: Schema, frame_id: str = "") -> foreign.NamedFrames:
+def read_named_frames(
+    opened: log.Log, topic: str, schema: Schema, frame_id: str = "", boxes: BoxesRead | None = None
+) -> foreign.NamedFrames:
     """Read the rows of a channel as ``read_frames`` does, with the names of classes and of the frame of reference.
 
-    ``frame_id`` is the frame that 3D boxes are brought to (see ``sources.fixed_frame``).
+    ``frame_id`` is the frame that 3D boxes are brought to (see ``sources.fixed_frame``); ``boxes`` keeps those of other
+    software.
     """
     channel = opened.channel(topic)
     if schema is DETECTIONS and channel.schema_name != DETECTIONS.name:
-        return named_detections(opened, topic, frame_id)
+        return (BoxesRead() if boxes is None else boxes).read(opened, topic, frame_id)
     return foreign.NamedFrames(
         opened.frames(topic, schema), class_names(channel.metadata), frame_id_of(channel.metadata)
     )

@@ -16,7 +16,7 @@ from mcaptrack.geometry.camera_path import CameraPath
 from mcaptrack.geometry.plane import Planes
 from mcaptrack.geometry.transform_tree import TransformTree
 from mcaptrack.notices import warn
-from mcaptrack.schema import GROUND_PLANE, PREDICTIONS, TRACKS, Frame, Schema
+from mcaptrack.schema import DETECTIONS, GROUND_PLANE, PREDICTIONS, TRACKS, Frame, Schema
 from mcaptrack.schema.framing import frame_times
 from mcaptrack.schema.provenance import VIEW, Provenance
 from mcaptrack.sources import foreign
@@ -40,7 +40,7 @@ _DRAWN_BY_VIEWERS: Final = (
     "visualization_msgs/Marker",
     "visualization_msgs/MarkerArray",
 )
-#: Schemas with a view on the ground plane, in metres.
+#: Schemas that always have a view in metres.
 _ON_GROUND: Final = (TRACKS, PREDICTIONS, GROUND_PLANE)
 
 
@@ -61,11 +61,15 @@ class ChannelToDraw(NamedTuple):
 
     def is_solid(self) -> bool:
         """Whether it has 3D boxes, or belongs to tracks that have."""
-        return bool(self.bodies) or (self.schema is TRACKS and has_bodies(self.frames))
+        return bool(self.bodies) or (self.schema in (DETECTIONS, TRACKS) and has_bodies(self.frames))
+
+    def is_on_ground(self) -> bool:
+        """Whether it has a view in metres."""
+        return self.schema in _ON_GROUND or (self.schema is DETECTIONS and self.is_solid())
 
 
 def has_bodies(frames: Iterable[Frame]) -> bool:
-    """Whether any row of these tracks has a 3D box."""
+    """Whether any row of these tracks or detections has a 3D box."""
     return any(np.isfinite(frame.rows["z_m"]).any() for frame in frames)
 
 
@@ -118,15 +122,15 @@ class ViewFactory:
             if len(self._picture_ns) and not is_solid:
                 drawn = drawing.on_pictures(self._picture_ns, self._stamp_ns)
                 yield View(topic + views.SUFFIX, foxglove.ANNOTATIONS, made_from, group, drawn)
-            for pictures, camera in self._cameras.items() if is_solid else ():
+            for pictures, camera in self._cameras.items() if is_solid and channel.schema is not DETECTIONS else ():
                 seen = drawing.on_camera(camera, channel.bodies)
                 yield View(topic + views.SUFFIX + pictures, foxglove.ANNOTATIONS, made_from, group, seen)
-            if channel.schema in _ON_GROUND:
+            if channel.is_on_ground():
                 own_ns = frame_times(channel.frames)
                 t_ns = self._picture_ns if len(self._picture_ns) and not is_solid else own_ns
                 scene = drawing.on_ground(t_ns, frame_id, channel.bodies)
                 yield View(topic + views.SCENE_SUFFIX, foxglove.SCENE, made_from, group, scene)
-        on_ground = {topic: channel for topic, channel in shown.items() if channel.schema in _ON_GROUND}
+        on_ground = {topic: channel for topic, channel in shown.items() if channel.is_on_ground()}
         if on_ground and self._frames:
             transforms = [
                 (start_ns, number, foxglove.pack_transform(start_ns, views.ground.world_of(self._prefix), frame_id))
@@ -150,7 +154,7 @@ def frame_of(prefix: str, channel: ChannelToDraw) -> str:
 
 def new_frames(prefix: str, shown: Mapping[str, ChannelToDraw], known: Collection[str]) -> list[str]:
     """Return the coordinate frames of drawings that are not ``known``, in order."""
-    wanted = [frame_of(prefix, channel) for channel in shown.values() if channel.schema in _ON_GROUND]
+    wanted = [frame_of(prefix, channel) for channel in shown.values() if channel.is_on_ground()]
     return [frame_id for frame_id in dict.fromkeys(wanted) if frame_id not in known]
 
 
@@ -189,8 +193,13 @@ def recorded_drawings(opened: log.Log, sources: Collection[str]) -> dict[str, bo
     return {
         channel.topic: channel.topic in sources
         for channel in sorted(opened.channels.values(), key=lambda one: one.topic)
-        if plain_name(channel.schema_name) in _DRAWN_BY_VIEWERS and Provenance.from_metadata(channel.metadata) is None
+        if is_drawn_by_viewers(channel)
     }
+
+
+def is_drawn_by_viewers(channel: log.Channel) -> bool:
+    """Return whether viewers draw the recorded messages of a channel in 3D."""
+    return plain_name(channel.schema_name) in _DRAWN_BY_VIEWERS and Provenance.from_metadata(channel.metadata) is None
 
 
 def recorded_sources(opened: log.Log, topics: Iterable[str]) -> list[str]:

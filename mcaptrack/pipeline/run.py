@@ -33,6 +33,7 @@ from mcaptrack.schema.classes import class_names
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.camera_motion import tracks_topic
 from mcaptrack.sources.cameras import camera_at, provenance_of
+from mcaptrack.sources.fixed_frame import BoxesRead
 from mcaptrack.transforms import FULL, STAGES, Transform
 from mcaptrack.transforms.guarded import guarded
 from mcaptrack.transforms.protocol import ModelCard, traits_of
@@ -75,16 +76,17 @@ def run(
     progress: Progress = lambda *_: None,
     watch: Watch | None = None,
     plane: PlaneChoice = AS_BEFORE,
+    boxes: BoxesRead | None = None,
 ) -> Report:
     """Run the jobs, and write their channels and views into the log, or into a copy of it at ``output``.
 
     With ``watch`` the last stage finds events of tracks, if they are missing or out of date. ``plane`` says how to make
-    a ground plane where none is given.
+    a ground plane where none is given. ``boxes`` keeps boxes of other software that are read.
 
     The log is replaced as a whole, after everything was computed.
     """
     with collected() as warnings:
-        report = _run(opened, prefix, jobs, output, progress, watch, plane)
+        report = _run(opened, prefix, jobs, output, progress, watch, plane, boxes or BoxesRead())
     report.warnings = list(dict.fromkeys(warnings))
     return report
 
@@ -97,13 +99,14 @@ def _run(
     progress: Progress,
     watch: Watch | None,
     choice: PlaneChoice,
+    boxes: BoxesRead,
 ) -> Report:
     made: dict[str, Made] = {}
     stamps: dict[str, list[int]] = {}
     report = Report()
     planes = read_planes(opened, prefix)
     for job in jobs:
-        given = _input(opened, job, made, stamps, progress)
+        given = _input(opened, job, made, stamps, progress, boxes)
         source = (job.source, given.digest())
         planes, ground, frame_id = planes_for(opened, prefix, job, given.frames, source, made, planes, choice)
         made |= ground
@@ -128,7 +131,7 @@ def _run(
         report.stages += [EVENTS_STAGE] if events else []
     if made or output is not None:
         path, _ = path_with(opened, prefix, tracks_topic(prefix), made)
-        report.layouts = write(opened, prefix, made, planes or (), stamps, output, path)
+        report.layouts = write(opened, prefix, made, planes or (), stamps, output, path, boxes.in_space())
     provenances = {topic: channel.provenance for topic, channel in made.items()}
     warn_findings(opened, prefix, provenances, planes or (), is_all=watch is not None or not jobs)
     report.stale = outdated_by(opened, {topic: channel.provenance.digest for topic, channel in made.items()})
@@ -291,7 +294,12 @@ def _at_video_rate(
 
 
 def _input(
-    opened: log.Log, job: Job, made: Mapping[str, Made], stamps: dict[str, list[int]], progress: Progress
+    opened: log.Log,
+    job: Job,
+    made: Mapping[str, Made],
+    stamps: dict[str, list[int]],
+    progress: Progress,
+    boxes: BoxesRead,
 ) -> _Input:
     """Return the input of a job; the capture times of pictures in ns are appended to ``stamps``, by topic."""
     if job.source not in made and job.transform.reads is VIDEO:
@@ -302,7 +310,7 @@ def _input(
         frames, how = made[job.source].frames, made[job.source].provenance
         of_rows, names, frame_id = how.digest, class_names(how.to_metadata()), how.frame_id
     else:
-        frames, names, frame_id = read_named_frames(opened, job.source, job.transform.reads, job.frame_id)
+        frames, names, frame_id = read_named_frames(opened, job.source, job.transform.reads, job.frame_id, boxes)
         of_rows = digest_of(opened, job.source)
     classes = {str(number): name for number, name in sorted(names.items())}
     stream = _Repeatable(lambda: _counted(frames, job.stage, progress))

@@ -20,7 +20,7 @@ from mcaptrack.schema.camera_motion import rows_to_verdict
 from mcaptrack.schema.classes import class_names
 from mcaptrack.sources.camera_motion import motion_topic, read_ground_truth
 from mcaptrack.sources.cameras import camera_at, provenance_of
-from mcaptrack.sources.fixed_frame import holds_boxes, named_detections
+from mcaptrack.sources.fixed_frame import BoxesRead, holds_boxes
 from mcaptrack.transforms import STAGES
 
 #: Minimum IoU of boxes at which a track matches the ground truth, as in the demo.
@@ -71,10 +71,11 @@ class Summary:
         return asdict(self)
 
 
-def summarise(opened: log.Log, prefix: str) -> Summary:
+def summarise(opened: log.Log, prefix: str, boxes_read: BoxesRead | None = None) -> Summary:
     """Count the results for a camera, and score them against its ground truth, if it has one.
 
-    Warns if IDF1 is lower after re-tracking than before.
+    ``boxes_read`` are boxes of other software that were read before. Warns if IDF1 is lower after re-tracking than
+    before.
     """
     camera = camera_at(opened, prefix)
     names = ("detect", "track", "sample", "predict", "retrack")
@@ -93,7 +94,7 @@ def summarise(opened: log.Log, prefix: str) -> Summary:
         )
     return Summary(
         pictures=opened.channels[camera.pictures].messages if camera.pictures else None,
-        boxes=_count_boxes(opened, tracks, boxes),
+        boxes=_count_boxes(opened, tracks, boxes, boxes_read or BoxesRead()),
         tracks=None if tracked is None else len(np.unique(tracked["track_id"])),
         repair=None if tracked is None or repaired is None else _repair(tracked, repaired),
         forecasts=None if forecasts is None else int((forecasts["step"] == 1).sum()),
@@ -111,14 +112,14 @@ def _rows(opened: log.Log, topic: str, schema: Schema) -> Rows | None:
     return opened.rows(topic, schema).rows if channel and channel.schema_name == schema.name else None
 
 
-def _count_boxes(opened: log.Log, tracks: str, usual: str) -> int | None:
+def _count_boxes(opened: log.Log, tracks: str, usual: str, boxes_read: BoxesRead) -> int | None:
     """Return the number of boxes that tracks were made from."""
     made = provenance_of(opened, tracks)
     source = opened.channels.get(made.input if made else usual) or opened.channels.get(usual)
     if source is None:
         return None
     if holds_boxes(opened, source.topic):
-        return sum(len(frame.rows) for frame in named_detections(opened, source.topic).frames)
+        return sum(len(frame.rows) for frame in boxes_read.read(opened, source.topic).frames)
     rows = _rows(opened, source.topic, DETECTIONS)
     return None if rows is None else len(rows)
 

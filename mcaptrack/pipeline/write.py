@@ -27,6 +27,7 @@ from mcaptrack.pipeline.drawing import (
     calibrated_cameras,
     frame_topic,
     has_bodies,
+    is_drawn_by_viewers,
     new_frames,
     recorded_drawings,
     recorded_sources,
@@ -114,8 +115,11 @@ def write(
     stamps: Mapping[str, Sequence[int]],
     output: Path | None,
     path: CameraPath | None = None,
+    boxes: Mapping[str, foreign.NamedFrames] = {},
 ) -> dict[str, bytes]:
     """Write channels and their views into the log, or into a copy at ``output``. Returns layout files by name.
+
+    ``boxes`` are recorded boxes in space that this run has read, by topic; those that viewers don't draw get a view.
 
     ``path`` is how the camera moves, if its tracks are compensated for it: so are views, and ``planes`` with it.
     ``made`` are the channels by topic; ``stamps`` the capture times in ns of pictures that stages have read, by topic.
@@ -126,7 +130,7 @@ def write(
     picture_ns = opened.times(video) if video else np.empty(0, np.int64)
     video = video if len(picture_ns) else None
     stamp_ns = _stamps(opened, video, stamps.get(video, ())) if video else picture_ns
-    shown = _channels_to_draw(opened, camera, made)
+    shown = _channels_to_draw(opened, camera, made) | _boxes_to_draw(opened, boxes)
     outdated = {topic + suffix for topic in shown for suffix in views.SUFFIXES}
     planes = moved_planes(planes, path)
     frame_id = _frame_id(opened, prefix, shown)
@@ -157,6 +161,7 @@ def write(
     drawn_first = [view for view in drawn.views(first, start_ns) if view.topic not in recorded]
     drawn_last = [view for view in drawn.views(last, start_ns) if view.topic not in recorded]
     topics = {*opened.channels} - outdated | {*made} | {view.topic for view in (*drawn_first, *drawn_last)}
+    by_viewers |= {one + views.SCENE_SUFFIX: True for one in sources if one + views.SCENE_SUFFIX in topics}
     names = frozenset(topic.removeprefix(prefix + "/") for topic in topics if topic.startswith(prefix + "/"))
     frame_id = frame_id or views.ground.frame_of(prefix)
     channels = layouts.CameraChannels(
@@ -208,8 +213,9 @@ def _channels_to_draw(opened: log.Log, camera: Camera, made: Mapping[str, Made])
         known = Provenance.from_metadata(channel.metadata)
         if topic in shown or topic not in camera.topics or not known or known.transform != INGEST:
             continue
-        drawn = opened.channels.get(topic + (views.SUFFIX if schema is DETECTIONS else views.SCENE_SUFFIX))
-        drawn_from = Provenance.from_metadata(drawn.metadata) if drawn else None
+        suffixes = views.SUFFIXES if schema is DETECTIONS else (views.SCENE_SUFFIX,)
+        drawn = [opened.channels[topic + suffix] for suffix in suffixes if topic + suffix in opened.channels]
+        drawn_from = Provenance.from_metadata(drawn[0].metadata) if drawn else None
         is_new = drawn_from is None or drawn_from.input_digest != known.digest
         if schema in (*views.DRAWN, GROUND_PLANE) and is_new:
             names, frame_id = class_names(channel.metadata), known.frame_id
@@ -219,6 +225,15 @@ def _channels_to_draw(opened: log.Log, camera: Camera, made: Mapping[str, Made])
         if one.schema is PREDICTIONS:
             shown[topic] = one._replace(bodies=_bodies(opened, shown, topic, inputs[topic]))
     return shown
+
+
+def _boxes_to_draw(opened: log.Log, boxes: Mapping[str, foreign.NamedFrames]) -> dict[str, ChannelToDraw]:
+    """Return the recorded boxes that viewers can't draw, by topic."""
+    return {
+        topic: ChannelToDraw(DETECTIONS, one.frames, digest_of(opened, topic), "", one.classes, one.frame_id)
+        for topic, one in boxes.items()
+        if not is_drawn_by_viewers(opened.channel(topic)) and has_bodies(one.frames)
+    }
 
 
 def _bodies(opened: log.Log, shown: Mapping[str, ChannelToDraw], topic: str, source: str) -> Sequence[Frame]:

@@ -113,6 +113,25 @@ def named_detections(opened: log.Log, topic: str, frame_id: str = "") -> foreign
     return foreign.NamedFrames(frames, names, fixed)
 
 
+class BoxesRead:
+    """Boxes of other software that were read from a log, for later steps: decoding them takes long."""
+
+    def __init__(self) -> None:
+        self._found: dict[str, foreign.NamedFrames] = {}
+
+    def read(self, opened: log.Log, topic: str, frame_id: str = "") -> foreign.NamedFrames:
+        """Return the boxes of a channel as ``named_detections`` does; those that were read before without decoding."""
+        wanted = plain_frame(frame_id) or _frame_before(opened, topic)
+        found = self._found.get(topic)
+        if found is None or found.frame_id != (wanted or found.frame_id):
+            self._found[topic] = found = named_detections(opened, topic, frame_id)
+        return found
+
+    def in_space(self) -> dict[str, foreign.NamedFrames]:
+        """Return the boxes in space that were read, by topic."""
+        return {topic: one for topic, one in self._found.items() if one.frame_id}
+
+
 def _fixed_frame(opened: log.Log, topic: str, found: Recorded3d, wanted: str) -> str:
     """The frame that boxes are brought to. Raises McaptrackError if there is no such frame."""
     counts = Counter(found.frame.tolist())

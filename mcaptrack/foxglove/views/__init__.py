@@ -88,6 +88,8 @@ class Drawing:
             yield from ground.tracks(self._people(t_ns), t_ns, frame_id, self._style, self._classes)
         elif self._schema is PREDICTIONS:
             yield from ground.predictions(self._frames, t_ns, frame_id, bodies)
+        elif self._schema is DETECTIONS:
+            yield from ground.detections(self._frames, t_ns, frame_id, self._classes)
 
     def _people(self, t_ns: Ints) -> People:
         """The people at these times, computed once for both views."""

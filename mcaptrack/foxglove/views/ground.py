@@ -17,24 +17,28 @@ from mcaptrack.foxglove.views.people import (
     ForecastPaths,
     People,
     base_heights,
+    bodies_of,
     by_count,
     ellipses,
     forecasts,
+    labels_of,
     latest,
     segments,
     shown_at,
     trails,
 )
-from mcaptrack.foxglove.views.style import INTERPOLATED, OBSERVED, TrackStyle
+from mcaptrack.foxglove.views.style import INTERPOLATED, OBSERVED, RETRACKED, TrackStyle
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.plane import GroundPlane, Planes
-from mcaptrack.schema import Frame
-from mcaptrack.schema.framing import frame_times
+from mcaptrack.schema import DETECTIONS, Frame
+from mcaptrack.schema.framing import frame_times, join_frames
 
 _BATCH: Final = 128
 _WHITE: Final = (1.0, 1.0, 1.0)
 _FORECAST_PX: Final = 3.0
+#: The opacity of detections, which tracks are seen through.
+_DETECTED: Final = 0.3125
 #: The outline of a picture ends where a pixel is this many times as large on the ground as in the middle of the lower
 #: edge; the horizon is farther away.
 _FARTHEST: Final = 20.0
@@ -107,6 +111,31 @@ def tracks(people: People, t_ns: Ints, frame_id: str, style: TrackStyle, classes
                 )  # fmt: skip
             else:
                 scene.people(frame, label, people.at_m[these], rgb[these], alpha[these], style.marker, trail, opacity)
+        yield from instants.numbered(span, scene)
+
+
+def detections(frames: Sequence[Frame], t_ns: Ints, frame_id: str, classes: Mapping[int, str] = {}) -> View:
+    """Draw the 3D boxes of detections, a frame at each of the times, in the colours of their classes.
+
+    Labels are the ids of the detector, or the numbers of rows where not all boxes of a frame have one of their own.
+    """
+    instants = _Instants(t_ns, frame_id)
+    joined = join_frames(DETECTIONS, frames)
+    body = bodies_of(joined.rows)
+    known = np.flatnonzero(np.isfinite(np.column_stack([body.centre_m, body.size_m])).all(axis=1))
+    number = joined.rows["source_id"].astype(np.int64)
+    if (number < 0).any() or len(np.unique(np.stack([joined.frame, number]), axis=1).T) < len(number):
+        number = np.arange(len(number)) - joined.ends[joined.frame]
+    class_id = joined.rows["class_id"].astype(np.int64)
+    label, rgb = labels_of(number, class_id, classes), class_colours(class_id, classes)
+    bounds = np.searchsorted(joined.frame[known], np.arange(len(t_ns) + 1))
+    for span, scene in instants.batches():
+        rows = known[bounds[span.start] : bounds[span.stop]]
+        some = body.chosen(rows)
+        scene.boxes(
+            joined.frame[rows] - span.start, label[rows], some, rgb[rows], np.full(len(rows), _DETECTED), rgb[rows],
+            RETRACKED.box, some.centre_m[:, None], np.ones(1), RETRACKED.marker,
+        )  # fmt: skip
         yield from instants.numbered(span, scene)
 
 

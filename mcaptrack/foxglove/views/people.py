@@ -121,7 +121,7 @@ def people_at(
         unknown = held & np.isnan(foot).any(axis=1) & np.isfinite(at_m).all(axis=1)
         foot[unknown] = plane.metres_to_pixels(at_m[unknown])
     number, class_id = rows["track_id"].astype(np.int64), rows["class_id"].astype(np.int64)
-    label, observed = _labels(number, class_id, classes), np.array(rows["observed"], bool)
+    label, observed = labels_of(number, class_id, classes), np.array(rows["observed"], bool)
     return People(number, frame, box, foot, at_m, observed, label, class_id, bodies_of(rows))
 
 
@@ -154,7 +154,7 @@ def base_heights(tracks: Sequence[Frame], made_ns: Ints, number: Ints) -> Floats
     return out
 
 
-def _labels(number: Ints, class_id: Ints, names: Mapping[int, str]) -> NDArray[Any]:
+def labels_of(number: Ints, class_id: Ints, names: Mapping[int, str]) -> NDArray[Any]:
     """The labels (S,) of people: ids, and the class if there is more than one."""
     if not len(number) or (class_id == class_id[0]).all():
         return number

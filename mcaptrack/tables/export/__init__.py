@@ -17,6 +17,7 @@ from typing import Final
 
 from mcaptrack import __version__, log, tables
 from mcaptrack.errors import McaptrackError
+from mcaptrack.sources.fixed_frame import BoxesRead
 from mcaptrack.tables import TABLES, Format
 from mcaptrack.tables.export.contents import LogTables
 from mcaptrack.tables.export.names import file_name, recording_name, topic_folder
@@ -69,6 +70,7 @@ def export(
     topics: Sequence[str] = (),
     blobs: bool = False,
     force: bool = False,
+    boxes: BoxesRead | None = None,
 ) -> Exported:
     """Update the tables of a log in a folder. Tables without rows are written, too, with their columns.
 
@@ -85,6 +87,8 @@ def export(
         Whether these tables have fields of bytes.
     force : bool
         Write all tables again, and replace those of another log with the same name.
+    boxes : BoxesRead, optional
+        Boxes of other software that were read before.
 
     Returns
     -------
@@ -95,7 +99,7 @@ def export(
     McaptrackError
         If a channel does not exist or can't be read, and if the folder holds tables of another log with the same name.
     """
-    contents = LogTables(opened)
+    contents = LogTables(opened, boxes)
     for topic in topics:
         opened.channel(topic)
     job = _Job(contents, folder, form, force, Exported())

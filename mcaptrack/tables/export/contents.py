@@ -17,7 +17,7 @@ from mcaptrack.schema.classes import class_names
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources import foreign
 from mcaptrack.sources.cameras import Camera, cameras
-from mcaptrack.sources.fixed_frame import holds_boxes, holds_boxes_3d, named_detections
+from mcaptrack.sources.fixed_frame import BoxesRead, holds_boxes, holds_boxes_3d
 from mcaptrack.sources.foreign.flatten import flattener, message_type_of
 from mcaptrack.tables import TABLES, Part, Pointers
 from mcaptrack.tables.export.names import file_name, recording_name
@@ -29,8 +29,9 @@ _OF_THE_WHOLE: Final = ("frames", "channels", "recordings")
 class LogTables:
     """The tables of a log. Rows are read once and kept, because several tables are made of them."""
 
-    def __init__(self, opened: log.Log) -> None:
+    def __init__(self, opened: log.Log, boxes: BoxesRead | None = None) -> None:
         self.opened = opened
+        self._boxes_read = boxes or BoxesRead()
         self.recording = recording_name(opened.path)
         self._parts: dict[str, Part] = {}
         self._class_names: dict[str, dict[int, str]] = {}
@@ -146,7 +147,7 @@ class LogTables:
     def _boxes(self, topic: str) -> Part:
         """Foreign boxes; none, and a note, if they can't be read: the other tables don't depend on them."""
         try:
-            frames, self._class_names[topic], _ = named_detections(self.opened, topic)
+            frames, self._class_names[topic], _ = self._boxes_read.read(self.opened, topic)
         except McaptrackError as error:
             self._note("detections", f"{error}; no boxes of {topic} are in the table")
             t_ns = self.opened.times(topic)
