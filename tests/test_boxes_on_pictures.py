@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import av
 import cv2
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
 from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
 
+import mcaptrack
 from mcaptrack import foxglove, log, notices
 from mcaptrack.foxglove import class_colour
 from mcaptrack.foxglove.views import Drawing, MovingCamera
@@ -229,6 +231,25 @@ def test_tracks_are_drawn_on_each_calibrated_camera_of_a_log(tmp_path):
     panels = json.loads(layouts["tracking"])["configById"]
     mode = panels["Image!camera0"]["imageMode"]
     assert (mode["imageTopic"], mode["annotations"]) == ("/front/image", {views[0]: {"visible": True}})
+
+
+def test_a_video_of_3d_boxes_is_on_the_pictures_of_a_calibrated_camera_or_from_above(tmp_path):
+    path = recorded(tmp_path / "drive.mcap")
+    with_tracks(path)
+    result = mcaptrack.render(path, tmp_path / "a.mp4", camera="lidar")
+    assert (result.pictures, result.views) == (PICTURES, ("/lidar/retracks/view/image/front/image",))
+    with log.read(path) as opened:
+        first = ImageAnnotations.FromString(next(opened.messages(result.views[0])).payload)
+    with av.open(str(tmp_path / "a.mp4")) as container:
+        picture = next(container.decode(video=0)).to_ndarray(format="bgr24")
+    x, y = lines(first).reshape(-1, 2).mean(axis=0)
+    assert picture.shape == (HEIGHT, WIDTH, 3)
+    assert picture[int(y) - 40 : int(y) + 40, int(x) - 40 : int(x) + 40].max() > 100
+    assert picture[:40, :40].max() < 30
+    for topic in ("/lidar/retracks", "/lidar/retracks/view/image/front/image"):
+        assert mcaptrack.render(path, tmp_path / "b.mp4", topic=topic, camera="lidar", force=True).views == result.views
+    above = mcaptrack.render(path, tmp_path / "c.mp4", topic="/lidar/retracks/view/scene", camera="lidar", end_s=0.1)
+    assert (above.pictures, above.views) == (2, ("/lidar/retracks/view/scene",))
 
 
 def test_without_any_calibration_nothing_is_said_and_older_drawings_go(tmp_path):

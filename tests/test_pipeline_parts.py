@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mcaptrack import log, notices, pipeline
+from mcaptrack import foxglove, log, notices, pipeline
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.pipeline import drawing, findings
@@ -714,8 +714,14 @@ def test_views_are_found_by_what_is_best_or_by_name(tmp_path):
     path = tmp_path / "a.mcap"
 
     def found(names: Sequence[str], *topics: str) -> list[str]:
-        with log.read(written(path, {f"/{name}": (TRACKS, None, []) for name in names})) as opened:
-            return pipeline.find_views(opened, "/camera", topics)
+        with log.create(path) as writer:
+            writer.add_channel("/camera/video", foxglove.schema_record(foxglove.VIDEO), "protobuf", {})
+            for name in names:
+                writer.add_channel(f"/{name}", (TRACKS.name, "protobuf", TRACKS.descriptor), "protobuf", {})
+        with log.read(path) as opened:
+            shown = pipeline.find_views(opened, "/camera", topics)
+        assert shown.pictures == "/camera/video"
+        return shown.views
 
     image = "/view/image"
     names = [f"camera/{name}{image}" for name in ("detections", "tracks", "retracks/full", "retracks/predictions")]
@@ -733,6 +739,11 @@ def test_views_are_found_by_what_is_best_or_by_name(tmp_path):
     assert str(error.value) == f"{path} has no views of /camera yet; `mcaptrack.run('{path}')` makes them"
     with pytest.raises(McaptrackError, match="/camera/samples/view/image"):
         found(names, "/camera/samples")
+    names += ["camera/tracks/view/scene"]
+    with pytest.raises(McaptrackError, match="views on /camera/video, scenes can't be drawn in one video; name those"):
+        found(names, "/camera/tracks", "/camera/tracks/view/scene")
+    with log.read(written(path, {f"/{name}": (TRACKS, None, []) for name in names})) as opened:
+        assert pipeline.find_views(opened, "/camera") == (["/camera/tracks/view/scene"], "")
 
 
 def test_a_digest_is_of_the_messages_whether_or_not_it_was_kept(tmp_path):

@@ -144,7 +144,9 @@ class Scene:
 
 #: By module, function and verb: a scene in which the message comes.
 SCENES: dict[str, Callable[[Scene], str]] = {
-    "api/outputs.py:render:info": lambda s: s.without("/camera/video").says("render", "LOG"),
+    "pipeline/shown.py:find_views:info": lambda s: s.without("/camera/video", "/camera/*/view/scene").says(
+        "render", "LOG"
+    ),
     "cli/running.py:_next:*": lambda s: s.says("run", "LOG", "--no-tables"),
     "api/running.py:warn_stale:run": lambda s: s.says("detect", "LOG", "--detector", "mog2"),
     "cli/train.py:_print:predict": lambda s: s.says(
@@ -181,7 +183,7 @@ SCENES: dict[str, Callable[[Scene], str]] = {
     "pipeline/plan.py:_warn_settings:run": Scene.of_a_later_version,
     "pipeline/plan.py:_refusal:run": Scene.by_own_tracker,
     "pipeline/plan.py:_not_made:*": Scene.elsewhere,
-    "pipeline/write.py:find_views:run": lambda s: s.untracked().says("render", "LOG"),
+    "pipeline/shown.py:find_views:run": lambda s: s.untracked().says("render", "LOG"),
     "viewing/report/contents.py:_score:ingest": lambda s: s.without("/camera/truth*").page(),
     "viewing/report/summary.py:_without_ground_truth:run": lambda s: s.ingested("clip.mp4").page(),
     "viewing/report/sections.py:scores:run": lambda s: s.ingested("clip.mp4").page(),

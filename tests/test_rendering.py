@@ -10,6 +10,8 @@ import av
 import numpy as np
 import pytest
 from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+from scipy.spatial.transform import Rotation
 
 from mcaptrack import foxglove, log
 from mcaptrack.errors import McaptrackError
@@ -18,6 +20,8 @@ from mcaptrack.sources.video import write_clip
 from mcaptrack.sources.video.decode import EncodedPicture, decode_bgr
 from mcaptrack.sources.video.encode import encode_image
 from mcaptrack.sources.video.raw_pixels import PixelLayout
+from mcaptrack.viewing import from_above
+from mcaptrack.viewing.from_above import Sight
 from mcaptrack.viewing.rendering import draw
 from tests.commands import call, printed
 
@@ -195,6 +199,50 @@ def test_a_log_without_views_says_what_makes_them(footage, tmp_path):
     assert (code, "has no pictures of /camera to draw on" in err) == (1, True)
 
 
+def scene_of(*cubes) -> SceneUpdate:
+    """Cubes of (centre, quaternion, size, colour)."""
+    scene = SceneUpdate()
+    for number, (centre, turn, size, colour) in enumerate(cubes):
+        cube = scene.entities.add(id=str(number), frame_id="map").cubes.add()
+        for axis, value in zip("xyz", centre, strict=True):
+            setattr(cube.pose.position, axis, value)
+        for axis, value in zip("xyzw", turn, strict=True):
+            setattr(cube.pose.orientation, axis, value)
+        for axis, value in zip("xyz", size, strict=True):
+            setattr(cube.size, axis, value)
+        paint(cube.color, colour)
+    return scene
+
+
+def test_cubes_from_above_have_the_corners_of_scipy_with_north_up():
+    sight = Sight(100.0, 50.0, 8.0, 640, 480)
+    turn = Rotation.from_euler("zyx", [0.7, 0.2, -0.1])
+    scene = scene_of(((103.0, 54.0, 9.0), turn.as_quat() * 2, (4.0, 2.0, 1.5), (0.0, 1.0, 0.0, 1.0)))
+    (part,) = from_above.drawing(scene, sight).points
+    wanted = turn.apply([[x, y, 0.0] for x, y in ((-2, -1), (2, -1), (2, 1), (-2, 1))]) + [103.0, 54.0, 9.0]
+    found = np.array([(point.x, point.y) for point in part.points])
+    np.testing.assert_allclose(found[:, 0], 320 + 8 * (wanted[:, 0] - 100), atol=1e-9)
+    np.testing.assert_allclose(found[:, 1], 240 - 8 * (wanted[:, 1] - 50), atol=1e-9)
+    image = draw(from_above.ground(sight), from_above.drawing(scene, sight))
+    x, y = 320 + 8 * 3, 240 - 8 * 4
+    assert image[y, x].tolist() == [0, 255, 0]
+    assert image[y + 2 * (240 - y), x].tolist() == image[0, 0].tolist()  # not mirrored
+
+
+@pytest.mark.parametrize(("px_per_m", "step"), [(96.0, 1), (40.0, 5), (12.0, 10), (0.9, 200)])
+def test_the_grid_has_round_steps_at_their_multiples(px_per_m, step):
+    sight = Sight(103.0, 57.0, px_per_m, 960, 720)
+    found = from_above.grid(sight)
+    assert [text.text for text in found.texts] == [f"{step} m"]
+    *lines, bar = (np.array([(point.x, point.y) for point in part.points]) for part in found.points)
+    assert bar[1, 0] - bar[0, 0] == pytest.approx(step * px_per_m)
+    east = [(ends[0, 0] - 480) / px_per_m + 103.0 for ends in lines if ends[0, 0] == ends[1, 0]]
+    north = [57.0 - (ends[0, 1] - 360) / px_per_m for ends in lines if ends[0, 1] == ends[1, 1]]
+    assert len(east) + len(north) == len(lines) > 2
+    np.testing.assert_allclose(np.array(east + north) / step, np.rint(np.array(east + north) / step), atol=1e-9)
+    np.testing.assert_allclose(np.diff(east), step)
+
+
 def test_nothing_is_left_of_a_clip_that_fails(tmp_path):
     def broken():
         yield 0, np.zeros((64, 64, 3), np.uint8)
@@ -208,6 +256,6 @@ def test_nothing_is_left_of_a_clip_that_fails(tmp_path):
 
 def test_re_tracked_people_are_drawn_at_the_rate_of_the_video(finished):
     with log.read(finished) as opened:
-        assert find_views(opened, "/camera", ["/camera/retracks"]) == ["/camera/retracks/full/view/image"]
+        assert find_views(opened, "/camera", ["/camera/retracks"]).views == ["/camera/retracks/full/view/image"]
         with pytest.raises(McaptrackError, match="has no channel /camera/unknown/view/image"):
             find_views(opened, "/camera", ["/camera/unknown"])

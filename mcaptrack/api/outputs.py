@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, cast
 
@@ -22,7 +23,7 @@ from mcaptrack.api.common import (
     warn_unused,
     warnings_about,
 )
-from mcaptrack.errors import McaptrackError, call
+from mcaptrack.errors import McaptrackError
 from mcaptrack.files import follow_links, is_same_file, publish_bytes, refuse_overwrite
 from mcaptrack.notices import Notice, collected, warn
 from mcaptrack.tables import Format
@@ -33,6 +34,7 @@ from mcaptrack.tables.rosbag2 import default_folder as default_bag
 from mcaptrack.viewing import report as pages
 from mcaptrack.viewing.rendering import RenderOptions
 from mcaptrack.viewing.rendering import render as draw_video
+from mcaptrack.viewing.rendering import render_from_above as draw_from_above
 
 #: ROS 2 bags by the format of ``export``.
 _BAGS: Mapping[str, Storage] = {"rosbag2": "mcap", "rosbag2-sqlite3": "sqlite3"}
@@ -290,7 +292,10 @@ def render(
     force: bool = False,
     progress: Progress = no_progress,
 ) -> RenderResult:
-    """Draw boxes, trails and predictions on the video of a log.
+    """Draw boxes, trails and predictions on the video of a log, or from above if it has none.
+
+    Tracks of 3D boxes are drawn on the pictures of a calibrated camera; without one, they are seen from above in their
+    frame of reference, around the robot.
 
     Parameters
     ----------
@@ -301,7 +306,7 @@ def render(
     topic : str or sequence of str, optional
         Draw these views; by default those that the layout shows.
     width : int, optional
-        Width in pixels; by default that of the video.
+        Width in pixels; by default that of the video, or 960 from above.
     max_fps : float, optional
         Largest number of pictures per second; by default all, in a GIF 10.
     start_s, end_s : float, optional
@@ -323,7 +328,7 @@ def render(
     Raises
     ------
     McaptrackError
-        If the log has no pictures, or if the video exists.
+        If the log has no pictures and no scenes, or if the video exists.
 
     Examples
     --------
@@ -339,10 +344,10 @@ def render(
     with warnings_about(path) as warnings, logs.read(path) as opened:
         warn_unused("the name of the output says what is written", gif=gif and output is not None)
         prefix = pipeline.find_camera(opened, camera)
-        pictures = pipeline.camera_at(opened, prefix).pictures
-        if pictures is None:
-            more = call("info", path)
-            raise McaptrackError(f"{path} has no pictures of {prefix} to draw on; {more} shows what it has")
-        views = pipeline.find_views(opened, prefix, names_of(topic))
-        count = draw_video(opened, pictures, views, target, options, progress)
-    return RenderResult(path, target, count, tuple(views), tuple(dict.fromkeys(warnings)))
+        shown = pipeline.find_views(opened, prefix, names_of(topic))
+        if shown.pictures:
+            count = draw_video(opened, shown.pictures, shown.views, target, options, progress)
+        else:
+            follow = partial(pipeline.robot_path, opened, prefix, shown.views[0])
+            count = draw_from_above(opened, shown.views, target, options, follow, progress)
+    return RenderResult(path, target, count, tuple(shown.views), tuple(dict.fromkeys(warnings)))

@@ -82,7 +82,8 @@ def render(
 ) -> None:
     """Draw boxes, trails and predictions on the video of a log: LOG.mp4, or a GIF.
 
-    Draws the views that Foxglove and Lichtblick show, in the same colours.
+    Draws the views that Foxglove and Lichtblick show, in the same colours. Tracks of 3D boxes are drawn on the pictures
+    of a calibrated camera; without one, they are seen from above, as with --topic /lidar/retracks/full/view/scene.
 
     Example: mcaptrack render log.mcap -o walk.gif --width 480 --start-s 2 --end-s 8
     """

@@ -9,9 +9,10 @@ from mcaptrack.pipeline.events import Watch
 from mcaptrack.pipeline.plan import plan_all, plan_stage
 from mcaptrack.pipeline.planes import AS_BEFORE, PlaneChoice, read_planes
 from mcaptrack.pipeline.run import Report, input_of, outdated_by, run
+from mcaptrack.pipeline.shown import RobotPath, Shown, find_views, robot_path
 from mcaptrack.pipeline.staleness import is_stale
 from mcaptrack.pipeline.summary import Summary, summarise
-from mcaptrack.pipeline.write import LAYOUTS, attachment_of, find_views, layout_path
+from mcaptrack.pipeline.write import LAYOUTS, attachment_of, layout_path
 from mcaptrack.sources.cameras import Camera, camera_at, find_camera
 
 __all__ = [
@@ -21,6 +22,8 @@ __all__ = [
     "Job",
     "PlaneChoice",
     "Report",
+    "RobotPath",
+    "Shown",
     "Summary",
     "Watch",
     "attachment_of",
@@ -34,6 +37,7 @@ __all__ = [
     "plan_all",
     "plan_stage",
     "read_planes",
+    "robot_path",
     "run",
     "summarise",
 ]

@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack import foxglove, log
-from mcaptrack.errors import McaptrackError, call
 from mcaptrack.foxglove import views
 from mcaptrack.foxglove.views import layouts
 from mcaptrack.geometry.arrays import Ints
@@ -39,7 +38,6 @@ from mcaptrack.schema.provenance import INGEST, VIEW, Provenance, digest, frame_
 from mcaptrack.sources import foreign
 from mcaptrack.sources.cameras import VIDEO, Camera, camera_at
 from mcaptrack.sources.frames import transforms_of
-from mcaptrack.transforms import FULL
 
 #: Log time in ns, channel number, sequence number and payload of a message.
 Numbered = tuple[int, int, int, bytes]
@@ -213,9 +211,8 @@ def _channels_to_draw(opened: log.Log, camera: Camera, made: Mapping[str, Made])
         known = Provenance.from_metadata(channel.metadata)
         if topic in shown or topic not in camera.topics or not known or known.transform != INGEST:
             continue
-        suffixes = views.SUFFIXES if schema is DETECTIONS else (views.SCENE_SUFFIX,)
-        drawn = [opened.channels[topic + suffix] for suffix in suffixes if topic + suffix in opened.channels]
-        drawn_from = Provenance.from_metadata(drawn[0].metadata) if drawn else None
+        drawn = opened.channels.get(topic + (views.SUFFIX if schema is DETECTIONS else views.SCENE_SUFFIX))
+        drawn_from = Provenance.from_metadata(drawn.metadata) if drawn else None
         is_new = drawn_from is None or drawn_from.input_digest != known.digest
         if schema in (*views.DRAWN, GROUND_PLANE) and is_new:
             names, frame_id = class_names(channel.metadata), known.frame_id
@@ -336,27 +333,3 @@ def attachment_of(name: str) -> str:
 #: The names of all layouts; the first one is the default.
 LAYOUTS: Final = tuple(layouts.FILES)
 ATTACHMENTS: Final = tuple(attachment_of(name) for name in layouts.FILES)
-
-
-def find_views(opened: log.Log, prefix: str, topics: Sequence[str] = ()) -> list[str]:
-    """Return the topics of the views that layouts show by default, or of the views of the given channels.
-
-    Raises McaptrackError if there are none.
-    """
-    if topics:
-        return [opened.channel(_view_of(opened, topic)).topic for topic in topics]
-    drawn = {
-        topic.removeprefix(prefix + "/").removesuffix(views.SUFFIX)
-        for topic in opened.channels
-        if topic.startswith(prefix + "/") and topic.endswith(views.SUFFIX)
-    }
-    found = [f"{prefix}/{name}{views.SUFFIX}" for name in layouts.best_channels(drawn)]
-    if not found:
-        raise McaptrackError(f"{opened.path} has no views of {prefix} yet; {call('run', opened.path)} makes them")
-    return found
-
-
-def _view_of(opened: log.Log, topic: str) -> str:
-    """Return the topic of a channel's view: its own, or the view of the same tracks at the video's rate."""
-    names = [topic] if topic.endswith(views.SUFFIX) else [topic + views.SUFFIX, topic + FULL + views.SUFFIX]
-    return next((name for name in names if name in opened.channels), names[0])

@@ -18,15 +18,25 @@ from numpy.typing import NDArray
 
 from mcaptrack import foxglove, log, notices
 from mcaptrack.errors import McaptrackError
-from mcaptrack.geometry.arrays import Image
+from mcaptrack.geometry.arrays import Image, Ints
 from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
+from mcaptrack.pipeline import RobotPath
 from mcaptrack.sources.pictures import Pictures
 from mcaptrack.sources.video import write_clip
+from mcaptrack.viewing import from_above
+from mcaptrack.viewing.from_above import Sight
 
 _LINE_LOOP, _LINE_STRIP, _LINE_LIST = 2, 3, 4
 #: The number of binary places of pixel coordinates.
 _SHIFT: Final = 4
 _GIF_FPS: Final = 10.0
+#: Seen from above: the width of a video in pixels and its height as a share of it, the width in metres around a robot,
+#: the least one around places, and the margin around these as a factor.
+_WIDTH_PX: Final = 960
+_HEIGHT: Final = 0.75
+_AROUND_M: Final = 80.0
+_LEAST_M: Final = 10.0
+_MARGIN: Final = 1.2
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,30 +83,12 @@ def render(
     McaptrackError
         If there are no pictures in the period, or if they can't be decoded.
     """
-    if output.suffix.lower() not in (".mp4", ".gif"):
-        raise McaptrackError(f"{output}: a video is rendered to .mp4 or .gif, not to {output.suffix or 'no suffix'}")
+    _check_suffix(output)
     pictures = Pictures(opened, picture_topic)
-    times = pictures.t_ns
-    if not len(times):
+    if not len(pictures.t_ns):
         raise McaptrackError(f"{opened.path}: {picture_topic} has no pictures")
-    first = int(times[0]) + seconds_to_ns(options.start_s)
-    last = int(times[-1]) if options.end_s is None else int(times[0]) + seconds_to_ns(options.end_s)
-    numbers = np.flatnonzero((times >= first) & (times <= last))
-    _, first_of = np.unique(times[numbers], return_index=True)
-    if len(first_of) < len(numbers):
-        notices.warn(f"{len(numbers) - len(first_of)} pictures have the time of another and are left out", "left-out")
-        numbers = numbers[first_of]
-    max_fps = options.max_fps or (_GIF_FPS if output.suffix.lower() == ".gif" else None)
-    if max_fps is not None and len(numbers):
-        ticks = np.floor((times[numbers] - times[numbers[0]]) / NS_PER_S * max_fps + 1e-6)
-        numbers = numbers[np.flatnonzero(np.diff(ticks, prepend=-1))]
-    chosen = times[numbers]
-    if not len(chosen):
-        end = "the end" if options.end_s is None else f"{options.end_s:g} s"
-        there = f"the pictures are from 0 to {(int(times[-1]) - int(times[0])) / NS_PER_S:.3f} s"
-        raise McaptrackError(f"{opened.path} has no picture between {options.start_s:g} s and {end}; {there}")
-    rest = np.diff(chosen)
-    fps = Fraction(NS_PER_S, int(np.median(rest))).limit_denominator(1001) if len(rest) else Fraction(1)
+    numbers = _chosen(opened, pictures.t_ns, "pictures", output, options)
+    chosen = pictures.t_ns[numbers]
 
     def drawn() -> Iterator[tuple[int, Image]]:
         span = int(chosen[0]), int(chosen[-1]) + 1
@@ -111,7 +103,118 @@ def render(
             yield frame.t_ns, image
             progress("render", done, len(chosen))
 
-    return write_clip(output, drawn(), fps)
+    return write_clip(output, drawn(), _rate_of(chosen))
+
+
+def render_from_above(
+    opened: log.Log,
+    view_topics: Sequence[str],
+    output: Path,
+    options: RenderOptions,
+    path_of_robot: Callable[[Ints], RobotPath | None] = lambda _: None,
+    progress: Callable[[str, int, int], None] = lambda *_: None,
+) -> int:
+    """Draw scenes, seen from above, and write a video, .mp4 or .gif by the suffix of ``output``.
+
+    Parameters
+    ----------
+    opened : Log
+    view_topics : sequence of str
+        Channels of SceneUpdate, drawn in this order; the first one gives the times.
+    output : Path
+    options : RenderOptions
+    path_of_robot : callable
+        Where the robot is at times (M,) in ns; the view follows it. Without one, all places are in the view.
+    progress : callable
+        Called with "render", the number of finished pictures and their total.
+
+    Returns
+    -------
+    int
+        The number of pictures in the video.
+
+    Raises
+    ------
+    McaptrackError
+        If there is no scene in the period.
+    """
+    _check_suffix(output)
+    times = opened.times(view_topics[0])
+    if not len(times):
+        raise McaptrackError(f"{opened.path}: {view_topics[0]} has no scenes")
+    chosen = times[_chosen(opened, times, "scenes", output, options)]
+    span = int(chosen[0]), int(chosen[-1]) + 1
+    path = path_of_robot(chosen)
+    sights = _sights(opened, view_topics, span, options.width_px or _WIDTH_PX, path, len(chosen))
+
+    def drawn() -> Iterator[tuple[int, Image]]:
+        views = [_at_times(opened.messages(topic, *span)) for topic in view_topics]
+        for done, (t_ns, sight) in enumerate(zip(chosen.tolist(), sights, strict=True), 1):
+            image = draw(from_above.ground(sight), from_above.grid(sight))
+            if path is not None:
+                image = draw(image, from_above.robot(sight, path.at_m[done - 1], float(path.heading_rad[done - 1])))
+            for view in views:
+                payload = view(t_ns)
+                if payload is not None:
+                    image = draw(image, from_above.drawing(foxglove.unpack(foxglove.SCENE, payload), sight))
+            yield t_ns, image
+            progress("render", done, len(chosen))
+
+    return write_clip(output, drawn(), _rate_of(chosen))
+
+
+def _sights(
+    opened: log.Log, topics: Sequence[str], span: tuple[int, int], width_px: int, path: RobotPath | None, count: int
+) -> list[Sight]:
+    """What each picture shows: the surroundings of the robot, or all boxes and people."""
+    size = width_px // 2 * 2, max(2, round(width_px * _HEIGHT) // 2 * 2)
+    if path is not None:
+        known = np.flatnonzero(np.isfinite(path.at_m).all(axis=1))
+        if len(known):
+            nearest = known[np.abs(known[None] - np.arange(count)[:, None]).argmin(axis=1)]
+            return [Sight(x, y, size[0] / _AROUND_M, *size) for x, y in path.at_m[nearest].tolist()]
+    places = [
+        (shape.pose.position.x, shape.pose.position.y)
+        for message in opened.messages(topics[0], *span)
+        for entity in foxglove.unpack(foxglove.SCENE, message.payload).entities
+        for shape in (*entity.cubes, *entity.cylinders)
+    ]
+    low, high = np.quantile(np.array(places), [0.01, 0.99], axis=0) if places else np.array([[-5.0, -5.0], [5.0, 5.0]])
+    extent = np.maximum((high - low) * _MARGIN, _LEAST_M)
+    scale = min(size[0] / extent[0], size[1] / extent[1])
+    x, y = ((low + high) / 2).tolist()
+    return [Sight(x, y, float(scale), *size)] * count
+
+
+def _check_suffix(output: Path) -> None:
+    if output.suffix.lower() not in (".mp4", ".gif"):
+        raise McaptrackError(f"{output}: a video is rendered to .mp4 or .gif, not to {output.suffix or 'no suffix'}")
+
+
+def _chosen(opened: log.Log, times: Ints, what: str, output: Path, options: RenderOptions) -> Ints:
+    """The numbers of the pictures, or scenes, of a video. Raises McaptrackError if there is none in the period."""
+    first = int(times[0]) + seconds_to_ns(options.start_s)
+    last = int(times[-1]) if options.end_s is None else int(times[0]) + seconds_to_ns(options.end_s)
+    numbers = np.flatnonzero((times >= first) & (times <= last))
+    _, first_of = np.unique(times[numbers], return_index=True)
+    if len(first_of) < len(numbers):
+        notices.warn(f"{len(numbers) - len(first_of)} {what} have the time of another and are left out", "left-out")
+        numbers = numbers[first_of]
+    max_fps = options.max_fps or (_GIF_FPS if output.suffix.lower() == ".gif" else None)
+    if max_fps is not None and len(numbers):
+        ticks = np.floor((times[numbers] - times[numbers[0]]) / NS_PER_S * max_fps + 1e-6)
+        numbers = numbers[np.flatnonzero(np.diff(ticks, prepend=-1))]
+    if not len(numbers):
+        end = "the end" if options.end_s is None else f"{options.end_s:g} s"
+        there = f"the {what} are from 0 to {(int(times[-1]) - int(times[0])) / NS_PER_S:.3f} s"
+        raise McaptrackError(f"{opened.path} has no {what[:-1]} between {options.start_s:g} s and {end}; {there}")
+    return numbers
+
+
+def _rate_of(t_ns: Ints) -> Fraction:
+    """The frame rate of a video with pictures at these times."""
+    rest = np.diff(t_ns)
+    return Fraction(NS_PER_S, int(np.median(rest))).limit_denominator(1001) if len(rest) else Fraction(1)
 
 
 def _at_times(messages: Iterator[log.Message]) -> Callable[[int], bytes | None]:

@@ -1,0 +1,153 @@
+"""Scenes in metres seen from above, for videos of logs without pictures: messages of scenes become annotations.
+
+North (y) is up. Letters: P points.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from mcaptrack.foxglove import ANNOTATIONS
+from mcaptrack.foxglove.messages import message_class
+from mcaptrack.geometry.arrays import Floats, Image
+
+_BACKGROUND: Final = (32, 28, 26)
+_GRID: Final = (0.2, 0.22, 0.25, 1.0)
+_INK: Final = (0.85, 0.87, 0.9, 1.0)
+_ROBOT: Final = (1.0, 1.0, 1.0, 0.9)
+#: Red, green, blue and opacity.
+Shade = tuple[float, float, float, float]
+#: Types of lines in scenes, and in annotations.
+_STRIP, _LOOP, _LIST = 0, 1, 2
+_ANNOTATED: Final = {_STRIP: 3, _LOOP: 2, _LIST: 4}
+_CORNERS: Final = np.array([[-0.5, -0.5, 0.0], [0.5, -0.5, 0.0], [0.5, 0.5, 0.0], [-0.5, 0.5, 0.0]])
+_ROUND: Final = np.array([[np.cos(turn), np.sin(turn), 0.0] for turn in np.arange(24) * np.pi / 12]) / 2
+#: The outline of a robot, which is 4 m long and 2 m wide: an arrow ahead.
+_ARROW: Final = np.array([[2.0, 0.0], [-2.0, 1.0], [-1.2, 0.0], [-2.0, -1.0]])
+#: The largest number of lines of the grid in a direction.
+_MOST_LINES: Final = 10
+_STEPS: Final = (1.0, 2.0, 5.0)
+_TEXT_PX: Final = 12.0
+
+
+class Sight(NamedTuple):
+    """What is seen: the middle in metres, pixels per metre, and width and height in pixels."""
+
+    x_m: float
+    y_m: float
+    px_per_m: float
+    width_px: int
+    height_px: int
+
+    def to_pixels(self, points_m: Floats) -> Floats:
+        """Points (P, 2 or 3) in metres as pixels (P, 2)."""
+        x = self.width_px / 2 + (points_m[:, 0] - self.x_m) * self.px_per_m
+        y = self.height_px / 2 - (points_m[:, 1] - self.y_m) * self.px_per_m
+        return np.stack([x, y], axis=-1)
+
+
+def ground(sight: Sight) -> Image:
+    """The empty ground, BGR (height, width, 3)."""
+    return np.full((sight.height_px, sight.width_px, 3), _BACKGROUND, np.uint8)
+
+
+def grid(sight: Sight) -> Any:
+    """Annotations of a grid with round steps, with a bar that shows the step."""
+    out = message_class(ANNOTATIONS)()
+    across, up = sight.width_px / sight.px_per_m, sight.height_px / sight.px_per_m
+    step = _round_step(max(across, up) / _MOST_LINES)
+    for axis, (middle, extent, other) in enumerate(((sight.x_m, across, up), (sight.y_m, up, across))):
+        first, last = np.ceil((middle - extent / 2) / step), np.floor((middle + extent / 2) / step)
+        for place in np.arange(first, last + 1) * step:
+            ends = np.array([[place, sight.y_m - other / 2], [place, sight.y_m + other / 2]])
+            if axis:
+                ends = np.array([[sight.x_m - other / 2, place], [sight.x_m + other / 2, place]])
+            _line(out, _ANNOTATED[_STRIP], sight.to_pixels(ends), _GRID)
+    low, left = sight.height_px - 14.0, 14.0
+    bar = np.array([[left, low], [left + step * sight.px_per_m, low]])
+    _line(out, _ANNOTATED[_STRIP], bar, _INK, 3.0)
+    _text(out, f"{step:g} m", bar[0] - [0.0, 6.0], _INK)
+    return out
+
+
+def robot(sight: Sight, at_m: Floats, heading_rad: float) -> Any:
+    """Annotations of a robot: an arrow ahead at its position (2,); none if it isn't known."""
+    out = message_class(ANNOTATIONS)()
+    if np.isfinite([*at_m, heading_rad]).all():
+        cosine, sine = np.cos(heading_rad), np.sin(heading_rad)
+        outline = at_m + _ARROW @ np.array([[cosine, sine], [-sine, cosine]])
+        _line(out, _ANNOTATED[_LOOP], sight.to_pixels(outline), _ROBOT, fill=_ROBOT)
+    return out
+
+
+def drawing(scene: Any, sight: Sight) -> Any:
+    """A SceneUpdate message as an ImageAnnotations message: cubes, cylinders, lines and texts."""
+    out = message_class(ANNOTATIONS)()
+    for entity in scene.entities:
+        for shapes, outline in ((entity.cylinders, _ROUND), (entity.cubes, _CORNERS)):
+            for shape in shapes:
+                size = np.array([shape.size.x, shape.size.y, 0.0])
+                corners = _placed(shape.pose, outline * size)
+                rgba = (shape.color.r, shape.color.g, shape.color.b, shape.color.a)
+                _line(out, _ANNOTATED[_LOOP], sight.to_pixels(corners), (*rgba[:3], min(1.0, 1.5 * rgba[3])), fill=rgba)
+    for entity in scene.entities:
+        for line in entity.lines:
+            points = np.array([(point.x, point.y, point.z) for point in line.points], float).reshape(-1, 3)
+            px = sight.to_pixels(_placed(line.pose, points))
+            shades: list[Shade] = [(one.r, one.g, one.b, one.a) for one in line.colors]
+            plain = (line.color.r, line.color.g, line.color.b, line.color.a)
+            shades = shades[1::2] if line.type == _LIST else shades
+            _line(out, _ANNOTATED.get(line.type, _ANNOTATED[_STRIP]), px, plain, line.thickness / 2, shades)
+        for text in entity.texts:
+            at = sight.to_pixels(_placed(text.pose, np.zeros((1, 3))))[0]
+            _text(out, text.text, at, (text.color.r, text.color.g, text.color.b, 1.0))
+    return out
+
+
+def _placed(pose: Any, points: Floats) -> Floats:
+    """Points (P, 3) of a shape in the frame of its scene."""
+    x, y, z, w = (getattr(pose.orientation, name) for name in "xyzw")
+    norm = x * x + y * y + z * z + w * w
+    if norm:
+        axis, scale = np.array([x, y, z]), 2 / norm
+        across = np.cross(axis, points)
+        points = points + scale * (w * across + np.cross(axis, across))
+    return np.asarray(points + np.array([pose.position.x, pose.position.y, pose.position.z]), np.float64)
+
+
+def _round_step(least: float) -> float:
+    """The least round number, 1, 2 or 5 times a power of ten, that is not below a number."""
+    power = 10.0 ** np.floor(np.log10(least))
+    return float(next((step * power for step in _STEPS if step * power >= least), 10 * power))
+
+
+def _line(
+    out: Any,
+    kind: int,
+    px: Floats,
+    rgba: Shade,
+    thickness: float = 1.0,
+    shades: list[Shade] | None = None,
+    fill: Shade | None = None,
+) -> None:
+    part = out.points.add(type=kind, thickness=max(1.0, thickness))
+    for x, y in px.tolist():
+        part.points.add(x=x, y=y)
+    _paint(part.outline_color, rgba)
+    for shade in shades or ():
+        _paint(part.outline_colors.add(), shade)
+    if fill is not None:
+        _paint(part.fill_color, fill)
+
+
+def _text(out: Any, words: str, at_px: Floats, rgba: Shade) -> None:
+    text = out.texts.add(text=words, font_size=_TEXT_PX)
+    text.position.x, text.position.y = at_px.tolist()
+    _paint(text.text_color, rgba)
+    _paint(text.background_color, (_BACKGROUND[2] / 255, _BACKGROUND[1] / 255, _BACKGROUND[0] / 255, 1.0))
+
+
+def _paint(colour: Any, rgba: Shade) -> None:
+    colour.r, colour.g, colour.b, colour.a = rgba
