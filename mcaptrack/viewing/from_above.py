@@ -33,7 +33,7 @@ _TEXT_PX: Final = 12.0
 
 
 class Sight(NamedTuple):
-    """What is seen: the middle in metres, pixels per metre, and width and height in pixels."""
+    """The part of the ground in a picture: its middle in metres, pixels per metre, and width and height in pixels."""
 
     x_m: float
     y_m: float

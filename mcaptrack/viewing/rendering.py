@@ -166,7 +166,7 @@ def render_from_above(
 def _sights(
     opened: log.Log, topics: Sequence[str], span: tuple[int, int], width_px: int, path: RobotPath | None, count: int
 ) -> list[Sight]:
-    """What each picture shows: the surroundings of the robot, or all boxes and people."""
+    """The part of the ground in each picture: the surroundings of the robot, or all boxes and people."""
     size = width_px // 2 * 2, max(2, round(width_px * _HEIGHT) // 2 * 2)
     if path is not None:
         known = np.flatnonzero(np.isfinite(path.at_m).all(axis=1))
