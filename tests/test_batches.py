@@ -53,7 +53,7 @@ def test_a_broken_input_does_not_stop_the_others(command, folder):
     bad = ["missing.mcap"] if command == "check" else ["broken.mcap", "missing.mcap"]  # check tells what is broken
     *bad, good = inputs(command, *bad, "a.mcap")
     outcome = call(command, *bad, good, "--json")
-    assert outcome.code == 1, outcome.err
+    assert outcome.code == 3, outcome.err
     data = json.loads(outcome.out)
     assert [Path(one["log"]).name for one in data["results"]] == ["a.mcap"]
     assert [one["input"] for one in data["failed"]] == bad

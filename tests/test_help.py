@@ -97,6 +97,17 @@ class TestHelp:
             ["--config"],
         ]
 
+    def test_options_for_many_logs_are_the_same_in_all_commands_that_take_a_log(self):
+        def many(command: str) -> list[tuple[list[str], str]]:
+            return [(one.opts, one.help) for one in shown(command) if one.rich_help_panel == "Many logs"]
+
+        known = many("run")
+        assert len(known) == 8
+        printing = [one for one in known if one[0] != ["--output-dir"]]
+        each = {*STAGES, "run", "events", "render", "export", "recover", "drop"}
+        for command in COMMANDS:
+            assert many(command) == (known if command in each else printing if command in ("info", "check") else [])
+
     def test_a_short_name_means_the_same_in_all_commands(self):
         for command in COMMANDS:
             short = {name: one.name for one in shown(command) for name in one.opts if re.fullmatch("-[a-z]", name)}

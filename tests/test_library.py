@@ -23,6 +23,7 @@ import pytest
 import mcaptrack
 from mcaptrack import log
 from mcaptrack.cli.flags import with_flags
+from mcaptrack.cli.many import NAMES
 from mcaptrack.errors import McaptrackError
 from mcaptrack.errors import call as proposed
 from mcaptrack.registry import BUILT_IN
@@ -141,7 +142,7 @@ class TestTheSameAsTheCommandLine:
     def test_a_command_has_a_function_with_the_same_parameters(self, name):
         command, function = GROUP.commands[name], inspect.signature(getattr(mcaptrack, name)).parameters
         options = {one.name: one for one in command.params if one.param_type_name == "option" and not one.hidden}
-        options = {option: one for option, one in options.items() if option not in OF_ALL_COMMANDS}
+        options = {option: one for option, one in options.items() if option not in (*OF_ALL_COMMANDS, *NAMES)}
         takes_others = any(one.kind is one.VAR_KEYWORD for one in function.values())
         without = {option for option in options if option not in function}
         if takes_others:  # options of transforms

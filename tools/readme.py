@@ -310,6 +310,7 @@ FILES: dict[str, Callable[[Path], None]] = {
     **dict.fromkeys(("drive.bag", "rosbag2_2026_05_01/"), bag),
     **dict.fromkeys(("robot.mcap", "other.mcap"), robot),
     **dict.fromkeys(("logs/*.mcap", "runs/*.mcap"), logs),
+    "logs/": lambda path: logs(path / "*.mcap"),
     "broken.mcap": broken,
     "red:trained/red.safetensors": lambda path: trained(Path("trained/red.safetensors")),
     "zones=zones.csv": lambda path: Path("zones.csv").write_text("track_id,zone\n1,door\n2,stairs\n") and None,

@@ -63,6 +63,11 @@ class ExportResult:
     written: tuple[str, ...]
     warnings: tuple[Notice, ...]
 
+    @property
+    def is_up_to_date(self) -> bool:
+        """Whether there was nothing to write."""
+        return not self.written
+
 
 @checked()
 def export(

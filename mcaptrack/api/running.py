@@ -84,6 +84,11 @@ class RunResult:
         """The topics of the channels that were made."""
         return tuple(self.frames)
 
+    @property
+    def is_up_to_date(self) -> bool:
+        """Whether there was nothing to do."""
+        return not self.stages
+
 
 #: Plans the jobs for a log; takes the open log, the prefix of its camera, and a function that takes notes.
 Plan = Callable[[logs.Log, str, Callable[[str], None]], list[Job]]

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import Field, fields, replace
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import Field, dataclass, fields, replace
 from types import MappingProxyType
 from typing import Any, get_type_hints
 
 from mcaptrack.cli.command import is_on_command_line, settings_of
+from mcaptrack.cli.flags import RUNNING
 from mcaptrack.cli.text import say
 from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import DETECTIONS
@@ -36,18 +37,19 @@ def make_transform(
     given: Mapping[str, Any],
     wanted: Mapping[str, Any],
     owners: Mapping[str, list[str]] = MappingProxyType({}),
+    typed: Collection[str] = (),
 ) -> Transform:
     """Return the chosen transform with those of the wanted parameters that it has.
 
-    ``owners`` has the names of the transforms that have an option. An option on the command line that the chosen
-    transform lacks is refused; one from a file or the environment is ignored, since it may be meant for another
-    transform.
+    ``owners`` has the names of the transforms that have an option. One of the options that were ``typed`` on the
+    command line is refused if the chosen transform lacks it; one from a file or the environment is ignored, since it
+    may be meant for another transform.
     """
     name = _chosen(stage, given, wanted)
     cls = stage.with_part(stage.find(name).cls if name else stage.default, wanted.get(stage.parameter))
     own = options_of(cls)
     for option in wanted:
-        if option in owners and option not in own and is_on_command_line(option):
+        if option in owners and option not in own and option in typed:
             flag = "--" + option.replace("_", "-")
             chosen = name or wanted.get(stage.option) or stage.choice(stage.default())
             raise McaptrackError(f"{flag} is an option of {listed(owners[option])}, not of {chosen}")
@@ -60,6 +62,41 @@ def make_transform(
     if stage.profiles and (profile := given.get("profile")):
         return replace(stage.profiles[profile], **values)
     return stage.make(name, **values)
+
+
+@dataclass(frozen=True)
+class Maker:
+    """Makes the transform of a stage by name, as ``make_transform`` does; other processes can do so, too.
+
+    Attributes
+    ----------
+    stage : str
+        Name of the stage.
+    given, wanted, owners, typed
+        The arguments of ``make_transform``; ``given`` has the profile, and the choice of the user.
+    """
+
+    stage: str
+    given: Mapping[str, Any]
+    wanted: Mapping[str, Any]
+    owners: Mapping[str, list[str]]
+    typed: tuple[str, ...]
+
+    @classmethod
+    def of(
+        cls, stage: Stage, given: Mapping[str, Any], wanted: Mapping[str, Any], owners: Mapping[str, list[str]]
+    ) -> Maker:
+        """Return a maker for the running command."""
+        chosen = {name: given[name] for name in (stage.kind, "profile") if name and name in given}
+        return cls(stage.name, chosen, wanted, owners, tuple(filter(is_on_command_line, wanted)))
+
+    def __call__(self, name: str) -> Transform:
+        """Make the transform of this name; for "" the one that the user chose, or the default one."""
+        stage, context = STAGES[self.stage], RUNNING.get()
+        given = {**self.given, "quiet": context is None or context.params.get("quiet")}
+        if name and stage.kind:
+            given[stage.kind] = name
+        return make_transform(stage, given, self.wanted, self.owners, self.typed)
 
 
 def _chosen(stage: Stage, given: Mapping[str, Any], wanted: Mapping[str, Any]) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import glob
+import inspect
 import io
 import json
 import logging
@@ -13,7 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout
 from contextvars import ContextVar
 from dataclasses import dataclass, field
-from functools import wraps
+from functools import partial, wraps
 from pathlib import Path
 from time import monotonic
 from typing import Annotated, Any, Final, Literal, NamedTuple, ParamSpec
@@ -35,10 +36,11 @@ P = ParamSpec("P")
 
 
 class Failed(NamedTuple):
-    """An input that could not be processed, and why."""
+    """An input that could not be processed, why, and the state that this left it in, as ``fleet.LogOutcome`` has it."""
 
     input: str
     error: str
+    state: str = "failed"
 
 
 @dataclass
@@ -47,6 +49,7 @@ class _Batch:
 
     tried: int = 0
     failed: list[Failed] = field(default_factory=list)
+    is_early: bool = False
 
 
 #: A warning of a parameter that has no effect.
@@ -175,7 +178,10 @@ def min_iou(was: str = "", was_if: tuple[str, str] | None = None) -> Any:
 
 
 Logs = Annotated[
-    list[Path], typer.Argument(metavar="LOG", help="One or several logs, or a pattern.", show_default=False)
+    list[Path],
+    typer.Argument(
+        metavar="LOG", help="Logs, folders of logs, patterns, or - for a list of logs on stdin.", show_default=False
+    ),
 ]
 
 
@@ -220,20 +226,16 @@ class Talk:
     def attempt(self, path: Path, paths: Sequence[Path]) -> Iterator[None]:
         """Process one of several inputs: an error in it is printed and does not stop the others.
 
-        The command ends with exit code 1 then, and its JSON lists the inputs that failed.
+        The command ends with exit code 3 then, and its JSON lists the inputs that failed.
         """
-        batch = _BATCH.get()
-        batch.tried += 1
+        tried(1)
         try:
             yield
         except McaptrackError as error:
             if len(paths) == 1:
                 raise
-            words = str(error).strip()
-            words = words if str(path) in words else f"{path}: {words}"
             self._stop()
-            say(f"mcaptrack: {words}")
-            batch.failed.append(Failed(str(path), with_flags(words)))
+            record_failure(path, str(error))
 
     def _hear(self, notice: Notice) -> None:
         self._stop()
@@ -318,14 +320,39 @@ def one_line(command: Callable[P, None]) -> Callable[P, None]:
             say(f"mcaptrack: {str(error).strip()}")
             raise typer.Exit(REFUSED) from None
         except typer.Exit:
-            if not batch.failed:
+            if not batch.failed and not batch.is_early:
                 raise
         if batch.failed:
             names = ", ".join(one.input for one in batch.failed)
             say(f"mcaptrack: {len(batch.failed)} of {batch.tried} failed: {names}")
-            raise typer.Exit(REFUSED)
+        if batch.failed or batch.is_early:
+            raise typer.Exit(LOST)
 
     return guarded
+
+
+def tried(inputs: int) -> None:
+    """Count inputs that the running command has tried."""
+    _BATCH.get().tried += inputs
+
+
+def end_early(reason: str) -> None:
+    """Say why some inputs were not tried; the command ends with exit code 3."""
+    say(f"mcaptrack: {reason}")
+    _BATCH.get().is_early = True
+
+
+def record_failure(path: Path, error: str, state: str = "failed") -> None:
+    """Print why one of several inputs failed, and keep it for the JSON and the end of the command."""
+    words = error.strip()
+    words = words if str(path) in words else f"{path}: {words}"
+    say(f"mcaptrack: {words}")
+    _BATCH.get().failed.append(Failed(str(path), with_flags(words), state))
+
+
+def with_progress(function: Callable[..., Any], progress: Any) -> Callable[..., Any]:
+    """Return a function with its parameter ``progress`` given, if it has one."""
+    return partial(function, progress=progress) if "progress" in inspect.signature(function).parameters else function
 
 
 def _show_warning(notice: Notice) -> None:

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
 from mcaptrack.cli import common
+from mcaptrack.cli.many import takes_many
 from mcaptrack.cli.running import run_on_logs
-
-if TYPE_CHECKING:
-    from mcaptrack import RunResult
 
 
 @common.one_line
+@takes_many()
 def events(
     logs: common.Logs,
     topic: Annotated[
@@ -51,11 +49,8 @@ def events(
 
     Example: mcaptrack events log.mcap --similarity metres --gate-m 1
     """
+    import mcaptrack
+
     given = {"logs": logs, "camera": camera, "output": output, "sidecar": sidecar, "force": force}
-
-    def run(path: Path, **where: Any) -> RunResult:
-        import mcaptrack
-
-        return mcaptrack.events(path, topic=topic, similarity=similarity, gate_m=gate_m, min_iou=min_iou, **where)
-
-    run_on_logs(given | {"json": json, "quiet": quiet, "verbose": verbose}, run, shows_events=True)
+    options = {"topic": topic, "similarity": similarity, "gate_m": gate_m, "min_iou": min_iou}
+    run_on_logs(given | {"json": json, "quiet": quiet, "verbose": verbose}, "events", mcaptrack.events, options)

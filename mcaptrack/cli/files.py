@@ -8,16 +8,21 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from mcaptrack.cli import common
+from mcaptrack.cli.many import Work, process, takes_many
 from mcaptrack.cli.text import console, show
+from mcaptrack.fleet import find_logs
 
 if TYPE_CHECKING:
-    from mcaptrack import LogRecovery
+    from mcaptrack import DropResult, LogCheck, LogRecovery
     from mcaptrack.log import CheckResult
 
 _SHOWN = 20
+#: Ending of the names of logs that were saved.
+_RECOVERED = ".recovered.mcap"
 
 
 @common.one_line
+@takes_many(outputs=False)
 def check(
     logs: common.Logs,
     output: common.Printed = None,
@@ -35,22 +40,26 @@ def check(
     Example: mcaptrack check log.mcap
     """
     import mcaptrack
-    from mcaptrack.api.upkeep import files_of
 
-    paths = [part for path in common.expand(logs) for part in files_of(path)]
-    checked: list[CheckResult] = []
+    work: Work[LogCheck] = Work("check", mcaptrack.check, {}, show=lambda *_: None, line=_verdict, writes=False)
     with common.Talk(quiet, verbose).open() as talk:
-        for path in dict.fromkeys(paths):
-            with talk.attempt(path, paths):
-                checked += mcaptrack.check(path, progress=talk.progress).files[:1]
+        found, totals = process(find_logs(logs), work, talk)
+    checked = [file for one in found for file in one.files]
     with common.printed_to(output, force):
         if json:
-            common.print_json({"results": [_as_json(one) for one in checked]})
+            common.print_json({"results": [_as_json(one) for one in checked], **totals})
         else:
             for one in checked:
                 _print_check(one, quiet)
     if not all(one.is_sound for one in checked):
         raise typer.Exit(common.REFUSED)
+
+
+def _verdict(checked: LogCheck) -> str:
+    """Return the result of one of many logs in one line; the findings are printed at the end."""
+    if checked.is_sound:
+        return "sound"
+    return f"damaged, {sum(found.level == 'error' for found in checked.findings)} errors"
 
 
 def _as_json(checked: CheckResult) -> dict[str, object]:
@@ -86,6 +95,7 @@ def _print_check(checked: CheckResult, quiet: bool) -> None:
 
 
 @common.one_line
+@takes_many()
 def recover(
     logs: common.Logs,
     output: Annotated[Path | None, common.output("LOG.recovered.mcap beside the log")] = None,
@@ -104,21 +114,23 @@ def recover(
     """
     import mcaptrack
 
-    paths = common.expand(logs, each=True)
-    common.only_one_output(paths, output)
-    reports: list[LogRecovery] = []
+    def show(_: Path, report: LogRecovery) -> None:
+        talk.say(f"{report.output}: {report.messages} messages in {report.chunks} chunks are saved")
+        for words in report.lost if verbose else report.lost[:_SHOWN]:
+            talk.say(f"lost: {words}")
+        if len(report.lost) > _SHOWN and not verbose:
+            talk.say(f"lost: {len(report.lost) - _SHOWN} more; -v shows them")
+        if not report.lost:
+            talk.say("nothing was lost")
+
+    def line(report: LogRecovery) -> str:
+        saved = f"{report.messages} messages in {report.chunks} chunks are saved in {report.output}"
+        return f"{saved}; {f'{len(report.lost)} losses' if report.lost else 'nothing was lost'}"
+
+    found = find_logs(logs, each=True, leave_out=_RECOVERED)
     with common.Talk(quiet, verbose).open() as talk:
-        for path in paths:
-            with talk.attempt(path, paths):
-                report = mcaptrack.recover(path, output, force=force, progress=talk.progress)
-                reports.append(report)
-                talk.say(f"{report.output}: {report.messages} messages in {report.chunks} chunks are saved")
-                for words in report.lost if verbose else report.lost[:_SHOWN]:
-                    talk.say(f"lost: {words}")
-                if len(report.lost) > _SHOWN and not verbose:
-                    talk.say(f"lost: {len(report.lost) - _SHOWN} more; -v shows them")
-                if not report.lost:
-                    talk.say("nothing was lost")
+        work = Work("recover", mcaptrack.recover, {"force": force}, show, line, _RECOVERED)
+        reports, totals = process(found, work, talk, output)
     if json:
         results = [
             {
@@ -130,14 +142,20 @@ def recover(
             }
             for r in reports
         ]
-        common.print_json({"results": results})
+        common.print_json({"results": results, **totals})
     if any(report.lost for report in reports):
         raise typer.Exit(common.LOST)
 
 
 @common.one_line
+@takes_many()
 def drop(
-    path: Annotated[Path, typer.Argument(metavar="LOG", help="The log.", show_default=False)],
+    path: Annotated[
+        Path,
+        typer.Argument(
+            metavar="LOG", help="A log, a folder of logs, a pattern, or - for a list on stdin.", show_default=False
+        ),
+    ],
     topics: Annotated[
         list[str],
         typer.Argument(metavar="TOPIC", help="Channels to remove, or patterns such as '/camera/*'."),
@@ -164,12 +182,17 @@ def drop(
     """
     import mcaptrack
 
+    def line(done: DropResult) -> str:
+        dropped = f"{', '.join(done.dropped)} with {done.messages} messages left out"
+        return f"{dropped}; {done.bytes_before} bytes became {done.bytes}"
+
+    options = {"topics": topics, "in_place": in_place, "force": force}
     with common.Talk(quiet, verbose).open() as talk:
-        done = mcaptrack.drop(path, topics, output=output, in_place=in_place, force=force)
-        talk.say(
-            f"{done.log}: {', '.join(done.dropped)} with {done.messages} messages left out; "
-            f"{done.bytes_before} bytes became {done.bytes}"
-        )
+        work = Work("drop", mcaptrack.drop, options, lambda _, one: talk.say(f"{one.log}: {line(one)}"), line)
+        results, totals = process(find_logs([path]), work, talk, output)
     if json:
-        result = {"log": str(done.log), "dropped": list(done.dropped), "messages": done.messages, "bytes": done.bytes}
-        common.print_json({"results": [result]})
+        listed = [
+            {"log": str(one.log), "dropped": list(one.dropped), "messages": one.messages, "bytes": one.bytes}
+            for one in results
+        ]
+        common.print_json({"results": listed, **totals})

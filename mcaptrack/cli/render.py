@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from mcaptrack.cli import common
+from mcaptrack.cli.many import Work, many_options, process, takes_many
+from mcaptrack.fleet import find_logs
+
+if TYPE_CHECKING:
+    from mcaptrack import RenderResult
 
 _PICTURE: Final = "Pictures"
 
 
 @common.one_line
+@takes_many()
 def render(
     logs: common.Logs,
     topic: Annotated[
@@ -89,19 +95,21 @@ def render(
     """
     import mcaptrack
 
-    paths = common.expand(logs)
-    common.only_one_output(paths, output)
+    def line(done: RenderResult) -> str:
+        return f"{done.pictures} pictures with {', '.join(done.views) or 'nothing drawn'}"
+
     given: dict[str, Any] = {"topic": topic, "width": width, "max_fps": max_fps, "start_s": start_s, "end_s": end_s}
-    given |= {"gif": gif, "camera": camera, "force": force}
-    results = []
+    is_named = many_options().output_dir is not None  # by a name that says what is written
+    given |= {"gif": gif and not is_named, "camera": camera, "force": force}
     with common.Talk(quiet, verbose).open() as talk:
-        for path in paths:
-            with talk.attempt(path, paths):
-                done = mcaptrack.render(path, output, progress=talk.progress, **given)
-                drawn = ", ".join(done.views) or "nothing drawn"
-                talk.say(f"{done.video}: {done.pictures} pictures with {drawn}")
-                results.append(
-                    {"log": str(path), "output": str(done.video), "pictures": done.pictures, "views": list(done.views)}
-                )
+        suffix = ".gif" if gif else ".mp4"
+        work = Work(
+            "render", mcaptrack.render, given, lambda _, one: talk.say(f"{one.video}: {line(one)}"), line, suffix
+        )
+        results, totals = process(find_logs(logs), work, talk, output)
     if json:
-        common.print_json({"results": results})
+        listed = [
+            {"log": str(one.log), "output": str(one.video), "pictures": one.pictures, "views": list(one.views)}
+            for one in results
+        ]
+        common.print_json({"results": listed, **totals})

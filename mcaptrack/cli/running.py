@@ -2,40 +2,41 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
-from mcaptrack import notices
 from mcaptrack.cli import common
 from mcaptrack.cli.flags import with_flags
-from mcaptrack.cli.text import stdout_to_stderr
+from mcaptrack.cli.many import Work, process
 from mcaptrack.errors import command
+from mcaptrack.fleet import find_logs
 
 if TYPE_CHECKING:
     from mcaptrack import RunResult
     from mcaptrack.pipeline import Summary
 
-#: Runs stages on a log; takes the keywords output, sidecar, force, camera and progress.
+#: Runs stages on a log; takes the keywords output, sidecar, force and camera, and may take progress.
 Run = Callable[..., "RunResult"]
 
 _UP_TO_DATE = "nothing to do, everything is up to date"
 
 
-def run_on_logs(given: Mapping[str, Any], run: Run, *, shows_events: bool = False) -> None:
-    """Run stages on each log, and print the results."""
-    paths = common.expand(given["logs"])
-    common.only_one_output(paths, given["output"])
-    results = []
+def run_on_logs(given: Mapping[str, Any], name: str, function: Run, options: Mapping[str, Any]) -> None:
+    """Run stages on each log, and print the results. ``function`` takes a log and ``options``."""
+    where = {name: given[name] for name in ("camera", "sidecar", "force")}
+    shows_events = name == "events"
     with common.Talk(given["quiet"], given["verbose"]).open() as talk:
-        for path in paths:
-            with talk.attempt(path, paths), notices.about(given["output"] or path):
-                names = ("camera", "output", "sidecar", "force")
-                with stdout_to_stderr():
-                    result = run(path, **{name: given[name] for name in names}, progress=talk.progress)
-                results.append(_as_json(result))
-                _print(result, shows_events, talk)
+        work: Work[RunResult] = Work(
+            name,
+            function,
+            {**options, **where},
+            show=lambda _, result: _print(result, shows_events, talk),
+            line=lambda result: _line_of(result, shows_events),
+        )
+        results, totals = process(find_logs(given["logs"]), work, talk, given["output"])
     if given["json"]:
-        common.print_json({"results": results})
+        common.print_json({"results": [_as_json(result) for result in results], **totals})
 
 
 def _as_json(result: RunResult) -> dict[str, Any]:
@@ -83,6 +84,20 @@ def _print(result: RunResult, shows_events: bool, talk: common.Talk) -> None:
     width = max(len(name) for name, _ in lines)
     for name, words in lines:
         talk.say(f"  {name:<{width}}  {words}")
+
+
+def _line_of(result: RunResult, shows_events: bool) -> str:
+    """Return the result for one of many logs in one line."""
+    words = [f"{', '.join(result.stages)} in {result.seconds:.1f} s" if result.stages else _UP_TO_DATE]
+    if shows_events:
+        counts = Counter({kind: n for kinds in result.events.values() for kind, n in kinds.items() if n})
+        words.append(", ".join(f"{kind} {count}" for kind, count in counts.items()) or "nothing happened")
+    summary = result.summary
+    if summary is not None and summary.tracks is not None:
+        words.append(f"{summary.tracks:,} tracks")
+    if codes := dict.fromkeys(notice.code for notice in result.warnings):
+        words.append(f"warnings: {', '.join(codes)}")
+    return "; ".join(words)
 
 
 def _lines_of_run(result: RunResult) -> Iterator[tuple[str, str]]:

@@ -6,13 +6,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 from mcaptrack.cli import common
+from mcaptrack.cli.many import Work, many_options, process, takes_many
 from mcaptrack.cli.text import console, printable
+from mcaptrack.fleet import find_logs
 
 if TYPE_CHECKING:
     from rich.tree import Tree
 
+    from mcaptrack import ExportResult, LogInfo
+
 
 @common.one_line
+@takes_many(outputs=False)
 def info(
     logs: common.Logs,
     frames: Annotated[
@@ -38,18 +43,15 @@ def info(
     """
     import mcaptrack
 
-    results = []
-    paths = common.expand(logs)
+    def show(_: Path, found: LogInfo) -> None:
+        if not json:
+            _print(found.to_json(), verbose)
+
+    work: Work[LogInfo] = Work("info", mcaptrack.info, {"frames": frames}, show, writes=False)
     with common.Talk(quiet, verbose).open() as talk, common.printed_to(output, force):
-        for path in paths:
-            with talk.attempt(path, paths):
-                data = mcaptrack.info(path, frames=frames).to_json()
-                if json:
-                    results.append(data)
-                else:
-                    _print(data, verbose)
+        found, totals = process(find_logs(logs), work, talk)
         if json:
-            common.print_json({"results": results})
+            common.print_json({"results": [one.to_json() for one in found], **totals})
 
 
 def _print(data: dict[str, Any], verbose: bool) -> None:
@@ -145,6 +147,7 @@ def _frames(frames: list[dict[str, Any]], start_ns: int) -> Tree:
 
 
 @common.one_line
+@takes_many()
 def export(
     logs: common.Logs,
     output: Annotated[
@@ -204,22 +207,24 @@ def export(
     import mcaptrack
     from mcaptrack.api.outputs import refuse_same_tables
 
-    results = []
-    paths = common.expand(logs)
-    if form.startswith("rosbag2"):
-        common.only_one_output(paths, output)
-    else:
-        refuse_same_tables(paths, output)
-    given: dict[str, Any] = {"form": form, "topic": topic, "blobs": blobs, "force": force}
+    found, is_bag = find_logs(logs), form.startswith("rosbag2")
+    if not is_bag:
+        refuse_same_tables([one.path for one in found], output or many_options().output_dir)
+
+    def rows(done: ExportResult) -> str:
+        return ", ".join(f"{name} {count}" for name, count in done.rows.items())
+
+    def show(_: Path, done: ExportResult) -> None:
+        talk.say(f"{done.folder}: {rows(done)}")
+        talk.detail(f"{done.folder}: written {', '.join(done.written) or 'nothing, all tables are up to date'}")
+
+    options: dict[str, Any] = {"form": form, "topic": topic, "blobs": blobs, "force": force}
     with common.Talk(quiet, verbose).open() as talk:
-        for path in paths:
-            with talk.attempt(path, paths):
-                done = mcaptrack.export(path, output, progress=talk.progress, **given)
-                talk.say(f"{done.folder}: " + ", ".join(f"{name} {rows}" for name, rows in done.rows.items()))
-                written = ", ".join(done.written) or "nothing, all tables are up to date"
-                talk.detail(f"{done.folder}: written {written}")
-                results.append(
-                    {"log": str(path), "folder": str(done.folder), "rows": done.rows, "written": list(done.written)}
-                )
+        work = Work("export", mcaptrack.export, options, show, rows, ".rosbag2", shares_output=not is_bag)
+        results, totals = process(found, work, talk, output)
     if json:
-        common.print_json({"results": results})
+        listed = [
+            {"log": str(one.log), "folder": str(one.folder), "rows": one.rows, "written": list(one.written)}
+            for one in results
+        ]
+        common.print_json({"results": listed, **totals})

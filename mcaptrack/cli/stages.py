@@ -8,15 +8,16 @@ import re
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, Field
-from pathlib import Path
+from functools import partial
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, get_args, get_type_hints
+from typing import Annotated, Any, Final, Literal, get_args, get_type_hints
 
 import typer
 
 from mcaptrack.cli import common
-from mcaptrack.cli.chosen import configured, is_open, listed, make_transform, options_of
+from mcaptrack.cli.chosen import Maker, configured, is_open, listed, options_of
 from mcaptrack.cli.command import settings_of
+from mcaptrack.cli.many import NAMES, takes_many
 from mcaptrack.cli.running import run_on_logs
 from mcaptrack.cli.text import stdout_to_stderr
 from mcaptrack.errors import McaptrackError
@@ -24,9 +25,6 @@ from mcaptrack.registry import BUILT_IN, Kind, names
 from mcaptrack.schema import DETECTIONS
 from mcaptrack.transforms import STAGES, Stage, Transform
 from mcaptrack.transforms.protocol import choices, member_type
-
-if TYPE_CHECKING:
-    from mcaptrack import RunResult
 
 #: Examples for the help, by command.
 _EXAMPLES: Final = {
@@ -64,13 +62,15 @@ def chooser(
     )
 
 
+#: Names of options that every stage has beside those of its own.
+RESERVED: Final = ("help", *(name.replace("_", "-") for name in NAMES))
 _AFTER: Final = "After the stages"
 _AGAIN: Final = "Use this {kind}, also where another one was used before"
 
 
 def add_stages(app: typer.Typer, panel: str) -> None:
     """Add ``run`` and a command for each stage below the heading ``panel`` of the help."""
-    common.register(app, panel, "run", common.one_line(run_all))
+    common.register(app, panel, "run", common.one_line(takes_many()(run_all)))
     for stage in STAGES.values():
         common.register(app, panel, stage.name, common.one_line(stage_command(stage)), stage_help(stage))
 
@@ -202,7 +202,7 @@ def stage_command(stage: Stage, plugins: Mapping[str, type[Transform]] = Mapping
         _parameter("config", common.Config, None),
     ]
 
-    flags = Counter(flag for parameter in parameters for flag in _flags(parameter)) + Counter(["help"])
+    flags = Counter(flag for parameter in parameters for flag in _flags(parameter)) + Counter(RESERVED)
     if twice := {flag.replace("-", "_") for flag, count in flags.items() if count > 1}:
         words = f"{' and '.join(plugins)} can't have a parameter {' or '.join(sorted(twice))}"
         raise McaptrackError(f"{words}: that is the name of an option of {stage.name}")
@@ -210,27 +210,19 @@ def stage_command(stage: Stage, plugins: Mapping[str, type[Transform]] = Mapping
     def command(**given: Any) -> None:
         wanted = {option: given[option] for option in owners if given[option] is not None}
 
-        def make(name: str) -> Transform:
-            return make_transform(
-                stage, {**given, **({stage.kind: name} if name and stage.kind else {})}, wanted, owners
-            )
+        from mcaptrack.api.running import run_stage
 
+        make = Maker.of(stage, given, wanted, owners)
+        options: dict[str, Any] = {"topic": given["topic"], "to": given["to"], "frame": given.get("frame")}
         with stdout_to_stderr():
             transform = None if is_open(stage, given) else make("")
-
-        def run(path: Path, **where: Any) -> RunResult:
-            from mcaptrack.api.running import run_stage
-
-            where |= {"topic": given["topic"], "to": given["to"], "stages": configured()}
-            where |= {"mode": given["mode"] if stage.modes else None, "frame": given.get("frame"), "make": make}
-            return run_stage(stage.name, transform, path, **where)
-
-        run_on_logs(given, run)
+            options |= {"stages": configured(), "mode": given["mode"] if stage.modes else None, "make": make}
+        run_on_logs(given, stage.name, partial(run_stage, stage.name, transform), options)
 
     command.__name__ = stage.name
     command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     command.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
-    return command
+    return takes_many()(command)
 
 
 def run_all(
@@ -325,20 +317,17 @@ def run_all(
     given |= {"json": json, "quiet": quiet, "verbose": verbose}
     named = {"detector": detector, "tracker": tracker, "retracker": retracker, "predictor": predictor}
     chosen = {kind: name for kind, name in named.items() if name}
+    import mcaptrack
+    from mcaptrack.evaluation.events import EventOptions
 
-    def run(path: Path, **where: Any) -> RunResult:
-        import mcaptrack
-        from mcaptrack.evaluation.events import EventOptions
-
+    with stdout_to_stderr():
         settings, stages = settings_of("events"), configured(chosen)
-        where |= {"camera_motion": camera_motion, "fit_plane": fit_plane, "person_height_m": person_height_m}
-        where |= {"ground_frame": ground_frame, "frame": frame, "across_classes": across_classes}
-        for stage in STAGES.values():
-            if stage.option in chosen:
-                where[stage.option] = stages.pop(stage.name)
-        watched = EventOptions(*(settings.get(name) for name in ("similarity", "gate_m", "min_iou")))
-        return mcaptrack.run(
-            path, topic=topic, events=watched if events else False, tables=tables, stages=stages, **where
-        )
-
-    run_on_logs(given, run)
+    options: dict[str, Any] = {"topic": topic, "tables": tables, "frame": frame, "camera_motion": camera_motion}
+    options |= {"fit_plane": fit_plane, "person_height_m": person_height_m, "ground_frame": ground_frame}
+    options |= {"across_classes": across_classes}
+    for stage in STAGES.values():
+        if stage.option in chosen:
+            options[stage.option] = stages.pop(stage.name)
+    watched = EventOptions(*(settings.get(name) for name in ("similarity", "gate_m", "min_iou")))
+    options |= {"events": watched if events else False, "stages": stages}
+    run_on_logs(given, "run", mcaptrack.run, options)

@@ -1,0 +1,321 @@
+"""Commands that take many logs: their options, one worker process a log at a time, and a summary at the end."""
+
+from __future__ import annotations
+
+import inspect
+import re
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from contextvars import ContextVar
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Annotated, Any, Final, Generic, TypeVar, get_type_hints
+
+from mcaptrack import notices
+from mcaptrack.cli import common
+from mcaptrack.cli.live import LiveTable
+from mcaptrack.cli.text import say, stdout_to_stderr
+from mcaptrack.errors import McaptrackError
+from mcaptrack.fleet import FleetResult, LogOutcome, NamedLog
+from mcaptrack.fleet import run as run_fleet
+
+T = TypeVar("T")
+#: Heading of the options in the help.
+PANEL: Final = "Many logs"
+_TIME: Final = re.compile(r"([0-9]+(?:\.[0-9]+)?)\s*([smh]?)")
+_SECONDS: Final = {"": 1, "s": 1, "m": 60, "h": 3600}
+#: The number of logs from which on the summary repeats why logs failed.
+_REPEATED: Final = 20
+
+
+@dataclass(frozen=True)
+class ManyOptions:
+    """The options for many logs."""
+
+    jobs: Annotated[
+        int | None,
+        common.option(
+            "--jobs",
+            panel=PANEL,
+            least=1,
+            most=1024,
+            help="Number of logs to process at the same time.",
+            show_default="1, or one for each thread of the cluster",
+        ),
+    ] = None
+    scheduler: Annotated[
+        str | None,
+        common.option(
+            "--scheduler",
+            panel=PANEL,
+            metavar="ADDRESS",
+            help="Let the workers of a Dask cluster process the logs, by the address of its scheduler.",
+            show_default="processes on this machine",
+        ),
+    ] = None
+    keep_going: Annotated[
+        bool, common.option("--keep-going/--no-keep-going", panel=PANEL, help="Go on after a log that failed.")
+    ] = True
+    output_dir: Annotated[
+        Path | None,
+        common.option(
+            "--output-dir",
+            panel=PANEL,
+            metavar="FOLDER",
+            help="Write the results for each log to this folder, under its name.",
+            show_default="in or beside each log",
+        ),
+    ] = None
+    ledger: Annotated[
+        Path | None,
+        common.option(
+            "--ledger",
+            panel=PANEL,
+            metavar="FILE",
+            help="Add a line of JSON to this file for each log and try, and skip logs that it says are done.",
+            show_default="none",
+        ),
+    ] = None
+    timeout: Annotated[
+        str | None,
+        common.option(
+            "--timeout",
+            panel=PANEL,
+            metavar="TIME",
+            help="Give a log up after this time, such as 90s, 10m or 2h.",
+            show_default="none",
+        ),
+    ] = None
+    memory_limit: Annotated[
+        str | None,
+        common.option(
+            "--memory-limit",
+            panel=PANEL,
+            metavar="SIZE",
+            help="End a worker whose resident memory exceeds this size, such as 2GB.",
+            show_default="none",
+        ),
+    ] = None
+    tries: Annotated[
+        int,
+        common.option(
+            "--tries",
+            panel=PANEL,
+            least=1,
+            most=100,
+            help="How often a log is tried that kills its worker or exceeds a limit.",
+        ),
+    ] = 2
+
+    @property
+    def are_given(self) -> bool:
+        """Whether any of them differs from its default, so that one log is processed as many are."""
+        return self != ManyOptions()
+
+    def for_fleet(self) -> dict[str, Any]:
+        """Return the arguments of ``mcaptrack.fleet.run``. Raises McaptrackError for a time that is none."""
+        return {
+            "jobs": self.jobs,
+            "scheduler": self.scheduler,
+            "keep_going": self.keep_going,
+            "ledger": self.ledger,
+            "timeout_s": _seconds(self.timeout),
+            "memory_limit": self.memory_limit,
+            "tries": self.tries,
+        }
+
+
+#: The options of the running command.
+_OPTIONS: Final[ContextVar[ManyOptions]] = ContextVar("many")
+NAMES: Final = tuple(one.name for one in fields(ManyOptions))
+
+
+def many_options() -> ManyOptions:
+    """Return the options of the running command."""
+    return _OPTIONS.get()
+
+
+def takes_many(*, outputs: bool = True) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Add the options for many logs to a command; without ``outputs`` all but ``--output-dir``."""
+    names = [name for name in NAMES if outputs or name != "output_dir"]
+
+    def decorate(command: Callable[..., None]) -> Callable[..., None]:
+        own = inspect.signature(command).parameters
+        hints = dict(getattr(command, "__annotations__", {}))
+        if any(isinstance(hint, str) for hint in hints.values()):
+            hints = get_type_hints(command, include_extras=True)
+        annotations = {name: hints[name] for name in own}
+        added = get_type_hints(ManyOptions, include_extras=True)
+        parameters = [
+            own[name].replace(annotation=hint, kind=inspect.Parameter.KEYWORD_ONLY)
+            for name, hint in annotations.items()
+        ]
+        defaults = ManyOptions()
+        parameters += [
+            inspect.Parameter(
+                name, inspect.Parameter.KEYWORD_ONLY, default=getattr(defaults, name), annotation=added[name]
+            )
+            for name in names
+        ]
+
+        def with_options(**given: Any) -> None:
+            _OPTIONS.set(ManyOptions(**{name: given.pop(name) for name in names}))
+            command(**given)
+
+        with_options.__name__, with_options.__doc__ = command.__name__, command.__doc__
+        with_options.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+        with_options.__annotations__ = {one.name: one.annotation for one in parameters}
+        return with_options
+
+    return decorate
+
+
+@dataclass(frozen=True)
+class Work(Generic[T]):
+    """What a command does with each log.
+
+    Attributes
+    ----------
+    name : str
+        The command.
+    function, options
+        What is called: ``function(log, output=..., **options, progress=...)``; it is sent to other processes.
+    show : callable
+        Prints a result, as the command does for a single log.
+    line : callable or None
+        Returns a result as one line. None where the results themselves are what is printed to stdout; they are printed
+        in the order of the logs then.
+    suffix : str
+        Ending of the names of outputs in ``--output-dir``.
+    writes : bool
+        Whether logs, or files beside them, are changed.
+    shares_output : bool
+        Whether all logs have one output, a folder.
+    """
+
+    name: str
+    function: Callable[..., T]
+    options: Mapping[str, Any]
+    show: Callable[[Path, T], None]
+    line: Callable[[T], str] | None = None
+    suffix: str = ".mcap"
+    writes: bool = True
+    shares_output: bool = False
+
+
+def process(
+    logs: Sequence[NamedLog], work: Work[T], talk: common.Talk, output: Path | None = None
+) -> tuple[list[T], dict[str, Any]]:
+    """Process logs: one as ever, several in workers. Returns the results, and totals for the JSON of several.
+
+    ``output`` is that of a single log. An error in one of several logs is printed and does not stop the others; the
+    command ends with exit code 3 then.
+    """
+    many = many_options()
+    if not logs:
+        talk.say("the list of logs is empty; there is nothing to do")
+        return [], {}
+    if many.output_dir is not None and output is not None:
+        raise McaptrackError("--output and --output-dir are two places for the same results; give one")
+    options = {**work.options} if output is None else {**work.options, "output": output}
+    folder = many.output_dir
+    if work.shares_output and folder is not None:
+        options, folder = {**options, "output": folder}, None
+    elif not work.shares_output:
+        common.only_one_output([one.path for one in logs], output)
+    if len(logs) == 1 and not many.are_given:
+        path = logs[0].path
+        with notices.about(output or path):
+            with stdout_to_stderr():
+                result = common.with_progress(work.function, talk.progress)(path, **options)
+            work.show(path, result)
+        return [result], {}
+    listener: _Printer[T] = _Printer(work, talk, [one.path for one in logs])
+    try:
+        with LiveTable.on_terminal(talk.quiet or work.line is None) as table:
+            done = run_fleet(
+                work.function,
+                logs,
+                options,
+                name=work.name,
+                output_dir=folder,
+                suffix=work.suffix,
+                writes=work.writes,
+                on_outcome=listener.hear,
+                on_status=table.show,
+                on_note=talk.say,
+                **many.for_fleet(),
+            )
+    except (KeyboardInterrupt, SystemExit):
+        talk.say(f"ended by a signal: {listener.ended} of {len(logs)} logs were processed; the same command goes on")
+        raise
+    _summarise(done, talk)
+    return [done.results[one.path] for one in logs if one.path in done.results], {"fleet": done.to_json()}
+
+
+class _Printer(Generic[T]):
+    """Prints the outcomes of logs; results for stdout in the order of the logs."""
+
+    def __init__(self, work: Work[T], talk: common.Talk, logs: Sequence[Path]) -> None:
+        self._work, self._talk = work, talk
+        self.ended = 0
+        self._next = deque(logs)
+        self._waiting: dict[Path, T | None] = {}
+
+    def hear(self, outcome: LogOutcome[T]) -> None:
+        """Print what became of a log."""
+        self.ended += 1
+        for line in outcome.printed.splitlines():
+            self._talk.say(f"{outcome.log}: {line}")
+        for notice in outcome.warnings:
+            with notices.about(notice.log or outcome.log):
+                notices.warn(notice.message, notice.code)
+        if outcome.state == "skipped":
+            self._talk.detail(f"{outcome.log}: done before, as the ledger says")
+        elif outcome.result is None:
+            for line in outcome.detail.splitlines():
+                self._talk.detail(line)
+            common.record_failure(outcome.log, outcome.error, outcome.state)
+        if self._work.line is None:
+            self._show_in_order(outcome)
+        elif outcome.result is not None and self._talk.verbose:
+            self._work.show(outcome.log, outcome.result)
+        elif outcome.result is not None:
+            self._talk.say(f"{outcome.log}: {self._work.line(outcome.result)}")
+
+    def _show_in_order(self, outcome: LogOutcome[T]) -> None:
+        self._waiting[outcome.log] = outcome.result
+        while self._next and self._next[0] in self._waiting:
+            log = self._next.popleft()
+            result = self._waiting.pop(log)
+            if result is not None:
+                self._work.show(log, result)
+
+
+def _summarise(done: FleetResult[Any], talk: common.Talk) -> None:
+    """Print the totals, and with many logs once more why some failed."""
+    common.tried(len(done.outcomes))
+    words = [f"{count} {state}" for state, count in done.counts.items()]
+    rate = len(done.outcomes) / max(done.seconds, 1e-3)
+    line = f"{len(done.outcomes)} logs in {done.seconds:.1f} s ({rate:.1f} a second): {', '.join(words)}"
+    if done.peak_bytes:
+        ran = [one for one in done.outcomes if one.tries]
+        used = done.cpu_seconds / max(1, len(ran))
+        line += f"; at most {done.peak_bytes / 1e6:,.0f} MB of memory, {used:.2f} s of processor time a log"
+    talk.say(line)
+    if len(done.outcomes) >= _REPEATED:
+        for one in done.failed:
+            say(f"  {one.state}: {one.error}")
+    if done.stopped:
+        left = done.counts.get("not-tried", 0)
+        common.end_early(f"{done.stopped}; {left} of {len(done.outcomes)} logs are left, and the same command goes on")
+
+
+def _seconds(text: str | None) -> float | None:
+    """Return a time such as 90s, 10m or 2h in seconds; None for None."""
+    if text is None:
+        return None
+    found = _TIME.fullmatch(text.strip().lower())
+    if found is None or not float(found[1]):
+        raise McaptrackError(f"--timeout needs a time such as 90s, 10m or 2h, not {text!r:.40}")
+    return float(found[1]) * _SECONDS[found[2]]

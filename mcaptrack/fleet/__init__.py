@@ -1,0 +1,179 @@
+"""Run one function of the library on many logs: in worker processes on this machine, or on a Dask cluster.
+
+``run`` does what the command line does with many logs: one log never takes the others down, a second call does only
+what is missing, and several calls can share a folder of logs.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+from mcaptrack.errors import McaptrackError
+from mcaptrack.fleet.child import Limits
+from mcaptrack.fleet.digests import digest_of_settings
+from mcaptrack.fleet.expansion import NamedLog, find_logs, outputs_in
+from mcaptrack.fleet.ledger import Ledger
+from mcaptrack.fleet.limits import size_in_bytes
+from mcaptrack.fleet.processes import Processes
+from mcaptrack.fleet.results import FleetResult, FleetStatus, LogOutcome, Running, Watch
+from mcaptrack.fleet.running import Crew, Fleet, Work, location_of
+
+T = TypeVar("T")
+
+__all__ = ["FleetResult", "FleetStatus", "LogOutcome", "NamedLog", "Running", "find_logs", "run"]
+
+
+def run(
+    function: Callable[..., T],
+    logs: str | os.PathLike[str] | Iterable[str | os.PathLike[str] | NamedLog],
+    options: Mapping[str, Any] | None = None,
+    *,
+    name: str = "",
+    jobs: int | None = None,
+    scheduler: str | None = None,
+    output_dir: str | os.PathLike[str] | None = None,
+    suffix: str = ".mcap",
+    ledger: str | os.PathLike[str] | None = None,
+    keep_going: bool = True,
+    timeout_s: float | None = None,
+    memory_limit: str | float | None = None,
+    tries: int = 2,
+    writes: bool = True,
+    on_outcome: Callable[[LogOutcome[T]], None] | None = None,
+    on_status: Watch | None = None,
+    on_note: Callable[[str], None] | None = None,
+    progress: Callable[[str, float, float | None], None] | None = None,
+) -> FleetResult[T]:
+    """Run a function on many logs, each in a worker process that stays warm for the next one.
+
+    A log that fails, kills its worker, hangs or takes too much memory is set aside and named; all others are processed.
+
+    Parameters
+    ----------
+    function : callable
+        Called as ``function(log, **options)``, such as ``mcaptrack.run``. Workers import it, so it can't be defined in
+        the script itself.
+    logs : path or iterable of path
+        Logs, folders of logs, patterns, or "-" for a list of logs on standard input.
+    options : mapping of str to object, optional
+        Keywords of the function, the same for all logs.
+    name : str, optional
+        Name of the work in the ledger, by default that of the function.
+    jobs : int, optional
+        Number of logs to process at the same time, by default 1, or one for each thread of the cluster. Each worker
+        process gets its share of the cores for its threads.
+    scheduler : str, optional
+        Address of a Dask scheduler, such as "tcp://host:8786", whose workers process the logs instead. They have to see
+        the logs, and the working folder, under the same names.
+    output_dir : path, optional
+        Folder for the outputs: the function gets ``output=``, a name in this folder, for each log.
+    suffix : str, default ".mcap"
+        Ending of names in ``output_dir``.
+    ledger : path, optional
+        File to which a line of JSON is added for each log and try. Logs that it says are done, with the same options,
+        and that have not changed since, are skipped.
+    keep_going : bool, default True
+        Whether to go on after a log that failed.
+    timeout_s : float, optional
+        Seconds after which a log is given up.
+    memory_limit : str or float, optional
+        Resident memory at which a worker is ended, such as "2GB", or in bytes. Address space that is reserved but not
+        used doesn't count.
+    tries : int, default 2
+        How often a log is tried that kills its worker, or exceeds a limit. Other failures are not tried again.
+    writes : bool, default True
+        Whether the function changes logs or writes beside them; then each log is claimed by a small file there while it
+        is processed, so that another fleet leaves it alone.
+    on_outcome, on_status, on_note : callable, optional
+        Called with a ``LogOutcome`` when a log has ended, with a ``FleetStatus`` several times a second, and with a
+        line of text when something is tried again or taken over.
+    progress : callable, optional
+        Called as ``progress("logs", done, total)``.
+
+    Returns
+    -------
+    FleetResult
+        The outcome of each log, and totals.
+
+    Raises
+    ------
+    McaptrackError
+        If there is no log, if an argument is wrong, or if the ledger can't be written.
+
+    Examples
+    --------
+    >>> import mcaptrack
+    >>> from mcaptrack import fleet
+    >>> done = fleet.run(mcaptrack.check, ["log.mcap"], jobs=2)
+    >>> done.counts
+    {'done': 1}
+
+    """
+    for what, value, least in (("jobs", jobs, 1), ("tries", tries, 1), ("timeout_s", timeout_s, 0.001)):
+        if value is not None and not least <= value < float("inf"):
+            raise McaptrackError(f"`{what}=` has to be at least {least}, not {value}")
+    found = _named(logs)
+    if not found:
+        raise McaptrackError("there are no logs to process")
+    given, command = dict(options or {}), name or _name_of(function)
+    folder = None if output_dir is None else Path(output_dir)
+    settings = digest_of_settings(function, given, str(folder.absolute()) if folder else None)
+    entries = None if ledger is None else Ledger(Path(ledger), command, settings)
+    claims_in = folder or (None if ledger is None else Path(ledger).absolute().parent)
+    work = []
+    outputs = outputs_in(folder, found, suffix) if folder is not None else []
+    for number, one in enumerate(found):
+        own = {"output": outputs[number]} if outputs else {}
+        beside = one.path.parent if writes and folder is None and os.access(one.path.parent, os.W_OK) else claims_in
+        work.append(Work(number, one.path, location_of(one.path), own, beside))
+    for output in outputs:
+        _make_folder(output.parent)
+    limits = Limits(min(jobs or 1, len(found)), os.getcwd(), timeout_s, size_in_bytes(memory_limit, "memory_limit"))
+
+    def hear(outcome: LogOutcome[T]) -> None:
+        if on_outcome is not None:
+            on_outcome(outcome)
+
+    def watch(status: FleetStatus) -> None:
+        if progress is not None:
+            progress("logs", status.logs - status.left, status.logs)
+        if on_status is not None:
+            on_status(status)
+
+    crew = _crew(scheduler, limits, jobs)
+    fleet = Fleet(function, given, work, crew, entries, tries, keep_going, hear, watch, on_note or _ignore)
+    return fleet.run()
+
+
+def _crew(scheduler: str | None, limits: Limits, jobs: int | None) -> Crew:
+    if scheduler is None:
+        return Processes(limits)
+    from mcaptrack.fleet.cluster import Cluster
+
+    return Cluster(scheduler, limits, jobs)
+
+
+def _named(logs: Any) -> list[NamedLog]:
+    if isinstance(logs, str | os.PathLike):
+        return find_logs([logs])
+    several = list(logs)
+    return several if all(isinstance(one, NamedLog) for one in several) else find_logs(several)
+
+
+def _name_of(function: Any) -> str:
+    """Return the name of a function, also of one with some arguments given."""
+    return str(getattr(getattr(function, "func", function), "__name__", type(function).__name__))
+
+
+def _make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise McaptrackError(f"the folder {folder} can't be made: {error.strerror or error}") from error
+
+
+def _ignore(_: str) -> None:
+    pass

@@ -1,0 +1,178 @@
+"""A worker process from the side of its parent: started when needed, watched, ended, and replaced."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from multiprocessing import Pipe
+from time import monotonic
+from typing import IO, Any, Final
+
+from mcaptrack.fleet.limits import environment_of_worker, resident_bytes
+from mcaptrack.fleet.results import State
+from mcaptrack.fleet.worker import Reply, Request
+
+#: What a new process runs. Its path of modules is that of its parent, without the working folder of ``-c``.
+_CODE: Final = (
+    "import json, sys; handle, sys.path[:] = json.loads(sys.argv[1]); "
+    "from mcaptrack.fleet.worker import serve; serve(handle)"
+)
+#: Seconds between two looks at a busy worker.
+_LOOK_S: Final = 0.1
+#: Seconds that a worker gets to start, and to end in order.
+_START_S: Final = 120.0
+_GRACE_S: Final = 3.0
+#: The most that is kept of what a worker prints, in bytes.
+_PRINTED: Final = 10_000
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Limits of each try: seconds and resident bytes; how many workers share the machine, and their working folder."""
+
+    workers: int = 1
+    folder: str | None = None
+    timeout_s: float | None = None
+    memory_bytes: int | None = None
+
+
+class StoppedError(Exception):
+    """The fleet is being ended, and this try with it."""
+
+
+class Child:
+    """A worker process. It is started by the first request, and again after one that ended it."""
+
+    def __init__(self, limits: Limits) -> None:
+        self._limits = limits
+        self._process: subprocess.Popen[bytes] | None = None
+        self._connection: Any = None
+        self._output: IO[bytes] = tempfile.TemporaryFile("ab+")  # noqa: SIM115
+        self.progress: tuple[str, float, float | None] = ("", 0.0, None)
+        self.resident = 0
+
+    def do(self, request: Request, is_stopping: Callable[[], bool]) -> Reply:
+        """Let the worker process a log. Whatever that does to the worker becomes a reply.
+
+        Raises StoppedError when ``is_stopping`` returns true; the worker is ended then.
+        """
+        began = monotonic()
+        self.progress, self.resident, peak = ("starting", 0.0, None), 0, 0
+        self._output.truncate(0)
+        if self._process is None:
+            try:
+                self._start()
+            except OSError as error:
+                words = f"{request.log}: no worker process can be started in {self._limits.folder or '.'}"
+                return Reply("failed", error=f"{words} ({error.strerror or error})")
+            deadline = began + _START_S
+        else:
+            self._connection.send(request)
+            deadline = self._deadline()
+        assert self._process is not None
+        while True:
+            if is_stopping():
+                self.end()
+                raise StoppedError
+            try:
+                message = self._connection.recv() if self._connection.poll(_LOOK_S) else self
+                if message is None:
+                    self._connection.send(request)
+                    began, deadline = monotonic(), self._deadline()
+            except (EOFError, OSError):
+                return replace(self._died(request), seconds=monotonic() - began, peak_bytes=peak)
+            if isinstance(message, Reply):
+                return replace(message, printed=self._printed())
+            if isinstance(message, tuple):
+                self.progress = message
+            self.resident = resident_bytes(self._process.pid)
+            peak = max(peak, self.resident)
+            if over := self._over(deadline, began, peak):
+                state, words = over
+                self.end(grace_s=_GRACE_S if state == "timed-out" else 0.0)
+                seconds = round(monotonic() - began, 3)
+                words = f"{request.log}: {words}, and was ended"
+                return Reply(state, error=words, seconds=seconds, peak_bytes=peak, detail=self._printed())
+            if self._process.poll() is not None and not self._connection.poll(0):
+                return replace(self._died(request), seconds=monotonic() - began, peak_bytes=peak)
+
+    def _over(self, deadline: float, began: float, peak: int) -> tuple[State, str] | None:
+        """Return which limit the worker exceeds, and that in words."""
+        if monotonic() > deadline:
+            return "timed-out", f"took longer than {monotonic() - began:.0f} s"
+        most = self._limits.memory_bytes
+        if most is not None and self.resident > most:
+            return "out-of-memory", f"took {peak / 1e6:,.0f} MB of memory, more than {most / 1e6:,.0f}"
+        return None
+
+    def _deadline(self) -> float:
+        return float("inf") if self._limits.timeout_s is None else monotonic() + self._limits.timeout_s
+
+    def _start(self) -> None:
+        own, its = Pipe()
+        try:
+            self._process = subprocess.Popen(
+                [sys.executable, "-c", _CODE, json.dumps([its.fileno(), sys.path])],
+                stdin=subprocess.DEVNULL,
+                stdout=self._output,
+                stderr=self._output,
+                cwd=self._limits.folder,
+                env=environment_of_worker(self._limits.workers),
+                pass_fds=[its.fileno()],
+                process_group=0,  # Ctrl-C at the terminal is for the parent alone
+            )
+        except BaseException:
+            own.close()
+            raise
+        finally:
+            its.close()
+        self._connection = own
+
+    def _died(self, request: Request) -> Reply:
+        """Return the reply for a worker that ended before it replied."""
+        assert self._process is not None
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(_GRACE_S)
+        code = self._process.poll()
+        self.end(grace_s=0.0)
+        how = "closed its connection" if code is None else f"exited with code {code}"
+        if code is not None and code < 0:
+            with suppress(ValueError):
+                how = f"was killed by {signal.Signals(-code).name}"
+        return Reply("killed", error=f"{request.log}: the worker process {how}", detail=self._printed())
+
+    def _printed(self) -> str:
+        """Return the last of what the worker has printed since the request."""
+        handle = self._output.fileno()
+        size = os.fstat(handle).st_size
+        text = os.pread(handle, _PRINTED, max(0, size - _PRINTED))
+        return text.decode("utf-8", "replace").strip()
+
+    def close(self, grace_s: float = _GRACE_S) -> None:
+        """End the process for good."""
+        self.end(grace_s)
+        self._output.close()
+
+    def end(self, grace_s: float = _GRACE_S) -> None:
+        """End the process and those that it started; within ``grace_s`` seconds it may leave things in order."""
+        process, self._process = self._process, None
+        if process is None:
+            return
+        with suppress(OSError):
+            self._connection.close()
+        try:
+            if grace_s:
+                process.terminate()
+                with suppress(subprocess.TimeoutExpired):
+                    process.wait(grace_s)
+        finally:
+            with suppress(OSError):
+                os.killpg(process.pid, signal.SIGKILL)
+            process.wait()

@@ -1,0 +1,177 @@
+"""Find the logs that arguments name: files, folders, patterns, and a list on standard input."""
+
+from __future__ import annotations
+
+import glob
+import os
+import sys
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
+
+from mcaptrack.errors import McaptrackError
+from mcaptrack.files import follow_links, refuse_special, refuse_url
+from mcaptrack.log import results_path
+from mcaptrack.log.recording_files import refuse_non_mcap
+from mcaptrack.notices import warn
+
+#: The argument that stands for a list of names on standard input.
+LIST: Final = "-"
+_SUFFIX: Final = ".mcap"
+
+
+@dataclass(frozen=True)
+class NamedLog:
+    """A log, and its name below the folder, pattern or list that named it, which is its name in an output folder."""
+
+    path: Path
+    below: Path
+
+
+def find_logs(
+    arguments: Iterable[str | os.PathLike[str]],
+    *,
+    each: bool = False,
+    leave_out: str = "",
+    read_list: Callable[[], bytes] | None = None,
+) -> list[NamedLog]:
+    """Return the logs that arguments name, each once, in order.
+
+    A folder stands for all logs in it and in the folders below; hidden ones are left out. LOG.results.mcap is left out
+    if LOG is there, because it is a part of LOG; with ``each`` it is kept.
+
+    Parameters
+    ----------
+    arguments : iterable of path
+        Files, folders, patterns, or "-" for a list of files on standard input: one a line, or ended by a zero byte as
+        by ``find -print0``.
+    each : bool, default False
+        Whether results beside a log are logs of their own.
+    leave_out : str
+        In folders, leave out files with this ending.
+    read_list : callable, optional
+        Returns the list instead of standard input.
+
+    Raises
+    ------
+    McaptrackError
+        If a folder has no log, if a pattern matches no file, or for a URL, a pipe or a device.
+
+    """
+    found: list[NamedLog] = []
+    for argument in arguments:
+        found += _logs_of(Path(argument), leave_out, read_list or _standard_input)
+    results = set() if each else {results_path(follow_links(one.path)) for one in found}
+    once: dict[object, NamedLog] = {}
+    for one in found:
+        if follow_links(one.path) not in results:
+            once.setdefault(_identity(one.path), one)
+    return list(once.values())
+
+
+def outputs_in(folder: Path, logs: Sequence[NamedLog], suffix: str) -> list[Path]:
+    """Return a name in a folder for the output of each log, which ends with ``suffix``.
+
+    Raises McaptrackError if two logs have the same name.
+    """
+    names: dict[Path, Path] = {}
+    for one in logs:
+        stem = one.below.name.removesuffix(one.below.suffix) if one.below.suffix.lower() == _SUFFIX else one.below.name
+        name = folder / one.below.with_name(stem + suffix)
+        other = names.setdefault(name, one.path)
+        if other != one.path:
+            raise McaptrackError(
+                f"the results of {other} and {one.path} would both be {name}; give the folder that holds both logs, "
+                "which keeps the folders below it apart"
+            )
+    return list(names)
+
+
+def _logs_of(argument: Path, leave_out: str, read_list: Callable[[], bytes]) -> Iterator[NamedLog]:
+    if str(argument) == LIST:
+        yield from _listed(read_list())
+        return
+    refuse_url(argument)
+    refuse_special(argument)
+    if argument.is_dir():
+        found = list(_logs_in(argument, leave_out))
+        if not found or (argument / "metadata.yaml").is_file():
+            refuse_non_mcap(argument)  # a bag is one recording, whatever number of files it has
+        if not found:
+            raise McaptrackError(f"the folder {argument} has no log: no file in it ends with {_SUFFIX}")
+        yield from found
+    elif argument.exists() or argument.is_symlink() or not glob.has_magic(str(argument)):
+        yield NamedLog(argument, Path(argument.name))
+    else:
+        yield from _matching(argument, leave_out)
+
+
+def _logs_in(folder: Path, leave_out: str) -> Iterator[NamedLog]:
+    """Yield all logs in a folder and below it, in order of their names."""
+
+    def unreadable(error: OSError) -> None:
+        warn(f"{error.filename} can't be listed ({error.strerror}); logs in it are left out", "left-out")
+
+    for place, folders, files in os.walk(folder, onerror=unreadable):
+        folders[:] = sorted(name for name in folders if not name.startswith("."))
+        for name in sorted(files):
+            if (
+                name.lower().endswith(_SUFFIX)
+                and not name.startswith(".")
+                and not (leave_out and name.endswith(leave_out))
+            ):
+                path = Path(place, name)
+                yield NamedLog(path, path.relative_to(folder))
+
+
+def _matching(pattern: Path, leave_out: str) -> Iterator[NamedLog]:
+    """Yield the files that a pattern matches, and the logs in folders that it matches."""
+    names = sorted(glob.glob(str(pattern), recursive=True))
+    if not names:
+        raise McaptrackError(f"no file matches {pattern}")
+    fixed = Path()
+    for part in pattern.parts[:-1]:
+        if glob.has_magic(part):
+            break
+        fixed /= part
+    for name in names:
+        path = Path(name)
+        if path.is_dir():
+            yield from (replace(one, below=one.path.relative_to(fixed)) for one in _logs_in(path, leave_out))
+        else:
+            yield NamedLog(path, path.relative_to(fixed))
+
+
+def _standard_input() -> bytes:
+    if sys.stdin is None or sys.stdin.closed:
+        raise McaptrackError("- is a list of logs on standard input, which is closed")
+    if sys.stdin.isatty():
+        raise McaptrackError("- is a list of logs on standard input, which is a terminal; pipe names of logs into it")
+    return sys.stdin.buffer.read()
+
+
+def _listed(text: bytes) -> Iterator[NamedLog]:
+    """Yield the logs of a list; their names are relative to the folder that all of them are in."""
+    lines = text.split(b"\0") if b"\0" in text else text.splitlines()
+    paths = [Path(os.fsdecode(line)) for line in lines if line.strip()]
+    for path in paths:
+        refuse_url(path)
+        refuse_special(path)
+        if path.is_dir():
+            raise McaptrackError(
+                f"the list of logs names {path}, which is a folder; list files, or give the folder itself"
+            )
+    full = [Path(os.path.abspath(path)) for path in paths]
+    common = os.path.commonpath([path.parent for path in full]) if full else ""
+    for path, whole in zip(paths, full, strict=True):
+        yield NamedLog(path, whole.relative_to(common))
+
+
+def _identity(path: Path) -> object:
+    """Return the same value for all names of one file."""
+    try:
+        about = path.stat()
+    except OSError:
+        return str(follow_links(path))
+    return about.st_dev, about.st_ino

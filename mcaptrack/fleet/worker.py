@@ -1,0 +1,169 @@
+"""The worker process of a fleet: it runs a function on one log after another, and stays warm between them.
+
+It is a process of its own (not forked, so that no thread of OpenCV, Arrow or ONNX Runtime is cut off), which talks to
+its parent through one socket. What a log may do to it is the parent's to notice: see ``child``.
+"""
+
+from __future__ import annotations
+
+import faulthandler
+import os
+import pickle
+import resource
+import signal
+import sys
+import traceback
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from multiprocessing.connection import Connection
+from pathlib import Path
+from threading import Thread
+from time import monotonic
+from types import FrameType
+from typing import Any, Final, NoReturn
+
+from mcaptrack.environment import hush_libraries
+from mcaptrack.errors import McaptrackError
+from mcaptrack.fleet.digests import digest_of_log
+from mcaptrack.fleet.results import State
+from mcaptrack.notices import Notice, about, listening
+
+#: Seconds between two messages about progress.
+_PROGRESS_S: Final = 0.2
+
+
+@dataclass(frozen=True)
+class Request:
+    """One log to run a function on: the function with its options, pickled, and those that differ between logs."""
+
+    log: Path
+    task: bytes
+    own: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Reply:
+    """What became of one try, as in ``LogOutcome``; ``result`` is pickled; ``digest`` is that of the log afterwards."""
+
+    state: State
+    result: bytes = b""
+    error: str = ""
+    detail: str = ""
+    seconds: float = 0.0
+    cpu_seconds: float = 0.0
+    peak_bytes: int = 0
+    warnings: tuple[Notice, ...] = ()
+    digest: str = ""
+    printed: str = ""
+
+
+def do(request: Request, progress: Callable[[str, float, float | None], None]) -> Reply:
+    """Run a function on a log. Faults become replies; only signals end this."""
+    began, used, warnings = monotonic(), _cpu_seconds(), list[Notice]()
+    _reset_peak()
+    try:
+        function, options = pickle.loads(request.task)  # noqa: S301  # from the parent
+        with listening(warnings.append), about(request.own.get("output") or request.log):
+            result = function(request.log, **options, **request.own, **_taking(function, progress))
+        state: State = "up-to-date" if getattr(result, "is_up_to_date", False) else "done"
+        reply = Reply(state, result=pickle.dumps(result), digest=digest_of_log(request.log))
+    except McaptrackError as error:
+        reply = Reply("failed", error=" ".join(str(error).split()))
+    except MemoryError:
+        reply = Reply("out-of-memory", error=f"{request.log}: the memory of this machine is not enough")
+    except Exception as error:
+        last = " ".join(traceback.format_exception_only(error)[-1].split())
+        words = f"{request.log}: {last}; this is a fault of the program, the ledger and -v have its traceback"
+        reply = Reply("failed", error=words, detail=traceback.format_exc())
+    seconds, cpu = round(monotonic() - began, 3), round(_cpu_seconds() - used, 3)
+    found = tuple(dict.fromkeys(warnings))
+    return replace(reply, seconds=seconds, cpu_seconds=cpu, peak_bytes=_peak_bytes(), warnings=found)
+
+
+def _taking(function: Any, progress: Any) -> dict[str, Any]:
+    """Return ``progress`` as a keyword, for functions that take it."""
+    import inspect
+
+    return {"progress": progress} if "progress" in inspect.signature(function).parameters else {}
+
+
+def serve(handle: int) -> None:
+    """Answer requests on a socket until the parent closes it or ends."""
+    connection: Connection[Any, Any] = Connection(handle)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent, which ends its workers
+    signal.signal(signal.SIGTERM, _end)
+    faulthandler.enable(sys.stderr)
+    hush_libraries()
+    _die_with_parent(os.getppid())
+    sent = 0.0
+
+    def progress(stage: str, done: float, total: float | None) -> None:
+        nonlocal sent
+        now = monotonic()
+        if now - sent >= _PROGRESS_S:
+            sent = now
+            connection.send((stage, done, total))
+
+    with suppress(EOFError, OSError):
+        connection.send(None)  # ready
+        while True:
+            request = connection.recv()
+            try:
+                reply = do(request, progress)
+            except SystemExit as ended:
+                if _ENDING:
+                    raise
+                reply = Reply("failed", error=f"{request.log}: it ended its process with code {ended.code}")
+            sys.stdout.flush()
+            sys.stderr.flush()
+            connection.send(reply)
+
+
+#: The signals that ended this worker.
+_ENDING: Final[list[int]] = []
+
+
+def _end(number: int, _: FrameType | None) -> NoReturn:
+    """Unwind, so that what is half written is removed."""
+    _ENDING.append(number)
+    raise SystemExit(128 + number)
+
+
+def _die_with_parent(parent: int) -> None:
+    """End this process when its parent has ended, however that did: nothing that it does would count any more."""
+    from mcaptrack.fleet.limits import killed_with_parent
+
+    if killed_with_parent() and os.getppid() == parent:
+        return
+
+    def watch() -> None:
+        from time import sleep
+
+        while os.getppid() == parent:
+            sleep(0.5)
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    Thread(target=watch, daemon=True).start()
+
+
+def _cpu_seconds() -> float:
+    """Return the processor time of this process and of those that it waited for."""
+    used = [resource.getrusage(which) for which in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return sum(one.ru_utime + one.ru_stime for one in used)
+
+
+def _reset_peak() -> None:
+    """Let the peak of the resident memory begin again, where the system can (Linux)."""
+    with suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5")
+
+
+def _peak_bytes() -> int:
+    """Return the peak of the resident memory since ``_reset_peak``; elsewhere than on Linux since the start."""
+    try:
+        status = Path("/proc/self/status").read_text()
+        return int(status.partition("VmHWM:")[2].split()[0]) * 1024
+    except (OSError, IndexError, ValueError):
+        most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        return most if sys.platform == "darwin" else most * 1024
