@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from mcaptrack.cli import common
-from mcaptrack.cli.many import Work, process, takes_many
+from mcaptrack.cli.many import LogWork, process, takes_many
 from mcaptrack.cli.text import console, show
 from mcaptrack.fleet import find_logs
 
@@ -41,7 +41,7 @@ def check(
     """
     import mcaptrack
 
-    work: Work[LogCheck] = Work("check", mcaptrack.check, {}, show=lambda *_: None, line=_verdict, writes=False)
+    work: LogWork[LogCheck] = LogWork("check", mcaptrack.check, {}, show=lambda *_: None, line=_verdict, writes=False)
     with common.Talk(quiet, verbose).open() as talk:
         found, totals = process(find_logs(logs), work, talk)
     checked = [file for one in found for file in one.files]
@@ -129,7 +129,7 @@ def recover(
 
     found = find_logs(logs, each=True, leave_out=_RECOVERED)
     with common.Talk(quiet, verbose).open() as talk:
-        work = Work("recover", mcaptrack.recover, {"force": force}, show, line, _RECOVERED)
+        work = LogWork("recover", mcaptrack.recover, {"force": force}, show, line, _RECOVERED)
         reports, totals = process(found, work, talk, output)
     if json:
         results = [
@@ -188,7 +188,7 @@ def drop(
 
     options = {"topics": topics, "in_place": in_place, "force": force}
     with common.Talk(quiet, verbose).open() as talk:
-        work = Work("drop", mcaptrack.drop, options, lambda _, one: talk.say(f"{one.log}: {line(one)}"), line)
+        work = LogWork("drop", mcaptrack.drop, options, lambda _, one: talk.say(f"{one.log}: {line(one)}"), line)
         results, totals = process(find_logs([path]), work, talk, output)
     if json:
         listed = [

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import re
+import signal
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from contextvars import ContextVar
@@ -92,7 +93,7 @@ class ManyOptions:
             "--memory-limit",
             panel=PANEL,
             metavar="SIZE",
-            help="End a worker whose resident memory exceeds this size, such as 2GB.",
+            help="End a worker if its resident memory exceeds this size, such as 2GB.",
             show_default="none",
         ),
     ] = None
@@ -108,9 +109,9 @@ class ManyOptions:
     ] = 2
 
     @property
-    def are_given(self) -> bool:
-        """Whether any of them differs from its default, so that one log is processed as many are."""
-        return self != ManyOptions()
+    def concern_one(self) -> bool:
+        """Whether any of them matters for a single log, so that it is processed as many are."""
+        return any((self.scheduler, self.output_dir, self.ledger, self.timeout, self.memory_limit))
 
     def for_fleet(self) -> dict[str, Any]:
         """Return the arguments of ``mcaptrack.fleet.run``. Raises McaptrackError for a time that is none."""
@@ -171,8 +172,8 @@ def takes_many(*, outputs: bool = True) -> Callable[[Callable[..., None]], Calla
 
 
 @dataclass(frozen=True)
-class Work(Generic[T]):
-    """What a command does with each log.
+class LogWork(Generic[T]):
+    """The work of a command on each log.
 
     Attributes
     ----------
@@ -204,7 +205,7 @@ class Work(Generic[T]):
 
 
 def process(
-    logs: Sequence[NamedLog], work: Work[T], talk: common.Talk, output: Path | None = None
+    logs: Sequence[NamedLog], work: LogWork[T], talk: common.Talk, output: Path | None = None
 ) -> tuple[list[T], dict[str, Any]]:
     """Process logs: one as ever, several in workers. Returns the results, and totals for the JSON of several.
 
@@ -223,7 +224,7 @@ def process(
         options, folder = {**options, "output": folder}, None
     elif not work.shares_output:
         common.only_one_output([one.path for one in logs], output)
-    if len(logs) == 1 and not many.are_given:
+    if len(logs) == 1 and not many.concern_one:
         path = logs[0].path
         with notices.about(output or path):
             with stdout_to_stderr():
@@ -246,8 +247,11 @@ def process(
                 on_note=talk.say,
                 **many.for_fleet(),
             )
-    except (KeyboardInterrupt, SystemExit):
-        talk.say(f"ended by a signal: {listener.ended} of {len(logs)} logs were processed; the same command goes on")
+    except (KeyboardInterrupt, SystemExit) as ended:
+        if isinstance(ended, KeyboardInterrupt) or ended.code == 128 + signal.SIGTERM:
+            talk.say(
+                f"ended by a signal: {listener.ended} of {len(logs)} logs were processed; the same command goes on"
+            )
         raise
     _summarise(done, talk)
     return [done.results[one.path] for one in logs if one.path in done.results], {"fleet": done.to_json()}
@@ -256,7 +260,7 @@ def process(
 class _Printer(Generic[T]):
     """Prints the outcomes of logs; results for stdout in the order of the logs."""
 
-    def __init__(self, work: Work[T], talk: common.Talk, logs: Sequence[Path]) -> None:
+    def __init__(self, work: LogWork[T], talk: common.Talk, logs: Sequence[Path]) -> None:
         self._work, self._talk = work, talk
         self.ended = 0
         self._next = deque(logs)

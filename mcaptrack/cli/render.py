@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from mcaptrack.cli import common
-from mcaptrack.cli.many import Work, many_options, process, takes_many
+from mcaptrack.cli.many import LogWork, many_options, process, takes_many
 from mcaptrack.fleet import find_logs
 
 if TYPE_CHECKING:
@@ -103,7 +103,7 @@ def render(
     given |= {"gif": gif and not is_named, "camera": camera, "force": force}
     with common.Talk(quiet, verbose).open() as talk:
         suffix = ".gif" if gif else ".mp4"
-        work = Work(
+        work = LogWork(
             "render", mcaptrack.render, given, lambda _, one: talk.say(f"{one.video}: {line(one)}"), line, suffix
         )
         results, totals = process(find_logs(logs), work, talk, output)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from mcaptrack.cli import common
 from mcaptrack.cli.flags import with_flags
-from mcaptrack.cli.many import Work, process
+from mcaptrack.cli.many import LogWork, process
 from mcaptrack.errors import command
 from mcaptrack.fleet import find_logs
 
@@ -27,7 +27,7 @@ def run_on_logs(given: Mapping[str, Any], name: str, function: Run, options: Map
     where = {name: given[name] for name in ("camera", "sidecar", "force")}
     shows_events = name == "events"
     with common.Talk(given["quiet"], given["verbose"]).open() as talk:
-        work: Work[RunResult] = Work(
+        work: LogWork[RunResult] = LogWork(
             name,
             function,
             {**options, **where},
@@ -94,7 +94,7 @@ def _line_of(result: RunResult, shows_events: bool) -> str:
         words.append(", ".join(f"{kind} {count}" for kind, count in counts.items()) or "nothing happened")
     summary = result.summary
     if summary is not None and summary.tracks is not None:
-        words.append(f"{summary.tracks:,} tracks")
+        words.append(f"{summary.tracks:,} {'track' if summary.tracks == 1 else 'tracks'}")
     if codes := dict.fromkeys(notice.code for notice in result.warnings):
         words.append(f"warnings: {', '.join(codes)}")
     return "; ".join(words)

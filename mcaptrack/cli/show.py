@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 from mcaptrack.cli import common
-from mcaptrack.cli.many import Work, many_options, process, takes_many
+from mcaptrack.cli.many import LogWork, many_options, process, takes_many
 from mcaptrack.cli.text import console, printable
 from mcaptrack.fleet import find_logs
 
@@ -47,7 +47,7 @@ def info(
         if not json:
             _print(found.to_json(), verbose)
 
-    work: Work[LogInfo] = Work("info", mcaptrack.info, {"frames": frames}, show, writes=False)
+    work: LogWork[LogInfo] = LogWork("info", mcaptrack.info, {"frames": frames}, show, writes=False)
     with common.Talk(quiet, verbose).open() as talk, common.printed_to(output, force):
         found, totals = process(find_logs(logs), work, talk)
         if json:
@@ -220,7 +220,7 @@ def export(
 
     options: dict[str, Any] = {"form": form, "topic": topic, "blobs": blobs, "force": force}
     with common.Talk(quiet, verbose).open() as talk:
-        work = Work("export", mcaptrack.export, options, show, rows, ".rosbag2", shares_output=not is_bag)
+        work = LogWork("export", mcaptrack.export, options, show, rows, ".rosbag2", shares_output=not is_bag)
         results, totals = process(found, work, talk, output)
     if json:
         listed = [

@@ -12,14 +12,14 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.fleet.child import Limits
+from mcaptrack.fleet.child import WorkerLimits
 from mcaptrack.fleet.digests import digest_of_settings
 from mcaptrack.fleet.expansion import NamedLog, find_logs, outputs_in
 from mcaptrack.fleet.ledger import Ledger
 from mcaptrack.fleet.limits import size_in_bytes
 from mcaptrack.fleet.processes import Processes
 from mcaptrack.fleet.results import FleetResult, FleetStatus, LogOutcome, Running, Watch
-from mcaptrack.fleet.running import Crew, Fleet, Work, location_of
+from mcaptrack.fleet.running import Crew, Fleet, QueuedLog, location_of
 
 T = TypeVar("T")
 
@@ -66,8 +66,8 @@ def run(
         Number of logs to process at the same time, by default 1, or one for each thread of the cluster. Each worker
         process gets its share of the cores for its threads.
     scheduler : str, optional
-        Address of a Dask scheduler, such as "tcp://host:8786", whose workers process the logs instead. They have to see
-        the logs, and the working folder, under the same names.
+        Address of a Dask scheduler, such as "tcp://host:8786"; its workers process the logs instead. They have to
+        see the logs, and the working folder, under the same names.
     output_dir : path, optional
         Folder for the outputs: the function gets ``output=``, a name in this folder, for each log.
     suffix : str, default ".mcap"
@@ -128,10 +128,12 @@ def run(
     for number, one in enumerate(found):
         own = {"output": outputs[number]} if outputs else {}
         beside = one.path.parent if writes and folder is None and os.access(one.path.parent, os.W_OK) else claims_in
-        work.append(Work(number, one.path, location_of(one.path), own, beside))
+        work.append(QueuedLog(number, one.path, location_of(one.path), own, beside))
     for output in outputs:
         _make_folder(output.parent)
-    limits = Limits(min(jobs or 1, len(found)), os.getcwd(), timeout_s, size_in_bytes(memory_limit, "memory_limit"))
+    limits = WorkerLimits(
+        min(jobs or 1, len(found)), os.getcwd(), timeout_s, size_in_bytes(memory_limit, "memory_limit")
+    )
 
     def hear(outcome: LogOutcome[T]) -> None:
         if on_outcome is not None:
@@ -148,7 +150,7 @@ def run(
     return fleet.run()
 
 
-def _crew(scheduler: str | None, limits: Limits, jobs: int | None) -> Crew:
+def _crew(scheduler: str | None, limits: WorkerLimits, jobs: int | None) -> Crew:
     if scheduler is None:
         return Processes(limits)
     from mcaptrack.fleet.cluster import Cluster

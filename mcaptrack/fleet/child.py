@@ -34,8 +34,8 @@ _PRINTED: Final = 10_000
 
 
 @dataclass(frozen=True)
-class Limits:
-    """Limits of each try: seconds and resident bytes; how many workers share the machine, and their working folder."""
+class WorkerLimits:
+    """Limits of each try (seconds, resident bytes); the number of workers on the machine, and their working folder."""
 
     workers: int = 1
     folder: str | None = None
@@ -50,7 +50,7 @@ class StoppedError(Exception):
 class Child:
     """A worker process. It is started by the first request, and again after one that ended it."""
 
-    def __init__(self, limits: Limits) -> None:
+    def __init__(self, limits: WorkerLimits) -> None:
         self._limits = limits
         self._process: subprocess.Popen[bytes] | None = None
         self._connection: Any = None

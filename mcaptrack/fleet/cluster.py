@@ -17,7 +17,7 @@ from uuid import uuid4
 
 from mcaptrack import __version__
 from mcaptrack.errors import McaptrackError
-from mcaptrack.fleet.child import Child, Limits
+from mcaptrack.fleet.child import Child, WorkerLimits
 from mcaptrack.fleet.results import Running
 from mcaptrack.fleet.worker import Reply, Request
 from mcaptrack.notices import warn
@@ -32,7 +32,7 @@ _LOGGERS: Final = ("distributed", "tornado", "asyncio")
 class Cluster:
     """Processes logs on a cluster. ``places`` is how many it can be busy with: one for each thread of its workers."""
 
-    def __init__(self, address: str, limits: Limits, most: int | None) -> None:
+    def __init__(self, address: str, limits: WorkerLimits, most: int | None) -> None:
         try:
             from distributed import Client
         except ImportError:
@@ -151,7 +151,7 @@ def versions() -> dict[str, str]:
 _OWN: Final = threading.local()
 
 
-def attempt(request: Request, limits: Limits) -> Reply:
+def attempt(request: Request, limits: WorkerLimits) -> Reply:
     """Process a log in a worker process beside this thread of a worker of the cluster."""
     from distributed import get_worker
 

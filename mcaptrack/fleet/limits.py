@@ -59,7 +59,7 @@ def resident_bytes(pid: int) -> int:
     with suppress(OSError, ValueError, IndexError):
         if _IS_LINUX:
             return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-        listed = subprocess.run(["/bin/ps", "-o", "rss=", "-p", str(pid)], capture_output=True, check=False)
+        listed = subprocess.run(["/bin/ps", "o", "rss=", "p", str(pid)], capture_output=True, check=False)
         return int(listed.stdout) * 1024
     return 0
 

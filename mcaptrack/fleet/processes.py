@@ -8,7 +8,7 @@ from pathlib import Path
 from threading import Event, Lock, local
 from time import monotonic
 
-from mcaptrack.fleet.child import Child, Limits
+from mcaptrack.fleet.child import Child, WorkerLimits
 from mcaptrack.fleet.results import Running
 from mcaptrack.fleet.worker import Reply, Request
 
@@ -16,7 +16,7 @@ from mcaptrack.fleet.worker import Reply, Request
 class Processes:
     """Processes logs in workers of their own. ``places`` is how many it can be busy with."""
 
-    def __init__(self, limits: Limits) -> None:
+    def __init__(self, limits: WorkerLimits) -> None:
         self.places = limits.workers
         self._limits, self._stopping, self._lock = limits, Event(), Lock()
         self._threads = ThreadPoolExecutor(limits.workers, "mcaptrack-worker")

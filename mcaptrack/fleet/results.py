@@ -1,4 +1,4 @@
-"""What a fleet returns: the outcome of each log, and totals."""
+"""Results of a fleet: the outcome of each log, and totals."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ AGAIN: Final = ("killed", "timed-out", "out-of-memory")
 
 @dataclass(frozen=True)
 class LogOutcome(Generic[T]):
-    """What became of one log.
+    """The outcome of one log.
 
     Attributes
     ----------
@@ -71,7 +71,7 @@ class LogOutcome(Generic[T]):
 
 @dataclass(frozen=True)
 class FleetResult(Generic[T]):
-    """What became of many logs.
+    """The outcomes of many logs.
 
     Attributes
     ----------
@@ -90,7 +90,7 @@ class FleetResult(Generic[T]):
 
     @property
     def results(self) -> dict[Path, T]:
-        """What the function returned for each log that was done now."""
+        """The results of the function, for logs that were done now."""
         return {one.log: one.result for one in self.outcomes if one.result is not None}
 
     @property
@@ -141,7 +141,7 @@ class Running:
 
 @dataclass(frozen=True)
 class FleetStatus:
-    """How far a fleet is: number of logs, by state of those that ended, and those that run."""
+    """The progress of a fleet: number of logs, by state of those that ended, and those that run."""
 
     logs: int
     ended: Mapping[State, int] = field(default_factory=dict)

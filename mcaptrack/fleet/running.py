@@ -54,7 +54,7 @@ class Crew(Protocol):
 
 
 @dataclass
-class Work:
+class QueuedLog:
     """A log to process: its place among all, what differs from other logs, and how often it was tried."""
 
     number: int
@@ -73,7 +73,7 @@ class Fleet(Generic[T]):
         self,
         function: Callable[..., T],
         options: Mapping[str, Any],
-        logs: Sequence[Work],
+        logs: Sequence[QueuedLog],
         crew: Crew,
         ledger: Ledger | None,
         tries: int,
@@ -88,8 +88,8 @@ class Fleet(Generic[T]):
         self._hear, self._watch, self._say = hear, watch, say
         self._logs = logs
         self._left = deque(logs)
-        self._busy: dict[int, Work] = {}
-        self._replies: SimpleQueue[tuple[Work, Future[Reply]]] = SimpleQueue()
+        self._busy: dict[int, QueuedLog] = {}
+        self._replies: SimpleQueue[tuple[QueuedLog, Future[Reply]]] = SimpleQueue()
         self._outcomes: dict[int, LogOutcome[T]] = {}
         self._stopped = ""
         self._began = monotonic()
@@ -142,7 +142,7 @@ class Fleet(Generic[T]):
             request = Request(work.log, self._task, work.own)
             self._crew.start(request, lambda future, work=work: self._replies.put((work, future)))  # type: ignore[misc]
 
-    def _claim(self, work: Work) -> bool:
+    def _claim(self, work: QueuedLog) -> bool:
         """Claim a log. Returns False if it is not to be processed now: it is done, or another fleet has it."""
         if self._ledger is not None and self._ledger.is_done(work.location, digest_of_log(work.log)):
             self._end(work, LogOutcome(work.log, "skipped"))
@@ -174,7 +174,7 @@ class Fleet(Generic[T]):
             if not self._stopped:
                 self._take(work, future)
 
-    def _take(self, work: Work, future: Future[Reply]) -> None:
+    def _take(self, work: QueuedLog, future: Future[Reply]) -> None:
         try:
             reply = future.result()
         except (CancelledError, StoppedError):
@@ -226,7 +226,7 @@ class Fleet(Generic[T]):
         if reply.state not in GOOD and not self._keep_going:
             self._stopped = f"{work.log} failed"
 
-    def _end(self, work: Work, outcome: LogOutcome[T]) -> None:
+    def _end(self, work: QueuedLog, outcome: LogOutcome[T]) -> None:
         self._outcomes[work.number] = outcome
         self._hear(outcome)
 

@@ -44,7 +44,7 @@ class Request:
 
 @dataclass(frozen=True)
 class Reply:
-    """What became of one try, as in ``LogOutcome``; ``result`` is pickled; ``digest`` is that of the log afterwards."""
+    """The outcome of one try, as in ``LogOutcome``; ``result`` is pickled; ``digest`` is that of the log afterwards."""
 
     state: State
     result: bytes = b""
