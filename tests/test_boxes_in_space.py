@@ -302,6 +302,15 @@ def test_velocities_of_zero_are_unknown_if_there_are_no_others():
     assert not found.remarks
 
 
+def test_scores_of_zero_are_unknown_if_there_are_no_others():
+    boxes = [box(score=0.0), box(score=0.0), box()]
+    found = recorded([(START_NS, Message3d(START_NS, "lidar", boxes))])
+    assert np.isnan(found.score).all()
+    assert found.remarks == {"boxes have a score of 0, and no box has another: it is unknown": 2}
+    found = recorded([(START_NS, Message3d(START_NS, "lidar", [*boxes, box(score=0.1)]))])
+    np.testing.assert_array_equal(found.score, [0, 0, np.nan, 0.1])
+
+
 def test_boxes_that_are_recorded_twice_count_once():
     nan, late = float("nan"), START_NS + 10**8
     first = [box(1.0, score=nan), box(2.0, class_name="car"), box(1.0, score=0.5), box(2.0)]

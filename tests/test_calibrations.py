@@ -21,7 +21,7 @@ from mcaptrack.notices import collected
 from mcaptrack.pipeline.planes import planes_to_json, read_planes
 from mcaptrack.schema import TRACKS
 from mcaptrack.schema.ground_plane import plane_to_rows, rows_to_plane
-from mcaptrack.sources.calibrations import find_calibration, read_calibrations, see_ground
+from mcaptrack.sources.calibrations import _is_rectified, find_calibration, read_calibrations, see_ground
 from mcaptrack.sources.cameras import camera_at
 from mcaptrack.sources.foreign import MessageType
 from tests.commands import call, done
@@ -280,6 +280,33 @@ class TestGround:
         assert code == 1
         assert "there are no transforms, which say where the camera of /front/camera_info is" in err.splitlines()[-1]
 
+    def test_a_camera_without_a_transform(self, tmp_path):
+        path = robot(tmp_path / "a.mcap", "", frame_id="other")
+        with pytest.raises(
+            McaptrackError, match=r"no transform has the frame 'other' of /front/camera_info; .* eye, map"
+        ):
+            ground(path)
+
+    def test_a_frame_with_x_ahead_is_not_that_of_a_camera(self, tmp_path, straight, monkeypatch):
+        monkeypatch.setattr("tests.test_calibrations.EYE", Rotation.identity())
+        _, said = ground(robot(tmp_path / "a.mcap", ""))
+        assert [words for words in said if words.startswith("eye looks up: z of a camera's frame points ahead")]
+        assert not any("looks up" in words for words in ground(straight)[1])
+
+    @pytest.mark.parametrize(
+        ("topic", "is_rectified"),
+        [
+            ("/front/image_rect", True),
+            ("/front/image_rect_color/compressed", True),
+            ("/front/rectified/image", True),
+            ("/front/image_raw/compressed", False),
+            ("/direct/image", False),
+            ("/rect/front/image", False),
+        ],
+    )
+    def test_rectified_pictures_by_their_topic(self, topic, is_rectified):
+        assert _is_rectified(topic) is is_rectified
+
     def test_a_given_plane_wins(self, straight, tmp_path):
         path = tmp_path / "robot.mcap"
         path.write_bytes(straight.read_bytes())
@@ -373,7 +400,8 @@ class TestCalibrations:
     @pytest.mark.parametrize(
         ("model", "changes", "words"),
         [
-            ("plumb_bob", {"k": np.zeros(9)}, "its camera matrix is 0"),
+            ("plumb_bob", {"k": np.zeros(9)}, "ns: it isn't calibrated: its focal length is 0 pixels"),
+            ("plumb_bob", {"k": np.full(9, np.nan)}, "ns: it isn't calibrated: its focal length is nan pixels"),
             ("cylinder", {}, "distortion by 'cylinder' is not read"),
             ("plumb_bob", {"d": np.full(6, 0.1)}, "coefficients of distortion, not 6"),
         ],
@@ -392,6 +420,7 @@ class TestCalibrations:
             assert find_calibration(opened, "/c/image", "left") == "/left/info"
             assert find_calibration(opened, "/b/image", "right") == "/b/info"
             assert find_calibration(opened, "/c/image", "else") == "/c/info"
+            assert find_calibration(opened, "/c/image/compressed", "") == "/c/info"
             with pytest.raises(McaptrackError, match="several calibrations fit /x/image: /a/info, /b/info"):
                 find_calibration(opened, "/x/image", "right")
             with pytest.raises(McaptrackError, match="no calibration is of the frame 'up' of /x/image"):

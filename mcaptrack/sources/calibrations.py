@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import takewhile
@@ -35,6 +36,10 @@ _FISHEYE: Final = ("equidistant", "kannala_brandt", "fisheye")
 _HEIGHTS_M: Final = (0.05, 30.0)
 #: Frames on the ground that robots have, in the order in which they are tried.
 _GROUND_FRAMES: Final = ("base_footprint", "base_link")
+#: A word of a topic of rectified pictures: /front/image_rect_color/compressed, but not /direct/image.
+_RECTIFIED: Final = re.compile(r"(?<![a-z])(image)?rect(ified)?(?![a-z])", re.IGNORECASE)
+#: Where the frame of a camera is no optical one, its z axis points up: z of a unit vector is more than this.
+_LOOKS_UP: Final = 0.7
 #: Pictures of another size than the calibration's have been resized if their shape is the same but for so much.
 _SHAPE: Final = 0.02
 
@@ -77,7 +82,10 @@ def find_calibration(opened: log.Log, source: str, frame_id: str) -> str:
     """
     known = {topic: _frame_of(opened, topic) for topic, one in opened.channels.items() if holds_calibrations(one)}
     same = [topic for topic, named in known.items() if frame_id and named == frame_id]
-    beside = [topic for topic in known if topic.rpartition("/")[0] == source.rpartition("/")[0]]
+    # Compressed pictures are one level lower: /front/image/compressed is beside /front/camera_info.
+    folder = source.rpartition("/")[0]
+    folders = (folder, folder.rpartition("/")[0]) if folder.count("/") > 1 else (folder,)
+    beside = [topic for topic in known if topic.rpartition("/")[0] in folders]
     fitting = same or beside
     if not fitting:
         frames = ", ".join(f"{topic} (frame {named or 'without a name'})" for topic, named in sorted(known.items()))
@@ -122,18 +130,23 @@ def see_ground(opened: log.Log, camera: Camera, frame: str = "", ground_frame: s
     log_ns, stamp_ns, frame_id = _headers(opened, sources)
     topic = find_calibration(opened, sources[0], frame_id)
     size = _picture_size(opened, camera.pictures)
-    found = read_calibrations(opened, topic, is_rectified="rect" in sources[0].rpartition("/")[2])
+    found = read_calibrations(opened, topic, _is_rectified(sources[0]))
     known = [(since_ns, _fitted(one, size, topic)) for since_ns, one in found]
     eye = known[0][1].frame_id or frame_id
     tree = transforms_of(opened)
     if tree is None:
         raise McaptrackError(f"there are no transforms, which say where the camera of {topic} is")
+    if eye not in tree.frames():
+        raise McaptrackError(f"no transform has the frame {eye!r} of {topic}; there are {', '.join(tree.frames())}")
     frame = frame or tree.root_of(eye)
     ground = ground_frame or _ground_frame(tree, frame, eye, stamp_ns)
     poses = poses_at(opened, sources[0], ground, eye, stamp_ns, log_ns)
     floor = poses_at(opened, sources[0], frame, ground, stamp_ns, log_ns) if ground != frame else None
     if not poses.is_known.any():
         raise McaptrackError(f"no pose of the frame {eye} in {ground} is known")
+    if np.nanmedian(poses.rotation[:, 2, 2]) > _LOOKS_UP:
+        words = f"{eye} looks up: z of a camera's frame points ahead (an optical frame), and that of {eye} doesn't"
+        warn(f"{words}; no boxes are on the ground", "transforms")
     planes = _planes(log_ns, known, poses, floor)
     return GroundSeen(planes, frame, ground, topic)
 
@@ -145,7 +158,7 @@ def moving_camera(opened: log.Log, topic: str, frame: str) -> MovingCamera:
     """
     log_ns, stamp_ns, frame_id = _headers(opened, [topic])
     source = find_calibration(opened, topic, frame_id)
-    found = read_calibrations(opened, source, is_rectified="rect" in topic.rpartition("/")[2])
+    found = read_calibrations(opened, source, _is_rectified(topic))
     size = _picture_size(opened, topic)
     known = [(since_ns, _fitted(one, size, source)) for since_ns, one in found]
     first = known[0][1]
@@ -160,6 +173,11 @@ def moving_camera(opened: log.Log, topic: str, frame: str) -> MovingCamera:
         turn @ poses.rotation, (turn @ poses.translation[..., None])[..., 0],
         [one.lens for _, one in known], which, first.width_px, first.height_px,
     )  # fmt: skip
+
+
+def _is_rectified(topic: str) -> bool:
+    """Return whether the pictures of a topic are rectified, by its last part or that before a kind of compression."""
+    return any(_RECTIFIED.search(part) for part in topic.split("/")[-2:])
 
 
 def _holding(known: Sequence[tuple[int, Calibration]], log_ns: Ints) -> Ints:
@@ -290,10 +308,10 @@ def _calibration(message: Any, is_rectified: bool) -> Calibration:
         return Calibration(_name_of(message), Lens((p[0], p[5]), (p[2], p[6])), width, height, turn)
     k = numbers["K"]
     if len(k) != 9 or not k[0] > 0:
-        raise ValueError("it isn't calibrated: its camera matrix is 0")
+        raise McaptrackError(f"it isn't calibrated: its focal length is {k[0] if k else 0:g} pixels")
     bent = numbers["D"] if any(numbers["D"]) else []
     if bent and model not in (*_POLYNOMIAL, *_FISHEYE):
-        raise ValueError(f"distortion by {model!r} is not read; {', '.join((*_POLYNOMIAL, *_FISHEYE))} are")
+        raise McaptrackError(f"distortion by {model!r} is not read; {', '.join((*_POLYNOMIAL, *_FISHEYE))} are")
     is_fisheye = bool(bent) and model in _FISHEYE
     while not is_fisheye and len(bent) > 8 and not bent[-1]:
         bent.pop()

@@ -251,8 +251,14 @@ def _checked(found: Recorded3d) -> Recorded3d:
         if (is_stated := np.isfinite(velocity).all(axis=1)).any() and not velocity[is_stated].any():
             kinds["boxes have a velocity of 0, and no box has another: it is unknown"] = is_stated
             velocity = np.full_like(velocity, np.nan)
+        score = found.score
+        if (is_scored := np.isfinite(score)).any() and not score[is_scored].any():
+            kinds["boxes have a score of 0, and no box has another: it is unknown"] = is_scored
+            score = np.full_like(score, np.nan)
         size = np.where(np.isfinite(size) & (size > 0), size, np.nan)
     turn = np.where((odd_turn | is_unturned)[:, None], [0.0, 0.0, 0.0, 1.0], turn)
     remarks = found.remarks | {words: int(which.sum()) for words, which in kinds.items() if which.any()}
     has_heading = found.has_heading & ~odd_turn
-    return replace(found, size=size, orientation=turn, velocity=velocity, has_heading=has_heading, remarks=remarks)
+    return replace(
+        found, size=size, orientation=turn, velocity=velocity, score=score, has_heading=has_heading, remarks=remarks
+    )
