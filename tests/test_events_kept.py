@@ -127,7 +127,7 @@ def test_events_are_tallied_by_kind_for_each_channel():
     rows = EVENTS.empty(len(kinds))
     rows["kind"] = kinds
     made = Made(EVENTS, [Frame(0, 0, rows[:1]), Frame(1, 1, rows[1:])], Provenance("events", {}))
-    text = made._replace(record=("foxglove.Log", "protobuf", b""))
+    text = made._replace(drawn="foxglove.Log")
     found = events.tally(
         {"/a/events": made, "/a/events/view/log": text, "/a/counts": Made(COUNTS, [], made.provenance)}
     )

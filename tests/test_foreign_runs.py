@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
 from mcap.reader import make_reader
 from mcap.writer import Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from mcaptrack import log, pipeline
 from mcaptrack.api import recording
@@ -57,8 +59,19 @@ def robot(recorded, tmp_path) -> Path:
     return Path(shutil.copy(recorded, tmp_path / "robot.mcap"))
 
 
-def annotations(path: Path, topic: str) -> list[tuple[int, ImageAnnotations]]:
-    return [(row[3], ImageAnnotations.FromString(row[6])) for row in content(path)[topic + SUFFIX]]
+def annotations(path: Path, topic: str) -> list[tuple[int, Any]]:
+    """The drawings of a channel: in a recording of ROS 2 they are ROS messages."""
+    rows, store = content(path)[topic + SUFFIX], get_typestore(Stores.EMPTY)
+    name, definition, *_ = rows[0]
+    if name == "foxglove.ImageAnnotations":
+        return [(row[3], ImageAnnotations.FromString(row[6])) for row in rows]
+    store.register(get_types_from_msg(definition.decode(), name))
+    return [(row[3], store.deserialize_cdr(row[6], name)) for row in rows]
+
+
+def stamped(part: Any) -> int:
+    stamp = part.timestamp
+    return stamp.sec * 10**9 + stamp.nanosec if hasattr(stamp, "sec") else stamp.ToNanoseconds()
 
 
 def test_stages_in_place_keep_all_channels_and_draw_at_capture_times(robot):
@@ -82,7 +95,7 @@ def test_stages_in_place_keep_all_channels_and_draw_at_capture_times(robot):
         assert [t_ns for t_ns, _ in drawn] == [row[3] for row in before[IMAGES]]
         for number, (_, message) in enumerate(drawn):
             for part in (message, *message.points, *message.texts):
-                assert part.timestamp.ToNanoseconds() == stamp_of(number)
+                assert stamped(part) == stamp_of(number)
     layout = json.loads(robot.with_suffix(".layout.json").read_text())
     assert layout["configById"]["Image!picture"]["imageMode"]["imageTopic"] == IMAGES
 
@@ -154,7 +167,7 @@ def test_recorded_detections_are_tracked(tmp_path):
         seen = [int(f.rows["observed"].sum()) for f in tracks]
         assert sum(seen) > 0.7 * sum(len(shot.boxes) for shot in shots)
     for number, (_, message) in enumerate(annotations(path, "/eye/tracks")):
-        assert message.timestamp.ToNanoseconds() == stamp_of(number)
+        assert stamped(message) == stamp_of(number)
     mcaptrack("run", path, "-q", "--topic", "/eye/detections", "--no-tables")
     with log.read(path) as opened:
         assert "/eye/retracks" in opened.channels
@@ -175,7 +188,7 @@ def test_recorded_channels_are_never_replaced(tmp_path):
             pipeline.plan_all(opened, "/eye", source="/eye/image")
     mcaptrack("detect", path, "-q", "--topic", "/eye/image", "--to", "/eye/found")
     assert content(path)["/eye/detections"] == content_of(before, tmp_path)["/eye/detections"]
-    assert [m.timestamp.ToNanoseconds() for _, m in annotations(path, "/eye/found")] == [stamp_of(n) for n in range(50)]
+    assert [stamped(m) for _, m in annotations(path, "/eye/found")] == [stamp_of(n) for n in range(50)]
 
 
 def content_of(data: bytes, folder: Path) -> dict[str, list]:
@@ -240,7 +253,7 @@ def test_a_real_log_of_images_is_processed_in_place(data, tmp_path):
     assert len(after["/image/detections"]) == 10
     for row, (t_ns, message) in zip(before["/image/compressed"], annotations(path, "/image/detections"), strict=True):
         said = json.loads(row[6])["timestamp"]
-        assert (t_ns, message.timestamp.ToNanoseconds()) == (row[3], said["sec"] * 10**9 + said["nsec"])
+        assert (t_ns, stamped(message)) == (row[3], said["sec"] * 10**9 + said["nsec"])
     with log.read(path) as opened:
         assert "/image/retracks" in opened.channels
 

@@ -172,12 +172,12 @@ def test_results_that_a_pattern_matches_too_are_part_of_their_log(path):
 
 def test_in_place_insists_and_what_is_in_place_goes_on_there(path):
     result = done("detect", path, "--in-place", "--detector", "frame-difference")
-    assert f"results are in {path}: --in-place was given; ROS tools may stumble over them" in result.err
+    assert f"results are in {path}: --in-place was given; they are ROS messages, for it is named in" in result.err
     with path.open("rb") as stream:
         assert "/robot/front/detections" in {c.topic for c in make_reader(stream).get_summary().channels.values()}
     result = done("track", path)
     (line,) = [line for line in result.err.splitlines() if "results are in" in line]
-    assert f"results are in {path}: earlier results are in it; ROS tools may stumble over them" in line
+    assert f"results are in {path}: earlier results are in it; they are ROS messages, for it is named in" in line
     assert [entry.name for entry in path.parent.glob("*.mcap")] == ["drive.mcap"]
     done("drop", path, "/robot/front/*detections*", "/robot/front/tracks*")  # ours
     result = call("drop", path, "/robot/front/image")

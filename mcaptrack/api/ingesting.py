@@ -28,6 +28,7 @@ from mcaptrack.geometry.plane import Point
 from mcaptrack.notices import Notice, warn
 from mcaptrack.sources.ingest import Format, ImageFormat, IngestOptions, InputRole
 from mcaptrack.sources.ingest import ingest as make_log
+from mcaptrack.sources.ingest.bags.metadata_update import update_metadata
 from mcaptrack.sources.ingest.labels.columns import check_keys, parse_columns
 from mcaptrack.sources.ingest.labels.wanted import WantedClasses
 from mcaptrack.sources.ingest.sidecar import SidecarChoice
@@ -218,6 +219,8 @@ def ingest(
                 written_to = opened.parts[-1].path
             if place.why:
                 report.remarks.append(place.words(written_to))
+            if written_to == target:
+                update_metadata(target)
         for lost in report.lost:
             warn(f"lost: {lost}", "lost")
         warn_unused("there is no label file", label_format=label_format != "auto" and not report.has_labels)

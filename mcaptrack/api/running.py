@@ -19,6 +19,7 @@ from mcaptrack.files import is_same_file, publish_bytes, refuse_overwrite
 from mcaptrack.notices import Notice, warn
 from mcaptrack.pipeline import AS_BEFORE, Job, PlaneChoice, Summary, Watch
 from mcaptrack.sources.fixed_frame import BoxesRead
+from mcaptrack.sources.ingest.bags.metadata_update import update_metadata
 from mcaptrack.sources.ingest.sidecar import SidecarChoice
 from mcaptrack.tables.export import default_folder, export
 from mcaptrack.transforms import STAGES, Transform
@@ -136,6 +137,8 @@ def work(
             jobs = plan(opened, prefix, notes.say)
             report = pipeline.run(opened, prefix, jobs, output, progress, watch, plane, boxes)
             written_to = output or opened.parts[-1].path
+        if written_to == path:
+            update_metadata(path)
         layouts = [pipeline.layout_path(target, name) for name in report.layouts]
         for layout, content in zip(layouts, report.layouts.values(), strict=True):
             publish_bytes(layout, content)

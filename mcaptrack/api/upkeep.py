@@ -15,6 +15,7 @@ from mcaptrack.files import is_same_file, refuse_overwrite
 from mcaptrack.log import CheckResult, Finding
 from mcaptrack.notices import Notice
 from mcaptrack.schema.provenance import Provenance
+from mcaptrack.sources.ingest.bags.metadata_update import update_metadata
 from mcaptrack.sources.ingest.sidecar import recording_of
 
 
@@ -259,6 +260,8 @@ def drop(
                     logs.extend(opened, target, drop={c.topic for c in gone}),
                 ):
                     pass
+                if copy is None and part == path:
+                    update_metadata(path)
         after = sum(targets[part].stat().st_size for part in holds)
     return DropResult(copy or path, tuple(sorted(dropped)), messages, before, after, tuple(dict.fromkeys(warnings)))
 

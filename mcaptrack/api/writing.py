@@ -23,6 +23,7 @@ from mcaptrack.schema import DETECTIONS, TRACKS, Frame, Schema
 from mcaptrack.schema.provenance import INGEST, Provenance
 from mcaptrack.sources.camera_motion import path_of, tracks_topic
 from mcaptrack.sources.cameras import USUAL
+from mcaptrack.sources.ingest.bags.metadata_update import update_metadata
 from mcaptrack.sources.ingest.sidecar import SidecarChoice
 
 #: What channels usually hold, by the end of their topic.
@@ -69,6 +70,8 @@ def write_rows(
             publish_bytes(pipeline.layout_path(path, layout), content)
         for topic_of_stage in stale:
             warn_stale(topic_of_stage, path)
+        if opened.results is None:
+            update_metadata(path)
     return len(frames)
 
 

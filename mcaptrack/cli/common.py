@@ -106,7 +106,7 @@ Sidecar = Annotated[
         "--sidecar/--in-place",
         panel=FILES,
         help="Write results to LOG.results.mcap from now on, so that LOG stays unchanged (--sidecar), or into LOG "
-        "(--in-place).",
+        "(--in-place; as ROS messages if it is a recording of ROS 2).",
         show_default="sidecar for recordings that ROS tools read, otherwise in place",
     ),
 ]

@@ -18,6 +18,7 @@ from mcaptrack.foxglove.messages import (
     unpack_picture,
 )
 from mcaptrack.foxglove.palette import class_colour, colour, colours
+from mcaptrack.foxglove.ros import messages_in, record_in
 from mcaptrack.foxglove.scenes import CuboidMarker, Cuboids, PersonMarker, SceneMessages
 
 __all__ = [
@@ -37,9 +38,11 @@ __all__ = [
     "colour",
     "colours",
     "message_class",
+    "messages_in",
     "pack_log",
     "pack_picture",
     "pack_transform",
+    "record_in",
     "schema_record",
     "unpack",
     "unpack_picture",

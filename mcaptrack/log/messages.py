@@ -43,6 +43,7 @@ from mcaptrack.log.records import (
     record_at,
 )
 from mcaptrack.schema import Rows, Schema
+from mcaptrack.schema.encodings import RowReader
 
 Times = NDArray[np.uint64]
 Span = tuple[int | None, int | None]
@@ -191,8 +192,8 @@ class Messages:
                 del opened[number]
                 size -= batch.size
 
-    def columns(self, channels: Sequence[int], schema: Schema) -> ChannelRows | None:
-        """Rows without a loop over messages; None if a message has another layout than the row codec writes."""
+    def columns(self, channels: Sequence[int], schema: Schema, reader: RowReader) -> ChannelRows | None:
+        """Rows without a loop over messages; None if a message has another layout than the reader's."""
         batches = self._batches(channels)
         t_ns = to_int64(np.concatenate([_NO_TIMES, *(batch.t_ns for batch in batches)]))
         sequence, counts = np.empty_like(t_ns), np.empty_like(t_ns)
@@ -200,7 +201,7 @@ class Messages:
         for batch in batches:
             content, offset = self._open(batch)
             found = message_heads_at(content, batch.channel, batch.t_ns, offset)
-            decoded = schema.codec.decode_at(np.frombuffer(content, np.uint8), found.start, found.end)
+            decoded = reader.decode_at(np.frombuffer(content, np.uint8), found.start, found.end)
             if decoded is None:
                 return None
             part, counts_of = decoded

@@ -23,13 +23,17 @@ from mcaptrack.log.snapshot import open_snapshot
 from mcaptrack.log.writer import create
 from mcaptrack.schema import Frame, Schema
 from mcaptrack.schema.classes import with_only_class
+from mcaptrack.schema.encodings import ROW_ENCODINGS, RowReader, reader_of, schema_name_of
 from mcaptrack.schema.framing import split_rows
 
 T = TypeVar("T")
 
 
 class Channel(NamedTuple):
-    """A channel of a log, or all channels of a topic: ``messages`` is their total, the rest describes the first one."""
+    """A channel of a log, or all channels of a topic: ``messages`` is their total, the rest describes the first one.
+
+    ``schema_name`` of rows is that of their schema, mcaptrack.Tracks, also where they are ROS messages.
+    """
 
     id: int
     topic: str
@@ -37,6 +41,10 @@ class Channel(NamedTuple):
     message_encoding: str
     metadata: dict[str, str]
     messages: int
+
+    def holds(self, schema: Schema) -> bool:
+        """Whether it has rows of a schema, in any encoding of rows."""
+        return self.schema_name == schema.name and self.message_encoding in ROW_ENCODINGS
 
 
 class Log:
@@ -157,7 +165,8 @@ class Log:
 
     def _channel(self, record: ChannelRecord) -> Channel:
         schema = self.index.schemas.get(record.schema_id)
-        name, count = schema.name if schema else "", self.index.counts.get(record.id, 0)
+        name = schema_name_of(schema.name, schema.encoding, record.message_encoding) if schema else ""
+        count = self.index.counts.get(record.id, 0)
         return Channel(record.id, record.topic, name, record.message_encoding, record.metadata, count)
 
     def _ids(self, topic: str) -> list[int]:
@@ -187,6 +196,11 @@ class Log:
             data = b"\n".join(b" ".join(line.partition(b"#")[0].split()) for line in data.splitlines())
             data = b"\n".join(filter(None, data.split(b"\n")))
         return (channel.message_encoding, schema.name, schema.encoding, hashlib.sha256(data).hexdigest())
+
+    def record_name(self, channel: Channel) -> str:
+        """The name in the schema record of a channel of this file: that of the ROS message for rows that are one."""
+        schema = self.index.schemas.get(self.index.channels[channel.id].schema_id)
+        return schema.name if schema else ""
 
     def metadata(self, name: str) -> dict[str, str] | None:
         """The last metadata record of that name."""
@@ -252,7 +266,7 @@ class Log:
         if (part := self.part(topic)) is not self:
             return part.rows(topic, schema)
         channel = self.channel(topic)
-        if channel.schema_name != schema.name or channel.message_encoding != "protobuf":
+        if not channel.holds(schema):
             raise McaptrackError(f"{self.path}: {topic} holds {channel.schema_name or 'no schema'}, not {schema.name}")
         found = self._rows(topic, schema)
         return found._replace(rows=with_only_class(schema, found.rows, channel.metadata))
@@ -260,18 +274,28 @@ class Log:
     def _rows(self, topic: str, schema: Schema) -> ChannelRows:
         """All rows of a channel of this file as they stand in its messages."""
         channels = self._ids(topic)
+        reader = self._reader(topic, schema)
         with self.snapshot.reporting_bad_times(topic):
-            found = self._messages.columns(channels, schema)
+            found = self._messages.columns(channels, schema, reader)
             self.snapshot.confirm_unchanged(channels)
             if found is not None:
                 return found
             messages = list(self.messages(topic))
             try:
-                rows, counts = schema.codec.decode_all([message.payload for message in messages])
+                rows, counts = reader.decode_all([message.payload for message in messages])
             except ValueError as error:
                 raise Damaged(f"{topic}: {error}") from None
         t_ns = np.array([message.t_ns for message in messages], np.int64)
         return ChannelRows(rows, t_ns, np.array([message.sequence for message in messages], np.int64), counts)
+
+    def _reader(self, topic: str, schema: Schema) -> RowReader:
+        """The decoder of a channel with rows. Raises McaptrackError if its definition is not one of such rows."""
+        channel = self.channel(topic)
+        record = self.index.schemas.get(self.index.channels[channel.id].schema_id)
+        try:
+            return reader_of(schema, channel.message_encoding, bytes(record.data) if record else b"")
+        except ValueError as error:
+            raise McaptrackError(f"{self.path}: {topic} can't be read as {schema.name}: {error}") from None
 
     def frames(self, topic: str, schema: Schema) -> list[Frame]:
         """All rows of a channel, one frame for each message."""

@@ -112,7 +112,7 @@ def make_events(opened: log.Log, prefix: str, made: Mapping[str, Made], watch: W
         nouns = nouns_of(truth().frames or (), frames, classes)
         text = list(log_messages(found.events, topic, opened.start_ns, found.frame_interval_s, nouns))
         view = Provenance(VIEW, {}, topic + _EVENTS, events.provenance.digest)
-        out[topic + _EVENTS + SUFFIX] = Made(EVENTS, [], view, text, foxglove.schema_record(foxglove.LOG))
+        out[topic + _EVENTS + SUFFIX] = Made(EVENTS, [], view, text, foxglove.LOG)
         out[topic + _COUNTS] = Made.of(COUNTS, found.counts, provenance)
     if not watch.topics:
         for name in FORECAST_INPUTS:
@@ -159,7 +159,7 @@ def tally(made: Mapping[str, Made]) -> dict[str, dict[str, int]]:
     """Count the events of each kind for each channel of tracks: count by name of the kind, by topic of the tracks."""
     out = {}
     for topic, channel in made.items():
-        if channel.schema is EVENTS and channel.record is None:
+        if channel.schema is EVENTS and not channel.drawn:
             kinds = EVENTS.joined([frame.rows for frame in channel.frames])["kind"]
             counts = np.bincount(kinds, minlength=max(EVENT_KINDS) + 1).tolist()
             out[topic.removesuffix(_EVENTS)] = {name: counts[kind] for kind, name in EVENT_KINDS.items()}
@@ -248,7 +248,7 @@ def _has_rows(opened: log.Log, topic: str, made: Mapping[str, Made] = {}, schema
     if topic in made:
         return made[topic].schema is schema
     channel = opened.channels.get(topic)
-    return channel is not None and channel.schema_name == schema.name and channel.message_encoding == "protobuf"
+    return channel is not None and channel.holds(schema)
 
 
 def _rows(

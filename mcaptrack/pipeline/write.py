@@ -34,10 +34,12 @@ from mcaptrack.pipeline.drawing import (
 )
 from mcaptrack.schema import DETECTIONS, FORECAST_SCORES, GROUND_PLANE, PREDICTIONS, SCHEMAS, TRACKS, Frame, Schema
 from mcaptrack.schema.classes import class_names, classes_beside_rows, has_classes, only_class, without_class
+from mcaptrack.schema.encodings import PROTOBUF, Encoding, encoded, record_of
 from mcaptrack.schema.provenance import INGEST, VIEW, Provenance, digest, frame_id_of
 from mcaptrack.sources import foreign
 from mcaptrack.sources.cameras import VIDEO, Camera, camera_at
 from mcaptrack.sources.frames import transforms_of
+from mcaptrack.sources.ingest.sidecar import check_topics, encoding_for
 
 #: Log time in ns, channel number, sequence number and payload of a message.
 Numbered = tuple[int, int, int, bytes]
@@ -48,15 +50,15 @@ _PREDICTED, _ONLINE = "/predictions", "/online"
 class Made(NamedTuple):
     """A channel that this run made.
 
-    It consists of ``frames`` of ``schema``, or of ``encoded``, messages (time in ns, sequence number, payload) with the
-    schema in ``record``: name, encoding and data.
+    It consists of ``frames`` of ``schema``, or of ``encoded``, messages (time in ns, sequence number, payload) for
+    viewers, of the schema ``drawn``.
     """
 
     schema: Schema
     frames: list[Frame]
     provenance: Provenance
     encoded: list[tuple[int, int, bytes]] | None = None
-    record: tuple[str, str, bytes] | None = None
+    drawn: str = ""
 
     @classmethod
     def of(cls, schema: Schema, frames: list[Frame], provenance: Provenance) -> Made:
@@ -80,6 +82,16 @@ class Made(NamedTuple):
         if self.provenance.class_id:  # it stands in the metadata instead
             return ((frame.t_ns, frame.index, encode(without_class(frame.rows))) for frame in self.frames)
         return ((frame.t_ns, frame.index, encode(frame.rows)) for frame in self.frames)
+
+    def record_in(self, encoding: Encoding) -> tuple[str, str, bytes]:
+        """Return the schema record of the channel for messages in this encoding."""
+        return foxglove.record_in(self.drawn, encoding) if self.drawn else record_of(self.schema, encoding)
+
+    def messages_in(self, encoding: Encoding) -> Iterator[tuple[int, int, bytes]]:
+        """Yield what ``messages`` does, in this encoding. Rows in CDR state their class, which takes no more bytes."""
+        if self.drawn:
+            return foxglove.messages_in(self.drawn, self.messages(), encoding)
+        return self.messages() if encoding == PROTOBUF else encoded(self.schema, self.frames, encoding)
 
     def size(self) -> int:
         """Return the number of messages."""
@@ -172,22 +184,24 @@ def write(
     replaced = [name for name in ATTACHMENTS if name not in unchanged]
     new_topics = {*made, *outdated, *(view.topic for view in (*drawn_first, *drawn_last))}
     log.refuse_to_replace_recorded(opened, new_topics, "write to another channel")
+    encoding = encoding_for(opened)
+    check_topics({*made, *(view.topic for view in (*drawn_first, *drawn_last))}, encoding)
     with log.extend(opened, output, drop={*made, *outdated}, drop_attachments=replaced) as writer:
         streams: list[Iterator[Numbered]] = []
 
         def add_views(some: Iterable[View]) -> None:
             for view in some:
-                record = foxglove.schema_record(view.schema_name)
+                record = foxglove.record_in(view.schema_name, encoding)
                 metadata = view.provenance.to_metadata()
-                number = writer.add_channel(view.topic, record, "protobuf", metadata, "views", view.group)
-                streams.append(_with_number(number, view.messages))
+                number = writer.add_channel(view.topic, record, encoding, metadata, "views", view.group)
+                streams.append(_with_number(number, foxglove.messages_in(view.schema_name, view.messages, encoding)))
 
         add_views(drawn_first)
         for topic, channel in made.items():
-            record = channel.record or (channel.schema.name, "protobuf", channel.schema.descriptor)
             made_by = channel.provenance.transform  # outputs of a stage are dropped together: they share chunks
-            number = writer.add_channel(topic, record, "protobuf", channel.provenance.to_metadata(), group=made_by)
-            streams.append(_with_number(number, channel.messages()))
+            record, metadata = channel.record_in(encoding), channel.provenance.to_metadata()
+            number = writer.add_channel(topic, record, encoding, metadata, group=made_by)
+            streams.append(_with_number(number, channel.messages_in(encoding)))
         add_views(drawn_last)
         _write_by_time(writer, streams)
         for name, content in new.items():

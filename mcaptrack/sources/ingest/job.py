@@ -20,6 +20,7 @@ from mcaptrack.geometry.plane import GroundPlane, Point
 from mcaptrack.notices import Notice, warn
 from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, GROUND_PLANE, TRACKS, Frame, Rows, Schema
 from mcaptrack.schema.classes import classes_beside_rows, only_class, without_class
+from mcaptrack.schema.encodings import PROTOBUF, Encoding, encoded, record_of
 from mcaptrack.schema.ground_plane import plane_to_rows
 from mcaptrack.schema.provenance import CLOCK, INGEST, Provenance, digest
 from mcaptrack.sources.ingest.labels.box_rows import OTHERS, fitted
@@ -29,6 +30,7 @@ from mcaptrack.sources.ingest.labels.motions import motion_frames, read_motions
 from mcaptrack.sources.ingest.labels.reading import read_homography, read_labels
 from mcaptrack.sources.ingest.labels.timeline import Placed, Timeline
 from mcaptrack.sources.ingest.labels.wanted import ONLY_PEOPLE, WantedClasses, describe_classes
+from mcaptrack.sources.ingest.sidecar import encoding_for
 from mcaptrack.sources.video import ImageFormat, VideoOptions
 
 Progress = Callable[[str, int, int], None]
@@ -123,7 +125,7 @@ class IngestReport:
 class IngestJob:
     """Base class of inputs: the topics of a camera, its labels and its ground plane.
 
-    ``into`` is the log to which channels are added, if it is not a new one.
+    ``into`` is the log to which channels are added, if it is not a new one; ``encoding`` is that of rows and pictures.
     """
 
     #: Whether the start time in the log's metadata is replaced.
@@ -134,6 +136,7 @@ class IngestJob:
     def __init__(self, source: Path, options: IngestOptions, into: log.Log | None = None) -> None:
         self._close = ExitStack()
         self.source, self.options, self.into, self.report = source, options, into, IngestReport()
+        self.encoding: Encoding = encoding_for(into) if into else PROTOBUF
         self.prefix = "/" + options.camera.strip("/")
         #: The topic of the pictures that labels belong to; "" if there is none.
         self.pictures = ""
@@ -353,22 +356,20 @@ class IngestJob:
         Frames are generated several times, for the digest and for the channel, so that they are never all in memory.
         """
         only = only_class(schema, frames())
-        without = without_class if only else None
 
         def messages() -> Iterator[tuple[int, int, bytes]]:
-            rows = ((frame, without(frame.rows) if without else frame.rows) for frame in frames())
-            return ((frame.t_ns, frame.index, schema.codec.encode(one)) for frame, one in rows)
+            without = (frame._replace(rows=without_class(frame.rows)) for frame in frames())
+            return encoded(schema, without if only else frames(), PROTOBUF)
 
-        names = {str(number): name for number, name in sorted(classes.items())}
-        class_id = str(only) if only else ""
+        names, class_id = {str(number): name for number, name in sorted(classes.items())}, str(only) if only else ""
         of_rows = digest(messages(), classes_beside_rows(class_id, names))
         made = Provenance(
             INGEST, parameters, self.pictures, digest=of_rows, classes=names, class_id=class_id, frame_id=frame_id
         )
-        topic, record = f"{self.prefix}/{suffix}", (schema.name, "protobuf", schema.descriptor)
-        channel = writer.add_channel(topic, record, "protobuf", made.to_metadata())
+        topic, record = f"{self.prefix}/{suffix}", record_of(schema, self.encoding)
+        channel = writer.add_channel(topic, record, self.encoding, made.to_metadata())
         count = 0
-        for message in messages():
+        for message in messages() if self.encoding == PROTOBUF else encoded(schema, frames(), self.encoding):
             writer.add_message(channel, *message)
             count += 1
         self.report.messages[topic] = count

@@ -1,19 +1,24 @@
 """Decide where the results of a log are written: into the log itself, or into a sidecar, LOG.results.mcap.
 
 ROS tools expect that all channels of a recording hold ROS messages, and that metadata.yaml counts all of them. A
-recording that ROS tools read is therefore not changed, unless ``sidecar`` is False.
+recording that ROS tools read is therefore not changed, unless ``sidecar`` is False. What is then written into a
+recording of ROS 2 are ROS messages, too.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
-from pathlib import Path, PurePath
+from pathlib import Path
 from typing import Final
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
+from mcaptrack.notices import warn
+from mcaptrack.schema.cdr import is_ros_topic
+from mcaptrack.schema.encodings import CDR, PROTOBUF, Encoding
 from mcaptrack.schema.provenance import Provenance
-from mcaptrack.sources.ingest.bags.metadata_yaml import METADATA, holds_metadata, read_metadata
+from mcaptrack.sources.ingest.bags.metadata_yaml import METADATA, names_file
 
 #: The profiles of the MCAP registry that ROS tools read, and their names in messages.
 _PROFILES: Final = {"ros1": "ROS 1", "ros2": "ROS 2"}
@@ -44,11 +49,7 @@ class SidecarChoice:
             return True
         recording = recording_of(opened)
         if self.wanted is False:
-            self.why = (
-                f"`sidecar=False` was given; ROS tools may stumble over them, for it is {recording}"
-                if recording
-                else ""
-            )
+            self.why = f"`sidecar=False` was given; {_for_ros_tools(opened, recording)}" if recording else ""
             return False
         if results.exists():
             self.why = "earlier results are there"
@@ -56,7 +57,7 @@ class SidecarChoice:
         if not recording:
             return False
         if any(Provenance.from_metadata(channel.metadata) for channel in opened.recorded):
-            self.why = f"earlier results are in it; ROS tools may stumble over them, for it is {recording}"
+            self.why = f"earlier results are in it; {_for_ros_tools(opened, recording)}"
             return False
         self.why = (
             f"{opened.path.name} is {recording}, which ROS tools read; `sidecar=False` writes into it all the same"
@@ -68,23 +69,41 @@ class SidecarChoice:
         return f"results are in {written_to}: {self.why}"
 
 
+def _for_ros_tools(opened: log.Log, recording: str) -> str:
+    """Say whether ROS tools can read the results in a recording, as text."""
+    ours = [channel for channel in opened.recorded if Provenance.from_metadata(channel.metadata)]
+    if encoding_for(opened) == CDR and all(channel.message_encoding == CDR for channel in ours):
+        return f"they are ROS messages, for it is {recording}"
+    return f"ROS tools may stumble over them, for it is {recording}"
+
+
+def encoding_for(opened: log.Log) -> Encoding:
+    """The encoding of results in a log, or in a copy of it: CDR in a recording of ROS 2 itself, otherwise protobuf."""
+    if opened.results is not None or not recording_of(opened):
+        return PROTOBUF
+    profile, library = log.header(opened)
+    is_ros1 = profile == "ros1" and not library.startswith(log.LIBRARY)
+    return PROTOBUF if is_ros1 else CDR
+
+
+def check_topics(topics: Iterable[str], encoding: Encoding) -> None:
+    """Warn of topics with results in a recording of ROS 2 that have no name of a topic there."""
+    odd = sorted(topic for topic in topics if not is_ros_topic(topic)) if encoding == CDR else ()
+    if odd:
+        warn(
+            f"ROS 2 accepts no topic like {', '.join(odd)}: its tools read these messages, but don't play them; a part "
+            "of a topic has letters, digits and _, and begins with no digit",
+            "other",
+        )
+
+
 def recording_of(opened: log.Log) -> str:
     """The name of a log for ROS tools: "a ROS 2 recording"; "" if they don't read it."""
     for path in (opened.path, opened.real_path):
         metadata = path.with_name(METADATA)
-        if _is_named(metadata, path.name):
+        if names_file(metadata, path.name):
             return f"named in {metadata}"
     profile, library = log.header(opened)
     if profile in _PROFILES and not library.startswith(log.LIBRARY):
         return f"a {_PROFILES[profile]} recording"
     return ""
-
-
-def _is_named(metadata: Path, name: str) -> bool:
-    """Whether a metadata.yaml names this file; true also if the metadata can't be parsed."""
-    if not holds_metadata(metadata):
-        return False
-    try:
-        return name in [PurePath(one).name for one in read_metadata(metadata)[1]]
-    except McaptrackError:
-        return True

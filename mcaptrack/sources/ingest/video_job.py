@@ -73,19 +73,22 @@ class VideoJob(IngestJob):
             parameters["quality"] = keep.jpeg_quality
         channel = writer.add_channel(
             self.pictures,
-            foxglove.schema_record(schema_name),
-            "protobuf",
+            foxglove.record_in(schema_name, self.encoding),
+            self.encoding,
             Provenance("ingest", parameters).to_metadata(),
             kind="media",
         )
         writer.add_metadata(CLOCK, {"start_ns": str(start_ns)})
         times, numbers = array("q"), array("q")
         frame_id = self.prefix.lstrip("/")
-        for picture in video.pictures(start_ns):
-            data = foxglove.pack_picture(schema_name, picture.t_ns, frame_id, video.format, picture.data)
-            writer.add_message(channel, picture.t_ns, picture.index, data)
-            times.append(picture.t_ns)
-            numbers.append(picture.index)
+        packed = (
+            (one.t_ns, one.index, foxglove.pack_picture(schema_name, one.t_ns, frame_id, video.format, one.data))
+            for one in video.pictures(start_ns)
+        )
+        for t_ns, index, data in foxglove.messages_in(schema_name, packed, self.encoding):
+            writer.add_message(channel, t_ns, index, data)
+            times.append(t_ns)
+            numbers.append(index)
             self._progress("ingest", len(times), max(video.frames, len(times)))
         if not times:
             raise McaptrackError(f"{video.path} is a video without frames")

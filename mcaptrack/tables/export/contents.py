@@ -73,7 +73,7 @@ class LogTables:
         if schema is None:
             raise KeyError(name)
         ours = log.topics_with_schema(self.opened, [schema.name])
-        found = [channel.topic for channel in ours if channel.message_encoding == "protobuf"]
+        found = [channel.topic for channel in ours if channel.holds(schema)]
         if schema is DETECTIONS:
             found += [topic for topic in self.opened.channels if holds_boxes(self.opened, topic)]
         return sorted(found)

@@ -172,7 +172,7 @@ class _Job:
         return [
             (channel.topic, SCHEMAS[channel.schema_name])
             for channel in sorted(found, key=lambda one: one.topic)
-            if channel.message_encoding == "protobuf"
+            if channel.holds(SCHEMAS[channel.schema_name])
         ]
 
     def streams(self, topic: str, schema: Schema) -> list[_Stream]:

@@ -151,7 +151,7 @@ def _read(opened: log.Log, out: LogReport) -> None:
         there = opened.channels.get(topic)
         if there is None:
             continue
-        if there.schema_name != TRACKS.name or there.message_encoding != "protobuf":
+        if not there.holds(TRACKS):
             out.notes.append(f"{topic} holds {there.schema_name or 'no schema'}, not tracks; it is left out")
             continue
         try:

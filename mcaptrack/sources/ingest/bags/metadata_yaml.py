@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path, PurePath, PurePosixPath
 from typing import Any, Final
 
 from mcaptrack.errors import McaptrackError
@@ -13,7 +13,7 @@ from mcaptrack.sources.ingest.bags import plain_yaml
 from mcaptrack.sources.ingest.bags.plain_yaml import Fields, UnsupportedYamlError
 
 METADATA: Final = "metadata.yaml"
-_ROOT: Final = "rosbag2_bagfile_information"
+ROOT: Final = "rosbag2_bagfile_information"
 
 
 @dataclass
@@ -30,7 +30,17 @@ class Bag:
 
 def holds_metadata(path: Path) -> bool:
     """Whether a file exists and looks like the metadata of a bag."""
-    return path.is_file() and _ROOT.encode() in _start(path)
+    return path.is_file() and ROOT.encode() in _start(path)
+
+
+def names_file(path: Path, name: str) -> bool:
+    """Whether a metadata.yaml names this file; true also if the metadata can't be parsed."""
+    if not holds_metadata(path):
+        return False
+    try:
+        return name in [PurePath(one).name for one in read_metadata(path)[1]]
+    except McaptrackError:
+        return True
 
 
 def _start(path: Path) -> bytes:
@@ -46,7 +56,7 @@ def read_metadata(path: Path) -> tuple[Bag, list[str]]:
     """Read a metadata.yaml; returns it and the files that it names. Raises McaptrackError if it is invalid."""
     text = _start(path)
     try:
-        fields = Fields(plain_yaml.load(text), "it").map(_ROOT)
+        fields = Fields(plain_yaml.load(text), "it").map(ROOT)
         mode, compression = fields.text("compression_mode", ""), fields.text("compression_format", "")
         topics = [_topic(Fields(entry, "a topic")) for entry in fields.values("topics_with_message_count")]
         names = [_name(entry) for entry in fields.values("relative_file_paths")]

@@ -100,7 +100,7 @@ def _build(yaml: Any, events: Iterator[Any]) -> Any:
 
 
 def dump(value: Any) -> str:
-    """Write a loaded value as YAML, one line for each value."""
+    """Write a loaded value as YAML, one line for each value. Text that isn't a Scalar is written without quotes."""
     import yaml
 
     dumper = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
@@ -122,6 +122,7 @@ def _events(yaml: Any, value: Any) -> Iterator[Any]:
             yield from _events(yaml, one)
         yield yaml.MappingEndEvent()
     else:
+        value = value if isinstance(value, Scalar) else Scalar.of(value, is_plain=True)
         yield yaml.ScalarEvent(None, None, (value.is_plain, not value.is_plain), str(value), style=_style(value))
 
 
