@@ -188,20 +188,23 @@ def print_results(scores: Scores) -> None:
             means = [f"{100 * result.class_means[name]:.1f}" if name in result.class_means else "" for name in columns]
             table.add_row(*first, result.tracks, "mean of classes", by, *means)
     out.print(table)
-    forecasts: dict[tuple[str, str], dict[str, float | None]] = {}
+    forecasts: dict[tuple[str, str, str | None], dict[str, float | None]] = {}
     for result in scores.results:
         if result.displacement is not None:
-            forecasts.setdefault((result.sequence, result.tracks), result.displacement.summary())
+            key = (result.sequence, result.tracks, result.of_class)
+            forecasts.setdefault(key, result.displacement.summary())
     if forecasts:
         table = Table(box=None, pad_edge=False, header_style="bold")
-        for name in (*(("sequence",) if several else ()), "forecasts of"):
+        has_classes = any(of_class is not None for _, _, of_class in forecasts)
+        for name in (*(("sequence",) if several else ()), "forecasts of", *(("class",) if has_classes else ())):
             table.add_column(name, no_wrap=True)
         for name in _FORECAST_COLUMNS.values():
             table.add_column(name, justify="right", no_wrap=True)
-        for (sequence, tracks), values in forecasts.items():
+        for (sequence, tracks, of_class), values in forecasts.items():
             numbers = ["-" if values[name] is None else f"{values[name]:.3f}" for name in _FORECAST_COLUMNS]
             first = [sequence] if several else []
-            table.add_row(*first, tracks, *numbers)
+            own = [_class_cell(of_class)] if has_classes else []
+            table.add_row(*first, tracks, *own, *numbers)
         out.print()
         out.print(table)
 

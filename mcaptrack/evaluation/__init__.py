@@ -9,7 +9,7 @@ Letters: N rows, G people of the ground truth, H tracks in one frame.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -32,7 +32,7 @@ from mcaptrack.evaluation.aligned import (
     sides_without,
 )
 from mcaptrack.evaluation.averages import averages, mean_of_classes, scored_matchups
-from mcaptrack.evaluation.by_class import of_class, share_classes
+from mcaptrack.evaluation.by_class import ids_of_class, of_class, share_classes, with_ids
 from mcaptrack.evaluation.forecasts import FORECAST_INPUTS, score_forecasts
 from mcaptrack.evaluation.metrics import Rules, Score, ScoredMatchup
 from mcaptrack.evaluation.metrics.displacement import Displacement, combine_displacements
@@ -316,11 +316,25 @@ def _score(
             f"{sequence.name}: {candidate.name} and the ground truth share neither boxes nor positions in metres"
         )
     if candidate.forecasts is not None and any(result.similarity == "metres" for result in results):
-        errors = score_forecasts(candidate.forecasts, candidate.frames, sequence.ground_truth, candidate.forecasts_name)
+        errors = _forecast_scores(sequence, candidate, candidate.forecasts, parts)
         for result in results:
-            is_of_all = result.similarity == "metres" and result.of_class is None
-            result.displacement = errors if is_of_all else None
+            result.displacement = errors.get(result.of_class) if result.similarity == "metres" else None
     return results
+
+
+def _forecast_scores(
+    sequence: EvaluationInput, candidate: Candidate, forecasts: Sequence[Frame], classes: Collection[str]
+) -> dict[str | None, Displacement | None]:
+    """The errors of all forecasts, under None, and of those of each class, by its name."""
+    name, ground_truth, tracks = candidate.forecasts_name, sequence.ground_truth, candidate.frames
+    out = {None: score_forecasts(forecasts, tracks, ground_truth, name)}
+    # At their own times, unlike the rows that tracks are scored by.
+    shared = share_classes(sequence.name, name, ground_truth, tracks, sequence.classes, candidate.classes)
+    for number, one in shared.names.items() if classes else ():
+        ids = ids_of_class(shared.tracks, number)
+        parts = (with_ids(forecasts, ids), with_ids(shared.tracks, ids), of_class(shared.ground_truth, number))
+        out[one] = score_forecasts(*parts, name)
+    return out
 
 
 def sequence_of_files(

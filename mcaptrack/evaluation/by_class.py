@@ -10,8 +10,9 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from mcaptrack.schema import Frame
-from mcaptrack.schema.classes import PERSON, class_name, is_person
+from mcaptrack.geometry.arrays import Ints
+from mcaptrack.schema import TRACKS, Frame
+from mcaptrack.schema.classes import PERSON, class_name, is_person, majority
 
 _SHOWN: Final = 8
 
@@ -97,6 +98,18 @@ def _counted(frames: Sequence[Frame], numbers: Sequence[int], names: Mapping[int
 def of_class(frames: Sequence[Frame], number: int) -> list[Frame]:
     """The rows of a class; frames without any stay, empty."""
     return [frame._replace(rows=frame.rows[frame.rows["class_id"] == number]) for frame in frames]
+
+
+def ids_of_class(frames: Sequence[Frame], number: int) -> Ints:
+    """The ids of the tracks that have a class in most of their rows."""
+    rows = TRACKS.joined([frame.rows for frame in frames])
+    ids, track = np.unique(rows["track_id"].astype(np.int64), return_inverse=True)
+    return ids[majority(track, rows["class_id"], len(ids)) == number]
+
+
+def with_ids(frames: Sequence[Frame], ids: Ints) -> list[Frame]:
+    """The rows of tracks with these ids; frames without any stay, empty."""
+    return [frame._replace(rows=frame.rows[np.isin(frame.rows["track_id"], ids)]) for frame in frames]
 
 
 def _numbers(frames: Sequence[Frame]) -> list[int]:
