@@ -327,7 +327,7 @@ def _forecast_scores(
 ) -> dict[str | None, Displacement | None]:
     """The errors of all forecasts, under None, and of those of each class, by its name."""
     name, ground_truth, tracks = candidate.forecasts_name, sequence.ground_truth, candidate.frames
-    out = {None: score_forecasts(forecasts, tracks, ground_truth, name)}
+    out: dict[str | None, Displacement | None] = {None: score_forecasts(forecasts, tracks, ground_truth, name)}
     # At their own times, unlike the rows that tracks are scored by.
     shared = share_classes(sequence.name, name, ground_truth, tracks, sequence.classes, candidate.classes)
     for number, one in shared.names.items() if classes else ():

@@ -104,7 +104,7 @@ def ids_of_class(frames: Sequence[Frame], number: int) -> Ints:
     """The ids of the tracks that have a class in most of their rows."""
     rows = TRACKS.joined([frame.rows for frame in frames])
     ids, track = np.unique(rows["track_id"].astype(np.int64), return_inverse=True)
-    return ids[majority(track, rows["class_id"], len(ids)) == number]
+    return np.asarray(ids[majority(track, rows["class_id"], len(ids)) == number], np.int64)
 
 
 def with_ids(frames: Sequence[Frame], ids: Ints) -> list[Frame]:
