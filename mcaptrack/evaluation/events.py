@@ -37,16 +37,16 @@ from mcaptrack.evaluation.metrics.matchup import RowPairs
 from mcaptrack.evaluation.track_lifecycle import (
     MAX_PAUSE_S,
     NO_ID,
-    TrackLifecycle,
     event_rows,
     frame_interval_ns,
+    lifecycle_of,
     unobserved_s,
 )
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
 from mcaptrack.geometry.ragged import group_index, run_starts
 from mcaptrack.schema import COUNTS, EVENTS, TRACKS, EventKind, Frame, Rows
-from mcaptrack.schema.framing import frame_times, join_frames, split_rows
+from mcaptrack.schema.framing import frame_numbers, frame_times, joined_parts, split_rows
 
 
 @dataclass(frozen=True)
@@ -138,17 +138,17 @@ def find_events(
         except McaptrackError as error:
             notes.append(f"no misses, false tracks and switches of {tracks_name}: {error}")
     compared = ground_truth or () if comparison else ()
-    index = {frame.t_ns: frame.index for frame in [*compared, *tracks]}
+    index: dict[int, int] = {}
+    for frames in (compared, tracks):
+        index |= zip(frame_times(frames).tolist(), frame_numbers(frames).tolist(), strict=True)
     compared_ns = comparison.t_ns if comparison else np.empty(0, np.int64)
     t_ns = np.unique(np.concatenate([frame_times(tracks), compared_ns]))
-    joined = join_frames(TRACKS, tracks)
-    order = np.lexsort((joined.rows["track_id"], joined.row_ns))
-    lifecycle = TrackLifecycle(joined.rows[order], joined.row_ns[order], np.unique(joined.t_ns))
+    lifecycle = lifecycle_of(tracks)
     parts = [lifecycle.births(), lifecycle.ends(), *([lifecycle.repairs()] if are_repaired else [])]
     if comparison:
         parts += [_switches(comparison), _misses(comparison), _false_tracks(comparison)]
     events, events_ns = _in_order(parts)
-    counts = _counts(t_ns, lifecycle, events, events_ns, comparison)
+    counts = _counts(t_ns, tracks, events, events_ns, comparison)
     numbers = [index.get(at, 0) for at in t_ns.tolist()]
     ends = np.searchsorted(events_ns, t_ns, "right")
     return TrackEvents(
@@ -292,17 +292,17 @@ def _periods(side: LocatedRows, matched: Ints, frame_ns: Ints) -> tuple[Ints, Ro
     return t_ns[start], rows[start], _Periods(slot[start], at[start], end - start, lasts)
 
 
-def _counts(
-    t_ns: Ints, lifecycle: TrackLifecycle, events: Rows, events_ns: Ints, comparison: _Comparison | None
-) -> Rows:
+def _counts(t_ns: Ints, tracks: Sequence[Frame], events: Rows, events_ns: Ints, comparison: _Comparison | None) -> Rows:
     """A row of Counts for each of the times (F,)."""
     total = len(t_ns)
     out = COUNTS.empty(total)
     for name in ("people", "matches", "misses", "false_tracks", "switches", "mota"):
         out[name] = np.nan
-    at = np.searchsorted(t_ns, lifecycle.row_ns)
-    out["tracked"] = np.bincount(at, minlength=total)
-    out["observed"] = np.bincount(at[lifecycle.rows["observed"]], minlength=total)
+    for _, _, joined in joined_parts(TRACKS, tracks):
+        at = np.searchsorted(t_ns, joined.row_ns)
+        for name, of in (("tracked", at), ("observed", at[joined.rows["observed"]])):
+            some, count = np.unique(of, return_counts=True)
+            out[name][some] += count.astype(out[name].dtype)
 
     def so_far(*kinds: EventKind) -> Ints:
         chosen = np.isin(events["kind"], kinds)

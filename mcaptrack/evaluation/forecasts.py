@@ -30,7 +30,8 @@ from mcaptrack.evaluation.metrics.displacement import (
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
 from mcaptrack.schema import FORECAST_ERRORS, FORECAST_SCORES, PREDICTIONS, TRACKS, Frame, Rows
-from mcaptrack.schema.framing import frame_times, join_frames, split_rows
+from mcaptrack.schema.frame_columns import FrameCollector
+from mcaptrack.schema.framing import frame_numbers, frame_times, join_frames, row_ends, spans_of, split_rows
 from mcaptrack.schema.resampling import is_observed_at
 
 #: The channels of forecasts, below the camera's prefix, and the tracks from which each is made.
@@ -38,6 +39,9 @@ FORECAST_INPUTS: Final[Mapping[str, str]] = {"predictions": "samples", "retracks
 NO_ID: Final = -1
 _WITHIN: Final = LEVELS.index(0.95)
 _AHEAD_S: Final = 1.0
+#: The past of a forecast may begin with a gap, and the last observation before it is at most so old, in seconds.
+_BEFORE_S: Final = 120.0
+_BESIDE_STEPS: Final = 2
 #: The columns of a forecast that is compared with a path.
 _MEASURES: Final = ("ade_m", "fde_m", "error_1s_m", "within_95")
 
@@ -52,9 +56,19 @@ class _PredictionClock(NamedTuple):
     def to_step(self, t_ns: Ints) -> Ints:
         return np.rint((t_ns - self.start_ns) / (self.step_s * NS_PER_S)).astype(np.int64)
 
-    def positions(self, frames: Sequence[Frame]) -> Positions:
-        """The positions of tracks with frames at ticks of this clock."""
-        joined = join_frames(TRACKS, frames)
+    def positions(
+        self, frames: Sequence[Frame], span: tuple[int, int] | None = None, forecasts: Forecasts | None = None
+    ) -> Positions:
+        """The positions of tracks with frames at ticks of this clock.
+
+        With a ``span`` of times in ns only those that ``forecasts`` made in it are compared with.
+        """
+        low, high = 0, len(frames)
+        if span and forecasts:
+            ahead_s = _BESIDE_STEPS * self.step_s + forecasts.mean_m.shape[1] * self.step_s
+            since_ns, until_ns = span[0] - seconds_to_ns(_BEFORE_S), span[1] + seconds_to_ns(ahead_s)
+            low, high = np.searchsorted(frame_times(frames), [since_ns, until_ns]).tolist()
+        joined = join_frames(TRACKS, frames, low, high)
         ids = joined.rows["track_id"].astype(np.int64)
         return Positions(self.to_step(joined.row_ns), ids, on_ground(joined.rows))
 
@@ -77,7 +91,18 @@ class _ForecastArrays(NamedTuple):
     clock: _PredictionClock
 
 
-def _arrays(frames: Sequence[Frame], tracks: Sequence[Frame], name: str) -> _ForecastArrays | None:
+def _clock(frames: Sequence[Frame], tracks: Sequence[Frame]) -> _PredictionClock | None:
+    """The clock of forecasts of tracks; None if there are none."""
+    first = next((frame.rows[0] for frame in frames if len(frame.rows)), None)
+    if first is None or not len(tracks):
+        return None
+    track_ns, step_s = frame_times(tracks), float(first["ahead_s"]) / int(first["step"])
+    return _PredictionClock(int(track_ns.min()), int(track_ns.max()), step_s)
+
+
+def _arrays(
+    frames: Sequence[Frame], tracks: Sequence[Frame], name: str, clock: _PredictionClock | None = None
+) -> _ForecastArrays | None:
     """Forecasts as arrays; None if there are none. Raises McaptrackError if they differ in their number of steps."""
     rows, message, _, _ = join_frames(PREDICTIONS, frames)
     if not len(rows) or not len(tracks):
@@ -87,9 +112,9 @@ def _arrays(frames: Sequence[Frame], tracks: Sequence[Frame], name: str) -> _For
     horizon = int(rows["step"].max())
     if len(rows) % horizon or not (rows["step"].reshape(-1, horizon) == np.arange(1, horizon + 1)).all():
         raise McaptrackError(f"{name}: not all forecasts have {horizon} steps")
-    track_ns = frame_times(tracks)
-    step_s = float(rows["ahead_s"][0]) / int(rows["step"][0])
-    clock = _PredictionClock(int(track_ns.min()), int(track_ns.max()), step_s)
+    if clock is None:
+        track_ns, step_s = frame_times(tracks), float(rows["ahead_s"][0]) / int(rows["step"][0])
+        clock = _PredictionClock(int(track_ns.min()), int(track_ns.max()), step_s)
     cov = np.stack([rows["cov_xx_m2"], rows["cov_xy_m2"], rows["cov_xy_m2"], rows["cov_yy_m2"]], axis=-1)
     forecasts = Forecasts(
         clock.to_step(frame_times(frames)[message[::horizon]]),
@@ -142,8 +167,8 @@ def score_forecasts(
 class ForecastErrorFrames(NamedTuple):
     """Rows of ForecastErrors and of ForecastScores: one frame of each for every frame of the forecasts."""
 
-    errors: list[Frame]
-    scores: list[Frame]
+    errors: Sequence[Frame]
+    scores: Sequence[Frame]
 
 
 def find_forecast_errors(
@@ -177,25 +202,34 @@ def find_forecast_errors(
     McaptrackError
         If forecasts differ in their number of steps.
     """
-    arrays = _arrays(frames, tracks, name) or _NOTHING
-    rows, scores = FORECAST_ERRORS.empty(len(arrays.message)), FORECAST_SCORES.empty(len(frames))
-    rows["track_id"], rows["truth_id"], rows["later_id"] = arrays.forecasts.id, NO_ID, NO_ID
-    scores["forecasts"] = np.bincount(arrays.message, minlength=len(frames))
-    paths = arrays.clock.positions(tracks)
-    people = arrays.clock.resampled(ground_truth or ())
-    if np.isfinite(people.xy_m).any():
-        false = _compare(arrays, pair_forecasts(people, paths, arrays.forecasts), rows, "truth_id", "")
-        scores["false_forecasts"] = np.bincount(arrays.message[false], minlength=len(frames))
-        scores["scored"] = _mean(arrays.message, rows, scores, "")
+    parts = list(spans_of(row_ends(frames)))
+    whole = _arrays(frames, tracks, name) if len(parts) == 1 else None
+    clock = _clock(frames, tracks) if len(frames) else None
+    people = (clock or _NOTHING.clock).resampled(ground_truth or ())
+    scores, errors = FORECAST_SCORES.empty(len(frames)), FrameCollector(FORECAST_ERRORS)
+    times, numbers, has_truth = frame_times(frames), frame_numbers(frames), bool(np.isfinite(people.xy_m).any())
+    for low, high in parts:
+        part: Sequence[Frame] = frames if len(parts) == 1 else frames[low:high]
+        arrays = (whole if len(parts) == 1 else clock and _arrays(part, tracks, name, clock)) or _NOTHING
+        rows = FORECAST_ERRORS.empty(len(arrays.message))
+        rows["track_id"], rows["truth_id"], rows["later_id"] = arrays.forecasts.id, NO_ID, NO_ID
+        of_part = scores[low:high]
+        of_part["forecasts"] = np.bincount(arrays.message, minlength=high - low)
+        span = (int(times[low]), int(times[high - 1])) if len(parts) > 1 else None
+        paths, offline = (arrays.clock.positions(some, span, arrays.forecasts) for some in (tracks, later))
+        if has_truth:
+            false = _compare(arrays, pair_forecasts(people, paths, arrays.forecasts), rows, "truth_id", "")
+            of_part["false_forecasts"] = np.bincount(arrays.message[false], minlength=high - low)
+            of_part["scored"] = _mean(arrays.message, rows, of_part, "")
+        _compare(arrays, pair_forecasts(offline, paths, arrays.forecasts), rows, "later_id", "later_")
+        of_part["later_scored"] = _mean(arrays.message, rows, of_part, "later_")
+        ends = np.searchsorted(arrays.message, np.arange(high - low + 1), "left")
+        errors.extend(times[low:high], numbers[low:high], ends, FORECAST_ERRORS.check(rows))
+    if has_truth:
         for so_far, measure in (("ade_so_far_m", "ade_m"), ("fde_so_far_m", "fde_m")):
             scores[so_far] = _so_far(scores["scored"], scores[measure])
-    _compare(arrays, pair_forecasts(arrays.clock.positions(later), paths, arrays.forecasts), rows, "later_id", "later_")
-    scores["later_scored"] = _mean(arrays.message, rows, scores, "later_")
-    ends = np.searchsorted(arrays.message, np.arange(len(frames)), "right")
-    times, numbers = frame_times(frames), [frame.index for frame in frames]
     return ForecastErrorFrames(
-        split_rows(times, numbers, FORECAST_ERRORS.check(rows), ends),
-        split_rows(times, numbers, FORECAST_SCORES.check(scores), np.arange(1, len(frames) + 1)),
+        errors.done(), split_rows(times, numbers, FORECAST_SCORES.check(scores), np.arange(1, len(frames) + 1))
     )
 
 

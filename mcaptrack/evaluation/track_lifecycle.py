@@ -5,6 +5,7 @@ Letters: N rows, R events.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
@@ -12,7 +13,8 @@ import numpy as np
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
 from mcaptrack.geometry.ragged import run_ends, run_starts
-from mcaptrack.schema import EVENTS, EventKind, Rows
+from mcaptrack.schema import EVENTS, TRACKS, EventKind, Frame, Rows
+from mcaptrack.schema.framing import frame_times, joined_parts
 
 NO_ID: Final = -1
 #: Interruptions shorter than this do not split a period.
@@ -46,15 +48,19 @@ def unobserved_s(frame_ns: Ints, last_ns: Ints, next_ns: Ints) -> Floats:
 
 
 class TrackLifecycle:
-    """The rows of tracks with the time of each, and the times of all frames. Rows are ordered by time and id."""
+    """The rows of tracks with the time of each, and the times of all frames. Rows are ordered by time and id.
 
-    def __init__(self, rows: Rows, row_ns: Ints, frame_ns: Ints) -> None:
+    Of the rows only those matter at which something begins or ends; ``size`` are the numbers of all rows of each track,
+    by rising ids.
+    """
+
+    def __init__(self, rows: Rows, row_ns: Ints, frame_ns: Ints, size: Ints) -> None:
         self.rows, self.row_ns, self.frame_ns = rows, row_ns, frame_ns
         order = np.lexsort((row_ns, rows["track_id"]))
         ids = rows["track_id"][order]
         starts = run_starts(ids)
         self._first, self._last = order[starts], order[run_ends(starts)]
-        self._size = np.unique(ids, return_counts=True)[1]
+        self._size = size
 
     def births(self) -> tuple[Ints, Rows]:
         """The first row of each track."""
@@ -107,6 +113,27 @@ class TrackLifecycle:
             source_id=source[parted],
         )
         return np.concatenate([t_ns[at], t_ns[start[parted]]]), np.concatenate([moved, split])
+
+
+def lifecycle_of(frames: Sequence[Frame]) -> TrackLifecycle:
+    """The life of tracks, from the rows at which a track, or a run of one source, begins or ends."""
+    ids, size = np.empty(0, np.int64), np.empty(0, np.int64)
+    kept, kept_ns = [TRACKS.empty()], [np.empty(0, np.int64)]
+    for _, _, joined in joined_parts(TRACKS, frames):
+        rows, row_ns = joined.rows, joined.row_ns
+        there, count = np.unique(rows["track_id"], return_counts=True)
+        ids, which = np.unique(np.concatenate([ids, there]), return_inverse=True)
+        size = np.bincount(which, np.concatenate([size, count]), len(ids)).astype(np.int64)
+        matters = np.zeros(len(rows), bool)
+        for some in (np.arange(len(rows)), np.flatnonzero(rows["source_id"] >= 0)):
+            order = some[np.lexsort((row_ns[some], rows["track_id"][some]))]
+            starts = run_starts(rows["track_id"][order], rows["source_id"][order])
+            matters[order[starts | run_ends(starts)]] = True
+        kept.append(rows[matters])
+        kept_ns.append(row_ns[matters])
+    rows, row_ns = TRACKS.joined(kept), np.concatenate(kept_ns)
+    order = np.lexsort((rows["track_id"], row_ns))
+    return TrackLifecycle(rows[order], row_ns[order], np.unique(frame_times(frames)), size)
 
 
 def _runs(track: Ints, source: Ints, t_ns: Ints) -> tuple[Ints, Ints]:

@@ -219,6 +219,27 @@ class Messages:
         rows.flags.writeable = False
         return ChannelRows(rows, t_ns[order], sequence[order], counts[order])
 
+    def parts(self, channels: Sequence[int], schema: Schema) -> Iterator[ChannelRows | None]:
+        """What ``columns`` gives, chunk by chunk: None where a message has another layout."""
+        for group in _in_order(self._batches(channels)):
+            t_ns = to_int64(np.concatenate([batch.t_ns for batch in group]))
+            rows, sequence, counts = [], [], []
+            for batch in group:
+                content, offset = self._open(batch)
+                found = message_heads_at(content, batch.channel, batch.t_ns, offset)
+                decoded = schema.codec.decode_at(np.frombuffer(content, np.uint8), found.start, found.end)
+                if decoded is None:
+                    yield None
+                    return
+                rows.append(decoded[0])
+                counts.append(decoded[1])
+                sequence.append(found.head["sequence"].astype(np.int64))
+            members, numbers, sizes = schema.joined(rows), np.concatenate(sequence), np.concatenate(counts)
+            order = np.argsort(t_ns, kind="stable")
+            if (np.diff(order) != 1).any():
+                members = members[ragged_range((np.cumsum(sizes) - sizes)[order], sizes[order])]
+            yield ChannelRows(members, t_ns[order], numbers[order], sizes[order])
+
     def fingerprint(self, channel_id: int | None = None) -> str:
         """The fingerprint of a channel, or of the whole log; computed once."""
         if channel_id not in self._fingerprints:
@@ -313,6 +334,21 @@ class Messages:
         payloads = (bytes(data[start:end]) for start, end in spans)
         head = found.head
         return map(Message, head["t_ns"].tolist(), head["sequence"].tolist(), head["publish_ns"].tolist(), payloads)
+
+
+def _in_order(batches: Sequence[_Batch]) -> Iterator[list[_Batch]]:
+    """Batches in groups that follow one another in time; batches of one group overlap, and keep their order."""
+    there = [(int(batch.t_ns[0]), number, batch) for number, batch in enumerate(batches) if len(batch.t_ns)]
+    group: list[tuple[int, int, _Batch]] = []
+    last = (-1, -1)  # time and number of the last message and batch so far
+    for first_ns, number, batch in sorted(there, key=lambda one: one[:2]):
+        if group and (first_ns, number) > last:
+            yield [one for _, _, one in sorted(group, key=lambda member: member[1])]
+            group = []
+        group.append((first_ns, number, batch))
+        last = max(last, (int(batch.t_ns[-1]), max(member[1] for member in group)))
+    if group:
+        yield [one for _, _, one in sorted(group, key=lambda member: member[1])]
 
 
 def _batch(channel_id: int, chunk: ChunkIndexRecord | None, is_direct: bool, entries: Entries, span: Span) -> _Batch:

@@ -24,6 +24,7 @@ from mcaptrack.log.writer import create
 from mcaptrack.schema import Frame, Schema
 from mcaptrack.schema.classes import with_only_class
 from mcaptrack.schema.encodings import ROW_ENCODINGS, RowReader, reader_of, schema_name_of
+from mcaptrack.schema.frame_columns import FrameCollector, FrameColumns
 from mcaptrack.schema.framing import split_rows
 
 T = TypeVar("T")
@@ -265,11 +266,16 @@ class Log:
         """
         if (part := self.part(topic)) is not self:
             return part.rows(topic, schema)
+        channel = self._row_channel(topic, schema)
+        found = self._rows(topic, schema)
+        return found._replace(rows=with_only_class(schema, found.rows, channel.metadata))
+
+    def _row_channel(self, topic: str, schema: Schema) -> Channel:
+        """The channel of a topic. Raises McaptrackError if it has another schema."""
         channel = self.channel(topic)
         if not channel.holds(schema):
             raise McaptrackError(f"{self.path}: {topic} holds {channel.schema_name or 'no schema'}, not {schema.name}")
-        found = self._rows(topic, schema)
-        return found._replace(rows=with_only_class(schema, found.rows, channel.metadata))
+        return channel
 
     def _rows(self, topic: str, schema: Schema) -> ChannelRows:
         """All rows of a channel of this file as they stand in its messages."""
@@ -301,6 +307,24 @@ class Log:
         """All rows of a channel, one frame for each message."""
         found = self.rows(topic, schema)
         return split_rows(found.t_ns.tolist(), found.sequence.tolist(), found.rows, np.cumsum(found.counts))
+
+    def frame_columns(self, topic: str, schema: Schema) -> FrameColumns:
+        """All rows of a channel as ``frames`` gives them, in blocks, most of which are not in memory."""
+        if (part := self.part(topic)) is not self:
+            return part.frame_columns(topic, schema)
+        metadata = self._row_channel(topic, schema).metadata
+        channels, out = self._ids(topic), FrameCollector(schema)
+        with self.snapshot.reporting_bad_times(topic):
+            for found in self._messages.parts(channels, schema):
+                if found is None:
+                    whole = self.rows(topic, schema)
+                    out = FrameCollector(schema)
+                    out.extend(whole.t_ns, whole.sequence, np.append(0, np.cumsum(whole.counts)), whole.rows)
+                    break
+                rows = with_only_class(schema, found.rows, metadata)
+                out.extend(found.t_ns, found.sequence, np.append(0, np.cumsum(found.counts)), rows)
+            self.snapshot.confirm_unchanged(channels)
+        return out.done()
 
     def times(self, topic: str) -> Ints:
         """The sorted times of a channel's messages, (M,) ns, without reading the messages."""

@@ -14,6 +14,7 @@ from mcaptrack.errors import McaptrackError, call
 from mcaptrack.foxglove import views
 from mcaptrack.schema import DETECTIONS, VIDEO, Frame, Schema
 from mcaptrack.schema.classes import class_names
+from mcaptrack.schema.frame_columns import collect
 from mcaptrack.schema.provenance import INGEST, VIEW, Provenance, frame_id_of
 from mcaptrack.sources import foreign
 from mcaptrack.sources.cameras import USUAL, chain_of
@@ -82,7 +83,7 @@ def fits(channel: log.Channel, reads: Schema) -> tuple[str, bool]:
     return channel.schema_name, theirs or channel.schema_name == reads.name
 
 
-def read_frames(opened: log.Log, topic: str, schema: Schema) -> list[Frame]:
+def read_frames(opened: log.Log, topic: str, schema: Schema) -> Sequence[Frame]:
     """Read the rows of a channel, or the detections of a recording in a foreign format."""
     return read_named_frames(opened, topic, schema).frames
 
@@ -97,9 +98,10 @@ def read_named_frames(
     """
     channel = opened.channel(topic)
     if schema is DETECTIONS and channel.schema_name != DETECTIONS.name:
-        return (BoxesRead() if boxes is None else boxes).read(opened, topic, frame_id)
+        found = (BoxesRead() if boxes is None else boxes).read(opened, topic, frame_id)
+        return found._replace(frames=collect(DETECTIONS, found.frames))
     return foreign.NamedFrames(
-        opened.frames(topic, schema), class_names(channel.metadata), frame_id_of(channel.metadata)
+        opened.frame_columns(topic, schema), class_names(channel.metadata), frame_id_of(channel.metadata)
     )
 
 

@@ -15,6 +15,7 @@ from mcaptrack.notices import warn
 from mcaptrack.pipeline.checks import Job
 from mcaptrack.pipeline.planes import is_poor
 from mcaptrack.schema import Frame
+from mcaptrack.schema.framing import frame_times
 from mcaptrack.schema.provenance import CLOCK
 from mcaptrack.sources.cameras import camera_at
 from mcaptrack.transforms import STAGES, Sample, Transform
@@ -41,7 +42,7 @@ def in_context(
     if "start_ns" in names:
         known["start_ns"] = _clock_start(opened, prefix)
     if "rate_hz" in names:
-        steps = np.diff([frame.t_ns for frame in frames])
+        steps = np.diff(frame_times(frames))
         if (steps > 0).any():  # frames may share a time
             known["rate_hz"] = round(NS_PER_S / float(np.median(steps[steps > 0])), 6)
             usual = f"{prefix}/{STAGES[job.stage].input_topic}"

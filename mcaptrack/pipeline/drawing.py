@@ -17,7 +17,7 @@ from mcaptrack.geometry.plane import Planes
 from mcaptrack.geometry.transform_tree import TransformTree
 from mcaptrack.notices import warn
 from mcaptrack.schema import DETECTIONS, GROUND_PLANE, PREDICTIONS, TRACKS, Frame, Schema
-from mcaptrack.schema.framing import frame_times
+from mcaptrack.schema.framing import frame_times, has_any
 from mcaptrack.schema.provenance import VIEW, Provenance
 from mcaptrack.sources import foreign
 from mcaptrack.sources.calibrations import holds_calibrations, moving_camera
@@ -52,7 +52,7 @@ class ChannelToDraw(NamedTuple):
     """
 
     schema: Schema
-    frames: list[Frame]
+    frames: Sequence[Frame]
     digest: str
     made_by: str
     classes: Mapping[int, str] = {}
@@ -61,16 +61,16 @@ class ChannelToDraw(NamedTuple):
 
     def is_solid(self) -> bool:
         """Whether it has 3D boxes, or belongs to tracks that have."""
-        return bool(self.bodies) or (self.schema in (DETECTIONS, TRACKS) and has_bodies(self.frames))
+        return bool(self.bodies) or (self.schema in (DETECTIONS, TRACKS) and has_bodies(self.schema, self.frames))
 
     def is_on_ground(self) -> bool:
         """Whether it has a view in metres."""
         return self.schema in _ON_GROUND or (self.schema is DETECTIONS and self.is_solid())
 
 
-def has_bodies(frames: Iterable[Frame]) -> bool:
+def has_bodies(schema: Schema, frames: Sequence[Frame]) -> bool:
     """Whether any row of these tracks or detections has a 3D box."""
-    return any(np.isfinite(frame.rows["z_m"]).any() for frame in frames)
+    return has_any(schema, frames, lambda rows: np.isfinite(rows["z_m"]))
 
 
 class View(NamedTuple):

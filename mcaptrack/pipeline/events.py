@@ -39,6 +39,7 @@ from mcaptrack.schema import (
     Schema,
 )
 from mcaptrack.schema.classes import class_names
+from mcaptrack.schema.framing import join_frames
 from mcaptrack.schema.provenance import VIEW, Provenance
 from mcaptrack.sources.cameras import camera_at, is_tracked_from_boxes, provenance_of
 
@@ -160,7 +161,7 @@ def tally(made: Mapping[str, Made]) -> dict[str, dict[str, int]]:
     out = {}
     for topic, channel in made.items():
         if channel.schema is EVENTS and not channel.drawn:
-            kinds = EVENTS.joined([frame.rows for frame in channel.frames])["kind"]
+            kinds = join_frames(EVENTS, channel.frames).rows["kind"]
             counts = np.bincount(kinds, minlength=max(EVENT_KINDS) + 1).tolist()
             out[topic.removesuffix(_EVENTS)] = {name: counts[kind] for kind, name in EVENT_KINDS.items()}
     return out
@@ -257,4 +258,4 @@ def _rows(
     """Return the frames of a channel, and the digest of its messages."""
     if topic in made:
         return made[topic].frames, made[topic].provenance.digest
-    return opened.frames(topic, schema), digest_of(opened, topic)
+    return opened.frame_columns(topic, schema), digest_of(opened, topic)

@@ -6,20 +6,25 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
+import numpy as np
+
 from mcaptrack import log
 from mcaptrack.errors import call
+from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.plane import Planes, is_assumed, is_estimated
 from mcaptrack.notices import known_code, warn
 from mcaptrack.pipeline.planes import plane_in_words
 from mcaptrack.schema import VIDEO, Frame
+from mcaptrack.schema.framing import frame_times, row_ends
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.cameras import camera_at
 from mcaptrack.transforms import STAGES, Transform
 
 #: The stages with results in metres: all except those that read pictures.
 _IN_METRES: Final = {name for name, stage in STAGES.items() if stage.default.reads is not VIDEO}
-#: The memory that stages need, in bytes, measured with 2 to 20 people at 15 pictures a second.
-_BASE, _A_PICTURE, _A_BOX = 100_000_000, 3_000, 1_600
+#: The memory that a run needs, in bytes: whatever its length, and for each second that a person is seen (re-tracking
+#: has all samples in memory).
+_BASE, _A_PERSON_SECOND = 400_000_000, 7_000
 
 
 def warn_no_rows(stage: str, source: str, transform: Transform, given: Sequence[Frame], made: Sequence[Frame]) -> None:
@@ -27,22 +32,24 @@ def warn_no_rows(stage: str, source: str, transform: Transform, given: Sequence[
 
     ``given`` are the frames that the stage read, ``made`` those of its first output.
     """
-    if any(len(frame.rows) for frame in made):
+    if row_ends(made)[-1]:
         return
-    if transform.reads is not VIDEO and not any(len(frame.rows) for frame in given):
+    if transform.reads is not VIDEO and not row_ends(given)[-1]:
         warn(f"{source} holds nothing, so nothing was made of it", "nothing-found")
         return
     reason = transform.why_empty(given, made) if hasattr(transform, "why_empty") else "the transform gave none"
     warn(f"no {STAGES[stage].rows} of {source}: {reason}", "nothing-found")
 
 
-def warn_memory(pictures: int, boxes: int) -> None:
-    """Warn if stages need more memory for this number of pictures and boxes than is free."""
-    needed, free = _BASE + pictures * _A_PICTURE + boxes * _A_BOX, free_memory()
+def warn_memory(frames: Sequence[Frame]) -> None:
+    """Warn if the stages that follow need more memory for these boxes than is free."""
+    boxes, steps = int(row_ends(frames)[-1]), np.diff(frame_times(frames))
+    seen_s = boxes * (float(np.median(steps)) / NS_PER_S if len(steps) else 0.0)
+    needed, free = _BASE + seen_s * _A_PERSON_SECOND, free_memory()
     if free is not None and needed > free:
         warn(
-            f"{boxes:,} boxes in {pictures:,} pictures take about {needed / 1e9:.1f} GB of memory, and "
-            f"{free / 1e9:.1f} GB are free: what is computed stays in memory until all is written",
+            f"{boxes:,} boxes, of people who are seen for {seen_s / 3600:,.0f} hours together, take about "
+            f"{needed / 1e9:.1f} GB of memory, and {free / 1e9:.1f} GB are free: re-tracking has all samples in memory",
             "memory",
         )
 

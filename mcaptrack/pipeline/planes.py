@@ -35,6 +35,7 @@ from mcaptrack.pipeline.visible import picture_size
 from mcaptrack.pipeline.write import Made, digest_of
 from mcaptrack.schema import DETECTIONS, GROUND_PLANE, TRACKS, Frame, Rows
 from mcaptrack.schema.classes import PERSON, UNKNOWN, is_person
+from mcaptrack.schema.framing import join_frames, thinned
 from mcaptrack.schema.ground_plane import plane_to_rows, rows_to_plane
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources import foreign
@@ -46,6 +47,8 @@ _ASSUME, _ESTIMATE, _CALIBRATE = "assume-ground-plane", "estimate-ground-plane",
 _MADE: Final = (_ASSUME, _ESTIMATE, _CALIBRATE)
 #: A plane is estimated from boxes of at most so many frames.
 _MOST_FRAMES: Final = 5000
+#: Scales are guessed from about so many boxes at most.
+_MOST_BOXES: Final = 500_000
 _BOX_COLUMNS: Final = ["x_px", "y_px", "w_px", "h_px", "score", "class_id"]
 #: More planes are recorded by their digest in the parameters of channels.
 _MOST_RECORDED: Final = 100
@@ -196,6 +199,7 @@ def make_plane(
     Both results are None if no frame has boxes in pixels.
     """
     names = next((one.classes for _, one in _chain(opened, source[0], made) if one and one.classes), {})
+    frames = thinned(frames, _MOST_BOXES)
     boxes, number, score, are_people = _boxes(frames, names)
     if not len(boxes):
         return None, None  # without boxes in pixels there is nothing to convert to metres
@@ -346,5 +350,5 @@ def fit_in_words(fit: Mapping[str, Any]) -> str:
 
 def is_poor(frames: Sequence[Frame]) -> bool:
     """Return whether the size of boxes varies too much over the picture for one scale."""
-    boxes = columns_to_boxes(TRACKS.joined([frame.rows for frame in frames]))
+    boxes = columns_to_boxes(join_frames(TRACKS, thinned(frames, _MOST_BOXES)).rows)
     return ground_depth(boxes[np.isfinite(boxes).all(axis=1)]) < LEAST_DEPTH

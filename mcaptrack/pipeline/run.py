@@ -8,8 +8,6 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.camera_path import CameraPath
@@ -30,6 +28,8 @@ from mcaptrack.predictors import weights_sha256
 from mcaptrack.schema import DETECTIONS, TRACKS, VIDEO, Frame, Schema
 from mcaptrack.schema.camera_motion import to_pictures, to_scene
 from mcaptrack.schema.classes import class_names
+from mcaptrack.schema.frame_columns import FrameCollector
+from mcaptrack.schema.framing import row_ends, unique_values
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.camera_motion import tracks_topic
 from mcaptrack.sources.cameras import camera_at, provenance_of
@@ -62,10 +62,9 @@ class Report:
 
     def count(self, topic: str, made: Made) -> None:
         """Count the frames, rows and tracks of a new channel."""
-        rows = made.schema.joined([frame.rows for frame in made.frames])
-        self.frames[topic], self.rows[topic] = len(made.frames), len(rows)
+        self.frames[topic], self.rows[topic] = len(made.frames), int(row_ends(made.frames)[-1])
         if made.schema is TRACKS:
-            self.tracks[topic] = len(np.unique(rows["track_id"]))
+            self.tracks[topic] = len(unique_values(TRACKS, made.frames, "track_id"))
 
 
 def run(
@@ -112,7 +111,7 @@ def _run(
         made |= ground
         given = given._replace(frame_id=given.frame_id or frame_id)
         if job.transform.reads is DETECTIONS:
-            warn_memory(len(given.frames), sum(len(frame.rows) for frame in given.frames))
+            warn_memory(given.frames)
         try:
             made |= _run_job(opened, prefix, job, given, made, planes or ())
         except McaptrackError as error:
@@ -165,7 +164,7 @@ class _Input(NamedTuple):
     """
 
     stream: Iterable[Frame]
-    frames: list[Frame]
+    frames: Sequence[Frame]
     digest: Callable[[], str]
     messages: Callable[[], int]
     classes: Mapping[str, str] = {}
@@ -173,9 +172,8 @@ class _Input(NamedTuple):
 
     def in_scene(self, path: CameraPath) -> _Input:
         """Return the same tracks with boxes in pixels of the reference picture."""
-        return self._replace(
-            stream=_Repeatable(lambda: iter(to_scene(list(self.stream), path))), frames=to_scene(self.frames, path)
-        )
+        moved = to_scene(self.frames, path)
+        return self._replace(stream=moved, frames=moved)
 
 
 def _run_job(
@@ -188,8 +186,8 @@ def _run_job(
         given, planes = given.in_scene(path), scene_planes(planes, path)
     context = in_context(opened, prefix, job, given.frames, planes, given.classes)
     transform = replace(context, **known.values)
-    outputs: list[list[Frame]] = [[] for _ in transform.writes]
-    taken: set[int] = set()
+    collectors = [FrameCollector(schema) for schema in transform.writes.values()]
+    taken = [0]
     try:
         with collected() as warnings:
             entry = STAGES[job.stage].entry(type(transform))
@@ -197,8 +195,9 @@ def _run_job(
             stream = _Repeatable(lambda: _counting(given.stream, taken))
             results = transform(stream) if is_own else guarded(entry, transform, stream)
             for result in results:
-                for frame, channel in zip(result, outputs, strict=True):
-                    channel.append(frame)
+                for frame, collector in zip(result, collectors, strict=True):
+                    collector.append(frame)
+            outputs: list[Sequence[Frame]] = [collector.done() for collector in collectors]
             if job.transform.reads is DETECTIONS and job.transform.writes[""] is TRACKS:
                 outputs[0] = settle_classes(outputs[0])
             if not warnings:  # otherwise a warning has given the reason
@@ -206,7 +205,7 @@ def _run_job(
     except McaptrackError as error:
         where = "" if str(opened.path) in str(error) else f"{opened.path}: {job.source}: "
         raise type(error)(f"{where}{error}") from None
-    left_out = given.messages() - len(taken)
+    left_out = given.messages() - max(taken)
     if transform.reads is VIDEO and left_out > 0:
         warn(
             f"{job.source}: {left_out} of {given.messages()} messages were left out: a video has to begin with a key "
@@ -226,9 +225,7 @@ def _run_job(
     if not traits_of(transform).keeps_unseen:
         seen = without_unseen(channels, lambda: picture_size(opened, camera_at(opened, prefix).pictures))
     return {
-        topic: Made.of(schema, list(frames), provenance)
-        for topic, (schema, frames) in seen.items()
-        if topic in job.kept()
+        topic: Made.of(schema, frames, provenance) for topic, (schema, frames) in seen.items() if topic in job.kept()
     }
 
 
@@ -275,7 +272,7 @@ def _at_video_rate(
     retracked: Sequence[Frame] | None,
     planes: Planes,
     path: CameraPath | None,
-) -> list[Frame]:
+) -> Sequence[Frame]:
     """Return re-tracked tracks at the rate of the tracks that were sampled; no frames if there are no such tracks.
 
     None for ``retracked`` stands for the tracks as they are. Where the camera moves by ``path``, ``planes`` and the
@@ -284,10 +281,10 @@ def _at_video_rate(
     samples = made[job.source].provenance if job.source in made else provenance_of(opened, job.source)
     source = samples.input if samples else ""
     if source in made:
-        tracks = made[source].frames if made[source].schema is TRACKS else []
+        tracks = made[source].frames if made[source].schema is TRACKS else ()
     else:
         there = source in opened.channels and opened.channels[source].schema_name == TRACKS.name
-        tracks = opened.frames(source, TRACKS) if there else []
+        tracks = opened.frame_columns(source, TRACKS) if there else ()
     tracks = to_scene(tracks, path)
     frames = unchanged_tracks(tracks, planes) if retracked is None else to_video_rate(tracks, retracked, planes)
     return to_pictures(frames, path)
@@ -317,10 +314,11 @@ def _input(
     return _Input(stream, frames, lambda: of_rows, lambda: len(frames), classes, frame_id)
 
 
-def _counting(frames: Iterable[Frame], taken: set[int]) -> Iterator[Frame]:
-    """Yield the frames, and add the number of each to ``taken``."""
+def _counting(frames: Iterable[Frame], taken: list[int]) -> Iterator[Frame]:
+    """Yield the frames, and append the number of them to ``taken``; they may be read several times."""
+    taken.append(0)
     for frame in frames:
-        taken.add(frame.index)
+        taken[-1] += 1
         yield frame
 
 
@@ -332,7 +330,7 @@ def _counted(frames: Sequence[Frame], stage: str, progress: Progress) -> Iterato
 
 def input_of(
     opened: log.Log, prefix: str, stage: str, transform: Transform, source: str | None = None
-) -> tuple[list[Frame], dict[str, Any]]:
+) -> tuple[Sequence[Frame], dict[str, Any]]:
     """Return the frames that a stage would read from a log, and the values of its context fields by name.
 
     Raises McaptrackError if the log has no such input.

@@ -12,12 +12,15 @@ from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation import Candidate, EvaluateOptions, EvaluationInput, evaluate
 from mcaptrack.evaluation.aligned import GATE_3D_M, GATE_M, are_3d
+from mcaptrack.geometry.arrays import Ints
 from mcaptrack.geometry.plane import origin_of
 from mcaptrack.notices import warn
 from mcaptrack.pipeline.planes import fit_of, read_planes
 from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, PREDICTIONS, TRACKS, Rows, Schema
 from mcaptrack.schema.camera_motion import rows_to_verdict
 from mcaptrack.schema.classes import class_names
+from mcaptrack.schema.frame_columns import FrameColumns
+from mcaptrack.schema.framing import joined_parts, row_ends
 from mcaptrack.sources.camera_motion import motion_topic, read_ground_truth
 from mcaptrack.sources.cameras import camera_at, provenance_of
 from mcaptrack.sources.fixed_frame import BoxesRead, holds_boxes
@@ -81,9 +84,8 @@ def summarise(opened: log.Log, prefix: str, boxes_read: BoxesRead | None = None)
     names = ("detect", "track", "sample", "predict", "retrack")
     boxes, tracks, samples, predictions, retracks = (f"{prefix}/{STAGES[name].output_topic}" for name in names)
     motion = _rows(opened, motion_topic(prefix), CAMERA_MOTION)
-    tracked, repaired = _rows(opened, tracks, TRACKS), _rows(opened, retracks, TRACKS)
-    forecasts = _rows(opened, f"{retracks}/predictions", PREDICTIONS)
-    forecasts = _rows(opened, predictions, PREDICTIONS) if forecasts is None else forecasts
+    tracked, repaired = _sources(opened, tracks), _sources(opened, retracks)
+    forecasts = _forecasts(opened, f"{retracks}/predictions") or _forecasts(opened, predictions)
     planes = read_planes(opened, prefix)
     scores = _scores(opened, prefix, camera.truth, (samples, retracks))
     if scores is not None and scores.idf1[1] < scores.idf1[0]:
@@ -95,10 +97,10 @@ def summarise(opened: log.Log, prefix: str, boxes_read: BoxesRead | None = None)
     return Summary(
         pictures=opened.channels[camera.pictures].messages if camera.pictures else None,
         boxes=_count_boxes(opened, tracks, boxes, boxes_read or BoxesRead()),
-        tracks=None if tracked is None else len(np.unique(tracked["track_id"])),
+        tracks=None if tracked is None else len(np.unique(tracked[0])),
         repair=None if tracked is None or repaired is None else _repair(tracked, repaired),
-        forecasts=None if forecasts is None else int((forecasts["step"] == 1).sum()),
-        horizon_s=None if forecasts is None or not len(forecasts) else round(float(forecasts["ahead_s"].max()), 3),
+        forecasts=None if forecasts is None else forecasts[0],
+        horizon_s=None if forecasts is None else forecasts[1],
         scores=scores,
         ground_plane=None if planes is None else origin_of(planes),
         plane_fit=fit_of(provenance_of(opened, camera.ground_plane)),
@@ -106,10 +108,39 @@ def summarise(opened: log.Log, prefix: str, boxes_read: BoxesRead | None = None)
     )
 
 
-def _rows(opened: log.Log, topic: str, schema: Schema) -> Rows | None:
+def _frames(opened: log.Log, topic: str, schema: Schema) -> FrameColumns | None:
     """Return all rows of a channel; None if it is missing or has another schema."""
     channel = opened.channels.get(topic)
-    return opened.rows(topic, schema).rows if channel and channel.schema_name == schema.name else None
+    return opened.frame_columns(topic, schema) if channel and channel.schema_name == schema.name else None
+
+
+def _rows(opened: log.Log, topic: str, schema: Schema) -> Rows | None:
+    frames = _frames(opened, topic, schema)
+    return None if frames is None else frames.rows()
+
+
+def _sources(opened: log.Log, topic: str) -> Ints | None:
+    """Return the different pairs of a track's id and the id that its rows had before, (2, P); None without tracks."""
+    frames = _frames(opened, topic, TRACKS)
+    if frames is None:
+        return None
+    pairs = np.empty((2, 0), np.int64)
+    for _, _, joined in joined_parts(TRACKS, frames):
+        those = np.stack([joined.rows["track_id"], joined.rows["source_id"]]).astype(np.int64)
+        pairs = np.unique(np.concatenate([pairs, those], axis=1), axis=1)
+    return pairs
+
+
+def _forecasts(opened: log.Log, topic: str) -> tuple[int, float | None] | None:
+    """Return the number of forecasts, and how far ahead they reach in seconds; None if there is no such channel."""
+    frames = _frames(opened, topic, PREDICTIONS)
+    if frames is None:
+        return None
+    count, ahead_s = 0, -1.0
+    for _, _, joined in joined_parts(PREDICTIONS, frames):
+        count += int((joined.rows["step"] == 1).sum())
+        ahead_s = float(joined.rows["ahead_s"].max(initial=ahead_s))
+    return count, None if ahead_s < 0 else round(ahead_s, 3)
 
 
 def _count_boxes(opened: log.Log, tracks: str, usual: str, boxes_read: BoxesRead) -> int | None:
@@ -119,21 +150,20 @@ def _count_boxes(opened: log.Log, tracks: str, usual: str, boxes_read: BoxesRead
     if source is None:
         return None
     if holds_boxes(opened, source.topic):
-        return sum(len(frame.rows) for frame in boxes_read.read(opened, source.topic).frames)
-    rows = _rows(opened, source.topic, DETECTIONS)
-    return None if rows is None else len(rows)
+        return int(row_ends(boxes_read.read(opened, source.topic).frames)[-1])
+    frames = _frames(opened, source.topic, DETECTIONS)
+    return None if frames is None else int(frames.ends[-1])
 
 
-def _repair(tracked: Rows, repaired: Rows) -> Repair:
-    """Count joined, split and missing tracks by the column ``source_id`` of re-tracked rows."""
-    named = repaired[repaired["source_id"] >= 0]
-    pairs = np.unique(np.stack([named["track_id"], named["source_id"]]), axis=1)
+def _repair(tracked: Ints, repaired: Ints) -> Repair:
+    """Count joined, split and missing tracks, by ``_sources`` of the tracks and of the re-tracked ones."""
+    pairs = repaired[:, repaired[1] >= 0]
     ids, sources = np.unique(pairs[0]), np.unique(pairs[1])
     return Repair(
-        tracks=len(np.unique(repaired["track_id"])),
+        tracks=len(np.unique(repaired[0])),
         joined=pairs.shape[1] - len(ids),
         parted=pairs.shape[1] - len(sources),
-        left_out=int((~np.isin(np.unique(tracked["track_id"]), sources)).sum()),
+        left_out=int((~np.isin(np.unique(tracked[0]), sources)).sum()),
     )
 
 

@@ -6,7 +6,7 @@ picture, where people come and go unseen, such a row is no statement about that 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import Final
 
 import numpy as np
@@ -17,7 +17,8 @@ from mcaptrack.geometry.arrays import Bools
 from mcaptrack.geometry.boxes import columns_to_boxes, share_inside
 from mcaptrack.notices import warn
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame, Rows, Schema
-from mcaptrack.schema.framing import JoinedFrames, join_frames, split_rows
+from mcaptrack.schema.frame_columns import FrameCollector
+from mcaptrack.schema.framing import JoinedFrames, filtered_rows, frame_numbers, has_any, joined_parts
 from mcaptrack.sources.pictures import size_of_pictures
 
 #: Width and height of pictures in pixels; None where they aren't known.
@@ -48,43 +49,65 @@ def without_unseen(channels: Channels, picture_size: Callable[[], PictureSize]) 
     """
     out = dict(channels)
     for topic, (schema, frames) in channels.items():
-        joined = join_frames(schema, frames)
-        is_unseen = _is_unseen(joined.rows, picture_size) if schema is TRACKS else np.zeros(0, bool)
-        if not is_unseen.any():
+        found = _find_unseen(frames, picture_size) if schema is TRACKS else None
+        if found is None:
             continue
-        out[topic] = schema, _kept(joined, ~is_unseen, frames)
-        count = np.count_nonzero(is_unseen)
+        is_unseen, count = found
         rows = "row is" if count == 1 else "rows are"
         warn(f"{topic}: {count:,} {rows} left out, outside of the picture and without a detection", "left-out")
         stem, _, name = topic.rpartition("/")
         predictions = f"{stem}/predictions"
         if name == "online" and predictions in channels:
+            gone: set[tuple[int, int]] = set()
+            for low, _, joined in joined_parts(schema, frames):
+                gone.update(_keys(joined, low, is_unseen(joined.rows)))
             made = channels[predictions][1]
-            theirs = join_frames(PREDICTIONS, made)
-            gone = {(f, one) for f, one, is_gone in zip(*_keys(joined), is_unseen.tolist(), strict=True) if is_gone}
-            kept = np.array([key not in gone for key in zip(*_keys(theirs), strict=True)], bool)
-            out[predictions] = PREDICTIONS, _kept(theirs, kept, made)
+            out[predictions] = PREDICTIONS, _without(made, gone)
+        out[topic] = schema, _seen(frames, is_unseen)
     return out
 
 
-def _is_unseen(rows: Rows, picture_size: Callable[[], PictureSize]) -> Bools:
-    """Mask the rows that are not observed and lie outside of the picture."""
-    boxes, observed = columns_to_boxes(rows), rows["observed"]
-    nothing = np.zeros(len(rows), bool)
-    if not (~observed & np.isfinite(boxes).all(axis=1)).any() or (size := picture_size()) is None:
-        return nothing
-    is_outside: Bools = share_inside(boxes, *size) < _LEAST_INSIDE  # false without a box
-    if np.count_nonzero(is_outside & observed) > _MOST_OUTSIDE * np.count_nonzero(observed):
-        return nothing
-    return np.asarray(is_outside & ~observed)
+def _seen(frames: Sequence[Frame], is_unseen: Callable[[Rows], Bools]) -> Sequence[Frame]:
+    return filtered_rows(TRACKS, frames, lambda joined: ~is_unseen(joined.rows))
 
 
-def _keys(joined: JoinedFrames) -> tuple[list[int], list[int]]:
-    """The number of the frame and the id of each row."""
-    return joined.frame.tolist(), joined.rows["track_id"].tolist()
+def _find_unseen(
+    frames: Sequence[Frame], picture_size: Callable[[], PictureSize]
+) -> tuple[Callable[[Rows], Bools], int] | None:
+    """Return what masks the rows that are not observed and lie outside of the picture, and their number.
+
+    None if there are none.
+    """
+
+    def may_be_unseen(rows: Rows) -> Bools:
+        return np.asarray(~rows["observed"] & np.isfinite(columns_to_boxes(rows)).all(axis=1))
+
+    if not has_any(TRACKS, frames, may_be_unseen) or (size := picture_size()) is None:
+        return None
+
+    def is_outside(rows: Rows) -> Bools:  # false without a box
+        return np.asarray(share_inside(columns_to_boxes(rows), *size) < _LEAST_INSIDE)
+
+    outside = observed = unseen = 0
+    for _, _, joined in joined_parts(TRACKS, frames):
+        outer, there = is_outside(joined.rows), joined.rows["observed"]
+        outside, observed = outside + np.count_nonzero(outer & there), observed + np.count_nonzero(there)
+        unseen += np.count_nonzero(outer & ~there)
+    if not unseen or outside > _MOST_OUTSIDE * observed:
+        return None
+    return lambda rows: np.asarray(is_outside(rows) & ~rows["observed"]), unseen
 
 
-def _kept(joined: JoinedFrames, kept: Bools, frames: Sequence[Frame]) -> list[Frame]:
-    """Return frames with those of their rows that are kept (N,)."""
-    ends = np.concatenate([[0], kept.cumsum()])[joined.ends[1:]]
-    return split_rows(joined.t_ns, [frame.index for frame in frames], joined.rows[kept], ends)
+def _keys(joined: JoinedFrames, low: int, mask: Bools | slice = slice(None)) -> Iterator[tuple[int, int]]:
+    """The number of the frame and the id of each row that ``mask`` chooses; ``low`` is the number of the first one."""
+    return zip((joined.frame[mask] + low).tolist(), joined.rows["track_id"][mask].tolist(), strict=True)
+
+
+def _without(frames: Sequence[Frame], gone: Collection[tuple[int, int]]) -> Sequence[Frame]:
+    """Return forecasts without those of these frames and ids."""
+    out, numbers = FrameCollector(PREDICTIONS), frame_numbers(frames)
+    for low, high, joined in joined_parts(PREDICTIONS, frames):
+        kept = np.array([key not in gone for key in _keys(joined, low)], bool)
+        ends = np.concatenate([[0], kept.cumsum()])[joined.ends]
+        out.extend(joined.t_ns, numbers[low:high], ends, joined.rows[kept])
+    return out.done()

@@ -35,6 +35,8 @@ from mcaptrack.pipeline.drawing import (
 from mcaptrack.schema import DETECTIONS, FORECAST_SCORES, GROUND_PLANE, PREDICTIONS, SCHEMAS, TRACKS, Frame, Schema
 from mcaptrack.schema.classes import class_names, classes_beside_rows, has_classes, only_class, without_class
 from mcaptrack.schema.encodings import PROTOBUF, Encoding, encoded, record_of
+from mcaptrack.schema.frame_columns import collect
+from mcaptrack.schema.framing import has_any, join_frames, joined_parts, thinned, unique_values
 from mcaptrack.schema.provenance import INGEST, VIEW, Provenance, digest, frame_id_of
 from mcaptrack.sources import foreign
 from mcaptrack.sources.cameras import VIDEO, Camera, camera_at
@@ -45,6 +47,8 @@ from mcaptrack.sources.ingest.sidecar import check_topics, encoding_for
 Numbered = tuple[int, int, int, bytes]
 #: Endings of the topics of forecasts, and of the online tracks that they belong to.
 _PREDICTED, _ONLINE = "/predictions", "/online"
+#: Where views look from follows from about so many rows at most.
+_MOST_ROWS: Final = 200_000
 
 
 class Made(NamedTuple):
@@ -55,18 +59,20 @@ class Made(NamedTuple):
     """
 
     schema: Schema
-    frames: list[Frame]
+    frames: Sequence[Frame]
     provenance: Provenance
     encoded: list[tuple[int, int, bytes]] | None = None
     drawn: str = ""
 
     @classmethod
-    def of(cls, schema: Schema, frames: list[Frame], provenance: Provenance) -> Made:
+    def of(cls, schema: Schema, frames: Sequence[Frame], provenance: Provenance) -> Made:
         """Check the rows of frames against the schema, and put classes and digest of the messages into the provenance.
 
         ``provenance`` has the names of classes for schemas with classes.
         """
-        frames = [frame._replace(rows=schema.check(frame.rows)) for frame in frames]
+        frames = collect(schema, frames)
+        for _, _, joined in joined_parts(schema, frames):
+            schema.check(joined.rows)
         names = provenance.classes if has_classes(schema) else {}
         only = only_class(schema, frames)
         provenance = replace(provenance, classes=names, class_id=str(only) if only else "")
@@ -230,7 +236,7 @@ def _channels_to_draw(opened: log.Log, camera: Camera, made: Mapping[str, Made])
         is_new = drawn_from is None or drawn_from.input_digest != known.digest
         if schema in (*views.DRAWN, GROUND_PLANE) and is_new:
             names, frame_id = class_names(channel.metadata), known.frame_id
-            shown[topic] = ChannelToDraw(schema, opened.frames(topic, schema), known.digest, "", names, frame_id)
+            shown[topic] = ChannelToDraw(schema, opened.frame_columns(topic, schema), known.digest, "", names, frame_id)
             inputs[topic] = known.input
     for topic, one in shown.items():
         if one.schema is PREDICTIONS:
@@ -252,8 +258,8 @@ def _bodies(opened: log.Log, shown: Mapping[str, ChannelToDraw], topic: str, sou
     beside = topic.removesuffix(_PREDICTED)
     for name in (beside + _ONLINE, beside, source):
         frames = _frames(opened, shown, name, TRACKS)
-        if frames:
-            return frames if has_bodies(frames) else ()
+        if len(frames):
+            return frames if has_bodies(TRACKS, frames) else ()
     return ()
 
 
@@ -261,25 +267,25 @@ def _start_ns(opened: log.Log, camera: Camera, shown: Mapping[str, ChannelToDraw
     """Return the time of a camera's first picture or row in ns; 0 if there is none."""
     known = [channel.topic for channel in opened.channels.values() if channel.schema_name in SCHEMAS]
     times = [picture_ns, *(opened.times(topic) for topic in known if topic in camera.topics)]
-    times += [np.array([channel.frames[0].t_ns], np.int64) for channel in shown.values() if channel.frames]
+    times += [np.array([channel.frames[0].t_ns], np.int64) for channel in shown.values() if len(channel.frames)]
     return min((int(some[0]) for some in times if len(some)), default=0)
 
 
-def _frames(opened: log.Log, shown: Mapping[str, ChannelToDraw], topic: str, schema: Schema) -> list[Frame]:
+def _frames(opened: log.Log, shown: Mapping[str, ChannelToDraw], topic: str, schema: Schema) -> Sequence[Frame]:
     """Return the frames of a channel of this run or of the log; empty if there is none with such rows."""
     if topic in shown:
-        return shown[topic].frames if shown[topic].schema is schema else []
+        return shown[topic].frames if shown[topic].schema is schema else ()
     channel = opened.channels.get(topic)
-    return opened.frames(topic, schema) if channel and channel.schema_name == schema.name else []
+    return opened.frame_columns(topic, schema) if channel and channel.schema_name == schema.name else ()
 
 
 def _last_step(opened: log.Log, prefix: str, shown: Mapping[str, ChannelToDraw]) -> int:
     """Return the horizon of forecasts as a number of steps; 0 if there are no forecasts."""
     for name in ("retracks/predictions", "predictions"):
         frames = _frames(opened, shown, f"{prefix}/{name}", PREDICTIONS)
-        last = max((int(frame.rows["step"].max()) for frame in frames if len(frame.rows)), default=0)
-        if last:
-            return last
+        steps = unique_values(PREDICTIONS, frames, "step")
+        if len(steps):
+            return int(steps[-1])
     return 0
 
 
@@ -287,7 +293,7 @@ def _is_truth_known(opened: log.Log, prefix: str, shown: Mapping[str, ChannelToD
     """Return whether any forecast is compared with the ground truth."""
     for name in ("retracks/predictions", "predictions"):
         frames = _frames(opened, shown, f"{prefix}/{name}/scores", FORECAST_SCORES)
-        if any(np.isfinite(frame.rows["ade_m"]).any() for frame in frames):
+        if has_any(FORECAST_SCORES, frames, lambda rows: np.isfinite(rows["ade_m"])):
             return True
     return False
 
@@ -296,7 +302,7 @@ def _positions(opened: log.Log, prefix: str, shown: Mapping[str, ChannelToDraw])
     """Return positions of people, (N, 2) in m, from the first channel of tracks that has any."""
     for name in ("retracks", "tracks", "truth", "samples"):
         frames = _frames(opened, shown, f"{prefix}/{name}", TRACKS)
-        rows = TRACKS.joined([frame.rows for frame in frames])
+        rows = join_frames(TRACKS, thinned(frames, _MOST_ROWS)).rows
         xy_m = np.stack([rows["x_m"], rows["y_m"]], axis=-1)
         if np.isfinite(xy_m).all(axis=1).any():
             return xy_m
@@ -317,7 +323,8 @@ def _frame_id(opened: log.Log, prefix: str, shown: Mapping[str, ChannelToDraw]) 
 def _floor_m(opened: log.Log, prefix: str, shown: Mapping[str, ChannelToDraw]) -> float:
     """Return the usual height of the bottoms of 3D boxes; 0 if there are none."""
     for name in ("retracks", "tracks", "truth", "samples"):
-        rows = TRACKS.joined([frame.rows for frame in _frames(opened, shown, f"{prefix}/{name}", TRACKS)])
+        frames = _frames(opened, shown, f"{prefix}/{name}", TRACKS)
+        rows = join_frames(TRACKS, thinned(frames, _MOST_ROWS)).rows
         base_m = rows["z_m"] - rows["height_m"] / 2
         if np.isfinite(base_m).any():
             return round(float(np.nanmedian(base_m)), 1)

@@ -13,7 +13,7 @@ from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.camera_path import FAR, CameraPath, CameraPose, Verdict, verdict_of
 from mcaptrack.schema import CAMERA_MOTION, TRACKS, Frame, Rows
-from mcaptrack.schema.framing import join_frames, split_rows
+from mcaptrack.schema.framing import JoinedFrames, mapped_rows
 
 _MOTION: Final = ("m00", "m01", "m02_px", "m10", "m11", "m12_px")
 _REFERENCE: Final = ("r00", "r01", "r02_px", "r10", "r11", "r12_px")
@@ -77,18 +77,20 @@ def is_motion(matrix: Floats) -> bool:
     return bool(np.isfinite(matrix).all() and abs(np.linalg.det(matrix[:, :2])) > 1e-12)
 
 
-def to_scene(frames: Sequence[Frame], path: CameraPath | None) -> list[Frame]:
+def to_scene(frames: Sequence[Frame], path: CameraPath | None) -> Sequence[Frame]:
     """Return frames of tracks with boxes in pixels of the reference picture; as they are without a path."""
-    return list(frames) if path is None else _moved(frames, path.to_scene)
+    return frames if path is None else _moved(frames, path.to_scene)
 
 
-def to_pictures(frames: Sequence[Frame], path: CameraPath | None) -> list[Frame]:
+def to_pictures(frames: Sequence[Frame], path: CameraPath | None) -> Sequence[Frame]:
     """Return frames of tracks with boxes in pixels of the picture at their time; as they are without a path."""
-    return list(frames) if path is None else _moved(frames, path.to_pictures)
+    return frames if path is None else _moved(frames, path.to_pictures)
 
 
-def _moved(frames: Sequence[Frame], move: Callable[[Floats, Ints], Floats]) -> list[Frame]:
-    joined = join_frames(TRACKS, frames)
-    rows = joined.rows.copy()
-    rows["x_px"], rows["y_px"], rows["w_px"], rows["h_px"] = move(columns_to_boxes(rows), joined.row_ns).T
-    return split_rows(joined.t_ns, [frame.index for frame in frames], rows, joined.ends[1:])
+def _moved(frames: Sequence[Frame], move: Callable[[Floats, Ints], Floats]) -> Sequence[Frame]:
+    def moved(joined: JoinedFrames) -> Rows:
+        rows = joined.rows
+        rows["x_px"], rows["y_px"], rows["w_px"], rows["h_px"] = move(columns_to_boxes(rows), joined.row_ns).T
+        return rows
+
+    return mapped_rows(TRACKS, frames, moved)

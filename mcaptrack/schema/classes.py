@@ -61,11 +61,13 @@ def only_class(schema: Schema, frames: Iterable[Frame]) -> int:
     """The class of all rows, if it stands in the metadata instead of in the rows; otherwise 0."""
     if not any(column.name == _COLUMN and column.since for column in schema.columns):
         return UNKNOWN
-    parts = [frame.rows[_COLUMN] for frame in frames if len(frame.rows)]
-    if not parts or not parts[0][0]:
-        return UNKNOWN
-    first = parts[0][0]
-    return int(first) if all((part == first).all() for part in parts) else UNKNOWN
+    first = UNKNOWN
+    for frame in frames:
+        if len(frame.rows):
+            first = first or int(frame.rows[_COLUMN][0])
+            if not first or (frame.rows[_COLUMN] != first).any():
+                return UNKNOWN
+    return first
 
 
 def without_class(rows: Rows) -> Rows:

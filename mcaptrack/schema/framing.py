@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from mcaptrack.geometry.arrays import Ints
 from mcaptrack.geometry.ragged import group_index
 from mcaptrack.schema import Frame, Rows, Schema
+from mcaptrack.schema.frame_columns import FrameCollector, FrameColumns
+
+#: The number of rows that are computed with at once where a channel may have more than fit into memory.
+PART_ROWS: Final = 2**16
 
 
 class JoinedFrames(NamedTuple):
@@ -32,10 +36,26 @@ class JoinedFrames(NamedTuple):
 
 def frame_times(frames: Sequence[Frame]) -> Ints:
     """The times of frames (F,)."""
+    if isinstance(frames, FrameColumns):
+        return frames.t_ns
     return np.fromiter((frame.t_ns for frame in frames), np.int64, len(frames))
 
 
-def join_frames(schema: Schema, frames: Sequence[Frame]) -> JoinedFrames:
+def frame_numbers(frames: Sequence[Frame]) -> Ints:
+    """The numbers of frames (F,)."""
+    if isinstance(frames, FrameColumns):
+        return frames.index
+    return np.fromiter((frame.index for frame in frames), np.int64, len(frames))
+
+
+def row_ends(frames: Sequence[Frame]) -> Ints:
+    """Where the rows of frames end if they are laid end to end: those of frame f are ``[f]`` to ``[f + 1]``, (F + 1,)."""
+    if isinstance(frames, FrameColumns):
+        return frames.ends
+    return np.cumsum([0, *(len(frame.rows) for frame in frames)])
+
+
+def join_frames(schema: Schema, frames: Sequence[Frame], first: int = 0, last: int | None = None) -> JoinedFrames:
     """Lay the rows of frames end to end.
 
     Parameters
@@ -43,14 +63,92 @@ def join_frames(schema: Schema, frames: Sequence[Frame]) -> JoinedFrames:
     schema : Schema
         Of the rows.
     frames : sequence of Frame
+    first, last : int, optional
+        Only the frames from ``first`` to before ``last``.
 
     Returns
     -------
     JoinedFrames
     """
-    counts = [len(frame.rows) for frame in frames]
-    rows = schema.joined([frame.rows for frame in frames])
-    return JoinedFrames(rows, group_index(counts), frame_times(frames), np.cumsum([0, *counts]))
+    last = len(frames) if last is None else last
+    if isinstance(frames, FrameColumns):
+        ends = frames.ends[first : last + 1] - frames.ends[first]
+        rows = frames.rows(first, last)
+        return JoinedFrames(rows, group_index(np.diff(ends)), frames.t_ns[first:last], ends)
+    some = frames if (first, last) == (0, len(frames)) else frames[first:last]
+    counts = [len(frame.rows) for frame in some]
+    rows = schema.joined([frame.rows for frame in some])
+    return JoinedFrames(rows, group_index(counts), frame_times(some), np.cumsum([0, *counts]))
+
+
+def spans_of(ends: Ints, rows: int = PART_ROWS) -> Iterator[tuple[int, int]]:
+    """First and last of the consecutive frames that have about so many rows together; ``ends`` as in ``row_ends``."""
+    low, count = 0, len(ends) - 1
+    while low < count:
+        high = int(np.searchsorted(ends, ends[low] + rows, "right")) - 1
+        high = min(max(high, low + 1), low + max(rows, 1), count)
+        yield low, high
+        low = high
+
+
+def joined_parts(
+    schema: Schema, frames: Sequence[Frame], rows: int = PART_ROWS
+) -> Iterator[tuple[int, int, JoinedFrames]]:
+    """Frames as ``join_frames`` lays them end to end, some at a time.
+
+    Parameters
+    ----------
+    schema : Schema
+    frames : sequence of Frame
+    rows : int, optional
+        About how many rows are laid end to end at once.
+
+    Yields
+    ------
+    tuple of int, int and JoinedFrames
+        First and last of the frames, and their rows.
+    """
+    for low, high in spans_of(row_ends(frames), rows):
+        yield low, high, join_frames(schema, frames, low, high)
+
+
+def mapped_rows(schema: Schema, frames: Sequence[Frame], change: Callable[[JoinedFrames], Rows]) -> FrameColumns:
+    """Frames with other values in their rows: ``change`` gives as many rows as it gets, some at a time."""
+    out, numbers = FrameCollector(schema), frame_numbers(frames)
+    for low, high, joined in joined_parts(schema, frames):
+        out.extend(joined.t_ns, numbers[low:high], joined.ends, change(joined))
+    return out.done()
+
+
+def filtered_rows(
+    schema: Schema, frames: Sequence[Frame], keep: Callable[[JoinedFrames], NDArray[Any]]
+) -> FrameColumns:
+    """Frames with some of their rows: ``keep`` gives a mask (N,) of the rows that it gets, some at a time."""
+    out, numbers = FrameCollector(schema), frame_numbers(frames)
+    for low, high, joined in joined_parts(schema, frames):
+        kept = keep(joined)
+        ends = np.concatenate([[0], kept.cumsum()])[joined.ends]
+        out.extend(joined.t_ns, numbers[low:high], ends, joined.rows[kept])
+    return out.done()
+
+
+def has_any(schema: Schema, frames: Sequence[Frame], holds: Callable[[Rows], NDArray[Any]]) -> bool:
+    """Whether any row of frames is one for which ``holds`` gives true; it gets rows (N,) and returns a mask (N,)."""
+    return any(bool(holds(joined.rows).any()) for _, _, joined in joined_parts(schema, frames))
+
+
+def unique_values(schema: Schema, frames: Sequence[Frame], column: str) -> NDArray[Any]:
+    """The different values of a column of all rows, rising."""
+    values = np.empty(0, schema.dtype[column])
+    for _, _, joined in joined_parts(schema, frames):
+        values = np.unique(np.concatenate([values, joined.rows[column]]))
+    return values
+
+
+def thinned(frames: Sequence[Frame], rows: int) -> Sequence[Frame]:
+    """Every second, third ... frame, as few as needed to have at most about so many rows; all if these are few."""
+    every = -(-int(row_ends(frames)[-1]) // rows)
+    return frames if every <= 1 else frames[::every]
 
 
 def split_rows(t_ns: Iterable[int], index: Iterable[int], rows: Rows, ends: ArrayLike) -> list[Frame]:

@@ -5,7 +5,7 @@ Letters: N rows in, F frames in, T times, S rows out.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Final
 
 import numpy as np
@@ -15,7 +15,7 @@ from mcaptrack.geometry.angles import wrapped
 from mcaptrack.geometry.arrays import Ints
 from mcaptrack.geometry.ragged import group_index, ragged_range, run_ends, run_starts
 from mcaptrack.schema import TRACKS, Frame, Rows
-from mcaptrack.schema.framing import join_frames
+from mcaptrack.schema.framing import PART_ROWS, frame_times, join_frames, row_ends
 
 #: The columns of a track that are interpolated, and those that are angles.
 LINEAR: Final = (
@@ -27,17 +27,19 @@ ANGLES: Final = ("heading_rad",)
 _MAX_STEP: Final = 1.5
 
 
-def resample(frames: Sequence[Frame], at_ns: Ints, max_gap_ns: int) -> tuple[Rows, Ints]:
+def resample(frames: Sequence[Frame], at_ns: Ints, max_gap_ns: int, usual_ns: float | None = None) -> tuple[Rows, Ints]:
     """Resample tracks to the times ``at_ns``.
 
     Parameters
     ----------
     frames : sequence of Frame
-        Rows of tracks.
+        Rows of tracks. Only those near the times are read.
     at_ns : (T,) of int64
         Sorted times in nanoseconds.
     max_gap_ns : int
         Rows of one id are interpolated if they are at most this far apart.
+    usual_ns : float, optional
+        The usual time between two frames, by default the median; a longer one is a gap.
 
     Returns
     -------
@@ -46,8 +48,12 @@ def resample(frames: Sequence[Frame], at_ns: Ints, max_gap_ns: int) -> tuple[Row
     at : (S,) of int64
         Index of the time of each row in ``at_ns``.
     """
-    joined = join_frames(TRACKS, frames)
-    usual_ns = float(np.median(np.diff(joined.t_ns))) if len(frames) > 1 else 0.0
+    t_ns, low, high = frame_times(frames), 0, len(frames)
+    usual_ns = interval_ns(t_ns) if usual_ns is None else usual_ns
+    if len(at_ns):  # a row that is farther away is not linked over any of the times
+        low = int(np.searchsorted(t_ns, at_ns[0] - max_gap_ns, "left"))
+        high = int(np.searchsorted(t_ns, at_ns[-1] + max_gap_ns, "right"))
+    joined = join_frames(TRACKS, frames, low, high)
     order = np.lexsort((joined.row_ns, joined.rows["track_id"]))
     rows, row_ns = joined.rows[order], joined.row_ns[order]
     has_next = ~run_ends(run_starts(rows["track_id"]))
@@ -74,6 +80,38 @@ def resample(frames: Sequence[Frame], at_ns: Ints, max_gap_ns: int) -> tuple[Row
     out["observed"] = np.where(share == 0, rows["observed"][before], between)
     order = np.lexsort((out["track_id"], at))
     return out[order], at[order].astype(np.int64)
+
+
+def resample_parts(
+    frames: Sequence[Frame], at_ns: Ints, max_gap_ns: int, rows: int = PART_ROWS
+) -> Iterator[tuple[int, int, Rows, Ints]]:
+    """Resample tracks as ``resample`` does, to some of the times at once: all rows may take more than the memory.
+
+    Parameters
+    ----------
+    frames, at_ns, max_gap_ns
+        As for ``resample``.
+    rows : int, optional
+        About how many rows are resampled at once.
+
+    Yields
+    ------
+    first, last : int
+        The times ``at_ns[first:last]``; the first ones first.
+    rows, at
+        What ``resample`` returns for these times; ``at`` are indices in ``at_ns``.
+    """
+    usual_ns, total = interval_ns(frame_times(frames)), int(row_ends(frames)[-1])
+    most = max(total, round(total / max(len(frames), 1) * len(at_ns)))
+    cuts = np.linspace(0, len(at_ns), max(min(-(-most // rows), len(at_ns)), 1) + 1).astype(np.int64).tolist()
+    for first, last in zip(cuts[:-1], cuts[1:], strict=True):
+        out, at = resample(frames, at_ns[first:last], max_gap_ns, usual_ns)
+        yield first, last, out, at + first
+
+
+def interval_ns(t_ns: Ints) -> float:
+    """The usual time between two frames at these times: the median."""
+    return float(np.median(np.diff(t_ns))) if len(t_ns) > 1 else 0.0
 
 
 def is_observed_at(frame_ns: Ints, at_ns: Ints, max_gap_ns: int) -> NDArray[np.bool_]:

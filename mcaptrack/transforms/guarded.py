@@ -121,6 +121,8 @@ class _Source:
         if not self._open[key]:
             return False
         self._open[key] -= 1
+        if not self._open[key]:
+            del self._open[key]
         return True
 
     def unanswered(self) -> int:

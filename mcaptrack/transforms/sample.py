@@ -19,8 +19,9 @@ from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
 from mcaptrack.geometry.plane import Planes, plane_at
 from mcaptrack.geometry.ragged import ragged_range
 from mcaptrack.schema import TRACKS, Frame, Rows, Schema
-from mcaptrack.schema.framing import frame_times
-from mcaptrack.schema.resampling import resample
+from mcaptrack.schema.frame_columns import FrameCollector
+from mcaptrack.schema.framing import frame_numbers, frame_times, split_rows
+from mcaptrack.schema.resampling import resample_parts
 from mcaptrack.transforms.protocol import check_options, context, option
 
 
@@ -64,18 +65,20 @@ class Sample:
         return MappingProxyType({"": max(self.max_gap_s, 2 / self.rate_hz)})
 
     def __call__(self, frames: Iterable[Frame]) -> Iterator[tuple[Frame, ...]]:
-        in_metres = [frame._replace(rows=_in_metres(frame, self.ground_planes)) for frame in frames]
-        if not in_metres:
+        kept = FrameCollector(TRACKS)
+        for frame in frames:
+            kept.append(frame._replace(rows=_in_metres(frame, self.ground_planes)))
+        in_metres = kept.done()
+        if not len(in_metres):
             return
-        frame_ns = frame_times(in_metres)
-        indices = np.array([frame.index for frame in in_metres])
+        frame_ns, indices = frame_times(in_metres), frame_numbers(in_metres)
         tick_ns = self._ticks(frame_ns, int(frame_ns[0]) if self.start_ns is None else self.start_ns)
-        rows, at = resample(in_metres, tick_ns, seconds_to_ns(self.max_gap_s))
-        rows["source_id"] = rows["track_id"]
         picture = indices[np.searchsorted(frame_ns, tick_ns, "right") - 1]  # the last one at each sample time
-        first, last = (np.searchsorted(at, np.arange(len(tick_ns)), side) for side in ("left", "right"))
-        for index, t_ns, low, high in zip(*(a.tolist() for a in (picture, tick_ns, first, last)), strict=True):
-            yield (Frame(t_ns, index, rows[low:high]),)
+        for first, last, rows, at in resample_parts(in_metres, tick_ns, seconds_to_ns(self.max_gap_s)):
+            rows["source_id"] = rows["track_id"]
+            ends = np.searchsorted(at, np.arange(first, last), "right")
+            made = split_rows(tick_ns[first:last].tolist(), picture[first:last].tolist(), rows, ends)
+            yield from ((frame,) for frame in made)
 
     def why_empty(self, given: Sequence[Frame], made: Sequence[Frame]) -> str:
         """Why there are no samples, for a warning."""

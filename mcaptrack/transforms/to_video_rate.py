@@ -15,7 +15,16 @@ from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.plane import Planes, plane_at
 from mcaptrack.geometry.ragged import run_starts
 from mcaptrack.schema import TRACKS, Frame, Rows
-from mcaptrack.schema.framing import frame_times, join_frames, split_rows
+from mcaptrack.schema.frame_columns import FrameCollector, FrameColumns, collect
+from mcaptrack.schema.framing import (
+    JoinedFrames,
+    frame_numbers,
+    frame_times,
+    has_any,
+    join_frames,
+    joined_parts,
+    mapped_rows,
+)
 from mcaptrack.schema.resampling import resample
 
 #: Columns taken from the tracker where it has a box.
@@ -24,7 +33,7 @@ _FROM_TRACKER: Final = ("x_px", "y_px", "w_px", "h_px", "score", "observed")
 _IN_METRES: Final = ("x_m", "y_m", "z_m", "heading_rad", "vx_m_per_s", "vy_m_per_s")
 
 
-def to_video_rate(tracks: Sequence[Frame], retracks: Sequence[Frame], planes: Planes) -> list[Frame]:
+def to_video_rate(tracks: Sequence[Frame], retracks: Sequence[Frame], planes: Planes) -> FrameColumns:
     """The frames of ``tracks`` with the ids of ``retracks``.
 
     Each box of the tracker gets the re-tracked id that its track has at the nearest sample time. Where a re-tracked
@@ -42,14 +51,41 @@ def to_video_rate(tracks: Sequence[Frame], retracks: Sequence[Frame], planes: Pl
 
     Returns
     -------
-    list of Frame
-        One for each of ``tracks``; no id is at two places of a frame, and no box has two ids.
+    FrameColumns
+        One frame for each of ``tracks``; no id is at two places of a frame, and no box has two ids.
     """
     if not tracks or not retracks:
-        return [Frame(frame.t_ns, frame.index, TRACKS.empty()) for frame in tracks]
-    tick_ns = frame_times(retracks)
+        return collect(TRACKS, (Frame(frame.t_ns, frame.index, TRACKS.empty()) for frame in tracks))
+    tick_ns, numbers = frame_times(retracks), frame_numbers(tracks)
     period = int(np.median(np.diff(tick_ns))) if len(tick_ns) > 1 else 1
-    boxes, at, frame_ns, _ = join_frames(TRACKS, tracks)
+    reach_ns = round(1.5 * period)
+    classes = _classes_of(retracks)
+    has_velocity = not has_any(TRACKS, tracks, lambda rows: ~np.isfinite(rows["vx_m_per_s"]))
+    columns = (*_FROM_TRACKER, *_IN_METRES) if has_velocity else _FROM_TRACKER
+    out = FrameCollector(TRACKS)
+    for first, last, joined in joined_parts(TRACKS, tracks):
+        # A sample farther away than that is neither the nearest of a box nor linked over the times of these frames.
+        low = int(np.searchsorted(tick_ns, joined.t_ns[0] - reach_ns - 1, "left"))
+        high = int(np.searchsorted(tick_ns, joined.t_ns[-1] + reach_ns + 1, "right"))
+        near = retracks if (low, high) == (0, len(retracks)) else retracks[low:high]
+        rows, ends = _part(joined, near, period, columns, planes, classes)
+        out.extend(joined.t_ns, numbers[first:last], ends, rows)
+    return out.done()
+
+
+def _part(
+    joined: JoinedFrames,
+    retracks: Sequence[Frame],
+    period: int,
+    columns: Sequence[str],
+    planes: Planes,
+    classes: tuple[Ints, Ints],
+) -> tuple[Rows, Ints]:
+    """The rows of some frames of the tracker with re-tracked ids, and where those of each frame end.
+
+    ``retracks`` are those near in time, ``period`` ns apart; ``columns`` are taken from the tracker where it has a box.
+    """
+    boxes, at, frame_ns, _ = joined
     base, base_at = resample(retracks, frame_ns, round(1.5 * period))
     base["observed"], base["source_id"] = False, -1
 
@@ -67,8 +103,7 @@ def to_video_rate(tracks: Sequence[Frame], retracks: Sequence[Frame], planes: Pl
     want = at * width + np.searchsorted(names, ids)
     place = np.minimum(np.searchsorted(have, want), max(len(have) - 1, 0))  # base is ordered by time and id
     inside = have[place] == want if len(have) else np.zeros(len(want), bool)
-    in_metres = len(boxes) > 0 and bool(np.isfinite(boxes["vx_m_per_s"]).all())
-    for name in (*_FROM_TRACKER, *_IN_METRES) if in_metres else _FROM_TRACKER:
+    for name in columns:
         base[name][place[inside]] = boxes[name][inside]
     base["source_id"][place[inside]] = boxes["track_id"][inside]
     outside = boxes[~inside]
@@ -76,22 +111,24 @@ def to_video_rate(tracks: Sequence[Frame], retracks: Sequence[Frame], planes: Pl
     _to_metres(outside, frame_ns[at[~inside]], planes)
     rows = np.concatenate([base, outside])
     rows_at = np.concatenate([base_at, at[~inside]])
-    _set_classes(rows, retracks)
+    known, class_id = classes
+    if len(known):  # of the re-tracked track: that of the tracker's box may be another one
+        rows["class_id"] = class_id[np.searchsorted(known, rows["track_id"])]
     order = np.lexsort((rows["track_id"], rows_at))
     rows, rows_at = rows[order], rows_at[order]
-    ends = np.searchsorted(rows_at, np.arange(len(tracks)), "right")
-    return split_rows(frame_ns, [frame.index for frame in tracks], rows, ends)
+    return rows, np.searchsorted(rows_at, np.arange(len(frame_ns) + 1), "left")
 
 
-def unchanged_tracks(tracks: Sequence[Frame], planes: Planes) -> list[Frame]:
+def unchanged_tracks(tracks: Sequence[Frame], planes: Planes) -> FrameColumns:
     """The frames of ``tracks`` under the ids that they have, in the form of ``to_video_rate``."""
-    out = []
-    for frame in tracks:
-        rows = frame.rows.copy()
+
+    def unchanged(joined: JoinedFrames) -> Rows:
+        rows = joined.rows
         rows["source_id"] = rows["track_id"]
-        _to_metres(rows, np.full(len(rows), frame.t_ns), planes)
-        out.append(frame._replace(rows=rows))
-    return out
+        _to_metres(rows, joined.row_ns, planes)
+        return rows
+
+    return mapped_rows(TRACKS, tracks, unchanged)
 
 
 def _retracked_ids(track: Ints, t_ns: Ints, retracks: Sequence[Frame]) -> tuple[Ints, Ints]:
@@ -120,17 +157,23 @@ def _retracked_ids(track: Ints, t_ns: Ints, retracks: Sequence[Frame]) -> tuple[
     return ids, distance_ns
 
 
-def _set_classes(rows: Rows, retracks: Sequence[Frame]) -> None:
-    """Give rows the class of their re-tracked track, in place: that of the tracker's box may be another one."""
-    of = join_frames(TRACKS, retracks).rows
-    ids, first = np.unique(of["track_id"], return_index=True)
-    if len(ids):
-        rows["class_id"] = of["class_id"][first][np.searchsorted(ids, rows["track_id"])]
+def _classes_of(retracks: Sequence[Frame]) -> tuple[Ints, Ints]:
+    """The ids of re-tracked tracks, rising, and the class of the first row of each."""
+    known, classes = np.empty(0, np.int64), np.empty(0, np.int64)
+    for _, _, joined in joined_parts(TRACKS, retracks):
+        ids = np.concatenate([known, joined.rows["track_id"]])
+        those = np.concatenate([classes, joined.rows["class_id"]])
+        known, first = np.unique(ids, return_index=True)
+        classes = those[first]
+    return known, classes
 
 
 def _to_metres(rows: Rows, t_ns: Ints, planes: Planes) -> None:
     """Fill in missing positions in metres, in place, where there is a ground plane."""
-    for when in np.unique(t_ns[np.isnan(rows["x_m"])]).tolist():
-        plane, here = plane_at(planes, when), (t_ns == when) & np.isnan(rows["x_m"])
+    missing = np.flatnonzero(np.isnan(rows["x_m"]))
+    missing = missing[np.argsort(t_ns[missing], kind="stable")]
+    starts = np.flatnonzero(run_starts(t_ns[missing]))
+    for here in np.split(missing, starts[1:]) if len(missing) else ():
+        plane = plane_at(planes, int(t_ns[here[0]]))
         if plane is not None:
             rows["x_m"][here], rows["y_m"][here] = plane.boxes_to_metres(columns_to_boxes(rows[here])).T

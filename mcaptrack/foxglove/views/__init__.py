@@ -12,7 +12,7 @@ import numpy as np
 
 from mcaptrack.foxglove.views import ground, image, projected
 from mcaptrack.foxglove.views.image import View
-from mcaptrack.foxglove.views.people import People, people_at
+from mcaptrack.foxglove.views.people import PeopleInParts
 from mcaptrack.foxglove.views.projected import MovingCamera
 from mcaptrack.foxglove.views.style import line_unit, style_of
 from mcaptrack.geometry.arrays import Ints
@@ -52,7 +52,7 @@ class Drawing:
         self._classes = classes
         self._schema, self._frames, self._planes, self._path = schema, frames, planes, path
         self._style = style_of(topic, is_retracked)
-        self._known: tuple[Ints, People] | None = None
+        self._known: PeopleInParts | None = None
 
     def on_pictures(self, picture_ns: Ints, stamp_ns: Ints) -> View:
         """Annotation messages (time, frame, payload), one for each picture.
@@ -91,8 +91,8 @@ class Drawing:
         elif self._schema is DETECTIONS:
             yield from ground.detections(self._frames, t_ns, frame_id, self._classes)
 
-    def _people(self, t_ns: Ints) -> People:
+    def _people(self, t_ns: Ints) -> PeopleInParts:
         """The people at these times, computed once for both views."""
-        if self._known is None or not np.array_equal(self._known[0], t_ns):
-            self._known = t_ns, people_at(self._frames, t_ns, self._planes, self._classes, self._path)
-        return self._known[1]
+        if self._known is None or not np.array_equal(self._known.at_ns, t_ns):
+            self._known = PeopleInParts(self._frames, t_ns, self._planes, self._classes, self._path)
+        return self._known

@@ -12,15 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack.foxglove import SceneMessages, class_colour, colours
-from mcaptrack.foxglove.views.image import View, fade
+from mcaptrack.foxglove.views.image import BATCH, View, fade
 from mcaptrack.foxglove.views.people import (
     ForecastPaths,
-    People,
+    PeopleInParts,
     base_heights,
     bodies_of,
     by_count,
     ellipses,
-    forecasts,
+    forecasts_in_parts,
     labels_of,
     latest,
     segments,
@@ -34,7 +34,6 @@ from mcaptrack.geometry.plane import GroundPlane, Planes
 from mcaptrack.schema import DETECTIONS, Frame
 from mcaptrack.schema.framing import frame_times, join_frames
 
-_BATCH: Final = 128
 _WHITE: Final = (1.0, 1.0, 1.0)
 _FORECAST_PX: Final = 3.0
 #: The opacity of detections, which tracks are seen through.
@@ -69,49 +68,52 @@ class _Instants:
     def __init__(self, t_ns: Ints, frame_id: str) -> None:
         self.t_ns, self._frame_id, self._lifetime_ns = t_ns, frame_id, lifetime_ns(t_ns)
 
-    def batches(self) -> Iterator[tuple[slice, SceneMessages]]:
-        for start in range(0, len(self.t_ns), _BATCH):
-            span = slice(start, min(start + _BATCH, len(self.t_ns)))
+    def batches(self, first: int = 0, last: int | None = None) -> Iterator[tuple[slice, SceneMessages]]:
+        last = len(self.t_ns) if last is None else last
+        for start in range(first, last, BATCH):
+            span = slice(start, min(start + BATCH, last))
             yield span, SceneMessages(self.t_ns[span], self._frame_id, self._lifetime_ns)
 
     def numbered(self, span: slice, scene: SceneMessages) -> View:
         yield from zip(self.t_ns[span].tolist(), range(span.start, span.stop), scene.messages(), strict=True)
 
 
-def tracks(people: People, t_ns: Ints, frame_id: str, style: TrackStyle, classes: Mapping[int, str] = {}) -> View:
+def tracks(shown: PeopleInParts, t_ns: Ints, frame_id: str, style: TrackStyle, classes: Mapping[int, str] = {}) -> View:
     """Draw cylinders with numbers and fading trails; interpolated positions are fainter.
 
-    ``people`` are those at these times. 3D boxes are drawn in the colours of their ``classes``, names by number.
+    ``shown`` are those at these times. 3D boxes are drawn in the colours of their ``classes``, names by number.
     """
     instants = _Instants(t_ns, frame_id)
-    has_body = people.has_body()
-    known = np.asarray(np.isfinite(people.at_m).all(axis=1), np.bool_)
-    lines = trails(people, known, t_ns)
-    longest = lines.row.shape[1] - 1
-    rgb = np.broadcast_to(_WHITE, (len(people.number), 3)) if style.is_white else colours(people.number)
-    body_rgb = rgb if style.is_white else class_colours(people.class_id, classes)
-    strength = np.where(people.observed, OBSERVED, INTERPOLATED)
-    alpha, body_alpha = 0.875 * strength, 0.625 * strength
-    places = np.column_stack([people.at_m, people.body.base_m()])
-    bounds = np.searchsorted(people.frame, np.arange(len(t_ns) + 1))
-    for span, scene in instants.batches():
-        rows = np.arange(bounds[span.start], bounds[span.stop])
-        rows = rows[known[rows]]
-        for points, is_solid, these in _alike(lines.points, has_body, rows):
-            trail = places[lines.row[these, -points:], : 3 if is_solid else 2]
-            opacity = fade(points, longest + 1)
-            if style.marker.in_pieces:
-                trail, opacity = segments(trail, style.dash), np.repeat(opacity[1:], 2)
-            frame, label = people.frame[these] - span.start, people.label[these]
-            if is_solid:
-                boxes = people.body.chosen(these)
-                scene.boxes(
-                    frame, label, boxes, body_rgb[these], body_alpha[these], rgb[these], style.box, trail, opacity,
-                    style.marker,
-                )  # fmt: skip
-            else:
-                scene.people(frame, label, people.at_m[these], rgb[these], alpha[these], style.marker, trail, opacity)
-        yield from instants.numbered(span, scene)
+    for first, last, people in shown.parts(BATCH):
+        has_body = people.has_body()
+        known = np.asarray(np.isfinite(people.at_m).all(axis=1), np.bool_)
+        lines = trails(people, known, t_ns)
+        longest = lines.row.shape[1] - 1
+        rgb = np.broadcast_to(_WHITE, (len(people.number), 3)) if style.is_white else colours(people.number)
+        body_rgb = rgb if style.is_white else class_colours(people.class_id, classes)
+        strength = np.where(people.observed, OBSERVED, INTERPOLATED)
+        alpha, body_alpha = 0.875 * strength, 0.625 * strength
+        places = np.column_stack([people.at_m, people.body.base_m()])
+        for span, scene in instants.batches(first, last):
+            rows = np.arange(*np.searchsorted(people.frame, [span.start, span.stop]))
+            rows = rows[known[rows]]
+            for points, is_solid, these in _alike(lines.points, has_body, rows):
+                trail = places[lines.row[these, -points:], : 3 if is_solid else 2]
+                opacity = fade(points, longest + 1)
+                if style.marker.in_pieces:
+                    trail, opacity = segments(trail, style.dash), np.repeat(opacity[1:], 2)
+                frame, label = people.frame[these] - span.start, people.label[these]
+                if is_solid:
+                    boxes = people.body.chosen(these)
+                    scene.boxes(
+                        frame, label, boxes, body_rgb[these], body_alpha[these], rgb[these], style.box, trail, opacity,
+                        style.marker,
+                    )  # fmt: skip
+                else:
+                    scene.people(
+                        frame, label, people.at_m[these], rgb[these], alpha[these], style.marker, trail, opacity
+                    )
+            yield from instants.numbered(span, scene)
 
 
 def detections(frames: Sequence[Frame], t_ns: Ints, frame_id: str, classes: Mapping[int, str] = {}) -> View:
@@ -127,7 +129,7 @@ def detections(frames: Sequence[Frame], t_ns: Ints, frame_id: str, classes: Mapp
     if (number < 0).any() or len(np.unique(np.stack([joined.frame, number]), axis=1).T) < len(number):
         number = np.arange(len(number)) - joined.ends[joined.frame]
     class_id = joined.rows["class_id"].astype(np.int64)
-    label, rgb = labels_of(number, class_id, classes), class_colours(class_id, classes)
+    label, rgb = labels_of(number, class_id, classes if len(np.unique(class_id)) > 1 else None), class_colours(class_id, classes)
     bounds = np.searchsorted(joined.frame[known], np.arange(len(t_ns) + 1))
     for span, scene in instants.batches():
         rows = known[bounds[span.start] : bounds[span.stop]]
@@ -161,22 +163,22 @@ def predictions(frames: Sequence[Frame], t_ns: Ints, frame_id: str, bodies: Sequ
     """
     instants = _Instants(t_ns, frame_id)
     wanted = latest(frames, t_ns)
-    futures = [
-        (raised(future, frames, bodies), ellipses(future.spread_m2), colours(future.number))
-        for future in forecasts(frames)
-    ]
-    for span, scene in instants.batches():
-        for future, (half, turn), rgb in futures:
-            which, frame = shown_at(future.message, wanted[span])
-            path = future.path_m[which]
-            weaker = fade(path.shape[1], path.shape[1], weakest=0.25)[::-1]
-            is_known = np.isfinite(half[which]).all(axis=1)
-            for has_ellipse in (True, False):
-                ok = is_known == has_ellipse
-                at = which[ok]
-                spread = (future.end_m[at], half[at], turn[at]) if has_ellipse else None
-                scene.forecasts(frame[ok], future.number[at], path[ok], rgb[at], weaker, _FORECAST_PX, spread)
-        yield from instants.numbered(span, scene)
+    for first, last, found in forecasts_in_parts(frames, wanted, BATCH, is_whole=bool(bodies)):
+        futures = [
+            (raised(future, frames, bodies), ellipses(future.spread_m2), colours(future.number)) for future in found
+        ]
+        for span, scene in instants.batches(first, last):
+            for future, (half, turn), rgb in futures:
+                which, frame = shown_at(future.message, wanted[span])
+                path = future.path_m[which]
+                weaker = fade(path.shape[1], path.shape[1], weakest=0.25)[::-1]
+                is_known = np.isfinite(half[which]).all(axis=1)
+                for has_ellipse in (True, False):
+                    ok = is_known == has_ellipse
+                    at = which[ok]
+                    spread = (future.end_m[at], half[at], turn[at]) if has_ellipse else None
+                    scene.forecasts(frame[ok], future.number[at], path[ok], rgb[at], weaker, _FORECAST_PX, spread)
+            yield from instants.numbered(span, scene)
 
 
 def raised(future: ForecastPaths, frames: Sequence[Frame], bodies: Sequence[Frame]) -> ForecastPaths:

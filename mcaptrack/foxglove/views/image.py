@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from mcaptrack.foxglove import Annotations, colours
 from mcaptrack.foxglove.views.people import (
     ForecastPaths,
-    People,
+    PeopleInParts,
     by_count,
     by_plane,
     ellipse_points,
     ellipses,
-    forecasts,
+    forecasts_in_parts,
     latest,
     segments,
     shown_at,
@@ -36,7 +36,7 @@ from mcaptrack.schema.framing import frame_times, join_frames
 View = Iterator[tuple[int, int, bytes]]
 
 #: The number of pictures of a batch.
-_BATCH: Final = 128
+BATCH: Final = 128
 _WORDS_PX: Final = 12.0
 #: The size of the rhombus that marks a position without a box.
 _MARK_PX: Final = 4.0
@@ -52,10 +52,11 @@ class PictureTimes(NamedTuple):
     t_ns: Ints
     stamp_ns: Ints
 
-    def batches(self) -> Iterator[tuple[slice, Annotations]]:
-        """Batches of pictures, with the annotations to draw on."""
-        for start in range(0, len(self.t_ns), _BATCH):
-            span = slice(start, min(start + _BATCH, len(self.t_ns)))
+    def batches(self, first: int = 0, last: int | None = None) -> Iterator[tuple[slice, Annotations]]:
+        """Batches of the pictures from ``first`` to before ``last``, with the annotations to draw on."""
+        last = len(self.t_ns) if last is None else last
+        for start in range(first, last, BATCH):
+            span = slice(start, min(start + BATCH, last))
             yield span, Annotations(self.stamp_ns[span])
 
     def numbered(self, span: slice, drawn: Annotations) -> View:
@@ -89,49 +90,55 @@ def detections(frames: Sequence[Frame], pictures: PictureTimes, planes: Planes) 
 
 
 def tracks(
-    people: People, pictures: PictureTimes, unit: float, style: TrackStyle, path: CameraPath | None = None
+    shown: PeopleInParts,
+    pictures: PictureTimes,
+    unit: float,
+    style: TrackStyle,
+    path: CameraPath | None = None,
 ) -> View:
     """Draw boxes with numbers and fading trails; interpolated positions are fainter.
 
-    ``people`` are those at the times of the pictures; lines of thickness 1 are ``unit`` px thick. ``path`` is how the
+    ``shown`` are those at the times of the pictures; lines of thickness 1 are ``unit`` px thick. ``path`` is how the
     camera moves, if trails are to stay where people walked.
     """
-    has_place = _near(people.foot_px)
-    has_box = _near(people.box_px)
-    lines = trails(people, has_place, pictures.t_ns)
-    longest = lines.row.shape[1] - 1
-    rgb = np.broadcast_to(_WHITE, (len(people.number), 3)) if style.is_white else colours(people.number)
-    alpha = np.where(people.observed, OBSERVED, INTERPOLATED)
-    bounds = np.searchsorted(people.frame, np.arange(len(pictures.t_ns) + 1))
-    for span, drawn in pictures.batches():
-        rows = np.arange(bounds[span.start], bounds[span.stop])
-        boxed, marked = rows[has_box[rows]], rows[~has_box[rows] & has_place[rows]]
-        frame = people.frame - span.start
-        boxes = people.box_px[boxed]
-        if style.is_open:
-            drawn.pairs(frame[boxed], _sides(boxes), rgb[boxed], alpha[boxed, None], style.thickness * unit)
-        else:
-            drawn.loops(frame[boxed], _corners(boxes), rgb[boxed], alpha[boxed], style.thickness * unit)
-        mark = people.foot_px[marked, None] + _MARK_PX * unit * np.array([[-1, 0], [0, -1], [1, 0], [0, 1]])
-        drawn.loops(frame[marked], mark, rgb[marked], alpha[marked], style.thickness * unit)
-        for points, chosen in by_count(lines.points[rows]):
-            if points > 1 and style.dash:
-                row = lines.row[rows[chosen], -points:]
-                t_ns = pictures.t_ns[people.frame[row]]
-                walked = _moved(people.foot_px[row], t_ns, t_ns[:, -1], path)
-                of, shade = frame[rows[chosen]], rgb[rows[chosen]]
-                drawn.pairs(of, segments(walked, style.dash), shade, fade(points - 1, longest), style.thickness * unit)
-        named = np.concatenate([boxed, marked])
-        named.sort()
-        corner = np.where(has_box[named, None], people.box_px[named, :2], people.foot_px[named])
-        size = np.where(has_box[named, None], people.box_px[named, 2:], 0.0)
-        words_px = _WORDS_PX * unit
-        if style.name_at == "below":
-            corner = corner + size * [0, 1] + [0, words_px + style.thickness * unit]
-        elif style.name_at == "beside":
-            corner = corner + size * [1, 0] + [style.thickness * unit, words_px]
-        drawn.labels(frame[named], corner, people.label[named], rgb[named], words_px)
-        yield from pictures.numbered(span, drawn)
+    for first, last, people in shown.parts(BATCH):
+        has_place = _near(people.foot_px)
+        has_box = _near(people.box_px)
+        lines = trails(people, has_place, pictures.t_ns)
+        longest = lines.row.shape[1] - 1
+        rgb = np.broadcast_to(_WHITE, (len(people.number), 3)) if style.is_white else colours(people.number)
+        alpha = np.where(people.observed, OBSERVED, INTERPOLATED)
+        for span, drawn in pictures.batches(first, last):
+            rows = np.arange(*np.searchsorted(people.frame, [span.start, span.stop]))
+            boxed, marked = rows[has_box[rows]], rows[~has_box[rows] & has_place[rows]]
+            frame = people.frame - span.start
+            boxes = people.box_px[boxed]
+            if style.is_open:
+                drawn.pairs(frame[boxed], _sides(boxes), rgb[boxed], alpha[boxed, None], style.thickness * unit)
+            else:
+                drawn.loops(frame[boxed], _corners(boxes), rgb[boxed], alpha[boxed], style.thickness * unit)
+            mark = people.foot_px[marked, None] + _MARK_PX * unit * np.array([[-1, 0], [0, -1], [1, 0], [0, 1]])
+            drawn.loops(frame[marked], mark, rgb[marked], alpha[marked], style.thickness * unit)
+            for points, chosen in by_count(lines.points[rows]):
+                if points > 1 and style.dash:
+                    row = lines.row[rows[chosen], -points:]
+                    t_ns = pictures.t_ns[people.frame[row]]
+                    walked = _moved(people.foot_px[row], t_ns, t_ns[:, -1], path)
+                    of, shade = frame[rows[chosen]], rgb[rows[chosen]]
+                    drawn.pairs(
+                        of, segments(walked, style.dash), shade, fade(points - 1, longest), style.thickness * unit
+                    )
+            named = np.concatenate([boxed, marked])
+            named.sort()
+            corner = np.where(has_box[named, None], people.box_px[named, :2], people.foot_px[named])
+            size = np.where(has_box[named, None], people.box_px[named, 2:], 0.0)
+            words_px = _WORDS_PX * unit
+            if style.name_at == "below":
+                corner = corner + size * [0, 1] + [0, words_px + style.thickness * unit]
+            elif style.name_at == "beside":
+                corner = corner + size * [1, 0] + [style.thickness * unit, words_px]
+            drawn.labels(frame[named], corner, people.label[named], rgb[named], words_px)
+            yield from pictures.numbered(span, drawn)
 
 
 def _moved(points: Floats, then_ns: Ints, now_ns: Ints, path: CameraPath | None) -> Floats:
@@ -153,29 +160,30 @@ def predictions(
     unit = line_unit((), planes)
     made_ns = frame_times(frames)
     wanted = latest(frames, pictures.t_ns)
-    futures = list(forecasts(frames)) if planes else []
     # Planes of pictures: each picture has its own, unless ``path`` says how it moved.
     has_own = path is None and len(planes) > 1
-    once = [] if has_own else [_in_pixels(future, planes, made_ns[future.message]) for future in futures]
     # Planes are those of pictures, and forecasts are made between them.
     last = np.searchsorted(pictures.t_ns, made_ns, "right") - 1
     seen_ns = pictures.t_ns[np.maximum(last, 0)] if len(pictures.t_ns) else made_ns
-    for span, drawn in pictures.batches():
-        for number, future in enumerate(futures):
-            which, frame = shown_at(future.message, wanted[span])
-            now_ns = pictures.t_ns[span][frame]
-            seen = _in_pixels(future.chosen(which), planes, now_ns) if has_own else once[number].chosen(which)
-            then_ns = seen_ns[seen.message][:, None]
-            ok = seen.has_path
-            if seen.path_px.shape[1] > 1 and ok.any():
-                line = segments(_moved(seen.path_px[ok], then_ns[ok], now_ns[ok], path))
-                weaker = fade(line.shape[1] // 2, line.shape[1] // 2, weakest=0.25)[::-1]
-                drawn.pairs(frame[ok], line, seen.rgb[ok], weaker, 1.5 * unit)
-            ok = seen.has_ellipse
-            if ok.any():
-                around_px = _moved(seen.ellipse_px[ok], then_ns[ok], now_ns[ok], path)
-                drawn.loops(frame[ok], around_px, seen.rgb[ok], np.full(len(around_px), 0.5), unit, fill=0.15)
-        yield from pictures.numbered(span, drawn)
+    for first, until, found in forecasts_in_parts(frames, wanted, BATCH):
+        futures = found if planes else []
+        once = [] if has_own else [_in_pixels(future, planes, made_ns[future.message]) for future in futures]
+        for span, drawn in pictures.batches(first, until):
+            for number, future in enumerate(futures):
+                which, frame = shown_at(future.message, wanted[span])
+                now_ns = pictures.t_ns[span][frame]
+                seen = _in_pixels(future.chosen(which), planes, now_ns) if has_own else once[number].chosen(which)
+                then_ns = seen_ns[seen.message][:, None]
+                ok = seen.has_path
+                if seen.path_px.shape[1] > 1 and ok.any():
+                    line = segments(_moved(seen.path_px[ok], then_ns[ok], now_ns[ok], path))
+                    weaker = fade(line.shape[1] // 2, line.shape[1] // 2, weakest=0.25)[::-1]
+                    drawn.pairs(frame[ok], line, seen.rgb[ok], weaker, 1.5 * unit)
+                ok = seen.has_ellipse
+                if ok.any():
+                    around_px = _moved(seen.ellipse_px[ok], then_ns[ok], now_ns[ok], path)
+                    drawn.loops(frame[ok], around_px, seen.rgb[ok], np.full(len(around_px), 0.5), unit, fill=0.15)
+            yield from pictures.numbered(span, drawn)
 
 
 class _Future(NamedTuple):

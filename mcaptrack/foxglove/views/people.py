@@ -21,12 +21,17 @@ from mcaptrack.geometry.ragged import group_index, ragged_range, run_starts
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame, Rows
 from mcaptrack.schema.camera_motion import to_scene
 from mcaptrack.schema.classes import class_name
-from mcaptrack.schema.framing import frame_times, join_frames
-from mcaptrack.schema.resampling import resample
+from mcaptrack.schema.framing import frame_times, join_frames, row_ends, unique_values
+from mcaptrack.schema.resampling import interval_ns, resample
 
 #: The duration of trails, and their number of lines.
 _TRAIL_S: Final = 2.0
 _TRAIL_LINES: Final = 4
+_TICK_NS: Final = seconds_to_ns(_TRAIL_S / _TRAIL_LINES)
+#: About how many people are computed with at once.
+_PART_ROWS: Final = 2**14
+#: About how many steps of forecasts are computed with at once.
+_PART_STEPS: Final = 2**16
 _MAX_GAP_S: Final = 2.0
 #: The longest name of a class in a label.
 _NAME_LENGTH: Final = 20
@@ -96,19 +101,58 @@ def by_plane(planes: Planes, t_ns: Ints) -> Iterator[tuple[GroundPlane, NDArray[
         yield planes[number][1], which == number
 
 
-def people_at(
-    frames: Sequence[Frame],
-    at_ns: Ints,
-    planes: Planes,
-    classes: Mapping[int, str] = {},
-    path: CameraPath | None = None,
-) -> People:
-    """The people of a channel of tracks at rising times; missing pixels or metres are computed with the plane.
+class PeopleInParts:
+    """The people of a channel of tracks at rising times (F,), for some of the times at once.
 
-    ``classes`` are names of classes by number, which labels show if the channel has several classes. ``path`` is how
-    the camera moves, if boxes between frames are to be compensated for it.
+    Missing pixels or metres are computed with the plane. ``classes`` are names of classes by number, which labels show
+    if the channel has several classes. ``path`` is how the camera moves, if boxes between frames are to be compensated
+    for it.
     """
-    rows, frame = resample(to_scene(frames, path), at_ns, seconds_to_ns(_MAX_GAP_S))
+
+    def __init__(
+        self,
+        frames: Sequence[Frame],
+        at_ns: Ints,
+        planes: Planes,
+        classes: Mapping[int, str] = {},
+        path: CameraPath | None = None,
+    ) -> None:
+        self.at_ns, self._planes, self._path = at_ns, planes, path
+        self._frames = to_scene(frames, path)
+        self._usual_ns = interval_ns(frame_times(frames))
+        has_several = len(unique_values(TRACKS, frames, "class_id")) > 1
+        self._names = classes if has_several else None
+        total = int(row_ends(frames)[-1])
+        self._each = max(total / max(len(frames), 1), total / max(len(at_ns), 1))
+        self._last: tuple[int, People] | None = None
+
+    def parts(self, batch: int) -> Iterator[tuple[int, int, People]]:
+        """Parts of the times, as long as so many of them or a multiple: their first and last, and the people at them.
+
+        There are also the people at the times before that trails of these people come from. ``People.frame`` are
+        indices of all times.
+        """
+        length = max(round(_PART_ROWS / max(self._each, 1e-9) / batch), 1) * batch
+        for first in range(0, len(self.at_ns), length):
+            last = min(first + length, len(self.at_ns))
+            if self._last is None or self._last[0] != first:
+                self._last = first, self._between(first, last)
+            yield first, last, self._last[1]
+
+    def _between(self, first: int, last: int) -> People:
+        # Trails begin at the first position in a tick of their clock.
+        since_ns = (int(self.at_ns[first]) - seconds_to_ns(_TRAIL_S)) // _TICK_NS * _TICK_NS
+        low = int(np.searchsorted(self.at_ns, since_ns, "left"))
+        at_ns = self.at_ns[low:last]
+        rows, frame = resample(self._frames, at_ns, seconds_to_ns(_MAX_GAP_S), self._usual_ns)
+        people = _people(rows, frame, at_ns, self._planes, self._names, self._path)
+        return people._replace(frame=people.frame + low)
+
+
+def _people(
+    rows: Rows, frame: Ints, at_ns: Ints, planes: Planes, classes: Mapping[int, str] | None, path: CameraPath | None
+) -> People:
+    """The people of rows (S,) at the times ``frame`` (S,); labels show classes unless their names are None."""
     box = columns_to_boxes(rows)
     box = box if path is None else path.to_pictures(box, at_ns[frame])
     at_m = np.stack([rows["x_m"], rows["y_m"]], axis=-1)
@@ -154,9 +198,9 @@ def base_heights(tracks: Sequence[Frame], made_ns: Ints, number: Ints) -> Floats
     return out
 
 
-def labels_of(number: Ints, class_id: Ints, names: Mapping[int, str]) -> NDArray[Any]:
-    """The labels (S,) of people: ids, and the class if there is more than one."""
-    if not len(number) or (class_id == class_id[0]).all():
+def labels_of(number: Ints, class_id: Ints, names: Mapping[int, str] | None) -> NDArray[Any]:
+    """The labels (S,) of people: ids, and the class unless ``names`` is None."""
+    if not len(number) or names is None:
         return number
     pairs, which = np.unique(np.stack([number, class_id]), axis=1, return_inverse=True)
     called = {one: _shortened(class_name(one, names), _NAME_LENGTH) for one in np.unique(class_id).tolist()}
@@ -178,7 +222,7 @@ def trails(people: People, known: NDArray[np.bool_], at_ns: Ints) -> Trails:
     order = np.lexsort((t_ns, people.number))
     order = order[known[order]]
     number, t_sorted = people.number[order], t_ns[order]
-    tick = t_sorted // seconds_to_ns(_TRAIL_S / _TRAIL_LINES)
+    tick = t_sorted // _TICK_NS
     is_anchor = run_starts(number, tick)
     anchor = np.flatnonzero(is_anchor)
     before: Ints = np.cumsum(is_anchor) - is_anchor  # the number of earlier anchors
@@ -199,9 +243,10 @@ def by_count(count: Ints) -> Iterator[tuple[int, Ints]]:
         yield points, np.flatnonzero(count == points)
 
 
-def forecasts(frames: Sequence[Frame]) -> Iterator[ForecastPaths]:
-    """The forecasts in a channel of predictions, for each number of steps."""
-    rows, message, _, _ = join_frames(PREDICTIONS, frames)
+def forecasts(frames: Sequence[Frame], first: int = 0, last: int | None = None) -> Iterator[ForecastPaths]:
+    """The forecasts in messages ``first`` to before ``last`` of a channel of predictions, for each number of steps."""
+    rows, message, _, _ = join_frames(PREDICTIONS, frames, first, last)
+    message = message + first
     order = np.lexsort((rows["step"], rows["track_id"], message))
     rows, message = rows[order], message[order]
     number = rows["track_id"].astype(np.int64)
@@ -214,6 +259,24 @@ def forecasts(frames: Sequence[Frame]) -> Iterator[ForecastPaths]:
         names = ("cov_xx_m2", "cov_xy_m2", "cov_xy_m2", "cov_yy_m2")
         spread = np.stack([rows[name][last] for name in names], axis=-1).reshape(-1, 2, 2)
         yield ForecastPaths(message[first], number[first], xy[first[:, None] + shown], xy[last], spread)
+
+
+def forecasts_in_parts(
+    frames: Sequence[Frame], wanted: Ints, batch: int, is_whole: bool = False
+) -> Iterator[tuple[int, int, list[ForecastPaths]]]:
+    """Parts of F instants, as long as ``batch`` or a multiple: their first and last, and the forecasts shown at them.
+
+    ``wanted`` (F,) is the message that is shown at each instant, -1 for none. With ``is_whole`` there is one part.
+    """
+    each = int(row_ends(frames)[-1]) / max(len(wanted), 1)
+    length = max(round(_PART_STEPS / max(each, 1e-9) / batch), 1) * batch
+    length = max(len(wanted), 1) if is_whole else length
+    for first in range(0, len(wanted), length):
+        last = min(first + length, len(wanted))
+        shown = wanted[first:last][wanted[first:last] >= 0]
+        span = (int(shown.min()), int(shown.max()) + 1) if len(shown) else (0, 0)
+        span = (0, len(frames)) if is_whole else span
+        yield first, last, list(forecasts(frames, *span))
 
 
 def latest(frames: Sequence[Frame], at_ns: Ints) -> Ints:

@@ -12,8 +12,16 @@ import numpy as np
 
 from mcaptrack.foxglove import Annotations, Cuboids, colours
 from mcaptrack.foxglove.views.ground import class_colours, raised
-from mcaptrack.foxglove.views.image import PictureTimes, View, fade
-from mcaptrack.foxglove.views.people import ellipse_points, ellipses, forecasts, latest, people_at, segments, shown_at
+from mcaptrack.foxglove.views.image import BATCH, PictureTimes, View, fade
+from mcaptrack.foxglove.views.people import (
+    PeopleInParts,
+    ellipse_points,
+    ellipses,
+    forecasts,
+    latest,
+    segments,
+    shown_at,
+)
 from mcaptrack.foxglove.views.style import INTERPOLATED, OBSERVED, TrackStyle, unit_of_width
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.pinhole import Lens, project
@@ -50,34 +58,33 @@ class MovingCamera(NamedTuple):
 
 def tracks(frames: Sequence[Frame], camera: MovingCamera, style: TrackStyle, classes: Mapping[int, str] = {}) -> View:
     """Draw the edges of 3D boxes in the colours of their classes, with numbers; interpolated ones are fainter."""
-    people = people_at(frames, camera.at_ns, (), classes)
     unit = unit_of_width(camera.width_px)
-    known = people.has_body()
-    rgb = np.broadcast_to(_WHITE, (len(people.number), 3)) if style.is_white else colours(people.number)
-    body_rgb = rgb if style.is_white else class_colours(people.class_id, classes)
-    alpha = np.where(people.observed, OBSERVED, INTERPOLATED)
-    bounds = np.searchsorted(people.frame, np.arange(len(camera.t_ns) + 1))
     pictures = PictureTimes(camera.t_ns, camera.stamp_ns)
-    for span, drawn in pictures.batches():
-        rows = np.arange(bounds[span.start], bounds[span.stop])
-        rows = rows[known[rows]]
-        ends = corners(people.body.chosen(rows))[:, _EDGES]
-        px, is_seen = _on_pictures(ends, people.frame[rows], camera)
-        _draw(
-            drawn,
-            people.frame[rows] - span.start,
-            px,
-            is_seen,
-            body_rgb[rows],
-            alpha[rows, None],
-            style.thickness * unit,
-        )
-        named = is_seen.any(axis=1)
-        inside = np.where(is_seen[..., None, None], px, np.inf)[named].reshape(int(named.sum()), -1, 2)
-        corner = np.maximum(inside.min(axis=1, initial=np.inf), [0.0, _TEXT_PX * unit])
-        these = rows[named]
-        drawn.labels(people.frame[these] - span.start, corner, people.label[these], rgb[these], _TEXT_PX * unit)
-        yield from pictures.numbered(span, drawn)
+    for first, last, people in PeopleInParts(frames, camera.at_ns, (), classes).parts(BATCH):
+        known = people.has_body()
+        rgb = np.broadcast_to(_WHITE, (len(people.number), 3)) if style.is_white else colours(people.number)
+        body_rgb = rgb if style.is_white else class_colours(people.class_id, classes)
+        alpha = np.where(people.observed, OBSERVED, INTERPOLATED)
+        for span, drawn in pictures.batches(first, last):
+            rows = np.arange(*np.searchsorted(people.frame, [span.start, span.stop]))
+            rows = rows[known[rows]]
+            ends = corners(people.body.chosen(rows))[:, _EDGES]
+            px, is_seen = _on_pictures(ends, people.frame[rows], camera)
+            _draw(
+                drawn,
+                people.frame[rows] - span.start,
+                px,
+                is_seen,
+                body_rgb[rows],
+                alpha[rows, None],
+                style.thickness * unit,
+            )
+            named = is_seen.any(axis=1)
+            inside = np.where(is_seen[..., None, None], px, np.inf)[named].reshape(int(named.sum()), -1, 2)
+            corner = np.maximum(inside.min(axis=1, initial=np.inf), [0.0, _TEXT_PX * unit])
+            these = rows[named]
+            drawn.labels(people.frame[these] - span.start, corner, people.label[these], rgb[these], _TEXT_PX * unit)
+            yield from pictures.numbered(span, drawn)
 
 
 def predictions(frames: Sequence[Frame], camera: MovingCamera, bodies: Sequence[Frame]) -> View:

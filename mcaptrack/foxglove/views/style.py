@@ -57,9 +57,9 @@ def line_unit(frames: Sequence[Frame], planes: Planes) -> float:
     """The thickness in px of a line of thickness 1, by the width of the pictures as far as it is known."""
     width = float(max((plane.width_px for _, plane in planes), default=0))
     if not width:
-        boxes = [frame.rows for frame in frames if {"x_px", "w_px"} <= set(frame.rows.dtype.names or ())]
-        right = np.concatenate([np.zeros(1), *(rows["x_px"] + rows["w_px"] for rows in boxes)])
-        width = float(np.nanmax(right))
+        for frame in frames:
+            if {"x_px", "w_px"} <= set(frame.rows.dtype.names or ()):
+                width = float(np.fmax.reduce(frame.rows["x_px"] + frame.rows["w_px"], initial=width))
     return unit_of_width(width)
 
 

@@ -1,0 +1,298 @@
+"""Frames as columns: their rows in blocks, most of which are in a temporary file.
+
+A log of hours has more rows than fit into memory, and a frame of a few rows takes more memory as objects than as
+bytes. What is read of a log, and what stages make of it, is therefore kept in blocks of about a megabyte. The first
+blocks of a channel stay in memory; the others go, compressed, into a file without a name, which disappears with the
+process.
+
+Letters: F frames, N rows, B blocks.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from array import array
+from bisect import bisect_right
+from collections import OrderedDict
+from collections.abc import Iterable, Iterator, Sequence
+from typing import BinaryIO, Final, NamedTuple, overload
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from mcaptrack.errors import McaptrackError
+from mcaptrack.geometry.arrays import Ints
+from mcaptrack.schema import Frame, Rows, Schema
+
+#: The size of a block in bytes of rows.
+BLOCK_BYTES: Final = 2**20
+#: Blocks of a channel that stay in memory, and blocks of the file that are kept after they were read.
+_IN_MEMORY: Final = 4
+_CACHED: Final = 2
+#: A block ends after so many frames, even if they have few rows.
+_MOST_PARTS: Final = 4096
+
+
+class _Block(NamedTuple):
+    """Rows of a block: themselves, or their place and size in the file, and their size before compression."""
+
+    rows: Rows | None
+    at: int = 0
+    stored: int = 0
+    size: int = 0
+
+
+class _SpillFile:
+    """A temporary file without a name, made when it is needed, with blocks of compressed bytes."""
+
+    def __init__(self) -> None:
+        self._file: BinaryIO | None = None
+        self._end = 0
+
+    def put(self, data: bytes) -> _Block:
+        """Append bytes. Raises McaptrackError if there is no room for them."""
+        import lz4.block
+
+        packed = lz4.block.compress(data, store_size=False)
+        try:
+            if self._file is None:
+                self._file = tempfile.TemporaryFile(prefix="mcaptrack-", buffering=0)  # noqa: SIM115  closed with it
+            done = 0
+            while done < len(packed):
+                done += os.pwrite(self._file.fileno(), packed[done:], self._end + done)
+        except OSError as error:
+            raise McaptrackError(
+                f"{tempfile.gettempdir()} takes no more of what is computed ({error.strerror or error}), which needs "
+                "more room than memory; the variable TMPDIR names another folder"
+            ) from error
+        block = _Block(None, self._end, len(packed), len(data))
+        self._end += len(packed)
+        return block
+
+    def get(self, block: _Block) -> bytes:
+        """The bytes of a block."""
+        import lz4.block
+
+        assert self._file is not None
+        packed = b""
+        while len(packed) < block.stored:
+            more = os.pread(self._file.fileno(), block.stored - len(packed), block.at + len(packed))
+            if not more:
+                raise McaptrackError(f"a temporary file in {tempfile.gettempdir()} was made shorter by another process")
+            packed += more
+        data: bytes = lz4.block.decompress(packed, uncompressed_size=block.size)
+        return data
+
+
+class FrameColumns(Sequence[Frame]):
+    """Frames of one schema, made by ``FrameCollector``: times, numbers and rows as columns.
+
+    A sequence of Frame; iterating it reads block by block.
+
+    Parameters
+    ----------
+    schema : Schema
+    t_ns, index : (F,) of int64
+        Times and numbers of the frames.
+    ends : (F + 1,) of int64
+        The rows of frame f are ``ends[f]`` to ``ends[f + 1]``.
+    first : sequence of int
+        The first frame of each block, and the number of frames.
+    blocks : sequence of _Block
+    file : _SpillFile
+        The file with the blocks that are not in memory.
+    """
+
+    def __init__(
+        self,
+        schema: Schema,
+        t_ns: Ints,
+        index: Ints,
+        ends: Ints,
+        first: Sequence[int],
+        blocks: Sequence[_Block],
+        file: _SpillFile,
+    ) -> None:
+        self.schema, self.t_ns, self.index, self.ends = schema, t_ns, index, ends
+        self._first, self._blocks, self._file = first, blocks, file
+        self._read: OrderedDict[int, Rows] = OrderedDict()
+
+    def __len__(self) -> int:
+        return len(self.t_ns)
+
+    def __iter__(self) -> Iterator[Frame]:
+        for number in range(len(self._blocks)):
+            yield from self._frames(number, self._first[number], self._first[number + 1])
+
+    @overload
+    def __getitem__(self, key: int) -> Frame: ...
+
+    @overload
+    def __getitem__(self, key: slice) -> list[Frame]: ...
+
+    def __getitem__(self, key: int | slice) -> Frame | list[Frame]:
+        if isinstance(key, slice):
+            first, last, step = key.indices(len(self))
+            if step != 1:
+                return [self[at] for at in range(first, last, step)]
+            out: list[Frame] = []
+            for number, low, high in self._touched(first, last):
+                out += self._frames(number, low, high)
+            return out
+        at = key + len(self) if key < 0 else key
+        if not 0 <= at < len(self):
+            raise IndexError(key)
+        return self[at : at + 1][0]
+
+    def rows(self, first: int = 0, last: int | None = None) -> Rows:
+        """The rows of frames from ``first`` to before ``last``, (N,); a copy."""
+        parts = []
+        for number, low, high in self._touched(first, len(self) if last is None else last):
+            start = self.ends[self._first[number]]
+            parts.append(self._rows(number)[self.ends[low] - start : self.ends[high] - start])
+        return self.schema.joined(parts)
+
+    def _touched(self, first: int, last: int) -> Iterator[tuple[int, int, int]]:
+        """The blocks with frames from ``first`` to before ``last``: number, and first and last of these frames."""
+        number = max(bisect_right(self._first, first) - 1, 0)
+        while first < last:
+            until = min(self._first[number + 1], last)
+            yield number, first, until
+            first, number = until, number + 1
+
+    def _frames(self, number: int, low: int, high: int) -> list[Frame]:
+        """Frames ``low`` to before ``high``, all of one block."""
+        rows = self._rows(number)
+        ends = (self.ends[low : high + 1] - self.ends[self._first[number]]).tolist()
+        named = zip(self.t_ns[low:high].tolist(), self.index[low:high].tolist(), ends[:-1], ends[1:], strict=True)
+        return [Frame(t_ns, index, rows[start:end]) for t_ns, index, start, end in named]
+
+    def _rows(self, number: int) -> Rows:
+        block = self._blocks[number]
+        if block.rows is not None:
+            return block.rows
+        rows = self._read.pop(number, None)
+        if rows is None:
+            rows = np.frombuffer(self._file.get(block), self.schema.dtype)
+        self._read[number] = rows
+        if len(self._read) > _CACHED:
+            self._read.popitem(last=False)
+        return rows
+
+
+class FrameCollector:
+    """Collects the frames of a channel: ``append`` or ``extend``, then ``done``.
+
+    Parameters
+    ----------
+    schema : Schema
+        Of the rows.
+    """
+
+    def __init__(self, schema: Schema) -> None:
+        self._schema = schema
+        self._t_ns, self._index, self._counts = array("q"), array("q"), array("q")
+        self._open: list[Rows] = []
+        self._size = 0
+        self._first, self._blocks = [0], list[_Block]()
+        self._file = _SpillFile()
+
+    def append(self, frame: Frame) -> None:
+        """Add a frame. Raises ValueError if its rows have other columns."""
+        rows = frame.rows
+        if rows.dtype != self._schema.dtype:
+            rows = self._converted(rows)
+        elif len(rows) and rows.base is not None:
+            rows = rows.copy()  # else it would keep the array of many frames that it is a part of
+        self._t_ns.append(frame.t_ns)
+        self._index.append(frame.index)
+        self._counts.append(len(rows))
+        self._add(rows)
+
+    def extend(self, t_ns: ArrayLike, index: ArrayLike, ends: ArrayLike, rows: Rows) -> None:
+        """Add many frames at once.
+
+        Parameters
+        ----------
+        t_ns, index : (F,) of int
+            Their times and numbers.
+        ends : (F + 1,) of int
+            The rows of frame f are ``ends[f]`` to ``ends[f + 1]``; all of ``rows`` are used.
+        rows : (N,) structured array
+        """
+        if rows.dtype != self._schema.dtype:
+            rows = self._converted(rows)
+        bounds, times, numbers = (np.asarray(values, np.int64) for values in (ends, t_ns, index))
+        most = max(BLOCK_BYTES // self._schema.dtype.itemsize, 1)
+        low = 0
+        while low < len(times):
+            high = max(int(np.searchsorted(bounds, bounds[low] + most, "right")) - 1, low + 1)
+            high = min(high, len(times))
+            for kept, values in ((self._t_ns, times), (self._index, numbers)):
+                kept.frombytes(np.ascontiguousarray(values[low:high]).tobytes())
+            self._counts.frombytes(np.diff(bounds[low : high + 1]).tobytes())
+            self._add(rows[bounds[low] : bounds[high]])
+            low = high
+
+    def _add(self, rows: Rows) -> None:
+        self._open.append(rows)
+        self._size += rows.nbytes
+        if self._size >= BLOCK_BYTES or len(self._open) >= _MOST_PARTS:
+            self._close()
+
+    def done(self) -> FrameColumns:
+        """The frames; nothing can be added any more."""
+        self._close()
+        ends = np.concatenate([[0], np.cumsum(np.array(self._counts, np.int64))]).astype(np.int64)
+        times, numbers = np.array(self._t_ns, np.int64), np.array(self._index, np.int64)
+        return FrameColumns(self._schema, times, numbers, ends, self._first, self._blocks, self._file)
+
+    def _converted(self, rows: Rows) -> Rows:
+        """Rows in the layout of the schema."""
+        checked = self._schema.check(rows)
+        out = self._schema.empty(len(checked))
+        for name in self._schema.dtype.names or ():
+            out[name] = checked[name]
+        return out
+
+    def _close(self) -> None:
+        if len(self._t_ns) == self._first[-1]:
+            return
+        rows = self._schema.joined(self._open)
+        self._open, self._size = [], 0
+        self._first.append(len(self._t_ns))
+        if len(self._blocks) < _IN_MEMORY:
+            rows.flags.writeable = False
+            self._blocks.append(_Block(rows))
+        else:
+            self._blocks.append(self._file.put(rows.tobytes()))
+
+
+def collect(schema: Schema, frames: Iterable[Frame]) -> FrameColumns:
+    """Keep frames as columns. Raises ValueError if rows have other columns than the schema.
+
+    Parameters
+    ----------
+    schema : Schema
+    frames : iterable of Frame
+
+    Returns
+    -------
+    FrameColumns
+        ``frames`` itself if it is one.
+
+    Examples
+    --------
+    >>> from mcaptrack.schema import DETECTIONS
+    >>> row = DETECTIONS.rows(x_px=[1.0], y_px=[2.0], w_px=[3.0], h_px=[4.0], class_id=[1])
+    >>> kept = collect(DETECTIONS, [Frame(0, 0, row), Frame(5, 1, DETECTIONS.empty())])
+    >>> [(frame.t_ns, len(frame.rows)) for frame in kept], kept.rows()["w_px"].tolist()
+    ([(0, 1), (5, 0)], [3.0])
+    """
+    if isinstance(frames, FrameColumns):
+        return frames
+    collector = FrameCollector(schema)
+    for frame in frames:
+        collector.append(frame)
+    return collector.done()
