@@ -168,7 +168,7 @@ def test_frames_without_forecasts_have_scores():
     found = find_forecast_errors(predictions(lambda n: {}, 4), walk(straight_on, 4), walk(straight_on, 4), [])
     assert [len(frame.rows) for frame in found.errors] == [0] * 4
     assert rows_of(found.scores)["forecasts"].tolist() == [0] * 4
-    assert find_forecast_errors([], [], [], []) == ([], [])
+    assert [list(frames) for frames in find_forecast_errors([], [], [], [])] == [[], []]
 
 
 # Laws

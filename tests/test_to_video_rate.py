@@ -90,7 +90,7 @@ def test_boxes_of_a_false_track_are_left_out():
 
 def test_without_re_tracked_tracks_every_frame_is_there_without_rows():
     assert full([{7: 0.0}] * 4, [{}]) == [{}] * 4
-    assert to_video_rate([], [], ()) == []
+    assert list(to_video_rate([], [], ())) == []
 
 
 @given(seed=st.integers(0, 2**32 - 1))

@@ -91,8 +91,8 @@ def _find_unseen(
     outside = observed = unseen = 0
     for _, _, joined in joined_parts(TRACKS, frames):
         outer, there = is_outside(joined.rows), joined.rows["observed"]
-        outside, observed = outside + np.count_nonzero(outer & there), observed + np.count_nonzero(there)
-        unseen += np.count_nonzero(outer & ~there)
+        outside, observed = outside + int((outer & there).sum()), observed + int(there.sum())
+        unseen += int((outer & ~there).sum())
     if not unseen or outside > _MOST_OUTSIDE * observed:
         return None
     return lambda rows: np.asarray(is_outside(rows) & ~rows["observed"]), unseen

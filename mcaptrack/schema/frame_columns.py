@@ -93,7 +93,7 @@ class FrameColumns(Sequence[Frame]):
     Parameters
     ----------
     schema : Schema
-    t_ns, index : (F,) of int64
+    t_ns, numbers : (F,) of int64
         Times and numbers of the frames.
     ends : (F + 1,) of int64
         The rows of frame f are ``ends[f]`` to ``ends[f + 1]``.
@@ -108,13 +108,13 @@ class FrameColumns(Sequence[Frame]):
         self,
         schema: Schema,
         t_ns: Ints,
-        index: Ints,
+        numbers: Ints,
         ends: Ints,
         first: Sequence[int],
         blocks: Sequence[_Block],
         file: _SpillFile,
     ) -> None:
-        self.schema, self.t_ns, self.index, self.ends = schema, t_ns, index, ends
+        self.schema, self.t_ns, self.numbers, self.ends = schema, t_ns, numbers, ends
         self._first, self._blocks, self._file = first, blocks, file
         self._read: OrderedDict[int, Rows] = OrderedDict()
 
@@ -165,7 +165,7 @@ class FrameColumns(Sequence[Frame]):
         """Frames ``low`` to before ``high``, all of one block."""
         rows = self._rows(number)
         ends = (self.ends[low : high + 1] - self.ends[self._first[number]]).tolist()
-        named = zip(self.t_ns[low:high].tolist(), self.index[low:high].tolist(), ends[:-1], ends[1:], strict=True)
+        named = zip(self.t_ns[low:high].tolist(), self.numbers[low:high].tolist(), ends[:-1], ends[1:], strict=True)
         return [Frame(t_ns, index, rows[start:end]) for t_ns, index, start, end in named]
 
     def _rows(self, number: int) -> Rows:

@@ -8,7 +8,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mcaptrack.geometry.arrays import Ints
+from mcaptrack.geometry.arrays import Bools, Ints
 from mcaptrack.geometry.ragged import group_index
 from mcaptrack.schema import Frame, Rows, Schema
 from mcaptrack.schema.frame_columns import FrameCollector, FrameColumns
@@ -44,12 +44,12 @@ def frame_times(frames: Sequence[Frame]) -> Ints:
 def frame_numbers(frames: Sequence[Frame]) -> Ints:
     """The numbers of frames (F,)."""
     if isinstance(frames, FrameColumns):
-        return frames.index
+        return frames.numbers
     return np.fromiter((frame.index for frame in frames), np.int64, len(frames))
 
 
 def row_ends(frames: Sequence[Frame]) -> Ints:
-    """Where the rows of frames end if they are laid end to end: those of frame f are ``[f]`` to ``[f + 1]``, (F + 1,)."""
+    """The ends of the rows of frames laid end to end, (F + 1,): those of frame f are ``[f]`` to ``[f + 1]``."""
     if isinstance(frames, FrameColumns):
         return frames.ends
     return np.cumsum([0, *(len(frame.rows) for frame in frames)])
@@ -121,7 +121,7 @@ def mapped_rows(schema: Schema, frames: Sequence[Frame], change: Callable[[Joine
 
 
 def filtered_rows(
-    schema: Schema, frames: Sequence[Frame], keep: Callable[[JoinedFrames], NDArray[Any]]
+    schema: Schema, frames: Sequence[Frame], keep: Callable[[JoinedFrames], Bools]
 ) -> FrameColumns:
     """Frames with some of their rows: ``keep`` gives a mask (N,) of the rows that it gets, some at a time."""
     out, numbers = FrameCollector(schema), frame_numbers(frames)

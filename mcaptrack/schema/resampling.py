@@ -6,6 +6,7 @@ Letters: N rows in, F frames in, T times, S rows out.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from itertools import pairwise
 from typing import Final
 
 import numpy as np
@@ -48,12 +49,12 @@ def resample(frames: Sequence[Frame], at_ns: Ints, max_gap_ns: int, usual_ns: fl
     at : (S,) of int64
         Index of the time of each row in ``at_ns``.
     """
-    t_ns, low, high = frame_times(frames), 0, len(frames)
+    t_ns, first, last = frame_times(frames), 0, len(frames)
     usual_ns = interval_ns(t_ns) if usual_ns is None else usual_ns
     if len(at_ns):  # a row that is farther away is not linked over any of the times
-        low = int(np.searchsorted(t_ns, at_ns[0] - max_gap_ns, "left"))
-        high = int(np.searchsorted(t_ns, at_ns[-1] + max_gap_ns, "right"))
-    joined = join_frames(TRACKS, frames, low, high)
+        first = int(np.searchsorted(t_ns, at_ns[0] - max_gap_ns, "left"))
+        last = int(np.searchsorted(t_ns, at_ns[-1] + max_gap_ns, "right"))
+    joined = join_frames(TRACKS, frames, first, last)
     order = np.lexsort((joined.row_ns, joined.rows["track_id"]))
     rows, row_ns = joined.rows[order], joined.row_ns[order]
     has_next = ~run_ends(run_starts(rows["track_id"]))
@@ -104,7 +105,7 @@ def resample_parts(
     usual_ns, total = interval_ns(frame_times(frames)), int(row_ends(frames)[-1])
     most = max(total, round(total / max(len(frames), 1) * len(at_ns)))
     cuts = np.linspace(0, len(at_ns), max(min(-(-most // rows), len(at_ns)), 1) + 1).astype(np.int64).tolist()
-    for first, last in zip(cuts[:-1], cuts[1:], strict=True):
+    for first, last in pairwise(cuts):
         out, at = resample(frames, at_ns[first:last], max_gap_ns, usual_ns)
         yield first, last, out, at + first
 

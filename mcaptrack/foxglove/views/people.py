@@ -245,8 +245,8 @@ def by_count(count: Ints) -> Iterator[tuple[int, Ints]]:
 
 def forecasts(frames: Sequence[Frame], first: int = 0, last: int | None = None) -> Iterator[ForecastPaths]:
     """The forecasts in messages ``first`` to before ``last`` of a channel of predictions, for each number of steps."""
-    rows, message, _, _ = join_frames(PREDICTIONS, frames, first, last)
-    message = message + first
+    rows, within, _, _ = join_frames(PREDICTIONS, frames, first, last)
+    message = within + first
     order = np.lexsort((rows["step"], rows["track_id"], message))
     rows, message = rows[order], message[order]
     number = rows["track_id"].astype(np.int64)
@@ -254,11 +254,11 @@ def forecasts(frames: Sequence[Frame], first: int = 0, last: int | None = None) 
     steps = np.diff(np.append(start, len(rows)))
     xy = np.stack([rows["x_m"], rows["y_m"]], axis=-1)
     for count, chosen in by_count(steps):
-        first, last = start[chosen], start[chosen] + count - 1
+        begin, end = start[chosen], start[chosen] + count - 1
         shown = np.unique(np.linspace(0, count - 1, min(count, _FORECAST_POINTS)).round().astype(np.int64))
         names = ("cov_xx_m2", "cov_xy_m2", "cov_xy_m2", "cov_yy_m2")
-        spread = np.stack([rows[name][last] for name in names], axis=-1).reshape(-1, 2, 2)
-        yield ForecastPaths(message[first], number[first], xy[first[:, None] + shown], xy[last], spread)
+        spread = np.stack([rows[name][end] for name in names], axis=-1).reshape(-1, 2, 2)
+        yield ForecastPaths(message[begin], number[begin], xy[begin[:, None] + shown], xy[end], spread)
 
 
 def forecasts_in_parts(

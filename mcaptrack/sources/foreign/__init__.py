@@ -76,7 +76,7 @@ class Picture(NamedTuple):
 class NamedFrames(NamedTuple):
     """Frames of a channel, the names of their classes by class id, and the frame that their metres are in, or ""."""
 
-    frames: list[Frame]
+    frames: Sequence[Frame]
     classes: dict[int, str]
     frame_id: str = ""
 
@@ -133,7 +133,7 @@ def stamps(opened: log.Log, topic: str) -> Ints:
     return np.array([picture.stamp_ns for _, picture in pictures(opened, topic)], np.int64)
 
 
-def detections(opened: log.Log, topic: str) -> list[Frame]:
+def detections(opened: log.Log, topic: str) -> Sequence[Frame]:
     """The boxes of another detector, one frame for each message. Raises McaptrackError as ``pictures`` does."""
     return named_detections(opened, topic).frames
 
