@@ -120,9 +120,7 @@ def mapped_rows(schema: Schema, frames: Sequence[Frame], change: Callable[[Joine
     return out.done()
 
 
-def filtered_rows(
-    schema: Schema, frames: Sequence[Frame], keep: Callable[[JoinedFrames], Bools]
-) -> FrameColumns:
+def filtered_rows(schema: Schema, frames: Sequence[Frame], keep: Callable[[JoinedFrames], Bools]) -> FrameColumns:
     """Frames with some of their rows: ``keep`` gives a mask (N,) of the rows that it gets, some at a time."""
     out, numbers = FrameCollector(schema), frame_numbers(frames)
     for low, high, joined in joined_parts(schema, frames):
