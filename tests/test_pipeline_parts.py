@@ -475,11 +475,11 @@ def test_tracks_that_are_only_passed_on_are_said(tmp_path, parameters, is_said):
 def test_little_memory_is_said_in_numbers(monkeypatch):
     monkeypatch.setattr(findings, "free_memory", lambda: 160_000_000)
     with notices.listening(lambda _: None), notices.collected() as said:
-        findings.warn_memory(50_000, 500_000)
+        findings.warn_memory([Frame(n * 40_000_000, n, DETECTIONS.empty(10)) for n in range(50_000)])
     assert [(one.message, one.code) for one in said] == [
         (
-            "500,000 boxes in 50,000 pictures take about 1.1 GB of memory, and 0.2 GB are free: what is computed stays in "
-            "memory until all is written",
+            "500,000 boxes, of people who are seen for 6 hours together, take about 0.5 GB of memory, and 0.2 GB are "
+            "free: re-tracking has all samples in memory",
             "memory",
         )
     ]

@@ -12,11 +12,12 @@ from __future__ import annotations
 
 import os
 import tempfile
+import weakref
 from array import array
 from bisect import bisect_right
 from collections import OrderedDict
 from collections.abc import Iterable, Iterator, Sequence
-from typing import BinaryIO, Final, NamedTuple, overload
+from typing import Final, NamedTuple, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -47,7 +48,7 @@ class _SpillFile:
     """A temporary file without a name, made when it is needed, with blocks of compressed bytes."""
 
     def __init__(self) -> None:
-        self._file: BinaryIO | None = None
+        self._handle: int | None = None
         self._end = 0
 
     def put(self, data: bytes) -> _Block:
@@ -56,11 +57,13 @@ class _SpillFile:
 
         packed = lz4.block.compress(data, store_size=False)
         try:
-            if self._file is None:
-                self._file = tempfile.TemporaryFile(prefix="mcaptrack-", buffering=0)  # noqa: SIM115  closed with it
+            if self._handle is None:
+                with tempfile.TemporaryFile(prefix="mcaptrack-") as file:
+                    self._handle = os.dup(file.fileno())
+                weakref.finalize(self, os.close, self._handle)
             done = 0
             while done < len(packed):
-                done += os.pwrite(self._file.fileno(), packed[done:], self._end + done)
+                done += os.pwrite(self._handle, packed[done:], self._end + done)
         except OSError as error:
             raise McaptrackError(
                 f"{tempfile.gettempdir()} takes no more of what is computed ({error.strerror or error}), which needs "
@@ -74,10 +77,10 @@ class _SpillFile:
         """The bytes of a block."""
         import lz4.block
 
-        assert self._file is not None
+        assert self._handle is not None
         packed = b""
         while len(packed) < block.stored:
-            more = os.pread(self._file.fileno(), block.stored - len(packed), block.at + len(packed))
+            more = os.pread(self._handle, block.stored - len(packed), block.at + len(packed))
             if not more:
                 raise McaptrackError(f"a temporary file in {tempfile.gettempdir()} was made shorter by another process")
             packed += more

@@ -81,9 +81,9 @@ def join_frames(schema: Schema, frames: Sequence[Frame], first: int = 0, last: i
     return JoinedFrames(rows, group_index(counts), frame_times(some), np.cumsum([0, *counts]))
 
 
-def spans_of(ends: Ints, rows: int = PART_ROWS) -> Iterator[tuple[int, int]]:
-    """First and last of the consecutive frames that have about so many rows together; ``ends`` as in ``row_ends``."""
-    low, count = 0, len(ends) - 1
+def spans_of(ends: Ints) -> Iterator[tuple[int, int]]:
+    """First and last of consecutive frames with about ``PART_ROWS`` rows together; ``ends`` are as in ``row_ends``."""
+    low, count, rows = 0, len(ends) - 1, PART_ROWS
     while low < count:
         high = int(np.searchsorted(ends, ends[low] + rows, "right")) - 1
         high = min(max(high, low + 1), low + max(rows, 1), count)
@@ -91,24 +91,20 @@ def spans_of(ends: Ints, rows: int = PART_ROWS) -> Iterator[tuple[int, int]]:
         low = high
 
 
-def joined_parts(
-    schema: Schema, frames: Sequence[Frame], rows: int = PART_ROWS
-) -> Iterator[tuple[int, int, JoinedFrames]]:
+def joined_parts(schema: Schema, frames: Sequence[Frame]) -> Iterator[tuple[int, int, JoinedFrames]]:
     """Frames as ``join_frames`` lays them end to end, some at a time.
 
     Parameters
     ----------
     schema : Schema
     frames : sequence of Frame
-    rows : int, optional
-        About how many rows are laid end to end at once.
 
     Yields
     ------
     tuple of int, int and JoinedFrames
         First and last of the frames, and their rows.
     """
-    for low, high in spans_of(row_ends(frames), rows):
+    for low, high in spans_of(row_ends(frames)):
         yield low, high, join_frames(schema, frames, low, high)
 
 

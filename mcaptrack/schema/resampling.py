@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from mcaptrack.geometry.angles import wrapped
 from mcaptrack.geometry.arrays import Ints
 from mcaptrack.geometry.ragged import group_index, ragged_range, run_ends, run_starts
-from mcaptrack.schema import TRACKS, Frame, Rows
-from mcaptrack.schema.framing import PART_ROWS, frame_times, join_frames, row_ends
+from mcaptrack.schema import TRACKS, Frame, Rows, framing
+from mcaptrack.schema.framing import frame_times, join_frames, row_ends
 
 #: The columns of a track that are interpolated, and those that are angles.
 LINEAR: Final = (
@@ -83,17 +83,13 @@ def resample(frames: Sequence[Frame], at_ns: Ints, max_gap_ns: int, usual_ns: fl
     return out[order], at[order].astype(np.int64)
 
 
-def resample_parts(
-    frames: Sequence[Frame], at_ns: Ints, max_gap_ns: int, rows: int = PART_ROWS
-) -> Iterator[tuple[int, int, Rows, Ints]]:
+def resample_parts(frames: Sequence[Frame], at_ns: Ints, max_gap_ns: int) -> Iterator[tuple[int, int, Rows, Ints]]:
     """Resample tracks as ``resample`` does, to some of the times at once: all rows may take more than the memory.
 
     Parameters
     ----------
     frames, at_ns, max_gap_ns
         As for ``resample``.
-    rows : int, optional
-        About how many rows are resampled at once.
 
     Yields
     ------
@@ -104,7 +100,9 @@ def resample_parts(
     """
     usual_ns, total = interval_ns(frame_times(frames)), int(row_ends(frames)[-1])
     most = max(total, round(total / max(len(frames), 1) * len(at_ns)))
-    cuts = np.linspace(0, len(at_ns), max(min(-(-most // rows), len(at_ns)), 1) + 1).astype(np.int64).tolist()
+    cuts = (
+        np.linspace(0, len(at_ns), max(min(-(-most // framing.PART_ROWS), len(at_ns)), 1) + 1).astype(np.int64).tolist()
+    )
     for first, last in pairwise(cuts):
         out, at = resample(frames, at_ns[first:last], max_gap_ns, usual_ns)
         yield first, last, out, at + first
