@@ -249,7 +249,7 @@ def _boxes_to_draw(opened: log.Log, boxes: Mapping[str, foreign.NamedFrames]) ->
     return {
         topic: ChannelToDraw(DETECTIONS, one.frames, digest_of(opened, topic), "", one.classes, one.frame_id)
         for topic, one in boxes.items()
-        if not is_drawn_by_viewers(opened.channel(topic)) and has_bodies(one.frames)
+        if not is_drawn_by_viewers(opened.channel(topic)) and has_bodies(DETECTIONS, one.frames)
     }
 
 

@@ -129,7 +129,10 @@ def detections(frames: Sequence[Frame], t_ns: Ints, frame_id: str, classes: Mapp
     if (number < 0).any() or len(np.unique(np.stack([joined.frame, number]), axis=1).T) < len(number):
         number = np.arange(len(number)) - joined.ends[joined.frame]
     class_id = joined.rows["class_id"].astype(np.int64)
-    label, rgb = labels_of(number, class_id, classes if len(np.unique(class_id)) > 1 else None), class_colours(class_id, classes)
+    label, rgb = (
+        labels_of(number, class_id, classes if len(np.unique(class_id)) > 1 else None),
+        class_colours(class_id, classes),
+    )
     bounds = np.searchsorted(joined.frame[known], np.arange(len(t_ns) + 1))
     for span, scene in instants.batches():
         rows = known[bounds[span.start] : bounds[span.stop]]
