@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from mcaptrack.geometry.angles import wrapped
 from mcaptrack.geometry.arrays import Ints
+from mcaptrack.geometry.clocks import LAST_NS
 from mcaptrack.geometry.ragged import group_index, ragged_range, run_ends, run_starts
 from mcaptrack.schema import TRACKS, Frame, Rows, framing
 from mcaptrack.schema.framing import frame_times, join_frames, row_ends
@@ -52,8 +53,8 @@ def resample(frames: Sequence[Frame], at_ns: Ints, max_gap_ns: int, usual_ns: fl
     t_ns, first, last = frame_times(frames), 0, len(frames)
     usual_ns = interval_ns(t_ns) if usual_ns is None else usual_ns
     if len(at_ns):  # a row that is farther away is not linked over any of the times
-        first = int(np.searchsorted(t_ns, at_ns[0] - max_gap_ns, "left"))
-        last = int(np.searchsorted(t_ns, at_ns[-1] + max_gap_ns, "right"))
+        first = int(np.searchsorted(t_ns, max(int(at_ns[0]) - max_gap_ns, 0), "left"))
+        last = int(np.searchsorted(t_ns, min(int(at_ns[-1]) + max_gap_ns, LAST_NS), "right"))
     joined = join_frames(TRACKS, frames, first, last)
     order = np.lexsort((joined.row_ns, joined.rows["track_id"]))
     rows, row_ns = joined.rows[order], joined.row_ns[order]

@@ -12,6 +12,7 @@ import numpy as np
 
 from mcaptrack.geometry.arrays import Ints
 from mcaptrack.geometry.boxes import columns_to_boxes
+from mcaptrack.geometry.clocks import LAST_NS
 from mcaptrack.geometry.plane import Planes, plane_at
 from mcaptrack.geometry.ragged import run_starts
 from mcaptrack.schema import TRACKS, Frame, Rows
@@ -65,8 +66,8 @@ def to_video_rate(tracks: Sequence[Frame], retracks: Sequence[Frame], planes: Pl
     out = FrameCollector(TRACKS)
     for first, last, joined in joined_parts(TRACKS, tracks):
         # A sample farther away than that is neither the nearest of a box nor linked over the times of these frames.
-        low = int(np.searchsorted(tick_ns, joined.t_ns[0] - reach_ns - 1, "left"))
-        high = int(np.searchsorted(tick_ns, joined.t_ns[-1] + reach_ns + 1, "right"))
+        low = int(np.searchsorted(tick_ns, int(joined.t_ns[0]) - reach_ns - 1, "left"))
+        high = int(np.searchsorted(tick_ns, min(int(joined.t_ns[-1]) + reach_ns, LAST_NS - 1) + 1, "right"))
         near = retracks if (low, high) == (0, len(retracks)) else retracks[low:high]
         rows, ends = _part(joined, near, period, columns, planes, classes)
         out.extend(joined.t_ns, numbers[first:last], ends, rows)
