@@ -11,8 +11,9 @@ from mcaptrack.log.check import CheckResult, check
 from mcaptrack.log.check_summary import Finding
 from mcaptrack.log.extend import extend, refuse_to_replace_recorded
 from mcaptrack.log.messages import ChannelRows, Message, MessageLocations
+from mcaptrack.log.opening import read, topics_with_schema
 from mcaptrack.log.paths import results_path
-from mcaptrack.log.reader import Channel, Log, read, topics_with_schema
+from mcaptrack.log.reader import Channel, Log
 from mcaptrack.log.recording_files import refuse_non_mcap, split_files_in
 from mcaptrack.log.recover import RecoverResult, recover
 from mcaptrack.log.stream import copy_attachments_and_metadata, header, stream

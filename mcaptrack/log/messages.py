@@ -219,7 +219,7 @@ class Messages:
         rows.flags.writeable = False
         return ChannelRows(rows, t_ns[order], sequence[order], counts[order])
 
-    def parts(self, channels: Sequence[int], schema: Schema) -> Iterator[ChannelRows | None]:
+    def parts(self, channels: Sequence[int], schema: Schema, reader: RowReader) -> Iterator[ChannelRows | None]:
         """What ``columns`` gives, chunk by chunk: None where a message has another layout."""
         for group in _in_order(self._batches(channels)):
             t_ns = to_int64(np.concatenate([batch.t_ns for batch in group]))
@@ -227,7 +227,7 @@ class Messages:
             for batch in group:
                 content, offset = self._open(batch)
                 found = message_heads_at(content, batch.channel, batch.t_ns, offset)
-                decoded = schema.codec.decode_at(np.frombuffer(content, np.uint8), found.start, found.end)
+                decoded = reader.decode_at(np.frombuffer(content, np.uint8), found.start, found.end)
                 if decoded is None:
                     yield None
                     return

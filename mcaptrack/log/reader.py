@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import heapq
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple, Self, TypeVar
 
@@ -17,10 +17,8 @@ from mcaptrack.geometry.arrays import Ints
 from mcaptrack.log import in_place, records
 from mcaptrack.log.chunks import MAX_NS
 from mcaptrack.log.messages import ChannelRows, Message, MessageLocations
-from mcaptrack.log.paths import RESULTS_SUFFIX, results_path
 from mcaptrack.log.records import ChannelRecord, Damaged
 from mcaptrack.log.snapshot import open_snapshot
-from mcaptrack.log.writer import create
 from mcaptrack.schema import Frame, Schema
 from mcaptrack.schema.classes import with_only_class
 from mcaptrack.schema.encodings import ROW_ENCODINGS, RowReader, reader_of, schema_name_of
@@ -313,9 +311,9 @@ class Log:
         if (part := self.part(topic)) is not self:
             return part.frame_columns(topic, schema)
         metadata = self._row_channel(topic, schema).metadata
-        channels, out = self._ids(topic), FrameCollector(schema)
+        channels, reader, out = self._ids(topic), self._reader(topic, schema), FrameCollector(schema)
         with self.snapshot.reporting_bad_times(topic):
-            for found in self._messages.parts(channels, schema):
+            for found in self._messages.parts(channels, schema, reader):
                 if found is None:
                     whole = self.rows(topic, schema)
                     out = FrameCollector(schema)
@@ -375,45 +373,3 @@ class Log:
 
 def _are_equal(one: MessageLocations, other: MessageLocations) -> bool:
     return all(map(np.array_equal, one, other))
-
-
-def read(path: Path, *, sidecar: bool | Callable[[Log], bool] | None = None) -> Log:
-    """Open a log.
-
-    Parameters
-    ----------
-    path : Path
-        An MCAP file.
-    sidecar : bool or callable, optional
-        Whether to open the log with its sidecar, LOG.results.mcap: by default if it exists; True creates it, False
-        ignores it. A callable gets the log alone and returns which.
-
-    Returns
-    -------
-    Log
-        Close it, or use it as a context manager.
-
-    Raises
-    ------
-    McaptrackError
-        If the file is missing, not an MCAP file, or damaged.
-    """
-    log, results = Log(path), results_path(path)
-    try:
-        if not path.name.endswith(RESULTS_SUFFIX) and (
-            sidecar(log) if callable(sidecar) else sidecar or (sidecar is None and results.exists())
-        ):
-            is_new = not results.exists()
-            if is_new:
-                with create(results):
-                    pass
-            log.attach_results(Log(results), is_new)
-    except BaseException:
-        log.__exit__()
-        raise
-    return log
-
-
-def topics_with_schema(log: Log, names: Sequence[str]) -> list[Channel]:
-    """The channels with one of these schemas, sorted by topic."""
-    return [channel for _, channel in sorted(log.channels.items()) if channel.schema_name in names]
