@@ -9,13 +9,21 @@ from typing import get_type_hints
 import numpy as np
 import pytest
 
-from mcaptrack.transforms import STAGES, TRACKERS, TRANSFORMS, MotionDetector, OnnxDetector, RetrackByConsistency
+from mcaptrack.transforms import (
+    STAGES,
+    TRACKERS,
+    TRANSFORMS,
+    GroundTracker,
+    MotionDetector,
+    OnnxDetector,
+    RetrackByConsistency,
+)
 from mcaptrack.transforms.protocol import bare_type
 from mcaptrack.transforms.retrack import RetrackOptions
-from tests.effects import Case, others, retrack, sort
+from tests.effects import Case, ground, others, retrack, sort
 
-CASES = retrack.CASES | sort.CASES | others.CASES
-KINDS = dict(TRANSFORMS) | dict(TRACKERS) | {"consistency": RetrackByConsistency}
+CASES = retrack.CASES | sort.CASES | others.CASES | ground.CASES
+KINDS = dict(TRANSFORMS) | dict(TRACKERS) | {"consistency": RetrackByConsistency, "ground": GroundTracker}
 BUILT_IN = {f"{stage} {name}": kind for stage, one in STAGES.items() for name, kind in one.built_in().items()}
 ORDER = ("least", "more", "most")
 

@@ -2,9 +2,11 @@
 
 Streets with parked cars, cars and trucks that go, brake and turn, cyclists, people who walk and stand. The detector
 misses objects by distance and in bursts, has noise that is correlated over time, turns headings by half and quarter
-turns, confuses classes, and adds false boxes: single ones, and clutter that lasts. All of it follows from a seed.
+turns, confuses classes, and adds false boxes: single ones, and clutter that lasts. Where objects hide one another
+(``Faults.hidden``), what the sensor can't see has no ground truth, as in labels made from lidar points, and what it
+sees little of is missed more often. All of it follows from a seed.
 
-Letters: F frames, N objects, S steps of one object.
+Letters: F frames, N objects, S steps of one object, R rays of the sensor.
 """
 
 from __future__ import annotations
@@ -40,43 +42,73 @@ class Faults:
     false_boxes: float = 1.0
     clutter: int = 5
     score_noise: float = 0.12
+    hidden: bool = False
+    groups: float = 0.0
+    doubles: float = 0.0
+    pose_noise_m: float = 0.0
+    pose_noise_rad: float = 0.0
 
 
 class Scene(NamedTuple):
-    """Rows of true objects and of boxes: arrays of equal length by name of the column, with ``frame`` and ``t_ns``."""
+    """Rows of true objects and of boxes: arrays of equal length by name of the column, with ``frame`` and ``t_ns``.
+
+    ``robot_m`` (F, 2) is where the robot is.
+    """
 
     truth: dict[str, np.ndarray]
     boxes: dict[str, np.ndarray]
     t_ns: np.ndarray
+    robot_m: np.ndarray
 
 
 def draw_traffic(
-    seed: int, seconds: float = 16.0, rate_hz: float = 10.0, faults: Faults = Faults(), density: float = 1.0
+    seed: int,
+    seconds: float = 16.0,
+    rate_hz: float = 10.0,
+    faults: Faults = Faults(),
+    density: float = 1.0,
+    lively: float = 1.0,
 ) -> Scene:
-    """Draw a scene of traffic, seen from a robot that drives along the street."""
+    """Draw a scene of traffic, seen from a robot that drives along the street.
+
+    ``lively`` is the share of the usual number of vehicles that turn or stop.
+    """
     rng = np.random.default_rng(seed)
     count = round(seconds * rate_hz)
     t_s = np.arange(count) / rate_hz + rng.normal(0, 0.01 / rate_hz, count)
     robot = np.stack([-20 + rng.uniform(0, 6) * t_s, np.full(count, -1.8)], axis=1)
     tracks = [_parked(rng) for _ in range(rng.poisson(16 * density))]
-    tracks += [_vehicle(rng, t_s, 3) for _ in range(rng.poisson(12 * density))]
-    tracks += [_vehicle(rng, t_s, 4) for _ in range(rng.poisson(3 * density))]
-    tracks += [_vehicle(rng, t_s, 2) for _ in range(rng.poisson(4 * density))]
+    tracks += [_vehicle(rng, t_s, 3, lively) for _ in range(rng.poisson(12 * density))]
+    tracks += [_vehicle(rng, t_s, 4, lively) for _ in range(rng.poisson(3 * density))]
+    tracks += [_vehicle(rng, t_s, 2, lively) for _ in range(rng.poisson(4 * density))]
     tracks += [_pedestrian(rng, t_s) for _ in range(rng.poisson(14 * density))]
+    more = np.random.default_rng([seed, 1])  # a generator of its own: scenes without these faults stay as they are
+    tracks += [one for _ in range(more.poisson(faults.groups * density)) for one in _group(more, t_s)]
     start_ns = 1_600_000_000_000_000_000
     t_ns = start_ns + np.rint(t_s * 1e9).astype(np.int64)
     true_parts, box_parts = [], []
-    for number, track in enumerate(tracks):
-        xy, heading, class_id, size = _laid(track, count)
+    tracks = [_laid(track, count) for track in tracks]
+    points = _points(more, robot, tracks) if faults.hidden else np.full((len(tracks), count), np.inf)
+    for number, (xy, heading, class_id, size) in enumerate(tracks):
         far = np.hypot(*(xy - robot).T)
-        there = np.flatnonzero((far < 60.0) & np.isfinite(xy[:, 0]))
+        there = np.flatnonzero((far < 60.0) & np.isfinite(xy[:, 0]) & (points[number] >= 1))
         if len(there) < 3:
             continue
         true_parts.append(_table(there, number + 1, class_id, xy[there], size, heading[there]))
-        box_parts.append(_boxes(rng, faults, there, far[there], xy[there], heading[there], class_id, size, rate_hz))
+        found = _boxes(rng, faults, there, far[there], xy[there], heading[there], class_id, size, rate_hz)
+        if faults.hidden:
+            few = np.exp(-points[number, found["frame"]] / 12)
+            kept = more.random(len(few)) > few
+            found = {name: values[kept] for name, values in found.items()}
+            found["score"] = np.clip(found["score"] - 0.25 * few[kept], 0.05, 0.99)
+        box_parts.append(found)
+        if faults.doubles:
+            box_parts.append(_doubles(more, faults, found))
     box_parts += [_false_boxes(rng, faults, robot, count), *_clutter(rng, faults, robot, count, rate_hz)]
     truth, boxes = (_joined(parts, t_ns, rng) for parts in (true_parts, box_parts))
-    return Scene(truth, boxes, t_ns)
+    if faults.pose_noise_m or faults.pose_noise_rad:
+        _shake(more, faults, boxes, robot, rate_hz)
+    return Scene(truth, boxes, t_ns, robot)
 
 
 class _Track(NamedTuple):
@@ -107,7 +139,7 @@ def _parked(rng: np.random.Generator) -> _Track:
     return _Track(np.array([xy]), np.array([heading + rng.normal(0, 0.02)]), 3, _size(rng, 3))
 
 
-def _vehicle(rng: np.random.Generator, t_s: np.ndarray, class_id: int) -> _Track:
+def _vehicle(rng: np.random.Generator, t_s: np.ndarray, class_id: int, lively: float) -> _Track:
     """A vehicle that goes along a lane, may brake and stop, and may turn at the crossing."""
     top = {2: 5.0, 3: 11.0, 4: 9.0}[class_id] * rng.uniform(0.6, 1.4)
     lane = int(rng.integers(4))
@@ -115,10 +147,10 @@ def _vehicle(rng: np.random.Generator, t_s: np.ndarray, class_id: int) -> _Track
     offset = {2: 4.4, 3: 1.8, 4: 1.8}[class_id] + rng.normal(0, 0.2)
     begin = rng.uniform(-70, 10)
     radius = {2: 5.0, 3: 8.0, 4: 12.0}[class_id] * rng.uniform(0.8, 1.6)
-    turn = float(rng.choice([0.0, 1.0, -1.0], p=[0.4, 0.3, 0.3]))
+    turn = float(rng.choice([0.0, 1.0, -1.0], p=[1 - 0.6 * lively, 0.3 * lively, 0.3 * lively]))
     turn_at = rng.uniform(-12, -6)
     speed, place, heading = top * rng.uniform(0.3, 1.0), np.array([begin, -offset]), 0.0
-    stop_at, stop_for = (rng.uniform(-30, -8), rng.uniform(1, 5)) if rng.random() < 0.35 else (np.inf, 0.0)
+    stop_at, stop_for = (rng.uniform(-30, -8), rng.uniform(1, 5)) if rng.random() < 0.35 * lively else (np.inf, 0.0)
     xy, angles, waited = np.empty((len(t_s), 2)), np.empty(len(t_s)), 0.0
     steps = np.diff(t_s, prepend=t_s[0])
     for number, dt in enumerate(steps.tolist()):
@@ -148,6 +180,68 @@ def _pedestrian(rng: np.random.Generator, t_s: np.ndarray) -> _Track:
     side = rng.choice([-1, 1]) * rng.uniform(5, 12)
     start = np.array([rng.uniform(-40, 40), side])
     return _Track(start + np.cumsum(moves, axis=0), angles, 1, _size(rng, 1))
+
+
+def _group(rng: np.random.Generator, t_s: np.ndarray) -> list[_Track]:
+    """Two to five people who walk or stand side by side."""
+    leader, count = _pedestrian(rng, t_s), int(rng.integers(2, 6))
+    across = np.stack([-np.sin(leader.heading), np.cos(leader.heading)], axis=1)
+    out = []
+    for place in range(count):
+        sway = 0.1 * np.sin(t_s * rng.uniform(0.2, 0.8) + rng.uniform(0, 6))
+        offset = (place * 0.75 + sway)[:, None] * across + rng.normal(0, 0.2, 2)
+        out.append(leader._replace(xy=leader.xy + offset, size=_size(rng, 1)))
+    return out
+
+
+def _points(rng: np.random.Generator, robot: np.ndarray, tracks: Sequence[_Track]) -> np.ndarray:
+    """The number of lidar points on each object in each frame (N, F), of what nearer objects and walls don't hide."""
+    count, rays = len(robot), 1440
+    walls = np.stack([rng.uniform(-50, 50, 6), rng.choice([-1, 1], 6) * rng.uniform(8, 11, 6)], axis=1)
+    xy = np.array([track.xy for track in tracks] + [np.repeat(one[None], count, axis=0) for one in walls])
+    heading = np.array([track.heading for track in tracks] + [np.zeros(count)] * len(walls))
+    length, width, height = np.array([track.size for track in tracks] + [np.array([4.0, 1.5, 2.5])] * len(walls)).T
+    off = xy - robot
+    far = np.maximum(np.hypot(off[..., 0], off[..., 1]), 1.0)
+    angle = np.arctan2(off[..., 1], off[..., 0])
+    side = np.abs(np.sin(angle - heading)) * length[:, None] + np.abs(np.cos(angle - heading)) * width[:, None]
+    half = np.arctan2(side / 2, far)
+    low = np.floor((angle - half) / (2 * np.pi) * rays).astype(int)
+    high = np.maximum(np.ceil((angle + half) / (2 * np.pi) * rays).astype(int), low + 1)
+    share = np.zeros(far.shape)
+    for frame in range(count):
+        top = np.zeros(rays)  # how high up the ray is blocked, as an elevation seen from the sensor at 1.9 m
+        for one in np.argsort(far[:, frame]).tolist():
+            ray = np.arange(low[one, frame], high[one, frame]) % rays
+            d = far[one, frame]
+            bottom, upper = -1.9 / d, (height[one] - 1.9) / d
+            blocked = np.where(top[ray] == 0, bottom, top[ray])
+            share[one, frame] = np.clip((upper - np.maximum(blocked, bottom)) / (upper - bottom), 0, 1).mean()
+            top[ray] = np.maximum(blocked, upper)
+    area = side * height[:, None] * share
+    return rng.poisson(np.minimum(30_000 * area / far**2, 1e6))[: len(tracks)].astype(float)
+
+
+def _doubles(rng: np.random.Generator, faults: Faults, found: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Second boxes of the same object, beside the first."""
+    one = rng.random(len(found["frame"])) < faults.doubles
+    out = {name: values[one].copy() for name, values in found.items()}
+    for name in ("x_m", "y_m"):
+        out[name] += rng.normal(0, 0.25, int(one.sum())) * np.maximum(out["length_m"], 1.0)
+    out["score"] = out["score"] * rng.uniform(0.3, 0.9, int(one.sum()))
+    return out
+
+
+def _shake(rng: np.random.Generator, faults: Faults, boxes: dict[str, np.ndarray], robot: np.ndarray, rate_hz: float):
+    """Errors of the robot's own pose, which move all boxes of a frame together, in place."""
+    spread = [faults.pose_noise_m, faults.pose_noise_m, faults.pose_noise_rad]
+    off = _slow_noise(rng, (len(robot), 3), rate_hz) * spread
+    frame = boxes["frame"]
+    x, y = boxes["x_m"] - robot[frame, 0], boxes["y_m"] - robot[frame, 1]
+    turn = off[frame, 2]
+    boxes["x_m"] = robot[frame, 0] + x * np.cos(turn) - y * np.sin(turn) + off[frame, 0]
+    boxes["y_m"] = robot[frame, 1] + x * np.sin(turn) + y * np.cos(turn) + off[frame, 1]
+    boxes["heading_rad"] = np.arctan2(np.sin(boxes["heading_rad"] + turn), np.cos(boxes["heading_rad"] + turn))
 
 
 def _table(frame: np.ndarray, number: int, class_id: object, xy: np.ndarray, size: np.ndarray, heading: np.ndarray):

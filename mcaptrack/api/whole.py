@@ -34,6 +34,7 @@ def run(
     predictor: str | Transform | None = None,
     camera_motion: CameraMotionUse | None = None,
     across_classes: bool | None = None,
+    class_limits: str | None = None,
     fit_plane: bool | None = None,
     person_height_m: float | None = None,
     ground_frame: str | None = None,
@@ -76,6 +77,9 @@ def run(
     across_classes : bool, optional
         Whether a track may continue with a detection, and after re-tracking with a track, of another class. By default
         as before, and False where there are no tracks yet.
+    class_limits : str, optional
+        Limits of the motion of classes instead of those of the table, for all stages: NAME=SPEED:DRIFT:NOISE:GATE with
+        commas between several, as in "car=40,pedestrian=4::0.1". By default as before.
     fit_plane : bool, optional
         Whether to estimate the ground plane from the boxes of a learned detector where none is given. By default as
         before, and True where there is none yet.
@@ -114,7 +118,7 @@ def run(
     transforms |= {s.name: transform_of(s.name, chosen[s.option], {}) for s in STAGES.values() if s.option in chosen}
 
     plane = PlaneChoice(fit_plane, person_height_m, frame, ground_frame)
-    given = {"camera_motion": camera_motion, "across_classes": across_classes}
+    given = {"camera_motion": camera_motion, "across_classes": across_classes, "class_limits": class_limits}
     shared = {name: value for name, value in given.items() if value is not None}
 
     def plan(opened: logs.Log, prefix: str, say: Callable[[str], None]) -> list[Job]:

@@ -274,6 +274,16 @@ def run_all(
             show_default="within",
         ),
     ] = None,
+    class_limits: Annotated[
+        str | None,
+        common.option(
+            "--class-limits",
+            tuning=True,
+            help="Limits of the motion of a class in all stages: NAME=SPEED:DRIFT:NOISE:GATE in m/s, m/s within a "
+            "second, m and m, as in car=40,pedestrian=4::0.1.",
+            show_default="a table",
+        ),
+    ] = None,
     fit_plane: Annotated[
         bool | None,
         common.option(
@@ -324,7 +334,7 @@ def run_all(
         settings, stages = settings_of("events"), configured(chosen)
     options: dict[str, Any] = {"topic": topic, "tables": tables, "frame": frame, "camera_motion": camera_motion}
     options |= {"fit_plane": fit_plane, "person_height_m": person_height_m, "ground_frame": ground_frame}
-    options |= {"across_classes": across_classes}
+    options |= {"across_classes": across_classes, "class_limits": class_limits}
     for stage in STAGES.values():
         if stage.option in chosen:
             options[stage.option] = stages.pop(stage.name)

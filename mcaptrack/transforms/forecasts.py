@@ -29,6 +29,8 @@ class Forecaster:
         Rate of the frames.
     class_names : ClassNames
         Names of classes, by which the unit of their positions is chosen: predictors know the speeds of people.
+    class_limits : str
+        Limits of the motion of classes instead of those of the table, as the option of transforms.
     **options
         Own parameters of the predictor.
     """
@@ -40,10 +42,11 @@ class Forecaster:
         min_history: int,
         rate_hz: float,
         class_names: ClassNames = (),
+        class_limits: str = "",
         **options: Any,
     ) -> None:
         self._rate_hz, self._min_history = rate_hz, min_history
-        self._class_names = class_names
+        self._class_names, self._class_limits = class_names, class_limits
         self._predictor = make(predictor, max(1, round(horizon_s * rate_hz)), 1 / rate_hz, **options)
         self._histories = Histories(max(self._predictor.past, min_history))
         self._last_ns: int | None = None
@@ -59,7 +62,7 @@ class Forecaster:
         # An interpolated position depends on later ones: a prediction from it would not be causal.
         ready = known[:, -self._min_history :].all(axis=1) & frame.rows["observed"]
         classes, of = np.unique(frame.rows["class_id"][ready], return_inverse=True)
-        unit_m = np.array(units_m(classes.tolist(), self._class_names))[of][:, None, None]
+        unit_m = np.array(units_m(classes.tolist(), self._class_names, self._class_limits))[of][:, None, None]
         mean, cov = self._predictor.predict(past[ready] / unit_m, known[ready])
         forecast = Forecast(mean * unit_m, cov * unit_m[..., None] ** 2)
         return forecast_to_rows(ids[ready], forecast, self._predictor.step_s)

@@ -15,6 +15,11 @@ from mcaptrack.errors import McaptrackError
 
 #: Names of classes by their numbers, as a parameter of transforms.
 ClassNames = tuple[tuple[int, str], ...]
+#: Help text of the option ``class_limits`` of transforms.
+LIMITS_HELP: Final = (
+    "limits of the motion of a class instead of those of the table: NAME=SPEED:DRIFT:NOISE:GATE in m/s, m/s within a "
+    "second, m and m, as in car=40,pedestrian=4::0.1"
+)
 
 
 class MotionLimits(NamedTuple):
@@ -112,7 +117,7 @@ def limits_by_class(numbers: Sequence[int], names: ClassNames, class_limits: str
     return {number: limits_of(known.get(number, UNKNOWN), own) for number in numbers}
 
 
-def units_m(numbers: Sequence[int], names: ClassNames) -> list[float]:
+def units_m(numbers: Sequence[int], names: ClassNames, class_limits: str = "") -> list[float]:
     """For each class the unit of length, in metres, in which its objects move as people do.
 
     What is made for people, as predictors are, works for other classes in this unit. It is 1 for classes without a row.
@@ -122,7 +127,7 @@ def units_m(numbers: Sequence[int], names: ClassNames) -> list[float]:
     >>> units_m([1, 3, 7], ((1, "pedestrian"), (3, "car")))
     [1.0, 4.0, 1.0]
     """
-    found = limits_by_class(numbers, names)
+    found = limits_by_class(numbers, names, class_limits)
     person = LIMITS["person"].speed_m_per_s
     return [1.0 if (row := found[one]).name == UNKNOWN else row.speed_m_per_s / person for one in numbers]
 

@@ -14,7 +14,7 @@ from mcaptrack.predictors.own_options import own_options
 from mcaptrack.registry import Entry
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame, Schema
 from mcaptrack.transforms.forecasts import Forecaster
-from mcaptrack.transforms.motion_limits import ClassNames
+from mcaptrack.transforms.motion_limits import LIMITS_HELP, ClassNames, read_limits
 from mcaptrack.transforms.protocol import check_options, context, is_option_type, option
 
 
@@ -47,6 +47,7 @@ class Predict:
     min_history: int = option(
         4, "number of positions, the current one included, that a prediction needs", least=1, most=100
     )
+    class_limits: str = option("", LIMITS_HELP)
     rate_hz: float = context(lambda: 2.5)
     class_names: ClassNames = context(tuple, is_recorded=False)
 
@@ -59,13 +60,15 @@ class Predict:
 
     def __post_init__(self) -> None:
         check_options(self)
+        read_limits(self.class_limits)
         entry, _ = entry_of(self.predictor)
         if self.own_options and predict_with(self.predictor) is not type(self):
             raise McaptrackError(f"{', '.join(self.own_options)} are no parameters of {entry}")
 
     def __call__(self, frames: Iterable[Frame]) -> Iterator[tuple[Frame, ...]]:
         own = {name: getattr(self, name) for name in self.own_options}
-        forecaster = Forecaster(self.predictor, self.horizon_s, self.min_history, self.rate_hz, self.class_names, **own)
+        classes = self.class_names, self.class_limits
+        forecaster = Forecaster(self.predictor, self.horizon_s, self.min_history, self.rate_hz, *classes, **own)
         for frame in frames:
             yield (frame._replace(rows=forecaster.predict(frame)),)
 

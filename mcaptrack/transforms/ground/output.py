@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from mcaptrack.geometry.angles import wrapped
-from mcaptrack.geometry.arrays import Bools, Floats
+from mcaptrack.geometry.arrays import Floats
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.ragged import group_index, ragged_range
 from mcaptrack.schema import TRACKS, Frame
@@ -64,14 +64,14 @@ class Waiting:
     def __init__(self) -> None:
         self._frames: deque[tuple[Frame, list[Floats]]] = deque()
         self._first = 0
-        self._is_confirmed = np.zeros(256, bool)
+        self._written_as = np.zeros(256, np.int64)
 
-    def confirm(self, ids: Floats) -> None:
-        """Tracks of these ids (K,) are confirmed: their rows are written, also those before."""
+    def confirm(self, ids: Floats, written_as: Floats) -> None:
+        """Tracks of these ids (K,) are confirmed: their rows are written under other ids (K,), also those before."""
         if len(ids):
-            while ids.max() >= len(self._is_confirmed):
-                self._is_confirmed = np.concatenate([self._is_confirmed, np.zeros_like(self._is_confirmed)])
-            self._is_confirmed[ids.astype(np.int64)] = True
+            while ids.max() >= len(self._written_as):
+                self._written_as = np.concatenate([self._written_as, np.zeros_like(self._written_as)])
+            self._written_as[ids.astype(np.int64)] = written_as
 
     def add(self, frame: Frame, tracks: Floats) -> None:
         """Add a frame with the rows of the tracks that were detected in it, as of their table (rows, K)."""
@@ -111,12 +111,10 @@ class Waiting:
             frame, parts = self._frames.popleft()
             self._first += 1
             rows = parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
-            yield frame, rows.compress(self._written(rows), axis=1)
-
-    def _written(self, rows: Floats) -> Bools:
-        ids = rows[_ID].astype(np.int64)
-        inside = ids < len(self._is_confirmed)
-        return np.asarray(inside & self._is_confirmed[np.where(inside, ids, 0)])
+            ids = rows[_ID].astype(np.int64)
+            known = np.minimum(ids, len(self._written_as) - 1)
+            rows[_ID] = np.where(ids == known, self._written_as[known], 0)
+            yield frame, rows.compress(rows[_ID] > 0, axis=1)
 
 
 def rows_to_frames(parts: Sequence[tuple[Frame, Floats]]) -> list[Frame]:

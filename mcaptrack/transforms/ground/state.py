@@ -31,11 +31,13 @@ _SIZE: Final = slice(LENGTH, HEIGHT + 1)
 (
     _AX, _AY, _PP, _PV, _PA, _VV, _VA, _AA, _COS, _SIN, _FACING, _SIZED,
     ID, SCORES, HITS, MISSED_S, LAST_FRAME, IS_CONFIRMED,
-    NOISE, GATE_M, _MAX_SPEED, _DRIFT, _TURNS, _SPEED,
-) = range(DETECTION_ROWS, DETECTION_ROWS + 24)  # fmt: skip
-#: The box at the last detection.
-LAST: Final = slice(DETECTION_ROWS + 24, DETECTION_ROWS + 31)
-_ROWS: Final = LAST.stop
+    NOISE, GATE_M, _MAX_SPEED, _DRIFT, _TURNS, SPEED, AGE_S, LAST_SPREAD,
+) = range(DETECTION_ROWS, DETECTION_ROWS + 26)  # fmt: skip
+#: The box at the last detection, the velocity then, and the position of the first.
+LAST: Final = slice(LAST_SPREAD + 1, LAST_SPREAD + 8)
+LAST_VELOCITY: Final = slice(LAST.stop, LAST.stop + 2)
+FIRST: Final = slice(LAST_VELOCITY.stop, LAST_VELOCITY.stop + 2)
+_ROWS: Final = FIRST.stop
 _VELOCITY, _ACCELERATION = slice(VX, VY + 1), slice(_AX, _AY + 1)
 _COVARIANCE: Final = slice(_PP, _AA + 1)
 
@@ -60,11 +62,16 @@ _FIRST_SIZES: Final = 3
 _FACING_SPEED: Final = 1.0
 
 
+def no_tracks() -> Floats:
+    """A table without tracks, (rows, 0)."""
+    return np.empty((_ROWS, 0))
+
+
 class GroundTracks:
     """The tracks that are alive: ``table`` (rows, K), and the scores of the classes that each had, ``votes`` (C, K)."""
 
     def __init__(self) -> None:
-        self.table: Floats = np.empty((_ROWS, 0))
+        self.table: Floats = no_tracks()
         self.votes: Floats = np.zeros((0, 0))
         self._classes: dict[int, int] = {}
 
@@ -103,6 +110,7 @@ class GroundTracks:
         else:
             t[PLACE] += dt * t[_VELOCITY]
         t[MISSED_S] += dt
+        t[AGE_S] += dt
 
     @staticmethod
     def _rotate(t: Floats, cos: Floats, sin: Floats) -> None:
@@ -125,7 +133,7 @@ class GroundTracks:
         t[HITS] += 1
         t[MISSED_S] = 0
         t[LAST_FRAME] = frame
-        t[LAST] = t[BOX]
+        t[LAST], t[LAST_VELOCITY], t[LAST_SPREAD] = t[BOX], t[_VELOCITY], t[_VV]
         self.table[:, track] = t
         self.table[CLASS, track] = self._winners(track)
 
@@ -140,11 +148,11 @@ class GroundTracks:
         t[_MAX_SPEED] = [row.max_speed_m_per_s for row in rows]
         t[_DRIFT] = [row.drift_m_per_s for row in rows]
         t[_TURNS] = [row.turns for row in rows]
-        t[_SPEED] = [row.speed_m_per_s for row in rows]
+        t[SPEED] = [row.speed_m_per_s for row in rows]
         is_given = np.isfinite(found[VX]) & np.isfinite(found[VY])
         t[_VELOCITY] = np.where(is_given, found[_VELOCITY], 0.0)
         t[_PP] = t[NOISE] ** 2
-        t[_VV] = np.where(is_given, _GIVEN_SPEED, t[_SPEED]) ** 2
+        t[_VV] = np.where(is_given, _GIVEN_SPEED, t[SPEED]) ** 2
         t[_AA] = (t[_DRIFT] * (1 - _NOISE_SHARE)) ** 2 * t[_TURNS]
         has_heading = np.isfinite(found[HEADING])
         angle = np.where(has_heading, found[HEADING], 0.0)
@@ -155,10 +163,17 @@ class GroundTracks:
         t[SCORES] = np.where(np.isnan(found[SCORE]), 0.5, found[SCORE])
         t[HITS] = 1
         t[LAST_FRAME] = frame
-        t[LAST] = t[BOX]
+        t[LAST], t[LAST_VELOCITY], t[LAST_SPREAD], t[FIRST] = t[BOX], t[_VELOCITY], t[_VV], t[PLACE]
         self.table = np.concatenate([self.table, t], axis=1)
         self.votes = np.concatenate([self.votes, np.zeros((len(self.votes), count))], axis=1)
         self._vote(np.arange(len(self) - count, len(self)), found)
+
+    def continue_tracks(self, which: Indices, lost: Floats) -> None:
+        """Let tracks (N,) continue lost ones, (rows, N): they get their ids and sizes."""
+        self.table[ID, which] = lost[ID]
+        known = lost[_SIZED] > self.table[_SIZED, which]
+        self.table[_SIZE, which] = np.where(known, lost[_SIZE], self.table[_SIZE, which])
+        self.table[_SIZED, which] += lost[_SIZED]
 
     def _vote(self, track: Indices, found: Floats) -> None:
         for one in np.unique(found[CLASS]).tolist():

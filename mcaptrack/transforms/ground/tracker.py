@@ -13,11 +13,12 @@ from typing import ClassVar, Final
 
 import numpy as np
 
-from mcaptrack.geometry.arrays import Floats
+from mcaptrack.geometry.arrays import Bools, Floats
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.notices import warn
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame, Schema
 from mcaptrack.transforms.ground.association import Cost, associate
+from mcaptrack.transforms.ground.lost_tracks import LostTracks, continuations
 from mcaptrack.transforms.ground.output import Waiting, rows_to_frames
 from mcaptrack.transforms.ground.state import (
     CLASS,
@@ -31,7 +32,7 @@ from mcaptrack.transforms.ground.state import (
     X,
     Y,
 )
-from mcaptrack.transforms.motion_limits import ClassNames, MotionLimits, limits_by_class, read_limits
+from mcaptrack.transforms.motion_limits import LIMITS_HELP, ClassNames, MotionLimits, limits_by_class, read_limits
 from mcaptrack.transforms.protocol import check_options, context, option
 
 _ASSOCIATION: Final = "Association"
@@ -92,12 +93,18 @@ class GroundTracker:
     """
 
     max_age_s: float = option(
-        2.0, "a track ends after this many seconds without a detection", least=0.0, search=(0.2, 4.0), theme=_LIFE
+        1.6, "a track ends after this many seconds without a detection", least=0.0, search=(0.2, 4.0), theme=_LIFE
     )
     delay_s: float = option(
         1.0,
         "rows are written this many seconds late, so that false births are taken back and short gaps are filled; 0 for "
         "results that depend on the past alone",
+        least=0.0,
+        theme=_LIFE,
+    )
+    link_s: float = option(
+        8.0,
+        "a new track continues a lost one that it fits, up to this many seconds after its last detection; 0 for never",
         least=0.0,
         theme=_LIFE,
     )
@@ -137,12 +144,7 @@ class GroundTracker:
         "a track may continue with a detection of another class; it then has the class of most of its detections",
         theme=_DETECTIONS,
     )
-    class_limits: str = option(
-        "",
-        "limits of the motion of a class instead of those of the table: NAME=SPEED:DRIFT:NOISE:GATE in m/s, m/s within "
-        "a second, m and m, as in car=40,pedestrian=4::0.1",
-        theme=_ASSOCIATION,
-    )
+    class_limits: str = option("", LIMITS_HELP, theme=_ASSOCIATION)
     class_names: ClassNames = context(tuple, is_recorded=False)
 
     reads: ClassVar[Schema] = DETECTIONS
@@ -181,6 +183,7 @@ class _Run:
         self._options = options
         self.tracks, self.waiting = GroundTracks(), Waiting()
         self._limits: dict[int, MotionLimits] = {}
+        self._lost = LostTracks(options.link_s)
         self._last_ns: int | None = None
         self._frame, self._next_id = 0, 1
         self._left_out = 0
@@ -192,6 +195,7 @@ class _Run:
         self._last_ns = frame.t_ns
         found = self._detections(frame)
         tracks.predict(dt)
+        self._lost.wait(dt)
         track, row, is_same = associate(tracks.table, found, options.cost, options.min_iou, options.across_classes)
         before = tracks.table[:, track]
         if len(track):
@@ -203,18 +207,42 @@ class _Run:
             starts[row] = False
             self._initiate(found[:, starts])
         table = tracks.table
-        is_new = (table[IS_CONFIRMED] == 0) & (table[SCORES] >= options.confirm_score)
-        table[IS_CONFIRMED, is_new] = 1
-        self.waiting.confirm(table[ID].compress(is_new))
         is_found = table[LAST_FRAME] == self._frame
+        is_new = (table[IS_CONFIRMED] == 0) & (table[SCORES] >= options.confirm_score)
+        if is_new.any():
+            is_found = is_found[self._confirm(is_new)]
+            table = tracks.table
         self.waiting.add(frame, table.compress(is_found, axis=1))
         if not is_found.all():
             age_s = np.where(table[IS_CONFIRMED] == 1, options.max_age_s, min(_TENTATIVE_S, options.max_age_s))
             is_over = table[MISSED_S] > np.maximum(age_s, 1.5 * dt)
             if is_over.any():
+                self._lost.add(table.compress(is_over & (table[IS_CONFIRMED] == 1), axis=1))
                 tracks.keep(~is_over)
         self._frame += 1
         return self.waiting.due(frame.t_ns - options.delay_s * NS_PER_S)
+
+    def _confirm(self, is_new: Bools) -> Bools:
+        """Confirm tracks (K,), some of which continue lost ones; returns which tracks are still there."""
+        tracks, lost = self.tracks, self._lost
+        new, table = is_new.nonzero()[0], tracks.table
+        ids = table[ID, new]
+        missed = ((table[IS_CONFIRMED] == 1) & (table[LAST_FRAME] < self._frame)).nonzero()[0]
+        kept = np.ones(len(tracks), bool)
+        if self._options.link_s > 0:
+            pool = np.concatenate([lost.table, table[:, missed]], axis=1)
+            old, which = continuations(pool, table[:, new])
+            tracks.continue_tracks(new[which], pool[:, old])
+            count = lost.table.shape[1]
+            is_left = np.ones(count, bool)
+            is_left[old[old < count]] = False
+            lost.keep(is_left)
+            kept[missed[old[old >= count] - count]] = False
+        table[IS_CONFIRMED, new] = 1
+        self.waiting.confirm(ids, table[ID, new])
+        if not kept.all():
+            tracks.keep(kept)
+        return kept
 
     def _initiate(self, found: Floats) -> None:
         """Start a track at each of these detections, (rows, N)."""

@@ -44,16 +44,16 @@ def usual_score(frames: Sequence[Frame]) -> float:
     return max(float(np.median(scores)), 1e-6) if len(scores) else 1.0
 
 
-def movers_of(frames: Sequence[Frame], class_names: ClassNames, usual_score: float) -> Movers:
+def movers_of(frames: Sequence[Frame], class_names: ClassNames, usual_score: float, class_limits: str = "") -> Movers:
     """The unit and the kind of the tracks in frames of one class."""
     parts = [frame.rows for frame in frames if len(frame.rows)]
     if not parts:
         return PEOPLE
     on_ground = all(np.isfinite(part["vx_m_per_s"]).all() for part in parts)
     number = int(parts[0]["class_id"][0])
-    limits = limits_by_class([number], class_names)[number]
+    limits = limits_by_class([number], class_names, class_limits)[number]
     drift_m_per_s = limits.drift_m_per_s if on_ground else None
-    (unit_m,) = units_m([number], class_names)
+    (unit_m,) = units_m([number], class_names, class_limits)
     return Movers(unit_m, on_ground, usual_score, drift_m_per_s)
 
 

@@ -52,6 +52,7 @@ class KeptIds:
             options.min_history,
             options.rate_hz,
             options.class_names,
+            options.class_limits,
         )
         frames = [frame._replace(rows=rows) for frame, rows in zip(self._frames, self.samples, strict=True)]
         joined = join_frames(TRACKS, frames)

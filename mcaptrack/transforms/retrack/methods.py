@@ -109,7 +109,7 @@ def _retrack_together(
     options: Options, new_pass: Callable[[Options, Movers], OnlinePass], frames: Sequence[Frame], score: float
 ) -> Iterator[tuple[Frame, ...]]:
     """Re-track frames without regard to classes; ``score`` is the usual one of the log."""
-    movers = movers_of(frames, options.class_names, score)
+    movers = movers_of(frames, options.class_names, score, options.class_limits)
     run: OnlinePass = KeptIds(options, movers) if movers.on_ground else new_pass(options, movers)
     times_ns = []
     for frame in frames:
