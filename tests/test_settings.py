@@ -66,7 +66,7 @@ def another(setting: Setting, default: Any) -> Any:
         one = next(name for name in get_args(setting.kind) if name != default)
     elif setting.kind is str and isinstance(setting.declared.tuning, str):
         pattern = setting.declared.tuning
-        one = next(word for word in ("cv", "25", "0.25", "min-iou") if re.fullmatch(pattern, word))
+        one = next(word for word in ("cv", "25", "0.25", "min-iou", "car=40") if re.fullmatch(pattern, word))
     else:
         one = {int: 7, float: 0.125, str: "a name", Path: "a file"}[setting.kind]
     return [one, one] if setting.many else one

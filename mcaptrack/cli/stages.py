@@ -24,6 +24,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.registry import BUILT_IN, Kind, names
 from mcaptrack.schema import DETECTIONS
 from mcaptrack.transforms import STAGES, Stage, Transform
+from mcaptrack.transforms.motion_limits import LIMITS_PATTERN
 from mcaptrack.transforms.protocol import choices, member_type
 
 #: Examples for the help, by command.
@@ -65,6 +66,7 @@ def chooser(
 #: Names of options that every stage has beside those of its own.
 RESERVED: Final = ("help", *(name.replace("_", "-") for name in NAMES))
 _AFTER: Final = "After the stages"
+_CLASSES: Final = "Classes of objects"
 _AGAIN: Final = "Use this {kind}, also where another one was used before"
 
 
@@ -111,7 +113,7 @@ def _option(field: Field[Any], annotation: Any, of: Sequence[str] = ()) -> inspe
     info = common.option(
         switch,
         panel=_panel(about.get("theme", ""), of),
-        tuning=_NAME if about.get("kind") else bool(choices(kind)) or kind is not str,
+        tuning=_NAME if about.get("kind") else about.get("pattern") or bool(choices(kind)) or kind is not str,
         help=f"{words[:1].upper()}{words[1:]}.",
         least=about.get("least", -math.inf),
         most=about.get("most", math.inf),
@@ -269,6 +271,7 @@ def run_all(
         bool | None,
         common.option(
             "--across-classes/--within-classes",
+            panel=_CLASSES,
             tuning=True,
             help="Let a track continue with a detection, and after re-tracking with a track, of another class.",
             show_default="within",
@@ -278,7 +281,8 @@ def run_all(
         str | None,
         common.option(
             "--class-limits",
-            tuning=True,
+            panel=_CLASSES,
+            tuning=LIMITS_PATTERN,
             help="Limits of the motion of a class in all stages: NAME=SPEED:DRIFT:NOISE:GATE in m/s, m/s within a "
             "second, m and m, as in car=40,pedestrian=4::0.1.",
             show_default="a table",

@@ -15,6 +15,8 @@ from mcaptrack.errors import McaptrackError
 
 #: Names of classes by their numbers, as a parameter of transforms.
 ClassNames = tuple[tuple[int, str], ...]
+#: Texts of the option ``class_limits`` of transforms.
+LIMITS_PATTERN: Final = r"[\w -]+=[\d.:]+(, ?[\w -]+=[\d.:]+)*"
 #: Help text of the option ``class_limits`` of transforms.
 LIMITS_HELP: Final = (
     "limits of the motion of a class instead of those of the table: NAME=SPEED:DRIFT:NOISE:GATE in m/s, m/s within a "

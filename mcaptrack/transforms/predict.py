@@ -14,7 +14,7 @@ from mcaptrack.predictors.own_options import own_options
 from mcaptrack.registry import Entry
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame, Schema
 from mcaptrack.transforms.forecasts import Forecaster
-from mcaptrack.transforms.motion_limits import LIMITS_HELP, ClassNames, read_limits
+from mcaptrack.transforms.motion_limits import LIMITS_HELP, LIMITS_PATTERN, ClassNames, read_limits
 from mcaptrack.transforms.protocol import check_options, context, is_option_type, option
 
 
@@ -47,7 +47,7 @@ class Predict:
     min_history: int = option(
         4, "number of positions, the current one included, that a prediction needs", least=1, most=100
     )
-    class_limits: str = option("", LIMITS_HELP)
+    class_limits: str = option("", LIMITS_HELP, pattern=LIMITS_PATTERN)
     rate_hz: float = context(lambda: 2.5)
     class_names: ClassNames = context(tuple, is_recorded=False)
 

@@ -168,6 +168,7 @@ def option(
     kind: Kind | None = None,
     theme: str = "",
     was: str = "",
+    pattern: str = "",
 ) -> Any:
     """Declare a parameter of a transform, as a field of its dataclass.
 
@@ -188,6 +189,8 @@ def option(
         Heading in the help of the command, shared by related parameters.
     was : str
         Former name, which is accepted for one release.
+    pattern : str
+        Regular expression of a text that a settings file in the working folder may set; "" for none.
 
     Returns
     -------
@@ -205,7 +208,7 @@ def option(
     if most is None:
         most = math.inf if least == -math.inf else LARGEST
     about = {"help": help, "least": least, "most": most, "search": search, "kind": kind, "theme": theme}
-    about["was"] = was
+    about |= {"was": was, "pattern": pattern}
     return field(default=default, metadata=about)
 
 

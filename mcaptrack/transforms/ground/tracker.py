@@ -32,7 +32,14 @@ from mcaptrack.transforms.ground.state import (
     X,
     Y,
 )
-from mcaptrack.transforms.motion_limits import LIMITS_HELP, ClassNames, MotionLimits, limits_by_class, read_limits
+from mcaptrack.transforms.motion_limits import (
+    LIMITS_HELP,
+    LIMITS_PATTERN,
+    ClassNames,
+    MotionLimits,
+    limits_by_class,
+    read_limits,
+)
 from mcaptrack.transforms.protocol import check_options, context, option
 
 _ASSOCIATION: Final = "Association"
@@ -144,7 +151,7 @@ class GroundTracker:
         "a track may continue with a detection of another class; it then has the class of most of its detections",
         theme=_DETECTIONS,
     )
-    class_limits: str = option("", LIMITS_HELP, theme=_ASSOCIATION)
+    class_limits: str = option("", LIMITS_HELP, pattern=LIMITS_PATTERN, theme=_ASSOCIATION)
     class_names: ClassNames = context(tuple, is_recorded=False)
 
     reads: ClassVar[Schema] = DETECTIONS

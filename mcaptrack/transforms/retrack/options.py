@@ -14,7 +14,7 @@ from mcaptrack.geometry.plane import Planes
 from mcaptrack.predictors import PredictorName
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame, Schema
 from mcaptrack.transforms.durations import longest_track_s
-from mcaptrack.transforms.motion_limits import LIMITS_HELP, ClassNames, read_limits
+from mcaptrack.transforms.motion_limits import LIMITS_HELP, LIMITS_PATTERN, ClassNames, read_limits
 from mcaptrack.transforms.protocol import check_options, context, option
 from mcaptrack.transforms.retrack.distances import Covariance, Distance
 
@@ -125,7 +125,7 @@ class RetrackOptions:
         "a track may continue with one of another class; offline it then has the class of most of its samples",
         theme=_ASSOCIATION,
     )
-    class_limits: str = option("", LIMITS_HELP, theme=_MOTION)
+    class_limits: str = option("", LIMITS_HELP, pattern=LIMITS_PATTERN, theme=_MOTION)
     smooth: bool = option(True, "smooth positions by past and future", theme=_OFFLINE)
     side_view: bool = option(
         False,
