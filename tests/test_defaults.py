@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from mcaptrack.transforms import PROFILES, TRACKERS, TRANSFORMS, RetrackByConsistency
+from mcaptrack.transforms import PROFILES, TRACKERS, TRANSFORMS, GroundTracker, RetrackByConsistency
 from tests.commands import GROUP
 
 SORT: dict[str, Any] = {
@@ -47,6 +47,7 @@ RETRACKING = {
     "resolve_swaps": True,
     "track_confidence": 0.5,
     "across_classes": False,
+    "class_limits": "",
     "smooth": True,
     "interpolated": False,
     "side_view": False,
@@ -65,9 +66,22 @@ DEFAULTS: dict[str, dict[str, Any]] = {
     "sort": SORT,
     "bytetrack": SORT | {"high_score": 0.5, "new_score": 0.6, "low_min_iou": 0.5},
     "ocsort": SORT | {"inertia": 0.2, "direction_frames": 3, "recover": True, "reupdate": True},
+    "ground": {
+        "max_age_s": 1.6,
+        "delay_s": 1.0,
+        "link_s": 8.0,
+        "confirm_score": 0.9,
+        "birth_score": 0.2,
+        "cost": "metres",
+        "min_iou": 0.05,
+        "min_score": None,
+        "class_id": None,
+        "across_classes": False,
+        "class_limits": "",
+    },
     "motion": {"mask_boxes": True},
     "sample": {"rate_hz": 2.5, "max_gap_s": 2.0},
-    "predict": {"predictor": "red", "horizon_s": 4.8, "min_history": 4},
+    "predict": {"predictor": "red", "horizon_s": 4.8, "min_history": 4, "class_limits": ""},
     "retrack": RETRACKING
     | {
         "merge_distance_m": 1.0,
@@ -125,7 +139,8 @@ def options_of(transform: Any) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize(
-    ("name", "kind"), (dict(TRANSFORMS) | dict(TRACKERS) | {"consistency": RetrackByConsistency}).items()
+    ("name", "kind"),
+    (dict(TRANSFORMS) | dict(TRACKERS) | {"consistency": RetrackByConsistency, "ground": GroundTracker}).items(),
 )
 def test_defaults(name, kind):
     assert options_of(kind()) == DEFAULTS[name]

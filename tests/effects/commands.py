@@ -101,6 +101,7 @@ CASES: dict[str, dict[str, Case]] = {
         predictor=("run a.mcap --no-tables", "--predictor cv"),
         retracker=("run a.mcap --no-tables", "--retracker none"),
         camera_motion=("run a.mcap --no-tables", "--camera-motion on"),
+        across_classes=("run a.mcap --no-tables", "--across-classes"),
         class_limits=("run a.mcap --no-tables", "--class-limits car=40"),
         fit_plane="--no-fit-plane",
         person_height_m="--person-height-m 1.5",
