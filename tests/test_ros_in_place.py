@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import json
 import shutil
+import sys
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import yaml
 from mcap.reader import make_reader
+from mcap.writer import Writer
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
@@ -19,10 +22,11 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import mcaptrack
 from mcaptrack import log
-from mcaptrack.schema import SCHEMAS
+from mcaptrack.schema import SCHEMAS, TRACKS
+from mcaptrack.schema.encodings import CDR, cdr_codec, record_of
 from mcaptrack.schema.provenance import Provenance
-from tests.bags import MOT
-from tests.commands import done
+from tests.bags import MOT, T0
+from tests.commands import call, done
 from tests.space_logs import WAYS, Robot, write
 from tests.test_ros_recordings import record
 
@@ -180,3 +184,184 @@ def test_drop_gives_the_recording_back(ran, tmp_path):
     assert raw(path) == ran["recorded"]
     assert metadata(path) == yaml.safe_load(ran["metadata"])["rosbag2_bagfile_information"]
     check_whole(path, ran["recorded"])
+
+
+def test_views_are_rendered(ran, tmp_path):
+    frames = {}
+    for one in (ran["path"], ran["beside"]):
+        done("render", one, "-o", tmp_path / "a.gif", "--width", "200", "--force")
+        frames[one] = (tmp_path / "a.gif").read_bytes()
+    assert frames[ran["path"]] == frames[ran["beside"]]
+
+
+def test_a_copy_holds_ros_messages_too(ran, tmp_path):
+    out = tmp_path / "copy.mcap"
+    shutil.copytree(ran["path"].parent, tmp_path / "drive")
+    path = tmp_path / "drive" / ran["path"].name
+    done("drop", path, *ours(path))
+    before = path.read_bytes()
+    source = "/lidar/boxes" if ran["words"][0] == "--topic" else "/robot/front/image"
+    stage = ["track", "--topic", source] if "boxes" in source else ["detect", "--detector", "frame-difference"]
+    done(stage[0], path, *stage[1:], "-o", out)
+    assert path.read_bytes() == before
+    with out.open("rb") as stream:
+        assert {one.message_encoding for one in make_reader(stream).get_summary().channels.values()} == {"cdr"}
+    assert Counter(topic for topic, *_ in by_rosbags(out)[0]) == by_mcap_ros2(out)
+    assert [one for one in raw(out) if one[0] not in ours(out)] == ran["recorded"]
+
+
+@pytest.fixture(scope="module")
+def tracked(tmp_path_factory) -> Path:
+    """A recording of two files with tracks in the first one. Not to be changed."""
+    folder = tmp_path_factory.mktemp("two") / "drive"
+    path = drive(folder, version=8, shots=4)
+    info = yaml.safe_load((folder / "metadata.yaml").read_text())
+    inner = info["rosbag2_bagfile_information"]
+    shutil.copy(path, folder / "drive_1.mcap")
+    for counted in (inner, *inner["topics_with_message_count"]):
+        counted["message_count"] *= 2
+    inner["files"].append(inner["files"][0] | {"path": "drive_1.mcap"})
+    inner["relative_file_paths"].append("drive/drive_1.mcap")
+    (folder / "metadata.yaml").write_text(json.dumps(info))  # which is YAML, too
+    (folder / "before.yaml").write_bytes((folder / "metadata.yaml").read_bytes())
+    done("track", path, "--topic", "/lidar/boxes", "--in-place")
+    return path
+
+
+@pytest.fixture
+def copied(tracked, tmp_path) -> Path:
+    shutil.copytree(tracked.parent, tmp_path / "drive")
+    return tmp_path / "drive" / "drive.mcap"
+
+
+def test_a_recording_of_several_files_is_counted_as_a_whole(copied):
+    other = copied.with_name("drive_1.mcap")
+    done("track", other, "--topic", "/lidar/boxes", "--in-place")
+    messages, topics = by_rosbags(copied.parent)
+    assert Counter(one[0] for one in messages) == Counter(one[0] for path in (copied, other) for one in raw(path))
+    assert topics.count("/lidar/tracks") == 1
+    info = metadata(copied)
+    assert [one["message_count"] for one in info["files"]] == [len(raw(copied)), len(raw(other))]
+    assert info["message_count"] == len(messages)
+    done("drop", other, *ours(other))
+    done("drop", copied, *ours(copied))
+    before = yaml.safe_load(copied.with_name("before.yaml").read_text())
+    assert metadata(copied) == before["rosbag2_bagfile_information"]
+
+
+def test_a_command_that_was_killed_before_it_wrote_the_metadata_is_made_good(copied):
+    whole = metadata(copied)
+    copied.with_name("metadata.yaml").write_bytes(copied.with_name("before.yaml").read_bytes())
+    assert metadata(copied) != whole
+    done("track", copied, "--topic", "/lidar/boxes")
+    assert metadata(copied) == whole
+
+
+def test_metadata_that_can_not_be_brought_up_to_date_is_said(copied):
+    copied.with_name("drive_1.mcap").unlink()
+    result = done("track", copied, "--topic", "/lidar/boxes", "--force")
+    (line,) = [line for line in result.err.splitlines() if "metadata.yaml does not count" in line]
+    assert "drive_1.mcap" in line
+
+
+def test_a_killed_write_leaves_the_recording_as_it_was(copied, monkeypatch):
+    before = copied.read_bytes(), metadata(copied)
+
+    def fail(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(sys.modules["mcaptrack.log.extend"], "verify", fail)
+    with pytest.raises(KeyboardInterrupt):
+        mcaptrack.predict(copied, topic="/lidar/tracks", predictor="cv")
+    assert (copied.read_bytes(), metadata(copied)) == before
+
+
+def test_results_that_stand_twice_are_said(copied):
+    other = copied.with_name("other")
+    shutil.copytree(copied.parent, other)
+    lone = other / "drive.mcap"
+    done("drop", lone, *ours(lone))
+    done("track", lone, "--topic", "/lidar/boxes", "--sidecar")
+    shutil.copy(lone.with_name("drive.results.mcap"), copied.with_name("drive.results.mcap"))
+    result = done("predict", copied, "--topic", "/lidar/tracks", "--predictor", "cv")
+    (line,) = [line for line in result.err.splitlines() if "and in drive.results.mcap" in line]
+    assert f"stand in {copied} and in drive.results.mcap; the second is read and replaced" in line
+
+
+def test_topics_that_ros_does_not_accept_are_said(copied):
+    result = done("track", copied, "--topic", "/lidar/boxes", "--to", "/lidar/2nd")
+    assert "ROS 2 accepts no topic like /lidar/2nd, /lidar/2nd/view/scene: its tools read these messages" in result.err
+    by_rosbags(copied.parent)
+    result = done("drop", copied, "/lidar/2nd*")
+    assert "ROS 2 accepts" not in result.err
+
+
+def odd(path: Path, topic: str, record: tuple[str, str, bytes], payloads: list[bytes], t_ns: int = T0) -> Path:
+    """A recording of ROS 2 with a channel as other software, or another version, wrote it."""
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start("ros2", "robot")
+        channel = writer.register_channel(topic, "cdr", writer.register_schema(*record))
+        for number, payload in enumerate(payloads):
+            writer.add_message(channel, t_ns + number * 100_000_000, payload, t_ns, number)
+        writer.finish()
+    return path
+
+
+def test_rows_of_another_version_are_read_and_wrong_ones_are_refused_in_one_line(tmp_path):
+    name, encoding, data = record_of(TRACKS, CDR)
+    rows = TRACKS.rows(
+        track_id=[3, 4], x_px=[1, 2], y_px=[1, 2], w_px=[1, 2], h_px=[1, 2], x_m=[1.5, 2], y_m=[0, 1], score=[0.5, 1],
+        observed=[True, False], source_id=[-1, 7],
+    )  # fmt: skip
+    payloads = cdr_codec(TRACKS).encode_all(rows, np.array([2]))
+    path = odd(tmp_path / "a.mcap", "/own/tracks", (name, encoding, data), [*payloads, *payloads])
+    with mcaptrack.open(path) as opened:
+        assert opened.array("tracks")["track_id"].tolist() == [3, 3, 4, 4]
+        assert opened.array("tracks")["x_m"].tolist() == [1.5, 1.5, 2, 2]
+    for number, (wrong, said) in enumerate(
+        [
+            (
+                (name, encoding, data.replace(b"int64 track_id", b"int32 track_id")),
+                "its definition of mcaptrack_msgs/TracksRow has int32 track_id, not int64",
+            ),
+            ((name, encoding, b"string data\n"), "its definition has not one field, rows"),
+            ((name, encoding, b""), "its definition has not one field, rows"),
+        ]
+    ):
+        path = odd(tmp_path / f"{number}.mcap", "/own/tracks", wrong, payloads)
+        result = call("export", path)
+        assert (result.code, result.err.count("\n")) == (1, 1), result.err
+        assert f"/own/tracks can't be read as mcaptrack.Tracks: {said}" in result.err
+    path = odd(tmp_path / "cut.mcap", "/own/tracks", (name, encoding, data), [payloads[0][:-9]])
+    result = call("export", path)
+    assert (result.code, result.err.count("\n")) == (1, 1)
+    assert f"{len(payloads[0]) - 9} bytes are not a CDR message of its definition" in result.err
+
+
+def test_times_that_ros_does_not_have_are_refused_in_one_line(tmp_path):
+    name, encoding, data = record_of(TRACKS, CDR)
+    rows = TRACKS.rows(
+        track_id=[3], x_px=[1], y_px=[1], w_px=[1], h_px=[1], x_m=[1.5], y_m=[0], score=[0.5], observed=[True],
+        source_id=[-1],
+    )  # fmt: skip
+    payloads = cdr_codec(TRACKS).encode_all(rows, np.array([1])) * 20
+    path = odd(tmp_path / "a.mcap", "/own/tracks", (name, encoding, data), payloads, 2**31 * 10**9)
+    before = path.read_bytes()
+    result = call("predict", path, "--topic", "/own/tracks", "--in-place", "--predictor", "cv")
+    assert result.code == 1
+    assert "ROS has times from 1970 to 2038 only" in result.err.splitlines()[-1]
+    assert path.read_bytes() == before
+
+
+def test_a_recording_of_ros_1_gets_protobuf_and_that_is_said(tmp_path):
+    path = odd(tmp_path / "a.mcap", "/own/tracks", record_of(TRACKS, CDR), [])
+    data = path.read_bytes().replace(b"ros2", b"ros1", 1)
+    path.write_bytes(data)
+    (tmp_path / "gt.txt").write_text(MOT)
+    result = done(
+        "ingest", tmp_path / "gt.txt", "--as", "truth", "--into", path, "--in-place", "--frames", "30", "--fps", "10"
+    )
+    assert "--in-place was given; ROS tools may stumble over them, for it is a ROS 1 recording" in result.err
+    with log.read(path) as opened:
+        assert opened.channel("/camera/truth").message_encoding == "protobuf"

@@ -16,11 +16,13 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaptrack import foxglove, log, notices
+from mcaptrack import log, notices
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Image, Ints
 from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
 from mcaptrack.pipeline import RobotPath
+from mcaptrack.sources.foreign.decoding import decoder_with_errors
+from mcaptrack.sources.foreign.flatten import message_type_of
 from mcaptrack.sources.pictures import Pictures
 from mcaptrack.sources.video import write_clip
 from mcaptrack.viewing import from_above
@@ -92,14 +94,14 @@ def render(
 
     def drawn() -> Iterator[tuple[int, Image]]:
         span = int(chosen[0]), int(chosen[-1]) + 1
-        views = [_at_times(opened.messages(topic, *span)) for topic in view_topics]
+        views = [(_at_times(opened.messages(topic, *span)), _reader(opened, topic)) for topic in view_topics]
         for done, frame in enumerate(pictures.frames(numbers.tolist()), 1):
             image = _scaled(np.asarray(frame.rows, np.uint8), options.width_px)
             scale = image.shape[1] / frame.rows.shape[1]
-            for view in views:
+            for view, read in views:
                 payload = view(frame.t_ns)
                 if payload is not None:
-                    image = draw(image, foxglove.unpack(foxglove.ANNOTATIONS, payload), scale)
+                    image = draw(image, read(payload), scale)
             yield frame.t_ns, image
             progress("render", done, len(chosen))
 
@@ -148,19 +150,24 @@ def render_from_above(
     sights = _sights(opened, view_topics, span, options.width_px or _WIDTH_PX, path, len(chosen))
 
     def drawn() -> Iterator[tuple[int, Image]]:
-        views = [_at_times(opened.messages(topic, *span)) for topic in view_topics]
+        views = [(_at_times(opened.messages(topic, *span)), _reader(opened, topic)) for topic in view_topics]
         for done, (t_ns, sight) in enumerate(zip(chosen.tolist(), sights, strict=True), 1):
             image = draw(from_above.ground(sight), from_above.grid(sight))
             if path is not None:
                 image = draw(image, from_above.robot(sight, path.at_m[done - 1], float(path.heading_rad[done - 1])))
-            for view in views:
+            for view, read in views:
                 payload = view(t_ns)
                 if payload is not None:
-                    image = draw(image, from_above.drawing(foxglove.unpack(foxglove.SCENE, payload), sight))
+                    image = draw(image, from_above.drawing(read(payload), sight))
             yield t_ns, image
             progress("render", done, len(chosen))
 
     return write_clip(output, drawn(), _rate_of(chosen))
+
+
+def _reader(opened: log.Log, topic: str) -> Callable[[bytes], Any]:
+    """A function that reads the messages of a view: ROS messages in recordings of ROS 2, otherwise protobuf."""
+    return decoder_with_errors(message_type_of(opened, topic), lambda message: message)
 
 
 def _sights(
@@ -173,10 +180,11 @@ def _sights(
         if len(known):
             nearest = known[np.abs(known[None] - np.arange(count)[:, None]).argmin(axis=1)]
             return [Sight(x, y, size[0] / _AROUND_M, *size) for x, y in path.at_m[nearest].tolist()]
+    read = _reader(opened, topics[0])
     places = [
         (shape.pose.position.x, shape.pose.position.y)
         for message in opened.messages(topics[0], *span)
-        for entity in foxglove.unpack(foxglove.SCENE, message.payload).entities
+        for entity in read(message.payload).entities
         for shape in (*entity.cubes, *entity.cylinders)
     ]
     low, high = np.quantile(np.array(places), [0.01, 0.99], axis=0) if places else np.array([[-5.0, -5.0], [5.0, 5.0]])

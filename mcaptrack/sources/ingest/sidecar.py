@@ -53,6 +53,7 @@ class SidecarChoice:
             return False
         if results.exists():
             self.why = "earlier results are there"
+            _warn_twice(opened, results)
             return True
         if not recording:
             return False
@@ -67,6 +68,21 @@ class SidecarChoice:
     def words(self, written_to: Path) -> str:
         """A line that says where results were written, and why."""
         return f"results are in {written_to}: {self.why}"
+
+
+def _warn_twice(opened: log.Log, results: Path) -> None:
+    """Warn of results that stand in a log and beside it."""
+    ours = {channel.topic for channel in opened.recorded if Provenance.from_metadata(channel.metadata)}
+    with log.read(results) as beside:
+        twice = sorted(ours & beside.channels.keys())
+    if twice:
+        those = twice[0] if len(twice) == 1 else f"{len(twice)} channels, such as {twice[0]},"
+        verb = "stands" if len(twice) == 1 else "stand"
+        warn(
+            f"{those} {verb} in {opened.path} and in {results.name}; the second is read and replaced "
+            "until it is removed",
+            "other",
+        )
 
 
 def _for_ros_tools(opened: log.Log, recording: str) -> str:
