@@ -161,6 +161,25 @@ def test_a_run_across_classes_tracks_and_retracks_so_until_told_otherwise(passed
         assert len(opened.rows("/lidar/tracks", TRACKS).rows) > 10 * len(OBJECTS)
 
 
+def test_rows_about_tracks_have_their_classes_in_tables(passed):
+    with mcaptrack.open(passed) as opened:
+        names = {}
+        for topic in ("/lidar/samples", "/lidar/retracks/online", "/lidar/retracks"):
+            rows = [row for row in opened.table("tracks").to_pylist() if row["topic"] == topic]
+            names[topic] = {row["track_id"]: row["class"] for row in rows}
+        assert set(names["/lidar/samples"].values()) == {"car", "pedestrian"}
+        for topic, tracks in (("predictions", "samples"), ("retracks/predictions", "retracks/online")):
+            for table, ending in (("predictions", ""), ("forecast_errors", "/errors")):
+                rows = [row for row in opened.table(table).to_pylist() if row["topic"] == f"/lidar/{topic}{ending}"]
+                assert len(rows) > 10
+                assert all(row["class"] == names[f"/lidar/{tracks}"][row["track_id"]] for row in rows)
+        events = [row for row in opened.table("events").to_pylist() if row["topic"] == "/lidar/retracks/events"]
+        truth = {number: name for number, (name, *_) in OBJECTS.items()}
+        wanted = [names["/lidar/retracks"].get(row["track_id"], truth.get(row["truth_id"])) for row in events]
+        assert [row["class"] for row in events] == wanted
+        assert None not in wanted
+
+
 def test_errors_of_predictions_are_those_of_each_class_alone(passed):
     """Both walk and drive straight on: a class scored by itself has the errors that a log of it alone would have."""
     scores = mcaptrack.evaluate(passed, similarity="metres", gate_m=2.0)

@@ -26,7 +26,7 @@ from hypothesis import strategies as st
 
 from mcaptrack import tables
 from mcaptrack.errors import McaptrackError
-from mcaptrack.schema import PREDICTIONS, SCHEMAS, TRACKS, Frame
+from mcaptrack.schema import EVENTS, PREDICTIONS, SCHEMAS, TRACKS, Frame
 from mcaptrack.tables import TABLES, Pointers
 from tests.strategies import columns
 from tests.worlds import ns, tracks_at
@@ -187,7 +187,15 @@ def test_tables_without_rows_keep_their_columns(tmp_path):
     tables.write(tmp_path / "a.parquet", tables.rows_table(PREDICTIONS, {}), {})
     read = pq.read_table(tmp_path / "a.parquet")
     assert read.num_rows == 0
-    assert read.schema.names == ["topic", "frame", "t", "t_ns", "row", *(column.name for column in PREDICTIONS.columns)]
+    assert read.schema.names == [
+        "topic",
+        "frame",
+        "t",
+        "t_ns",
+        "row",
+        *(column.name for column in PREDICTIONS.columns),
+        "class",
+    ]
     assert tables.verify(tmp_path / "a.parquet") == 0
 
 
@@ -499,3 +507,15 @@ def test_tracks_of_other_tools_are_read_as_frames(tmp_path, more):
         assert row["source_id"] == -1
         assert row["observed"] == ("observed" not in more or row["x_m"] != 1.5)
         assert all(np.isnan(row[name]) for name in ("x_px", "y_px", "w_px", "h_px", "score"))
+
+
+def test_rows_about_tracks_have_the_class_of_the_track_or_of_the_object_that_is_missed():
+    rows = EVENTS.empty(4)
+    rows["kind"], rows["track_id"], rows["truth_id"] = 5, [3, -1, 4, -1], [-1, 3, 9, 8]
+    named = tables.TrackNames({3: "car", 9: "bus"}, {3: "dog", 9: "cat"})
+    table = tables.rows_table(
+        EVENTS, {"/b/events": [Frame(1, 0, rows)], "/a/events": [Frame(1, 0, rows)]}, {}, {"/b/events": named}
+    )
+    found = {(row["topic"], row["row"]): row["class"] for row in table.to_pylist()}
+    assert [found["/b/events", n] for n in range(4)] == ["car", "dog", None, None]
+    assert {found["/a/events", n] for n in range(4)} == {None}

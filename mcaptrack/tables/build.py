@@ -59,12 +59,23 @@ def table_of(schema: Schema) -> Table:
     return next(table for table in TABLES.values() if table.rows_of is schema)
 
 
+class TrackNames(NamedTuple):
+    """The names of the classes of tracks by their ids: of the tracks that rows are about, and of the ground truth."""
+
+    tracks: Mapping[int, str] = {}
+    truth: Mapping[int, str] = {}
+
+
 def rows_table(
-    schema: Schema, channels: Mapping[str, Part | Sequence[Frame]], names: Mapping[str, Mapping[int, str]] = {}
+    schema: Schema,
+    channels: Mapping[str, Part | Sequence[Frame]],
+    names: Mapping[str, Mapping[int, str]] = {},
+    of_tracks: Mapping[str, TrackNames] = {},
 ) -> Any:
     """All rows of channels of one schema as an Arrow table, in the table's order; missing numbers are null.
 
-    ``names`` are the names of classes by their number, for each channel that names any.
+    ``names`` are the names of classes by their number, for each channel that names any; ``of_tracks`` those of tracks,
+    for each channel with rows about tracks of another one.
     """
     import pyarrow as pa
 
@@ -76,26 +87,57 @@ def rows_table(
     pieces = [_rows_of(schema, table, Part(*part)) for part in members.values()]
     own = [field.name for field in table.arrow if field.name not in ("topic", CLASS.name)]
     columns = {name: pa.chunked_array([piece[name] for piece in pieces], table.arrow.field(name).type) for name in own}
-    if CLASS.name in table.arrow.names:
+    if table.is_of_tracks():
+        columns[CLASS.name] = _names_of_tracks(pieces, [of_tracks.get(topic, TrackNames()) for topic in members])
+    elif CLASS.name in table.arrow.names:
         ids = [np.asarray(piece["class_id"]) for piece in pieces]
         columns[CLASS.name] = _class_column(ids, [names.get(topic, {}) for topic in members])
     columns["topic"] = _repeated(list(members), [len(part[0]) for part in members.values()])
     return pa.table([columns[field.name] for field in table.arrow], schema=table.arrow)
 
 
+def names_by_track(rows: Rows, names: Mapping[int, str]) -> dict[int, str]:
+    """The names of the classes of tracks by id, as far as they have one; ``names`` are those of classes by number."""
+    ids, track = np.unique(rows["track_id"].astype(np.int64), return_inverse=True)
+    known = {PERSON: _PERSON, **names}
+    classes = majority(track, rows["class_id"], len(ids)).tolist()
+    return {one: known[of] for one, of in zip(ids.tolist(), classes, strict=True) if of in known}
+
+
+def _names_of_tracks(pieces: Sequence[Mapping[str, Any]], names: Sequence[TrackNames]) -> Any:
+    """The names of the classes of tracks as an Arrow dictionary; for rows without a track, of the ground truth."""
+    words: dict[str, int] = {}
+    codes = []
+    for piece, known in zip(pieces, names, strict=True):
+        ids = np.asarray(piece["track_id"])
+        code = _codes(ids, known.tracks, words)
+        if "truth_id" in piece:
+            code = np.where(ids >= 0, code, _codes(np.asarray(piece["truth_id"]), known.truth, words))
+        codes.append(code)
+    return _dictionary(codes, words)
+
+
 def _class_column(ids: Sequence[NDArray[Any]], names: Sequence[Mapping[int, str]]) -> Any:
     """The names of classes as an Arrow dictionary; ``ids`` and ``names`` are those of each channel."""
+    words: dict[str, int] = {}
+    known = {PERSON: _PERSON}
+    parts = zip(ids, names, strict=True)
+    return _dictionary([_codes(some, {**known, **of_channel}, words) for some, of_channel in parts], words)
+
+
+def _codes(numbers: NDArray[Any], names: Mapping[int, str], words: dict[str, int]) -> NDArray[np.int32]:
+    """The places of names in ``words``, to which new ones are added; -1 for numbers without a name."""
+    there, which = np.unique(numbers, return_inverse=True)
+    called = [names.get(number) for number in there.tolist()]
+    of = [-1 if name is None else words.setdefault(name, len(words)) for name in called]
+    return np.array(of, np.int32)[which]
+
+
+def _dictionary(codes: Sequence[NDArray[np.int32]], words: Mapping[str, int]) -> Any:
+    """Names as an Arrow dictionary; null for -1."""
     import pyarrow as pa
 
-    known = {PERSON: _PERSON}
-    words: dict[str, int] = {}
-    codes = [np.empty(0, np.int32)]
-    for some, of_channel in zip(ids, names, strict=True):
-        there, which = np.unique(some, return_inverse=True)
-        called = [{**known, **of_channel}.get(number) for number in there.tolist()]
-        of = [-1 if name is None else words.setdefault(name, len(words)) for name in called]
-        codes.append(np.array(of, np.int32)[which])
-    joined = np.concatenate(codes)
+    joined = np.concatenate([np.empty(0, np.int32), *codes])
     return pa.DictionaryArray.from_arrays(pa.array(joined, mask=joined < 0), pa.array(list(words), pa.string()))
 
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 #: Version of the tables' columns: the second number grows when columns are added.
-TABLE_VERSION: Final = "1.3"
+TABLE_VERSION: Final = "1.4"
 
 #: The unit of counts and ids.
 _NONE: Final = "1"
@@ -75,7 +75,13 @@ class Table:
         if self.rows_of is not None:
             fields += [_with_unit(field) for field in self.rows_of.arrow]
             fields += [CLASS.arrow] if has_classes(self.rows_of) else []
+            fields += [TRACK_CLASS.arrow] if self.is_of_tracks() else []
         return pa.schema(fields)
+
+    def is_of_tracks(self) -> bool:
+        """Whether its rows name tracks by their ids, and so have the classes of these."""
+        of = self.rows_of
+        return of is not None and not has_classes(of) and "track_id" in {column.name for column in of.columns}
 
 
 def _with_unit(field: Any) -> Any:
@@ -96,6 +102,14 @@ TIMES: Final = (_TOPIC, _FRAME, _T, _T_NS)
 _ROW: Final = Field("row", _INT, "number of the row in its channel, in the order of the log, from 0")
 #: The last column of each table of rows with a ``class_id``.
 CLASS: Final = Field("class", _NAME, "name of its class in this channel; null if it has none", nullable=True)
+
+#: The last column of each table of rows that name tracks of another channel.
+TRACK_CLASS: Final = Field(
+    CLASS.name,
+    _NAME,
+    "name of the class of its track, or of the object that is missed; null if it has none",
+    nullable=True,
+)
 
 #: The column with the name of the log; in files it is in the name of the folder.
 RECORDING: Final = Field("recording", _NAME, "the log, by name; the same in all tables")

@@ -14,12 +14,12 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.clocks import LAST_NS
 from mcaptrack.schema import DETECTIONS
 from mcaptrack.schema.classes import class_names
-from mcaptrack.schema.provenance import Provenance
+from mcaptrack.schema.provenance import Provenance, input_of
 from mcaptrack.sources import foreign
-from mcaptrack.sources.cameras import Camera, cameras
+from mcaptrack.sources.cameras import Camera, cameras, provenance_of
 from mcaptrack.sources.fixed_frame import BoxesRead, holds_boxes, holds_boxes_3d
 from mcaptrack.sources.foreign.flatten import flattener, message_type_of
-from mcaptrack.tables import TABLES, Part, Pointers
+from mcaptrack.tables import TABLES, Part, Pointers, TrackNames
 from mcaptrack.tables.export.names import file_name, recording_name
 
 #: Tables about the places of messages, or about the whole log.
@@ -43,7 +43,8 @@ class LogTables:
         table = TABLES[name]
         if table.rows_of is not None:
             parts = {topic: self._part(topic) for topic in self.topics(name)}
-            return tables.rows_table(table.rows_of, parts, self._class_names)
+            of_tracks = {topic: self._track_names(topic) for topic in parts} if table.is_of_tracks() else {}
+            return tables.rows_table(table.rows_of, parts, self._class_names, of_tracks)
         made: Mapping[str, Callable[[], Any]] = {
             "frames": lambda: tables.frames_table({topic: self._pointers(topic) for topic in self.topics("frames")}),
             "track_summary": lambda: tables.summary_table(
@@ -153,6 +154,21 @@ class LogTables:
             t_ns = self.opened.times(topic)
             return Part(DETECTIONS.empty(), t_ns, np.arange(len(t_ns)), np.zeros(len(t_ns), np.int64))
         return tables.frames_to_part(DETECTIONS, frames)
+
+    def _track_names(self, topic: str) -> TrackNames:
+        """The names of the classes of the tracks, and of the ground truth, that the rows of a channel are about."""
+        made = provenance_of(self.opened, topic)
+        base = topic.removesuffix("/events").removesuffix("/errors")
+        beside = base.removesuffix("/predictions")
+        near = (base,) if base == beside else (f"{beside}/online", beside, input_of(self.opened.channel(base).metadata))
+        there = set(self.topics("tracks"))
+        tracks = next((one for one in near if one in there), "")
+        truth = next((one for one in made.references if one in there), "") if made else ""
+
+        def names(of: str) -> dict[int, str]:
+            return tables.names_by_track(self._part(of).rows, self._class_names.get(of, {})) if of else {}
+
+        return TrackNames(names(tracks), names(truth))
 
     def _note(self, name: str, words: str) -> None:
         self.notes[name] = "; ".join([*filter(None, [self.notes.get(name)]), words])
