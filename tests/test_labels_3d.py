@@ -185,13 +185,18 @@ def test_kitti_boxes_have_the_same_corners_with_z_up(tmp_path):
     )
     path = tmp_path / "0001.txt"
     lines = [kitti(k // 3, k % 3, ("Car", "Pedestrian", "Van")[k % 3], *box) for k, box in enumerate(boxes)]
-    path.write_text("\n".join([*lines, "1 -1 DontCare -1 -1 -10 1 2 3 4 -1 -1 -1 -1000 -1000 -1000 -10"]))
+    path.write_text(
+        "\n".join(
+            [*lines, *[f"{frame} -1 DontCare -1 -1 -10 1 2 3 4 -1 -1 -1 -1000 -1000 -1000 -10" for frame in (1, 2)]]
+        )
+    )
     result, found, metadata = ingested(path, label_format="kitti-3d", fps=10)
-    assert found.t_ns.tolist() == [0, 100_000_000]
+    assert found.t_ns.tolist() == [0, 100_000_000, 200_000_000]
+    assert np.diff(found.ends).tolist() == [3, 3, 0]  # a picture with a region alone is labelled, too
     assert json.loads(metadata["mcaptrack.classes"]) == {"1": "Pedestrian", "2": "Car", "3": "Van"}
     assert metadata["mcaptrack.frame_id"] == "camera_link"
     assert "x is forward, y left, z up" in " ".join(result.notes)
-    assert "also holds 1 regions (DontCare)" in " ".join(one.message for one in result.warnings)
+    assert "also holds 2 regions (DontCare)" in " ".join(one.message for one in result.warnings)
     ours = columns_to_oriented_boxes(found.rows)
     for box, one in zip(boxes, ours, strict=True):
         corners = [(*xy, one[2] + up * one[5] / 2) for xy in bev_corners(one[None])[0] for up in (1, -1)]
@@ -262,6 +267,45 @@ def test_a_scene_of_nuscenes(tmp_path):
     assert len(found.rows) == 6
 
 
+#: The classes of the detection task as nuScenes defines them; other categories have no class.
+NUSCENES_CLASSES = {
+    "movable_object.barrier": "barrier",
+    "vehicle.bicycle": "bicycle",
+    "vehicle.bus.bendy": "bus",
+    "vehicle.bus.rigid": "bus",
+    "vehicle.car": "car",
+    "vehicle.construction": "construction_vehicle",
+    "vehicle.motorcycle": "motorcycle",
+    "human.pedestrian.adult": "pedestrian",
+    "human.pedestrian.child": "pedestrian",
+    "human.pedestrian.construction_worker": "pedestrian",
+    "human.pedestrian.police_officer": "pedestrian",
+    "movable_object.trafficcone": "traffic_cone",
+    "vehicle.trailer": "trailer",
+    "vehicle.truck": "truck",
+}
+WITHOUT_CLASS = ("animal", "human.pedestrian.stroller", "vehicle.emergency.police", "static_object.bicycle_rack")
+
+
+def test_categories_of_nuscenes_have_the_classes_of_its_tasks(tmp_path):
+    categories = [*NUSCENES_CLASSES, *WITHOUT_CLASS]
+    (tmp_path / "data").mkdir()
+    _, (first, *_) = nuscenes(tmp_path / "data")
+    source, _ = nuscenes(
+        tmp_path / "data",
+        category=[{"token": f"c{k}", "name": name} for k, name in enumerate(categories)],
+        instance=[{"token": f"i{k}", "category_token": f"c{k}"} for k in range(len(categories))],
+        sample_annotation=[first | {"token": f"a{k}", "instance_token": f"i{k}"} for k in range(len(categories))],
+    )
+    _, found, metadata = ingested(source, scene="scene-0061", classes="all")
+    names = {int(number): name for number, name in json.loads(metadata["mcaptrack.classes"]).items()}
+    order = np.argsort(found.rows["track_id"])
+    called = [names[number] for number in found.rows["class_id"][order].tolist()]
+    assert called == [*NUSCENES_CLASSES.values(), *WITHOUT_CLASS]
+    _, found, _ = ingested(source, scene="scene-0061")
+    assert len(found.rows) == len(NUSCENES_CLASSES)
+
+
 @pytest.mark.parametrize(
     ("scene", "changed", "words"),
     [
@@ -316,7 +360,9 @@ def test_a_log_of_argoverse_in_the_citys_frame(tmp_path):
     turn = Rotation.from_euler("zyx", np.column_stack([rng.uniform(-3, 3, 7), rng.uniform(-0.05, 0.05, (7, 2))]))
     moved = rng.uniform(-900, 900, (7, 3))
     order = rng.permutation(7)
-    poses = {"timestamp_ns": (T0 + 100_000_000 * np.arange(-1, 6))[order]} | quaternions(turn[order])
+    poses = {"timestamp_ns": (T0 + 100_000_000 * np.arange(-1, 6))[order]} | {
+        name: 1.03 * values for name, values in quaternions(turn[order]).items()
+    }
     poses |= dict(zip(("tx_m", "ty_m", "tz_m"), moved[order].T, strict=True))
     feather.write_feather(pa.table(poses), folder / "city_SE3_egovehicle.feather")
     _, found, metadata = ingested(folder / "annotations.feather")

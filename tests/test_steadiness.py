@@ -94,6 +94,16 @@ def test_a_shift_below_a_third_of_a_pixel_is_no_motion(by, is_moved):
     assert found[0, 2] == pytest.approx(by * is_moved, abs=0.15)
 
 
+def test_a_picture_without_a_fit_lies_where_the_one_before_it_lay():
+    wide, other, camera = textured(width=480), textured(width=480, seed=4), Registration()
+    camera.register(shifted(wide, 0))
+    before, _ = camera.register(shifted(wide, 5))
+    found, begins = camera.register(shifted(other, 5))
+    assert (camera.view, begins) == ("lost", False)
+    assert before[0, 2] == pytest.approx(5, abs=0.3)
+    np.testing.assert_array_equal(found, before)
+
+
 def test_a_picture_without_a_fit_is_moving_or_lost():
     """Moving: all points share one shift since the picture before. Lost: none of them is found again."""
     wide, other = textured(width=480), textured(width=480, seed=4)
