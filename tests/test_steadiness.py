@@ -104,6 +104,17 @@ def test_a_picture_without_a_fit_lies_where_the_one_before_it_lay():
     np.testing.assert_array_equal(found, before)
 
 
+def test_a_camera_that_has_come_to_stand_elsewhere_shakes_about_that_place():
+    wide, camera = textured(width=480), Registration()
+    path = [*np.arange(0, 50, 2.0), *[50.0] * 60]
+    begins = [camera.register(shifted(wide, by))[1] for by in path]
+    assert begins[0]
+    assert begins[1:].count(True) == 1
+    found, _ = camera.register(shifted(wide, 52))
+    assert camera.view == "steady"
+    assert found[0, 2] == pytest.approx(2, abs=0.3)
+
+
 def test_a_picture_without_a_fit_is_moving_or_lost():
     """Moving: all points share one shift since the picture before. Lost: none of them is found again."""
     wide, other = textured(width=480), textured(width=480, seed=4)
