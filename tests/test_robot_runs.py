@@ -102,6 +102,13 @@ def test_a_video_from_above_follows_the_robot_and_has_all_objects_in_their_place
     assert np.abs(away - [32, 28, 26]).max() < 40
 
 
+def test_a_video_of_recorded_boxes_follows_the_robot_too(passed, tmp_path):
+    result = mcaptrack.render(passed, tmp_path / "a.mp4", topic="/lidar/boxes", end_s=0.05)
+    assert result.views == ("/lidar/boxes/view/scene",)
+    with av.open(str(tmp_path / "a.mp4")) as container:
+        assert next(container.decode(video=0)).to_ndarray(format="bgr24")[360, 480].min() > 180
+
+
 def test_without_a_robot_all_places_are_in_the_video(tmp_path):
     rows = [f"{n * 100_000_000},{k},{100 + 300 * k + n},{50 - 20 * k},0.5,4,2,1.5,0" for n in range(16) for k in (1, 2)]
     (tmp_path / "truth.csv").write_text("\n".join(["t_ns,id,x_m,y_m,z_m,length_m,width_m,height_m,heading_rad", *rows]))

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from itertools import islice
+from typing import Final, NamedTuple
 
 import numpy as np
 
-from mcaptrack import log
+from mcaptrack import foxglove, log
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.foxglove import views
 from mcaptrack.foxglove.views import layouts
@@ -15,10 +16,12 @@ from mcaptrack.geometry.angles import headings
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.notices import warn
 from mcaptrack.pipeline.drawing import recorded_sources, robot_frame
-from mcaptrack.schema.provenance import frame_id_of, input_of
 from mcaptrack.sources.cameras import camera_at
 from mcaptrack.sources.frames import transforms_of
 from mcaptrack.transforms import FULL
+
+#: The number of scenes that are read to find their frame.
+_MOST_READ: Final = 100
 
 
 class Shown(NamedTuple):
@@ -104,8 +107,7 @@ class RobotPath(NamedTuple):
 
 def robot_path(opened: log.Log, prefix: str, view: str, t_ns: Ints) -> RobotPath | None:
     """Return the path of the robot that recorded the boxes of a view; None if none moves in its frame."""
-    channel = opened.channels.get(input_of(opened.channel(view).metadata))
-    fixed, tree = frame_id_of(channel.metadata) if channel else "", transforms_of(opened)
+    fixed, tree = _frame_of(opened, view), transforms_of(opened)
     if not fixed or tree is None:
         return None
     sources = recorded_sources(opened, camera_at(opened, prefix).topics)
@@ -114,3 +116,9 @@ def robot_path(opened: log.Log, prefix: str, view: str, t_ns: Ints) -> RobotPath
         return None
     poses = tree.lookup(fixed, robot, t_ns)
     return RobotPath(np.asarray(poses.translation[:, :2]), headings(poses.rotation[:, :, 0]))
+
+
+def _frame_of(opened: log.Log, view: str) -> str:
+    """Return the frame of the scenes of a view; "" if the first ones are empty."""
+    scenes = (foxglove.unpack(foxglove.SCENE, one.payload) for one in islice(opened.messages(view), _MOST_READ))
+    return next((str(entity.frame_id) for scene in scenes for entity in scene.entities), "")
