@@ -25,7 +25,7 @@ from mcaptrack import log
 from mcaptrack.schema import SCHEMAS, TRACKS
 from mcaptrack.schema.encodings import CDR, cdr_codec, record_of
 from mcaptrack.schema.provenance import Provenance
-from tests.bags import MOT, T0
+from tests.bags import MOT, T0, bag1, bag2
 from tests.commands import call, done
 from tests.space_logs import WAYS, Robot, write
 from tests.test_ros_recordings import record
@@ -365,3 +365,31 @@ def test_a_recording_of_ros_1_gets_protobuf_and_that_is_said(tmp_path):
     assert "--in-place was given; ROS tools may stumble over them, for it is a ROS 1 recording" in result.err
     with log.read(path) as opened:
         assert opened.channel("/camera/truth").message_encoding == "protobuf"
+
+
+def test_a_bag_of_ros_1_in_a_recording_of_ros_2_is_said(copied):
+    bag1(copied.parent / "a.bag", 3, 50)
+    result = done("ingest", copied.parent / "a.bag", "--into", copied, "--in-place")
+    assert f"{copied} gets messages that are not of ROS 2 (encoding: ros1); ROS tools may stumble" in result.err
+    assert "/talk" not in {one["topic_metadata"]["name"] for one in metadata(copied)["topics_with_message_count"]}
+    (copied.parent / "a.bag").unlink()
+
+
+def test_a_bag_of_ros_2_in_a_recording_is_counted(copied, tmp_path):
+    bag2(tmp_path / "more", "MCAP")
+    result = done("ingest", tmp_path / "more", "--into", copied, "--in-place")
+    assert "not of ROS 2" not in result.err
+    counts = {
+        one["topic_metadata"]["name"]: one["message_count"] for one in metadata(copied)["topics_with_message_count"]
+    }
+    assert (counts["/talk"], counts["/image"]) == (30, 10)
+    assert metadata(copied)["message_count"] == sum(counts.values())
+
+
+def test_labels_in_a_copy_of_a_recording_are_ros_messages(tmp_path):
+    path = record(tmp_path / "drive")
+    (tmp_path / "gt.txt").write_text(MOT)
+    words = ["--truth", tmp_path / "gt.txt", "--camera", "robot/front", "-o", tmp_path / "labelled.mcap"]
+    done("ingest", path, *words)
+    assert by_mcap_ros2(tmp_path / "labelled.mcap")["/robot/front/truth"]
+    assert [one for one in raw(tmp_path / "labelled.mcap") if one[0] == "/robot/front/image"] == raw(path)

@@ -220,7 +220,7 @@ class Messages:
         return ChannelRows(rows, t_ns[order], sequence[order], counts[order])
 
     def parts(self, channels: Sequence[int], schema: Schema, reader: RowReader) -> Iterator[ChannelRows | None]:
-        """What ``columns`` gives, chunk by chunk: None where a message has another layout."""
+        """Yield the rows that ``columns`` returns, chunk by chunk; None where a message has another layout."""
         for group in _in_order(self._batches(channels)):
             t_ns = to_int64(np.concatenate([batch.t_ns for batch in group]))
             rows, sequence, counts = [], [], []

@@ -15,11 +15,14 @@ from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.clocks import LAST_NS
 from mcaptrack.geometry.plane import GroundPlane
+from mcaptrack.notices import warn
+from mcaptrack.schema.encodings import CDR
 from mcaptrack.sources import foreign
 from mcaptrack.sources.ingest.bags.recording import Connection, ReadingNotes, RecordingReader
 from mcaptrack.sources.ingest.job import IngestJob, IngestOptions, Progress
 from mcaptrack.sources.ingest.labels.camera import choose_camera, picture_predicate, timeline_of
 from mcaptrack.sources.ingest.labels.timeline import Timeline
+from mcaptrack.sources.ingest.sidecar import encoding_for
 from mcaptrack.sources.video import EncodedPicture, decode_gray
 
 #: A larger message would need a chunk that readers with a size limit refuse.
@@ -94,9 +97,11 @@ class RecordingJob(IngestJob):
             itself = self._recorded.as_log
             if itself is not None and itself.real_path == into.real_path:
                 raise McaptrackError(f"{self.source} can't be added to itself")
+            self._warn_encodings(into)
             return log.extend(into, drop=self.topics_to_replace(into, force))
         self._copied_log = self._recorded.as_log
         if self._copied_log is not None:
+            self.encoding = encoding_for(self._copied_log)
             return log.extend(self._copied_log, output, drop=self.topics_to_replace(self._copied_log, force))
         recorded = {connection.topic for connection in self._recorded.connections}
         doubled = recorded & set(super().topics())
@@ -105,6 +110,13 @@ class RecordingJob(IngestJob):
                 f"{self.source} has {', '.join(sorted(doubled))} already; {super().hint_other_topic(recorded)}"
             )
         return log.create(output, self._recorded.profile)
+
+    def _warn_encodings(self, into: log.Log) -> None:
+        """Warn if a recording of ROS 2 gets messages that ROS 2 can't read."""
+        odd = sorted({connection.encoding or "none" for connection in self._recorded.connections} - {CDR})
+        if self.encoding == CDR and odd:
+            words = f"{into.path} gets messages that are not of ROS 2 (encoding: {', '.join(odd)})"
+            warn(f"{words}; ROS tools may stumble over them", "other")
 
     def write(self, writer: log.LogWriter, has_clock: bool) -> None:
         """Write everything in the recording, then the labels."""

@@ -1,7 +1,7 @@
-"""Keep metadata.yaml true where results are written into a file of a recording of ROS 2, or removed from it.
+"""Keep metadata.yaml true where channels are written into a file of a recording of ROS 2, or removed from it.
 
 The file of messages is written first, so an interruption in between leaves a metadata.yaml that counts too few or too
-many; the next command that writes to the log brings it up to date. Topics of other software are left as they are.
+many; the next command that writes to the log brings it up to date. The counts of recorded topics stay as they are.
 """
 
 from __future__ import annotations
@@ -29,10 +29,15 @@ _HASH: Final = 7
 
 
 class _Content(NamedTuple):
-    """The messages of a file by topic, the types of those that hold results, and the times of all."""
+    """All topics of a file, and of those with ROS messages their messages and types, and which hold results.
 
+    The times are those of all messages.
+    """
+
+    topics: set[str]
     messages: Counts
-    results: dict[str, str]
+    kinds: dict[str, str]
+    results: set[str]
     start_ns: int
     end_ns: int
 
@@ -58,15 +63,16 @@ def _update(metadata: Path) -> None:
     before, info = plain_yaml.dump(whole), whole[ROOT]
     old = [(name, count) for name, *_, count in bag.topics]
     there = _totals(files.values())
-    results = {topic: kind for file in files.values() for topic, kind in file.results.items()}
+    kinds = {topic: kind for file in files.values() for topic, kind in file.kinds.items()}
+    results = {topic for file in files.values() for topic in file.results}
     entries = [
         entry | ({"message_count": _number(there[name])} if name in results else {})
         for entry, (name, count) in zip(info["topics_with_message_count"] or [], old, strict=True)
-        if name in there or not count
+        if not count or any(name in file.topics for file in files.values())
     ]
     version = info.get("version", "")
     version = int(version) if str(version).isdecimal() else 0
-    entries += [_entry(topic, results[topic], there[topic], version) for topic in sorted(results.keys() - dict(old))]
+    entries += [_entry(topic, kinds[topic], there[topic], version) for topic in sorted(there.keys() - dict(old))]
     info["topics_with_message_count"] = entries
     new = [(str(entry["topic_metadata"]["name"]), int(entry["message_count"])) for entry in entries]
     if "message_count" in info and str(info["message_count"]).isdecimal():
@@ -84,15 +90,15 @@ def _update(metadata: Path) -> None:
 
 def _read(path: Path) -> _Content:
     with log.read(path, sidecar=False) as opened:
-        ours = [channel for channel in opened.recorded if Provenance.from_metadata(channel.metadata)]
         # ROS tools refuse a recording that names other encodings.
-        odd = {channel.topic for channel in ours if channel.message_encoding != CDR or not channel.messages}
+        known = [one for one in opened.recorded if one.message_encoding == CDR and one.messages]
         messages: Counts = {}
-        for channel in opened.recorded:
-            if channel.topic not in odd:
-                messages[channel.topic] = messages.get(channel.topic, 0) + channel.messages
-        results = {channel.topic: opened.record_name(channel) for channel in ours if channel.topic not in odd}
-        return _Content(messages, results, opened.start_ns, opened.end_ns)
+        for channel in known:
+            messages[channel.topic] = messages.get(channel.topic, 0) + channel.messages
+        kinds = {channel.topic: opened.record_name(channel) for channel in known}
+        results = {channel.topic for channel in known if Provenance.from_metadata(channel.metadata)}
+        topics = {channel.topic for channel in opened.recorded}
+        return _Content(topics, messages, kinds, results, opened.start_ns, opened.end_ns)
 
 
 def _sum(topics: Iterable[tuple[str, int]]) -> int:
