@@ -8,7 +8,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from mcaptrack import foxglove, log
+from mcaptrack import log
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.foxglove import views
 from mcaptrack.foxglove.views import layouts
@@ -17,6 +17,7 @@ from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.notices import warn
 from mcaptrack.pipeline.drawing import recorded_sources, robot_frame
 from mcaptrack.sources.cameras import camera_at
+from mcaptrack.sources.foreign.flatten import message_decoder
 from mcaptrack.sources.frames import transforms_of
 from mcaptrack.transforms import FULL
 
@@ -120,5 +121,6 @@ def robot_path(opened: log.Log, prefix: str, view: str, t_ns: Ints) -> RobotPath
 
 def _frame_of(opened: log.Log, view: str) -> str:
     """Return the frame of the scenes of a view; "" if the first ones are empty."""
-    scenes = (foxglove.unpack(foxglove.SCENE, one.payload) for one in islice(opened.messages(view), _MOST_READ))
+    decode = message_decoder(opened, view)
+    scenes = (decode(one.payload) for one in islice(opened.messages(view), _MOST_READ))
     return next((str(entity.frame_id) for scene in scenes for entity in scene.entities), "")

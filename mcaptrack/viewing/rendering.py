@@ -21,8 +21,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Image, Ints
 from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
 from mcaptrack.pipeline import RobotPath
-from mcaptrack.sources.foreign.decoding import decoder_with_errors
-from mcaptrack.sources.foreign.flatten import message_type_of
+from mcaptrack.sources.foreign.flatten import message_decoder
 from mcaptrack.sources.pictures import Pictures
 from mcaptrack.sources.video import write_clip
 from mcaptrack.viewing import from_above
@@ -94,7 +93,7 @@ def render(
 
     def drawn() -> Iterator[tuple[int, Image]]:
         span = int(chosen[0]), int(chosen[-1]) + 1
-        views = [(_at_times(opened.messages(topic, *span)), _reader(opened, topic)) for topic in view_topics]
+        views = [(_at_times(opened.messages(topic, *span)), message_decoder(opened, topic)) for topic in view_topics]
         for done, frame in enumerate(pictures.frames(numbers.tolist()), 1):
             image = _scaled(np.asarray(frame.rows, np.uint8), options.width_px)
             scale = image.shape[1] / frame.rows.shape[1]
@@ -150,7 +149,7 @@ def render_from_above(
     sights = _sights(opened, view_topics, span, options.width_px or _WIDTH_PX, path, len(chosen))
 
     def drawn() -> Iterator[tuple[int, Image]]:
-        views = [(_at_times(opened.messages(topic, *span)), _reader(opened, topic)) for topic in view_topics]
+        views = [(_at_times(opened.messages(topic, *span)), message_decoder(opened, topic)) for topic in view_topics]
         for done, (t_ns, sight) in enumerate(zip(chosen.tolist(), sights, strict=True), 1):
             image = draw(from_above.ground(sight), from_above.grid(sight))
             if path is not None:
@@ -165,11 +164,6 @@ def render_from_above(
     return write_clip(output, drawn(), _rate_of(chosen))
 
 
-def _reader(opened: log.Log, topic: str) -> Callable[[bytes], Any]:
-    """A function that reads the messages of a view: ROS messages in recordings of ROS 2, otherwise protobuf."""
-    return decoder_with_errors(message_type_of(opened, topic), lambda message: message)
-
-
 def _sights(
     opened: log.Log, topics: Sequence[str], span: tuple[int, int], width_px: int, path: RobotPath | None, count: int
 ) -> list[Sight]:
@@ -180,7 +174,7 @@ def _sights(
         if len(known):
             nearest = known[np.abs(known[None] - np.arange(count)[:, None]).argmin(axis=1)]
             return [Sight(x, y, size[0] / _AROUND_M, *size) for x, y in path.at_m[nearest].tolist()]
-    read = _reader(opened, topics[0])
+    read = message_decoder(opened, topics[0])
     places = [
         (shape.pose.position.x, shape.pose.position.y)
         for message in opened.messages(topics[0], *span)

@@ -16,7 +16,7 @@ import numpy as np
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.clocks import NS_PER_S
-from mcaptrack.sources.foreign.decoding import MessageType, unpacker
+from mcaptrack.sources.foreign.decoding import MessageType, decoder_with_errors, unpacker
 
 Path = tuple[str, ...]
 Value = bool | int | float | str | bytes | list[Any] | None
@@ -38,6 +38,14 @@ def message_type_of(opened: log.Log, topic: str) -> MessageType:
     schema = index.schemas.get(index.channels[channel.id].schema_id)
     words = (schema.name, schema.encoding, bytes(schema.data)) if schema else ("", "", b"")
     return MessageType(*words, channel.message_encoding)
+
+
+def message_decoder(opened: log.Log, topic: str) -> Callable[[bytes], Any]:
+    """A function that decodes the messages of a channel: a view is a ROS message in a recording of ROS 2.
+
+    Raises McaptrackError as ``unpacker`` does; so does the returned function for malformed payloads.
+    """
+    return decoder_with_errors(message_type_of(opened, topic), lambda message: message)
 
 
 def flattener(kind: MessageType) -> Callable[[bytes], dict[Path, Value]]:
