@@ -30,6 +30,8 @@ _ARROW: Final = np.array([[2.0, 0.0], [-2.0, 1.0], [-1.2, 0.0], [-2.0, -1.0]])
 _MOST_LINES: Final = 10
 _STEPS: Final = (1.0, 2.0, 5.0)
 _TEXT_PX: Final = 12.0
+#: The distance of labels from their places, so that they don't hide small objects.
+_BESIDE_PX: Final = np.array([8.0, -8.0])
 
 
 class Sight(NamedTuple):
@@ -101,7 +103,7 @@ def drawing(scene: Any, sight: Sight) -> Any:
             shades = shades[1::2] if line.type == _LIST else shades
             _line(out, _ANNOTATED.get(line.type, _ANNOTATED[_STRIP]), px, plain, line.thickness / 2, shades)
         for text in entity.texts:
-            at = sight.to_pixels(_placed(text.pose, np.zeros((1, 3))))[0]
+            at = sight.to_pixels(_placed(text.pose, np.zeros((1, 3))))[0] + _BESIDE_PX
             _text(out, text.text, at, (text.color.r, text.color.g, text.color.b, 1.0))
     return out
 
