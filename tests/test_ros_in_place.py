@@ -162,6 +162,15 @@ def test_rows_are_those_that_stand_beside(ran):
             assert tables[0].equals(tables[1]), name
 
 
+def test_scores_are_those_of_results_that_stand_beside(ran):
+    if ran["words"][0] == "--topic":
+        return  # without ground truth
+    scores = [json.loads(done("evaluate", ran[name], "--json").out)["results"] for name in ("path", "beside")]
+    text = json.dumps(scores[0]).replace(str(ran["path"]), str(ran["beside"]))
+    assert '"IDF1"' in text
+    assert json.loads(text) == scores[1]
+
+
 def test_a_second_run_does_nothing_and_a_stage_again_stays_whole(ran, tmp_path):
     shutil.copytree(ran["path"].parent, tmp_path / "drive")
     path = tmp_path / "drive" / ran["path"].name
@@ -393,3 +402,16 @@ def test_labels_in_a_copy_of_a_recording_are_ros_messages(tmp_path):
     done("ingest", path, *words)
     assert by_mcap_ros2(tmp_path / "labelled.mcap")["/robot/front/truth"]
     assert [one for one in raw(tmp_path / "labelled.mcap") if one[0] == "/robot/front/image"] == raw(path)
+
+
+def test_a_recording_with_compressed_messages_is_not_mixed_with_others(tmp_path):
+    bag2(tmp_path / "bag", "MCAP", "MESSAGE")
+    path = tmp_path / "bag" / "bag.mcap"
+    before = path.read_bytes(), metadata(path)
+    (tmp_path / "gt.txt").write_text(MOT)
+    words = ["--as", "truth", "--frames", "30", "--fps", "10", "--into", path]
+    result = call("ingest", tmp_path / "gt.txt", *words, "--in-place")
+    assert (result.code, result.err.count("\n")) == (1, 1)
+    assert "compressed one by one; results in bag.mcap would not be" in result.err
+    assert "leave --in-place out, or use --sidecar" in result.err
+    assert (path.read_bytes(), metadata(path)) == before

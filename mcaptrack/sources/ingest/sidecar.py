@@ -18,7 +18,7 @@ from mcaptrack.notices import warn
 from mcaptrack.schema.cdr import is_ros_topic
 from mcaptrack.schema.encodings import CDR, PROTOBUF, Encoding
 from mcaptrack.schema.provenance import Provenance
-from mcaptrack.sources.ingest.bags.metadata_yaml import METADATA, names_file
+from mcaptrack.sources.ingest.bags.metadata_yaml import METADATA, is_packed, names_file
 
 #: The profiles of the MCAP registry that ROS tools read, and their names in messages.
 _PROFILES: Final = {"ros1": "ROS 1", "ros2": "ROS 2"}
@@ -94,9 +94,18 @@ def _for_ros_tools(opened: log.Log, recording: str) -> str:
 
 
 def encoding_for(opened: log.Log) -> Encoding:
-    """The encoding of results in a log, or in a copy of it: CDR in a recording of ROS 2 itself, otherwise protobuf."""
+    """The encoding of results in a log, or in a copy of it: CDR in a recording of ROS 2 itself, otherwise protobuf.
+
+    Raises McaptrackError for a recording with messages that are compressed one by one: results are not.
+    """
     if opened.results is not None or not recording_of(opened):
         return PROTOBUF
+    for path in (opened.path, opened.real_path):
+        if is_packed(path.with_name(METADATA), path.name):
+            raise McaptrackError(
+                f"{path.with_name(METADATA)} says that messages are compressed one by one; results in {path.name} "
+                "would not be, and ROS tools could not read them; leave `sidecar=False` out, or use `sidecar=True`"
+            )
     profile, library = log.header(opened)
     is_ros1 = profile == "ros1" and not library.startswith(log.LIBRARY)
     return PROTOBUF if is_ros1 else CDR

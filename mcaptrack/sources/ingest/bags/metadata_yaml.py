@@ -43,6 +43,17 @@ def names_file(path: Path, name: str) -> bool:
         return True
 
 
+def is_packed(path: Path, name: str) -> bool:
+    """Whether a metadata.yaml says that the messages of this file are compressed one by one."""
+    if not holds_metadata(path):
+        return False
+    try:
+        bag, names = read_metadata(path)
+    except McaptrackError:
+        return False
+    return bag.packed and name in names
+
+
 def _start(path: Path) -> bytes:
     """The first bytes up to the limit, and one more if there are more."""
     try:
