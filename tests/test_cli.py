@@ -319,7 +319,7 @@ class TestErrors:
         "input as output": (["ingest", "clip.mp4", "-o", "clip.mp4", "--force"], "clip.mp4 is both input and output"),
         "a log as its own copy": (["run", "a.mcap", "-o", "a.mcap", "--force"], "a.mcap is both input and output"),
         "no log": (["run", "text.mp4"], "text.mp4 can't be read as an MCAP file"),
-        "a folder as a log": (["info", "folder"], "folder is a folder, not an MCAP file"),
+        "a folder as a log": (["info", "folder"], "the folder folder has no log: no file in it ends with .mcap"),
         "a video as a log": (["run", "clip.mp4"], "clip.mp4 is a video, not an MCAP file; `mcaptrack ingest clip.mp4`"),
         "truth beside a log": (
             ["evaluate", "a.mcap", "--truth", "good.txt"],
@@ -542,7 +542,9 @@ def test_check_lists_findings_in_a_table(finished, tmp_path):
     raw[len(raw) // 3] ^= 1
     (tmp_path / "bad.mcap").write_bytes(raw)
     code, out, err = call("check", finished, tmp_path / "bad.mcap")
-    assert (code, err) == (1, "")
+    each, bad, together = err.splitlines()  # of many logs, a line for each as it ends, and one for all
+    assert (code, each) == (1, f"{finished}: sound")
+    assert bad.startswith(f"{tmp_path / 'bad.mcap'}: damaged, ") and together.startswith("2 logs in ")
     assert f"{tmp_path / 'bad.mcap'}: damaged; " in out
     assert "the checksum of a chunk is wrong" in out
     code, out, _ = call("check", tmp_path / "bad.mcap", "--json")
