@@ -1,0 +1,94 @@
+"""Logs on a Dask cluster: what one log does to its worker harms no other, and a lost scheduler is one line."""
+
+from __future__ import annotations
+
+import builtins
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from mcaptrack import fleet
+from mcaptrack.errors import McaptrackError
+from mcaptrack.fleet import cluster
+from mcaptrack.fleet.worker import Request
+from tests import fleet_tasks
+
+pytest.importorskip("distributed")
+pytestmark = pytest.mark.usefixtures("never_waits")
+
+
+@pytest.fixture(scope="module")
+def scheduler() -> Iterator[tuple[str, subprocess.Popen[str]]]:
+    """The address of a scheduler with two workers, and its process."""
+    command = [sys.executable, "-m", "tests.fleet_cluster"]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        yield process.stdout.readline().strip(), process
+        process.kill()
+
+
+def test_a_cluster_does_what_processes_do_until_its_scheduler_is_lost(scheduler, tmp_path, monkeypatch):
+    address, process = scheduler
+    monkeypatch.chdir(tmp_path)
+    words = {"a": "a", "b": "b", "die": "die", "hang": "hang", "refuse": "refuse", "warn": "warn"}
+    for name, text in words.items():
+        Path(f"{name}.mcap").write_text(text)
+    given = {"scheduler": address, "ledger": "ledger.jsonl"}
+    done = fleet.run(fleet_tasks.touch, ".", {"add": "+"}, timeout_s=2.0, tries=1, **given)
+    states = {one.log.name: one.state for one in done.outcomes}
+    good = {f"{name}.mcap": "done" for name in ("a", "b", "warn")}
+    assert states == good | {"die.mcap": "killed", "hang.mcap": "timed-out", "refuse.mcap": "failed"}
+    assert done.outcomes[-1].warnings[0].code == "clock"
+    assert Path("a.mcap").read_text() == "a+"
+    assert not list(Path().glob(".*"))
+
+    def lose(status: fleet.FleetStatus) -> None:
+        if Path("hang.hangs").exists() and status.running:
+            process.kill()
+
+    Path("hang.hangs").unlink()
+    for name in ("die", "refuse"):
+        Path(f"{name}.mcap").write_text("good")
+    lost = fleet.run(fleet_tasks.touch, ".", {"add": "+"}, on_status=lose, **given)
+    assert lost.stopped == f"the scheduler at {address} was lost"
+    assert lost.counts["skipped"] == 3
+    assert lost.outcomes[3].state == "not-tried"
+    assert not list(Path().glob(".*"))
+    Path("hang.mcap").write_text("good")
+    again = fleet.run(fleet_tasks.touch, ".", {"add": "+"}, ledger="ledger.jsonl")
+    assert all(one.is_good for one in again.outcomes)
+    assert Path("hang.mcap").read_text() == "good+"
+
+
+def test_what_is_wrong_is_one_line(monkeypatch, tmp_path):
+    (tmp_path / "a.mcap").write_text("a")
+    monkeypatch.setattr(cluster, "_ANSWER_S", 0.2)
+    with pytest.raises(McaptrackError, match=r"no Dask scheduler answers at tcp://127\.0\.0\.1:9: "):
+        fleet.run(fleet_tasks.touch, tmp_path, scheduler="tcp://127.0.0.1:9")
+    with pytest.raises(McaptrackError, match="no Dask scheduler answers at nonsense"):
+        fleet.run(fleet_tasks.touch, tmp_path, scheduler="nonsense://x")
+    known = builtins.__import__
+
+    def without(name, *more):
+        if name == "distributed":
+            raise ImportError(name)
+        return known(name, *more)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    with pytest.raises(McaptrackError, match=r"pip install 'mcaptrack\[fleet\]'"):
+        fleet.run(fleet_tasks.touch, tmp_path, scheduler="tcp://127.0.0.1:9")
+
+
+def test_a_log_with_which_workers_of_the_cluster_died_is_named():
+    from distributed import KilledWorker
+
+    class Task:
+        def result(self, timeout):
+            raise KilledWorker("x", None, 3)
+
+    made = object.__new__(cluster.Cluster)
+    made._futures = {}
+    reply = made._reply(Request(Path("x.mcap"), b"", {}), Task()).result()
+    assert (reply.state, reply.error) == ("killed", "x.mcap: workers of the cluster died while they processed it")
