@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -86,7 +87,7 @@ def test_a_log_with_which_workers_of_the_cluster_died_is_named():
 
     class Task:
         def result(self, timeout):
-            raise KilledWorker("x", None, 3)
+            raise KilledWorker("x", SimpleNamespace(address="tcp://none"), 3)
 
     made = object.__new__(cluster.Cluster)
     made._futures = {}

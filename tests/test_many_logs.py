@@ -80,6 +80,16 @@ def test_one_log_is_processed_as_ever_unless_an_option_for_many_is_given(folder)
     assert fleet == json.loads(plain)
 
 
+def test_commands_that_combine_logs_take_folders_and_lists(folder, monkeypatch):
+    done("report", "logs", "-o", "page.html")
+    data = json.loads(done("evaluate", "logs", "--json").out)
+    assert {one["sequence"] for one in data["results"]} == {"a", "b", "COMBINED"}
+    rows = done("query", "logs", "select count(distinct recording) as n from tracks", "--format", "csv").out
+    assert rows.split()[-1] == "2"
+    monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(b"logs/a.mcap\n")))
+    assert {one["sequence"] for one in json.loads(done("evaluate", "-", "--json").out)["results"]} == {"a"}
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [

@@ -394,18 +394,23 @@ def print_json(data: dict[str, Any]) -> None:
     print(json.dumps(whole, indent=2, allow_nan=False), flush=True)
 
 
-def expand(paths: Sequence[Path], *, each: bool = False) -> list[Path]:
+def expand(paths: Sequence[Path], *, each: bool = False, folders: bool = False) -> list[Path]:
     """Return paths, with patterns replaced by the files that match.
 
+    With ``folders``, a folder that has logs stands for these, and "-" for a list of logs on standard input.
     LOG.results.mcap is left out if LOG is among the paths, because it is a part of LOG; with ``each`` it is kept.
     Raises McaptrackError for a pattern that matches no file.
     """
     from mcaptrack.files import follow_links
+    from mcaptrack.fleet.expansion import LIST, find_logs, has_logs
     from mcaptrack.log import results_path
 
     out: list[Path] = []
     for path in paths:
         refuse_url(path)
+        if folders and (str(path) == LIST or (path.is_dir() and has_logs(path))):
+            out += [one.path for one in find_logs([path])]
+            continue
         if path.exists() or not glob.has_magic(str(path)):
             out.append(path)
             continue

@@ -41,7 +41,9 @@ _NESTED: Final = ("displacement", "class_means")
 def evaluate(
     inputs: Annotated[
         list[Path],
-        typer.Argument(metavar="LOG|TRACKS", help="Logs, or files of tracks.", show_default=False),
+        typer.Argument(
+            metavar="LOG|TRACKS", help="Logs, folders of logs, patterns, or files of tracks.", show_default=False
+        ),
     ],
     truth: Annotated[
         list[Path] | None,
@@ -103,7 +105,7 @@ def evaluate(
     limits = dict(_limit(text) for text in fail_under or ())
     gates = _gates(gate_m)
     with common.Talk(quiet, verbose).open() as talk:
-        paths, truths = common.expand(inputs), common.expand(truth) if truth else None
+        paths, truths = common.expand(inputs, folders=True), common.expand(truth) if truth else None
         scores = mcaptrack.evaluate(
             paths,
             truth=truths,

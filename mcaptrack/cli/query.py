@@ -105,7 +105,7 @@ def query(
     paths, sql = _asked(words or [], file, tables)
     if tables:
         warn_unused("--tables lists what could be asked", "form", "rows")
-    paths = common.expand(paths)
+    paths = common.expand(paths, folders=True)
     chosen = _form(form, output, json)
     if output is not None:
         from mcaptrack.files import is_same_file, refuse_overwrite

@@ -40,7 +40,7 @@ def report(
     """
     import mcaptrack
 
-    paths = common.expand(logs)
+    paths = common.expand(logs, folders=True)
     with common.Talk(quiet, verbose).open() as talk:
         done = mcaptrack.report(paths, output, camera=camera, force=force, progress=talk.progress)
         talk.say(f"{done.page}: {len(paths)} log{'s' if len(paths) > 1 else ''}, {done.size / 1e6:.2f} MB")

@@ -70,6 +70,11 @@ def find_logs(
     return list(once.values())
 
 
+def has_logs(folder: Path) -> bool:
+    """Whether there is a log in a folder or below it."""
+    return next(_logs_in(folder, ""), None) is not None
+
+
 def outputs_in(folder: Path, logs: Sequence[NamedLog], suffix: str) -> list[Path]:
     """Return a name in a folder for the output of each log, which ends with ``suffix``.
 
