@@ -3,10 +3,11 @@
     .venv/bin/python tools/bench/fleet.py             # 200 logs, in processes and on a Dask LocalCluster
     .venv/bin/python tools/bench/fleet.py --logs 40   # fewer
 
-Draws logs of boxes (3 people, 60 frames), and runs `mcaptrack run` on them: a log that kills its worker, one that hangs,
-one that is cut and one of noise are among them, and a worker is killed from outside meanwhile. Then again; and once more
-with the command killed at a random moment, and started again. Prints logs a second, processor time a log, and both as
-ratios to a shell loop over some of the logs. The harmful logs are harmful by their name (see ``harmful_run``).
+Draws logs of boxes (3 people, 60 frames), and runs `mcaptrack run` on them: a log that kills its worker, one that
+hangs, one that is cut and one of noise are among them, and a worker is killed from outside meanwhile. Then again; and
+once more with the command killed at a random moment, and started again. Prints logs a second and processor time a log,
+and the ratio of the latter to that of a shell loop over some of the logs. The harmful logs are harmful by their name
+(see ``harmful_run``).
 """
 
 from __future__ import annotations
