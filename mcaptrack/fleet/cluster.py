@@ -129,11 +129,13 @@ class Cluster:
 
     def stop(self, grace_s: float) -> None:
         """Cancel all tasks; their worker processes end within ``grace_s`` seconds."""
-        if not self.lost() and self._futures:
+        is_lost = bool(self.lost())
+        if not is_lost and self._futures:
             self._client.cancel([task for task, _ in self._futures.values()], force=True)
         with suppress(OSError, TimeoutError):
             self._client.close(timeout=max(0.1, grace_s))
-        self._restore_logging()
+        if not is_lost:  # otherwise Dask still logs that it can't connect
+            self._restore_logging()
 
     def _restore_logging(self) -> None:
         for name, level in self._levels.items():
