@@ -544,7 +544,8 @@ def test_check_lists_findings_in_a_table(finished, tmp_path):
     code, out, err = call("check", finished, tmp_path / "bad.mcap")
     each, bad, together = err.splitlines()  # of many logs, a line for each as it ends, and one for all
     assert (code, each) == (1, f"{finished}: sound")
-    assert bad.startswith(f"{tmp_path / 'bad.mcap'}: damaged, ") and together.startswith("2 logs in ")
+    assert bad.startswith(f"{tmp_path / 'bad.mcap'}: damaged, ")
+    assert together.startswith("2 logs in ")
     assert f"{tmp_path / 'bad.mcap'}: damaged; " in out
     assert "the checksum of a chunk is wrong" in out
     code, out, _ = call("check", tmp_path / "bad.mcap", "--json")
