@@ -107,8 +107,13 @@ def check_whole(path: Path, recorded: list[Raw]) -> None:
         assert set(ours(path)) | names == set(topics)
     assert by_mcap_ros2(path) == Counter(one[0] for one in messages)
     info = metadata(path)
-    counts = {one["topic_metadata"]["name"]: one["message_count"] for one in info["topics_with_message_count"]}
+    entries = {one["topic_metadata"]["name"]: one for one in info["topics_with_message_count"]}
+    counts = {topic: one["message_count"] for topic, one in entries.items()}
     assert counts == Counter(one[0] for one in messages)
+    theirs = entries[recorded[0][0]]["topic_metadata"]
+    for one in entries.values():
+        assert one["topic_metadata"].keys() == theirs.keys()
+        assert one["topic_metadata"]["offered_qos_profiles"] == theirs["offered_qos_profiles"]
     times = [t_ns for _, t_ns, _ in messages]
     for entry in (info, *info["files"]):
         assert entry["message_count"] == len(messages)
@@ -229,6 +234,8 @@ def tracked(tmp_path_factory) -> Path:
     shutil.copy(path, folder / "drive_1.mcap")
     for counted in (inner, *inner["topics_with_message_count"]):
         counted["message_count"] *= 2
+    silent = {"topic_metadata": inner["topics_with_message_count"][0]["topic_metadata"] | {"name": "/silent"}}
+    inner["topics_with_message_count"].append(silent | {"message_count": 0})
     inner["files"].append(inner["files"][0] | {"path": "drive_1.mcap"})
     inner["relative_file_paths"].append("drive/drive_1.mcap")
     (folder / "metadata.yaml").write_text(json.dumps(info))  # which is YAML, too
@@ -283,6 +290,21 @@ def test_a_killed_write_leaves_the_recording_as_it_was(copied, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         mcaptrack.predict(copied, topic="/lidar/tracks", predictor="cv")
     assert (copied.read_bytes(), metadata(copied)) == before
+
+
+def test_rows_of_a_user_are_counted(copied):
+    with mcaptrack.open(copied) as opened:
+        rows = opened.table("tracks", "/lidar/tracks")
+        assert opened.write("/lidar/tracks/mine/tracks", rows, sidecar=False)
+    topics = {one["topic_metadata"]["name"]: one for one in metadata(copied)["topics_with_message_count"]}
+    assert topics["/lidar/tracks/mine/tracks"]["topic_metadata"] == {
+        "name": "/lidar/tracks/mine/tracks",
+        "type": "mcaptrack_msgs/msg/Tracks",
+        "serialization_format": "cdr",
+        "offered_qos_profiles": "",
+        "type_description_hash": "",
+    }
+    assert "/lidar/tracks/mine/tracks" in {one[0] for one in by_rosbags(copied.parent)[0]}
 
 
 def test_results_that_stand_twice_are_said(copied):

@@ -163,7 +163,6 @@ class CdrCodec:
         names = rows.dtype.names or ()
         self._formats = [(field.name, _FORMATS[field.kind]) for field in fields]
         self._known = [number for number, field in enumerate(fields) if field.name in names]
-        self._least = sum(form.itemsize for _, form in self._formats)
         # By where a row begins, modulo 8: where its fields lie, and its length.
         self._offsets = np.zeros((_ALIGN, len(fields)), np.int64)
         self._sizes = np.zeros(_ALIGN, np.int64)
@@ -225,8 +224,6 @@ class CdrCodec:
             return None
         is_big: Bools = head[:, 1] == 0
         counts = _swapped(_take(raw, start + _HEAD, np.dtype("<u4"))[:, 0], is_big).astype(np.int64)
-        if (counts * self._least > length).any():
-            return None
         left = length - _HEAD - self._lengths(counts)
         if (left < 0).any() or (left >= _FILL).any():
             return None
@@ -236,8 +233,7 @@ class CdrCodec:
         for number in self._known:
             name, form = self._formats[number]
             values = _take(raw, row_at + self._offsets[starts % _ALIGN, number], form)[:, 0]
-            values = _swapped(values, big_rows)
-            rows[name] = values != 0 if rows.dtype[name].kind == "b" else values
+            rows[name] = _swapped(values, big_rows)
         return rows, counts
 
     def _starts_of(self, number: Ints) -> Ints:
