@@ -29,6 +29,7 @@ from tests.bags import MOT, T0, bag1, bag2
 from tests.commands import call, done
 from tests.space_logs import WAYS, Robot, write
 from tests.test_ros_recordings import record
+from tests.worlds import write_clip
 
 Raw = tuple[str, int, bytes]
 
@@ -158,6 +159,8 @@ def test_rows_are_those_that_stand_beside(ran):
     there, beside = rows_of(ran["path"]), rows_of(ran["beside"])
     assert len(there) > 6
     assert there == beside
+    with log.read(ran["beside"]) as opened:
+        assert {channel.message_encoding for channel in opened.results.recorded} == {"protobuf"}
     with mcaptrack.open(ran["path"]) as one, mcaptrack.open(ran["beside"]) as other:
         for name in ("detections", "tracks", "predictions", "events", "counts", "track_summary"):
             drop = {"recording", "file", "chunk_offset", "message_offset"}
@@ -304,7 +307,25 @@ def test_rows_of_a_user_are_counted(copied):
         "offered_qos_profiles": "",
         "type_description_hash": "",
     }
-    assert "/lidar/tracks/mine/tracks" in {one[0] for one in by_rosbags(copied.parent)[0]}
+    first_ns = metadata(copied)["starting_time"]["nanoseconds_since_epoch"]
+    with mcaptrack.open(copied) as opened:
+        early = [mcaptrack.detections([[1, 2, 3, 4]], t_ns=first_ns - 5, box_format="xywh")]
+        assert opened.write("/mine/detections", early, sidecar=False) == 1
+    messages = by_rosbags(copied.parent)[0]
+    assert {"/lidar/tracks/mine/tracks", "/mine/detections"} < {one[0] for one in messages}
+    assert metadata(copied)["starting_time"]["nanoseconds_since_epoch"] == first_ns - 5
+    assert metadata(copied)["duration"]["nanoseconds"] == max(one[1] for one in messages) - first_ns + 5
+
+
+def test_a_video_in_a_recording_is_one_of_ros_messages(copied, tmp_path):
+    write_clip(tmp_path / "clip.mp4", 5)
+    done("ingest", tmp_path / "clip.mp4", "--into", copied, "--in-place", "--camera", "eye")
+    done("ingest", tmp_path / "clip.mp4", "-o", tmp_path / "eye.mcap", "--camera", "eye")
+    assert Counter(topic for topic, *_ in by_rosbags(copied)[0])["/eye/video"] == 5
+    assert by_mcap_ros2(copied)["/eye/video"] == 5
+    with mcaptrack.open(copied) as one, mcaptrack.open(tmp_path / "eye.mcap") as other:
+        pictures = [[frame.rows for frame in opened.frames("/eye/video")] for opened in (one, other)]
+    assert all(map(np.array_equal, *pictures))
 
 
 def test_results_that_stand_twice_are_said(copied):
