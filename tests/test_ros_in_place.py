@@ -25,6 +25,7 @@ from mcaptrack import log
 from mcaptrack.schema import SCHEMAS, TRACKS
 from mcaptrack.schema.encodings import CDR, cdr_codec, record_of
 from mcaptrack.schema.provenance import Provenance
+from mcaptrack.sources.ingest.bags import metadata_update
 from tests.bags import MOT, T0, bag1, bag2
 from tests.commands import call, done
 from tests.space_logs import WAYS, Robot, write
@@ -273,6 +274,26 @@ def test_a_command_that_was_killed_before_it_wrote_the_metadata_is_made_good(cop
     copied.with_name("metadata.yaml").write_bytes(copied.with_name("before.yaml").read_bytes())
     assert metadata(copied) != whole
     done("track", copied, "--topic", "/lidar/boxes")
+    assert metadata(copied) == whole
+
+
+def test_files_of_one_recording_may_be_written_at_once(copied, monkeypatch):
+    """Another process that counted before this one began may write after it."""
+    whole, before = metadata(copied), copied.with_name("before.yaml").read_bytes()
+    copied.with_name("metadata.yaml").write_bytes(before)
+    published = []
+
+    def publish(path: Path, data: bytes) -> None:
+        path.write_bytes(before if len(published) == 1 else data)
+        published.append(data)
+
+    monkeypatch.setattr(metadata_update, "publish_bytes", publish)
+    metadata_update.update_metadata(copied)
+    assert len(published) == 1
+    assert metadata(copied) == whole
+    copied.with_name("metadata.yaml").write_bytes(before)
+    metadata_update.update_metadata(copied)
+    assert len(published) == 3
     assert metadata(copied) == whole
 
 

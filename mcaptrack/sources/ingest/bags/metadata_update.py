@@ -20,6 +20,8 @@ from mcaptrack.sources.ingest.bags import plain_yaml
 from mcaptrack.sources.ingest.bags.metadata_yaml import METADATA, ROOT, names_file, read_metadata
 from mcaptrack.sources.ingest.bags.plain_yaml import Scalar
 
+#: Files of one recording may be written at once, each by a process that counts all of them: the last one counts again.
+_MOST_TRIES: Final = 5
 Counts = dict[str, int]
 #: The versions of metadata.yaml since which topics have profiles of quality of service, as text and as a list, and the
 #: hash of their type.
@@ -51,12 +53,15 @@ def update_metadata(path: Path) -> None:
         metadata = file.with_name(METADATA)
         if names_file(metadata, file.name):
             try:
-                _update(metadata)
+                for _ in range(_MOST_TRIES):
+                    if not _update(metadata):
+                        break
             except McaptrackError as error:
                 warn(f"{metadata} does not count the results in {file.name}: {error}", "left-out")
 
 
-def _update(metadata: Path) -> None:
+def _update(metadata: Path) -> bool:
+    """Bring a metadata.yaml up to date; returns whether it was not."""
     bag, names = read_metadata(metadata)
     files = {name: _read(metadata.with_name(name)) for name in names}
     whole = plain_yaml.load(bag.text)
@@ -84,8 +89,10 @@ def _update(metadata: Path) -> None:
             entry["message_count"] = _number(sum(file.messages.get(topic, 0) for topic in dict(new)))
             _set_times(entry, [file])
     after = plain_yaml.dump(whole)
-    if after != before:
-        publish_bytes(metadata, after.encode())
+    if after == before:
+        return False
+    publish_bytes(metadata, after.encode())
+    return True
 
 
 def _read(path: Path) -> _Content:
