@@ -60,6 +60,8 @@ _LAST_S: Final = 2**31 - 1
 _Append = Callable[[Any, bytearray], None]
 _U4: Final = struct.Struct("<I")
 _TIME: Final = struct.Struct("<iI")
+_PADDING: Final = bytes(8)
+_NO_MEMBERS: Final = bytes(4)
 
 
 def record_in(schema_name: str, encoding: Encoding) -> tuple[str, str, bytes]:
@@ -176,7 +178,8 @@ def _appender(descriptor: Any) -> _Append:
 
 
 def _align(out: bytearray, width: int) -> None:
-    out += bytes(-len(out) % width)
+    if rest := len(out) % width:
+        out += _PADDING[rest - width :]
 
 
 def _append_numbers(names: tuple[str, ...]) -> _Append:
@@ -240,11 +243,13 @@ def _append_list(field: Any, get: Callable[[Any], Any]) -> _Append:
             out += np.array(found, form).tobytes()
 
     def append(message: Any, out: bytearray) -> None:
-        found = get(message)
         _align(out, _U4.size)
-        out += _U4.pack(len(found))
+        found = get(message)
         if found:
+            out += _U4.pack(len(found))
             content(found, out)
+        else:
+            out += _NO_MEMBERS
 
     return append
 
