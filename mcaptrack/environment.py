@@ -49,6 +49,20 @@ def cache_folder() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or usual) / "mcaptrack"
 
 
+def cores() -> int:
+    """The number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def threads() -> int:
+    """The number of threads for computing: as OMP_NUM_THREADS says, otherwise one for each core.
+
+    Workers that share a machine get their share of the cores in this variable, which libraries read as well.
+    """
+    said = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0].strip()
+    return int(said) if said.isascii() and said.isdecimal() and int(said) > 0 else cores()
+
+
 def hush_libraries() -> None:
     """Silence OpenCV's messages about damaged pictures, which the command reports in one line."""
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -13,11 +14,13 @@ from pathlib import Path
 
 import pytest
 
-from mcaptrack import fleet
+import mcaptrack
+from mcaptrack import environment, fleet
 from mcaptrack.errors import McaptrackError
-from mcaptrack.fleet import claims, digests
+from mcaptrack.fleet import claims, digests, limits
 from mcaptrack.fleet.claims import Claims, claim_path
 from mcaptrack.fleet.ledger import Ledger
+from mcaptrack.log import read
 from tests import fleet_tasks
 
 pytestmark = pytest.mark.usefixtures("never_waits")
@@ -363,3 +366,31 @@ def test_lines_of_a_ledger_are_whole_though_many_write(tmp_path):
     ledgers[0].refresh()
     assert ledgers[0].is_done("/99", "d")
     assert not ledgers[0].is_done("/99", "e")
+
+
+def test_workers_share_the_cores(monkeypatch):
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(limits, "cores", lambda: 9)
+    assert environment.threads() == environment.cores()
+    given = [limits.environment_of_worker(workers) for workers in (1, 2, 20)]
+    assert [(one["OMP_NUM_THREADS"], one["OPENCV_FOR_THREADS_NUM"]) for one in given] == [
+        ("9",) * 2,
+        ("4",) * 2,
+        ("1",) * 2,
+    ]
+    for said, wanted in (("3", 3), ("2,1", 2), ("0", environment.cores()), ("many", environment.cores())):
+        monkeypatch.setenv("OMP_NUM_THREADS", said)
+        assert environment.threads() == wanted
+        assert limits.environment_of_worker(2)["OMP_NUM_THREADS"] == said
+
+
+def test_a_log_that_another_process_writes_is_named(template, tmp_path):
+    log = Path(shutil.copyfile(template, tmp_path / "a.mcap"))
+    before = log.read_bytes()
+    with read(log) as opened:
+        opened.lock()
+        (outcome,) = fleet.run(mcaptrack.run, tmp_path, {"force": True, "tables": False}).outcomes
+    assert outcome.state == "failed"
+    assert "another process" in outcome.error or "is being written" in outcome.error, outcome.error
+    assert log.read_bytes() == before

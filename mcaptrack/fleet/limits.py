@@ -11,6 +11,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
+from mcaptrack.environment import cores
 from mcaptrack.errors import McaptrackError
 
 #: Variables that say how many threads a library uses: OpenBLAS, OpenMP (also Arrow and torch), MKL, Accelerate, OpenCV.
@@ -24,11 +25,6 @@ _THREADS: Final = (
 _SIZE: Final = re.compile(r"([0-9]+(?:\.[0-9]+)?)\s*([kmgt]?)(i?)b?", re.IGNORECASE)
 _IS_LINUX: Final = sys.platform.startswith("linux")
 _PARENT_DIES: Final = 1  # PR_SET_PDEATHSIG of <sys/prctl.h>
-
-
-def cores() -> int:
-    """Return the number of cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def environment_of_worker(workers: int) -> dict[str, str]:

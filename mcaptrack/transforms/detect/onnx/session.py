@@ -6,7 +6,6 @@ The file may be hostile: it is read as bytes, so that it can't refer to other fi
 from __future__ import annotations
 
 import hashlib
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,6 +15,7 @@ from typing import Any, Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from mcaptrack.environment import threads
 from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import warn
 from mcaptrack.transforms.detect.onnx import graph
@@ -241,8 +241,8 @@ _OPENING: Final = Lock()
 
 
 def workers() -> int:
-    """The number of pictures to detect in at a time: one for each core that this process may use."""
-    return max(1, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
+    """The number of pictures to detect in at a time: one for each thread that this process may use."""
+    return threads()
 
 
 def _known(size: tuple[int | None, int | None]) -> Size | None:
