@@ -111,10 +111,11 @@ def test_logs_that_harm_their_worker_are_named_and_the_others_are_done(folder):
     for word in harm:
         (folder / f"{word}.mcap").write_text(word)
     (folder / "once.mcap").write_text(f"once {folder / 'mark'}")
-    (folder / "warn.mcap").write_text("warn")
+    for name in ("warn", "warn2", "warn3"):
+        (folder / f"{name}.mcap").write_text("warn")
     ledger, said = folder / "ledger.jsonl", []
     done = fleet.run(fleet_tasks.touch, folder, jobs=2, ledger=ledger, on_note=said.append)
-    good = {f"{name}.mcap": "done" for name in ("a", "b", "c", "once", "warn")}
+    good = {f"{name}.mcap": "done" for name in ("a", "b", "c", "once", "warn", "warn2", "warn3")}
     assert states(done) == good | {f"{word}.mcap": state for word, (state, _) in harm.items()}
     by_name = {one.log.stem: one for one in done.outcomes}
     for word, (_, words) in harm.items():
@@ -124,7 +125,7 @@ def test_logs_that_harm_their_worker_are_named_and_the_others_are_done(folder):
     assert "last words" in by_name["crash"].detail
     assert "ZeroDivisionError" in by_name["break"].detail
     assert [notice.code for notice in by_name["warn"].warnings] == ["clock"]
-    assert by_name["warn"].printed == "printed by a library"
+    assert {by_name[name].printed for name in ("warn", "warn2", "warn3")} == {"printed by a library"}
     tries = Counter(Path(line["location"]).stem for line in lines(ledger))
     assert tries == Counter([*by_name, "die", "crash", "leave", "once"])
     assert (by_name["once"].tries, by_name["a"].tries) == (2, 1)

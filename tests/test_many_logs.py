@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from mcaptrack.fleet import FleetStatus, Running
-from tests.commands import call, done, start
+from tests.commands import call, done
 
 pytestmark = pytest.mark.usefixtures("never_waits")
 
@@ -103,13 +103,6 @@ def test_commands_that_combine_logs_take_folders_and_lists(folder, monkeypatch):
 )
 def test_what_is_wrong_is_one_line(folder, words, said):
     assert call("check", "logs", *words) == (1, "", f"mcaptrack: {said}\n")
-
-
-def test_a_reader_that_has_enough_ends_it_without_a_word(folder):
-    with start("info", "logs", "--json", folder=folder) as process:
-        process.stdout.close()
-        assert process.wait() in (0, 1)  # as with one log
-        assert "Traceback" not in process.stderr.read()
 
 
 def test_the_table_on_a_terminal_names_the_logs_that_run(folder):

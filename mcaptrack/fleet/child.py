@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import signal
@@ -54,7 +55,9 @@ class Child:
         self._limits = limits
         self._process: subprocess.Popen[bytes] | None = None
         self._connection: Any = None
-        self._output: IO[bytes] = tempfile.TemporaryFile("ab+")  # noqa: SIM115
+        self._output: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115
+        flags = fcntl.fcntl(self._output, fcntl.F_GETFL)
+        fcntl.fcntl(self._output, fcntl.F_SETFL, flags | os.O_APPEND)  # what is printed starts at 0 again for each log
         self.progress: tuple[str, float, float | None] = ("", 0.0, None)
         self.resident = 0
 
