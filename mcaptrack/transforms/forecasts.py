@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
+from mcaptrack.geometry.arrays import Floats
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.histories import Histories
 from mcaptrack.predictors import Forecast, make
 from mcaptrack.schema import Frame, Rows
 from mcaptrack.schema.predictions import forecast_to_rows
-from mcaptrack.transforms.motion_limits import ClassNames, units_m
+from mcaptrack.transforms.motion_limits import ClassNames, limits_by_class, units_m
+
+#: Vehicles that stand mostly stay: their speed over this many steps, in units of length per second, up to which they
+#: count as standing; the probability that they stay; and how far they seem to move then, in units per second.
+_RECENT: Final = 7
+_REST_PER_S: Final = 0.15
+_STAYS: Final = 0.95
+_CREEP_PER_S: Final = 0.03
 
 
 class Forecaster:
@@ -62,7 +70,38 @@ class Forecaster:
         # An interpolated position depends on later ones: a prediction from it would not be causal.
         ready = known[:, -self._min_history :].all(axis=1) & frame.rows["observed"]
         classes, of = np.unique(frame.rows["class_id"][ready], return_inverse=True)
-        unit_m = np.array(units_m(classes.tolist(), self._class_names, self._class_limits))[of][:, None, None]
-        mean, cov = self._predictor.predict(past[ready] / unit_m, known[ready])
-        forecast = Forecast(mean * unit_m, cov * unit_m[..., None] ** 2)
+        numbers = classes.tolist()
+        unit_m = np.array(units_m(numbers, self._class_names, self._class_limits))[of]
+        scale = unit_m[:, None, None]
+        mean, cov = self._predictor.predict(past[ready] / scale, known[ready])
+        forecast = Forecast(mean * scale, cov * scale[..., None] ** 2)
+        is_measured = np.isfinite(frame.rows["vx_m_per_s"][ready]) & (unit_m != 1)
+        if is_measured.any():
+            limits = limits_by_class(numbers, self._class_names, self._class_limits)
+            noise_m = np.array([limits[one].noise_m for one in numbers])[of]
+            stay = is_measured * _standing(past[ready], unit_m, self._predictor.step_s)
+            forecast = _with_rest(forecast, past[ready][:, -1], stay, noise_m, unit_m, self._predictor.step_s)
         return forecast_to_rows(ids[ready], forecast, self._predictor.step_s)
+
+
+def _standing(past: Floats, unit_m: Floats, step_s: float) -> Floats:
+    """The probability that objects at ``past`` (N, L, 2), known at the end, stand and stay where they are, (N,)."""
+    recent = past[:, -_RECENT - 1 :]
+    first = np.isfinite(recent[:, :, 0]).argmax(axis=1)
+    steps = np.maximum(recent.shape[1] - 1 - first, 1)
+    way = recent[:, -1] - recent[np.arange(len(recent)), first]
+    speed = np.hypot(way[:, 0], way[:, 1]) / (steps * step_s * unit_m)
+    return np.asarray(_STAYS * np.exp(-((speed / _REST_PER_S) ** 2)) * (steps > 1))
+
+
+def _with_rest(
+    forecast: Forecast, now: Floats, stay: Floats, noise_m: Floats, unit_m: Floats, step_s: float
+) -> Forecast:
+    """Forecasts of objects at ``now`` (N, 2) that stay there with a probability (N,): mean and covariance of both."""
+    ahead_s = step_s * np.arange(1, forecast.mean.shape[1] + 1)
+    rest = noise_m[:, None] ** 2 + (_CREEP_PER_S * unit_m[:, None] * ahead_s) ** 2
+    p, q = stay[:, None, None, None], 1 - stay[:, None, None, None]
+    off = forecast.mean - now[:, None]
+    cov = p * rest[:, :, None, None] * np.eye(2) + q * forecast.cov
+    cov += p * q * off[..., :, None] * off[..., None, :]
+    return Forecast(now[:, None] + q[..., 0] * off, cov)
