@@ -14,6 +14,7 @@ from typing import IO, Final
 
 from mcaptrack import notices
 from mcaptrack.errors import McaptrackError
+from mcaptrack.location import SCHEMES, Location, Url, hide_secrets
 
 
 @contextmanager
@@ -154,8 +155,15 @@ def follow_links(path: Path) -> Path:
     return Path(os.path.realpath(path))  # Path.resolve raises RuntimeError for these up to Python 3.12
 
 
-def is_same_file(one: Path, other: Path) -> bool:
+def place_of(location: Location) -> Location:
+    """The place that a location leads to: with symbolic links resolved, if it is a path."""
+    return location if isinstance(location, Url) else follow_links(location)
+
+
+def is_same_file(one: Location, other: Location) -> bool:
     """Whether two paths lead to the same existing file."""
+    if isinstance(one, Url) or isinstance(other, Url):
+        return one == other
     return one.exists() and other.exists() and one.samefile(other)
 
 
@@ -179,8 +187,12 @@ def refuse_url(path: Path | str) -> None:
     """Raise McaptrackError for a URL, with the slashes that it had."""
     found = _URL.fullmatch(str(path))
     if found and not Path(path).exists():
-        scheme, rest = found.groups()
-        raise McaptrackError(f"{scheme}://{rest} is a URL; only files are read and written: copy it here first")
+        url = hide_secrets(f"{found[1]}://{found[2]}")
+        if found[1].lower() in SCHEMES:
+            raise McaptrackError(f"{url} is in a store, from which only logs are read; give a file here")
+        raise McaptrackError(
+            f"{url} is a URL; only files, and logs at s3://, gs:// and az://, are read: copy it here first"
+        )
 
 
 def refuse_overwrite(path: Path, force: bool) -> None:

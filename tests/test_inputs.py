@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import os
+import sys
 from pathlib import Path
 from typing import Any, get_type_hints
 
@@ -42,15 +43,37 @@ def words_with(name: str, parameter: Any, value: str) -> list[str]:
     return [*words, parameter.opts[0], value] if parameter.param_type_name == "option" else words
 
 
-@pytest.mark.parametrize(("name", "parameter"), PATHS, ids=[f"{name} {p.name}" for name, p in PATHS])
-@pytest.mark.parametrize("url", ["s3://bucket/a.mcap", "https://example.org/a/b?c=d", "gs://b/*.mcap"])
-def test_a_url_is_refused_as_a_url(tmp_path, monkeypatch, name, parameter, url):
-    monkeypatch.chdir(tmp_path)
+def said_of(name: str, parameter: Any, url: str) -> str:
+    """Return the one line that a command says of a URL, which changes nothing."""
     Path("a.txt").write_text("1,1,1,1,2,2\n")
     code, _, err = call(*words_with(name, parameter, url))
-    said = [line for line in err.splitlines() if line]
-    assert (code, said) == (1, [f"mcaptrack: {url} is a URL; only files are read and written: copy it here first"])
+    assert code == 1
+    (said,) = [line for line in err.splitlines() if line]
     assert os.listdir() == ["a.txt"]
+    return said.removeprefix("mcaptrack: ")
+
+
+@pytest.mark.parametrize(("name", "parameter"), PATHS, ids=[f"{name} {p.name}" for name, p in PATHS])
+def test_a_url_is_refused_as_a_url(tmp_path, monkeypatch, name, parameter):
+    monkeypatch.chdir(tmp_path)
+    words = "is a URL; only files, and logs at s3://, gs:// and az://, are read: copy it here first"
+    assert said_of(name, parameter, "https://me:secret@example.org/a/b?c=d") == f"https://example.org/a/b?... {words}"
+
+
+#: Arguments that are logs, which may be in a store.
+LOGS = {(name, "logs") for name in (*STAGES, "run", "events", "recover", "render", "info", "check", "export", "report")}
+LOGS |= {("query", "words"), ("evaluate", "inputs")}
+
+
+@pytest.mark.parametrize(("name", "parameter"), PATHS, ids=[f"{name} {p.name}" for name, p in PATHS])
+def test_only_logs_are_read_from_a_store(tmp_path, monkeypatch, name, parameter):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(sys.modules, "obstore", None)
+    said = said_of(name, parameter, "s3://bucket/a/b.mcap")
+    if (name, parameter.name) in LOGS:
+        assert said.startswith("s3://bucket/a/b.mcap is in Amazon S3, which needs obstore, ")
+    else:
+        assert said.startswith("s3://bucket/a/b.mcap is in a store, ")
 
 
 def test_paths_of_all_commands_have_a_test():
@@ -67,7 +90,7 @@ def test_a_folder_that_looks_like_a_url_is_a_folder(tmp_path, monkeypatch):
     Path("s3:").mkdir()
     Path("s3:/a").write_text("x")
     refuse_url(Path("s3:/a"))
-    with pytest.raises(McaptrackError, match="s3://b is a URL"):
+    with pytest.raises(McaptrackError, match="s3://b is in a store"):
         refuse_url(Path("s3:/b"))
 
 

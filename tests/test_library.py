@@ -280,7 +280,7 @@ class TestRefused:
                 lambda: mcaptrack.tune("log.mcap", search=["min_ious"]),
                 "`search=` has min_ious, which can't be searched; there are max_age_s",
             ),
-            "a URL": (lambda: mcaptrack.info("s3://bucket/a.mcap"), "s3://bucket/a.mcap is a URL"),
+            "a URL": (lambda: mcaptrack.info("https://host/a.mcap"), "https://host/a.mcap is a URL"),
             "what exists": (lambda: mcaptrack.recover("log.mcap", "log.mcap"), "both input and output"),
             "frames per second": (lambda: mcaptrack.ingest("video.mp4", "b.mcap", fps=0), "`fps=` needs a number"),
             "a class": (

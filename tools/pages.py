@@ -25,6 +25,7 @@ NOT_RUN = {
     "environment": "it changes the Python environment",
     "make": "make installs packages; another job runs these targets",
     "minutes": "it takes minutes",
+    "store": "it needs a bucket and its credentials",
     "torch": "it needs torch, several gigabytes",
     "viewer": "it waits for a viewer",
     "weights": "it needs weights of a network, which are fetched",

@@ -13,6 +13,7 @@ from mcaptrack import log as logs
 from mcaptrack import notices
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import is_same_file, refuse_special, refuse_url
+from mcaptrack.location import Location, Url, is_remote, parse
 from mcaptrack.notices import Notice
 
 PathLike = str | os.PathLike[str]
@@ -42,10 +43,24 @@ def optional_path(path: PathLike | None) -> Path | None:
     return None if path is None else as_path(path)
 
 
-def log_path(path: PathLike) -> Path:
-    """Return the path of a log that stands. Raises McaptrackError as ``as_path``, and for a folder."""
-    found = as_path(path)
-    if found.is_dir():
+def as_location(path: PathLike) -> Location:
+    """Return the location of a log: an object in a store, or a path as ``as_path`` returns it."""
+    found = parse(path)
+    return found if isinstance(found, Url) and (is_remote(path) or not Path(path).exists()) else as_path(path)
+
+
+def log_file(path: PathLike) -> Path:
+    """Return the path of a log that stands. Raises McaptrackError as ``log_location``, and for an object in a store."""
+    found = log_location(path)
+    if isinstance(found, Url):
+        raise McaptrackError(f"{found} is in a store, and this works with files only; copy it here first")
+    return found
+
+
+def log_location(path: PathLike) -> Location:
+    """Return the location of a log that stands. Raises McaptrackError as ``as_path``, and for a folder."""
+    found = as_location(path)
+    if isinstance(found, Path) and found.is_dir():
         logs.refuse_non_mcap(found)
         raise McaptrackError(f"{found} is a folder, not an MCAP file; give the log in it")
     return found
@@ -53,9 +68,17 @@ def log_path(path: PathLike) -> Path:
 
 def paths_of(paths: PathLike | Sequence[PathLike]) -> list[Path]:
     """Return one path, or several, as a list."""
-    if isinstance(paths, Iterable) and not isinstance(paths, str | bytes | os.PathLike):
-        return [as_path(path) for path in paths]
-    return [as_path(paths)]
+    return [as_path(path) for path in _each(paths)]
+
+
+def locations_of(paths: PathLike | Sequence[PathLike]) -> list[Location]:
+    """Return one location, or several, as a list."""
+    return [as_location(path) for path in _each(paths)]
+
+
+def _each(paths: PathLike | Sequence[PathLike]) -> Iterable[PathLike]:
+    is_several = isinstance(paths, Iterable) and not isinstance(paths, str | bytes | os.PathLike)
+    return paths if is_several else [paths]  # type: ignore[list-item,return-value]  # one of the two
 
 
 def names_of(names: str | Sequence[str] | None) -> tuple[str, ...]:
@@ -63,7 +86,7 @@ def names_of(names: str | Sequence[str] | None) -> tuple[str, ...]:
     return () if names is None else (names,) if isinstance(names, str) else tuple(names)
 
 
-def log_output(path: PathLike, source: Path) -> Path:
+def log_output(path: PathLike, source: Location) -> Path:
     """Return the path of a log to write, made from ``source``.
 
     Raises McaptrackError for a name that does not end with .mcap. Callers check whether it is ``source`` itself.

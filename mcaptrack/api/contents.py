@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from math import degrees
-from pathlib import Path
 from typing import Any, Literal
 
 from mcaptrack import log as logs
 from mcaptrack import pipeline
-from mcaptrack.api.common import PathLike, as_path, warnings_about
+from mcaptrack.api.common import PathLike, as_location, warnings_about
 from mcaptrack.geometry.transform_series import TransformSeries
+from mcaptrack.location import Location
 from mcaptrack.notices import Notice, warn
 from mcaptrack.schema.provenance import Provenance, frame_id_of
 from mcaptrack.sources.frames import read_frames
@@ -111,13 +111,13 @@ class LogInfo:
 
     Attributes
     ----------
-    log : pathlib.Path
-        The log.
+    log : pathlib.Path or str
+        The log; the URL of one in a store.
     bytes : int
         Its size.
     start_ns, end_ns : int
         Time of the first and last message, in nanoseconds.
-    results : pathlib.Path or None
+    results : pathlib.Path, str or None
         The file with its results, if it stands beside the log.
     messages : int
         Number of messages.
@@ -132,11 +132,11 @@ class LogInfo:
 
     """
 
-    log: Path
+    log: Location
     bytes: int
     start_ns: int
     end_ns: int
-    results: Path | None
+    results: Location | None
     messages: int
     attachments: tuple[str, ...]
     channels: tuple[ChannelInfo, ...]
@@ -199,7 +199,7 @@ def info(log: PathLike, *, frames: bool = False) -> LogInfo:
     ()
 
     """
-    path = as_path(log)
+    path = as_location(log)
     with warnings_about(path) as warnings, logs.read(path) as opened:
         every = [(channel, part) for part in opened.parts for channel in part.recorded]
         every.sort(key=lambda found: (found[0].topic, found[1] is opened, found[0].id))

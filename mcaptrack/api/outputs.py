@@ -15,16 +15,17 @@ from mcaptrack.api.common import (
     PathLike,
     Progress,
     detail,
-    log_path,
+    locations_of,
+    log_location,
     names_of,
     no_progress,
     optional_path,
-    paths_of,
     warn_unused,
     warnings_about,
 )
 from mcaptrack.errors import McaptrackError
-from mcaptrack.files import follow_links, is_same_file, publish_bytes, refuse_overwrite
+from mcaptrack.files import is_same_file, place_of, publish_bytes, refuse_overwrite
+from mcaptrack.location import Location, local_name
 from mcaptrack.notices import Notice, collected, warn
 from mcaptrack.tables import Format
 from mcaptrack.tables.export import default_folder, recording_name
@@ -46,8 +47,10 @@ class ExportResult:
 
     Attributes
     ----------
-    log, folder : pathlib.Path
-        The log, and the folder with its tables.
+    log : pathlib.Path or str
+        The log; the URL of one in a store.
+    folder : pathlib.Path
+        The folder with its tables.
     rows : dict of str to int
         Number of rows of each table; of a bag, the number of messages of each topic.
     written : tuple of str
@@ -57,7 +60,7 @@ class ExportResult:
 
     """
 
-    log: Path
+    log: Location
     folder: Path
     rows: Mapping[str, int]
     written: tuple[str, ...]
@@ -91,7 +94,8 @@ def export(
     log : path
         The log.
     output : path, optional
-        Folder for the tables, by default LOG.tables beside the log, or for the bag, by default LOG.rosbag2.
+        Folder for the tables, by default LOG.tables beside the log, or for the bag, by default LOG.rosbag2; of a log
+        in a store, in the working folder.
     form : {"parquet", "arrow", "csv", "jsonl", "rosbag2", "rosbag2-sqlite3"}, default "parquet"
         Format of the files. "rosbag2" is a ROS 2 bag in MCAP, "rosbag2-sqlite3" one in a database.
     topic : str or sequence of str, optional
@@ -120,7 +124,7 @@ def export(
     True
 
     """
-    path = log_path(log)
+    path = log_location(log)
     if form in _BAGS:
         return _export_bag(path, optional_path(output), _BAGS[form], topic, blobs, force, progress)
     folder = optional_path(output) or default_folder(path)
@@ -139,7 +143,7 @@ def export(
 
 
 def _export_bag(
-    path: Path,
+    path: Location,
     output: Path | None,
     storage: Storage,
     topic: str | Sequence[str] | None,
@@ -158,12 +162,12 @@ def _export_bag(
     return ExportResult(path, folder, done.messages, tuple(done.messages), tuple(dict.fromkeys(warnings)))
 
 
-def refuse_same_tables(logs_to_export: Sequence[Path], output: Path | None) -> None:
+def refuse_same_tables(logs_to_export: Sequence[Location], output: Path | None) -> None:
     """Raise McaptrackError if two different logs would have the same name in the tables of one folder."""
-    folders: dict[tuple[Path, str], Path] = {}
+    folders: dict[tuple[Path, str], Location] = {}
     for path in logs_to_export:
         other = folders.setdefault((output or default_folder(path), recording_name(path)), path)
-        if follow_links(other) != follow_links(path):
+        if place_of(other) != place_of(path):
             raise McaptrackError(
                 f"{other} and {path} would both be {recording_name(path)} in the tables; export them to two folders"
             )
@@ -211,7 +215,8 @@ def report(
     log : path or sequence of paths
         The log, or several.
     output : path, optional
-        The page, by default LOG.report.html beside the log; several logs need a name.
+        The page, by default LOG.report.html beside the log, or in the working folder if that is in a store; several
+        logs need a name.
     camera : str, optional
         Name of the camera, if a log has several.
     force : bool, default False
@@ -236,12 +241,12 @@ def report(
     'page.html'
 
     """
-    paths = [log_path(path) for path in paths_of(log)]
+    paths = [log_location(path) for path in locations_of(log)]
     if not paths:
         raise McaptrackError("there is no log to report on; give one, or several")
     if output is None and len(paths) != 1:
         raise McaptrackError(f"{len(paths)} logs become one page; name it with `output=`")
-    target = optional_path(output) or paths[0].with_suffix(".report.html")
+    target = optional_path(output) or local_name(paths[0], ".report.html")
     if any(is_same_file(path, target) for path in paths):
         raise McaptrackError(f"{target} is a log; give the page another name with `output=`")
     refuse_overwrite(target, force)
@@ -264,8 +269,10 @@ class RenderResult:
 
     Attributes
     ----------
-    log, video : pathlib.Path
-        The log, and the video or GIF.
+    log : pathlib.Path or str
+        The log; the URL of one in a store.
+    video : pathlib.Path
+        The video or GIF.
     pictures : int
         Number of pictures.
     views : tuple of str
@@ -275,7 +282,7 @@ class RenderResult:
 
     """
 
-    log: Path
+    log: Location
     video: Path
     pictures: int
     views: tuple[str, ...]
@@ -342,8 +349,8 @@ def render(
     True
 
     """
-    path = log_path(log)
-    target = optional_path(output) or path.with_suffix(".gif" if gif else ".mp4")
+    path = log_location(log)
+    target = optional_path(output) or local_name(path, ".gif" if gif else ".mp4")
     refuse_overwrite(target, force)
     options = RenderOptions(width_px=width, max_fps=max_fps, start_s=start_s, end_s=end_s)
     with warnings_about(path) as warnings, logs.read(path) as opened:

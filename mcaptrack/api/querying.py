@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from mcaptrack.api.common import PathLike, as_path, detail, paths_of
+from mcaptrack.api.common import PathLike, as_path, detail, locations_of
 from mcaptrack.tables import RECORDING, TABLES
 
 if TYPE_CHECKING:
@@ -50,7 +50,7 @@ def query(
     from mcaptrack.tables.sql import Database
 
     named = {name: as_path(path) for name, path in (files or {}).items()}
-    with Database(paths_of(log), named) as database:
+    with Database(locations_of(log), named) as database:
         answer = database.ask(sql)
         for note in database.notes:
             detail(note)
@@ -160,7 +160,7 @@ def list_tables(log: PathLike | Sequence[PathLike] = (), *, files: Mapping[str, 
         )
         for table in TABLES.values()
     )
-    paths = paths_of(log)
+    paths = locations_of(log)
     if not paths:
         return TableList(tables, (), ())
     from mcaptrack.tables.sql import Database

@@ -23,11 +23,12 @@ from numpy.typing import NDArray
 from mcaptrack import log as logs
 from mcaptrack import tables
 from mcaptrack.api.checked import checked
-from mcaptrack.api.common import as_path, log_output
+from mcaptrack.api.common import as_location, log_output
 from mcaptrack.api.fetching import FetchedMessage, fetch_message, shown_pictures
 from mcaptrack.api.supervision import supervision_of
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.files import refuse_overwrite
+from mcaptrack.location import Location, Url
 from mcaptrack.schema import DETECTIONS, SCHEMAS, TRACKS, Frame
 from mcaptrack.schema.classes import class_names
 from mcaptrack.sources.pictures import Pictures, find_pictures
@@ -57,12 +58,14 @@ class Recording:
 
     """
 
-    def __init__(self, path: Path) -> None:
-        self._place = path.absolute()  # where the log is, wherever the working folder moves
+    def __init__(self, path: Location) -> None:
+        self._place = (
+            path if isinstance(path, Url) else path.absolute()
+        )  # where the log is, wherever the working folder moves
         self._reading = RLock()  # tables are kept once they were made, and several threads may ask for them
         self._open(path)
 
-    def _open(self, path: Path) -> None:
+    def _open(self, path: Location) -> None:
         self._there = logs.read(path)
         self._contents = export.LogTables(self._there)
         self._is_open = True
@@ -88,8 +91,8 @@ class Recording:
         self._there.__exit__()
 
     @property
-    def path(self) -> Path:
-        """The file of the log."""
+    def path(self) -> Location:
+        """The file of the log, or its URL."""
         return self._there.path
 
     @property
@@ -349,7 +352,7 @@ class Recording:
         from mcaptrack.api.writing import write_rows
 
         path = self._log.path
-        path = path if path.absolute() == self._place else self._place
+        path = path if isinstance(path, Url) or path.absolute() == self._place else self._place
         with self._reading:
             count = write_rows(path, topic, rows, classes=classes, frame_id=frame_id, replace=replace, sidecar=sidecar)
             self.close()
@@ -369,7 +372,7 @@ def open(path: str | Path, *, create: bool = False) -> Recording:  # noqa: A001 
     Parameters
     ----------
     path : path
-        The log.
+        The log, or the URL of one in a store: "s3://bucket/log.mcap".
     create : bool, default False
         Make a new, empty log; one that exists is refused.
 
@@ -397,4 +400,4 @@ def open(path: str | Path, *, create: bool = False) -> Recording:  # noqa: A001 
         refuse_overwrite(made, force=False)
         with logs.create(made):
             pass
-    return Recording(as_path(path))
+    return Recording(as_location(path))

@@ -13,9 +13,10 @@ import numpy as np
 
 from mcaptrack import log as logs
 from mcaptrack import pipeline
-from mcaptrack.api.common import Notes, PathLike, Progress, as_path, log_output, no_progress, warnings_about
+from mcaptrack.api.common import Notes, PathLike, Progress, as_location, log_output, no_progress, warnings_about
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.files import is_same_file, publish_bytes, refuse_overwrite
+from mcaptrack.location import Location
 from mcaptrack.notices import Notice, warn
 from mcaptrack.pipeline import AS_BEFORE, Job, PlaneChoice, Summary, Watch
 from mcaptrack.sources.fixed_frame import BoxesRead
@@ -35,8 +36,8 @@ class RunResult:
 
     Attributes
     ----------
-    log : pathlib.Path
-        The log that holds the results.
+    log : pathlib.Path or str
+        The log that holds the results; the URL of one in a store.
     stages : tuple of str
         The stages that ran, in order; empty if everything was up to date.
     frames, rows, tracks : dict of str to int
@@ -51,7 +52,7 @@ class RunResult:
         Number of rows of each table that was written; only ``run`` writes tables.
     summary : mcaptrack.pipeline.Summary or None
         What the log holds now, in numbers; only ``run`` counts it.
-    written_to : pathlib.Path or None
+    written_to : pathlib.Path, str or None
         The file that holds the new channels: the log, or LOG.results.mcap beside it; None if nothing was written.
     written_because : str
         Why the results went there, where that needs a reason.
@@ -64,7 +65,7 @@ class RunResult:
 
     """
 
-    log: Path
+    log: Location
     stages: tuple[str, ...]
     frames: Mapping[str, int]
     rows: Mapping[str, int]
@@ -74,7 +75,7 @@ class RunResult:
     layouts: tuple[Path, ...]
     tables: Mapping[str, int]
     summary: Summary | None
-    written_to: Path | None
+    written_to: Location | None
     written_because: str
     warnings: tuple[Notice, ...]
     notes: tuple[str, ...]
@@ -117,9 +118,10 @@ def work(
 ) -> RunResult:
     """Plan and run on one log. ``tables`` is None where a single stage runs, which neither exports nor summarises."""
     began = monotonic()
-    path = as_path(where.log)
+    path = as_location(where.log)
     output = None if where.output is None else log_output(where.output, path)
-    target, notes = output or path, Notes()
+    target: Location = output or path
+    notes = Notes()
     if output is not None and where.sidecar is not None:
         raise McaptrackError(f"`sidecar={where.sidecar}` and `output=` are two places for the same results; give one")
     boxes = BoxesRead()
@@ -137,14 +139,16 @@ def work(
             jobs = plan(opened, prefix, notes.say)
             report = pipeline.run(opened, prefix, jobs, output, progress, watch, plane, boxes)
             written_to = output or opened.parts[-1].path
-        if written_to == path:
+        if written_to == path and isinstance(path, Path):
             update_metadata(path)
-        layouts = [pipeline.layout_path(target, name) for name in report.layouts]
-        for layout, content in zip(layouts, report.layouts.values(), strict=True):
-            publish_bytes(layout, content)
+        layouts = write_layouts(target, report.layouts)
         for topic in report.stale:
             warn_stale(topic, target)
-        rows = _export(target, where.force, progress, boxes) if tables else {}
+        rows = _export(target, where.force, progress, boxes) if tables and isinstance(target, Path) else {}
+        if tables and not isinstance(target, Path):
+            notes.say(
+                f"no tables are written, because {target} is in a store; {call('export', target)} writes them here"
+            )
         summary = None
         if tables is not None:
             with logs.read(target) as opened:
@@ -168,7 +172,17 @@ def work(
     )
 
 
-def warn_stale(topic: str, log: Path) -> None:
+def write_layouts(log: Location, layouts: Mapping[str, bytes]) -> list[Path]:
+    """Write the layouts of a log beside it; returns their paths. None beside an object: the log itself holds them."""
+    if not isinstance(log, Path):
+        return []
+    paths = [pipeline.layout_path(log, name) for name in layouts]
+    for path, content in zip(paths, layouts.values(), strict=True):
+        publish_bytes(path, content)
+    return paths
+
+
+def warn_stale(topic: str, log: Location) -> None:
     """Warn of a channel that is out of date now."""
     again = call("run", log)
     warn(f"{topic} is out of date, because its input was replaced; {again} brings it up to date", "out-of-date")

@@ -19,7 +19,9 @@ from mcaptrack.api.common import (
     Notes,
     PathLike,
     Progress,
+    as_path,
     detail,
+    locations_of,
     names_of,
     no_progress,
     optional_path,
@@ -42,6 +44,7 @@ from mcaptrack.evaluation.aligned import IOU_THRESHOLD, Similarity
 from mcaptrack.evaluation.metrics import Rules
 from mcaptrack.geometry.arrays import Floats
 from mcaptrack.geometry.plane import Point
+from mcaptrack.location import Location
 from mcaptrack.notices import Notice, collected, warn
 from mcaptrack.tables.compared import compare_files, pair_files
 
@@ -292,13 +295,15 @@ def evaluate(
     topics, notes = names_of(topic), Notes()
     gates = tuple(np.asarray(gate_m, float).reshape(-1).tolist())
     options = EvaluateOptions((similarity,) if similarity else (), gates, min_iou, rules, topics)
-    paths = paths_of(tracks)
+    paths = locations_of(tracks)
     with collected() as warnings:
         if truth is None:
             sequences = _from_logs(paths, camera, topics)
         else:
             plane = optional_path(ground_plane)
-            sequences = _from_files(paths, paths_of(truth), parse_fps(fps), plane, point, topics, notes)
+            sequences = _from_files(
+                [as_path(path) for path in paths], paths_of(truth), parse_fps(fps), plane, point, topics, notes
+            )
         total, counter = sum(len(sequence.candidates) for sequence in sequences), count()
 
         def tell(candidate: str) -> None:
@@ -332,12 +337,12 @@ def _check_name(name: str, row: Mapping[str, Any]) -> None:
         raise McaptrackError(f"there is no score {name}; there are {', '.join(scores)}")
 
 
-def holds_tables(path: Path) -> bool:
+def holds_tables(path: Location) -> bool:
     """Return whether a file is a table of tracks, which may hold several channels."""
     return path.suffix.lower() in _TABLES
 
 
-def _from_logs(paths: Sequence[Path], camera: str | None, topics: tuple[str, ...]) -> list[EvaluationInput]:
+def _from_logs(paths: Sequence[Location], camera: str | None, topics: tuple[str, ...]) -> list[EvaluationInput]:
     sequences = []
     for path in paths:
         if path.suffix.lower() in _FILES:

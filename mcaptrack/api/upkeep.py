@@ -9,9 +9,19 @@ from pathlib import Path
 
 from mcaptrack import log as logs
 from mcaptrack.api.checked import checked
-from mcaptrack.api.common import PathLike, Progress, log_output, log_path, names_of, no_progress, warnings_about
+from mcaptrack.api.common import (
+    PathLike,
+    Progress,
+    log_file,
+    log_location,
+    log_output,
+    names_of,
+    no_progress,
+    warnings_about,
+)
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import is_same_file, refuse_overwrite
+from mcaptrack.location import Location, local_name
 from mcaptrack.log import CheckResult, Finding
 from mcaptrack.notices import Notice
 from mcaptrack.schema.provenance import Provenance
@@ -25,8 +35,8 @@ class LogCheck:
 
     Attributes
     ----------
-    log : pathlib.Path
-        The log.
+    log : pathlib.Path or str
+        The log; the URL of one in a store.
     files : tuple of mcaptrack.log.CheckResult
         What was found in each file: the log, and LOG.results.mcap if it stands beside it. Each has ``path``,
         ``messages``, ``chunks``, ``findings`` and ``is_sound``.
@@ -35,7 +45,7 @@ class LogCheck:
 
     """
 
-    log: Path
+    log: Location
     files: tuple[CheckResult, ...]
     warnings: tuple[Notice, ...]
 
@@ -78,16 +88,16 @@ def check(log: PathLike, *, progress: Progress = no_progress) -> LogCheck:
     True
 
     """
-    path = log_path(log)
+    path = log_location(log)
     with warnings_about(path) as warnings:
         files = tuple(logs.check(part, progress) for part in files_of(path))
     return LogCheck(path, files, tuple(dict.fromkeys(warnings)))
 
 
-def files_of(log: Path) -> list[Path]:
+def files_of(log: Location) -> list[Location]:
     """Return the files of a log: itself, and its results if they stand beside it."""
-    results = logs.results_path(log)
-    return [log, results] if results != log and results.exists() else [log]
+    results = logs.find_results(log)
+    return [log] if results is None else [log, results]
 
 
 @dataclass(frozen=True)
@@ -96,8 +106,10 @@ class LogRecovery:
 
     Attributes
     ----------
-    log, output : pathlib.Path
-        The damaged log, and the log with what is intact.
+    log : pathlib.Path or str
+        The damaged log; the URL of one in a store.
+    output : pathlib.Path
+        The log with what is intact.
     messages, chunks : int
         Number of messages and chunks that were saved.
     lost : tuple of str
@@ -107,7 +119,7 @@ class LogRecovery:
 
     """
 
-    log: Path
+    log: Location
     output: Path
     messages: int
     chunks: int
@@ -126,7 +138,7 @@ def recover(
     log : path
         The damaged log.
     output : path, optional
-        The log to write, by default LOG.recovered.mcap beside the log.
+        The log to write, by default LOG.recovered.mcap beside the log, or in the working folder if that is in a store.
     force : bool, default False
         Overwrite ``output`` if it exists.
     progress : callable, optional
@@ -149,8 +161,8 @@ def recover(
     ()
 
     """
-    path = log_path(log)
-    target = path.with_suffix(".recovered.mcap") if output is None else log_output(output, path)
+    path = log_location(log)
+    target = local_name(path, ".recovered.mcap") if output is None else log_output(output, path)
     if is_same_file(target, path):
         raise McaptrackError(f"{path} is both input and output; give another name with `output=`")
     refuse_overwrite(target, force)
@@ -228,7 +240,7 @@ def drop(
     ('/camera/video',)
 
     """
-    path = log_path(log)
+    path = log_file(log)
     if not names_of(topics):
         raise McaptrackError("name the channels to remove with `topics=`")
     copy = None if output is None else log_output(output, path)
@@ -240,7 +252,7 @@ def drop(
     with warnings_about(path) as warnings:
         with logs.read(path) as opened:
             dropped = _chosen(opened, names_of(topics))
-            holds = {part.path: [c for c in part.recorded if c.topic in dropped] for part in opened.parts}
+            holds = {Path(part.path): [c for c in part.recorded if c.topic in dropped] for part in opened.parts}
             messages = sum(channel.messages for gone in holds.values() for channel in gone)
             before = sum(part.size for part in opened.parts)
             recorded = {c.topic for c in holds[path] if Provenance.from_metadata(c.metadata) is None}

@@ -11,7 +11,7 @@ from typing import Self
 
 from mcaptrack import log as logs
 from mcaptrack.api.checked import checked
-from mcaptrack.api.common import Notes, PathLike, as_path
+from mcaptrack.api.common import Notes, PathLike, log_file
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.notices import Notice, collected, warn
 from mcaptrack.pipeline import LAYOUTS, attachment_of, layout_path
@@ -152,14 +152,14 @@ def view(
     """
     if not lichtblick.startswith(("http://", "https://")):
         raise McaptrackError(f"`lichtblick=` needs an address such as http://localhost:8080, not {lichtblick!r}")
-    path, notes = as_path(log), Notes()
+    path, notes = log_file(log), Notes()
     with collected() as warnings, logs.read(path) as opened:
         if not opened.is_on_disk:
             raise McaptrackError(
                 f"viewers can't open {path}: a change of it goes on or was interrupted. The next command that writes "
                 f"to it mends it; {call('recover', path)} saves it to another file"
             )
-        files = {part.path.name: part.real_path for part in opened.parts}
+        files = {part.path.name: Path(part.real_path) for part in opened.parts}
         layouts = _layouts(path, opened, notes)
     if layout is not None and layout not in layouts:
         raise McaptrackError(f"{path} has no layout {layout}; it has {', '.join(layouts) or 'none'}")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -14,10 +13,10 @@ from mcaptrack.api.class_names import checked_names
 from mcaptrack.api.columns import UNNUMBERED
 from mcaptrack.api.common import warnings_about
 from mcaptrack.api.rows import frames_of
-from mcaptrack.api.running import warn_stale
+from mcaptrack.api.running import warn_stale, write_layouts
 from mcaptrack.errors import McaptrackError
-from mcaptrack.files import publish_bytes
 from mcaptrack.geometry.plane import Planes, plane_at
+from mcaptrack.location import Location
 from mcaptrack.pipeline.write import Made, write
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame, Schema
 from mcaptrack.schema.provenance import INGEST, Provenance
@@ -38,7 +37,7 @@ _LONGEST: Final = 1024
 
 
 def write_rows(
-    path: Path,
+    path: Location,
     topic: str,
     rows: Any,
     *,
@@ -66,8 +65,7 @@ def write_rows(
         path_of_camera, _ = path_of(opened, prefix, tracks_topic(prefix))
         layouts = write(opened, prefix, {name: made}, planes, {}, None, path_of_camera)
         stale = pipeline.outdated_by(opened, {name: made.provenance.digest})
-        for layout, content in layouts.items():
-            publish_bytes(pipeline.layout_path(path, layout), content)
+        write_layouts(path, layouts)
         for topic_of_stage in stale:
             warn_stale(topic_of_stage, path)
         if opened.results is None:

@@ -29,6 +29,7 @@ from mcaptrack.cli.settings import Declared
 from mcaptrack.cli.text import say
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import publish_bytes, refuse_overwrite, refuse_url
+from mcaptrack.location import Location, is_remote, parse
 from mcaptrack.notices import Code, Notice
 from mcaptrack.transforms.protocol import limits
 
@@ -223,7 +224,7 @@ class Talk:
         notices.warn(words, code)
 
     @contextmanager
-    def attempt(self, path: Path, paths: Sequence[Path]) -> Iterator[None]:
+    def attempt(self, path: Location, paths: Sequence[Location]) -> Iterator[None]:
         """Process one of several inputs: an error in it is printed and does not stop the others.
 
         The command ends with exit code 3 then, and its JSON lists the inputs that failed.
@@ -312,7 +313,7 @@ def one_line(command: Callable[P, None]) -> Callable[P, None]:
         batch = _Batch()
         _BATCH.set(batch)
         try:
-            check_paths(kwargs.values())
+            check_paths(kwargs)
             check_ranges(kwargs)
             with notices.listening(_show_warning):
                 command(*args, **kwargs)
@@ -394,19 +395,22 @@ def print_json(data: dict[str, Any]) -> None:
     print(json.dumps(whole, indent=2, allow_nan=False), flush=True)
 
 
-def expand(paths: Sequence[Path], *, each: bool = False, folders: bool = False) -> list[Path]:
+def expand(paths: Sequence[Path], *, each: bool = False, folders: bool = False) -> list[Location]:
     """Return paths, with patterns replaced by the files that match.
 
     With ``folders``, a folder that has logs stands for these, and "-" for a list of logs on standard input.
     LOG.results.mcap is left out if LOG is among the paths, because it is a part of LOG; with ``each`` it is kept.
     Raises McaptrackError for a pattern that matches no file.
     """
-    from mcaptrack.files import follow_links
+    from mcaptrack.files import place_of
     from mcaptrack.fleet.expansion import LIST, find_logs, has_logs
     from mcaptrack.log import results_path
 
-    out: list[Path] = []
+    out: list[Location] = []
     for path in paths:
+        if is_remote(url := parse(path)):
+            out.append(url)
+            continue
         refuse_url(path)
         if folders and (str(path) == LIST or (path.is_dir() and has_logs(path))):
             out += [one.path for one in find_logs([path])]
@@ -418,11 +422,11 @@ def expand(paths: Sequence[Path], *, each: bool = False, folders: bool = False) 
         if not found:
             raise McaptrackError(f"no file matches {path}")
         out += found
-    results = {results_path(follow_links(path)) for path in out}
-    return [path for path in out if each or follow_links(path) not in results]
+    results = {results_path(place_of(path)) for path in out}
+    return [path for path in out if each or place_of(path) not in results]
 
 
-def only_one_output(paths: Sequence[Path], output: Path | None) -> None:
+def only_one_output(paths: Sequence[Location], output: Path | None) -> None:
     """Raise McaptrackError if several inputs would be written to one output."""
     if output is not None and len(paths) > 1:
         raise McaptrackError(

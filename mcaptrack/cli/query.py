@@ -15,6 +15,7 @@ from mcaptrack.cli.command import warn_unused
 from mcaptrack.cli.text import console, printable, show
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import refuse_url
+from mcaptrack.location import is_remote, parse
 
 if TYPE_CHECKING:
     from mcaptrack import TableList
@@ -105,23 +106,23 @@ def query(
     paths, sql = _asked(words or [], file, tables)
     if tables:
         warn_unused("--tables lists what could be asked", "form", "rows")
-    paths = common.expand(paths, folders=True)
+    logs = common.expand(paths, folders=True)
     chosen = _form(form, output, json)
     if output is not None:
         from mcaptrack.files import is_same_file, refuse_overwrite
 
         refuse_overwrite(output, force)
-        if any(is_same_file(output, path) for path in paths):
+        if any(is_same_file(output, path) for path in logs):
             raise McaptrackError(f"{output} is both input and output; give another name with -o")
     import mcaptrack
 
     with common.Talk(quiet, verbose).open() as talk:
         if tables:
-            listed = mcaptrack.list_tables(paths, files=_named(files or []))
+            listed = mcaptrack.list_tables(logs, files=_named(files or []))
             with common.printed_to(output, force):
                 _print_tables(listed, json)
             return
-        answer = mcaptrack.query(paths, sql, files=_named(files or []))
+        answer = mcaptrack.query(logs, sql, files=_named(files or []))
         if chosen == "table":
             limit = rows if rows is not None else _SHOWN if sys.stdout.isatty() and output is None else 0
             with common.printed_to(output, force):
@@ -137,7 +138,8 @@ def _asked(words: Sequence[str], file: Path | None, tables: bool) -> tuple[list[
     from_file = file is not None or tables
     names = list(words) if from_file else list(words[:-1])
     for word in words:
-        refuse_url(word)
+        if not is_remote(parse(word)):
+            refuse_url(word)
     stray = next((name for name in names if name.lower() in _KEYWORDS and not Path(name).exists()), None)
     if stray is not None:
         raise McaptrackError(f'{stray} is not a log; the query is one argument, in quotes: "{stray} ..."')

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mcaptrack.cli import common
@@ -58,12 +59,13 @@ def _as_json(result: RunResult) -> dict[str, Any]:
 
 def _next(result: RunResult) -> list[str]:
     """Return commands to run next."""
+    show = "view" if isinstance(result.log, Path) else "report"  # viewers open files
     if result.summary is None:
-        steps = ["view"] if result.stages == ("events",) else ["run"]
+        steps = [show] if result.stages == ("events",) else ["run"]
     elif not result.summary.tracks:
         steps = ["info"]
     else:
-        steps = ["view", "evaluate"] if result.summary.scores else ["view"]
+        steps = [show, "evaluate"] if result.summary.scores else [show]
     return [command(step, result.log).strip("`") for step in steps]
 
 

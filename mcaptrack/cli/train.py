@@ -219,8 +219,11 @@ def train(
     Example: mcaptrack train synthetic -o trained
     """
     import mcaptrack
+    from mcaptrack.files import refuse_url
     from mcaptrack.training.sources import SYNTHETIC
 
+    for source in sources:
+        refuse_url(source)
     paths = common.expand([Path(source) for source in sources if source != SYNTHETIC])
     with common.Talk(quiet, verbose).open() as talk:
         trained = mcaptrack.train(

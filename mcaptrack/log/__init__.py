@@ -11,7 +11,7 @@ from mcaptrack.log.check import CheckResult, check
 from mcaptrack.log.check_summary import Finding
 from mcaptrack.log.extend import extend, refuse_to_replace_recorded
 from mcaptrack.log.messages import ChannelRows, Message, MessageLocations
-from mcaptrack.log.opening import read, topics_with_schema
+from mcaptrack.log.opening import find_results, read, topics_with_schema
 from mcaptrack.log.paths import results_path
 from mcaptrack.log.reader import Channel, Log
 from mcaptrack.log.recording_files import refuse_non_mcap, split_files_in
@@ -34,6 +34,7 @@ __all__ = [
     "copy_attachments_and_metadata",
     "create",
     "extend",
+    "find_results",
     "header",
     "read",
     "recover",

@@ -10,11 +10,12 @@ import os
 import stat
 import time
 import weakref
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Final, NamedTuple, overload
+from typing import Final, NamedTuple, Protocol, overload
 
 from mcaptrack.errors import McaptrackError
+from mcaptrack.location import Location, Url
 from mcaptrack.log.checksums import crc_of
 from mcaptrack.log.recording_files import refuse_non_mcap
 from mcaptrack.log.records import BLOCK, Damaged
@@ -22,6 +23,8 @@ from mcaptrack.log.records import BLOCK, Damaged
 #: Read-ahead of small reads in bytes: it starts with the minimum and doubles with every sequential read.
 _MIN_AHEAD: Final = 4 * 2**10
 _MAX_AHEAD: Final = 256 * 2**10
+#: Ranges of an object with a smaller gap between them are read as one: that is as quick as another request.
+GAP_BYTES: Final = 512 * 2**10
 #: The running checksum is updated in steps of at least this many bytes.
 _MIN_SUMMED: Final = 64 * 2**10
 #: Resolution of file times: two changes within this time may get the same timestamp.
@@ -61,6 +64,26 @@ class Signature(NamedTuple):
         return abs(time.time() - self.changed_ns / 1e9) > _TICK_S
 
 
+class ReadFile(Protocol):
+    """The interface of a file or of an object in a store (``log/remote.py``) that a log is read from."""
+
+    @property
+    def size(self) -> int:
+        """The present size in bytes."""
+
+    def signature(self) -> Signature:
+        """The present signature: another one means that the content was changed."""
+
+    def expect(self, ranges: Iterable[tuple[int, int]], gap: int, /) -> None:
+        """Announce which bytes will be read, from start to end: a store can then give them in few requests."""
+
+    def read(self, at: int, size: int) -> bytes:
+        """``size`` bytes from offset ``at``. Raises Damaged if there are fewer."""
+
+    def close(self) -> object:
+        """Close it; further reads are refused."""
+
+
 class OpenFile:
     """A regular file, open for reading; closed by ``close`` or by garbage collection."""
 
@@ -87,11 +110,32 @@ class OpenFile:
             raise McaptrackError(f"{path} is {kind}, not an MCAP file{hint}")
         return file
 
+    @property
+    def size(self) -> int:
+        """The present size in bytes."""
+        return os.fstat(self.handle).st_size
+
+    def signature(self) -> Signature:
+        """The present signature."""
+        return Signature.of(self.handle)
+
+    def expect(self, ranges: Iterable[tuple[int, int]], gap: int, /) -> None:
+        """Nothing is gained from knowing what will be read of a file."""
+
     def read(self, at: int, size: int) -> bytes:
         """``size`` bytes from offset ``at``. Raises Damaged if the file has become shorter or can't be read."""
         if not self.close.alive:
             raise McaptrackError("the log is closed; what is read bit by bit, such as pictures, needs it open")
         return read_exactly(self.handle, at, size)
+
+
+def open_file(location: Location) -> ReadFile:
+    """Open a file or an object for reading. Raises McaptrackError if it is missing or can't be read."""
+    if isinstance(location, Url):
+        from mcaptrack.log.remote import RemoteFile
+
+        return RemoteFile(location)
+    return OpenFile.at(location)
 
 
 def read_exactly(handle: int, at: int, size: int) -> bytes:
@@ -111,7 +155,7 @@ def read_exactly(handle: int, at: int, size: int) -> bytes:
 class Piece(NamedTuple):
     """A part of an open file."""
 
-    file: OpenFile
+    file: ReadFile
     at: int
     size: int
 
@@ -126,16 +170,28 @@ class ByteSource:
     def __init__(self, pieces: Sequence[Piece], ahead: int = 0) -> None:
         self.pieces: tuple[Piece, ...] = tuple(pieces)
         self._size = sum(piece.size for piece in pieces)
-        self._ahead = ahead
+        self._ahead = ahead or int(self.is_remote)  # what is read of a store, reads ahead itself
         self._next_ahead = ahead or _MIN_AHEAD
         self._window: tuple[int, memoryview] = (0, memoryview(b""))
         #: Offset from which bytes stay in the read-ahead window, because they will be read again.
         self.anchor: int | None = None
 
     @classmethod
-    def of(cls, file: OpenFile) -> ByteSource:
+    def of(cls, file: ReadFile) -> ByteSource:
         """The whole file, at its current size."""
-        return cls([Piece(file, 0, os.fstat(file.handle).st_size)])
+        return cls([Piece(file, 0, file.size)])
+
+    @property
+    def is_remote(self) -> bool:
+        """Whether reading takes requests to a store."""
+        return any(not isinstance(piece.file, OpenFile) for piece in self.pieces)
+
+    def expect(self, ranges: Sequence[tuple[int, int]], gap: int = GAP_BYTES) -> None:
+        """Announce which bytes will be read, from start to end each, in place of what was announced before. Those with
+        a smaller ``gap`` between them come in one request.
+        """
+        for piece in self.pieces:
+            piece.file.expect(((piece.at + low, piece.at + high) for low, high in ranges), gap)
 
     def __len__(self) -> int:
         return self._size

@@ -8,15 +8,15 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 
 from mcaptrack import notices
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import follow_links
+from mcaptrack.location import Location, Url
 from mcaptrack.log import records
-from mcaptrack.log.byte_source import ByteSource, OpenFile, RunningChecksum, Signature
+from mcaptrack.log.byte_source import ByteSource, OpenFile, ReadFile, RunningChecksum, open_file
 from mcaptrack.log.check_summary import Finding, Findings, check_summary, record_name
 from mcaptrack.log.checksums import attachment_is_whole
 from mcaptrack.log.chunks import (
@@ -50,7 +50,7 @@ Progress = Callable[[str, int, int], None]
 class CheckResult:
     """The result of ``check``."""
 
-    path: Path
+    path: Location
     messages: int = 0
     chunks: int = 0
     findings: list[Finding] = field(default_factory=list)
@@ -61,13 +61,13 @@ class CheckResult:
         return all(finding.level != "error" for finding in self.findings)
 
 
-def check(path: Path, progress: Progress = lambda *_: None) -> CheckResult:
+def check(path: Location, progress: Progress = lambda *_: None) -> CheckResult:
     """Check every byte of a log.
 
     Parameters
     ----------
-    path : Path
-        An MCAP file.
+    path : Path or Url
+        An MCAP file, or an object that is one.
     progress : callable, optional
         Called with "check", the bytes read, and the size of the file.
 
@@ -83,7 +83,7 @@ def check(path: Path, progress: Progress = lambda *_: None) -> CheckResult:
         Only if the file can't be read at all, or changes meanwhile.
     """
     with open_bytes(path) as (source, file):
-        signature = Signature.of(file.handle)
+        signature = file.signature()
         found = find_journal(path, file)
         if found and found.is_busy:
             raise McaptrackError(f"{path} is being written to by another process; try again when it is done")
@@ -97,7 +97,7 @@ def check(path: Path, progress: Progress = lambda *_: None) -> CheckResult:
             look.check_all()
         except Damaged as error:  # an unreadable file; damaged content is a finding
             raise McaptrackError(f"{path} can't be read to its end: {error}") from None
-        if Signature.of(file.handle) != signature:
+        if file.signature() != signature:
             raise changed(path)
     findings = sorted(look.findings, key=lambda found: (found.level, found.where))
     return CheckResult(path, sum(look.found.counts.values()), len(look.found.chunks), findings)
@@ -113,13 +113,13 @@ def is_sound(source: ByteSource) -> bool:
     return all(finding.level != "error" for finding in look.findings)
 
 
-def content_to_recover(path: Path, source: ByteSource, file: OpenFile) -> ByteSource:
+def content_to_recover(path: Location, source: ByteSource, file: ReadFile) -> ByteSource:
     """The content that `recover` reads: the old content by a journal if the file itself is damaged, else the file.
 
     The log itself is not written to, so a journal is good enough that doesn't prove that it belongs to this file.
     """
     found = find_journal(path, file)
-    if found is None:
+    if found is None or isinstance(path, Url) or not isinstance(file, OpenFile):
         return source
     before = found.journal.old_content() if found.journal else load_old_content(follow_links(path), file)
     if before is None or (not found.journal and is_sound(source)) or not is_sound(before):
@@ -134,9 +134,9 @@ def content_to_recover(path: Path, source: ByteSource, file: OpenFile) -> ByteSo
 
 
 @contextmanager
-def open_bytes(path: Path) -> Iterator[tuple[ByteSource, OpenFile]]:
+def open_bytes(path: Location) -> Iterator[tuple[ByteSource, ReadFile]]:
     """Open the bytes of a file. Raises McaptrackError if it is missing or empty."""
-    file = OpenFile.at(path)
+    file = open_file(path)
     try:
         source = ByteSource.of(file)
         if not len(source):

@@ -10,14 +10,16 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Collection, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import IO
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import can_replace, publish_stream
+from mcaptrack.location import is_remote
 from mcaptrack.log import records
-from mcaptrack.log.byte_source import ByteSource
+from mcaptrack.log.byte_source import ByteSource, OpenFile
 from mcaptrack.log.checksums import crc_before, crc_of
 from mcaptrack.log.chunks import chunk_record, message_head, open_chunk
 from mcaptrack.log.in_place import rewrite_tail
@@ -33,6 +35,7 @@ from mcaptrack.log.records import (
     Record,
     walk,
 )
+from mcaptrack.log.remote import publish_object
 from mcaptrack.log.writer import LogWriter, Sink, refuse_earlier_results, verify
 from mcaptrack.schema.provenance import Provenance
 
@@ -60,7 +63,8 @@ def extend(
         log.lock()
     with log.snapshot.reporting_damage():
         change = _Rewrite.plan(log, drop, drop_metadata, drop_attachments)
-        is_in_place = output is None and (change.is_cheaper_in_place or not can_replace(log.real_path))
+        place = log.real_path if output is None and not is_remote(log.path) else None
+        is_in_place = isinstance(place, Path) and change.is_better_in_place(place)
         opened = _in_place(log, change) if is_in_place else _as_copy(log, change, output)
         with opened as writer:
             yield writer
@@ -88,6 +92,8 @@ def refuse_to_replace_recorded(log: Log, topics: Collection[str], instead: str) 
 def _in_place(log: Log, change: _Rewrite) -> Iterator[LogWriter]:
     index = log.index
     crc = change.crc_before()
+    assert isinstance(log.real_path, Path)
+    assert isinstance(log.snapshot.file, OpenFile)
     try:
         with rewrite_tail(log.real_path, log.lock(), change.cut, log.snapshot.file) as end:
             log.snapshot.source.pieces = end.journal.pieces()  # readers of this log continue to see the old content
@@ -106,7 +112,7 @@ def _as_copy(log: Log, change: _Rewrite, output: Path | None) -> Iterator[LogWri
     """Write a copy under a temporary name; it gets its final name when it is complete, verified and synced to disk."""
     if output is not None:
         refuse_earlier_results(output)
-    with publish_stream(output or log.real_path) as stream:
+    with _published(log, output) as stream:
         crc = change.crc_before()
         _copy_bytes(log.snapshot.source, change.cut, stream)
         writer = LogWriter(stream, change.cut, crc, change.index_before())
@@ -117,6 +123,14 @@ def _as_copy(log: Log, change: _Rewrite, output: Path | None) -> Iterator[LogWri
         copy = Path(stream.name)
         _compare(log.snapshot.source, copy, change.cut)
         verify(copy, writer, messages, change.cut, crc or 0)
+
+
+def _published(log: Log, output: Path | None) -> AbstractContextManager[IO[bytes]]:
+    """A stream to write the new content of a log to, or ``output``."""
+    if output is None and is_remote(log.path):
+        return publish_object(log.path, log.version)
+    assert isinstance(log.real_path, Path)
+    return publish_stream(output or log.real_path)
 
 
 def _copy_bytes(source: ByteSource, end: int, stream: Sink) -> None:
@@ -178,10 +192,11 @@ class _Rewrite:
                 return channel_id in _described_in(open_chunk(self.source, chunk_record(self.source, chunk)))[0]
         return False
 
-    @property
-    def is_cheaper_in_place(self) -> bool:
-        """Whether writing the tail twice (to the journal and in place) is less work than writing everything once."""
-        return self.index.regular and self.cut > len(self.source) - self.cut
+    def is_better_in_place(self, path: Path) -> bool:
+        """Whether writing the tail twice (to the journal and in place) is less work than writing everything once, or
+        whether a copy can't replace the file.
+        """
+        return (self.index.regular and self.cut > len(self.source) - self.cut) or not can_replace(path)
 
     def crc_before(self) -> int | None:
         """The checksum of all bytes before the cut; None if the log has no checksum."""

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import NamedTuple
 
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.files import follow_links
-from mcaptrack.log.byte_source import OpenFile
+from mcaptrack.location import Location, Url
+from mcaptrack.log.byte_source import OpenFile, ReadFile
 from mcaptrack.log.journal import Journal, UnusableJournal, find, journal_of, load_old_content, remove_hint
 
 
@@ -19,8 +19,10 @@ class JournalFinding(NamedTuple):
     is_busy: bool = False
 
 
-def find_journal(path: Path, file: OpenFile) -> JournalFinding | None:
+def find_journal(path: Location, file: ReadFile) -> JournalFinding | None:
     """The state of the journal beside a log that is opened for reading; None if there is no journal."""
+    if isinstance(path, Url) or not isinstance(file, OpenFile):
+        return None  # objects are replaced as a whole
     real_path = follow_links(path)
     try:
         journal = find(real_path, file)
@@ -45,16 +47,16 @@ def find_journal(path: Path, file: OpenFile) -> JournalFinding | None:
     return JournalFinding(f"{left}. The next command that writes to it removes the journal") if state else None
 
 
-def changed(path: Path) -> McaptrackError:
+def changed(path: Location) -> McaptrackError:
     """The error for a file that another process changed while it was read."""
     return McaptrackError(f"{path} was changed by another process while it was being read; try again")
 
 
-def recover_hint(path: Path) -> str:
+def recover_hint(path: Location) -> str:
     """The hint for a damaged log: the command that recovers what is intact."""
     return f"{recover_command(path)} saves what is intact"
 
 
-def recover_command(path: Path) -> str:
+def recover_command(path: Location) -> str:
     """The command that recovers a damaged log."""
     return call("recover", path)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from mcaptrack.geometry.arrays import Ints
 from mcaptrack.geometry.ragged import group_index, ragged_range, run_starts
-from mcaptrack.log.byte_source import ByteSource
+from mcaptrack.log.byte_source import GAP_BYTES, ByteSource
 from mcaptrack.log.checksums import crc_of
 from mcaptrack.log.chunks import (
     MAX_NS,
@@ -33,6 +33,7 @@ from mcaptrack.log.fingerprint import fingerprint
 from mcaptrack.log.index import Index
 from mcaptrack.log.records import (
     BLOCK,
+    CHUNK_HEAD_BYTES,
     MESSAGE_HEAD,
     Bytes,
     ChunkIndexRecord,
@@ -52,6 +53,10 @@ Span = tuple[int | None, int | None]
 OPEN_BYTES: Final = 128 * 2**20
 #: Messages outside of chunks are read one by one if their average distance in the file is larger.
 _MAX_GAP_BYTES: Final = 16 * 2**10
+#: Chunks in a store that are smaller together are read with their indexes, others after them. Indexes that are nearer
+#: to each other come in one request.
+_READ_AT_ONCE_BYTES: Final = 16 * 2**20
+_MIN_GAP_BYTES: Final = 64 * 2**10
 _NONE: Final = np.empty(0, np.int64)
 _NO_TIMES: Final = np.empty(0, np.uint64)
 
@@ -131,11 +136,12 @@ class Messages:
 
     def times(self, channels: Sequence[int], span: Span = (None, None)) -> Ints:
         """The sorted times of messages, (M,)."""
-        return np.sort(to_int64(np.concatenate([_NO_TIMES, *(b.t_ns for b in self._batches(channels, span))])))
+        batches = self._located(channels, span, are_read=False)
+        return np.sort(to_int64(np.concatenate([_NO_TIMES, *(batch.t_ns for batch in batches)])))
 
     def places(self, channels: Sequence[int]) -> MessageLocations:
         """The locations of messages, in the order of ``by_time``."""
-        batches = self._batches(channels)
+        batches = self._located(channels, (None, None), are_read=False)
         t_ns = to_int64(np.concatenate([_NO_TIMES, *(batch.t_ns for batch in batches)]))
         offset = np.concatenate([_NONE, *(batch.offset for batch in batches)])
         starts = np.array([batch.chunk.offset if batch.chunk else -1 for batch in batches], np.int64)
@@ -167,7 +173,7 @@ class Messages:
         ``span`` is a half-open interval of times. Chunks stay open while they have messages to come, within the limit
         ``OPEN_BYTES``.
         """
-        batches = self._batches(channels, span)
+        batches = self._located(channels, span)
         if not any(len(batch.t_ns) for batch in batches):
             return
         t_ns = np.concatenate([batch.t_ns for batch in batches])
@@ -194,7 +200,7 @@ class Messages:
 
     def columns(self, channels: Sequence[int], schema: Schema, reader: RowReader) -> ChannelRows | None:
         """Rows without a loop over messages; None if a message has another layout than the reader's."""
-        batches = self._batches(channels)
+        batches = self._located(channels, (None, None))
         t_ns = to_int64(np.concatenate([_NO_TIMES, *(batch.t_ns for batch in batches)]))
         sequence, counts = np.empty_like(t_ns), np.empty_like(t_ns)
         rows, done, taken = schema.empty(), 0, 0
@@ -243,6 +249,9 @@ class Messages:
     def fingerprint(self, channel_id: int | None = None) -> str:
         """The fingerprint of a channel, or of the whole log; computed once."""
         if channel_id not in self._fingerprints:
+            if self.source.is_remote:
+                chunks = [c for c in self.index.chunks if channel_id in (None, *c.message_index_offsets)]
+                self.source.expect([(chunk.offset, chunk.offset + CHUNK_HEAD_BYTES) for chunk in chunks])
             self._fingerprints[channel_id] = fingerprint(self.source, self.index, channel_id, self._checksums)
         return self._fingerprints[channel_id]
 
@@ -251,7 +260,31 @@ class Messages:
         pieces = all(crc_of(source, start, end) == crc for start, (end, crc) in self._pieces.items())
         return pieces and all(checksum_at(source, start) == crc for start, crc in self._chunks.items())
 
-    def _batches(self, channels: Sequence[int], span: Span = (None, None)) -> list[_Batch]:
+    def _located(self, channels: Sequence[int], span: Span, *, are_read: bool = True) -> list[_Batch]:
+        """The batches of channels. A store learns what will be read of them: their indexes, and if they ``are_read``
+        their chunks.
+        """
+        if not self.source.is_remote:
+            return self._batches(channels, span)
+        first, last = span
+        indexes, wholes = [], []
+        for chunk in self.index.chunks:
+            is_before = first is not None and chunk.end_ns < first
+            if is_before or (last is not None and chunk.start_ns >= last):
+                continue
+            if not chunk.message_index_offsets.keys().isdisjoint(channels):
+                end = chunk.offset + chunk.length  # its message indexes follow
+                indexes.append((end, end + chunk.message_index_length))
+                is_direct = is_left_in_file(chunk.compression, chunk.compressed_size)
+                wholes.append((end if is_direct else chunk.offset, end + chunk.message_index_length))
+        is_one = are_read and sum(end - start for start, end in wholes) <= _READ_AT_ONCE_BYTES
+        self.source.expect(wholes if is_one else indexes, GAP_BYTES if is_one or not are_read else _MIN_GAP_BYTES)
+        batches = self._batches(channels, span)
+        if are_read and not is_one:
+            self.source.expect(wholes)
+        return batches
+
+    def _batches(self, channels: Sequence[int], span: Span) -> list[_Batch]:
         return [batch for channel_id in channels for batch in self._batches_of(channel_id, span)]
 
     def _batches_of(self, channel_id: int, span: Span) -> list[_Batch]:

@@ -4,19 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
+from mcaptrack import objects
+from mcaptrack.location import Location, Url
 from mcaptrack.log.paths import RESULTS_SUFFIX, results_path
 from mcaptrack.log.reader import Channel, Log
 from mcaptrack.log.writer import create
+from mcaptrack.objects import AbsentError
 
 
-def read(path: Path, *, sidecar: bool | Callable[[Log], bool] | None = None) -> Log:
+def read(path: Location, *, sidecar: bool | Callable[[Log], bool] | None = None) -> Log:
     """Open a log.
 
     Parameters
     ----------
-    path : Path
-        An MCAP file.
+    path : Path or Url
+        An MCAP file, or an object that is one.
     sidecar : bool or callable, optional
         Whether to open the log with its sidecar, LOG.results.mcap: by default if it exists; True creates it, False
         ignores it. A callable gets the log alone and returns which.
@@ -31,11 +35,15 @@ def read(path: Path, *, sidecar: bool | Callable[[Log], bool] | None = None) -> 
     McaptrackError
         If the file is missing, not an MCAP file, or damaged.
     """
-    log, results = Log(path), results_path(path)
+    log = Log(path)
     try:
-        if not path.name.endswith(RESULTS_SUFFIX) and (
-            sidecar(log) if callable(sidecar) else sidecar or (sidecar is None and results.exists())
-        ):
+        if path.name.endswith(RESULTS_SUFFIX):
+            return log
+        if isinstance(path, Url):
+            _attach_remote(log, results_path(path), sidecar(log) if callable(sidecar) else sidecar)
+            return log
+        results = results_path(path)
+        if sidecar(log) if callable(sidecar) else sidecar or (sidecar is None and results.exists()):
             is_new = not results.exists()
             if is_new:
                 with create(results):
@@ -50,3 +58,32 @@ def read(path: Path, *, sidecar: bool | Callable[[Log], bool] | None = None) -> 
 def topics_with_schema(log: Log, names: Sequence[str]) -> list[Channel]:
     """The channels with one of these schemas, sorted by topic."""
     return [channel for _, channel in sorted(log.channels.items()) if channel.schema_name in names]
+
+
+def find_results(path: Location) -> Location | None:
+    """The sidecar of a log, if there is one."""
+    if path.name.endswith(RESULTS_SUFFIX):
+        return None
+    if isinstance(path, Url):
+        objects.library(path)
+        url = results_path(path)
+        return None if objects.find(url) is None else url
+    results = results_path(path)
+    return results if results.exists() else None
+
+
+def _attach_remote(log: Log, results: Url, sidecar: bool | None) -> None:
+    """Attach the sidecar of a log in a store: the one that is there, or with ``sidecar`` a new one."""
+    if sidecar is False:
+        return
+    try:
+        found = Log(results)
+    except AbsentError:
+        if not sidecar:
+            return
+        made = TemporaryDirectory(prefix="mcaptrack-")
+        with create(Path(made.name, results.name)):
+            pass
+        log.attach_results(Log(results, made), is_new=True)
+    else:
+        log.attach_results(found, is_new=False)

@@ -7,18 +7,23 @@ import heapq
 import os
 from collections.abc import Iterable, Iterator
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import NamedTuple, Self, TypeVar
 
 import numpy as np
 
 from mcaptrack.errors import McaptrackError, call
-from mcaptrack.files import follow_links
+from mcaptrack.files import place_of
 from mcaptrack.geometry.arrays import Ints
+from mcaptrack.location import Location, is_remote
 from mcaptrack.log import in_place, records
+from mcaptrack.log.byte_source import OpenFile
 from mcaptrack.log.chunks import MAX_NS
 from mcaptrack.log.messages import ChannelRows, Message, MessageLocations
 from mcaptrack.log.records import ChannelRecord, Damaged
+from mcaptrack.log.remote import RemoteFile
 from mcaptrack.log.snapshot import open_snapshot
+from mcaptrack.objects import Version
 from mcaptrack.schema import Frame, Schema
 from mcaptrack.schema.classes import with_only_class
 from mcaptrack.schema.encodings import ROW_ENCODINGS, RowReader, reader_of, schema_name_of
@@ -54,11 +59,13 @@ class Log:
     new channels are written to the sidecar.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Location, made: TemporaryDirectory[str] | None = None) -> None:
         self.path = path
-        self.real_path = follow_links(path)
+        self._made = made  # holds the content of a new log in a store, until it is written there
+        place = path if made is None else Path(made.name, path.name)
+        self.real_path = place_of(place)
         self._lock: int | None = None
-        self.snapshot = open_snapshot(path)
+        self.snapshot = open_snapshot(place)
         self.index, self._messages = self.snapshot.index, self.snapshot.messages
         self.results: Log | None = None
         self.is_new = False  # just created; removed again if nothing is written to it
@@ -87,24 +94,37 @@ class Log:
             os.close(self._lock)
             self._lock = None
         self.snapshot.file.close()
+        if self._made is not None:
+            self._made.cleanup()
         if self.results is not None:
             self.results.__exit__()
-            if self.results.is_new:
+            if self.results.is_new and isinstance(self.results.path, Path):
                 with Log(self.results.path) as left:
                     is_empty = not left.channels
                 if is_empty:
                     self.results.path.unlink()
 
+    @property
+    def version(self) -> Version | None:
+        """The version of an object that a new one has to replace; None if there is none yet."""
+        file = self.snapshot.file
+        return file.version if isinstance(file, RemoteFile) else None
+
     def lock(self) -> int:
         """Lock this log for writing until it is closed; returns a file descriptor to write to.
 
-        Raises McaptrackError if another process holds the lock, or if the file is not writable.
+        Objects need no lock: an object is replaced only if it is the one that was opened; then -1 is returned. Raises
+        McaptrackError if another process holds the lock, or if the file is not writable.
         """
         if self.results is not None:
             return self.results.lock()
         if self.is_outdated:
             raise McaptrackError(f"{self.path} was changed since it was opened; open it again")
+        if is_remote(self.path):
+            return -1
         if self._lock is None:
+            assert isinstance(self.real_path, Path)
+            assert isinstance(self.snapshot.file, OpenFile)
             try:
                 handle = os.open(self.real_path, os.O_RDWR)
             except OSError as error:

@@ -24,7 +24,8 @@ FOOTER_BODY: Final = struct.Struct("<QQI")
 #: The head of a chunk, by compression: times, size, checksum, length of the name, the name, size of the records.
 _CHUNK_HEADS: Final = {name: struct.Struct(f"<QQQII{len(name)}xQ") for name in (b"zstd", b"", b"lz4")}
 _CHUNK_NAME_AT: Final = struct.calcsize("<QQQII")
-_CHUNK_HEAD_SIZE: Final = max(layout.size for layout in _CHUNK_HEADS.values())
+#: Bytes that hold the head of a chunk of a usual compression.
+CHUNK_HEAD_BYTES: Final = max(layout.size for layout in _CHUNK_HEADS.values())
 _INDEX_HEAD: Final = struct.Struct("<HI")
 _CHUNK_INDEX_HEAD: Final = struct.Struct("<QQQQI")
 _CHUNK_INDEX_OFFSET: Final = struct.Struct("<HQ")
@@ -249,7 +250,7 @@ def read_channel(buffer: Bytes, record: Record) -> ChannelRecord:
 
 
 def read_chunk(buffer: Bytes, record: Record) -> ChunkHead:
-    near = buffer[record.body : min(record.body + _CHUNK_HEAD_SIZE, record.end)]
+    near = buffer[record.body : min(record.body + CHUNK_HEAD_BYTES, record.end)]
     for name, layout in _CHUNK_HEADS.items():  # fast path for the usual compressions
         if len(near) >= layout.size:
             first, last, size, crc, length, data_size = layout.unpack_from(near)

@@ -20,6 +20,7 @@ from typing import Final, TypeVar
 import numpy as np
 
 from mcaptrack.errors import McaptrackError
+from mcaptrack.location import Location
 from mcaptrack.log import records
 from mcaptrack.log.byte_source import ByteSource, RunningChecksum
 from mcaptrack.log.check import content_to_recover, open_bytes
@@ -65,20 +66,20 @@ _NOT_BEHIND: Final = (Opcode.MESSAGE, Opcode.CHUNK, Opcode.MESSAGE_INDEX, Opcode
 class RecoverResult:
     """The result of ``recover``: how much was recovered, and what was lost where."""
 
-    path: Path
+    path: Location
     output: Path
     messages: int = 0
     chunks: int = 0
     lost: list[str] = field(default_factory=list)
 
 
-def recover(path: Path, output: Path, progress: Progress = lambda *_: None) -> RecoverResult:
+def recover(path: Location, output: Path, progress: Progress = lambda *_: None) -> RecoverResult:
     """Write the intact parts of a damaged log to a new log.
 
     Parameters
     ----------
-    path : Path
-        The damaged log; it is not changed.
+    path : Path or Url
+        The damaged log, a file or an object; it is not changed.
     output : Path
         The new log.
     progress : callable, optional

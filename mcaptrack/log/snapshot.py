@@ -6,13 +6,13 @@ import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Final, TypeVar
 
 from mcaptrack import notices
 from mcaptrack.errors import DamagedError, McaptrackError, call
+from mcaptrack.location import Location, Url
 from mcaptrack.log import records
-from mcaptrack.log.byte_source import ByteSource, OpenFile, Signature
+from mcaptrack.log.byte_source import ByteSource, OpenFile, ReadFile, Signature, open_file
 from mcaptrack.log.index import Index, read_index
 from mcaptrack.log.journal_check import changed, find_journal, recover_hint
 from mcaptrack.log.messages import Messages, TimeOutOfRange
@@ -33,7 +33,7 @@ class Snapshot:
     """
 
     def __init__(
-        self, path: Path, file: OpenFile, source: ByteSource, index: Index, signature: Signature, is_certain: bool
+        self, path: Location, file: ReadFile, source: ByteSource, index: Index, signature: Signature, is_certain: bool
     ) -> None:
         self.path, self.file, self.source, self.index = path, file, source, index
         self.messages = Messages(source, index)
@@ -58,7 +58,7 @@ class Snapshot:
 
     def confirm_file_unchanged(self) -> None:
         """Raise McaptrackError if the file was changed at all."""
-        if Signature.of(self.file.handle) != self._signature and not self.is_through_journal:
+        if self.file.signature() != self._signature and not self.is_through_journal:
             raise changed(self.path)
 
     def consistent(self, look: Callable[[Messages], T], are_equal: Callable[[T, T], bool]) -> T:
@@ -83,7 +83,7 @@ class Snapshot:
         try:
             yield
         except Damaged as error:
-            if Signature.of(self.file.handle) != self._signature:
+            if self.file.signature() != self._signature:
                 raise changed(self.path) from None
             where = f"{self.path}: {topic}" if topic else str(self.path)
             raise DamagedError(f"{where} is damaged: {error}; {recover_hint(self.path)}") from None
@@ -111,9 +111,9 @@ class Snapshot:
     def is_on_disk(self, there: os.stat_result) -> bool:
         """Whether a file is the one that was opened, with the same content on the disk."""
         try:
-            if not os.path.samestat(there, os.fstat(self.file.handle)):
+            if not isinstance(self.file, OpenFile) or not os.path.samestat(there, os.fstat(self.file.handle)):
                 return False
-            if Signature.of(self.file.handle) == self._signature and self._is_certain:
+            if self.file.signature() == self._signature and self._is_certain:
                 return not self.is_through_journal
             on_disk = ByteSource.of(self.file)
             if not self.index.equals(read_index(on_disk)):
@@ -128,7 +128,7 @@ class Snapshot:
 
         Raises Damaged if it is no longer a log, and McaptrackError if it is being changed.
         """
-        now = Signature.of(self.file.handle)
+        now = self.file.signature()
         is_certain = now.is_certain
         if now == self._signature and self._is_certain:
             return None
@@ -139,16 +139,16 @@ class Snapshot:
                 self._signature, self._is_certain = now, is_certain
             elif is_certain:
                 self._fresh_at = now
-            if Signature.of(self.file.handle) != now:
+            if self.file.signature() != now:
                 raise changed(self.path)
         return self._fresh
 
 
-def open_snapshot(path: Path) -> Snapshot:
+def open_snapshot(path: Location) -> Snapshot:
     """Open a log. Raises McaptrackError if it is not an MCAP file, is damaged, or keeps changing."""
     until = time.monotonic() + _WAIT_S
     while True:
-        file = OpenFile.at(path)
+        file = open_file(path)
         try:
             found = _look(path, file)
         except BaseException:
@@ -162,9 +162,9 @@ def open_snapshot(path: Path) -> Snapshot:
         time.sleep(_PAUSE_S)
 
 
-def _look(path: Path, file: OpenFile) -> Snapshot | McaptrackError:
+def _look(path: Location, file: ReadFile) -> Snapshot | McaptrackError:
     """Read an open file. Returns an error if another attempt may succeed; raises it if none will."""
-    signature = Signature.of(file.handle)
+    signature = file.signature()
     is_certain = signature.is_certain
     try:
         found = find_journal(path, file)
@@ -180,22 +180,25 @@ def _look(path: Path, file: OpenFile) -> Snapshot | McaptrackError:
         if found:
             notices.warn(found.message, "journal")
         raise words from None
-    if Signature.of(file.handle) != signature and not (found and found.is_busy):
+    if file.signature() != signature and not (found and found.is_busy):
         return McaptrackError(f"{path} is being changed by another process; try again when it is done")
     if found:
         notices.warn(found.message, "journal")
     return Snapshot(path, file, source, index, signature, is_certain)
 
 
-def _looks_like_mcap(file: OpenFile, size: int) -> bool:
+def _looks_like_mcap(file: ReadFile, size: int) -> bool:
     """Whether a file begins or ends with the MCAP magic bytes, so that `recover` may find something in it."""
-    ends = (os.pread(file.handle, len(records.MAGIC), at) for at in (0, max(size - len(records.MAGIC), 0)))
-    return records.MAGIC in ends
+    source = ByteSource.of(file)
+    ends = (source[at : at + len(records.MAGIC)] for at in (0, max(size - len(records.MAGIC), 0)))
+    return any(bytes(end) == records.MAGIC for end in ends)
 
 
-def _is_unchanged(path: Path, file: OpenFile, signature: Signature) -> bool:
+def _is_unchanged(path: Location, file: ReadFile, signature: Signature) -> bool:
     """Whether the path still leads to this file, and the file has not changed."""
+    if isinstance(path, Url) or not isinstance(file, OpenFile):
+        return True
     try:
-        return os.path.samestat(path.stat(), os.fstat(file.handle)) and Signature.of(file.handle) == signature
+        return os.path.samestat(path.stat(), os.fstat(file.handle)) and file.signature() == signature
     except OSError:
         return False

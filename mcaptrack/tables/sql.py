@@ -20,7 +20,8 @@ from typing import Any, Final, Protocol, Self
 
 from mcaptrack import log, tables
 from mcaptrack.errors import McaptrackError, call
-from mcaptrack.files import follow_links
+from mcaptrack.files import place_of
+from mcaptrack.location import Location
 from mcaptrack.log.paths import results_path
 from mcaptrack.tables import TABLES
 from mcaptrack.tables.export import TOPICS, LogTables, current_file, default_folder, topic_folder
@@ -54,7 +55,7 @@ class _TableSource(Protocol):
     """A log, or the tables of a log in a folder."""
 
     recording: str
-    where: Path
+    where: Location
 
     def part(self, name: str) -> Any:
         """One of ``TABLES`` as Arrow or as a Parquet file; None if it does not exist."""
@@ -67,11 +68,11 @@ class _TableSource(Protocol):
 
 
 class _LogTables:
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Location) -> None:
         self.opened = log.read(path)
         self.contents = LogTables(self.opened)
         self.recording = self.contents.recording
-        self.where = follow_links(path).parent
+        self.where: Location = place_of(path).parent
 
     def part(self, name: str) -> Any:
         return current_file(self.contents, default_folder(self.opened.path), name) or self.contents.table(name)
@@ -86,7 +87,7 @@ class _LogTables:
 class _FolderTables:
     def __init__(self, folder: Path, recording: str) -> None:
         self.folder, self.recording = folder, recording
-        self.where = follow_links(folder)
+        self.where: Location = place_of(folder)
         self._member = Path(f"recording={recording}", "part-0.parquet")
 
     def part(self, name: str) -> Any:
@@ -107,7 +108,7 @@ class Database:
 
     Parameters
     ----------
-    paths : sequence of Path
+    paths : sequence of Path or Url
         Logs and folders. The column ``recording`` has their names, with folders where names are the same.
     files : mapping of str to Path, optional
         More tables by name: CSV, JSON or Parquet. Queries read nothing else, and leave nothing behind.
@@ -118,7 +119,7 @@ class Database:
         If there is nothing to read, or if DuckDB isn't installed.
     """
 
-    def __init__(self, paths: Sequence[Path], files: Mapping[str, Path] | None = None) -> None:
+    def __init__(self, paths: Sequence[Location], files: Mapping[str, Path] | None = None) -> None:
         self._stack = ExitStack()
         with ExitStack() as opening:
             self._duckdb = _duckdb()
@@ -241,8 +242,8 @@ class Database:
     def _named(self) -> list[tuple[str, _TableSource]]:
         return list(zip(self._names, self._sources, strict=True))
 
-    def _opened(self, path: Path, opening: ExitStack) -> list[_TableSource]:
-        if not path.is_dir():
+    def _opened(self, path: Location, opening: ExitStack) -> list[_TableSource]:
+        if not isinstance(path, Path) or not path.is_dir():
             source = _LogTables(path)
             opening.enter_context(source.opened)
             return [source]
@@ -308,11 +309,11 @@ def _duckdb() -> Any:
     return duckdb
 
 
-def _unique_paths(paths: Sequence[Path]) -> list[Path]:
+def _unique_paths(paths: Sequence[Location]) -> list[Location]:
     """Paths without repetitions, and without results of a log that is among them."""
-    by_place: dict[Path, Path] = {}
+    by_place: dict[Location, Location] = {}
     for path in paths:
-        by_place.setdefault(follow_links(path), path)
+        by_place.setdefault(place_of(path), path)
     results = {results_path(place) for place in by_place}
     return [path for place, path in by_place.items() if place not in results]
 

@@ -14,6 +14,7 @@ from typing import Final
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
+from mcaptrack.location import Location, Url
 from mcaptrack.notices import warn
 from mcaptrack.schema.cdr import is_ros_topic
 from mcaptrack.schema.encodings import CDR, PROTOBUF, Encoding
@@ -37,8 +38,16 @@ class SidecarChoice:
 
     def __call__(self, opened: log.Log) -> bool:
         """Whether to use a sidecar. Raises McaptrackError if there is one, but results must go into the log itself."""
-        results = log.results_path(opened.path)
         self.why = ""
+        if isinstance(opened.path, Url):
+            if self.wanted is False:
+                raise McaptrackError(
+                    f"{opened.path} can't be changed in place: objects in a store are only replaced as a whole; leave "
+                    "`sidecar=False` out, and results go beside it"
+                )
+            self.why = "objects in a store are only replaced as a whole, so that the log stays as it is"
+            return True
+        results = log.results_path(opened.path)
         if self.wanted is False and results.exists():
             raise McaptrackError(
                 f"{results} holds results of {opened.path}; `sidecar=False` would leave them there and make others: "
@@ -65,7 +74,7 @@ class SidecarChoice:
         )
         return True
 
-    def words(self, written_to: Path) -> str:
+    def words(self, written_to: Location) -> str:
         """A line that says where results were written, and why."""
         return f"results are in {written_to}: {self.why}"
 
@@ -125,6 +134,8 @@ def check_topics(topics: Iterable[str], encoding: Encoding) -> None:
 def recording_of(opened: log.Log) -> str:
     """The name of a log for ROS tools: "a ROS 2 recording"; "" if they don't read it."""
     for path in (opened.path, opened.real_path):
+        if isinstance(path, Url):
+            continue
         metadata = path.with_name(METADATA)
         if names_file(metadata, path.name):
             return f"named in {metadata}"

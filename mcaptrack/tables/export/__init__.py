@@ -17,6 +17,7 @@ from typing import Final
 
 from mcaptrack import __version__, log, tables
 from mcaptrack.errors import McaptrackError
+from mcaptrack.location import Location, local_name
 from mcaptrack.sources.fixed_frame import BoxesRead
 from mcaptrack.tables import TABLES, Format
 from mcaptrack.tables.export.contents import LogTables
@@ -47,9 +48,9 @@ class Exported:
     notes: list[str] = field(default_factory=list)
 
 
-def default_folder(path: Path) -> Path:
+def default_folder(path: Location) -> Path:
     """The default folder for the tables of a log: log.mcap -> log.tables beside it."""
-    return path.with_suffix(".tables")
+    return local_name(path, ".tables")
 
 
 def current_file(contents: LogTables, folder: Path, name: str) -> Path | None:

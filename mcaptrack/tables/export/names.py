@@ -5,8 +5,9 @@ from __future__ import annotations
 import hashlib
 import os
 import re
-from pathlib import Path
 from typing import Final
+
+from mcaptrack.location import Location
 
 #: Longer names are cut, with a digest of the whole name; file systems allow 255 bytes.
 _MAX_BYTES: Final = 200
@@ -16,7 +17,7 @@ _MAX_BYTES: Final = 200
 _NO_TEXT: Final = ("nan", "inf", "infinity", "true", "false", "null", "none")
 
 
-def recording_name(path: Path) -> str:
+def recording_name(path: Location) -> str:
     """The name of a log for a path and a partition: without slashes, equals signs and leading dots.
 
     Names that readers would take for numbers or dates (0001 would become 1) get "log-" before them.
@@ -26,7 +27,7 @@ def recording_name(path: Path) -> str:
     return name if is_text and name.lower().lstrip("-") not in _NO_TEXT else f"log-{name}"
 
 
-def file_name(path: Path) -> str:
+def file_name(path: Location) -> str:
     """The name of a file as text; bytes that are not UTF-8 are escaped, because tables hold only text."""
     return os.fsencode(path.name).decode("utf-8", "backslashreplace")
 

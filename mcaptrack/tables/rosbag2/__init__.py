@@ -22,6 +22,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.foxglove.views import ground
 from mcaptrack.foxglove.views.people import base_heights
 from mcaptrack.geometry.clocks import NS_PER_S
+from mcaptrack.location import Location, local_name
 from mcaptrack.schema import DETECTIONS, PREDICTIONS, SCHEMAS, TRACKS, Frame, Schema
 from mcaptrack.schema.classes import class_names
 from mcaptrack.schema.provenance import frame_id_of, input_of
@@ -58,9 +59,9 @@ class _Stream(NamedTuple):
     is_latched: bool = False
 
 
-def default_folder(path: Path) -> Path:
+def default_folder(path: Location) -> Path:
     """The default folder for the bag of a log: log.mcap -> log.rosbag2 beside it."""
-    return path.with_suffix(".rosbag2")
+    return local_name(path, ".rosbag2")
 
 
 def write_bag(

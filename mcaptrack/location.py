@@ -1,0 +1,147 @@
+"""The location of a log: a file, or an object in a store (Amazon S3, Google Cloud Storage, Azure). Only names; no I/O.
+
+    parse("log.mcap")                     Path("log.mcap")
+    parse("s3://bucket/night/a.mcap")     Url("s3://bucket/night/a.mcap")
+
+A path and a URL have the same parts: ``name``, ``stem``, ``suffix``, ``parent``, ``parts``, ``with_name``,
+``with_suffix``, and ``/`` adds a name. Only a path can be asked what is there, so that the type checker finds code that
+takes an object for a file.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path, PurePosixPath
+from typing import Final, Self, TypeGuard
+
+from mcaptrack.errors import McaptrackError
+
+__all__ = ["SCHEMES", "Location", "Url", "hide_secrets", "is_remote", "join", "local_name", "parse"]
+
+#: The schemes of URLs of objects, and what they stand for.
+SCHEMES: Final = {"s3": "Amazon S3", "gs": "Google Cloud Storage", "az": "Azure Blob Storage"}
+#: A URL, also one that has become a path: "s3://bucket/a" is "s3:/bucket/a" then.
+_URL: Final = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):(?:/+(.*))?", re.DOTALL)
+
+
+class Url(str):
+    """The URL of an object in a store, or of a prefix of such: "s3://BUCKET/NAME". Made by ``parse``."""
+
+    __slots__ = ()
+
+    @property
+    def scheme(self) -> str:
+        """The kind of store: one of ``SCHEMES``."""
+        return self.partition("://")[0]
+
+    @property
+    def bucket(self) -> str:
+        """The bucket; a container in Azure."""
+        return self.partition("://")[2].partition("/")[0]
+
+    @property
+    def key(self) -> str:
+        """The name of the object in its bucket; "" for the bucket itself."""
+        return self.partition("://")[2].partition("/")[2]
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """The scheme with the bucket, and the parts of the key."""
+        return (f"{self.scheme}://{self.bucket}", *filter(None, self.key.split("/")))
+
+    @property
+    def name(self) -> str:
+        """The last part of the key; "" for a bucket."""
+        return self.key.rstrip("/").rpartition("/")[2]
+
+    @property
+    def stem(self) -> str:
+        """The name without its suffix."""
+        return PurePosixPath(self.name).stem
+
+    @property
+    def suffix(self) -> str:
+        """The suffix of the name, with its dot."""
+        return PurePosixPath(self.name).suffix
+
+    @property
+    def parent(self) -> Self:
+        """The URL without its last part; that of a bucket is itself."""
+        first, *more = self.parts
+        return type(self)("/".join([first, *more[:-1]]))
+
+    def with_name(self, name: str) -> Self:
+        """The URL with another last part."""
+        return self.parent / name
+
+    def with_suffix(self, suffix: str) -> Self:
+        """The URL with another suffix of its name."""
+        return self.with_name(str(PurePosixPath(self.name).with_suffix(suffix)))
+
+    def __truediv__(self, name: str) -> Self:
+        return type(self)(f"{self.rstrip('/')}/{name}")
+
+
+Location = Path | Url
+
+
+def is_remote(location: object) -> TypeGuard[Url]:
+    """Whether a location is an object in a store."""
+    return isinstance(location, Url)
+
+
+def parse(text: str | os.PathLike[str]) -> Location:
+    """The location that a text or a path names.
+
+    Raises McaptrackError for a URL that can't be the name of an object. URLs of other schemes become paths, which
+    ``files.refuse_url`` refuses.
+
+    Examples
+    --------
+    >>> parse(Path("s3://bucket/night/a.mcap"))
+    's3://bucket/night/a.mcap'
+    >>> parse("s3://bucket/night/a.mcap").with_suffix(".results.mcap").key
+    'night/a.results.mcap'
+    """
+    if isinstance(text, Url):
+        return text
+    found = _URL.fullmatch(os.fspath(text))
+    if found is None or found[1].lower() not in SCHEMES:
+        return Path(text)
+    scheme, rest = found[1].lower(), found[2] or ""
+    url = Url(f"{scheme}://{rest}")
+    if "@" in url.bucket or ":" in url.bucket:
+        raise McaptrackError(
+            f"{hide_secrets(url)}: credentials don't belong in a URL; put them into the environment or a profile, "
+            f"where programs for {SCHEMES[scheme]} look for them"
+        )
+    if not url.bucket:
+        raise McaptrackError(f"{scheme}:// names no bucket; give {scheme}://BUCKET/NAME")
+    if not url.isprintable():
+        raise McaptrackError(f"{str(url)!a} is no URL: it has characters that can't be printed")
+    parts = url.key.rstrip("/").split("/") if url.key else []
+    if wrong := [part for part in parts if part in ("", ".", "..")]:
+        raise McaptrackError(f"{url} can't be read: a part of its name is {wrong[0]!r}; give the name of an object")
+    return url
+
+
+def join(base: Location, *names: str) -> Location:
+    """The location of a name below another, as with ``/``."""
+    for name in names:
+        base = base / name
+    return base
+
+
+def local_name(location: Location, suffix: str) -> Path:
+    """The default path of a file that is made of a log: beside a file, or for an object in the working folder."""
+    return Path(location.name).with_suffix(suffix) if is_remote(location) else Path(location).with_suffix(suffix)
+
+
+def hide_secrets(url: str) -> str:
+    """A URL without a user's name and password, and without what follows a question mark, for messages."""
+    scheme, _, rest = url.partition("://")
+    host, slash, path = rest.partition("/")
+    if scheme.lower() not in SCHEMES:
+        path = path.partition("?")[0] + ("?..." if "?" in path else "")
+    return f"{scheme}://{host.rpartition('@')[2]}{slash}{path}"

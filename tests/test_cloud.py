@@ -1,0 +1,291 @@
+"""Logs in a store: as few requests as the index allows, the same results as of files, and one version at a time."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import sys
+from collections.abc import Iterator
+from itertools import count
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+import mcaptrack
+from mcaptrack import log, objects
+from mcaptrack.errors import McaptrackError
+from mcaptrack.location import Url, parse
+from mcaptrack.objects import stores
+from mcaptrack.schema import TRACKS, Frame
+from mcaptrack.schema.provenance import Provenance
+from tests.commands import call, done
+from tests.stores import BUCKET, Store, only_in
+
+
+@pytest.fixture(scope="session")
+def server() -> Iterator[Store]:
+    made = Store()
+    yield made
+    made.stop()
+
+
+@pytest.fixture
+def store(server, monkeypatch, tmp_path) -> Store:
+    """The store, empty and without faults, and a working folder that is empty."""
+    only_in(monkeypatch, server)
+    for key in server.names():
+        server.client.delete_object(Bucket=BUCKET, Key=key)
+    monkeypatch.chdir(tmp_path)
+    return server
+
+
+@pytest.fixture
+def impatient(monkeypatch) -> Iterator[None]:
+    """Failed requests are sent again once only."""
+    monkeypatch.setattr(stores, "_RETRIES", 1)
+    stores._made_store.cache_clear()
+    yield
+    stores._made_store.cache_clear()
+
+
+@pytest.fixture(scope="session")
+def bare(template, tmp_path_factory) -> Path:
+    """A log before the first stage."""
+    path = tmp_path_factory.mktemp("bare") / "bare.mcap"
+    with log.read(template) as opened:
+        made = [name for name, channel in opened.channels.items() if _stage(channel) not in (None, "ingest")]
+    mcaptrack.drop(template, made, output=path)
+    return path
+
+
+def _stage(channel: log.Channel) -> str | None:
+    how = Provenance.from_metadata(channel.metadata)
+    return how.transform if how else None
+
+
+def _tracks(frames: int = 150, each: int = 8) -> list[Frame]:
+    random = np.random.default_rng(1)
+    found = []
+    for number in range(frames):
+        rows = TRACKS.empty(each)
+        for name in rows.dtype.names or ():
+            if rows[name].dtype.kind == "f":
+                rows[name] = random.normal(size=rows[name].shape)
+        rows["track_id"] = np.arange(1, each + 1)
+        found.append(Frame(number * 40_000_000, number, rows))
+    return found
+
+
+@pytest.fixture(scope="session")
+def large(tmp_path_factory) -> Path:
+    """A log of 24 MB of pictures, with two channels of tracks behind and a third one between the pictures."""
+    path = tmp_path_factory.mktemp("large") / "large.mcap"
+    schema = (TRACKS.name, "protobuf", TRACKS.descriptor)
+    with log.create(path) as writer:
+        picture = writer.add_channel(
+            "/camera/video", ("foxglove.CompressedVideo", "protobuf", b""), "protobuf", {}, "media"
+        )
+        for number in range(48):
+            writer.add_message(picture, number * 320_000_000, number, os.urandom(2**19))
+        for topic in ("/camera/tracks", "/other/tracks"):
+            channel = writer.add_channel(topic, schema, "protobuf", {}, "rows", topic)
+            for frame in _tracks():
+                writer.add_message(channel, frame.t_ns, frame.index, TRACKS.codec.encode(frame.rows))
+    return path
+
+
+def test_one_channel_takes_few_requests_and_few_bytes(store, large):
+    url = parse(store.put("large.mcap", large))
+    with store.counted() as requests, log.read(url) as opened:
+        frames = opened.frames("/camera/tracks", TRACKS)
+    with log.read(large) as opened:
+        expected = opened.frames("/camera/tracks", TRACKS)
+    assert [frame.t_ns for frame in frames] == [frame.t_ns for frame in expected]
+    assert len(frames) == 150
+    assert all(np.array_equal(one.rows, other.rows) for one, other in zip(frames, expected, strict=True))
+    assert len(requests) <= 4, "\n".join(map(str, requests))
+    assert sum(request.bytes for request in requests) <= 0.02 * large.stat().st_size
+
+
+def test_commands_give_the_same_of_a_store_as_of_a_file(store, template):
+    Path("here").mkdir()
+    path = Path(shutil.copy(template, "here/a.mcap"))
+    url = store.put("night/a.mcap", path)
+    for words in (["info", "--json"], ["check", "--json"], ["evaluate", "--json"]):
+        ours, theirs = (done(words[0], log, *words[1:]).out for log in (path, url))
+        assert theirs == ours.replace(str(path), url)
+    sql = "select * from tracks order by all"
+    assert done("query", url, sql, "--json").out == done("query", path, sql, "--json").out
+    done("export", path)
+    done("export", url)
+    names = {str(file.relative_to("here/a.tables")) for file in Path("here").rglob("*.parquet")}
+    assert names
+    assert names == {str(file.relative_to("a.tables")) for file in Path("a.tables").rglob("*.parquet")}
+    for name in names:
+        assert (Path("a.tables") / name).read_bytes() == (Path("here/a.tables") / name).read_bytes()
+    assert pq.read_table("a.tables/recordings")["recording"].to_pylist() == ["a"]
+    done("report", url)
+    done("render", url)
+    assert sorted(os.listdir()) == ["a.mp4", "a.report.html", "a.tables", "here"]
+    assert store.names() == ["night/a.mcap"]
+
+
+def test_stages_write_the_same_results_beside_an_object_as_beside_a_file(store, bare):
+    path = Path(shutil.copy(bare, "b.mcap"))
+    url = store.put("night/b.mcap", path)
+    local = json.loads(done("run", path, "--sidecar", "--no-tables", "--json").out)["results"][0]
+    with store.counted() as requests:
+        remote = json.loads(done("run", url, "--json").out)["results"][0]
+    assert store.get("night/b.mcap") == bare.read_bytes()
+    assert store.get("night/b.results.mcap") == Path("b.results.mcap").read_bytes()
+    assert remote["written_to"] == "s3://bucket/night/b.results.mcap"
+    assert {name: remote[name] for name in ("stages", "frames", "events")} == {
+        name: local[name] for name in ("stages", "frames", "events")
+    }
+    assert [r.key for r in requests if r.method not in ("GET", "HEAD")] == ["night/b.results.mcap"]
+    assert json.loads(done("run", url, "--json").out)["results"][0]["stages"] == []
+    again = mcaptrack.track(url, tracker="bytetrack")
+    mcaptrack.track(path, tracker="bytetrack")
+    assert (str(again.log), again.written_to) == (url, "s3://bucket/night/b.results.mcap")
+    assert store.get("night/b.results.mcap") == Path("b.results.mcap").read_bytes()
+    with mcaptrack.open(url) as opened:
+        rows = mcaptrack.detections([[9, 20, 17, 28]], t_ns=0, box_format="xyxy")
+        assert opened.write("/mine/detections", [rows]) == 1
+        assert "/mine/detections" in opened.topics
+    assert store.get("night/b.mcap") == bare.read_bytes()
+    assert sorted(store.names()) == ["night/b.mcap", "night/b.results.mcap"]
+
+
+@pytest.mark.parametrize("fault", ["error", "slow", "cut", "lost"])
+def test_requests_that_fail_now_and_then_change_nothing(store, bare, fault):
+    url = store.put("b.mcap", bare)
+    number = count()
+    with store.failing(lambda _: fault if next(number) % 3 == 1 else ""):
+        result = mcaptrack.track(url)
+    assert next(number) >= 4
+    expected = mcaptrack.track(shutil.copy(bare, "b.mcap"), sidecar=True)
+    assert result.rows == expected.rows
+    assert store.get("b.results.mcap") == Path("b.results.mcap").read_bytes()
+
+
+@pytest.mark.parametrize("fault", ["error", "cut"])
+def test_a_store_that_fails_always_gives_one_line(store, bare, impatient, fault):
+    url = store.put("b.mcap", bare)
+    with store.failing(lambda _: fault):
+        code, out, err = call("info", url)
+    assert (code, out, err.count("\n")) == (1, "", 1)
+    assert err.startswith(f"mcaptrack: {url} can't be read: ")
+    with store.failing(lambda request: fault if request.method == "PUT" else ""):
+        code, out, err = call("track", url, "-q")
+    assert (code, out, store.names()) == (
+        (1, "", ["b.mcap"]) if fault == "error" else (0, "", ["b.mcap", "b.results.mcap"])
+    )
+
+
+def test_an_object_that_is_replaced_while_it_is_read_gives_one_error(store, large):
+    url = parse(store.put("large.mcap", large))
+    with log.read(url) as opened:
+        store.put("large.mcap", large.read_bytes()[:-4] + b"else")
+        opened.channel("/camera/tracks")  # what was read when it was opened
+        with pytest.raises(McaptrackError, match=f"^{url} was replaced by another version while it was being read; "):
+            opened.frames("/camera/tracks", TRACKS)
+    store.put("large.mcap", large)
+    with log.read(url) as opened:
+        assert len(opened.frames("/camera/tracks", TRACKS)) == 150
+
+
+def test_results_of_another_process_are_never_replaced_unseen(store, bare):
+    url = parse(store.put("b.mcap", bare))
+    for _ in range(2):  # new results, and results that were there
+        with log.read(url, sidecar=True) as opened:
+            mcaptrack.track(url, tracker="bytetrack", max_age_s=0.3 + len(store.names()))
+            theirs = store.get("b.results.mcap")
+            with pytest.raises(McaptrackError, match=r"b\.results\.mcap was written by another process meanwhile"):  # noqa: SIM117
+                with log.extend(opened) as writer:
+                    writer.add_metadata("ours", {})
+        assert store.get("b.results.mcap") == theirs
+
+
+def test_nothing_is_left_of_a_stage_that_fails(store, bare):
+    url = parse(store.put("b.mcap", bare))
+    with pytest.raises(ZeroDivisionError), log.read(url, sidecar=True) as opened, log.extend(opened):
+        1 / 0  # noqa: B018
+    assert store.names() == ["b.mcap"]
+
+
+ABSENT = {
+    "s3://bucket": "can't be read: it is a bucket; name the logs in it, as in s3://bucket/*.mcap",
+    "s3://bucket/night": "can't be read: it is no object but a prefix, of s3://bucket/night/a.mcap and maybe others; name "
+    "logs, as in s3://bucket/night/*.mcap",
+    "s3://bucket/none.mcap": "can't be read: there is no such object",
+    "s3://nowhere/a.mcap": "can't be read: there is no such bucket",
+    "s3://bucket/empty.mcap": "can't be read as an MCAP file: it is empty",
+    "s3://bucket/text.mcap": "can't be read as an MCAP file: it does not begin as an MCAP file does",
+}
+
+
+@pytest.mark.parametrize("url", ABSENT)
+def test_what_is_no_log_is_named_in_one_line(store, url):
+    for name, content in (("night/a.mcap", b"x"), ("empty.mcap", b""), ("text.mcap", b"text" * 99)):
+        store.put(name, content)
+    assert call("info", url) == (1, "", f"mcaptrack: {url} {ABSENT[url]}\n")
+
+
+@pytest.mark.parametrize("words", [["drop", "/camera/tracks"], ["view"], ["track", "--in-place"]])
+def test_what_needs_a_file_refuses_an_object(store, bare, words):
+    url = store.put("b.mcap", bare)
+    code, _, err = call(words[0], url, *words[1:])
+    assert (code, err.count("\n")) == (1, 1)
+    assert url in err
+    assert store.names() == ["b.mcap"]
+
+
+def test_without_the_library_one_line_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "obstore", None)
+    words = (
+        "s3://b/a.mcap is in Amazon S3, which needs obstore, and that is not installed; install it with: pip install "
+    )
+    assert call("info", "s3://b/a.mcap") == (1, "", f'mcaptrack: {words}"mcaptrack[cloud]"\n')
+
+
+def test_credentials_come_from_a_profile_and_are_never_shown(store, bare, monkeypatch):
+    url = store.put("b.mcap", bare)
+    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY", "AWS_ENDPOINT_URL"):
+        monkeypatch.delenv(name)
+    Path("keys").write_text("[default]\n[robots]\naws_access_key_id = AKIDROBOTS\naws_secret_access_key = hidden\n")
+    Path("config").write_text(f"[profile robots]\nregion = eu-west-1\nendpoint_url = {store.endpoint}\n")
+    for name, value in (("CONFIG_FILE", "config"), ("SHARED_CREDENTIALS_FILE", "keys"), ("PROFILE", "robots")):
+        monkeypatch.setenv(f"AWS_{name}", value)
+    with store.counted() as requests:
+        done("info", url)
+    assert {request.key_id for request in requests} == {"AKIDROBOTS"}
+    monkeypatch.setenv("AWS_PROFILE", "default")
+    code, _, err = call("info", url)
+    assert (code, err.count("\n")) == (1, 1)
+    assert "the profile default of AWS (AWS_PROFILE) has no aws_access_key_id" in err
+    code, _, err = call("info", "s3://AKIDROBOTS:hidden@bucket/b.mcap")
+    assert (code, err.count("\n")) == (1, 1)
+    assert "hidden" not in err
+    assert "AKID" not in err
+
+
+def test_a_log_in_a_store_is_recovered_to_a_file(store, template):
+    url = store.put("a.mcap", template.read_bytes()[:-2000])
+    assert call("check", url).code == 1
+    done("recover", url)
+    with mcaptrack.open("a.recovered.mcap") as opened:
+        assert "/camera/tracks" in opened.topics
+
+
+def test_a_claim_is_taken_by_one_process(store):
+    url = parse("s3://bucket/night/a.mcap.claim")
+    assert isinstance(url, Url)
+    assert [objects.put_if_absent(url, name) for name in (b"one", b"two")] == [True, False]
+    assert objects.read(url) == b"one"
+    assert [str(found) for found, _ in objects.list_objects(url.parent)] == [url]
+    objects.delete(url)
+    objects.delete(url)
+    assert objects.find(url) is None
