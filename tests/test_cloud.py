@@ -17,6 +17,7 @@ import pytest
 import mcaptrack
 from mcaptrack import log, objects
 from mcaptrack.errors import McaptrackError
+from mcaptrack.fleet import find_logs
 from mcaptrack.location import Url, parse
 from mcaptrack.objects import stores
 from mcaptrack.schema import TRACKS, Frame
@@ -231,7 +232,9 @@ ABSENT = {
 def test_what_is_no_log_is_named_in_one_line(store, url):
     for name, content in (("night/a.mcap", b"x"), ("empty.mcap", b""), ("text.mcap", b"text" * 99)):
         store.put(name, content)
-    assert call("info", url) == (1, "", f"mcaptrack: {url} {ABSENT[url]}\n")
+    with pytest.raises(McaptrackError) as raised:
+        mcaptrack.info(url)
+    assert str(raised.value) == f"{url} {ABSENT[url]}"
 
 
 @pytest.mark.parametrize("words", [["drop", "/camera/tracks"], ["view"], ["track", "--in-place"]])
@@ -241,6 +244,35 @@ def test_what_needs_a_file_refuses_an_object(store, bare, words):
     assert (code, err.count("\n")) == (1, 1)
     assert url in err
     assert store.names() == ["b.mcap"]
+
+
+def test_prefixes_and_patterns_name_the_logs_below(store, bare):
+    for name in (
+        "b/one.mcap",
+        "b/one.results.mcap",
+        "b/2/two.mcap",
+        "b/.old/x.mcap",
+        "b/notes.txt",
+        "bb/three.mcap",
+        "[4].mcap",
+    ):
+        store.put(name, b"" if name.endswith(".txt") else bare)
+
+    def found(*given: str) -> list[tuple[str, str]]:
+        return [(str(one.path).removeprefix("s3://bucket/"), str(one.below)) for one in find_logs(given)]
+
+    both = [("b/2/two.mcap", "2/two.mcap"), ("b/one.mcap", "one.mcap")]
+    assert found("s3://bucket/b") == found("s3://bucket/b/") == both
+    assert found("s3://bucket/b*/*.mcap") == [("b/one.mcap", "b/one.mcap"), ("bb/three.mcap", "bb/three.mcap")]
+    assert found("s3://bucket/**/t*.mcap") == [("b/2/two.mcap", "b/2/two.mcap"), ("bb/three.mcap", "bb/three.mcap")]
+    assert found("s3://bucket/[b]b") == [("bb/three.mcap", "bb/three.mcap")]
+    assert found("s3://bucket/b/one.mcap", "s3://bucket/b") == [("b/one.mcap", "one.mcap"), both[0]]
+    for url, words in (("none/", "has no log: no object below it ends with .mcap"), ("x*.mcap", "no object matches")):
+        with pytest.raises(McaptrackError, match=words):
+            find_logs([f"s3://bucket/{url}"])
+    code, out, err = call("info", "s3://bucket/b", "--json")
+    assert code == 0, err
+    assert [one["log"] for one in json.loads(out)["results"]] == ["s3://bucket/b/2/two.mcap", "s3://bucket/b/one.mcap"]
 
 
 def test_without_the_library_one_line_says_what_to_install(monkeypatch):

@@ -343,7 +343,7 @@ def end_early(reason: str) -> None:
     _BATCH.get().is_early = True
 
 
-def record_failure(path: Path, error: str, state: str = "failed") -> None:
+def record_failure(path: Location, error: str, state: str = "failed") -> None:
     """Print why one of several inputs failed, and keep it for the JSON and the end of the command."""
     words = error.strip()
     words = words if str(path) in words else f"{path}: {words}"

@@ -11,6 +11,7 @@ from mcaptrack.cli import common
 from mcaptrack.cli.many import LogWork, process, takes_many
 from mcaptrack.cli.text import console, show
 from mcaptrack.fleet import find_logs
+from mcaptrack.location import Location
 
 if TYPE_CHECKING:
     from mcaptrack import DropResult, LogCheck, LogRecovery
@@ -114,7 +115,7 @@ def recover(
     """
     import mcaptrack
 
-    def show(_: Path, report: LogRecovery) -> None:
+    def show(_: Location, report: LogRecovery) -> None:
         talk.say(f"{report.output}: {report.messages} messages in {report.chunks} chunks are saved")
         for words in report.lost if verbose else report.lost[:_SHOWN]:
             talk.say(f"lost: {words}")

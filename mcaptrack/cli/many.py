@@ -19,6 +19,7 @@ from mcaptrack.cli.text import say, stdout_to_stderr
 from mcaptrack.errors import McaptrackError
 from mcaptrack.fleet import FleetResult, LogOutcome, NamedLog
 from mcaptrack.fleet import run as run_fleet
+from mcaptrack.location import Location
 
 T = TypeVar("T")
 #: Heading of the options in the help.
@@ -197,7 +198,7 @@ class LogWork(Generic[T]):
     name: str
     function: Callable[..., T]
     options: Mapping[str, Any]
-    show: Callable[[Path, T], None]
+    show: Callable[[Location, T], None]
     line: Callable[[T], str] | None = None
     suffix: str = ".mcap"
     writes: bool = True
@@ -260,11 +261,11 @@ def process(
 class _Printer(Generic[T]):
     """Prints the outcomes of logs; results for stdout in the order of the logs."""
 
-    def __init__(self, work: LogWork[T], talk: common.Talk, logs: Sequence[Path]) -> None:
+    def __init__(self, work: LogWork[T], talk: common.Talk, logs: Sequence[Location]) -> None:
         self._work, self._talk = work, talk
         self.ended = 0
         self._next = deque(logs)
-        self._waiting: dict[Path, T | None] = {}
+        self._waiting: dict[Location, T | None] = {}
 
     def hear(self, outcome: LogOutcome[T]) -> None:
         """Print what became of a log."""

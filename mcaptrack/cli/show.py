@@ -9,6 +9,7 @@ from mcaptrack.cli import common
 from mcaptrack.cli.many import LogWork, many_options, process, takes_many
 from mcaptrack.cli.text import console, printable
 from mcaptrack.fleet import find_logs
+from mcaptrack.location import Location
 
 if TYPE_CHECKING:
     from rich.tree import Tree
@@ -43,7 +44,7 @@ def info(
     """
     import mcaptrack
 
-    def show(_: Path, found: LogInfo) -> None:
+    def show(_: Location, found: LogInfo) -> None:
         if not json:
             _print(found.to_json(), verbose)
 
@@ -214,7 +215,7 @@ def export(
     def rows(done: ExportResult) -> str:
         return ", ".join(f"{name} {count}" for name, count in done.rows.items())
 
-    def show(_: Path, done: ExportResult) -> None:
+    def show(_: Location, done: ExportResult) -> None:
         talk.say(f"{done.folder}: {rows(done)}")
         talk.detail(f"{done.folder}: written {', '.join(done.written) or 'nothing, all tables are up to date'}")
 

@@ -127,7 +127,8 @@ def run(
     outputs = outputs_in(folder, found, suffix) if folder is not None else []
     for number, one in enumerate(found):
         own = {"output": outputs[number]} if outputs else {}
-        beside = one.path.parent if writes and folder is None and os.access(one.path.parent, os.W_OK) else claims_in
+        beside = one.path.parent if writes and folder is None else None
+        beside = beside if isinstance(beside, Path) and os.access(beside, os.W_OK) else claims_in
         work.append(QueuedLog(number, one.path, location_of(one.path), own, beside))
     for output in outputs:
         _make_folder(output.parent)

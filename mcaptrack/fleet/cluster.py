@@ -10,7 +10,6 @@ from collections.abc import Callable
 from concurrent.futures import CancelledError, Future
 from contextlib import suppress
 from dataclasses import replace
-from pathlib import Path
 from time import monotonic
 from typing import Any, Final
 from uuid import uuid4
@@ -20,6 +19,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.fleet.child import Child, WorkerLimits
 from mcaptrack.fleet.results import Running
 from mcaptrack.fleet.worker import Reply, Request
+from mcaptrack.location import Location
 from mcaptrack.notices import warn
 
 #: Seconds to wait for the scheduler, and between two looks at the number of workers.
@@ -48,7 +48,7 @@ class Cluster:
             self._restore_logging()
             words = " ".join(str(error).split()) or type(error).__name__
             raise McaptrackError(f"no Dask scheduler answers at {address}: {words:.200}") from error
-        self._futures: dict[Path, tuple[Any, float]] = {}
+        self._futures: dict[Location, tuple[Any, float]] = {}
         self._places, self._looked = 0, 0.0
         self._limits = limits
         try:

@@ -15,18 +15,23 @@ from typing import Any, Final
 
 import numpy as np
 
+from mcaptrack import objects
+from mcaptrack.errors import McaptrackError
+from mcaptrack.location import Location, Url
 from mcaptrack.log import results_path
 
 #: Bytes at the end of a file that count: in MCAP they hold the summary, with the number and the sizes of all chunks.
 _TAIL: Final = 65536
 
 
-def digest_of_log(path: Path) -> str:
+def digest_of_log(path: Location) -> str:
     """Return a digest of a log and of the results beside it; "" if it can't be read.
 
     It is made of sizes, times of modification and the ends of the files: reading all of a night's recordings to learn
     that nothing has changed would take longer than many commands.
     """
+    if isinstance(path, Url):
+        return _digest_in_store(path)
     found = hashlib.sha256()
     try:
         results = results_path(path)
@@ -41,6 +46,14 @@ def digest_of_log(path: Path) -> str:
     except OSError:
         return ""
     return found.hexdigest()[:32]
+
+
+def _digest_in_store(url: Url) -> str:
+    try:
+        parts = [objects.find(part) for part in dict.fromkeys((url, results_path(url)))]
+    except McaptrackError:
+        return ""
+    return hashlib.sha256(repr([part and tuple(part) for part in parts]).encode()).hexdigest()[:32] if parts[0] else ""
 
 
 def digest_of_settings(*settings: object) -> str:

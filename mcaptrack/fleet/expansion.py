@@ -1,4 +1,4 @@
-"""Find the logs that arguments name: files, folders, patterns, and a list on standard input."""
+"""Find the logs that arguments name: files, folders, URLs, patterns, and a list on standard input."""
 
 from __future__ import annotations
 
@@ -10,8 +10,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
+from mcaptrack.api.common import as_location
 from mcaptrack.errors import McaptrackError
-from mcaptrack.files import follow_links, refuse_special, refuse_url
+from mcaptrack.files import place_of, refuse_special, refuse_url
+from mcaptrack.fleet.in_store import logs_in_store
+from mcaptrack.location import Location, Url
 from mcaptrack.log import results_path
 from mcaptrack.log.recording_files import refuse_non_mcap
 from mcaptrack.notices import warn
@@ -25,7 +28,7 @@ _SUFFIX: Final = ".mcap"
 class NamedLog:
     """A log, and its name below the folder, pattern or list that named it, which is its name in an output folder."""
 
-    path: Path
+    path: Location
     below: Path
 
 
@@ -38,14 +41,14 @@ def find_logs(
 ) -> list[NamedLog]:
     """Return the logs that arguments name, each once, in order.
 
-    A folder stands for all logs in it and in the folders below; hidden ones are left out. LOG.results.mcap is left out
-    if LOG is there, because it is a part of LOG; with ``each`` it is kept.
+    A folder, or the prefix of objects in a store, stands for all logs in it and in the folders below; hidden ones are
+    left out. LOG.results.mcap is left out if LOG is there, because it is a part of LOG; with ``each`` it is kept.
 
     Parameters
     ----------
     arguments : iterable of path
-        Files, folders, patterns, or "-" for a list of files on standard input: one a line, or ended by a zero byte as
-        by ``find -print0``.
+        Files, folders, URLs of objects in a store, patterns, or "-" for a list of them on standard input: one a line,
+        or ended by a zero byte as by ``find -print0``.
     each : bool, default False
         Whether results beside a log are logs of their own.
     leave_out : str
@@ -56,16 +59,16 @@ def find_logs(
     Raises
     ------
     McaptrackError
-        If a folder has no log, if a pattern matches no file, or for a URL, a pipe or a device.
+        If a folder has no log, if a pattern matches no file, or for another URL, a pipe or a device.
 
     """
     found: list[NamedLog] = []
     for argument in arguments:
-        found += _logs_of(Path(argument), leave_out, read_list or _standard_input)
-    results = set() if each else {results_path(follow_links(one.path)) for one in found}
+        found += _logs_of(argument, leave_out, read_list or _standard_input)
+    results = set() if each else {results_path(place_of(one.path)) for one in found}
     once: dict[object, NamedLog] = {}
     for one in found:
-        if follow_links(one.path) not in results:
+        if place_of(one.path) not in results:
             once.setdefault(_identity(one.path), one)
     return list(once.values())
 
@@ -80,7 +83,7 @@ def outputs_in(folder: Path, logs: Sequence[NamedLog], suffix: str) -> list[Path
 
     Raises McaptrackError if two logs have the same name.
     """
-    names: dict[Path, Path] = {}
+    names: dict[Path, Location] = {}
     for one in logs:
         stem = one.below.name.removesuffix(one.below.suffix) if one.below.suffix.lower() == _SUFFIX else one.below.name
         name = folder / one.below.with_name(stem + suffix)
@@ -93,9 +96,13 @@ def outputs_in(folder: Path, logs: Sequence[NamedLog], suffix: str) -> list[Path
     return list(names)
 
 
-def _logs_of(argument: Path, leave_out: str, read_list: Callable[[], bytes]) -> Iterator[NamedLog]:
-    if str(argument) == LIST:
+def _logs_of(named: str | os.PathLike[str], leave_out: str, read_list: Callable[[], bytes]) -> Iterator[NamedLog]:
+    if str(named) == LIST:
         yield from _listed(read_list())
+        return
+    argument = as_location(named)
+    if isinstance(argument, Url):
+        yield from (NamedLog(url, below) for url, below in logs_in_store(argument, leave_out))
         return
     refuse_url(argument)
     refuse_special(argument)
@@ -143,7 +150,7 @@ def _matching(pattern: Path, leave_out: str) -> Iterator[NamedLog]:
     for name in names:
         path = Path(name)
         if path.is_dir():
-            yield from (replace(one, below=one.path.relative_to(fixed)) for one in _logs_in(path, leave_out))
+            yield from (replace(one, below=path.relative_to(fixed) / one.below) for one in _logs_in(path, leave_out))
         else:
             yield NamedLog(path, path.relative_to(fixed))
 
@@ -159,7 +166,9 @@ def _standard_input() -> bytes:
 def _listed(text: bytes) -> Iterator[NamedLog]:
     """Yield the logs of a list; their names are relative to the folder that all of them are in."""
     lines = text.split(b"\0") if b"\0" in text else text.splitlines()
-    paths = [Path(os.fsdecode(line)) for line in lines if line.strip()]
+    named = [as_location(os.fsdecode(line)) for line in lines if line.strip()]
+    yield from (NamedLog(url, Path(url.bucket, url.key)) for url in named if isinstance(url, Url))
+    paths = [path for path in named if isinstance(path, Path)]
     for path in paths:
         refuse_url(path)
         refuse_special(path)
@@ -173,10 +182,12 @@ def _listed(text: bytes) -> Iterator[NamedLog]:
         yield NamedLog(path, whole.relative_to(common))
 
 
-def _identity(path: Path) -> object:
+def _identity(path: Location) -> object:
     """Return the same value for all names of one file."""
+    if isinstance(path, Url):
+        return str(path)
     try:
         about = path.stat()
     except OSError:
-        return str(follow_links(path))
+        return str(place_of(path))
     return about.st_dev, about.st_ino

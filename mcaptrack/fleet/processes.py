@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from pathlib import Path
 from threading import Event, Lock, local
 from time import monotonic
 
 from mcaptrack.fleet.child import Child, WorkerLimits
 from mcaptrack.fleet.results import Running
 from mcaptrack.fleet.worker import Reply, Request
+from mcaptrack.location import Location
 
 
 class Processes:
@@ -22,7 +22,7 @@ class Processes:
         self._threads = ThreadPoolExecutor(limits.workers, "mcaptrack-worker")
         self._own = local()
         self._children: list[Child] = []
-        self._busy: dict[Path, tuple[Child, float]] = {}
+        self._busy: dict[Location, tuple[Child, float]] = {}
 
     def start(self, request: Request, then: Callable[[Future[Reply]], None]) -> None:
         """Begin with a log; ``then`` is called in another thread when it has ended."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, Final, Generic, Literal, TypeVar
 
+from mcaptrack.location import Location
 from mcaptrack.notices import Notice
 
 T = TypeVar("T")
@@ -27,7 +27,7 @@ class LogOutcome(Generic[T]):
 
     Attributes
     ----------
-    log : pathlib.Path
+    log : pathlib.Path or str
         The log, as it was named.
     state : str
         "done", "up-to-date" (there was nothing to do), "skipped" (done before, as the ledger says), "failed",
@@ -51,7 +51,7 @@ class LogOutcome(Generic[T]):
 
     """
 
-    log: Path
+    log: Location
     state: State
     result: T | None = None
     error: str = ""
@@ -89,7 +89,7 @@ class FleetResult(Generic[T]):
     stopped: str = ""
 
     @property
-    def results(self) -> dict[Path, T]:
+    def results(self) -> dict[Location, T]:
         """The results of the function, for logs that were done now."""
         return {one.log: one.result for one in self.outcomes if one.result is not None}
 
@@ -131,7 +131,7 @@ class FleetResult(Generic[T]):
 class Running:
     """A log that a worker is busy with: the stage, how much of it is done, since when, and its memory."""
 
-    log: Path
+    log: Location
     stage: str = ""
     done: float = 0.0
     total: float | None = None

@@ -16,7 +16,7 @@ from typing import Any, Final, Generic, Protocol, TypeVar
 
 from mcaptrack import __version__
 from mcaptrack.errors import McaptrackError
-from mcaptrack.files import follow_links
+from mcaptrack.files import place_of
 from mcaptrack.fleet import claims
 from mcaptrack.fleet.child import StoppedError
 from mcaptrack.fleet.claims import Claims
@@ -24,6 +24,7 @@ from mcaptrack.fleet.digests import digest_of_log
 from mcaptrack.fleet.ledger import Ledger
 from mcaptrack.fleet.results import AGAIN, GOOD, FleetResult, FleetStatus, LogOutcome, Running, Watch
 from mcaptrack.fleet.worker import Reply, Request
+from mcaptrack.location import Location
 
 T = TypeVar("T")
 #: Seconds between two looks at everything, and at logs that another fleet works on.
@@ -58,7 +59,7 @@ class QueuedLog:
     """A log to process: its place among all, what differs from other logs, and how often it was tried."""
 
     number: int
-    log: Path
+    log: Location
     location: str
     own: dict[str, Any]
     claims_in: Path | None
@@ -249,6 +250,6 @@ def task_of(function: Callable[..., Any], options: Mapping[str, Any]) -> bytes:
     return task
 
 
-def location_of(log: Path) -> str:
-    """Return the name of a log in ledgers and claims: its path without links."""
-    return str(follow_links(log))
+def location_of(log: Location) -> str:
+    """Return the name of a log in ledgers and claims: its path without links, or its URL."""
+    return str(place_of(log))

@@ -27,6 +27,7 @@ from mcaptrack.environment import hush_libraries
 from mcaptrack.errors import McaptrackError
 from mcaptrack.fleet.digests import digest_of_log
 from mcaptrack.fleet.results import State
+from mcaptrack.location import Location
 from mcaptrack.notices import Notice, about, listening
 
 #: Seconds between two messages about progress.
@@ -37,7 +38,7 @@ _PROGRESS_S: Final = 0.2
 class Request:
     """One log to run a function on: the function with its options, pickled, and those that differ between logs."""
 
-    log: Path
+    log: Location
     task: bytes
     own: dict[str, Any]
 
