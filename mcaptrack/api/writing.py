@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -68,7 +69,7 @@ def write_rows(
         write_layouts(path, layouts)
         for topic_of_stage in stale:
             warn_stale(topic_of_stage, path)
-        if opened.results is None:
+        if opened.results is None and isinstance(path, Path):
             update_metadata(path)
     return len(frames)
 
