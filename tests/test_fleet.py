@@ -90,7 +90,7 @@ class TestWhichLogs:
 
     @pytest.mark.parametrize(
         ("argument", "words"),
-        [("empty", "has no log"), ("*.none", "no file matches"), ("s3://b/a.mcap", "is a URL")],
+        [("empty", "has no log"), ("*.none", "no file matches"), ("ftp://b/a.mcap", "is a URL")],
     )
     def test_what_names_no_log_is_refused(self, folder, argument, words, monkeypatch):
         monkeypatch.chdir(folder)

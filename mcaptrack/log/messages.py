@@ -227,7 +227,7 @@ class Messages:
 
     def parts(self, channels: Sequence[int], schema: Schema, reader: RowReader) -> Iterator[ChannelRows | None]:
         """Yield the rows that ``columns`` returns, chunk by chunk; None where a message has another layout."""
-        for group in _in_order(self._batches(channels)):
+        for group in _in_order(self._located(channels, (None, None))):
             t_ns = to_int64(np.concatenate([batch.t_ns for batch in group]))
             rows, sequence, counts = [], [], []
             for batch in group:

@@ -110,7 +110,7 @@ def encoding_for(opened: log.Log) -> Encoding:
     if opened.results is not None or not recording_of(opened):
         return PROTOBUF
     for path in (opened.path, opened.real_path):
-        if is_packed(path.with_name(METADATA), path.name):
+        if isinstance(path, Path) and is_packed(path.with_name(METADATA), path.name):
             raise McaptrackError(
                 f"{path.with_name(METADATA)} says that messages are compressed one by one; results in {path.name} "
                 "would not be, and ROS tools could not read them; leave `sidecar=False` out, or use `sidecar=True`"
