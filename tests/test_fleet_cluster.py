@@ -17,7 +17,6 @@ from mcaptrack.fleet import cluster
 from mcaptrack.fleet.worker import Request
 from tests import fleet_tasks
 
-pytest.importorskip("distributed")
 pytestmark = pytest.mark.usefixtures("never_waits")
 
 
