@@ -527,7 +527,9 @@ def test_a_file_that_is_not_a_log_is_refused(tmp_path):
     assert "it is empty" in refusal(tmp_path / "empty.mcap", "select 1")
     assert "can't be opened" in refusal(tmp_path / "none.mcap", "select 1")
     assert "no log" in refusal("select 1")
-    assert "a folder without tables" in refusal(tmp_path, "select 1")
+    assert "it is empty" in refusal(tmp_path, "select 1")  # a folder stands for the logs in it
+    (tmp_path / "folder").mkdir()
+    assert "a folder without tables" in refusal(tmp_path / "folder", "select 1")
     assert "no file matches" in refusal(tmp_path / "x*.mcap", "select 1")
 
 
