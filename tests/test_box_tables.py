@@ -583,6 +583,7 @@ def test_halves_of_nanoseconds_are_rounded_to_the_even_one():
         ([1.0, 1.5, 2.5], None, [1.0, 1.5, 2.0, 2.5], "4 frames by the times, about 2 a second, 1 of them without boxes"),
         ([3.0], None, [3.0], "1 frames by the times, about 1 a second, 0 of them without boxes"),
         ([1.0, 1.5, 2.3], None, [1.0, 1.5, 2.3], "3 frames by the times, which are irregular; frames without boxes are not known"),
+        ([0.0, 1.0, 2.5], None, [0.0, 1.0, 2.5], "3 frames by the times, which are irregular; frames without boxes are not known"),
         ([1.0, 2.0], Fraction(2), [1.0, 1.5, 2.0], "3 frames by the times, about 2 a second, 1 of them without boxes"),
         ([1.0, 1.6], Fraction(2), [1.0, 1.6], "2 frames by the times, about 2 a second, 0 of them without boxes"),
     ],

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from mcaptrack.geometry.affine import IDENTITY
+from mcaptrack.geometry.affine import IDENTITY, invert, shift_px
 from mcaptrack.geometry.camera_motion import MotionEstimator
 from mcaptrack.geometry.camera_path import CameraPath, CameraPose, Verdict, poses_of
 from mcaptrack.schema import CAMERA_MOTION, Frame
@@ -143,6 +143,21 @@ def test_a_slow_pan_moves_the_camera(step):
     found = poses_of(np.array([[[1.0, 0, -step], [0, 1, 0]]] * 600), WIDTH, HEIGHT)
     assert verdict(found) is Verdict.MOVING
     assert verdict(found[: round(50 / step)]) is Verdict.SHAKING  # a tenth of the diagonal is 60 px
+
+
+@pytest.mark.parametrize("corner", [(0, 0), (1, 0), (0, 1), (1, 1)])
+@pytest.mark.parametrize(("by", "is_elsewhere"), [(1.02, True), (0.98, False)])
+def test_the_corner_that_moves_most_tells_whether_the_camera_looks_elsewhere(corner, by, is_elsewhere):
+    """One corner moves by a tenth of the diagonal, two by half of that, and the one across stays."""
+    along_x, along_y = ((1 if there else -1) * 0.5 for there in corner)
+    start = (0.5 if not corner[0] else 0) + (0.5 if not corner[1] else 0)
+    px = by * 0.1 * np.hypot(WIDTH, HEIGHT)
+    motion = np.array([[1 + px * along_x / WIDTH, px * along_y / HEIGHT, px * start], [0, 1, 0]])
+    pose = poses_of(np.array([IDENTITY, invert(motion)]), WIDTH, HEIGHT)[1]
+    assert pose.is_elsewhere == is_elsewhere
+    assert shift_px(motion, WIDTH, HEIGHT) == pytest.approx(px)
+    path = frames_to_path([Frame(0, 0, pose_to_rows(pose, WIDTH, HEIGHT))])
+    assert [one.is_elsewhere for _, one in path.poses_between(None, None)] == [is_elsewhere]
 
 
 def test_a_camera_that_has_turned_once_looks_elsewhere_from_then_on():

@@ -20,6 +20,27 @@ def scored(truth, tracks, options=METRES, forecasts=None):
     return [result.to_json() for result in outcome.results]
 
 
+@pytest.mark.parametrize("similarity", ["metres", "iou"])
+def test_rows_that_cannot_be_compared_are_as_if_they_were_not_there(similarity):
+    """Of the ground truth and of the tracks, in the first frame, in the middle and in the last one."""
+    rng = np.random.default_rng(3)
+    options = EvaluateOptions(similarities=(similarity,), gates_m=(1.0,))
+    whole, lacking, without = [], [], []
+    for n in range(12):
+        places = {number: (10.0 * number + n, rng.normal(0, 0.2)) for number in (3, 5, 8)}
+        rows = tracks_at(places) if similarity == "metres" else boxed({k: (20 * x, y) for k, (x, y) in places.items()})
+        gone = rng.random(3) < (0.7 if n in (0, 6, 11) else 0.1)
+        odd = rows.copy()
+        for name in ("x_m", "y_m") if similarity == "metres" else ("x_px", "y_px", "w_px", "h_px"):
+            odd[name][gone] = np.nan
+        whole.append(Frame(ns(n), n, rows))
+        lacking.append(Frame(ns(n), n, odd))
+        without.append(Frame(ns(n), n, rows[~gone]))
+    for one, other in ((whole, lacking), (lacking, whole), (lacking, lacking)):
+        same = [without if some is lacking else some for some in (one, other)]
+        assert scored(one, other, options) == scored(*same, options)
+
+
 def test_at_common_times_nothing_is_interpolated():
     truth = walk(lambda n: {1: (float(n), 0.0)}, 10)
     (row,) = scored(truth, walk(lambda n: {5: (float(n), 0.0)}, 10))

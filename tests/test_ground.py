@@ -335,6 +335,34 @@ def test_cars_are_predicted_in_their_own_unit():
     assert forecast("car", 4.0) == pytest.approx(4 * forecast("pedestrian", 1.0))
 
 
+def test_forecasts_of_retracked_cars_are_those_of_predict():
+    """In the unit of cars, mean and covariance: online tracks that are samples have the forecasts of samples."""
+    names = ((CAR, "car"),)
+    frames = [
+        Frame(
+            t * 400_000_000,
+            t,
+            TRACKS.rows(
+                track_id=[1, 2],
+                x_m=[2.0 * t, 40 - 1.5 * t],
+                y_m=[0.2 * t, 30.0],
+                observed=[True] * 2,
+                source_id=[-1] * 2,
+                class_id=[CAR] * 2,
+            ),
+        )
+        for t in range(12)
+    ]
+    retrack = Retrack(class_names=names)
+    outputs = dict(zip(retrack.writes, list(retrack(frames))[-1], strict=True))
+    (topic,) = [name for name in outputs if "predictions" in name]
+    *_, (wanted,) = Predict(class_names=names, predictor=retrack.predictor)(frames)
+    own = outputs[topic].rows
+    assert len(own) == len(wanted.rows) > 0
+    for name in ("x_m", "y_m", "cov_xx_m2", "cov_xy_m2", "cov_yy_m2"):
+        np.testing.assert_allclose(own[name], wanted.rows[name], rtol=1e-6, err_msg=name)
+
+
 def test_the_faults_of_the_detector_are_what_they_are_set_to():
     """The scenes that choose the settings have the faults that they say."""
     none = replace(Faults(), miss_near=0.0, miss_far=0.0, occlusions_per_s=0.0, false_boxes=0.0, clutter=0)

@@ -313,6 +313,11 @@ def test_a_forecast_may_be_of_any_numbers(kind):
         ({"steps": 10**9}, "steps and past at most 10000"),
         ({"step_s": float("nan")}, "has steps=2, step_s=nan, past=1; all"),
         ({"step_s": 0.0}, "has steps=2, step_s=0, past=1; all"),
+        ({"step_s": float("inf")}, "has steps=2, step_s=inf, past=1; all"),
+        ({"steps": 0}, "has steps=0, step_s=0.5, past=1; all have to be above 0"),
+        ({"past": 0}, "has steps=2, step_s=0.5, past=0; all have to be above 0"),
+        ({"past": 10_001}, "past=10001; all have to be above 0, steps and past at most 10000"),
+        ({"steps": 10_001}, "steps=10001, step_s=0.5, past=1; all have to be above 0, steps and past at most 10000"),
         ({"past": "two"}, "needs the numbers steps, step_s and past: ValueError"),
     ],
 )  # fmt: skip
@@ -322,6 +327,14 @@ def test_a_predictor_that_goes_wrong_is_named(attributes, said):
     assert str(refused.value).startswith("predictor own ")
     assert said in str(refused.value)
     assert "\n" not in str(refused.value)
+
+
+def test_a_predictor_may_look_at_and_give_ten_thousand_positions():
+    cls = type("Own", (Own,), {"past": 10_000, "steps": 10_000})
+    checked = CheckedPredictor.of(Entry("own", "predictor", cls, __name__, "", ""), {"steps": 2, "step_s": 0.5})
+    assert (checked.steps, checked.past) == (10_000, 10_000)
+    nothing = checked.predict(np.empty((0, 1, 2)), np.empty((0, 1), bool))
+    assert (nothing.mean.shape, nothing.cov.shape) == ((0, 10_000, 2), (0, 10_000, 2, 2))
 
 
 @dataclass(frozen=True)

@@ -248,6 +248,16 @@ def test_a_database_is_read_with_the_guards_of_sqlite(folder, monkeypatch):
     opened.close()
 
 
+def test_damaged_words_of_a_database_that_are_no_text_are_said_as_such(commands, folder):
+    """SQLite quotes them in its message, which Python then can't decode."""
+    database(folder / "a.db3", 3, [], TOPICS)
+    with sqlite3.connect(folder / "a.db3") as db:
+        db.execute("PRAGMA writable_schema=ON")
+        db.execute("UPDATE sqlite_master SET sql = CAST(x'637265617465ff' AS TEXT) WHERE name = 'messages'")
+    db.close()
+    refused(commands, folder / "a.db3", "a.db3 is damaged: it can't be understood")
+
+
 def test_one_of_two_tables_is_no_bag(commands, folder):
     for gone in ("topics", "messages"):
         database(folder / "a.db3", 3, [], TOPICS)

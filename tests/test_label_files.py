@@ -17,6 +17,7 @@ from mcaptrack.sources.ingest.labels import formats, number_table
 from mcaptrack.sources.ingest.labels.formats import Labels
 from mcaptrack.sources.ingest.labels.reading import read_homography, read_labels
 from mcaptrack.sources.ingest.labels.timeline import Timeline, count_frames
+from mcaptrack.sources.ingest.labels.wanted import WantedClasses
 
 NAN = float("nan")
 MOT = """3,2,10,20,4,8,0.5,1,1
@@ -206,6 +207,14 @@ FILES: dict[str, tuple[str, str, str, Read]] = {
         ),
     ),
 }
+
+
+def test_a_class_of_mot_that_no_row_can_have_is_taken_as_people(tmp_path):
+    kinds = (2**31 - 1, 2**31, -1, 3)
+    path = written(tmp_path / "a.txt", "".join(f"{n},{n},1,2,3,4,1,{kind}\n" for n, kind in enumerate(kinds, start=1)))
+    labels = read_labels(path, "mot", "tracks", wanted=WantedClasses("all"))
+    assert labels.class_id.tolist() == [2**31 - 1, 1, 1, 3]
+    assert labels.classes == {1: "pedestrian", 3: "car"}
 
 
 @pytest.mark.parametrize(("text", "name", "role", "wanted"), FILES.values(), ids=FILES)

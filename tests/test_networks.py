@@ -27,6 +27,7 @@ from mcaptrack.sources.ingest import IngestOptions, ingest
 from mcaptrack.training.walks import walks
 from mcaptrack.training.windows import Windows, ar1
 from mcaptrack.transforms import Predict
+from tests.onnx_graphs import model, node, value
 from tests.worlds import walk
 
 #: Small networks, and what torch made of the same numbers.
@@ -367,6 +368,15 @@ class TestOnnx:
     )
     def test_matrices_that_are_no_covariances_are_recognised(self, cov):
         assert not are_covariances(np.full((1, 3, 2, 2), cov))
+
+    @pytest.mark.parametrize("shape", [["B", 4], ["B", 4, 2, 1], ["B", "L", 2], ["B", 4, 3], ["B", 4, "C"]])
+    def test_the_first_input_is_positions_of_a_fixed_number(self, tmp_path, shape):
+        path = tmp_path / "net.onnx"
+        path.write_bytes(model([node("Identity", ["past"], ["y"])], [value("past", shape)], [value("y", None)]))
+        with pytest.raises(
+            McaptrackError, match=r"net\.onnx: its first input has to be B x L x 2 with a fixed L, not \["
+        ):
+            make(f"onnx:{path}", 3, 0.4)
 
     def test_unusable_networks_are_refused_in_one_line(self, tmp_path):
         name = self.file(tmp_path, WRONG)

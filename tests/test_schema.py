@@ -102,6 +102,23 @@ def test_a_channel_is_its_messages_laid_end_to_end(data):
     assert decoded[1].tolist() == counts.tolist()
 
 
+@pytest.mark.parametrize("order", ["sls", "lsl", "ssl", "lls"])
+def test_messages_with_and_without_later_columns_are_read_together(order):
+    """Of two rows each, the short ones without the columns that came later; and one without rows."""
+    box = {"y_px": [2.0, 2.0], "w_px": [3.0, 3.0], "h_px": [4.0, 4.0], "score": [0.5, 0.5], "class_id": [1, 1]}
+    parts = [DETECTIONS.empty()]
+    for number, kind in enumerate(order):
+        more = {"z_m": [7.0, 8.0], "x_m": [1.0, 1.0], "y_m": [1.0, 1.0]} if kind == "l" else {}
+        parts.append(DETECTIONS.rows(x_px=[number, 0.5], **box, **more))
+    payloads = [DETECTIONS.codec.encode(part) for part in parts]
+    assert len({len(payload) for payload in payloads[1:]}) == 2
+    end = np.cumsum([len(payload) for payload in payloads])
+    start = end - np.array([len(payload) for payload in payloads])
+    found, counts = DETECTIONS.codec.decode_at(np.frombuffer(b"".join(payloads), np.uint8), start, end)
+    assert counts.tolist() == [0, 2, 2, 2]
+    assert same(found, np.concatenate(parts))
+
+
 def test_a_writer_that_leaves_defaults_out_is_read_between_others():
     ours = TRACKS.rows(track_id=[5], x_m=[1.5], y_m=[2.5], observed=[True], source_id=[7])
     message = TRACKS.codec.message_class()
