@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -186,6 +187,25 @@ def test_markers_that_are_no_cubes_are_counted_and_lists_of_cubes_are_boxes():
     assert found.ignored == {"markers that are no cubes": 1}
     one = ros("visualization_msgs/Marker")
     assert boxes_of(one, marker(one, START_NS, SEEN)).boxes[0].source_id == 12
+
+
+def test_texts_beside_cubes_say_what_these_do_not():
+    writer = ros("visualization_msgs/MarkerArray")
+
+    def named(number: int, kind: int, space: str, text: str):
+        seen = replace(SEEN, number=number)
+        return marker(writer, START_NS, seen, kind, space=space, text=text)
+
+    markers = [
+        named(1, 1, "boxes", " "), named(1, 9, "labels", "van 0.40 m/s 0.75"),
+        named(2, 1, "truck", "0.25"), named(2, 9, "labels", "car 0.5"),
+        named(3, 1, "boxes", " "), named(3, 9, "labels", "car"), named(3, 9, "speeds", "bus"),  # which of them?
+        named(4, 9, "labels", "car"),
+    ]  # fmt: skip
+    found = boxes_of(writer, writer.new("visualization_msgs/MarkerArray", markers))
+    assert [box.class_name for box in found.boxes] == ["van", "truck", ""]
+    np.testing.assert_array_equal([box.score for box in found.boxes], [0.75, 0.25, np.nan])
+    assert found.ignored == {"markers that are no cubes": 3}
 
 
 def test_cubes_of_one_entity_have_no_id_and_metadata_has_several_names():

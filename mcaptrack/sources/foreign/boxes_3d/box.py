@@ -22,7 +22,8 @@ UNKNOWN_VECTOR: Final[Vector] = (nan, nan, nan)
 UNSTATED: Final[Quaternion] = (0.0, 0.0, 0.0, 0.0)
 _WORD: Final = re.compile(r"[^\W\d_][\w-]*")
 _PERCENT: Final = re.compile(r"(?<![\w.])(\d{1,3}(?:\.\d+)?)\s*%")
-_SHARE: Final = re.compile(r"(?<![\w.])(?:0?\.\d+|1\.0+|[01]\.)(?![\w.])")
+#: A number from 0 to 1 that isn't a distance, speed or angle.
+_SHARE: Final = re.compile(r"(?<![\w.-])(?:0?\.\d+|1\.0+|[01]\.)(?![\w.])(?!\s*(?:c?m|km|m?s|deg|rad|kph)\b|\s*°)")
 
 
 class Box3d(NamedTuple):

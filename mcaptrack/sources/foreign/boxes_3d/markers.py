@@ -6,6 +6,8 @@ Markers are drawings, as entities of scenes are (see ``scene_update``): a cube c
 from __future__ import annotations
 
 import re
+from collections import Counter
+from math import isnan
 from typing import Any, Final
 
 from mcaptrack.sources.foreign.boxes_3d.box import (
@@ -20,7 +22,7 @@ from mcaptrack.sources.foreign.boxes_3d.box import (
 )
 from mcaptrack.sources.foreign.values import integer, text
 
-_CUBE, _CUBE_LIST, _ADD = 1, 6, 0
+_CUBE, _CUBE_LIST, _TEXT, _ADD = 1, 6, 9, 0
 #: Namespaces that say nothing about the class of their markers.
 _GENERIC: Final = re.compile(
     r"(b(ounding)?_?box(es)?|(basic_?)?shapes?|(box|cube|detection|marker|object|obstacle|track)(e?s)?|ns)(_?array)?|\W*"
@@ -31,14 +33,15 @@ def boxes_of(message: Any) -> Message3d:
     """The cubes of a message."""
     markers = list(message.markers) if hasattr(message, "markers") else [message]
     out = Message3d(*(head_of(markers[0]) if markers else (0, "")))
-    is_added = False
-    for marker in markers:
-        if integer(part(marker, "action") or 0) != _ADD:
-            continue  # deletions say nothing about what is measured
-        is_added = True
+    # Deletions say nothing about what is measured.
+    added = [marker for marker in markers if integer(part(marker, "action") or 0) == _ADD]
+    labels = _labels(added)
+    for marker in added:
         kind = integer(marker.type)
         if kind == _CUBE:
             name, score = _class_of(marker)
+            label, share = words_of(labels.get(integer(marker.id), ""))
+            name, score = name or label, share if isnan(score) else score
             pose = _pose(marker)
             found = Box3d(*head_of(marker), *pose, vector(marker.scale), name, score, integer(marker.id))
             out.boxes.append(found)
@@ -50,10 +53,20 @@ def boxes_of(message: Any) -> Message3d:
                 for size in [vector(marker.scale)]
                 for point in part(marker, "points") or ()
             ]
-        else:
+        elif kind != _TEXT or integer(marker.id) not in labels:
             out.ignored["markers that are no cubes"] += 1
-    out.is_measured = bool(out.boxes) or not (markers and (out.ignored or not is_added))
+    out.is_measured = bool(out.boxes) or not (markers and (out.ignored or not added))
     return out
+
+
+def _labels(markers: list[Any]) -> dict[int, str]:
+    """The texts of markers beside cubes, by the id that they share with one cube."""
+    cubes, texts = (Counter(integer(one.id) for one in markers if integer(one.type) == kind) for kind in (_CUBE, _TEXT))
+    return {
+        integer(one.id): text(part(one, "text") or "")
+        for one in markers
+        if integer(one.type) == _TEXT and cubes[integer(one.id)] == texts[integer(one.id)] == 1
+    }
 
 
 def _pose(marker: Any) -> tuple[tuple[float, float, float], tuple[float, float, float, float]]:
