@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 import pytest
 
+from mcaptrack.errors import McaptrackError
 from mcaptrack.sources.foreign import MessageType
 from mcaptrack.sources.foreign.boxes_3d import boxes_3d_decoder
 from mcaptrack.sources.foreign.boxes_3d.box import Message3d
@@ -226,6 +227,30 @@ def test_a_box_is_the_same_in_every_family_and_encoding(family, encoding):
     assert str(box.source_id) == str(wanted["source_id"])
     assert box.class_name == wanted["class_name"]
     assert found.ignored == {}
+
+
+def test_detections_that_state_their_pose_in_a_result_alone():
+    def vectors(*values: float):
+        return dict(zip("xyzw", values, strict=False))
+
+    def one(centre, pose):
+        bbox = {"center": {"position": vectors(*centre), "orientation": vectors(0, 0, 0, 0)}, "size": vectors(4, 2, 1)}
+        guess = {"hypothesis": {"class_id": "car", "score": 0.5}}
+        posed = {"pose": {"pose": {"position": vectors(*pose), "orientation": vectors(0, 0, 0, 1)}}}
+        return {"header": head, "bbox": bbox, "results": [guess | posed]}
+
+    head = {"stamp": {"sec": 1, "nanosec": 0}, "frame_id": "lidar"}
+    boxes = [one((0, 0, 0), (7, 8, 9)), one((1, 0, 0), (7, 8, 9)), one((0, 0, 0), (0, 0, 0))]
+    kind = MessageType("vision_msgs/msg/Detection3DArray", "jsonschema", b"{}", "json")
+    found = boxes_3d_decoder(kind)(json.dumps({"header": head, "detections": boxes}).encode())
+    assert [box.centre for box in found.boxes] == [(7, 8, 9), (1, 0, 0), (0, 0, 0)]
+    assert [box.orientation for box in found.boxes] == [(0, 0, 0, 1), (0, 0, 0, 0), (0, 0, 0, 0)]
+
+
+def test_a_field_that_is_missing_is_named():
+    kind = MessageType("jsk_recognition_msgs/BoundingBoxArray", "jsonschema", b"{}", "json")
+    with pytest.raises(McaptrackError, match=r"message \(it has no field 'stamp'\)$"):
+        boxes_3d_decoder(kind)(b'{"header": {"frame_id": "a"}, "boxes": []}')
 
 
 def test_scenes_of_foxglove_are_the_same_in_all_encodings():

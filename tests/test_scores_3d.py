@@ -235,7 +235,7 @@ def test_a_log_of_3d_labels_is_evaluated_on_the_command_line(tmp_path):
     assert "AMOTA" in table[0].split(",")
     assert len(table) == 9
     assert call("evaluate", log, "--gate-m", "2", "--fail-under", "amota=0.99").code == 4
-    with pytest.raises(McaptrackError, match=r"have no boxes$"):
+    with pytest.raises(McaptrackError, match=r"have no boxes in pictures$"):
         mcaptrack.evaluate(log, similarity="iou")
 
 

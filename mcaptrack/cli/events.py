@@ -25,7 +25,7 @@ def events(
     similarity: Annotated[
         common.SimilarityName | None, common.similarity("iou at the video's rate, otherwise metres")
     ] = None,
-    gate_m: Annotated[float | None, common.gate_m("1.0", was="--gate")] = None,
+    gate_m: Annotated[float | None, common.gate_m("1.0, and 2.0 for 3D boxes", was="--gate")] = None,
     min_iou: Annotated[float | None, common.min_iou(was="--gate", was_if=("similarity", "iou"))] = None,
     camera: common.Camera = None,
     output: common.Output = None,

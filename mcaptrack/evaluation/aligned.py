@@ -46,7 +46,7 @@ _NEEDED: Final[dict[Similarity, tuple[str, ...]]] = {
     "3d-iou": ("x_m", "z_m", "length_m", "width_m", "height_m", "heading_rad"),
 }
 _UNITS: Final[dict[Similarity, str]] = {
-    "iou": "boxes",
+    "iou": "boxes in pictures",
     "metres": "positions in metres",
     "bev-iou": "boxes in metres with a heading",
     "3d-iou": "3D boxes (with z_m, height_m and a heading)",

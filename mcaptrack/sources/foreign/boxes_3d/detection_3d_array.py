@@ -14,6 +14,13 @@ def boxes_of(message: Any) -> Message3d:
     return Message3d(*head, [_box(one, head) for one in message.detections])
 
 
+def _pose(centre: Any, results: Any) -> Any:
+    """The pose of a box; that of its first result where only this one is filled in."""
+    stated = [one.pose.pose for one in results if part(part(one, "pose"), "pose") is not None]
+    is_unset = not any(vector(centre.position)) and bool(stated) and any(vector(stated[0].position))
+    return stated[0] if is_unset else centre
+
+
 def _box(detection: Any, around: tuple[int, str]) -> Box3d:
     # Before Humble a result is its own hypothesis, with ``id`` in the place of ``class_id``.
     guesses = [getattr(result, "hypothesis", result) for result in detection.results]
@@ -21,7 +28,7 @@ def _box(detection: Any, around: tuple[int, str]) -> Box3d:
     known = [(score, guess) for score, guess in scored if isfinite(score)]
     score, best = max(known or scored, key=lambda pair: pair[0], default=(nan, None))
     found = None if best is None else best.class_id if hasattr(best, "class_id") else best.id
-    pose = detection.bbox.center
+    pose = _pose(detection.bbox.center, detection.results)
     return Box3d(
         *own_head(detection, around),
         vector(pose.position),
